@@ -24,7 +24,8 @@ from scipy.spatial import KDTree
 
 from experiments import results
 from experiments.cells import append_cell, read_cells
-from jsecon.app.relations import ObjectScene, query_relation
+from jsecon.app.object_scene import ObjectScene
+from jsecon.app.relations import query_relation
 from jsecon.demo.capture import room_cameras, write_room
 from jsecon.demo.raycast import render_views
 from jsecon.demo.room import (

@@ -12,12 +12,12 @@ from table_field import THINGS, table_field
 
 import jsecon
 from jsecon.app import cli
-from jsecon.app.relations import ObjectScene
+from jsecon.app.object_scene import ObjectScene
 from jsecon.errors import InputError
 from jsecon.language.field import save_field
 from jsecon.query.expressions import RELATIONS, is_expression, parse_expression
 from jsecon.query.object_shapes import ObjectShapes
-from jsecon.query.relations import PAIRS, Viewpoint, between_scores, near, order_values, pair_scores
+from jsecon.query.relations import PAIRS, Viewpoint, between_scores, gap, near, order_values, pair_scores
 from jsecon.types import Regions
 
 CORNERS = np.stack(np.meshgrid(*[np.linspace(-1, 1, 3)] * 3), -1).reshape(-1, 3)
@@ -39,7 +39,8 @@ def looking(eye=(0.0, -9.0, 1.0), turn=0.0):
 
 
 def scores(a, b, view=None):
-    return {name: float(table[0, 0]) for name, table in pair_scores(a, b, view or looking()).items()}
+    table = {name: float(pair_scores(name, a, b, view or looking())[0, 0]) for name in PAIRS}
+    return table | {"gap": float(gap(a, b)[0])}
 
 
 @settings(max_examples=40, deadline=None)
@@ -113,7 +114,13 @@ def test_predicates_are_pure_jitted_and_batched():
         lambda *columns: jnp.concatenate(columns), brick((0, 0, 0), (0.1,) * 3), brick((1, 0, 0), (0.2,) * 3)
     )
     table = jax.vmap(lambda a: jax.vmap(lambda b: near(a, b))(both))(both)
-    np.testing.assert_allclose(table, pair_scores(both, both, looking())["near"], rtol=1e-5)
+    for relation in PAIRS:
+        scored = pair_scores(relation, both, both, looking())
+        compiled = jax.jit(pair_scores, static_argnums=0)(relation, both, both, looking())
+        plain = pair_scores(relation, jax.tree.map(np.asarray, both), jax.tree.map(np.asarray, both), looking())
+        np.testing.assert_allclose(scored, compiled, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(scored, plain, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(table, pair_scores("near", both, both, looking()), rtol=1e-5)
     np.testing.assert_allclose(jax.jit(near)(both[0], both[1]), table[0, 1], rtol=1e-5)
     values = order_values(both, looking())
     assert values["largest"].argmin() == values["tallest"].argmin() == values["rightmost"].argmin() == 1

@@ -16,10 +16,11 @@ from jsecon.language.columns import vote_blocks
 from jsecon.language.membership import SHARE_THRESHOLD, membership_probability, vote_shares
 from jsecon.numerics import normalize
 from jsecon.query.groups import containment, objects_of_gaussians, same_object
-from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes, scene_up
+from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.outliers import MIN_SAMPLES
 from jsecon.splat.transform import transform_gaussians_float64
 from jsecon.types import LanguageField
+from jsecon.views.frame import field_up
 from jsecon.vision.reference_words import REFERENCE_WORDS, reference_of
 
 NAMES = 3
@@ -119,7 +120,13 @@ class _Names(NamedTuple):
     """of cosines in the softmax"""
 
 
-def objects(field: LanguageField, vocabulary: Sequence[str] | None = None, embedder: Any = None) -> Catalogue:
+def objects(
+    field: LanguageField,
+    vocabulary: Sequence[str] | None = None,
+    embedder: Any = None,
+    *,
+    up: Sequence[Any] | np.ndarray | None = None,
+) -> Catalogue:
     """Lists the objects of a field.
 
     Regions that show one object are joined by the rules that queries use for pieces and duplicates (`same_object`). So
@@ -131,16 +138,18 @@ def objects(field: LanguageField, vocabulary: Sequence[str] | None = None, embed
       vocabulary: Names to choose from. None takes those of the embedder: of colours their names, of things and of the
         background; of others common nouns.
       embedder: Embedder of the field; None opens it if names need it.
+      up: Up axis in the capture's world; None finds it (`field_up`).
 
     Returns:
       The catalogue. It is empty if the field has no regions.
 
     Raises:
-      InputError: The vocabulary is empty, or the embedder cannot represent a name.
+      InputError: The vocabulary is empty, the embedder cannot represent a name, or `up` has no direction.
     """
+    upright = field_up(field, up)
     names = _vocabulary(field, vocabulary, embedder)
     size, main = _sizes(field)
-    groups = _groups(field, main)
+    groups = _groups(field, main, upright)
     members = np.arange(groups.max(initial=-1) + 1)[:, None] == groups  # (G, R)
     pixels = np.asarray(field.regions.pixels, np.float64)
     weighted = pixels.sum(1)[:, None] * np.asarray(field.regions.embeddings, np.float64)
@@ -159,8 +168,8 @@ def objects(field: LanguageField, vocabulary: Sequence[str] | None = None, embed
     best = np.argsort(-shown, axis=1, kind="stable")[:, :FRAMES]
     best = np.where(np.take_along_axis(shown, best, axis=1) > 0, best, -1)
     to_source = np.asarray(field.to_source, np.float64)
-    up = to_source[:3, :3] @ scene_up(field.cameras)
-    up /= np.linalg.norm(up)
+    upright = to_source[:3, :3] @ upright
+    upright /= np.linalg.norm(upright)
     return Catalogue(
         names=text[order[rows]],
         probability=probability[rows],
@@ -169,11 +178,11 @@ def objects(field: LanguageField, vocabulary: Sequence[str] | None = None, embed
         confidence=confidence[rows],
         views=(shown > 0).sum(1),
         frames=np.pad(best, ((0, 0), (0, FRAMES - best.shape[1])), constant_values=-1),
-        shapes=_shapes(field, labels, part_labels, renumber[whole[rows]], up),
+        shapes=_shapes(field, labels, part_labels, renumber[whole[rows]], upright),
         labels=labels,
         part_labels=part_labels,
         regions=renumber[groups],
-        up=up,
+        up=upright,
         frame_names=field.names,
     )
 
@@ -248,12 +257,11 @@ def _sizes(field: LanguageField) -> tuple[Float[np.ndarray, " r"], Int[np.ndarra
     return size, np.concatenate(main)
 
 
-def _groups(field: LanguageField, main: np.ndarray) -> Int[np.ndarray, " r"]:
+def _groups(field: LanguageField, main: np.ndarray, up: np.ndarray) -> Int[np.ndarray, " r"]:
     """Returns the group of each region: those that show one object have the same one."""
     joined, alike = map(np.array, same_object(field))
     if not len(joined):
         return np.zeros(0, int)
-    up = scene_up(field.cameras)
     pairs = np.argwhere(np.triu(alike & ~joined, 1))
     rows = {region: np.flatnonzero(main == region) for region in np.unique(pairs)}
     means = np.asarray(field.gaussians.means, np.float64)

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from jsecon.errors import require, require_shape
-from jsecon.types import Array, Camera, Gaussians, Leaf, record
+from jsecon.types import Array, Gaussians, Leaf, record
 
 BOX_TAIL = 0.02
 """share of the Gaussians at each end of an axis that a box leaves out as strays"""
@@ -20,8 +20,6 @@ YAW_STEPS = 18
 """directions, evenly spaced over a right angle, that an upright box tries"""
 YAW_POINTS = 400
 """points of an object that these directions are tried on"""
-PARALLEL = 0.01
-"""share of the cameras' x axes off their common line up to which they do not tell the up axis"""
 
 
 @record
@@ -162,25 +160,3 @@ def gaussian_spreads(gaussians: Gaussians) -> Float[np.ndarray, "n 3 3"]:
     """Returns the axes of Gaussians as columns, each as long as its standard deviation, world units, float64."""
     rotations = Rotation.from_quat(np.asarray(gaussians.quaternions, np.float64), scalar_first=True).as_matrix()
     return rotations * np.exp(np.asarray(gaussians.log_scales, np.float64))[:, None, :]
-
-
-def scene_up(cameras: Camera) -> Float[np.ndarray, " 3"]:
-    """Finds the up axis of a scene from its cameras, which people and planners hold level.
-
-    It is the direction that is most nearly perpendicular to the x axes of all cameras, on the side of their upper
-    edges. If all cameras have nearly the same x axis, it is the mean direction of their upper edges.
-
-    Args:
-      cameras: T cameras, T >= 1.
-
-    Returns:
-      (3,) float64 unit vector, world.
-    """
-    pose = np.asarray(cameras.world_to_camera, np.float64)
-    right = pose[:, 0, :3]
-    mean_up = -pose[:, 1, :3].mean(0)
-    values, vectors = np.linalg.eigh(right.T @ right / len(right))
-    up = vectors[:, 0] * (np.sign(vectors[:, 0] @ mean_up) or 1.0)
-    if values[1] < PARALLEL and np.linalg.norm(mean_up) > 0:
-        up = mean_up
-    return up / np.linalg.norm(up)

@@ -1,13 +1,17 @@
 """Where objects stand to each other: soft predicates on boxes and points, and orders. Pure functions: jit or vmap them.
 
-Each predicate takes shapes of single objects (`ObjectShapes` without the leading axis, upright boxes) and returns a
-score in [0, 1]; from SATISFIED on the relation holds. `pair_scores` and `between_scores` take all pairs and triples.
-All distances are relative to the objects' sizes: a scene that is scaled, shifted, or turned about the up axis together
-with its viewpoint has the same scores. Subtract a common origin before coordinates become float32.
+Each predicate takes shapes of objects (`ObjectShapes`, upright boxes) whose leading axes broadcast, and returns scores
+in [0, 1]; from SATISFIED on the relation holds. `pair_scores` and `between_scores` take all pairs and triples. NumPy
+arrays are scored by NumPy, without a program to compile, and jax arrays by jax. All distances are relative to the
+objects' sizes: a scene that is scaled, shifted, or turned about the up axis together with its viewpoint has the same
+scores. Subtract a common origin before coordinates become float32.
 """
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Bool, Float
 
 from jsecon.query.object_shapes import ObjectShapes
@@ -36,9 +40,6 @@ BETWEEN = 0.5
 """distance from the line between two objects, in units of half its length and the object's half size together"""
 REACH = 1.4
 """factor by which a footprint grows to take in the other object's surface around it, since it hides that below"""
-PAIRS = ("left of", "right of", "in front of", "behind", "above", "below", "on", "under", "in", "next to", "near")
-PAIRS += ("far from", "touching")
-"""relations of `pair_scores`"""
 ORDERS = ("largest", "smallest", "tallest", "shortest", "highest", "lowest", "leftmost", "rightmost")
 ORDERS += ("nearest", "farthest")
 """orders of `order_values`"""
@@ -58,7 +59,7 @@ class Viewpoint:
     @property
     def right(self) -> Array:
         """(3,) horizontal unit vector to the right."""
-        return jnp.cross(self.forward, self.up)
+        return _module(self.up).cross(self.forward, self.up)
 
 
 def viewpoint(camera: Camera, up: Float[Array, " 3"]) -> Viewpoint:
@@ -69,78 +70,100 @@ def viewpoint(camera: Camera, up: Float[Array, " 3"]) -> Viewpoint:
       up: Unit up axis, world.
 
     Returns:
-      The viewpoint, float32.
+      The viewpoint.
     """
-    axes = jnp.asarray(camera.world_to_camera)[:3, :3]
+    xp = _module(camera.world_to_camera)
+    axes = camera.world_to_camera[:3, :3]
     forward, upper = _level(axes[2], up), _level(-axes[1], up)
-    tilted = jnp.linalg.norm(forward) < 0.2
-    forward = jnp.where(tilted, upper * jnp.sign(-(axes[2] @ up)), forward)
-    forward = forward / jnp.maximum(jnp.linalg.norm(forward), 1e-9)
-    return Viewpoint(jnp.asarray(camera.centres), forward, jnp.asarray(up))
+    tilted = _length(forward) < 0.2
+    forward = xp.where(tilted, upper * xp.sign(-_dot(axes[2], up)), forward)
+    return Viewpoint(camera.centres, forward / xp.maximum(_length(forward), 1e-9), up)
+
+
+def _module(array: Any) -> Any:
+    """Returns the module that computes with an array: jax.numpy, or NumPy."""
+    return jnp if isinstance(array, jax.Array) else np
+
+
+def _dot(a: Array, b: Array) -> Any:
+    """Products of vectors (..., 3), which broadcast.
+
+    As a sum of products: a matrix times a vector, reduced under vmap, can be silently wrong (jax issue 39103).
+    """
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
+
+
+def _length(vector: Array) -> Any:
+    """Lengths of vectors (..., 3)."""
+    return _module(vector).sqrt(_dot(vector, vector))
 
 
 def _level(vector: Array, up: Array) -> Array:
-    """The horizontal part of a vector."""
-    return vector - (vector @ up) * up
+    """The horizontal part of vectors (..., 3)."""
+    return vector - _dot(vector, up)[..., None] * up
 
 
-def size_of(shape: ObjectShapes) -> Float[Array, "..."]:
-    """Mean of the three sides of a box, world units."""
-    return 2.0 * jnp.mean(shape.half_size, axis=-1)
+def size_of(shape: ObjectShapes) -> Float[Array, "*batch"]:
+    """Mean of the three sides of boxes, world units."""
+    return 2.0 * shape.half_size.mean(-1)
 
 
 def _rise(x: Array, steepness: float = 10.0) -> Array:
-    """A soft step, 0.5 at x = 0."""
-    return jax.nn.sigmoid(steepness * x)
+    """A soft step, 0.5 at x = 0: the logistic function."""
+    return 0.5 + 0.5 * _module(x).tanh(0.5 * steepness * x)
 
 
 def _within(x: Array, power: float = 2.0) -> Array:
     """Falls from 1 at x = 0 over 0.5 at x = 1 to 0."""
-    return 1.0 / (1.0 + jnp.maximum(x, 0.0) ** power)
+    return 1.0 / (1.0 + _module(x).maximum(x, 0.0) ** power)
+
+
+def _over(x: Array, size: Array) -> Array:
+    """Quotient of x and a size, which may be 0."""
+    return x / _module(size).maximum(size, 1e-12)
 
 
 def _heights(shape: ObjectShapes) -> tuple[Array, Array, Array]:
     """Bottom, top and height of an upright box along its third axis."""
-    middle = shape.center @ shape.axes[:, 2]
-    return middle - shape.half_size[2], middle + shape.half_size[2], 2.0 * shape.half_size[2]
+    middle, half = _dot(shape.center, shape.axes[..., 2]), shape.half_size[..., 2]
+    return middle - half, middle + half, 2.0 * half
 
 
-def _along(points: Array, axis: Array) -> Array:
-    """Coordinates of points (..., 3) along an axis (3,).
-
-    As a sum of products: a matrix times a vector, reduced under vmap, can be silently wrong (jax issue 39103).
-    """
-    return jnp.sum(points * axis, axis=-1)
-
-
-def _local_points(points: Array, shape: ObjectShapes) -> Array:
-    """Distances of points (P, 3) from the middle of a box along its axes, (P, 3)."""
-    return jnp.abs(jnp.sum((points - shape.center)[:, :, None] * shape.axes, axis=1))
+def _local_points(points: Array, shape: ObjectShapes) -> tuple[Array, Array, Array]:
+    """Distances of points (..., P, 3) from the middle of a box along each of its axes, (..., P)."""
+    offset = points - shape.center[..., None, :]
+    x, y, z = (abs(_dot(offset, shape.axes[..., None, :, k])) for k in range(3))
+    return x, y, z
 
 
-def _inside(points: Array, shape: ObjectShapes, grow: float = 1.0) -> tuple[Bool[Array, " p"], Bool[Array, " p"]]:
-    """Which points (P, 3) lie within the footprint of an upright box grown by a factor, and which in the box."""
-    local = _local_points(points, shape)
-    footprint = jnp.all(local[:, :2] <= grow * shape.half_size[:2], axis=1)
-    return footprint, footprint & (local[:, 2] <= shape.half_size[2])
+def _inside(
+    points: Array, shape: ObjectShapes, grow: float = 1.0
+) -> tuple[Bool[Array, "*batch p"], Bool[Array, "*batch p"]]:
+    """Which points (..., P, 3) lie within the footprint of an upright box grown by a factor, and which in the box."""
+    x, y, z = _local_points(points, shape)
+    half = shape.half_size[..., None, :]
+    footprint = (x <= grow * half[..., 0]) & (y <= grow * half[..., 1])
+    return footprint, footprint & (z <= half[..., 2])
 
 
-def gap(a: ObjectShapes, b: ObjectShapes) -> Float[Array, ""]:
+def gap(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
     """Free distance between the surfaces of two objects, world units; 0 where they touch.
 
     The smallest distance of the points of one to the box of the other, of both ways the larger: a box may hold free
     space, as that of an arch does. Points of a large object may lie farther apart than a small one is wide, which is
     taken off.
     """
+    xp = _module(a.points)
 
-    def to_box(points: Array, own: ObjectShapes, other: ObjectShapes) -> Array:
-        beyond = jnp.maximum(_local_points(points, other) - other.half_size, 0.0)
-        x, y, z = own.half_size
-        spacing = jnp.sqrt(8.0 * (x * y + y * z + z * x) / points.shape[0])
-        missed = jnp.maximum(spacing - 0.25 * size_of(other), 0.0)
-        return jnp.sqrt(jnp.min(jnp.sum(beyond * beyond, axis=1))) - missed
+    def to_box(own: ObjectShapes, other: ObjectShapes) -> Array:
+        local = _local_points(own.points, other)
+        beyond = (xp.maximum(distance - other.half_size[..., None, k], 0.0) for k, distance in enumerate(local))
+        x, y, z = (own.half_size[..., k] for k in range(3))
+        spacing = xp.sqrt(8.0 * (x * y + y * z + z * x) / own.points.shape[-2])
+        missed = xp.maximum(spacing - 0.25 * size_of(other), 0.0)
+        return xp.sqrt(sum(side * side for side in beyond).min(-1)) - missed
 
-    return jnp.maximum(jnp.maximum(to_box(a.points, a, b), to_box(b.points, b, a)), 0.0)
+    return xp.maximum(xp.maximum(to_box(a, b), to_box(b, a)), 0.0)
 
 
 def _sight(a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> tuple[Array, Array]:
@@ -149,37 +172,37 @@ def _sight(a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> tuple[Array, Ar
     So left and right agree with the image of the camera. Where the eye is as near as the objects are apart, or nearly
     above them, they are those of the viewpoint.
     """
+    xp = _module(a.center)
     to = 0.5 * (a.center + b.center) - view.eye
     across = _level(to, view.up)
-    distance = jnp.linalg.norm(across)
-    apart = jnp.linalg.norm(_level(a.center - b.center, view.up))
-    usual = distance > jnp.maximum(0.5 * apart, 0.25 * jnp.abs(to @ view.up))
-    forward = jnp.where(usual, across / jnp.where(usual, distance, 1.0), view.forward)
-    return forward, jnp.cross(forward, view.up)
+    distance = _length(across)
+    apart = _length(_level(a.center - b.center, view.up))
+    usual = distance > xp.maximum(0.5 * apart, 0.25 * abs(_dot(to, view.up)))
+    forward = xp.where(usual[..., None], across / xp.where(usual, distance, 1.0)[..., None], view.forward)
+    return forward, xp.cross(forward, view.up)
 
 
 def _towards(a: ObjectShapes, b: ObjectShapes, along: Array, across: Array) -> Array:
     """Whether a lies in the direction `along` from b."""
 
     def interval(shape: ObjectShapes, axis: Array) -> tuple[Array, Array]:
-        places = _along(shape.points, axis)
-        return 0.5 * (places.max() + places.min()), 0.5 * (places.max() - places.min())
+        places = _dot(shape.points, axis[..., None, :])
+        return 0.5 * (places.max(-1) + places.min(-1)), 0.5 * (places.max(-1) - places.min(-1))
 
     (middle_a, half_a), (middle_b, half_b) = interval(a, along), interval(b, along)
     (side_a, wide_a), (side_b, wide_b) = interval(a, across), interval(b, across)
     shift = middle_a - middle_b
-    apart = shift / jnp.maximum(half_a + half_b, 1e-12)
-    beside = jnp.maximum(jnp.abs(side_a - side_b) - wide_a - wide_b, 0.0)
-    return _rise(apart - APART) * _within(beside / (SIDEWAYS * jnp.maximum(shift, 1e-12)))
+    beside = abs(side_a - side_b) - wide_a - wide_b
+    return _rise(_over(shift, half_a + half_b) - APART) * _within(_over(beside, SIDEWAYS * shift))
 
 
-def left_of(a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> Float[Array, ""]:
+def left_of(a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> Float[Array, "*batch"]:
     """Whether a is left of b as the viewpoint sees it; b is then as much right of a."""
     forward, right = _sight(a, b, view)
     return _towards(a, b, -right, forward)
 
 
-def in_front_of(a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> Float[Array, ""]:
+def in_front_of(a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> Float[Array, "*batch"]:
     """Whether a is nearer to the viewpoint than b and not far aside; b is then as much behind a."""
     forward, right = _sight(a, b, view)
     return _towards(a, b, -forward, right)
@@ -187,7 +210,7 @@ def in_front_of(a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> Float[Arra
 
 def _overlap(a: ObjectShapes, b: ObjectShapes) -> Array:
     """Share of the points of one object within the footprint of the other, of both ways the larger."""
-    return jnp.maximum(_inside(a.points, b)[0].mean(), _inside(b.points, a)[0].mean())
+    return _module(a.points).maximum(_inside(a.points, b)[0].mean(-1), _inside(b.points, a)[0].mean(-1))
 
 
 def _local(a: ObjectShapes, b: ObjectShapes, share: float, otherwise: Array) -> Array:
@@ -196,140 +219,137 @@ def _local(a: ObjectShapes, b: ObjectShapes, share: float, otherwise: Array) -> 
     So the seat of a chair, not its back, is what a cushion lies on, and the top of a table, not its feet, what is above
     a box. The heights are taken as evenly spread around their mean: a sort would take most of the time.
     """
+    xp = _module(a.points)
     close, _ = _inside(a.points, b, REACH)
-    heights = _along(a.points, a.axes[:, 2])
-    number = jnp.maximum(close.sum(), 1)
-    mean = jnp.sum(jnp.where(close, heights, 0.0)) / number
-    variance = jnp.sum(jnp.where(close, (heights - mean) ** 2, 0.0)) / number
-    spread = jnp.sqrt(12.0 * jnp.maximum(variance, 1e-30))
-    return jnp.where(close.any(), mean + (share - 0.5) * spread, otherwise)
+    heights = _dot(a.points, a.axes[..., None, :, 2])
+    number = xp.maximum(close.sum(-1), 1)
+    mean = xp.where(close, heights, 0.0).sum(-1) / number
+    variance = xp.where(close, (heights - mean[..., None]) ** 2, 0.0).sum(-1) / number
+    spread = xp.sqrt(12.0 * xp.maximum(variance, 1e-30))
+    return xp.where(close.any(-1), mean + (share - 0.5) * spread, otherwise)
 
 
 def _tolerance(shape: ObjectShapes) -> Array:
     """Tolerance of a contact in height, world units."""
-    return CONTACT * 2.0 * (shape.half_size[2] + 0.5 * (shape.half_size[0] + shape.half_size[1]))
+    x, y, z = (shape.half_size[..., k] for k in range(3))
+    return CONTACT * 2.0 * (z + 0.5 * (x + y))
 
 
-def above(a: ObjectShapes, b: ObjectShapes) -> Float[Array, ""]:
+def above(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
     """Whether a is over b, touching or not: footprints overlap, and a begins where b ends there. b is then under a."""
     bottom, _, _ = _heights(a)
     _, top, _ = _heights(b)
     free = _local(a, b, 0.1, bottom) - _local(b, a, 0.9, top)
-    return _rise(_overlap(a, b) - OVER) * _rise(free / jnp.maximum(_tolerance(a), 1e-12) + 1.0, 4.0)
+    return _rise(_overlap(a, b) - OVER) * _rise(_over(free, _tolerance(a)) + 1.0, 4.0)
 
 
-def inside(a: ObjectShapes, b: ObjectShapes) -> Float[Array, ""]:
+def inside(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
     """Whether a is in b: enough of its points lie in the box of b, which is no smaller across and reaches below it."""
-    share = _inside(a.points, b)[1].mean()
+    share = _inside(a.points, b)[1].mean(-1)
     bottom, top, height = _heights(a)
     deep = 0.5 * (bottom + top) - _local(b, a, 0.25, _heights(b)[0])
-    smaller = jnp.prod(b.half_size[:2]) / jnp.maximum(jnp.prod(a.half_size[:2]), 1e-12)
-    return _rise(share - INSIDE) * _rise(deep / jnp.maximum(height, 1e-12)) * _rise(smaller - 0.7)
+    smaller = _over(b.half_size[..., :2].prod(-1), a.half_size[..., :2].prod(-1))
+    return _rise(share - INSIDE) * _rise(_over(deep, height)) * _rise(smaller - 0.7)
 
 
-def on(a: ObjectShapes, b: ObjectShapes) -> Float[Array, ""]:
+def on(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
     """Whether a rests on b: most of it is over the footprint of b, it touches the surface there, and is not in b."""
     bottom, _, height = _heights(a)
     _, top, _ = _heights(b)
-    held = _inside(a.points, b, 1.1)[0].mean()
+    held = _inside(a.points, b, 1.1)[0].mean(-1)
     surface = _local(b, a, 0.75, top)
-    contact = _within((bottom - surface) / jnp.maximum(_tolerance(a), 1e-12), 4.0)
-    sunk = (surface - bottom) / jnp.maximum(height, 1e-12)
-    return _rise(held - 0.5) * contact * _rise(0.4 - sunk) * (1.0 - inside(a, b))
+    contact = _within(_over(bottom - surface, _tolerance(a)), 4.0)
+    return _rise(held - 0.5) * contact * _rise(0.4 - _over(surface - bottom, height)) * (1.0 - inside(a, b))
 
 
-def next_to(a: ObjectShapes, b: ObjectShapes) -> Float[Array, ""]:
+def next_to(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
     """Whether the objects are close to each other on one level, neither over the other."""
+    xp = _module(a.points)
     (low_a, high_a, tall_a), (low_b, high_b, tall_b) = _heights(a), _heights(b)
-    common = (jnp.minimum(high_a, high_b) - jnp.maximum(low_a, low_b)) / jnp.maximum(jnp.minimum(tall_a, tall_b), 1e-12)
+    common = _over(xp.minimum(high_a, high_b) - xp.maximum(low_a, low_b), xp.minimum(tall_a, tall_b))
     return _within(_relative_gap(a, b) / NEXT) * _rise(common - LEVEL) * _rise(OVER - _overlap(a, b))
 
 
 def _relative_gap(a: ObjectShapes, b: ObjectShapes) -> Array:
     """The gap in units of the geometric mean of the sizes."""
-    return gap(a, b) / jnp.maximum(jnp.sqrt(size_of(a) * size_of(b)), 1e-12)
+    return _over(gap(a, b), _module(a.points).sqrt(size_of(a) * size_of(b)))
 
 
-def near(a: ObjectShapes, b: ObjectShapes) -> Float[Array, ""]:
+def near(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
     """Whether the gap is at most about the objects' size. It falls as the gap grows."""
     return _within(_relative_gap(a, b) / NEAR)
 
 
-def far_from(a: ObjectShapes, b: ObjectShapes) -> Float[Array, ""]:
+def far_from(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
     """Whether the gap is several times the objects' size."""
     return 1.0 - _within(_relative_gap(a, b) / FAR)
 
 
-def touching(a: ObjectShapes, b: ObjectShapes) -> Float[Array, ""]:
+def touching(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
     """Whether the surfaces meet."""
-    return _within(gap(a, b) / jnp.maximum(TOUCH * jnp.minimum(size_of(a), size_of(b)), 1e-12))
+    return _within(_over(gap(a, b), TOUCH * _module(a.points).minimum(size_of(a), size_of(b))))
 
 
-def between(a: ObjectShapes, b: ObjectShapes, c: ObjectShapes) -> Float[Array, ""]:
+def between(a: ObjectShapes, b: ObjectShapes, c: ObjectShapes) -> Float[Array, "*batch"]:
     """Whether a lies between b and c: its middle projects between theirs and is not far off the line."""
-    line = c.center - b.center
-    length = jnp.maximum(jnp.linalg.norm(line), 1e-12)
-    along = ((a.center - b.center) @ line) / length**2
-    off = jnp.linalg.norm(a.center - b.center - along * line)
-    reach = BETWEEN * (0.5 * length + 0.5 * size_of(a))
-    return _rise(along - 0.1, 20.0) * _rise(0.9 - along, 20.0) * _within(off / jnp.maximum(reach, 1e-12), 4.0)
+    line, offset = c.center - b.center, a.center - b.center
+    length = _module(line).maximum(_length(line), 1e-12)
+    along = _dot(offset, line) / length**2
+    off = _length(offset - along[..., None] * line)
+    reach = BETWEEN * 0.5 * (length + size_of(a))
+    return _rise(along - 0.1, 20.0) * _rise(0.9 - along, 20.0) * _within(_over(off, reach), 4.0)
 
 
-def _pair(a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> dict[str, Array]:
-    """All relations of two objects by name."""
-    return {
-        "left of": left_of(a, b, view),
-        "right of": left_of(b, a, view),
-        "in front of": in_front_of(a, b, view),
-        "behind": in_front_of(b, a, view),
-        "above": above(a, b),
-        "below": above(b, a),
-        "on": on(a, b),
-        "under": above(b, a),
-        "in": inside(a, b),
-        "next to": next_to(a, b),
-        "near": near(a, b),
-        "far from": far_from(a, b),
-        "touching": touching(a, b),
-        "gap": gap(a, b),
-    }
+_PREDICATES = {
+    "left of": left_of,
+    "right of": lambda a, b, view: left_of(b, a, view),
+    "in front of": in_front_of,
+    "behind": lambda a, b, view: in_front_of(b, a, view),
+    "above": lambda a, b, _: above(a, b),
+    "below": lambda a, b, _: above(b, a),
+    "on": lambda a, b, _: on(a, b),
+    "under": lambda a, b, _: above(b, a),
+    "in": lambda a, b, _: inside(a, b),
+    "next to": lambda a, b, _: next_to(a, b),
+    "near": lambda a, b, _: near(a, b),
+    "far from": lambda a, b, _: far_from(a, b),
+    "touching": lambda a, b, _: touching(a, b),
+}
+PAIRS = tuple(_PREDICATES)
+"""relations of `pair_scores`"""
 
 
-@jax.jit
-def pair_scores(a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> dict[str, Float[Array, "k l"]]:
-    """Scores every relation of PAIRS between all objects of two sets.
+def pair_scores(relation: str, a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> Float[Array, "k l"]:
+    """Scores a relation between all objects of two sets.
 
     Args:
+      relation: One of PAIRS.
       a: K objects.
       b: L objects.
       view: From where directions are seen.
 
     Returns:
-      (K, L) scores of "object of a RELATION object of b" by the name of the relation, and under "gap" the free
-      distances in world units.
+      (K, L) scores of "object of a RELATION object of b".
     """
-    return jax.vmap(lambda one: jax.vmap(lambda other: _pair(one, other, view))(b))(a)
+    return _PREDICATES[relation](a[:, None], b[None], view)
 
 
-@jax.jit
 def between_scores(a: ObjectShapes, b: ObjectShapes, c: ObjectShapes) -> Float[Array, "k l m"]:
     """Scores "object of a between object of b and object of c" for all triples."""
-    triple = jax.vmap(between, in_axes=(None, None, 0))
-    return jax.vmap(jax.vmap(triple, in_axes=(None, 0, None)), in_axes=(0, None, None))(a, b, c)
+    return between(a[:, None, None], b[None, :, None], c[None, None])
 
 
-@jax.jit
 def order_values(shapes: ObjectShapes, view: Viewpoint) -> dict[str, Float[Array, " k"]]:
     """Values by which K objects are ordered, the first has the smallest, for each of ORDERS.
 
     "largest" compares the volumes of boxes, "leftmost" the directions from the viewpoint, "nearest" the distances.
     """
-    volume = jnp.prod(2.0 * shapes.half_size, axis=1) ** (1 / 3)
+    volume = (2.0 * shapes.half_size).prod(1) ** (1 / 3)
     height = 2.0 * shapes.half_size[:, 2]
-    level = _along(shapes.center, view.up)
+    level = _dot(shapes.center, view.up)
     away = shapes.center - view.eye
-    bearing = jnp.arctan2(_along(away, view.right), _along(away, view.forward))
-    distance = jnp.linalg.norm(away, axis=1)
+    bearing = _module(away).arctan2(_dot(away, view.right), _dot(away, view.forward))
+    distance = _length(away)
     pairs = {"smallest": volume, "shortest": height, "lowest": level, "leftmost": bearing, "nearest": distance}
     opposite = dict(zip(pairs, ("largest", "tallest", "highest", "rightmost", "farthest")))
     return pairs | {opposite[name]: -value for name, value in pairs.items()}

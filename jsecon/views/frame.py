@@ -1,17 +1,20 @@
-"""The frame of a bare scene: its centre, its size, and which way is up, from the Gaussians alone.
+"""The frame of a scene: its centre, its size, and which way is up, from the Gaussians alone or from its cameras.
 
 Host functions on NumPy arrays. All choices are relative to the scene's own size and to the order of its Gaussians, so
 that a scene that is turned, scaled or shifted gets the same frame, turned, scaled and shifted with it.
 """
 
+import contextlib
 import dataclasses
+from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 
 from jsecon.errors import InputError
-from jsecon.types import Gaussians
+from jsecon.types import Camera, Gaussians, LanguageField
 
 SAMPLES = 6000
 """points that stand for the scene's surface, drawn by opacity times area"""
@@ -33,6 +36,10 @@ SURE_SIDE = 0.85
 """share of the remaining surface on one side of the ground plane from which its sign is trusted"""
 DISTINCT = np.cos(np.radians(20))
 """cosine below which two planes have different normals"""
+PARALLEL = 0.01
+"""share of the cameras' x axes off their common line up to which they tell the up axis only up to their tilt"""
+SAME_WAY = 0.7
+"""cosine of the ground's normal with the cameras' up axis from which it is the same way up"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,10 +124,7 @@ def scene_frame(points: Float[np.ndarray, "p 3"], up: np.ndarray | None = None) 
     if up is None:
         up, sure, evidence = _ground_normal(points)
     else:
-        up = np.asarray(up, np.float64)
-        if not np.isfinite(up).all() or not np.linalg.norm(up) > 0:
-            raise InputError("--up", f"{up.tolist()} is no direction", "", "Give three numbers, for example 0 0 1.")
-        sure, evidence = True, "given"
+        up, sure, evidence = _direction(up), True, "given"
     up = up / np.linalg.norm(up)
     side = np.eye(3)[np.argmin(np.abs(up))]
     first = np.cross(up, side)
@@ -189,3 +193,59 @@ def _refined(points: np.ndarray, normal: np.ndarray, offset: float, tolerance: f
     fitted = np.linalg.svd(near - middle, full_matrices=False)[2][2]
     fitted *= np.sign(fitted @ normal) or 1.0
     return fitted, float(middle @ fitted)
+
+
+def _direction(up: Any) -> np.ndarray:
+    """Returns a given up axis as a vector (3,) of any length."""
+    up = np.asarray(up, np.float64)
+    if up.shape != (3,) or not np.isfinite(up).all() or not np.linalg.norm(up) > 0:
+        raise InputError("--up", f"{up.tolist()} is no direction", "", "Give three numbers, for example 0 0 1.")
+    return up
+
+
+def scene_up(cameras: Camera) -> Float[np.ndarray, " 3"]:
+    """Finds the up axis of a scene from its cameras, which people and planners hold level.
+
+    It is the direction that is most nearly perpendicular to the x axes of all cameras, on the side of their upper
+    edges. If all cameras have nearly the same x axis, it is the mean direction of their upper edges.
+
+    Args:
+      cameras: T cameras, T >= 1.
+
+    Returns:
+      (3,) float64 unit vector, world.
+    """
+    pose = np.asarray(cameras.world_to_camera, np.float64)
+    right = pose[:, 0, :3]
+    mean_up = -pose[:, 1, :3].mean(0)
+    values, vectors = np.linalg.eigh(right.T @ right / len(right))
+    up = vectors[:, 0] * (np.sign(vectors[:, 0] @ mean_up) or 1.0)
+    if values[1] < PARALLEL and np.linalg.norm(mean_up) > 0:
+        up = mean_up
+    return up / np.linalg.norm(up)
+
+
+def field_up(field: LanguageField, up: Sequence[Any] | np.ndarray | None = None) -> Float[np.ndarray, " 3"]:
+    """Finds the up axis of a field: that of its cameras; of cameras that all look one way, the ground's if it is sure.
+
+    Args:
+      field: The field.
+      up: (3,) the up axis in the capture's world where it is known.
+
+    Returns:
+      (3,) float64 unit vector in the field's world.
+
+    Raises:
+      InputError: `up` has no direction.
+    """
+    if up is not None:
+        own = np.asarray(field.to_source, np.float64)[:3, :3].T @ _direction(up)
+        return own / np.linalg.norm(own)
+    axis = scene_up(field.cameras)
+    right = np.asarray(field.cameras.world_to_camera, np.float64)[:, 0, :3]
+    if np.linalg.eigvalsh(right.T @ right / len(right))[1] < PARALLEL:
+        with contextlib.suppress(InputError):  # a scene without a surface has no ground
+            ground = scene_frame(surface_points(field.gaussians))
+            if ground.sure and ground.axes[2] @ axis >= SAME_WAY:
+                return ground.axes[2]
+    return axis

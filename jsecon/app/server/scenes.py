@@ -14,8 +14,9 @@ import numpy as np
 from jsecon.app.ask import Answer, ask_pixel, ask_text
 from jsecon.app.catalogue_files import object_record
 from jsecon.app.locate import Place, locate_answer
+from jsecon.app.object_scene import ObjectScene
 from jsecon.app.outputs import best_frames, selected_gaussians
-from jsecon.app.relations import Measure, ObjectScene, RelationAnswer, measure, query_relation
+from jsecon.app.relations import Measure, RelationAnswer, measure, query_relation
 from jsecon.data.gaussians.ply import save_ply
 from jsecon.errors import InputError
 from jsecon.language.field import load_field

@@ -1,0 +1,168 @@
+"""A field prepared for referring expressions: the objects that phrases name, with their Gaussians, boxes and points."""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsecon.app.ask import frame_index, with_phrases
+from jsecon.app.catalogue import Catalogue, objects as list_objects
+from jsecon.data.capture import may_have_depth
+from jsecon.errors import InputError
+from jsecon.language.membership import SHARE_THRESHOLD
+from jsecon.pipeline.sources import locate_sources
+from jsecon.query.match import RegionMatch, match_regions
+from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
+from jsecon.query.outliers import split_outliers
+from jsecon.query.referring import FoundObject
+from jsecon.query.relations import Viewpoint, viewpoint
+from jsecon.query.rules import MIN_PIECE_OVERLAP, QueryRules
+from jsecon.query.select import select_by_share
+from jsecon.types import Camera, LanguageField
+from jsecon.views.frame import field_up
+
+ONE_WAY = 0.5
+"""length of the mean of the cameras' horizontal directions from which they look one way"""
+
+
+class ObjectScene:
+    """A field prepared for expressions. It keeps the objects that phrases named, with their shapes.
+
+    Args:
+      field: The field.
+      embedder: Its embedder.
+      up: (3,) up axis in the capture's world; None takes it from the cameras, or from the ground.
+
+    Raises:
+      InputError: `up` has no direction.
+    """
+
+    def __init__(self, field: LanguageField, embedder: Any, *, up: Sequence[Any] | None = None):
+        """Finds the up axis; objects are measured when they are first asked for."""
+        self.up = field_up(field, up)
+        field = with_phrases(field, embedder)
+        regions = jax.tree.map(jnp.asarray, field.regions)  # on the device once, not for each phrase
+        reference = None if field.reference is None else jnp.asarray(field.reference)
+        self.field = dataclasses.replace(field, regions=regions, reference=reference)
+        self.embedder = embedder
+        self.to_source = np.asarray(field.to_source, np.float64)
+        self.scale = float(np.cbrt(abs(np.linalg.det(self.to_source[:3, :3]))))
+        self.rules = QueryRules(all_of_kind=True, logits=getattr(embedder, "logits", None))
+        self._given_up = up
+        self._votes = jax.tree.map(jnp.asarray, field.votes)
+        self._overlap = None if field.votes.overlap is None else np.asarray(field.votes.overlap)
+        self._objects: dict[tuple[int, ...], tuple[np.ndarray, ObjectShapes] | None] = {}
+        self._phrases: dict[str, tuple[list[FoundObject], float]] = {}
+
+    def prepare(self) -> None:
+        """Measures the object of every region, so that the first questions are as fast as later ones.
+
+        Raises:
+          InputError: The embedder has no names for objects.
+        """
+        for region in range(self.field.regions.count):
+            self._object((region,))
+        if self.field.regions.count:
+            match_regions(self.field, self.field.regions.embeddings[:1], self.rules)  # compiles it
+        _ = self.catalogue
+
+    @functools.cached_property
+    def catalogue(self) -> Catalogue:
+        """All objects with names, which tell objects of one name apart."""
+        return list_objects(self.field, None, self.embedder, up=self._given_up)
+
+    def objects_of(self, phrase: str) -> tuple[list[FoundObject], float]:
+        """Finds the objects that a phrase names: regions that match it, pieces of one object joined.
+
+        Args:
+          phrase: Free text for the embedder.
+
+        Returns:
+          The objects, and the share of unrelated words that are less similar to the scene than the phrase.
+
+        Raises:
+          InputError: The embedder has no words for the phrase.
+        """
+        if phrase not in self._phrases:
+            embedded = jax.device_put(self.embedder.embed_text([phrase]))
+            match = match_regions(self.field, embedded, self.rules)
+            regions = np.flatnonzero(np.asarray(match.chosen)) if int(match.region) >= 0 else np.zeros(0, int)
+            made = [(group, self._object(group)) for group in _joined(regions, self._overlap)]
+            objects = [FoundObject(phrase, group, *parts) for group, parts in made if parts is not None]
+            self._phrases[phrase] = objects, float(match.quantile)
+        return self._phrases[phrase]
+
+    def _object(self, regions: tuple[int, ...]) -> tuple[np.ndarray, ObjectShapes] | None:
+        """Returns Gaussians and shape of the object of some regions; None if it has no Gaussian."""
+        if regions not in self._objects:
+            chosen = np.zeros(self.field.regions.count, bool)
+            chosen[list(regions)] = True
+            match = RegionMatch(chosen, np.asarray(regions[0], np.int32), np.asarray(1.0, np.float32))
+            selection = select_by_share(self._votes, match, SHARE_THRESHOLD)
+            rows = np.flatnonzero(selection.mask)
+            taken = dataclasses.replace(self.field.gaussians, sh=None)
+            taken = jax.tree.map(lambda column: np.asarray(column)[rows], taken)
+            weight = np.clip(np.asarray(selection.similarity)[rows], 0, 1) * np.asarray(self.field.votes.total)[rows]
+            kept = split_outliers(taken.means, np.ones(len(rows), bool), keep="supported", weight=weight).mask
+            self._objects[regions] = None
+            if kept.any():
+                taken = jax.tree.map(lambda column: column[kept], taken)
+                labels = np.zeros(taken.count, int)
+                shape = object_shapes(taken.means, labels, self.up, spreads=gaussian_spreads(taken))
+                self._objects[regions] = rows[kept], shape
+        return self._objects[regions]
+
+    def view(self, frame: int | str | None, camera: Camera | None) -> tuple[Viewpoint, str]:
+        """Returns the viewpoint of a frame or a camera, or of the mean camera, and what it is in words.
+
+        Cameras that look in all directions have no mean; then it is the frame that shows most objects.
+        """
+        words = "as seen from the given camera"
+        if camera is None and frame is None:
+            ahead = np.asarray(self.field.cameras.world_to_camera, np.float64)[:, 2, :3]
+            ahead = ahead - (ahead @ self.up)[:, None] * self.up
+            ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
+            mean = ahead.mean(0)
+            if np.linalg.norm(mean) >= ONE_WAY:
+                middle = np.asarray(self.field.cameras.centres, np.float64).mean(0)
+                return Viewpoint(middle, mean / np.linalg.norm(mean), self.up), "as seen from the mean of the cameras"
+            pixels = np.asarray(self.field.regions.pixels, np.int64)
+            frame = int(np.lexsort((pixels.sum(0), (pixels > 0).sum(0)))[-1])
+        if camera is None:
+            index = frame_index(self.field, frame if frame is not None else 0)
+            camera = jax.tree.map(np.asarray, self.field.cameras)[index]
+            words = f"as seen from {self.field.names[index]}"
+        return viewpoint(jax.tree.map(np.asarray, camera), self.up), words
+
+    @property
+    def unit(self) -> str:
+        """Unit of the capture's world."""
+        capture = locate_sources(self.field).capture
+        return "metres" if capture is not None and may_have_depth(Path(capture)) else "capture units"
+
+
+def _joined(regions: np.ndarray, overlap: np.ndarray | None) -> list[tuple[int, ...]]:
+    """Groups regions that overlap, directly or by way of others: the pieces of one object."""
+    groups: list[set[int]] = []
+    for region in map(int, regions):
+        near = [g for g in groups if overlap is not None and (overlap[region, list(g)] >= MIN_PIECE_OVERLAP).any()]
+        groups = [g for g in groups if g not in near] + [set().union({region}, *near)]
+    return sorted(tuple(sorted(group)) for group in groups)
+
+
+def open_scene(field: LanguageField | ObjectScene, embedder: Any, up: Sequence[Any] | None = None) -> ObjectScene:
+    """Returns the `ObjectScene` of a field, or the one that is given."""
+    if isinstance(field, ObjectScene):
+        return field
+    if field.regions.count == 0:
+        raise InputError("field", "it has no regions, so no objects", remedy="Make it again with other --masks.")
+    if embedder is None:
+        from jsecon.pipeline.networks import field_embedder
+
+        embedder = field_embedder(field)
+    return ObjectScene(field, embedder, up=up)

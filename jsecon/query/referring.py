@@ -1,0 +1,190 @@
+"""Which objects a referring expression names: candidates of its words, the scores of its conditions, and its order.
+
+The parsed text (query/expressions) is compared with shapes by the soft predicates of query/relations. Host code.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jsecon.query.expressions import ANCHORED_ORDERS, Condition, Thing
+from jsecon.query.object_shapes import ObjectShapes
+from jsecon.query.relations import SATISFIED, Viewpoint, between_scores, gap, order_values, pair_scores, size_of
+
+WITHIN_REACH = 0.2
+"""score from which an object that was not chosen is an alternative"""
+CLOSE_CALL = 0.04
+"""difference of two values of an order, in units of their size, up to which neither is clearly before the other"""
+CLOSE_ANGLE = 0.02
+"""the same of directions, radians"""
+BLOCK = 512
+"""pairs that are scored at once: their points stay in the processor's cache"""
+
+
+@dataclasses.dataclass(frozen=True)
+class FoundObject:
+    """An object that a phrase names.
+
+    Attributes:
+      phrase: The words that it was found by.
+      regions: Its regions.
+      rows: (M,) its Gaussians.
+      shape: Its box and points, in the field's world.
+      conditions: Score of each condition that was put to it, by the condition in words.
+    """
+
+    phrase: str
+    regions: tuple[int, ...]
+    rows: np.ndarray
+    shape: ObjectShapes
+    conditions: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    @property
+    def score(self) -> float:
+        """The smallest score of its conditions; 1 without any."""
+        return min(self.conditions.values(), default=1.0)
+
+
+Find = Callable[[str], tuple[list[FoundObject], float]]
+"""the objects that a phrase names, and the share of unrelated words that are less similar to the scene than it"""
+
+
+@dataclasses.dataclass
+class Outcome:
+    """The objects of one reading of a thing with its conditions.
+
+    Attributes:
+      chosen: The objects, best first.
+      alternatives: Other objects of the name, with scores of at least WITHIN_REACH, best first.
+      used: The objects that they were compared with.
+      undecided: Objects among which the text does not choose; empty if it does.
+      reason: Why there is no object, or not the number that the text says; else empty.
+    """
+
+    chosen: list[FoundObject]
+    alternatives: list[FoundObject] = dataclasses.field(default_factory=list)
+    used: list[FoundObject] = dataclasses.field(default_factory=list)
+    undecided: list[FoundObject] = dataclasses.field(default_factory=list)
+    reason: str = ""
+
+
+def stack_shapes(objects: Sequence[FoundObject]) -> ObjectShapes:
+    """Returns the shapes of K objects as one record (K, ...)."""
+    return jax.tree.map(lambda *columns: np.concatenate(columns), *(found.shape for found in objects))
+
+
+def evaluate(find: Find, thing: Thing, conditions: Sequence[Condition], view: Viewpoint) -> Outcome:
+    """Finds the objects of a name that meet conditions, and chooses among them by the order.
+
+    Args:
+      find: Finds the objects that a phrase names.
+      thing: The object that is looked for.
+      conditions: Its conditions, one reading of the text.
+      view: From where directions are seen.
+
+    Returns:
+      The outcome.
+    """
+    candidates, quantile = find(thing.text)
+    if not candidates:
+        known = "" if np.isnan(quantile) else f" ({int(100 * quantile)} % of unrelated words are less like the scene)"
+        return Outcome([], reason=f"there is no {thing.text!r} in the scene{known}")
+    shapes = stack_shapes(candidates)
+    used: list[FoundObject] = []
+    orders: list[tuple[str, np.ndarray]] = []
+    for condition in conditions:
+        anchors = []
+        for anchor in condition.anchors:
+            outcome = evaluate(find, anchor, condition.conditions if anchor is condition.anchors[-1] else (), view)
+            if not outcome.chosen:
+                return Outcome([], used=used, reason=f"nothing to compare with: {outcome.reason}")
+            anchors.append(outcome.chosen)
+            used += [found for found in outcome.chosen if found not in used]
+        scores = _condition_scores(candidates, shapes, condition, anchors, view)
+        if condition.relation in ANCHORED_ORDERS:
+            orders.append((condition.relation, scores))
+            continue
+        named = [found.conditions | {str(condition): round(float(x), 4)} for found, x in zip(candidates, scores)]
+        candidates = [dataclasses.replace(found, conditions=row) for found, row in zip(candidates, named)]
+    valid = [k for k, found in enumerate(candidates) if found.score >= SATISFIED]
+    valid = [k for k in valid if all(np.isfinite(values[k]) for _, values in orders)]
+    rest = [k for k in range(len(candidates)) if k not in valid and candidates[k].score >= WITHIN_REACH]
+    if not valid:
+        return Outcome([], [candidates[k] for k in rest], used, reason=_nearest_miss(candidates))
+    valid.sort(key=lambda k: -candidates[k].score)
+    if thing.order is not None:
+        orders.append((thing.order, order_values(shapes, view)[thing.order]))
+    close: list[int] = []
+    others: list[int] = []
+    for name, values in orders:
+        count = len(valid)
+        valid, close, others = _ordered(shapes, valid, values, thing, name)
+        if not valid:
+            reason = f"there are {count} {thing.text!r}, so none is number {thing.rank}"
+            return Outcome([], [candidates[k] for k in others], used, reason=reason)
+    chosen = [candidates[k] for k in valid]
+    alternatives = [candidates[k] for k in dict.fromkeys([*close, *others, *rest])]
+    undecided = [chosen[-1], *(candidates[k] for k in close)] if close else []
+    if len(chosen) > 1 and not thing.every and not orders and thing.number is None:
+        undecided = chosen
+    wrong = thing.number is not None and len(chosen) != thing.number
+    reason = f"the text says {thing.number} and {len(chosen)} match" if wrong else ""
+    return Outcome(chosen, alternatives, used, undecided, reason)
+
+
+def _apart(a: Sequence[FoundObject], b: Sequence[FoundObject]) -> Bool[np.ndarray, "k l"]:
+    """Which pairs of objects have no region in common."""
+    return np.array([[not set(one.regions) & set(other.regions) for other in b] for one in a])
+
+
+def _condition_scores(
+    candidates: Sequence[FoundObject],
+    shapes: ObjectShapes,
+    condition: Condition,
+    anchors: Sequence[Sequence[FoundObject]],
+    view: Viewpoint,
+) -> Float[np.ndarray, " k"]:
+    """Score of a condition for each candidate, with the anchor that fits best; for an anchored order the value."""
+    others = stack_shapes(anchors[0])
+    usable = _apart(candidates, anchors[0])
+    if condition.relation == "between":
+        ends = stack_shapes(anchors[-1])
+        distinct = _apart(candidates, anchors[-1])[:, None] & _apart(anchors[0], anchors[-1])
+        scores = between_scores(shapes, others, ends)
+        return np.where(usable[:, :, None] & distinct, scores, 0.0).max((1, 2))
+    rows = max(BLOCK // len(others), 1)
+    parts = [shapes[first : first + rows] for first in range(0, len(shapes), rows)]
+    if condition.relation in ANCHORED_ORDERS:
+        gaps = np.concatenate([gap(part[:, None], others[None]) for part in parts])
+        gaps = np.where(usable, gaps, np.inf).min(1)
+        return gaps if condition.relation == "nearest to" else np.where(np.isfinite(gaps), -gaps, np.inf)
+    scores = np.concatenate([pair_scores(condition.relation, part, others, view) for part in parts])
+    return np.where(usable, scores, 0.0).max(1)
+
+
+def _ordered(
+    shapes: ObjectShapes, valid: Sequence[int], values: np.ndarray, thing: Thing, name: str
+) -> tuple[list[int], list[int], list[int]]:
+    """Chooses by an order: the objects, the others that are as good by a hair, and all others."""
+    ranked = sorted(valid, key=lambda k: values[k])
+    count = (thing.number or 1) if thing.every or (thing.number or 0) > 1 else 1
+    first = thing.rank - 1 if name not in ANCHORED_ORDERS else 0
+    chosen = ranked[first : first + count]
+    others = [k for k in ranked if k not in chosen]
+    tolerance = CLOSE_ANGLE if name in ("leftmost", "rightmost") else CLOSE_CALL * np.median(size_of(shapes)[ranked])
+    close = [k for k in others if chosen and min(abs(values[k] - values[c]) for c in chosen) <= tolerance]
+    return chosen, close, others
+
+
+def _nearest_miss(candidates: Sequence[FoundObject]) -> str:
+    """Says which candidate came nearest, and which condition it does not meet."""
+    best = max(candidates, key=lambda found: found.score)
+    if not best.conditions:
+        return f"there is no other object to compare the {best.phrase!r} with"
+    condition, score = min(best.conditions.items(), key=lambda item: item[1])
+    count = len(candidates)
+    kind = f"of {count} {best.phrase!r} none" if count > 1 else f"the {best.phrase!r} there is not"
+    return f"{kind} {condition}: the nearest scores {score:.2f}, and {SATISFIED:g} is needed"
