@@ -307,7 +307,9 @@ class StepRunner:
 
     def views(self, size: float) -> TrainingViews:
         """Returns the training frames at a size, as a share of their full size."""
-        return self._views.setdefault(size, TrainingViews(self._capture, size))
+        if size not in self._views:
+            self._views[size] = TrainingViews(self._capture, size)
+        return self._views[size]
 
     def compile(self, state: TrainState, size: float, config: StepConfig) -> Future:
         """Starts to compile the program of steps at that size in a thread of its own, unless that has begun.
