@@ -263,6 +263,8 @@ def test_directions_follow_the_frame_and_cameras_around_take_the_fullest_frame()
 def test_the_ground_tells_what_is_up_where_cameras_look_one_way_and_down():
     field, embedder = table_field((*THINGS, ("light grey floor", (0.0, 0.0, -0.01), (1.5, 1.5, 0.001))))
     np.testing.assert_allclose(ObjectScene(field, embedder).up, [0, 0, 1], atol=0.02)
+    np.testing.assert_allclose(jsecon.objects(field, None, embedder).up, [0, 0, 1], atol=0.02)
+    np.testing.assert_allclose(jsecon.objects(field, None, embedder, up=(0, 2, 0)).up, [0, 1, 0], atol=1e-9)
     around = table_field(directions=[(0.0, -2.0, 0.8), (2.0, 0.0, 0.8)])
     np.testing.assert_allclose(ObjectScene(*around).up, [0, 0, 1], atol=1e-3)
 
@@ -304,7 +306,7 @@ def test_query_answers_expressions_and_says_so(tmp_path, capsys):
     save_field(tmp_path / "field.safetensors", field)
     texts = "the leftmost red mug", "the dark blue box near", '"red mug" or "dark blue box"', "how many red mugs"
     line = ["query", str(tmp_path / "field.safetensors"), *texts, "--from", "frame_0", "--out", str(tmp_path / "out")]
-    assert cli.main(line) == 2
+    assert cli.main([*line, "--up", "0", "0", "1"]) == 2
     told = capsys.readouterr()
     assert "read as 'red mug', leftmost, as seen from frame_0: 1 object (red mug)" in told.out
     assert "an object is missing" in told.err
@@ -314,5 +316,6 @@ def test_query_answers_expressions_and_says_so(tmp_path, capsys):
     assert record["place"]["centroid"] == pytest.approx([-0.5, 0, 0.05], abs=0.02)
     records = [json.loads(file.read_text()) for file in (tmp_path / "out").glob("*.json")]
     assert sorted(record["by"] for record in records) == ["relation", "relation", "votes"]
-    assert cli.main([*line[:2], "red mug", *line[-4:]]) == 2
-    assert "no text has a relation" in capsys.readouterr().err
+    for option in (line[-4:-2], ["--up", "0", "0", "1"]):
+        assert cli.main([*line[:2], "red mug", *option, *line[-2:]]) == 2
+        assert f"{option[0]}: no text has a relation" in capsys.readouterr().err

@@ -94,6 +94,13 @@ def test_a_text_lights_up(viewer):
         np.testing.assert_array_equal(handle.buffer[:, :7], was[:, :7])
 
 
+def test_a_relation_lights_up_and_says_how_it_was_read(viewer):
+    word = word_of(viewer)
+    settled(viewer, lambda: viewer.then(lambda s: view_state.with_texts(s, f"the largest {word}; {word} across")))
+    assert viewer.answer(view_state.ViewQuery(f"the largest {word}")).mask.any()
+    assert f"read as &#x27;{word}&#x27;, largest: 1 object" in viewer.panel._messages.content
+
+
 def test_show_only_hide_and_undo(viewer):
     word, opacity = word_of(viewer), colours(viewer)[:, 3]
     mask = viewer.answer(view_state.ViewQuery(word)).mask

@@ -110,8 +110,11 @@ def _query(verb: Query, console: Console) -> VerbResult:
     answers, errors = ([], []) if verb.phrases is None else _ask_phrases(field, verb, console)
     expressions = [text for text in texts if is_expression(text)]
     texts = [text for text in texts if text not in expressions]
+    if expressions and large:
+        problem = f"{expressions[0]!r} has a relation, an order or a number, which needs the whole field in memory"
+        raise InputError(verb.field, problem, remedy="Raise JSECON_MEMORY (GiB), or put the text in quotes.")
     if expressions:
-        answers, errors = _ask_relations(field, embedder, verb, expressions, large, console)
+        answers, errors = _ask_relations(field, embedder, expressions, console, frame=verb.from_frame, up=verb.up)
     with console.progress("answers"):
         outline: dict[str, Any] = {"threshold": verb.threshold, "outliers": not verb.keep_outliers}
         options = outline | {"by": verb.by, "several": verb.all, "quantile": verb.quantile}
@@ -130,17 +133,14 @@ def _query(verb: Query, console: Console) -> VerbResult:
 
 
 def _ask_relations(
-    field: Any, embedder: Any, verb: Query, texts: list[str], large: bool, console: Console
+    field: Any, embedder: Any, texts: list[str], console: Console, *, frame: str | None = None, up: Any = None
 ) -> tuple[list[Any], list[InputError]]:
     """Returns the answers to texts with relations, orders or numbers, and the errors of those not understood."""
-    if large:
-        problem = f"{texts[0]!r} has a relation, an order or a number, which needs the whole field in memory"
-        raise InputError(verb.field, problem, remedy="Raise JSECON_MEMORY (GiB), or put the text in quotes.")
     from jsecon.app import ask, relations
 
     with console.progress("relations"):
-        scene = relations.open_scene(field, embedder)
-        queries = [lambda text=text: relations.query_relation(scene, text, frame=verb.from_frame) for text in texts]
+        scene = relations.open_scene(field, embedder, up)
+        queries = [lambda text=text: relations.query_relation(scene, text, frame=frame) for text in texts]
         answers, errors = ask.collect(queries)
     for answer in answers:
         console.say(f"{answer.text!r}: {answer.describe()}")
@@ -153,7 +153,7 @@ def _field_of_scene(verb: Query, console: Console) -> Path:
     from jsecon.pipeline import run as pipeline
     from jsecon.pipeline.options import Options
 
-    options = Options(verb.field, embedder=verb.embedder)
+    options = Options(verb.field, embedder=verb.embedder, up=verb.up)
     folder = verb.out / "field"
     with console.progress("plan"):
         path = pipeline.current_field(options, folder)
@@ -176,6 +176,9 @@ def _check_query(verb: Query) -> None:
     if verb.from_frame is not None and not any(map(is_expression, verb.texts)):
         remedy = 'For example: "the red mug left of the bottle" --from frame_00012'
         raise InputError("--from", "no text has a relation that is seen from a frame", remedy=remedy)
+    if verb.up is not None and not any(map(is_expression, verb.texts)) and not is_bare_scene(verb.field):
+        problem = "no text has a relation, and the field has its views"
+        raise InputError("--up", problem, remedy="Leave it out, or make the field again: jsecon run --up.")
     if not 0 <= verb.quantile <= 1:
         remedy = f"{Query.quantile:g} is the default; 0 refuses no text."
         raise InputError("--quantile", f"{verb.quantile:g}", "a share of words, 0 to 1", remedy)
@@ -344,7 +347,10 @@ def _export_page(verb: View, console: Console) -> VerbResult:
 
         field = load_field(verb.field)
         embedder = _embedder(field, verb, console) if verb.texts else None
-        answers, errors = ask_each(field, embedder, texts=verb.texts)
+        expressions = [text for text in verb.texts if is_expression(text)]
+        answers, errors = _ask_relations(field, embedder, expressions, console) if expressions else ([], [])
+        more, refused = ask_each(field, embedder, texts=[text for text in verb.texts if text not in expressions])
+        answers, errors = answers + more, errors + refused
         size = write_page(field, answers, verb.export, title=verb.field.resolve().parent.name)
     count = field.gaussians.count
     console.say(f"{count} Gaussians, {len(answers)} answers, {size / 2**20:.1f} MiB  {verb.export}")

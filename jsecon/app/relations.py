@@ -73,7 +73,8 @@ class RelationAnswer:
         record = {name: getattr(self, name) for name in ("text", "reading", "viewpoint", "ambiguous", "question")}
         groups = {name: [_plain(o, self.to_source) for o in getattr(self, name)] for name in ("objects", "used")}
         alternatives = [_plain(found, self.to_source) for found in self.alternatives]
-        return record | {"reason": self.reason, "count": self.count} | groups | {"alternatives": alternatives}
+        record |= {"description": self.describe(), "reason": self.reason, "count": self.count}
+        return record | groups | {"alternatives": alternatives}
 
 
 @dataclasses.dataclass(frozen=True)

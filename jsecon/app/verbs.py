@@ -191,6 +191,8 @@ class Query(FieldVerb):
         an object as they stand.
       from_frame: Frame from which left, right, front and behind are seen. By default it is the mean camera, or the
         frame that shows most objects where the cameras look in all directions.
+      up: Up axis of the capture's world, three numbers, for relations, and for the views of a file of Gaussians. By
+        default it is that of the cameras, or the normal of the ground.
       at: Selects what lies under the pixel in column X and row Y of a frame, in the frames as the run used them. A
         frame is named by its name, the end of its name, or its place such as #10.
       mask: Selects the object that a mask outlines in a frame, or masks in several frames. Black is outside.
@@ -232,6 +234,7 @@ class Query(FieldVerb):
     )
     out: Option[Path]
     from_frame: Annotated[Option[str | None], arg(name="from", metavar="FRAME")] = None
+    up: Option[tuple[float, float, float] | None] = None
     by: Option[By] = "votes"
     threshold: Option[float | None] = None
     quantile: Advanced[float] = 0.82

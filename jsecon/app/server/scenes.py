@@ -156,7 +156,7 @@ class Scene:
 
 
 def open_scenes(files: list[Path], embedder: Path | None) -> dict[str, Scene]:
-    """Loads fields, and asks each once so that its programs are compiled.
+    """Loads fields, asks each once so that its programs are compiled, and measures its objects.
 
     Args:
       files: Paths of field.safetensors files. A field is named like its folder.
@@ -177,4 +177,5 @@ def open_scenes(files: list[Path], embedder: Path | None) -> dict[str, Scene]:
         scenes[name] = Scene(name, field, field_embedder(field, embedder))
         with contextlib.suppress(InputError):  # an embedder that has no word for it
             scenes[name].mask(scenes[name].answer(SceneQuery("red")), 0)
+            scenes[name].object_scene.prepare()
     return scenes

@@ -223,6 +223,9 @@ def messages(field: LanguageField, state: ViewState, answers: Sequence[Answer | 
         if isinstance(answer, InputError):
             lines.append(_box(f"{head}: {_error(answer)}"))
             continue
+        if answer.relation is not None:
+            lines.append(_box(f"{head}: {html.escape(answer.relation['description'])}"))
+            continue
         score = float(answer.selection.score)
         count = int(answer.mask.sum())
         if int(answer.selection.region) < 0 and not np.asarray(answer.selection.mask).any():

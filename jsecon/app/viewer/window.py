@@ -20,8 +20,10 @@ import numpy as np
 
 from jsecon.app.access import listen, token_for
 from jsecon.app.ask import Answer, ask_region, ask_text, edit_answers
+from jsecon.app.object_scene import ObjectScene
 from jsecon.app.outputs import answer_masks, file_stem, write_answer
 from jsecon.app.pictures import UNKNOWN, code_colours, palette
+from jsecon.app.relations import query_relation, relation_answer
 from jsecon.app.viewer import view_state
 from jsecon.app.viewer.access import guarded_pages
 from jsecon.app.viewer.candidates import Candidate, RegionPictures, candidates, region_along
@@ -30,6 +32,7 @@ from jsecon.app.viewer.scene import FieldScene
 from jsecon.app.viewer.view_state import History, ViewQuery, ViewState
 from jsecon.errors import InputError
 from jsecon.query.edits import mutual_neighbours
+from jsecon.query.expressions import is_expression
 from jsecon.types import LanguageField
 
 REMEDY = 'Run: pip install "jsecon[viewer]". Or write a page with --export.'
@@ -81,6 +84,11 @@ class Viewer:
         return RegionPictures(self.field)
 
     @functools.cached_property
+    def objects(self) -> ObjectScene:
+        """The field as relations read it."""
+        return ObjectScene(self.field, self.embedder)
+
+    @functools.cached_property
     def _neighbours(self) -> np.ndarray:
         """The Gaussians next to each."""
         return mutual_neighbours(self.field.gaussians.means)
@@ -95,6 +103,7 @@ class Viewer:
         self._find_candidates(example, answers)
         self.do(lambda: self.pictures.renderer.photo(0))
         self.do(lambda: self._describe(self.history.state))
+        self.do(self._prepare_objects)
         self._thread.start()
 
     def run(self) -> None:
@@ -234,7 +243,9 @@ class Viewer:
         """Answers a query that is not among the last ones."""
         options: dict[str, Any] = {"several": query.all_matches, "piece_threshold": 1 - query.part_vs_whole}
         try:
-            if isinstance(query.query, str):
+            if isinstance(query.query, str) and is_expression(query.query):
+                answer = relation_answer(query_relation(self.objects, query.query))
+            elif isinstance(query.query, str):
                 answer = ask_text(self.field, self.embedder, query.query, threshold=query.threshold, **options)
             else:
                 answer = ask_region(self.field, query.query, threshold=query.threshold, **options)
@@ -244,6 +255,11 @@ class Viewer:
             return edit_answers(self.field, [answer], near=self._neighbours, **shells)[0]
         except InputError as error:
             return error
+
+    def _prepare_objects(self) -> None:
+        """Measures the objects, so that the first relation is answered as fast as later ones."""
+        with contextlib.suppress(InputError):  # an embedder without words: each text then has this error
+            self.objects.prepare()
 
     def _selection(self, query: ViewQuery) -> tuple[np.ndarray, np.ndarray]:
         """Returns mask (N,) and similarity (N,) of an answer; zeros for an error."""
@@ -295,7 +311,8 @@ class Viewer:
     def _find_candidates(self, state: ViewState, answers: Sequence[Answer | InputError]) -> list[tuple[int, Candidate]]:
         """Returns the index of a query with each of its candidates, for up to four queries."""
         count = 6 if len(answers) == 1 else 3
-        queries = [(k, q) for k, q in enumerate(state.queries) if not isinstance(answers[k], InputError)][:4]
+        named = [isinstance(answer, Answer) and answer.relation is None for answer in answers]
+        queries = [(k, q) for k, q in enumerate(state.queries) if named[k]][:4]
         return [(k, c) for k, query in queries for c in candidates(self.field, self.embedder, query, count)]
 
 
