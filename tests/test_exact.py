@@ -1,5 +1,5 @@
 """The renderer as it ships: its images against the brute-force float64 twin, on one device and on two; votes against
-the twin's weights. The stability table's rows have the gradients."""
+the twin's weights. In every run the rows of the stability table have images and gradients of one camera."""
 
 import numpy as np
 import pytest
@@ -9,10 +9,10 @@ from jsecon.parallel import host_mesh
 from jsecon.splat.reference import render_reference, weights_reference
 from jsecon.splat.render import render
 
-pytestmark = pytest.mark.as_shipped
+pytestmark = [pytest.mark.as_shipped, pytest.mark.long]
 
 
-@pytest.mark.parametrize("channels", [3, *(pytest.param(n, marks=pytest.mark.long) for n in (1, 16))])
+@pytest.mark.parametrize("channels", [1, 3, 16])
 def test_images_are_the_brute_force_sum(scene, cameras, channels):
     features = np.random.default_rng(1).normal(size=(scene.count, channels)).astype(np.float32)
     for t in range(4):
@@ -27,7 +27,6 @@ def test_images_are_the_brute_force_sum(scene, cameras, channels):
         assert np.abs(np.asarray(rendering.alpha) - alpha).max() < 1 / 255
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("channels", [3, 16])
 def test_several_devices_give_what_one_gives_to_the_last_bit(scene, camera, channels):
     """In every run test_cores has an image of three devices."""
@@ -37,7 +36,6 @@ def test_several_devices_give_what_one_gives_to_the_last_bit(scene, camera, chan
     np.testing.assert_array_equal(one.alpha, two.alpha)
 
 
-@pytest.mark.long
 def test_votes_are_the_twins_weights(scene, cameras):
     labels = np.random.default_rng(5).integers(-1, 11, (4, 5, 6)).repeat(8, 1).repeat(8, 2).astype(np.int32)
     votes = region_votes(scene, cameras, labels, 11, top=11)

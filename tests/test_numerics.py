@@ -9,11 +9,10 @@ from hypothesis.extra import numpy as hnp
 
 from jsecon.numerics import all_finite, cosine, cosine_matrix, normalize, safe_norm, sigmoid
 
-pytestmark = pytest.mark.as_shipped
-
 vectors = hnp.arrays(np.float32, (3,), elements=st.floats(-(2.0**126), 2.0**126, width=32))
 
 
+@pytest.mark.as_shipped
 @settings(deadline=None, max_examples=60)
 @given(vectors)
 def test_length_and_direction_over_the_float_range(x):
@@ -41,6 +40,7 @@ def test_zero_has_cosine_zero_and_gradient_zero():
         np.testing.assert_array_equal(jax.grad(function)(zero), 0)
 
 
+@pytest.mark.as_shipped
 def test_infinite_and_nan_are_not_hidden():
     assert bool(jnp.isnan(normalize(jnp.asarray([jnp.nan, 1.0]))).all())
     assert bool(jnp.isnan(normalize(jnp.asarray([jnp.inf, 1.0]))).all())
@@ -61,6 +61,7 @@ def test_gradients_equal_central_differences(x64, scale):
             np.testing.assert_allclose(gradient[i], estimate, rtol=1e-6, atol=1e-8 / scale)
 
 
+@pytest.mark.as_shipped
 def test_sigmoid_and_its_derivative_over_the_float_range():
     x = np.float32([-np.inf, -1e4, -80, -30, -5, -1e-30, 0, 1, 5, 10, 17, 30, 80, 1e4, np.inf])
     value, slope = jax.vmap(jax.value_and_grad(sigmoid))(x)
@@ -69,6 +70,7 @@ def test_sigmoid_and_its_derivative_over_the_float_range():
     np.testing.assert_allclose(slope, half / (1 + half) ** 2, rtol=2e-6, atol=1e-37)
 
 
+@pytest.mark.as_shipped
 @pytest.mark.parametrize("count", [40000, *(pytest.param(n, marks=pytest.mark.long) for n in (16385, 32769, 100000))])
 def test_at_the_sizes_where_jax_39103_strikes(count):
     rng = np.random.default_rng(count)

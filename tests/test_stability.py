@@ -118,6 +118,7 @@ def test_colour_and_depth_of_bad_gaussians(touched):
     assert int(count_non_finite(broken)) == 2
 
 
+@pytest.mark.as_shipped  # so are the rows whose program it shares
 @pytest.mark.parametrize("number", [np.nan, np.inf])
 def test_a_camera_that_is_not_finite_sees_nan_and_has_no_gradient(number):
     case = ordinary()
