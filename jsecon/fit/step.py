@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jax.tree_util import PyTreeDef
 
 from jsecon.errors import InputError
 from jsecon.fit.corrections import (
@@ -253,9 +252,10 @@ def step(
     return after, value, overflow
 
 
-def _step_of_leaves(leaves: list[Array], treedef: PyTreeDef, capacity: int, mesh: Mesh | None):
+def _step_of_leaves(leaves: list[Array], treedef: Any, capacity: int, mesh: Mesh | None):
     """`step` of a tree that is taken apart: jax fills lowered trees with other things than arrays."""
-    return step(*jax.tree.unflatten(treedef, leaves), capacity, mesh)
+    state, view, inputs = jax.tree.unflatten(treedef, leaves)
+    return step(state, view, inputs, capacity, mesh)
 
 
 # of one device, and over a mesh

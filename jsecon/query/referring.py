@@ -116,7 +116,7 @@ def evaluate(find: Find, thing: Thing, conditions: Sequence[Condition], view: Vi
         return Outcome([], [candidates[k] for k in rest], used, reason=_nearest_miss(candidates))
     valid.sort(key=lambda k: -candidates[k].score)
     if thing.order is not None:
-        orders.append((thing.order, order_values(shapes, view)[thing.order]))
+        orders.append((thing.order, np.asarray(order_values(shapes, view)[thing.order])))
     close: list[int] = []
     others: list[int] = []
     for name, values in orders:

@@ -161,7 +161,8 @@ def gap(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
         x, y, z = (own.half_size[..., k] for k in range(3))
         spacing = xp.sqrt(8.0 * (x * y + y * z + z * x) / own.points.shape[-2])
         missed = xp.maximum(spacing - 0.25 * size_of(other), 0.0)
-        return xp.sqrt(sum(side * side for side in beyond).min(-1)) - missed
+        dx, dy, dz = beyond
+        return xp.sqrt((dx * dx + dy * dy + dz * dz).min(-1)) - missed
 
     return xp.maximum(xp.maximum(to_box(a, b), to_box(b, a)), 0.0)
 
