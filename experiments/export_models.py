@@ -7,7 +7,7 @@ Without weights the true architectures are written with random ones in every par
 every graph's outputs. SigLIP, SigLIP 2 and MobileCLIP are put through jsecon's embedder too, from texts and crops to
 embeddings; `siglip` and `sam_images` (SAM 2.1 and EdgeTAM for transformers.js) also against transformers. `sam2_video`
 tracks a clip by jsecon over the five graphs of SAM 2.1 with memory, and by PyTorch. `--only` takes some of the parts;
-figures of the others are kept.
+figures of the others, and of other models of a part, are kept.
 """
 
 import argparse
@@ -38,7 +38,7 @@ class Options:
     """an open_clip tag or a file; None: random."""
     siglip: tuple[str, ...] = ("ViT-B-16-SigLIP", "ViT-B-16-SigLIP2", "siglip-base-patch16-224")
     """of open_clip, in immich's layout; the last of transformers, in that of transformers.js. Random weights."""
-    mobileclip: tuple[str, ...] = ("MobileCLIP-S1",)
+    mobileclip: tuple[str, ...] = ("MobileCLIP-S1", "MobileCLIP2-S0")
     """of open_clip; random weights."""
     sam: str = "vit_b"
     """vit_b, vit_l, vit_h, or slimsam."""
@@ -58,7 +58,8 @@ def main(options: Options) -> dict:
     kept = folder / "metrics.json"
     metrics = json.loads(kept.read_text()) if kept.exists() else {}
     for part in options.only:
-        metrics[part] = _MADE[part](options)
+        made = _MADE[part](options)
+        metrics[part] = metrics.get(part, {}) | made if isinstance(made, dict) else made
         metrics["versions"] = metrics.get("versions", {}) | _versions()
         done = tuple(name for name in PARTS if name in metrics)
         results.save(folder, dataclasses.replace(options, out="models", only=done), metrics, table(metrics))

@@ -4,7 +4,8 @@
     python -m experiments.vision_speed --graphs models      seconds: graphs of true size by experiments.export_models
 
 `masks` counts the true masks of rooms that guided prompts and the grid find, at two levels of SAM. `seconds` times
-every graph in a folder of models and adds up a frame; the machine should do nothing else.
+every graph in a folder of models, adds up a frame, and compares lower precisions (written by `--prepare`) with full
+precision; the machine should do nothing else.
 """
 
 import argparse
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.distance import pdist
 
 from experiments import results
 from experiments.datasets.plain_room import make_room
@@ -24,11 +26,10 @@ from experiments.simulated_vision.exact_sam import ExactSam, found_shares, level
 from jsecon.demo.capture import room_cameras
 from jsecon.demo.raycast import render_views
 from jsecon.demo.room import crowded_room
-from jsecon.networks.clip import find_clip, masked_crop
+from jsecon.networks.clip import ClipEmbedder, find_clip
 from jsecon.networks.hub import SUFFIXES, Precision, Role
 from jsecon.networks.sam import ENCODER, Level, Prompts, SamGraphs, SamSettings, find_sam
 from jsecon.networks.sam2 import FrameEncoder, Prompt, follow, open_sam2
-from jsecon.networks.session import Graph
 from jsecon.process import cores
 
 THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9)
@@ -40,6 +41,7 @@ GUIDED = 70
 """guided prompts of a frame"""
 REGIONS = 40
 """regions of a frame that are embedded"""
+TEXTS = ("a red mug", "grey sofa", "the small green plant on the window sill", "keyboard", "tea", "wooden table")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,8 +123,14 @@ def _count_frame(row: dict[str, Any], frame: np.ndarray, labels: dict[str, np.nd
 
 def time_models(folder: Path, options: Options) -> dict[str, Any]:
     """Times the graphs of each model in a folder, and compares lower precisions with full precision."""
-    kinds = {"segmenter": _time_segmenter, "embedder": _time_embedder, "tracker": _time_tracker}
-    frame = np.random.default_rng(0).integers(0, 256, (options.height, options.width, 3), dtype=np.uint8)
+    room = make_room(options.rooms[0])
+    cameras = room_cameras(room, views=1, width=options.width, height=options.height)
+    frame, masks = render_views(room, cameras)[0][0], masks_of(level_labels(room, cameras[0])["l"], LEAST_PX)
+    kinds = {
+        "segmenter": _time_segmenter,
+        "embedder": lambda model, precision, frame: _time_embedder(model, precision, frame, masks[:8]),
+        "tracker": _time_tracker,
+    }
     measured: dict[str, Any] = {}
     for model in sorted(path for path in folder.iterdir() if path.is_dir()):
         role = role_of(model)
@@ -150,10 +158,7 @@ def _first_graph(model: Path) -> str:
 
 
 def write_precisions(folder: Path) -> None:
-    """Writes the graphs of every model in half and in 8-bit precision beside the full ones, as public exports do.
-
-    Graphs of texts stay in full precision under those names: a question is one text.
-    """
+    """Writes the graphs of every model in half and in 8-bit precision beside the full ones, as public exports do."""
     import onnx
     from onnxruntime.quantization import QuantType, quantize_dynamic
     from onnxruntime.transformers.float16 import convert_float_to_float16
@@ -164,11 +169,6 @@ def write_precisions(folder: Path) -> None:
             continue
         half = path.with_name(f"{path.stem}_fp16.onnx")
         eight = path.with_name(f"{path.stem}_quantized.onnx")
-        if path.parent.name == "textual":
-            for variant in (half, eight):
-                variant.unlink(missing_ok=True)
-                variant.hardlink_to(path)
-            continue
         if not half.exists():
             onnx.save(convert_float_to_float16(onnx.load(str(path)), keep_io_types=True), str(half))
         if not eight.exists():
@@ -209,24 +209,21 @@ def _time_segmenter(model: Path, precision: Precision, frame: np.ndarray) -> dic
     return {"encoder": encoder, "prompt": decoder, "frame": frames, "least_cosine": min(cosines)}
 
 
-def _time_embedder(model: Path, precision: Precision, frame: np.ndarray) -> dict[str, Any]:
-    masks = np.zeros((8, *frame.shape[:2]), bool)
-    for n, mask in enumerate(masks):
-        mask[20 + 60 * (n // 4) : 80 + 60 * (n // 4), 20 + 90 * (n % 4) : 100 + 90 * (n % 4)] = True
-    files = find_clip(model, precision)
-    graph = Graph(files.visual)
-    name, output = next(iter(graph.inputs)), next(iter(graph.outputs))
-    size = files.size or graph.inputs[name].fixed(3) or 224
-    crops = np.stack([masked_crop(frame, mask, size) for mask in masks]).astype(np.float32) / 255
-    images = ((crops - np.float32(files.mean)) / np.float32(files.std)).transpose(0, 3, 1, 2)
-    crop = {}
-    for batch in (1, 8):
-        part = images[:batch]
-        crop[batch] = _best_seconds(lambda part=part: graph.run({name: part}, [output])) / batch
-    rows = graph.run({name: images}, [output])[output]
-    same = rows if precision == "fp32" else Graph(find_clip(model, "fp32").visual).run({name: images}, [output])[output]
-    cosine = min(_cosine(one, other) for one, other in zip(rows, same))
-    return {"crop": crop, "frame": REGIONS * min(crop.values()), "least_cosine": cosine}
+def _time_embedder(model: Path, precision: Precision, frame: np.ndarray, masks: np.ndarray) -> dict[str, Any]:
+    def embed(embedder: ClipEmbedder) -> tuple[np.ndarray, np.ndarray]:
+        return embedder.embed_regions(frame, masks), embedder.embed_text(list(TEXTS))
+
+    embedder = ClipEmbedder(find_clip(model, precision))
+    regions, texts = embed(embedder)
+    crop = {n: _best_seconds(lambda n=n: embedder.embed_regions(frame, masks[:n])) / n for n in (1, len(masks))}
+    text = _best_seconds(lambda: embedder.embed_text([TEXTS[0]]))
+    embedder.close()
+    exact = (regions, texts) if precision == "fp32" else embed(ClipEmbedder(find_clip(model, "fp32")))
+    cosines = [float((one * other).sum(1).min()) for one, other in zip((regions, texts), exact)]
+    others = [float(1 - pdist(rows, "cosine").mean()) for rows in exact]
+    frame_seconds = REGIONS * min(crop.values())
+    figures = {"crop": crop, "frame": frame_seconds, "text": text}
+    return figures | {"least_cosine": cosines[0], "least_cosine_texts": cosines[1], "others": others}
 
 
 def _time_tracker(model: Path, precision: Precision, frame: np.ndarray) -> dict[str, Any]:
@@ -264,9 +261,10 @@ def table(metrics: dict) -> str:
                     rows.append((kind, level, prompts, f"{count:.0f}", row["true"], *mine["found"]))
         parts.append(results.table(header, rows))
     header = ("model", "precision", "encoder, s", "prompt or crop, s", "frame, s", "by the grid, s", "least cosine")
-    rows = []
-    for model, found in metrics.get("seconds", {}).items():
-        for precision, row in found.items():
+    texts_header = ("model", "precision", "text, s", "least cosine of texts", "mean of two crops", "of two texts")
+    rows, texts = [], []
+    for model, figures in metrics.get("seconds", {}).items():
+        for precision, row in figures.items():
             if precision != "role":
                 each = row.get("prompt", row.get("crop", {"": row.get("object")}))
                 batch = min(each, key=each.get)
@@ -276,8 +274,10 @@ def table(metrics: dict) -> str:
                 encoder = f"{row['encoder']:.2f}" if "encoder" in row else "-"
                 cosine = f"{row['least_cosine']:.5f}" if "least_cosine" in row else "-"
                 rows.append((model, precision, encoder, single, f"{frame['guided']:.1f}", grid, cosine))
-    if rows:
-        parts.append(results.table(header, rows))
+                if "text" in row:
+                    cosines = (f"{value:.5f}" for value in (row["least_cosine_texts"], *row["others"]))
+                    texts.append((model, precision, f"{row['text']:.3f}", *cosines))
+    parts += [results.table(*given) for given in ((header, rows), (texts_header, texts)) if given[1]]
     return "\n\n".join(parts)
 
 

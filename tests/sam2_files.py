@@ -53,7 +53,8 @@ def write_sam2(folder: Path, *, seed: int = 1, memory: int = MEMORY) -> Path:
         g("Conv", "pixel_values", weight, kernel_shape=[stride] * 2, strides=[stride] * 2, into=f"feats{level}")
     g("Add", "feats2", g.weight(1, CHANNELS, 1, 1, scale=0.5), into="feats2_no_mem")
     g("Identity", g.weight(*image, scale=1.0), into="vision_pos_embed")
-    outputs = fine | {"feats2": image, "feats2_no_mem": image, "vision_pos_embed": image}
+    coarsest = ("batch", CHANNELS, "rows", "columns")  # as PyTorch's exporter declares it
+    outputs = fine | dict.fromkeys(("feats2", "feats2_no_mem", "vision_pos_embed"), coarsest)
     g.save(folder / "onnx" / "vision_encoder.onnx", {"pixel_values": (1, 3, SIZE, SIZE)}, outputs)
 
     g = Sketch(rng)

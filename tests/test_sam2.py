@@ -236,7 +236,7 @@ def change_constants(folder, **changes):
         (lambda f: change_constants(f, image_std=None), "image_std"),
         (lambda f: change_constants(f, memory_temporal_positional_encoding=[[0.0] * 4] * 3), r"\(3, 4\)"),
         (lambda f: change_constants(f, image_mean=["a"] * 3), "cannot be read"),
-        (lambda f: shutil.copy(f / "onnx" / "pointer_tpos.onnx", f / "onnx" / "mask_decoder.onnx"), "feats0"),
+        (lambda f: shutil.copy(f / "onnx" / "pointer_tpos.onnx", f / "onnx" / "mask_decoder.onnx"), "feats2_cond"),
         (lambda f: shutil.copy(write_sam2(f / "o", memory=6) / "onnx" / "memory_encoder.onnx", f / "onnx"), "tokens"),
         (
             lambda f: (f / "onnx" / "vision_encoder.onnx").write_bytes(

@@ -163,12 +163,13 @@ def open_sam2(folder: Path, *, threads: int | None = None) -> Sam2Graphs:
     files = sam2_files(folder)
     constants = _read_constants(files[CONSTANTS])
     graphs = {name: Graph(files[f"{name}.onnx"], threads=threads) for name in SIGNATURES}
-    encoder = graphs["vision_encoder"]
+    encoder, decoder = graphs["vision_encoder"], graphs["mask_decoder"]
     image = encoder.require("input", "pixel_values", (1, 3, None, None), "SAM 2's vision encoder")
-    features = encoder.require("output", "feats2", (1, None, None, None), "SAM 2's vision encoder")
+    # Sizes are those of inputs: PyTorch's exporter leaves some sizes of the encoder's outputs open.
+    features = decoder.require("input", "feats2_cond", (1, None, None, None), "SAM 2's mask decoder")
     side, channels, grid = image.fixed(2), features.fixed(1), features.fixed(2)
     if side is None or channels is None or grid is None:
-        raise InputError(encoder.path, f"{image} and {features}", "an image and features of fixed sizes", PUBLISHED)
+        raise InputError(decoder.path, f"{image} and {features}", "an image and features of fixed sizes", PUBLISHED)
     sizes = {"S": side, "C": channels, "G": grid, "T": grid * grid, "M": constants.temporal_code.shape[1]}
     for name, graph in graphs.items():
         for tensors, kind in zip(SIGNATURES[name], ("input", "output")):
