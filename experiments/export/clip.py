@@ -59,7 +59,8 @@ def export(model: torch.nn.Module, name: str, folder: Path, *, seed: int, thread
     preprocessing |= {"mean": list(model.visual.image_mean), "std": list(model.visual.image_std)}
     write_text(folder / "visual" / "preprocess_cfg.json", json.dumps(preprocessing, indent=2) + "\n")
     merges = [list(pair) for pair, _ in sorted(tokenizer.bpe_ranks.items(), key=lambda item: item[1])]
-    vocabulary = {"model": {"type": "BPE", "vocab": tokenizer.encoder, "merges": merges}}
+    model = {"type": "BPE", "end_of_word_suffix": "</w>", "vocab": tokenizer.encoder, "merges": merges}
+    vocabulary = {"model": model}
     write_text(folder / "textual" / "tokenizer.json", json.dumps(vocabulary, ensure_ascii=False) + "\n")
     return [dataclasses.replace(row, graph=f"{half}/model.onnx") for row, half in zip(rows, ("visual", "textual"))]
 

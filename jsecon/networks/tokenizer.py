@@ -133,6 +133,7 @@ class TextTokenizer:
 
         if not isinstance(self._tokenizer.model, models.BPE):
             raise ValueError(f"type {type(self._tokenizer.model).__name__}, not CLIP's BPE")
+        self._tokenizer.model.end_of_word_suffix = "</w>"
         for sign in pre_tokenizers.ByteLevel.alphabet():
             self._token_id(sign)
             self._token_id(f"{sign}</w>")
