@@ -384,7 +384,10 @@ class ClipEmbedder:
         return _normalize(rows.mean(1), self.files.textual)
 
     def seconds_per_crop(self) -> float:
-        """Measures the seconds of a region in a full batch."""
+        """Measures the seconds of a region in a full batch.
+
+        The crops are blank: which regions are embedded is known only after their masks were tracked.
+        """
         crops = np.zeros((self._batch, self.size, self.size, 3), np.uint8)
         self._run_visual(crops)  # opens the graph
         started = time.monotonic()
