@@ -162,7 +162,7 @@ def one_component(points: Float[Array, "m 3"], eps: float) -> bool:
     if not len(points):
         return False
     places, _, _ = _places(np.asarray(points, np.float64), eps)
-    near = KDTree(places).query(places, k=_LINKS, distance_upper_bound=eps)[1]
+    near = np.asarray(KDTree(places).query(places, k=_LINKS, distance_upper_bound=eps)[1])
     linked = near < len(places)
     ends = np.nonzero(linked)[0], near[linked]
     graph = coo_array((np.ones(len(ends[0]), bool), ends), shape=(len(places), len(places)))
