@@ -24,6 +24,10 @@ def refused(*parts):
     assert info.value.remedy
 
 
+ROOM_FIT = {"holdout": 4, "steps": 110, "gaussians_at_most": 4000}
+"""options of the fixture `room_run`: two chunks of steps and a part of a third, one growth"""
+
+
 def ring_poses(count: int, radius: float = 3.0) -> np.ndarray:
     """(count, 4, 4) float64 world-to-camera around the origin, looking at it, each with a roll of its own."""
     poses = np.tile(np.eye(4), (count, 1, 1))

@@ -205,9 +205,11 @@ def room(made_once) -> Path:
 @pytest.fixture(scope="session")
 def room_run(room, made_once, tmp_path_factory):
     """(result, folder) of a finished run on the room with its true masks; the folder is this worker's copy."""
+    from capture_files import ROOM_FIT
+
     from jsecon.pipeline import run as pipeline
 
-    options = pipeline.Options(room, masks=room / "masks", holdout=4, steps=150)
+    options = pipeline.Options(room, masks=room / "masks", **ROOM_FIT)
     with made_once("run") as folder:
         pipeline.run(options, folder)
         own = Path(shutil.copytree(folder, tmp_path_factory.mktemp("run") / "out"))

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from capture_files import ROOM_FIT
 
 from jsecon.app import cli, verbs
 from jsecon.app.ask import METHODS
@@ -25,7 +26,7 @@ def _run(*arguments):
     return cli.main([str(argument) for argument in arguments])
 
 
-FITTED = "--holdout", 4, "--steps", 150
+FITTED = [word for name, value in ROOM_FIT.items() for word in (f"--{name.replace('_', '-')}", value)]
 """options of `room_run`'s fit"""
 
 

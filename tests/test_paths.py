@@ -107,10 +107,13 @@ MANY = 100_000
 def test_a_hundred_thousand_frames_are_listed_in_seconds(tmp_path):
     """Their names and poses, in each format, and the digest of the files; of the pictures a few are read."""
     (tmp_path / "images").mkdir()
-    cv2.imwrite(str(tmp_path / "one.png"), np.zeros((16, 24, 3), np.uint8))
     names = [f"frame_{n}.png" for n in range(MANY)]
-    for name in names:
-        os.link(tmp_path / "one.png", tmp_path / "images" / name)
+    for n, name in enumerate(names):
+        if n % 50_000 == 0:  # ext4 allows 65,000 links to a file
+            cv2.imwrite(str(tmp_path / "images" / name), np.zeros((16, 24, 3), np.uint8))
+            original = tmp_path / "images" / name
+        else:
+            os.link(original, tmp_path / "images" / name)
     lens, pose = {"w": 24, "h": 16, "fl_x": 20}, np.eye(4).tolist()
     frames = [{"file_path": f"images/{name}", "transform_matrix": pose} for name in reversed(names)]
     (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))

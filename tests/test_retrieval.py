@@ -85,10 +85,11 @@ def test_gradient_equals_central_differences(rows):
         given = tuple(jnp.asarray(a, jnp.float64) for a in rows)
         weights = jnp.asarray(np.random.default_rng(0).normal(size=7))
 
+        @jax.jit
         def total(*given):
             return jnp.sum(weights * region_similarities(*given, "apart")[0])
 
-        for place, gradient in enumerate(jax.grad(total, (0, 1, 2))(*given)):
+        for place, gradient in enumerate(jax.jit(jax.grad(total, (0, 1, 2)))(*given)):
             step = np.random.default_rng(place).normal(size=given[place].shape) * 1e-6
             moved = [total(*(a + s * step if i == place else a for i, a in enumerate(given))) for s in (1, -1)]
             assert float(jnp.sum(gradient * step)) == pytest.approx(float(moved[0] - moved[1]) / 2, rel=1e-5)
