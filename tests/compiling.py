@@ -20,15 +20,14 @@ SHIPPED = {
 }
 """XLA's own defaults"""
 LOOPS = {"xla_backend_optimization_level": 1}
-"""options of programs that run hundreds of times: three times faster than FAST, for twice the compilation time. Files
-marked `few_steps` do without them."""
-RUN_OFTEN = frozenset({"jit_step", "jit__step", "jit__epochs", "jit__descend", "jit__run"})
-"""their names: the training loops"""
+"""options of programs that run hundreds of times: three times faster than FAST, for twice the compilation time"""
+RUN_OFTEN = frozenset({"jit__step", "jit__epochs", "jit__descend"})
+"""their names: the loops of alignment.py, autoencoder.py and distill.py. The fits of the tests take tens of steps."""
 
 ENVIRONMENT = " ".join(f"--{name}={str(value).lower()}" for name, value in FAST.items())
 """the part of XLA_FLAGS that makes all processes of a run compile fast"""
 
-_state = {"shipped": False, "loops": True}
+_state = {"shipped": False}
 
 
 @functools.cache
@@ -40,7 +39,7 @@ def install() -> None:
 
     def chosen(backend, computation, devices, options, *rest):
         name = str(computation.operation.attributes["sym_name"]).strip('"')
-        mine = SHIPPED if _state["shipped"] else LOOPS if name in RUN_OFTEN and _state["loops"] else {}
+        mine = SHIPPED if _state["shipped"] else LOOPS if name in RUN_OFTEN else {}
         if backend.platform == "cpu":  # a GPU's compiler does not know them
             options.env_option_overrides = list((mine | dict(options.env_option_overrides)).items())
         return compile_or_read(backend, computation, devices, options, *rest)
@@ -48,14 +47,13 @@ def install() -> None:
     compiler.compile_or_get_cached = chosen
 
 
-def choose(*, shipped: bool, loops: bool = True) -> None:
+def choose(*, shipped: bool) -> None:
     """Sets the options of further programs: XLA's defaults if `shipped`, else FAST, with LOOPS for training loops.
 
     A change of `shipped` clears the compiled programs. On disk, jax's keys tell both kinds apart.
     """
     import jax
 
-    _state["loops"] = loops
     if _state["shipped"] != shipped:
         _state["shipped"] = shipped
         jax.clear_caches()

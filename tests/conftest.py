@@ -89,8 +89,7 @@ def pytest_collection_modifyitems(items):
 def pytest_runtest_protocol(item, nextitem):
     """Compiles the programs of a test and of its fixtures as the file's mark says; after a file, clears the programs if
     they hold many of the process's memory maps."""
-    marked = {name: item.get_closest_marker(name) is not None for name in ("as_shipped", "few_steps")}
-    compiling.choose(shipped=marked["as_shipped"], loops=not marked["few_steps"])
+    compiling.choose(shipped=item.get_closest_marker("as_shipped") is not None)
     done = yield
     if nextitem is None or nextitem.path != item.path:
         clear_programs(above=40_000)

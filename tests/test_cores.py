@@ -15,7 +15,6 @@ from jsecon.app.ask import ask_text
 from jsecon.language.field import save_field
 from jsecon.vision.colours import ColourEmbedder
 
-pytestmark = pytest.mark.few_steps
 TESTS = Path(__file__).resolve().parent
 PARTS = "votes", "image", "fit", "query"
 VOTES = "regions", "weights", "labelled", "total", "peak", "views", "by_view"

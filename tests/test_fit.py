@@ -18,7 +18,6 @@ from jsecon.fit.step import cameras_extent
 from jsecon.splat.render import render, render_rgb
 from jsecon.types import Camera, Capture, Gaussians
 
-pytestmark = pytest.mark.few_steps
 KEY = jax.random.key(0)
 RATES = LearningRates(means=1e-3, means_last=1e-4, log_scales=0.02, colors=0.02, quaternions=0.01)
 VIEWS, STEPS = 5, 40
