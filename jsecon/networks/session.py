@@ -123,7 +123,12 @@ class Graph:
             options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
         try:
             return onnxruntime.InferenceSession(
-                str(self.path), options, providers=["CPUExecutionProvider"], enable_fallback=0
+                str(self.path),
+                options,
+                providers=["CPUExecutionProvider"],
+                enable_fallback=0,
+                # It crashes the process on graphs of CLIP, SigLIP 2 and MobileCLIP in half precision (version 1.32).
+                disabled_optimizers=["NchwcTransformer"] if "fp16" in self.path.stem else None,
             )
         except Exception as error:  # ONNX Runtime's exceptions have no common base but this
             problem = f"ONNX Runtime {onnxruntime.__version__} cannot open it ({_reason(error)})"
