@@ -72,7 +72,9 @@ class TextTokenizer:
         expected = "a tokenizer.json of Hugging Face's kind"
         with _tokenizer_errors(self._path, f"{expected} with the token {rules.pad!r}" if rules else expected):
             text = self._path.read_text(encoding="utf-8")
-            _check_template(parse_json(text).get("post_processor"))
+            content = parse_json(text)
+            _check_template(content.get("post_processor"))
+            _check_merges(content.get("model"))
             self._tokenizer = Tokenizer.from_str(text)
             self._end = -1
             self._pad = 0 if rules is None else self._token_id(rules.pad)
@@ -155,6 +157,17 @@ def _repair(text: str) -> str:
     import ftfy
 
     return " ".join(html.unescape(html.unescape(ftfy.fix_text(text))).split())
+
+
+def _check_merges(model: Any) -> None:
+    """Raises ValueError if a merge makes a token that the vocabulary lacks: `tokenizers` would abort."""
+    if not isinstance(model, dict) or not model.get("merges"):
+        return
+    vocabulary, prefix = model["vocab"], len(model.get("continuing_subword_prefix") or "")
+    for merge in model["merges"]:
+        first, second = merge.split(" ") if isinstance(merge, str) else merge
+        if len(second) < prefix or first + second[prefix:] not in vocabulary:
+            raise ValueError(f"the merge of {first!r} and {second!r} makes no token")
 
 
 def _check_template(processor: Any) -> None:
