@@ -95,7 +95,7 @@ class SceneViews:
         return atoms, seen, [votes.data, votes.indices, votes.indptr], votes.shape, within
 
     def _views_of(self, frames: UInt8[np.ndarray, "t h w 3"], indices: Sequence[int]) -> Iterator[tuple]:
-        """Result of `_view` for each frame of `indices`; a thread of each core works on a frame of its own."""
+        """Results of `_view` for the frames of `indices`, in order; threads work on several frames at a time."""
         pool = ThreadPoolExecutor(min(cores(), LANES))
         try:
             yield from pool.map(self._view, (frames[t] for t in indices), indices)

@@ -312,7 +312,7 @@ class StepRunner:
         return self._views[size]
 
     def compile(self, state: TrainState, size: float, config: StepConfig) -> Future:
-        """Starts to compile the program of steps at that size in a thread of its own, unless that has begun.
+        """Starts to compile the program of steps at that size in another thread, unless that has begun.
 
         Returns:
           The program, once it is compiled.

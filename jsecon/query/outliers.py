@@ -107,7 +107,7 @@ def split_outliers(
     if len(chosen) < min_samples:
         return OutlierResult(mask, f"fewer than {min_samples} Gaussians are selected", 0, 0)
     eps = default_eps(points) if eps is None else eps
-    if one_component(points, eps):  # as where DBSCAN finds one cluster of all points
+    if one_component(points, eps):  # then nothing lies apart, and DBSCAN is not needed
         return OutlierResult(mask, "the selection is one component", 1, 0)
     labels = dbscan(points, eps, min_samples)
     if labels.max() < 0:
