@@ -91,7 +91,10 @@ const send = (kind, x, y, more = {}) => canvas.dispatchEvent(new PointerEvent(ki
 canvas.setPointerCapture = () => {};
 (async () => {
   try {
-    const start = pixels(), words = () => document.getElementById("message").textContent;
+    const words = () => document.getElementById("message").textContent;
+    found.opened = words();
+    if (chosen.kind !== "none") choose(chosen);
+    const start = pixels();
     found.colours = new Set(Array.from({ length: start.length / 4 }, (_, i) => start[4 * i] >> 4)).size;
     const button = document.querySelector("#texts button");
     button.click(); found.text = words(); found.lit = apart(start, pixels()); found.pressed = button.ariaPressed;
@@ -126,6 +129,7 @@ def test_in_a_browser_it_does_what_a_person_tries(made, tmp_path):
     _, answers, text, _ = made
     found = driven(text, [[320, 240], [2, 470]], tmp_path)
     assert "error" not in found, found
+    assert found["opened"] == found["text"]  # the first text is lit from the start
     assert found["colours"] > 3  # the canvas is not blank
     assert found["text"] == f"the second </script>: {int(answers[0].mask.sum())} Gaussians, score 0.75."
     assert found["pressed"] == "true"

@@ -353,7 +353,7 @@ def _export_page(verb: View, console: Console) -> VerbResult:
         answers, errors = answers + more, errors + refused
         size = write_page(field, answers, verb.export, title=verb.field.resolve().parent.name)
     count = field.gaussians.count
-    console.say(f"{count} Gaussians, {len(answers)} answers, {size / 2**20:.1f} MiB  {verb.export}")
+    console.say(f"{count} Gaussians, texts answered: {len(answers)}, {size / 2**20:.1f} MiB  {verb.export}")
     texts = [answer.query for answer in answers]
     return {"written": {"page": verb.export}, "gaussians": count, "answers": texts, "bytes": size, "errors": errors}
 
