@@ -22,7 +22,6 @@ class Output:
     """
 
     def __init__(self, stream: Any):
-        """Wraps `stream`."""
         self._stream = stream
         self.failure: OSError | None = None
 

@@ -21,7 +21,6 @@ class InputError(ValueError):
     """
 
     def __init__(self, where: object, problem: str, expected: str = "", remedy: str = ""):
-        """Joins the parts to a message, and shortens parts that are very long."""
         half = MAX_QUOTED // 2
         texts = [t if len(t) <= MAX_QUOTED else f"{t[:half]} ... {t[-half:]}" for t in (str(where), problem)]
         self.where, self.problem = texts

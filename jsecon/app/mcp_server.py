@@ -41,7 +41,6 @@ class Tools:
     """
 
     def __init__(self, scenes: dict[str, Scene]):
-        """Takes the fields."""
         self.scenes = scenes
 
     def scene(self, name: str | None) -> Scene:

@@ -223,7 +223,6 @@ class Renderer:
     """
 
     def __init__(self, gaussians: Gaussians, cameras: Camera, *, in_blocks: bool = False):
-        """Prepares to render a scene from its cameras."""
         self._gaussians = gaussians if in_blocks else jax.device_put(gaussians)
         self._in_blocks = in_blocks
         self._cameras = jax.tree.map(np.asarray, cameras)  # whose items need no compilation

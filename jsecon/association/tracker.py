@@ -38,7 +38,6 @@ class GeometricTracker:
         *,
         atoms_per_frame: int = 256,
     ):
-        """Prepares the views of a scene and their proposals."""
         self.views = SceneViews(gaussians, cameras, proposals, atoms_per_frame=atoms_per_frame)
 
     def __call__(

@@ -75,7 +75,6 @@ class SceneViews:
         atoms_per_frame: int = 256,
         centre: float = 0.0,
     ):
-        """Prepares the weights of all views."""
         require(atoms_per_frame > 0, "atoms_per_frame", atoms_per_frame, "at least 1", "Use 200 for small frames.")
         self.gaussians, self.cameras, self.count = gaussians, cameras, gaussians.count
         self.atoms_per_frame, self.centre = atoms_per_frame, centre

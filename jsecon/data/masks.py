@@ -89,7 +89,6 @@ class FrameNames:
     """
 
     def __init__(self, names: Sequence[str], files: Mapping[str, ImageFile] | None = None):
-        """Indexes the frames."""
         frames = [_frame(name, (files or {}).get(name)) for name in names]
         self._by_name: dict[str, list[_Frame]] = collections.defaultdict(list)
         by_first_part: dict[str, list[_Frame]] = collections.defaultdict(list)
@@ -611,7 +610,6 @@ class MaskFitter:
         size: tuple[int, int],
         shape: Callable[[str], tuple[int, ...] | None],
     ):
-        """Decides whether masks are of the stored pixels."""
         self.files, (self.height, self.width) = files, size
         self.count: collections.Counter[str] = collections.Counter()
         self.of_stored_pixels = False

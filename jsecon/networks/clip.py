@@ -303,7 +303,6 @@ class ClipEmbedder:
         threads: int | None = None,
         store: str | Path | None = None,
     ):
-        """Opens the graphs and the tokenizer of a model."""
         if not templates or not all("{}" in template for template in templates):
             problem = ", ".join(map(repr, templates)) or "no template"
             remedy = 'For example "a photo of a {}.", or "{}", the text alone.'

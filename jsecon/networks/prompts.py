@@ -30,7 +30,6 @@ class GuidedPrompts:
     """
 
     def __init__(self, image: UInt8[np.ndarray, "h w 3"], levels: int):
-        """Cuts the image into regions by colour."""
         self._regions = PROPOSALS.partition(image, 0)
         self._explained = np.zeros((levels, *self._regions.shape), bool)
         self._prompted = np.zeros(self._regions.shape, bool)

@@ -142,7 +142,6 @@ class SamGraphs:
     """
 
     def __init__(self, files: SamFiles, *, batch: int = BATCH, threads: int | None = None):
-        """Opens the two graphs of a model."""
         self.files = files
         self._encoder = Graph(files.encoder, threads=threads)
         self._decoder = Graph(files.decoder, threads=threads)
@@ -334,7 +333,6 @@ class SamSegmenter:
         batch: int = BATCH,
         threads: int | None = None,
     ):
-        """Prepares the generator of masks."""
         self.files = model if isinstance(model, SamFiles) else find_sam(model)
         self.settings = settings or SamSettings()
         self.name = f"sam-{self.files.digest(extra=repr(self.settings))}"

@@ -330,7 +330,6 @@ class Sam2Tracker:
     """
 
     def __init__(self, folder: Path, *, hole_area: int = 8, keep: int = 16, threads: int | None = None):
-        """Names the model of `folder`; its graphs are opened at the first frame."""
         self.name = f"sam2-{sam2_digest(folder, extra=repr(hole_area))}"
         self.hole_area = hole_area
         self._folder = folder
@@ -397,7 +396,6 @@ class FrameEncoder:
     """
 
     def __init__(self, graphs: Sam2Graphs, *, keep: int = 1):
-        """Keeps the features of the last `keep` frames."""
         self._graphs = graphs
         self._keep = max(keep, 1)
         self._known: OrderedDict[bytes, FrameFeatures] = OrderedDict()

@@ -133,7 +133,6 @@ class Sam3:
     """
 
     def __init__(self, model: str | Path | Sam3Files, *, threads: int | None = None):
-        """Finds the files of `model`; its graphs are opened when they are needed."""
         self.files = model if isinstance(model, Sam3Files) else find_sam3(model)
         self._threads = threads
 

@@ -95,7 +95,6 @@ class Graph:
     """
 
     def __init__(self, path: str | os.PathLike, *, threads: int | None = None, optimise: bool = True):
-        """Opens an ONNX graph."""
         self.path = Path(path)
         self._threads = threads or cores()
         _check_bytes(self.path)

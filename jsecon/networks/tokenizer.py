@@ -64,7 +64,6 @@ class TextTokenizer:
     """
 
     def __init__(self, path: str | Path, rules: TextRules | None = None):
-        """Opens a tokenizer.json."""
         from tokenizers import Tokenizer
 
         self._path = Path(path)

@@ -40,7 +40,6 @@ class ExternalSpace:
     """
 
     def __init__(self, dim: int):
-        """Stands for an embedder of `dim` numbers whose model is not at hand."""
         self.dim, self.name = dim, f"{_EXTERNAL}{dim}"
         self.canonical = self.reference = np.zeros((0, dim), np.float32)
 

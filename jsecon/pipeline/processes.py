@@ -193,7 +193,6 @@ class Coordinator:
     """
 
     def __init__(self, several: bool):
-        """Makes the coordinator of one or of several processes."""
         self._several = several
         self._sent: set[str] = set()
 

@@ -107,7 +107,6 @@ class Console(Listener):
     """
 
     def __init__(self, out: Stream | None = None, err: Stream | None = None):
-        """Prints to `out`, and messages to `err`."""
         self._out = out or sys.stdout
         self._err = err or sys.stderr
 

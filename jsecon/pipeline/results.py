@@ -55,7 +55,6 @@ class Results:
     """report of structure from motion, if the capture had no poses"""
 
     def __init__(self, **results: Any):
-        """Starts with the results that are known."""
         for name, value in results.items():
             self.add(name, value)
 
@@ -113,7 +112,6 @@ class Checkpoint:
     """
 
     def __init__(self, path: Path):
-        """Keeps records beside `path`."""
         self._path = path
         self._last = time.monotonic()
 

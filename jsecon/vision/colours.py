@@ -111,7 +111,6 @@ class ColourEmbedder:
     softmax_scale = SOFTMAX_SCALE
 
     def __init__(self):
-        """Prepares the table of colour words."""
         self.names = tuple(PALETTE)
         self._points = lab_of(np.asarray(list(PALETTE.values())))
         self._by_name = dict(zip(self.names, self._points))

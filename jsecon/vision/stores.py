@@ -98,7 +98,6 @@ class StoredSegmenter:
     """
 
     def __init__(self, segmenter: NamedSegmenter, folder: str | Path):
-        """Keeps the masks of `segmenter` in `folder`."""
         self.name = segmenter.name
         self._segmenter, self._folder = segmenter, Path(folder)
 

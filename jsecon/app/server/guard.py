@@ -45,7 +45,6 @@ class Workers:
     """
 
     def __init__(self, threads: int, places: int):
-        """Starts `threads` workers with `places` waiting questions."""
         self._places = threading.Semaphore(places)
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="jsecon-answer")
 
@@ -90,7 +89,6 @@ class Guard:
     """
 
     def __init__(self, app: Any, token: str, limits: Limits, hosts: Collection[str] = ()):
-        """Wraps the application `app`."""
         self.app = app
         self.token = token
         self.limits = limits

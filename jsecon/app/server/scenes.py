@@ -64,7 +64,6 @@ class Scene:
     """
 
     def __init__(self, name: str, field: LanguageField, embedder: Any):
-        """Prepares a field to be asked under `name`."""
         self.name = name
         self.field = field
         self.embedder = embedder

@@ -101,7 +101,6 @@ class RegionPictures:
     """
 
     def __init__(self, field: LanguageField):
-        """Prepares pictures of the main regions of `field`."""
         self.renderer = Renderer(field.gaussians, field.cameras)
         self.regions = main_regions(field)
         self._means = np.asarray(field.gaussians.means)

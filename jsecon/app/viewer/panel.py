@@ -39,7 +39,6 @@ class Panel:
     """
 
     def __init__(self, viewer: Any, server: Any, field: LanguageField):
-        """Draws the panel of a field."""
         self._viewer = viewer
         self._names = field.names
         self._ray = np.zeros(3)

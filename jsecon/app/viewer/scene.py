@@ -40,7 +40,6 @@ class FieldScene:
     """
 
     def __init__(self, server: Any, field: LanguageField):
-        """Shows the Gaussians of a field."""
         gaussians = field.gaussians
         usable = np.asarray(is_usable(gaussians))
 

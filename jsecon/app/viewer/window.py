@@ -62,7 +62,6 @@ class Viewer:
     """
 
     def __init__(self, field: LanguageField, embedder: Any, server: Any, *, name: str):
-        """Connects a field and its embedder with one client of the server."""
         self.field = field
         self.embedder = embedder
         self.server = server
