@@ -60,8 +60,6 @@ GROUND = ("types", "numerics", "errors", "files", "parallel", "process", "backen
 LOW = "splat", "vision", "data", "fit", "networks", "language", "association", "query", "evaluate", "views"
 LAYERS = *LOW, "pipeline", "app", "demo"
 """packages, lowest first: each imports the modules of the root, itself, and packages before it"""
-COMMAND_LINE = "actions.py", "cli.py"
-"""modules of app that start the verbs, the demo among them; like __main__ they may import every package"""
 
 
 def test_packages_import_downwards_only():
@@ -71,7 +69,7 @@ def test_packages_import_downwards_only():
     assert modules == {*GROUND, "__init__", "__main__"}
     for path in PACKAGE.rglob("*.py"):
         package = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
-        if package in ("__init__", "__main__") or path.name in COMMAND_LINE:  # the table of contents, and the program
+        if package in ("__init__", "__main__"):  # the table of contents, and the program
             continue
         lower = LAYERS[: LAYERS.index(package) + 1] if package in LAYERS else ()
         allowed = {*GROUND, "__version__", *lower}

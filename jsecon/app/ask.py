@@ -25,13 +25,12 @@ from jsecon.language.columns import is_mapped
 from jsecon.language.field import subset_field
 from jsecon.language.membership import SHARE_THRESHOLD
 from jsecon.language.regions import ALIKE_THRESHOLD
-from jsecon.process import MEMORY, memory_budget
 from jsecon.query import edits
 from jsecon.query.blocks import SparseSelection, select_in_blocks
 from jsecon.query.composite import parse_query
 from jsecon.query.match import ONE_REGION, RegionMatch, best_presence, match_region, match_regions
 from jsecon.query.outliers import split_outliers
-from jsecon.query.outline import box_mask, lift
+from jsecon.query.outline import lift
 from jsecon.query.parts import PartsAnswer, parts_fallback
 from jsecon.query.pixel import region_at
 from jsecon.query.rules import PIECE_THRESHOLD, QUANTILE, QueryRules
@@ -226,7 +225,7 @@ def ask_outline(
     Args:
       field: The field.
       name: Name of the answer.
-      outlines: Index or name of a frame -> mask (H, W), or what `box_mask` makes.
+      outlines: Index or name of a frame -> mask (H, W), or what `jsecon.query.outline.box_mask` makes.
       threshold: Share of a Gaussian that must lie inside; None is 0.5.
       outliers: Whether to drop outliers.
       key: Key of the answer; None is its name.
@@ -448,48 +447,6 @@ def read_mask(file: Path, field: LanguageField) -> Bool[np.ndarray, "h w"]:
     return resize_nearest(mask, width, height) > 0
 
 
-def ask_masks(field: LanguageField, pairs: Sequence[str], **options: Any) -> Answer:
-    """Selects the Gaussians of an object that mask files outline.
-
-    Args:
-      field: The field.
-      pairs: Frame, file, frame, file ...
-      **options: Options of `ask_outline`.
-
-    Returns:
-      The answer, named after the first file.
-
-    Raises:
-      InputError: As of `ask_outline` and `read_mask`, or a frame has two masks.
-    """
-    frames, files = pairs[::2], pairs[1::2]
-    names = [field.names[frame_index(field, frame)] for frame in frames]
-    if len(set(names)) < len(names):
-        raise InputError("--mask", "a frame has two masks", remedy="Give one mask of an object in each frame.")
-    outlines = {name: read_mask(Path(file), field) for name, file in zip(names, files)}
-    key = "\0".join(("mask", *(part for pair in zip(names, files) for part in pair)))
-    return ask_outline(field, Path(files[0]).stem, outlines, key=key, **options)
-
-
-def ask_box(field: LanguageField, frame: str, *ends: int, **options: Any) -> Answer:
-    """Selects the Gaussians of the object in a box of a frame.
-
-    Args:
-      field: The field.
-      frame: Name of the frame.
-      *ends: Left, upper, right and lower end, px.
-      **options: Options of `ask_outline`.
-
-    Returns:
-      The answer.
-
-    Raises:
-      InputError: As of `ask_outline`.
-    """
-    name = f"box {field.names[frame_index(field, frame)]} {' '.join(map(str, ends))}"
-    return ask_outline(field, name, {frame: box_mask(field, *ends)}, **options)
-
-
 def ask_each(
     field: LanguageField,
     embedder: Any,
@@ -563,32 +520,3 @@ def _select_rows(field: LanguageField, match: _Match, sparse: SparseSelection, b
     selection = Selection(np.arange(size) < count, similarity, *best, np.asarray(quantile), match.regions.confidence)
     answer = _finish(subset_field(field, rows), match, selection, by, None, outliers)
     return dataclasses.replace(answer, rows=rows)
-
-
-def larger_than_memory(file: Path) -> bool:
-    """Returns whether a field file is larger than what may stay in memory (`memory_budget`)."""
-    return file.is_file() and file.stat().st_size > memory_budget()
-
-
-def require_blocks(file: Path, *, by: str, outlined: bool, edited: bool) -> None:
-    """Checks that queries of a field larger than memory can be answered in blocks.
-
-    Args:
-      file: Path of the field.
-      by: How Gaussians are selected.
-      outlined: Whether a query is an outline or a phrase.
-      edited: Whether answers are grown, shrunk or inverted.
-
-    Raises:
-      InputError: They need the whole field in memory.
-    """
-    options = {f"--by {by}": by not in ("votes", "code"), "--mask, --box or --phrases": outlined}
-    options |= {"--grow, --shrink or --invert": edited}
-    for option, used in options.items():
-        if used:
-            size, budget = file.stat().st_size / 2**30, memory_budget() / 2**30
-            problem = f"the field has {size:.3g} GiB, memory has room for {budget:.3g}, and {option} needs all of it"
-            remedy = (
-                f"Ask by a text or --at, by votes or code, or read it into memory: {MEMORY}={1.1 * size:.2g} (GiB)."
-            )
-            raise InputError(file, problem, remedy=remedy)

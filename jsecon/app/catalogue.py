@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -185,28 +184,6 @@ def objects(
         up=upright,
         frame_names=field.names,
     )
-
-
-def read_vocabulary(file: Path) -> list[str]:
-    """Reads names, one a line. Empty lines and those that begin with # are left out.
-
-    Args:
-      file: The text file, in UTF-8.
-
-    Returns:
-      The names, each once.
-
-    Raises:
-      InputError: The file cannot be read, or has no names.
-    """
-    try:
-        lines = [line.strip() for line in Path(file).read_text(encoding="utf-8-sig").splitlines()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(file, f"cannot read it ({error})", remedy="Give a text file with one name a line.") from error
-    names = list(dict.fromkeys(line for line in lines if line and not line.startswith("#")))
-    if not names:
-        raise InputError(file, "it has no names", remedy="Write one name a line.")
-    return names
 
 
 def _vocabulary(field: LanguageField, vocabulary: Sequence[str] | None, embedder: Any) -> _Names:

@@ -1,4 +1,4 @@
-"""A catalogue as files: objects.json, objects.csv, catalogue.html with pictures, and a .ply of each object."""
+"""`jsecon objects` and `jsecon export`: a catalogue as a page, JSON and CSV; a scene, or objects of it, as files."""
 
 import csv
 import io
@@ -9,12 +9,18 @@ from typing import Any
 import jax
 import numpy as np
 
-from jsecon.app import pictures, report
-from jsecon.app.catalogue import Catalogue
+from jsecon.app import pictures, report, verbs
+from jsecon.app.ask import ask_text
+from jsecon.app.catalogue import Catalogue, objects
 from jsecon.app.locate import decimals, rounded
+from jsecon.app.models import open_embedder
 from jsecon.app.outputs import save_scene, slug
+from jsecon.data.gaussians.files import require_writable_format
+from jsecon.errors import InputError
 from jsecon.files import atomic_write, write_text
-from jsecon.pipeline.progress import Listener
+from jsecon.language.field import check_field, load_field
+from jsecon.pipeline.options import require_writable
+from jsecon.pipeline.progress import Console, Listener
 from jsecon.query.render import selection_mask
 from jsecon.types import LanguageField
 
@@ -45,7 +51,90 @@ def object_record(catalogue: Catalogue, index: int) -> dict[str, Any]:
     }
 
 
-def print_catalogue(catalogue: Catalogue, listener: Listener) -> None:
+def objects_verb(verb: verbs.Objects, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon objects`."""
+    if verb.out is not None:
+        require_writable(verb.out)
+    with console.progress("field"):
+        names = None if verb.vocabulary is None else _read_vocabulary(verb.vocabulary)
+        field = load_field(verb.field)
+        by_model = names is not None or verb.template or verb.embedder is not None  # else its words may be in the field
+        listed = objects(field, names, open_embedder(field, verb, console) if by_model else None)
+    _print_catalogue(listed, console)
+    result: verbs.VerbResult = {"objects": [object_record(listed, n) for n in range(len(listed))]}
+    if verb.out is None:
+        return result
+    files = _write_catalogue(field, listed, verb.out, console)
+    console.say(f"pictures  {files['catalogue']}")
+    return result | {"written": files}
+
+
+def _read_vocabulary(file: Path) -> list[str]:
+    """Reads names in UTF-8, one a line, each once. Empty lines and those that begin with # are left out."""
+    try:
+        lines = [line.strip() for line in file.read_text(encoding="utf-8-sig").splitlines()]
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(file, f"cannot read it ({error})", remedy="Give a text file with one name a line.") from error
+    names = list(dict.fromkeys(line for line in lines if line and not line.startswith("#")))
+    if not names:
+        raise InputError(file, "it has no names", remedy="Write one name a line.")
+    return names
+
+
+def export_verb(verb: verbs.Export, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon export`."""
+    _check_export(verb)
+    with console.progress("field"):
+        if verb.out is not None:
+            require_writable_format(verb.out)
+        text = verb.only if verb.only is not None else verb.without
+        listed_ids = verb.with_labels or verb.labels is not None or verb.objects is not None
+        check_field(verb.field)
+        field = load_field(verb.field, mapped=text is None and not listed_ids)
+    rows = None
+    if text is not None:
+        mask = ask_text(field, open_embedder(field, verb, console), text).mask
+        if not mask.any():
+            option = "--only" if verb.only is not None else "--without"
+            raise InputError(option, f"{text!r} selects no Gaussian", remedy="Ask with other words.")
+        rows = np.flatnonzero(mask if verb.only is not None else ~mask)
+    result: verbs.VerbResult = {"written": {}, "gaussians": field.gaussians.count if rows is None else len(rows)}
+    with console.progress("files"):
+        listed = objects(field) if listed_ids else None
+        if verb.out is not None:
+            save_scene(field, verb.out, rows=rows, object_ids=listed.labels if listed and verb.with_labels else None)
+            result["bytes"] = verb.out.stat().st_size
+            result["written"]["scene"] = verb.out
+            console.say(f"{result['gaussians']} Gaussians, {result['bytes'] / 2**20:.1f} MiB  {verb.out}")
+        if listed is not None and verb.labels is not None:
+            ids = np.asarray(listed.labels if rows is None else listed.labels[rows], np.int32)
+            with atomic_write(verb.labels) as temporary, temporary.open("wb") as stream:
+                np.save(stream, ids)
+            result["written"]["labels"] = verb.labels
+            console.say(f"{len(ids)} ids of objects, {int((ids < 0).sum())} of them -1  {verb.labels}")
+        if listed is not None and verb.objects is not None:
+            files = _save_objects(field, listed, verb.objects)
+            result["written"]["objects"] = files
+            console.say(f"{len(files)} objects  {verb.objects}")
+    return result
+
+
+def _check_export(verb: verbs.Export) -> None:
+    """Raises InputError for options of an export that say nothing, or that cannot be combined."""
+    if verb.out is None and verb.labels is None and verb.objects is None:
+        raise InputError("export", "there is nothing to write", remedy="Give --out scene.ply, --labels or --objects.")
+    if verb.with_labels and (verb.out is None or verb.out.suffix.lower() != ".ply"):
+        raise InputError("--with-labels", "only a .ply holds them", remedy="Give --out scene.ply, or --labels ids.npy.")
+    if verb.only is not None and verb.without is not None:
+        raise InputError("--only", "it cannot be combined with --without", remedy="Export twice, with one of them.")
+    if verb.objects is not None and (verb.only is not None or verb.without is not None):
+        problem = "it writes all objects, so --only and --without cannot be combined with it"
+        raise InputError("--objects", problem, remedy="Leave one of them out.")
+    if verb.labels is not None and verb.labels.suffix != ".npy":
+        raise InputError("--labels", f"{verb.labels} does not end in .npy", remedy="For example: --labels ids.npy")
+
+
+def _print_catalogue(catalogue: Catalogue, listener: Listener) -> None:
     """Prints a line for each object; parts are indented under their wholes."""
     wide = max((len(_title(catalogue, n)) for n in range(len(catalogue))), default=4) + 2
     listener.say(f"{'id':>4}  {'name':<{wide}}  prob.  Gaussians  views  conf.  size, centre")
@@ -59,18 +148,8 @@ def print_catalogue(catalogue: Catalogue, listener: Listener) -> None:
         listener.say("  there are no objects: the field has no regions with Gaussians")
 
 
-def write_catalogue(field: LanguageField, catalogue: Catalogue, out: Path, listener: Listener) -> dict[str, Path]:
-    """Writes OUT/objects.json, OUT/objects.csv and OUT/catalogue.html.
-
-    Args:
-      field: The field.
-      catalogue: Its catalogue.
-      out: Output folder.
-      listener: Receives progress.
-
-    Returns:
-      The files.
-    """
+def _write_catalogue(field: LanguageField, catalogue: Catalogue, out: Path, listener: Listener) -> dict[str, Path]:
+    """Writes OUT/objects.json, OUT/objects.csv and OUT/catalogue.html; returns the files."""
     files = {name: out / f"{name}.{ending}" for name, ending in (("objects", "json"), ("catalogue", "html"))}
     files["table"] = out / "objects.csv"
     rows = [object_record(catalogue, n) for n in range(len(catalogue))]
@@ -87,29 +166,14 @@ def write_catalogue(field: LanguageField, catalogue: Catalogue, out: Path, liste
     return files
 
 
-def save_objects(field: LanguageField, catalogue: Catalogue, folder: Path) -> list[Path]:
-    """Writes a .ply of each object, named by its id and name; of a whole with the Gaussians of its parts.
-
-    Args:
-      field: The field.
-      catalogue: Its catalogue.
-      folder: Output folder.
-
-    Returns:
-      The files, in the order of the catalogue.
-    """
+def _save_objects(field: LanguageField, catalogue: Catalogue, folder: Path) -> list[Path]:
+    """Writes a .ply of each object, named by its id and name; of a whole with the Gaussians of its parts."""
     files = []
     for n in range(len(catalogue)):
         name = slug(_title(catalogue, n)).encode()[:MAX_NAME_BYTES].decode("utf-8", "ignore")
         files.append(folder / f"{n:03d}-{name}.ply")
         save_scene(field, files[-1], rows=np.flatnonzero(catalogue.mask(n)))
     return files
-
-
-def save_labels(labels: np.ndarray, file: Path) -> None:
-    """Writes the id of the object of each Gaussian as a .npy of int32, -1 for none."""
-    with atomic_write(file) as temporary, temporary.open("wb") as stream:
-        np.save(stream, np.asarray(labels, np.int32))
 
 
 def _page(field: LanguageField, catalogue: Catalogue, listener: Listener) -> str:

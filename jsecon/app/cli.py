@@ -1,12 +1,13 @@
 """The command line: finds the verb, lets tyro read its options, and runs it.
 
-Bad input ends in one message and exit code 2, Ctrl-C in exit code 130. The options of a verb are in verbs.py, its work
-is in actions.py.
+Bad input ends in one message and exit code 2, Ctrl-C in exit code 130. verbs.py has the options of each verb, and names
+the module that does its work.
 """
 
 import contextlib
 import dataclasses
 import difflib
+import importlib
 import inspect
 import io
 import json
@@ -21,8 +22,7 @@ import tyro
 
 import jsecon
 from jsecon.app import help
-from jsecon.app.actions import VERBS
-from jsecon.app.verbs import Completion, Output, Verb, VerbResult
+from jsecon.app.verbs import VERBS, Completion, Output, Verb, VerbResult
 from jsecon.errors import InputError, describe_error
 from jsecon.pipeline.progress import Console
 from jsecon.process import show_full_tracebacks
@@ -238,7 +238,18 @@ def _completion(verb: Completion, console: Console) -> VerbResult:
     return {"shell": verb.shell, "script": script}
 
 
+def _act(module: str) -> Callable[[Any, Console], VerbResult]:
+    """Returns the function that does the work of a verb; its module is imported when it is called."""
+
+    def act(verb: Verb, console: Console) -> VerbResult:
+        with console.progress("start"):
+            work = getattr(importlib.import_module(f"jsecon.{module}"), f"{type(verb).__name__.lower()}_verb")
+        return work(verb, console)
+
+    return act
+
+
 _VERBS: dict[str, tuple[Callable[[Any, Console], VerbResult], type[Verb]]] = {
-    **VERBS,
+    **{kind.__name__.lower(): (_act(module), kind) for kind, module in VERBS.items()},
     "completion": (_completion, Completion),
 }

@@ -10,7 +10,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
+from jsecon.app import verbs
 from jsecon.errors import InputError, describe_error
+from jsecon.pipeline.progress import Console
 from jsecon.process import available_memory, cores, read_cgroup
 
 MIN_MEMORY = 2 << 30
@@ -88,6 +90,14 @@ def run_checks(models: Path | None = None) -> list[Check]:
     checks = [Check("python", "ok", f"{platform.python_version()}, {platform.platform(terse=True)}"), check_packages()]
     checks += [*_check_jax(), check_cores(), check_memory(), _check_disk(), check_programs()]
     return [*checks, *_check_models(models), *map(_check_extra, EXTRAS)]
+
+
+def doctor_verb(verb: verbs.Doctor, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon doctor`."""
+    with console.progress("checks"):
+        checks = run_checks(verb.models)
+    console.say("\n".join(f"{check.status:<8} {check.name:<10} {check.message}" for check in checks))
+    return {"checks": checks, "errors": failures(checks)}
 
 
 def failures(checks: Iterable[Check]) -> list[InputError]:

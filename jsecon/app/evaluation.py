@@ -3,19 +3,22 @@
 import dataclasses
 import json
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 
+from jsecon.app import verbs
 from jsecon.app.ask import ask_text, with_phrases
+from jsecon.app.models import open_embedder
 from jsecon.data.labels import LabelledFrame, load_lerf_labels
 from jsecon.errors import InputError
 from jsecon.evaluate.lerf import Row, evaluate_point_level_rendered
 from jsecon.files import write_text
 from jsecon.language.codes import encode
-from jsecon.pipeline.progress import Listener
+from jsecon.language.field import load_field
+from jsecon.pipeline.options import require_writable
+from jsecon.pipeline.progress import Console, Listener
 from jsecon.query.baselines import query_canonical, query_one_step
 from jsecon.query.composite import parse_query
 from jsecon.types import LanguageField, Selection
@@ -98,26 +101,18 @@ def select_by_code(field: LanguageField, embedder: Any, text: str, kind: str) ->
     return query_canonical(field.codes, code, canonical, CANONICAL_THRESHOLD)
 
 
-def write_evaluation(
-    field: LanguageField, embedder: Any, folder: Path, out: Path, listener: Listener
-) -> dict[str, Any]:
-    """Measures a field, prints the table, and writes OUT/evaluation.json with every pair.
-
-    Args:
-      field: The field.
-      embedder: Its embedder.
-      folder: Folder of LERF's label files.
-      out: Output folder.
-      listener: Receives the table.
-
-    Returns:
-      The summary of each kind of query, and the path of the file under "written".
-    """
-    results = evaluate(field, embedder, load_lerf_labels(folder), listener)
-    print_table(results, listener)
+def eval_verb(verb: verbs.Eval, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon eval`: prints the table, and writes OUT/evaluation.json with every pair."""
+    out = verb.out or verb.field.parent
+    require_writable(out)
+    with console.progress("field"):
+        field = load_field(verb.field)
+        embedder = open_embedder(field, verb, console)
+    results = evaluate(field, embedder, load_lerf_labels(verb.labels), console)
+    print_table(results, console)
     pairs = {kind: summary | {"rows": [_pair(row) for row in rows]} for kind, (rows, summary) in results.items()}
     write_text(out / "evaluation.json", json.dumps(pairs, indent=2) + "\n")
-    listener.say(f"all pairs  {out / 'evaluation.json'}")
+    console.say(f"all pairs  {out / 'evaluation.json'}")
     return {"written": {"pairs": out / "evaluation.json"}} | {kind: summary for kind, (_, summary) in results.items()}
 
 

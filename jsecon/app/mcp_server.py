@@ -5,21 +5,23 @@ that tell the model what to change.
 """
 
 import inspect
+import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Annotated, Any
 
 import cv2
 import jax.numpy as jnp
 import numpy as np
 
-from jsecon.app import pictures
+from jsecon.app import pictures, verbs
 from jsecon.app.ask import frame_index
 from jsecon.app.locate import locate_answer
+from jsecon.app.models import with_models
 from jsecon.app.outputs import best_frames
 from jsecon.app.relations import relation_answer
 from jsecon.app.server.scenes import Scene, SceneQuery, open_scenes
 from jsecon.errors import InputError
+from jsecon.pipeline.progress import Console
 from jsecon.query.expressions import is_expression
 from jsecon.query.render import selection_mask
 
@@ -169,20 +171,13 @@ def make_server(scenes: dict[str, Scene]) -> Any:
     return server
 
 
-def serve_models(files: list[Path], embedder: Path | None) -> tuple[dict[str, Any], Callable[[], None]]:
-    """Loads fields for a server of the Model Context Protocol.
-
-    Args:
-      files: Paths of field.safetensors files.
-      embedder: Folder of the CLIP model of the fields; None where the runs had it.
-
-    Returns:
-      {"fields": ...}, and the function that answers on standard input and output until they close.
-
-    Raises:
-      InputError: The extra is missing, or a field cannot be read.
-    """
-    make_server({})
-    scenes = open_scenes(files, embedder)
-    server = make_server(scenes)
-    return {"fields": [scene.description() for scene in scenes.values()]}, server.run
+def mcp_verb(verb: verbs.Mcp, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon mcp`."""
+    console = Console(sys.stderr)  # standard output belongs to the protocol
+    with console.progress("fields"):
+        embedder = with_models(verb, console, yes=False).embedder
+        make_server({})  # before the fields are loaded, since its extra may be missing
+        scenes = open_scenes(verb.fields, embedder)
+    for scene in scenes.values():
+        console.say(f"{scene.name}: {scene.field.gaussians.count} Gaussians, {scene.field.regions.count} regions")
+    return {"then": make_server(scenes).run}

@@ -1,21 +1,27 @@
-"""What is written at the end of a run: metrics.json, and report.html with pictures of its stages."""
+"""`jsecon run` and `jsecon fit`, and what a run writes at its end: metrics.json, and report.html with pictures."""
 
 import dataclasses
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jsecon.app import pictures, report
-from jsecon.data.gaussians.files import save_gaussians
+from jsecon.app import pictures, report, verbs
+from jsecon.app.models import with_models
+from jsecon.data.frames import evenly_spaced
+from jsecon.data.gaussians.files import require_writable_format, save_gaussians
 from jsecon.files import write_text
-from jsecon.pipeline.progress import Listener
+from jsecon.pipeline import processes, run as pipeline
+from jsecon.pipeline.progress import Console, Listener
 from jsecon.pipeline.results import WARNING, vision_frames
 from jsecon.pipeline.run import Run
-from jsecon.process import peak_memory_mib
-from jsecon.types import Capture, Gaussians, Quality
+from jsecon.process import peak_memory_mib, worker_info
+from jsecon.types import Quality
 
+FILES = ("field.safetensors", "report.html", "metrics.json")
+"""files of a run"""
 FRAMES = 6
 """number of frames that are shown with masklets and codes"""
 MASKLETS = 10
@@ -24,18 +30,42 @@ LARGE = 0.15
 """share of a frame; a masklet that fills more in some frame is not shown by itself"""
 
 
-def write_run(run: Run, out: Path, listener: Listener) -> dict[str, Any]:
-    """Writes OUT/metrics.json and OUT/report.html of a run, and prints its figures.
+def run_verb(verb: verbs.Run, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon run`."""
+    options = with_models(verb.options, console, yes=verb.yes)
+    if verb.dry_run:
+        return pipeline.dry_run(options, verb.out, listener=console)
+    place = worker_info()
+    if place is None and (verb.processes, verb.coordinator, verb.process) != (1, None, None):
+        raise SystemExit(processes.launch(sys.argv[1:], verb.processes, verb.coordinator, verb.process))
+    with processes.exit_if_disconnected():
+        if place is not None:
+            processes.join(options, *place)
+            if place[0] > 0:
+                pipeline.run_worker(options, verb.out)
+                return {}
+        coordinator = processes.Coordinator(several=place is not None)
+        run = pipeline.run(options, verb.out, listener=console, coordinator=coordinator)
+        coordinator.shutdown()
+    return {"written": [verb.out / name for name in FILES]} | _write_run(run, verb.out, console)
 
-    Args:
-      run: The run.
-      out: Output folder.
-      listener: Receives the figures.
 
-    Returns:
-      The metrics.
-    """
-    metrics = run_metrics(run)
+def fit_verb(verb: verbs.Fit, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon fit`: writes the scene in the world of the capture's files, and prints its figures."""
+    require_writable_format(verb.out)
+    folder = verb.out.with_suffix("")
+    if verb.dry_run:
+        return pipeline.dry_run(verb.options, folder, scene_only=True, listener=console)
+    gaussians, capture, held_out = pipeline.fit(verb.options, folder, listener=console)
+    save_gaussians(verb.out, gaussians, similarity=capture.to_source)
+    _print_quality(held_out, console)
+    console.say(f"{gaussians.count} Gaussians  {verb.out}")
+    return {"written": {"scene": verb.out}, "gaussians": gaussians.count} | _quality_metrics(held_out)
+
+
+def _write_run(run: Run, out: Path, listener: Listener) -> dict[str, Any]:
+    """Writes OUT/metrics.json and OUT/report.html of a run, prints its figures, and returns the metrics."""
+    metrics = _run_metrics(run)
     write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
     warnings = [note.removeprefix(WARNING) for note in run.notes if note.startswith(WARNING)]
     with listener.progress("report"):
@@ -43,7 +73,7 @@ def write_run(run: Run, out: Path, listener: Listener) -> dict[str, Any]:
         parts += [report.tiles(_tiles(metrics)), *scene_parts(run), *work_parts(run)]
         title = f"Language field of {run.options.capture.resolve().name}"
         write_text(out / "report.html", report.page(title, "Made by jsecon from posed frames.", parts))
-    print_quality(run.held_out, listener)
+    _print_quality(run.held_out, listener)
     for note in warnings:
         listener.say(f"{WARNING}{note}")
     listener.say(
@@ -57,28 +87,7 @@ def write_run(run: Run, out: Path, listener: Listener) -> dict[str, Any]:
     return metrics
 
 
-def write_scene(
-    gaussians: Gaussians, capture: Capture, held_out: Quality, out: Path, listener: Listener
-) -> dict[str, Any]:
-    """Writes the file of a fitted scene in the world of the capture's files, and prints its figures.
-
-    Args:
-      gaussians: The scene.
-      capture: The capture that it was fitted to.
-      held_out: Its quality in held-out frames.
-      out: The .ply, .spz or .glb to write.
-      listener: Receives the figures.
-
-    Returns:
-      The path of the file under "written", and the figures.
-    """
-    save_gaussians(out, gaussians, similarity=capture.to_source)
-    print_quality(held_out, listener)
-    listener.say(f"{gaussians.count} Gaussians  {out}")
-    return {"written": {"scene": out}, "gaussians": gaussians.count} | quality_metrics(held_out)
-
-
-def quality_metrics(held_out: Quality) -> dict[str, float | None]:
+def _quality_metrics(held_out: Quality) -> dict[str, float | None]:
     """Returns mean PSNR (dB) and SSIM of the held-out frames, None if there are no such frames."""
     some = len(held_out.frames) > 0
     return {
@@ -87,7 +96,7 @@ def quality_metrics(held_out: Quality) -> dict[str, float | None]:
     }
 
 
-def print_quality(held_out: Quality, listener: Listener) -> None:
+def _print_quality(held_out: Quality, listener: Listener) -> None:
     """Prints mean PSNR and SSIM if there are held-out frames."""
     count = len(held_out.frames)
     if count:
@@ -95,7 +104,7 @@ def print_quality(held_out: Quality, listener: Listener) -> None:
         listener.say(f"held-out PSNR {psnr:.2f} dB, SSIM {ssim:.3f} over {count} frames")
 
 
-def run_metrics(run: Run) -> dict[str, Any]:
+def _run_metrics(run: Run) -> dict[str, Any]:
     """Returns the figures of a run for metrics.json."""
     return {
         "gaussians": run.field.gaussians.count,
@@ -103,7 +112,7 @@ def run_metrics(run: Run) -> dict[str, Any]:
         "code_size": int(run.field.region_codes.shape[1]),
         "frames": len(run.capture.names),
         "size": [run.capture.cameras.width, run.capture.cameras.height],
-        **quality_metrics(run.held_out),
+        **_quality_metrics(run.held_out),
         "seconds": {name: round(value, 2) for name, value in run.seconds.items()},
         "skipped": run.skipped,
         "notes": list(run.notes),
@@ -131,7 +140,7 @@ def scene_parts(run: Run) -> list[str]:
     renderer = pictures.Renderer(run.field.gaussians, run.field.cameras)
     colours = pictures.code_colours(run.field)
     cells = []
-    for row in _evenly(len(train), FRAMES):
+    for row in evenly_spaced(len(train), FRAMES):
         t = int(train[row])
         frame = np.asarray(run.capture.frames[t])
         cells += [
@@ -149,7 +158,7 @@ def scene_parts(run: Run) -> list[str]:
         held_out = np.flatnonzero(run.capture.held_out)
         psnr = dict(zip(held_out.tolist(), run.psnr.tolist()))
         cells = []
-        for t in held_out[_evenly(len(held_out), 4)].tolist():
+        for t in held_out[evenly_spaced(len(held_out), 4)].tolist():
             cells.append(report.figure(np.asarray(run.capture.frames[t]), run.capture.names[t]))
             cells.append(report.figure(renderer.photo(t), "rendered", strong=f"{psnr[t]:.2f} dB"))
         words = "Photographs that no step has seen, and their renderings."
@@ -159,7 +168,7 @@ def scene_parts(run: Run) -> list[str]:
 
 def _masklet_part(run: Run, train: np.ndarray) -> str:
     """Returns the part of a page that shows the largest masklets of single things through the frames."""
-    views = _evenly(len(train), MASKLETS)
+    views = evenly_spaced(len(train), MASKLETS)
     frames = np.asarray(run.capture.frames)[train[views]]
     labels = run.labels[views]
     sizes = np.stack([np.bincount(view[view >= 0], minlength=run.field.regions.count) for view in labels])
@@ -172,11 +181,6 @@ def _masklet_part(run: Run, train: np.ndarray) -> str:
         rows.append(report.wide(tiles, f"in {count} of {len(run.labels)} frames", strong=f"region {region}"))
     words = "Each row is one region, cut out of frames around the scene. A dark tile is a frame that does not show it."
     return report.section("Masklets through the frames", words, *rows)
-
-
-def _evenly(count: int, most: int) -> np.ndarray:
-    """Returns at most `most` indices below `count`, evenly spaced."""
-    return np.unique(np.linspace(0, count - 1, most).round().astype(int))
 
 
 def work_parts(run: Run) -> list[str]:

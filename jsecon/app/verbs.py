@@ -31,8 +31,8 @@ RepeatedAdvanced: TypeAlias = Advanced[UseAppendAction[list[T]]]
 By = Literal["votes", "silhouette", "code"]
 
 VerbResult: TypeAlias = dict[str, Any]
-"""Files and figures of a verb: plain values, paths and records; under "errors" the InputErrors of what it could not do
-besides."""
+"""Files and figures of a verb, which --json prints: plain values, paths and records; under "errors" the InputErrors of
+what it could not do besides, under "then" what to do after that is printed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -466,3 +466,20 @@ class Completion(Verb):
     examples = ("jsecon completion bash > ~/.local/share/bash-completion/completions/jsecon",)
 
     shell: Positional[Literal["bash", "zsh", "fish"]]
+
+
+VERBS: dict[type[Verb], str] = {
+    Demo: "demo.demo",
+    Run: "app.run_report",
+    Fit: "app.run_report",
+    Query: "app.querying",
+    Objects: "app.catalogue_files",
+    Export: "app.catalogue_files",
+    View: "app.viewer.window",
+    Eval: "app.evaluation",
+    Serve: "app.server.serve",
+    Mcp: "app.mcp_server",
+    Models: "app.models",
+    Doctor: "app.doctor",
+}
+"""A verb's options -> the module whose function NAME_verb does its work: of (verb, `Console`), to a `VerbResult`."""

@@ -8,12 +8,13 @@ import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import cv2
 import numpy as np
 
-from jsecon.app import ask, evaluation, pictures, report, run_report
+from jsecon.app import ask, evaluation, pictures, report, run_report, verbs
+from jsecon.app.evaluation import Evaluation
 from jsecon.app.outputs import answer_masks, write_answer
 from jsecon.data.labels import LabelledFrame, load_lerf_labels
 from jsecon.demo import write_room
@@ -23,14 +24,12 @@ from jsecon.evaluate.lerf import Row
 from jsecon.files import atomic_write, write_text
 from jsecon.pipeline import networks, run as pipeline
 from jsecon.pipeline.options import Options, require_writable
-from jsecon.pipeline.progress import Listener
+from jsecon.pipeline.progress import Console, Listener
 from jsecon.pipeline.run import Run
 from jsecon.process import peak_memory_mib
 
 HOLDOUT = 5
 """Every `HOLDOUT`-th frame is held out."""
-Results: TypeAlias = dict[str, tuple[list[Row], dict[str, Any]]]
-"""Rows and summary of the evaluation by kind of query."""
 
 
 def run_demo(
@@ -97,6 +96,13 @@ def run_demo(
     return metrics
 
 
+def demo_verb(verb: verbs.Demo, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon demo`."""
+    names = (*run_report.FILES, "queries", "demo.jpg", "demo.webp")
+    result = run_demo(verb.out, seed=verb.seed, steps=verb.steps, listener=console)
+    return {"written": [verb.out / name for name in names]} | result
+
+
 def _write_capture(folder: Path, seed: int, room: dict[str, int], listener: Listener) -> Path:
     """Writes the room, unless the folder already holds the whole room of these options."""
     marker = folder / "demo.json"
@@ -110,7 +116,7 @@ def _write_capture(folder: Path, seed: int, room: dict[str, int], listener: List
     return folder
 
 
-def _metrics(results: Results, run: Run, true_run: Run) -> dict[str, Any]:
+def _metrics(results: Evaluation, run: Run, true_run: Run) -> dict[str, Any]:
     """Figures of metrics.json; `run_demo` adds the peak memory."""
     keys = ("miou", "macc", "acc_50", "loc_acc", "pairs", "missing")
     metrics: dict[str, Any] = {kind: {key: figures[key] for key in keys} for kind, (_, figures) in results.items()}
@@ -148,7 +154,7 @@ def _write_panels(file: Path, run: Run, frame: int, masks: Mapping[str, np.ndarr
 
 def _page(
     run: Run,
-    results: Results,
+    results: Evaluation,
     queries: dict[str, dict[str, Any]],
     labels: list[LabelledFrame],
     metrics: dict[str, Any],
@@ -220,7 +226,7 @@ def _query_section(
     return report.section("Queries", words, report.grid(cells, 4))
 
 
-def _iou_section(results: Results) -> str:
+def _iou_section(results: Evaluation) -> str:
     """Mean IoU of each text by each kind of query."""
     texts = sorted({row.query for row in results["anchored"][0]})
     table = []

@@ -18,9 +18,12 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
+from jsecon.app import verbs
 from jsecon.app.access import bracketed, listen, token_for
+from jsecon.app.models import OLD_FIELD, with_models
 from jsecon.app.server.scenes import open_scenes
 from jsecon.errors import InputError
+from jsecon.pipeline.progress import Console
 
 REMEDY = 'pip install "jsecon[serve]"'
 
@@ -66,3 +69,17 @@ def prepare(
     address = f"http://{bracketed(host)}:{listening.getsockname()[1]}"
     description = {"address": address, "fields": [scene.description() for scene in scenes.values()]}
     return description, lambda: uvicorn.Server(config).run(sockets=[listening])
+
+
+def serve_verb(verb: verbs.Serve, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon serve`."""
+    access = {"host": verb.host, "port": verb.port, "token": verb.token, "hosts": verb.allow_host}
+    with console.progress("fields"):
+        embedder = with_models(verb, console, yes=False).embedder
+        result, serve = prepare(verb.fields, embedder=embedder, **access)
+    for scene in result["fields"]:
+        console.say(f"{scene['name']}: {scene['gaussians']} Gaussians, {scene['regions']} regions")
+        if scene["unrelated_words"] is None:
+            console.note(f"{scene['name']}: {OLD_FIELD}")
+    console.say(result["address"])
+    return result | {"then": serve}

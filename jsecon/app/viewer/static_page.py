@@ -15,10 +15,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jsecon.app.ask import Answer
+from jsecon.app import verbs
+from jsecon.app.ask import Answer, ask_each
+from jsecon.app.models import open_embedder
 from jsecon.app.outputs import main_regions
+from jsecon.app.querying import ask_relations
+from jsecon.errors import InputError
 from jsecon.files import write_text
+from jsecon.language.field import load_field
 from jsecon.numerics import sigmoid
+from jsecon.pipeline.options import require_writable
+from jsecon.pipeline.progress import Console
+from jsecon.query.expressions import is_expression
 from jsecon.splat.sh import C0
 from jsecon.types import Gaussians, LanguageField
 
@@ -32,25 +40,36 @@ MIN_OPACITY = 4
 """smallest opacity of a Gaussian that is drawn, of 255"""
 
 
-def write_page(field: LanguageField, answers: Sequence[Answer], file: Path, *, title: str) -> int:
-    """Writes the page of a field.
+def export_page(verb: verbs.View, file: Path, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon view --export FILE`."""
+    if file.suffix != ".html":
+        raise InputError("--export", f"{file} does not end in .html", remedy="For example: --export page.html")
+    require_writable(file.parent)
+    with console.progress("page"):
+        field = load_field(verb.field)
+        embedder = open_embedder(field, verb, console) if verb.texts else None
+        expressions = [text for text in verb.texts if is_expression(text)]
+        answers, errors = ask_relations(field, embedder, expressions, console) if expressions else ([], [])
+        more, refused = ask_each(field, embedder, texts=[text for text in verb.texts if text not in expressions])
+        answers, errors = answers + more, errors + refused
+        write_text(file, page(field, answers, title=verb.field.resolve().parent.name))
+    count, size = field.gaussians.count, file.stat().st_size
+    console.say(f"{count} Gaussians, texts answered: {len(answers)}, {size / 2**20:.1f} MiB  {file}")
+    texts = [answer.query for answer in answers]
+    return {"written": {"page": file}, "gaussians": count, "answers": texts, "bytes": size, "errors": errors}
+
+
+def page(field: LanguageField, answers: Sequence[Answer], *, title: str) -> str:
+    """Makes the page of a field.
 
     Args:
       field: The field.
       answers: Answers to texts.
-      file: The .html to write.
       title: Title of the page.
 
     Returns:
-      Its size in bytes.
+      The HTML.
     """
-    text = page(field, answers, title=title)
-    write_text(file, text)
-    return len(text.encode())
-
-
-def page(field: LanguageField, answers: Sequence[Answer], *, title: str) -> str:
-    """Returns the page of a field; arguments as for `write_page`."""
     gaussians = field.gaussians
     means = np.asarray(gaussians.means, np.float64)
     finite = np.isfinite(means).all(1)

@@ -15,11 +15,14 @@ import zipfile
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlencode
 
 import numpy as np
 
-from jsecon.app.access import listen, token_for
+from jsecon.app import verbs
+from jsecon.app.access import bracketed, listen, token_for
 from jsecon.app.ask import Answer, ask_region, ask_text, edit_answers
+from jsecon.app.models import open_embedder
 from jsecon.app.object_scene import ObjectScene
 from jsecon.app.outputs import answer_masks, file_stem, write_answer
 from jsecon.app.pictures import UNKNOWN, code_colours, palette
@@ -29,8 +32,12 @@ from jsecon.app.viewer.access import guarded_pages
 from jsecon.app.viewer.candidates import Candidate, RegionPictures, candidates, region_along
 from jsecon.app.viewer.panel import Panel, candidate_grid, messages
 from jsecon.app.viewer.scene import FieldScene
+from jsecon.app.viewer.static_page import export_page
 from jsecon.app.viewer.view_state import History, ViewQuery, ViewState
 from jsecon.errors import InputError
+from jsecon.language.field import load_field
+from jsecon.pipeline.networks import ExternalSpace, external_dim
+from jsecon.pipeline.progress import Console
 from jsecon.query.edits import mutual_neighbours
 from jsecon.query.expressions import is_expression
 from jsecon.types import LanguageField
@@ -356,3 +363,26 @@ def open_viewer(
     viewer = Viewer(field, embedder, server, name=name)
     viewer.start(state)
     return viewer
+
+
+def view_verb(verb: verbs.View, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon view`."""
+    if verb.export is not None:
+        return export_page(verb, verb.export, console)
+    token = token_for(verb.host, verb.token)
+    state = view_state.from_link(verb.link) if verb.link else ViewState()
+    if verb.texts:
+        state = view_state.with_texts(state, "; ".join(verb.texts))
+    field = load_field(verb.field)
+    name = verb.field.resolve().parent.name
+    dim = None
+    if not verb.texts and verb.embedder is None:
+        dim = external_dim(field.embedder)  # without its model a field can be clicked, but not searched by texts
+    embedder = open_embedder(field, verb, console) if dim is None else ExternalSpace(dim)
+    access = {"host": verb.host, "port": verb.port, "token": token, "hosts": verb.allow_host}
+    viewer = open_viewer(field, embedder, name=name, state=state, **access)
+    console.say(f"{name}: {field.gaussians.count} Gaussians, {field.regions.count} regions")
+    query = f"/?{urlencode({'token': token})}" if token else ""
+    console.say(f"http://{bracketed(verb.host)}:{viewer.server.get_port()}{query}")
+    viewer.run()
+    return {}

@@ -1,0 +1,204 @@
+"""`jsecon query`: its checks, the answers to its texts, pixels and outlines, and their files."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from jsecon.app import ask, relations, verbs
+from jsecon.app.ask import Answer
+from jsecon.app.models import open_embedder, with_models
+from jsecon.app.outputs import write_answers
+from jsecon.data.gaussians.files import require_writable_format
+from jsecon.errors import InputError
+from jsecon.language.field import check_field, load_field
+from jsecon.pipeline import run as pipeline
+from jsecon.pipeline.options import Options, is_bare_scene, require_writable
+from jsecon.pipeline.progress import Console
+from jsecon.process import MEMORY, memory_budget
+from jsecon.query.expressions import is_expression
+from jsecon.query.outline import box_mask
+from jsecon.types import LanguageField
+
+
+def query_verb(verb: verbs.Query, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon query`."""
+    _check_query(verb)
+    require_writable(verb.out)
+    verb = with_models(verb, console, yes=verb.yes)
+    require_writable_format(verb.out / f"answer.{verb.format}")
+    if is_bare_scene(verb.field):
+        verb = dataclasses.replace(verb, field=_field_of_scene(verb, console))
+    with console.progress("field"):
+        large = verb.field.is_file() and verb.field.stat().st_size > memory_budget()
+        if large:
+            _require_blocks(verb)
+            check_field(verb.field)
+        field = load_field(verb.field, mapped=large)
+        texts = verb.texts if verb.phrases is None else []
+        embedder = open_embedder(field, verb, console) if texts else None
+    answers, errors = ([], []) if verb.phrases is None else _ask_phrases(field, verb, console)
+    expressions = [text for text in texts if is_expression(text)]
+    texts = [text for text in texts if text not in expressions]
+    if expressions and large:
+        problem = f"{expressions[0]!r} has a relation, an order or a number, which needs the whole field in memory"
+        raise InputError(verb.field, problem, remedy="Raise JSECON_MEMORY (GiB), or put the text in quotes.")
+    if expressions:
+        answers, errors = ask_relations(field, embedder, expressions, console, frame=verb.from_frame, up=verb.up)
+    with console.progress("answers"):
+        outline: dict[str, Any] = {"threshold": verb.threshold, "outliers": not verb.keep_outliers}
+        options = outline | {"by": verb.by, "several": verb.all, "quantile": verb.quantile}
+        outlines = [lambda pairs=pairs: _ask_masks(field, pairs, **outline) for pairs in verb.mask]
+        outlines += [lambda box=box: _ask_box(field, *box, **outline) for box in verb.box]
+        for more, refused in (
+            ask.ask_each(field, embedder, texts=texts, pixels=verb.at, **options),
+            ask.collect(outlines),
+        ):
+            answers += more
+            errors += refused
+        answers = ask.edit_answers(field, answers, grow=verb.grow, shrink=verb.shrink, invert=verb.invert)
+    files = {"views": verb.views, "ending": verb.format}
+    result = write_answers(field, answers, verb.out, console, **files) if answers else {"answers": []}
+    return result | {"errors": errors}
+
+
+def ask_relations(
+    field: LanguageField,
+    embedder: Any,
+    texts: Sequence[str],
+    console: Console,
+    *,
+    frame: str | None = None,
+    up: Sequence[float] | None = None,
+) -> tuple[list[Answer], list[InputError]]:
+    """Answers texts with relations, orders or numbers, and prints how each was read.
+
+    Args:
+      field: The field.
+      embedder: Its embedder.
+      texts: The texts.
+      console: Receives progress and how each text was read.
+      frame: Frame from which directions are seen, as for `query_relation`.
+      up: Up axis in the capture's world, as for `query_relation`.
+
+    Returns:
+      The answers, and the errors of texts that are not understood.
+    """
+    with console.progress("relations"):
+        scene = relations.open_scene(field, embedder, up)
+        queries = [lambda text=text: relations.query_relation(scene, text, frame=frame) for text in texts]
+        answers, errors = ask.collect(queries)
+    for answer in answers:
+        console.say(f"{answer.text!r}: {answer.describe()}")
+        console.note("Words in quotes are searched for as they stand, without relations.")
+    return [relations.relation_answer(answer) for answer in answers], errors
+
+
+def _field_of_scene(verb: verbs.Query, console: Console) -> Path:
+    """Returns the field of a scene without photographs, which is made in OUT/field unless it is there."""
+    options = Options(verb.field, embedder=verb.embedder, up=verb.up)
+    folder = verb.out / "field"
+    with console.progress("plan"):
+        path = pipeline.current_field(options, folder)
+    if path is None:
+        pipeline.run(options, folder, listener=console)
+        path = folder / pipeline.FIELD_FILE
+        console.say(f"field   {path}")
+    return path
+
+
+def _check_query(verb: verbs.Query) -> None:
+    """Raises InputError for options of a query that are out of range, or that cannot be combined."""
+    if not (verb.texts or verb.at or verb.mask or verb.box):
+        remedy = 'For example: jsecon query field.safetensors "red mug" --out answers'
+        raise InputError("query", "there is no query", "a TEXT, --at FRAME X Y, --mask or --box", remedy)
+    for pairs in verb.mask:
+        if len(pairs) % 2:
+            remedy = "For example: --mask frame_00012 mug.png"
+            raise InputError("--mask", " ".join(pairs), "FRAME PNG, in pairs", remedy)
+    if verb.from_frame is not None and not any(map(is_expression, verb.texts)):
+        remedy = 'For example: "the red mug left of the bottle" --from frame_00012'
+        raise InputError("--from", "no text has a relation that is seen from a frame", remedy=remedy)
+    if verb.up is not None and not any(map(is_expression, verb.texts)) and not is_bare_scene(verb.field):
+        problem = "no text has a relation, and the field has its views"
+        raise InputError("--up", problem, remedy="Leave it out, or make the field again: jsecon run --up.")
+    if not 0 <= verb.quantile <= 1:
+        remedy = f"{verbs.Query.quantile:g} is the default; 0 refuses no text."
+        raise InputError("--quantile", f"{verb.quantile:g}", "a share of words, 0 to 1", remedy)
+    for name, shells in (("--grow", verb.grow), ("--shrink", verb.shrink)):
+        if shells < 0:
+            raise InputError(name, f"{shells}", "a number of shells, 0 or more", "1 is a small step.")
+    if (verb.mask or verb.box) and verb.by != "votes":
+        problem = "--mask and --box select by the outline alone"
+        raise InputError("--by", problem, remedy="Leave --by out, or ask by a text.")
+    if verb.phrases is None:
+        for name, used in (("--images", verb.images is not None), ("--looks", verb.looks != verbs.Query.looks)):
+            if used:
+                raise InputError(name, "it needs --phrases", remedy="Give --phrases DIR, a SAM 3 model folder.")
+        return
+    if not verb.texts:
+        remedy = 'For example: jsecon query field.safetensors "red mug" --phrases sam3 --out answers'
+        raise InputError("--phrases", "there is no text, which is the phrase", remedy=remedy)
+    unused = {
+        "--by": verb.by != "votes",
+        "--all": verb.all,
+        "--quantile": verb.quantile != verbs.Query.quantile,
+        "--template": bool(verb.template),
+        "--embedder": verb.embedder is not None,
+    }
+    if any(unused.values()):
+        flags = " ".join(flag for flag, used in unused.items() if used)
+        problem = f"{flags} cannot be combined with it, since SAM 3 reads the texts and finds all objects of a kind"
+        raise InputError("--phrases", problem, remedy=f"Leave out {flags}.")
+
+
+def _require_blocks(verb: verbs.Query) -> None:
+    """Raises InputError if queries of a field that is larger than memory need the whole field there."""
+    needs_all = {
+        f"--by {verb.by}": verb.by not in ("votes", "code"),
+        "--mask, --box or --phrases": verb.mask or verb.box or verb.phrases,
+        "--grow, --shrink or --invert": verb.grow or verb.shrink or verb.invert,
+    }
+    for option, used in needs_all.items():
+        if used:
+            size, budget = verb.field.stat().st_size / 2**30, memory_budget() / 2**30
+            problem = f"the field has {size:.3g} GiB, memory has room for {budget:.3g}, and {option} needs all of it"
+            remedy = (
+                f"Ask by a text or --at, by votes or code, or set {MEMORY}={1.1 * size:.2g} (GiB) to read it whole."
+            )
+            raise InputError(verb.field, problem, remedy=remedy)
+
+
+def _ask_phrases(field: LanguageField, verb: verbs.Query, console: Console) -> tuple[list[Answer], list[InputError]]:
+    """Returns the answers of SAM 3 to the texts, and the errors of texts that it cannot read."""
+    with console.progress("phrases") as progress:
+        from jsecon.app import phrases
+        from jsecon.networks.sam3 import Sam3
+
+        assert verb.phrases is not None
+        sam3 = Sam3(verb.phrases)
+        capture = verb.images or phrases.find_capture(field, verb.field.parent)
+        frames = phrases.load_frames(field, capture, verb.looks)
+        options = {"threshold": verb.threshold, "outliers": not verb.keep_outliers, "progress": progress}
+        answers, errors = phrases.ask_phrases(field, sam3, verb.texts, frames, **options)
+    for answer in answers:
+        seen = sum(map(bool, (answer.frames or {}).values()))
+        console.say(f"{answer.query!r}: seen in {seen} of {len(frames)} frames")
+    return answers, errors
+
+
+def _ask_masks(field: LanguageField, pairs: Sequence[str], **options: Any) -> Answer:
+    """Answers a frame, a mask file, a frame, a file ...: the object that they outline, named after the first file."""
+    frames, files = pairs[::2], pairs[1::2]
+    names = [field.names[ask.frame_index(field, frame)] for frame in frames]
+    if len(set(names)) < len(names):
+        raise InputError("--mask", "a frame has two masks", remedy="Give one mask of an object in each frame.")
+    outlines = {name: ask.read_mask(Path(file), field) for name, file in zip(names, files)}
+    key = "\0".join(("mask", *(part for pair in zip(names, files) for part in pair)))
+    return ask.ask_outline(field, Path(files[0]).stem, outlines, key=key, **options)
+
+
+def _ask_box(field: LanguageField, frame: str, *ends: int, **options: Any) -> Answer:
+    """Answers a box: the left, upper, right and lower end in a frame, px."""
+    name = f"box {field.names[ask.frame_index(field, frame)]} {' '.join(map(str, ends))}"
+    return ask.ask_outline(field, name, {frame: box_mask(field, *ends)}, **options)
