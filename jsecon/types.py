@@ -11,12 +11,14 @@ channels.
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Iterator
 from typing import Any, TypeAlias, dataclass_transform
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import export
 from jaxtyping import PRNGKeyArray, UInt32
 
 Array: TypeAlias = jax.Array | np.ndarray
@@ -33,8 +35,15 @@ def static(**kwargs) -> Any:
 
 @dataclass_transform(frozen_default=True)
 def record(cls):
-    """A frozen dataclass that is a pytree."""
-    return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(cls))
+    """A frozen dataclass that is a pytree; jax.export stores it where its static fields are plain values."""
+    cls = jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(cls))
+    export.register_pytree_node_serialization(
+        cls,
+        serialized_name=f"{cls.__module__}.{cls.__qualname__}",
+        serialize_auxdata=lambda static: json.dumps(static).encode(),
+        deserialize_auxdata=lambda text: tuple(json.loads(text)),
+    )
+    return cls
 
 
 class _Shown:

@@ -56,7 +56,7 @@ def jsecon_imports(path: Path) -> set[str]:
     return found
 
 
-GROUND = ("types", "numerics", "errors", "files", "parallel", "process", "backend")
+GROUND = ("types", "numerics", "errors", "files", "parallel", "process", "programs", "backend")
 LOW = "splat", "vision", "data", "fit", "networks", "language", "association", "query", "evaluate", "views"
 LAYERS = *LOW, "pipeline", "app", "demo"
 """packages, lowest first: each imports the modules of the root, itself, and packages before it"""

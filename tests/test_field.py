@@ -50,6 +50,9 @@ def test_with_an_autoencoder_and_without_any_coder(field, tmp_path):
     texts = unit_rows(np.random.default_rng(1), 3, 12)
     save_field(tmp_path / "a.field", dataclasses.replace(field, autoencoder=coder))
     np.testing.assert_array_equal(load_field(tmp_path / "a.field").autoencoder.encode(texts), coder.encode(texts))
+    bare = dataclasses.replace(coder, encoder=coder.encoder | {"batch_stats": {}})
+    with pytest.raises(ValueError, match=r"a coder that does not encode.*batch_stats"):
+        save_field(tmp_path / "b.field", dataclasses.replace(field, autoencoder=bare))
 
 
 def test_with_the_parts_of_the_scene(field, tmp_path):

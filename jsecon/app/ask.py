@@ -264,9 +264,9 @@ def _match_text(
     if several and by == "code":
         problem = "codes cannot select several regions"
         raise InputError(f"query {text!r}", problem, remedy="Ask by votes or silhouette, or for one thing.")
-    embedded = jax.device_put(embedder.embed_text(included + excluded))
-    texts = embedded[: len(included)]
-    regions = match_regions(field, texts, rules, excluded=embedded[len(included) :])
+    embedded = embedder.embed_text(included + excluded)  # NumPy's slices need no compilation
+    texts, without = jax.device_put((embedded[: len(included)], embedded[len(included) :]))
+    regions = match_regions(field, texts, rules, excluded=without)
     presence = best_presence(field.regions, texts, regions.region, rules.logits)
     if several:
         return _Match(text, regions, {}, keep="all", presence=presence)
@@ -383,10 +383,10 @@ def with_phrases(field: LanguageField, embedder: Any) -> LanguageField:
     Returns:
       The field with canonical phrases, and with unrelated words in the embedder's templates if it has any.
     """
-    reference = None if field.reference is None else getattr(embedder, "reference", None)
     has_templates = getattr(embedder, "templates", ("{}",)) != ("{}",)
-    if len(field.canonical) and (reference is None or not has_templates):
+    if len(field.canonical) and (field.reference is None or not has_templates):
         return field
+    reference = None if field.reference is None else getattr(embedder, "reference", None)
     canonical = field.canonical if len(field.canonical) else np.asarray(embedder.canonical, np.float32)
     reference = field.reference if reference is None else np.asarray(reference, np.float16)
     return dataclasses.replace(field, canonical=canonical, reference=reference)

@@ -41,6 +41,21 @@ class Autoencoder:
         """E, size of an embedding."""
         return self.encoder["params"]["Dense_0"]["kernel"].shape[0]
 
+    def require_layers(self) -> None:
+        """Raises ValueError unless the shapes of all arrays are those of LangSplat's layers. Does not import flax."""
+        parts = ("encoder", self.encoder, self.dim), ("decoder", self.decoder, self.latent)
+        for name, variables, inputs in parts:
+            widths = _widths(variables["params"])
+            sizes = zip((inputs, *widths), widths)
+            shapes = {f"Dense_{n}": {"kernel": size, "bias": size[1:]} for n, size in enumerate(sizes)}
+            norms = {f"BatchNorm_{n}": (width,) for n, width in enumerate(widths[:-1]) if name == "encoder"}
+            shapes |= {norm: {"scale": size, "bias": size} for norm, size in norms.items()}
+            expected = {"params": shapes}
+            if norms:
+                expected["batch_stats"] = {norm: {"mean": size, "var": size} for norm, size in norms.items()}
+            shapes = jax.tree.map(np.shape, variables)
+            require(shapes == expected, name, f"{shapes}", f"{expected}", "Train it again.")
+
     def encode(self, embeddings: Float[Array, "*batch e"]) -> Float[Array, "*batch d"]:
         """(..., E) embeddings of any length -> (..., d) unit codes; a zero embedding stays a zero (unknown) code."""
         require_shape("embeddings", embeddings, (..., self.dim), "Embed with what the autoencoder was trained on.")

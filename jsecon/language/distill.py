@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
 from jaxtyping import Float, Int, Shaped
 
 from jsecon.errors import require, require_one_of, require_shape
@@ -117,7 +116,7 @@ class DistillState:
 
     features: Array
     """(N, d) before normalisation."""
-    moments: optax.OptState
+    moments: Any
     """Adam's."""
     order: Array
     """(steps,) int32 the view of each step."""
@@ -261,7 +260,9 @@ def continue_distillation(
     return _descend(state, gaussians, cameras, labels, table, plans, until, learning_rate, capacity)
 
 
-def _optimizer(learning_rate: Any) -> optax.GradientTransformation:
+def _optimizer(learning_rate: Any) -> Any:
+    import optax  # late: a field is read without it
+
     return optax.adam(learning_rate, eps=ADAM_EPS)
 
 
@@ -286,7 +287,7 @@ def _descend(state, gaussians, cameras, labels, region_codes, plans, until, lear
     def step(index, state):
         (value, overflow), gradient = jax.value_and_grad(loss, has_aux=True)(state.features, state.order[index])
         updates, moments = optimizer.update(gradient, state.moments)
-        features: Any = optax.apply_updates(state.features, updates)
+        features = state.features + updates
         history = state.history.at[index].set(jnp.where(overflow > 0, jnp.nan, value))
         return DistillState(features, moments, state.order, history, jnp.asarray(index + 1, jnp.int32))
 

@@ -243,10 +243,15 @@ def _oddity(field: LanguageField, checked: bool = True) -> str | None:
     if not 0 < field.cameras.width * field.cameras.height <= MAX_PIXELS:
         return f"views of {field.cameras.width}x{field.cameras.height} px"
     if field.autoencoder is not None:
+        size = field.canonical.shape[1], field.codes.shape[1]
         try:
-            coded = jax.eval_shape(field.autoencoder.encode, field.canonical).shape
-        except Exception as error:  # flax's own kinds have no common base but this
+            if isinstance(field.autoencoder, Autoencoder):
+                field.autoencoder.require_layers()
+                coded = field.autoencoder.dim, field.autoencoder.latent
+            else:
+                coded = size[0], *jax.eval_shape(field.autoencoder.encode, field.canonical).shape[1:]
+        except Exception as error:  # jax's own kinds have no common base but this
             return f"a coder that does not encode ({error})"
-        if coded[1:] != field.codes.shape[1:]:
-            return f"a coder to {coded[1:]} numbers beside codes of {field.codes.shape[1:]}"
+        if coded != size:
+            return f"a coder from and to {coded} numbers beside embeddings and codes of {size}"
     return None

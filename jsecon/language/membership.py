@@ -25,6 +25,7 @@ from jaxtyping import Bool, Float, Int
 from jsecon.errors import require
 from jsecon.language.regions import ALIKE_THRESHOLD, mean_residuals
 from jsecon.numerics import FULL_PRECISION, cosine_matrix
+from jsecon.programs import stored_jit
 from jsecon.types import Array, Regions, Votes
 
 SHARE_THRESHOLD = 0.5
@@ -265,7 +266,7 @@ def probability_inside(share: Float[Array, " n"], votes: Votes, mask: Bool[Array
     return np.asarray(_probability(*picked, CORRELATION))[: len(chosen)]
 
 
-@jax.jit
+@stored_jit
 def _probability(share: Array, views: Array, total: Array, correlation: Array | float) -> Array:
     known = (views > 0) & jnp.isfinite(share) & jnp.isfinite(total) & (total > 0)
     count = jnp.where(known, jnp.minimum(views.astype(share.dtype), total), 1.0)

@@ -31,12 +31,8 @@ from jsecon.data.sfm import find_poses, list_photographs
 from jsecon.data.video import DEFAULT_VIDEO_FRAMES, is_video, write_frames
 from jsecon.errors import InputError
 from jsecon.files import write_text
-from jsecon.fit.corrections import RefineOptions
 from jsecon.fit.depth import points_from_depth
-from jsecon.fit.optimise import fit_gaussians
 from jsecon.fit.quality import QUICK_LONG_SIDE, is_weak, measure_quality
-from jsecon.fit.refine import refine_capture
-from jsecon.fit.schedule import Schedule, default_max_gaussians
 from jsecon.fit.start import starting_gaussians
 from jsecon.language.autoencoder import Autoencoder
 from jsecon.language.codes import region_codes
@@ -217,6 +213,9 @@ def _load(stage: StageInput) -> StageResult:
 
 def _refine(capture: Capture, options: Options, refine: Refinement, progress: Progress) -> Capture:
     """Corrects poses and exposures by short fits, and leaves out the frames that these do not explain."""
+    from jsecon.fit.corrections import RefineOptions  # late, like all that imports optax: a plan needs none of it
+    from jsecon.fit.refine import refine_capture
+
     what, max_fit_steps = None, None
     if refine == "auto" and capture.depths is not None:
         what, max_fit_steps = RefineOptions(), _fit_steps(options, capture) / 2
@@ -280,6 +279,9 @@ def _read_gaussians(stage: StageInput) -> StageResult:
 
 
 def _fit_gaussians(stage: StageInput) -> StageResult:
+    from jsecon.fit.optimise import fit_gaussians
+    from jsecon.fit.schedule import Schedule, default_max_gaussians
+
     options, capture, state = stage.context.options, stage.results.load, stage.checkpoint.read()
     start, notes = None, ()
     if state is None:

@@ -11,11 +11,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import export
 from jaxtyping import Bool, Float, Int, Shaped
 
 from jsecon.errors import require
 from jsecon.language.regions import ALIKE_THRESHOLD, mean_residuals
 from jsecon.numerics import cosine_matrix, normalize
+from jsecon.programs import stored_jit
 from jsecon.query.confidence import answer_confidence
 from jsecon.query.rules import (
     EVIDENCE_FULL_PX,
@@ -56,6 +58,7 @@ class RegionMatch(NamedTuple):
     """Probability that the best region shows what the text names (`answer_confidence`); NaN without such words."""
 
 
+export.register_namedtuple_serialization(RegionMatch, serialized_name="jsecon.RegionMatch")  # for `stored_jit`
 NO_REGIONS = RegionMatch(np.zeros(0, bool), np.asarray(-1, np.int32), np.asarray(0.0, np.float32))
 """The match of a field without regions."""
 
@@ -120,7 +123,7 @@ def match_regions(
     return _match(*jax.tree.map(jnp.asarray, arrays), reference_words(field), rules)
 
 
-@jax.jit
+@stored_jit
 def _match(embeddings, pixels, overlap, queries, excluded, reference, rules: QueryRules) -> RegionMatch:
     reference_scores = None if reference is None else reference_similarities(embeddings, reference, rules.retrieval)
 

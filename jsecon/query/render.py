@@ -2,11 +2,11 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
 from jsecon.errors import require_shape
+from jsecon.programs import stored_jit
 from jsecon.splat.render import render
 from jsecon.types import Array, Camera, Gaussians, Rendering
 
@@ -81,7 +81,7 @@ def _rendered(
     return render(dataclasses.replace(gaussians, opacity_logits=logits), camera, features, capacity=capacity)
 
 
-@jax.jit
+@stored_jit
 def _alone(logits: Array, mask: Array, similarity: Array | None) -> tuple[Array, Array]:
     """Returns opacity logits that hide what is not selected, and the features of each Gaussian.
 

@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from jsecon.errors import require_one_of, require_shape
 from jsecon.language.codes import CODE_THRESHOLD
 from jsecon.language.membership import SHARE_THRESHOLD, share_of
+from jsecon.programs import stored_jit
 from jsecon.query.match import ONE_REGION, RULES, RegionMatch, match_region, match_regions
 from jsecon.query.rules import QueryRules
 from jsecon.query.similarity import Number, UnitCodes, as_codes, similarities
@@ -141,7 +142,7 @@ def select_gaussians(
     return select_by_code(as_codes(field.codes if codes is None else codes), table, views, match, threshold)
 
 
-@jax.jit
+@stored_jit
 def select_by_share(votes: Votes, match: RegionMatch, threshold: Number) -> Selection:
     """`select_gaussians` by "votes", of the votes of any N Gaussians. Each row stands for itself."""
     share, known = share_of(votes, match.chosen)

@@ -19,6 +19,7 @@ from jaxtyping import Float
 from jsecon.errors import require, require_shape
 from jsecon.numerics import NEAR, all_finite, is_traced
 from jsecon.parallel import MESH_OPTIONS, map_rows
+from jsecon.programs import stored_jit
 from jsecon.splat.autodiff import rasterize_contained, view_lists
 from jsecon.splat.capacity import default_capacity, enough_capacity, round_capacity
 from jsecon.splat.project import check_geometry, project
@@ -70,8 +71,9 @@ def make_plan(
 
 
 # of one device, and over a mesh
-_make_plan_compiled = [
-    jax.jit(make_plan, static_argnums=(2, 4), compiler_options=options) for options in (None, MESH_OPTIONS)
+_make_plan_compiled: list[Any] = [
+    stored_jit(make_plan, static_argnums=(2, 4)),
+    jax.jit(make_plan, static_argnums=(2, 4), compiler_options=MESH_OPTIONS),
 ]
 
 
@@ -180,7 +182,8 @@ def composite_plan(plan: ViewPlan, features: Array, background: Array | None, de
 
 
 _composite_plan_compiled: list[Any] = [
-    jax.jit(composite_plan, static_argnums=3, compiler_options=options) for options in (None, MESH_OPTIONS)
+    stored_jit(composite_plan, static_argnums=(3,)),
+    jax.jit(composite_plan, static_argnums=3, compiler_options=MESH_OPTIONS),
 ]
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from jsecon.errors import require_shape
 from jsecon.numerics import NEAR
+from jsecon.programs import stored_jit
 from jsecon.splat.plan import plan_view, render_plan, require_background
 from jsecon.splat.project import check_geometry, check_shapes
 from jsecon.splat.sh import colours_from_sh
@@ -112,7 +113,7 @@ def render_rgb(
     return render(gaussians, camera, rgb, background=background, capacity=capacity, near=near, mesh=mesh)
 
 
-_colours = jax.jit(colours_from_sh)
+_colours = stored_jit(colours_from_sh)
 
 
 def render_depth(

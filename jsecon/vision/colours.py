@@ -4,6 +4,7 @@ Regions and texts become distributions over CIELAB, and by a smooth kernel vecto
 which has the basic colour terms (Berlin & Kay 1969) and common mixed ones.
 """
 
+import functools
 import itertools
 import re
 
@@ -125,8 +126,12 @@ class ColourEmbedder:
         neutral = lab_of(np.asarray([(128, 128, 128), (190, 182, 170), (64, 62, 60)]))
         colours = [self._mean(self._points), *(self._mean(point[None]) for point in neutral)]
         self.canonical = np.stack([_joined(c, angle) for c, angle in zip(colours, (0.25, 0.25, 0.5, 0.25))])
+
+    @functools.cached_property
+    def reference(self) -> Float32[np.ndarray, "w e"]:
+        """Embeddings of unrelated texts. A field holds its own."""
         basic = [name for name in self.names if name.split()[-1] in BASIC]
-        self.reference = self.embed_text([f"{one} and {other}" for one, other in itertools.combinations(basic, 2)])
+        return self.embed_text([f"{one} and {other}" for one, other in itertools.combinations(basic, 2)])
 
     def embed_regions(
         self, frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m _ _"]

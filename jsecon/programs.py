@@ -1,0 +1,100 @@
+"""Programs whose traces stay on disk, so that a new process neither traces nor lowers them again.
+
+jax's folder of compiled programs spares XLA's work alone. To trace and lower the programs of one question takes three
+times as long as to read what XLA made of them.
+"""
+
+import contextlib
+import functools
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax import export
+
+import jsecon
+from jsecon.errors import InputError
+from jsecon.files import atomic_write
+from jsecon.numerics import is_traced
+
+_CHECKSUM = 16
+"""bytes before a trace"""
+
+
+def stored_jit(function: Callable, *, static_argnums: tuple[int, ...] = ()) -> Callable:
+    """Compiles a function like jax.jit, and keeps each trace in jax's folder of compiled programs, if there is one.
+
+    Inside a trace, and for arrays on several devices, it is jax.jit.
+
+    Args:
+      function: Pure function of positional arguments. Its result holds arrays in tuples and records (`jsecon.types`),
+        and named tuples that are registered with jax.export.
+      static_argnums: As for jax.jit. A trace belongs to the repr of such an argument.
+
+    Returns:
+      The compiled function.
+    """
+    compiled = jax.jit(function, static_argnums=static_argnums)
+    programs: dict[Any, Callable] = {}
+
+    @functools.wraps(function)
+    def call(*args):
+        folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+        leaves, tree = jax.tree.flatten([arg for n, arg in enumerate(args) if n not in static_argnums])
+        if folder is None or is_traced(leaves) or any(_is_spread(leaf) for leaf in leaves):
+            return compiled(*args)
+        types = [jax.typeof(leaf) for leaf in leaves]
+        static = {n: repr(args[n]) for n in static_argnums}
+        key = tree, str(static), tuple((t.shape, t.dtype, t.weak_type) for t in types), jax.config.jax_enable_x64
+        if key not in programs:
+
+            def flat(*leaves):
+                dynamic = iter(jax.tree.unflatten(tree, leaves))
+                return function(*(arg if n in static_argnums else next(dynamic) for n, arg in enumerate(args)))
+
+            text = f"{jax.__version__} {jax.default_backend()} {_source()} {function.__module__} {key}"
+            name = f"{function.__name__}-{hashlib.blake2b(text.encode(), digest_size=16).hexdigest()}.trace"
+            traced = _stored(Path(folder) / name, jax.jit(flat), types)
+
+            def program(*leaves):
+                return traced.call(*leaves)
+
+            program.__name__ = function.__name__
+            programs[key] = jax.jit(program)
+        return programs[key](*leaves)
+
+    return call
+
+
+def _stored(file: Path, function: Any, types: list[Any]) -> export.Exported:
+    """Reads the trace of a function for arguments of some types, or makes and writes it."""
+    with contextlib.suppress(OSError):
+        data = file.read_bytes()
+        if _checksum(data[_CHECKSUM:]) == data[:_CHECKSUM]:
+            return export.deserialize(bytearray(data[_CHECKSUM:]))
+    shapes = [jax.ShapeDtypeStruct(t.shape, t.dtype, weak_type=t.weak_type) for t in types]
+    traced = export.export(function)(*shapes)
+    data = bytes(traced.serialize())
+    with contextlib.suppress(InputError), atomic_write(file) as temporary:  # `jsecon doctor` reports a full disk
+        temporary.write_bytes(_checksum(data) + data)
+    return traced
+
+
+def _is_spread(leaf: Any) -> bool:
+    """Whether an array lies on several devices."""
+    return isinstance(leaf, jax.Array) and len(leaf.devices()) > 1
+
+
+def _checksum(data: bytes) -> bytes:
+    return hashlib.blake2b(data, digest_size=_CHECKSUM).digest()
+
+
+@functools.cache
+def _source() -> str:
+    """Hashes jsecon's source files."""
+    digest = hashlib.blake2b(digest_size=16)
+    for file in sorted(Path(jsecon.__file__).parent.rglob("*.py")):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()

@@ -1,0 +1,91 @@
+"""Traces on disk: a new process runs the stored program, to the same bits, and nothing else is taken for it."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jsecon.programs import stored_jit
+from jsecon.splat.plan import make_plan
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """An empty folder of compiled programs."""
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    yield tmp_path
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+def counted():
+    """A stored program, and the list that its traces grow."""
+    traces = []
+
+    def scaled(x, factor, power):
+        traces.append(power)
+        return {"y": factor * x**power}
+
+    return stored_jit(scaled, static_argnums=(2,)), traces
+
+
+def test_the_next_process_does_not_trace(folder):
+    x = np.linspace(0, 1, 5, dtype=np.float32)
+    for repeat in range(2):  # each `counted` has programs of its own, like a process
+        run, traces = counted()
+        np.testing.assert_array_equal(run(x, 2.0, 3)["y"], jax.jit(lambda x: 2.0 * x**3)(x))
+        np.testing.assert_array_equal(run(x, 3.0, 3)["y"], jax.jit(lambda x: 3.0 * x**3)(x))
+        assert traces == ([] if repeat else [3])
+    assert len(list(folder.glob("scaled-*.trace"))) == 1
+
+
+def test_other_types_and_options_are_other_programs(folder):
+    run, traces = counted()
+    x = jnp.ones(4, jnp.bfloat16)
+    assert run(x, 2.0, 2)["y"].dtype == jnp.bfloat16  # 2.0 has no type of its own
+    assert run(x, np.float32(2), 2)["y"].dtype == jnp.float32
+    run(x, 2.0, 3)
+    run(jnp.ones(5), 2.0, 3)
+    with jax.enable_x64(True):
+        assert run(np.ones(5), 2.0, 3)["y"].dtype == np.float64
+    assert traces == [2, 2, 3, 3, 3]
+
+
+def test_inside_of_a_trace_it_is_an_ordinary_function(folder):
+    run, _ = counted()
+    slope = jax.vmap(jax.grad(lambda x: run(x, 2.0, 2)["y"]))(jnp.arange(3.0))
+    np.testing.assert_array_equal(slope, [0, 4, 8])
+    assert not list(folder.glob("*.trace"))
+
+
+@pytest.mark.parametrize("cut", [0, 1, 20, -1])
+def test_a_damaged_trace_is_made_again(folder, cut):
+    x = np.ones(3, np.float32)
+    run, _ = counted()
+    run(x, 2.0, 2)
+    (file,) = folder.glob("*.trace")
+    file.write_bytes(file.read_bytes()[:cut])
+    for expected in ([2], []):
+        run, traces = counted()
+        np.testing.assert_array_equal(run(x, 2.0, 2)["y"], 2 * x)
+        assert traces == expected
+
+
+def test_a_folder_that_cannot_be_written_costs_only_time(folder):
+    jax.config.update("jax_compilation_cache_dir", str(folder / "file"))
+    (folder / "file").write_text("in the way")
+    run, traces = counted()
+    run(np.ones(3, np.float32), 2.0, 2)
+    run(np.ones(3, np.float32), 2.0, 2)
+    assert traces == [2]
+
+
+def test_plans_of_views_are_the_same_bits(folder, scene, camera):
+    arguments = (dataclasses.replace(scene, sh=None), camera, 4096, 0.01, None)
+    expected = jax.jit(make_plan, static_argnums=(2, 4))(*arguments)
+    for _ in range(2):
+        plan = stored_jit(make_plan, static_argnums=(2, 4))(*arguments)
+        assert (plan.width, plan.height, plan.mesh, plan.lists.tile) == (48, 40, None, expected.lists.tile)
+        jax.tree.map(np.testing.assert_array_equal, plan, expected)
