@@ -204,7 +204,7 @@ if __name__ == "__main__":
     given = parser.parse_args()
     seeds, choosing, only = tuple(given.seeds), tuple(given.choosing), tuple(given.only)
     if given.quick:
-        seeds, choosing, only = (1,), (0,), ("parts", "kinds")
+        seeds, choosing, only = (0,), (0,), ("parts", "kinds")
     values = (HARD,) if given.quick else tuple(given.values)
     there = tuple(given.scenes_trained), tuple(given.seeds_trained) or seeds[:1]
     out = results_folder(given, "worlds")
