@@ -140,7 +140,7 @@ def read_colmap(path: Path, models: Sequence[Path]) -> PosedImages:
     if _model_file(model, "points3D") is None:
         notes.append("The model has no points3D file: there are no sparse points.")
         return PosedImages(shots, model, notes=tuple(notes))
-    return PosedImages(shots, model, *read_points(model), notes=tuple(notes))
+    return PosedImages(shots, model, *_read_points(model), notes=tuple(notes))
 
 
 def _find_images(path: Path, names: Sequence[str]) -> dict[str, Path]:
@@ -329,18 +329,8 @@ def _count_images(model: Path) -> int:
         return int.from_bytes(stream.read(8), "little")
 
 
-def read_points(model: Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
-    """Reads the sparse points of a model.
-
-    Args:
-      model: Folder of the model.
-
-    Returns:
-      (P, 3) float64 points and (P, 3) uint8 colours.
-
-    Raises:
-      InputError: The file is missing or damaged.
-    """
+def _read_points(model: Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
+    """Reads the sparse points of a model, float64, and their colours."""
     file = _require_file(model, "points3D")
     if file.suffix == ".txt":
         rows = _parse_lines(file, "POINT3D_ID X Y Z R G B ERROR TRACK", _parse_point)

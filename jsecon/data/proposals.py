@@ -93,21 +93,8 @@ def _parse_runs(text: str) -> list[int]:
     return runs
 
 
-def fill_polygons(polygons: Any, width: int, height: int, where: str | Path) -> Bool[np.ndarray, "h w"]:
-    """Draws COCO's polygons as a mask; a polygon within another is a hole in it.
-
-    Args:
-      polygons: [[x, y, x, y, ...], ...], px.
-      width: Width of the image, px.
-      height: Height of the image, px.
-      where: Name of the mask for errors.
-
-    Returns:
-      (H, W) mask.
-
-    Raises:
-      InputError: They are not polygons, or lie outside of the image.
-    """
+def _fill_polygons(polygons: Any, width: int, height: int, where: str | Path) -> Bool[np.ndarray, "h w"]:
+    """Draws COCO's polygons [[x, y, x, y, ...], ...], px, as a mask; a polygon within another is a hole in it."""
     expected = "[[x, y, x, y, ...], ...] with three corners or more each"
     nested = isinstance(polygons, list) and all(isinstance(polygon, list) for polygon in polygons)
     try:
@@ -282,7 +269,7 @@ def _decode_records(file: Path, records: list[Any], frame: tuple[int, int]) -> l
         if isinstance(segmentation, dict):
             masks.append(decode_rle(segmentation, where))
         elif isinstance(segmentation, list):
-            masks += [fill_polygons(segmentation, *frame, where)] if segmentation else []
+            masks += [_fill_polygons(segmentation, *frame, where)] if segmentation else []
         else:
             raise InputError(where, f"the mask is {str(segmentation)[:40]!r}", "run lengths or polygons", _REMEDY)
     return masks

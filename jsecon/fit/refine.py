@@ -293,7 +293,7 @@ def _align_by_depth(capture: Capture, train: Bool[np.ndarray, " t"], others: Boo
     moved = align_cameras(capture, train)
     if moved is None:
         return None
-    moved = moved @ rigid_drift(moved[train], poses[train], cameras_extent(capture.cameras[train]))
+    moved = moved @ _rigid_drift(moved[train], poses[train], cameras_extent(capture.cameras[train]))
     aligned = _with_poses(capture, moved)
     moved = align_cameras(aligned, others, train)
     return aligned if moved is None else _with_poses(aligned, moved)
@@ -401,7 +401,7 @@ def _apply(
         poses = np.asarray(cameras.world_to_camera, np.float64)
         moved = np.asarray(jax.vmap(se3_exp)(corrections.twists), np.float64) @ poses
         if keep_world:
-            moved = moved @ rigid_drift(moved[train], poses[train], cameras_extent(cameras[train]))
+            moved = moved @ _rigid_drift(moved[train], poses[train], cameras_extent(cameras[train]))
         capture = _with_poses(capture, moved)
     if refine.exposure:
         maps = np.asarray(corrections.colours, np.float64)
@@ -418,16 +418,11 @@ def _apply(
     return capture
 
 
-def rigid_drift(moved: Float[Array, "t 4 4"], poses: Float[Array, "t 4 4"], extent: float) -> Float[np.ndarray, "4 4"]:
-    """Computes the rigid motion of the world that brings moved cameras nearest to their original poses (Umeyama 1991).
+def _rigid_drift(moved: Float[Array, "t 4 4"], poses: Float[Array, "t 4 4"], extent: float) -> Float[np.ndarray, "4 4"]:
+    """Returns the rigid motion of the world that brings moved cameras nearest to their original poses (Umeyama 1991).
 
-    Args:
-      moved: (T, 4, 4) moved world-to-camera poses.
-      poses: (T, 4, 4) original world-to-camera poses.
-      extent: Length of the cameras' axes in world units, whose ends are matched beside the centres.
-
-    Returns:
-      (4, 4) map from points of the original world to the world of the moved cameras.
+    It maps points of the original world into that of the moved cameras. The ends of the cameras' axes, `extent` world
+    units long, are matched beside their centres.
     """
 
     def centre(poses):

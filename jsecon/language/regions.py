@@ -55,7 +55,7 @@ def region_embeddings(
     def of_frame(t, masks):
         return embed(frames[t], masks)
 
-    return pool_embeddings(labels, of_frame, weighting=weighting, num_regions=num_regions, progress=progress)
+    return _pool_embeddings(labels, of_frame, weighting=weighting, num_regions=num_regions, progress=progress)
 
 
 def embeddings_of_masks(
@@ -90,10 +90,10 @@ def embeddings_of_masks(
         sums = pixels @ embeddings[rows].astype(np.float64)
         return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
 
-    return pool_embeddings(labels, under, **options)
+    return _pool_embeddings(labels, under, **options)
 
 
-def pool_embeddings(
+def _pool_embeddings(
     labels: Shaped[np.ndarray, "t h w"],
     embed: Embed,
     *,
@@ -101,10 +101,7 @@ def pool_embeddings(
     num_regions: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Regions:
-    """`region_embeddings` for an `embed` that takes a frame's index.
-
-    Several processes (`jax.distributed`) share the frames.
-    """
+    """`region_embeddings` for an `embed` that takes the index of a frame. Several processes share the frames."""
     require_one_of("weighting", weighting, ("pixels", "uniform"), "Use 'pixels', as the paper does.")
     count = int(labels.max(initial=-1)) + 1 if num_regions is None else num_regions
     require_labels(labels, count)

@@ -213,17 +213,10 @@ def _square_side(size: object) -> int | None:
     return None if size is None else int(str(size))
 
 
-def read_logits(path: Path) -> Logits:
-    """Reads scale and bias of a model trained with a sigmoid (SigLIP, arXiv 2303.15343).
+def _read_logits(path: Path) -> Logits:
+    """Reads scale and bias of a model trained with a sigmoid (SigLIP, arXiv 2303.15343), which its graphs do not hold.
 
-    The text is true of the image with probability sigmoid(scale * cosine + bias). Both belong to the loss, so the
-    encoders' graphs do not hold them.
-
-    Args:
-      path: A logits.json, {"scale": s, "bias": b}.
-
-    Raises:
-      InputError: The file cannot be read, or its numbers are out of range.
+    The text is true of the image with probability sigmoid(scale * cosine + bias).
     """
     expected = f'{{"scale": s, "bias": b}}, 0 < s <= {MAX_SCALE:g}, |b| <= {MAX_BIAS:g}'
     content = read_json(path, expected, LOGITS_REMEDY)
@@ -335,7 +328,7 @@ class ClipEmbedder:
     @functools.cached_property
     def logits(self) -> Logits | None:
         """Scale and bias of a model trained with a sigmoid if the folder has them, else None."""
-        return None if self.files.logits is None else read_logits(self.files.logits)
+        return None if self.files.logits is None else _read_logits(self.files.logits)
 
     @property
     def size(self) -> int:
@@ -432,7 +425,7 @@ class ClipEmbedder:
 
     @property
     def _visual_output(self) -> Tensor:
-        return embedding_output(self._visual, self._output_names(_VISUAL_OUTPUTS), _VISUAL)
+        return _embedding_output(self._visual, self._output_names(_VISUAL_OUTPUTS), _VISUAL)
 
     def _output_names(self, names: tuple[str, ...]) -> tuple[str, ...]:
         return names if self.files.rules is None else (*names, _SIGLIP_OUTPUT)
@@ -451,7 +444,7 @@ class ClipEmbedder:
     def _embed_phrases(self, phrases: list[str]) -> Float32[np.ndarray, "p e"]:
         """(P, E) unit embeddings of phrases as they are."""
         graph = self._textual
-        output = embedding_output(graph, self._output_names(_TEXTUAL_OUTPUTS), _TEXTUAL)
+        output = _embedding_output(graph, self._output_names(_TEXTUAL_OUTPUTS), _TEXTUAL)
         masks = [name for name in graph.inputs if "mask" in name]
         names = [name for name in graph.inputs if name not in masks]
         tensor = graph.require("input", names[0] if len(names) == 1 else "input_ids", (None, None), _TEXTUAL)
@@ -469,18 +462,10 @@ class ClipEmbedder:
         return _normalize(rows, self.files.textual)
 
 
-def embedding_output(graph: Graph, names: Sequence[str], what: str) -> Tensor:
-    """Finds the output (B, E) of a graph.
+def _embedding_output(graph: Graph, names: Sequence[str], what: str) -> Tensor:
+    """Returns the output (B, E) of a graph: the first of `names` that it has, else its only output with two axes.
 
     A pooler's output counts only if it is named: CLIP's lies before the projection into the joint space.
-
-    Args:
-      graph: The graph.
-      names: Names of the output, the preferred first; else the only output with two axes is taken.
-      what: What the graph should be, for the message.
-
-    Raises:
-      InputError: No output fits, or several do.
     """
     for name in names:
         if name in graph.outputs:

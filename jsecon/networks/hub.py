@@ -15,7 +15,7 @@ import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from jsecon.errors import InputError, describe_error
 
@@ -26,8 +26,6 @@ Precision = Literal["fp32", "fp16", "int8"]
 SUFFIXES: Mapping[Precision, str] = {"fp32": "", "fp16": "_fp16", "int8": "_quantized"}
 """precision -> what public exports append to the name of a graph"""
 PREFIX = "hub:"
-CHUNK = 1 << 20
-"""bytes that are hashed at once"""
 
 
 def graph_variants(names: Sequence[str], precision: Precision | None = None) -> Iterator[tuple[str, ...]]:
@@ -45,17 +43,13 @@ class NoSuchFilesError(InputError):
     """A repository has none of the layouts of a role."""
 
 
-@dataclasses.dataclass(frozen=True)
-class FileSet:
-    """The files of one public layout of a model. `{p}` stands for the suffix of the precision.
-
-    Attributes:
-      required: Files without which the model does not work.
-      optional: Files that are fetched where the repository has them.
-    """
+class _FileSet(NamedTuple):
+    """The files of one public layout of a model. `{p}` stands for the suffix of the precision."""
 
     required: tuple[str, ...]
+    """files without which the model does not work"""
     optional: tuple[str, ...] = ()
+    """files that are fetched where the repository has them"""
 
 
 _TEXTS = ("config.json", "tokenizer_config.json")
@@ -63,24 +57,24 @@ _TRACKER = tuple(
     f"onnx/{part}.onnx"
     for part in ("vision_encoder", "mask_decoder", "memory_attention", "memory_encoder", "pointer_tpos")
 )
-LAYOUTS: Mapping[Role, tuple[FileSet, ...]] = {
+LAYOUTS: Mapping[Role, tuple[_FileSet, ...]] = {
     "embedder": (
-        FileSet(
+        _FileSet(
             ("onnx/vision_model{p}.onnx", "onnx/text_model{p}.onnx", "preprocessor_config.json", "tokenizer.json"),
             (*_TEXTS, "logits.json"),
         ),
-        FileSet(
+        _FileSet(
             ("visual/model.onnx", "textual/model.onnx", "visual/preprocess_cfg.json", "textual/tokenizer.json"),
             (*_TEXTS, "textual/tokenizer_config.json", "logits.json"),
         ),
     ),
     "segmenter": (
-        FileSet(
+        _FileSet(
             ("onnx/vision_encoder{p}.onnx", "onnx/prompt_encoder_mask_decoder{p}.onnx"),
             ("preprocessor_config.json", "config.json"),
         ),
     ),
-    "tracker": (FileSet((*_TRACKER, "constants.json")), FileSet((*_TRACKER, "onnx/constants.json"))),
+    "tracker": (_FileSet((*_TRACKER, "constants.json")), _FileSet((*_TRACKER, "onnx/constants.json"))),
 }
 """role -> the layouts that its public exports have. A graph's external data (`.onnx_data`) comes with the graph."""
 
@@ -346,7 +340,7 @@ def fetch(download: Download) -> Path:
         folder = Path(snapshot_download(model.repository, revision=model.revision, allow_patterns=names))
     for file in download.files:
         expected = {file.digest} | ({model.sha256[file.path]} if file.path in model.sha256 else set())
-        if any(content_hash(folder / file.path, digest) != digest for digest in expected):
+        if any(_content_hash(folder / file.path, digest) != digest for digest in expected):
             broken = folder / file.path
             broken.resolve().unlink()
             broken.unlink(missing_ok=True)
@@ -355,21 +349,11 @@ def fetch(download: Download) -> Path:
     return folder
 
 
-def content_hash(path: Path, like: str) -> str:
-    """Hashes a file.
-
-    Args:
-      path: The file.
-      like: A hash of the kind asked for: 64 hexadecimal digits are SHA-256, 40 are the hash of a git blob.
-
-    Returns:
-      Its hash as hexadecimal digits.
-    """
+def _content_hash(path: Path, like: str) -> str:
+    """Returns the SHA-256 of a file in hexadecimal digits, or the hash of its git blob if `like` has 40 digits."""
     digest = hashlib.sha256() if len(like) == 64 else hashlib.sha1(b"blob %d\0" % path.stat().st_size)
     with path.open("rb") as file:
-        while chunk := file.read(CHUNK):
-            digest.update(chunk)
-    return digest.hexdigest()
+        return hashlib.file_digest(file, lambda: digest).hexdigest()
 
 
 def cached_address(folder: Path) -> str | None:
@@ -409,24 +393,11 @@ def remove(model: HubModel) -> int:
 
 
 def catalogue_rows() -> Iterator[dict[str, Any]]:
-    """Yields the rows of `jsecon models list`: each named model, and the precisions that are in the cache."""
+    """Yields the rows of `jsecon models list`: each named model, and under "cached" the precisions on this machine."""
     for row in catalogue():
-        cached = [
-            precision
-            for precision in row.megabytes
-            if cached_folder(HubModel(row.role, row.repository, row.revision, precision)) is not None
-        ]
-        yield {
-            "name": row.name,
-            "role": row.role,
-            "repository": row.repository,
-            "megabytes": dict(row.megabytes),
-            "licence": row.licence,
-            "purpose": row.purpose,
-            "seconds": dict(row.seconds),
-            "precision": row.precision,
-            "cached": cached,
-        }
+        models = [HubModel(row.role, row.repository, row.revision, precision) for precision in row.megabytes]
+        cached = [model.precision for model in models if cached_folder(model) is not None]
+        yield dataclasses.asdict(row) | {"cached": cached}
 
 
 def get_command(model: HubModel) -> str:

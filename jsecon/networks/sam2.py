@@ -139,17 +139,6 @@ def sam2_files(folder: Path) -> dict[str, Path]:
     return files
 
 
-def sam2_digest(folder: Path, *, extra: str = "") -> str:
-    """Returns 32 hex digits of the contents of the model's files, and of `extra`.
-
-    Raises:
-      InputError: A file is missing.
-    """
-    files = sam2_files(folder)
-    graphs = [part for name in SIGNATURES for part in graph_files(files[f"{name}.onnx"])]
-    return content_digest([*graphs, files[CONSTANTS]], extra=extra)
-
-
 def open_sam2(folder: Path, *, threads: int | None = None) -> Sam2Graphs:
     """Opens the model in a folder.
 
@@ -330,7 +319,9 @@ class Sam2Tracker:
     """
 
     def __init__(self, folder: Path, *, hole_area: int = 8, keep: int = 16, threads: int | None = None):
-        self.name = f"sam2-{sam2_digest(folder, extra=repr(hole_area))}"
+        files = sam2_files(folder)
+        graphs = [part for name in SIGNATURES for part in graph_files(files[f"{name}.onnx"])]
+        self.name = f"sam2-{content_digest([*graphs, files[CONSTANTS]], extra=repr(hole_area))}"
         self.hole_area = hole_area
         self._folder = folder
         self._keep = keep

@@ -37,7 +37,7 @@ def check_inputs(context: RunContext, running: Collection[str], results: Mapping
         to the frames.
     """
     options = context.options
-    require_place(context.out)
+    _require_place(context.out)
     if "poses" in running:
         require_pycolmap(options.capture)
         if is_video(options.capture) and min(video_size(options.capture)) < 1:
@@ -56,15 +56,8 @@ def check_inputs(context: RunContext, running: Collection[str], results: Mapping
         _check_masks(options, running, extent, [extent.names[t] for t in seen])
 
 
-def require_place(folder: Path) -> None:
-    """Checks that an output folder can be created, without creating it.
-
-    Args:
-      folder: The output folder.
-
-    Raises:
-      InputError: A parent of the folder is a file, or cannot be written.
-    """
+def _require_place(folder: Path) -> None:
+    """Raises InputError if an output folder cannot be created: a parent of it is a file, or cannot be written."""
     parent = next(place for place in (folder, *folder.absolute().parents) if place.exists())
     if not parent.is_dir():
         raise InputError(folder, f"{parent} is a file", "a folder that can be written", "Choose another output folder.")

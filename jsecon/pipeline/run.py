@@ -131,12 +131,8 @@ class Plan:
     steps: list[Step]
 
 
-def plan_run(context: RunContext, stage_list: list[Stage], folder: Path) -> Plan:
-    """Plans stages: which of them `folder` already holds. Writes no file.
-
-    Raises:
-      InputError: An option or input is invalid.
-    """
+def _plan(context: RunContext, stage_list: list[Stage], folder: Path) -> Plan:
+    """Plans stages: which of them `folder` already holds. Writes no file; raises InputError for invalid options."""
     require_inputs(context.options)
     require_own_folder(context.options, context.out)
     require_contrib()
@@ -198,7 +194,7 @@ def compute_stages(
     listener = listener or Listener()
     coordinator = coordinator or Coordinator(several=False)
     with listener.progress("plan"):
-        plan = plan_run(context, stage_list, folder)
+        plan = _plan(context, stage_list, folder)
         require_writable(context.out)
     with exclusive_lock(context.out):
         cache.prepare(folder)
@@ -324,7 +320,7 @@ def current_field(options: Options, out: Path) -> Path | None:
     if not path.is_file():
         return None
     context = RunContext(options, networks.open_networks(options, out / "cache"), out)
-    keys = plan_run(context, run_stages(context), out / "cache").keys
+    keys = _plan(context, run_stages(context), out / "cache").keys
     try:
         provenance = json.loads(load_field(path, mapped=True).provenance)
     except (InputError, ValueError):  # damaged: the run writes it anew
@@ -356,7 +352,7 @@ def dry_run(options: Options, out: Path, *, scene_only: bool = False, listener: 
     with listener.progress("plan"):
         context = RunContext(options, networks.open_networks(options, out / "cache"), out)
         stage_list = fit_stages(context) if scene_only else run_stages(context)
-        plan = plan_run(context, stage_list, out / "cache")
+        plan = _plan(context, stage_list, out / "cache")
         running = [step.name for step in plan.steps if step.status == "run"]
         context.networks.require_ready(running)
         check_inputs(context, running, plan.paths)

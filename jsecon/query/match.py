@@ -186,14 +186,10 @@ def reference_words(field: LanguageField) -> Array | None:
     return jnp.asarray(field.reference) if field.reference is not None and len(field.reference) else None
 
 
-def text_direction(
+def _text_direction(
     text: Float[Array, "*batch e"], reference: Float[Array, "w e"] | None, retrieval: str
 ) -> Float[Array, "*batch e"]:
-    """Returns the directions of texts (..., E) that are compared with regions.
-
-    By "apart" these are the unit texts minus the mean of the W unit unrelated words. Without such words they are the
-    plain texts.
-    """
+    """Returns unit texts (..., E), by "apart" minus the mean of the W unit unrelated words if there are such words."""
     unit = normalize(text)
     if retrieval == "cosine" or reference is None:
         return unit
@@ -206,8 +202,8 @@ def region_similarities(
     reference: Float[Array, "w e"] | None,
     retrieval: str,
 ) -> tuple[Float[Array, " r"], Bool[Array, " r"]]:
-    """Cosines (R,) of regions with the `text_direction` of a text (E,), and where they are known; 0 elsewhere."""
-    return similarities(embeddings, text_direction(text, reference, retrieval))
+    """Cosines (R,) of regions with the `_text_direction` of a text (E,), and where they are known; 0 elsewhere."""
+    return similarities(embeddings, _text_direction(text, reference, retrieval))
 
 
 def reference_similarities(
@@ -215,7 +211,7 @@ def reference_similarities(
 ) -> Float[Array, "w r"]:
     """`region_similarities` of each of W unrelated words with each of R regions (W, R); NaN where it is not known."""
     words = reference.astype(embeddings.dtype)
-    words = text_direction(words, words, retrieval)
+    words = _text_direction(words, words, retrieval)
     # As one product of matrices: W queries of their own would walk all regions W times.
     known = jnp.any(words != 0, axis=1)[:, None] & jnp.any(embeddings != 0, axis=1)
     return jnp.where(known, cosine_matrix(words, embeddings), jnp.nan)

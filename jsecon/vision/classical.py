@@ -67,7 +67,7 @@ class ClassicalSegmenter:
     def __call__(self, frame: np.ndarray, index: int) -> Bool[np.ndarray, "m h w"]:
         """Segments a frame (H, W, 3) uint8 into masks (M, H, W) bool, best first: a partition without specks."""
         labels = self.partition(frame, index)
-        return masks_best_first(frame, labels, max_regions=self.max_regions, min_area=self.min_area)
+        return _masks_best_first(frame, labels, max_regions=self.max_regions, min_area=self.min_area)
 
     def partition(self, frame: np.ndarray, index: int) -> Int32[np.ndarray, "h w"]:
         """Partitions a frame into connected regions.
@@ -164,19 +164,12 @@ def oversegment(
     return np.asarray(graph.processImage(np.ascontiguousarray(features)), np.int32)
 
 
-def masks_best_first(
+def _masks_best_first(
     frame: UInt8[np.ndarray, "h w 3"], labels: Int32[np.ndarray, "h w"], *, max_regions: int, min_area: float
 ) -> Bool[np.ndarray, "m h w"]:
-    """Ranks regions by the mean edge strength along their borders times the square root of their area.
+    """Returns masks of regions, by the mean edge strength along their borders times the square root of their area.
 
-    Args:
-      frame: (H, W, 3) uint8 RGB.
-      labels: (H, W) int32 regions.
-      max_regions: Maximum number of masks.
-      min_area: Share of the frame below which regions are dropped.
-
-    Returns:
-      (M, H, W) bool masks, best first.
+    Regions below a share of `min_area` of the frame are dropped.
     """
     lab = cv2.cvtColor(frame.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
     gradient = np.hypot(cv2.Sobel(lab, cv2.CV_32F, 1, 0), cv2.Sobel(lab, cv2.CV_32F, 0, 1)).sum(-1)
