@@ -12,18 +12,22 @@ import inspect
 import io
 import json
 import re
+import shutil
 import sys
+import textwrap
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import Annotated, Any, Union
+from typing import Annotated, Any, Union, get_type_hints
 
+import docstring_parser
 import tyro
 
 import jsecon
-from jsecon.app import help
-from jsecon.app.verbs import VERBS, Completion, Output, Verb, VerbResult
+from jsecon.app.models import help_table
+from jsecon.app.verbs import VERBS, Completion, Output, Run, Verb, VerbResult
 from jsecon.errors import InputError, describe_error
+from jsecon.pipeline.options import ADVANCED
 from jsecon.pipeline.progress import Console
 from jsecon.process import show_full_tracebacks
 
@@ -54,6 +58,8 @@ examples
 jsecon VERB --help has the options of a verb. Repeat the command of a stopped run to resume it. jsecon --version prints
 the version."""
 
+MAX_WIDTH = 100
+"""columns that a description takes at most"""
 MARKERS = (tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff, tyro.conf.PositionalMetavarFromFieldName)
 
 
@@ -116,15 +122,73 @@ def parse(argv: Sequence[str]) -> Verb:
     if argv and argv[0] in _VERBS:
         kind, prog = _VERBS[argv[0]][1], f"jsecon {argv[0]}"
         if "--help-all" in argv:
-            return _read(kind, prog, ["--help"], description=help.description(kind, whole=True))
+            return _read(kind, prog, ["--help"], description=_description(kind, whole=True))
         if {"-h", "--help"} & set(argv):
-            shown = help.common_options(kind)
-            return _read(shown, prog, ["--help"], description=help.description(kind, whole=False))
+            shown = _common_options(kind)
+            return _read(shown, prog, ["--help"], description=_description(kind, whole=False))
         return _read(kind, prog, argv[1:])
     if argv and not argv[0].startswith("-"):
         similar = "".join(f"Did you mean {name}? " for name in difflib.get_close_matches(argv[0], _VERBS, 1))
         raise InputError("jsecon", f"{argv[0]} is not a verb", remedy=f"{similar}jsecon --help lists the verbs.")
     return _read(_all_verbs(), "jsecon", argv, description=ABOUT)
+
+
+def _description(kind: Any, *, whole: bool) -> str:
+    """Describes a verb: what it does, in one sentence or as a `whole`, examples, and how to see all options."""
+    width = min(shutil.get_terminal_size().columns, MAX_WIDTH)
+    parsed = docstring_parser.parse(inspect.getdoc(kind) or "", docstring_parser.DocstringStyle.GOOGLE)
+    paragraphs = [parsed.short_description or "", *((parsed.long_description or "").split("\n\n") if whole else [])]
+    filled = [textwrap.fill(" ".join(paragraph.split()), width) for paragraph in paragraphs if paragraph]
+    examples = "\n".join(["examples", *(f"  {line}" for line in kind.examples)])
+    verb = kind.examples[0].split()[1]
+    more = [help_table()] if whole and kind is Run else []
+    if not whole:
+        more = [f"jsecon {verb} --help-all describes every option."]
+    return "\n\n".join([*filled, examples, *more])
+
+
+def _common_options(kind: Any) -> Any:
+    """Makes a dataclass of the options of a verb that are not `Advanced`, with the first sentence of each.
+
+    tyro prints its help, which fits a screen. The options of the verb's groups come after its own.
+    """
+    fields: list[tuple[str, Any, dataclasses.Field]] = []
+    sentences: list[str] = []
+    for owner in (kind, *_groups(kind)):
+        hints = get_type_hints(owner, include_extras=True)
+        for field in dataclasses.fields(owner):
+            if dataclasses.is_dataclass(hints[field.name]) or ADVANCED in getattr(
+                hints[field.name], "__metadata__", ()
+            ):
+                continue
+            default = {"default": field.default, "default_factory": field.default_factory}
+            fields.append((field.name, hints[field.name], dataclasses.field(**default, kw_only=True)))
+            sentences.append(f"  {field.name}: {_first_sentence(_help_text(owner, field.name))}")
+    made = dataclasses.make_dataclass(kind.__name__, fields, frozen=True)
+    made.__doc__ = "\n".join(["Options.", "", "Attributes:", *sentences])
+    return made
+
+
+def _groups(kind: Any) -> list[Any]:
+    """The classes of a verb's groups of options, but for those of the output, which every verb has."""
+    hints = get_type_hints(kind, include_extras=True)
+    groups = [hints[field.name] for field in dataclasses.fields(kind) if field.name != "output"]
+    return [group for group in groups if dataclasses.is_dataclass(group)]
+
+
+def _help_text(owner: Any, name: str) -> str:
+    """The help text of an option, from the docstring of its class or of a base of it."""
+    for cls in owner.__mro__:
+        for parameter in docstring_parser.parse(cls.__doc__ or "", docstring_parser.DocstringStyle.GOOGLE).params:
+            if parameter.arg_name == name:
+                return " ".join((parameter.description or "").split())
+    raise LookupError(f"{owner.__name__}.{name} has no help text")
+
+
+def _first_sentence(text: str) -> str:
+    """The text up to the first full stop that ends a sentence; a stop before a small letter or a digit ends none."""
+    end = re.search(r"[.:](?= [A-Z`])", text)
+    return text if end is None else text[: end.start()] + "."
 
 
 def verbs() -> tuple[str, ...]:

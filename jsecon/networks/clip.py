@@ -28,7 +28,7 @@ from jsecon.networks.tokenizer import CLIP_LENGTH, TextRules, TextTokenizer, rea
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.vision.protocols import CANONICAL, Logits
 from jsecon.vision.reference_words import cached_reference
-from jsecon.vision.stores import EmbeddingStore, lookup_vectors, mask_key
+from jsecon.vision.stores import EmbeddingStore, mask_key
 
 CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 """mean and deviation of RGB in 0..1, for folders that do not state them"""
@@ -349,8 +349,13 @@ class ClipEmbedder:
         """
         keys = [mask_key(mask) for mask in masks]
         known = {} if self._store is None else self._store.read(frame)
-        rows, missing = lookup_vectors(known, keys, self.dim)
-        missing = [index for index in missing if masks[index].any()]
+        rows = np.zeros((len(keys), self.dim), np.float32)
+        missing = []
+        for index, key in enumerate(keys):
+            if key in known and known[key].shape == (self.dim,):
+                rows[index] = known[key]
+            elif masks[index].any():
+                missing.append(index)
         for start in range(0, len(missing), self._batch):
             chunk = missing[start : start + self._batch]
             crops = np.stack([masked_crop(frame, masks[index], self.size) for index in chunk])

@@ -1,4 +1,4 @@
-"""Options of a run, and checks of them before any work.
+"""Options of a run.
 
 The command line is made from these classes by tyro: an attribute's docstring is its help text, and its type says which
 values it accepts. Each class is a group of the help.
@@ -202,25 +202,6 @@ class Options(FieldOptions, ModelOptions, MaskOptions, BareOptions, SceneOptions
         return self.association if self.tracker is None else "tracking"
 
 
-LEAST: dict[str, float] = {
-    "downscale": 1,
-    "long_side": 16,
-    "frames": 2,
-    "views": 2,
-    "holdout": 0,
-    "steps": 1,
-    "minutes": 0.05,
-    "gaussians_at_most": 1,
-    "points_per_side": 1,
-    "vision_frames": 2,
-    "crop_layers": 0,
-    "latent": 1,
-    "top": 1,
-    "centre": 0,
-}
-"""smallest value of an option"""
-
-
 SPLATS = (".ply", ".spz", ".sog", ".splat", ".glb")
 """endings of files that are scenes of Gaussians"""
 
@@ -228,54 +209,6 @@ SPLATS = (".ply", ".spz", ".sog", ".splat", ".glb")
 def is_bare_scene(capture: Path) -> bool:
     """Returns whether the input of a run is a file of Gaussians instead of a capture."""
     return capture.suffix.lower() in SPLATS and not capture.is_dir()
-
-
-def require_inputs(options: Options) -> None:
-    """Checks that the files and folders of a run exist and that its numbers are in their ranges.
-
-    Args:
-      options: Options of the run.
-
-    Raises:
-      InputError: A file or folder is missing, a number is out of its range, or there are several sources of masks.
-    """
-    for name, value in vars(options).items():
-        flag = f"--{name.replace('_', '-')}"
-        if isinstance(value, Path) and not value.exists():
-            remedy = "Check the path." if name == "capture" else f"Check the path, or leave out {flag}."
-            raise InputError(value, "no such file or folder", remedy=remedy)
-        if name in LEAST and isinstance(value, int | float) and not value >= LEAST[name]:
-            raise InputError(flag, str(value), f"at least {LEAST[name]}", "Change the option.")
-    sources = [f"--{name}" for name in ("masks", "proposals", "segmenter") if getattr(options, name) is not None]
-    if len(sources) > 1:
-        expected = "one: tracked masks, masks of single frames, or a model that finds them"
-        raise InputError(" ".join(sources), "more than one source of masks", expected, "Leave out the others.")
-    if not 0 < options.agreement <= 1:
-        remedy = "Leave it out, or use 0.3 to 0.6."
-        raise InputError("--agreement", str(options.agreement), "a share above 0 and at most 1", remedy)
-    if options.centre > 1:
-        raise InputError("--centre", str(options.centre), "0 to 1", "Use 1 for the pixel of the centre alone.")
-
-
-def require_own_folder(options: Options, out: Path) -> None:
-    """Checks that the output folder is not one of the input folders, nor a folder of the capture's files.
-
-    Args:
-      options: Options of the run.
-      out: Its output folder.
-
-    Raises:
-      InputError: It is.
-    """
-    capture = options.capture
-    inputs = {name: [value] for name, value in vars(options).items() if isinstance(value, Path)}
-    inputs["capture"] = [capture, *(capture / name for name in ("images", "sparse", "sparse/0", "keyframes"))]
-    for name, folders in inputs.items():
-        for folder in folders:
-            if folder.is_dir() and folder.resolve() == out.resolve():
-                problem = f"it is the input folder ({name}) and the output folder at once"
-                remedy = f"Give the output its own folder, for example {out / 'field'}, or one elsewhere."
-                raise InputError(out, problem, "", remedy)
 
 
 def require_writable(folder: Path) -> None:

@@ -18,11 +18,13 @@ is skipped and why. These files are passed on the way, by default; behind each l
     field       language/field
 """
 
+import contextlib
 import dataclasses
 import functools
 import json
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,12 +32,19 @@ import jax
 import numpy as np
 
 import jsecon
+from jsecon.data.capture import capture_extent
+from jsecon.data.frames import CaptureExtent, downscaled_size, evenly_spaced, frame_names, holdout_mask
+from jsecon.data.images import image_size
+from jsecon.data.langsplat import load_features
+from jsecon.data.masks import check_labels
+from jsecon.data.proposals import load_proposals
+from jsecon.data.sfm import check_photographs, list_photographs, require_pycolmap
+from jsecon.data.video import DEFAULT_VIDEO_FRAMES, is_video, video_size
 from jsecon.errors import InputError
 from jsecon.files import exclusive_lock
 from jsecon.language.field import load_field, save_field
 from jsecon.pipeline import cache, networks, processes, stages
-from jsecon.pipeline.checks import check_inputs
-from jsecon.pipeline.options import Options, require_inputs, require_own_folder, require_writable
+from jsecon.pipeline.options import Options, is_bare_scene, require_writable
 from jsecon.pipeline.processes import Coordinator
 from jsecon.pipeline.progress import Listener, Step
 from jsecon.pipeline.results import (
@@ -46,14 +55,33 @@ from jsecon.pipeline.results import (
     Stage,
     StageInput,
     StageResult,
+    require_training,
     vision_frames,
 )
+from jsecon.pipeline.scene_files import read_scene
 from jsecon.pipeline.sources import hub_addresses, relative_folders
 from jsecon.process import compilation_counts
-from jsecon.types import Capture, Gaussians, LanguageField, Quality
+from jsecon.types import Capture, Gaussians, ImageFile, LanguageField, Quality
 from jsecon.vision.classical import require_contrib
 
 FIELD_FILE = "field.safetensors"
+LEAST: dict[str, float] = {
+    "downscale": 1,
+    "long_side": 16,
+    "frames": 2,
+    "views": 2,
+    "holdout": 0,
+    "steps": 1,
+    "minutes": 0.05,
+    "gaussians_at_most": 1,
+    "points_per_side": 1,
+    "vision_frames": 2,
+    "crop_layers": 0,
+    "latent": 1,
+    "top": 1,
+    "centre": 0,
+}
+"""smallest value of an option"""
 OUT_OF_MEMORY = "Take smaller frames (--long-side), fewer (--frames), or fewer Gaussians (--gaussians-at-most)."
 """what to do if memory is full"""
 
@@ -133,8 +161,8 @@ class Plan:
 
 def _plan(context: RunContext, stage_list: list[Stage], folder: Path) -> Plan:
     """Plans stages: which of them `folder` already holds. Writes no file; raises InputError for invalid options."""
-    require_inputs(context.options)
-    require_own_folder(context.options, context.out)
+    _require_inputs(context.options)
+    _require_own_folder(context.options, context.out)
     require_contrib()
     keys: dict[str, str] = {}
     files: dict[str, str | None] = {}
@@ -147,6 +175,39 @@ def _plan(context: RunContext, stage_list: list[Stage], folder: Path) -> Plan:
     steps = [Step(stage.name, "cached" if stage.name in cached else "run", stage.how) for stage in stage_list]
     steps += [Step(part, "skipped", why) for stage in stage_list for part, why in stage.skipped.items()]
     return Plan(keys, files, paths, stale, steps)
+
+
+def _require_inputs(options: Options) -> None:
+    """Raises InputError for a missing file, a number that is out of its range, or several sources of masks."""
+    for name, value in vars(options).items():
+        flag = f"--{name.replace('_', '-')}"
+        if isinstance(value, Path) and not value.exists():
+            remedy = "Check the path." if name == "capture" else f"Check the path, or leave out {flag}."
+            raise InputError(value, "no such file or folder", remedy=remedy)
+        if name in LEAST and isinstance(value, int | float) and not value >= LEAST[name]:
+            raise InputError(flag, str(value), f"at least {LEAST[name]}", "Change the option.")
+    sources = [f"--{name}" for name in ("masks", "proposals", "segmenter") if getattr(options, name) is not None]
+    if len(sources) > 1:
+        expected = "one: tracked masks, masks of single frames, or a model that finds them"
+        raise InputError(" ".join(sources), "more than one source of masks", expected, "Leave out the others.")
+    if not 0 < options.agreement <= 1:
+        remedy = "Leave it out, or use 0.3 to 0.6."
+        raise InputError("--agreement", str(options.agreement), "a share above 0 and at most 1", remedy)
+    if options.centre > 1:
+        raise InputError("--centre", str(options.centre), "0 to 1", "Use 1 for the pixel of the centre alone.")
+
+
+def _require_own_folder(options: Options, out: Path) -> None:
+    """Raises InputError if the output folder is an input folder, or a folder of the capture's files."""
+    capture = options.capture
+    inputs = {name: [value] for name, value in vars(options).items() if isinstance(value, Path)}
+    inputs["capture"] = [capture, *(capture / name for name in ("images", "sparse", "sparse/0", "keyframes"))]
+    for name, folders in inputs.items():
+        for folder in folders:
+            if folder.is_dir() and folder.resolve() == out.resolve():
+                problem = f"it is the input folder ({name}) and the output folder at once"
+                remedy = f"Give the output its own folder, for example {out / 'field'}, or one elsewhere."
+                raise InputError(out, problem, "", remedy)
 
 
 def _owns_output(stage: Stage, stage_list: list[Stage], paths: dict[str, Path]) -> bool:
@@ -355,10 +416,86 @@ def dry_run(options: Options, out: Path, *, scene_only: bool = False, listener: 
         plan = _plan(context, stage_list, out / "cache")
         running = [step.name for step in plan.steps if step.status == "run"]
         context.networks.require_ready(running)
-        check_inputs(context, running, plan.paths)
+        _check_inputs(context, running, plan.paths)
     listener.steps(f"{options.capture} -> {out}, a dry run", plan.steps)
     listener.say("Nothing was written.")
     return {"stages": plan.steps}
+
+
+def _check_inputs(context: RunContext, running: Collection[str], results: Mapping[str, Path]) -> None:
+    """Raises InputError for inputs that a run would refuse, as its stages check them before their long work.
+
+    Of the stages that would not run, inputs are not checked. `results` are the cache files of all stages; those of
+    stages that would run need not exist. It reads no more than headers and a few files.
+    """
+    options = context.options
+    _require_place(context.out)
+    if "poses" in running:
+        require_pycolmap(options.capture)
+        if is_video(options.capture) and min(video_size(options.capture)) < 1:
+            remedy = "Copy it again, or convert it (ffmpeg -i VIDEO walk.mp4)."
+            raise InputError(options.capture, "no frame that OpenCV can read", "a video", remedy)
+    if is_bare_scene(options.capture):
+        read_scene(options.capture)
+        return
+    extent = _extent(context, running, results)
+    train = np.flatnonzero(~holdout_mask(extent.frames, options.holdout))
+    require_training(len(train) if extent.frames > 1 else extent.frames, extent.frames)
+    if options.gaussians is not None and "gaussians" in running:
+        read_scene(options.gaussians)
+    if extent.names:
+        seen = train[evenly_spaced(len(train), options.vision_frames)]
+        _check_masks(options, running, extent, [extent.names[t] for t in seen])
+
+
+def _require_place(folder: Path) -> None:
+    """Raises InputError if an output folder cannot be created: a parent of it is a file, or cannot be written."""
+    parent = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    if not parent.is_dir():
+        raise InputError(folder, f"{parent} is a file", "a folder that can be written", "Choose another output folder.")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        remedy = "Choose another output folder, or mend its permissions."
+        raise InputError(folder, f"{parent} cannot be written", "a folder that can be written", remedy)
+
+
+def _extent(context: RunContext, running: Collection[str], results: Mapping[str, Path]) -> CaptureExtent:
+    """Returns number, size and names of the frames that a run would load. A video's frames have no names yet."""
+    options = context.options
+    size_options = {name: getattr(options, name) for name in ("downscale", "long_side", "frames")}
+    if "load" not in running:
+        with contextlib.suppress(cache.CorruptCacheError):  # a run would compute it again
+            capture = cache.load(results["load"]).value
+            size = capture.cameras.width, capture.cameras.height
+            return CaptureExtent(len(capture.names), size, capture.names, capture.files)
+    if "poses" not in results:
+        return capture_extent(options.capture, **size_options)
+    if "poses" not in running:
+        return capture_extent(context.out / "poses", **size_options)
+    if is_video(options.capture):
+        size = downscaled_size(video_size(options.capture), options.downscale, options.long_side)
+        return CaptureExtent(options.frames or DEFAULT_VIDEO_FRAMES, size)
+    photos = list_photographs(options.capture)
+    paths = check_photographs(photos, options.capture)
+    names = frame_names(paths, options.capture)
+    sizes = [image_size(photo) for photo in photos]
+    chosen = evenly_spaced(len(photos), options.frames)
+    size = downscaled_size(max(set(sizes), key=sizes.count), options.downscale, options.long_side)
+    files = tuple(ImageFile(paths[i], *sizes[i]) for i in chosen)
+    return CaptureExtent(len(chosen), size, tuple(names[i] for i in chosen), files)
+
+
+def _check_masks(options: Options, running: Collection[str], extent: CaptureExtent, train_names: list[str]) -> None:
+    """Checks that files of masks, proposals and features belong to the frames."""
+    width, height = extent.size
+    files = dict(zip(extent.names, extent.files))
+    layout = {"level": options.level, "order": extent.names, "files": files}
+    if options.masks is not None and "masklets" in running:
+        check_labels(options.masks, train_names, (height, width), **layout)
+    if options.proposals is not None and "masklets" in running:
+        read, _ = load_proposals(options.proposals, train_names, (height, width), **layout)
+        read(0)
+    if options.features is not None and "regions" in running:
+        load_features(options.features, train_names[:1], (height, width), **layout)
 
 
 def fit(options: Options, out: Path, *, listener: Listener | None = None) -> tuple[Gaussians, Capture, Quality]:

@@ -12,7 +12,7 @@ import hashlib
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, UInt8
 
 from jsecon.files import READ_ERRORS, atomic_write, read_arrays, write_arrays
 from jsecon.vision.protocols import NamedSegmenter
@@ -61,29 +61,6 @@ def frame_digest(model: str, frame: UInt8[np.ndarray, "h w 3"]) -> str:
 def mask_key(mask: Bool[np.ndarray, "h w"]) -> bytes:
     """Returns 16 bytes that identify a mask (H, W)."""
     return hashlib.blake2b(np.packbits(mask).tobytes(), digest_size=16).digest()
-
-
-def lookup_vectors(
-    known: dict[bytes, np.ndarray], keys: list[bytes], dim: int
-) -> tuple[Float32[np.ndarray, "m e"], list[int]]:
-    """Collects cached vectors.
-
-    Args:
-      known: Vectors by mask key.
-      keys: Keys of M masks.
-      dim: E.
-
-    Returns:
-      (M, E) vectors, zero if missing, and the indices of the missing ones.
-    """
-    rows = np.zeros((len(keys), dim), np.float32)
-    missing = []
-    for index, key in enumerate(keys):
-        if key in known and known[key].shape == (dim,):
-            rows[index] = known[key]
-        else:
-            missing.append(index)
-    return rows, missing
 
 
 class StoredSegmenter:
