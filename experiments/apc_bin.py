@@ -22,7 +22,7 @@ from experiments.datasets.depth_points import confirmed_depths
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import accuracy_at, iou, mean_iou
 from jsecon.fit.depth import points_from_depth
-from jsecon.fit.quality import evaluate_psnr
+from jsecon.fit.quality import measure_quality
 from jsecon.fit.start import gaussians_from_points
 from jsecon.language.distill import distill_votes
 from jsecon.language.membership import with_shown
@@ -198,7 +198,7 @@ def main(options: Options = Options()) -> dict:
     metrics = {
         "gaussians": gaussians.count,
         "held_out": [capture.names[t] for t in np.flatnonzero(capture.held_out)],
-        "psnr_held_out_db": float(evaluate_psnr(gaussians, capture).mean()),
+        "psnr_held_out_db": float(measure_quality(gaussians, capture).psnr.mean()),
         "miou": {way: mean_iou(r["iou"] for r in rows if r["by"] == way) for way in WAYS},
         "macc_025": {way: accuracy_at([r["iou"] for r in rows if r["by"] == way]) for way in WAYS},
         "objects": {

@@ -21,7 +21,7 @@ from jsecon.fit.corrections import (
     se3_exp,
 )
 from jsecon.fit.optimise import fit_gaussians, init_fit_state
-from jsecon.fit.quality import evaluate_psnr
+from jsecon.fit.quality import measure_quality
 from jsecon.fit.refine import refine_capture
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.start import starting_gaussians
@@ -223,7 +223,7 @@ def test_a_settled_capture_is_nearer_to_the_truth_and_its_held_out_frames_have_n
     assert "poses refined" in " ".join(better.notes)
     assert "held-out" in better.notes[-1]
     assert same(better.cameras.fx, told.cameras.fx)
-    assert evaluate_psnr(truth, better)[0] > evaluate_psnr(truth, told)[0] + 2.5
+    assert measure_quality(truth, better).psnr[0] > measure_quality(truth, told).psnr[0] + 2.5
     frames = told.frames.copy()
     frames[2] = 255 - frames[2]
     other = refine_capture(dataclasses.replace(told, frames=frames), start, key=KEY, visits=15, probes=2)
@@ -245,7 +245,7 @@ def test_a_rough_capture_is_corrected_and_its_held_out_frames_have_no_part_in_th
     given = {"key": KEY, "visits": 15, "probes": 2, "decide": True}
     better = refine_capture(told, truth, **given)
     assert "are corrected" in " ".join(better.notes)
-    assert evaluate_psnr(truth, better)[0] > evaluate_psnr(truth, told)[0] + 2.5
+    assert measure_quality(truth, better).psnr[0] > measure_quality(truth, told).psnr[0] + 2.5
     frames = told.frames.copy()
     frames[2] = 255 - frames[2]
     other = refine_capture(dataclasses.replace(told, frames=frames), truth, **given)

@@ -12,7 +12,7 @@ from jsecon.errors import InputError
 from jsecon.fit import step as one_step
 from jsecon.fit.growth import in_use
 from jsecon.fit.optimise import fit_gaussians, init_fit_state, view_order
-from jsecon.fit.quality import evaluate_psnr
+from jsecon.fit.quality import measure_quality
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.step import cameras_extent
 from jsecon.splat.render import render, render_rgb
@@ -89,12 +89,12 @@ def same(a, b):
 
 def test_fit_brings_the_held_out_view_closer(capture, start, truth, fitted):
     gaussians, losses, _ = fitted
-    before, after = evaluate_psnr(start, capture), evaluate_psnr(gaussians, capture)
+    before, after = measure_quality(start, capture).psnr, measure_quality(gaussians, capture).psnr
     assert before.shape == after.shape == (1,)
     assert after[0] > before[0] + 4
     assert np.isfinite(losses).all()
     assert losses[-8:].mean() < 0.5 * losses[:8].mean()
-    assert evaluate_psnr(truth, capture)[0] > 50  # the photographs are 8-bit copies of it
+    assert measure_quality(truth, capture).psnr[0] > 50  # the photographs are 8-bit copies of it
 
 
 def test_held_out_frames_are_never_fitted_to(capture, start, fitted):
@@ -146,7 +146,7 @@ def test_a_growing_fit_gains_gaussians_where_the_picture_is_wrong_and_resumes_to
     counts = [int(in_use(state.gaussians).sum()) for state in states]
     assert counts == sorted(counts)
     assert 50 <= gaussians.count <= MOST
-    assert evaluate_psnr(gaussians, capture) > evaluate_psnr(few, capture) + 2
+    assert measure_quality(gaussians, capture).psnr > measure_quality(few, capture).psnr + 2
     again, _ = fit_gaussians(capture, state=jax.tree.map(np.asarray, states[3]), **given)
     assert same(again, gaussians)
 

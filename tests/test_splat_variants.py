@@ -118,7 +118,7 @@ def test_a_spz_whose_second_axis_is_depth(tmp_path, number, name):
     given = {key: value.copy() for key, value in SCENE.items()}
     if np.linalg.det(matrix) < 0:  # x of the stored numbers changes its sign
         matrix[:, 0] *= -1
-    stored = jsecon.data.gaussians.compressed.transform_axes(gaussians(given), np.linalg.inv(matrix))
+    stored = jsecon.splat.transform.transform_axes(gaussians(given), np.linalg.inv(matrix))
     arrays = {field.name: np.asarray(getattr(stored, field.name), np.float64) for field in dataclasses.fields(stored)}
     sign = -1 if matrix[TOWARDS[name[0]][0], 0] != TOWARDS[name[0]][1] else 1
     data = splat_files.spz(

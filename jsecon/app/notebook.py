@@ -14,6 +14,7 @@ from jaxtyping import UInt8
 from jsecon.app import pictures, report
 from jsecon.app.ask import ask_text
 from jsecon.app.outputs import answer_masks
+from jsecon.data.frames import evenly_spaced
 from jsecon.errors import InputError
 from jsecon.fit.resize import resize_frame, scale_cameras
 from jsecon.pipeline import networks
@@ -95,8 +96,8 @@ def _capture_picture(capture: Capture) -> tuple[np.ndarray, str]:
     """Puts some of the frames side by side."""
     cameras = capture.cameras
     small = scale_cameras(cameras, _scale(cameras.width, cameras.height))
-    frames = np.unique(np.linspace(0, len(capture.names) - 1, CAPTURE_FRAMES).round().astype(int))
-    image = np.concatenate([resize_frame(np.asarray(capture.frames[t]), small) for t in frames], axis=1)
+    chosen = evenly_spaced(len(capture.names), CAPTURE_FRAMES)
+    image = np.concatenate([resize_frame(np.asarray(capture.frames[t]), small) for t in chosen], axis=1)
     words = f"Capture of {len(capture.names)} frames of {cameras.width}x{cameras.height}, "
     words += f"{int(np.asarray(capture.held_out).sum())} held out, {len(capture.points):,} sparse points"
     return image, words + ("" if capture.depths is None else ", with depth")

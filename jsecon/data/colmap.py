@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from scipy.spatial.transform import Rotation
 
 from jsecon.data.coordinates import transform_poses
 from jsecon.data.frames import PosedImage, PosedImages
@@ -270,13 +271,8 @@ def _pose(file: Path, name: str, numbers: tuple[float, ...]) -> np.ndarray:
     if not length > 1e-6:
         problem = f"the pose of {name} has NaN, infinite or absurd numbers, or no rotation: {numbers}"
         raise InputError(file, problem, remedy="Estimate the poses again, or delete this image from the model.")
-    w, x, y, z = quaternion / length
     pose = np.eye(4)
-    pose[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    pose[:3, :3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
     pose[:3, 3] = numbers[4:7]
     return pose
 

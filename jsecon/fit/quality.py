@@ -73,13 +73,6 @@ def measure_quality(
     return Quality(chosen, by_frame[:, 0], by_frame[:, 1])
 
 
-def evaluate_psnr(
-    gaussians: Gaussians, capture: Capture, *, progress: Callable[[int, int], None] | None = None
-) -> Float[np.ndarray, " f"]:
-    """Returns the PSNR (dB) of each held-out frame; arguments as for `measure_quality`."""
-    return np.asarray(measure_quality(gaussians, capture, progress=progress).psnr)
-
-
 def is_weak(psnr: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
     """Finds frames that the scene does not explain: wrong poses, moving things, a finger before the lens.
 

@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Literal, Protocol, TypeAlias, runtime_checkable
+from typing import Any, Literal, TypeAlias
 
 from tqdm import tqdm
 
@@ -81,32 +81,15 @@ class Listener:
         yield lambda done, total: None
 
 
-@runtime_checkable
-class Stream(Protocol):
-    """A text stream: sys.stdout, sys.stderr, or a replacement."""
-
-    def write(self, text: str, /) -> object:
-        """Writes a text."""
-        ...
-
-    def flush(self) -> None:
-        """Writes out what is buffered."""
-        ...
-
-    def isatty(self) -> bool:
-        """Returns whether a person reads the stream."""
-        ...
-
-
 class Console(Listener):
     """The listener of the command line.
 
     Args:
-      out: Stream for results; by default standard output.
-      err: Stream for progress; by default standard error.
+      out: Text stream for results; by default standard output.
+      err: Text stream for progress; by default standard error.
     """
 
-    def __init__(self, out: Stream | None = None, err: Stream | None = None):
+    def __init__(self, out: Any = None, err: Any = None):
         self._out = out or sys.stdout
         self._err = err or sys.stderr
 
@@ -166,7 +149,7 @@ class _Bar(tqdm):
 
     monitor_interval = 0  # without the thread of tqdm that redraws bars
 
-    def __init__(self, name: str, file: Stream):
+    def __init__(self, name: str, file: Any):
         self._drawn = False
         super().__init__(desc=f"  {name}", file=file, leave=False, dynamic_ncols=True, delay=QUIET_SECONDS)
         self._time = time.monotonic  # a clock that cannot be set back
@@ -203,7 +186,7 @@ _Bar.set_lock(threading.RLock())  # one lock of C: a signal could leave the pair
 class _Lines(_Bar):
     """A line of text at each `draw`, for logs."""
 
-    def __init__(self, name: str, file: Stream):
+    def __init__(self, name: str, file: Any):
         self._began = time.monotonic()
         self._log = file
         super().__init__(name, io.StringIO())

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from jsecon.data.gaussians.ply import drawable_gaussians, in_float32, needs_float64, usable_blocks
+from jsecon.data.gaussians.ply import drawable_gaussians, needs_float64, usable_blocks
 from jsecon.errors import InputError, describe_error
 from jsecon.files import READ_ERRORS, atomic_write, parse_json
 from jsecon.splat.project import check_gaussians
@@ -162,7 +162,7 @@ def _attributes(block: Gaussians) -> dict[str, np.ndarray]:
     }
 
 
-def load_glb(path: str | Path) -> Gaussians:
+def read_glb(path: Path) -> Gaussians:
     """Reads the Gaussians of all primitives of a scene, in the world of the .ply that they were made from.
 
     They are transformed by their nodes, then turned back from glTF's axes. Numbers may be float32, or whole numbers as
@@ -172,19 +172,13 @@ def load_glb(path: str | Path) -> Gaussians:
       path: The file.
 
     Returns:
-      Its Gaussians, float32.
+      Its Gaussians as NumPy arrays, the means in float64.
 
     Raises:
       InputError: The file is damaged, holds numbers that cannot be drawn, or needs what is not supported: an extension
         or another file, a kernel but ellipses, a projection but the perspective, colours but sRGB, a node that shears,
         mirrors or scales its axes unequally.
     """
-    path = Path(path)
-    return in_float32(path, read_glb(path))
-
-
-def read_glb(path: Path) -> Gaussians:
-    """Reads Gaussians as `load_glb` does, as NumPy arrays, the means in float64. Raises InputError as it does."""
     parts, count = [], 0
     try:
         with path.open("rb") as file:
