@@ -4,24 +4,24 @@ A frame without a mask of the phrase counts too: what it sees is outside. So an 
 in one frame alone is not selected.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from jsecon.app.ask import Answer, drop_outliers
-from jsecon.data.frames import Progress, evenly_spaced
+from jsecon.app import verbs
+from jsecon.app.ask import Answer, collect, drop_outliers
+from jsecon.data.capture import load_capture
+from jsecon.data.frames import evenly_spaced
 from jsecon.errors import InputError
 from jsecon.language.membership import SHARE_THRESHOLD
 from jsecon.networks.sam3 import IMAGE_SIDE, PhraseMasks, Sam3
+from jsecon.pipeline.progress import Console
 from jsecon.pipeline.sources import locate_sources
 from jsecon.query.outline import lift
 from jsecon.query.select import query_region
 from jsecon.types import LanguageField
-
-Frames = Mapping[int, np.ndarray]
-"""index of a field's frame -> (H, W, 3) uint8 RGB, at any size of the frame's shape"""
 
 
 def load_frames(field: LanguageField, capture: Path, count: int) -> dict[int, np.ndarray]:
@@ -38,8 +38,6 @@ def load_frames(field: LanguageField, capture: Path, count: int) -> dict[int, np
     Raises:
       InputError: It is another capture, or cannot be read, or `count` is not positive.
     """
-    from jsecon.data.capture import load_capture
-
     if count < 1:
         raise InputError("--looks", str(count), "at least 1", "8 is the default.")
     indices = [int(t) for t in evenly_spaced(len(field.names), count)]
@@ -77,50 +75,38 @@ def find_capture(field: LanguageField, folder: Path) -> Path:
     return capture
 
 
-def ask_phrases(
-    field: LanguageField,
-    sam3: Sam3,
-    phrases: Sequence[str],
-    frames: Frames,
-    *,
-    threshold: float | None = None,
-    outliers: bool = True,
-    progress: Progress = None,
-) -> tuple[list[Answer], list[InputError]]:
-    """Selects all objects that phrases name. Each frame is encoded once for all phrases.
+def ask_phrases(field: LanguageField, verb: verbs.Query, console: Console) -> tuple[list[Answer], list[InputError]]:
+    """Selects all objects that the texts of a query name, and prints in how many frames SAM 3 sees them.
 
     Args:
       field: The field.
-      sam3: The model. It is closed afterwards.
-      phrases: The phrases.
-      frames: Frames to search.
-      threshold: Share of a Gaussian that must lie inside the masks; None is 0.5.
-      outliers: Whether to drop outliers.
-      progress: Called with the number of finished frames, and of all.
+      verb: The query; its `phrases` is the model's folder. Each frame is encoded once for all texts.
+      console: Receives progress.
 
     Returns:
-      The answers, and the errors of phrases that the model cannot read.
+      The answers, and the errors of texts that the model cannot read.
 
     Raises:
-      InputError: The model cannot be used.
+      InputError: The model or the capture cannot be used.
     """
-    tokens = {}
-    errors = []
-    for phrase in phrases:
-        try:
-            tokens[phrase] = sam3.read(phrase)
-        except InputError as error:
-            errors.append(error)
-    masks: dict[str, dict[int, PhraseMasks]] = {phrase: {} for phrase in tokens}
-    for n, (t, frame) in enumerate(frames.items() if tokens else ()):
-        encoded = sam3.encode(frame)
-        for phrase, words in tokens.items():
-            masks[phrase][t] = sam3.masks(encoded, words)
-        if progress is not None:
+    assert verb.phrases is not None
+    with console.progress("phrases") as progress:
+        sam3 = Sam3(verb.phrases)
+        frames = load_frames(field, verb.images or find_capture(field, verb.field.parent), verb.looks)
+        words, errors = collect([lambda text=text: (text, sam3.read(text)) for text in verb.texts])
+        masks: dict[str, dict[int, PhraseMasks]] = {text: {} for text, _ in words}
+        for n, (t, frame) in enumerate(frames.items() if words else ()):
+            encoded = sam3.encode(frame)
+            for text, tokens in words:
+                masks[text][t] = sam3.masks(encoded, tokens)
             progress(n + 1, len(frames))
-    sam3.close()
-    threshold = SHARE_THRESHOLD if threshold is None else threshold
-    answers = [lift_phrase(field, phrase, m, threshold=threshold, outliers=outliers) for phrase, m in masks.items()]
+        sam3.close()
+        threshold = SHARE_THRESHOLD if verb.threshold is None else verb.threshold
+        options = {"threshold": threshold, "outliers": not verb.keep_outliers}
+        answers = [lift_phrase(field, text, of_text, **options) for text, of_text in masks.items()]
+    for answer in answers:
+        seen = sum(map(bool, (answer.frames or {}).values()))
+        console.say(f"{answer.query!r}: seen in {seen} of {len(frames)} frames")
     return answers, errors
 
 

@@ -37,7 +37,11 @@ def query_verb(verb: verbs.Query, console: Console) -> verbs.VerbResult:
         field = load_field(verb.field, mapped=large)
         texts = verb.texts if verb.phrases is None else []
         embedder = open_embedder(field, verb, console) if texts else None
-    answers, errors = ([], []) if verb.phrases is None else _ask_phrases(field, verb, console)
+    answers, errors = [], []
+    if verb.phrases is not None:
+        from jsecon.app.phrases import ask_phrases  # SAM 3 runs on ONNX Runtime, which other queries may not need
+
+        answers, errors = ask_phrases(field, verb, console)
     expressions = [text for text in texts if is_expression(text)]
     texts = [text for text in texts if text not in expressions]
     if expressions and large:
@@ -167,24 +171,6 @@ def _require_blocks(verb: verbs.Query) -> None:
                 f"Ask by a text or --at, by votes or code, or set {MEMORY}={1.1 * size:.2g} (GiB) to read it whole."
             )
             raise InputError(verb.field, problem, remedy=remedy)
-
-
-def _ask_phrases(field: LanguageField, verb: verbs.Query, console: Console) -> tuple[list[Answer], list[InputError]]:
-    """Returns the answers of SAM 3 to the texts, and the errors of texts that it cannot read."""
-    with console.progress("phrases") as progress:
-        from jsecon.app import phrases
-        from jsecon.networks.sam3 import Sam3
-
-        assert verb.phrases is not None
-        sam3 = Sam3(verb.phrases)
-        capture = verb.images or phrases.find_capture(field, verb.field.parent)
-        frames = phrases.load_frames(field, capture, verb.looks)
-        options = {"threshold": verb.threshold, "outliers": not verb.keep_outliers, "progress": progress}
-        answers, errors = phrases.ask_phrases(field, sam3, verb.texts, frames, **options)
-    for answer in answers:
-        seen = sum(map(bool, (answer.frames or {}).values()))
-        console.say(f"{answer.query!r}: seen in {seen} of {len(frames)} frames")
-    return answers, errors
 
 
 def _ask_masks(field: LanguageField, pairs: Sequence[str], **options: Any) -> Answer:

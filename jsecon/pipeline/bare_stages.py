@@ -1,16 +1,19 @@
 """The stages of a scene that comes without photographs: its views are planned and rendered, its Gaussians are read."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 
-from jsecon.data.coordinates import transform_poses
-from jsecon.data.poses import load_poses
+from jsecon.data.colmap import find_model, read_cameras, read_images
+from jsecon.data.coordinates import make_rigid, transform_poses
+from jsecon.data.frames import downscaled_size, frame_names
+from jsecon.data.nerfstudio import read_poses
 from jsecon.errors import InputError
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import RunContext, Stage, StageInput, StageResult
 from jsecon.pipeline.scene_files import check_overlap, read_scene
-from jsecon.types import Quality
+from jsecon.types import Camera, Quality
 from jsecon.views.capture import capture_from_cameras, into_world, render_capture, world_of_scene
 
 OF_PHOTOGRAPHS = ("downscale", "frames", "holdout", "refine", "drop_frames")
@@ -82,12 +85,41 @@ def _render_poses(stage: StageInput) -> StageResult:
     assert options.cameras is not None
     source, _ = read_scene(options.capture)
     to_source = world_of_scene(source)
-    cameras, names = load_poses(options.cameras, long_side=options.long_side)
+    cameras, names = _load_poses(options.cameras, options.long_side)
     poses = transform_poses(np.asarray(cameras.world_to_camera), np.linalg.inv(to_source)).astype(np.float32)
     cameras = dataclasses.replace(cameras, world_to_camera=poses)
     scene = into_world(source, to_source)
     check_overlap(scene, cameras, str(options.cameras))
     return StageResult(capture_from_cameras(scene, cameras, names, to_source))
+
+
+def _load_poses(path: Path, long_side: int) -> tuple[Camera, tuple[str, ...]]:
+    """Returns T cameras to render from, poses in float64 in the world of their file, and their names.
+
+    `path` is the folder of a COLMAP model (.bin or .txt) or of a capture that has one, or a transforms.json. All
+    cameras get the size of the first lens, shrunk to `long_side`, each with its field of view and without distortion.
+    """
+    model = find_model(path) if path.is_dir() else None
+    file = path / "transforms.json" if path.is_dir() else path
+    if model is not None:
+        lenses = read_cameras(model)
+        posed = [(name, lenses[number], pose) for name, number, pose in read_images(model)]
+    elif file.is_file() and file.suffix.lower() == ".json":
+        posed = read_poses(file)
+    else:
+        expected = "a folder with cameras.bin and images.bin (or .txt), or a transforms.json"
+        raise InputError(path, "it has no poses", expected, "Check the path.")
+    if not posed:
+        raise InputError(path, "it has no frame", "at least one pose", "Estimate the poses again.")
+    width, height = downscaled_size((posed[0][1].width, posed[0][1].height), None, long_side)
+    sized = [lens.resized(width, height) for _, lens, _ in posed]
+
+    def column(name):
+        return np.array([getattr(lens, name) for lens in sized], np.float32)
+
+    poses = np.stack([make_rigid(pose, path, name) for name, _, pose in posed])
+    cameras = Camera(poses, column("fx"), column("fy"), column("cx"), column("cy"), width, height)
+    return cameras, frame_names([name for name, _, _ in posed], path)
 
 
 def scene_itself(context: RunContext) -> Stage:
