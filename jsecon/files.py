@@ -195,6 +195,29 @@ def read_json(path: Path, expected: str, remedy: str) -> Any:
         raise InputError(path, f"it is not JSON ({describe_error(error)})", expected, remedy) from error
 
 
+@contextlib.contextmanager
+def reading(
+    path: object, expected: str = "", remedy: str = "", *, problem: str = "it cannot be read"
+) -> Iterator[None]:
+    """Turns what the reading of a damaged file raises (READ_ERRORS) into an InputError.
+
+    Args:
+      path: The file, or a place in it.
+      expected: What should be there.
+      remedy: What to do about it, a sentence.
+      problem: What is wrong; the error follows in brackets.
+
+    Raises:
+      InputError: The body raises an error.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except READ_ERRORS as error:
+        raise InputError(path, f"{problem} ({describe_error(error)})", expected, remedy) from error
+
+
 def map_npy(path: Path) -> np.ndarray:
     """Memory-maps the array of a .npy file.
 

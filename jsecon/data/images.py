@@ -24,7 +24,7 @@ from PIL.PngImagePlugin import PngImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
 from jsecon.errors import InputError, describe_error
-from jsecon.files import READ_ERRORS, atomic_write, map_npy
+from jsecon.files import atomic_write, map_npy, reading
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif")
 IMAGE_SUFFIXES = (*_SUFFIXES, *(suffix.upper() for suffix in _SUFFIXES))
@@ -374,10 +374,8 @@ def read_label_image(path: str | Path) -> tuple[Int[np.ndarray, "h w"], bool]:
 def _read_id_array(path: Path) -> Int[np.ndarray, "h w"]:
     """Reads the ids of a .npy."""
     expected, remedy = "whole numbers of shape (H, W)", "Write the mask again."
-    try:
+    with reading(path, expected, remedy, problem="the array cannot be read"):
         image = map_npy(path)
-    except READ_ERRORS as error:
-        raise InputError(path, f"the array cannot be read: {describe_error(error)}", expected, remedy) from error
     image = np.asarray(image.squeeze() if image.ndim == 3 and 1 in (image.shape[0], image.shape[2]) else image)
     if image.ndim == 3:
         remedy = "Give such stacks with --proposals, or write one image of ids for each frame."
@@ -409,11 +407,8 @@ def read_depth(path: str | Path, unit: float) -> Float[np.ndarray, "h w"]:
     expected = "one channel of 16 bits (PNG), or a .npy of shape (H, W)"
     remedy = "Write the depth in millimetres as a 16 bit PNG."
     if path.suffix.lower() == ".npy":
-        try:
+        with reading(path, expected, remedy, problem="the depth map cannot be read"):
             depth = map_npy(path)
-        except READ_ERRORS as error:
-            problem = f"the depth map cannot be read: {describe_error(error)}"
-            raise InputError(path, problem, expected, remedy) from error
         depth = depth[..., 0] if depth.ndim == 3 and depth.shape[2] == 1 else depth
         valid = depth.ndim == 2 and depth.size > 0
     else:

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from jsecon.data.masks import MaskFitter, compact_ids, find_masks, read_level
-from jsecon.errors import InputError, describe_error
-from jsecon.files import READ_ERRORS, map_npy
+from jsecon.errors import InputError
+from jsecon.files import map_npy, reading
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.types import ImageFile
 
@@ -104,14 +104,8 @@ def embedding_size(folder: Path) -> int:
 
 def _read_table(file: Path) -> np.ndarray:
     """Reads an array of embeddings."""
-    try:
+    with reading(file, "a (M, E) array, one row per mask", "Run LangSplat's preprocess.py on every frame."):
         table = map_npy(file)
         if table.ndim == 0:
             raise ValueError("a single number")
-    except READ_ERRORS as error:
-        problem, remedy = (
-            f"it cannot be read ({describe_error(error)})",
-            "Run LangSplat's preprocess.py on every frame.",
-        )
-        raise InputError(file, problem, "a (M, E) array, one row per mask", remedy) from error
     return table

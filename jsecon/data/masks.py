@@ -20,8 +20,8 @@ from jaxtyping import Int, Int16
 
 from jsecon.data.frames import Progress
 from jsecon.data.images import IMAGE_SUFFIXES, TRANSPOSED, apply_orientation, read_label_image
-from jsecon.errors import InputError, describe_error
-from jsecon.files import READ_ERRORS, is_output_folder, map_npy
+from jsecon.errors import InputError
+from jsecon.files import is_output_folder, map_npy, reading
 from jsecon.types import ImageFile
 
 LEVELS = ("default", "s", "m", "l")
@@ -554,11 +554,9 @@ def read_level(path: Path, level: str | int) -> Int[np.ndarray, "h w"]:
     """
     if level not in (*LEVELS, 0, 1, 2, 3):
         raise InputError("level", f"there is no level {level!r}", f"one of {', '.join(LEVELS)}", "l is the coarsest.")
-    try:
+    expected = f"a .npy of shape ({len(LEVELS)}, H, W)"
+    with reading(path, expected, "Write the masks again.", problem="the array is damaged or missing"):
         image = map_npy(path)
-    except READ_ERRORS as error:
-        problem = f"the array is damaged or missing ({describe_error(error)})"
-        raise InputError(path, problem, f"a .npy of shape ({len(LEVELS)}, H, W)", "Write the masks again.") from error
     if image.ndim != 3 or len(image) != len(LEVELS) or not image.size:
         expected = f"({len(LEVELS)}, H, W): levels {', '.join(LEVELS)}"
         raise InputError(

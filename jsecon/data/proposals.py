@@ -21,8 +21,8 @@ from jaxtyping import Bool
 
 from jsecon.data.images import MAX_PIXELS, read_label_image
 from jsecon.data.masks import FrameNames, MaskFiles, MaskFitter, find_masks, is_black_and_white, read_level
-from jsecon.errors import InputError, describe_error
-from jsecon.files import READ_ERRORS, map_npy, read_json
+from jsecon.errors import InputError
+from jsecon.files import READ_ERRORS, map_npy, read_json, reading
 from jsecon.types import ImageFile
 
 SUFFIXES = (".json", "_s.npy", ".png", ".npy")
@@ -54,14 +54,12 @@ def decode_rle(rle: Any, where: str | Path) -> Bool[np.ndarray, "h w"]:
     Raises:
       InputError: It is something else, or its runs do not fill the mask.
     """
-    try:
+    with reading(where, _RLE, _REMEDY, problem="the mask cannot be read"):
         height, width = rle["size"]
         if not isinstance(height, int) or not isinstance(width, int):
             raise ValueError("its size is not a pair of whole numbers")
         counts = rle["counts"]
         runs = np.asarray(_parse_runs(counts) if isinstance(counts, str) else counts, np.int64)
-    except (TypeError, KeyError, ValueError, IndexError, OverflowError) as error:
-        raise InputError(where, f"the mask cannot be read: {describe_error(error)}", _RLE, _REMEDY) from error
     valid = runs.ndim == 1 and ((runs >= 0) & (runs <= MAX_PIXELS)).all() and min(height, width) > 0
     if not valid or height * width > MAX_PIXELS or runs.sum() != height * width:
         raise InputError(where, f"the mask's runs fill {int(runs.sum())} of {height}x{width} pixels", _RLE, _REMEDY)
@@ -248,21 +246,17 @@ def _records(content: Any) -> list[Any]:
 def _read_json(file: Path, frame: tuple[int, int]) -> list[np.ndarray]:
     """The masks of a file of SAM's generator, or of one image as in SA-1B."""
     content = read_json(file, _JSON, _REMEDY)
-    try:
+    with reading(file, _JSON, _REMEDY, problem="it holds no masks"):
         records = _records(content)
         images = [content.get("image"), *content.get("images", [])[:1]] if isinstance(content, dict) else []
         size = next((size for size in map(_image_size, images) if size is not None), frame)
-    except (ValueError, TypeError) as error:
-        raise InputError(file, f"it holds no masks: {describe_error(error)}", _JSON, _REMEDY) from error
     return _decode_records(file, records, size)
 
 
 def _decode_records(file: Path, records: list[Any], frame: tuple[int, int]) -> list[np.ndarray]:
     """The masks of records, the best first."""
-    try:
+    with reading(file, remedy=_REMEDY, problem="a mask's score is not a number"):
         scores = [float(r.get("predicted_iou", 1.0)) * float(r.get("stability_score", 1.0)) for r in records]
-    except (ValueError, TypeError) as error:
-        raise InputError(file, "a mask's score is not a number", remedy=_REMEDY) from error
     masks = []
     for number in np.argsort(-np.asarray(scores), kind="stable"):
         segmentation, where = records[number]["segmentation"], f"{file}, mask {number}"
@@ -302,14 +296,12 @@ def _read_dataset(
     files: Mapping[str, ImageFile],
 ) -> dict[str, Callable[[], list[tuple[Path, np.ndarray]]]]:
     """Readers of the masks of a COCO file, by frame."""
-    try:
+    with reading(file, _JSON, _REMEDY, problem="it is not a COCO file"):
         images = {image["id"]: image for image in content["images"]}
         by_image: dict[Any, list[Any]] = {number: [] for number in images}
         for record in _records(content):
             by_image[record["image_id"]].append(record)
         paths = {number: PurePosixPath(str(image["file_name"])) for number, image in images.items()}
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(file, f"it is not a COCO file: {describe_error(error)}", _JSON, _REMEDY) from error
     matches = {n: frame_names.match(Path(path.name), path.parts[:-1], "") for n, path in paths.items()}
     images_of = {match.frame: number for number, match in matches.items() if match is not None}
     if not images_of:

@@ -4,10 +4,10 @@ Formats: ScanNet SensReader/python; TUM's RGB-D benchmark (file_formats); ARKitS
 polycam_utils.py and record3d_utils.py. Each keeps its world; phones look along -z with y up.
 """
 
-import contextlib
 import dataclasses
+import functools
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,8 @@ from jsecon.data.coordinates import invert_pose
 from jsecon.data.frames import MIN_FOCAL, PosedImage, PosedImages
 from jsecon.data.images import MAX_PIXELS, image_header, image_size
 from jsecon.data.lens import Lens
-from jsecon.errors import InputError, describe_error
-from jsecon.files import READ_ERRORS, parse_json, read_text
+from jsecon.errors import InputError
+from jsecon.files import parse_json, read_text, reading
 from jsecon.numerics import is_finite_and_bounded
 
 _TUM_INTRINSICS = {
@@ -35,6 +35,8 @@ _MAX_GAP = 0.02
 """seconds between an image and its pose or depth"""
 _PHONE_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 _EXPORT = "Export the capture again."
+_parsing = functools.partial(reading, remedy=_EXPORT)
+"""makes errors in parsing a file InputErrors"""
 
 
 def find_rgbd(path: Path) -> Callable[[Path], PosedImages] | None:
@@ -61,17 +63,6 @@ def _with_input_errors(reader: Callable[[Path], PosedImages]) -> Callable[[Path]
             return reader(path)
 
     return read
-
-
-@contextlib.contextmanager
-def _parsing(file: Path) -> Iterator[None]:
-    """Makes errors in parsing a file InputErrors."""
-    try:
-        yield
-    except InputError:
-        raise
-    except READ_ERRORS as error:
-        raise InputError(file, f"it cannot be read ({describe_error(error)})", remedy=_EXPORT) from error
 
 
 def _lines(file: Path) -> list[str]:

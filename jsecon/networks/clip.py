@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from jsecon.errors import InputError, describe_error, require
-from jsecon.files import read_json
+from jsecon.errors import InputError, require
+from jsecon.files import read_json, reading
 from jsecon.networks.hub import Precision, graph_variants
 from jsecon.networks.session import Graph, Tensor, batches, content_digest, describe, graph_files
 from jsecon.networks.tokenizer import CLIP_LENGTH, TextRules, TextTokenizer, read_text_rules
@@ -182,7 +182,7 @@ def read_preprocessing(
     expected = "mean and std of three channels, and a size in px"
     remedy = "Fetch the file again."
     content = read_json(path, expected, remedy)
-    try:
+    with reading(path, expected, remedy):
         content = content.get("preprocess_cfg", content)
         mean = content.get("mean", content.get("image_mean", None if complete else CLIP_MEAN))
         std = content.get("std", content.get("image_std", None if complete else CLIP_STD))
@@ -193,8 +193,6 @@ def read_preprocessing(
             raise ValueError(f"pixels times {rescale:g}, not 1/255")
         size = _square_side(content.get("crop_size", content.get("size")))
         mean, std = tuple(map(float, mean)), tuple(map(float, std))
-    except (ValueError, TypeError, AttributeError, KeyError, OverflowError) as error:
-        raise InputError(path, f"it cannot be read ({describe_error(error)})", expected, remedy) from error
     is_valid = len(mean) == len(std) == 3 and is_finite_and_bounded(mean, std) and min(std) >= 1e-6
     if not is_valid or not 1 <= (size or 1) <= MAX_SIDE:
         raise InputError(path, f"mean {mean}, std {std}, size {size}", expected, remedy)
@@ -220,10 +218,8 @@ def _read_logits(path: Path) -> Logits:
     """
     expected = f'{{"scale": s, "bias": b}}, 0 < s <= {MAX_SCALE:g}, |b| <= {MAX_BIAS:g}'
     content = read_json(path, expected, LOGITS_REMEDY)
-    try:
+    with reading(path, expected, LOGITS_REMEDY):
         logits = Logits(float(content["scale"]), float(content["bias"]))
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(path, f"it cannot be read ({describe_error(error)})", expected, LOGITS_REMEDY) from error
     if not (is_finite_and_bounded(*logits) and 0 < logits.scale <= MAX_SCALE and abs(logits.bias) <= MAX_BIAS):
         raise InputError(path, f"scale {logits.scale:g}, bias {logits.bias:g}", expected, LOGITS_REMEDY)
     return logits

@@ -27,8 +27,8 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
-from jsecon.errors import InputError, describe_error, require
-from jsecon.files import read_json
+from jsecon.errors import InputError, require
+from jsecon.files import read_json, reading
 from jsecon.networks.session import Graph, content_digest, graph_files
 from jsecon.numerics import is_finite_and_bounded
 
@@ -171,11 +171,9 @@ def open_sam2(folder: Path, *, threads: int | None = None) -> Sam2Graphs:
 def _read_constants(path: Path) -> Constants:
     expected = f"image_mean, image_std and memory_temporal_positional_encoding of {SLOTS} rows"
     content = read_json(path, expected, PUBLISHED)
-    try:
+    with reading(path, expected, PUBLISHED):
         names = ("image_mean", "image_std", "memory_temporal_positional_encoding")
         constants = Constants(*(np.asarray(content[name], np.float32) for name in names))
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(path, f"it cannot be read ({describe_error(error)})", expected, PUBLISHED) from error
     shapes = [array.shape for array in constants]
     fits = shapes[:2] == [(3,), (3,)] and len(shapes[2]) == 2 and shapes[2][0] == SLOTS and shapes[2][1] > 0
     if not fits or not is_finite_and_bounded(*constants) or constants.std.min() <= 0:
