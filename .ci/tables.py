@@ -1,6 +1,6 @@
 """Runs experiments in small, one after the other in this process: python .ci/tables.py FOLDER NAME ...
 
-They share imports and programs, which are compiled fast as those of the tests, unless XLA_FLAGS says how.
+They share imports and programs, which are compiled fast as those of the tests.
 Each leaves its results in FOLDER/NAME and its output in FOLDER/NAME.log.
 """
 

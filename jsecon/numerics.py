@@ -1,5 +1,6 @@
 """Safe maths and the named constants, each with its reason. Every guard is finite in value and gradient everywhere."""
 
+import functools
 import math
 from typing import Any
 
@@ -50,6 +51,7 @@ def safe_scale(size: Array) -> Array:
     return jax.lax.stop_gradient(factor.astype(size.dtype))
 
 
+@functools.partial(jax.jit, static_argnames=("axis", "keepdims"), inline=True)
 def safe_norm(x: Array, axis: int = -1, keepdims: bool = False) -> Array:
     """Euclidean length over `axis`, right over the whole float range (1e-30 and 1e30 alike); gradient zero at zero."""
     x = jnp.asarray(x)
@@ -62,6 +64,7 @@ def safe_norm(x: Array, axis: int = -1, keepdims: bool = False) -> Array:
     return length if keepdims else jnp.squeeze(length, axis)
 
 
+@functools.partial(jax.jit, static_argnames="axis", inline=True)
 def normalize(x: Array, axis: int = -1) -> Array:
     """X / |x| over `axis`; zero (with zero gradient) where x is zero, NaN where x is not finite."""
     x = jnp.asarray(x)
@@ -86,16 +89,19 @@ def sigmoid(x: Array) -> Array:
 sigmoid.defjvps(lambda tangent, value, x: tangent * value * jax.nn.sigmoid(-x))
 
 
+@functools.partial(jax.jit, inline=True)
 def cosine(x: Array, y: Array) -> Array:
     """Cosine over the last axis, broadcasting; 0 where either is zero. Multiply-and-sum: see jax issue 39103."""
     return jnp.sum(normalize(x) * normalize(y), axis=-1)
 
 
+@functools.partial(jax.jit, inline=True)
 def cosine_matrix(x: Array, y: Array) -> Array:
     """(N, d), (M, d) -> (N, M) cosines as one matrix product, the form that jax issue 39103 leaves right."""
     return jnp.matmul(normalize(x), normalize(y).T, precision=FULL_PRECISION)
 
 
+@functools.partial(jax.jit, inline=True)
 def all_finite(*arrays: Array) -> Array:
     """() bool: every number in every array is finite."""
     result = jnp.asarray(True)

@@ -90,6 +90,7 @@ def with_shown(votes: Votes, regions: Regions, *, alike_threshold: float = ALIKE
     return add_shown(votes, shows)
 
 
+@functools.partial(jax.jit, static_argnames="alike_threshold")
 def views_that_show(regions: Regions, *, alike_threshold: float = ALIKE_THRESHOLD) -> Bool[Array, "r t"]:
     """(R, T) which views show a region, or one that is alike."""
     apart, known = mean_residuals(jnp.asarray(regions.embeddings))

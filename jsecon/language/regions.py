@@ -1,8 +1,10 @@
 """One embedding per region: the mean of its views' embeddings, weighted by its pixels in each view (paper: phi_bar)."""
 
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
@@ -132,6 +134,7 @@ def _unit_rows(rows: np.ndarray) -> np.ndarray:
     return np.where(length > 0, rows / np.where(length > 0, length, 1.0), 0.0).astype(np.float32)
 
 
+@functools.partial(jax.jit, inline=True)
 def mean_residuals(embeddings: Float[Array, "r e"]) -> tuple[Float[Array, "r e"], Bool[Array, " r"]]:
     """What sets each of R regions apart from the others. Pure.
 

@@ -283,8 +283,9 @@ def check_overlap(gaussians: Gaussians, cameras: Camera, where: str) -> None:
     Raises:
       InputError: Fewer than MIN_OVERLAP of them are in the view of two cameras.
     """
-    visible = jax.lax.map(lambda camera: project(gaussians, camera).visible, jax.tree.map(jnp.asarray, cameras))
-    share = float(jnp.mean(visible.sum(0) >= 2)) if gaussians.count else 0.0
+    each = jax.lax.map(lambda camera: project(gaussians, camera).visible, jax.tree.map(jnp.asarray, cameras))
+    visible = np.asarray(each)
+    share = float(np.mean(visible.sum(0) >= 2)) if gaussians.count else 0.0
     if share < MIN_OVERLAP:
         problem = f"{share:.1%} of {gaussians.count} points in the view of two or more of the {len(visible)} frames"
         remedy = "Check that the poses belong to these frames, and the Gaussians to this capture."

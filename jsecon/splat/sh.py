@@ -1,5 +1,7 @@
 """Real spherical harmonics of colour, degrees 0 to 3, in the order and signs of INRIA's layout. Pure functions."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Float
@@ -86,6 +88,7 @@ def _colours_backward(residuals: tuple[Array, Array], bar: Array) -> tuple[Array
 _colours.defvjp(lambda directions, sh: (_colours(directions, sh), (directions, sh)), _colours_backward)
 
 
+@functools.partial(jax.jit, inline=True)
 def colours_from_sh(gaussians: Gaussians, camera: Camera) -> Float[Array, "n 3"]:
     """Computes the colours of N Gaussians as a camera sees them. Reverse mode only.
 
