@@ -13,10 +13,6 @@ import numpy as np
 from jsecon.errors import require
 from jsecon.types import Array, Gaussians, record
 
-LONG_STEPS = 3000
-"""Number of steps from which a fit counts as long."""
-LONG_MINUTES = 3.0
-"""Minutes from which a fit counts as long."""
 MAX_GAUSSIANS = 100_000
 """Default limit on the number of Gaussians: more make each step slower. bonsai at 400x266 after two minutes has 28.6 dB
 with 50,000, 28.8 with 100,000 and 28.2 with 200,000 (experiments/retired.md)."""
@@ -109,18 +105,3 @@ class Schedule:
             return None
         share = (done - self.growth_start) / (self.growth_end - self.growth_start)
         return round(start + share * (self.max_gaussians - start))
-
-
-def default_max_gaussians(pixels: int, *, steps: int | None, minutes: float | None) -> int:
-    """Chooses a limit on the number of Gaussians from the size of the frames and the length of the fit.
-
-    Args:
-      pixels: Pixels of a frame.
-      steps: Number of steps of the fit.
-      minutes: Minutes of the fit; takes precedence over `steps`.
-
-    Returns:
-      One Gaussian for every second pixel, in long fits one for every pixel, at most MAX_GAUSSIANS.
-    """
-    long = steps >= LONG_STEPS if minutes is None and steps is not None else (minutes or 0) >= LONG_MINUTES
-    return min(pixels if long else pixels // 2, MAX_GAUSSIANS)

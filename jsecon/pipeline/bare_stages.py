@@ -13,9 +13,17 @@ from jsecon.errors import InputError
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import RunContext, Stage, StageInput, StageResult
 from jsecon.pipeline.scene_files import check_overlap, read_scene
-from jsecon.types import Camera, Quality
-from jsecon.views.capture import capture_from_cameras, into_world, render_capture, world_of_scene
+from jsecon.splat.transform import transform_gaussians_float64
+from jsecon.types import Camera, Gaussians, Quality
+from jsecon.views.capture import capture_from_cameras, render_capture
+from jsecon.views.frame import scene_frame, surface_points
 
+ORDINARY = (3.0, 30.0)
+"""diagonal of a scene that keeps its units: a table to a flat, in metres"""
+DIAGONAL = 6.0
+"""diagonal that any other scene is brought to"""
+FAR = 100.0
+"""diagonals from the origin beyond which a scene is moved to it: float32 has few digits out there"""
 OF_PHOTOGRAPHS = ("downscale", "frames", "holdout", "refine", "drop_frames")
 """options that only photographs have a use for"""
 OF_BARE_SCENES = ("views", "up", "cameras")
@@ -67,9 +75,9 @@ def planned_views(context: RunContext) -> Stage:
 def _render_views(stage: StageInput) -> StageResult:
     options = stage.context.options
     source, _ = read_scene(options.capture)
-    to_source = world_of_scene(source)
+    to_source = _world_of_scene(source)
     capture = render_capture(
-        into_world(source, to_source),
+        _into_world(source, to_source),
         to_source,
         views=options.views,
         width=options.long_side,
@@ -84,13 +92,30 @@ def _render_poses(stage: StageInput) -> StageResult:
     options = stage.context.options
     assert options.cameras is not None
     source, _ = read_scene(options.capture)
-    to_source = world_of_scene(source)
+    to_source = _world_of_scene(source)
     cameras, names = _load_poses(options.cameras, options.long_side)
     poses = transform_poses(np.asarray(cameras.world_to_camera), np.linalg.inv(to_source)).astype(np.float32)
     cameras = dataclasses.replace(cameras, world_to_camera=poses)
-    scene = into_world(source, to_source)
+    scene = _into_world(source, to_source)
     check_overlap(scene, cameras, str(options.cameras))
     return StageResult(capture_from_cameras(scene, cameras, names, to_source))
+
+
+def _world_of_scene(gaussians: Gaussians) -> np.ndarray:
+    """Returns the (4, 4) similarity to the world of a scene's file from one in which the scene has ordinary numbers."""
+    frame = scene_frame(surface_points(gaussians))
+    to_source = np.eye(4)
+    if not ORDINARY[0] <= frame.diagonal <= ORDINARY[1]:
+        to_source[:3, :3] *= frame.diagonal / DIAGONAL
+    if np.linalg.norm(frame.centre) > FAR * frame.diagonal:
+        to_source[:3, 3] = frame.centre
+    return to_source
+
+
+def _into_world(gaussians: Gaussians, to_source: np.ndarray) -> Gaussians:
+    """Moves Gaussians from the world of their file into that of the capture, in float32."""
+    moved = transform_gaussians_float64(gaussians, np.linalg.inv(to_source))
+    return dataclasses.replace(moved, means=np.asarray(moved.means, np.float32))
 
 
 def _load_poses(path: Path, long_side: int) -> tuple[Camera, tuple[str, ...]]:
@@ -131,7 +156,7 @@ def scene_itself(context: RunContext) -> Stage:
 
 def _read_scene(stage: StageInput) -> StageResult:
     source, notes = read_scene(stage.context.options.capture)
-    return StageResult(into_world(source, np.asarray(stage.results.load.to_source, np.float64)), notes=notes)
+    return StageResult(_into_world(source, np.asarray(stage.results.load.to_source, np.float64)), notes=notes)
 
 
 def no_photographs() -> Stage:

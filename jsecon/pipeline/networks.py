@@ -4,8 +4,7 @@ Networks are opened when first needed and closed when their stage is done, to fr
 """
 
 import contextlib
-import time
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -22,10 +21,6 @@ from jsecon.vision.stores import StoredSegmenter
 if TYPE_CHECKING:
     from jsecon.networks.clip import ClipFiles
 
-CROPS_PER_FRAME = 40
-"""regions of a frame, where no segmenter tells"""
-FEW_FRAMES = 4
-"""the time of fewer frames is not estimated"""
 _EXTERNAL = "given-"
 """prefix of the names of external spaces, as fields hold them"""
 
@@ -107,43 +102,6 @@ def describe_model(options: Options, role: Role) -> str:
     folder = getattr(options, role)
     row = named_model(folder, role)
     return folder.name if row is None else row.name
-
-
-def estimate_vision(networks: Networks, frames: np.ndarray, stages: Collection[str]) -> Iterator[str]:
-    """Measures the models on two frames, and estimates how long all of them take.
-
-    The masks of these two frames are stored, so that no work is lost.
-
-    Args:
-      networks: Models of the run.
-      frames: (T, H, W, 3) uint8 frames in which masks are found and embedded.
-      stages: Names of the stages that will run.
-
-    Yields:
-      A sentence for each model whose time can be measured.
-    """
-    crops = CROPS_PER_FRAME
-    segmenter = networks.segmenter
-    if "masklets" in stages and isinstance(segmenter, StoredSegmenter):
-        missing = [t for t in range(len(frames)) if not segmenter.has(frames[t])]
-        if len(missing) >= FEW_FRAMES:
-            seconds = 0.0
-            for t in missing[:2]:  # the first also opens the graphs
-                started = time.monotonic()
-                crops = len(segmenter(frames[t], t))
-                seconds = time.monotonic() - started
-            yield f"SAM: {len(missing) - 2} frames, about {_duration(seconds * (len(missing) - 2))}"
-    seconds_per_crop = getattr(networks.embedder, "seconds_per_crop", None)
-    if "regions" in stages and seconds_per_crop is not None and len(frames) >= FEW_FRAMES:
-        count = crops * len(frames)
-        yield f"CLIP: some {count:,} regions, about {_duration(seconds_per_crop() * count)}"
-    networks.close()
-
-
-def _duration(seconds: float) -> str:
-    """Writes seconds for a reader."""
-    minutes = seconds / 60
-    return f"{seconds:.0f} s" if minutes < 1.5 else f"{minutes:.0f} min" if minutes < 90 else f"{minutes / 60:.1f} h"
 
 
 def open_embedder(

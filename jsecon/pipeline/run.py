@@ -63,6 +63,7 @@ from jsecon.pipeline.sources import hub_addresses, relative_folders
 from jsecon.process import compilation_counts
 from jsecon.types import Capture, Gaussians, ImageFile, LanguageField, Quality
 from jsecon.vision.classical import require_contrib
+from jsecon.vision.stores import StoredSegmenter
 
 FIELD_FILE = "field.safetensors"
 LEAST: dict[str, float] = {
@@ -82,6 +83,10 @@ LEAST: dict[str, float] = {
     "centre": 0,
 }
 """smallest value of an option"""
+CROPS_PER_FRAME = 40
+"""regions of a frame, where no segmenter tells"""
+FEW_FRAMES = 4
+"""the time of fewer frames is not estimated"""
 OUT_OF_MEMORY = "Take smaller frames (--long-side), fewer (--frames), or fewer Gaussians (--gaussians-at-most)."
 """what to do if memory is full"""
 
@@ -273,12 +278,32 @@ def compute_stages(
 
 
 def _note_vision_time(context: RunContext, capture: Capture, running: list[str], listener: Listener) -> None:
-    """Says how long the models will take, before the long stages."""
+    """Measures the models on two frames, and says how long all will take; the masks of these two frames are stored."""
     frames = np.asarray(capture.frames)[vision_frames(capture, context.options)]
+    segmenter, crops, notes = context.networks.segmenter, CROPS_PER_FRAME, []
     with listener.progress("vision"):
-        notes = list(networks.estimate_vision(context.networks, frames, running))
+        if "masklets" in running and isinstance(segmenter, StoredSegmenter):
+            missing = [t for t in range(len(frames)) if not segmenter.has(frames[t])]
+            if len(missing) >= FEW_FRAMES:
+                seconds = 0.0
+                for t in missing[:2]:  # the first also opens the graphs
+                    started = time.monotonic()
+                    crops = len(segmenter(frames[t], t))
+                    seconds = time.monotonic() - started
+                notes.append(f"SAM: {len(missing) - 2} frames, about {_duration(seconds * (len(missing) - 2))}")
+        seconds_per_crop = getattr(context.networks.embedder, "seconds_per_crop", None)
+        if "regions" in running and seconds_per_crop is not None and len(frames) >= FEW_FRAMES:
+            count = crops * len(frames)
+            notes.append(f"CLIP: some {count:,} regions, about {_duration(seconds_per_crop() * count)}")
+        context.networks.close()
     for note in notes:
         listener.note(f"{note}. Fewer frames: --vision-frames.")
+
+
+def _duration(seconds: float) -> str:
+    """Writes seconds for a reader."""
+    minutes = seconds / 60
+    return f"{seconds:.0f} s" if minutes < 1.5 else f"{minutes:.0f} min" if minutes < 90 else f"{minutes / 60:.1f} h"
 
 
 def _compute_stage(

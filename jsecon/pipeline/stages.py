@@ -69,6 +69,10 @@ SECONDS_PER_STEP = 0.024
 """s of a step of the fit, on two cores of an AMD EPYC; estimates how many steps --minutes allows"""
 SECONDS_PER_MEGAPIXEL = 0.2
 """s more of a step per million pixels of a frame"""
+LONG_STEPS = 3000
+"""Number of steps from which a fit counts as long."""
+LONG_MINUTES = 3.0
+"""Minutes from which a fit counts as long."""
 MAX_CLOUD_POINTS = 100_000
 """points from depth whose normals are estimated"""
 MIN_CLOUD_SPACING = 0.02
@@ -280,7 +284,7 @@ def _read_gaussians(stage: StageInput) -> StageResult:
 
 def _fit_gaussians(stage: StageInput) -> StageResult:
     from jsecon.fit.optimise import fit_gaussians
-    from jsecon.fit.schedule import Schedule, default_max_gaussians
+    from jsecon.fit.schedule import MAX_GAUSSIANS, Schedule
 
     options, capture, state = stage.context.options, stage.results.load, stage.checkpoint.read()
     start, notes = None, ()
@@ -289,7 +293,8 @@ def _fit_gaussians(stage: StageInput) -> StageResult:
         check_overlap(start, capture.cameras[training_frames(capture)], str(options.capture))
         notes = (f"start of the fit: {origin}",)
     pixels, minutes = capture.cameras.width * capture.cameras.height, options.minutes
-    most = options.gaussians_at_most or default_max_gaussians(pixels, steps=options.steps, minutes=minutes)
+    is_long = options.steps >= LONG_STEPS if minutes is None else minutes >= LONG_MINUTES
+    most = options.gaussians_at_most or min(pixels if is_long else pixels // 2, MAX_GAUSSIANS)
     fitted, losses = fit_gaussians(
         capture,
         key=jax.random.key(options.seed),

@@ -1,6 +1,5 @@
 """A capture of renders: the frames of a bare scene, seen from planned views."""
 
-import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -9,40 +8,11 @@ import numpy as np
 
 from jsecon.splat.render import render_rgb
 from jsecon.splat.sh import colours_from_sh
-from jsecon.splat.transform import transform_gaussians_float64
 from jsecon.types import Camera, Capture, Gaussians
-from jsecon.views.frame import scene_frame, surface_points
 from jsecon.views.plan import plan_views
 
-ORDINARY = (3.0, 30.0)
-"""diagonal of a scene that keeps its units: a table to a flat, in metres"""
-DIAGONAL = 6.0
-"""diagonal that any other scene is brought to"""
-FAR = 100.0
-"""diagonals from the origin beyond which a scene is moved to it: float32 has few digits out there"""
 BACKGROUNDS = (0.0, 1.0, 0.5)
 """grey values that may lie behind a scene, the usual one first"""
-
-
-def world_of_scene(gaussians: Gaussians) -> np.ndarray:
-    """Finds the world in which a bare scene has ordinary numbers.
-
-    Args:
-      gaussians: Scene of N Gaussians, in the world of its file.
-
-    Returns:
-      (4, 4) float64 similarity (a shift and a scale) from that world to the file's; the identity for ordinary scenes.
-
-    Raises:
-      InputError: The scene has no visible surface.
-    """
-    frame = scene_frame(surface_points(gaussians))
-    to_source = np.eye(4)
-    if not ORDINARY[0] <= frame.diagonal <= ORDINARY[1]:
-        to_source[:3, :3] *= frame.diagonal / DIAGONAL
-    if np.linalg.norm(frame.centre) > FAR * frame.diagonal:
-        to_source[:3, 3] = frame.centre
-    return to_source
 
 
 def render_capture(
@@ -109,20 +79,6 @@ def capture_from_cameras(
         names=names,
         notes=notes,
     )
-
-
-def into_world(gaussians: Gaussians, to_source: np.ndarray) -> Gaussians:
-    """Moves Gaussians from the world of their file into that of the capture.
-
-    Args:
-      gaussians: Scene of N Gaussians, means float32 or float64.
-      to_source: (4, 4) similarity from the capture's world to the file's.
-
-    Returns:
-      The scene in float32.
-    """
-    moved = transform_gaussians_float64(gaussians, np.linalg.inv(to_source))
-    return dataclasses.replace(moved, means=np.asarray(moved.means, np.float32))
 
 
 def _background(gaussians: Gaussians, camera: Camera) -> np.ndarray:
