@@ -5,14 +5,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from jsecon.app import ask, relations, verbs
+from jsecon.app import ask, verbs
 from jsecon.app.ask import Answer
 from jsecon.app.models import open_embedder, with_models
 from jsecon.app.outputs import write_answers
 from jsecon.data.gaussians.files import require_writable_format
 from jsecon.errors import InputError
 from jsecon.language.field import check_field, load_field
-from jsecon.pipeline import run as pipeline
 from jsecon.pipeline.options import Options, is_bare_scene, require_writable
 from jsecon.pipeline.progress import Console
 from jsecon.process import MEMORY, memory_budget
@@ -89,6 +88,8 @@ def ask_relations(
       The answers, and the errors of texts that are not understood.
     """
     with console.progress("relations"):
+        from jsecon.app import relations  # late: plain texts need none of it
+
         scene = relations.open_scene(field, embedder, up)
         queries = [lambda text=text: relations.query_relation(scene, text, frame=frame) for text in texts]
         answers, errors = ask.collect(queries)
@@ -100,6 +101,8 @@ def ask_relations(
 
 def _field_of_scene(verb: verbs.Query, console: Console) -> Path:
     """Returns the field of a scene without photographs, which is made in OUT/field unless it is there."""
+    from jsecon.pipeline import run as pipeline  # late: queries of a field need none of it
+
     options = Options(verb.field, embedder=verb.embedder, up=verb.up)
     folder = verb.out / "field"
     with console.progress("plan"):
