@@ -6,8 +6,10 @@ jsecon is imported.
 
 import atexit
 import contextlib
+import functools
 import gc
 import os
+import pickle
 import shutil
 import tempfile
 from collections import Counter
@@ -17,6 +19,8 @@ import compiling
 
 os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count=2 {compiling.ENVIRONMENT}")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of a worker: threads of several wait by spinning
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")  # as the command line sets them
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
@@ -186,6 +190,25 @@ def made_once(tmp_path_factory):
             yield base / name
 
     return alone
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _bake_once():
+    """Lights the surfaces of a made-up room once a process: most of the time of a small rendering."""
+    from jsecon.demo import raycast
+
+    bake, kept = raycast.bake_room, {}
+
+    @functools.wraps(bake)
+    def once(room):
+        key = pickle.dumps(room)
+        if key not in kept:
+            kept[key] = bake(room)
+        return kept[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(raycast, "bake_room", once)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -6,6 +6,7 @@ A coder has `.encode` and `.decode`: `Rotation` (principal directions; exact whe
 """
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -76,6 +77,7 @@ Coder: TypeAlias = Autoencoder | Rotation | Spread | None
 """What encodes embeddings; None: the codes are the unit embeddings themselves."""
 
 
+@functools.partial(jax.jit, inline=True)
 def _among(x: Array, keys: Array, values: Array) -> Array:
     """Rows x (..., A) -> unit rows (..., B): the values (R, B) of the keys (R, A) most similar to each."""
     rows = x.reshape(-1, x.shape[-1])

@@ -6,6 +6,7 @@ compared: the mean of unrelated words (`LanguageField.reference`). Those words a
 the scene: it is refused unless it beats most of them (`QueryRules.quantile`).
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -254,6 +255,7 @@ def best_presence(
     return float(each[region] if int(region) >= 0 else each.max())
 
 
+@functools.partial(jax.jit, inline=True)
 def evidence(pixels: Shaped[Array, "r t"]) -> Float[Array, " r"]:
     """How much stands behind each of R embeddings, in (0, 1], from the region's pixels in T views.
 

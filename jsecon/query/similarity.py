@@ -58,6 +58,7 @@ def as_codes(codes: Array | UnitCodes) -> Array | UnitCodes:
     return codes if isinstance(codes, UnitCodes) else jnp.asarray(codes)
 
 
+@functools.partial(jax.jit, inline=True)
 def similarities(codes: Codes, code: Float[Array, " d"]) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
     """Cosines (N,) of rows with one code, and which are known: both finite and not zero; 0 elsewhere."""
     unit = normalize(code)

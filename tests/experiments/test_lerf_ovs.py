@@ -28,7 +28,7 @@ def test_every_field_comes_back(twin):
     scene = load_lerf_ovs(twin, "figurines")
     told = json.loads((twin / "twin.json").read_text())["scenes"]["figurines"]
     room = make_room(0, num_objects=6)
-    _, instances, _ = rooms_instances(0, scene.capture.cameras)
+    instances = rooms_instances(0, scene.capture.cameras)
     assert scene.capture.names == tuple(f"frame_{n:05d}" for n in range(1, 7))
     np.testing.assert_array_equal(scene.capture.held_out, np.arange(6) % 3 == 0)
     assert [frame.name for frame in scene.frames] == told["frames"] == ["frame_00001", "frame_00004"]

@@ -25,7 +25,7 @@ def copy(twin, tmp_path):
 def test_every_field_comes_back(twin):
     scene = load_ovs3d(twin, "bed")
     room = make_room(1, num_objects=6)
-    _, instances, _ = rooms_instances(1, scene.capture.cameras)
+    instances = rooms_instances(1, scene.capture.cameras)
     assert scene.queries == tuple(sorted(room.names))
     assert len(scene.frames) == 3
     assert scene.pairs == 18

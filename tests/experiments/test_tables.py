@@ -148,7 +148,7 @@ def test_vision_on_disk_is_what_was_simulated(folder):
 
 def test_twins_of_two_sizes_lie_side_by_side(folder):
     data = small(lerf.QUICK, folder, "sizes").data
-    fewer = dataclasses.replace(data, size=tuple({**dict(data.size), "views": 6}.items()))
+    fewer = dataclasses.replace(data, size=tuple({**dict(data.size), "views": 6, "width": 40, "height": 30}.items()))
     roots = [each.place("figurines", 0, "perfect") for each in (data, fewer, data)]
     assert roots[0] == roots[2] != roots[1]
     for each, root, views in zip((data, fewer), roots, (8, 6)):

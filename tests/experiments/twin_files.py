@@ -24,9 +24,11 @@ def replica_twin(root, scene="room0"):
 def rooms_instances(seed, cameras):
     """(T, H, W) the objects that ray casting finds, asked for again from the room itself."""
     from experiments.datasets.plain_room import make_room
-    from jsecon.demo import render_views
+    from jsecon.demo.raycast import trace_rays
 
-    return render_views(make_room(seed, num_objects=SMALL["num_objects"]), cameras)
+    room = make_room(seed, num_objects=SMALL["num_objects"])
+    owners = np.array([part.owner for part in room.parts] + [-1])
+    return np.stack([owners[trace_rays(room, cameras[t])[1]] for t in range(len(cameras.fx))])
 
 
 def evidence_of_tracks(gaussians, cameras, tracks, embeddings):
