@@ -41,13 +41,14 @@ def stored_jit(function: Callable, *, static_argnums: tuple[int, ...] = ()) -> C
 
     @functools.wraps(function)
     def call(*args):
-        folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+        config: Any = jax.config
+        folder = config.jax_compilation_cache_dir
         leaves, tree = jax.tree.flatten([arg for n, arg in enumerate(args) if n not in static_argnums])
         if folder is None or is_traced(leaves) or any(_is_spread(leaf) for leaf in leaves):
             return compiled(*args)
         types = [jax.typeof(leaf) for leaf in leaves]
         static = {n: repr(args[n]) for n in static_argnums}
-        key = tree, str(static), tuple((t.shape, t.dtype, t.weak_type) for t in types), jax.config.jax_enable_x64
+        key = tree, str(static), tuple((t.shape, t.dtype, t.weak_type) for t in types), config.jax_enable_x64
         if key not in programs:
 
             def flat(*leaves):

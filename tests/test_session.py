@@ -2,6 +2,7 @@
 
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
 from onnx_files import node, write_graph
 
@@ -126,6 +127,35 @@ def test_half_precision_is_met_with_half_precision(tmp_path):
     path = write_graph(tmp_path / "half.onnx", [node("Add", ["x", "x"], ["y"])], *half)
     found = Graph(path, threads=1).run({"x": np.ones(3, np.float32)})
     assert found["y"].dtype == np.float16
+
+
+@pytest.mark.parametrize("place", ["initializer", "external", "constant", "branch", None])
+def test_the_optimiser_that_half_precision_crashes_is_left_out_of_such_graphs(tmp_path, monkeypatch, place):
+    """Their names need not say it."""
+    weights = np.ones((8, 3, 3, 3), np.float32 if place is None else np.float16)
+    cast = [] if place is None else [node("Cast", ["x"], ["h"], to=onnx.TensorProto.FLOAT16)]
+    nodes = [*cast, node("Conv", ["h" if cast else "x", "w"], ["y"])]
+    constants, tensor = {"w": weights}, onnx.numpy_helper.from_array(weights, "w")
+    if place in ("constant", "branch"):
+        constants, made = {}, node("Constant", [], ["w"], value=tensor)
+        if place == "branch":
+            constants, out = {"yes": np.array(True)}, onnx.helper.make_tensor_value_info("w", 10, weights.shape)
+            branch = onnx.helper.make_graph([made], "branch", [], [out])
+            made = node("If", ["yes"], ["w"], then_branch=branch, else_branch=branch)
+        nodes.insert(0, made)
+    kinds = {"x": ("float32", [1, 3, 8, 8])}, {"y": ("float16" if cast else "float32", [1, 8, 6, 6])}
+    path = write_graph(tmp_path / "model.onnx", nodes, *kinds, constants, external="w" if place == "external" else None)
+    disabled = []
+    opened = onnxruntime.InferenceSession
+
+    def noted(*args, **options):
+        disabled.append(options["disabled_optimizers"])
+        return opened(*args, **options)
+
+    monkeypatch.setattr(onnxruntime, "InferenceSession", noted)
+    found = Graph(path, threads=1).run({"x": np.ones((1, 3, 8, 8), np.float32)})
+    np.testing.assert_array_equal(found["y"], np.full((1, 8, 6, 6), 27))
+    assert disabled == [None, None if place is None else ["NchwcTransformer"]]
 
 
 @pytest.mark.parametrize("size", [2**31, 2**40])

@@ -8,6 +8,7 @@ names the file and the tensor.
 import dataclasses
 import hashlib
 import math
+import mmap
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -33,6 +34,18 @@ _KINDS = {"b": "bool", "i": "integer", "u": "integer", "f": "float"}
 _MISUSED = "This graph has another size or kind than the one that it is used as."
 MAX_INPUT_NUMBERS = 1 << 26
 """size of an input; an image of 4096 x 4096 px has 2^25.6 numbers"""
+_MESSAGES = {
+    ("model", 7): "graph",
+    ("graph", 1): "node",
+    ("graph", 5): "tensor",
+    ("node", 5): "attribute",
+    ("attribute", 5): "tensor",
+    ("attribute", 6): "graph",
+}
+"""messages of onnx.proto that lead to constants, by their place: the message around them and their field"""
+_DATA_TYPE = 2
+"""field of a tensor with its type"""
+_FLOAT16 = 10
 _LFS_POINTER = b"version https://git-lfs"
 Size = int | str | None
 """size of an axis: a number if it is fixed, the name of a symbol or None if it is free"""
@@ -127,7 +140,7 @@ class Graph:
                 providers=["CPUExecutionProvider"],
                 enable_fallback=0,
                 # It crashes the process on graphs of CLIP, SigLIP 2 and MobileCLIP in half precision (version 1.32).
-                disabled_optimizers=["NchwcTransformer"] if "fp16" in self.path.stem else None,
+                disabled_optimizers=["NchwcTransformer"] if optimise and _has_half_precision(self.path) else None,
             )
         except Exception as error:  # ONNX Runtime's exceptions have no common base but this
             problem = f"ONNX Runtime {onnxruntime.__version__} cannot open it ({_reason(error)})"
@@ -255,6 +268,38 @@ def content_digest(files: Iterable[str | os.PathLike], *, extra: str = "") -> st
         except OSError as error:
             raise _unreadable(Path(file), error.strerror or "an error on reading") from error
     return digest.hexdigest()
+
+
+def _has_half_precision(path: Path) -> bool:
+    """Returns whether a constant of a whole graph is of half precision. Skips the numbers of the constants."""
+    with open(path, "rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+
+        def varint(at: int) -> tuple[int, int]:
+            value = shift = 0
+            while True:
+                byte = data[at]
+                value |= (byte & 127) << shift
+                at, shift = at + 1, shift + 7
+                if byte < 128:
+                    return value, at
+
+        def found(message: str, at: int, end: int) -> bool:
+            while at < end:
+                tag, at = varint(at)
+                field, kind = tag >> 3, tag & 7
+                if kind == 0:
+                    value, at = varint(at)
+                    if message == "tensor" and field == _DATA_TYPE and value == _FLOAT16:
+                        return True
+                    continue
+                size, at = varint(at) if kind == 2 else ({1: 8, 5: 4}[kind], at)
+                inner = _MESSAGES.get((message, field))
+                if inner is not None and found(inner, at, at + size):
+                    return True
+                at += size
+            return False
+
+        return found("model", 0, len(data))
 
 
 def _check_bytes(path: Path) -> None:
