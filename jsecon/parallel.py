@@ -21,7 +21,7 @@ from jax.experimental.multihost_utils import process_allgather
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from jsecon.files import pack_tree, unpack_tree
-from jsecon.types import Array
+from jsecon.types import Array, Progress
 
 AXIS = "devices"
 """name of the only axis of the mesh"""
@@ -132,7 +132,7 @@ def accumulate_over_views(
     *,
     prepare: Callable | None = None,
     static: tuple = (),
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> tuple[Any, Any]:
     """Accumulates a state over views, several at a time. A host function; dispatch is asynchronous.
 
@@ -269,7 +269,7 @@ def _states_of_all(state: Any) -> list[Any]:
 def map_over_processes(
     count: int,
     rows: Callable[[Sequence[int]], Iterable[Any]],
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> list[Any]:
     """Maps a host function over indices, each process with its part of them.
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, TypeAlias, dataclass_transform
 
 import jax
@@ -26,6 +26,8 @@ Leaf: TypeAlias = Any
 """an array field of a pytree defined elsewhere: while jax transforms it, it may hold a tracer, an axis or a sentinel"""
 Key: TypeAlias = PRNGKeyArray | UInt32[Array, "2"]
 """of jax.random, new style or old"""
+Progress: TypeAlias = Callable[[int, int], None]
+"""called as progress(done, total)"""
 
 
 def static(**kwargs) -> Any:

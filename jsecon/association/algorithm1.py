@@ -10,9 +10,8 @@ from scipy import sparse
 from jsecon.association.atoms import Sparse, one_hot
 from jsecon.association.run_lengths import RunLengthMasks, encode_masks, encode_rows
 from jsecon.errors import require, require_shape
+from jsecon.types import Progress
 from jsecon.vision.protocols import Segmenter, Tracker
-
-Progress = Callable[[int, int], None]
 
 
 @dataclasses.dataclass(frozen=True)

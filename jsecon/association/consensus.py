@@ -6,8 +6,6 @@ is outvoted by the other views. Frames have no order and there is no tracking, s
 mask clustering by view consensus (Yan et al., CVPR 2024), between pieces of the scene instead of masks.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 from jaxtyping import Float, Int, Int16, UInt8
 from scipy import sparse
@@ -15,6 +13,7 @@ from scipy import sparse
 from jsecon.association.atoms import Sparse, one_hot, sum_entries
 from jsecon.association.views import FrameView, SceneViews, claim_atoms
 from jsecon.errors import require
+from jsecon.types import Progress
 from jsecon.vision.region_graph import relabel_sequential
 
 MAX_PIECES = 3000
@@ -226,7 +225,7 @@ def consensus_masklets(
     agreement: float = 0.4,
     abstain_if_unlabelled: bool = True,
     seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Int16[np.ndarray, "t h w"]:
     """Makes masklets by consensus, independent of the order of the frames.
 
@@ -264,7 +263,7 @@ def pieces_on_masks(
     scene: SceneViews,
     *,
     seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> tuple[Int[np.ndarray, " n"], Sparse]:
     """Computes pieces of a scene and the weight of each Gaussian on all masks, the input of `scene_parts`.
 

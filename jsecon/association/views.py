@@ -18,7 +18,7 @@ from jsecon.association.atoms import MIN_ATOM_PX, Sparse, atom_coverage, atom_vo
 from jsecon.errors import require
 from jsecon.parallel import LANES, map_over_processes
 from jsecon.process import cores
-from jsecon.types import Camera, Gaussians
+from jsecon.types import Camera, Gaussians, Progress
 
 MIN_PROPOSAL_SHARE = 0.4
 MIN_ATOM_SHARE = 0.6
@@ -101,9 +101,7 @@ class SceneViews:
         finally:
             pool.shutdown(cancel_futures=True)
 
-    def all(
-        self, frames: UInt8[np.ndarray, "t h w 3"], progress: Callable[[int, int], None] | None = None
-    ) -> list[FrameView]:
+    def all(self, frames: UInt8[np.ndarray, "t h w 3"], progress: Progress | None = None) -> list[FrameView]:
         """Computes the votes of all frames; several processes (`jax.distributed`) divide the frames.
 
         Args:

@@ -11,7 +11,6 @@ from jsecon.data.colmap import find_models, read_colmap
 from jsecon.data.frames import (
     CaptureExtent,
     PosedImages,
-    Progress,
     build_capture,
     check_capture_options,
     planned_extent,
@@ -21,7 +20,7 @@ from jsecon.data.rgbd import find_rgbd
 from jsecon.data.sfm import list_photographs
 from jsecon.errors import InputError
 from jsecon.files import is_output_folder
-from jsecon.types import Camera, Capture
+from jsecon.types import Camera, Capture, Progress
 
 _POINT_BLOCK = 65536
 """points that are projected at a time"""
@@ -35,7 +34,7 @@ def load_capture(
     frames: int | None = None,
     holdout: int | None = 8,
     only: Collection[str] | None = None,
-    progress: Progress = None,
+    progress: Progress | None = None,
 ) -> Capture:
     """Loads a capture.
 

@@ -23,10 +23,7 @@ from jsecon.data.images import TRANSPOSED, ImageHeader, apply_orientation, image
 from jsecon.data.lens import Lens, distort, resample_depth, undistorted_pinhole, undistortion_maps
 from jsecon.errors import InputError
 from jsecon.numerics import is_finite_and_bounded
-from jsecon.types import Camera, Capture, ImageFile
-
-Progress = Callable[[int, int], None] | None
-"""called with (done, total)"""
+from jsecon.types import Camera, Capture, ImageFile, Progress
 
 MIN_FOCAL = 1e-3
 """px: smaller focal lengths are errors"""
@@ -394,7 +391,7 @@ def build_capture(
     frames: int | None = None,
     holdout: int | None = 8,
     only: Collection[str] | None = None,
-    progress: Progress = None,
+    progress: Progress | None = None,
 ) -> Capture:
     """Reads the images of a capture: in name order, undistorted, at one size.
 

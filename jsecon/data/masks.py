@@ -18,11 +18,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int, Int16
 
-from jsecon.data.frames import Progress
 from jsecon.data.images import IMAGE_SUFFIXES, TRANSPOSED, apply_orientation, read_label_image
 from jsecon.errors import InputError
 from jsecon.files import is_output_folder, map_npy, reading
-from jsecon.types import ImageFile
+from jsecon.types import ImageFile, Progress
 
 LEVELS = ("default", "s", "m", "l")
 """levels of LangSplat's `_s.npy`, in their order: all of SAM's masks, subparts, parts, whole objects"""
@@ -341,7 +340,7 @@ def load_labels(
     shared: bool | None = None,
     order: Sequence[str] | None = None,
     files: Mapping[str, ImageFile] | None = None,
-    progress: Progress = None,
+    progress: Progress | None = None,
 ) -> TrackedMasks:
     """Reads masks whose ids mean the same object in every frame.
 

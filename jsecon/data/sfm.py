@@ -24,7 +24,7 @@ import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -32,10 +32,11 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from jsecon.data.frames import Progress, frame_names
+from jsecon.data.frames import frame_names
 from jsecon.data.images import IMAGE_SUFFIXES, image_header, read_image, write_image
 from jsecon.errors import InputError
 from jsecon.files import list_files, write_text
+from jsecon.types import Progress
 
 MIN_PHOTOS = 3
 """photographs that a model needs"""
@@ -158,7 +159,7 @@ def check_photographs(photos: Sequence[Path], where: object) -> list[str]:
 
 
 def find_poses(
-    photos: Sequence[Path], work: Path, *, where: object = "photographs", progress: Progress = None
+    photos: Sequence[Path], work: Path, *, where: object = "photographs", progress: Progress | None = None
 ) -> tuple[SfmResult, Path]:
     """Estimates the poses of photographs.
 
@@ -240,7 +241,7 @@ def _link(photo: Path, link: Path, *, upright_copy: bool = False) -> None:
         shutil.copyfile(photo, link)
 
 
-def _run_steps(work: Path, progress: Progress) -> None:
+def _run_steps(work: Path, progress: Progress | None) -> None:
     """Runs the steps in a process that ends with this one, and passes its progress on."""
     home = str(Path(__file__).parents[2])
     environ = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, (home, os.environ.get("PYTHONPATH"))))}
@@ -303,7 +304,7 @@ def main(work: Path) -> None:
     write_text(work / "result.json", json.dumps(result))
 
 
-def _extract(colmap: Any, job: dict[str, Any], work: Path, progress: Callable[[int, int], None]) -> None:
+def _extract(colmap: Any, job: dict[str, Any], work: Path, progress: Progress) -> None:
     """Detects the features of the photographs that have none in the database."""
     database, total = work / "database.db", len(job["names"])
     options, reader = colmap.FeatureExtractionOptions(), colmap.ImageReaderOptions()
@@ -327,7 +328,7 @@ def _extract(colmap: Any, job: dict[str, Any], work: Path, progress: Callable[[i
         progress(total - len(left) + start + len(names), total)
 
 
-def _match(colmap: Any, work: Path, progress: Callable[[int, int], None]) -> None:
+def _match(colmap: Any, work: Path, progress: Progress) -> None:
     """Matches and verifies the image pairs that are not in the database yet."""
     database = work / "database.db"
     with colmap.Database.open(database) as opened:
@@ -373,7 +374,7 @@ def _pairs_that_look_alike(colmap: Any, opened: Any, images: list[int], file: Pa
     return colmap.VocabTreePairGenerator(retrieval, opened).all_pairs()
 
 
-def _map(colmap: Any, total: int, work: Path, progress: Callable[[int, int], None]) -> tuple[Any, int]:
+def _map(colmap: Any, total: int, work: Path, progress: Progress) -> tuple[Any, int]:
     """Returns the best model, or None, and the number of models of its mapper.
 
     Focal lengths that EXIF does not name are estimated from the pairs first (Sweeney et al., "Optimizing the viewing

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from jsecon.data.frames import Progress
 from jsecon.errors import InputError
 from jsecon.files import atomic_write
+from jsecon.types import Progress
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".3gp")
 DEFAULT_VIDEO_FRAMES = 150
@@ -50,7 +50,9 @@ def sharpest_frames(sharpness: list[float], count: int) -> list[int]:
     return [int(a + np.argmax(sharpness[a:b])) for a, b in itertools.pairwise(edges)]
 
 
-def write_frames(video: Path, folder: Path, *, frames: int | None = None, progress: Progress = None) -> list[Path]:
+def write_frames(
+    video: Path, folder: Path, *, frames: int | None = None, progress: Progress | None = None
+) -> list[Path]:
     """Writes the sharpest frame of each stretch of a video as a JPEG, named by its number in the video.
 
     Sharpness is the variance of the Laplacian of the grey values (Pech-Pacheco et al., "Diatom autofocusing in

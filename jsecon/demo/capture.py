@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -18,7 +18,7 @@ from jsecon.demo.raycast import render_views
 from jsecon.demo.room import Room
 from jsecon.errors import require
 from jsecon.files import atomic_write, write_text
-from jsecon.types import Camera, Capture
+from jsecon.types import Camera, Capture, Progress
 
 MIN_LABEL_PIXELS = 40
 """Visible pixels from which `write_room` labels an object in a frame."""
@@ -68,7 +68,7 @@ def room_capture(
     height: int = 240,
     holdout: int = 5,
     points: int = 6000,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> tuple[Capture, Int16[np.ndarray, "t h w"]]:
     """Makes the capture of a room from cameras around its table.
 
@@ -105,7 +105,7 @@ def render_capture(
     is_held_out: Bool[np.ndarray, " t"],
     *,
     points: int,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> tuple[Capture, Int16[np.ndarray, "t h w"]]:
     """Makes the capture of a room from chosen cameras.
 
@@ -169,7 +169,7 @@ def write_room(
     room: Room,
     *,
     holdout: int = 5,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
     **options: int,
 ) -> Path:
     """Writes a room as a COLMAP capture (images/, sparse/0/) with its ground truth beside it.

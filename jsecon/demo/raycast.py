@@ -8,14 +8,14 @@ Walls, floor and table top are painted and lit once, so that their shadows are t
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Float, Float32, Int16, UInt8
 
 from jsecon.demo.room import TABLE_HALF, TABLE_HEIGHT, TABLE_WOOD, Part, Room, Texture, srgb_to_linear
 from jsecon.demo.shapes import blocks_segment, first_hit, normals
-from jsecon.types import Camera
+from jsecon.types import Camera, Progress
 
 SKY_RADIANCE, LAMP_RADIANCE = 0.84, 0.48
 """Radiance of a white surface under the whole sky, and facing the lamp. Their sum keeps the lightness of a colour."""
@@ -400,7 +400,7 @@ def linear_to_srgb(rgb: Float[np.ndarray, "... 3"]) -> UInt8[np.ndarray, "... 3"
 
 
 def render_views(
-    room: Room, cameras: Camera, *, progress: Callable[[int, int], None] | None = None
+    room: Room, cameras: Camera, *, progress: Progress | None = None
 ) -> tuple[UInt8[np.ndarray, "t h w 3"], Int16[np.ndarray, "t h w"], Float32[np.ndarray, "t h w"]]:
     """Renders a room.
 

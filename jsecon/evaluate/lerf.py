@@ -19,7 +19,7 @@ from jsecon.errors import InputError
 from jsecon.evaluate.metrics import accuracy_at, in_any_box, iou, mean_iou
 from jsecon.fit.resize import resize_camera
 from jsecon.query.render import ALPHA_THRESHOLD, VALA_THRESHOLD, render_selection
-from jsecon.types import Camera, Gaussians, Selection
+from jsecon.types import Camera, Gaussians, Progress, Selection
 
 LOCALISATION_WINDOW = 0.04
 """Side of the box filter before the maximum is taken, as a share of the image height: LangSplat's 30 px of 730."""
@@ -78,7 +78,7 @@ def evaluate_at_thresholds(
     *,
     alpha_thresholds: tuple[float, ...] = (ALPHA_THRESHOLD, VALA_THRESHOLD),
     expected_pairs: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> dict[float, tuple[list[Row], dict]]:
     """Evaluates selections at several alpha thresholds, from one rendering per pair.
 

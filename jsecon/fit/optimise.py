@@ -20,7 +20,7 @@ from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.step import StepConfig, StepRunner, TrainState, put_on_devices, to_host
 from jsecon.parallel import host_mesh
 from jsecon.splat.tiles import most_strips
-from jsecon.types import Array, Capture, Gaussians, record
+from jsecon.types import Array, Capture, Gaussians, Progress, record
 
 _RATES, _SCHEDULE = LearningRates(), Schedule()
 ALLOCATED_AT_START = 1 << 16
@@ -128,7 +128,7 @@ def fit_gaussians(
     refine: RefineOptions | None = None,
     chunk: int = 50,
     on_checkpoint: Callable[[FitState], None] | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> FitResult:
     """Fits Gaussians to the training frames of a capture.
 

@@ -1,6 +1,6 @@
 """Image quality of a scene: PSNR and SSIM of its renderings against the photographs. Host code."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from jsecon.fit.photometric import psnr, ssim_map
 from jsecon.fit.resize import resize_frame, resize_mask, shrink_cameras
 from jsecon.parallel import map_over_processes
 from jsecon.splat.render import render_rgb
-from jsecon.types import Array, Capture, Gaussians, Quality
+from jsecon.types import Array, Capture, Gaussians, Progress, Quality
 
 QUICK_LONG_SIDE = 400
 """Longer side in px at which weak frames are looked for: a thousand large frames would take half an hour."""
@@ -37,7 +37,7 @@ def measure_quality(
     *,
     frames: Int[np.ndarray, " f"] | None = None,
     long_side: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Quality:
     """Compares renderings, clamped to [0, 1], with photographs. Ignored pixels do not count.
 

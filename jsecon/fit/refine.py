@@ -18,7 +18,6 @@ and exposure, as methods that refine poses are measured (Lin et al. 2021, BARF, 
 
 import dataclasses
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import cv2
@@ -44,7 +43,7 @@ from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.start import starting_gaussians
 from jsecon.fit.step import cameras_extent
 from jsecon.splat.render import render_rgb
-from jsecon.types import Array, Camera, Capture, Gaussians
+from jsecon.types import Array, Camera, Capture, Gaussians, Progress
 
 VISITS = 30
 """Visits of each frame by a probe."""
@@ -134,7 +133,7 @@ class _Prober:
     key: PRNGKeyArray
     start: Gaussians | None
     total: int
-    progress: Callable[[int, int], None] | None
+    progress: Progress | None
     done: int = 0
 
     def initial(self, capture: Capture) -> Gaussians:
@@ -209,7 +208,7 @@ def refine_capture(
     max_fit_steps: float | None = None,
     visits: int = VISITS,
     probes: int = PROBES,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Capture:
     """Corrects the poses and exposures of a capture by short fits, and drops frames that these do not explain.
 

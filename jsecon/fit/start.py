@@ -1,7 +1,6 @@
 """Initial scene of a fit: points of the capture, and Gaussians made from points. Host code (NumPy)."""
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +11,7 @@ from jsecon.errors import require
 from jsecon.fit.depth import points_from_depth
 from jsecon.fit.triangulate import MIN_POINTS, triangulated_points
 from jsecon.splat.sh import sh_from_rgb
-from jsecon.types import Array, Capture, Gaussians
+from jsecon.types import Array, Capture, Gaussians, Progress
 
 MIN_SQUARED_DISTANCE = 1e-7
 """Least squared distance to the neighbours, world units^2 (INRIA): duplicate points get a scale too."""
@@ -34,7 +33,7 @@ def starting_gaussians(
     *,
     sh_degree: int = 0,
     max_points: int = MAX_DEPTH_POINTS,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Start:
     """Makes the Gaussians that a fit of `capture` starts from.
 

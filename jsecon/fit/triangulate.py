@@ -5,14 +5,13 @@ reproject within a few pixels from a point in front of every camera with enough 
 12).
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from jsecon.errors import InputError
-from jsecon.types import Capture
+from jsecon.types import Capture, Progress
 
 MIN_POINTS = 50
 """Least number of points for a scene: with fewer the views do not overlap or have no texture."""
@@ -168,9 +167,7 @@ def triangulate_tracks(
     return points, error, np.where(seen, depth, np.inf).min(axis=1), np.arccos(np.clip(cosine.min(axis=(1, 2)), -1, 1))
 
 
-def triangulated_points(
-    capture: Capture, *, progress: Callable[[int, int], None] | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+def triangulated_points(capture: Capture, *, progress: Progress | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Triangulates sparse points from the training frames. Deterministic.
 
     Args:

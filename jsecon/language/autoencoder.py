@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -12,7 +11,7 @@ from jaxtyping import Float
 
 from jsecon.errors import require, require_shape
 from jsecon.numerics import FULL_PRECISION, cosine, is_traced, normalize
-from jsecon.types import Array, Key
+from jsecon.types import Array, Key, Progress
 
 ENCODER_WIDTHS = (256, 128, 64, 32)
 DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
@@ -80,7 +79,7 @@ def train_autoencoder(
     batch: int = 64,
     learning_rate: float = 7e-4,
     cosine_weight: float = 0.001,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Autoencoder:
     """Trains LangSplat's autoencoder (minghanqin/LangSplat, autoencoder/) on the regions' embeddings.
 

@@ -6,7 +6,6 @@ casts on each Gaussian) hold what a closed form needs. `distill_l1` is the paper
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +16,7 @@ from jsecon.errors import require, require_one_of, require_shape
 from jsecon.numerics import is_traced, normalize, require_labels, safe_norm
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.plan import ViewPlan, plan_view, plan_views, render_plan
-from jsecon.types import Array, Camera, Gaussians, Key, Votes
+from jsecon.types import Array, Camera, Gaussians, Key, Progress, Votes
 
 ADAM_EPS = 1e-15
 """3DGS's and LangSplat's: gradients per Gaussian are means over all pixels, far below the usual 1e-8"""
@@ -146,7 +145,7 @@ def distill_l1(
     init: str | Float[Array, "n d"] = "zero",
     learning_rate: float = 0.0025,
     capacity: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Distillation:
     """The paper's distillation (as LangSplat's, train.py): Adam on the L1 between rendered and target codes.
 

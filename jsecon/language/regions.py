@@ -13,7 +13,7 @@ from scipy import sparse
 from jsecon.errors import require, require_one_of, require_shape
 from jsecon.numerics import normalize, require_labels
 from jsecon.parallel import map_over_processes
-from jsecon.types import Array, Parts, Regions
+from jsecon.types import Array, Parts, Progress, Regions
 
 ALIKE_THRESHOLD = 0.9
 """Cosine of what sets two regions apart from the mean region (`mean_residuals`), from which they are one object seen
@@ -32,7 +32,7 @@ def region_embeddings(
     *,
     weighting: Literal["pixels", "uniform"] = "pixels",
     num_regions: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Regions:
     """Embeds the regions of a labelled sequence: the mean over the views, scaled to unit length. Host code.
 
@@ -101,7 +101,7 @@ def _pool_embeddings(
     *,
     weighting: Literal["pixels", "uniform"] = "pixels",
     num_regions: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Regions:
     """`region_embeddings` for an `embed` that takes the index of a frame. Several processes share the frames."""
     require_one_of("weighting", weighting, ("pixels", "uniform"), "Use 'pixels', as the paper does.")

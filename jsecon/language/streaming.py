@@ -10,7 +10,7 @@ import dataclasses
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -28,7 +28,7 @@ from jsecon.language.membership import add_shown, overlap_sums, soft_iou, views_
 from jsecon.language.votes import dense_votes, region_blocks
 from jsecon.numerics import NEAR, require_labels
 from jsecon.splat.visible import geometry_of_rows, visible_rows
-from jsecon.types import Array, Camera, Gaussians, Regions, Votes
+from jsecon.types import Array, Camera, Gaussians, Progress, Regions, Votes
 
 _PAIR = np.dtype([("gaussian", "<u4"), ("region", "<i4"), ("weight", "<f4")])
 """The weight that a view's region casts on a Gaussian."""
@@ -63,7 +63,7 @@ def region_votes_in_blocks(
     centre: float = 0.0,
     near: float = NEAR,
     rows: int = ROWS,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Votes:
     """`region_votes` of Gaussians in memory-mapped columns, equal up to float32's rounding of the sums.
 

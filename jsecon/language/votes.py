@@ -6,7 +6,6 @@ targets take only R values. The N x R votes therefore hold all that distillation
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -22,7 +21,7 @@ from jsecon.splat.capacity import default_capacity, enough_capacity
 from jsecon.splat.fusion import materialize
 from jsecon.splat.plan import ViewPlan, plan_view
 from jsecon.splat.walk import blend_weights, make_batches, make_table, to_tiles, walk
-from jsecon.types import Array, Camera, Gaussians, Votes
+from jsecon.types import Array, Camera, Gaussians, Progress, Votes
 
 # A tile of 8x8 pixels seldom shows more regions than this; where one does, the view is walked again for the rest.
 _SLOTS = 4
@@ -44,7 +43,7 @@ def region_votes(
     centre: float = 0.0,
     capacity: int | None = None,
     near: float = NEAR,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Votes:
     """Adds up the weight that each region casts on each Gaussian over all views.
 
@@ -90,7 +89,7 @@ def region_votes(
     return _as_votes(kept, labelled, state, totals if by_view else None, num_regions)
 
 
-def _report_block(progress: Callable[[int, int], None], block: int, blocks: int, done: int, total: int) -> None:
+def _report_block(progress: Progress, block: int, blocks: int, done: int, total: int) -> None:
     """Reports the views of one of several blocks of regions."""
     progress(block * total + done, blocks * total)
 
@@ -155,7 +154,7 @@ def dense_votes(
     centre: float = 0.0,
     capacity: int | None = None,
     near: float = NEAR,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> tuple[dict[str, Array], Array | None, int]:
     """Computes the votes of a block of regions. Host code.
 

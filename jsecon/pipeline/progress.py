@@ -15,8 +15,6 @@ from typing import Any, Literal, TypeAlias
 
 from tqdm import tqdm
 
-Progress: TypeAlias = Callable[[int, int], None]
-"""callback with the progress of a step: (done, total)"""
 Status: TypeAlias = Literal["run", "cached", "skipped"]
 
 QUIET_SECONDS = 2.0
@@ -72,7 +70,7 @@ class Listener:
         """Receives a line of results."""
 
     @contextlib.contextmanager
-    def progress(self, name: str) -> Iterator[Progress]:
+    def progress(self, name: str) -> Iterator[Callable[[int, int], None]]:
         """Yields a callback `(done, total)` for the duration of a step.
 
         Args:
@@ -118,7 +116,7 @@ class Console(Listener):
         self.say(f"  note: {text}")
 
     @contextlib.contextmanager
-    def progress(self, name: str) -> Iterator[Progress]:
+    def progress(self, name: str) -> Iterator[Callable[[int, int], None]]:
         """Draws a bar with the time left on a terminal, and prints a line now and then elsewhere.
 
         Args:

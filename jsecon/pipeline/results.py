@@ -18,8 +18,7 @@ from jsecon.errors import InputError
 from jsecon.language.codes import Coder
 from jsecon.pipeline import cache
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.progress import Progress
-from jsecon.types import Array, Capture, Gaussians, Parts, Quality, Regions, Votes
+from jsecon.types import Array, Capture, Gaussians, Parts, Progress, Quality, Regions, Votes
 from jsecon.vision.protocols import Networks
 
 CHECKPOINT_SECONDS = 20.0

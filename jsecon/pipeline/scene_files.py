@@ -22,12 +22,11 @@ from jsecon.data.gaussians.ply import MAX_READ_ROUNDING
 from jsecon.errors import InputError
 from jsecon.fit.quality import QUICK_LONG_SIDE
 from jsecon.fit.resize import resize_frame, shrink_cameras
-from jsecon.pipeline.progress import Progress
 from jsecon.pipeline.results import WARNING
 from jsecon.splat.project import project
 from jsecon.splat.render import render_rgb
 from jsecon.splat.transform import transform_gaussians_float64
-from jsecon.types import Camera, Capture, Gaussians
+from jsecon.types import Camera, Capture, Gaussians, Progress
 
 MIN_LEAD = 0.05
 """correlation with the frames by which a less likely world must exceed a likelier one"""

@@ -44,7 +44,6 @@ from jsecon.language.votes import region_votes, votes_memory
 from jsecon.pipeline.bare_stages import no_photographs, planned_views, require_options_apply, scene_itself
 from jsecon.pipeline.networks import describe_model
 from jsecon.pipeline.options import Options, is_bare_scene
-from jsecon.pipeline.progress import Progress
 from jsecon.pipeline.results import (
     KEY_FILE,
     Checkpoint,
@@ -59,7 +58,7 @@ from jsecon.pipeline.results import (
 from jsecon.pipeline.scene_files import check_overlap, place_in_capture, read_scene
 from jsecon.process import memory_budget
 from jsecon.splat.render import render_depth
-from jsecon.types import Capture, Gaussians, LanguageField, Regions
+from jsecon.types import Capture, Gaussians, LanguageField, Progress, Regions
 from jsecon.vision.classical import GRANULARITIES, ClassicalSegmenter
 from jsecon.vision.protocols import Embedder, Segmenter
 from jsecon.vision.reference_words import reference_of

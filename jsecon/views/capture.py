@@ -1,14 +1,12 @@
 """A capture of renders: the frames of a bare scene, seen from planned views."""
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jsecon.splat.render import render_rgb
 from jsecon.splat.sh import colours_from_sh
-from jsecon.types import Camera, Capture, Gaussians
+from jsecon.types import Camera, Capture, Gaussians, Progress
 from jsecon.views.plan import plan_views
 
 BACKGROUNDS = (0.0, 1.0, 0.5)
@@ -23,7 +21,7 @@ def render_capture(
     width: int = 400,
     height: int = 300,
     up: np.ndarray | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Capture:
     """Plans views of a bare scene and renders them as the frames of a capture.
 

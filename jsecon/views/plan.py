@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 
 from jsecon.errors import InputError, require
 from jsecon.language.votes import region_votes
-from jsecon.types import Camera, Gaussians
+from jsecon.types import Camera, Gaussians, Progress
 from jsecon.views.frame import SceneFrame, scene_frame, surface_points
 
 FIELD_OF_VIEW = 60.0
@@ -88,7 +88,7 @@ def plan_views(
     width: int = 400,
     height: int = 300,
     up: np.ndarray | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> PlannedViews:
     """Plans virtual views of a scene from its Gaussians alone.
 
