@@ -26,7 +26,6 @@ from jsecon.data.lens import PROJECTIONS, Lens
 from jsecon.errors import InputError
 from jsecon.files import atomic_write, path_within, read_text
 from jsecon.numerics import is_finite_and_bounded
-from jsecon.splat.transform import quaternion_from_matrix
 from jsecon.types import Capture
 
 _MODELS = {
@@ -395,8 +394,8 @@ def write_colmap(capture: Capture, path: str | Path, *, image_format: str = "png
     to_poses = np.eye(4) if capture.to_poses is None else np.asarray(capture.to_poses, np.float64)
     poses = transform_poses(np.asarray(cameras.world_to_camera, np.float64), to_poses)
     for n, (name, pose, camera) in enumerate(zip(names, poses, camera_of.ravel()), start=1):
-        quaternion = quaternion_from_matrix(pose[:3, :3])
-        numbers = itertools.chain(-quaternion if quaternion[0] < 0 else quaternion, pose[:3, 3])
+        quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True, scalar_first=True)
+        numbers = itertools.chain(quaternion, pose[:3, 3])
         head = struct.pack("<i7di", n, *numbers, camera + 1)
         image_bytes.append(head + os.fsencode(name) + b"\0" + struct.pack("<Q", 0))
     points = np.zeros(len(capture.points), "<u8, 3<f8, 3u1, <f8, <u8")

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from jsecon.errors import require
 from jsecon.splat.sh import sh_basis
@@ -52,7 +53,7 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -
         return Gaussians(
             means=means @ like(means, scale * rotation.T) + like(means, matrix[:3, 3]),
             log_scales=gaussians.log_scales + like(gaussians.log_scales, np.log(scale)),
-            quaternions=turns @ like(turns, _product_matrix(quaternion_from_matrix(rotation))),
+            quaternions=turns @ like(turns, _product_matrix(Rotation.from_matrix(rotation).as_quat(scalar_first=True))),
             opacity_logits=gaussians.opacity_logits,
             sh=like(sh, _sh_rotation(rotation, sh.shape[1])) @ sh,
         )
@@ -142,20 +143,6 @@ def recenter(
     back[:3, 3] = origin
     moved = dataclasses.replace(gaussians, means=(means - origin).astype(np.float32))
     return moved, dataclasses.replace(cameras, world_to_camera=poses.astype(np.float32)), back
-
-
-def quaternion_from_matrix(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
-    """Returns the unit quaternion (4,) wxyz of a rotation (3, 3): an eigenvector (Bar-Itzhack 2000), always stable."""
-    (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, np.float64)
-    symmetric = np.array(
-        [
-            [a + e + i, h - f, c - g, d - b],
-            [h - f, a - e - i, b + d, c + g],
-            [c - g, b + d, e - a - i, f + h],
-            [d - b, c + g, f + h, i - a - e],
-        ]
-    )
-    return np.linalg.eigh(symmetric)[1][:, -1]
 
 
 def _product_matrix(q: np.ndarray) -> np.ndarray:

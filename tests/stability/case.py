@@ -8,8 +8,8 @@ the compiled programs are shared.
 import dataclasses
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from jsecon.splat.transform import quaternion_from_matrix
 from jsecon.types import Camera, Gaussians
 
 COUNT = 64
@@ -85,7 +85,7 @@ def case_of(name, points, scales, quaternions=FACING, logits=1.0, *, camera=None
         log_scales = np.log(np.broadcast_to(np.asarray(scales, np.float64), (n, 3)))
     turned = np.broadcast_to(np.asarray(quaternions, np.float64), (n, 4))
     if not np.array_equal(pose[:3, :3], np.eye(3)):
-        turned = _product(quaternion_from_matrix(pose[:3, :3].T), turned)
+        turned = _product(Rotation.from_matrix(pose[:3, :3].T).as_quat(scalar_first=True), turned)
     behind = np.array([0.0, 0.0, -5.0])
     points = np.concatenate([points, np.tile(behind, (count - n, 1))])
     means = (points - pose[:3, 3]) @ pose[:3, :3]
