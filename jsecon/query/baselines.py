@@ -37,7 +37,8 @@ def query_one_step(codes: Codes, text_code: Float[Array, " d_text"], threshold: 
 
 @jax.jit
 def _one_step(codes: Array | UnitCodes, text_code: Array, threshold: Number) -> Selection:
-    return _selection(*similarities(codes, text_code), threshold)
+    similarity, known = similarities(codes, text_code)
+    return _selection(similarity, known, threshold)
 
 
 def query_canonical(
