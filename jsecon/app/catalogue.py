@@ -1,7 +1,8 @@
 """The catalogue of a field: its objects with names, boxes, sizes and parts."""
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -244,27 +245,31 @@ def _groups(field: LanguageField, main: np.ndarray, up: np.ndarray) -> Int[np.nd
     means = np.asarray(field.gaussians.means, np.float64)
     centers = {region: means[own].mean(0) for region, own in rows.items() if len(own) >= MIN_SAMPLES}
     reach = {region: np.linalg.norm(means[rows[region]] - c, axis=1).max() for region, c in centers.items()}
-    for first, second in pairs:
+    plain = jax.tree.map(np.asarray, dataclasses.replace(field.gaussians, sh=None))
+
+    def shape_of(*regions: int) -> ObjectShapes:
+        taken = jax.tree.map(lambda column: column[np.concatenate([rows[region] for region in regions])], plain)
+        return object_shapes(taken.means, np.zeros(taken.count, int), up, spreads=gaussian_spreads(taken))
+
+    shape = functools.cache(shape_of)
+    for first, second in pairs.tolist():
         if first in centers and second in centers:
             distance = np.linalg.norm(centers[first] - centers[second])
             near = distance <= 1.5 * (reach[first] + reach[second])  # before the boxes, which cost more
-            joined[first, second] = near and _is_continued(field, rows[first], rows[second], up)
+            common = functools.partial(shape_of, first, second)
+            joined[first, second] = near and _is_continued(shape(first), shape(second), common)
     return connected_components(joined, directed=False)[1]
 
 
-def _is_continued(field: LanguageField, first: np.ndarray, second: np.ndarray, up: np.ndarray) -> bool:
-    """Whether the Gaussians of two lists of rows touch, are of like size and fill a common upright box."""
-    chosen = np.concatenate([first, second, first, second])
-    own = np.repeat([0, 1, 2], [len(first), len(second), len(first) + len(second)])
-    gaussians = dataclasses.replace(field.gaussians, sh=None)
-    spreads = gaussian_spreads(jax.tree.map(lambda column: np.asarray(column)[chosen], gaussians))
-    shapes = object_shapes(np.asarray(field.gaussians.means)[chosen], own, up, spreads=spreads)
-    local = [np.abs((shapes.points[1 - k] - shapes.center[k]) @ shapes.axes[k]) for k in (0, 1)]
-    gap = min(np.linalg.norm(np.maximum(local[k] - shapes.half_size[k], 0), axis=1).min() for k in (0, 1))
-    volume = np.prod(shapes.half_size, axis=1)
-    size = 2 * np.linalg.norm(shapes.half_size[:2], axis=1).min()
-    comparable = volume[:2].max() <= SIZE_RATIO * volume[:2].min()
-    return bool(comparable and gap <= TOUCHING * size and volume[0] + volume[1] >= FILLED * volume[2])
+def _is_continued(first: ObjectShapes, second: ObjectShapes, common: Callable[[], ObjectShapes]) -> bool:
+    """Whether two objects touch, are of like size and fill the box of their `common` shape, which costs the most."""
+    pair = jax.tree.map(lambda *columns: np.concatenate(columns), first, second)
+    local = [np.abs((pair.points[1 - k] - pair.center[k]) @ pair.axes[k]) for k in (0, 1)]
+    gap = min(np.linalg.norm(np.maximum(local[k] - pair.half_size[k], 0), axis=1).min() for k in (0, 1))
+    volume = np.prod(pair.half_size, axis=1)
+    size = 2 * np.linalg.norm(pair.half_size, axis=1).min()
+    comparable = volume.max() <= SIZE_RATIO * volume.min()
+    return bool(comparable and gap <= TOUCHING * size and volume.sum() >= FILLED * np.prod(common().half_size))
 
 
 def _wholes(

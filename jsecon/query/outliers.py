@@ -154,7 +154,8 @@ def dbscan(points: Float[Array, "m 3"], eps: float, min_samples: int) -> Int[np.
     if not len(points):
         return np.full(0, -1)
     places, voxel, count = _places(points, eps)
-    return DBSCAN(eps=eps, min_samples=min_samples).fit(places, sample_weight=count).labels_[voxel]
+    weight = count if len(places) < len(points) else None  # of ones it would add up each list of neighbours
+    return DBSCAN(eps=eps, min_samples=min_samples).fit(places, sample_weight=weight).labels_[voxel]
 
 
 def one_component(points: Float[Array, "m 3"], eps: float) -> bool:
@@ -166,8 +167,12 @@ def one_component(points: Float[Array, "m 3"], eps: float) -> bool:
     linked = near < len(places)
     ends = np.nonzero(linked)[0], near[linked]
     graph = coo_array((np.ones(len(ends[0]), bool), ends), shape=(len(places), len(places)))
-    # The nearest links are enough where the points are evenly spaced, and spare the import of scikit-learn.
-    return connected_components(graph, directed=False)[0] == 1 or bool((dbscan(points, eps, 1) == 0).all())
+    count, component = connected_components(graph, directed=False)
+    # The nearest links are enough where the points are evenly spaced, and spare the import of scikit-learn; also where
+    # a component is so small that the links of its points show all that is near.
+    if count == 1 or np.bincount(component).min() < _LINKS:
+        return count == 1
+    return bool((dbscan(points, eps, 1) == 0).all())
 
 
 def _places(points: np.ndarray, eps: float) -> tuple[np.ndarray, Int[np.ndarray, " m"], Int[np.ndarray, " v"]]:
