@@ -70,8 +70,8 @@ gc.set_threshold(20_000, 20, 20)
 # fmt: off
 LONGEST = (
     "pipeline", "fit", "corrections", "views", "cores", "cli", "rivals", "readme", "networks", "classes", "render",
-    "motion", "silhouette", "viewer", "refinement", "synthetic", "tables", "codes", "autoencoder", "consensus",
-    "scene_stages", "processes", "capacity", "distill",
+    "capacity", "relations", "retrieval", "distill", "evidence", "motion", "silhouette", "autoencoder", "synthetic",
+    "consensus", "names", "codes", "scene_stages", "viewer", "processes",
 )
 # fmt: on
 """files, without test_, that start first; files that use `room_run` come after test_pipeline, which makes it"""
