@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from jax import export
 
 import jsecon
@@ -26,7 +27,7 @@ _CHECKSUM = 16
 def stored_jit(function: Callable, *, static_argnums: tuple[int, ...] = ()) -> Callable:
     """Compiles a function like jax.jit, and keeps each trace in jax's folder of compiled programs, if there is one.
 
-    Inside a trace, and for arrays on several devices, it is jax.jit.
+    Inside a trace, off the CPU, and for arrays that were put on a device, it is jax.jit.
 
     Args:
       function: Pure function of positional arguments. Its result holds arrays in tuples and records (`jsecon.types`),
@@ -44,7 +45,7 @@ def stored_jit(function: Callable, *, static_argnums: tuple[int, ...] = ()) -> C
         config: Any = jax.config
         folder = config.jax_compilation_cache_dir
         leaves, tree = jax.tree.flatten([arg for n, arg in enumerate(args) if n not in static_argnums])
-        if folder is None or is_traced(leaves) or any(_is_spread(leaf) for leaf in leaves):
+        if folder is None or jax.default_backend() != "cpu" or is_traced(leaves) or any(map(_is_placed, leaves)):
             return compiled(*args)
         types = [jax.typeof(leaf) for leaf in leaves]
         static = {n: repr(args[n]) for n in static_argnums}
@@ -64,7 +65,8 @@ def stored_jit(function: Callable, *, static_argnums: tuple[int, ...] = ()) -> C
 
             program.__name__ = function.__name__
             programs[key] = jax.jit(program)
-        return programs[key](*leaves)
+        # A stored program commits its results to a device: a mesh could not take them. On a CPU this is no copy.
+        return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)), programs[key](*leaves))
 
     return call
 
@@ -83,9 +85,9 @@ def _stored(file: Path, function: Any, types: list[Any]) -> export.Exported:
     return traced
 
 
-def _is_spread(leaf: Any) -> bool:
-    """Whether an array lies on several devices."""
-    return isinstance(leaf, jax.Array) and len(leaf.devices()) > 1
+def _is_placed(leaf: Any) -> bool:
+    """Whether an array was put on one device, or on several."""
+    return isinstance(leaf, jax.Array) and leaf.committed
 
 
 def _checksum(data: bytes) -> bytes:

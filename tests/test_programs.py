@@ -6,7 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import NamedSharding, PartitionSpec
 
+from jsecon.parallel import host_mesh
 from jsecon.programs import stored_jit
 from jsecon.splat.plan import make_plan
 
@@ -89,3 +91,12 @@ def test_plans_of_views_are_the_same_bits(folder, scene, camera):
         plan = stored_jit(make_plan, static_argnums=(2, 4))(*arguments)
         assert (plan.width, plan.height, plan.mesh, plan.lists.tile) == (48, 40, None, expected.lists.tile)
         jax.tree.map(np.testing.assert_array_equal, plan, expected)
+
+
+def test_a_result_goes_on_to_several_devices_and_a_placed_array_stays_where_it_is(folder):
+    run, _ = counted()
+    x = np.arange(4, dtype=np.float32)
+    spread = jax.device_put(x, NamedSharding(host_mesh(), PartitionSpec()))
+    np.testing.assert_array_equal(jnp.add(run(x, 2.0, 2)["y"], spread), 2 * x**2 + x)
+    last = jax.devices()[-1]
+    assert run(jax.device_put(x, last), 2.0, 2)["y"].devices() == {last}

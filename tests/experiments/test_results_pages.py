@@ -62,7 +62,7 @@ def test_tables_4_and_5_and_thresholds():
 
 
 def test_equal_rules():
-    readings, untrained, trained, published, fresh, high, shared, _ = page("equal_rules")
+    readings, untrained, trained, published, fresh, high, shared, levels, _ = page("equal_rules")
     assert readings[0][0] == "reading"
     chosen = metrics("fair") | metrics("fair_replica")
     fresh_runs = metrics("fair_fresh") | metrics("fair_fresh_replica")
@@ -96,6 +96,12 @@ def test_equal_rules():
         if not method.startswith("ours"):
             assert cells[0] == f"{runs[0]['published']:.3f}"
             assert [cells[2], cells[4]] == ["{:+.3f} [{:+.3f}, {:+.3f}]".format(*run["ahead"]) for run in runs]
+    of_levels = metrics("fair_thresholds")
+    for level, *cells in levels[1:]:
+        for figure, told in (("miou", cells[:3]), ("miou_vala", cells[3:])):
+            row = of_levels[f"lerf {level}"][f"Occam's LGS, {figure}"]
+            ahead = "{:+.3f} [{:+.3f}, {:+.3f}]".format(*row["ahead"])
+            assert told == [f"{row['ours there']:.3f}", f"{row['mean']:.3f}", ahead]
     for method, *cells in published[1:]:
         runs = [chosen[f"{name} medium"][f"{method}, miou"]["published"] for name in TABLES]
         assert cells == [f"{value:.3f}" for value in runs]
