@@ -9,6 +9,7 @@ with the points that the true masks of all views put into the object.
 Then refusal: texts of the scene, and of names that nothing in it has (`twins.absent_texts`), are held against
 thresholds on the similarity of their best region. The thresholds are constants, or quantiles of the similarities of
 reference words in the same field. One half of the absent names are the reference words, the other half are refused.
+The rows "jsecon query" refuse as the command does, by its own unrelated words and all absent names.
 """
 
 import argparse
@@ -35,7 +36,7 @@ from jsecon.process import clear_programs
 from jsecon.query.match import match_regions
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.parts import parts_fallback
-from jsecon.query.rules import RETRIEVAL_THRESHOLD, QueryRules
+from jsecon.query.rules import QUANTILE, RETRIEVAL_THRESHOLD, QueryRules
 from jsecon.query.select import query_anchored, query_several
 from jsecon.types import LanguageField
 
@@ -159,7 +160,19 @@ def measure(data: twins.Data, scene: str, seed: int, level: str) -> dict:
                     told[by][row][query] = round(float((kept & own).sum() / (kept | own).sum()), 4)
         if by == "consensus":
             told["refusal"] = refusal(setting, field)
+        told["refusal"] |= default_refusal(setting, field, by)
     return told
+
+
+def default_refusal(setting: Setting, field: LanguageField, by: str) -> dict[str, float]:
+    """Shares of the present texts that `jsecon query` answers by default, and of the absent ones that it refuses."""
+    absent = twins.words_of(setting.bench, setting.folder.parent, setting.level, setting.seed).absent
+
+    def share(texts):
+        return float(np.mean([bool(match_regions(field, jnp.asarray(text)[None]).chosen.any()) for text in texts]))
+
+    name = f"jsecon query, {by}, quantile {QUANTILE:g}"
+    return {f"{name}: kept": share(setting.texts), f"{name}: refused": 1 - share(absent)}
 
 
 def best_scores(field: LanguageField, texts: np.ndarray, retrieval: str) -> np.ndarray:

@@ -470,11 +470,11 @@ class Completion(Verb):
 
 VERBS: dict[type[Verb], str] = {
     Demo: "demo.demo",
-    Run: "app.run_report",
-    Fit: "app.run_report",
+    Run: "app.running",
+    Fit: "app.running",
     Query: "app.querying",
-    Objects: "app.catalogue_files",
-    Export: "app.catalogue_files",
+    Objects: "app.exports",
+    Export: "app.exports",
     View: "app.viewer.window",
     Eval: "app.evaluation",
     Serve: "app.server.serve",

@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from jsecon.app import ask, evaluation, pictures, report, run_report, verbs
+from jsecon.app import ask, evaluation, pictures, report, running, verbs
 from jsecon.app.evaluation import Evaluation
 from jsecon.app.outputs import answer_masks, write_answer
 from jsecon.data.labels import LabelledFrame, load_lerf_labels
@@ -98,7 +98,7 @@ def run_demo(
 
 def demo_verb(verb: verbs.Demo, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon demo`."""
-    names = (*run_report.FILES, "queries", "demo.jpg", "demo.webp")
+    names = (*running.FILES, "queries", "demo.jpg", "demo.webp")
     result = run_demo(verb.out, seed=verb.seed, steps=verb.steps, listener=console)
     return {"written": [verb.out / name for name in names]} | result
 
@@ -196,8 +196,8 @@ def _page(
         report.section("How well", words, table),
         _iou_section(results),
         _query_section(run, results["anchored"][0], results["true_masks"][0], queries, labels),
-        *run_report.scene_parts(run),
-        *run_report.work_parts(run),
+        *running.scene_parts(run),
+        *running.work_parts(run),
     ]
     lead = "A made-up room as an ordinary capture: frames, poses and sparse points in, answers to texts out, "
     lead += "on a plain CPU and without any learned weights."

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsecon.app.ask import Answer, ask_pixel, ask_text
-from jsecon.app.catalogue_files import object_record
+from jsecon.app.exports import object_record
 from jsecon.app.locate import Place, locate_answer
 from jsecon.app.object_scene import ObjectScene
 from jsecon.app.outputs import best_frames, selected_gaussians
