@@ -5,7 +5,6 @@ import os
 import re
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import jax
@@ -122,13 +121,11 @@ def test_a_stop_that_python_drops_comes_again():
         "Gone(lambda: os.kill(os.getpid(), signal.SIGTERM))\n"
         "print('went on', flush=True)\n"
         "try:\n"
-        "    time.sleep(30)\n"
+        "    time.sleep(600)\n"
         "except KeyboardInterrupt:\n"
         "    sys.exit(130)"
     )
-    began = time.monotonic()
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT)
-    assert time.monotonic() - began < 30, "it waited for the sleep to end"
     assert (done.returncode, done.stdout) == (130, "went on\n")
     assert "ZeroDivisionError" in done.stderr
     assert "KeyboardInterrupt" not in done.stderr
