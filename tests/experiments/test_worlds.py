@@ -1,6 +1,7 @@
 """Hard worlds: each switch does what it says, alike in all views, and nothing where it is off."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from experiments.simulated_vision.masks import LEVELS
 from experiments.simulated_vision.worlds import World, seen_in, world_of
 from experiments.tables import twins
 from experiments.tables.rows import TRAINED
+from experiments.worlds import Asked, main
 from jsecon.data.labels import LabelledFrame
 from jsecon.demo.room import TABLE_WOOD, srgb_to_linear
 from jsecon.errors import InputError
@@ -272,3 +274,16 @@ def test_every_fault_has_its_worlds_and_methods_are_read_as_suits_them_there():
     text = worlds.layout({("none", 0.0): told, ("kinds", 1.0): told | {"VALA": {"miou": 0.99, "miou_vala": 0.0}}})
     assert "| kinds 1 | 0.990 | 0.900 | -0.090 |" in text
     assert "behind in: kinds 1 (VALA, by 0.090)" in text
+
+
+@pytest.mark.long
+def test_a_quick_run_measures_every_method_in_the_plain_world_and_under_two_faults(tmp_path):
+    main(Asked((), (0,), (0,), ("parts", "kinds"), (1.0,), (), (0,), True, str(tmp_path)), processes=1)
+    worlds_of = json.loads((tmp_path / "metrics.json").read_text())
+    assert set(worlds_of) == {"none 0", "parts 1", "kinds 1"}
+    for methods in worlds_of.values():
+        assert {"ours, consensus", "ours, tracks", "Occam's LGS"} <= set(methods)
+        assert all(0 <= figure <= 1 for figures in methods.values() for figure in figures.values())
+        assert methods["ours, consensus"]["miou"] > 0
+    assert "| miou" in (tmp_path / "table.md").read_text()
+    assert (tmp_path / "figure.webp").exists()
