@@ -106,6 +106,38 @@ def test_the_frame_turns_scales_and_moves_with_the_scene(room, seed):
     assert second.sure
 
 
+def walls_of(length, width, height):
+    """Points of a floor and four walls of a room."""
+    x, y, z = np.diag([length, width, height])
+    return [sheet(np.zeros(3), *sides) for sides in ((x, y), (x, z), (y, z))] + [sheet(y, x, z), sheet(x, y, z)]
+
+
+PLACES = {
+    "wall larger than the floor": (walls_of(6.0, 2.0, 4.0)[:2], 0.3),
+    "room higher than wide": (walls_of(3.0, 3.0, 5.0), 0.3),
+    "ceiling": ([*walls_of(4.0, 3.0, 2.5), sheet([0.0, 0.0, 2.5], [4.0, 0.0, 0.0], [0.0, 3.0, 0.0])], 0.3),
+    "no floor": ([sheet([-2.0, 0.0, -1.0], [6.0, 0.0, 0.0], [0.0, 0.0, 3.0])], 0.0),
+}
+"""points of planes, and the height of what lies before them"""
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("seed", range(2))
+def test_up_is_right_where_the_largest_plane_is_no_floor(place, seed):
+    planes, height = PLACES[place]
+    things = [ball_points([x, y, height]) for x, y in ((0.8, 0.6), (2.2, 1.2), (1.4, 1.0))]
+    if place == "no floor":  # a board on the wall, and things to both sides of it
+        board = sheet([1.0, -0.2, -0.5], [0.5, -1.0, 0.0], [0.0, 0.0, 1.5])
+        things = [board, ball_points([1.0, -0.6, 0.2]), ball_points([1.2, 0.8, -0.2])]
+    points = np.concatenate([*planes, *things])
+    turn = Rotation.random(random_state=seed).as_matrix()
+    for scale, rotation in ((1.0, np.eye(3)), (7.0, turn)):
+        frame = scene_frame(scale * points @ rotation.T + scale)
+        up = rotation.T @ frame.axes[2]
+        assert up[2] > 0.98 or (place == "no floor" and up[2] < -0.98)
+        assert not (frame.sure and place == "no floor")
+
+
 def test_the_up_axis_can_be_given(room):
     frame = scene_frame(surface_points(room), np.array([0.0, 2.0, 0.0]))
     np.testing.assert_allclose(frame.axes[2], [0, 1, 0])

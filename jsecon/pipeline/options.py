@@ -94,7 +94,7 @@ class BareOptions:
 
     Attributes:
       views: Number of virtual views that are planned and rendered, at least 2.
-      up: Up axis of the scene, three numbers. By default it is the normal of the largest plane, the ground.
+      up: Up axis of the scene, three numbers. By default it is the normal of the ground, a large plane.
       cameras: Renders the scene from these poses instead of planned ones: a COLMAP model, or a transforms.json. Their
         images are not needed.
     """

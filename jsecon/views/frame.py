@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import KDTree
 
 from jsecon.errors import InputError
 from jsecon.types import Camera, Gaussians, LanguageField
@@ -32,8 +33,12 @@ RIVAL = 0.5
 """share of the largest plane's surface from which another plane may be the ground"""
 SURE_SHARE = 0.1
 """share of the surface in the ground plane from which its direction is trusted"""
-SURE_SIDE = 0.85
-"""share of the remaining surface on one side of the ground plane from which its sign is trusted"""
+ONE_SIDED = 0.85
+"""share of the remaining surface on one side of a plane from which it may be the ground"""
+MARGIN = 2.0
+"""ratio of another such plane's score to that of the ground from which the choice is trusted"""
+NEIGHBOURS = 32
+"""points that tell which way the surface around a point faces"""
 DISTINCT = np.cos(np.radians(20))
 """cosine below which two planes have different normals"""
 PARALLEL = 0.01
@@ -108,8 +113,10 @@ def surface_points(gaussians: Gaussians) -> Float[np.ndarray, "p 3"]:
 def scene_frame(points: Float[np.ndarray, "p 3"], up: np.ndarray | None = None) -> SceneFrame:
     """Finds the robust box of a scene and its up axis.
 
-    The ground is the largest plane, or one of those nearly as large along whose normal the scene is flattest. It is
-    turned so that the scene lies above it.
+    The ground is a large plane with nearly all of the scene on one side, which is up. Of several such planes (floor,
+    ceiling, walls) it is the one with the smallest product of two lengths: the scene's height above it, and the median
+    height of what lies in none of them. Without such a plane, up is the direction that fewest surfaces face, as walls
+    do not; it is then not trusted.
 
     Args:
       points: (P, 3) points of the surface (`surface_points`).
@@ -144,32 +151,48 @@ def scene_frame(points: Float[np.ndarray, "p 3"], up: np.ndarray | None = None) 
 
 
 def _ground_normal(points: np.ndarray) -> tuple[np.ndarray, bool, str]:
-    """Returns the normal of the ground, whether it is trusted, and on what evidence."""
+    """Returns the normal of the ground, or what walls tell of it; whether it is trusted, and on what evidence."""
     low, high = np.quantile(points, [TRIM, 1 - TRIM], axis=0)
     tolerance = PLANE_TOLERANCE * float(np.linalg.norm(high - low))
     normals, offsets, shares = _planes(points, tolerance)
-    order = np.argsort(-shares)
-    distinct: list[int] = []
-    for index in order:
-        if shares[index] < RIVAL * shares[order[0]]:
+    grounds: list[tuple[np.ndarray, np.ndarray, float]] = []  # normal, heights of the points, share of the rest above
+    for index in np.argsort(-shares):
+        if shares[index] < RIVAL * shares.max():
             break
-        if all(abs(normals[index] @ normals[other]) < DISTINCT for other in distinct):
-            distinct.append(index)
-    spans = []
-    for index in distinct:
-        heights = points @ normals[index]
-        spans.append(np.subtract(*np.quantile(heights, [1 - TRIM, TRIM])))
-    best = distinct[int(np.argmin(spans))]
-    normal, offset = _refined(points, normals[best], offsets[best], tolerance)
-    heights = points @ normal - offset
-    rest = np.abs(heights) > tolerance
-    above = float((heights[rest] > 0).mean()) if rest.any() else 0.5
-    if above < 0.5:
-        normal, above = -normal, 1 - above
-    share = float(1 - rest.mean())
-    sure = share >= SURE_SHARE and above >= SURE_SIDE
+        normal, offset = _refined(points, normals[index], offsets[index], tolerance)
+        heights = points @ normal - offset
+        rest = heights[np.abs(heights) > tolerance]
+        above = float((rest > 0).mean()) if len(rest) else 1.0
+        if above < 0.5:
+            normal, heights, above = -normal, -heights, 1 - above
+        if above >= ONE_SIDED and all(normal @ other < DISTINCT for other, _, _ in grounds):
+            grounds.append((normal, heights, above))
+    if not grounds:
+        return _along_walls(points), False, "walls: fewest surfaces face it, as no plane has the scene on one side"
+    outside = np.all([np.abs(heights) > tolerance for _, heights, _ in grounds], axis=0)
+    things = outside if outside.any() else slice(None)
+    spans = [np.subtract(*np.quantile(heights, [1 - TRIM, TRIM])) for _, heights, _ in grounds]
+    scores = [span * np.median(np.abs(heights[things])) for span, (_, heights, _) in zip(spans, grounds)]
+    best = int(np.argmin(scores))
+    normal, heights, above = grounds[best]
+    share = float((np.abs(heights) <= tolerance).mean())
+    clear = outside.any() and (np.delete(scores, best) >= MARGIN * scores[best]).all()
     evidence = f"a plane with {share:.0%} of the surface, and {above:.0%} of the rest above it"
-    return normal, sure, evidence
+    evidence += f", of {len(grounds)} such planes the one nearest to the things" if len(grounds) > 1 else ""
+    return normal, bool(share >= SURE_SHARE and clear), evidence
+
+
+def _along_walls(points: np.ndarray) -> np.ndarray:
+    """Returns the direction that fewest surfaces face, on the side of the sparser half of the points."""
+    unique = np.unique(points, axis=0)
+    near = unique[KDTree(unique).query(unique, min(NEIGHBOURS, len(unique)))[1]]
+    centred = near - near.mean(1, keepdims=True)
+    spread, axes = np.linalg.eigh(centred.mT @ centred)
+    flatness = (spread[:, 1] - spread[:, 0]) / spread[:, 2]
+    normals = axes[:, :, 0]
+    up = np.linalg.eigh((flatness[:, None] * normals).T @ normals)[1][:, 0]
+    low, middle, high = np.quantile(points @ up, [TRIM, 0.5, 1 - TRIM])
+    return up if 2 * middle <= low + high else -up
 
 
 def _planes(points: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

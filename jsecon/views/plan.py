@@ -97,7 +97,7 @@ def plan_views(
       views: T, number of views.
       width: Width of the views, px.
       height: Height of the views, px.
-      up: (3,) up axis of the world; None takes it from the largest plane.
+      up: (3,) up axis of the world; None finds it (`scene_frame`).
       progress: Called as progress(done, total) while candidates are rendered.
 
     Returns:
