@@ -11,13 +11,13 @@ from jsecon.parallel import host_mesh
 from jsecon.process import compilation_counts
 from jsecon.query.render import selection_mask
 from jsecon.splat.capacity import default_capacity, enough_capacity, plan_capacity
-from jsecon.splat.plan import plan_view, plan_views, render_plan
+from jsecon.splat.plan import plan_views, render_plan
 from jsecon.splat.reference import render_reference
 from jsecon.splat.render import render, render_depth
 from jsecon.types import Gaussians
 
-COVERING = 2100
-"""Gaussians of `covering`: with four blocks in the image, 8,400 pairs"""
+COVERING = 1100
+"""Gaussians of `covering`: with four blocks in the image, 4,400 pairs"""
 
 
 @pytest.fixture(scope="module")
@@ -44,9 +44,6 @@ def test_jit_without_a_capacity_is_exact(scene, camera):
     assert int(rendering.overflow) == 0
     assert np.median(np.abs(np.asarray(rendering.features) - expected)) < 1e-6
     assert np.abs(np.asarray(rendering.alpha) - alpha).max() < 1 / 255
-    # also where the scene is a constant to jit
-    inside = jax.jit(lambda f: render(scene, camera, f))(features)
-    np.testing.assert_allclose(inside.features, rendering.features, atol=5e-6)
 
 
 @pytest.mark.long
@@ -94,17 +91,16 @@ def test_plans_and_votes_hold_what_exceeds_it(covering, cameras):
     pair = jax.tree.map(lambda a: a[:2], cameras)
     plans = plan_views(covering, pair)
     assert np.asarray(plans.overflow).tolist() == [0, 0]
-    features = features_of(COVERING)
+    features, weight = features_of(COVERING), 0.0
     for t in range(2):
         one = render_plan(jax.tree.map(lambda a, t=t: a[t], plans), features)
         np.testing.assert_allclose(one.features, render_reference(covering, pair[t], features)[0], atol=2e-4)
+        weight += np.asarray(one.alpha).sum()
     assert plan_views(covering, pair, max_bytes=1000) is None
 
     labels = np.zeros((2, 40, 48), np.int32)
     votes = region_votes(covering, pair, labels, 1)
     assert int(votes.overflow) == 0
-    weight = np.asarray(render_plan(plan_view(covering, pair[0]), np.ones((COVERING, 1), np.float32)).alpha).sum()
-    weight += np.asarray(render_plan(plan_view(covering, pair[1]), np.ones((COVERING, 1), np.float32)).alpha).sum()
     np.testing.assert_allclose(np.asarray(votes.total).sum(), weight, rtol=1e-4)
     inside = jax.jit(lambda seen: region_votes(covering, pair, seen, 1))(labels)
     assert int(inside.overflow) == 2 * (4 * COVERING - default_capacity(COVERING, 48, 40))

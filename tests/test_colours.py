@@ -149,7 +149,7 @@ def test_a_mask_of_two_unlike_pixels_has_an_embedding(embedder):
     assert np.linalg.norm(found) == pytest.approx(1, abs=1e-5)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=10)
 @given(st.integers(0, 2**32 - 1))
 def test_equivariance_and_exposure(seed):
     """Rows follow the masks; mirroring the frame changes nothing; a little less light keeps a colour's vector near."""

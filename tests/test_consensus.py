@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from balls import HEIGHT, VIEWS, WIDTH, ious, ring_of_balls
-from hypothesis import given, strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy import sparse
 
 from jsecon.association.consensus import (
@@ -160,6 +160,7 @@ def same_partition(a, b):
     return np.array_equal(a[:, None] == a[None], b[:, None] == b[None])
 
 
+@settings(deadline=None, max_examples=40)
 @given(st.integers(0, 10**6), st.integers(1, 14), st.floats(0.05, 0.95))
 def test_average_linkage_joins_what_the_slow_twin_joins(seed, count, least):
     rng = np.random.default_rng(seed)

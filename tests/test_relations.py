@@ -43,7 +43,7 @@ def scores(a, b, view=None):
     return table | {"gap": float(gap(a, b)[0])}
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(PLACES, PLACES, SIDES, SIDES, st.floats(0.1, 50.0), st.floats(-3, 3), PLACES)
 def test_scores_stand_any_scene_that_is_moved_turned_and_scaled(a, b, half_a, half_b, scale, turn, shift):
     c, s = np.cos(turn), np.sin(turn)
@@ -62,7 +62,7 @@ def test_scores_stand_any_scene_that_is_moved_turned_and_scaled(a, b, half_a, ha
     assert there["gap"] == pytest.approx(scale * here["gap"], rel=1e-3, abs=scale * 1e-4)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(PLACES, PLACES, SIDES, SIDES)
 def test_directions_are_antisymmetric(a, b, half_a, half_b):
     one, other = brick(a, half_a), brick(b, half_b)
@@ -74,7 +74,7 @@ def test_directions_are_antisymmetric(a, b, half_a, half_b):
         assert forth[name] == pytest.approx(back[name], abs=1e-5)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(SIDES, SIDES, st.lists(st.floats(0, 10, width=32), min_size=2, max_size=2))
 def test_near_falls_with_the_distance(half_a, half_b, distances):
     one = brick((0, 0, 0), half_a)
@@ -113,16 +113,16 @@ def test_predicates_are_pure_jitted_and_batched():
     both = jax.tree.map(
         lambda *columns: jnp.concatenate(columns), brick((0, 0, 0), (0.1,) * 3), brick((1, 0, 0), (0.2,) * 3)
     )
-    table = jax.vmap(lambda a: jax.vmap(lambda b: near(a, b))(both))(both)
+    table = jax.jit(jax.vmap(jax.vmap(near, (None, 0)), (0, None)))(both, both)
+    compiled = jax.jit(lambda a, b, view: {name: pair_scores(name, a, b, view) for name in PAIRS})
+    scored, arrays = compiled(both, both, looking()), jax.tree.map(np.asarray, both)
     for relation in PAIRS:
-        scored = pair_scores(relation, both, both, looking())
-        compiled = jax.jit(pair_scores, static_argnums=0)(relation, both, both, looking())
-        plain = pair_scores(relation, jax.tree.map(np.asarray, both), jax.tree.map(np.asarray, both), looking())
-        np.testing.assert_allclose(scored, compiled, rtol=1e-5, atol=1e-6)
-        np.testing.assert_allclose(scored, plain, rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(table, pair_scores("near", both, both, looking()), rtol=1e-5)
+        plain = pair_scores(relation, arrays, arrays, looking())
+        np.testing.assert_allclose(scored[relation], plain, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(scored["near"], pair_scores("near", both, both, looking()), rtol=1e-5)
+    np.testing.assert_allclose(table, scored["near"], rtol=1e-5)
     np.testing.assert_allclose(jax.jit(near)(both[0], both[1]), table[0, 1], rtol=1e-5)
-    values = order_values(both, looking())
+    values = order_values(arrays, looking())
     assert values["largest"].argmin() == values["tallest"].argmin() == values["rightmost"].argmin() == 1
 
 
