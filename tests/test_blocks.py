@@ -81,27 +81,24 @@ def test_weights_at_the_centre(scene, cameras, labels, tmp_path):
 
 @pytest.mark.parametrize("opaque", [0.0, pytest.param(4.0, marks=pytest.mark.long)])
 def test_equal_at_many_gaussians(tmp_path, monkeypatch, opaque):
-    """12,000, all visible; opaque, most lie behind what stopped every pixel. Dense blocks hold two regions each."""
-    monkeypatch.setattr(votes_module, "_DENSE_BYTES", 4 * 2 * 12_288)
-    scene, cameras = ball(12_000, 3, 160, 120, opaque=opaque)
+    """4,000, all visible; opaque, most lie behind what stopped every pixel. Dense blocks hold two regions each."""
+    monkeypatch.setattr(votes_module, "_DENSE_BYTES", 4 * 2 * 4096)
+    scene, cameras = ball(4000, 3, 160, 120, opaque=opaque)
     labels = blocky(np.random.default_rng(1), 3, 120, 160, 7)
     memory = region_votes(scene, cameras, labels, 7, top=3)
-    cast = region_votes_in_blocks(scene, cameras, labels, 7, top=3, folder=tmp_path / "v", rows=1500)
+    cast = region_votes_in_blocks(scene, cameras, labels, 7, top=3, folder=tmp_path / "v", rows=500)
     assert_alike(cast, memory, pixels=3)
     assert (np.asarray(cast.regions) != np.asarray(memory.regions)).sum() <= 4
     assert (np.asarray(cast.views) != np.asarray(memory.views)).sum() <= 4
     np.testing.assert_allclose(cast.cut, memory.cut, rtol=1e-4, atol=1e-3)
 
 
-def test_equal_depths_keep_the_order_of_indices(tmp_path):
-    """Thirty Gaussians in one place: each sees what those before it leave."""
-    one, cameras = ball(1, 1, 40, 40)
-    scene = jax.tree.map(lambda a: np.repeat(a, 30, 0), one)
-    scene.means[:] = 0
-    scene.log_scales[:] = -1
-    labels = np.zeros((1, 40, 40), np.int32)
-    memory = region_votes(scene, cameras, labels, 1)
-    cast = region_votes_in_blocks(scene, cameras, labels, 1, folder=tmp_path / "v", rows=7)
+def test_equal_depths_keep_the_order_of_indices(scene, cameras, labels, tmp_path):
+    """All Gaussians in one place: each sees what those before it leave."""
+    alike = {"means": np.zeros_like(scene.means), "log_scales": np.full_like(scene.log_scales, -1)}
+    scene = dataclasses.replace(scene, **alike, opacity_logits=np.full_like(scene.opacity_logits, -3))
+    memory = region_votes(scene, cameras, labels, REGIONS, top=REGIONS)
+    cast = region_votes_in_blocks(scene, cameras, labels, REGIONS, top=REGIONS, folder=tmp_path / "v", rows=16)
     assert (np.diff(cast.total) < 0).all()
     assert_alike(cast, memory)
 
