@@ -81,6 +81,7 @@ def test_the_tools_answer(server):
         ("relation", {"text": "word " * 90}, "at most"),
         ("relation", {"text": "red mug", "frame": "nowhere"}, "no such frame"),
         ("locate", {"text": "two red mugs"}, "names 2 objects"),
+        ("locate", {"text": "red mug"}, "names 2 objects"),
         ("measure", {"a": "red mug", "b": "dark blue box"}, "names 2 objects"),
         ("measure", {"a": "red mug"}, "b"),
         ("render", {"text": "red mug", "frame": "#99"}, "no such frame"),

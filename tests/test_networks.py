@@ -301,8 +301,8 @@ def test_models_by_name_are_fetched_once_and_found_again_for_a_moved_field(
 
 def test_models_are_listed_fetched_checked_and_removed_by_name(hub, tmp_path, monkeypatch, capsys):
     use_hub(hub, tmp_path / "cache", monkeypatch)
-    assert cli.main(["models", "get", "siglip2", "--yes"]) == 0
-    capsys.readouterr()
+    assert cli.main(["models", "get", "edgetam", "siglip2", "--yes"]) == 2  # this hub has no tracker of the first name
+    assert "has no such repository" in capsys.readouterr().err
     assert cli.main(["models", "list", "--json"]) == 0
     rows = {
         row["name"]: row["cached"] for row in json.loads(capsys.readouterr().out)["models"] if row["role"] == "embedder"
@@ -318,5 +318,7 @@ def test_models_are_listed_fetched_checked_and_removed_by_name(hub, tmp_path, mo
     assert cli.main(["models", "remove", "siglip2"]) == 0
     assert cli.main(["models", "check", "siglip2"]) == 2
     assert "jsecon models get siglip2" in capsys.readouterr().err
+    assert cli.main(["models", "get", "auto", "--yes"]) == 0
+    assert cli.main(["models", "check", "siglip2"]) == 0
     assert cli.main(["models", "get", "clap", "--yes"]) == 2
     assert cli.main(["models", "get"]) == 2

@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from small_field import make_field
+from table_field import table_field
 
-from jsecon.app.ask import Answer
+import jsecon
+from jsecon.app.ask import Answer, ask_text, edit_answers
 from jsecon.app.locate import locate_answer
+from jsecon.app.server.scenes import Scene, SceneQuery
 from jsecon.errors import InputError
 from jsecon.types import Selection
 
@@ -64,3 +67,15 @@ def test_what_selects_nothing_has_no_place(answer):
     field, asked, *_ = answer
     with pytest.raises(InputError, match="no Gaussian is selected"):
         locate_answer(field, dataclasses.replace(asked, mask=np.zeros(64, bool)))
+
+
+def test_two_objects_of_a_name_are_counted_and_have_no_place_together():
+    field, embedder = table_field()
+    mugs, box = (ask_text(field, embedder, text) for text in ("red mug", "dark blue box"))
+    assert (mugs.objects, box.objects) == (2, 1)
+    assert edit_answers(field, [mugs], invert=True)[0].objects == 1
+    assert Scene("table", field, embedder).record(SceneQuery("red mug"))["objects"] == 2
+    with pytest.raises(InputError, match="names 2 objects"):
+        jsecon.locate(field, "red mug", embedder)
+    place = jsecon.locate(field, "dark blue box", embedder)
+    np.testing.assert_allclose(place.center, locate_answer(field, box).center)

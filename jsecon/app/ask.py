@@ -28,7 +28,7 @@ from jsecon.language.regions import ALIKE_THRESHOLD
 from jsecon.query import edits
 from jsecon.query.blocks import SparseSelection, select_in_blocks
 from jsecon.query.composite import parse_query
-from jsecon.query.match import ONE_REGION, RegionMatch, best_presence, match_region, match_regions
+from jsecon.query.match import ONE_REGION, RegionMatch, best_presence, join_pieces, match_region, match_regions
 from jsecon.query.outliers import split_outliers
 from jsecon.query.outline import lift
 from jsecon.query.parts import PartsAnswer, parts_fallback
@@ -65,6 +65,8 @@ class Answer:
       key: What tells the query from any other in the names of its files; None for a text, which does so itself.
       clusters: Number of clusters that DBSCAN kept and dropped, (0, 0) if it was not needed.
       relation: Of a referring expression, what `RelationAnswer.as_dict` has.
+      objects: Number of separate objects that the selection shows: groups of regions that overlap, at most as many as
+        there are clusters. It is 1 where the selection does not tell.
     """
 
     query: str
@@ -78,6 +80,7 @@ class Answer:
     key: str | None = None
     clusters: tuple[int, int] = (0, 0)
     relation: Mapping[str, Any] | None = None
+    objects: int = 1
 
     @property
     def quantile(self) -> float | None:
@@ -310,7 +313,12 @@ def _finish(
         mask &= (jnp.asarray(field.votes.views) > 0) & jnp.any(selection.mask)
         selection = dataclasses.replace(selection, mask=mask)
     answer = Answer(match.name, by, selection, np.asarray(selection.mask), match.skipped, match.presence, key=match.key)
-    return drop_outliers(field, answer, outliers, keep=match.keep)
+    answer = drop_outliers(field, answer, outliers, keep=match.keep)
+    overlap = field.votes.overlap
+    if match.parts is not None or overlap is None:
+        return answer
+    groups = join_pieces(np.flatnonzero(match.regions.chosen), np.asarray(overlap))
+    return dataclasses.replace(answer, objects=max(1, min(len(groups), answer.clusters[0])))
 
 
 def drop_outliers(field: LanguageField, answer: Answer, enabled: bool = True, *, keep: str = "supported") -> Answer:
@@ -368,7 +376,8 @@ def edit_answers(
             mask = answer.mask if near is None else edits.shrink(edits.grow(answer.mask, near, grow), near, shrink)
             mask = np.asarray(edits.invert(mask) if invert else mask)
             selection = dataclasses.replace(answer.selection, mask=mask)
-            answer = dataclasses.replace(answer, selection=selection, mask=mask)
+            objects = 1 if invert else answer.objects
+            answer = dataclasses.replace(answer, selection=selection, mask=mask, objects=objects)
         edited.append(answer)
     return edited
 

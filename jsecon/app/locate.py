@@ -58,7 +58,7 @@ class Place:
 
 
 def locate(field: LanguageField, text: str, embedder: Any = None, **options: Any) -> Place:
-    """Locates the thing that a text names.
+    """Locates the one thing that a text names.
 
     In five made-up rooms it finds all 60 things that have a unique name; `center` is off by 5 mm in the median
     (experiments/catalogue.py).
@@ -73,13 +73,32 @@ def locate(field: LanguageField, text: str, embedder: Any = None, **options: Any
       Centre, boxes and points of the selection.
 
     Raises:
-      InputError: No Gaussian is selected, or the embedder has no words for the text.
+      InputError: No Gaussian or more than one object is selected, or the embedder has no words for the text.
     """
     if embedder is None:
         from jsecon.pipeline.networks import field_embedder
 
         embedder = field_embedder(field)
-    return locate_answer(field, ask_text(field, embedder, text, **options))
+    return locate_single(field, ask_text(field, embedder, text, **options))
+
+
+def locate_single(field: LanguageField, answer: Answer) -> Place:
+    """Locates the object that an answer selected: the box of several would have its centre between them.
+
+    Args:
+      field: The field.
+      answer: Answer of that field, with a row for each of its Gaussians.
+
+    Returns:
+      As `locate_answer`.
+
+    Raises:
+      InputError: No Gaussian is selected, or more than one object.
+    """
+    if answer.objects > 1:
+        remedy = "Say which, as in 'the red mug left of the green bottle' (jsecon.query_relation), or point at it."
+        raise InputError(f"query {answer.query!r}", f"it names {answer.objects} objects", "one object", remedy)
+    return locate_answer(field, answer)
 
 
 def locate_answer(field: LanguageField, answer: Answer) -> Place:

@@ -15,7 +15,7 @@ import numpy as np
 
 from jsecon.app import pictures, verbs
 from jsecon.app.ask import frame_index
-from jsecon.app.locate import locate_answer
+from jsecon.app.locate import locate_answer, locate_single
 from jsecon.app.models import with_models
 from jsecon.app.outputs import best_frames
 from jsecon.app.relations import relation_answer
@@ -80,7 +80,7 @@ class Tools:
                 raise InputError(f"locate {text!r}", problem, remedy="Name one object.")
             place = locate_answer(scene.field, relation_answer(answer))
         else:
-            place = locate_answer(scene.field, scene.answer(SceneQuery(_words(text))))
+            place = locate_single(scene.field, scene.answer(SceneQuery(_words(text))))
         return place.as_dict() | {"top": np.round(scene.top_of(place), 6).tolist()}
 
     def measure(self, a: str, b: str, frame: str | None = None, field: str | None = None) -> dict[str, Any]:

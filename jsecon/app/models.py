@@ -36,7 +36,7 @@ def with_models(options: T, console: Console, *, yes: bool) -> T:
       InputError: A name is unknown, a model cannot be fetched, or the user declines.
     """
     precision = getattr(options, "precision", None)
-    recommended = hub.RECOMMENDED if getattr(options, "models", None) == "auto" else {}
+    recommended = hub.RECOMMENDED if getattr(options, "models", None) == AUTO else {}
     models = {}
     for role in get_args(Role):
         value = getattr(options, role, None) or recommended.get(role)
@@ -62,7 +62,7 @@ def _folders_of_models(
     with console.progress("hub"):
         downloads: list[tuple[Role, hub.Download]] = [(role, hub.plan_download(m)) for role, m in missing.items()]
     for _, download in downloads:
-        console.note(f"fetching {download}")
+        console.note(f"needs {download}" if not yes else f"fetching {download}")
     if not yes:
         commands = "; ".join(hub.get_command(model) for model in missing.values())
         where = " ".join(model.address for model in missing.values())
@@ -99,6 +99,8 @@ def open_embedder(field: Any, verb: verbs.FieldVerb, console: Console) -> Any:
     return networks.field_embedder(field, folder, templates=verb.template or ("{}",))
 
 
+AUTO = "auto"
+"""in place of a name: the recommended models"""
 TABLE_HEAD = f"{'name':<11} {'role':<10} {'MB':>5} {'s/frame':>7}"
 TABLE_NOTE = (
     "MB and seconds are of the default precision: a frame of 400x300 on two cores, 40 regions or one object in it."
@@ -142,14 +144,18 @@ def _list_models(console: Console) -> verbs.VerbResult:
 
 
 def _get_models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
-    """Fetches models, also if an older revision of them is on this machine."""
-    folders = {}
-    for name in verb.names:
-        for model in _models_of(name, verb.role, verb.precision):
+    """Fetches models, also if an older revision of them is on this machine. One that fails does not stop the others."""
+    folders, errors = {}, []
+    models = [(name, model) for name in verb.names for model in _models_of(name, verb.role, verb.precision)]
+    for name, model in models:
+        try:
             folder = _folders_of_models({model.role: model}, console, yes=verb.yes, fresh=True)[model.role]
-            console.say(f"{name}  {model.role}  {folder}")
-            folders[f"{name} ({model.role})"] = folder
-    return {"models": folders}
+        except InputError as error:
+            errors.append(error)
+            continue
+        console.say(f"{name}  {model.role}  {folder}")
+        folders[f"{name} ({model.role})"] = folder
+    return {"models": folders, "errors": errors}
 
 
 def _remove_models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
@@ -192,6 +198,9 @@ def _cached_model(name: str) -> Path:
 
 def _models_of(name: str, role: Role | None, precision: Precision | None) -> list[HubModel]:
     """Returns the models of a name, one for each of its roles."""
+    if name == AUTO:
+        named = [(each, row) for each, row in hub.RECOMMENDED.items() if role in (None, each)]
+        return [model for each, row in named for model in _models_of(row, each, precision)]
     if name.startswith(hub.PREFIX):
         roles: list[Role] = [role or _role_of_repository(name)]
     else:

@@ -16,12 +16,12 @@ from jsecon.data.capture import may_have_depth
 from jsecon.errors import InputError
 from jsecon.language.membership import SHARE_THRESHOLD
 from jsecon.pipeline.sources import locate_sources
-from jsecon.query.match import RegionMatch, match_regions
+from jsecon.query.match import RegionMatch, join_pieces, match_regions
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.outliers import split_outliers
 from jsecon.query.referring import FoundObject
 from jsecon.query.relations import Viewpoint, viewpoint
-from jsecon.query.rules import MIN_PIECE_OVERLAP, QueryRules
+from jsecon.query.rules import QueryRules
 from jsecon.query.select import select_by_share
 from jsecon.types import Camera, LanguageField
 from jsecon.views.frame import field_up
@@ -92,7 +92,7 @@ class ObjectScene:
             embedded = jax.device_put(self.embedder.embed_text([phrase]))
             match = match_regions(self.field, embedded, self.rules)
             regions = np.flatnonzero(np.asarray(match.chosen)) if int(match.region) >= 0 else np.zeros(0, int)
-            made = [(group, self._object(group)) for group in _joined(regions, self._overlap)]
+            made = [(group, self._object(group)) for group in join_pieces(regions, self._overlap)]
             objects = [FoundObject(phrase, group, *parts) for group, parts in made if parts is not None]
             self._phrases[phrase] = objects, float(match.quantile)
         return self._phrases[phrase]
@@ -144,15 +144,6 @@ class ObjectScene:
         """Unit of the capture's world."""
         capture = locate_sources(self.field).capture
         return "metres" if capture is not None and may_have_depth(Path(capture)) else "capture units"
-
-
-def _joined(regions: np.ndarray, overlap: np.ndarray | None) -> list[tuple[int, ...]]:
-    """Groups regions that overlap, directly or by way of others: the pieces of one object."""
-    groups: list[set[int]] = []
-    for region in map(int, regions):
-        near = [g for g in groups if overlap is not None and (overlap[region, list(g)] >= MIN_PIECE_OVERLAP).any()]
-        groups = [g for g in groups if g not in near] + [set().union({region}, *near)]
-    return sorted(tuple(sorted(group)) for group in groups)
 
 
 def open_scene(field: LanguageField | ObjectScene, embedder: Any, up: Sequence[Any] | None = None) -> ObjectScene:

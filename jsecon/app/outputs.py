@@ -161,6 +161,7 @@ def _record(field: LanguageField, answer: Answer) -> dict[str, Any]:
         "query": answer.query,
         "by": answer.by,
         "count": len(means),
+        "objects": answer.objects if len(means) else 0,
         "score": round(float(answer.selection.score), 6),
         "quantile": answer.quantile,
         "confidence": answer.confidence,
@@ -229,7 +230,9 @@ def write_answers(
 
 def _line(record: Mapping[str, Any]) -> str:
     """Returns the record of an answer as one line."""
-    parts = [f"{record['count']} of {record['gaussians']} Gaussians", f"score {record['score']:.3f}"]
+    parts = [f"{record['count']} of {record['gaussians']} Gaussians"]
+    parts += [f"{record['objects']} objects"] if record["objects"] > 1 else []
+    parts.append(f"score {record['score']:.3f}")
     if record["quantile"] is not None:
         parts.append(quantile_message(record["quantile"]))
     if record["confidence"] is not None and record["region"] is not None:

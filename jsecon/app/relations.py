@@ -210,7 +210,9 @@ def relation_answer(answer: RelationAnswer) -> Answer:
     score = answer.objects[0].score if answer.objects else 0.0
     best = np.asarray(region, np.int32), np.asarray(score, np.float32)
     selection = Selection(answer.mask, answer.mask.astype(np.float32), *best)
-    return Answer(answer.text, "relation", selection, answer.mask, {}, relation=answer.as_dict())
+    return Answer(
+        answer.text, "relation", selection, answer.mask, {}, relation=answer.as_dict(), objects=max(1, answer.count)
+    )
 
 
 def measure(

@@ -413,7 +413,8 @@ class Models(Verb):
 
     Attributes:
       action: What to do.
-      names: Names, addresses (hub:owner/name or hub:owner/name@revision), and for check also folders.
+      names: Names, addresses (hub:owner/name or hub:owner/name@revision), and for check also folders. auto stands for
+        the models of `jsecon run --models auto`.
       role: What the models are for. By default every role that a name has.
       precision: Precision of the graphs. By default it is the one that jsecon uses.
       yes: Fetches the models without asking first.
@@ -421,7 +422,7 @@ class Models(Verb):
 
     examples = (
         "jsecon models list",
-        "jsecon models get edgetam siglip2",
+        "jsecon models get auto",
         "jsecon models check my_models",
     )
 

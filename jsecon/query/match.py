@@ -7,7 +7,8 @@ the scene: it is refused unless it beats most of them (`QueryRules.quantile`).
 """
 
 import functools
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -180,6 +181,23 @@ def _match_region(embeddings: Array, overlap: Array | None, region: Array, rules
     if rules.alike_threshold is not None:
         chosen |= is_alike(embeddings, jnp.maximum(region, 0), rules.alike_threshold)
     return RegionMatch(chosen & valid, jnp.where(valid, region, -1).astype(jnp.int32), valid.astype(embeddings.dtype))
+
+
+def join_pieces(regions: Sequence[Any] | np.ndarray, overlap: np.ndarray | None) -> list[tuple[int, ...]]:
+    """Groups regions that overlap, directly or by way of others: the pieces of one object. Host code.
+
+    Args:
+      regions: Ids of regions.
+      overlap: (R, R) overlap of all regions (`Votes.overlap`); None makes each region a group.
+
+    Returns:
+      The groups, each sorted.
+    """
+    groups: list[set[int]] = []
+    for region in map(int, regions):
+        near = [g for g in groups if overlap is not None and (overlap[region, list(g)] >= MIN_PIECE_OVERLAP).any()]
+        groups = [g for g in groups if g not in near] + [set().union({region}, *near)]
+    return sorted(tuple(sorted(group)) for group in groups)
 
 
 def reference_words(field: LanguageField) -> Array | None:

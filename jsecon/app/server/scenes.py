@@ -89,6 +89,7 @@ class Scene:
             "query": answer.query,
             "field": self.name,
             "count": int(answer.mask.sum()),
+            "objects": answer.objects if answer.mask.any() else 0,
             "region": region if region >= 0 else None,
             "score": round(float(answer.selection.score), 6),
             "place": locate_answer(self.field, answer).as_dict() if answer.mask.any() else None,
