@@ -112,7 +112,7 @@ def test_one_program_serves_all_views_and_selections_of_a_size(scene, cameras):
     def look(t):
         render(some, cameras[t], features_of(some.count))
         selection_mask(some, cameras[t], np.arange(some.count) % (t + 2) == 0)
-        region_votes(some, cameras[t : t + 1], np.full((1, 40, 48), t % 2, np.int32), 2)
+        region_votes(some, cameras[t : t + 1], np.full((1, 40, 48), t % 2, np.int32), 2, near=0.01 * (t + 1))
 
     compilation_counts()
     look(0)

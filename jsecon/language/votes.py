@@ -129,10 +129,11 @@ def scan_region_votes(
       ValueError: Shapes disagree, or labels are no integers.
     """
     _require_views(cameras, labels, num_regions)
-    static = _default_capacity(gaussians, cameras) if capacity is None else capacity, near, by_view, centre
+    static = _default_capacity(gaussians, cameras) if capacity is None else capacity, by_view, centre
     kept, labelled, totals, state = _none_kept(jnp, gaussians), None, None, {}
     for block in region_blocks(gaussians.count, num_regions):
-        common = _without_colour(gaussians), np.array([block.start, min(block.stop, num_regions)], np.int32)
+        regions = np.array([block.start, min(block.stop, num_regions)], np.int32)
+        common = _without_colour(gaussians), regions, jnp.asarray(near, gaussians.means.dtype)
 
         def one_view(state, view, common=common):
             return _add_view(state, common, _plan_view(common, view, *static), *static)
@@ -164,10 +165,12 @@ def dense_votes(
     `regions` are consecutive ids; other options as for `region_votes`.
     """
     size = _default_capacity(gaussians, cameras) if capacity is None else capacity
-    common = _without_colour(gaussians), np.array([regions.start, regions.stop], np.int32)
+    ids = np.array([regions.start, regions.stop], np.int32)
+    # One program serves every near plane, which `plan_views` chooses by the scene's size.
+    common = _without_colour(gaussians), ids, np.asarray(near, gaussians.means.dtype)
     start = _empty(np, gaussians.count, len(regions), gaussians.means.dtype)
     while True:
-        static = size, near, by_view, centre
+        static = size, by_view, centre
         state, totals = accumulate_over_views(
             _add_view, start, _merge, common, (cameras, labels), prepare=_plan_view, static=static, progress=progress
         )
@@ -254,26 +257,25 @@ def _keep_strongest(
 
 
 def _plan_view(
-    common: tuple[Gaussians, Array], view: tuple[Camera, Array], capacity: int, near: float, *_: Any
+    common: tuple[Gaussians, Array, Array], view: tuple[Camera, Array], capacity: int, *_: Any
 ) -> tuple[ViewPlan, Array]:
     """The plan of a view, and its labels. Pure."""
-    return plan_view(common[0], view[0], capacity=capacity, near=near), view[1]
+    return plan_view(common[0], view[0], capacity=capacity, near=common[2]), view[1]
 
 
 def _add_view(
     state: dict[str, Array],
-    common: tuple[Gaussians, Array],
+    common: tuple[Gaussians, Array, Array],
     view: tuple[ViewPlan, Array],
     capacity: int,
-    near: float,
     by_view: bool,
     centre: float,
 ) -> tuple[dict[str, Array], Array | None]:
     """Adds one view's votes to the dense accumulators; and (N,) the weight that the view sees, where it is wanted.
 
-    `common`: the scene, and the first region of the block and the one after its last. Pure.
+    `common`: the scene, the first region of the block and the one after its last, and the near plane. Pure.
     """
-    (_, (first, after)), (plan, labels) = common, view
+    (_, (first, after), _), (plan, labels) = common, view
     labels = jnp.asarray(labels, jnp.int32)
     labels = jnp.where((labels >= first) & (labels < after), labels - first, -1)
     splats, lists = plan.splats, plan.lists
