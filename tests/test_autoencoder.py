@@ -125,7 +125,7 @@ def test_the_key_decides_everything(trained):
     coder, again, other = (
         train_autoencoder(embeddings, latent=3, key=jax.random.key(seed), epochs=20) for seed in (0, 0, 1)
     )
-    assert all((a == b).all() for a, b in zip(jax.tree.leaves(coder), jax.tree.leaves(again), strict=True))
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(coder), jax.tree.leaves(again), strict=True))
     assert not np.allclose(other.encode(embeddings), coder.encode(embeddings), atol=1e-2)
 
 

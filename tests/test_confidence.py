@@ -4,7 +4,10 @@ import jax
 import numpy as np
 
 from experiments.calibration import Bin, calibration_error
-from jsecon.query.confidence import OFFSET, SLOPE, answer_confidence
+from jsecon.query import confidence
+from jsecon.query.confidence import OFFSET, SLOPE
+
+answer_confidence = jax.jit(confidence.answer_confidence)
 
 
 def case(seed: int = 0, regions: int = 7, words: int = 20):
@@ -23,7 +26,7 @@ def test_it_is_a_logistic_curve_of_how_far_the_answer_stands_out():
     similarity, known, evidence, words = case()
     ratio = height(similarity, evidence) / np.mean([height(word, evidence) for word in words])
     expected = 1 / (1 + np.exp(-(OFFSET + SLOPE * ratio)))
-    found = jax.jit(answer_confidence)(similarity, known, evidence, words)
+    found = answer_confidence(similarity, known, evidence, words)
     np.testing.assert_allclose(found, expected, rtol=1e-4)
     np.testing.assert_allclose(answer_confidence(3 * similarity, known, evidence, 3 * words), expected, rtol=1e-4)
 

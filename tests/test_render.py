@@ -186,7 +186,7 @@ def test_vmapped_gradients_equal_a_loop(scene, cameras):
 
 
 def test_projection_equals_its_twin(scene, camera):
-    got, expected = project(scene, camera), project_reference(scene, camera)
+    got, expected = jax.jit(project)(scene, camera), project_reference(scene, camera)
     np.testing.assert_allclose(got.means_px, expected["means_px"], rtol=1e-4, atol=1e-3)
     np.testing.assert_allclose(got.depths, expected["depths"], rtol=1e-5)
     inverse = np.linalg.inv(expected["covariances"])
