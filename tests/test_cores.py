@@ -1,9 +1,11 @@
 """Any number of cores gives the same answers; and machines without Unix's modules give any."""
 
 import dataclasses
+import functools
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import compiling
@@ -83,11 +85,16 @@ def asked(scene, cameras, tmp_path_factory) -> tuple[str, str]:
 
 
 @pytest.fixture(scope="module")
-def two(asked, tmp_path_factory) -> Path:
-    """The folder of what this process computes on its two devices."""
-    folder = tmp_path_factory.mktemp("two")
-    work(str(folder), *asked, PARTS)
-    return folder
+def two(asked, tmp_path_factory) -> Callable[[tuple[str, ...]], Path]:
+    """Gives the folder of what this process computes on its two devices."""
+
+    @functools.cache
+    def folder_of(parts):
+        folder = tmp_path_factory.mktemp("two")
+        work(str(folder), *asked, parts)
+        return folder
+
+    return folder_of
 
 
 HIDDEN = "fcntl", "resource", "termios", "pwd", "grp"
@@ -138,14 +145,17 @@ def agree(two: Path, found: Path) -> None:
     assert answers(found / "answer") == answers(two / "answer")
 
 
-@pytest.mark.parametrize("devices", [3, *(pytest.param(n, marks=pytest.mark.long) for n in (1, 5, 6, 8, 16))])
-def test_any_number_of_devices_gives_the_same_answers_without_the_modules_of_unix(two, asked, tmp_path, devices):
-    """Every module is imported there."""
+LONG = [pytest.param(devices, PARTS, marks=pytest.mark.long) for devices in (1, 3, 5, 6, 8, 16)]
+
+
+@pytest.mark.parametrize(("devices", "parts"), [(3, ("votes", "image", "query")), *LONG])
+def test_any_number_of_devices_gives_the_same_answers_without_the_modules_of_unix(two, asked, tmp_path, devices, parts):
+    """Every module is imported there. (Long: a fit, whose step each number of devices compiles anew.)"""
     environ = os.environ | {
         "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices} {compiling.ENVIRONMENT}",
         "PYTHONPATH": os.pathsep.join([str(TESTS), str(TESTS.parent)]),
     }
-    line = [sys.executable, "-c", WITHOUT, str(tmp_path), *asked, str(devices), " ".join(PARTS)]
+    line = [sys.executable, "-c", WITHOUT, str(tmp_path), *asked, str(devices), " ".join(parts)]
     done = subprocess.run(line, env=environ, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
-    agree(two, tmp_path)
+    agree(two(parts), tmp_path)
