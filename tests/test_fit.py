@@ -21,6 +21,8 @@ from jsecon.types import Camera, Capture, Gaussians
 KEY = jax.random.key(0)
 RATES = LearningRates(means=1e-3, means_last=1e-4, log_scales=0.02, colors=0.02, quaternions=0.01)
 VIEWS, STEPS = 5, 40
+COUNT = 41
+"""Gaussians: no multiple of the devices among which their rows are divided"""
 MOST = 60
 """Gaussians of the fits that grow, which share their program"""
 SCHEDULE = Schedule(max_gaussians=0, degree_interval=0.25)
@@ -42,7 +44,7 @@ INRIA_RATES = LearningRates(
 @pytest.fixture(scope="module")
 def truth():
     rng = np.random.default_rng(0)
-    count = 40
+    count = COUNT
     return Gaussians(
         rng.uniform(-0.7, 0.7, (count, 3)).astype(np.float32),
         np.log(rng.uniform(0.1, 0.25, (count, 3))).astype(np.float32),
@@ -70,9 +72,9 @@ def start(truth):
         truth,
         means=truth.means + 0.03 * rng.normal(size=truth.means.shape).astype(np.float32),
         log_scales=np.full_like(truth.log_scales, np.log(0.12)),
-        quaternions=np.eye(4, dtype=np.float32)[np.zeros(40, int)],
-        opacity_logits=np.zeros(40, np.float32),
-        sh=np.concatenate([0.5 * truth.sh, np.zeros((40, 3, 3), np.float32)], axis=1),
+        quaternions=np.eye(4, dtype=np.float32)[np.zeros(COUNT, int)],
+        opacity_logits=np.zeros(COUNT, np.float32),
+        sh=np.concatenate([0.5 * truth.sh, np.zeros((COUNT, 3, 3), np.float32)], axis=1),
     )
 
 
@@ -235,7 +237,7 @@ def test_wrong_fits_are_refused(capture, start):
         fit_gaussians(capture, steps=4, key=KEY, state=half)
     with pytest.raises(InputError, match="held out"):
         fit_gaussians(dataclasses.replace(capture, held_out=np.ones(VIEWS, bool)), steps=1, key=KEY, start=start)
-    astray = dataclasses.replace(start, means=np.where(np.arange(40)[:, None] == 7, np.float32(np.nan), start.means))
+    astray = dataclasses.replace(start, means=np.where(np.arange(COUNT)[:, None] == 7, np.float32(np.nan), start.means))
     with pytest.raises(InputError, match="not finite"):
         fit_gaussians(capture, steps=STEPS, key=KEY, start=astray, schedule=WHOLE, rates=RATES, chunk=1)
 
