@@ -159,7 +159,7 @@ def _ground_normal(points: np.ndarray) -> tuple[np.ndarray, bool, str]:
     for index in np.argsort(-shares):
         if shares[index] < RIVAL * shares.max():
             break
-        normal, offset = _refined(points, normals[index], offsets[index], tolerance)
+        normal, offset = _refined(points, normals[index], float(offsets[index]), tolerance)
         heights = points @ normal - offset
         rest = heights[np.abs(heights) > tolerance]
         above = float((rest > 0).mean()) if len(rest) else 1.0
