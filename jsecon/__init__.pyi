@@ -1,12 +1,13 @@
 """Public names of `jsecon`, and the module of each."""
 
 from .app.catalogue import Catalogue as Catalogue, objects as objects
-from .app.locate import Place as Place, locate as locate
+from .app.locate import Place as Place
 from .app.notebook import show as show, to_html as to_html, to_png as to_png
 from .app.object_scene import ObjectScene as ObjectScene
 from .app.relations import (
     Measure as Measure,
     RelationAnswer as RelationAnswer,
+    locate as locate,
     measure as measure,
     query_relation as query_relation,
 )

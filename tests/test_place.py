@@ -77,5 +77,9 @@ def test_two_objects_of_a_name_are_counted_and_have_no_place_together():
     assert Scene("table", field, embedder).record(SceneQuery("red mug"))["objects"] == 2
     with pytest.raises(InputError, match="names 2 objects"):
         jsecon.locate(field, "red mug", embedder)
+    left = jsecon.locate(field, "the leftmost red mug", embedder)
+    np.testing.assert_allclose(left.center[:2], [-0.5, 0], atol=0.02)
+    with pytest.raises(InputError, match="names 0 objects"):
+        jsecon.locate(field, "the red mug on the dark blue box", embedder)
     place = jsecon.locate(field, "dark blue box", embedder)
     np.testing.assert_allclose(place.center, locate_answer(field, box).center)

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jsecon.app.ask import Answer, ask_text
+from jsecon.app.ask import Answer
 from jsecon.errors import InputError
 from jsecon.language.membership import probability_inside
 from jsecon.query.object_shapes import gaussian_spreads, object_shapes
@@ -57,31 +57,6 @@ class Place:
         }
 
 
-def locate(field: LanguageField, text: str, embedder: Any = None, **options: Any) -> Place:
-    """Locates the one thing that a text names.
-
-    In five made-up rooms it finds all 60 things that have a unique name; `center` is off by 5 mm in the median
-    (experiments/catalogue.py).
-
-    Args:
-      field: The field.
-      text: The text.
-      embedder: Embedder of the field; None opens it.
-      **options: Options of `jsecon.app.ask.ask_text`.
-
-    Returns:
-      Centre, boxes and points of the selection.
-
-    Raises:
-      InputError: No Gaussian or more than one object is selected, or the embedder has no words for the text.
-    """
-    if embedder is None:
-        from jsecon.pipeline.networks import field_embedder
-
-        embedder = field_embedder(field)
-    return locate_single(field, ask_text(field, embedder, text, **options))
-
-
 def locate_single(field: LanguageField, answer: Answer) -> Place:
     """Locates the object that an answer selected: the box of several would have its centre between them.
 
@@ -96,7 +71,7 @@ def locate_single(field: LanguageField, answer: Answer) -> Place:
       InputError: No Gaussian is selected, or more than one object.
     """
     if answer.objects > 1:
-        remedy = "Say which, as in 'the red mug left of the green bottle' (jsecon.query_relation), or point at it."
+        remedy = "Say which, as in 'the red mug left of the green bottle', or point at it."
         raise InputError(f"query {answer.query!r}", f"it names {answer.objects} objects", "one object", remedy)
     return locate_answer(field, answer)
 

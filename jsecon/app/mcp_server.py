@@ -15,10 +15,10 @@ import numpy as np
 
 from jsecon.app import pictures, verbs
 from jsecon.app.ask import frame_index
-from jsecon.app.locate import locate_answer, locate_single
+from jsecon.app.locate import locate_single
 from jsecon.app.models import with_models
 from jsecon.app.outputs import best_frames
-from jsecon.app.relations import relation_answer
+from jsecon.app.relations import locate_relation, relation_answer
 from jsecon.app.server.scenes import Scene, SceneQuery, open_scenes
 from jsecon.errors import InputError
 from jsecon.pipeline.progress import Console
@@ -74,11 +74,7 @@ class Tools:
         """Locates one thing: oriented box, and the middle of its top, where a gripper from above would close."""
         scene = self.scene(field)
         if is_expression(text):
-            answer = scene.relation(text, frame)
-            if answer.count != 1:
-                problem = f"it names {answer.count} objects. {answer.reason or answer.question}"
-                raise InputError(f"locate {text!r}", problem, remedy="Name one object.")
-            place = locate_answer(scene.field, relation_answer(answer))
+            place = locate_relation(scene.object_scene, scene.relation(text, frame))
         else:
             place = locate_single(scene.field, scene.answer(SceneQuery(_words(text))))
         return place.as_dict() | {"top": np.round(scene.top_of(place), 6).tolist()}
