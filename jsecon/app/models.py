@@ -199,8 +199,8 @@ def _cached_model(name: str) -> Path:
 def _models_of(name: str, role: Role | None, precision: Precision | None) -> list[HubModel]:
     """Returns the models of a name, one for each of its roles."""
     if name == AUTO:
-        recommended = {each: row for each, row in hub.RECOMMENDED.items() if role in (None, each)}
-        return [model for each, row in recommended.items() for model in _models_of(row, each, precision)]
+        recommended: list[Role] = [each for each in hub.RECOMMENDED if role is None or each == role]
+        return [model for each in recommended for model in _models_of(hub.RECOMMENDED[each], each, precision)]
     if name.startswith(hub.PREFIX):
         roles: list[Role] = [role or _role_of_repository(name)]
     else:
