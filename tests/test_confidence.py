@@ -28,6 +28,7 @@ def test_it_is_a_logistic_curve_of_how_far_the_answer_stands_out():
     expected = 1 / (1 + np.exp(-(OFFSET + SLOPE * ratio)))
     found = answer_confidence(similarity, known, evidence, words)
     np.testing.assert_allclose(found, expected, rtol=1e-4)
+    np.testing.assert_allclose(confidence.answer_confidence(similarity, known, evidence, words), found, rtol=1e-5)
     np.testing.assert_allclose(answer_confidence(3 * similarity, known, evidence, 3 * words), expected, rtol=1e-4)
 
 
