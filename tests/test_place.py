@@ -79,6 +79,8 @@ def test_two_objects_of_a_name_are_counted_and_have_no_place_together():
         jsecon.locate(field, "red mug", embedder)
     left = jsecon.locate(field, "the leftmost red mug", embedder)
     np.testing.assert_allclose(left.center[:2], [-0.5, 0], atol=0.02)
+    with pytest.raises(ValueError, match="no options"):
+        jsecon.locate(field, "the leftmost red mug", embedder, by="code")
     with pytest.raises(InputError, match="names 0 objects"):
         jsecon.locate(field, "the red mug on the dark blue box", embedder)
     place = jsecon.locate(field, "dark blue box", embedder)

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from jsecon.app.ask import Answer, ask_text
 from jsecon.app.locate import Place, locate_answer, locate_single, rounded
 from jsecon.app.object_scene import ObjectScene, open_scene
-from jsecon.errors import InputError
+from jsecon.errors import InputError, require
 from jsecon.query.expressions import is_expression, parse_expression
 from jsecon.query.referring import FoundObject, evaluate, stack_shapes
 from jsecon.query.relations import Viewpoint, order_values
@@ -242,6 +242,7 @@ def locate(
 
     Raises:
       InputError: The text names no object, or several; or the embedder has no words for it.
+      ValueError: An expression has options of a text.
     """
     if not is_expression(text):
         if isinstance(field, ObjectScene):
@@ -251,6 +252,7 @@ def locate(
 
             embedder = field_embedder(field)
         return locate_single(field, ask_text(field, embedder, text, **options))
+    require(not options, f"locate {text!r}", sorted(options), "no options of a plain text", "Leave them out.")
     scene = open_scene(field, embedder, up)
     return locate_relation(scene, query_relation(scene, text, frame=frame))
 
