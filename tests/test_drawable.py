@@ -9,7 +9,7 @@ import pytest
 from small_field import make_field
 
 import jsecon
-from jsecon.splat.project import check_shapes, is_usable
+from jsecon.splat.project import check_gaussians, is_usable
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,7 @@ def changed(scene, **columns):
 def test_harmonics_of_no_whole_degree_are_refused_everywhere(scene, camera, field, tmp_path, count):
     odd = with_coefficients(scene, count)
     ways = [
-        lambda: check_shapes(odd, camera),
+        lambda: check_gaussians(odd, camera),
         lambda: jsecon.render_rgb(odd, camera),
         lambda: jax.jit(jsecon.render_rgb)(odd, camera),
         lambda: jsecon.save_field(tmp_path / "f.safetensors", dataclasses.replace(field, gaussians=odd)),

@@ -10,7 +10,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 from jsecon.parallel import host_mesh
 from jsecon.programs import stored_jit
-from jsecon.splat.plan import make_plan
+from jsecon.splat.plan import plan_view
 
 
 @pytest.fixture
@@ -85,10 +85,13 @@ def test_a_folder_that_cannot_be_written_costs_only_time(folder):
 
 
 def test_plans_of_views_are_the_same_bits(folder, scene, camera):
-    arguments = (dataclasses.replace(scene, sh=None), camera, 4096, 0.01, None)
-    expected = jax.jit(make_plan, static_argnums=(2, 4))(*arguments)
+    def plan_with(gaussians, camera, capacity):
+        return plan_view(gaussians, camera, capacity=capacity)
+
+    arguments = dataclasses.replace(scene, sh=None), camera, 4096
+    expected = jax.jit(plan_with, static_argnums=2)(*arguments)
     for _ in range(2):
-        plan = stored_jit(make_plan, static_argnums=(2, 4))(*arguments)
+        plan = stored_jit(plan_with, static_argnums=(2,))(*arguments)
         assert (plan.width, plan.height, plan.mesh, plan.lists.tile) == (48, 40, None, expected.lists.tile)
         jax.tree.map(np.testing.assert_array_equal, plan, expected)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jsecon.splat.render import render_rgb
-from jsecon.splat.transform import recenter, transform_gaussians
+from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Gaussians
 
 ANGLES = np.radians([20.0, -70.0, 130.0])
@@ -71,31 +71,3 @@ def test_the_identity_changes_nothing(scene):
 def test_what_is_no_similarity_is_refused(scene, matrix):
     with pytest.raises(ValueError, match="rotation, one positive scale"):
         transform_gaussians(scene, matrix)
-
-
-def test_a_recentred_scene_looks_the_same_from_every_camera(scene, cameras):
-    shift = np.array([3e6, -2e6, 5e5])
-    poses = np.asarray(cameras.world_to_camera, np.float64)
-    poses[:, :3, 3] -= poses[:, :3, :3] @ shift
-    far = dataclasses.replace(scene, means=scene.means.astype(np.float64) + shift)
-    moved, views, back = recenter(far, dataclasses.replace(cameras, world_to_camera=poses))
-    assert moved.means.dtype == views.world_to_camera.dtype == np.float32
-    np.testing.assert_allclose(moved.means + back[:3, 3], far.means, atol=1e-6)
-    assert np.abs(moved.means).max() < 2
-    for t in (0, 2):
-        np.testing.assert_allclose(
-            render_rgb(moved, views[t]).features, render_rgb(scene, cameras[t]).features, atol=2e-5
-        )
-    stays, same, none = recenter(scene, cameras, origin=np.zeros(3))
-    np.testing.assert_array_equal(stays.means, scene.means)
-    np.testing.assert_array_equal(same.world_to_camera, cameras.world_to_camera)
-    np.testing.assert_array_equal(none, np.eye(4))
-
-
-def test_the_origin_is_found_beside_numbers_that_are_none(scene, camera):
-    means = scene.means + np.float32(100)
-    means[3] = np.nan
-    moved, _, back = recenter(dataclasses.replace(scene, means=means), camera)
-    assert np.abs(back[:3, 3] - 100).max() < 1
-    assert np.isnan(moved.means[3]).all()
-    assert np.isfinite(np.delete(moved.means, 3, axis=0)).all()

@@ -19,7 +19,8 @@ from jsecon.fit.growth import drop_free_rows, grow, pad_with_free_rows, padded_r
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.step import StepConfig, StepRunner, TrainState, put_on_devices, to_host
 from jsecon.parallel import host_mesh
-from jsecon.splat.tiles import most_strips
+from jsecon.splat.strips import BLOCK
+from jsecon.splat.tiles import TILE
 from jsecon.types import Array, Capture, Gaussians, Progress, record
 
 _RATES, _SCHEDULE = LearningRates(), Schedule()
@@ -162,7 +163,7 @@ def fit_gaussians(
     exclusive = (start is None) != (state is None)
     got = start is not None, state is not None
     require(exclusive, "start, state", got, "exactly one of the two", "Pass state to resume a fit.")
-    mesh = host_mesh(most_strips(capture.cameras.height))
+    mesh = host_mesh(-(-capture.cameras.height // (BLOCK * TILE)))  # no strip is empty
     runner = StepRunner(capture, mesh)
     frames = len(runner.views(1.0).frame_indices)
     if start is not None:

@@ -24,43 +24,15 @@ from jaxtyping import Float
 
 from jsecon.splat.composite import composite, composite_features_vjp
 from jsecon.splat.gradient import composite_vjp
-from jsecon.splat.project import Projection
-from jsecon.splat.strips import map_strips
-from jsecon.splat.tiles import TILE, TileLists, tile_lists
+from jsecon.splat.tiles import TileLists
 from jsecon.types import Array
 
 
-def view_lists(
-    projection: Projection, width: int, height: int, *, capacity: int, tile: int = TILE, mesh: Mesh | None = None
-) -> TileLists:
-    """Makes the tile lists of all strips, which share `capacity`; views run one by one under vmap, without gradient."""
-    per_strip = capacity if mesh is None else -(-capacity // mesh.size)
-
-    def local(strip, divided, projection):
-        del divided
-        return tile_lists(projection, width, height, capacity=per_strip, tile=tile, strip=strip)
-
-    lists = sequential_vmap(lambda p: map_strips(local, (), p, mesh))
-    return lists(jax.tree.map(lax.stop_gradient, projection))
-
-
 @functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4, 5))
-def rasterize(
+def _rasterize(
     splats: Array, features: Array, lists: TileLists, width: int, height: int, mesh: Mesh | None = None
 ) -> tuple[Array, Array]:
-    """Composites features through tile lists.
-
-    Args:
-      splats: (N, 6) as in `ViewPlan`.
-      features: (N, D) finite features.
-      lists: Tile lists of the view.
-      width: Width of the image, px.
-      height: Height of the image, px.
-      mesh: Devices that hold the strips, or None.
-
-    Returns:
-      Image (H, W, D) and final transmittance (H, W).
-    """
+    """Composites finite features; arguments and results as for `rasterize_contained`."""
     return _forward(splats, features, lists, width, height, mesh)[:2]
 
 
@@ -86,7 +58,7 @@ def _rasterize_backward(width, height, mesh, residual, cotangents):
     return by_splat, gradient.astype(features.dtype), None
 
 
-rasterize.defvjp(_rasterize_forward, _rasterize_backward, symbolic_zeros=True)
+_rasterize.defvjp(_rasterize_forward, _rasterize_backward, symbolic_zeros=True)
 
 
 def _forward(splats, features, lists, width: int, height: int, mesh: Mesh | None) -> tuple[Array, Array, Array]:
@@ -145,18 +117,26 @@ def rasterize_contained(
     height: int,
     mesh: Mesh | None = None,
 ) -> tuple[Float[Array, "h w d"], Float[Array, "h w"]]:
-    """Composites features of which some may be NaN or infinite; arguments as for `rasterize`.
+    """Composites features of which some may be NaN or infinite.
+
+    Args:
+      splats: (N, 6) as in `ViewPlan`.
+      features: (N, D).
+      lists: Tile lists of the view.
+      width: Width of the image, px.
+      height: Height of the image, px.
+      mesh: Devices that hold the strips, or None.
 
     Returns:
       Image (H, W, D), NaN in exactly the pixels that a Gaussian with a non-finite feature touches, and final
       transmittance (H, W). Those pixels and features have gradient zero.
     """
     finite = jnp.isfinite(features)
-    image, transmittance = rasterize(splats, jnp.where(finite, features, 0.0), lists, width, height, mesh)
+    image, transmittance = _rasterize(splats, jnp.where(finite, features, 0.0), lists, width, height, mesh)
     bad = lax.stop_gradient(1.0 - finite.all(1, keepdims=True).astype(splats.dtype))
 
     def walk(bad) -> Array:
-        image, _ = cast(tuple[Array, Array], rasterize(lax.stop_gradient(splats), bad, lists, width, height, mesh))
+        image, _ = cast(tuple[Array, Array], _rasterize(lax.stop_gradient(splats), bad, lists, width, height, mesh))
         return image[..., 0] > 0
 
     touched = lax.cond(_any(bad), walk, lambda bad: jnp.zeros((height, width), bool), bad)

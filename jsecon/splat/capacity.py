@@ -9,7 +9,7 @@ from jaxtyping import Int
 
 from jsecon.splat.project import project
 from jsecon.splat.strips import BLOCK, Strip
-from jsecon.splat.tiles import TILE, pair_counts, round_up_to_words, tile_grid
+from jsecon.splat.tiles import TILE, WORD, pair_counts, tile_grid
 from jsecon.types import Array, Camera, Gaussians
 
 PAIRS_PER_GAUSSIAN, PAIRS_PER_BLOCK = 2, 256
@@ -69,8 +69,16 @@ def default_capacity(count: int, width: int, height: int, *, strips: int = 1) ->
 
 
 def enough_capacity(capacity: int, overflow: Int[Array, " strips"]) -> int:
-    """Returns a capacity that holds what overflowed, a power of two per strip so that views share programs."""
-    per_strip = round_up_to_words(-(-capacity // overflow.shape[0])) + int(overflow.max())
+    """Enlarges a capacity so that it holds what overflowed.
+
+    Args:
+      capacity: Number of pairs of all strips together.
+      overflow: (strips,) pairs of each strip that found no room.
+
+    Returns:
+      Number of pairs of all strips; a power of two per strip, so that views share programs.
+    """
+    per_strip = -(-capacity // (overflow.shape[0] * WORD)) * WORD + int(overflow.max())
     return overflow.shape[0] << (per_strip - 1).bit_length()
 
 

@@ -12,7 +12,7 @@ from jsecon.numerics import FULL_PRECISION, MIN_TRANSMITTANCE
 from jsecon.splat.fusion import materialize
 from jsecon.splat.strips import join_strips, map_strips, split_into_strips
 from jsecon.splat.tiles import TileLists
-from jsecon.splat.walk import CHUNK, blend_weights, make_batches, make_table, to_image, to_tiles, walk
+from jsecon.splat.walk import CHUNK, Batches, blend_weights, make_batches, make_table, to_tiles, walk
 from jsecon.types import Array
 
 MAX_RECOMPUTED = 6
@@ -64,7 +64,7 @@ def composite(
             return walk(table, lists, batches, tiles, body, total)
 
         totals, seen = lax.map(one_batch, batches.tiles)
-        image = to_image(totals, batches, width)[None]
+        image = _to_image(totals, batches, width)[None]
         by_tile = jnp.zeros(batches.number + 1, jnp.int32).at[batches.tiles].set(seen)[:-1]
         return image[..., :-1], 1 - image[..., -1], by_tile
 
@@ -73,6 +73,16 @@ def composite(
     table = make_table(splats, ones) if separate else make_table(splats, features, ones)
     image, transmittance, seen = map_strips(local, lists, (table, features if separate else None), mesh)
     return join_strips(image, lists.tile, height), join_strips(transmittance, lists.tile, height), seen
+
+
+def _to_image(batched: Array, batches: Batches, width: int) -> Array:
+    """Arranges batches (batches, B, D, pixels) as the image (rows, W, D) of the strip."""
+    down, tile, channels = batches.number // batches.across, batches.tile, batched.shape[2]
+    slots = batches.tiles.reshape(-1)
+    place = jnp.zeros(batches.number + 1, jnp.int32).at[slots].set(lax.iota(jnp.int32, slots.shape[0]))[:-1]
+    tiles = batched.reshape(slots.shape[0], channels, tile, tile)[place]
+    image = tiles.reshape(down, batches.across, channels, tile, tile).transpose(0, 3, 1, 4, 2)
+    return image.reshape(down * tile, batches.across * tile, channels)[:, :width]
 
 
 def _add_recomputed(transmittance: Array, total: Array, chunk) -> tuple[Array, Array]:

@@ -34,6 +34,13 @@ def materialize(always: Array, compute: Callable, *operands: Any) -> Any:
 
 
 def opaque_true(number: Array) -> Array:
-    """Returns () bool true for any number (); the compiler cannot infer it."""
+    """Makes a condition for `materialize`.
+
+    Args:
+      number: () float of any value, NaN included.
+
+    Returns:
+      () bool, true; the compiler cannot infer it.
+    """
     bits = lax.bitcast_convert_type(number, jnp.int32 if number.dtype.itemsize == 4 else jnp.int64)
     return (bits | 1) != 0

@@ -1,6 +1,6 @@
 """Plans of views: what repeated renderings of frozen geometry share, so that they skip projection and sorting.
 
-`make_plan` and `composite_plan` are pure. `plan_view`, `plan_views` and `render_plan` are their drivers: outside of a
+`_make_plan` and `_composite_plan` are pure. `plan_view`, `plan_views` and `render_plan` are their drivers: outside of a
 trace they call compiled programs, and plan again if the capacity overflows.
 """
 
@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.custom_batching import sequential_vmap
 from jax.sharding import Mesh
 from jaxtyping import Float
 
@@ -20,10 +21,11 @@ from jsecon.errors import require, require_shape
 from jsecon.numerics import NEAR, all_finite, is_traced
 from jsecon.parallel import MESH_OPTIONS, map_rows
 from jsecon.programs import stored_jit
-from jsecon.splat.autodiff import rasterize_contained, view_lists
+from jsecon.splat.autodiff import rasterize_contained
 from jsecon.splat.capacity import default_capacity, enough_capacity, round_capacity
-from jsecon.splat.project import check_geometry, project
-from jsecon.splat.tiles import TileLists
+from jsecon.splat.project import Projection, check_gaussians, project
+from jsecon.splat.strips import map_strips
+from jsecon.splat.tiles import TileLists, tile_lists
 from jsecon.types import Array, Camera, Gaussians, Leaf, Rendering, record, static
 
 MAX_PLAN_BYTES = 1 << 30
@@ -55,13 +57,13 @@ class ViewPlan:
         return self.lists.overflow.sum(-1)
 
 
-def make_plan(
+def _make_plan(
     gaussians: Gaussians, camera: Camera, capacity: int, near: float | Array = NEAR, mesh: Mesh | None = None
 ) -> ViewPlan:
-    """Projects and lists one view. Pure; arguments as for `plan_view`, with a fixed capacity."""
+    """Projects and lists one view with a fixed capacity. Pure; arguments as for `plan_view`."""
     gaussians, camera = jax.tree.map(jnp.asarray, (gaussians, camera))
     projection = map_rows(lambda rows, view: project(rows, view[0], near=view[1]), gaussians, (camera, near), mesh)
-    lists = view_lists(projection, camera.width, camera.height, capacity=capacity, mesh=mesh)
+    lists = _view_lists(projection, camera.width, camera.height, capacity, mesh)
     columns = [projection.means_px, projection.whitening * math.sqrt(0.5), projection.opacities[:, None]]
     # An invisible Gaussian is in no list; its row is zeroed so that no non-finite number reaches a gradient.
     splats = jnp.where(projection.visible[:, None], jnp.concatenate(columns, axis=1), 0.0)
@@ -70,10 +72,22 @@ def make_plan(
     return ViewPlan(splats, depths, finite, lists, camera.width, camera.height, mesh)
 
 
+def _view_lists(projection: Projection, width: int, height: int, capacity: int, mesh: Mesh | None) -> TileLists:
+    """Makes the tile lists of all strips, which share the capacity. Without gradient; under vmap views run in turn."""
+    per_strip = capacity if mesh is None else -(-capacity // mesh.size)
+
+    def local(strip, divided, projection):
+        del divided
+        return tile_lists(projection, width, height, capacity=per_strip, strip=strip)
+
+    lists = sequential_vmap(lambda p: map_strips(local, (), p, mesh))
+    return lists(jax.tree.map(lax.stop_gradient, projection))
+
+
 # of one device, and over a mesh
 _make_plan_compiled: list[Any] = [
-    stored_jit(make_plan, static_argnums=(2, 4)),
-    jax.jit(make_plan, static_argnums=(2, 4), compiler_options=MESH_OPTIONS),
+    stored_jit(_make_plan, static_argnums=(2, 4)),
+    jax.jit(_make_plan, static_argnums=(2, 4), compiler_options=MESH_OPTIONS),
 ]
 
 
@@ -93,10 +107,10 @@ def plan_view(
     Args:
       gaussians: Scene of N Gaussians; its `sh` may be None.
       camera: One camera.
-      capacity: As for `render`. By default, outside of a trace, the call waits for the view's overflow and plans again
-        with enough capacity if there is any.
+      capacity: Number of (block, Gaussian) pairs, see `render`. By default, outside of a trace, the call waits for the
+        view's overflow and plans again with enough capacity if there is any.
       near: Near plane, world units.
-      mesh: As for `render`; each device plans and keeps its strip of the image.
+      mesh: Devices of this process, each of which plans and keeps its strip of the image; None uses one.
 
     Returns:
       The plan; `overflow` is 0 if its renderings are exact.
@@ -104,7 +118,7 @@ def plan_view(
     Raises:
       ValueError: Shapes disagree.
     """
-    check_geometry(gaussians, camera)
+    check_gaussians(gaussians, camera, colour=False)
     size = capacity
     if size is None:
         strips = 1 if mesh is None else mesh.size
@@ -113,7 +127,7 @@ def plan_view(
     no_sh = np.zeros((gaussians.means.shape[0], 0, 3), gaussians.means.dtype)
     geometry = dataclasses.replace(gaussians, sh=no_sh)
     if is_traced((geometry, camera, near)):
-        return make_plan(geometry, camera, size, near, mesh)
+        return _make_plan(geometry, camera, size, near, mesh)
     compiled = _make_plan_compiled[mesh is not None]
     plan = compiled(geometry, camera, size, near, mesh)
     if capacity is None and (overflow := np.asarray(plan.lists.overflow)).any():
@@ -129,7 +143,7 @@ def plan_views(
     Args:
       gaussians: Scene of N Gaussians; its `sh` may be None.
       cameras: Batch of T cameras.
-      capacity: As for `render`.
+      capacity: Number of (block, Gaussian) pairs of a view, see `plan_view`.
       max_bytes: Memory limit of all plans together.
 
     Returns:
@@ -163,7 +177,7 @@ def _cut_lists(plan: ViewPlan, length: int | None = None) -> ViewPlan:
     return dataclasses.replace(plan, lists=dataclasses.replace(plan.lists, gaussians=ids))
 
 
-def composite_plan(plan: ViewPlan, features: Array, background: Array | None, depth: bool) -> Rendering:
+def _composite_plan(plan: ViewPlan, features: Array, background: Array | None, depth: bool) -> Rendering:
     """Renders features through a plan. Pure; arguments as for `render_plan`."""
     features = jnp.asarray(features)
     if depth or features.dtype != jnp.bfloat16:
@@ -182,8 +196,8 @@ def composite_plan(plan: ViewPlan, features: Array, background: Array | None, de
 
 
 _composite_plan_compiled: list[Any] = [
-    stored_jit(composite_plan, static_argnums=(3,)),
-    jax.jit(composite_plan, static_argnums=3, compiler_options=MESH_OPTIONS),
+    stored_jit(_composite_plan, static_argnums=(3,)),
+    jax.jit(_composite_plan, static_argnums=3, compiler_options=MESH_OPTIONS),
 ]
 
 
@@ -194,12 +208,12 @@ def render_plan(
 
     Args:
       plan: Plan of one view; its devices are used.
-      features: As for `render`.
-      background: As for `render`.
-      depth: As for `render`.
+      features: (N, D) numbers, float32 or bfloat16.
+      background: (D,) numbers or one, added with weight 1 - alpha.
+      depth: Whether to render the expected z-depth too.
 
     Returns:
-      Features (H, W, D), alpha and overflow.
+      Features (H, W, D), alpha (H, W), overflow, and depth (H, W) in world units or None.
 
     Raises:
       ValueError: Shapes disagree.
@@ -207,12 +221,20 @@ def render_plan(
     require_shape("features", features, (plan.splats.shape[0], "D"), "Pass one row of features per Gaussian.")
     require_background(background, features.shape[1])
     traced = is_traced((plan, features, background))
-    run = composite_plan if traced else _composite_plan_compiled[plan.mesh is not None]
+    run = _composite_plan if traced else _composite_plan_compiled[plan.mesh is not None]
     return run(plan, features, background, depth)
 
 
 def require_background(background: Array | None, channels: int) -> None:
-    """Raises ValueError unless a background has one number per channel of the features, or one for all."""
+    """Checks the shape of a background.
+
+    Args:
+      background: () or (D,) numbers, or None.
+      channels: D, number of channels of the features.
+
+    Raises:
+      ValueError: The shape is another.
+    """
     if background is not None:
         got, remedy = np.shape(background), "Pass one number per channel of the features."
         require(got in ((), (channels,)), "background", got, f"({channels},)", remedy)

@@ -160,39 +160,29 @@ def _whitening(row_1: list[Array], row_2: list[Array]) -> tuple[Array, ...]:
     )
 
 
-def check_shapes(gaussians: Gaussians, camera: Camera) -> None:
-    """Raises ValueError if the shapes of `gaussians` disagree, including `sh`, or `camera` is a batch."""
-    check_gaussians(gaussians)
-    _check_camera(camera)
+def check_gaussians(gaussians: Gaussians, camera: Camera | None = None, *, colour: bool = True) -> None:
+    """Checks the shapes of what is to be rendered or written.
 
+    Args:
+      gaussians: Scene of N Gaussians.
+      camera: One camera, or None to leave it out.
+      colour: Whether to check the spherical harmonics too.
 
-def check_geometry(gaussians: Gaussians, camera: Camera) -> None:
-    """Raises ValueError if the shapes of `gaussians` disagree, except `sh`, or `camera` is a batch."""
-    _check_geometry(gaussians)
-    _check_camera(camera)
-
-
-def check_gaussians(gaussians: Gaussians) -> None:
-    """Raises ValueError if the shapes of `gaussians` disagree or its spherical harmonics have an incomplete degree."""
-    _check_geometry(gaussians)
-    require(gaussians.sh is not None, "gaussians.sh", None, "an array (N, K, 3)", "Pass spherical harmonics.")
-    require_shape("gaussians.sh", gaussians.sh, (gaussians.count, "K", 3), "Pass one row per Gaussian.")
-    shape = tuple(gaussians.sh.shape)
-    require(
-        shape[1] in COEFFICIENT_COUNTS, "gaussians.sh", shape, "(N, K, 3) with K of 1, 4, 9 or 16", "Pad it with zeros."
-    )
-
-
-def _check_geometry(gaussians: Gaussians) -> None:
+    Raises:
+      ValueError: Shapes disagree, the harmonics have an incomplete degree, or the camera is a batch.
+    """
     require_shape("gaussians.means", gaussians.means, ("N", 3), "Pass one centre per Gaussian.")
     for name, rest in (("log_scales", (3,)), ("quaternions", (4,)), ("opacity_logits", ())):
         expected = gaussians.count, *rest
         require_shape(f"gaussians.{name}", getattr(gaussians, name), expected, "Pass one row per Gaussian.")
-
-
-def _check_camera(camera: Camera) -> None:
-    remedy = "Pass a single camera: index the batch (cameras[t]) or use jax.vmap over it."
-    require_shape("camera.world_to_camera", camera.world_to_camera, (4, 4), remedy)
+    if colour:
+        require(gaussians.sh is not None, "gaussians.sh", None, "an array (N, K, 3)", "Pass spherical harmonics.")
+        require_shape("gaussians.sh", gaussians.sh, (gaussians.count, "K", 3), "Pass one row per Gaussian.")
+        shape, expected = tuple(gaussians.sh.shape), "(N, K, 3) with K of 1, 4, 9 or 16"
+        require(shape[1] in COEFFICIENT_COUNTS, "gaussians.sh", shape, expected, "Pad it with zeros.")
+    if camera is not None:
+        remedy = "Pass a single camera: index the batch (cameras[t]) or use jax.vmap over it."
+        require_shape("camera.world_to_camera", camera.world_to_camera, (4, 4), remedy)
 
 
 def project(gaussians: Gaussians, camera: Camera, *, near: float | Array = NEAR) -> Projection:
@@ -212,7 +202,7 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float | Array = NEAR)
     Raises:
       ValueError: Shapes disagree.
     """
-    check_geometry(gaussians, camera)
+    check_gaussians(gaussians, camera, colour=False)
     gaussians, camera, drawn = _replace_non_finite(*jax.tree.map(jnp.asarray, (gaussians, camera)))
     w2c = camera.world_to_camera
     width, height = camera.width, camera.height

@@ -11,7 +11,7 @@ from jsecon.errors import require_shape
 from jsecon.numerics import NEAR
 from jsecon.programs import stored_jit
 from jsecon.splat.plan import plan_view, render_plan, require_background
-from jsecon.splat.project import check_geometry, check_shapes
+from jsecon.splat.project import check_gaussians
 from jsecon.splat.sh import colours_from_sh
 from jsecon.types import Array, Camera, Gaussians, Rendering
 
@@ -70,7 +70,7 @@ def render(
     Raises:
       ValueError: Shapes disagree.
     """
-    check_geometry(gaussians, camera)
+    check_gaussians(gaussians, camera, colour=False)
     require_shape("features", features, (gaussians.count, "D"), "Pass one row of features per Gaussian.")
     require_background(background, features.shape[1])
     if gaussians.means.shape[0] == 0:
@@ -108,7 +108,7 @@ def render_rgb(
     Raises:
       ValueError: Shapes disagree.
     """
-    check_shapes(gaussians, camera)
+    check_gaussians(gaussians, camera)
     rgb = _colours(gaussians, camera)
     return render(gaussians, camera, rgb, background=background, capacity=capacity, near=near, mesh=mesh)
 

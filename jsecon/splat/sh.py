@@ -124,5 +124,12 @@ def colours_from_sh(gaussians: Gaussians, camera: Camera) -> Float[Array, "n 3"]
 
 
 def sh_from_rgb(rgb: Float[Array, "n 3"]) -> Float[Array, "n 1 3"]:
-    """Returns the degree-0 coefficients (N, 1, 3) of colours (N, 3) in [0, 1]."""
+    """Converts colours to spherical harmonics of degree 0.
+
+    Args:
+      rgb: (N, 3) in [0, 1].
+
+    Returns:
+      (N, 1, 3) coefficients.
+    """
     return ((rgb - 0.5) / C0)[:, None, :]

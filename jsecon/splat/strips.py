@@ -26,15 +26,36 @@ class Strip:
     count: int = 1
 
     def first_row(self, rows: Array) -> Array:
-        """Returns the number of the strip's rows of blocks before a row of blocks of the image."""
+        """Counts the strip's rows of blocks before rows of blocks of the image.
+
+        Args:
+          rows: Row numbers in the image, int.
+
+        Returns:
+          Their numbers in the strip.
+        """
         return (rows - self.index + self.count - 1) // self.count
 
     def block_row(self, row: Array) -> Array:
-        """Returns the row of blocks of the image for a row of blocks of the strip."""
+        """Finds the row of blocks in the image of a row of blocks in the strip.
+
+        Args:
+          row: Row numbers in the strip, int.
+
+        Returns:
+          Row numbers in the image.
+        """
         return row * self.count + self.index
 
     def tile_row(self, row: Array) -> Array:
-        """Returns the row of tiles of the image for a row of tiles of the strip."""
+        """Finds the row of tiles in the image of a row of tiles in the strip.
+
+        Args:
+          row: Row numbers in the strip, int.
+
+        Returns:
+          Row numbers in the image.
+        """
         return self.block_row(row // BLOCK) * BLOCK + row % BLOCK
 
 
@@ -43,12 +64,30 @@ FULL_IMAGE = Strip()
 
 
 def tile_rows(height: int, tile: int, count: int) -> int:
-    """Returns the number of rows of tiles in each of `count` strips of an image of that height in px."""
+    """Counts the rows of tiles of each strip.
+
+    Args:
+      height: Height of the image, px.
+      tile: Edge of a tile, px.
+      count: Number of strips.
+
+    Returns:
+      Number of rows; with several strips a multiple of BLOCK.
+    """
     return -(-height // tile) if count == 1 else -(-height // (BLOCK * tile * count)) * BLOCK
 
 
 def split_into_strips(image: Array, tile: int, count: int) -> Array:
-    """Divides an image (H, W, ...) into strips (count, rows of a strip in px, W, ...), zero below the image."""
+    """Divides an image into strips.
+
+    Args:
+      image: (H, W, ...).
+      tile: Edge of a tile, px.
+      count: Number of strips.
+
+    Returns:
+      (count, rows of a strip in px, W, ...), zero below the image.
+    """
     height, *rest = image.shape
     rows = tile_rows(height, tile, count) * tile
     image = jnp.pad(image, [(0, count * rows - height)] + [(0, 0)] * len(rest))
@@ -58,7 +97,16 @@ def split_into_strips(image: Array, tile: int, count: int) -> Array:
 
 
 def join_strips(strips: Array, tile: int, height: int) -> Array:
-    """Joins strips (count, rows, W, ...) to an image (H, W, ...): the inverse of `split_into_strips`."""
+    """Joins strips: the inverse of `split_into_strips`.
+
+    Args:
+      strips: (count, rows in px, W, ...).
+      tile: Edge of a tile, px.
+      height: Height of the image, px.
+
+    Returns:
+      (H, W, ...) image.
+    """
     count, rows, *rest = strips.shape
     if count == 1:
         return strips[0, :height]

@@ -59,13 +59,17 @@ class TileLists:
 
 
 def tile_grid(width: int, height: int, tile: int) -> tuple[int, int]:
-    """Returns the number of tiles across and down an image of that size in px."""
+    """Counts the tiles of an image.
+
+    Args:
+      width: Width of the image, px.
+      height: Height of the image, px.
+      tile: Edge of a tile, px.
+
+    Returns:
+      Tiles across and down.
+    """
     return -(-width // tile), -(-height // tile)
-
-
-def most_strips(height: int) -> int:
-    """Returns the largest number of strips of an image of that height in px of which none is empty."""
-    return tile_grid(1, height, BLOCK * TILE)[1]
 
 
 def _rectangles(projection: Projection, width: int, height: int, edge: int, strip: Strip):
@@ -183,7 +187,7 @@ def tile_lists(
     """
     most = (2**31 - 1) // _TILES - WORD  # so that int32 can count their tiles
     require(0 < capacity <= most, "capacity", capacity, f"1 to {most} pairs", "Render such a large image in parts.")
-    capacity = round_up_to_words(capacity)
+    capacity = -(-capacity // WORD) * WORD
     chunk = min(CHUNK_PAIRS, capacity)
     room = -(-capacity // chunk) * chunk
     edge = BLOCK * tile
@@ -213,7 +217,7 @@ def tile_lists(
         return owner[-1], put(blocks, block), put(owners, owner)
 
     no_pairs = jnp.full(room, number, jnp.int32), jnp.zeros(room, jnp.int32)
-    _, blocks, owner = loop_in_chunks(total, chunk, lay_out, (jnp.int32(-1), *no_pairs))
+    _, blocks, owner = _loop_in_chunks(total, chunk, lay_out, (jnp.int32(-1), *no_pairs))
     default = jnp.asarray(1.0, projection.depths.dtype)
     depths = lax.stop_gradient(jnp.where(projection.visible, jnp.maximum(projection.depths, 0), default))
     blocks, owner = _sorted_pairs(blocks, owner, depths, number)
@@ -288,12 +292,7 @@ def _saturating_cumsum(areas: Array) -> Array:
     return jnp.where(wrapped, largest, exact)
 
 
-def round_up_to_words(pairs: int) -> int:
-    """Rounds a number of pairs up to whole words of bits."""
-    return -(-pairs // WORD) * WORD
-
-
-def loop_in_chunks(total: Array, size: int, step: Callable[[Array, Any], Any], carry: Any) -> Any:
+def _loop_in_chunks(total: Array, size: int, step: Callable[[Array, Any], Any], carry: Any) -> Any:
     """Runs `carry = step(first, carry)` for first = 0, size, 2 size, ... below `total`, and returns the last carry."""
 
     def advance(state):
@@ -302,7 +301,7 @@ def loop_in_chunks(total: Array, size: int, step: Callable[[Array, Any], Any], c
     return lax.while_loop(lambda state: state[0] < total, advance, (jnp.int32(0), carry))[1]
 
 
-def transpose_words(reached: UInt[Array, " pairs"], tiles: int) -> UInt[Array, "words t"]:
+def _transpose_words(reached: UInt[Array, " pairs"], tiles: int) -> UInt[Array, "words t"]:
     """(pairs / 32, tiles) words whose bit k is the bit of the tile in pair k."""
     words = reached.reshape(-1, WORD)
     bits = ((words[:, :, None] >> lax.iota(jnp.uint32, tiles)) & 1) << lax.iota(jnp.uint32, WORD)[:, None]
@@ -333,7 +332,7 @@ def tile_bits(
     def step(first: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         so_far, members, before = carry
         reached = materialize(first < total, reach, part(owner, first), part(blocks, first))
-        bits = transpose_words(reached, tiles)
+        bits = _transpose_words(reached, tiles)
         ends = so_far + lax.cumsum(lax.population_count(bits).astype(jnp.int32))
 
         def put(array, part):
@@ -343,7 +342,7 @@ def tile_bits(
 
     words = owner.shape[0] // WORD
     zeros = jnp.zeros(tiles, jnp.int32), jnp.zeros((words, tiles), jnp.uint32), jnp.zeros((words, tiles), jnp.int32)
-    of_tile, members, before = loop_in_chunks(total, chunk, step, zeros)
+    of_tile, members, before = _loop_in_chunks(total, chunk, step, zeros)
     # Unused words come after all others of their tile.
     filled = (lax.iota(jnp.int32, words) * WORD < total)[:, None]
     return members, jnp.where(filled, before, of_tile) + (lax.cumsum(of_tile) - of_tile)
@@ -387,7 +386,7 @@ def compact_tile_lists(
         return ends[-1], table, begins.at[place].add(mark, mode="promise_in_bounds")
 
     zeros = jnp.zeros((out_of_range[0] + 1, 3), jnp.int32), jnp.zeros(out_of_range[1] + 1, jnp.uint32)
-    _, table, begins = loop_in_chunks(-(-total // WORD), chunk, gather, (lax.cumsum(counts) - counts, *zeros))
+    _, table, begins = _loop_in_chunks(-(-total // WORD), chunk, gather, (lax.cumsum(counts) - counts, *zeros))
     columns = [table[:, i] for i in range(3)]
     until = (jnp.uint32(2) << lax.iota(jnp.uint32, WORD)) - 1
 
@@ -419,5 +418,5 @@ def compact_tile_lists(
         pairs = materialize(always, pair_of, first, *materialize(always, lambda s: [c[s] for c in columns], segment))
         return begun[-1], lax.dynamic_update_slice(out, owner[pairs], (first,))
 
-    out = loop_in_chunks(last, _CHUNK_SLOTS, fill, (jnp.int32(0), jnp.zeros(slots, jnp.int32)))[1]
+    out = _loop_in_chunks(last, _CHUNK_SLOTS, fill, (jnp.int32(0), jnp.zeros(slots, jnp.int32)))[1]
     return out[: WORD * words * tiles]

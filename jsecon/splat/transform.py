@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from jsecon.errors import require
 from jsecon.splat.sh import sh_basis
-from jsecon.types import Array, Camera, Gaussians
+from jsecon.types import Array, Gaussians
 
 BLOCK_ROWS = 1 << 18
 """Number of Gaussians transformed at a time."""
@@ -49,7 +49,7 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -
         return xp.asarray(array, column.dtype)
 
     means, turns, sh = gaussians.means, gaussians.quaternions, gaussians.sh
-    with jax.default_matmul_precision("highest"):  # WHOLE, for NumPy arrays too
+    with jax.default_matmul_precision("highest"):  # of jax's arrays
         return Gaussians(
             means=means @ like(means, scale * rotation.T) + like(means, matrix[:3, 3]),
             log_scales=gaussians.log_scales + like(gaussians.log_scales, np.log(scale)),
@@ -60,16 +60,33 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -
 
 
 def transform_gaussians_float64(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -> Gaussians:
-    """Calls `transform_gaussians` on the host with float64 means before and after (NumPy).
+    """Calls `transform_gaussians` on the host with float64 means.
 
     Needed into and out of worlds with large coordinates (map projections), where float32 cannot represent millimetres.
+
+    Args:
+      gaussians: N Gaussians; means may be float64.
+      similarity: (4, 4) matrix of x' = s R x + t.
+
+    Returns:
+      The Gaussians in the new world, NumPy, means float64.
+
+    Raises:
+      ValueError: The matrix is not a similarity.
     """
     host = jax.tree.map(np.asarray, gaussians)
     return transform_gaussians(dataclasses.replace(host, means=host.means.astype(np.float64)), similarity)
 
 
 def float32_rounding(gaussians: Gaussians) -> Float[np.ndarray, " n"]:
-    """Returns (N,) the rounding of each mean by float32, in units of the largest standard deviation of its Gaussian."""
+    """Measures what float32 would cost the means.
+
+    Args:
+      gaussians: N Gaussians with float64 means.
+
+    Returns:
+      (N,) the rounding of each mean in units of the largest standard deviation of its Gaussian.
+    """
     means = np.asarray(gaussians.means)
     moved = np.abs(means - means.astype(np.float32).astype(np.float64)).max(axis=1, initial=0.0)
     sizes = np.asarray(gaussians.log_scales, np.float64).max(axis=1, initial=-np.inf)
@@ -78,9 +95,19 @@ def float32_rounding(gaussians: Gaussians) -> Float[np.ndarray, " n"]:
 
 
 def transform_axes(gaussians: Gaussians, axes: Float[Array, "4 4"]) -> Gaussians:
-    """Calls `transform_gaussians` with a matrix (4, 4) that may also mirror.
+    """Transforms Gaussians between axes that may differ in handedness.
 
     A Gaussian equals its mirror image along its axes, so mirroring is a rotation.
+
+    Args:
+      gaussians: N Gaussians.
+      axes: (4, 4) similarity that may mirror.
+
+    Returns:
+      The Gaussians in the new world.
+
+    Raises:
+      ValueError: The matrix is not a similarity, mirrored or not.
     """
     matrix = np.asarray(axes, np.float64)
     if np.linalg.det(matrix[:3, :3]) > 0:
@@ -115,34 +142,6 @@ def transform_blocks(
         rows = slice(first, min(first + BLOCK_ROWS, gaussians.count))
         part = jax.tree.map(lambda a, rows=rows: np.asarray(a[rows]), gaussians)
         yield rows, part if similarity is None else transform_gaussians_float64(part, similarity)
-
-
-def recenter(
-    gaussians: Gaussians, cameras: Camera, *, origin: Float[np.ndarray, "3"] | None = None
-) -> tuple[Gaussians, Camera, Float[np.ndarray, "4 4"]]:
-    """Shifts a scene and its cameras to another origin. Host code.
-
-    Float32 resolves a coordinate of 1e6 m to 6 cm, so that a scene in such coordinates (a map projection's) cannot be
-    rendered directly. The shift is computed in float64; pass float64 arrays if there are any.
-
-    Args:
-      gaussians: N Gaussians.
-      cameras: One camera or a batch.
-      origin: (3,) new origin; by default the median of the means.
-
-    Returns:
-      Gaussians and cameras in float32, and the (4, 4) float64 shift back.
-    """
-    means = np.asarray(gaussians.means, np.float64)
-    if origin is None:
-        finite = means[np.isfinite(means).all(1)]
-        origin = np.median(finite, axis=0) if len(finite) else np.zeros(3)
-    poses = np.array(cameras.world_to_camera, np.float64)
-    poses[..., :3, 3] += poses[..., :3, :3] @ origin
-    back = np.eye(4)
-    back[:3, 3] = origin
-    moved = dataclasses.replace(gaussians, means=(means - origin).astype(np.float32))
-    return moved, dataclasses.replace(cameras, world_to_camera=poses.astype(np.float32)), back
 
 
 def _product_matrix(q: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jsecon.numerics import NEAR
-from jsecon.splat.project import check_shapes, project
+from jsecon.splat.project import check_gaussians, project
 from jsecon.splat.render import render
 from jsecon.splat.sh import colours_from_sh
 from jsecon.types import Array, Camera, Gaussians
@@ -41,7 +41,7 @@ def visible_rows(
     Raises:
       ValueError: Shapes disagree.
     """
-    check_shapes(gaussians, camera)
+    check_gaussians(gaussians, camera)
     geometry = dataclasses.replace(gaussians, sh=np.zeros((gaussians.count, 0, 3), np.float32))
     ids = [np.zeros(0, np.int64)]
     for first in range(0, gaussians.count, rows):
@@ -55,15 +55,30 @@ def _is_visible(gaussians: Gaussians, camera: Camera, near: float) -> Array:
     return project(gaussians, camera, near=near).visible
 
 
-def padded_size(count: int) -> int:
-    """`count` rounded up to an eighth of a power of two, at least 4,096: views share compiled programs."""
+def _padded_size(count: int) -> int:
+    """Rounds a number of rows up, so that views share compiled programs.
+
+    Args:
+      count: Number of Gaussians.
+
+    Returns:
+      A multiple of an eighth of a power of two, at least 4,096.
+    """
     step = max(4096, 1 << max(count.bit_length() - 4, 0))
     return max(-(-count // step), 1) * step
 
 
 def geometry_of_rows(gaussians: Gaussians, ids: Int[np.ndarray, " m"]) -> Gaussians:
-    """The Gaussians `ids` (M,) in black, then transparent ones up to `padded_size`. NumPy, float32."""
-    size = padded_size(len(ids))
+    """Reads the geometry of some Gaussians. Host code.
+
+    Args:
+      gaussians: Scene of N Gaussians; its columns may be memory-mapped.
+      ids: (M,) rows.
+
+    Returns:
+      The M Gaussians in black, float32 (NumPy), then transparent ones up to `_padded_size(M)`.
+    """
+    size = _padded_size(len(ids))
     bare = dataclasses.replace(gaussians, sh=np.zeros((gaussians.count, 0, 3), np.float32))
 
     def fill(a):
@@ -90,7 +105,7 @@ def render_in_blocks(gaussians: Gaussians, camera: Camera, *, near: float = NEAR
     """
     camera = jax.tree.map(np.asarray, camera)
     ids = visible_rows(gaussians, camera, near=near)
-    colours = np.zeros((padded_size(len(ids)), 3), np.float32)
+    colours = np.zeros((_padded_size(len(ids)), 3), np.float32)
     for first in range(0, len(ids), ROWS):
         rows = ids[first : first + ROWS]
         part = jax.tree.map(lambda a, rows=rows: np.asarray(a[rows]), gaussians)

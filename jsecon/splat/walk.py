@@ -49,7 +49,15 @@ class Batches(NamedTuple):
     strip: Strip
 
     def corners(self, tiles: Array, dtype) -> tuple[Array, Array]:
-        """Returns x and y of the upper left corners of tiles in the image, px."""
+        """Finds the upper left corners of tiles in the image.
+
+        Args:
+          tiles: Tile ids, int, of any shape.
+          dtype: Type of the result.
+
+        Returns:
+          x and y, px.
+        """
         x, y = tiles % self.across, self.strip.tile_row(tiles // self.across)
         return (x * self.tile).astype(dtype), (y * self.tile).astype(dtype)
 
@@ -77,18 +85,16 @@ def make_batches(lists: TileLists, width: int, strip: Strip = FULL_IMAGE, most: 
     return Batches(order.reshape(-1, batch), starts, lengths, -(-width // lists.tile), number, lists.tile, strip)
 
 
-def to_image(batched: Float[Array, "k b d p"], batches: Batches, width: int) -> Float[Array, "h w d"]:
-    """Arranges batches (batches, B, D, pixels) as the image (rows, W, D) of the strip."""
-    down, tile, channels = batches.number // batches.across, batches.tile, batched.shape[2]
-    slots = batches.tiles.reshape(-1)
-    place = jnp.zeros(batches.number + 1, jnp.int32).at[slots].set(lax.iota(jnp.int32, slots.shape[0]))[:-1]
-    tiles = batched.reshape(slots.shape[0], channels, tile, tile)[place]
-    image = tiles.reshape(down, batches.across, channels, tile, tile).transpose(0, 3, 1, 4, 2)
-    return image.reshape(down * tile, batches.across * tile, channels)[:, :width]
-
-
 def to_tiles(image: Array, tile: int) -> Array:
-    """Divides an image (H, W, ...) into tiles (tiles + 1, tile * tile, ...), zero outside; the last tile is empty."""
+    """Divides an image into tiles, row by row.
+
+    Args:
+      image: (H, W, ...).
+      tile: Edge of a tile, px.
+
+    Returns:
+      (tiles + 1, tile * tile, ...), zero outside of the image; the last tile is empty.
+    """
     height, width, *rest = image.shape
     across, down = tile_grid(width, height, tile)
     padding = [(0, down * tile - height), (0, across * tile - width)] + [(0, 0)] * len(rest)
@@ -133,7 +139,15 @@ class Chunk(NamedTuple):
 
 
 def make_table(splats: Float[Array, "n 6"], *columns: Array) -> Float[Array, "n k"]:
-    """Makes the table that a walk gathers from: splats, binary logarithms of opacities, and `columns` (N, ...)."""
+    """Makes the table that a walk gathers from.
+
+    Args:
+      splats: (N, 6) as in `ViewPlan`.
+      *columns: (N, ...) further columns.
+
+    Returns:
+      (N, 7 + ...) the splats, the binary logarithms of their opacities, and the columns.
+    """
     opacity = splats[:, 5:]
     binary = jnp.where(opacity > 0, jnp.log2(jnp.where(opacity > 0, opacity, 1.0)), -jnp.inf)
     return jnp.concatenate([splats, binary, *columns], axis=1)
@@ -154,7 +168,15 @@ def _exp2(e: Array) -> Array:
 
 
 def pixel_centres(tile: int, dtype) -> tuple[Array, Array]:
-    """Returns x and y (pixels,) of the pixels of a tile from its upper left corner."""
+    """Finds the centres of the pixels of a tile, from its upper left corner.
+
+    Args:
+      tile: Edge of a tile, px.
+      dtype: Type of the result.
+
+    Returns:
+      x and y (tile * tile,), px, row by row; NumPy.
+    """
     local = (np.arange(tile) + 0.5).astype(dtype)
     return np.tile(local, tile), np.repeat(local, tile)
 

@@ -5,7 +5,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from jsecon.splat.transform import recenter
 from jsecon.types import Camera
 from stability.case import (
     ARGUMENTS,
@@ -214,9 +213,13 @@ def offsets() -> Iterator[Case]:
         ("1e6 m off, stored in float32, then recentred", (stored, stored_camera)),
         ("1e6 m off, recentred from float64", (far, far_camera)),
     ):
-        gaussians, camera, back = recenter(*exact)
+        means, poses = (np.asarray(a, np.float64) for a in (exact[0].means, exact[1].world_to_camera))
+        origin, moved = np.median(means, axis=0), poses.copy()
+        moved[:3, 3] += poses[:3, :3] @ origin
+        gaussians = dataclasses.replace(exact[0], means=(means - origin).astype(np.float32))
+        camera = dataclasses.replace(exact[1], world_to_camera=moved.astype(np.float32))
         yield dataclasses.replace(
-            base, name=name, gaussians=gaussians, camera=camera, exact=exact, origin=tuple(back[:3, 3])
+            base, name=name, gaussians=gaussians, camera=camera, exact=exact, origin=tuple(origin)
         )
 
 
