@@ -56,14 +56,34 @@ class Autoencoder:
             require(shapes == expected, name, f"{shapes}", f"{expected}", "Train it again.")
 
     def encode(self, embeddings: Float[Array, "*batch e"]) -> Float[Array, "*batch d"]:
-        """(..., E) embeddings of any length -> (..., d) unit codes; a zero embedding stays a zero (unknown) code."""
+        """Encodes embeddings.
+
+        Args:
+          embeddings: (..., E) of any length.
+
+        Returns:
+          (..., d) unit codes; zero (unknown) for a zero embedding.
+
+        Raises:
+          ValueError: Embeddings of another size.
+        """
         require_shape("embeddings", embeddings, (..., self.dim), "Embed with what the autoencoder was trained on.")
         units = normalize(jnp.asarray(embeddings))
         codes = _encode(self.encoder, units.reshape(-1, self.dim))
         return codes.reshape(*units.shape[:-1], self.latent)
 
     def decode(self, codes: Float[Array, "*batch d"]) -> Float[Array, "*batch e"]:
-        """(..., d) codes -> (..., E) unit embeddings."""
+        """Decodes codes.
+
+        Args:
+          codes: (..., d) of any length.
+
+        Returns:
+          (..., E) unit embeddings.
+
+        Raises:
+          ValueError: Codes of another size.
+        """
         require_shape("codes", codes, (..., self.latent), "Decode codes of this autoencoder.")
         codes = jnp.asarray(codes)
         rows = _decode(self.decoder, codes.reshape(-1, self.latent))
@@ -85,19 +105,20 @@ def train_autoencoder(
 
     Args:
       embeddings: (R, E), R >= 1, of any length; zero rows (never embedded) are left out.
-      latent: Numbers of a code.
+      latent: d, size of a code.
       key: The same key gives the same parameters.
       epochs: Passes over the regions; None takes LangSplat's 100, or as many as make 1,000 steps.
-      batch: Largest batch. Batches have like sizes: batch normalisation cannot learn from a remnant of one or two.
-      learning_rate: Of Adam.
+      batch: Maximum number of regions of a batch. All batches have similar sizes, because batch normalisation cannot
+        learn from one or two regions.
+      learning_rate: Learning rate of Adam.
       cosine_weight: Weight of the cosine term of the loss.
-      progress: Called as progress(done, total) between stretches of epochs.
+      progress: Called as progress(done, total), in epochs.
 
     Returns:
       The best parameters, by the loss in evaluation mode, of the last twentieth of the epochs.
 
     Raises:
-      ValueError: No usable row, numbers that are not finite, or options out of range.
+      ValueError: All rows are zero, numbers are not finite, or options are out of range.
     """
     require(latent >= 1, "train_autoencoder", f"latent={latent}", "at least 1", "3 is LangSplat's.")
     positive, options = batch >= 1 and (epochs is None or epochs >= 1), f"batch={batch}, epochs={epochs}"
@@ -130,7 +151,15 @@ def train_autoencoder(
 
 
 def require_finite(where: str, embeddings: np.ndarray) -> None:
-    """Raises ValueError, naming the function `where`, for embeddings that are not finite."""
+    """Checks that embeddings are finite.
+
+    Args:
+      where: Name of the function that the message names.
+      embeddings: Array of any shape.
+
+    Raises:
+      ValueError: A number is NaN or infinite.
+    """
     remedy, finite = "Find the regions whose crops gave NaN and leave them out.", bool(np.isfinite(embeddings).all())
     require(finite, where, "embeddings that are not finite", "finite numbers", remedy)
 

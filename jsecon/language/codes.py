@@ -43,11 +43,25 @@ class Rotation:
     """(E, d) orthonormal columns, or zero columns where the span has fewer than d dimensions."""
 
     def encode(self, embeddings: Float[Array, "*batch e"]) -> Float[Array, "*batch d"]:
-        """(..., E) -> (..., d) unit codes: the part of the embedding inside the span, brought to unit length."""
+        """Encodes embeddings by the part of each that lies inside the span.
+
+        Args:
+          embeddings: (..., E) of any length.
+
+        Returns:
+          (..., d) unit codes.
+        """
         return normalize(jnp.matmul(normalize(jnp.asarray(embeddings)), self.basis, precision=FULL_PRECISION))
 
     def decode(self, codes: Float[Array, "*batch d"]) -> Float[Array, "*batch e"]:
-        """(..., d) -> (..., E) unit embeddings inside the span."""
+        """Decodes codes.
+
+        Args:
+          codes: (..., d) of any length.
+
+        Returns:
+          (..., E) unit embeddings inside the span.
+        """
         return normalize(jnp.matmul(jnp.asarray(codes), jnp.asarray(self.basis).T, precision=FULL_PRECISION))
 
 
@@ -65,11 +79,25 @@ class Spread:
     """(R, d) their unit codes."""
 
     def encode(self, embeddings: Float[Array, "*batch e"]) -> Float[Array, "*batch d"]:
-        """(..., E) -> (..., d) unit codes; a zero embedding gets a zero code."""
+        """Encodes embeddings by the codes of the regions that they are most similar to.
+
+        Args:
+          embeddings: (..., E) of any length.
+
+        Returns:
+          (..., d) unit codes; zero for a zero embedding.
+        """
         return _among(jnp.asarray(embeddings), jnp.asarray(self.embeddings), jnp.asarray(self.codes))
 
     def decode(self, codes: Float[Array, "*batch d"]) -> Float[Array, "*batch e"]:
-        """(..., d) -> (..., E) unit embeddings."""
+        """Decodes codes by the embeddings of the regions with the most similar codes.
+
+        Args:
+          codes: (..., d) of any length.
+
+        Returns:
+          (..., E) unit embeddings; zero for a zero code.
+        """
         return _among(jnp.asarray(codes), jnp.asarray(self.codes), jnp.asarray(self.embeddings))
 
 
@@ -91,7 +119,15 @@ def _among(x: Array, keys: Array, values: Array) -> Array:
 
 
 def encode(coder: Coder, embeddings: Float[Array, "*batch e"]) -> Float[Array, "*batch d"]:
-    """Codes of embeddings (of a text, say) under a field's coder; with None the codes are the unit embeddings."""
+    """Encodes embeddings, such as those of a text, with the coder of a field.
+
+    Args:
+      coder: Coder of the field; None keeps the embeddings.
+      embeddings: (..., E) of any length.
+
+    Returns:
+      (..., d) unit codes.
+    """
     return normalize(jnp.asarray(embeddings)) if coder is None else coder.encode(embeddings)
 
 
@@ -116,12 +152,12 @@ def region_codes(embeddings: Float[Array, "r e"], *, latent: int | str, key: Key
 
     Args:
       embeddings: (R, E); a zero row (never embedded) gets a zero code.
-      latent: Largest number of numbers, or "auto".
-      key: For the autoencoder.
+      latent: Maximum size of a code, at least 1, or "auto".
+      key: Random key of the autoencoder.
       training: Options of `train_autoencoder`.
 
     Returns:
-      The codes.
+      The codes, their coder, and the reason for the choice.
 
     Raises:
       ValueError: Numbers are not finite, or `latent` is out of range.
@@ -172,20 +208,43 @@ def _spread_out(units: Array, latent: int) -> tuple[Array, Spread]:
 
 
 def distinct_pairs(units: Float[Array, "r e"]) -> Bool[np.ndarray, "r r"]:
-    """(R, R) where two regions with an embedding are two things: their cosine is below `DISTINCT_COSINE`."""
+    """Finds pairs of regions that are two things: their cosine is below DISTINCT_COSINE.
+
+    Args:
+      units: (R, E) unit embeddings; zero rows are in no pair.
+
+    Returns:
+      (R, R) bool, symmetric.
+    """
     exact = np.asarray(units, np.float64)
     known = np.any(exact != 0, axis=1)
     return (exact @ exact.T < DISTINCT_COSINE) & known[:, None] & known[None]
 
 
 def confused_pairs(units: Float[Array, "r e"], codes: Float[Array, "r d"]) -> int:
-    """Pairs of distinct regions whose unit codes have a cosine of at least `CODE_THRESHOLD`."""
+    """Counts distinct regions that a query takes for each other: the cosine of their codes is at least CODE_THRESHOLD.
+
+    Args:
+      units: (R, E) unit embeddings.
+      codes: (R, d) their unit codes.
+
+    Returns:
+      Number of pairs.
+    """
     exact = np.asarray(codes, np.float64)
     return int((distinct_pairs(units) & (exact @ exact.T >= CODE_THRESHOLD)).sum()) // 2
 
 
 def principal_rotation(units: Float[Array, "r e"], latent: int) -> Rotation:
-    """The `latent` principal directions of unit rows (R, E); not centred: cosines, not distances, are to be kept."""
+    """Finds the principal directions of embeddings, not centred: cosines are to be kept, not distances.
+
+    Args:
+      units: (R, E) unit embeddings.
+      latent: d, number of directions.
+
+    Returns:
+      The rotation into them.
+    """
     exact = np.asarray(units, np.float64)
     _, sizes, directions = np.linalg.svd(exact, full_matrices=False)
     rank = int(np.sum(sizes > 1e-6 * max(sizes.max(initial=0.0), 1e-300)))

@@ -18,21 +18,42 @@ _NOT_BY_ROW = ("overflow", "num_regions", "by_view", "overlap")
 
 
 def is_mapped(tree: Any) -> bool:
-    """Whether any array of a tree lies in a memory-mapped file."""
+    """Finds out whether any array of a tree lies in a memory-mapped file.
+
+    Args:
+      tree: Tree of arrays.
+
+    Returns:
+      True if one does.
+    """
     return any(isinstance(leaf, np.memmap) for leaf in jax.tree.leaves(tree))
 
 
 def row_slices(tree: Any, count: int, rows: int | None = None) -> Iterator[slice]:
-    """Consecutive slices of `count` rows: of ROWS rows (or `rows`) if the tree has mapped arrays, else one of all.
+    """Divides rows into consecutive slices, so that at most one block of mapped columns is in memory.
 
-    A pure function of rows, applied slice by slice, therefore never holds more than a block of mapped columns.
+    Args:
+      tree: Tree of arrays with rows.
+      count: N, number of rows.
+      rows: Number of rows of a slice if the tree has mapped arrays, by default ROWS.
+
+    Returns:
+      The slices; a single one if no array is mapped.
     """
     step = (ROWS if rows is None else rows) if is_mapped(tree) else max(count, 1)
     return (slice(first, min(first + step, count)) for first in range(0, count, step))
 
 
 def votes_of_rows(votes: Votes, rows: slice | Int[np.ndarray, " m"]) -> Votes:
-    """The votes of some of the Gaussians, NumPy, without what has no row for each (`by_view`, `overlap`)."""
+    """Takes the votes of some of the Gaussians.
+
+    Args:
+      votes: Votes of N Gaussians.
+      rows: (M,) rows, or a slice.
+
+    Returns:
+      Votes of M Gaussians, NumPy, without `by_view` and `overlap`, which have no row for each Gaussian.
+    """
 
     def take(column):
         return None if column is None else np.asarray(column[rows])
@@ -43,5 +64,12 @@ def votes_of_rows(votes: Votes, rows: slice | Int[np.ndarray, " m"]) -> Votes:
 
 
 def vote_blocks(votes: Votes) -> Iterator[Votes]:
-    """The votes on jax's device, block after block of Gaussians if they are mapped."""
+    """Divides votes into blocks of Gaussians.
+
+    Args:
+      votes: Votes of N Gaussians.
+
+    Returns:
+      The votes of each block on jax's device; a single block if they are not mapped.
+    """
     return (jax.tree.map(jnp.asarray, votes_of_rows(votes, rows)) for rows in row_slices(votes, len(votes.views)))

@@ -43,8 +43,8 @@ def distill_votes(
     """Computes the codes of Gaussians from their strongest votes and the codes of the regions. Pure.
 
     Args:
-      votes: Of N Gaussians.
-      region_codes: (R, d).
+      votes: Votes of N Gaussians.
+      region_codes: (R, d) codes of the regions.
       reduce: "mode", the code of the strongest region. "mean", the weighted mean, which minimises the weighted squared
         error. "median", the weighted median of each number, which minimises the rendered L1 of a Gaussian taken alone;
         if a whole interval does, the value closest to the mode.
@@ -159,16 +159,16 @@ def distill_l1(
       cameras: Batch of T cameras.
       labels: (T, H, W) integer region ids, -1 where a pixel belongs to no region. Inside a trace ids of R and more
         count as -1.
-      region_codes: (R, d).
+      region_codes: (R, d) codes of the regions.
       steps: Number of steps.
-      key: Of the order of views and of random codes.
+      key: Random key of the order of views and of random codes.
       init: "zero" is LangSplat's, and a trap: the gradient through `f / (|f| + 1e-9)` at zero is 1e9 times too large,
         Adam's second moment remembers it for about 15,000 steps, and until then a code hardly moves from the corner of
         the cube that its first step took it to. "random" (length 0.01) or (N, d) codes, such as those of
         `distill_votes`, escape it.
-      learning_rate: Of Adam.
-      capacity: As for `render`.
-      progress: Called as progress(done, total) between stretches of steps.
+      learning_rate: Learning rate of Adam.
+      capacity: Number of (block, Gaussian) pairs of a view, see `render`.
+      progress: Called as progress(done, total), in steps.
 
     Returns:
       The codes and the losses.
@@ -195,7 +195,7 @@ def distill_l1(
     if not is_traced(state.history):
         problem = f"capacity={capacity}, too small for a view, or NaN"
         expected = "every view within the capacity, finite Gaussians and codes"
-        remedy = "Leave capacity out, and check the Gaussians with jsecon.numerics.finite."
+        remedy = "Leave capacity out, and check the Gaussians with jsecon.splat.project.count_non_finite."
         require(not bool(jnp.isnan(state.history).any()), "distill_l1", problem, expected, remedy)
     codes = normalize(state.features)
     if isinstance(init, str) and init == "random":
@@ -214,7 +214,23 @@ def start_distillation(
     key: Key,
     init: str | Float[Array, "n d"] = "zero",
 ) -> DistillState:
-    """The state before the first step of `distill_l1`; see there for the arguments."""
+    """Makes the state before the first step of `distill_l1`.
+
+    Args:
+      gaussians: Scene of N Gaussians.
+      cameras: Batch of T cameras.
+      labels: (T, H, W) integer region ids, -1 where a pixel belongs to no region.
+      region_codes: (R, d) codes of the regions.
+      steps: Number of steps of the whole run.
+      key: Random key of the order of views and of random codes.
+      init: "zero", "random" or (N, d) codes, see `distill_l1`.
+
+    Returns:
+      The state.
+
+    Raises:
+      ValueError: Shapes disagree, there is nothing to distill, or `init` is unknown.
+    """
     views, count, size = labels.shape[0], gaussians.count, region_codes.shape[1]
     expected = (*cameras.world_to_camera.shape[:-2], cameras.height, cameras.width)
     require_shape("labels", labels, expected, "Pass the labels and the cameras of the same views at the same size.")
@@ -250,9 +266,21 @@ def continue_distillation(
     learning_rate: float = 0.0025,
     plans: ViewPlan | None = None,
 ) -> DistillState:
-    """Takes `state` on to `until` steps. In stretches or at once, with one compilation and one result.
+    """Takes steps of `distill_l1`. Many calls give the same result as one, with one compilation.
 
-    `plans` are those of `splat.plan.plan_views`; without them each step plans its view.
+    Args:
+      state: Where to start.
+      gaussians: Scene of N Gaussians.
+      cameras: Batch of T cameras.
+      labels: (T, H, W) integer region ids, -1 where a pixel belongs to no region.
+      region_codes: (R, d) codes of the regions.
+      until: Number of steps that are taken in the end, those of `state` included.
+      capacity: Number of (block, Gaussian) pairs of a view, see `render`.
+      learning_rate: Learning rate of Adam.
+      plans: Result of `splat.plan.plan_views`; without it each step plans its view.
+
+    Returns:
+      The state after the last step.
     """
     # Regions in multiples of 256, the last without a code: scenes share their compiled programs.
     table = jnp.pad(jnp.asarray(region_codes), ((0, -len(region_codes) % 256), (0, 0)))

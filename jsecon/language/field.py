@@ -117,7 +117,15 @@ def load_field(path: str | os.PathLike, *, mapped: bool = False) -> LanguageFiel
 
 
 def subset_field(field: LanguageField, rows: Int[np.ndarray, " m"]) -> LanguageField:
-    """The field of some of its Gaussians (M,), with NumPy columns; of mapped columns only their rows are read."""
+    """Takes some of the Gaussians of a field; of mapped columns only their rows are read.
+
+    Args:
+      field: Field of N Gaussians.
+      rows: (M,) rows.
+
+    Returns:
+      Field of M Gaussians with NumPy columns.
+    """
 
     def take(a):
         return np.asarray(a)[rows]
@@ -141,7 +149,7 @@ def check_field(path: str | os.PathLike) -> None:
       path: The file.
 
     Raises:
-      InputError: As for `load_field`.
+      InputError: The file is missing, not a field, cut short, damaged, of a later version, or inconsistent.
     """
     _read(Path(path), MAPPED, checked=True)
 

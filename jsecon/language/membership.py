@@ -57,21 +57,30 @@ class Share(NamedTuple):
 def finish_votes(votes: Votes, regions: Regions) -> Votes:
     """Adds what queries read to votes that were cast `by_view`: `with_overlap(with_shown(votes, regions))`. Pure.
 
-    `finish_votes_in_blocks` does the same for memory-mapped votes.
+    Args:
+      votes: Votes of N Gaussians, cast `by_view`. Memory-mapped ones need `finish_votes_in_blocks`.
+      regions: Regions made from the labels that voted.
+
+    Returns:
+      The votes with `shown` (N, K) and `overlap` (R, R), without `by_view`.
+
+    Raises:
+      ValueError: The votes have no `by_view`, or other views than `regions`.
     """
     return with_overlap(with_shown(votes, regions))
 
 
 def with_shown(votes: Votes, regions: Regions, *, alike_threshold: float = ALIKE_THRESHOLD) -> Votes:
-    """Replaces `by_view` by `shown`: the weight with which the views that show a vote's region see the Gaussian.
+    """Replaces `by_view` by `shown`: the weight with which the views that show a vote's region see the Gaussian. Pure.
 
     The share that follows is the object posterior of B3-Seg: weight inside over inside and outside, over the views that
-    contain the object. Pure.
+    contain the object.
 
     Args:
-      votes: Cast `by_view`.
-      regions: Made from the labels that voted.
-      alike_threshold: Regions that are alike are shown together, as queries join them (`is_alike`).
+      votes: Votes of N Gaussians, cast `by_view`.
+      regions: Regions made from the labels that voted.
+      alike_threshold: Cosine of `mean_residuals` from which regions are shown together, as queries join them
+        (`is_alike`).
 
     Returns:
       The votes with `shown` (N, K).
@@ -92,7 +101,15 @@ def with_shown(votes: Votes, regions: Regions, *, alike_threshold: float = ALIKE
 
 @functools.partial(jax.jit, static_argnames="alike_threshold")
 def views_that_show(regions: Regions, *, alike_threshold: float = ALIKE_THRESHOLD) -> Bool[Array, "r t"]:
-    """(R, T) which views show a region, or one that is alike."""
+    """Finds the views that show a region, or one that is alike. Pure.
+
+    Args:
+      regions: R regions with their pixels in T views.
+      alike_threshold: Cosine of `mean_residuals` from which two regions are alike.
+
+    Returns:
+      (R, T) bool.
+    """
     apart, known = mean_residuals(jnp.asarray(regions.embeddings))
     alike = cosine_matrix(apart, apart) >= alike_threshold
     alike = (alike & known[:, None] & known[None]) | jnp.eye(regions.count, dtype=bool)
@@ -101,7 +118,15 @@ def views_that_show(regions: Regions, *, alike_threshold: float = ALIKE_THRESHOL
 
 @jax.jit
 def add_shown(votes: Votes, shows: Bool[Array, "r t"]) -> Votes:
-    """`with_shown` for views that show a region by `views_that_show`. Each Gaussian stands for itself."""
+    """Replaces `by_view` by `shown`, see `with_shown`. Pure; Gaussian by Gaussian.
+
+    Args:
+      votes: Votes of N Gaussians, cast `by_view`.
+      shows: (R, T) result of `views_that_show`.
+
+    Returns:
+      The votes with `shown` (N, K).
+    """
     by_view, regions = jnp.asarray(votes.by_view), jnp.asarray(votes.regions)
     count = regions.shape[0]
     block = min(_BLOCK, max(count, 1))
@@ -128,6 +153,12 @@ def with_overlap(votes: Votes) -> Votes:
     with p the shares; 0 for a region without votes. Two pieces that masks cut out of one object in different views
     overlap in its Gaussians; two objects meet only where they touch, and what lies behind all of them is far larger
     than any.
+
+    Args:
+      votes: Votes of N Gaussians.
+
+    Returns:
+      The votes with `overlap`.
     """
     sums = overlap_sums(jnp.asarray(votes.regions), vote_shares(votes), votes.num_regions)
     return dataclasses.replace(votes, overlap=soft_iou(sums))
@@ -135,7 +166,16 @@ def with_overlap(votes: Votes) -> Votes:
 
 @functools.partial(jax.jit, static_argnums=2)
 def overlap_sums(regions: Int[Array, "n k"], share: Float[Array, "n k"], count: int) -> Float[Array, "r r"]:
-    """(R, R) sum_n min(p_nr, p_ns), of each n at [r, s] where r is the stronger of the two."""
+    """Adds up the smaller share of two regions over the Gaussians. Pure.
+
+    Args:
+      regions: (N, K) region of each vote, -1 for none.
+      share: (N, K) share of each vote, see `vote_shares`.
+      count: R.
+
+    Returns:
+      (R, R) sum_n min(p_nr, p_ns), of each n at [r, s] where r is the stronger of the two.
+    """
     valid = (regions >= 0) & (regions < count) & jnp.isfinite(share)
     place, share = jnp.where(valid, regions, count).T, jnp.where(valid, share, 0.0).T  # one past the end: dropped
     first, second = jnp.triu_indices(regions.shape[1])
@@ -149,7 +189,14 @@ def overlap_sums(regions: Int[Array, "n k"], share: Float[Array, "n k"], count: 
 
 @jax.jit
 def soft_iou(both: Float[Array, "r r"]) -> Float[Array, "r r"]:
-    """The overlap of `with_overlap` from its `overlap_sums`, which add up over Gaussians."""
+    """Computes the overlap of `with_overlap`. Pure.
+
+    Args:
+      both: (R, R) `overlap_sums`, which add up over blocks of Gaussians.
+
+    Returns:
+      (R, R) soft IoU, symmetric.
+    """
     size = jnp.diagonal(both)
     both = jnp.where(jnp.eye(len(both), dtype=bool), both, both + both.T)
     either = size[:, None] + size - both
@@ -158,7 +205,14 @@ def soft_iou(both: Float[Array, "r r"]) -> Float[Array, "r r"]:
 
 @jax.jit
 def vote_shares(votes: Votes) -> Float[Array, "n k"]:
-    """The share p_nr of each vote (N, K), in [0, 1]: 0 without a vote, NaN where its numbers are not finite. Pure."""
+    """Computes the share p_nr of each vote. Pure.
+
+    Args:
+      votes: Votes of N Gaussians.
+
+    Returns:
+      (N, K) in [0, 1]: 0 without a vote, NaN if its numbers are not finite.
+    """
     seen = votes.total[:, None] if votes.shown is None else jnp.maximum(votes.shown, _least_seen(votes)[:, None])
     return ratio(jnp.where(votes.regions >= 0, votes.weights, 0.0), jnp.where(votes.regions >= 0, seen, 0.0))
 
@@ -166,9 +220,13 @@ def vote_shares(votes: Votes) -> Float[Array, "n k"]:
 def vote_columns(votes: Votes) -> Iterator[tuple[Int[Array, " n"], Float[Array, " n"], Float[Array, " n"]]]:
     """Iterates over every Gaussian's k-th vote, k = 1 to K. For compiled code.
 
-    Each item is r (N,), w_nr (N,) and what that is a share of (N,). r is -1 where there is no vote.
-
     Column by column: a reduction over short rows does not vectorise (1 million Gaussians of 8 votes: 27 ms against 4).
+
+    Args:
+      votes: Votes of N Gaussians.
+
+    Yields:
+      The region r (N,), -1 without a vote; its weight w_nr (N,); and the weight that this is a share of (N,).
     """
     least = _least_seen(votes)
     for k in range(votes.regions.shape[1]):
@@ -182,7 +240,15 @@ def _least_seen(votes: Votes) -> Array:
 
 
 def ratio(weight: Array, seen: Array) -> Array:
-    """Weight / seen in [0, 1]; 0 where the Gaussian was not seen, NaN where a number is not finite."""
+    """Divides weights. Pure.
+
+    Args:
+      weight: Weights of any shape.
+      seen: Weights that they are a share of, of the same shape.
+
+    Returns:
+      Shares in [0, 1]; 0 if `seen` is 0, NaN if a number is not finite.
+    """
     share = jnp.where(seen > 0, jnp.clip(weight / jnp.where(seen > 0, seen, 1.0), 0.0, 1.0), 0.0)
     return jnp.where(jnp.isfinite(weight) & jnp.isfinite(seen), share, jnp.nan)
 
@@ -197,8 +263,8 @@ def share_of(votes: Votes, chosen: Bool[Array, " r"]) -> Share:
     them, where one is shown wherever the others are, and no more elsewhere.
 
     Args:
-      votes: Of N Gaussians.
-      chosen: (R,) the regions.
+      votes: Votes of N Gaussians.
+      chosen: (R,) bool.
 
     Returns:
       The share. It is not known for Gaussians that no view sees, that have no vote for a chosen region, or whose votes
@@ -243,15 +309,15 @@ def membership_probability(
 ) -> Float[Array, " n"]:
     """Computes the probability that most of a Gaussian belongs to what was selected. Pure.
 
-    Views are draws, of which n count as independent. Under a flat prior the true part has the posterior
-    Beta(1 + n share, 1 + n (1 - share)), and the probability is its mass above one half. n is the number of views, at
-    most the Gaussian's weight in pixels, damped by the correlation r to n / (1 + (n - 1) r). So 0.9 of one view's
-    weight is less certain than 0.9 of twenty views'.
+    Views are draws, of which n count as independent. Under a flat prior the true part has the posterior Beta(1 + n
+    share, 1 + n (1 - share)), and the probability is its mass above one half. n is the number of views, at most the
+    Gaussian's weight in pixels, damped by the correlation r to n / (1 + (n - 1) r). So 0.9 of one view's weight is less
+    certain than 0.9 of twenty views'.
 
     Args:
-      share: (N,) similarity of a query by votes (`share_of`).
-      votes: Of the N Gaussians.
-      correlation: Of two views' errors.
+      share: (N,) in [0, 1], similarity of a query by votes (`share_of`).
+      votes: Votes of the N Gaussians.
+      correlation: Correlation of the errors of two views, in [0, 1].
 
     Returns:
       (N,) in [0, 1]; 0 for Gaussians that were never seen.
@@ -260,7 +326,16 @@ def membership_probability(
 
 
 def probability_inside(share: Float[Array, " n"], votes: Votes, mask: Bool[Array, " n"]) -> Float[np.ndarray, " m"]:
-    """`membership_probability` of the M Gaussians of `mask` (N,) alone. Host code, compiled for a few sizes."""
+    """Computes `membership_probability` of selected Gaussians alone. Host code, compiled for a few sizes.
+
+    Args:
+      share: (N,) in [0, 1].
+      votes: Votes of the N Gaussians.
+      mask: (N,) bool, the M selected Gaussians.
+
+    Returns:
+      (M,) in [0, 1].
+    """
     chosen = np.flatnonzero(np.asarray(mask))
     rows = np.resize(chosen, 1 << max(len(chosen) - 1, 0).bit_length()) if len(chosen) else np.zeros(1, int)
     picked = (np.asarray(a)[rows] for a in (share, votes.views, votes.total))

@@ -44,7 +44,7 @@ def region_embeddings(
       embed: `Embedder.embed_regions`: (H, W, 3) and masks (M, H, W) -> (M, E) unit embeddings.
       weighting: "pixels" as above (the paper), or "uniform": omega_t = 1 / number of views of r.
       num_regions: R; None takes the largest label + 1.
-      progress: Called as progress(done, total) while frames finish.
+      progress: Called as progress(done, total), in frames.
 
     Returns:
       Regions. A view whose embedding is zero does not count; a region without any view has a zero embedding.
@@ -80,7 +80,7 @@ def embeddings_of_masks(
       Regions. Views in which a region lies on no mask do not count.
 
     Raises:
-      ValueError: As for `region_embeddings`.
+      ValueError: Shapes disagree, a label is out of range, or the weighting is unknown.
     """
     require_shape("masks", masks, labels.shape, "Give one image of rows per frame, of the labels' size.")
 

@@ -40,7 +40,7 @@ _MAX_CASTS = 1 << 26
 
 @runtime_checkable
 class Images(Protocol):
-    """One image after the other: an array, or what reads them from where they lie."""
+    """Sequence of images: an array, or an object that reads them one at a time."""
 
     def __len__(self) -> int:
         """Returns the number of items."""
@@ -75,14 +75,14 @@ def region_votes_in_blocks(
       gaussians: Scene of N Gaussians, such as `load_field(path, mapped=True).gaussians`.
       cameras: Batch of T cameras.
       labels: T label images (H, W) that are read one at a time; -1 where a pixel belongs to no region.
-      num_regions: R.
-      folder: New or empty folder for the votes' columns; they stay as long as its files do.
+      num_regions: R. Labels must be smaller.
+      folder: New or empty folder for the columns of the votes; they stay as long as its files do.
       top: Number of strongest regions, of the sums over all views, that each Gaussian keeps.
       by_view: Whether to keep each view's total too, as `finish_votes_in_blocks` needs it.
-      centre: As for `region_votes`.
+      centre: In [0, 1]. A weight away from the pixel that holds the Gaussian's centre counts 1 - `centre`.
       near: Near plane, world units.
-      rows: Gaussians that are added up at once, at most.
-      progress: Called as progress(done, total) while views finish.
+      rows: Maximum number of Gaussians that are added up at once.
+      progress: Called as progress(done, total), in views.
 
     Returns:
       Votes whose columns are memory maps.
@@ -116,7 +116,18 @@ def region_votes_in_blocks(
 
 
 def finish_votes_in_blocks(votes: Votes, regions: Regions) -> Votes:
-    """`finish_votes` block by block of mapped votes; `shown` then lies in memory. Votes in memory are one block."""
+    """`finish_votes` of memory-mapped votes, block by block. Host code.
+
+    Args:
+      votes: Votes of N Gaussians, cast `by_view`; votes in memory are one block.
+      regions: Regions made from the labels that voted.
+
+    Returns:
+      The votes with `shown` (N, K), in memory, and `overlap` (R, R), without `by_view`.
+
+    Raises:
+      ValueError: The votes have no `by_view`.
+    """
     shows = views_that_show(regions)
     sums = jnp.zeros((regions.count, regions.count), jnp.float32)
     shown = [np.zeros((0, votes.regions.shape[1]), np.float32)]
@@ -141,17 +152,20 @@ def codes_in_blocks(
     *,
     min_labelled: float = MIN_LABELLED,
 ) -> Float[np.ndarray, "n d"]:
-    """`distill_votes` of mapped votes, block by block.
+    """`distill_votes` of memory-mapped votes, block by block. Host code.
 
     Args:
-      votes: Of N Gaussians.
-      region_codes: Of the regions.
+      votes: Votes of N Gaussians.
+      region_codes: (R, d) codes of the regions.
       path: File of the codes, .npy.
-      reduce: As for `distill_votes`.
-      min_labelled: As for `distill_votes`.
+      reduce: "mode", "mean" or "median", see `distill_votes`.
+      min_labelled: Smallest share of a Gaussian's weight on labelled pixels.
 
     Returns:
-      The codes as a memory map of the file.
+      (N, d) unit codes as a memory map of the file, zero if unknown.
+
+    Raises:
+      ValueError: Shapes disagree, or the reduction is unknown.
     """
     shape = (votes.regions.shape[0], region_codes.shape[1])
     blocks = (distill_votes(block, region_codes, reduce, min_labelled=min_labelled) for block in vote_blocks(votes))
@@ -236,10 +250,15 @@ def _sum_block(scratch: Path, views: int, rows: slice, regions: int, top: int, b
 
 
 def strongest(votes: Any, top: int) -> tuple[np.ndarray, np.ndarray]:
-    """Finds the largest weights of each row of a sparse matrix (N, R).
+    """Finds the largest weights of each row of a sparse matrix.
 
-    Returns ids (N, top) int32, largest first as float32, equal ones by id, -1 where a row has fewer; and weights (N,
-    top) float32.
+    Args:
+      votes: (N, R) scipy CSR array of weights.
+      top: Number of weights of a row.
+
+    Returns:
+      Column ids (N, top) int32, largest first as float32, equal ones by id, -1 where a row has fewer; and weights (N,
+      top) float32.
     """
     lengths, weights = np.diff(votes.indptr), votes.data.astype(np.float32)
     row = np.repeat(np.arange(votes.shape[0]), lengths)

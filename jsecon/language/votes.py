@@ -47,9 +47,6 @@ def region_votes(
 ) -> Votes:
     """Adds up the weight that each region casts on each Gaussian over all views.
 
-    With the geometry frozen, a rendering is linear in the features of the Gaussians. So one pass over the views holds
-    what any later choice of embedding or code needs.
-
     Host code: the views are spread over jax's local devices, and over processes that all make the same call
     (`jax.distributed`). The result has the same bits on any number of devices. Called inside a trace it is
     `scan_region_votes`.
@@ -63,9 +60,10 @@ def region_votes(
       by_view: Whether to keep each view's total too (`Votes.by_view`, 4 T N bytes), as `with_shown` needs it.
       centre: In [0, 1]. A weight away from the pixel that holds the Gaussian's centre counts 1 - `centre`: at 1 a
         Gaussian is what its centre is, at 0 what its whole footprint is.
-      capacity: As for `render`. Without it, votes of views that overflow are cast again with enough.
+      capacity: Number of (block, Gaussian) pairs of a view, see `render`. By default votes of views that overflow are
+        cast again with enough.
       near: Near plane, world units.
-      progress: Called as progress(done, total) while views finish.
+      progress: Called as progress(done, total), in views.
 
     Returns:
       Votes of the N Gaussians. `overflow` is 0 if they are exact.
@@ -108,18 +106,16 @@ def scan_region_votes(
 ) -> Votes:
     """`region_votes` as a pure function: it scans the views on one device, under jit and vmap.
 
-    Labels cannot be checked there: a label of `num_regions` and more counts as -1. Pairs that overflow the capacity are
-    left out and counted in `overflow`.
-
     Args:
-      gaussians: As for `region_votes`, like all that follow.
+      gaussians: Scene of N Gaussians.
       cameras: Batch of T cameras.
-      labels: (T, H, W) integers.
+      labels: (T, H, W) integers, -1 where a pixel belongs to no region; inside a trace R and more count as -1.
       num_regions: R.
-      top: Regions that each Gaussian keeps.
-      by_view: Whether to keep each view's total.
-      centre: In [0, 1].
-      capacity: As for `render`.
+      top: Number of strongest regions that each Gaussian keeps.
+      by_view: Whether to keep each view's total too.
+      centre: In [0, 1]. A weight away from the pixel that holds the Gaussian's centre counts 1 - `centre`.
+      capacity: Number of (block, Gaussian) pairs of a view, see `render`. Pairs beyond it are left out and counted in
+        `overflow`.
       near: Near plane, world units.
 
     Returns:
@@ -157,12 +153,22 @@ def dense_votes(
     near: float = NEAR,
     progress: Progress | None = None,
 ) -> tuple[dict[str, Array], Array | None, int]:
-    """Computes the votes of a block of regions. Host code.
+    """Computes the votes of a block of regions. Host code; other arguments as for `region_votes`.
 
-    Returns {"votes" (N, len(regions)), "total", "peak", "views" (N,), "overflow"}, the total of each view (T, N) with
-    `by_view`, and the capacity that was used.
+    Args:
+      gaussians: Scene of N Gaussians.
+      cameras: Batch of T cameras.
+      labels: (T, H, W) integer region ids, -1 where a pixel belongs to no region.
+      regions: Consecutive region ids of the block.
+      by_view: Whether to keep each view's total.
+      centre: In [0, 1], weight of a Gaussian's centre against its footprint.
+      capacity: Number of (block, Gaussian) pairs of a view; None finds one that suffices.
+      near: Near plane, world units.
+      progress: Called as progress(done, total), in views.
 
-    `regions` are consecutive ids; other options as for `region_votes`.
+    Returns:
+      {"votes" (N, len(regions)), "total", "peak", "views" (N,), "overflow"}; the total of each view (T, N) or None; and
+      the capacity that was used.
     """
     size = _default_capacity(gaussians, cameras) if capacity is None else capacity
     ids = np.array([regions.start, regions.stop], np.int32)
@@ -181,7 +187,15 @@ def dense_votes(
 
 
 def region_blocks(count: int, regions: int) -> list[range]:
-    """Blocks of region ids, of one length, whose dense (N, block) votes fit into _DENSE_BYTES; at least one."""
+    """Divides region ids into blocks of one length whose dense (N, block) votes fit into 1 GiB.
+
+    Args:
+      count: N, number of Gaussians.
+      regions: R.
+
+    Returns:
+      The ids of each block, at least one block; the last may reach beyond R.
+    """
     size = _block_size(count, regions)
     return [range(first, first + size) for first in range(0, max(regions, 1), size)]
 
@@ -220,10 +234,18 @@ def _as_votes(kept: tuple[Array, Array], labelled: Any, state: Any, by_view: Any
 
 
 def votes_memory(count: int, views: int, regions: int) -> int:
-    """Estimates the bytes that `region_votes` with `by_view` takes beside its inputs.
+    """Estimates the memory of `region_votes` with `by_view`, beside its inputs.
 
     These are the views' totals, a copy of the Gaussians with one band of colour, and a dense block for each lane that
     is worked on and for their sum.
+
+    Args:
+      count: N, number of Gaussians.
+      views: T.
+      regions: R.
+
+    Returns:
+      Number of bytes.
     """
     dense = 4 * count * _block_size(count, regions)
     return (4 * views + _BARE_BYTES) * count + (concurrent_lanes(views, dense) + 1) * dense
@@ -330,9 +352,15 @@ def _add_view(
 
 
 def at_centre(splats: Float[Array, "b c 6"], corners: tuple[Array, Array], tile: int) -> Float[Array, "b c pixels"]:
-    """Marks the pixel of a tile that holds the splat's centre by 1; the others are 0.
+    """Marks the pixel of a tile that holds the centre of a splat.
 
-    `corners` (B,), (B,) px are the upper left corners of the tiles.
+    Args:
+      splats: (B, C, 6) as in `ViewPlan`, C of each tile.
+      corners: x and y (B,) of the upper left corners of the tiles, px.
+      tile: Edge of a tile, px.
+
+    Returns:
+      (B, C, tile * tile), 1 at that pixel, 0 elsewhere.
     """
     x, y = (jnp.floor(splats[..., k] - corners[k][:, None]) for k in range(2))
     inside = (x >= 0) & (x < tile) & (y >= 0) & (y < tile)
@@ -341,7 +369,15 @@ def at_centre(splats: Float[Array, "b c 6"], corners: tuple[Array, Array], tile:
 
 
 def distinct_labels(tiles: Int[Array, "n p"], slots: int) -> Int[Array, "n q"]:
-    """Each tile's distinct labels, ascending and to the left; _NOBODY after them, `slots` more columns than pixels."""
+    """Finds the distinct labels of each tile.
+
+    Args:
+      tiles: (N, P) labels of the pixels, -1 for none.
+      slots: Number of additional columns.
+
+    Returns:
+      (N, P + slots) labels, ascending from the left, negative after the last.
+    """
     ordered = jnp.sort(tiles, axis=1)
     first = jnp.ones_like(ordered[:, :1], bool)
     new = jnp.concatenate([first, ordered[:, 1:] != ordered[:, :-1]], axis=1) & (ordered >= 0)

@@ -98,9 +98,9 @@ def render_rgb(
       gaussians: Scene of N Gaussians.
       camera: One camera.
       background: (3,) colour, added with weight 1 - alpha.
-      capacity: As for `render`.
-      near: As for `render`.
-      mesh: As for `render`.
+      capacity: Number of (block, Gaussian) pairs, see `render`.
+      near: Near plane, world units.
+      mesh: Devices of this process to divide the work among, see `render`; None uses one.
 
     Returns:
       Features (H, W, 3), not clamped above 1, alpha and overflow.
@@ -124,8 +124,8 @@ def render_depth(
     Args:
       gaussians: Scene of N Gaussians; its `sh` may be None.
       camera: One camera.
-      capacity: As for `render`.
-      near: As for `render`.
+      capacity: Number of (block, Gaussian) pairs, see `render`.
+      near: Near plane, world units.
 
     Returns:
       Depth and alpha, (H, W) each; NaN if pairs overflowed the capacity.

@@ -133,7 +133,7 @@ def transform_blocks(
 
     Args:
       gaussians: N Gaussians.
-      similarity: As for `transform_gaussians`; None copies the blocks to NumPy.
+      similarity: (4, 4) matrix of x' = s R x + t; None copies the blocks to NumPy.
 
     Yields:
       The rows of each block, and its Gaussians (NumPy).
