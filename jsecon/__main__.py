@@ -30,11 +30,22 @@ class Output:
         return getattr(self._stream, name)
 
     def isatty(self) -> bool:
-        """Whether it is a terminal."""
+        """Whether it is a terminal.
+
+        Returns:
+          The stream's own answer.
+        """
         return self._stream.isatty()
 
     def write(self, text: str) -> int:
-        """Writes `text`; returns how many characters it has."""
+        """Writes a text, or drops it after a failure.
+
+        Args:
+          text: The text.
+
+        Returns:
+          The number of its characters.
+        """
         try:
             return self._stream.write(text)
         except OSError as error:
@@ -56,7 +67,11 @@ class Output:
 
 
 def main() -> int:
-    """Entry point: returns the exit code."""
+    """Runs the command line.
+
+    Returns:
+      The exit code: STOPPED after an interrupt, UNREAD if the reader of standard output went away.
+    """
     several = worker_info() is not None
     if several:
         prepare_worker()

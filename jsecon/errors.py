@@ -35,10 +35,13 @@ class InputError(ValueError):
 
 
 def describe_error(error: BaseException) -> str:
-    """Describes an exception on one line, without its Python name.
+    """Describes an exception without its Python name.
 
     Args:
       error: Any exception of a reader or writer.
+
+    Returns:
+      One line without a full stop.
     """
     if isinstance(error, OSError) and error.strerror:
         return error.strerror.partition(" (")[0]

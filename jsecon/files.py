@@ -57,9 +57,13 @@ class ForeignFileError(ValueError):
 
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
-    """Yields a temporary path beside `path`, which is renamed to `path` at the end, or removed if the body raised.
+    """Opens a temporary path beside a file, which gets the file's name at the end, or is removed if the body raised.
 
-    The temporary name keeps the ending of `path`, for writers that choose the format by it.
+    Args:
+      path: The file. Missing folders are made. The temporary name keeps its suffix, by which writers choose the format.
+
+    Yields:
+      The temporary path, an empty file.
 
     Raises:
       InputError: The folder cannot be written, or the disk is full.
@@ -86,7 +90,13 @@ def _unwritten(path: Path, error: OSError) -> InputError:
 
 @contextlib.contextmanager
 def exclusive_lock(folder: Path) -> Iterator[None]:
-    """Locks a folder for this process.
+    """Locks a folder for this process, for the body of a `with`.
+
+    Args:
+      folder: The folder, which must exist. On a file system without locks the body runs unlocked.
+
+    Yields:
+      None.
 
     Raises:
       InputError: Another run has locked it, or it cannot be written.
@@ -109,7 +119,14 @@ def exclusive_lock(folder: Path) -> Iterator[None]:
 
 
 def path_within(folder: Path, name: str) -> Path:
-    """Returns the path of a name that a file gives, beneath a folder.
+    """Joins a folder and a name that comes from a file.
+
+    Args:
+      folder: The folder.
+      name: Relative path beneath it.
+
+    Returns:
+      The path, which need not exist.
 
     Raises:
       InputError: The name leads out of the folder.
@@ -122,18 +139,26 @@ def path_within(folder: Path, name: str) -> Path:
 
 
 def is_output_folder(folder: Path) -> bool:
-    """Returns whether a folder is the output folder of a run or a query, which is never input."""
+    """Whether a folder is the output folder of a run or a query, which is never input.
+
+    Args:
+      folder: The folder.
+
+    Returns:
+      True if it has the cache of a run or the page of a query.
+    """
     return (folder / "cache" / "CACHEDIR.TAG").is_file() or (folder / "answers.html").is_file()
 
 
 def list_files(root: Path, *, exclude: Path | None = None) -> Iterator[Path]:
-    """Yields the files beneath a folder in the order of their names, through links too.
-
-    Hidden files and output folders of jsecon are skipped.
+    """Lists the files beneath a folder, through links too. Hidden files and output folders of jsecon are skipped.
 
     Args:
       root: The folder.
       exclude: A folder to skip.
+
+    Yields:
+      The files in the order of their paths.
     """
     excluded = None if exclude is None else exclude.resolve()
     files, visited = [], set()
@@ -148,7 +173,15 @@ def list_files(root: Path, *, exclude: Path | None = None) -> Iterator[Path]:
 
 
 def write_text(path: str | os.PathLike, text: str) -> None:
-    r"""Writes a text (UTF-8) atomically; bytes of file names that are no UTF-8 become \\udcxx."""
+    r"""Writes a text (UTF-8) atomically.
+
+    Args:
+      path: The file.
+      text: The text; bytes of file names that are no UTF-8 become \\udcxx.
+
+    Raises:
+      InputError: The file cannot be written.
+    """
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
@@ -156,7 +189,11 @@ def write_text(path: str | os.PathLike, text: str) -> None:
 def read_text(path: Path) -> str:
     """Reads a text file as UTF-8, or as UTF-16 if it begins with that byte order mark.
 
-    Bytes that are no UTF-8 become surrogates, as in file names: a path made of them finds its file.
+    Args:
+      path: The file.
+
+    Returns:
+      The text. Bytes that are no UTF-8 are surrogates, as in file names: a path made of them finds its file.
     """
     data = path.read_bytes()
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -165,7 +202,13 @@ def read_text(path: Path) -> str:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parses JSON; whole numbers of 300 digits and more become floats.
+    """Parses JSON.
+
+    Args:
+      text: The text, or its bytes in UTF-8.
+
+    Returns:
+      Its value; whole numbers of 300 digits and more are floats.
 
     Raises:
       ValueError: It is not JSON.
@@ -177,12 +220,15 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def read_json(path: Path, expected: str, remedy: str) -> Any:
-    """Reads a JSON file, as `parse_json` does.
+    """Reads a JSON file.
 
     Args:
       path: The file.
       expected: What it should hold, for the message.
       remedy: What to do about it, a sentence.
+
+    Returns:
+      Its value, as of `parse_json`.
 
     Raises:
       InputError: It cannot be read.
@@ -206,6 +252,9 @@ def reading(
       expected: What should be there.
       remedy: What to do about it, a sentence.
       problem: What is wrong; the error follows in brackets.
+
+    Yields:
+      None.
 
     Raises:
       InputError: The body raises an error.
@@ -391,6 +440,9 @@ def unpack_tree(node: Any, arrays: Mapping[str, np.ndarray], kind_of: Callable[[
       node: The description.
       arrays: NumPy arrays by their paths.
       kind_of: Returns the type of record of a name.
+
+    Returns:
+      The tree. A tuple of plain values stays a tuple.
 
     Raises:
       OSError, ValueError, ...: One of READ_ERRORS. `pack_tree` did not write the description.

@@ -34,16 +34,29 @@ MAX_MAGNITUDE = 1e18
 
 @np.errstate(invalid="ignore")  # a signalling NaN
 def is_finite_and_bounded(*numbers: Any) -> bool:
-    """Returns whether all numbers are finite and at most MAX_MAGNITUDE in size."""
+    """Whether all numbers are finite and at most MAX_MAGNITUDE in size.
+
+    Args:
+      *numbers: Numbers and arrays of any shape.
+
+    Returns:
+      True also for empty arrays.
+    """
     return all(bool((np.abs(np.asarray(values, np.float64)) <= MAX_MAGNITUDE).all()) for values in numbers)
 
 
 def safe_scale(size: Array) -> Array:
-    """A power of two that brings numbers of this size to where squares neither overflow nor vanish.
+    """Chooses a power of two that brings numbers to where squares neither overflow nor vanish.
 
     Multiplied, not divided: XLA turns a division by a row's largest number into a product with its reciprocal, and that
     of 1e38 is flushed to zero. A constant to the gradient, which stays exact: lengths are homogeneous, directions
     invariant.
+
+    Args:
+      size: Sizes of the numbers, any shape, not negative.
+
+    Returns:
+      The factors, of the shape of `size`; 1 for most sizes.
     """
     limit = jnp.finfo(size.dtype).maxexp
     far, shift = limit * 5 // 16, limit * 21 // 32
@@ -53,7 +66,16 @@ def safe_scale(size: Array) -> Array:
 
 @functools.partial(jax.jit, static_argnames=("axis", "keepdims"), inline=True)
 def safe_norm(x: Array, axis: int = -1, keepdims: bool = False) -> Array:
-    """Euclidean length over `axis`, right over the whole float range (1e-30 and 1e30 alike); gradient zero at zero."""
+    """Computes Euclidean lengths, right over the whole float range (1e-30 and 1e30 alike).
+
+    Args:
+      x: Vectors.
+      axis: Their axis.
+      keepdims: Keep that axis, with one entry.
+
+    Returns:
+      The lengths; the gradient at a zero vector is zero.
+    """
     x = jnp.asarray(x)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True, initial=0.0))
     usable = (largest > 0) & jnp.isfinite(largest)
@@ -66,7 +88,15 @@ def safe_norm(x: Array, axis: int = -1, keepdims: bool = False) -> Array:
 
 @functools.partial(jax.jit, static_argnames="axis", inline=True)
 def normalize(x: Array, axis: int = -1) -> Array:
-    """X / |x| over `axis`; zero (with zero gradient) where x is zero, NaN where x is not finite."""
+    """Scales vectors to unit length.
+
+    Args:
+      x: Vectors.
+      axis: Their axis.
+
+    Returns:
+      x / |x|: zero, with a zero gradient, where x is zero; NaN where x is not finite.
+    """
     x = jnp.asarray(x)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True, initial=0.0))
     usable = (largest > 0) & jnp.isfinite(largest)
@@ -82,6 +112,12 @@ def sigmoid(x: Array) -> Array:
 
     The derivative is s(x) s(-x), because 1 - s(x) cancels: jax.nn.sigmoid's is off by 5e-4 at x = 10, and 0 from 17 on,
     in float32.
+
+    Args:
+      x: Any shape.
+
+    Returns:
+      Of that shape, in 0..1.
     """
     return jax.nn.sigmoid(x)
 
@@ -91,19 +127,42 @@ sigmoid.defjvps(lambda tangent, value, x: tangent * value * jax.nn.sigmoid(-x))
 
 @functools.partial(jax.jit, inline=True)
 def cosine(x: Array, y: Array) -> Array:
-    """Cosine over the last axis, broadcasting; 0 where either is zero. Multiply-and-sum: see jax issue 39103."""
+    """Computes cosines by multiply-and-sum, which jax issue 39103 leaves right.
+
+    Args:
+      x: (..., d) vectors.
+      y: (..., d) vectors; leading axes broadcast.
+
+    Returns:
+      (...) cosines; 0 where either vector is zero.
+    """
     return jnp.sum(normalize(x) * normalize(y), axis=-1)
 
 
 @functools.partial(jax.jit, inline=True)
 def cosine_matrix(x: Array, y: Array) -> Array:
-    """(N, d), (M, d) -> (N, M) cosines as one matrix product, the form that jax issue 39103 leaves right."""
+    """Computes all cosines of two sets as one matrix product, the form that jax issue 39103 leaves right.
+
+    Args:
+      x: (N, d) vectors.
+      y: (M, d) vectors.
+
+    Returns:
+      (N, M) cosines; 0 where either vector is zero.
+    """
     return jnp.matmul(normalize(x), normalize(y).T, precision=FULL_PRECISION)
 
 
 @functools.partial(jax.jit, inline=True)
 def all_finite(*arrays: Array) -> Array:
-    """() bool: every number in every array is finite."""
+    """Whether every number in every array is finite.
+
+    Args:
+      *arrays: Arrays of any shape.
+
+    Returns:
+      () bool; true without arrays.
+    """
     result = jnp.asarray(True)
     for array in arrays:
         result &= jnp.all(jnp.isfinite(array))
@@ -111,9 +170,14 @@ def all_finite(*arrays: Array) -> Array:
 
 
 def is_traced(tree: Any = ()) -> bool:
-    """Returns whether a leaf of `tree` is being traced (jit, grad, vmap).
+    """Whether a tree is being traced by jax (jit, grad, vmap).
 
-    Inside a jit all that is computed is traced, also arrays that its function closes over.
+    Args:
+      tree: Tree of arrays. Inside a jit all that is computed is traced, also arrays that its function closes over: the
+        answer is then True for any tree.
+
+    Returns:
+      True if a leaf is a tracer.
     """
     return any(isinstance(leaf, Tracer) for leaf in [*jax.tree.leaves(tree), jnp.zeros(())])
 

@@ -38,16 +38,17 @@ _AHEAD = 2
 """steps that are dispatched before one is done"""
 _TREE = "__tree__"
 _PIECE = 1 << 26
-"""bytes of one exchange of `allgather_bytes`"""
+"""bytes of one exchange of `_allgather_bytes`"""
 
 
 def host_mesh(most: int | None = None) -> Mesh | None:
-    """Returns a mesh of this process's devices for the strips of one view, or None for a single device.
-
-    It is a constant to jit.
+    """Makes a mesh of this process's devices for the strips of one view. It is a constant to jit.
 
     Args:
       most: Maximum number of devices, by default all.
+
+    Returns:
+      The mesh, or None for a single device.
     """
     devices = jax.local_devices()[:most]
     return Mesh(np.array(devices), (AXIS,), axis_types=(AxisType.Auto,)) if len(devices) > 1 else None
@@ -103,14 +104,14 @@ def map_rows(local: Callable, rows: Any, common: Any, mesh: Mesh | None) -> Any:
 
 
 def concurrent_lanes(views: int, state_bytes: int) -> int:
-    """Returns how many lanes of `accumulate_over_views` this process works on at a time.
-
-    They are at most as many as devices, the same number in every turn, and above two no more than fit into
-    _LANES_BYTES.
+    """Computes how many lanes of `accumulate_over_views` this process works on at a time.
 
     Args:
       views: Number of views.
       state_bytes: Size of the state of a lane.
+
+    Returns:
+      At most the number of devices, the same in every turn, and above two no more than fit into _LANES_BYTES.
     """
     world = jax.process_count()
     lanes = -(-_lane_count(views) // world)
@@ -308,29 +309,31 @@ def cache_worker_programs() -> None:
     distributed.global_state.process_id = 0
 
 
-def serialize_tree(tree: Any) -> bytes:
-    """Packs a tree of arrays, plain values, dicts, lists and tuples into bytes, without pickle."""
+def allgather_tree(tree: Any) -> list[Any]:
+    """Exchanges trees between the processes, without pickle: all call it, minutes apart if need be.
+
+    Args:
+      tree: Tree of arrays, plain values, dicts, lists and tuples of this process.
+
+    Returns:
+      The tree of each process, in their order, with NumPy arrays.
+    """
     arrays: dict[str, np.ndarray] = {}
     description = json.dumps(pack_tree(tree, "root", arrays, lambda kind: None)).encode()
     stream = io.BytesIO()
     np.savez(stream, allow_pickle=False, **{_TREE: np.frombuffer(description, np.uint8)}, **arrays)
-    return stream.getvalue()
+    return [_deserialize(data) for data in _allgather_bytes(stream.getvalue())]
 
 
-def deserialize_tree(data: bytes) -> Any:
-    """Unpacks what `serialize_tree` packed."""
+def _deserialize(data: bytes) -> Any:
+    """The tree in the bytes of one process."""
     with np.load(io.BytesIO(data)) as file:
         arrays = {name: file[name] for name in file.files}
     return unpack_tree(json.loads(arrays.pop(_TREE).tobytes()), arrays, lambda name: dict)
 
 
-def allgather_tree(tree: Any) -> list[Any]:
-    """Exchanges trees, as `allgather_bytes` exchanges bytes."""
-    return [deserialize_tree(part) for part in allgather_bytes(serialize_tree(tree))]
-
-
-def allgather_bytes(data: bytes) -> list[bytes]:
-    """Exchanges bytes: all processes call it, minutes apart if need be, and get the bytes of each.
+def _allgather_bytes(data: bytes) -> list[bytes]:
+    """Exchanges bytes.
 
     It uses all_gather in pieces of at most _PIECE bytes, whose lengths are powers of two, as jax compiles for each
     length. (Gloo's psum_scatter fails if one process comes 30 s after the other: jax issue 40831.)

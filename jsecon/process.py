@@ -89,7 +89,11 @@ def _remove_damaged_programs(folder: Path) -> None:
 
 
 def worker_info() -> tuple[int, int, str] | None:
-    """Returns (index, count, HOST:PORT of the first) if this is one of the processes of a run, else None."""
+    """Reads from WORKER which of the processes of a run this is.
+
+    Returns:
+      (index, number of processes, HOST:PORT of the first); None if this is no such process.
+    """
     words = os.environ.get(WORKER, "").split()
     return (int(words[0]), int(words[1]), words[2]) if words else None
 
@@ -135,14 +139,19 @@ def _stop_main() -> None:
 
 
 def cores() -> int:
-    """Returns the number of CPU cores that this process may use."""
+    """Counts the CPU cores that this process may use.
+
+    Returns:
+      The number, at least 1.
+    """
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def available_memory() -> tuple[int | None, int | None]:
-    """Returns the free memory and the limit of this process's cgroup in bytes; None for what the system does not state.
+    """Reads the free memory and the limit of this process's cgroup.
 
-    The limit counts in the free memory.
+    Returns:
+      Bytes that are free within the limit, and the limit; None for what the system does not state.
     """
     try:
         import psutil
@@ -158,7 +167,11 @@ def available_memory() -> tuple[int | None, int | None]:
 
 
 def peak_memory_mib() -> float:
-    """Returns the largest resident memory of this process so far in MiB; 0 if the system does not state it."""
+    """Reads the largest resident memory of this process so far.
+
+    Returns:
+      MiB; 0 if the system does not state it.
+    """
     with contextlib.suppress(ImportError):
         import resource
 
@@ -172,9 +185,10 @@ def peak_memory_mib() -> float:
 
 
 def memory_budget() -> float:
-    """Returns the bytes for a scene's columns, above which they are read in blocks.
+    """Computes how much memory a scene's columns may take; larger ones are read in blocks.
 
-    It is half of the free memory, as reading takes twice the size of the columns, or the value of MEMORY.
+    Returns:
+      Bytes: the value of MEMORY, or half of the free memory, as reading takes twice the size of the columns.
 
     Raises:
       InputError: MEMORY is not a number.
@@ -210,7 +224,11 @@ def read_cgroup(new: str, old: str) -> list[str]:
 
 
 def compilation_counts() -> dict[str, int]:
-    """Counts the programs that jax has compiled since the first call: "all", and those that it read "from_disk"."""
+    """Counts the programs that jax has compiled since the first call.
+
+    Returns:
+      "all", and of these those that it read "from_disk".
+    """
     import jax
 
     if not _counts:
@@ -258,15 +276,18 @@ def clear_programs(*, above: int = 25_000) -> bool:
 
 
 def settings(environ: Mapping[str, str], cores: int, cpu_features: frozenset[str]) -> dict[str, str]:
-    """Returns environment variables for one host device per core, full-width vectors and stored programs.
+    """Chooses environment variables for one host device per core, full-width vectors and stored programs.
 
-    Flags already in XLA_FLAGS stay. 512-bit vectors are used only if the CPU has them. The folder of compiled programs
-    is named by a digest of the CPU's features, so that different machines can share a home folder.
+    512-bit vectors are used only if the CPU has them. The folder of compiled programs is named by a digest of the CPU's
+    features, so that different machines can share a home folder.
 
     Args:
-      environ: Environment variables.
+      environ: Environment variables. Flags that XLA_FLAGS has stay.
       cores: Number of cores.
       cpu_features: Names of the CPU's features.
+
+    Returns:
+      The variables to set, by name.
     """
     flags = environ.get("XLA_FLAGS", "").split()
     present = {flag.split("=")[0] for flag in flags}
@@ -284,7 +305,14 @@ def settings(environ: Mapping[str, str], cores: int, cpu_features: frozenset[str
 
 
 def cache_home(environ: Mapping[str, str]) -> Path | None:
-    """Returns the user's cache folder, or None if it cannot be written: a program must run without one."""
+    """Finds the user's cache folder, and makes it if it is missing.
+
+    Args:
+      environ: Environment variables.
+
+    Returns:
+      The folder, or None if it cannot be written: a program must run without one.
+    """
     home = Path(environ["HOME"]) / ".cache" if "HOME" in environ else None
     base = environ.get("XDG_CACHE_HOME") or home or environ.get("LOCALAPPDATA")  # the last on Windows
     if base is None:

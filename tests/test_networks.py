@@ -29,7 +29,7 @@ from jsecon.pipeline import networks, run as pipeline
 from jsecon.pipeline.networks import ExternalSpace
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import Checkpoint, Results, RunContext, StageInput
-from jsecon.pipeline.stages import gaussians, load, masklets, parts, regions
+from jsecon.pipeline.stages import run_stages
 from jsecon.query.match import evidence
 from jsecon.vision.protocols import NamedSegmenter
 from jsecon.vision.stores import StoredSegmenter
@@ -142,7 +142,7 @@ def test_a_run_that_is_stopped_while_sam_2_tracks_goes_on_at_its_frame(room, spl
     def tracked(folder):
         called.clear()
         work, results = RunContext(options, networks.open_networks(options, folder), folder), Results()
-        for stage in (load(work), gaussians(work), masklets(work)):
+        for stage in run_stages(work)[:3]:
             checkpoint = Checkpoint(folder / f"{stage.name}.safetensors")
             given = StageInput(work, results, lambda done, total: None, checkpoint)
             results.add(stage.name, stage.compute(given).value)
@@ -192,18 +192,19 @@ def test_regions_take_their_embeddings_from_langsplat_s_files(room, splat, model
         vectors = np.random.default_rng(t).normal(size=(labels.max() + 1, 3))
         write_features(folder, name, labels, vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
         rows += [] if capture.held_out[t] else list(np.load(folder / f"{name}_f.npy"))
-    options = Options(room, gaussians=splat, holdout=4, masks=folder, features=folder)
+    options = Options(room, gaussians=splat, holdout=4, masks=folder, features=folder, parts=True)
     work = RunContext(options, networks.open_networks(options, tmp_path), tmp_path)
     assert work.networks.embedder.name == "given-3"
-    stage, results = regions(work), Results(load=capture, gaussians=load_ply(splat))
+    planned, results = {s.name: s for s in run_stages(work)}, Results(load=capture, gaussians=load_ply(splat))
+    stage = planned["regions"]
     given = StageInput(work, results, lambda done, total: None, Checkpoint(tmp_path / "none.safetensors"))
     assert "read from language_features, level l" in stage.how
     assert "embedder" in stage.skipped
-    results.add("masklets", masklets(work).compute(given).value)
+    results.add("masklets", planned["masklets"].compute(given).value)
     found = stage.compute(given)
     np.testing.assert_allclose(found.value.embeddings, rows, atol=1e-6)
     assert found.notes == (f"{len(rows)} embeddings in the files",)
-    of_masks = parts(work).compute(given).value
+    of_masks = planned["parts"].compute(given).value
     seen = of_masks.weight > 0
     np.testing.assert_allclose(np.linalg.norm(of_masks.embeddings[seen], axis=1), 1, atol=1e-5)
     assert of_masks.embeddings.shape[1] == 3

@@ -15,7 +15,7 @@ from jsecon.data.gaussians.files import load_gaussians, save_gaussians
 from jsecon.data.nerfstudio import trained_to_source
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import Checkpoint, Results, RunContext, StageInput
-from jsecon.pipeline.stages import gaussians as stage_of
+from jsecon.pipeline.stages import run_stages
 from jsecon.splat.render import render_rgb
 from jsecon.splat.transform import transform_gaussians, transform_gaussians_float64
 from jsecon.vision.colours import ColourEmbedder
@@ -29,7 +29,7 @@ TRAINED = np.diag([0.4, 0.4, 0.4, 1]) @ TURN
 def read(capture, file):
     """The outcome of the stage that reads `file`, and the stage."""
     work = RunContext(Options(capture=file.parent, gaussians=file), Networks(ColourEmbedder()), file.parent / "out")
-    stage = stage_of(work)
+    stage = next(stage for stage in run_stages(work) if stage.name == "gaussians")
     stage_input = StageInput(work, Results(load=capture), lambda done, total: None, Checkpoint(work.out))
     return stage.compute(stage_input), stage
 

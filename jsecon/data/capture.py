@@ -65,7 +65,20 @@ def load_capture(
 def capture_extent(
     path: str | Path, *, downscale: float | None = None, long_side: int | None = None, frames: int | None = None
 ) -> CaptureExtent:
-    """Computes the number, size and names of the frames that `load_capture` would load, from image headers only."""
+    """Computes what frames `load_capture` would load, from image headers only.
+
+    Args:
+      path: As in `load_capture`.
+      downscale: As in `load_capture`.
+      long_side: As in `load_capture`.
+      frames: As in `load_capture`.
+
+    Returns:
+      Number, size and names of the frames.
+
+    Raises:
+      InputError: As in `load_capture`, but for damaged pixels.
+    """
     check_capture_options(downscale, frames, None, long_side)
     return planned_extent(_read(Path(path)), downscale, long_side, frames)
 
@@ -95,13 +108,20 @@ def _read(path: Path) -> PosedImages:
     return reader()
 
 
-def has_poses(path: Path) -> bool:
+def _has_poses(path: Path) -> bool:
     """Whether a path is a capture with poses, of any known format."""
     return _find_reader(path) is not None
 
 
 def may_have_depth(path: Path) -> bool:
-    """Whether a capture can have depth maps, by its format and its transforms.json; reads no frame."""
+    """Whether a capture can have depth maps, by its format and its transforms.json; reads no frame.
+
+    Args:
+      path: As in `load_capture`; anything else has no depth.
+
+    Returns:
+      False for COLMAP, and for transforms without `depth_file_path`.
+    """
     if path.is_dir() and find_models(path):
         return False
     if (file := _transforms_file(path)) is not None:
@@ -118,7 +138,7 @@ def unposed_photographs(path: Path) -> list[Path]:
     Returns:
       Paths of the photographs; empty if the folder has poses.
     """
-    if not path.is_dir() or has_poses(path):
+    if not path.is_dir() or _has_poses(path):
         return []
     photos = list_photographs(path)
     is_nested = bool(photos) and photos[0].parent not in (path, path / "images")
@@ -128,7 +148,7 @@ def unposed_photographs(path: Path) -> list[Path]:
 def _inner_captures(path: Path) -> list[Path]:
     """The subfolders that are captures."""
     folders = sorted(child for child in path.iterdir() if child.is_dir() and not child.name.startswith("."))
-    return [child for child in folders if not is_output_folder(child) and has_poses(child)]
+    return [child for child in folders if not is_output_folder(child) and _has_poses(child)]
 
 
 def _no_capture(path: Path) -> InputError:

@@ -88,7 +88,14 @@ def _models_in(folder: Path) -> list[Path]:
 
 
 def find_model(path: str | Path) -> Path | None:
-    """Finds the largest COLMAP model of a capture, see `find_models`; None if there is none."""
+    """Finds the largest COLMAP model of a capture.
+
+    Args:
+      path: As in `find_models`.
+
+    Returns:
+      Its folder, or None.
+    """
     return next(iter(find_models(path)), None)
 
 
@@ -243,7 +250,17 @@ def _lens(file: Path, model: str, width: int, height: int, parameters: tuple[flo
 
 
 def read_cameras(model: Path) -> dict[int, Lens]:
-    """Reads the lenses of a model by camera number. Raises InputError if the file is missing or damaged."""
+    """Reads the lenses of a model.
+
+    Args:
+      model: Folder of the model.
+
+    Returns:
+      Lenses by camera number.
+
+    Raises:
+      InputError: The file is missing or damaged, or a lens sees all around.
+    """
     file = _require_file(model, "cameras")
 
     def parse(line: str) -> tuple[int, Lens]:
@@ -277,13 +294,13 @@ def _pose(file: Path, name: str, numbers: tuple[float, ...]) -> np.ndarray:
 
 
 def read_images(model: Path) -> list[tuple[str, int, np.ndarray]]:
-    """Reads (name, camera number, (4, 4) world_to_camera) of each image of a model.
+    """Reads the images of a model.
 
     Args:
       model: Folder of the model.
 
     Returns:
-      The images in the order of the file.
+      (name, camera number, (4, 4) float64 world_to_camera) of each image, in the order of the file.
 
     Raises:
       InputError: The file is missing or damaged.

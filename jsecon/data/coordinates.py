@@ -67,7 +67,19 @@ def make_rigid(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Floa
 
 
 def invert_pose(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Float[np.ndarray, "4 4"]:
-    """Inverts a pose: camera to world becomes world to camera. Arguments and errors are those of `make_rigid`."""
+    """Inverts a pose: camera to world becomes world to camera.
+
+    Args:
+      pose: As in `make_rigid`.
+      where: As in `make_rigid`.
+      name: As in `make_rigid`.
+
+    Returns:
+      (4, 4) float64 inverse, rigid.
+
+    Raises:
+      InputError: As in `make_rigid`.
+    """
     pose = make_rigid(pose, where, name)
     result = np.eye(4)
     result[:3, :3] = pose[:3, :3].T

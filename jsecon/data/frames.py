@@ -86,7 +86,17 @@ class CaptureExtent(NamedTuple):
 def check_capture_options(
     downscale: float | int | None, frames: int | None, holdout: int | None, long_side: int | None = None
 ) -> None:
-    """Raises InputError on options that no capture can be loaded with; see `build_capture`."""
+    """Checks the options of `build_capture`.
+
+    Args:
+      downscale: As in `build_capture`.
+      frames: As in `build_capture`.
+      holdout: As in `build_capture`; 1 would leave no frame to fit to.
+      long_side: As in `build_capture`.
+
+    Raises:
+      InputError: No capture can be loaded with one of them.
+    """
     if downscale is not None and not (np.isfinite(downscale) and downscale >= 1):
         raise InputError("downscale", str(downscale), "a number of at least 1", "2 halves width and height.")
     if long_side is not None and long_side < 1:

@@ -222,7 +222,15 @@ class ImageHeader(NamedTuple):
         return (height, width) if self.orientation in TRANSPOSED else (width, height)
 
     def closest_to_centre(self, cx: object, cy: object) -> tuple[int, int]:
-        """The stored or the upright size, whichever a principal point (px) is nearer to the middle of."""
+        """Chooses the size, stored or upright, that a principal point fits better.
+
+        Args:
+          cx: Its x, px; anything but a number means that it is not known.
+          cy: Its y, px.
+
+        Returns:
+          (width, height), px: the one whose middle is nearer to the point; the upright size if that is not known.
+        """
         if not isinstance(cx, int | float) or not isinstance(cy, int | float):
             return self.upright
         return min(self.upright, self.stored, key=lambda size: abs(2 * cx - size[0]) + abs(2 * cy - size[1]))
@@ -250,7 +258,17 @@ def image_header(path: str | Path) -> ImageHeader:
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
-    """Reads the upright (width, height) of an image file, px. Raises InputError as `image_header` does."""
+    """Reads the upright size of an image file.
+
+    Args:
+      path: An image file.
+
+    Returns:
+      (width, height), px.
+
+    Raises:
+      InputError: As in `image_header`.
+    """
     return image_header(path).upright
 
 

@@ -94,7 +94,17 @@ def load_features(
 
 
 def embedding_size(folder: Path) -> int:
-    """Reads the size E of the embeddings in a folder. Raises InputError if it has no `_f.npy`, or a damaged one."""
+    """Reads the size of the embeddings in a folder.
+
+    Args:
+      folder: The language_features folder.
+
+    Returns:
+      E, of the first file.
+
+    Raises:
+      InputError: It has no `_f.npy`, or a damaged one.
+    """
     files = sorted(folder.rglob("*_f.npy"))
     if not files:
         remedy = "Give the language_features folder that LangSplat's preprocess.py wrote."

@@ -55,7 +55,15 @@ class Lens:
         return self.fisheye or self.model is not None or any(k != 0 for k in self.distortion)
 
     def resized(self, width: int, height: int) -> Lens:
-        """Returns the lens of the same image at another size."""
+        """Scales the lens to another size of the same image.
+
+        Args:
+          width: New width, px.
+          height: New height, px.
+
+        Returns:
+          The lens; its distortion stays.
+        """
         x, y = width / self.width, height / self.height
         return dataclasses.replace(
             self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y

@@ -55,7 +55,14 @@ class MaskFiles(NamedTuple):
     """How the files were understood, a sentence each."""
 
     def path(self, name: str) -> Path | None:
-        """The file of a frame, or one of those of its objects."""
+        """Looks up the mask of a frame.
+
+        Args:
+          name: Name of the frame.
+
+        Returns:
+          Its file, or one of those of its objects; None if it has no mask.
+        """
         return self.files.get(name) or next(iter(self.objects.get(name, {}).values()), None)
 
 
@@ -409,7 +416,19 @@ def check_labels(
     order: Sequence[str] | None = None,
     files: Mapping[str, ImageFile] | None = None,
 ) -> None:
-    """Checks masks by their names and the first of them; arguments and errors are those of `load_labels`."""
+    """Checks masks by their names and the first of them.
+
+    Args:
+      folder: As in `load_labels`.
+      names: As in `load_labels`.
+      size: As in `load_labels`.
+      level: As in `load_labels`.
+      order: As in `load_labels`.
+      files: As in `load_labels`.
+
+    Raises:
+      InputError: As in `load_labels`, but for damage in other files than the first.
+    """
     masks = _find_one_kind(Path(folder), names, order, files)
     first = next(name for name in names if masks.path(name) is not None)
     load_labels(folder, [first], size, level=level, order=order, files=files)
@@ -432,7 +451,17 @@ def _find_one_kind(
 
 
 def is_black_and_white(path: Path) -> bool:
-    """Whether a label image has only the values 0 and 1, or 0 and the largest of its type."""
+    """Whether a label image holds the mask of one object.
+
+    Args:
+      path: A .png or .npy file.
+
+    Returns:
+      True if it has only the values 0 and 1, or 0 and the largest of its type.
+
+    Raises:
+      InputError: The file is damaged or of another kind.
+    """
     image, is_colour = read_label_image(path)
     values = np.unique(image)
     values = values // GREY_COLOUR if is_colour and not (values % GREY_COLOUR).any() else values
@@ -521,7 +550,7 @@ class _LabelReader:
         if missing := [name for name, path in paths.items() if path is None]:
             problem = f"{len(missing)} of {len(self.names)} frames have no mask (the first: {missing[0]})"
             notes.append(f"{problem}; they are unlabelled.")
-        notes += self.fit.notes()
+        notes += self.fit.notes
         if any(self.is_colour.values()):
             notes.append("The masks are colour images: each colour is a region, numbered R*65536 + G*256 + B.")
         if self.has_negative and background == 0:
@@ -653,6 +682,7 @@ class MaskFitter:
         self.count["resized"] += 1
         return resize_nearest(image, self.width, self.height)
 
+    @property
     def notes(self) -> list[str]:
         """The changes, a sentence each."""
         notes = []

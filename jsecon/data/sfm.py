@@ -81,8 +81,9 @@ class SfmResult:
     seconds: dict[str, float]
     """Seconds of each step."""
 
+    @property
     def notes(self) -> tuple[str, ...]:
-        """Describes the result in sentences for the user."""
+        """The result in sentences for the user."""
         count = len(self.registered) + len(self.skipped)
         steps = ", ".join(f"{name} {value:.0f} s" for name, value in self.seconds.items())
         notes = [
@@ -130,7 +131,14 @@ def _is_image(file: Path) -> bool:
 
 
 def require_pycolmap(where: object) -> None:
-    """Raises InputError, naming `where`, if pycolmap is not installed."""
+    """Checks that pycolmap is installed.
+
+    Args:
+      where: Name of the capture for errors.
+
+    Raises:
+      InputError: It is not.
+    """
     if importlib.util.find_spec("pycolmap") is None:
         remedy = "Run: pip install 'jsecon[sfm]' (or give poses: sparse/0 of COLMAP, or transforms.json)."
         raise InputError(where, "photographs without poses need pycolmap, which is not installed", remedy=remedy)

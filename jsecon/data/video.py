@@ -23,12 +23,26 @@ SHARPNESS_SIDE = 640
 
 
 def is_video(path: Path) -> bool:
-    """Whether a path is a file with the suffix of a video."""
+    """Whether a path is a file with the suffix of a video.
+
+    Args:
+      path: The path.
+
+    Returns:
+      False also if it does not exist.
+    """
     return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
 
 
 def video_size(path: Path) -> tuple[int, int]:
-    """Reads the (width, height) of a video's frames, px, from its header."""
+    """Reads the size of a video's frames from its header.
+
+    Args:
+      path: The video.
+
+    Returns:
+      (width, height), px; zeros if OpenCV cannot read it.
+    """
     reader = cv2.VideoCapture(os.fspath(path))
     try:
         return int(reader.get(cv2.CAP_PROP_FRAME_WIDTH)), int(reader.get(cv2.CAP_PROP_FRAME_HEIGHT))

@@ -50,7 +50,16 @@ def room_cameras(room: Room, *, views: int = 30, width: int = 320, height: int =
 
 
 def look_at(centre, target, up=(0, 0, 1)):
-    """(4, 4) float32 world-to-camera matrix of an upright camera at `centre` that looks at `target`."""
+    """Makes the pose of an upright camera.
+
+    Args:
+      centre: (3,) its place, world.
+      target: (3,) the point in the middle of its image.
+      up: (3,) direction that is up in the image.
+
+    Returns:
+      (4, 4) float32 world-to-camera matrix.
+    """
     forward = (target - centre) / np.linalg.norm(target - centre)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
@@ -248,6 +257,14 @@ def _box(mask):
 
 
 def write_label_image(path: Path, ids: UInt[np.ndarray, "h w"]) -> None:
-    """Writes a label image as a grey PNG, atomically."""
+    """Writes a label image as a grey PNG, atomically.
+
+    Args:
+      path: The file.
+      ids: (H, W) ids of 8 or 16 bits.
+
+    Raises:
+      InputError: The file cannot be written.
+    """
     with atomic_write(path) as temporary:
         temporary.write_bytes(cv2.imencode(".png", ids)[1].tobytes())

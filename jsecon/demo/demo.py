@@ -97,7 +97,15 @@ def run_demo(
 
 
 def demo_verb(verb: verbs.Demo, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon demo`."""
+    """Does the work of `jsecon demo`.
+
+    Args:
+      verb: Options of the command.
+      console: Receives messages and progress.
+
+    Returns:
+      The metrics, and the paths of what was written.
+    """
     names = (*running.FILES, "queries", "demo.jpg", "demo.webp")
     result = run_demo(verb.out, seed=verb.seed, steps=verb.steps, listener=console)
     return {"written": [verb.out / name for name in names]} | result

@@ -26,7 +26,14 @@ SHADOW_OFFSET_M = np.float32(1e-3)
 
 
 def lamp_points(room: Room) -> Float32[np.ndarray, "3 m"]:
-    """End points of shadow rays on the lamp, (3, M) world."""
+    """Spreads end points of shadow rays over the lamp.
+
+    Args:
+      room: The room.
+
+    Returns:
+      (3, M) float32 points, world.
+    """
     ticks = ((np.arange(_LAMP_SIDE) + 0.5) / _LAMP_SIDE * 2 - 1) * room.light_half
     x, y = np.meshgrid(ticks, ticks)
     return (room.light[:, None] + np.stack([x.ravel(), y.ravel(), 0 * x.ravel()])).astype(np.float32)
@@ -83,7 +90,7 @@ def _may_shade(room, bound, points):
     return (off * off).sum(0) < reach * reach
 
 
-def lamp_cosine(
+def _lamp_cosine(
     room: Room, points: Float[np.ndarray, "3 n"], normal: Float[np.ndarray, "3 n"]
 ) -> Float[np.ndarray, " n"]:
     """Cosine between the normal and the direction of the lamp's middle, 0 where the surface faces away."""
@@ -91,7 +98,7 @@ def lamp_cosine(
     return np.maximum((normal * to_lamp).sum(0) / np.sqrt((to_lamp * to_lamp).sum(0)), 0)
 
 
-def sky_visibility(
+def _sky_visibility(
     room: Room, points: Float[np.ndarray, "3 n"], normal: Float[np.ndarray, "3 n"]
 ) -> Float[np.ndarray, " n"]:
     """Share of the sky that a point sees past the objects, each part of which counts as a sphere within its bound."""
@@ -136,7 +143,15 @@ class LitRoom:
 
 
 def texture_pattern(texture: Texture, points: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, " n"]:
-    """Value in [-1, 1] of a texture at points (3, n) in the frame of its object, m."""
+    """Evaluates a texture.
+
+    Args:
+      texture: The texture.
+      points: (3, N) in the frame of its object, m.
+
+    Returns:
+      (N,) float32 in [-1, 1]; 0 for "plain".
+    """
     p = (points + texture.phase[:, None]) / np.float32(texture.scale)
     if texture.kind == "checks":
         return (2 * (np.floor(p).sum(0) % 2) - 1).astype(np.float32)
@@ -153,7 +168,14 @@ def texture_pattern(texture: Texture, points: Float[np.ndarray, "3 n"]) -> Float
 
 
 def bake_room(room: Room) -> LitRoom:
-    """Paints and lights the flat surfaces of a room, in colours that no object has."""
+    """Paints and lights the flat surfaces of a room, in colours that no object has.
+
+    Args:
+      room: The room.
+
+    Returns:
+      The room with its walls, floor, ceiling and table top.
+    """
     x, y = (float(v) for v in room.half)
     floor, ceiling = -TABLE_HEIGHT, room.ceiling
     right, back, up = np.eye(3, dtype=np.float32)
@@ -240,10 +262,10 @@ def _flat(room, draw, origin, width, depth, normal, texel, shadow_texel, paint):
         seen = lamp_visibility(room, lifted, lamps=lamp_points(room), skip_furniture=on_table).reshape(cu.shape)
         if on_table:
             upward = np.broadcast_to(normal[:, None], coarse.shape)
-            light *= _stretch(sky_visibility(room, coarse, upward).reshape(cu.shape), u.shape)
+            light *= _stretch(_sky_visibility(room, coarse, upward).reshape(cu.shape), u.shape)
         else:
             light *= _under_table(points).reshape(u.shape)
-        light += LAMP_RADIANCE * lamp_cosine(room, points, turn).reshape(u.shape) * _stretch(seen, u.shape)
+        light += LAMP_RADIANCE * _lamp_cosine(room, points, turn).reshape(u.shape) * _stretch(seen, u.shape)
     return _Plane(origin, right, back, texel, (paint(draw, u, v) * light[..., None]).astype(np.float32))
 
 
@@ -265,7 +287,7 @@ def _wall(room, draw, tall, corner, first, span, normal):
     for k in range(3):
         _hang_picture(draw, paint, blot, u, v, span * (k + 0.5) / 3 + draw.uniform(-0.15, 0.15))
     turn = np.broadcast_to(normal[:, None], points.shape)
-    light = SKY_RADIANCE * (0.82 + 0.18 * np.clip(v / 0.5, 0, 1)) + 0.6 * LAMP_RADIANCE * lamp_cosine(
+    light = SKY_RADIANCE * (0.82 + 0.18 * np.clip(v / 0.5, 0, 1)) + 0.6 * LAMP_RADIANCE * _lamp_cosine(
         room, points, turn
     ).reshape(u.shape)
     return _Plane(origin, first, up, 0.008, (paint * light[..., None]).astype(np.float32))
@@ -385,7 +407,7 @@ def _shade_object(room, owner, p, index, lamps):
         normal[:, on] = normals(room.parts[k].solid, room.parts[k].hollow, p[:, on])
         albedo[on] = room.parts[k].albedo
     light = SKY_RADIANCE * (0.9 + 0.1 * normal[2]) * (0.8 + 0.2 * np.clip(p[2] / 0.06, 0, 1))
-    from_lamp = LAMP_RADIANCE * lamp_cosine(room, p, normal)
+    from_lamp = LAMP_RADIANCE * _lamp_cosine(room, p, normal)
     facing = np.flatnonzero(from_lamp > 0)
     lifted = p[:, facing] + SHADOW_OFFSET_M * normal[:, facing]
     light[facing] += from_lamp[facing] * lamp_visibility(room, lifted, lamps=lamps, skip_furniture=True)
@@ -393,7 +415,7 @@ def _shade_object(room, owner, p, index, lamps):
     return albedo * (tone * light)[:, None]
 
 
-def linear_to_srgb(rgb: Float[np.ndarray, "... 3"]) -> UInt8[np.ndarray, "... 3"]:
+def _linear_to_srgb(rgb: Float[np.ndarray, "... 3"]) -> UInt8[np.ndarray, "... 3"]:
     """Converts linear RGB, clipped to 0..1, to 8-bit sRGB (IEC 61966-2-1)."""
     c = np.clip(rgb, 0, 1)
     return np.round(255 * np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)).astype(np.uint8)
@@ -425,7 +447,7 @@ def render_views(
             t, hit = trace_rays(room, camera, dx=dx, dy=dy)
             origin, direction = _rays(camera, dx, dy)
             total += _shade(baked, origin[:, None] + t.ravel() * direction, hit.ravel(), lamps[:, k :: len(_OFFSETS)])
-        frames.append(linear_to_srgb(total / len(_OFFSETS)).reshape(*depth.shape, 3))
+        frames.append(_linear_to_srgb(total / len(_OFFSETS)).reshape(*depth.shape, 3))
         instances.append(owners[index])
         depths.append(depth)
         if progress is not None:

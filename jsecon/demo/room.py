@@ -100,13 +100,30 @@ class Room:
 
 
 def srgb_to_linear(srgb) -> np.ndarray:
-    """Converts sRGB in 0..255 to linear RGB in 0..1 (IEC 61966-2-1)."""
+    """Converts sRGB to linear RGB (IEC 61966-2-1).
+
+    Args:
+      srgb: Numbers in 0..255, any shape.
+
+    Returns:
+      Numbers in 0..1, float32.
+    """
     c = np.asarray(srgb, np.float32) / np.float32(255)
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 def build_room(draw: np.random.Generator, objects: tuple[RoomObject, ...], seed: int, *, cloth: bool = False) -> Room:
-    """Puts walls, a lamp and a table around the objects."""
+    """Puts walls, a lamp and a table around objects.
+
+    Args:
+      draw: Random source of their sizes and places.
+      objects: The objects.
+      seed: Seed of the room, which also decides its paint.
+      cloth: Whether a chequered cloth lies on the table.
+
+    Returns:
+      The room.
+    """
     half = np.array([draw.uniform(2.25, 2.5), draw.uniform(2.1, 2.35)], np.float32)
     aside, turn = draw.uniform(0.8, 1.1), draw.uniform(0, 2 * np.pi)
     light = np.array([aside * np.cos(turn), aside * np.sin(turn), 1.85], np.float32)
@@ -114,7 +131,14 @@ def build_room(draw: np.random.Generator, objects: tuple[RoomObject, ...], seed:
 
 
 def footprint_radius(body: Body) -> float:
-    """Radius of a circle around the footprint of a shape, m."""
+    """Measures the footprint of a shape.
+
+    Args:
+      body: The shape.
+
+    Returns:
+      Radius of a circle around it, m.
+    """
     return max(radius_about_axis(solid) for solid, _, _ in body)
 
 
@@ -162,7 +186,22 @@ def place_object(
     spot: Sequence[float] | np.ndarray,
     yaw: float | None = None,
 ) -> RoomObject:
-    """Makes object `index` of a room at `spot` (x, y or x, y, z; m), rotated by `yaw` radians (default: random)."""
+    """Makes an object of a room, with a random texture.
+
+    Args:
+      draw: Random source.
+      index: Index of the object in the room.
+      colour: First part of its name.
+      shape: Second part of its name.
+      srgb: Its colour, 0..255.
+      body: Its shape.
+      radius: Radius of its footprint, m.
+      spot: Place under it, x y or x y z, m.
+      yaw: Rotation about z, radians; None: random.
+
+    Returns:
+      The object.
+    """
     axes = rotation(yaw=draw.uniform(0, 2 * np.pi) if yaw is None else yaw)
     centre = np.array([*spot, 0.0][:3], np.float32)
     albedo = srgb_to_linear(srgb) * np.float32(draw.uniform(0.94, 1.0))

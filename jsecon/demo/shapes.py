@@ -54,14 +54,34 @@ def _solid(quadric, planes, radius: float, middle=(0.0, 0.0, 0.0), nappe: float 
 
 
 def ellipsoid(rx: float, ry: float, rz: float, *, below: float | None = None, above: float | None = None) -> Solid:
-    """Ellipsoid of radii rx, ry, rz about the origin, optionally cut to z <= `below` and z >= `above`."""
+    """Makes an ellipsoid about the origin.
+
+    Args:
+      rx: Radius along x, m.
+      ry: Radius along y, m.
+      rz: Radius along z, m.
+      below: Cuts it to z <= below, m.
+      above: Cuts it to z >= above, m.
+
+    Returns:
+      The solid.
+    """
     planes = [] if below is None else [(0, 0, 1, below)]
     planes += [] if above is None else [(0, 0, -1, -above)]
     return _solid((rx**-2, ry**-2, rz**-2, 0.0, -1.0), planes, max(rx, ry, rz))
 
 
 def frustum(bottom: float, top: float, height: float) -> Solid:
-    """Upright cone section, radius `bottom` at z = 0 and `top` at z = `height`; a cylinder where they agree."""
+    """Makes an upright section of a cone, or a cylinder, that stands on z = 0.
+
+    Args:
+      bottom: Radius at z = 0, m.
+      top: Radius at z = height, m.
+      height: Height, m.
+
+    Returns:
+      The solid.
+    """
     slope = (top - bottom) / height
     planes = [(0, 0, 1, height), (0, 0, -1, 0.0)]
     quadric = (1.0, 1.0, -(slope**2), -bottom * slope, -(bottom**2))
@@ -70,7 +90,16 @@ def frustum(bottom: float, top: float, height: float) -> Solid:
 
 
 def box(width: float, depth: float, height: float) -> Solid:
-    """Upright box standing on z = 0, centred in x and y."""
+    """Makes an upright box that stands on z = 0, centred in x and y.
+
+    Args:
+      width: Size along x, m.
+      depth: Size along y, m.
+      height: Size along z, m.
+
+    Returns:
+      The solid.
+    """
     sides = [(1, 0, 0, width / 2), (-1, 0, 0, width / 2), (0, 1, 0, depth / 2), (0, -1, 0, depth / 2)]
     planes = [*sides, (0, 0, 1, height), (0, 0, -1, 0.0)]
     radius = 0.5 * float(np.sqrt(width**2 + depth**2 + height**2))
@@ -78,13 +107,31 @@ def box(width: float, depth: float, height: float) -> Solid:
 
 
 def cut(solid: Solid, normal: tuple[float, float, float], offset: float) -> Solid:
-    """The part of a solid with normal . p <= offset, in the solid's frame; `normal` has unit length."""
+    """Cuts a solid by a plane.
+
+    Args:
+      solid: The solid.
+      normal: Unit normal in the solid's frame.
+      offset: Offset of the plane, m.
+
+    Returns:
+      Its part with normal . p <= offset.
+    """
     plane = np.array([[*normal, offset]], np.float32)
     return dataclasses.replace(solid, planes=np.concatenate([solid.planes, plane]))
 
 
 def place(solid: Solid, centre, axes=None) -> Solid:
-    """A solid whose parent frame is rotated by `axes` (3, 3) and then shifted by `centre` (3,), metres."""
+    """Moves a solid in its parent frame.
+
+    Args:
+      solid: The solid.
+      centre: (3,) shift, applied last, m.
+      axes: (3, 3) rotation; None: none.
+
+    Returns:
+      The moved solid.
+    """
     turn = np.eye(3, dtype=np.float32) if axes is None else np.asarray(axes, np.float32)
     shift = np.asarray(centre, np.float32)
     bound = np.concatenate([turn @ solid.bound[:3] + shift, solid.bound[3:]])
@@ -92,7 +139,16 @@ def place(solid: Solid, centre, axes=None) -> Solid:
 
 
 def rotation(yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> Float[np.ndarray, "3 3"]:
-    """Rotation about z by `yaw` after y by `pitch` after x by `roll`, radians."""
+    """Makes a rotation about z after one about y after one about x.
+
+    Args:
+      yaw: Angle about z, radians.
+      pitch: Angle about y, radians.
+      roll: Angle about x, radians.
+
+    Returns:
+      (3, 3) float32 matrix.
+    """
     (cz, sz), (cy, sy), (cx, sx) = ((np.cos(a), np.sin(a)) for a in (yaw, pitch, roll))
     about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
     about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
@@ -101,14 +157,32 @@ def rotation(yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> Float[n
 
 
 def contains(solid: Solid, points: Float[np.ndarray, "3 n"], *, margin: float = 0.0) -> Bool[np.ndarray, " n"]:
-    """Whether each point lies in the solid, or (to first order) within `margin` metres of it."""
+    """Whether points lie in a solid.
+
+    Args:
+      solid: The solid.
+      points: (3, N) in its parent frame, m.
+      margin: Distance outside that still counts, m, to first order.
+
+    Returns:
+      (N,) bool.
+    """
     return _nearest_surface(solid, points)[0] <= margin
 
 
 def ray_interval(
     solid: Solid, origin: Float[np.ndarray, "3 _"], direction: Float[np.ndarray, "3 n"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Ray parameters between which origin + t direction lies in the solid; enter >= leave where it misses."""
+    """Intersects rays with a solid.
+
+    Args:
+      solid: The solid.
+      origin: (3, N) or (3, 1) in its parent frame, m.
+      direction: (3, N), of any length.
+
+    Returns:
+      (N,) ray parameters t between which origin + t direction lies in the solid; enter >= leave where it misses.
+    """
     d = solid.axes.T @ direction
     o = solid.axes.T @ (origin - solid.centre[:, None])
     # Start where the ray passes the solid's origin, so that the terms of the quadratic have the size of the solid.
@@ -156,7 +230,17 @@ def _quadric_interval(solid, o, d):
 def first_hit(
     solid: Solid, hollow: Solid | None, origin: Float[np.ndarray, "3 _"], direction: Float[np.ndarray, "3 n"]
 ) -> Float[np.ndarray, " n"]:
-    """Ray parameter of the first surface of `solid` less `hollow`; inf where missed. The origin must lie outside."""
+    """Finds the first surface that rays meet of a solid less a hollow.
+
+    Args:
+      solid: The solid.
+      hollow: The hollow, or None.
+      origin: As in `ray_interval`, outside of the solid.
+      direction: As in `ray_interval`.
+
+    Returns:
+      (N,) ray parameters; inf where missed.
+    """
     enter, leave = ray_interval(solid, origin, direction)
     hit = (enter < leave) & (enter > 0)
     if hollow is not None:
@@ -170,7 +254,17 @@ def first_hit(
 def blocks_segment(
     solid: Solid, hollow: Solid | None, origin: Float[np.ndarray, "3 _"], direction: Float[np.ndarray, "3 n"]
 ) -> Bool[np.ndarray, " n"]:
-    """Whether `solid` less `hollow` meets the segment from origin to origin + direction."""
+    """Whether a solid less a hollow meets segments.
+
+    Args:
+      solid: The solid.
+      hollow: The hollow, or None.
+      origin: As in `ray_interval`.
+      direction: From the origin to the other end.
+
+    Returns:
+      (N,) bool.
+    """
     enter, leave = ray_interval(solid, origin, direction)
     enter, leave = np.maximum(enter, 0), np.minimum(leave, 1)
     blocked = enter < leave
@@ -199,7 +293,16 @@ def _nearest_surface(solid, points):
 
 
 def normals(solid: Solid, hollow: Solid | None, points: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
-    """Unit normals that point out of the material, at points on the surface of `solid` less `hollow`."""
+    """Computes normals of a solid less a hollow.
+
+    Args:
+      solid: The solid.
+      hollow: The hollow, or None.
+      points: (3, N) on its surface.
+
+    Returns:
+      (3, N) unit normals that point out of the material.
+    """
     distance, normal = _nearest_surface(solid, points)
     if hollow is None:
         return normal
@@ -212,7 +315,14 @@ Body: TypeAlias = Sequence[tuple[Solid, Solid | None, float]]
 
 
 def radius_about_axis(solid: Solid) -> float:
-    """Radius of the smallest cylinder about z around the solid, m. A grid makes it too large by up to one cell."""
+    """Computes the radius of the smallest cylinder about z around a solid.
+
+    Args:
+      solid: The solid.
+
+    Returns:
+      Metres, too large by up to one cell of a grid of 25 a side.
+    """
     steps, cell = np.linspace(-1, 1, 25, dtype=np.float32), solid.bound[3] / 12
     grid = np.stack(np.meshgrid(steps, steps, steps)).reshape(3, -1)
     points = solid.bound[:3, None] + solid.bound[3] * grid

@@ -62,9 +62,21 @@ def evaluate_point_level_rendered(
     alpha_threshold: float = ALPHA_THRESHOLD,
     **options: Any,
 ) -> tuple[list[Row], dict]:
-    """Calls `evaluate_at_thresholds` with one threshold; returns its rows and summary.
+    """Calls `evaluate_at_thresholds` with one threshold, by default that of the protocol.
 
-    By default it is the threshold of the protocol.
+    Args:
+      gaussians: As in `evaluate_at_thresholds`.
+      cameras: As in `evaluate_at_thresholds`.
+      labels: As in `evaluate_at_thresholds`.
+      select: As in `evaluate_at_thresholds`.
+      alpha_threshold: The threshold.
+      **options: Further options of `evaluate_at_thresholds`.
+
+    Returns:
+      Its rows and summary.
+
+    Raises:
+      InputError: As in `evaluate_at_thresholds`.
     """
     results = evaluate_at_thresholds(gaussians, cameras, labels, select, alpha_thresholds=(alpha_threshold,), **options)
     return results[alpha_threshold]
@@ -105,7 +117,7 @@ def evaluate_at_thresholds(
     """
     for frame in labels:
         _check(frame, cameras)
-    pairs = labelled_pairs(labels, expected_pairs)
+    pairs = _labelled_pairs(labels, expected_pairs)
     answers: dict[str, Selection | None] = {}
     rows: dict[float, list[Row]] = {threshold: [] for threshold in alpha_thresholds}
     for done, (frame, category) in enumerate(pairs, start=1):
@@ -117,14 +129,11 @@ def evaluate_at_thresholds(
             rows[threshold].append(row)
         if progress is not None:
             progress(done, len(pairs))
-    return {threshold: (pairs, summary(pairs, threshold)) for threshold, pairs in rows.items()}
+    return {threshold: (pairs, _summary(pairs, threshold)) for threshold, pairs in rows.items()}
 
 
-def summary(rows: Sequence[Row], alpha_threshold: float = ALPHA_THRESHOLD) -> dict:
-    """Summarises rows at one alpha threshold.
-
-    Keys: protocol, pairs, frames, queries, missing, miou, macc, acc_50, loc_acc, loc_mask and loc_box.
-    """
+def _summary(rows: Sequence[Row], alpha_threshold: float) -> dict:
+    """Summarises rows at one alpha threshold."""
     ious = [row.iou for row in rows]
     return {
         "protocol": f"point level, rendered: selected Gaussians alone, alpha > {alpha_threshold:.3g}; mean over pairs",
@@ -141,7 +150,7 @@ def summary(rows: Sequence[Row], alpha_threshold: float = ALPHA_THRESHOLD) -> di
     }
 
 
-def labelled_pairs(labels: Sequence[LabelledFrame], expected: int | None) -> list[tuple[LabelledFrame, str]]:
+def _labelled_pairs(labels: Sequence[LabelledFrame], expected: int | None) -> list[tuple[LabelledFrame, str]]:
     """Returns all (frame, query) pairs. Raises InputError if there are no pairs, or not as many as `expected`."""
     pairs = [(frame, query) for frame in labels for query in frame.objects]
     if not pairs or (expected is not None and len(pairs) != expected):

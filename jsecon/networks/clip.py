@@ -89,11 +89,13 @@ class ClipFiles:
     rules: TextRules | None = None
     logits: Path | None = None
 
-    def digest(self) -> str:
-        """Returns hex digits of all that the embeddings depend on."""
+    @functools.cached_property
+    def name(self) -> str:
+        """Name of the space: "clip-" and hex digits of all that the embeddings depend on."""
         files = [*graph_files(self.visual), *graph_files(self.textual), self.tokenizer]
         settings = (self.mean, self.std, self.size)
-        return content_digest(files, extra=repr(settings if self.rules is None else (*settings, *self.rules)))
+        extra = repr(settings if self.rules is None else (*settings, *self.rules))
+        return f"clip-{content_digest(files, extra=extra)}"
 
 
 def find_clip(folder: str | Path, precision: Precision | None = None) -> ClipFiles:
@@ -102,6 +104,9 @@ def find_clip(folder: str | Path, precision: Precision | None = None) -> ClipFil
     Args:
       folder: The folder.
       precision: Precision of its graphs; None takes the highest that is there.
+
+    Returns:
+      The files, and how the model takes images and texts.
 
     Raises:
       InputError: A file is missing or cannot be read.
@@ -225,11 +230,6 @@ def _read_logits(path: Path) -> Logits:
     return logits
 
 
-def clip_name(files: ClipFiles) -> str:
-    """Names the space of a CLIP model by the content of its files."""
-    return f"clip-{files.digest()}"
-
-
 def masked_crop(
     frame: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], size: int
 ) -> UInt8[np.ndarray, "size size 3"]:
@@ -298,7 +298,7 @@ class ClipEmbedder:
             raise InputError("--template", problem, "a phrase that holds {}", remedy)
         self.files = model if isinstance(model, ClipFiles) else find_clip(model)
         self.templates = tuple(templates)
-        self.name = clip_name(self.files)
+        self.name = self.files.name
         self._batch = batch
         self._threads = threads
         self._store = None if store is None else EmbeddingStore(Path(store), self.name)
@@ -361,7 +361,10 @@ class ClipEmbedder:
         return rows
 
     def embed_text(self, texts: list[str]) -> Float32[np.ndarray, "q e"]:
-        """Embeds Q texts.
+        """Embeds texts.
+
+        Args:
+          texts: Q texts.
 
         Returns:
           (Q, E) unit embeddings, the mean over the templates.
@@ -377,9 +380,12 @@ class ClipEmbedder:
         return _normalize(rows.mean(1), self.files.textual)
 
     def seconds_per_crop(self) -> float:
-        """Measures the seconds of a region in a full batch.
+        """Measures the time of a region in a full batch.
 
         The crops are blank: which regions are embedded is known only after their masks were tracked.
+
+        Returns:
+          Seconds.
         """
         crops = np.zeros((self._batch, self.size, self.size, 3), np.uint8)
         self._run_visual(crops)  # opens the graph

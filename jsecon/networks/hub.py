@@ -29,11 +29,14 @@ PREFIX = "hub:"
 
 
 def graph_variants(names: Sequence[str], precision: Precision | None = None) -> Iterator[tuple[str, ...]]:
-    """Yields the names of graphs in one precision after the other.
+    """Names graphs in one precision after the other.
 
     Args:
       names: Names of the graphs in full precision, such as onnx/vision_model.onnx.
       precision: The only precision to yield; None yields all, full precision first.
+
+    Yields:
+      The names in that precision, in the order of `names`.
     """
     for suffix in SUFFIXES.values() if precision is None else (SUFFIXES[precision],):
         yield tuple(name.removesuffix(".onnx") + f"{suffix}.onnx" for name in names)
@@ -117,7 +120,11 @@ RECOMMENDED: Mapping[Role, str] = {"segmenter": "edgetam", "embedder": "siglip2"
 
 @functools.cache
 def catalogue() -> tuple[NamedModel, ...]:
-    """Reads the table of named models, catalogue.toml beside this file."""
+    """Reads the table of named models, catalogue.toml beside this file.
+
+    Returns:
+      Its rows.
+    """
     rows = tomllib.loads(Path(__file__).with_name("catalogue.toml").read_text())["model"]
     return tuple(NamedModel(**row) for row in rows)
 
@@ -225,7 +232,15 @@ def _refused(row: NamedModel, precision: Precision) -> InputError:
 
 
 def named_model(folder: Path, role: Role) -> NamedModel | None:
-    """Returns the row of the catalogue whose files a folder of the hub's cache holds, or None for another folder."""
+    """Finds the row of the catalogue whose files a folder holds.
+
+    Args:
+      folder: A folder of the hub's cache.
+      role: What the model is for.
+
+    Returns:
+      The row; None for another folder or repository.
+    """
     repository = (cached_address(folder) or "").removeprefix(PREFIX).partition("@")[0]
     return next((row for row in catalogue() if (row.role, row.repository) == (role, repository)), None)
 
@@ -357,7 +372,14 @@ def _content_hash(path: Path, like: str) -> str:
 
 
 def cached_address(folder: Path) -> str | None:
-    """Returns "hub:owner/name@commit" for a folder in the hub's cache, or None for every other folder."""
+    """Names what a folder of the hub's cache holds.
+
+    Args:
+      folder: A folder; it need not exist.
+
+    Returns:
+      "hub:owner/name@commit"; None for every other folder.
+    """
     parts = folder.absolute().parts
     inside = len(parts) > 2 and parts[-2] == "snapshots" and parts[-3].startswith("models--")
     if not inside:
@@ -393,7 +415,11 @@ def remove(model: HubModel) -> int:
 
 
 def catalogue_rows() -> Iterator[dict[str, Any]]:
-    """Yields the rows of `jsecon models list`: each named model, and under "cached" the precisions on this machine."""
+    """Lists the named models, and which of them are on this machine.
+
+    Yields:
+      A row of `jsecon models list`: the fields of `NamedModel`, and "cached", precisions in the hub's cache.
+    """
     for row in catalogue():
         models = [HubModel(row.role, row.repository, row.revision, precision) for precision in row.megabytes]
         cached = [model.precision for model in models if cached_folder(model) is not None]
@@ -401,7 +427,14 @@ def catalogue_rows() -> Iterator[dict[str, Any]]:
 
 
 def get_command(model: HubModel) -> str:
-    """Returns the command that fetches a model."""
+    """Writes the command that fetches a model.
+
+    Args:
+      model: The model.
+
+    Returns:
+      The command line.
+    """
     named = [row for row in catalogue() if row.repository == model.repository and row.role == model.role]
     name = named[0].name if named and model.revision == named[0].revision else model.address
     precision = "" if model.precision == "fp32" else f" --precision {model.precision}"

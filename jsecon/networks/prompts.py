@@ -37,7 +37,11 @@ class GuidedPrompts:
         self._left = MAX_PROMPTS
 
     def next_points(self) -> Float32[np.ndarray, "p 2"]:
-        """Returns the points (P, 2) x, y in px of the next round, those in the largest patches first; at last none."""
+        """Chooses the points of the next round.
+
+        Returns:
+          (P, 2) x, y in px, those in the largest patches first; P is 0 when no round is left.
+        """
         patches = np.asarray(self._regions, np.int32)
         least = 0.0
         if self._rounds:
@@ -56,7 +60,13 @@ class GuidedPrompts:
         return pixels.astype(np.float32) + np.float32(0.5)
 
     def explain(self, level: int, point: Float32[np.ndarray, " 2"], mask: Bool[np.ndarray, "h w"]) -> None:
-        """Takes a mask (H, W) that a point x, y led to at a level."""
+        """Takes a mask of a point.
+
+        Args:
+          level: Index of its level.
+          point: (2,) the point x, y.
+          mask: (H, W) the mask.
+        """
         column, row = point.astype(int)
         self._explained[level] |= mask & (self._regions == self._regions[row, column])
 

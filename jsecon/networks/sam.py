@@ -78,11 +78,6 @@ class SamFiles:
     configured: bool = False
     side: int | None = None
 
-    def digest(self, *, extra: str = "") -> str:
-        """Returns 32 hex digits of the files' contents, of the colours, and of `extra`."""
-        settings = extra if self.colours is None else f"{extra}{self.colours}"
-        return content_digest([*graph_files(self.encoder), *graph_files(self.decoder)], extra=settings)
-
 
 def find_sam(folder: str | Path, precision: Precision | None = None) -> SamFiles:
     """Finds the graphs of the SAM model in a folder, or in its subfolder `onnx`.
@@ -90,6 +85,9 @@ def find_sam(folder: str | Path, precision: Precision | None = None) -> SamFiles
     Args:
       folder: The folder.
       precision: Precision of its graphs; None takes the highest that is there.
+
+    Returns:
+      The files, and how the model takes colours.
 
     Raises:
       InputError: A graph is missing, or the configuration cannot be read.
@@ -191,6 +189,9 @@ class SamGraphs:
 
         Args:
           frame: (H, W, 3) RGB.
+
+        Returns:
+          Its features, for `decode`.
         """
         height, width = frame.shape[:2]
         scale = self.side / max(height, width)
@@ -231,7 +232,15 @@ class SamGraphs:
         return masks[:, -3:].astype(np.float32), scores[:, -3:].astype(np.float32)  # of 4, the first is SAM's best
 
     def to_frame(self, logits: Float32[np.ndarray, "l l"], encoded: EncodedFrame) -> Float32[np.ndarray, "h w"]:
-        """Resizes the logits of a mask (L, L) to the frame (H, W), bilinearly, through the encoder's square as SAM."""
+        """Resizes the logits of a mask to the frame, bilinearly, through the encoder's square as SAM does.
+
+        Args:
+          logits: (L, L) from `decode`.
+          encoded: The frame.
+
+        Returns:
+          (H, W) logits.
+        """
         size = encoded.size[::-1]
         if self.stretched:
             return cv2.resize(logits, size)
@@ -255,7 +264,7 @@ class Crop(NamedTuple):
         return (self.right - self.left) * (self.bottom - self.top)
 
 
-class Candidate(NamedTuple):
+class _Candidate(NamedTuple):
     """A predicted mask on its way through the filters."""
 
     bits: np.ndarray
@@ -335,7 +344,9 @@ class SamSegmenter:
     ):
         self.files = model if isinstance(model, SamFiles) else find_sam(model)
         self.settings = settings or SamSettings()
-        self.name = f"sam-{self.files.digest(extra=repr(self.settings))}"
+        graphs = [*graph_files(self.files.encoder), *graph_files(self.files.decoder)]
+        extra = repr(self.settings) if self.files.colours is None else f"{self.settings}{self.files.colours}"
+        self.name = f"sam-{content_digest(graphs, extra=extra)}"
         self._batch = batch
         self._threads = threads
 
@@ -387,7 +398,7 @@ class SamSegmenter:
     def _graphs(self) -> SamGraphs:
         return SamGraphs(self.files, batch=self._batch, threads=self._threads)
 
-    def _candidates(self, frame: np.ndarray, crop: Crop, tokens: Sequence[int]) -> Iterable[Candidate]:
+    def _candidates(self, frame: np.ndarray, crop: Crop, tokens: Sequence[int]) -> Iterable[_Candidate]:
         """Yields the masks of one crop that are good, stable and not cut off, in the order of the points."""
         part = np.ascontiguousarray(frame[crop.top : crop.bottom, crop.left : crop.right])
         encoded = self._graphs.encode(part)
@@ -405,7 +416,7 @@ class SamSegmenter:
 
     def _predicted(
         self, frame: np.ndarray, crop: Crop, encoded: EncodedFrame, points: np.ndarray, tokens: Sequence[int]
-    ) -> Iterator[tuple[int, Candidate]]:
+    ) -> Iterator[tuple[int, _Candidate]]:
         """Yields the masks of points (P, 2) in px of a crop, each with the number of its point."""
         height, width = frame.shape[:2]
         start = 0
@@ -422,15 +433,15 @@ class SamSegmenter:
                 box = box_of(mask)
                 if mask.any() and not cut_by_crop(box, crop, width, height):
                     iou = float(ious[prompt, token])
-                    yield start + prompt, Candidate(np.packbits(mask), box, iou, steady, int(token), crop)
+                    yield start + prompt, _Candidate(np.packbits(mask), box, iou, steady, int(token), crop)
             start += len(ious)
 
     def _filtered(
-        self, size: tuple[int, int], by_crop: list[list[Candidate]], tokens: tuple[int, ...]
+        self, size: tuple[int, int], by_crop: list[list[_Candidate]], tokens: tuple[int, ...]
     ) -> tuple[Bool[np.ndarray, "m h w"], Float64[np.ndarray, " m"]]:
         """Filters the candidates of some tokens; returns masks and scores."""
         settings = self.settings
-        left: list[Candidate] = []
+        left: list[_Candidate] = []
         for candidates in by_crop:
             mine = [c for c in candidates if c.token in tokens]
             left += [mine[i] for i in box_nms(_boxes(mine), np.asarray([c.iou for c in mine]), settings.box_iou)]
@@ -455,12 +466,18 @@ class SamSegmenter:
         return masks[kept], scores[kept]
 
 
-def _boxes(candidates: list[Candidate]) -> Float64[np.ndarray, "m 4"]:
+def _boxes(candidates: list[_Candidate]) -> Float64[np.ndarray, "m 4"]:
     return np.asarray([c.box for c in candidates], np.float64).reshape(-1, 4)
 
 
 def point_grid(side: int) -> Float32[np.ndarray, "p 2"]:
-    """Returns (side^2, 2) points x, y in 0..1, the centres of side x side cells, x fastest.
+    """Makes SAM's grid of points.
+
+    Args:
+      side: Points a side, at least 1.
+
+    Returns:
+      (side^2, 2) x, y in 0..1, the centres of side x side cells, x fastest.
 
     Raises:
       ValueError: side is below 1.
@@ -471,13 +488,16 @@ def point_grid(side: int) -> Float32[np.ndarray, "p 2"]:
 
 
 def crops_of(height: int, width: int, layers: int, overlap: float) -> list[Crop]:
-    """Returns the whole frame, then 2^k x 2^k crops for each layer k, column by column.
+    """Cuts a frame into crops: 2^k x 2^k in layer k.
 
     Args:
       height: px of the frame.
       width: px of the frame.
       layers: Number of layers of crops.
       overlap: Neighbours overlap by this share of the frame's shorter side, times 2 / 2^k.
+
+    Returns:
+      The whole frame, then the crops layer by layer, column by column.
     """
     crops = [Crop(0, 0, width, height, 0)]
     for layer in range(1, layers + 1):
@@ -538,7 +558,14 @@ def langsplat_nms(
 
 
 def shared_areas(masks: Bool[np.ndarray, "m h w"]) -> Float64[np.ndarray, "m m"]:
-    """Returns (M, M) numbers of pixels that any two masks (M, H, W) share; the diagonal has their areas."""
+    """Counts the pixels that any two masks share.
+
+    Args:
+      masks: (M, H, W) bool.
+
+    Returns:
+      (M, M) numbers of pixels; the diagonal has the areas.
+    """
     flat = masks.reshape(len(masks), masks.shape[1] * masks.shape[2])
     columns = np.flatnonzero(flat) % max(flat.shape[1], 1)
     ends = np.concatenate([[0], np.cumsum(np.count_nonzero(flat, axis=1))])
@@ -547,19 +574,44 @@ def shared_areas(masks: Bool[np.ndarray, "m h w"]) -> Float64[np.ndarray, "m m"]
 
 
 def stability(logits: Float[np.ndarray, "h w"], offset: float) -> float:
-    """Returns the IoU of the masks at thresholds of +offset and -offset; 0 if the wider one is empty."""
+    """Compares the masks of logits at two thresholds.
+
+    Args:
+      logits: (H, W).
+      offset: The thresholds are +offset and -offset.
+
+    Returns:
+      IoU of the two masks; 0 if the wider one is empty.
+    """
     wide = int(np.count_nonzero(logits > -offset))
     return int(np.count_nonzero(logits > offset)) / wide if wide else 0.0
 
 
 def box_of(mask: Bool[np.ndarray, "h w"]) -> tuple[int, int, int, int]:
-    """Returns (left, top, right, bottom), the outermost pixels of a mask; zeros if it is empty."""
+    """Finds the outermost pixels of a mask.
+
+    Args:
+      mask: (H, W) bool.
+
+    Returns:
+      (left, top, right, bottom), all within the mask; zeros if it is empty.
+    """
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     return (int(columns[0]), int(rows[0]), int(columns[-1]), int(rows[-1])) if len(rows) else (0, 0, 0, 0)
 
 
 def cut_by_crop(box: tuple[int, int, int, int], crop: Crop, width: int, height: int) -> bool:
-    """Returns whether a box in frame px lies within EDGE of an edge of its crop that is no edge of the frame."""
+    """Whether the edge of a crop probably cuts off a thing.
+
+    Args:
+      box: (left, top, right, bottom) of its mask, px of the frame.
+      crop: The crop.
+      width: px of the frame.
+      height: px of the frame.
+
+    Returns:
+      True if the box lies within EDGE of an edge of the crop that is no edge of the frame.
+    """
     pairs = zip(box, (crop.left, crop.top, crop.right, crop.bottom), (0, 0, width, height))
     return any(abs(side - edge) <= EDGE and abs(side - frame) > EDGE for side, edge, frame in pairs)
 
@@ -596,7 +648,11 @@ def box_nms(
 
 
 def remove_small_regions(mask: Bool[np.ndarray, "h w"], least: int) -> tuple[Bool[np.ndarray, "h w"], bool]:
-    """Fills holes, then removes islands, of fewer than `least` pixels (8-connected).
+    """Fills small holes of a mask, then removes small islands (8-connected).
+
+    Args:
+      mask: (H, W) bool.
+      least: Pixels from which a hole or island is not small.
 
     Returns:
       The mask (H, W), and whether it changed. If every island is small, the largest stays.

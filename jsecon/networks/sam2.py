@@ -117,11 +117,19 @@ class Sam2Graphs:
     sizes: Mapping[str, int]
 
     def run(self, name: str, **feeds: np.ndarray) -> dict[str, np.ndarray]:
-        """Runs a graph; returns its outputs by name."""
+        """Runs a graph.
+
+        Args:
+          name: Its name in SIGNATURES.
+          **feeds: Its inputs by name.
+
+        Returns:
+          Its outputs by name.
+        """
         return self.graphs[name].run(feeds)
 
 
-def sam2_files(folder: Path) -> dict[str, Path]:
+def _sam2_files(folder: Path) -> dict[str, Path]:
     """Finds the five graphs and constants.json by name.
 
     Raises:
@@ -146,10 +154,13 @@ def open_sam2(folder: Path, *, threads: int | None = None) -> Sam2Graphs:
       folder: The folder.
       threads: Number of cores of one run, as for `Graph`.
 
+    Returns:
+      The graphs, with the sizes that they agree on.
+
     Raises:
       InputError: A file is missing or damaged, or its tensors do not fit the rest of the folder.
     """
-    files = sam2_files(folder)
+    files = _sam2_files(folder)
     constants = _read_constants(files[CONSTANTS])
     graphs = {name: Graph(files[f"{name}.onnx"], threads=threads) for name in SIGNATURES}
     encoder, decoder = graphs["vision_encoder"], graphs["mask_decoder"]
@@ -217,7 +228,7 @@ class Prompt:
         require(fits, "Prompt", f"mask, points, labels: {present}", "a mask, or points with labels", "Use one of both.")
 
 
-class Prediction(NamedTuple):
+class _Prediction(NamedTuple):
     """An object in a frame."""
 
     logits: np.ndarray
@@ -284,9 +295,17 @@ class Bank:
         return memories, pointers
 
     def with_tracked(self, t: int, memory: Memory, step: int) -> "Bank":
-        """Adds frame t, and drops what no later frame can reach.
+        """Adds a frame, and drops what no later frame can reach.
 
         The backward pass begins before the prompted frame and reads what the forward pass left beyond it.
+
+        Args:
+          t: The frame.
+          memory: Its memory.
+          step: Direction of tracking: 1 forward, -1 backward.
+
+        Returns:
+          The new bank.
         """
         kept = {}
         for frame, old in {**self.tracked, t: memory}.items():
@@ -317,7 +336,7 @@ class Sam2Tracker:
     """
 
     def __init__(self, folder: Path, *, hole_area: int = 8, keep: int = 16, threads: int | None = None):
-        files = sam2_files(folder)
+        files = _sam2_files(folder)
         graphs = [part for name in SIGNATURES for part in graph_files(files[f"{name}.onnx"])]
         self.name = f"sam2-{content_digest([*graphs, files[CONSTANTS]], extra=repr(hole_area))}"
         self.hole_area = hole_area
@@ -372,7 +391,7 @@ class Sam2Tracker:
         numbers = np.array([*objects, -1], np.int16)
         masks = [Prompt(prompts[b]) for b in objects]
         for t, logits in follow(self.graphs, frames, index, masks, hole_area=self.hole_area, encode=self._encode):
-            labels[t] = numbers[strongest(logits, (height, width))]
+            labels[t] = numbers[_strongest(logits, (height, width))]
         return labels
 
 
@@ -453,7 +472,7 @@ def follow(
             yield t, logits
 
 
-def _prompted(graphs: Sam2Graphs, features: FrameFeatures, prompt: Prompt, size: tuple[int, int]) -> Prediction:
+def _prompted(graphs: Sam2Graphs, features: FrameFeatures, prompt: Prompt, size: tuple[int, int]) -> _Prediction:
     """Predicts the object of a prompt in a frame of size (H, W) from that frame alone."""
     side = graphs.sizes["S"]
     scale = np.array([side / size[1], side / size[0]], np.float32)
@@ -465,7 +484,7 @@ def _prompted(graphs: Sam2Graphs, features: FrameFeatures, prompt: Prompt, size:
     box = np.array([[columns[0], rows[0]], [columns[-1] + 1, rows[-1] + 1]], np.float32) * scale
     decoded = _decode(graphs, features, features.feats2_no_mem, box, np.array([2, 3]))
     mask = np.where(_resize(prompt.mask.astype(np.float32), side) >= 0.5, MASK_LOGIT, -MASK_LOGIT).astype(np.float32)
-    return Prediction(
+    return _Prediction(
         _resize(mask, len(decoded.logits)), mask, decoded.pointer, np.full((1, 1), MASK_LOGIT, np.float32)
     )
 
@@ -483,7 +502,7 @@ def _tracked(
     step: int,
     count: int,
     position: np.ndarray | None,
-) -> Prediction:
+) -> _Prediction:
     """Predicts the object of a bank in frame t of `count`; `position` (K, M) is the spatial code of a memory."""
     memories, pointers = bank.attended(t, step, count)
     width = graphs.sizes["M"]
@@ -504,7 +523,7 @@ def _tracked(
 
 def _decode(
     graphs: Sam2Graphs, features: FrameFeatures, image: np.ndarray, points: np.ndarray, labels: np.ndarray
-) -> Prediction:
+) -> _Prediction:
     """Runs the mask decoder with points (P, 2) in px of the square image; it chooses among its masks by itself."""
     outputs = graphs.run(
         "mask_decoder",
@@ -515,13 +534,13 @@ def _decode(
         input_labels=labels[None, None],
     )
     score = outputs["object_score_logits"].reshape(1, 1)
-    return Prediction(
+    return _Prediction(
         outputs["low_res_mask"][0, 0], outputs["high_res_mask"][0, 0], outputs["object_pointer"][0, 0], score
     )
 
 
 def _memorize(
-    graphs: Sam2Graphs, features: FrameFeatures, prediction: Prediction, *, binarize: bool
+    graphs: Sam2Graphs, features: FrameFeatures, prediction: _Prediction, *, binarize: bool
 ) -> tuple[Memory, np.ndarray]:
     """Encodes the memory of an object in a frame, binary if it was prompted there; also returns its spatial code."""
     outputs = graphs.run(
@@ -541,7 +560,15 @@ def _as_tokens(grid: np.ndarray) -> np.ndarray:
 
 
 def fill_holes(logits: np.ndarray, area: int) -> np.ndarray:
-    """Raises holes of at most `area` pixels (8-connected, logits at or below 0) of (L, L) to 0.1."""
+    """Fills small holes of a mask.
+
+    Args:
+      logits: (L, L) mask logits.
+      area: Pixels (8-connected, logits at or below 0) up to which a hole is small.
+
+    Returns:
+      (L, L) logits, 0.1 in the holes that were filled.
+    """
     if area <= 0:
         return logits
     number, labels, stats, _ = cv2.connectedComponentsWithStats((logits <= 0).astype(np.uint8), connectivity=8)
@@ -550,7 +577,7 @@ def fill_holes(logits: np.ndarray, area: int) -> np.ndarray:
     return np.where(small[np.asarray(labels, np.intp)], np.float32(0.1), logits) if number > 1 else logits
 
 
-def strongest(logits: Sequence[np.ndarray], size: tuple[int, int]) -> np.ndarray:
+def _strongest(logits: Sequence[np.ndarray], size: tuple[int, int]) -> np.ndarray:
     """Returns (H, W) int16: the object with the highest of the logits (L, L) at each pixel, -1 if none is above 0."""
     best, label = np.zeros(size, np.float32), np.full(size, -1, np.int16)
     for number, low in enumerate(logits):
@@ -561,5 +588,13 @@ def strongest(logits: Sequence[np.ndarray], size: tuple[int, int]) -> np.ndarray
 
 
 def at_size(logits: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Resizes logits (L, L) to (H, W) bilinearly."""
+    """Resizes logits bilinearly.
+
+    Args:
+      logits: (L, L).
+      size: (H, W).
+
+    Returns:
+      (H, W) logits.
+    """
     return cv2.resize(logits, size[::-1], interpolation=cv2.INTER_LINEAR)

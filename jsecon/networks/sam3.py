@@ -99,6 +99,12 @@ class PhraseMasks(NamedTuple):
 def find_sam3(folder: str | Path) -> Sam3Files:
     """Finds the files of the SAM 3 model in a folder.
 
+    Args:
+      folder: The folder.
+
+    Returns:
+      The files.
+
     Raises:
       InputError: A file is missing, or there are several.
     """
@@ -145,7 +151,13 @@ class Sam3:
         return self.masks(self.encode(frame), self.read(phrase))
 
     def read(self, phrase: str) -> dict[str, np.ndarray]:
-        """Encodes a noun phrase for the decoder, by name.
+        """Encodes a noun phrase for the decoder.
+
+        Args:
+          phrase: The phrase.
+
+        Returns:
+          Inputs of the decoder by name.
 
         Raises:
           InputError: It is empty or too long.
@@ -161,9 +173,15 @@ class Sam3:
         return {name: outputs[output] for name, output in _WORDS.items()}
 
     def encode(self, frame: UInt8[np.ndarray, "h w 3"]) -> Sam3Frame:
-        """Encodes a frame (H, W, 3) RGB for the decoder.
+        """Encodes a frame for the decoder.
 
         It is resized by Pillow, as in SAM 3's training: its kernel widens if an image shrinks.
+
+        Args:
+          frame: (H, W, 3) uint8 RGB.
+
+        Returns:
+          Its features.
 
         Raises:
           ValueError: The frame is no such image.

@@ -72,14 +72,28 @@ class Tensor:
         return f"{self.name} {self.dtype}[{', '.join('?' if size is None else str(size) for size in self.shape)}]"
 
     def fixed(self, axis: int) -> int | None:
-        """Returns the size of an axis if the file fixes it, else None."""
+        """Reads the size of an axis.
+
+        Args:
+          axis: The axis; negative ones count from the last.
+
+        Returns:
+          The size if the file fixes it, else None.
+        """
         if self.shape is None or not -len(self.shape) <= axis < len(self.shape):
             return None
         size = self.shape[axis]
         return size if isinstance(size, int) and size > 0 else None
 
     def fits(self, shape: Sequence[Size]) -> bool:
-        """Returns whether an array of this shape could be the tensor; None and symbols fit every size."""
+        """Whether an array could be the tensor.
+
+        Args:
+          shape: Shape of the array; None and symbols fit every size.
+
+        Returns:
+          True also if the file declares no shape.
+        """
         if self.shape is None:
             return True
         return len(self.shape) == len(shape) and all(
@@ -148,13 +162,16 @@ class Graph:
             raise InputError(self.path, problem, expected, "Fetch or export the file again.") from error
 
     def require(self, side: Literal["input", "output"], name: str, shape: Sequence[Size], what: str) -> Tensor:
-        """Returns a tensor of the graph after checking its shape.
+        """Checks the shape of a tensor of the graph.
 
         Args:
           side: Whether it is an input or an output.
           name: Its name.
           shape: Its shape; None fits any size.
           what: What the graph should be, for the message.
+
+        Returns:
+          The tensor.
 
         Raises:
           InputError: There is no such tensor, or it has another shape.
@@ -210,7 +227,14 @@ class Graph:
 
 
 def describe(tensors: Iterable[Tensor]) -> str:
-    """Lists name, type and shape of tensors on one line."""
+    """Lists name, type and shape of tensors.
+
+    Args:
+      tensors: The tensors.
+
+    Returns:
+      One line.
+    """
     return ", ".join(map(str, tensors)) or "no tensor"
 
 
@@ -235,7 +259,13 @@ def batches(rows: np.ndarray, fixed: int | None, free: int) -> Iterator[tuple[np
 
 
 def graph_files(path: str | os.PathLike) -> tuple[Path, ...]:
-    """Lists the .onnx file and the external data files that it names beneath its folder.
+    """Lists the files of a graph.
+
+    Args:
+      path: The .onnx file.
+
+    Returns:
+      The file, and the external data files that it names beneath its folder.
 
     Raises:
       InputError: The .onnx file cannot be read.

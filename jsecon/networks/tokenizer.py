@@ -100,13 +100,27 @@ class TextTokenizer:
             return np.array([row.ids for row in rows], np.int64).reshape(len(texts), length)
 
     def count(self, text: str) -> int:
-        """Returns the number of tokens of a text, start and end included."""
+        """Counts the tokens of a text.
+
+        Args:
+          text: The text.
+
+        Returns:
+          Their number, start and end included.
+        """
         self._tokenizer.no_truncation()
         self._tokenizer.no_padding()
         return len(self._tokenizer.encode(self.clean(text)).ids)
 
     def clean(self, text: str) -> str:
-        """Returns a text as the model was trained on it."""
+        """Cleans a text as the model was trained on it.
+
+        Args:
+          text: The text.
+
+        Returns:
+          The clean text.
+        """
         repaired = _repair(text)
         if self._rules is None or self._rules.clean == "lower":
             return repaired.lower()
@@ -116,7 +130,14 @@ class TextTokenizer:
         return " ".join(bare.lower().split())
 
     def mask(self, ids: Int64[np.ndarray, "b l"]) -> Int64[np.ndarray, "b l"]:
-        """Returns the attention mask of token ids: for CLIP 1 up to the first end, else 1 everywhere."""
+        """Makes the attention mask of token ids.
+
+        Args:
+          ids: (B, L).
+
+        Returns:
+          (B, L): for CLIP 1 up to the first end, else 1 everywhere.
+        """
         if self._rules is not None:
             return np.ones_like(ids)
         ends = ids == self._end

@@ -54,7 +54,14 @@ def require_options_apply(options: Options, *, bare: bool) -> None:
 
 
 def planned_views(context: RunContext) -> Stage:
-    """Plans the stage "load" of a bare scene: virtual views, or given cameras, rendered as its frames."""
+    """Plans the stage "load" of a bare scene: virtual views, or given cameras, rendered as its frames.
+
+    Args:
+      context: The run.
+
+    Returns:
+      The stage; its key has the options of the views or the file of poses.
+    """
     options = context.options
     skipped = {"photographs": "the scene comes without any"}
     if options.cameras is not None:
@@ -148,7 +155,14 @@ def _load_poses(path: Path, long_side: int) -> tuple[Camera, tuple[str, ...]]:
 
 
 def scene_itself(context: RunContext) -> Stage:
-    """Plans the stage "gaussians" of a bare scene: those of its file, in the world of the planned views."""
+    """Plans the stage "gaussians" of a bare scene.
+
+    Args:
+      context: The run.
+
+    Returns:
+      The stage, which reads the scene into the world of the planned views.
+    """
     path = context.options.capture
     skipped = {"photometric fit": f"the scene's Gaussians are given ({path.name})"}
     return Stage("gaussians", f"read from {path.name}", _read_scene, after=("load",), files=path, skipped=skipped)
@@ -160,7 +174,11 @@ def _read_scene(stage: StageInput) -> StageResult:
 
 
 def no_photographs() -> Stage:
-    """Plans the stage "held_out" of a bare scene, whose frames are its own renders: the quality of no frame."""
+    """Plans the stage "held_out" of a bare scene, whose frames are its own renders.
+
+    Returns:
+      The stage, whose result is the quality of no frame.
+    """
 
     def quality_of_no_frame(stage):
         return StageResult(Quality(np.zeros(0, int), np.zeros(0), np.zeros(0)))

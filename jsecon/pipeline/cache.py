@@ -125,17 +125,40 @@ def source_digest() -> str:
 
 
 def path_of(folder: Path, stage: str, key: str) -> Path:
-    """Returns the file of a stage's result."""
+    """Names the file of a stage's result.
+
+    Args:
+      folder: Folder of the cache.
+      stage: Name of the stage.
+      key: Its key, from `key_of`.
+
+    Returns:
+      The path.
+    """
     return folder / f"{stage}-{key}.safetensors"
 
 
 def record_path_of(path: Path) -> Path:
-    """Returns the file of the checkpoint that a stage writes while it computes the result at `path`."""
+    """Names the file of the checkpoint that a stage writes while it computes its result.
+
+    Args:
+      path: File of the result.
+
+    Returns:
+      A path beside it.
+    """
     return path.with_suffix(".checkpoint.safetensors")
 
 
 def prepare(folder: Path) -> None:
-    """Creates the folder, marks it as a cache for backup programs, and removes half-written files of killed runs."""
+    """Makes the folder of a cache, marks it for backup programs, and removes half-written files of killed runs.
+
+    Args:
+      folder: The folder.
+
+    Raises:
+      InputError: The folder cannot be written.
+    """
     tag = folder / "CACHEDIR.TAG"
     if not tag.exists():
         write_text(tag, "Signature: 8a477f597d28d172789f06886806bc55\n# Made by jsecon; see bford.info/cachedir\n")
@@ -155,6 +178,12 @@ def fetch(path: Path, compute: Callable[[], Any], *, note: Callable[[str], None]
       path: File of the result.
       compute: Computes the result if the file is missing or damaged.
       note: Receives a sentence about a damaged file.
+
+    Returns:
+      The result, its arrays in NumPy, and how long it took.
+
+    Raises:
+      InputError: The file cannot be written.
     """
     if path.exists():
         try:
@@ -175,7 +204,15 @@ def fetch(path: Path, compute: Callable[[], Any], *, note: Callable[[str], None]
 
 
 def save(path: Path, value: Any) -> None:
-    """Writes a tree of plain values, arrays and jsecon's records to a file, atomically."""
+    """Writes a tree to a file, atomically.
+
+    Args:
+      path: The file.
+      value: Tree of plain values, arrays and jsecon's records.
+
+    Raises:
+      InputError: The file cannot be written.
+    """
     _write(path, *pack(value), seconds=0.0)
 
 
@@ -184,6 +221,9 @@ def load(path: Path) -> Any:
 
     Args:
       path: The file.
+
+    Returns:
+      The tree; arrays of more than MAPPED bytes are memory-mapped.
 
     Raises:
       CorruptCacheError: The file cannot be read.
@@ -207,7 +247,14 @@ def _read(path: Path) -> tuple[Any, float]:
 
 
 def pack(value: Any) -> tuple[Any, dict[str, np.ndarray]]:
-    """Splits a tree of plain values, arrays and jsecon's records into its description and its arrays by path."""
+    """Splits a tree into its description and its arrays.
+
+    Args:
+      value: Tree of plain values, arrays and jsecon's records.
+
+    Returns:
+      A JSON value, and the arrays by their paths in the tree.
+    """
     arrays: dict[str, np.ndarray] = {}
 
     def name_of(kind: type) -> str | None:
@@ -223,6 +270,9 @@ def unpack(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     Args:
       tree: The description.
       arrays: Arrays by path.
+
+    Returns:
+      The tree.
 
     Raises:
       Exception: One of READ_ERRORS, if `pack` did not write the tree.

@@ -45,6 +45,12 @@ class ModelReport:
 def inspect_models(folder: str | Path) -> ModelReport:
     """Opens every graph of a folder, and tries the folder as each kind of model.
 
+    Args:
+      folder: The folder; graphs in its subfolders count too.
+
+    Returns:
+      What it holds, and what each kind of model lacks.
+
     Raises:
       InputError: There is no such folder.
     """
@@ -56,7 +62,14 @@ def inspect_models(folder: str | Path) -> ModelReport:
 
 
 def report_lines(findings: ModelReport) -> Iterable[str]:
-    """Formats a report as lines of text."""
+    """Formats a report.
+
+    Args:
+      findings: From `inspect_models`.
+
+    Yields:
+      Lines of text.
+    """
     yield f"{findings.folder}: {len(findings.graphs)} graphs"
     for path, signature in findings.graphs.items():
         yield f"  {path}"
@@ -67,7 +80,14 @@ def report_lines(findings: ModelReport) -> Iterable[str]:
 
 
 def unusable(findings: ModelReport) -> list[InputError]:
-    """Returns an error if no model of the folder can be used, else an empty list."""
+    """Says whether no model of a folder can be used.
+
+    Args:
+      findings: From `inspect_models`.
+
+    Returns:
+      One error, or an empty list if a model can be used.
+    """
     if any(use.usable for use in findings.uses):
         return []
     expected = f"{' or '.join(use.model for use in findings.uses)} as ONNX graphs"

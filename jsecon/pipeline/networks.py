@@ -39,20 +39,36 @@ class ExternalSpace:
         self.canonical = self.reference = np.zeros((0, dim), np.float32)
 
     def embed_regions(self, frame: np.ndarray, masks: np.ndarray) -> NoReturn:
-        """Raises InputError."""
-        raise missing_model(self.dim)
+        """Raises InputError.
+
+        Args:
+          frame: Not used.
+          masks: Not used.
+        """
+        raise _missing_model(self.dim)
 
     def embed_text(self, texts: list[str]) -> NoReturn:
-        """Raises InputError."""
-        raise missing_model(self.dim)
+        """Raises InputError.
+
+        Args:
+          texts: Not used.
+        """
+        raise _missing_model(self.dim)
 
 
 def external_dim(name: str | None) -> int | None:
-    """Returns the length of an embedding in the external space of this name, or None for any other space."""
+    """Reads the name of a space of embeddings from files.
+
+    Args:
+      name: Name of a field's space, or None.
+
+    Returns:
+      Length of its embeddings; None for the space of an embedder.
+    """
     return int(name.removeprefix(_EXTERNAL)) if name is not None and name.startswith(_EXTERNAL) else None
 
 
-def missing_model(dim: int) -> InputError:
+def _missing_model(dim: int) -> InputError:
     """Returns the error that the model of an external space is needed."""
     remedy = "Give its folder: --embedder DIR. Without it, ask by a pixel (--at)."
     problem = f"regions whose embeddings came from files, {dim} numbers each"
@@ -65,6 +81,9 @@ def open_networks(options: Options, store: Path) -> Networks:
     Args:
       options: Options of the run.
       store: Folder that caches proposals and embeddings.
+
+    Returns:
+      The models; colours embed if no CLIP is named.
 
     Raises:
       InputError: A folder holds no such model.
@@ -98,7 +117,15 @@ def open_networks(options: Options, store: Path) -> Networks:
 
 
 def describe_model(options: Options, role: Role) -> str:
-    """Returns the name of a model of a run: that of the catalogue, or of its folder."""
+    """Names a model of a run for its plan.
+
+    Args:
+      options: Options of the run, which have a folder for the role.
+      role: What the model is for.
+
+    Returns:
+      Its name in the catalogue, or that of its folder.
+    """
     folder = getattr(options, role)
     row = named_model(folder, role)
     return folder.name if row is None else row.name
@@ -119,12 +146,15 @@ def open_embedder(
       templates: Phrases for texts of CLIP.
       store: Folder that caches embeddings.
 
+    Returns:
+      The embedder.
+
     Raises:
       InputError: The folder holds no CLIP model, or the embedder is of another space.
     """
     dim = external_dim(name)
     if dim is not None and folder is None:
-        raise missing_model(dim)
+        raise _missing_model(dim)
     if folder is not None:
         from jsecon.networks.clip import ClipEmbedder
 
@@ -175,7 +205,14 @@ def field_embedder(field: LanguageField, folder: Path | None = None, *, template
 
 
 def missing_model_of_field(field: LanguageField) -> HubModel | None:
-    """Returns the model of the hub that a field needs and that is not on this machine, or None."""
+    """Looks for the model that a field's texts need.
+
+    Args:
+      field: The field.
+
+    Returns:
+      The model of the hub that is to be fetched; None if it is on this machine, or came from a folder.
+    """
     sources = locate_sources(field)
     return None if _model_of_field(sources) is not None else _hub_model(sources)
 
@@ -190,13 +227,13 @@ def _model_of_field(sources: Sources) -> "ClipFiles | None":
     """The CLIP model that a field was made with, in its folder or in the hub's cache; None if it is at neither."""
     if not (sources.embedder or "").startswith("clip-"):
         return None
-    from jsecon.networks.clip import clip_name, find_clip
+    from jsecon.networks.clip import find_clip
 
     model = _hub_model(sources)
     for folder in (sources.model, None if model is None else cached_folder(model)):
         if folder is not None:
             with contextlib.suppress(InputError):  # another model is there now
                 files = find_clip(folder, sources.precision)
-                if clip_name(files) == sources.embedder:
+                if files.name == sources.embedder:
                     return files
     return None

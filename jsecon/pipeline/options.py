@@ -17,12 +17,12 @@ from jsecon.networks.hub import Precision
 T = TypeVar("T")
 
 
-def default_hint(default: str) -> str:
+def _default_hint(default: str) -> str:
     """Returns the default of an option for its help text; empty for a flag or an option without a default."""
     return "" if default in ("", "None", "False") else f"(default: {default})"
 
 
-Option: TypeAlias = Annotated[T, tyro.conf.arg(prefix_name=False, help_behavior_hint=default_hint)]
+Option: TypeAlias = Annotated[T, tyro.conf.arg(prefix_name=False, help_behavior_hint=_default_hint)]
 """an option of the command line; its flag does not name the group"""
 ADVANCED = "advanced"
 """mark of an option that --help leaves out and --help-all describes"""
@@ -207,7 +207,14 @@ SPLATS = (".ply", ".spz", ".sog", ".splat", ".glb")
 
 
 def is_bare_scene(capture: Path) -> bool:
-    """Returns whether the input of a run is a file of Gaussians instead of a capture."""
+    """Whether the input of a run is a file of Gaussians instead of a capture.
+
+    Args:
+      capture: Path of the input.
+
+    Returns:
+      True by the suffix, also if the file is missing.
+    """
     return capture.suffix.lower() in SPLATS and not capture.is_dir()
 
 

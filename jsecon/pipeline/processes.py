@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import jsecon
 from jsecon.errors import InputError
-from jsecon.parallel import allgather_bytes, cache_worker_programs, deserialize_tree, serialize_tree
+from jsecon.parallel import allgather_tree, cache_worker_programs
 from jsecon.pipeline import cache
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import Checkpoint, Results, RunContext, Stage, StageInput
@@ -168,14 +168,18 @@ def join(options: Options, index: int, count: int, address: str) -> None:
     atexit.unregister(jax.distributed.shutdown)  # it waits for the others, also if this process ends in an error
     cache_worker_programs()
     mine = f"jsecon {jsecon.__version__}, {options}"
-    first = allgather_bytes(mine.encode())[0].decode()
+    first = allgather_tree(mine)[0]
     if first != mine:
         raise InputError(f"process {index}", mine, first, "Give all processes the same options and version.")
 
 
 @contextlib.contextmanager
 def exit_if_disconnected() -> Iterator[None]:
-    """Ends the process with CONNECTION_LOST if an exchange with the others fails; the parent process explains it."""
+    """Ends the process with CONNECTION_LOST if an exchange with the others fails; the parent process explains it.
+
+    Yields:
+      None.
+    """
     try:
         yield
     except Exception as error:
@@ -197,24 +201,34 @@ class Coordinator:
         self._sent: set[str] = set()
 
     def broadcast(self, stage: Stage, results: Results) -> None:
-        """Lets all compute a stage with this process, if it is distributed."""
+        """Lets all compute a stage with this process, if it is distributed.
+
+        Args:
+          stage: The stage.
+          results: Results of the stages before it; each is sent once.
+        """
         if self._several and stage.distributed:
-            news = results.select([name for name in stage.after if name not in self._sent])
+            news = {name: getattr(results, name) for name in stage.after if name not in self._sent}
             self._sent |= set(news)
             tree, arrays = cache.pack(news)
-            allgather_bytes(serialize_tree({"stage": stage.name, "tree": json.dumps(tree), "arrays": arrays}))
+            allgather_tree({"stage": stage.name, "tree": json.dumps(tree), "arrays": arrays})
 
     def shutdown(self) -> None:
         """Ends the work of the others."""
         if self._several:
-            allgather_bytes(serialize_tree({"stage": ""}))
+            allgather_tree({"stage": ""})
             _disconnect()
 
 
 def run_worker(context: RunContext, stages: Sequence[Stage]) -> None:
-    """Computes each stage that the first process calls for, until it shuts down. It writes no file."""
+    """Computes each stage that the first process calls for, until it shuts down. It writes no file.
+
+    Args:
+      context: The run, with the options of the first process.
+      stages: Stages of the run.
+    """
     by_name, results = {stage.name: stage for stage in stages}, Results()
-    while (call := deserialize_tree(allgather_bytes(b"")[0]))["stage"]:
+    while (call := allgather_tree(None)[0])["stage"]:
         for name, value in cache.unpack(json.loads(call["tree"]), call["arrays"]).items():
             results.add(name, value)
         checkpoint = Checkpoint(context.out / "worker")

@@ -52,7 +52,11 @@ class Listener:
         """
 
     def step(self, step: Step) -> None:
-        """Receives a step that only the data could settle."""
+        """Receives a step that only the data could settle.
+
+        Args:
+          step: The step.
+        """
 
     def done(self, name: str, seconds: float, fresh: bool) -> None:
         """Receives the end of a stage.
@@ -64,17 +68,28 @@ class Listener:
         """
 
     def note(self, text: str) -> None:
-        """Receives a sentence about the input or the run."""
+        """Receives a note.
+
+        Args:
+          text: A sentence about the input or the run.
+        """
 
     def say(self, text: str) -> None:
-        """Receives a line of results."""
+        """Receives a line of results.
+
+        Args:
+          text: The line.
+        """
 
     @contextlib.contextmanager
     def progress(self, name: str) -> Iterator[Callable[[int, int], None]]:
-        """Yields a callback `(done, total)` for the duration of a step.
+        """Reports the progress of a step, for the body of a `with`.
 
         Args:
           name: Name of the step.
+
+        Yields:
+          A callback (done, total).
         """
         yield lambda done, total: None
 
@@ -92,27 +107,50 @@ class Console(Listener):
         self._err = err or sys.stderr
 
     def steps(self, title: str, steps: Sequence[Step]) -> None:
-        """Prints the stages, one a line."""
+        """Prints the stages, one a line.
+
+        Args:
+          title: Line above them.
+          steps: The stages.
+        """
         self.say(title)
         for step in steps:
             self.step(step)
 
     def step(self, step: Step) -> None:
-        """Prints a line for a step."""
+        """Prints a line for a step.
+
+        Args:
+          step: The step.
+        """
         self.say(f"  {step.name:<16} {step.status:<9} {step.why}".rstrip())
 
     def done(self, name: str, seconds: float, fresh: bool) -> None:
-        """Prints the wall time of a stage that was computed in this run."""
+        """Prints the wall time of a stage that was computed in this run.
+
+        Args:
+          name: Name of the stage.
+          seconds: Its wall time.
+          fresh: Whether it was computed in this run.
+        """
         if fresh:
             self.say(f"  {name:<16} {'done':<9} {seconds:.1f} s")
 
     def say(self, text: str) -> None:
-        """Prints a line, above the bar if one is drawn."""
+        """Prints a line, above the bar if one is drawn.
+
+        Args:
+          text: The line.
+        """
         with _Bar.external_write_mode(file=self._out):
             print(text, file=self._out, flush=True)
 
     def note(self, text: str) -> None:
-        """Prints a sentence behind the word "note"."""
+        """Prints a sentence behind the word "note".
+
+        Args:
+          text: The sentence.
+        """
         self.say(f"  note: {text}")
 
     @contextlib.contextmanager
@@ -121,6 +159,9 @@ class Console(Listener):
 
         Args:
           name: Name of the step.
+
+        Yields:
+          A callback (done, total).
         """
         terminal = self._err.isatty()
         shown = (_Bar if terminal else _Lines)(name, self._err)

@@ -58,13 +58,14 @@ class Results:
             self.add(name, value)
 
     def add(self, stage: str, value: Any) -> None:
-        """Adds the result of a stage."""
+        """Adds the result of a stage.
+
+        Args:
+          stage: Name of the stage.
+          value: Its result.
+        """
         assert stage in Results.__annotations__, stage
         setattr(self, stage, value)
-
-    def select(self, names: Sequence[str]) -> dict[str, Any]:
-        """Returns the results of the named stages."""
-        return {name: getattr(self, name) for name in names}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,7 +100,14 @@ class RunContext:
     load: Callable[[], Capture] | None = None
 
     def key_options(self, *names: str) -> dict[str, Any]:
-        """Returns the named options, for the key of a stage."""
+        """Picks options for the key of a stage.
+
+        Args:
+          *names: Names of the options.
+
+        Returns:
+          Their values by name.
+        """
         return {name: getattr(self.options, name) for name in names}
 
 
@@ -120,16 +128,21 @@ class Checkpoint:
         return self._path.with_suffix("")
 
     def read(self) -> Any | None:
-        """Returns the last state, or None.
+        """Reads the last state.
 
-        A file that cannot be read costs only time: the stage starts again, to the same result.
+        Returns:
+          The state; None if there is none, or if its file cannot be read: the stage then starts again.
         """
         with contextlib.suppress(cache.CorruptCacheError):
             return cache.load(self._path) if self._path.exists() else None
         return None
 
     def keep(self, state: Callable[[], Any]) -> None:
-        """Writes `state()`, at most every CHECKPOINT_SECONDS."""
+        """Writes the state, at most every CHECKPOINT_SECONDS.
+
+        Args:
+          state: Returns the state; not called otherwise.
+        """
         if time.monotonic() - self._last >= CHECKPOINT_SECONDS:
             cache.save(self._path, state())
             self._last = time.monotonic()
@@ -197,7 +210,14 @@ class Stage:
         )
 
     def files_digest(self, context: RunContext) -> str | None:
-        """Digest of names, sizes and times of the input files."""
+        """Hashes names, sizes and times of the input files.
+
+        Args:
+          context: The run, whose output folder is skipped.
+
+        Returns:
+          16 hex digits; None if the stage reads no files.
+        """
         if self.files is None:
             return None
         paths = [self.files] if isinstance(self.files, Path) else self.files()
@@ -209,6 +229,9 @@ class Stage:
         Args:
           stage_input: What it computes from.
           files: Digest of the input files that is part of the key.
+
+        Returns:
+          The result.
 
         Raises:
           InputError: The input files changed meanwhile, so that the key does not describe the result.
@@ -223,7 +246,13 @@ class Stage:
 
 
 def training_frames(capture: Capture) -> np.ndarray:
-    """Returns the indices of the frames that may be fitted to.
+    """Lists the frames that may be fitted to.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      Ascending indices.
 
     Raises:
       InputError: There are fewer than two.
@@ -234,20 +263,31 @@ def training_frames(capture: Capture) -> np.ndarray:
 
 
 def vision_frames(capture: Capture, options: Options) -> np.ndarray:
-    """Returns the indices of the training frames in which masks are found and embedded.
+    """Lists the training frames in which masks are found and embedded.
+
+    Args:
+      capture: The capture.
+      options: Options of the run; `vision_frames` is the maximum.
+
+    Returns:
+      Ascending indices, evenly spaced among the training frames.
 
     Raises:
-      InputError: There are fewer than two.
+      InputError: There are fewer than two training frames.
     """
     train = training_frames(capture)
     return train[evenly_spaced(len(train), options.vision_frames)]
 
 
 def require_training(count: int, total: int) -> None:
-    """Checks that at least two of `total` frames may be fitted to.
+    """Checks that there are frames to fit to.
+
+    Args:
+      count: Number of training frames.
+      total: Number of frames.
 
     Raises:
-      InputError: There are fewer.
+      InputError: There are fewer than two training frames.
     """
     if count < 2:
         problem = f"{count} of {total} frames to work with"

@@ -130,41 +130,19 @@ class Run:
         return {step.name: step.why for step in self.steps if step.status == "skipped"}
 
 
-def run_stages(context: RunContext) -> list[Stage]:
-    """Plans the stages of a run in order. Mask files come before the long fit, so that their errors are found early."""
-    first = [stages.gaussians(context), stages.masklets(context)]
-    if context.options.masks is not None:
-        first.reverse()
-    parts = [stages.parts(context)] if context.options.parts else []
-    last = [plan(context) for plan in (stages.codes, stages.votes, stages.distil, stages.held_out)]
-    return [*stages.capture_stages(context), *first, stages.regions(context), *parts, *last]
-
-
-def fit_stages(context: RunContext) -> list[Stage]:
-    """Plans the stages that make and measure the scene."""
-    return [*stages.capture_stages(context), stages.gaussians(context), stages.held_out(context)]
-
-
 @dataclasses.dataclass(frozen=True)
-class Plan:
-    """What would run.
-
-    Attributes:
-      keys: Key of each stage.
-      files: Digest of each stage's input files, as it went into the key.
-      paths: Cache file of each stage.
-      stale: Stages whose result is stored and whose output folder is another run's.
-      steps: Stages, and what the options make needless.
-    """
+class _Plan:
+    """Which of the stages would run: their keys, digests of their input files, and cache files, by name."""
 
     keys: dict[str, str]
     files: dict[str, str | None]
     paths: dict[str, Path]
     stale: list[str]
+    """Stages whose result is stored and whose output folder is another run's."""
     steps: list[Step]
 
 
-def _plan(context: RunContext, stage_list: list[Stage], folder: Path) -> Plan:
+def _plan(context: RunContext, stage_list: list[Stage], folder: Path) -> _Plan:
     """Plans stages: which of them `folder` already holds. Writes no file; raises InputError for invalid options."""
     _require_inputs(context.options)
     _require_own_folder(context.options, context.out)
@@ -179,7 +157,7 @@ def _plan(context: RunContext, stage_list: list[Stage], folder: Path) -> Plan:
     cached = {name for name, path in paths.items() if path.exists() and name not in stale}
     steps = [Step(stage.name, "cached" if stage.name in cached else "run", stage.how) for stage in stage_list]
     steps += [Step(part, "skipped", why) for stage in stage_list for part, why in stage.skipped.items()]
-    return Plan(keys, files, paths, stale, steps)
+    return _Plan(keys, files, paths, stale, steps)
 
 
 def _require_inputs(options: Options) -> None:
@@ -254,6 +232,9 @@ def compute_stages(
       listener: Receives plan, progress and notes.
       coordinator: Calls the other processes of the run, if there are any.
 
+    Returns:
+      Results, keys, steps, times and notes of the stages.
+
     Raises:
       InputError: An option or input is invalid, or memory is full.
     """
@@ -307,7 +288,7 @@ def _duration(seconds: float) -> str:
 
 
 def _compute_stage(
-    context: RunContext, stage: Stage, plan: Plan, computed: Computed, listener: Listener, coordinator: Coordinator
+    context: RunContext, stage: Stage, plan: _Plan, computed: Computed, listener: Listener, coordinator: Coordinator
 ) -> None:
     """Computes one stage or reads it from the cache, and adds it to `computed`."""
     path, before = plan.paths[stage.name], compilation_counts()
@@ -361,13 +342,16 @@ def run(
       cache_folder: Folder of the cache; by default OUT/cache.
       coordinator: Calls the other processes of the run (`run_worker`), if there are any.
 
+    Returns:
+      The field, and what the run did.
+
     Raises:
       InputError: An option or input is invalid. Finished stages are kept.
     """
     listener, before = listener or Listener(), compilation_counts()
     folder = cache_folder or out / "cache"
     context = RunContext(options, networks.open_networks(options, folder), out, load)
-    computed = compute_stages(context, run_stages(context), folder, listener=listener, coordinator=coordinator)
+    computed = compute_stages(context, stages.run_stages(context), folder, listener=listener, coordinator=coordinator)
     results, embedder = computed.results, context.networks.embedder
     started = time.monotonic()
     with listener.progress("field"):
@@ -406,7 +390,7 @@ def current_field(options: Options, out: Path) -> Path | None:
     if not path.is_file():
         return None
     context = RunContext(options, networks.open_networks(options, out / "cache"), out)
-    keys = _plan(context, run_stages(context), out / "cache").keys
+    keys = _plan(context, stages.run_stages(context), out / "cache").keys
     try:
         provenance = json.loads(load_field(path, mapped=True).provenance)
     except (InputError, ValueError):  # damaged: the run writes it anew
@@ -415,9 +399,14 @@ def current_field(options: Options, out: Path) -> Path | None:
 
 
 def run_worker(options: Options, out: Path) -> None:
-    """Does the part of a run of every process but the first (`processes`)."""
+    """Does the part of a run of every process but the first (`processes`).
+
+    Args:
+      options: Options of the run.
+      out: Its output folder, where this process writes no file.
+    """
     context = RunContext(options, networks.open_networks(options, out / "cache"), out)
-    processes.run_worker(context, run_stages(context))
+    processes.run_worker(context, stages.run_stages(context))
 
 
 def dry_run(options: Options, out: Path, *, scene_only: bool = False, listener: Listener) -> dict[str, Any]:
@@ -437,7 +426,7 @@ def dry_run(options: Options, out: Path, *, scene_only: bool = False, listener: 
     """
     with listener.progress("plan"):
         context = RunContext(options, networks.open_networks(options, out / "cache"), out)
-        stage_list = fit_stages(context) if scene_only else run_stages(context)
+        stage_list = stages.fit_stages(context) if scene_only else stages.run_stages(context)
         plan = _plan(context, stage_list, out / "cache")
         running = [step.name for step in plan.steps if step.status == "run"]
         context.networks.require_ready(running)
@@ -538,7 +527,7 @@ def fit(options: Options, out: Path, *, listener: Listener | None = None) -> tup
       InputError: An option or input is invalid.
     """
     context = RunContext(options, networks.open_networks(options, out / "cache"), out)
-    results = compute_stages(context, fit_stages(context), out / "cache", listener=listener).results
+    results = compute_stages(context, stages.fit_stages(context), out / "cache", listener=listener).results
     return results.gaussians, results.load, results.held_out
 
 

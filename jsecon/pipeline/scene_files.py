@@ -59,6 +59,9 @@ _COLMAP_TO_NERFSTUDIO = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [
 def read_scene(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
     """Reads a file of Gaussians.
 
+    Args:
+      path: The file.
+
     Returns:
       The Gaussians (NumPy), and the notes of the reader.
 

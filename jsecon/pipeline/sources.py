@@ -31,7 +31,15 @@ class Sources(NamedTuple):
 
 
 def relative_folders(options: Options, out: Path) -> dict[str, str]:
-    """Returns the hints of a run: folders of options, relative to the output folder."""
+    """Makes the hints of a run for its field.
+
+    Args:
+      options: Options of the run.
+      out: Its output folder.
+
+    Returns:
+      Option ("embedder", "capture") -> its folder relative to `out`; models of the hub are left out.
+    """
     folders = {}
     for name in ("embedder", "capture"):
         folder = getattr(options, name)
@@ -44,7 +52,14 @@ def relative_folders(options: Options, out: Path) -> dict[str, str]:
 
 
 def hub_addresses(options: Options) -> dict[str, str]:
-    """The models of a run that come from the hub: option -> "hub:owner/name@commit"."""
+    """Finds the models of a run that come from the hub.
+
+    Args:
+      options: Options of the run.
+
+    Returns:
+      Option -> "hub:owner/name@commit".
+    """
     folders = {name: getattr(options, name) for name in ("segmenter", "tracker", "embedder")}
     addresses = {name: cached_address(folder) for name, folder in folders.items() if folder is not None}
     return {name: address for name, address in addresses.items() if address is not None}
@@ -56,6 +71,9 @@ def locate_sources(field: LanguageField, beside: Path | None = None) -> Sources:
     Args:
       field: The field.
       beside: Folder of its file; `load_field` has recorded it in a field that it read.
+
+    Returns:
+      Their places on this machine; None for what is not there.
 
     Raises:
       InputError: The provenance is not what a run writes.

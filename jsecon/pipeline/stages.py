@@ -1,4 +1,4 @@
-"""The stages of a run. A function without underscore plans a stage, the function below it computes the result.
+"""The stages of a run. A function `_plan_...` plans a stage, the function below it computes the result.
 
     poses, load, gaussians, masklets, regions, parts, codes, votes, distil, held_out
 
@@ -80,22 +80,67 @@ MIN_CLOUD_SPACING = 0.02
 Refinement = Literal["none", "poses", "exposure", "both", "auto"]
 
 
+def run_stages(context: RunContext) -> list[Stage]:
+    """Plans the stages of a run. Mask files come before the long fit, so that their errors are found early.
+
+    Args:
+      context: The run.
+
+    Returns:
+      The stages in order.
+
+    Raises:
+      InputError: An option is set that the input has no use for.
+    """
+    first = [_plan_gaussians(context), _plan_masklets(context)]
+    if context.options.masks is not None:
+        first.reverse()
+    parts = [_plan_parts(context)] if context.options.parts else []
+    last = [plan(context) for plan in (_plan_codes, _plan_votes, _plan_distil, _plan_held_out)]
+    return [*capture_stages(context), *first, _plan_regions(context), *parts, *last]
+
+
+def fit_stages(context: RunContext) -> list[Stage]:
+    """Plans the stages that make and measure the scene.
+
+    Args:
+      context: The run.
+
+    Returns:
+      The stages in order.
+
+    Raises:
+      InputError: As in `run_stages`.
+    """
+    return [*capture_stages(context), _plan_gaussians(context), _plan_held_out(context)]
+
+
 # Poses
 
 
 def capture_stages(context: RunContext) -> list[Stage]:
-    """Plans the capture, and before it the poses if there are photographs or a video without poses."""
+    """Plans the capture, and before it the poses if there are photographs or a video without poses.
+
+    Args:
+      context: The run.
+
+    Returns:
+      The stage "load", perhaps after "poses".
+
+    Raises:
+      InputError: An option is set that the input has no use for.
+    """
     bare = _is_bare(context)
     require_options_apply(context.options, bare=bare)
     if bare:
         return [planned_views(context)]
     if context.load is not None or not _is_unposed(context.options.capture):
-        return [load(context)]
-    stage = poses(context)
+        return [_plan_load(context)]
+    stage = _plan_poses(context)
     assert stage.output_dir is not None
     options = dataclasses.replace(context.options, capture=stage.output_dir)
     posed = dataclasses.replace(context, options=options)
-    plan = load(posed)
+    plan = _plan_load(posed)
 
     # The stage computes from the posed capture, whatever the context of the run says.
     def compute(stage_input):
@@ -114,7 +159,7 @@ def _is_unposed(capture: Path) -> bool:
     return len(unposed_photographs(capture)) > 0 if capture.is_dir() else is_video(capture)
 
 
-def poses(context: RunContext) -> Stage:
+def _plan_poses(context: RunContext) -> Stage:
     """Plans the poses of photographs or of a video's frames, as a COLMAP capture in OUT/poses."""
     capture, options = context.options.capture, context.options
     if is_video(capture):
@@ -146,13 +191,13 @@ def _find_poses(stage: StageInput) -> StageResult:
     shutil.rmtree(out, ignore_errors=True)
     shutil.move(posed, out)
     write_text(out / KEY_FILE, folder.name)
-    return StageResult(report, notes=(*report.notes(), f"The poses are in {out}: COLMAP opens them."))
+    return StageResult(report, notes=(*report.notes, f"The poses are in {out}: COLMAP opens them."))
 
 
 # The capture
 
 
-def load(context: RunContext) -> Stage:
+def _plan_load(context: RunContext) -> Stage:
     """Plans the capture at the size that the options ask for, corrected if they ask for that."""
     options = context.options
     key_options = context.key_options("downscale", "long_side", "frames", "holdout")
@@ -160,7 +205,7 @@ def load(context: RunContext) -> Stage:
     held_out = f"1 in {options.holdout} held out" if options.holdout else "none held out"
     how = f"{count}, {_size_words(options)}, {held_out}"
     key_options["loader"] = getattr(context.load, "__qualname__", None)
-    refine = refinement(context)
+    refine = _refinement(context)
     if refine != "none" or options.drop_frames != "none":
         key_options |= context.key_options("drop_frames", "seed") | {"refine": refine}
         if refine == "auto":
@@ -181,7 +226,7 @@ def _size_words(options: Options) -> str:
     return "full size" if options.downscale == 1 else f"{options.downscale:g} times smaller"
 
 
-def refinement(context: RunContext) -> Refinement:
+def _refinement(context: RunContext) -> Refinement:
     """What a run corrects of poses and exposures: "auto" only if depth and the data can still decide it."""
     options = context.options
     if options.refine != "auto":
@@ -206,7 +251,7 @@ def _load(stage: StageInput) -> StageResult:
     frames = f"{count} frames of {width}x{height} ({size}), {count - len(train)} of them held out"
     points = f"{len(capture.points)} sparse points{'' if capture.depths is None else ', depth'}"
     notes = (f"{frames}, {points}", *capture.notes)
-    refine = refinement(context)
+    refine = _refinement(context)
     if refine == "none" and options.drop_frames == "none":
         return StageResult(capture, notes=notes)
     better = _refine(capture, options, refine, stage.progress)
@@ -246,7 +291,7 @@ def _fit_steps(options: Options, capture: Capture) -> float:
 # The Gaussians
 
 
-def gaussians(context: RunContext) -> Stage:
+def _plan_gaussians(context: RunContext) -> Stage:
     """Plans the scene's Gaussians: of a file, brought into the capture's world, or fitted to the training frames."""
     if _is_bare(context):
         return scene_itself(context)
@@ -308,7 +353,7 @@ def _fit_gaussians(stage: StageInput) -> StageResult:
     return StageResult(fitted, notes=(*notes, f"{fitted.count} Gaussians after {len(losses)} steps"))
 
 
-def held_out(context: RunContext) -> Stage:
+def _plan_held_out(context: RunContext) -> Stage:
     """Plans PSNR and SSIM of the held-out frames."""
     if _is_bare(context):
         return no_photographs()
@@ -333,7 +378,7 @@ def _measure(stage: StageInput) -> StageResult:
 # The masklets
 
 
-def masklets(context: RunContext) -> Stage:
+def _plan_masklets(context: RunContext) -> Stage:
     """Plans the labels of the training frames: from mask files, or proposals associated over the frames."""
     options, networks, folder = context.options, context.networks, context.options.masks
     if folder is not None:
@@ -413,8 +458,16 @@ def frame_proposals(
 ) -> tuple[Callable[[int], np.ndarray], tuple[str, ...]]:
     """Opens the proposals of the frames: from files, by a segmenter, or by colour and texture.
 
+    Args:
+      context: The run.
+      capture: The capture.
+      gaussians: The scene, whose depth shapes coarse proposals without a model.
+
     Returns:
       A function of t that gives the masks (M, H, W) of the t-th training frame, and notes.
+
+    Raises:
+      InputError: The files of proposals belong to no frame.
     """
     options, train = context.options, vision_frames(capture, context.options)
     frames = np.asarray(capture.frames)[train]
@@ -513,7 +566,7 @@ def _require_regions(labels: np.ndarray, where: str) -> None:
 # The regions
 
 
-def regions(context: RunContext) -> Stage:
+def _plan_regions(context: RunContext) -> Stage:
     """Plans an embedding of each region: by the embedder, or from files."""
     options, embedder = context.options, context.networks.embedder
     after, key_options = ("load", "masklets"), context.key_options("weighting")
@@ -563,7 +616,7 @@ def _read_regions(stage: StageInput) -> StageResult:
     return StageResult(embedded, notes=notes)
 
 
-def parts(context: RunContext) -> Stage:
+def _plan_parts(context: RunContext) -> Stage:
     """Plans small parts of the scene, each with the embeddings of all single-frame masks that contain it."""
     key_options = context.key_options("seed", "level", "granularity", "centre")
     return Stage(
@@ -617,7 +670,7 @@ def _masks_with_embeddings(context: RunContext, results: Results) -> tuple[Calla
 # The codes
 
 
-def codes(context: RunContext) -> Stage:
+def _plan_codes(context: RunContext) -> Stage:
     """Plans the codes of the regions: their embeddings, compressed if they are longer than a code."""
     latent = context.options.latent
     auto = "as few numbers per region as keep them apart"
@@ -635,7 +688,7 @@ def _encode(stage: StageInput) -> StageResult:
     return StageResult((table, coder), {"autoencoder": reason})
 
 
-def votes(context: RunContext) -> Stage:
+def _plan_votes(context: RunContext) -> Stage:
     """Plans the weight of each region on each Gaussian over the training frames, with each frame's total."""
     return Stage(
         "votes",
@@ -668,7 +721,7 @@ def _accumulate_votes(stage: StageInput) -> StageResult:
     return StageResult(accumulated, skipped, notes)
 
 
-def distil(context: RunContext) -> Stage:
+def _plan_distil(context: RunContext) -> Stage:
     """Plans the codes of the Gaussians, from their votes."""
     how = f"a Gaussian's code is its votes' {context.options.reduce}"
     return Stage("distil", how, _distil, after=("votes", "codes"), key_options=context.key_options("reduce"))
@@ -682,7 +735,17 @@ def _distil(stage: StageInput) -> StageResult:
 
 
 def field_of(results: Results, embedder: Embedder, provenance: str, options: Options) -> LanguageField:
-    """Joins the results to a field. It has all views; in frames that vision left out no region has any pixels."""
+    """Joins the results of a run to a field.
+
+    Args:
+      results: Results of all stages.
+      embedder: The embedder of the run.
+      provenance: JSON for `LanguageField.provenance`.
+      options: Options of the run.
+
+    Returns:
+      The field. It has all views; in frames that vision left out no region has any pixels.
+    """
     capture, embedded = results.load, results.regions
     pixels = np.zeros((embedded.count, len(capture.names)), np.int32)
     pixels[:, vision_frames(capture, options)] = embedded.pixels

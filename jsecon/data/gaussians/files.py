@@ -184,7 +184,14 @@ def save_gaussians(
 
 
 def require_writable_format(path: Path) -> None:
-    """Raises InputError if files with the suffix of `path` cannot be written."""
+    """Checks that `save_gaussians` can write a file.
+
+    Args:
+      path: The file, which need not exist.
+
+    Raises:
+      InputError: Its suffix is not one of WRITTEN.
+    """
     if path.suffix.lower() not in WRITTEN:
         remedy = f"For example: {path.stem}.ply; npx @playcanvas/splat-transform makes other formats of it."
         raise InputError(path, f"its name ends in {path.suffix or 'no suffix'}", " or ".join(WRITTEN), remedy)

@@ -8,6 +8,7 @@ pygltflib is not used: it checks neither sizes nor strides, and reads and writes
 """
 
 import dataclasses
+import functools
 import json
 import math
 import struct
@@ -85,20 +86,7 @@ def save_glb(
     if needs_float64(gaussians, into):
         origin = np.median(next(transform_blocks(gaussians, into))[1].means, axis=0)
 
-    def blocks(source: Gaussians) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-        for rows, block in usable_blocks(path, source, into):
-            if block.log_scales.max() > _MAX_LOG_SCALE:
-                problem = f"a Gaussian is exp({block.log_scales.max():.4g}) units large"
-                raise InputError(path, problem, "at most exp(88) in a .glb", "Write a .ply, or scale the scene down.")
-            attributes = _attributes(dataclasses.replace(block, means=block.means - origin))
-            if codes is not None:
-                table = np.asarray(codes[rows])
-                attributes |= {f"_CODE_{n // 4}": table[:, n : n + 4] for n in range(0, table.shape[1], 4)}
-            if regions is not None:
-                attributes["_REGION"] = np.asarray(regions[rows])[:, None]
-            kinds = {name: np.uint8 if name == "COLOR_0" else "<f4" for name in attributes}
-            yield rows.start, {name: np.ascontiguousarray(a, kinds[name]) for name, a in attributes.items()}
-
+    blocks = functools.partial(_attribute_blocks, path, into, origin, codes, regions)
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for _, block in blocks(dataclasses.replace(gaussians, sh=gaussians.sh[:, :1])):
         low, high = np.minimum(low, block["POSITION"].min(0)), np.maximum(high, block["POSITION"].max(0))
@@ -139,6 +127,24 @@ def save_glb(
             for view, array in zip(views, block.values(), strict=True):
                 file.seek(body + view["byteOffset"] + start * array[:1].nbytes)
                 file.write(array.tobytes())
+
+
+def _attribute_blocks(
+    path: str | Path, into: np.ndarray, origin: np.ndarray, codes: Any, regions: Any, gaussians: Gaussians
+) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+    """Yields the attributes of Gaussians in blocks, as the file has them, after the number of the first Gaussian."""
+    for rows, block in usable_blocks(path, gaussians, into):
+        if block.log_scales.max() > _MAX_LOG_SCALE:
+            problem = f"a Gaussian is exp({block.log_scales.max():.4g}) units large"
+            raise InputError(path, problem, "at most exp(88) in a .glb", "Write a .ply, or scale the scene down.")
+        attributes = _attributes(dataclasses.replace(block, means=block.means - origin))
+        if codes is not None:
+            table = np.asarray(codes[rows])
+            attributes |= {f"_CODE_{n // 4}": table[:, n : n + 4] for n in range(0, table.shape[1], 4)}
+        if regions is not None:
+            attributes["_REGION"] = np.asarray(regions[rows])[:, None]
+        kinds = {name: np.uint8 if name == "COLOR_0" else "<f4" for name in attributes}
+        yield rows.start, {name: np.ascontiguousarray(a, kinds[name]) for name, a in attributes.items()}
 
 
 def _attributes(block: Gaussians) -> dict[str, np.ndarray]:

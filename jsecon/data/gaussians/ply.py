@@ -57,12 +57,22 @@ _LAYOUT = "3D Gaussians in INRIA's layout (x y z, f_dc_0..2, opacity, scale_0..2
 
 
 def ply_error(path: Path, problem: str, expected: str = "", remedy: str = "Export the file again.") -> InputError:
-    """The error of a .ply that cannot be read."""
+    """Makes the error of a .ply that cannot be read.
+
+    Args:
+      path: The file.
+      problem: What is wrong, as in InputError.
+      expected: What should be there.
+      remedy: What to do about it.
+
+    Returns:
+      The error.
+    """
     return InputError(path, problem, expected, remedy)
 
 
 @dataclasses.dataclass
-class Element:
+class _Element:
     """An element of a .ply."""
 
     name: str
@@ -93,7 +103,7 @@ class Header:
 
     form: str
     """One of ORDERS."""
-    elements: list[Element]
+    elements: list[_Element]
     comments: tuple[str, ...]
     start: int
     """Offset of the first byte after the header."""
@@ -121,7 +131,7 @@ def _parse_header(path: Path, data: bytes) -> Header:
             elif words[0] == "format":
                 form = words[1]
             elif words[0] == "element":
-                elements.append(Element(words[1], int(words[2]), [], {}))
+                elements.append(_Element(words[1], int(words[2]), [], {}))
                 if elements[-1].count < 0:
                     raise ValueError(words[2])
             elif words[0] == "property" and words[1] == "list":
@@ -152,14 +162,34 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
 
 
 def read_ply_file(path: Path) -> tuple[bytes, Header]:
-    """Reads a whole .ply: all its bytes, and its header. Raises InputError if it is not one."""
+    """Reads a whole .ply.
+
+    Args:
+      path: The file.
+
+    Returns:
+      All its bytes, and its header.
+
+    Raises:
+      InputError: It is not a .ply.
+    """
     with _opened(path) as file:
         data = file.read()
     return data, _parse_header(path, data)
 
 
 def read_header(path: Path) -> Header:
-    """Reads the header of a .ply and no more. Raises InputError if it is not one."""
+    """Reads the header of a .ply and no more.
+
+    Args:
+      path: The file.
+
+    Returns:
+      The header.
+
+    Raises:
+      InputError: It is not a .ply.
+    """
     with _opened(path) as file:
         data = file.read(1 << 16)
         while not _END.search(data) and len(data) < _MAX_HEADER and (more := file.read(len(data))):
@@ -182,7 +212,7 @@ def read_vertices(path: Path) -> np.ndarray:
     return next(_vertex_blocks(path, read_header(path), sys.maxsize)[1])
 
 
-def _vertex_blocks(path: Path, header: Header, rows: int) -> tuple[Element, Iterator[np.ndarray]]:
+def _vertex_blocks(path: Path, header: Header, rows: int) -> tuple[_Element, Iterator[np.ndarray]]:
     """Returns the element of the vertices, and the vertices in blocks of `rows` at most, one block at least.
 
     A binary file without lists before or in its vertices is read block by block.
@@ -220,7 +250,7 @@ def _read_blocks(path: Path, offset: int, dtype: np.dtype, count: int, rows: int
             yield np.frombuffer(data, dtype)
 
 
-def _read_irregular(path: Path, before: list[Element], vertex: Element) -> np.ndarray:
+def _read_irregular(path: Path, before: list[_Element], vertex: _Element) -> np.ndarray:
     """Reads the vertices of a text file, or of one with lists before or in its vertices."""
     data, header = read_ply_file(path)
     if header.form == "ascii":
@@ -252,7 +282,7 @@ def read_elements(path: Path) -> tuple[Header, dict[str, np.ndarray]]:
     return header, tables
 
 
-def _parse_rows(path: Path, data: bytes, offset: int, element: Element, order: str) -> tuple[np.ndarray, int]:
+def _parse_rows(path: Path, data: bytes, offset: int, element: _Element, order: str) -> tuple[np.ndarray, int]:
     """Returns the rows of a binary element without their lists, and the offset of their end."""
     dtype = element.dtype(order)
     if element.fixed:
@@ -286,7 +316,7 @@ def _truncated(path: Path, there: int, count: int, name: str = "vertex") -> Inpu
     return ply_error(path, f"the file is cut short: it holds {max(there, 0)} of {count} {rows}")
 
 
-def _parse_text(path: Path, body: bytes, skip: int, vertex: Element) -> np.ndarray:
+def _parse_text(path: Path, body: bytes, skip: int, vertex: _Element) -> np.ndarray:
     """Parses the vertices of a text file, whose first `skip` rows are those of other elements."""
     lines = [line for line in body.splitlines() if line.strip()][skip : skip + vertex.count]
     rows = [line.split() for line in lines]
@@ -309,7 +339,7 @@ def _parse_text(path: Path, body: bytes, skip: int, vertex: Element) -> np.ndarr
     return result
 
 
-def _without_lists(words: list[bytes], element: Element) -> list[bytes]:
+def _without_lists(words: list[bytes], element: _Element) -> list[bytes]:
     """The words of a line that are not part of a list."""
     kept, position = [], 0
     for _, kind in element.fields:
@@ -568,9 +598,14 @@ def save_ply(
 
 
 def needs_float64(gaussians: Gaussians, similarity: Float[Array, "4 4"] | None = None) -> bool:
-    """Whether float32 would round centres, after `similarity`, by more than a reader should see.
+    """Whether float32 would round centres by more than MAX_WRITE_ROUNDING of the size of more than 1 in 100 Gaussians.
 
-    That is by more than MAX_WRITE_ROUNDING of the size of more than 1 in 100 Gaussians.
+    Args:
+      gaussians: N Gaussians; may be memory-mapped.
+      similarity: (4, 4) transform that is applied first; None: none.
+
+    Returns:
+      False for float32 centres without a transform.
     """
     if similarity is None and gaussians.means.dtype != np.float64:
         return False
