@@ -5,7 +5,7 @@ import subprocess
 
 import pytest
 
-from jsecon.app.cli import completion_script
+from jsecon.app import cli
 
 TRY = """
 source {script}
@@ -22,10 +22,11 @@ def _shell(name):
 
 
 @pytest.fixture
-def script(tmp_path):
+def script(tmp_path, capsys):
     def made(shell):
         path = tmp_path / f"jsecon.{shell}"
-        path.write_text(completion_script(shell))
+        assert cli.main(["completion", shell]) == 0
+        path.write_text(capsys.readouterr().out)
         return path
 
     return made

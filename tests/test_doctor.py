@@ -22,6 +22,10 @@ def _lines(capsys, *options):
     return code, {line[9:19].strip(): (line[:8].strip(), line[20:]) for line in out.splitlines()}
 
 
+def _check(name):
+    return next(check for check in doctor.run_checks() if check.name == name)
+
+
 def test_it_tells_what_is_here_and_what_is_not(tmp_path, capsys, monkeypatch):
     write_clip(tmp_path / "clip", "immich")
     monkeypatch.setitem(doctor.EXTRAS, "sfm", (("no_such_module",), "poses"))
@@ -56,14 +60,14 @@ def test_what_every_run_needs_and_is_wrong_is_exit_code_2(capsys, monkeypatch):
 
 def test_a_package_that_cannot_be_imported(monkeypatch):
     monkeypatch.setattr(doctor, "PACKAGES", ("numpy", "no_such_module"))
-    check = doctor.check_packages()
+    check = _check("packages")
     assert check.status == "missing"
     assert "no_such_module (No module named" in check.message
-    assert [error.where for error in doctor.failures([check])] == ["packages"]
+    assert check.remedy
     monkeypatch.setattr(doctor, "PACKAGES", ("cv2",))
-    assert doctor.check_packages().status == "ok"
+    assert _check("packages").status == "ok"
     monkeypatch.delattr("cv2.ximgproc.createSuperpixelSLIC")
-    assert "without ximgproc" in doctor.check_packages().message
+    assert "without ximgproc" in _check("packages").message
 
 
 def test_it_knows_the_packages_and_extras_of_the_project():
@@ -77,14 +81,14 @@ def test_limits_of_a_cgroup_are_told(monkeypatch):
     files = {"memory.max": ["1073741824"], "memory.current": ["1000"], "cpu.max": ["50000", "100000"]}
     for module in (doctor, process):
         monkeypatch.setattr(module, "read_cgroup", lambda new, old: files.get(new, []))
-    memory, cores = doctor.check_memory(), doctor.check_cores()
+    memory, cores = _check("memory"), _check("cores")
     assert (memory.status, "limit 1.0 GiB (cgroup)" in memory.message) == ("wrong", True)
     assert "the time of 0.5 (cgroup)" in cores.message
 
 
 def test_a_disk_without_room_for_programs_is_told(tmp_path, monkeypatch):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "not" / "yet"))
-    assert doctor.check_programs().status == "ok"
+    assert _check("programs").status == "ok"
     monkeypatch.setattr(doctor, "MIN_CACHE_DISK", 1 << 60)
-    check = doctor.check_programs()
+    check = _check("programs")
     assert (check.status, "every run compiles further ones" in check.message) == ("missing", True)

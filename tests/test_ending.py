@@ -6,9 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from jsecon.app import cli, verbs
-from jsecon.app.cli import finish
-from jsecon.app.verbs import Output
+from jsecon.app import cli
 from jsecon.errors import InputError, describe_error
 
 PARTS = {"where": "mug.png", "problem": "text", "expected": "a picture", "remedy": "Draw one."}
@@ -19,20 +17,36 @@ def _errors():
     return [InputError("cup.png", "nothing", "a picture", "Draw it."), InputError(*PARTS.values())]
 
 
-def test_figures_and_paths_are_one_object(capsys):
-    assert finish(Output(json=True), {"written": {"field": Path("out/field.safetensors")}, "gaussians": 3}) == 0
+@pytest.fixture
+def end(monkeypatch):
+    """Runs a verb that has a given result or raises a given error."""
+
+    def run(outcome, *options):
+        def act(verb, console):
+            if isinstance(outcome, BaseException):
+                raise outcome
+            return dict(outcome)
+
+        monkeypatch.setattr("jsecon.app.models.models_verb", act)
+        return cli.main(["models", "list", *options])
+
+    return run
+
+
+def test_figures_and_paths_are_one_object(end, capsys):
+    assert end({"written": {"field": Path("out/field.safetensors")}, "gaussians": 3}, "--json") == 0
     assert json.loads(capsys.readouterr().out) == {"written": {"field": "out/field.safetensors"}, "gaussians": 3}
-    assert finish(Output(), {"gaussians": 3}) == 0
+    assert end({"gaussians": 3}) == 0
     assert capsys.readouterr() == ("", "")
 
 
-def test_what_was_refused_is_told_beside_what_was_not(capsys):
-    assert finish(Output(json=True), {"answers": [1], "errors": _errors()}) == 2
+def test_what_was_refused_is_told_beside_what_was_not(end, capsys):
+    assert end({"answers": [1], "errors": _errors()}, "--json") == 2
     out, err = capsys.readouterr()
     told = json.loads(out)
     assert told["error"] == told["errors"][1] == ERROR
     assert (told["errors"][0]["where"], told["answers"], err) == ("cup.png", [1], "")
-    assert finish(Output(), {"errors": _errors()}) == 2
+    assert end({"errors": _errors()}) == 2
     out, err = capsys.readouterr()
     assert out == ""
     assert [line.split(":")[1] for line in err.splitlines()] == [" cup.png", " mug.png"]
@@ -64,14 +78,7 @@ def test_debug_shows_where_an_error_came_from(tmp_path, capsys, monkeypatch):
     assert os.environ["JAX_TRACEBACK_FILTERING"] == "off"
 
 
-def test_a_stop_and_a_bug_are_error_objects_with_their_own_codes(tmp_path, monkeypatch, capsys):
-    def fails(error):
-        def act(asked, console):
-            raise error
-
-        monkeypatch.setitem(cli._VERBS, "models", (act, verbs.Models))
-        return cli.main(["models", "check", str(tmp_path), "--json"])
-
+def test_a_stop_and_a_bug_are_error_objects_with_their_own_codes(end, capsys):
     def within(stop):  # as a library that tidies up after a stop, and fails in that
         error = InputError("a file", "half of it", "all of it", "Fetch it again.")
         error.__context__ = RuntimeError("cannot release un-acquired lock")
@@ -79,15 +86,15 @@ def test_a_stop_and_a_bug_are_error_objects_with_their_own_codes(tmp_path, monke
         return error
 
     for error in (KeyboardInterrupt(), within(KeyboardInterrupt())):
-        assert fails(error) == 130
+        assert end(error, "--json") == 130
         assert (
             json.loads(capsys.readouterr().out)["error"]["message"]
             == "interrupted. Run the same command again to resume."
         )
-    assert fails(within(None)) == 2
+    assert end(within(None), "--json") == 2
     assert json.loads(capsys.readouterr().out)["error"]["problem"] == "half of it"
     with pytest.raises(ZeroDivisionError):
-        fails(ZeroDivisionError("a bug"))
+        end(ZeroDivisionError("a bug"), "--json")
     assert json.loads(capsys.readouterr().out)["error"]["problem"] == "internal error: a bug"
 
 

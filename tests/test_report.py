@@ -10,7 +10,6 @@ import pytest
 from browser import CHROMIUM, dumped
 
 from jsecon.app import pictures, report
-from jsecon.pipeline.progress import Step
 
 
 class _Reader(HTMLParser):
@@ -45,22 +44,22 @@ def page():
             report.section(
                 "Frames", "words", report.grid([report.figure(_image(), "<b>x</b>", strong="IoU 0.5", sharp=True)], 2)
             ),
-            report.section("Plan", "", report.steps([Step("photometric fit", "skipped", "a .ply is given")])),
             report.section("Seconds", "", report.bars({"load": 1.0, "fit": 3.0}, {"fit": "12 <b>programs</b>"})),
             report.section(
                 "Answers", "", report.grid([report.pair(_image(), _image(1), "mask", strong="<i>mug</i>")], 1)
             ),
-            report.search_box("Search"),
             report.cards(
-                report.card(_image(), name, "words", report.grid([report.figure(_image(), "view")], 3), search=name)
-                for name in ("red <mug>", "blue mug")
+                [
+                    report.card(_image(), name, "words", report.grid([report.figure(_image(), "view")], 3), search=name)
+                    for name in ("red <mug>", "blue mug")
+                ],
+                "Search",
             ),
-            report.wide(_image(), "in 3 of 4 frames", strong="region 7"),
+            report.figure(_image(), "in 3 of 4 frames", strong="region 7", wide=True),
             report.film(b"RIFF", "a film"),
             report.shades(["text", "votes", "code"], [("red <mug>", [0.5, None]), ("mean", [1.0, 0.0])]),
             report.folded("the others & more", report.table(["c"], [["d"]])),
             report.table(["a", "b"], [[1, "<script>"]]),
-            report.preformatted("{}"),
         ],
     )
 

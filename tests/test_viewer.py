@@ -43,7 +43,7 @@ def free_port() -> int:
 def viewer(scene, cameras):
     field, _ = make_field(scene, cameras, dim=ColourEmbedder().dim)
     field = dataclasses.replace(field, votes=with_overlap(field.votes), embedder=ColourEmbedder.name)
-    port, state = free_port(), view_state.with_texts(ViewState(), START)
+    port, state = free_port(), ViewState().with_texts(START)
     viewer = open_viewer(field, ColourEmbedder(), host="127.0.0.1", port=port, name="<desk>", state=state)
     yield viewer
     viewer.stop()
@@ -83,7 +83,7 @@ def colours(viewer: Viewer) -> np.ndarray:
 def test_a_text_lights_up(viewer):
     base, word = colours(viewer), word_of(viewer)
     before = [handle.buffer.copy() for _, handle in viewer.scene._groups]
-    settled(viewer, lambda: viewer.then(lambda s: view_state.with_texts(s, word)))
+    settled(viewer, lambda: viewer.then(lambda s: s.with_texts(word)))
     mask = viewer.answer(view_state.ViewQuery(word)).mask
     lit = colours(viewer)
     assert (lit[~mask, :3].astype(int) <= base[~mask, :3]).all()
@@ -96,7 +96,7 @@ def test_a_text_lights_up(viewer):
 
 def test_a_relation_lights_up_and_says_how_it_was_read(viewer):
     word = word_of(viewer)
-    settled(viewer, lambda: viewer.then(lambda s: view_state.with_texts(s, f"the largest {word}; {word} across")))
+    settled(viewer, lambda: viewer.then(lambda s: s.with_texts(f"the largest {word}; {word} across")))
     assert viewer.answer(view_state.ViewQuery(f"the largest {word}")).mask.any()
     assert f"read as &#x27;{word}&#x27;, largest: 1 object" in viewer.panel._messages.content
 
@@ -104,23 +104,23 @@ def test_a_relation_lights_up_and_says_how_it_was_read(viewer):
 def test_show_only_hide_and_undo(viewer):
     word, opacity = word_of(viewer), colours(viewer)[:, 3]
     mask = viewer.answer(view_state.ViewQuery(word)).mask
-    settled(viewer, lambda: viewer.then(lambda s: view_state.with_texts(s, word)))
-    settled(viewer, lambda: viewer.then(view_state.isolate))
+    settled(viewer, lambda: viewer.then(lambda s: s.with_texts(word)))
+    settled(viewer, lambda: viewer.then(ViewState.isolate))
     np.testing.assert_array_equal(colours(viewer)[:, 3], np.where(mask, opacity, 0))
     settled(viewer, viewer.undo)
     np.testing.assert_array_equal(colours(viewer)[:, 3], opacity)
-    settled(viewer, lambda: viewer.then(view_state.hide))
+    settled(viewer, lambda: viewer.then(ViewState.hide))
     np.testing.assert_array_equal(colours(viewer)[:, 3], np.where(mask, 0, opacity))
-    assert settled(viewer, lambda: viewer.then(view_state.show_all)) == ViewState()
+    assert settled(viewer, lambda: viewer.then(ViewState.show_all)) == ViewState()
 
 
 @pytest.mark.parametrize("paint", view_state.COLOURINGS)
 def test_every_paint(viewer, paint):
-    settled(viewer, lambda: viewer.then(lambda s: view_state.with_controls(s, colouring=paint)))
+    settled(viewer, lambda: viewer.then(lambda s: s.with_controls(colouring=paint)))
     told = colours(viewer)
     kinds = len(np.unique(told[:, :3], axis=0))
     assert kinds == 1 if paint == "score" else kinds > 2
-    settled(viewer, lambda: viewer.then(lambda s: view_state.with_texts(s, word_of(viewer))))
+    settled(viewer, lambda: viewer.then(lambda s: s.with_texts(word_of(viewer))))
     assert (colours(viewer)[:, :3] != told[:, :3]).any()
 
 
@@ -133,7 +133,7 @@ def test_part_or_whole_changes_what_a_region_takes(viewer):
 
 
 def test_odd_texts_and_links_are_told_and_change_nothing(viewer):
-    state = settled(viewer, lambda: viewer.then(lambda s: view_state.with_texts(s, "the meaning of life; black or ''")))
+    state = settled(viewer, lambda: viewer.then(lambda s: s.with_texts("the meaning of life; black or ''")))
     assert len(state.queries) == 2
     told = viewer.panel._messages.content
     assert "no colour word" in told
@@ -144,9 +144,9 @@ def test_odd_texts_and_links_are_told_and_change_nothing(viewer):
     assert "Copy the whole line" in viewer.panel._notice.content
     assert viewer.history.state == state
     np.testing.assert_array_equal(colours(viewer), before)
-    settled(viewer, lambda: viewer.then(lambda s: view_state.with_texts(s, "<script>alert(1)</script> red")))
+    settled(viewer, lambda: viewer.then(lambda s: s.with_texts("<script>alert(1)</script> red")))
     assert "<script>" not in viewer.panel._messages.content
-    settled(viewer, lambda: viewer.then(lambda s: view_state.toggle_region(s, 4000)))
+    settled(viewer, lambda: viewer.then(lambda s: s.toggle_region(4000)))
     assert "no match" in viewer.panel._messages.content
 
 
@@ -154,7 +154,7 @@ def test_an_error_inside_is_told_and_the_viewer_goes_on(viewer, capsys):
     settled(viewer, lambda: viewer.then(lambda s: 1 / 0))
     assert "The terminal shows its trace" in viewer.panel._notice.content
     assert "ZeroDivisionError" in capsys.readouterr().err
-    assert settled(viewer, lambda: viewer.then(lambda s: view_state.toggle_region(s, 1))).queries == (1,)
+    assert settled(viewer, lambda: viewer.then(lambda s: s.toggle_region(1))).queries == (1,)
 
 
 def test_files_of_the_answers(viewer, tmp_path):

@@ -16,22 +16,13 @@ from jsecon.app.viewer.view_state import (
     ViewState,
     answer_colours,
     from_link,
-    hide,
     highlight,
-    isolate,
-    replace_match,
     score_colours,
-    show_all,
-    text_line,
-    to_link,
-    toggle_region,
     visible_gaussians,
-    with_controls,
-    with_texts,
 )
 from jsecon.errors import InputError
 
-MUG = with_texts(ViewState(), "red mug")
+MUG = ViewState().with_texts("red mug")
 
 texts = st.text(min_size=1, max_size=30).filter(str.strip)
 things = st.lists(texts | st.integers(0, 10_000), max_size=5).map(tuple)
@@ -43,84 +34,84 @@ parts_of_states = st.tuples(things, part, part, st.booleans(), st.sampled_from(C
 
 
 def test_a_line_asks_for_each_text_once():
-    state = with_texts(ViewState(queries=(7,)), " red mug ;; blue bowl;red mug; ")
+    state = ViewState(queries=(7,)).with_texts(" red mug ;; blue bowl;red mug; ")
     assert state.queries == ("red mug", "blue bowl")
-    assert text_line(state) == "red mug; blue bowl"
-    assert with_texts(state, " ; ").queries == ()
-    assert len(with_texts(state, ";".join(map(str, range(99)))).queries) == MAX_QUERIES
+    assert state.text_line == "red mug; blue bowl"
+    assert state.with_texts(" ; ").queries == ()
+    assert len(state.with_texts(";".join(map(str, range(99)))).queries) == MAX_QUERIES
 
 
 def test_a_click_lights_up_takes_away_and_adds():
-    state = toggle_region(MUG, 3)
+    state = MUG.toggle_region(3)
     assert state.queries == (3,)
-    assert toggle_region(state, 3).queries == ()
-    assert toggle_region(MUG, 3, add=True).queries == ("red mug", 3)
-    both = toggle_region(state, 4, add=True)
+    assert state.toggle_region(3).queries == ()
+    assert MUG.toggle_region(3, add=True).queries == ("red mug", 3)
+    both = state.toggle_region(4, add=True)
     assert both.queries == (3, 4)
-    assert toggle_region(both, 3, add=True).queries == (4,)
-    assert toggle_region(both, 3).queries == (3,)
+    assert both.toggle_region(3, add=True).queries == (4,)
+    assert both.toggle_region(3).queries == (3,)
     full = ViewState(queries=tuple(range(MAX_QUERIES)))
-    assert toggle_region(full, 99, add=True).queries == (*range(1, MAX_QUERIES), 99)
+    assert full.toggle_region(99, add=True).queries == (*range(1, MAX_QUERIES), 99)
 
 
 def test_another_candidate_takes_the_place_of_its_thing():
-    state = with_texts(ViewState(), "a; b; c")
-    assert replace_match(state, 1, 5).queries == ("a", 5, "c")
-    assert replace_match(ViewState(queries=("a", 5)), 0, 5).queries == (5,)
+    state = ViewState().with_texts("a; b; c")
+    assert state.replace_match(1, 5).queries == ("a", 5, "c")
+    assert ViewState(queries=("a", 5)).replace_match(0, 5).queries == (5,)
 
 
 def test_controls_apply_to_all_that_is_lit_up_and_stay_within_their_ends():
-    state = with_controls(with_texts(MUG, "a; b"), threshold=0.7, part_vs_whole=2, all_matches=True, colouring="code")
+    state = MUG.with_texts("a; b").with_controls(threshold=0.7, part_vs_whole=2, all_matches=True, colouring="code")
     assert state.view_queries == (ViewQuery("a", 0.7, 1.0, True), ViewQuery("b", 0.7, 1.0, True))
     assert state.colouring == "code"
-    assert with_controls(state, threshold=-1).threshold == 0
-    grown = with_controls(MUG, shells=-2)
-    assert from_link(to_link(grown)).view_queries == (ViewQuery("red mug", shells=-2),)
+    assert state.with_controls(threshold=-1).threshold == 0
+    grown = MUG.with_controls(shells=-2)
+    assert from_link(grown.link).view_queries == (ViewQuery("red mug", shells=-2),)
 
 
 def test_only_and_hidden_keep_how_they_were_asked():
-    only = isolate(with_controls(MUG, threshold=0.7))
+    only = MUG.with_controls(threshold=0.7).isolate()
     assert only.isolated == (ViewQuery("red mug", 0.7),)
     assert only.queries == MUG.queries
-    assert with_controls(only, threshold=0.2).isolated == (ViewQuery("red mug", 0.7),)
-    assert isolate(with_texts(only, "")) == with_texts(only, "")
-    gone = hide(MUG)
+    assert only.with_controls(threshold=0.2).isolated == (ViewQuery("red mug", 0.7),)
+    assert only.with_texts("").isolate() == only.with_texts("")
+    gone = MUG.hide()
     assert gone.queries == ()
     assert gone.hidden == (ViewQuery("red mug"),)
-    again = hide(toggle_region(gone, 4))
+    again = gone.toggle_region(4).hide()
     assert again.hidden == (ViewQuery("red mug"), ViewQuery(4))
-    assert hide(with_texts(again, "red mug")).hidden == again.hidden
-    assert show_all(isolate(toggle_region(again, 1))) == ViewState(queries=(1,))
+    assert again.with_texts("red mug").hide().hidden == again.hidden
+    assert again.toggle_region(1).isolate().show_all() == ViewState(queries=(1,))
 
 
 def test_undo_leads_back_and_a_slider_is_one_step():
     history = History().then(MUG)
     for value in (0.6, 0.7, 0.8):
-        history = history.then(with_controls(history.state, threshold=value))
+        history = history.then(history.state.with_controls(threshold=value))
     assert len(history.past) == 2
     assert history.then(history.state) is history
     for change in ({"part_vs_whole": 0.1}, {"threshold": 0.9}, {"threshold": 0.7}):
-        history = history.then(with_controls(history.state, **change))
+        history = history.then(history.state.with_controls(**change))
     expected = [{"threshold": 0.8, "part_vs_whole": 0.1}, {"threshold": 0.8}, {}]
-    for state in (*(with_controls(MUG, **controls) for controls in expected), ViewState(), ViewState()):
+    for state in (*(MUG.with_controls(**controls) for controls in expected), ViewState(), ViewState()):
         history = history.back()
         assert history.state == state
     long = History()
     for k in range(300):
-        long = long.then(toggle_region(ViewState(), k))
+        long = long.then(ViewState().toggle_region(k))
     assert len(long.past) == MAX_UNDO
 
 
 @given(parts_of_states)
 def test_a_link_keeps_the_state(parts):
     state = ViewState(*parts)
-    assert from_link(to_link(state)) == state
-    assert "\n" not in to_link(state)
+    assert from_link(state.link) == state
+    assert "\n" not in state.link
 
 
 def test_a_link_holds_only_what_is_not_as_usual():
-    assert to_link(ViewState()) == "{}"
-    assert json.loads(to_link(with_texts(ViewState(), "blaue Tasse ä"))) == {"queries": ["blaue Tasse ä"]}
+    assert ViewState().link == "{}"
+    assert json.loads(ViewState().with_texts("blaue Tasse ä").link) == {"queries": ["blaue Tasse ä"]}
 
 
 @pytest.mark.parametrize(
@@ -176,6 +167,6 @@ def test_scores_as_colours():
 
 
 def test_states_are_values():
-    assert len({MUG, with_texts(ViewState(), "red mug"), ViewState()}) == 2
+    assert len({MUG, ViewState().with_texts("red mug"), ViewState()}) == 2
     with pytest.raises(dataclasses.FrozenInstanceError):
         MUG.colouring = "code"  # type: ignore[misc]

@@ -18,43 +18,35 @@ TOKEN = "JSECON_TOKEN"
 """environment variable with the token, used without --token"""
 
 
-def is_loopback(host: str) -> bool:
-    """Returns whether a host is this machine and cannot be reached by others: localhost, 127.0.0.0/8 or ::1.
-
-    Args:
-      host: Name or address.
-    """
+def _is_loopback(host: str) -> bool:
+    """Returns whether a host is this machine and cannot be reached by others: localhost, 127.0.0.0/8 or ::1."""
     try:
         return ipaddress.ip_address(host.strip("[]").partition("%")[0]).is_loopback
     except ValueError:
         return host.rstrip(".").lower() == "localhost"
 
 
-def host_of(header: str) -> str:
-    """Reads the host of a Host header or an Origin.
-
-    Args:
-      header: Value of the header.
-
-    Returns:
-      The host in lower case, without port and brackets; "" if the header has no host.
-    """
+def _host_of(header: str) -> str:
+    """Returns the host of a Host header in lower case, without port and brackets; "" if the header has no host."""
     try:
-        name = urlsplit(header if "://" in header else f"//{header}").hostname
+        name = urlsplit(f"//{header}").hostname
     except ValueError:
         return ""
     return (name or "").rstrip(".")
 
 
 def is_allowed_host(header: str, hosts: Collection[str]) -> bool:
-    """Returns whether a Host header names this machine.
+    """Checks whether a Host header names this machine.
 
     Args:
       header: Value of the header.
       hosts: Names of this machine besides those of loopback.
+
+    Returns:
+      Whether it does.
     """
-    host = host_of(header)
-    return bool(host) and (is_loopback(host) or host in {host_of(bracketed(name)) for name in hosts})
+    host = _host_of(header)
+    return bool(host) and (_is_loopback(host) or host in {_host_of(bracketed(name)) for name in hosts})
 
 
 def token_matches(sent: str | bytes, token: str) -> bool:
@@ -63,13 +55,16 @@ def token_matches(sent: str | bytes, token: str) -> bool:
     Args:
       sent: Token of the request.
       token: The right token.
+
+    Returns:
+      Whether they are equal.
     """
     sent = sent.encode("utf-8", "surrogateescape") if isinstance(sent, str) else sent
     return hmac.compare_digest(sent, token.encode("utf-8", "surrogateescape"))
 
 
 def token_for(host: str, token: str) -> str:
-    """Returns the token that clients must have.
+    """Finds the token that clients must have.
 
     Args:
       host: Address to listen on.
@@ -82,7 +77,7 @@ def token_for(host: str, token: str) -> str:
       InputError: Others can reach the host, and there is no token.
     """
     token = token or os.environ.get(TOKEN, "")
-    if not token and not is_loopback(host):
+    if not token and not _is_loopback(host):
         problem = f"others can reach {host}, so there must be a token that clients must have"
         raise InputError("--host", problem, remedy="Set --token, or leave --host out to listen on 127.0.0.1 alone.")
     return token
@@ -94,6 +89,9 @@ def listen(host: str, port: int) -> socket.socket:
     Args:
       host: Name or address of this machine.
       port: Port; 0 takes a free one.
+
+    Returns:
+      The socket.
 
     Raises:
       InputError: The address cannot be used.
@@ -109,5 +107,12 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def bracketed(host: str) -> str:
-    """Returns a host as it stands in a URL: IPv6 addresses in brackets."""
+    """Writes a host as it stands in a URL.
+
+    Args:
+      host: Name or address.
+
+    Returns:
+      The host, an IPv6 address in brackets.
+    """
     return f"[{host}]" if ":" in host and not host.startswith("[") else host

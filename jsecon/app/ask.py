@@ -115,7 +115,14 @@ class _Match(NamedTuple):
 
 
 def quantile_message(quantile: float) -> str:
-    """Describes a quantile among unrelated words in whole percent, rounded down."""
+    """Describes how a text compares with unrelated words.
+
+    Args:
+      quantile: Share of unrelated words that are less similar to the scene, 0 to 1.
+
+    Returns:
+      A clause with whole percent, rounded down.
+    """
     return f"more similar than {int(100 * quantile + 1e-6)} % of unrelated words"
 
 
@@ -242,10 +249,10 @@ def ask_outline(
     frames = [frame_index(field, frame) for frame in outlines]
     masks = np.stack([np.asarray(mask).astype(int) for mask in outlines.values()])
     selection = lift(field, masks, frames, threshold=SHARE_THRESHOLD if threshold is None else threshold)
-    answer = Answer(
-        name, "outline", selection, np.asarray(selection.mask), {"text encoder": "the outline is the query"}
-    )
-    return drop_outliers(field, dataclasses.replace(answer, key=name if key is None else key), outliers)
+    skipped = {"text encoder": "the outline is the query"}
+    key = name if key is None else key
+    answer = Answer(name, "outline", selection, np.asarray(selection.mask), skipped, key=key)
+    return drop_outliers(field, answer, outliers)
 
 
 def _match_text(
@@ -500,7 +507,14 @@ def ask_each(
 
 
 def collect(queries: Sequence[Callable[[], T]]) -> tuple[list[T], list[InputError]]:
-    """Calls functions, and returns their results and the InputErrors of those that fail."""
+    """Calls functions. One that fails does not stop the others.
+
+    Args:
+      queries: Functions without arguments.
+
+    Returns:
+      The results, and the InputErrors of the functions that fail.
+    """
     results: list[T] = []
     errors: list[InputError] = []
     for query in queries:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 
+from jsecon.app.locate import gaussian_rows
 from jsecon.errors import InputError
 from jsecon.language.columns import vote_blocks
 from jsecon.language.membership import SHARE_THRESHOLD, membership_probability, vote_shares
@@ -89,11 +90,22 @@ class Catalogue:
         return len(self.parent)
 
     def mask(self, index: int | np.integer) -> Bool[np.ndarray, " n"]:
-        """(N,) Gaussians of an object: of a whole also those of its parts."""
+        """Selects the Gaussians of an object.
+
+        Args:
+          index: Id of the object.
+
+        Returns:
+          (N,) bool; of a whole also the Gaussians of its parts.
+        """
         return self.labels == index if self.parent[index] < 0 else self.part_labels == index
 
     def to_dict(self) -> dict[str, list[Any]]:
-        """Returns a column of plain values for each figure, as `pandas.DataFrame` takes them."""
+        """Makes a table, as `pandas.DataFrame` takes it.
+
+        Returns:
+          Name of a column -> K plain values. "length", "width" and "height" are sides of the oriented box.
+        """
         columns: dict[str, Any] = {"id": np.arange(len(self)), "parent": self.parent}
         for n in range(NAMES):
             suffix = f"_{n + 1}" if n else ""
@@ -245,10 +257,10 @@ def _groups(field: LanguageField, main: np.ndarray, up: np.ndarray) -> Int[np.nd
     means = np.asarray(field.gaussians.means, np.float64)
     centers = {region: means[own].mean(0) for region, own in rows.items() if len(own) >= MIN_SAMPLES}
     reach = {region: np.linalg.norm(means[rows[region]] - c, axis=1).max() for region, c in centers.items()}
-    plain = jax.tree.map(np.asarray, dataclasses.replace(field.gaussians, sh=None))
+    plain = dataclasses.replace(field.gaussians, sh=None)
 
     def shape_of(*regions: int) -> ObjectShapes:
-        taken = jax.tree.map(lambda column: column[np.concatenate([rows[region] for region in regions])], plain)
+        taken = gaussian_rows(plain, np.concatenate([rows[region] for region in regions]))
         return object_shapes(taken.means, np.zeros(taken.count, int), up, spreads=gaussian_spreads(taken))
 
     shape = functools.cache(shape_of)
@@ -337,7 +349,7 @@ def _shapes(
     chosen = np.concatenate([np.flatnonzero(labels >= 0), np.flatnonzero(part_labels >= 0)])
     own = np.concatenate([labels[labels >= 0], part_labels[part_labels >= 0]])
     plain = dataclasses.replace(field.gaussians, sh=field.gaussians.sh[:, :1])  # the place does not need colours
-    taken = jax.tree.map(lambda column: np.asarray(column)[chosen], plain)
+    taken = gaussian_rows(plain, chosen)
     placed = transform_gaussians_float64(taken, field.to_source)
     to_source = np.asarray(field.to_source, np.float64)
     means = np.asarray(taken.means, np.float64) @ to_source[:3, :3].T + to_source[:3, 3]

@@ -92,15 +92,15 @@ def main(argv: Sequence[str] | None = None) -> int:
             remedy = "Run the same command again to resume."
             print(f"\njsecon: interrupted. {remedy}", file=sys.stderr)
             result = {"error": InputError("", "interrupted", remedy=remedy)}
-            return finish(output, result, 130)
+            return _finish(output, result, 130)
         if isinstance(error, InputError):
-            return finish(output, {"errors": [error]})
+            return _finish(output, {"errors": [error]})
         # a bug, whose trace the interpreter prints
         remedy = "Report it with the trace on standard error."
-        finish(output, {"error": InputError("jsecon", f"internal error: {describe_error(error)}", remedy=remedy)})
+        _finish(output, {"error": InputError("jsecon", f"internal error: {describe_error(error)}", remedy=remedy)})
         raise
     then = result.pop("then", lambda: None)
-    code = finish(output, result)
+    code = _finish(output, result)
     with contextlib.suppress(KeyboardInterrupt):  # so a server ends
         then()
     return code
@@ -192,7 +192,11 @@ def _first_sentence(text: str) -> str:
 
 
 def verbs() -> tuple[str, ...]:
-    """Returns the names of the verbs."""
+    """Lists the verbs.
+
+    Returns:
+      Their names.
+    """
     return tuple(_VERBS)
 
 
@@ -243,17 +247,8 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__ or error.__context__
 
 
-def finish(output: Output, result: VerbResult, code: int = 0) -> int:
-    """Prints the errors of a verb, and with --json its result, in which the last error is "error".
-
-    Args:
-      output: Options of the output.
-      result: Result of the verb.
-      code: Exit code if no error is in the result.
-
-    Returns:
-      The exit code: 2 if the result has errors.
-    """
+def _finish(output: Output, result: VerbResult, code: int = 0) -> int:
+    """Prints errors, and with --json the result, with the last error as "error"; returns 2 if there are any."""
     errors = result.get("errors", ())
     for error in errors:
         if output.debug:
@@ -276,28 +271,18 @@ def _to_json(value: Any) -> Any:
     return vars(value) if dataclasses.is_dataclass(value) else str(value)
 
 
-def completion_script(shell: str) -> str:
-    """Makes the script that completes verbs, options, choices and paths in a shell.
+def _completion(verb: Completion, console: Console) -> VerbResult:
+    """Prints the script that completes verbs, options, choices and paths in a shell.
 
     shtab makes it from tyro's parser. The scripts of tyro 1.0 itself do not complete positional arguments, such as the
     path of a capture, and start Python at each key press.
-
-    Args:
-      shell: "bash", "zsh" or "fish".
-
-    Returns:
-      The script.
     """
     import shtab
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # tyro names no other way to a parser
         parser: Any = tyro.extras.get_parser(_all_verbs(), prog="jsecon", config=MARKERS)
-    return shtab.complete(parser, shell)
-
-
-def _completion(verb: Completion, console: Console) -> VerbResult:
-    script = completion_script(verb.shell)
+    script = shtab.complete(parser, verb.shell)
     console.say(script)
     return {"shell": verb.shell, "script": script}
 

@@ -6,7 +6,6 @@ import importlib.util
 import os
 import platform
 import shutil
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
@@ -21,28 +20,12 @@ MIN_DISK = 200 << 20
 """bytes that `jsecon demo` writes, rounded up"""
 MIN_CACHE_DISK = 32 << 20
 """bytes of the compiled programs of `jsecon demo`, rounded up"""
+# fmt: off
 PACKAGES = (
-    "numpy",
-    "filelock",
-    "psutil",
-    "scipy",
-    "sklearn",
-    "cv2",
-    "PIL",
-    "jaxtyping",
-    "optax",
-    "flax",
-    "onnxruntime",
-    "tokenizers",
-    "safetensors",
-    "ftfy",
-    "tqdm",
-    "tyro",
-    "shtab",
-    "docstring_parser",
-    "lazy_loader",
-    "huggingface_hub",
+    "numpy", "filelock", "psutil", "scipy", "sklearn", "cv2", "PIL", "jaxtyping", "optax", "flax", "onnxruntime",
+    "tokenizers", "safetensors", "ftfy", "tqdm", "tyro", "shtab", "docstring_parser", "lazy_loader", "huggingface_hub",
 )
+# fmt: on
 """modules of the packages that jsecon requires; jax has another check"""
 EXTRAS = {
     "sfm": (("pycolmap",), "poses of photographs and videos"),
@@ -87,26 +70,32 @@ def run_checks(models: Path | None = None) -> list[Check]:
     Raises:
       InputError: There is no such folder.
     """
-    checks = [Check("python", "ok", f"{platform.python_version()}, {platform.platform(terse=True)}"), check_packages()]
-    checks += [*_check_jax(), check_cores(), check_memory(), _check_disk(), check_programs()]
+    checks = [Check("python", "ok", f"{platform.python_version()}, {platform.platform(terse=True)}"), _check_packages()]
+    checks += [*_check_jax(), _check_cores(), _check_memory(), _check_disk(), _check_programs()]
     return [*checks, *_check_models(models), *map(_check_extra, EXTRAS)]
 
 
 def doctor_verb(verb: verbs.Doctor, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon doctor`."""
+    """Does the work of `jsecon doctor`.
+
+    Args:
+      verb: Its options.
+      console: Receives a line for each check.
+
+    Returns:
+      The checks, and an error for each that failed and that every run depends on.
+
+    Raises:
+      InputError: There is no such folder of models.
+    """
     with console.progress("checks"):
         checks = run_checks(verb.models)
     console.say("\n".join(f"{check.status:<8} {check.name:<10} {check.message}" for check in checks))
-    return {"checks": checks, "errors": failures(checks)}
-
-
-def failures(checks: Iterable[Check]) -> list[InputError]:
-    """Returns an error for each check that failed and that every run depends on."""
     failed = [check for check in checks if check.remedy and check.status != "ok"]
-    return [InputError(check.name, check.message, remedy=check.remedy) for check in failed]
+    return {"checks": checks, "errors": [InputError(c.name, c.message, remedy=c.remedy) for c in failed]}
 
 
-def check_packages() -> Check:
+def _check_packages() -> Check:
     """Imports the packages that jsecon requires."""
     broken = {}
     for name in PACKAGES:
@@ -144,7 +133,7 @@ def _check_jax() -> list[Check]:
     return [jax_check, Check("backend", "ok", message)]
 
 
-def check_cores() -> Check:
+def _check_cores() -> Check:
     """Counts the cores that may be used, and the time limit of the cgroup."""
     quota = read_cgroup("cpu.max", "cpu/cpu.cfs_quota_us")
     period = (quota[1:] or read_cgroup("", "cpu/cpu.cfs_period_us") or ["100000"])[0]
@@ -154,7 +143,7 @@ def check_cores() -> Check:
     return Check("cores", "ok", message)
 
 
-def check_memory() -> Check:
+def _check_memory() -> Check:
     """Measures the free memory."""
     free, limit = available_memory()
     if free is None:
@@ -173,7 +162,7 @@ def _check_disk() -> Check:
     return Check("disk", "ok" if writable and free >= MIN_DISK else "wrong", message)
 
 
-def check_programs() -> Check:
+def _check_programs() -> Check:
     """Examines the folder of compiled programs."""
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     if folder is None:

@@ -67,7 +67,7 @@ def evaluate(
         def select(text: str, kind: str = kind) -> Selection | None:
             try:
                 if kind in BASELINES:
-                    return select_by_code(field, embedder, text, kind)
+                    return _select_by_code(field, embedder, text, kind)
                 answer = ask_text(field, embedder, text, **KINDS[kind])
             except InputError:  # no words for it
                 return None
@@ -78,21 +78,8 @@ def evaluate(
     return results
 
 
-def select_by_code(field: LanguageField, embedder: Any, text: str, kind: str) -> Selection:
-    """Selects the Gaussians whose codes are similar to that of a text, without regions.
-
-    Args:
-      field: The field.
-      embedder: Its embedder.
-      text: The text.
-      kind: "one_step" for the cosine, "canonical" for the relevancy against the canonical phrases.
-
-    Returns:
-      The selection.
-
-    Raises:
-      InputError: The embedder has no words for the text.
-    """
+def _select_by_code(field: LanguageField, embedder: Any, text: str, kind: str) -> Selection:
+    """Selects the Gaussians whose codes are similar to that of a text: by a kind of BASELINES, without regions."""
     texts = parse_query(text).included
     code = encode(field.autoencoder, jax.device_put(embedder.embed_text(texts[:1])[0]))
     if kind == "one_step":
@@ -102,7 +89,18 @@ def select_by_code(field: LanguageField, embedder: Any, text: str, kind: str) ->
 
 
 def eval_verb(verb: verbs.Eval, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon eval`: prints the table, and writes OUT/evaluation.json with every pair."""
+    """Does the work of `jsecon eval`: prints the table, and writes OUT/evaluation.json with every pair.
+
+    Args:
+      verb: Its options.
+      console: Receives the progress and the table.
+
+    Returns:
+      The summary of each kind of query, and the file under "written".
+
+    Raises:
+      InputError: The field or the labels cannot be read, a model is missing, or the folder cannot be written.
+    """
     out = verb.out or verb.field.parent
     require_writable(out)
     with console.progress("field"):
@@ -130,7 +128,12 @@ def _pair(row: Row) -> dict[str, Any]:
 
 
 def print_table(results: Evaluation, listener: Listener) -> None:
-    """Prints the protocol, and mIoU, mAcc@0.25 and localisation accuracy of each kind of query."""
+    """Prints the protocol, and mIoU, mAcc@0.25 and localisation accuracy of each kind of query.
+
+    Args:
+      results: What `evaluate` returned.
+      listener: Receives the lines.
+    """
     _, first = next(iter(results.values()))
     listener.say(
         f"{first['protocol']}\n{first['pairs']} pairs of {first['queries']} queries in {first['frames']} frames"

@@ -30,8 +30,20 @@ MAX_NAME_BYTES = 60
 """bytes of an object's name in the name of a file"""
 
 
-def object_record(catalogue: Catalogue, index: int) -> dict[str, Any]:
-    """Returns an object as plain values for JSON. Columns of "axes" are the axes of the box."""
+def object_records(catalogue: Catalogue) -> list[dict[str, Any]]:
+    """Makes the records of a catalogue for JSON.
+
+    Args:
+      catalogue: The catalogue.
+
+    Returns:
+      Plain values of each object by name, in the capture's world. The columns of "axes" are the axes of the box.
+    """
+    return [_object_record(catalogue, index) for index in range(len(catalogue))]
+
+
+def _object_record(catalogue: Catalogue, index: int) -> dict[str, Any]:
+    """Returns the record of an object."""
     shape = catalogue.shapes[index]
     length = float(np.linalg.norm(shape.high - shape.low))
     names = zip(catalogue.names[index], catalogue.probability[index])
@@ -52,7 +64,18 @@ def object_record(catalogue: Catalogue, index: int) -> dict[str, Any]:
 
 
 def objects_verb(verb: verbs.Objects, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon objects`."""
+    """Does the work of `jsecon objects`.
+
+    Args:
+      verb: Its options.
+      console: Receives a line for each object.
+
+    Returns:
+      The records of the objects, and the files under "written".
+
+    Raises:
+      InputError: An input cannot be read, a model is missing, or the output folder cannot be written.
+    """
     if verb.out is not None:
         require_writable(verb.out)
     with console.progress("field"):
@@ -61,7 +84,7 @@ def objects_verb(verb: verbs.Objects, console: Console) -> verbs.VerbResult:
         by_model = names is not None or verb.template or verb.embedder is not None  # else its words may be in the field
         listed = objects(field, names, open_embedder(field, verb, console) if by_model else None)
     _print_catalogue(listed, console)
-    result: verbs.VerbResult = {"objects": [object_record(listed, n) for n in range(len(listed))]}
+    result: verbs.VerbResult = {"objects": object_records(listed)}
     if verb.out is None:
         return result
     files = _write_catalogue(field, listed, verb.out, console)
@@ -82,7 +105,18 @@ def _read_vocabulary(file: Path) -> list[str]:
 
 
 def export_verb(verb: verbs.Export, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon export`."""
+    """Does the work of `jsecon export`.
+
+    Args:
+      verb: Its options.
+      console: Receives a line for each kind of file.
+
+    Returns:
+      The number of exported Gaussians, bytes of the scene, and the files under "written".
+
+    Raises:
+      InputError: Options cannot be combined, an input cannot be read, or a text selects no Gaussian.
+    """
     _check_export(verb)
     with console.progress("field"):
         if verb.out is not None:
@@ -152,8 +186,8 @@ def _write_catalogue(field: LanguageField, catalogue: Catalogue, out: Path, list
     """Writes OUT/objects.json, OUT/objects.csv and OUT/catalogue.html; returns the files."""
     files = {name: out / f"{name}.{ending}" for name, ending in (("objects", "json"), ("catalogue", "html"))}
     files["table"] = out / "objects.csv"
-    rows = [object_record(catalogue, n) for n in range(len(catalogue))]
-    content = {"frame": "the capture's world", "up": catalogue.up.round(6).tolist(), "objects": rows}
+    content = {"frame": "the capture's world", "up": catalogue.up.round(6).tolist()}
+    content |= {"objects": object_records(catalogue)}
     write_text(files["objects"], json.dumps(content, indent=2) + "\n")
     columns = catalogue.to_dict()
     table = io.StringIO()
@@ -191,13 +225,14 @@ def _page(field: LanguageField, catalogue: Catalogue, listener: Listener) -> str
             for t in frames:
                 seen = np.asarray(selection_mask(gaussians, cameras[t], mask))
                 figures.append(report.figure(pictures.selection_overlay(renderer.photo(t), seen), field.names[t]))
-            photo = renderer.photo(frames[0] if frames else 0)
-            crop = pictures.crop_to_points(photo, cameras[frames[0] if frames else 0], means[mask])
+            best = frames[0] if frames else 0
+            crop = pictures.crop_to_points(renderer.photo(best), cameras[best], means[mask])
+            parent = catalogue.parent[n]
             cards[bool(catalogue.surroundings[n])].append(
                 report.card(
                     pictures.fitted(crop, THUMBNAIL_PX),
                     _title(catalogue, n),
-                    f"{n} · {_size(catalogue, n)}{_part(catalogue, n)}",
+                    f"{n} · {_size(catalogue, n)}" + (f" · part of {parent}" if parent >= 0 else ""),
                     report.grid(figures, 3),
                     report.table(("", ""), _facts(catalogue, n), numbers_from=2),
                     search=" ".join((str(n), *map(str, catalogue.names[n]))),
@@ -211,7 +246,7 @@ def _page(field: LanguageField, catalogue: Catalogue, listener: Listener) -> str
         "surroundings": str(int(catalogue.surroundings.sum())),
         "of the Gaussians in objects": f"{float((catalogue.labels >= 0).mean() if len(catalogue.labels) else 0):.0%}",
     }
-    parts = [report.tiles(figures), report.search_box("Search names and ids"), report.cards(cards[False])]
+    parts = [report.tiles(figures), report.cards(cards[False], search="Search names and ids")]
     if cards[True]:
         words = "Walls, floors and the like, by their names."
         parts.append(report.section("Surroundings", words, report.cards(cards[True])))
@@ -238,11 +273,6 @@ def _facts(catalogue: Catalogue, n: int) -> list[tuple[str, str]]:
 def _title(catalogue: Catalogue, n: int) -> str:
     """Returns the best name of an object, or "object" where there is no vocabulary."""
     return str(catalogue.names[n, 0]) or "object"
-
-
-def _part(catalogue: Catalogue, n: int) -> str:
-    """Returns what an object is a part of, in words, or ""."""
-    return f" · part of {catalogue.parent[n]}" if catalogue.parent[n] >= 0 else ""
 
 
 def _size(catalogue: Catalogue, n: int) -> str:

@@ -13,7 +13,7 @@ from jsecon.errors import InputError
 from jsecon.language.membership import probability_inside
 from jsecon.query.object_shapes import gaussian_spreads, object_shapes
 from jsecon.splat.transform import transform_gaussians_float64
-from jsecon.types import LanguageField
+from jsecon.types import Gaussians, LanguageField
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +43,11 @@ class Place:
     frame: str = "the capture's world"
 
     def as_dict(self) -> dict[str, Any]:
-        """Returns plain values for JSON. Of the points it holds the count."""
+        """Makes a record for JSON.
+
+        Returns:
+          Plain values by name: those of this class, with the number of the points in place of the points.
+        """
         size = float(np.linalg.norm(self.high - self.low))
         lengths = {name: rounded(getattr(self, name), size) for name in ("centroid", "center", "extent", "low", "high")}
         return {
@@ -61,8 +65,8 @@ def locate_single(field: LanguageField, answer: Answer) -> Place:
     """Locates the object that an answer selected: the box of several would have its centre between them.
 
     Args:
-      field: The field.
-      answer: Answer of that field, with a row for each of its Gaussians.
+      field: As for `locate_answer`.
+      answer: As for `locate_answer`.
 
     Returns:
       As `locate_answer`.
@@ -94,7 +98,7 @@ def locate_answer(field: LanguageField, answer: Answer) -> Place:
         raise InputError(f"query {answer.query!r}", problem, remedy="Ask with other words, or by a pixel.")
     mask = np.asarray(answer.mask)
     plain = dataclasses.replace(field.gaussians, sh=field.gaussians.sh[:, :1])  # the place does not need colours
-    selected = transform_gaussians_float64(jax.tree.map(lambda a: np.asarray(a)[mask], plain), field.to_source)
+    selected = transform_gaussians_float64(gaussian_rows(plain, mask), field.to_source)
     points = selected_centers(field, mask)
     shape = object_shapes(points, np.zeros(len(points), int), spreads=gaussian_spreads(selected))[0]
     return Place(
@@ -111,17 +115,54 @@ def locate_answer(field: LanguageField, answer: Answer) -> Place:
     )
 
 
+def gaussian_rows(gaussians: Gaussians, rows: np.ndarray) -> Gaussians:
+    """Takes some of the Gaussians.
+
+    Args:
+      gaussians: N Gaussians.
+      rows: Mask (N,) bool, or the indices of those to take.
+
+    Returns:
+      These Gaussians as NumPy arrays.
+    """
+    return jax.tree.map(lambda column: np.asarray(column)[np.asarray(rows)], gaussians)
+
+
 def selected_centers(field: LanguageField, mask: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "m 3"]:
-    """Returns the centres of the Gaussians of a mask (N,) in the capture's world, (M, 3) float64."""
+    """Places the Gaussians of a mask in the capture's world.
+
+    Args:
+      field: The field.
+      mask: (N,) bool, M of them True.
+
+    Returns:
+      (M, 3) float64 centres.
+    """
     to_source = np.asarray(field.to_source, np.float64)
     return np.asarray(field.gaussians.means)[mask].astype(np.float64) @ to_source[:3, :3].T + to_source[:3, 3]
 
 
 def decimals(size: float, part: float) -> int:
-    """Returns how many decimals tell coordinates apart that differ by `part` of a thing's size; 6 for a size of 0."""
+    """Counts the decimals of a thing's coordinates.
+
+    Args:
+      size: Size of the thing.
+      part: Share of the size, by which coordinates can still be told apart.
+
+    Returns:
+      The number of decimals; 6 for a size of 0 or one that is not finite.
+    """
     return max(0, math.ceil(-math.log10(size * part))) if size > 0 and math.isfinite(size) else 6
 
 
 def rounded(values: np.ndarray, size: float) -> list[float]:
-    """Rounds coordinates of a thing to a millionth of its size, and at least to six decimals."""
+    """Rounds coordinates of a thing to a millionth of its size.
+
+    Args:
+      values: The coordinates, of any shape.
+      size: Size of the thing, in their unit.
+
+    Returns:
+      The coordinates as a list, with six decimals or more.
+    """
     return np.round(np.asarray(values, np.float64), max(6, decimals(size, 1e-6))).tolist()

@@ -15,10 +15,11 @@ import numpy as np
 
 from jsecon.app import pictures, verbs
 from jsecon.app.ask import frame_index
-from jsecon.app.locate import locate_single
+from jsecon.app.exports import object_records
+from jsecon.app.locate import Place, locate_single
 from jsecon.app.models import with_models
 from jsecon.app.outputs import best_frames
-from jsecon.app.relations import locate_relation, relation_answer
+from jsecon.app.relations import locate_relation, measure, query_relation, relation_answer
 from jsecon.app.server.scenes import Scene, SceneQuery, open_scenes
 from jsecon.errors import InputError
 from jsecon.pipeline.progress import Console
@@ -35,12 +36,8 @@ MAX_OBJECTS = 100
 """objects in an answer of the tool `objects`"""
 
 
-class Tools:
-    """The work of the tools: plain values out, InputError for bad input.
-
-    Args:
-      scenes: Fields by name. The first is the default.
-    """
+class _Tools:
+    """The work of the tools: plain values out, InputError for bad input. Models read the docstrings."""
 
     def __init__(self, scenes: dict[str, Scene]):
         self.scenes = scenes
@@ -63,40 +60,41 @@ class Tools:
         The answer has 0, 1 or several objects, alternatives, and a question where the text leaves open which is meant.
         Directions are seen from a frame, or as `viewpoint` says.
         """
-        return self.scene(field).relation(text, frame).as_dict()
+        return query_relation(self.scene(field).object_scene, text, frame=frame).as_dict()
 
     def objects(self, field: str | None = None) -> dict[str, Any]:
         """Lists the objects of a scene with names, sizes and places, the largest first."""
-        rows = self.scene(field).catalogue_rows()
+        rows = object_records(self.scene(field).object_scene.catalogue)
         return {"count": len(rows), "objects": rows[:MAX_OBJECTS]}
 
     def locate(self, text: str, frame: str | None = None, field: str | None = None) -> dict[str, Any]:
         """Locates one thing: oriented box, and the middle of its top, where a gripper from above would close."""
         scene = self.scene(field)
         if is_expression(text):
-            place = locate_relation(scene.object_scene, scene.relation(text, frame))
+            place = locate_relation(scene.object_scene, query_relation(scene.object_scene, text, frame=frame))
         else:
             place = locate_single(scene.field, scene.answer(SceneQuery(_words(text))))
-        return place.as_dict() | {"top": np.round(scene.top_of(place), 6).tolist()}
+        return place.as_dict() | {"top": np.round(_top_of(scene, place), 6).tolist()}
 
     def measure(self, a: str, b: str, frame: str | None = None, field: str | None = None) -> dict[str, Any]:
         """Measures the distance of two things: between surfaces, between centres, free gap, angle above horizontal."""
-        return self.scene(field).measure(a, b, frame).as_dict()
+        return measure(self.scene(field).object_scene, a, b, frame=frame).as_dict()
 
     def count(self, text: str, frame: str | None = None, field: str | None = None) -> dict[str, Any]:
         """Counts the things that a text names: "bottles", "red mugs on the table"."""
-        answer = self.scene(field).relation(text if is_expression(text) else f"how many {text}", frame)
+        text = text if is_expression(text) else f"how many {text}"
+        answer = query_relation(self.scene(field).object_scene, text, frame=frame)
         return {"count": answer.count, "reading": answer.reading, "reason": answer.reason}
 
     def render(self, text: str, frame: str | None = None, field: str | None = None) -> bytes:
         """Renders a frame with what a text names lit up, as a PNG; by default the frame that shows it best."""
         scene = self.scene(field)
         if is_expression(text):
-            answer = relation_answer(scene.relation(text, frame))
+            answer = relation_answer(query_relation(scene.object_scene, text, frame=frame))
         else:
             answer = scene.answer(SceneQuery(_words(text)))
-        shown = [*best_frames(scene.field, answer, 1), 0] if frame is None else [frame_index(scene.field, frame)]
-        index = shown[0]
+        best = [*best_frames(scene.field, answer, 1), 0][0]
+        index = best if frame is None else frame_index(scene.field, frame)
         photo = pictures.Renderer(scene.field.gaussians, scene.field.cameras).photo(index)
         camera = scene.cameras[index]
         mask = np.asarray(selection_mask(scene.gaussians, camera, jnp.asarray(answer.mask)))
@@ -109,6 +107,13 @@ def _words(text: str) -> str:
     if not text.strip():
         raise InputError("text", "it is empty", remedy='For example "red mug".')
     return text
+
+
+def _top_of(scene: Scene, place: Place) -> np.ndarray:
+    """Returns the middle of the upper side of a place's points, (3,) in the capture's world."""
+    up = np.asarray(scene.field.to_source, np.float64)[:3, :3] @ scene.object_scene.up
+    up /= np.linalg.norm(up)
+    return place.center + (np.quantile(place.points @ up, 0.98) - place.center @ up) * up
 
 
 def make_server(scenes: dict[str, Scene]) -> Any:
@@ -132,7 +137,7 @@ def make_server(scenes: dict[str, Scene]) -> Any:
         problem = f"the package {error.name} is missing"
         raise InputError("jsecon mcp", problem, remedy=f"Run: {REMEDY}") from error
     server = MCPServer("jsecon", instructions=f"{INSTRUCTIONS} Fields: {', '.join(scenes)}.")
-    tools = Tools(scenes)
+    tools = _Tools(scenes)
     word = Annotated[str, Field(description="What is asked for, in words", min_length=1, max_length=500)]
     frame = Annotated[str | None, Field(description="Name of the frame that it is seen from, or #3 for the fourth")]
     field = Annotated[str | None, Field(description="Name of the field; the first by default")]
@@ -168,8 +173,19 @@ def make_server(scenes: dict[str, Scene]) -> Any:
 
 
 def mcp_verb(verb: verbs.Mcp, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon mcp`."""
-    console = Console(sys.stderr)  # standard output belongs to the protocol
+    """Does the work of `jsecon mcp`.
+
+    Args:
+      verb: Its options.
+      console: Gives way to one on standard error, since standard output belongs to the protocol.
+
+    Returns:
+      Under "then", the function that serves until standard input ends.
+
+    Raises:
+      InputError: The extra or a model is missing, or a field cannot be read.
+    """
+    console = Console(sys.stderr)
     with console.progress("fields"):
         embedder = with_models(verb, console, yes=False).embedder
         make_server({})  # before the fields are loaded, since its extra may be missing

@@ -115,13 +115,28 @@ def _table_lines() -> Iterator[str]:
 
 
 def help_table() -> str:
-    """Returns a table of the named models and what each adds, for the help of a run."""
+    """Makes a table of the named models, for the help of a run.
+
+    Returns:
+      Lines with name, role, size, seconds and what each model adds.
+    """
     lines = [f"{line}  {row.purpose}" for row, line in zip(hub.catalogue(), _table_lines())]
     return "\n".join(["models", *(f"  {line}" for line in (f"{TABLE_HEAD}  adds", *lines, TABLE_NOTE))])
 
 
 def models_verb(verb: verbs.Models, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon models`."""
+    """Does the work of `jsecon models`.
+
+    Args:
+      verb: Its options.
+      console: Receives the lines of the action, and asks before it fetches.
+
+    Returns:
+      Rows, folders, freed bytes or reports, and the errors of the models that an action failed for.
+
+    Raises:
+      InputError: A name is missing or unknown, or the model is not on this machine.
+    """
     if verb.action == "list":
         return _list_models(console)
     if not verb.names:

@@ -29,13 +29,27 @@ HISTOGRAM_HEIGHT = 80
 
 
 def to_html(value: Any) -> str:
-    """Returns a LanguageField, a Selection or a Capture as a picture and a line of HTML."""
+    """Shows a value as HTML.
+
+    Args:
+      value: A LanguageField, a Selection or a Capture.
+
+    Returns:
+      Its picture and a line of words.
+    """
     image, words = _picture(value)
     return f'<div><img alt="" src="{report.data_uri(image)}"><br>{html.escape(words)}</div>'
 
 
 def to_png(value: Any) -> bytes:
-    """Returns the picture of a LanguageField, a Selection or a Capture as a PNG file."""
+    """Draws the picture of a value.
+
+    Args:
+      value: A LanguageField, a Selection or a Capture.
+
+    Returns:
+      The content of a PNG file.
+    """
     return cv2.imencode(".png", cv2.cvtColor(_picture(value)[0], cv2.COLOR_RGB2BGR))[1].tobytes()
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from jsecon.app.ask import frame_index, with_phrases
 from jsecon.app.catalogue import Catalogue, objects as list_objects
+from jsecon.app.locate import gaussian_rows
 from jsecon.data.capture import may_have_depth
 from jsecon.errors import InputError
 from jsecon.language.membership import SHARE_THRESHOLD
@@ -105,22 +106,30 @@ class ObjectScene:
             match = RegionMatch(chosen, np.asarray(regions[0], np.int32), np.asarray(1.0, np.float32))
             selection = select_by_share(self._votes, match, SHARE_THRESHOLD)
             rows = np.flatnonzero(selection.mask)
-            taken = dataclasses.replace(self.field.gaussians, sh=None)
-            taken = jax.tree.map(lambda column: np.asarray(column)[rows], taken)
+            taken = gaussian_rows(dataclasses.replace(self.field.gaussians, sh=None), rows)
             weight = np.clip(np.asarray(selection.similarity)[rows], 0, 1) * np.asarray(self.field.votes.total)[rows]
             kept = split_outliers(taken.means, np.ones(len(rows), bool), keep="supported", weight=weight).mask
             self._objects[regions] = None
             if kept.any():
-                taken = jax.tree.map(lambda column: column[kept], taken)
+                taken = gaussian_rows(taken, kept)
                 labels = np.zeros(taken.count, int)
                 shape = object_shapes(taken.means, labels, self.up, spreads=gaussian_spreads(taken))
                 self._objects[regions] = rows[kept], shape
         return self._objects[regions]
 
     def view(self, frame: int | str | None, camera: Camera | None) -> tuple[Viewpoint, str]:
-        """Returns the viewpoint of a frame or a camera, or of the mean camera, and what it is in words.
+        """Chooses from where directions are seen.
 
-        Cameras that look in all directions have no mean; then it is the frame that shows most objects.
+        Args:
+          frame: Name or index of a frame, or None.
+          camera: Camera in the field's world, or None. Without frame and camera it is the mean camera, or the frame
+            that shows most objects where the cameras look in all directions.
+
+        Returns:
+          The viewpoint, and what it is in words.
+
+        Raises:
+          InputError: The field has no such frame.
         """
         words = "as seen from the given camera"
         if camera is None and frame is None:
@@ -147,7 +156,19 @@ class ObjectScene:
 
 
 def open_scene(field: LanguageField | ObjectScene, embedder: Any, up: Sequence[Any] | None = None) -> ObjectScene:
-    """Returns the `ObjectScene` of a field, or the one that is given."""
+    """Prepares a field for expressions, unless it is prepared.
+
+    Args:
+      field: The field, or an `ObjectScene`, which is returned as it is.
+      embedder: Embedder of the field; None opens it.
+      up: (3,) up axis in the capture's world; None finds it.
+
+    Returns:
+      The prepared field.
+
+    Raises:
+      InputError: The field has no regions, its embedder cannot be opened, or `up` has no direction.
+    """
     if isinstance(field, ObjectScene):
         return field
     if field.regions.count == 0:

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Int
 
 from jsecon.app import pictures, report
 from jsecon.app.ask import Answer, quantile_message
-from jsecon.app.locate import decimals, rounded, selected_centers
+from jsecon.app.locate import decimals, gaussian_rows, rounded, selected_centers
 from jsecon.data.gaussians.files import save_gaussians
 from jsecon.data.gaussians.ply import save_ply
 from jsecon.files import atomic_write, write_text
@@ -29,7 +29,7 @@ from jsecon.language.membership import SHARE_THRESHOLD, probability_inside, vote
 from jsecon.pipeline.progress import Listener
 from jsecon.query.render import selection_mask
 from jsecon.splat.transform import transform_gaussians_float64
-from jsecon.types import Gaussians, LanguageField
+from jsecon.types import LanguageField
 
 MAX_SLUG_BYTES = 80
 """bytes of a slug; a file name may have 255 bytes, two slugs and their hashes among them"""
@@ -39,13 +39,15 @@ POINTED = re.compile(r"(at|box|region) .*\d", re.DOTALL)
 """names of queries without a text: a pixel, a box, a region"""
 
 
-def selected_gaussians(gaussians: Gaussians, mask: np.ndarray) -> Gaussians:
-    """Returns the Gaussians of a mask (N,)."""
-    return jax.tree.map(lambda a: np.asarray(a)[np.asarray(mask)], gaussians)
-
-
 def main_regions(field: LanguageField) -> Int[np.ndarray, " n"]:
-    """Returns the region that has at least half of each Gaussian, or -1. The votes are read in blocks."""
+    """Finds the main region of each Gaussian. The votes are read in blocks.
+
+    Args:
+      field: A field of N Gaussians.
+
+    Returns:
+      (N,) int id of the region that has at least half of the Gaussian's weight, or -1.
+    """
     blocks = [np.zeros(0, np.int32)]
     for votes in vote_blocks(field.votes):
         shares = np.nan_to_num(np.asarray(vote_shares(votes)))
@@ -59,7 +61,7 @@ def best_frames(field: LanguageField, answer: Answer, count: int) -> list[int]:
     """Chooses the frames that show a selection best.
 
     Args:
-      field: The field, or its part (`part_of`).
+      field: The field, with a row for each row of the answer.
       answer: The answer.
       count: Maximum number of frames.
 
@@ -92,14 +94,14 @@ def answer_masks(field: LanguageField, answer: Answer, views: int) -> dict[int, 
     Returns:
       Index of a frame -> (H, W) bool, where their alpha is above 0.7.
     """
-    field = part_of(field, answer)
+    field = _part_of(field, answer)
     gaussians, mask = jax.device_put((field.gaussians, answer.mask))
     cameras = jax.tree.map(np.asarray, field.cameras)  # whose items need no compilation
     frames = best_frames(field, answer, views)
     return {t: np.asarray(selection_mask(gaussians, cameras[t], mask)) for t in frames}
 
 
-def part_of(field: LanguageField, answer: Answer) -> LanguageField:
+def _part_of(field: LanguageField, answer: Answer) -> LanguageField:
     """Returns the field of the Gaussians that an answer has rows for, which are all without `Answer.rows`."""
     return field if answer.rows is None else subset_field(field, answer.rows)
 
@@ -125,13 +127,13 @@ def write_answer(
       The record of the .json. Its coordinates are in the capture's world.
     """
     stem = file_stem(answer)
-    part = part_of(field, answer)
+    part = _part_of(field, answer)
     record = _record(part, answer) | {"gaussians": field.gaussians.count, ending: None, "masks": {}}
     if answer.mask.any():
         record[ending] = f"{stem}.{ending}"
         columns = {"codes": np.asarray(part.codes), "regions": main_regions(part)} if ending == "glb" else {}
         columns = {name: column[answer.mask] for name, column in columns.items()}
-        selected = transform_gaussians_float64(selected_gaussians(part.gaussians, answer.mask), part.to_source)
+        selected = transform_gaussians_float64(gaussian_rows(part.gaussians, answer.mask), part.to_source)
         save_gaussians(out / record[ending], selected, **columns)
         for t, mask in masks.items():
             record["masks"][field.names[t]] = file = f"{stem}-{_frame_stem(field, t)}.png"
@@ -313,7 +315,14 @@ def _frame_stem(field: LanguageField, frame: int) -> str:
 
 
 def slug(text: str) -> str:
-    """Returns the letters and digits of a text, in lower case, with hyphens between; "query" without any."""
+    """Makes a part of a file name of a text.
+
+    Args:
+      text: The text.
+
+    Returns:
+      Its letters and digits in lower case, with hyphens between; "query" if it has none.
+    """
     folded = unicodedata.normalize("NFC", unicodedata.normalize("NFC", text).casefold())
     return re.sub(r"[^\w]+", "-", folded).strip("-") or "query"
 

@@ -29,7 +29,14 @@ _FONT = (cv2.FONT_HERSHEY_SIMPLEX, 0.36)
 
 
 def palette(count: int) -> UInt8[np.ndarray, "n 3"]:
-    """Returns the RGB of regions 0 .. count-1: hues a golden angle apart, three lightnesses in turn."""
+    """Chooses the colours of regions: hues a golden angle apart, three lightnesses in turn.
+
+    Args:
+      count: Number of regions.
+
+    Returns:
+      RGB of regions 0 .. count-1, each of which does not depend on `count`.
+    """
     hues = (0.11 + GOLDEN_ANGLE * np.arange(count)) % 1.0
     colours = [colorsys.hls_to_rgb(h, (0.62, 0.42, 0.72)[i % 3], 0.85) for i, h in enumerate(hues)]
     return (np.asarray(colours, np.float64).reshape(count, 3) * 255).astype(np.uint8)
@@ -38,7 +45,16 @@ def palette(count: int) -> UInt8[np.ndarray, "n 3"]:
 def label_overlay(
     frame: UInt8[np.ndarray, "h w 3"], labels: Int[np.ndarray, "h w"], *, opacity: float = 0.72
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns the frame in grey with each region in its colour and a dark line between regions. -1 stays grey."""
+    """Paints regions over a frame.
+
+    Args:
+      frame: RGB of the frame.
+      labels: Region ids of its pixels, -1 outside of regions.
+      opacity: Share of the region's colour in a pixel.
+
+    Returns:
+      The frame in grey, with each region in its colour (`palette`) and a dark line between regions.
+    """
     grey = np.repeat(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=2).astype(np.float32)
     colours = palette(int(labels.max(initial=0)) + 1)[np.maximum(labels, 0)]
     image = np.where((labels >= 0)[..., None], (1 - opacity) * grey + opacity * colours, 0.55 * grey)
@@ -52,7 +68,16 @@ def label_overlay(
 def selection_overlay(
     frame: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], truth: Bool[np.ndarray, "h w"] | None = None
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns the frame, dark outside of the selection's mask and tinted inside, with the ground truth's outline."""
+    """Shows a selection in a frame.
+
+    Args:
+      frame: RGB of the frame.
+      mask: Pixels of the selection.
+      truth: Pixels of the ground truth, if there is one.
+
+    Returns:
+      The frame, dark outside of the selection and tinted inside, with the outline of the ground truth.
+    """
     image = frame.astype(np.float32)
     image = np.where(mask[..., None], 0.55 * image + 0.45 * np.array(SELECTED, np.float32), 0.5 * image)
     image = _outlined(image.astype(np.uint8), mask, SELECTED, 1)
@@ -158,7 +183,15 @@ def crop_to_points(
 
 
 def fitted(image: UInt8[np.ndarray, "h w 3"], side: int) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Returns an image whose longer side has `side` pixels."""
+    """Scales an image.
+
+    Args:
+      image: The image.
+      side: Longer side of the result, px.
+
+    Returns:
+      The image at that size.
+    """
     scale = side / max(image.shape[:2])
     size = max(round(scale * image.shape[1]), 1), max(round(scale * image.shape[0]), 1)
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
@@ -200,7 +233,15 @@ def code_colours(field: LanguageField) -> Float[np.ndarray, "n 3"]:
 
 
 def side_by_side(panels: Mapping[str, UInt8[np.ndarray, "h w 3"]], *, gap: int = 6) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Returns pictures of one height side by side on white, each over its caption."""
+    """Puts pictures side by side on white.
+
+    Args:
+      panels: Caption -> picture; all have one height.
+      gap: Distance of the pictures, px.
+
+    Returns:
+      One picture, with the caption under each panel.
+    """
     caption_height = 26
     columns = []
     for caption, image in panels.items():
@@ -235,7 +276,15 @@ class Renderer:
         return _to_bytes(render_rgb(self._gaussians, self._cameras[view]).features)
 
     def colours(self, view: int, rgb: Float[Array, "n 3"]) -> UInt8[np.ndarray, "h w 3"]:
-        """Renders a view with one colour (in [0, 1]) for each Gaussian."""
+        """Renders a view in other colours than the scene's.
+
+        Args:
+          view: Index of the view.
+          rgb: Colour of each Gaussian, in [0, 1].
+
+        Returns:
+          The picture, uint8.
+        """
         return _to_bytes(render(self._gaussians, self._cameras[view], np.asarray(rgb, np.float32)).features)
 
 

@@ -21,7 +21,18 @@ from jsecon.types import LanguageField
 
 
 def query_verb(verb: verbs.Query, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon query`."""
+    """Does the work of `jsecon query`.
+
+    Args:
+      verb: Its options.
+      console: Receives a line for each answer.
+
+    Returns:
+      The records of the answers, the files under "written", and the errors of the queries that failed.
+
+    Raises:
+      InputError: Options cannot be combined, an input cannot be read, or a model is missing.
+    """
     _check_query(verb)
     require_writable(verb.out)
     verb = with_models(verb, console, yes=verb.yes)

@@ -62,14 +62,22 @@ class RelationAnswer:
         return len(self.objects)
 
     def describe(self) -> str:
-        """Describes the answer in a sentence or two."""
+        """Describes the answer.
+
+        Returns:
+          A sentence or two: how the text was read, the number of objects, the reason, and the question.
+        """
         names = sorted({found.phrase for found in self.objects})
         number = f"{self.count} object{'s' * (self.count != 1)}{f' ({names[0]})' if names else ''}"
         sentences = [f"read as {self.reading}{f', {self.viewpoint}' if self.viewpoint else ''}: {number}"]
         return ". ".join([*sentences, *filter(None, (self.reason.rstrip("."), self.question))])
 
     def as_dict(self) -> dict[str, Any]:
-        """Returns plain values for JSON, coordinates in the capture's world."""
+        """Makes a record for JSON.
+
+        Returns:
+          Plain values by name: those of this class and its description, without the mask, in the capture's world.
+        """
         record = {name: getattr(self, name) for name in ("text", "reading", "viewpoint", "ambiguous", "question")}
         groups = {name: [_plain(o, self.to_source) for o in getattr(self, name)] for name in ("objects", "used")}
         alternatives = [_plain(found, self.to_source) for found in self.alternatives]
@@ -100,7 +108,11 @@ class Measure:
     unit: str
 
     def as_dict(self) -> dict[str, Any]:
-        """Returns plain values for JSON."""
+        """Makes a record for JSON.
+
+        Returns:
+          The attributes by name, rounded.
+        """
         lengths = rounded(np.array([self.surfaces, self.centers, self.gap]), self.centers)
         return vars(self) | dict(zip(("surfaces", "centers", "gap"), lengths)) | {"angle": round(self.angle, 2)}
 
@@ -205,7 +217,14 @@ def _plain(found: FoundObject, to_source: np.ndarray) -> dict[str, Any]:
 
 
 def relation_answer(answer: RelationAnswer) -> Answer:
-    """Returns the Gaussians of an expression as an `Answer`, for files and pictures."""
+    """Makes an `Answer` of the answer to an expression, for files and pictures.
+
+    Args:
+      answer: The answer to the expression.
+
+    Returns:
+      Its Gaussians with a similarity of 1, and the best region if it has one object, else -1.
+    """
     region = answer.objects[0].regions[0] if len(answer.objects) == 1 else -1
     score = answer.objects[0].score if answer.objects else 0.0
     best = np.asarray(region, np.int32), np.asarray(score, np.float32)

@@ -12,32 +12,64 @@ from importlib import resources
 import cv2
 import numpy as np
 
-from jsecon.pipeline.progress import Step
-
 JPEG_QUALITY = 88
 
 
 def page(title: str, lead: str, parts: Iterable[str]) -> str:
-    """Returns the whole document. `parts` are elements that the functions below return."""
+    """Makes the whole document.
+
+    Args:
+      title: Title of the page.
+      lead: Sentence under the title.
+      parts: Elements that the functions below return.
+
+    Returns:
+      The HTML.
+    """
     template = resources.files("jsecon.app").joinpath("report_page.html").read_text(encoding="utf-8")
     filled = template.replace("__TITLE__", _escaped(title)).replace("__LEAD__", _escaped(lead))
     return filled.replace("__PARTS__", "\n".join(parts))
 
 
 def section(title: str, words: str, *parts: str) -> str:
-    """Returns a heading with a sentence or two and its elements."""
+    """Makes a section.
+
+    Args:
+      title: Its heading.
+      words: A sentence or two under the heading, or "".
+      *parts: Its elements.
+
+    Returns:
+      The element.
+    """
     paragraph = f'<p class="soft">{_escaped(words)}</p>' if words else ""
     return f"<section><h2>{_escaped(title)}</h2>{paragraph}{''.join(parts)}</section>"
 
 
 def tiles(figures: Mapping[str, str]) -> str:
-    """Returns headline figures: name -> value."""
+    """Makes headline figures.
+
+    Args:
+      figures: Name -> value with its unit.
+
+    Returns:
+      The element.
+    """
     tile = '<div class="tile"><b>{}</b><span>{}</span></div>'
     return f'<div class="tiles">{"".join(tile.format(_escaped(v), _escaped(k)) for k, v in figures.items())}</div>'
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[object]], *, numbers_from: int = 1) -> str:
-    """Returns a table. Columns from `numbers_from` on are aligned to the right."""
+    """Makes a table.
+
+    Args:
+      header: Names of the columns.
+      rows: Values of each row.
+      numbers_from: Index of the first column that is aligned to the right.
+
+    Returns:
+      The element.
+    """
 
     def cells(tag: str, row: Sequence[object]) -> str:
         kinds = ("" if i < numbers_from else " class=n" for i in range(len(row)))
@@ -48,7 +80,15 @@ def table(header: Sequence[str], rows: Iterable[Sequence[object]], *, numbers_fr
 
 
 def shades(header: Sequence[str], rows: Iterable[tuple[str, Sequence[float | None]]]) -> str:
-    """Returns a table of values from 0 to 1, deeper in colour the higher they are. None is a gap."""
+    """Makes a table of shares, deeper in colour the higher they are.
+
+    Args:
+      header: Names of the columns, that of the rows' names first.
+      rows: Name and values (0 to 1) of each row; None is a gap.
+
+    Returns:
+      The element.
+    """
 
     def cell(value: float | None) -> str:
         return "<td></td>" if value is None else f'<td class="n" style="--v:{100 * value:.0f}%">{value:.2f}</td>'
@@ -59,7 +99,15 @@ def shades(header: Sequence[str], rows: Iterable[tuple[str, Sequence[float | Non
 
 
 def bars(seconds: Mapping[str, float], notes: Mapping[str, str] | None = None) -> str:
-    """Returns a bar for the seconds of each stage, and a note beside it."""
+    """Makes a bar for each stage.
+
+    Args:
+      seconds: Stage -> its seconds.
+      notes: Stage -> what stands beside its bar.
+
+    Returns:
+      The element, with a sum.
+    """
     longest = max(seconds.values(), default=0.0) or 1.0
     rows = "".join(
         f'<tr><td>{_escaped(name)}</td><td class="n">{value:.1f} s</td><td class="length"><div class="bar" '
@@ -70,78 +118,124 @@ def bars(seconds: Mapping[str, float], notes: Mapping[str, str] | None = None) -
     return _scrolled(f"<table><tbody>{rows}{total}</tbody></table>")
 
 
-def steps(steps: Iterable[Step]) -> str:
-    """Returns a table of the stages: which ran, were cached or were skipped, and why."""
-    return table(("step", "", "how, or why not"), [(s.name, s.status, s.why) for s in steps], numbers_from=9)
-
-
-def figure(image: np.ndarray, caption: str, *, strong: str = "", sharp: bool = False) -> str:
-    """Returns an image (H, W, 3) uint8 RGB with its caption, which a click enlarges.
+def figure(image: np.ndarray, caption: str, *, strong: str = "", sharp: bool = False, wide: bool = False) -> str:
+    """Makes a figure, which a click enlarges.
 
     Args:
-      image: The image.
+      image: (H, W, 3) uint8 RGB.
       caption: The caption.
       strong: Bold words before the caption.
       sharp: Keeps the image without loss, for masks and flat colours.
+      wide: Lets a narrow screen scroll the image sideways.
+
+    Returns:
+      The element.
     """
-    return f"<figure>{_image(image, f'{strong} {caption}', sharp, ' tabindex=0')}{_caption(caption, strong)}</figure>"
-
-
-def wide(image: np.ndarray, caption: str, *, strong: str = "") -> str:
-    """Returns a strip of pictures, which a narrow screen scrolls sideways."""
-    return f'<div class="wide">{figure(image, caption, strong=strong)}</div>'
+    picture = _image(image, f"{strong} {caption}", sharp, " tabindex=0")
+    element = f"<figure>{picture}{_caption(caption, strong)}</figure>"
+    return f'<div class="wide">{element}</div>' if wide else element
 
 
 def film(webp: bytes, caption: str) -> str:
-    """Returns an animated WebP with its caption."""
+    """Makes a figure of a film.
+
+    Args:
+      webp: Content of an animated WebP.
+      caption: The caption.
+
+    Returns:
+      The element.
+    """
     data = base64.b64encode(webp).decode()
     image = f'<img alt="{_escaped(caption)}" src="data:image/webp;base64,{data}" tabindex=0>'
     return f'<figure class="film">{image}{_caption(caption, "")}</figure>'
 
 
 def pair(before: np.ndarray, after: np.ndarray, caption: str, *, strong: str = "") -> str:
-    """Returns two pictures of one view on top of each other, with a slider between them."""
+    """Makes a figure of two pictures of one view on top of each other, with a slider between them.
+
+    Args:
+      before: (H, W, 3) uint8 RGB of the lower picture.
+      after: (H, W, 3) uint8 RGB of the upper picture, of which the slider shows a part.
+      caption: The caption.
+      strong: Bold words before the caption.
+
+    Returns:
+      The element.
+    """
     both = _image(before, "before") + _image(after, f"{strong} {caption}", attributes=' class="after"')
     slider = '<input type="range" value="25" aria-label="how much of each picture is shown">'
     return f'<figure class="pair"><div>{both}{slider}</div>{_caption(caption, strong)}</figure>'
 
 
 def grid(figures: Iterable[str], columns: int) -> str:
-    """Returns figures side by side."""
+    """Puts figures side by side.
+
+    Args:
+      figures: The figures.
+      columns: Number of columns on a wide screen.
+
+    Returns:
+      The element.
+    """
     return f'<div class="grid" style="--columns:{columns}">{"".join(figures)}</div>'
 
 
-def search_box(words: str) -> str:
-    """Returns an input that shows only the cards whose `search` has each of its words."""
-    return f'<input id="search" type="search" placeholder="{_escaped(words)}" aria-label="{_escaped(words)}">'
+def cards(elements: Iterable[str], search: str = "") -> str:
+    """Puts cards side by side.
 
+    Args:
+      elements: The cards (`card`).
+      search: Words in a box above them, in which one types what to search for on the page; "" leaves it out.
 
-def cards(elements: Iterable[str]) -> str:
-    """Returns cards side by side."""
-    return f'<div class="cards">{"".join(elements)}</div>'
+    Returns:
+      The element. The box hides the cards of the page whose `search` lacks one of its words.
+    """
+    words = _escaped(search)
+    box = f'<input id="search" type="search" placeholder="{words}" aria-label="{words}">' if search else ""
+    return f'{box}<div class="cards">{"".join(elements)}</div>'
 
 
 def card(image: np.ndarray, title: str, words: str, *parts: str, search: str) -> str:
-    """Returns a picture with a title and words, which a click opens to show its elements.
+    """Makes a card, which a click opens to show its elements.
 
-    `search` is the text that a search box compares.
+    Args:
+      image: (H, W, 3) uint8 RGB of its picture.
+      title: Its title.
+      words: Words under the title.
+      *parts: Its elements.
+      search: Text in which a search box looks for its words.
+
+    Returns:
+      The element.
     """
     summary = f"<summary>{_image(image, title)}<b>{_escaped(title)}</b><span>{_escaped(words)}</span></summary>"
     return f'<details class="card" data-search="{_escaped(search.lower())}">{summary}{"".join(parts)}</details>'
 
 
 def folded(title: str, *parts: str) -> str:
-    """Returns elements that a click on their title shows."""
+    """Hides elements until a click on their title.
+
+    Args:
+      title: The title.
+      *parts: The elements.
+
+    Returns:
+      The element.
+    """
     return f"<details><summary>{_escaped(title)}</summary>{''.join(parts)}</details>"
 
 
-def preformatted(text: str) -> str:
-    """Returns text with its line breaks and spaces."""
-    return f"<pre>{_escaped(text)}</pre>"
-
-
 def data_uri(image: np.ndarray, *, sharp: bool = False) -> str:
-    """Returns an image (H, W, 3) uint8 RGB as a data URI: a JPEG, or a PNG if `sharp`."""
+    """Encodes an image.
+
+    Args:
+      image: (H, W, 3) uint8 RGB.
+      sharp: Encodes without loss.
+
+    Returns:
+      A data URI: of a JPEG, or of a PNG if `sharp`.
+    """
     ending, kind, options = (".png", "png", []) if sharp else (".jpg", "jpeg", [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     _, data = cv2.imencode(ending, cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2BGR), options)
     return f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode()}"

@@ -1,6 +1,7 @@
 """`jsecon run` and `jsecon fit`, and what a run writes at its end: metrics.json, and report.html with pictures."""
 
 import dataclasses
+import html
 import json
 import sys
 from pathlib import Path
@@ -31,7 +32,18 @@ LARGE = 0.15
 
 
 def run_verb(verb: verbs.Run, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon run`."""
+    """Does the work of `jsecon run`.
+
+    Args:
+      verb: Its options.
+      console: Receives the stages, the notes and the figures.
+
+    Returns:
+      The metrics, and the files under "written". Process 0 of several returns them; with --dry-run it is the plan.
+
+    Raises:
+      InputError: The capture or an option cannot be used, or a model is missing.
+    """
     options = with_models(verb.options, console, yes=verb.yes)
     if verb.dry_run:
         return pipeline.dry_run(options, verb.out, listener=console)
@@ -51,7 +63,18 @@ def run_verb(verb: verbs.Run, console: Console) -> verbs.VerbResult:
 
 
 def fit_verb(verb: verbs.Fit, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon fit`: writes the scene in the world of the capture's files, and prints its figures."""
+    """Does the work of `jsecon fit`: writes the scene in the world of the capture's files, and prints its figures.
+
+    Args:
+      verb: Its options.
+      console: Receives the stages and the figures.
+
+    Returns:
+      The number of Gaussians, PSNR (dB) and SSIM of the held-out frames, and the file under "written".
+
+    Raises:
+      InputError: The capture, an option or the output file cannot be used.
+    """
     require_writable_format(verb.out)
     folder = verb.out.with_suffix("")
     if verb.dry_run:
@@ -135,7 +158,14 @@ def _tiles(metrics: dict[str, Any]) -> dict[str, str]:
 
 
 def scene_parts(run: Run) -> list[str]:
-    """Returns the parts of a page that show frames, masklets, codes and the rendered scene."""
+    """Makes the parts of a page that show frames, masklets, codes and the rendered scene.
+
+    Args:
+      run: The run.
+
+    Returns:
+      Sections (`jsecon.app.report`).
+    """
     train = vision_frames(run.capture, run.options)
     renderer = pictures.Renderer(run.field.gaussians, run.field.cameras)
     colours = pictures.code_colours(run.field)
@@ -178,20 +208,30 @@ def _masklet_part(run: Run, train: np.ndarray) -> str:
     for region in largest[sizes.sum(0)[largest] > 0].tolist():
         count = int((np.asarray(run.field.regions.pixels)[region] > 0).sum())
         tiles = pictures.masklet_strip(frames, labels, region)
-        rows.append(report.wide(tiles, f"in {count} of {len(run.labels)} frames", strong=f"region {region}"))
+        caption = f"in {count} of {len(run.labels)} frames"
+        rows.append(report.figure(tiles, caption, strong=f"region {region}", wide=True))
     words = "Each row is one region, cut out of frames around the scene. A dark tile is a frame that does not show it."
     return report.section("Masklets through the frames", words, *rows)
 
 
 def work_parts(run: Run) -> list[str]:
-    """Returns the parts of a page that show seconds, stages, notes and settings."""
+    """Makes the parts of a page that show seconds, stages, notes and settings.
+
+    Args:
+      run: The run.
+
+    Returns:
+      Sections (`jsecon.app.report`).
+    """
+    steps = [(step.name, step.status, step.why) for step in run.steps]
+    stages = report.table(["step", "", "how, or why not"], steps, numbers_from=9)
     notes = report.table(["notes"], [[note] for note in run.notes], numbers_from=9) if run.notes else ""
     options = [(f.name, getattr(run.options, f.name), f.default) for f in dataclasses.fields(run.options)]
     changed, default = (
         report.table([head, "value"], [row[:2] for row in options if (row[1] == row[2]) == is_default], numbers_from=9)
         for head, is_default in (("changed", False), ("setting", True))
     )
-    provenance = report.preformatted(json.dumps(json.loads(run.field.provenance), indent=2))
+    provenance = f"<pre>{html.escape(json.dumps(json.loads(run.field.provenance), indent=2))}</pre>"
     folded = report.folded("settings at their defaults", default), report.folded("provenance of the field", provenance)
     measured = (
         "Wall time of each stage, also of those that an earlier run computed, and the number of programs that jax "
@@ -200,6 +240,6 @@ def work_parts(run: Run) -> list[str]:
     programs = {name: f"{n['all']} ({n['from_disk']})" if n["all"] else "" for name, n in run.compilations.items()}
     return [
         report.section("Seconds of each stage", measured, report.bars(run.seconds, programs)),
-        report.section("Stages", "What ran, and what this scene does not need.", report.steps(run.steps), notes),
+        report.section("Stages", "What ran, and what this scene does not need.", stages, notes),
         report.section("Settings", "", changed, *folded),
     ]

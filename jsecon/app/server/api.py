@@ -5,6 +5,7 @@ page at / lists the paths instead.
 """
 
 import contextlib
+import functools
 import json
 import re
 from collections.abc import AsyncIterator, Callable, Collection
@@ -19,6 +20,8 @@ from starlette.exceptions import HTTPException as AnyHTTPException
 
 import jsecon
 from jsecon.app.ask import frame_index
+from jsecon.app.exports import object_records
+from jsecon.app.relations import Measure, measure, query_relation
 from jsecon.app.server.guard import LIMITS, Guard, Limits, Workers
 from jsecon.app.server.scenes import Scene, SceneQuery
 from jsecon.app.verbs import By
@@ -90,12 +93,18 @@ class Failure(BaseModel):
     error: str
 
 
-class AsciiResponse(JSONResponse):
+class _AsciiResponse(JSONResponse):
     """JSON in ASCII, which can hold any text of a request."""
 
     def render(self, content: Any) -> bytes:
-        """Returns the JSON of plain values."""
         return json.dumps(content, allow_nan=False).encode()
+
+
+@contextlib.asynccontextmanager
+async def _lifespan(workers: Workers, app: FastAPI) -> AsyncIterator[None]:
+    """Closes the threads after the application."""
+    yield
+    workers.close()
 
 
 def application(
@@ -113,21 +122,15 @@ def application(
       The application, behind its `Guard`.
     """
     workers = Workers(cores(), limits.waiting)
-
-    @contextlib.asynccontextmanager
-    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        yield
-        workers.close()
-
     app = FastAPI(
         title="jsecon",
         version=jsecon.__version__,
         docs_url=None,
         redoc_url=None,
         redirect_slashes=False,
-        default_response_class=AsciiResponse,
+        default_response_class=_AsciiResponse,
         responses={status: {"model": Failure} for status in (400, 404, 422, 503)},
-        lifespan=lifespan,
+        lifespan=functools.partial(_lifespan, workers),
     )
     app.add_middleware(Guard, token=token, limits=limits, hosts=hosts)
 
@@ -155,25 +158,29 @@ def application(
         record = scene.records.get(scene_query)
         if record is None:
             record = await computed(lambda: scene.record(scene_query), "text" if request.at is None else "at")
-        return AsciiResponse(record)
+        return _AsciiResponse(record)
 
     @app.post("/relation", summary="The objects that an expression such as 'the mug left of the bottle' names")
     async def relation(request: RelationQuery) -> Response:
         scene = scene_of(request.field)
-        answer = await computed(lambda: scene.relation(request.text, request.frame), "text")
-        return AsciiResponse({"field": scene.name} | answer.as_dict())
+        answer = await computed(lambda: query_relation(scene.object_scene, request.text, frame=request.frame), "text")
+        return _AsciiResponse({"field": scene.name} | answer.as_dict())
 
     @app.post("/measure", summary="Distances between two objects: surfaces, centres, free gap, angle")
     async def distance(request: MeasureQuery) -> Response:
         scene = scene_of(request.field)
-        told = await computed(lambda: scene.measure(request.a, request.b, request.frame), "a or b")
-        return AsciiResponse({"field": scene.name} | told.as_dict())
+
+        def work() -> Measure:
+            return measure(scene.object_scene, request.a, request.b, frame=request.frame)
+
+        distances = await computed(work, "a or b")
+        return _AsciiResponse({"field": scene.name} | distances.as_dict())
 
     @app.get("/objects", summary="The objects of a field: names, boxes, Gaussians")
     async def objects(request: Annotated[Fields, Query()]) -> Response:
         scene = scene_of(request.field)
-        rows = await computed(scene.catalogue_rows, "field")
-        return AsciiResponse({"field": scene.name, "objects": rows})
+        rows = await computed(lambda: object_records(scene.object_scene.catalogue), "field")
+        return _AsciiResponse({"field": scene.name, "objects": rows})
 
     @app.get("/regions", summary="Pixels and views of each region")
     async def regions(request: Annotated[Fields, Query()]) -> Response:
@@ -187,7 +194,7 @@ def application(
             }
             for region, pixels in enumerate(np.asarray(scene.field.regions.pixels))
         ]
-        return AsciiResponse({"field": scene.name, "regions": rows})
+        return _AsciiResponse({"field": scene.name, "regions": rows})
 
     @app.get("/selection.ply", summary="The selected Gaussians in the capture's world")
     async def selection(request: Annotated[TextQuery, Query()]) -> Response:
@@ -214,7 +221,7 @@ def application(
 
     @app.get("/healthz", summary="The fields and their frames")
     async def health() -> Response:
-        return AsciiResponse({"status": "ok", "fields": [scene.description() for scene in scenes.values()]})
+        return _AsciiResponse({"status": "ok", "fields": [scene.description() for scene in scenes.values()]})
 
     @app.get("/", include_in_schema=False)
     async def page() -> Response:
@@ -228,16 +235,16 @@ def application(
     async def invalid(request: Request, error: Exception) -> Response:
         assert isinstance(error, RequestValidationError)
         status, message = _invalid(request.url.path, error)
-        return AsciiResponse({"error": message}, status)
+        return _AsciiResponse({"error": message}, status)
 
     @app.exception_handler(AnyHTTPException)
     async def refused(request: Request, error: Exception) -> Response:
         assert isinstance(error, AnyHTTPException)
-        return AsciiResponse({"error": error.detail}, error.status_code, error.headers)
+        return _AsciiResponse({"error": error.detail}, error.status_code, error.headers)
 
     @app.exception_handler(500)
     async def failed(request: Request, error: Exception) -> Response:
-        return AsciiResponse({"error": "Internal error. The server's log has it."}, 500)
+        return _AsciiResponse({"error": "Internal error. The server's log has it."}, 500)
 
     return app
 

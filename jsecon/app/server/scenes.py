@@ -12,11 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsecon.app.ask import Answer, ask_pixel, ask_text
-from jsecon.app.exports import object_record
-from jsecon.app.locate import Place, locate_answer
+from jsecon.app.locate import gaussian_rows, locate_answer
 from jsecon.app.object_scene import ObjectScene
-from jsecon.app.outputs import best_frames, selected_gaussians
-from jsecon.app.relations import Measure, RelationAnswer, measure, query_relation
+from jsecon.app.outputs import best_frames
 from jsecon.data.gaussians.ply import save_ply
 from jsecon.errors import InputError
 from jsecon.language.field import load_field
@@ -80,7 +78,17 @@ class Scene:
         return ask_text(self.field, self.embedder, query.text, several=query.several, **options)
 
     def record(self, query: SceneQuery) -> dict[str, Any]:
-        """Answers a query by plain values: what is selected and where it is. They are kept in `records`."""
+        """Answers a query by plain values, which are kept in `records`.
+
+        Args:
+          query: The query.
+
+        Returns:
+          Count, objects, region, score and `Place` of the selection, without a place if it is empty.
+
+        Raises:
+          InputError: The query cannot be answered (`ask_text`, `ask_pixel`).
+        """
         answer = self.answer(query)
         region = int(answer.selection.region)
         if len(self.records) >= MAX_RECORDS:
@@ -101,27 +109,6 @@ class Scene:
         """The field as relations read it."""
         return ObjectScene(self.field, self.embedder)
 
-    def relation(self, text: str, frame: str | int | None = None) -> RelationAnswer:
-        """Answers a referring expression, seen from a frame (`query_relation`)."""
-        return query_relation(self.object_scene, text, frame=frame)
-
-    def measure(self, a: str, b: str, frame: str | int | None = None) -> Measure:
-        """Measures the distance between two objects (`jsecon.measure`)."""
-        return measure(self.object_scene, a, b, frame=frame)
-
-    def catalogue_rows(self) -> list[dict[str, Any]]:
-        """Returns the objects of the field as plain values."""
-        listed = self.object_scene.catalogue
-        return [object_record(listed, row) for row in range(len(listed))]
-
-    def top_of(self, place: Place) -> np.ndarray:
-        """Returns the middle of the upper side of a place's points, (3,) in the capture's world."""
-        turn = np.asarray(self.field.to_source, np.float64)[:3, :3]
-        up = turn @ self.object_scene.up
-        up /= np.linalg.norm(up)
-        heights = place.points @ up
-        return place.center + (np.quantile(heights, 0.98) - place.center @ up) * up
-
     def mask(self, answer: Answer, frame: int | None) -> tuple[str, bytes]:
         """Renders an answer alone in a frame.
 
@@ -137,14 +124,25 @@ class Scene:
         return self.field.names[frames[0]], cv2.imencode(".png", np.asarray(shown, np.uint8) * 255)[1].tobytes()
 
     def ply(self, answer: Answer) -> bytes:
-        """Returns the selected Gaussians as a .ply in the capture's world."""
+        """Makes a .ply of the selected Gaussians.
+
+        Args:
+          answer: The answer.
+
+        Returns:
+          Content of the file, in the capture's world.
+        """
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "selection.ply"
-            save_ply(file, selected_gaussians(self.field.gaussians, answer.mask), similarity=self.field.to_source)
+            save_ply(file, gaussian_rows(self.field.gaussians, answer.mask), similarity=self.field.to_source)
             return file.read_bytes()
 
     def description(self) -> dict[str, Any]:
-        """Returns name, sizes and frames of the field as plain values."""
+        """Describes the field.
+
+        Returns:
+          Plain values: name, numbers of Gaussians and regions, frames and their size.
+        """
         return {
             "name": self.name,
             "gaussians": self.field.gaussians.count,

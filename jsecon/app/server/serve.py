@@ -72,7 +72,18 @@ def prepare(
 
 
 def serve_verb(verb: verbs.Serve, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon serve`."""
+    """Does the work of `jsecon serve`.
+
+    Args:
+      verb: Its options.
+      console: Receives the fields and the address.
+
+    Returns:
+      As the first of `prepare`, and under "then" the second.
+
+    Raises:
+      InputError: As `prepare`, or a model is missing.
+    """
     access = {"host": verb.host, "port": verb.port, "token": verb.token, "hosts": verb.allow_host}
     with console.progress("fields"):
         embedder = with_models(verb, console, yes=False).embedder

@@ -15,12 +15,15 @@ from jsecon.app.access import is_allowed_host, token_matches
 def guarded_pages(token: str, hosts: Collection[str]) -> Iterator[None]:
     """Guards the viser servers that are started inside of this context.
 
-    Their pages and sockets need the token, or without a token a Host header that names this machine. viser has no hook
-    for requests, so this wraps the function of the package websockets by which it listens, while the server starts.
+    viser has no hook for requests, so this wraps the function of the package websockets by which it listens, while the
+    server starts.
 
     Args:
-      token: The token, or "".
+      token: Token that pages and sockets need; "" takes requests whose Host header names this machine.
       hosts: Names of this machine besides those of loopback.
+
+    Yields:
+      None.
 
     Raises:
       RuntimeError: This viser listens in another way, so its page would be open to everybody.
@@ -32,7 +35,7 @@ def guarded_pages(token: str, hosts: Collection[str]) -> Iterator[None]:
 
     def serve(handler: Any, *address: Any, process_request: Callable[..., Any], **kwargs: Any) -> Any:
         def checked(connection: Any, request: Any) -> Any:
-            return refusal(request, token, hosts) or process_request(connection, request)
+            return _refusal(request, token, hosts) or process_request(connection, request)
 
         wrapped.append(True)
         return listen(handler, *address, process_request=checked, **kwargs)
@@ -46,17 +49,10 @@ def guarded_pages(token: str, hosts: Collection[str]) -> Iterator[None]:
         raise RuntimeError("this viser does not listen through websockets.asyncio.server.serve")
 
 
-def refusal(request: Any, token: str, hosts: Collection[str]) -> Any:
-    """Checks a request.
+def _refusal(request: Any, token: str, hosts: Collection[str]) -> Any:
+    """Returns the response to a request that may not see the page, None for one that may go on.
 
-    Args:
-      request: Request of the package websockets.
-      token: The token, or "".
-      hosts: Names of this machine besides those of loopback.
-
-    Returns:
-      The response to a request that may not see the page, or whose address carries the token, which then becomes a
-      cookie; None for a request that may go on.
+    A request whose address carries the token is sent to the page with a cookie in its place.
     """
     host = request.headers.get("Host", "")
     origin = request.headers.get("Origin")

@@ -107,7 +107,15 @@ class RegionPictures:
         self._cameras = jax.tree.map(np.asarray, field.cameras)
 
     def region(self, region: int, frame: int) -> UInt8[np.ndarray, "h w 3"]:
-        """Returns the part of a frame that shows a region's Gaussians, or else the whole frame."""
+        """Cuts a region out of a frame.
+
+        Args:
+          region: Id of the region.
+          frame: Index of the frame.
+
+        Returns:
+          The part of the frame that shows the region's Gaussians; the whole frame if it shows none of them.
+        """
         points = self._means[self.regions == region]
         return crop_to_points(self.renderer.photo(frame), self._cameras[frame], points)
 

@@ -81,7 +81,7 @@ class Panel:
             hint = "Copy this line to keep the view. Paste a line and press enter to restore it."
             self._link = gui.add_text("link", "", hint=hint)
 
-        text_form.on_submit(_in_order(lambda _: viewer.then(lambda s: view_state.with_texts(s, self._text.value))))
+        text_form.on_submit(_in_order(lambda _: viewer.then(lambda s: s.with_texts(self._text.value))))
         link_form.on_submit(_in_order(lambda _: viewer.restore(self._link.value)))
         for name in ("all_matches", "threshold", "part_vs_whole", "shells", "colouring"):
             control = getattr(self, f"_{name}")
@@ -103,9 +103,9 @@ class Panel:
     def _press(self, event: Any) -> None:
         """Handles a button."""
         steps: dict[str, Step] = {
-            "isolate": view_state.isolate,
-            "hide": view_state.hide,
-            "show all": view_state.show_all,
+            "isolate": ViewState.isolate,
+            "hide": ViewState.hide,
+            "show all": ViewState.show_all,
         }
         button = event.target.value
         if button in steps:
@@ -118,7 +118,7 @@ class Panel:
     def _set_control(self, name: str, value: Any) -> None:
         """Handles a control that a user moved."""
         if getattr(self._viewer.history.state, name) != value:
-            self._viewer.then(lambda state: view_state.with_controls(state, **{name: value}))
+            self._viewer.then(lambda state: state.with_controls(**{name: value}))
 
     def _choose_frame(self, event: Any) -> None:
         """Handles a frame of the list."""
@@ -141,8 +141,12 @@ class Panel:
         self._viewer.click(event.ray_origin, event.ray_direction, focal, add=event.modifier == "shift")
 
     def show_state(self, state: ViewState) -> None:
-        """Sets the controls to a state."""
-        self._text.value = view_state.text_line(state)
+        """Sets the controls.
+
+        Args:
+          state: State that they show.
+        """
+        self._text.value = state.text_line
         self._all_matches.value = state.all_matches
         self._colouring.value = state.colouring
         self._threshold.value = state.threshold
@@ -150,30 +154,52 @@ class Panel:
         self._shells.value = state.shells
 
     def show_messages(self, content: str) -> None:
-        """Shows messages about the answers, and removes the notice."""
+        """Shows messages about the answers, and removes the notice.
+
+        Args:
+          content: HTML (`messages`).
+        """
         self._messages.content = content
         self._notice.visible = False
 
     def show_notice(self, text: str | InputError) -> None:
-        """Shows a notice."""
+        """Shows a notice above the answers.
+
+        Args:
+          text: Plain text, or an error.
+        """
         self._notice.content = _box(_error(text) if isinstance(text, InputError) else html.escape(text))
         self._notice.visible = True
 
     def show_candidates(self, content: str, count: int) -> None:
-        """Shows candidates, with a button for each."""
+        """Shows candidates, with a button for each.
+
+        Args:
+          content: HTML (`candidate_grid`).
+          count: Number of candidates; 0 hides the folder.
+        """
         self._candidates.content = content
         self._candidate_folder.visible = count > 0
         if count:
             self._select.options = tuple(str(k + 1) for k in range(count))
 
     def show_frame(self, frame: int, picture: np.ndarray) -> None:
-        """Shows a frame's picture (H, W, 3) uint8."""
+        """Shows a frame in the panel.
+
+        Args:
+          frame: Index of the frame.
+          picture: (H, W, 3) uint8 RGB.
+        """
         self._frame.value = self._names[frame]
         self._picture.image = picture
         self._picture.visible = True
 
     def show_link(self, link: str) -> None:
-        """Shows the link of the view."""
+        """Shows the link of the view.
+
+        Args:
+          link: The link (`ViewState.link`).
+        """
         self._link.value = link
 
 
@@ -208,12 +234,15 @@ def _swatch(place: int) -> str:
 
 
 def messages(field: LanguageField, state: ViewState, answers: Sequence[Answer | InputError]) -> str:
-    """Describes the answers as HTML: how many Gaussians with which mean membership, or why no Gaussian is selected.
+    """Describes answers.
 
     Args:
       field: The field.
       state: The state.
       answers: The answer or the error of each of its queries.
+
+    Returns:
+      HTML: of each query how many Gaussians with which mean membership, or why no Gaussian is selected.
     """
     lines = []
     for place, (query, answer) in enumerate(zip(state.queries, answers, strict=True)):
@@ -256,11 +285,14 @@ def _refusal(answer: Answer) -> str:
 def candidate_grid(
     answers: Sequence[Answer | InputError], pictured: Sequence[tuple[int, Candidate, np.ndarray]]
 ) -> str:
-    """Lays out candidates as HTML. A region that is selected has a frame in the colour of its answer.
+    """Lays out candidates.
 
     Args:
       answers: The answers.
       pictured: Index of an answer, one of its candidates, and that candidate's picture.
+
+    Returns:
+      HTML. A region that is selected has a frame in the colour of its answer.
     """
     cells = []
     for number, (place, candidate, picture) in enumerate(pictured):

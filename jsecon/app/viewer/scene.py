@@ -92,7 +92,14 @@ class FieldScene:
         camera.far = 1e4 * self.scale
 
     def fov(self, frame: int) -> float:
-        """Returns the vertical field of view of a frame, radians."""
+        """Computes the field of view of a frame.
+
+        Args:
+          frame: Index of the frame.
+
+        Returns:
+          The vertical field of view, radians.
+        """
         return 2 * float(np.arctan(self._cameras.height / 2 / np.asarray(self._cameras.fy)[frame]))
 
     def _add_frustums(self, server: Any) -> dict[int, Any]:
@@ -118,7 +125,12 @@ class FieldScene:
         }
 
     def paint(self, colours: np.ndarray, visible: np.ndarray) -> None:
-        """Sets colours (N, 3) uint8 and visibility (N,) of the Gaussians. Only groups that change are sent."""
+        """Colours the Gaussians. Only groups that change are sent.
+
+        Args:
+          colours: (N, 3) uint8 RGB.
+          visible: (N,) bool.
+        """
         opacity = np.where(visible, self._opacity, np.uint8(0))
         packed = np.concatenate([colours, opacity[:, None]], axis=1).view(np.uint32)[:, 0]
         with self._server.atomic():
@@ -130,13 +142,21 @@ class FieldScene:
         self._server.flush()
 
     def show_frames(self, shown: bool) -> None:
-        """Shows or hides the cameras of the frames, except for the one at the viewpoint, which would cover the view."""
+        """Shows or hides the cameras of the frames.
+
+        Args:
+          shown: Whether to show them, except for the one at the viewpoint, which would cover the view.
+        """
         self._frames_shown = shown
         for frame, frustum in self.frustums.items():
             frustum.visible = shown and frame != self._frame
 
     def look(self, camera: Sequence[float]) -> None:
-        """Moves all clients to the camera of a `ViewState`."""
+        """Moves all clients to a camera.
+
+        Args:
+          camera: As in `ViewState`, nine numbers.
+        """
         position, target, up = np.asarray(camera, np.float64).reshape(3, 3)
         start = self._server.initial_camera
         start.position, start.look_at = position * self.scale, target * self.scale
@@ -147,7 +167,12 @@ class FieldScene:
                 client.camera.look_at = target * self.scale
 
     def fly(self, client: Any, frame: int) -> None:
-        """Moves a client to the camera of a frame."""
+        """Moves a client to the camera of a frame.
+
+        Args:
+          client: The viser client.
+          frame: Index of the frame.
+        """
         start = np.asarray(client.camera.position)
         ends = [Rotation.from_quat(client.camera.wxyz, scalar_first=True), self._rotations[frame]]
         rotation = Slerp([0, 1], Rotation.concatenate(ends))

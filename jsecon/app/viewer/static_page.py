@@ -41,7 +41,19 @@ MIN_OPACITY = 4
 
 
 def export_page(verb: verbs.View, file: Path, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon view --export FILE`."""
+    """Does the work of `jsecon view --export`.
+
+    Args:
+      verb: Options of the verb.
+      file: The .html to write.
+      console: Receives the figures.
+
+    Returns:
+      Number of Gaussians, answered texts, bytes, the file under "written", and the errors of the other texts.
+
+    Raises:
+      InputError: The file has another ending or cannot be written, or the field cannot be read.
+    """
     if file.suffix != ".html":
         raise InputError("--export", f"{file} does not end in .html", remedy="For example: --export page.html")
     require_writable(file.parent)

@@ -89,53 +89,95 @@ class ViewState:
         options = self.threshold, self.part_vs_whole, self.all_matches, self.shells
         return tuple(ViewQuery(query, *options) for query in self.queries)
 
+    @property
+    def text_line(self) -> str:
+        """The highlighted texts, separated by semicolons."""
+        return "; ".join(query for query in self.queries if isinstance(query, str))
 
-def with_texts(state: ViewState, line: str) -> ViewState:
-    """Highlights the texts of a line, which semicolons separate, each once."""
-    texts = dict.fromkeys(text.strip() for text in line.split(";") if text.strip())
-    return dataclasses.replace(state, queries=tuple(texts)[:MAX_QUERIES])
+    @property
+    def link(self) -> str:
+        """The state as one line of JSON, without fields at their defaults."""
+        default = ViewState()
+        fields = {name: value for name, value in dataclasses.asdict(self).items() if value != getattr(default, name)}
+        return json.dumps(fields, ensure_ascii=False, separators=(",", ":"))
 
+    def with_texts(self, line: str) -> "ViewState":
+        """Highlights texts in place of what is highlighted.
 
-def text_line(state: ViewState) -> str:
-    """Returns the line of the highlighted texts."""
-    return "; ".join(query for query in state.queries if isinstance(query, str))
+        Args:
+          line: The texts, separated by semicolons. Each counts once.
 
+        Returns:
+          The next state.
+        """
+        texts = dict.fromkeys(text.strip() for text in line.split(";") if text.strip())
+        return dataclasses.replace(self, queries=tuple(texts)[:MAX_QUERIES])
 
-def toggle_region(state: ViewState, region: int, *, add: bool = False) -> ViewState:
-    """Highlights a region, alone or with `add` beside the other queries. A second time removes it."""
-    others = tuple(query for query in state.queries if query != region) if add else ()
-    remove = region in state.queries if add else state.queries == (region,)
-    return dataclasses.replace(state, queries=others if remove else (*others, region)[-MAX_QUERIES:])
+    def toggle_region(self, region: int, *, add: bool = False) -> "ViewState":
+        """Highlights a region, or removes it where it is highlighted.
 
+        Args:
+          region: Id of the region.
+          add: Whether the other queries stay.
 
-def replace_match(state: ViewState, place: int, region: int) -> ViewState:
-    """Highlights a region in place of the query number `place`."""
-    queries = dict.fromkeys((*state.queries[:place], region, *state.queries[place + 1 :]))
-    return dataclasses.replace(state, queries=tuple(queries))
+        Returns:
+          The next state.
+        """
+        others = tuple(query for query in self.queries if query != region) if add else ()
+        remove = region in self.queries if add else self.queries == (region,)
+        return dataclasses.replace(self, queries=others if remove else (*others, region)[-MAX_QUERIES:])
 
+    def replace_match(self, place: int, region: int) -> "ViewState":
+        """Highlights a region in place of a query.
 
-def with_controls(state: ViewState, **controls: Any) -> ViewState:
-    """Sets threshold, part_vs_whole (both clipped to 0 .. 1), all_matches, shells, colouring or camera."""
-    for name in ("threshold", "part_vs_whole"):
-        if name in controls:
-            controls[name] = round(min(max(float(controls[name]), 0.0), 1.0), 3)
-    return dataclasses.replace(state, **controls)
+        Args:
+          place: Index of the query.
+          region: Id of the region.
 
+        Returns:
+          The next state.
+        """
+        queries = dict.fromkeys((*self.queries[:place], region, *self.queries[place + 1 :]))
+        return dataclasses.replace(self, queries=tuple(queries))
 
-def isolate(state: ViewState) -> ViewState:
-    """Shows only what is highlighted, if anything is."""
-    return dataclasses.replace(state, isolated=state.view_queries) if state.queries else state
+    def with_controls(self, **controls: Any) -> "ViewState":
+        """Sets controls.
 
+        Args:
+          **controls: Fields of the state; threshold and part_vs_whole are clipped to 0 .. 1.
 
-def hide(state: ViewState) -> ViewState:
-    """Hides what is highlighted."""
-    hidden = dict.fromkeys((*state.hidden, *state.view_queries))
-    return dataclasses.replace(state, queries=(), hidden=tuple(hidden)[-MAX_QUERIES:])
+        Returns:
+          The next state.
+        """
+        for name in ("threshold", "part_vs_whole"):
+            if name in controls:
+                controls[name] = round(min(max(float(controls[name]), 0.0), 1.0), 3)
+        return dataclasses.replace(self, **controls)
 
+    def isolate(self) -> "ViewState":
+        """Shows only the highlighted Gaussians.
 
-def show_all(state: ViewState) -> ViewState:
-    """Shows all Gaussians again."""
-    return dataclasses.replace(state, isolated=(), hidden=())
+        Returns:
+          The next state: the same one if no query is highlighted.
+        """
+        return dataclasses.replace(self, isolated=self.view_queries) if self.queries else self
+
+    def hide(self) -> "ViewState":
+        """Hides the highlighted Gaussians.
+
+        Returns:
+          The next state, without highlighted queries.
+        """
+        hidden = dict.fromkeys((*self.hidden, *self.view_queries))
+        return dataclasses.replace(self, queries=(), hidden=tuple(hidden)[-MAX_QUERIES:])
+
+    def show_all(self) -> "ViewState":
+        """Shows all Gaussians again.
+
+        Returns:
+          The next state.
+        """
+        return dataclasses.replace(self, isolated=(), hidden=())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,7 +193,14 @@ class History:
     past: tuple[ViewState, ...] = ()
 
     def then(self, state: ViewState) -> "History":
-        """Returns the history with a next state. All moves of one slider in a row count as one step."""
+        """Adds a state. All moves of one slider in a row count as one step.
+
+        Args:
+          state: The next state.
+
+        Returns:
+          The history with that state as the present one.
+        """
         if state == self.state:
             return self
         changed = _differences(self.state, state)
@@ -161,7 +210,11 @@ class History:
         return History(state, (*self.past, self.state)[-MAX_UNDO:])
 
     def back(self) -> "History":
-        """Returns the history before the last step. The first state stays."""
+        """Takes the last step back.
+
+        Returns:
+          The history before that step; the same one if there is none.
+        """
         return History(self.past[-1], self.past[:-1]) if self.past else self
 
 
@@ -171,18 +224,11 @@ def _differences(one: ViewState, other: ViewState) -> set[str]:
     return {name for name in names if getattr(one, name) != getattr(other, name)}
 
 
-def to_link(state: ViewState) -> str:
-    """Returns the state as one line of JSON, without fields at their defaults."""
-    default = ViewState()
-    fields = {name: value for name, value in dataclasses.asdict(state).items() if value != getattr(default, name)}
-    return json.dumps(fields, ensure_ascii=False, separators=(",", ":"))
-
-
 def from_link(link: str) -> ViewState:
-    """Reads the state that `to_link` wrote.
+    """Reads a link.
 
     Args:
-      link: The line of JSON.
+      link: What `ViewState.link` wrote.
 
     Returns:
       The state.
@@ -241,7 +287,14 @@ def _check_fields(state: ViewState) -> None:
 
 
 def answer_colours(count: int) -> UInt8[np.ndarray, "k 3"]:
-    """Returns the RGB of answers 0 .. count-1: strong hues, a golden angle apart."""
+    """Chooses the colours of answers: strong hues, a golden angle apart.
+
+    Args:
+      count: Number of answers K.
+
+    Returns:
+      RGB of answers 0 .. K-1, each of which does not depend on `count`.
+    """
     hues = (0.91 + GOLDEN_ANGLE * np.arange(count)) % 1.0
     return (255 * np.array([colorsys.hls_to_rgb(h, 0.6, 1.0) for h in hues]).reshape(count, 3)).astype(np.uint8)
 

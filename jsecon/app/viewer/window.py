@@ -100,10 +100,14 @@ class Viewer:
         return mutual_neighbours(self.field.gaussians.means)
 
     def start(self, state: ViewState) -> None:
-        """Draws a first state, compiles what queries need, and starts the thread."""
+        """Draws the first state, compiles what queries need, and starts the thread.
+
+        Args:
+          state: The first state.
+        """
         self._set_state(state, update_controls=True)
         self._paint(self.history.state)
-        example = view_state.with_texts(ViewState(), "red")
+        example = ViewState().with_texts("red")
         answers = [self.answer(query) for query in example.view_queries]
         messages(self.field, example, answers)
         self._find_candidates(example, answers)
@@ -125,11 +129,20 @@ class Viewer:
         self._thread.join()
 
     def then(self, step: Callable[[ViewState], ViewState], *, update_controls: bool = False) -> None:
-        """Queues a step from the state to the next. `update_controls` also sets the controls and the camera."""
+        """Queues a step.
+
+        Args:
+          step: Makes the next state of the present one.
+          update_controls: Also sets the controls.
+        """
         self._steps.put(lambda: self._set_state(step(self.history.state), update_controls=update_controls))
 
     def do(self, act: Callable[[], Any]) -> None:
-        """Queues an act that does not change the state."""
+        """Queues an act that does not change the state.
+
+        Args:
+          act: Is called without arguments.
+        """
         self._steps.put(act)
 
     def undo(self) -> None:
@@ -142,16 +155,31 @@ class Viewer:
         self.do(back)
 
     def restore(self, link: str) -> None:
-        """Queues the state of a link."""
+        """Queues the state of a link.
+
+        Args:
+          link: The link. The panel shows what is wrong with it.
+        """
         self.then(lambda _: view_state.from_link(link), update_controls=True)
 
     def set_camera(self, camera: Any) -> None:
-        """Records where a client looks from, for the link."""
+        """Records where a client looks from, for the link.
+
+        Args:
+          camera: Camera of the viser client.
+        """
         numbers = np.concatenate([camera.position, camera.look_at]) / self.scene.scale
         self._camera = tuple(np.round(np.concatenate([numbers, camera.up_direction]), 5).tolist())
 
     def click(self, origin: Sequence[float], direction: Sequence[float], focal: float, *, add: bool) -> None:
-        """Queues highlighting the region that a ray of the window meets."""
+        """Queues highlighting the region that a ray meets.
+
+        Args:
+          origin: (3,) origin of the ray, in the window's world.
+          direction: (3,) its direction.
+          focal: Focal length of the client's view, px.
+          add: Keeps the other queries.
+        """
         start = np.asarray(origin) / self.scene.scale
 
         def step(state: ViewState) -> ViewState:
@@ -160,21 +188,30 @@ class Viewer:
             if region < 0:
                 self.panel.show_notice("No region is known there: it is background, or no frame shows it.")
                 return state
-            return view_state.toggle_region(state, region, add=add)
+            return state.toggle_region(region, add=add)
 
         self.then(step, update_controls=True)
 
     def select(self, number: int) -> None:
-        """Queues highlighting a candidate in place of its query."""
+        """Queues highlighting a candidate in place of its query.
+
+        Args:
+          number: Index of the candidate in the panel.
+        """
 
         def step(state: ViewState) -> ViewState:
             place, candidate = self._candidates[number]
-            return view_state.replace_match(state, place, candidate.region)
+            return state.replace_match(place, candidate.region)
 
         self.then(step, update_controls=True)
 
     def go_to_frame(self, client: Any, frame: int) -> None:
-        """Queues a flight to a frame, and its picture with its regions."""
+        """Queues a flight to a frame, and its picture with its regions.
+
+        Args:
+          client: The viser client, or None for the picture alone.
+          frame: Index of the frame.
+        """
 
         def act() -> None:
             if client is not None:
@@ -186,7 +223,11 @@ class Viewer:
         self.do(act)
 
     def export(self, client: Any) -> None:
-        """Queues sending the highlighted answers as a .zip: .ply, .json and masks of each."""
+        """Queues sending the highlighted answers as a .zip: .ply, .json and masks of each.
+
+        Args:
+          client: The viser client.
+        """
 
         def act() -> None:
             answers = [self.answer(query) for query in self.history.state.view_queries]
@@ -199,12 +240,17 @@ class Viewer:
         self.do(act)
 
     def zipped(self, answers: Sequence[Answer]) -> bytes:
-        """Returns a .zip of the files of answers."""
+        """Packs the files of answers.
+
+        Args:
+          answers: The answers.
+
+        Returns:
+          Content of the .zip.
+        """
         packed = io.BytesIO()
-        options: dict[str, Any] = {
-            "compression": zipfile.ZIP_DEFLATED,
-            "strict_timestamps": False,
-        }  # clocks before 1980
+        options: dict[str, Any] = {"strict_timestamps": False}  # clocks before 1980
+        options["compression"] = zipfile.ZIP_DEFLATED
         with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(packed, "w", **options) as archive:
             for answer in answers:
                 write_answer(self.field, answer, Path(folder), answer_masks(self.field, answer, EXPORTED_MASKS))
@@ -235,7 +281,7 @@ class Viewer:
 
     def _set_state(self, state: ViewState, *, update_controls: bool) -> None:
         """Makes a state the present one."""
-        self.history = self.history.then(view_state.with_controls(state, camera=()))
+        self.history = self.history.then(state.with_controls(camera=()))
         if update_controls:
             self.panel.show_state(state)
         if state.camera:
@@ -243,7 +289,7 @@ class Viewer:
 
     def _update_link(self) -> None:
         """Shows the link of the state and the camera."""
-        self.panel.show_link(view_state.to_link(view_state.with_controls(self.history.state, camera=self._camera)))
+        self.panel.show_link(self.history.state.with_controls(camera=self._camera).link)
 
     def _answer(self, query: ViewQuery) -> Answer | InputError:
         """Answers a query that is not among the last ones."""
@@ -366,13 +412,24 @@ def open_viewer(
 
 
 def view_verb(verb: verbs.View, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon view`."""
+    """Does the work of `jsecon view`.
+
+    Args:
+      verb: Its options.
+      console: Receives the address.
+
+    Returns:
+      Nothing once the viewer is stopped; with --export as `export_page`.
+
+    Raises:
+      InputError: As `open_viewer` and `export_page`, or the link, the field or its model cannot be read.
+    """
     if verb.export is not None:
         return export_page(verb, verb.export, console)
     token = token_for(verb.host, verb.token)
     state = view_state.from_link(verb.link) if verb.link else ViewState()
     if verb.texts:
-        state = view_state.with_texts(state, "; ".join(verb.texts))
+        state = state.with_texts("; ".join(verb.texts))
     field = load_field(verb.field)
     name = verb.field.resolve().parent.name
     dim = None
