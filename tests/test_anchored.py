@@ -14,7 +14,7 @@ from jsecon.errors import InputError
 from jsecon.language.membership import finish_votes, vote_shares, with_shown
 from jsecon.language.votes import region_votes
 from jsecon.query.classes import query_classes
-from jsecon.query.pixel import pixel_weights, region_at, region_shares_at
+from jsecon.query.pixel import pixel_weights, region_at, region_shares_seen
 from jsecon.query.rules import QueryRules
 from jsecon.query.select import query_anchored, query_region, query_several
 from jsecon.splat.render import render
@@ -330,7 +330,7 @@ def test_the_region_under_a_pixel_is_the_labelled_one(field, made):
     labels = made[1]
     agree, clear = 0, 0
     for view, y, x in np.random.default_rng(0).permutation(np.argwhere(labels >= 0))[:40]:
-        shares = region_shares_at(field, int(view), int(x), int(y))
+        shares = region_shares_seen(field, field.cameras[int(view)], int(x), int(y))
         rendered = _rendered_shares(field, int(view))[y, x]
         np.testing.assert_allclose(shares, rendered, atol=1e-5)
         found = region_at(field, int(view), int(x), int(y))

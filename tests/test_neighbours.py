@@ -1,11 +1,9 @@
-"""Similarities evened out over neighbours: against a slow twin, with equal places and places that are no numbers."""
+"""Nearest neighbours: against a slow twin, with equal places and places that are no numbers."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon.query.smoothing import nearest_neighbours, smooth_over_neighbours
+from jsecon.query.edits import nearest_neighbours
 
 
 def test_the_nearest_are_the_nearest_but_oneself():
@@ -28,22 +26,3 @@ def test_many_in_one_place_and_places_that_are_no_numbers():
         assert nearest_neighbours(means[:few], count=4).shape == (few, max(min(4, few - 1), 1))
     with pytest.raises(ValueError, match="at least 1"):
         nearest_neighbours(means, count=0)
-
-
-def test_evened_is_half_of_ones_own():
-    draw = np.random.default_rng(1)
-    similarity, near = draw.random(50, np.float32), draw.integers(0, 50, (50, 6)).astype(np.int32)
-    slow = [0.5 * similarity[n] + 0.5 * np.mean([similarity[m] for m in near[n]]) for n in range(50)]
-    np.testing.assert_allclose(smooth_over_neighbours(similarity, near), slow, rtol=1e-6)
-    several = draw.random((3, 50)).astype(np.float32)
-    by_vmap = jax.vmap(smooth_over_neighbours, in_axes=(0, None))(several, near)
-    np.testing.assert_allclose(by_vmap, np.stack([smooth_over_neighbours(row, near) for row in several]), rtol=1e-6)
-    with jax.disable_jit():
-        np.testing.assert_allclose(smooth_over_neighbours(jnp.asarray(similarity), near), slow, rtol=1e-6)
-    gradient = jax.grad(lambda s: (smooth_over_neighbours(s, near) ** 2).sum())(jnp.asarray(similarity))
-    step = np.zeros(50, np.float32)
-    step[7] = 1e-2
-    ends = [
-        float((np.asarray(smooth_over_neighbours(similarity + k * step, near), np.float64) ** 2).sum()) for k in (1, -1)
-    ]
-    assert float(gradient[7]) == pytest.approx((ends[0] - ends[1]) / 2e-2, rel=1e-2)

@@ -5,15 +5,15 @@ import time
 import numpy as np
 import pytest
 
-from jsecon.query.outliers import default_eps, one_component, remove_outliers
+from jsecon.query.outliers import default_eps, remove_outliers, split_outliers
 
 
 def test_one_component_is_seen_where_points_are_dense():
     sphere = np.random.default_rng(0).normal(size=(4_000, 3))
     sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
-    assert one_component(sphere, default_eps(sphere))
-    assert not one_component(np.concatenate([sphere, [[1.5, 0, 0]]]), default_eps(sphere))
-    assert one_component(sphere[:1], 0.1)
+    for points, whole in ((sphere, True), (np.concatenate([sphere, [[1.5, 0, 0]]]), False), (sphere[:1], True)):
+        found = split_outliers(points, np.ones(len(points), bool), eps=default_eps(sphere), min_samples=1)
+        assert found.skipped == ("the selection is one component" if whole else "")
 
 
 def two_blobs_and_strays(scale=1.0):

@@ -17,7 +17,7 @@ from jsecon.errors import InputError
 from jsecon.language.field import save_field
 from jsecon.query.expressions import RELATIONS, is_expression, parse_expression
 from jsecon.query.object_shapes import ObjectShapes
-from jsecon.query.relations import PAIRS, Viewpoint, between_scores, gap, near, order_values, pair_scores
+from jsecon.query.relations import PAIRS, Viewpoint, between_scores, gap, order_values, pair_scores
 from jsecon.types import Regions
 
 CORNERS = np.stack(np.meshgrid(*[np.linspace(-1, 1, 3)] * 3), -1).reshape(-1, 3)
@@ -113,6 +113,11 @@ def test_predicates_are_pure_jitted_and_batched():
     both = jax.tree.map(
         lambda *columns: jnp.concatenate(columns), brick((0, 0, 0), (0.1,) * 3), brick((1, 0, 0), (0.2,) * 3)
     )
+
+    def near(a, b):
+        one, other = (jax.tree.map(lambda column: column[None], shape) for shape in (a, b))
+        return pair_scores("near", one, other, looking())[0, 0]
+
     table = jax.jit(jax.vmap(jax.vmap(near, (None, 0)), (0, None)))(both, both)
     compiled = jax.jit(lambda a, b, view: {name: pair_scores(name, a, b, view) for name in PAIRS})
     scored, arrays = compiled(both, both, looking()), jax.tree.map(np.asarray, both)

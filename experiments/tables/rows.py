@@ -26,9 +26,9 @@ from experiments.tables.ours import ask_field, field_of, paper_field
 from experiments.tables.readings import CHOOSERS, RULES, SHARP, SHARPENED, as_share, chosen_by, read, scores
 from experiments.tables.setting import Setting
 from jsecon.language.membership import SHARE_THRESHOLD
+from jsecon.query.edits import nearest_neighbours
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.rules import RETRIEVALS
-from jsecon.query.smoothing import nearest_neighbours, smooth_over_neighbours
 from jsecon.types import Selection
 
 NO_REFUSAL = -1.0
@@ -121,7 +121,8 @@ def _evened(setting: Setting, answers: Answers, *, clean: bool) -> Answers:
         found = answers.select(k)
         if found is None:
             return None
-        share = smooth_over_neighbours(jnp.asarray(found.similarity, jnp.float32), near)
+        share = jnp.asarray(found.similarity, jnp.float32)
+        share = 0.5 * (share + jnp.mean(share[near], axis=1))
         mask = np.asarray(share >= SHARE_THRESHOLD)
         mask = remove_outliers(means, mask) if clean else mask
         return dataclasses.replace(found, mask=jnp.asarray(mask), similarity=share)

@@ -79,8 +79,7 @@ def with_shown(votes: Votes, regions: Regions, *, alike_threshold: float = ALIKE
     Args:
       votes: Votes of N Gaussians, cast `by_view`.
       regions: Regions made from the labels that voted.
-      alike_threshold: Cosine of `mean_residuals` from which regions are shown together, as queries join them
-        (`is_alike`).
+      alike_threshold: Cosine of `mean_residuals` from which regions are shown together, as queries join them.
 
     Returns:
       The votes with `shown` (N, K).

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jsecon.errors import require, require_shape
-from jsecon.query.similarity import Codes, Number, UnitCodes, as_codes, similarities
+from jsecon.query.similarity import Codes, Number, UnitCodes, similarities
 from jsecon.types import Array, Selection
 
 TEMPERATURE = 10.0
@@ -17,22 +17,22 @@ TEMPERATURE = 10.0
 
 
 def query_one_step(codes: Codes, text_code: Float[Array, " d_text"], threshold: Number) -> Selection:
-    """Selects the Gaussians whose code has a cosine of at least `threshold` with the text's code.
+    """Selects the Gaussians whose code has a cosine of at least `threshold` with the text's code. Pure.
 
     Args:
       codes: (N, d) of any length, or `unit_codes(codes)`, made once for many queries. A zero code (unknown) or one that
         is not finite has similarity 0 and is never selected.
       text_code: (d,) of any length.
-      threshold: On the cosine.
+      threshold: Smallest cosine.
 
     Returns:
-      The selection; `score` is the best similarity. Pure.
+      The selection; `score` is the best similarity.
 
     Raises:
       ValueError: Shapes disagree.
     """
     require_shape("query_one_step", text_code, (codes.shape[1],), "Encode the text with the field's coder.")
-    return _one_step(as_codes(codes), jnp.asarray(text_code), threshold)
+    return _one_step(codes, text_code, threshold)
 
 
 @jax.jit
@@ -44,19 +44,20 @@ def _one_step(codes: Array | UnitCodes, text_code: Array, threshold: Number) -> 
 def query_canonical(
     features: Codes, text: Float[Array, " d_text"], canonical: Float[Array, "c d_canonical"], threshold: Number
 ) -> Selection:
-    """Selects the Gaussians whose relevancy to the text is at least `threshold`.
+    """Selects the Gaussians whose relevancy to the text is at least `threshold`. Pure.
 
     The relevancy is the smallest, over the phrases c, of softmax(10 [cos(f, text), cos(f, c)])[0] (Kerr et al. 2023,
     LERF), in (0, 1); above 0.5 the text is closer than every phrase.
 
     Args:
-      features: (N, d) embeddings, or codes; zero or non-finite ones have relevancy 0 and are never selected.
+      features: (N, d) embeddings or codes, or their `unit_codes`; zero or non-finite ones have relevancy 0 and are
+        never selected.
       text: (d,) in the same space.
       canonical: (C, d) phrases in the same space, C >= 1.
-      threshold: On the relevancy.
+      threshold: Smallest relevancy.
 
     Returns:
-      The selection; `score` is the best relevancy. Pure.
+      The selection; `score` is the best relevancy.
 
     Raises:
       ValueError: Shapes disagree.
@@ -65,7 +66,7 @@ def query_canonical(
     fit = text.shape[0] == size and canonical.shape[1] == size and canonical.shape[0] >= 1
     shapes, expected = f"text {text.shape}, canonical {canonical.shape}", f"({size},) and (C >= 1, {size})"
     require(fit, "query_canonical", shapes, expected, "Embed or encode text and canonical phrases as the features are.")
-    return _canonical(as_codes(features), jnp.asarray(text), jnp.asarray(canonical), threshold)
+    return _canonical(features, text, canonical, threshold)
 
 
 @jax.jit
@@ -74,7 +75,16 @@ def _canonical(features: Codes, text: Array, canonical: Array, threshold: Number
 
 
 def relevancies(features: Codes, text: Float[Array, " d"], canonical: Float[Array, "c d"]) -> tuple[Array, Array]:
-    """LERF's relevancy (N,), and where it is known (N,); 0 elsewhere."""
+    """Computes LERF's relevancy, see `query_canonical`. Pure.
+
+    Args:
+      features: (N, d) embeddings or codes.
+      text: (d,) in the same space.
+      canonical: (C, d) phrases in the same space.
+
+    Returns:
+      Relevancy (N,) in (0, 1), and whether it is known (N,); 0 if not.
+    """
     positive, known = similarities(features, text)
     # One phrase at a time: the sums stay multiply-and-sum, and no (N, C) array of products is made.
     negative, known_too = jax.lax.map(lambda phrase: similarities(features, phrase), canonical)

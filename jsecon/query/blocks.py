@@ -43,11 +43,11 @@ def query_in_blocks(
     Memory: one block of columns, and 12 bytes for each selected Gaussian.
 
     Args:
-      field: From `load_field(path, mapped=True)`.
-      text_embeddings: One row per text.
+      field: Field of R regions, such as `load_field(path, mapped=True)`.
+      text_embeddings: (Q, E), one row per text.
       rules: How texts match regions.
-      by: How Gaussians are chosen (`select_gaussians`).
-      similarity_threshold: On their similarity; None takes the default of `by`.
+      by: "votes" or "code", see `select_gaussians`.
+      similarity_threshold: Smallest similarity; None takes 0.5 for votes and 0.9 for codes.
 
     Returns:
       One answer per text.
@@ -69,10 +69,10 @@ def select_in_blocks(
     """`select_gaussians` of several matches in one pass over the columns of a field.
 
     Args:
-      field: From `load_field(path, mapped=True)`.
-      matches: From `match_regions`.
-      by: How Gaussians are chosen.
-      similarity_threshold: On their similarity; None takes the default of `by`.
+      field: Field of R regions, such as `load_field(path, mapped=True)`.
+      matches: Results of `match_regions`.
+      by: "votes" or "code", see `select_gaussians`.
+      similarity_threshold: Smallest similarity; None takes 0.5 for votes and 0.9 for codes.
 
     Returns:
       One answer per match.

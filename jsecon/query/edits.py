@@ -8,10 +8,41 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
 
 from jsecon.errors import require
-from jsecon.query.smoothing import nearest_neighbours
 from jsecon.types import Array
+
+NEIGHBOURS = 10
+"""Nearest Gaussians that are averaged."""
+
+
+def nearest_neighbours(means: Float[Array, "n 3"], *, count: int = NEIGHBOURS) -> Int[np.ndarray, "n k"]:
+    """Finds the Gaussians whose centres are nearest to each. Host code.
+
+    Args:
+      means: (N, 3) centres.
+      count: Neighbours of each.
+
+    Returns:
+      (N, K) int32 ids without the Gaussian itself; K = N - 1 if there are fewer. A centre that is not finite is not a
+      neighbour, and has itself as its neighbours.
+
+    Raises:
+      ValueError: `count` is below 1.
+    """
+    require(count >= 1, "nearest_neighbours", count, "at least 1", "10 is the default.")
+    means = np.asarray(means, np.float64)
+    finite = np.flatnonzero(np.isfinite(means).all(1))
+    ids = np.repeat(np.arange(len(means), dtype=np.int32)[:, None], min(count, max(len(means) - 1, 1)), axis=1)
+    if len(finite) > 1:
+        points = means[finite]
+        kept = min(ids.shape[1], len(finite) - 1)
+        near = np.asarray(KDTree(points).query(points, k=kept + 1, workers=-1)[1])
+        itself = near == np.arange(len(points))[:, None]
+        itself[~itself.any(1), -1] = True  # of many in one place the farthest goes in its stead
+        ids[finite, :kept] = finite[near[~itself].reshape(len(points), kept)]
+    return ids
 
 
 def mutual_neighbours(means: Float[Array, "n 3"]) -> Int[np.ndarray, "n k"]:
@@ -41,8 +72,8 @@ def grow(mask: Bool[Array, " n"], near: Int[Array, "n k"], shells: int = 1) -> B
 
     Args:
       mask: (N,) the selected Gaussians.
-      near: `mutual_neighbours` of all.
-      shells: How often the neighbours of what is selected are added.
+      near: (N, K) `mutual_neighbours` of all.
+      shells: Number of shells that are added.
 
     Returns:
       (N,) mask, which contains the first one.
@@ -58,20 +89,29 @@ def grow(mask: Bool[Array, " n"], near: Int[Array, "n k"], shells: int = 1) -> B
 
 
 def shrink(mask: Bool[Array, " n"], near: Int[Array, "n k"], shells: int = 1) -> Bool[Array, " n"]:
-    """Removes shells of a selection: `grow` of what is not selected, with the same arguments and errors."""
+    """Removes shells of a selection: `grow` of what is not selected.
+
+    Args:
+      mask: (N,) the selected Gaussians.
+      near: (N, K) `mutual_neighbours` of all.
+      shells: Number of shells that are removed.
+
+    Returns:
+      (N,) mask, which the first one contains.
+
+    Raises:
+      ValueError: `shells` is negative.
+    """
     return ~grow(~jnp.asarray(mask), near, shells)
 
 
 def invert(mask: Bool[Array, " n"]) -> Bool[Array, " n"]:
-    """Selects what is not selected."""
+    """Selects what is not selected.
+
+    Args:
+      mask: (N,) the selected Gaussians.
+
+    Returns:
+      (N,) mask.
+    """
     return ~jnp.asarray(mask)
-
-
-def union(*masks: Bool[Array, " n"]) -> Bool[Array, " n"]:
-    """Selects what any of the masks selects."""
-    return jnp.any(jnp.stack(masks), axis=0)
-
-
-def subtract(mask: Bool[Array, " n"], *others: Bool[Array, " n"]) -> Bool[Array, " n"]:
-    """Selects what the mask selects and none of the others does."""
-    return jnp.asarray(mask) & ~union(jnp.zeros_like(jnp.asarray(mask)), *others)

@@ -154,7 +154,12 @@ class Expression:
         return {c.relation for c in self.conditions} | {thing.order for thing in things if thing.order is not None}
 
     def readings(self) -> list[tuple[Condition, ...]]:
-        """The conditions of the object, all of them first; then the second as one of the first one's anchor."""
+        """Lists the ways to attach the relations to the objects.
+
+        Returns:
+          The conditions of the object: all of them first; then, if the text allows it, the second as one of the first
+          one's anchor.
+        """
         readings = [self.conditions]
         if len(self.conditions) > 1 and not self.joined:
             first, second = self.conditions
@@ -162,7 +167,14 @@ class Expression:
         return readings
 
     def describe(self, conditions: Sequence[Condition] | None = None) -> str:
-        """Describes how the text is read: the object, its order, and its conditions."""
+        """Describes how the text is read.
+
+        Args:
+          conditions: One of `readings`, by default the first.
+
+        Returns:
+          The object, its conditions and its order, in words.
+        """
         thing = self.thing
         order = [] if thing.order is None else [f"{_ordinal(thing.rank)}{thing.order}"]
         conditions = self.conditions if conditions is None else conditions
@@ -184,7 +196,14 @@ _ORDER_OF = _spellings(ORDERS)
 
 
 def is_expression(text: str) -> bool:
-    """Returns whether a text has a relation, an order or a number of the grammar outside quotes."""
+    """Finds out whether a text needs the grammar.
+
+    Args:
+      text: Any text.
+
+    Returns:
+      True if it has a relation, an order or a number of the grammar outside of quotes.
+    """
     tokens = _tokens(text)
     _, rest = _question(tokens)
     counted = len(rest) < len(tokens) and tokens[0].key in ("how", "count")

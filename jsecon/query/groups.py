@@ -28,7 +28,7 @@ def same_object(field: LanguageField, rules: QueryRules = RULES) -> SameObject:
 
     Args:
       field: Field of R regions.
-      rules: `piece_threshold` and `alike_threshold` are read.
+      rules: Rules of which `piece_threshold` and `alike_threshold` are read.
 
     Returns:
       The pairs. Without `Votes.overlap` no two regions are joined.
@@ -52,8 +52,8 @@ def containment(overlap: Float[Array, "r r"], size: Float[Array, " r"]) -> Float
     """Computes how much of a region lies in another: sum_n min(p_nr, p_ns) / sum_n p_nr, with p the shares.
 
     Args:
-      overlap: Soft IoU of R regions (`Votes.overlap`).
-      size: Sum of each region's shares.
+      overlap: (R, R) soft IoU (`Votes.overlap`).
+      size: (R,) sum of each region's shares.
 
     Returns:
       (R, R) of each region in row r, its part in region s; 0 for a region without votes.
@@ -72,12 +72,12 @@ def objects_of_gaussians(
     the same Gaussians, and those that belong to another object even more.
 
     Args:
-      votes: Of N Gaussians on R regions.
-      objects: Object of each region, or -1.
+      votes: Votes of N Gaussians on R regions.
+      objects: (R,) object of each region, -1 for none.
       threshold: Smallest share.
 
     Returns:
-      (N,) object or -1, and (N,) its share; 0 without votes. Each row stands for itself.
+      (N,) object, -1 for none, and (N,) its share; 0 without votes. Each row stands for itself.
     """
     columns = list(vote_columns(votes))
     owners = [jnp.where(region >= 0, objects[jnp.maximum(region, 0)], -1) for region, _, _ in columns]

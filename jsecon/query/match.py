@@ -89,7 +89,7 @@ def match_regions(
     *,
     excluded: Float[Array, "u e"] | None = None,
 ) -> RegionMatch:
-    """Finds the regions that match any of the queries and none of the excluded texts.
+    """Finds the regions that match any of the queries and none of the excluded texts. Pure.
 
     A text matches the region with the largest similarity s times `evidence`, the anchor, unless the rules refuse it.
     With m the median similarity and b the largest, other regions join the anchor that have
@@ -103,9 +103,9 @@ def match_regions(
 
     Args:
       field: Field of R regions with embeddings of E numbers.
-      queries: Embeddings of the texts, Q >= 1.
+      queries: (Q, E) embeddings of the texts, Q >= 1.
       rules: How texts match.
-      excluded: Embeddings of texts whose regions are left out.
+      excluded: (U, E) embeddings of texts whose regions are left out; None leaves out none.
 
     Returns:
       The match.
@@ -132,7 +132,7 @@ def _match(embeddings, pixels, overlap, queries, excluded, reference, rules: Que
     def best_of(texts):
         def of_text(text):
             scores = score_text(embeddings, text, pixels, reference, reference_scores, rules)
-            return scores, answering_regions(embeddings, scores, overlap, rules)
+            return scores, _answering_regions(embeddings, scores, overlap, rules)
 
         scores, chosen = jax.vmap(of_text)(texts)
         return scores, chosen.any(0), jnp.max(jnp.where(chosen, scores.similarity, -jnp.inf), axis=0)
@@ -162,9 +162,15 @@ def _match(embeddings, pixels, overlap, queries, excluded, reference, rules: Que
 
 
 def match_region(field: LanguageField, region: int | Int[Array, ""], rules: QueryRules = ONE_REGION) -> RegionMatch:
-    """Region `region` as a match with score 1, and what the rules join to it, its embedding in place of a text's.
+    """Matches one region in place of a text.
 
-    A region that the field does not have (-1, for example) gives a match with region -1 and score 0.
+    Args:
+      field: Field of R regions.
+      region: Id of the region.
+      rules: Which regions join it, its embedding in place of a text's; by default none.
+
+    Returns:
+      The match, with score 1. For a region that the field does not have, such as -1, its region is -1 and its score 0.
     """
     if field.regions.count == 0:
         return NO_REGIONS
@@ -179,7 +185,7 @@ def _match_region(embeddings: Array, overlap: Array | None, region: Array, rules
         cosines, known = similarities(embeddings, embeddings[jnp.maximum(region, 0)])
         chosen |= is_piece(cosines, known, chosen, overlap, threshold=rules.piece_threshold)
     if rules.alike_threshold is not None:
-        chosen |= is_alike(embeddings, jnp.maximum(region, 0), rules.alike_threshold)
+        chosen |= _is_alike(embeddings, jnp.maximum(region, 0), rules.alike_threshold)
     return RegionMatch(chosen & valid, jnp.where(valid, region, -1).astype(jnp.int32), valid.astype(embeddings.dtype))
 
 
@@ -201,7 +207,14 @@ def join_pieces(regions: Sequence[Any] | np.ndarray, overlap: np.ndarray | None)
 
 
 def reference_words(field: LanguageField) -> Array | None:
-    """The embeddings (W, E) of a field's unrelated words; None if it has none."""
+    """Reads the unrelated words of a field.
+
+    Args:
+      field: The field.
+
+    Returns:
+      (W, E) embeddings, or None if it has none.
+    """
     return jnp.asarray(field.reference) if field.reference is not None and len(field.reference) else None
 
 
@@ -221,14 +234,33 @@ def region_similarities(
     reference: Float[Array, "w e"] | None,
     retrieval: str,
 ) -> tuple[Float[Array, " r"], Bool[Array, " r"]]:
-    """Cosines (R,) of regions with the `_text_direction` of a text (E,), and where they are known; 0 elsewhere."""
+    """Compares regions with a text. Pure.
+
+    Args:
+      embeddings: (R, E) of the regions.
+      text: (E,) embedding of the text.
+      reference: (W, E) unrelated words, or None.
+      retrieval: "apart" subtracts the mean of the unrelated words from the text; "cosine" does not.
+
+    Returns:
+      Cosines (R,), and whether they are known (R,); 0 if not.
+    """
     return similarities(embeddings, _text_direction(text, reference, retrieval))
 
 
 def reference_similarities(
     embeddings: Float[Array, "r e"], reference: Float[Array, "w e"], retrieval: str
 ) -> Float[Array, "w r"]:
-    """`region_similarities` of each of W unrelated words with each of R regions (W, R); NaN where it is not known."""
+    """Compares regions with unrelated words, as `region_similarities` does with a text. Pure.
+
+    Args:
+      embeddings: (R, E) of the regions.
+      reference: (W, E) unrelated words.
+      retrieval: "apart" or "cosine".
+
+    Returns:
+      (W, R) cosines, NaN if unknown.
+    """
     words = reference.astype(embeddings.dtype)
     words = _text_direction(words, words, retrieval)
     # As one product of matrices: W queries of their own would walk all regions W times.
@@ -239,10 +271,18 @@ def reference_similarities(
 def quantile_among(
     best: Float[Array, ""], text: Float[Array, " e"], reference: Float[Array, "w e"], scores: Float[Array, "w r"]
 ) -> Float[Array, ""]:
-    """Computes the share of W unrelated words (W, E) that are less similar to the scene than a text.
+    """Ranks a text among unrelated words by how similar they are to the scene. Pure.
 
-    A word's similarity is its largest score with any region, of `scores` (W, R); the text's is `best`. The
-    REFERENCE_CUT share that is nearest to the text is left out; 1 if no word is left.
+    The REFERENCE_CUT share of the words that is nearest to the text is left out.
+
+    Args:
+      best: () largest similarity of the text with any region.
+      text: (E,) embedding of the text.
+      reference: (W, E) unrelated words.
+      scores: (W, R) their `reference_similarities`.
+
+    Returns:
+      () share of the words with a smaller largest similarity; 1 if no word is left.
     """
     largest = jnp.max(jnp.where(jnp.isfinite(scores), scores, -jnp.inf), axis=1)
     units = normalize(reference.astype(text.dtype))
@@ -255,9 +295,15 @@ def quantile_among(
 
 
 def presence(embeddings: Float[Array, "r e"], text: Float[Array, " e"], logits: Logits) -> Float[Array, " r"]:
-    """Computes the probability that a text (E,) is true of each of R regions: sigmoid(scale cos + bias).
+    """Computes the probability that a text is true of each region: sigmoid(scale cos + bias). Pure.
 
-    The embedder was trained with this sigmoid. The probability is 0 where either has no direction.
+    Args:
+      embeddings: (R, E) of the regions.
+      text: (E,) embedding of the text.
+      logits: Scale and bias of the embedder, which was trained with this sigmoid.
+
+    Returns:
+      (R,) probabilities; 0 if either has no direction.
     """
     cosines, known = similarities(embeddings, text)
     return jnp.where(known, jax.nn.sigmoid(logits.scale * cosines + logits.bias), 0.0)
@@ -266,7 +312,17 @@ def presence(embeddings: Float[Array, "r e"], text: Float[Array, " e"], logits: 
 def best_presence(
     regions: Regions, texts: Float[Array, "q e"], region: Int[Array, ""], logits: Logits | None
 ) -> float | None:
-    """The largest `presence` of any of Q texts in `region`, for -1 in any region; None without `logits`."""
+    """Computes the largest `presence` of several texts in a region.
+
+    Args:
+      regions: R regions.
+      texts: (Q, E) embeddings.
+      region: Id of the region; -1 takes the best of all.
+      logits: Scale and bias of the embedder, or None.
+
+    Returns:
+      A probability; None without `logits` or regions.
+    """
     if logits is None or regions.count == 0:
         return None
     each = jnp.stack([presence(jnp.asarray(regions.embeddings), text, logits) for text in texts]).max(axis=0)
@@ -275,12 +331,17 @@ def best_presence(
 
 @functools.partial(jax.jit, inline=True)
 def evidence(pixels: Shaped[Array, "r t"]) -> Float[Array, " r"]:
-    """How much stands behind each of R embeddings, in (0, 1], from the region's pixels in T views.
+    """Computes how much stands behind the embedding of each region. Pure.
 
         v / (v + EVIDENCE_PRIOR_VIEWS) over its largest value,  v = sum_t min(pixels_t / EVIDENCE_FULL_PX, 1)
 
     A sliver that few views show has one colour, so its embedding is purer than that of the object that it belongs to.
-    1 everywhere if no pixels are known.
+
+    Args:
+      pixels: (R, T) number of pixels of each region in each view.
+
+    Returns:
+      (R,) in (0, 1]; 1 everywhere if no pixels are known.
     """
     views = jnp.sum(jnp.minimum(jnp.asarray(pixels) / EVIDENCE_FULL_PX, 1.0), axis=-1)
     weight = views / (views + EVIDENCE_PRIOR_VIEWS)
@@ -296,14 +357,14 @@ def score_text(
     reference_scores: Float[Array, "w r"] | None,
     rules: QueryRules,
 ) -> TextScores:
-    """Compares one text (E,) with R regions.
+    """Compares one text with all regions. Pure.
 
     Args:
-      embeddings: Of the regions.
-      text: Embedding of the text.
-      pixels: Of each region in T views.
-      reference: Unrelated words, or None.
-      reference_scores: Their `reference_similarities`, or None.
+      embeddings: (R, E) of the regions.
+      text: (E,) embedding of the text.
+      pixels: (R, T) number of pixels of each region in each view.
+      reference: (W, E) unrelated words, or None.
+      reference_scores: (W, R) their `reference_similarities`, or None.
       rules: How texts match.
 
     Returns:
@@ -329,46 +390,47 @@ def score_text(
 
 
 def fixed_threshold(rules: QueryRules) -> Number:
-    """The threshold on the best region of a text where no quantile decides; a probability where there are logits."""
+    """Chooses the threshold on the best region of a text where no quantile decides.
+
+    Args:
+      rules: How texts match.
+
+    Returns:
+      A cosine; a probability if the rules have logits.
+    """
     if rules.retrieval_threshold is not None:
         return rules.retrieval_threshold
     return RETRIEVAL_THRESHOLD if rules.logits is None else PRESENCE_THRESHOLD
 
 
-def answering_regions(
+def _answering_regions(
     embeddings: Float[Array, "r e"],
     scores: TextScores,
     overlap: Float[Array, "r r"] | None,
     rules: QueryRules,
 ) -> Bool[Array, " r"]:
-    """Which of R regions match one text, by the rule of `match_regions`; `overlap` (R, R) is `Votes.overlap`."""
+    """Finds which of R regions match one text, by the rule of `match_regions`."""
     chosen = jnp.arange(embeddings.shape[0]) == scores.anchor
     if rules.all_of_kind:
-        chosen |= reaches(scores.similarity, scores.known, rules.kind_threshold)
+        chosen |= _reaches(scores.similarity, scores.known, rules.kind_threshold)
     if overlap is not None and rules.piece_threshold is not None:
         chosen |= is_piece(scores.similarity, scores.known, chosen, overlap, threshold=rules.piece_threshold)
     if rules.alike_threshold is not None:
-        chosen |= is_alike(embeddings, scores.anchor, rules.alike_threshold)
+        chosen |= _is_alike(embeddings, scores.anchor, rules.alike_threshold)
     return chosen & scores.known & scores.accepted
 
 
-def is_alike(
+def _is_alike(
     embeddings: Float[Array, "r e"], region: Int[Array, ""], threshold: Number = ALIKE_THRESHOLD
 ) -> Bool[Array, " r"]:
-    """Finds which of R regions are the same object as `region`.
-
-    What sets both apart from the mean region then has a cosine of at least `threshold`.
-    """
+    """Finds regions that are the same object as `region`: what sets both apart from the mean region is as similar."""
     residuals, known = mean_residuals(embeddings)
     cosines, comparable = similarities(residuals, residuals[region])
     return known & comparable & (cosines >= threshold)
 
 
-def reaches(similarity: Float[Array, " r"], known: Bool[Array, " r"], relative_score: Number) -> Bool[Array, " r"]:
-    """Finds which of R regions have a similarity of at least m + `relative_score` (b - m).
-
-    m is the median and b the largest. No region does if all are equally similar.
-    """
+def _reaches(similarity: Float[Array, " r"], known: Bool[Array, " r"], relative_score: Number) -> Bool[Array, " r"]:
+    """Finds regions with a similarity of at least m + `relative_score` (b - m), m the median and b > m the largest."""
     middle = jnp.nanmedian(jnp.where(known, similarity, jnp.nan))
     best = jnp.max(jnp.where(known, similarity, -jnp.inf))
     return known & (similarity >= middle + relative_score * (best - middle)) & (best > middle)
@@ -383,10 +445,20 @@ def is_piece(
     threshold: Number = PIECE_THRESHOLD,
     min_overlap: Number = MIN_PIECE_OVERLAP,
 ) -> Bool[Array, " r"]:
-    """Finds which of R regions are pieces of the objects that the `chosen` regions (R,) show.
+    """Finds the regions that are pieces of the objects that chosen regions show. Pure.
 
-    They reach the relative score `threshold` and overlap (R, R) one of them. A second object of the kind is as similar,
-    but has its own Gaussians.
+    They overlap one of these. A second object of the kind is as similar, but has its own Gaussians.
+
+    Args:
+      similarity: (R,) similarities with the text.
+      known: (R,) whether they mean something.
+      chosen: (R,) the chosen regions.
+      overlap: (R, R) `Votes.overlap`.
+      threshold: Smallest relative score, 0 at the median region and 1 at the best.
+      min_overlap: Smallest overlap.
+
+    Returns:
+      (R,) bool; False for all if all regions are equally similar.
     """
     overlaps = jnp.max(jnp.where(chosen[:, None], overlap, 0.0), axis=0) >= min_overlap
-    return reaches(similarity, known, threshold) & overlaps
+    return _reaches(similarity, known, threshold) & overlaps

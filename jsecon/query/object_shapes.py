@@ -66,12 +66,12 @@ def object_shapes(
     """Measures objects.
 
     Args:
-      means: Centres of N Gaussians.
-      labels: Object of each Gaussian, 0 .. K-1, or -1 for none. Every object has a Gaussian.
-      up: Up axis; boxes stand upright along it, turned so that their footprint is smallest. None takes the principal
-        axes of each object.
-      spreads: `gaussian_spreads` of the Gaussians; None takes them as points.
-      points: P, the number of points of each object.
+      means: (N, 3) centres of Gaussians.
+      labels: (N,) object of each Gaussian, 0 .. K-1, or -1 for none. Every object has a Gaussian.
+      up: (3,) up axis; boxes stand upright along it, turned so that their footprint is smallest. None takes the
+        principal axes of each object.
+      spreads: (N, 3, 3) `gaussian_spreads` of the Gaussians; None takes them as points.
+      points: P, number of points of each object.
 
     Returns:
       The shapes, in the world of the means. Equal inputs give equal bits.
@@ -157,6 +157,13 @@ def _spaced_points(points: np.ndarray, count: int) -> np.ndarray:
 
 
 def gaussian_spreads(gaussians: Gaussians) -> Float[np.ndarray, "n 3 3"]:
-    """Returns the axes of Gaussians as columns, each as long as its standard deviation, world units, float64."""
+    """Computes the axes of Gaussians, each as long as its standard deviation.
+
+    Args:
+      gaussians: N Gaussians.
+
+    Returns:
+      (N, 3, 3) columns, world units, float64.
+    """
     rotations = Rotation.from_quat(np.asarray(gaussians.quaternions, np.float64), scalar_first=True).as_matrix()
     return rotations * np.exp(np.asarray(gaussians.log_scales, np.float64))[:, None, :]

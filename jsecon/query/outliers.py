@@ -56,28 +56,28 @@ def remove_outliers(
     keep: str = "largest",
     weight: Float[Array, " n"] | None = None,
 ) -> Bool[np.ndarray, " n"]:
-    """Removes the selected Gaussians that lie apart, by DBSCAN on their centres.
+    """Removes the selected Gaussians that lie apart, by DBSCAN on their centres. Host code: it cannot be traced.
 
     Noise is dropped, and so are the clusters that `keep` does not name. Three kinds of selections come back as they
     are, except for centres that are not finite: fewer than `min_samples` points, a single component (no gap of eps
-    anywhere), and points in which DBSCAN finds no cluster. Host code: it cannot be traced.
+    anywhere), and points in which DBSCAN finds no cluster.
 
     Args:
-      means: Centres, world units.
-      mask: The selected Gaussians.
+      means: (N, 3) centres, world units.
+      mask: (N,) the selected Gaussians.
       eps: Radius, world units; None takes `default_eps` of the selection, which follows its scale.
-      min_samples: Points within eps, itself included, that make a core point.
+      min_samples: Number of points within eps, itself included, that make a core point.
       keep: "largest" keeps the cluster with most Gaussians (the paper). "supported" keeps each cluster that has at
         least MIN_CLUSTER_SUPPORT of the weight of the heaviest: a mask may show one object in several pieces. "all"
         keeps every cluster.
-      weight: With keep="supported", how much the views' masks show of each Gaussian, such as share * votes.total, in
-        pixels; None counts each as 1.
+      weight: (N,) with keep="supported", how much the views' masks show of each Gaussian, such as share * votes.total,
+        in pixels; None counts each as 1.
 
     Returns:
       (N,) bool.
 
     Raises:
-      ValueError: An option is out of range.
+      ValueError: An option is out of range, or `weight` has another length.
     """
     return split_outliers(means, mask, eps=eps, min_samples=min_samples, keep=keep, weight=weight).mask
 
@@ -91,7 +91,22 @@ def split_outliers(
     keep: str = "largest",
     weight: Float[Array, " n"] | None = None,
 ) -> OutlierResult:
-    """`remove_outliers`, with how many clusters it kept and dropped; arguments and errors are the same."""
+    """`remove_outliers` that also counts the clusters.
+
+    Args:
+      means: (N, 3) centres, world units.
+      mask: (N,) the selected Gaussians.
+      eps: Radius, world units; None takes `default_eps` of the selection.
+      min_samples: Number of points within eps, itself included, that make a core point.
+      keep: "largest", "supported" or "all".
+      weight: (N,) weights with keep="supported"; None counts each as 1.
+
+    Returns:
+      The mask without outliers, and how many clusters were kept and dropped.
+
+    Raises:
+      ValueError: An option is out of range, or `weight` has another length.
+    """
     require_one_of("remove_outliers", keep, KEEP, "Use 'all' to keep several objects.")
     positive, options = min_samples >= 1 and (eps is None or eps > 0), f"eps={eps}, min_samples={min_samples}"
     remedy = "Leave eps out to have it follow the selection's spacing."
@@ -107,7 +122,7 @@ def split_outliers(
     if len(chosen) < min_samples:
         return OutlierResult(mask, f"fewer than {min_samples} Gaussians are selected", 0, 0)
     eps = default_eps(points) if eps is None else eps
-    if one_component(points, eps):  # then nothing lies apart, and DBSCAN is not needed
+    if _one_component(points, eps):  # then nothing lies apart, and DBSCAN is not needed
         return OutlierResult(mask, "the selection is one component", 1, 0)
     labels = dbscan(points, eps, min_samples)
     if labels.max() < 0:
@@ -126,10 +141,15 @@ def split_outliers(
 
 
 def default_eps(points: Float[Array, "m 3"], *, spacings: float = EPS_SPACINGS) -> float:
-    """`spacings` times the median distance of the points (M, 3) to their third neighbour; world units.
+    """Chooses DBSCAN's radius by the median distance of points to their third neighbour.
 
-    The median is taken over at most 20,000 of them, evenly spaced in their order. Where more than half of the points
-    coincide the spacing is that of the distinct ones; 1 where there is only one place.
+    Args:
+      points: (M, 3), world units; the median is taken over at most 20,000 of them.
+      spacings: Factor on that distance.
+
+    Returns:
+      Radius, world units. If more than half of the points coincide the spacing is that of the distinct ones; 1 if there
+      is only one place.
     """
     points = np.asarray(points, np.float64)
     for candidates in (points, np.unique(points, axis=0)):
@@ -143,10 +163,15 @@ def default_eps(points: Float[Array, "m 3"], *, spacings: float = EPS_SPACINGS) 
 
 
 def dbscan(points: Float[Array, "m 3"], eps: float, min_samples: int) -> Int[np.ndarray, " m"]:
-    """Cluster of each of the points (M, 3), counted from 0 in the order of their first core point; -1 = noise.
+    """Clusters points by scikit-learn's DBSCAN. Above 5,000 points those of one voxel have one label.
 
-    Above `_EXACT_POINTS` points, those of one voxel have one label: that of the voxel's mean, which counts as often as
-    it has points.
+    Args:
+      points: (M, 3), world units.
+      eps: Radius, world units.
+      min_samples: Number of points within eps, itself included, that make a core point.
+
+    Returns:
+      (M,) cluster, counted from 0 in the order of their first core point; -1 for noise.
     """
     from sklearn.cluster import DBSCAN
 
@@ -158,8 +183,8 @@ def dbscan(points: Float[Array, "m 3"], eps: float, min_samples: int) -> Int[np.
     return DBSCAN(eps=eps, min_samples=min_samples).fit(places, sample_weight=weight).labels_[voxel]
 
 
-def one_component(points: Float[Array, "m 3"], eps: float) -> bool:
-    """Whether steps of at most eps lead from each of the points (M, 3) to every other."""
+def _one_component(points: Float[Array, "m 3"], eps: float) -> bool:
+    """Finds out whether steps of at most eps lead from each of the points (M, 3) to every other."""
     if not len(points):
         return False
     places, _, _ = _places(np.asarray(points, np.float64), eps)

@@ -42,7 +42,7 @@ def lift(
       field: The field.
       masks: (K, H, W) bool, or integers of OUTSIDE, INSIDE and UNKNOWN.
       frames: Index or name of each frame; held-out frames count too.
-      threshold: On the share.
+      threshold: Smallest share of a selected Gaussian.
 
     Returns:
       The selection. `region` is the region that lies in the masks with most of its weight, or -1; `score` its part

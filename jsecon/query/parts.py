@@ -56,16 +56,16 @@ class PartsAnswer(NamedTuple):
 def part_scores(
     parts: Parts, text: Float[Array, " e"], reference: Float[Array, "w e"] | None, *, retrieval: str = RULES.retrieval
 ) -> Float[Array, " n"]:
-    """Scores each Gaussian by its part: 0 as similar to the text as the median part, 1 as the most similar one.
+    """Scores each Gaussian by its part: 0 as similar to the text as the median part, 1 as the most similar one. Pure.
 
     Args:
       parts: P parts of N Gaussians.
-      text: Embedding of the text.
-      reference: Unrelated words, or None.
-      retrieval: As in `QueryRules`.
+      text: (E,) embedding of the text.
+      reference: (W, E) unrelated words, or None.
+      retrieval: "apart" or "cosine", see `QueryRules`.
 
     Returns:
-      (N,) scores; 0 for Gaussians without a part, and for all if all parts are equally similar. Pure.
+      (N,) scores; 0 for Gaussians without a part, and for all if all parts are equally similar.
     """
     similarity, known = region_similarities(parts.embeddings, text, reference, retrieval)
     middle = jnp.nanmedian(jnp.where(known, similarity, jnp.nan))
@@ -92,12 +92,12 @@ def parts_fallback(
     rules do not refuse it, measured against the parts that match unrelated words best.
 
     Args:
-      field: A field with parts.
-      text: Embedding of the text.
+      field: Field with parts.
+      text: (E,) embedding of the text.
       score: `RegionMatch.score` of the text.
-      rules: As for `match_regions`.
-      similarity_threshold: On the selection's similarity, the part score on a scale that is 0.5 at PART_THRESHOLD;
-        None takes 0.5.
+      rules: How texts match, as for `match_regions`.
+      similarity_threshold: Smallest similarity of a selected Gaussian, the part score on a scale that is 0.5 at
+        PART_THRESHOLD; None takes 0.5.
 
     Returns:
       The answer, or None if a region matches, or no parts do.
@@ -151,10 +151,17 @@ def _pooled(
 def best_cluster(
     mask: Bool[np.ndarray, " n"], scores: Float[np.ndarray, " n"], means: Float[Array, "n 3"]
 ) -> Bool[np.ndarray, " n"]:
-    """Finds the cluster of the Gaussians `mask` whose upper quantile of scores is best. Host code.
+    """Finds the cluster of Gaussians whose upper quantile of scores is best. Host code.
 
-    DBSCAN on their centres (N, 3) with SPACINGS; clusters with less than a tenth of the largest's Gaussians do not
-    compete. All Gaussians are returned if there are too few to cluster.
+    DBSCAN on their centres with SPACINGS; clusters with less than a tenth of the largest's Gaussians do not compete.
+
+    Args:
+      mask: (N,) the Gaussians to cluster.
+      scores: (N,) `part_scores`.
+      means: (N, 3) centres, world units.
+
+    Returns:
+      (N,) bool; all Gaussians of the mask if there are too few to cluster.
     """
     mask = mask & np.isfinite(np.asarray(means)).all(axis=1)
     chosen = np.flatnonzero(mask)

@@ -64,33 +64,18 @@ def _alphas(gaussians: Gaussians, camera: Camera, x: Array | float, y: Array | f
     return jnp.where(counts, jnp.minimum(alpha, MAX_ALPHA), 0.0), splats.depths
 
 
-def region_shares_at(field: LanguageField, frame: int, x: int, y: int) -> Float[np.ndarray, " r"]:
-    """How much of a pixel each region makes up: sum_n w_n p_nr, w the weights alpha T and p the shares of votes.
+def region_shares_seen(field: LanguageField, camera: Camera, x: int, y: int) -> Float[np.ndarray, " r"]:
+    """Computes how much of a pixel each region makes up: sum_n w_n p_nr, w the weights alpha T and p the vote shares.
 
     Args:
       field: Field of R regions.
-      frame: Index of the frame.
+      camera: The view.
       x: Column of the pixel.
       y: Row of the pixel.
 
     Returns:
       (R,), each at most the pixel's alpha.
-
-    Raises:
-      InputError: The field does not have the frame or the pixel.
     """
-    frames, width, height = field.cameras.world_to_camera.shape[0], field.cameras.width, field.cameras.height
-    if not 0 <= frame < frames:
-        raise InputError("frame", str(frame), f"0 to {frames - 1}", "Frames are numbered in the order of their names.")
-    if not (0 <= x < width and 0 <= y < height):
-        remedy = f"Give x and y in the frames as the run used them, {width}x{height}."
-        known = f"column 0 to {width - 1}, row 0 to {height - 1}"
-        raise InputError("pixel", f"column {x}, row {y} is outside the frame", known, remedy)
-    return region_shares_seen(field, jax.tree.map(jnp.asarray, field.cameras)[frame], x, y)
-
-
-def region_shares_seen(field: LanguageField, camera: Camera, x: int, y: int) -> Float[np.ndarray, " r"]:
-    """`region_shares_at` for any camera."""
     ids, weights = pixel_weights(field.gaussians, camera, x, y)
     shares = np.zeros(field.regions.count)
     if not len(ids):
@@ -118,5 +103,12 @@ def region_at(field: LanguageField, frame: int, x: int, y: int, *, min_share: fl
     Raises:
       InputError: The field does not have the frame or the pixel.
     """
-    shares = region_shares_at(field, frame, x, y)
+    frames, width, height = field.cameras.world_to_camera.shape[0], field.cameras.width, field.cameras.height
+    if not 0 <= frame < frames:
+        raise InputError("frame", str(frame), f"0 to {frames - 1}", "Frames are numbered in the order of their names.")
+    if not (0 <= x < width and 0 <= y < height):
+        remedy = f"Give x and y in the frames as the run used them, {width}x{height}."
+        known = f"column 0 to {width - 1}, row 0 to {height - 1}"
+        raise InputError("pixel", f"column {x}, row {y} is outside the frame", known, remedy)
+    shares = region_shares_seen(field, jax.tree.map(jnp.asarray, field.cameras)[frame], x, y)
     return int(shares.argmax()) if shares.size and shares.max() >= min_share else -1

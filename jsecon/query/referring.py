@@ -72,7 +72,14 @@ class Outcome:
 
 
 def stack_shapes(objects: Sequence[FoundObject]) -> ObjectShapes:
-    """Returns the shapes of K objects as one record (K, ...)."""
+    """Joins the shapes of objects.
+
+    Args:
+      objects: K objects, K >= 1.
+
+    Returns:
+      Their shapes as one record (K, ...).
+    """
     return jax.tree.map(lambda *columns: np.concatenate(columns), *(found.shape for found in objects))
 
 
@@ -86,7 +93,7 @@ def evaluate(find: Find, thing: Thing, conditions: Sequence[Condition], view: Vi
       view: From where directions are seen.
 
     Returns:
-      The outcome.
+      The chosen objects, or the reason why there are none.
     """
     candidates, quantile = find(thing.text)
     if not candidates:

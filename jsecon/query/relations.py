@@ -1,6 +1,6 @@
 """Where objects stand to each other: soft predicates on boxes and points, and orders. Pure functions: jit or vmap them.
 
-Each predicate takes shapes of objects (`ObjectShapes`, upright boxes) whose leading axes broadcast, and returns scores
+A predicate takes shapes of objects (`ObjectShapes`, upright boxes) whose leading axes broadcast, and returns scores
 in [0, 1]; from SATISFIED on the relation holds. `pair_scores` and `between_scores` take all pairs and triples. NumPy
 arrays are scored by NumPy, without a program to compile, and jax arrays by jax. All distances are relative to the
 objects' sizes: a scene that is scaled, shifted, or turned about the up axis together with its viewpoint has the same
@@ -66,8 +66,8 @@ def viewpoint(camera: Camera, up: Float[Array, " 3"]) -> Viewpoint:
     """Makes the viewpoint of a camera. One that looks straight up or down sees as forward where its upper edge points.
 
     Args:
-      camera: A single camera.
-      up: Unit up axis, world.
+      camera: One camera.
+      up: (3,) unit up axis, world.
 
     Returns:
       The viewpoint.
@@ -104,7 +104,14 @@ def _level(vector: Array, up: Array) -> Array:
 
 
 def size_of(shape: ObjectShapes) -> Float[Array, "*batch"]:
-    """Mean of the three sides of boxes, world units."""
+    """Measures objects.
+
+    Args:
+      shape: Objects of any leading axes.
+
+    Returns:
+      Mean of the three sides of each box, world units.
+    """
     return 2.0 * shape.half_size.mean(-1)
 
 
@@ -147,11 +154,18 @@ def _inside(
 
 
 def gap(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
-    """Free distance between the surfaces of two objects, world units; 0 where they touch.
+    """Measures the free distance between the surfaces of two objects.
 
-    The smallest distance of the points of one to the box of the other, of both ways the larger: a box may hold free
-    space, as that of an arch does. Points of a large object may lie farther apart than a small one is wide, which is
-    taken off.
+    It is the smallest distance of the points of one to the box of the other, of both ways the larger: a box may hold
+    free space, as that of an arch does. Points of a large object may lie farther apart than a small one is wide, which
+    is taken off.
+
+    Args:
+      a: Objects.
+      b: Objects, whose leading axes broadcast with those of `a`.
+
+    Returns:
+      Distances, world units; 0 if the surfaces touch.
     """
     xp = _module(a.points)
 
@@ -197,13 +211,13 @@ def _towards(a: ObjectShapes, b: ObjectShapes, along: Array, across: Array) -> A
     return _rise(_over(shift, half_a + half_b) - APART) * _within(_over(beside, SIDEWAYS * shift))
 
 
-def left_of(a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> Float[Array, "*batch"]:
+def _left_of(a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> Float[Array, "*batch"]:
     """Whether a is left of b as the viewpoint sees it; b is then as much right of a."""
     forward, right = _sight(a, b, view)
     return _towards(a, b, -right, forward)
 
 
-def in_front_of(a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> Float[Array, "*batch"]:
+def _in_front_of(a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> Float[Array, "*batch"]:
     """Whether a is nearer to the viewpoint than b and not far aside; b is then as much behind a."""
     forward, right = _sight(a, b, view)
     return _towards(a, b, -forward, right)
@@ -236,7 +250,7 @@ def _tolerance(shape: ObjectShapes) -> Array:
     return CONTACT * 2.0 * (z + 0.5 * (x + y))
 
 
-def above(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
+def _above(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
     """Whether a is over b, touching or not: footprints overlap, and a begins where b ends there. b is then under a."""
     bottom, _, _ = _heights(a)
     _, top, _ = _heights(b)
@@ -244,7 +258,7 @@ def above(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
     return _rise(_overlap(a, b) - OVER) * _rise(_over(free, _tolerance(a)) + 1.0, 4.0)
 
 
-def inside(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
+def _in_box(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
     """Whether a is in b: enough of its points lie in the box of b, which is no smaller across and reaches below it."""
     share = _inside(a.points, b)[1].mean(-1)
     bottom, top, height = _heights(a)
@@ -253,17 +267,17 @@ def inside(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
     return _rise(share - INSIDE) * _rise(_over(deep, height)) * _rise(smaller - 0.7)
 
 
-def on(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
+def _on(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
     """Whether a rests on b: most of it is over the footprint of b, it touches the surface there, and is not in b."""
     bottom, _, height = _heights(a)
     _, top, _ = _heights(b)
     held = _inside(a.points, b, 1.1)[0].mean(-1)
     surface = _local(b, a, 0.75, top)
     contact = _within(_over(bottom - surface, _tolerance(a)), 4.0)
-    return _rise(held - 0.5) * contact * _rise(0.4 - _over(surface - bottom, height)) * (1.0 - inside(a, b))
+    return _rise(held - 0.5) * contact * _rise(0.4 - _over(surface - bottom, height)) * (1.0 - _in_box(a, b))
 
 
-def next_to(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
+def _next_to(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
     """Whether the objects are close to each other on one level, neither over the other."""
     xp = _module(a.points)
     (low_a, high_a, tall_a), (low_b, high_b, tall_b) = _heights(a), _heights(b)
@@ -276,22 +290,22 @@ def _relative_gap(a: ObjectShapes, b: ObjectShapes) -> Array:
     return _over(gap(a, b), _module(a.points).sqrt(size_of(a) * size_of(b)))
 
 
-def near(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
+def _near(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
     """Whether the gap is at most about the objects' size. It falls as the gap grows."""
     return _within(_relative_gap(a, b) / NEAR)
 
 
-def far_from(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
+def _far_from(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
     """Whether the gap is several times the objects' size."""
     return 1.0 - _within(_relative_gap(a, b) / FAR)
 
 
-def touching(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
+def _touching(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
     """Whether the surfaces meet."""
     return _within(_over(gap(a, b), TOUCH * _module(a.points).minimum(size_of(a), size_of(b))))
 
 
-def between(a: ObjectShapes, b: ObjectShapes, c: ObjectShapes) -> Float[Array, "*batch"]:
+def _between(a: ObjectShapes, b: ObjectShapes, c: ObjectShapes) -> Float[Array, "*batch"]:
     """Whether a lies between b and c: its middle projects between theirs and is not far off the line."""
     line, offset = c.center - b.center, a.center - b.center
     length = _module(line).maximum(_length(line), 1e-12)
@@ -302,26 +316,26 @@ def between(a: ObjectShapes, b: ObjectShapes, c: ObjectShapes) -> Float[Array, "
 
 
 _PREDICATES = {
-    "left of": left_of,
-    "right of": lambda a, b, view: left_of(b, a, view),
-    "in front of": in_front_of,
-    "behind": lambda a, b, view: in_front_of(b, a, view),
-    "above": lambda a, b, _: above(a, b),
-    "below": lambda a, b, _: above(b, a),
-    "on": lambda a, b, _: on(a, b),
-    "under": lambda a, b, _: above(b, a),
-    "in": lambda a, b, _: inside(a, b),
-    "next to": lambda a, b, _: next_to(a, b),
-    "near": lambda a, b, _: near(a, b),
-    "far from": lambda a, b, _: far_from(a, b),
-    "touching": lambda a, b, _: touching(a, b),
+    "left of": _left_of,
+    "right of": lambda a, b, view: _left_of(b, a, view),
+    "in front of": _in_front_of,
+    "behind": lambda a, b, view: _in_front_of(b, a, view),
+    "above": lambda a, b, _: _above(a, b),
+    "below": lambda a, b, _: _above(b, a),
+    "on": lambda a, b, _: _on(a, b),
+    "under": lambda a, b, _: _above(b, a),
+    "in": lambda a, b, _: _in_box(a, b),
+    "next to": lambda a, b, _: _next_to(a, b),
+    "near": lambda a, b, _: _near(a, b),
+    "far from": lambda a, b, _: _far_from(a, b),
+    "touching": lambda a, b, _: _touching(a, b),
 }
 PAIRS = tuple(_PREDICATES)
 """relations of `pair_scores`"""
 
 
 def pair_scores(relation: str, a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> Float[Array, "k l"]:
-    """Scores a relation between all objects of two sets.
+    """Scores "object of a RELATION object of b" for all pairs.
 
     Args:
       relation: One of PAIRS.
@@ -330,20 +344,35 @@ def pair_scores(relation: str, a: ObjectShapes, b: ObjectShapes, view: Viewpoint
       view: From where directions are seen.
 
     Returns:
-      (K, L) scores of "object of a RELATION object of b".
+      (K, L) scores in [0, 1]; from SATISFIED on the relation holds.
     """
     return _PREDICATES[relation](a[:, None], b[None], view)
 
 
 def between_scores(a: ObjectShapes, b: ObjectShapes, c: ObjectShapes) -> Float[Array, "k l m"]:
-    """Scores "object of a between object of b and object of c" for all triples."""
-    return between(a[:, None, None], b[None, :, None], c[None, None])
+    """Scores "object of a between object of b and object of c" for all triples.
+
+    Args:
+      a: K objects.
+      b: L objects.
+      c: M objects.
+
+    Returns:
+      (K, L, M) scores in [0, 1]; from SATISFIED on the relation holds.
+    """
+    return _between(a[:, None, None], b[None, :, None], c[None, None])
 
 
 def order_values(shapes: ObjectShapes, view: Viewpoint) -> dict[str, Float[Array, " k"]]:
-    """Values by which K objects are ordered, the first has the smallest, for each of ORDERS.
+    """Computes the values by which objects are ordered; the first has the smallest.
 
-    "largest" compares the volumes of boxes, "leftmost" the directions from the viewpoint, "nearest" the distances.
+    Args:
+      shapes: K objects.
+      view: From where directions and distances are seen.
+
+    Returns:
+      (K,) values for each of ORDERS. "largest" compares the volumes of boxes, "leftmost" the directions from the
+      viewpoint, "nearest" the distances.
     """
     volume = (2.0 * shapes.half_size).prod(1) ** (1 / 3)
     height = 2.0 * shapes.half_size[:, 2]

@@ -34,8 +34,8 @@ def selection_mask(
       gaussians: Scene of N Gaussians.
       camera: The view.
       mask: (N,) the selected ones.
-      threshold: On alpha.
-      capacity: As for `render`; inside a trace `render_selection` returns the overflow.
+      threshold: Alpha above which a pixel is inside.
+      capacity: Number of (block, Gaussian) pairs, see `render`; inside a trace `render_selection` returns the overflow.
 
     Returns:
       (H, W) bool.
@@ -61,7 +61,7 @@ def render_selection(
       camera: The view.
       mask: (N,) the selected ones.
       similarity: (N,) feature of each; ones by default.
-      capacity: As for `render`.
+      capacity: Number of (block, Gaussian) pairs, see `render`.
 
     Returns:
       The rendering; features (H, W, 1) are sum alpha T similarity.

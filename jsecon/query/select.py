@@ -10,7 +10,7 @@ from jsecon.language.membership import SHARE_THRESHOLD, share_of
 from jsecon.programs import stored_jit
 from jsecon.query.match import ONE_REGION, RULES, RegionMatch, match_region, match_regions
 from jsecon.query.rules import QueryRules
-from jsecon.query.similarity import Number, UnitCodes, as_codes, similarities
+from jsecon.query.similarity import Number, UnitCodes, similarities
 from jsecon.types import Array, LanguageField, Selection, Votes
 
 THRESHOLDS = {"votes": SHARE_THRESHOLD, "code": CODE_THRESHOLD}
@@ -37,8 +37,8 @@ def query_anchored(
       field: The field; close over it to jit or vmap over texts.
       text_embedding: (E,) by the field's embedder.
       rules: How the text matches regions (`match_regions`).
-      by: How Gaussians are chosen (`select_gaussians`).
-      similarity_threshold: On their similarity; None takes the default of `by`.
+      by: "votes" or "code", see `select_gaussians`.
+      similarity_threshold: Smallest similarity; None takes 0.5 for votes and 0.9 for codes.
       codes: `unit_codes(field.codes)`, made once for many queries by "code".
 
     Returns:
@@ -62,14 +62,14 @@ def query_several(
     rules: QueryRules = ALL_OF_KIND,
     similarity_threshold: Number | None = None,
 ) -> Selection:
-    """Selects the Gaussians of all regions that match any of the queries (Q, E) and no excluded text (U, E), by votes.
+    """Selects the Gaussians of all regions that match any of the queries and no excluded text, by votes.
 
     Args:
       field: The field.
-      queries: Embeddings of the texts, Q >= 1.
-      excluded: Embeddings of texts whose regions are left out (`match_regions`).
+      queries: (Q, E) embeddings of the texts, Q >= 1.
+      excluded: (U, E) embeddings of texts whose regions are left out (`match_regions`); None leaves out none.
       rules: How texts match regions; by default all regions of a kind match.
-      similarity_threshold: On the share of votes; None takes 0.5.
+      similarity_threshold: Smallest share of votes; None takes 0.5.
 
     Returns:
       The selection.
@@ -95,8 +95,8 @@ def query_region(
       field: The field.
       region: Its id. An id that the field does not have, such as -1, selects no Gaussian.
       rules: Which regions join it; by default none.
-      by: How Gaussians are chosen (`select_gaussians`).
-      similarity_threshold: On their similarity; None takes the default of `by`.
+      by: "votes" or "code", see `select_gaussians`.
+      similarity_threshold: Smallest similarity; None takes 0.5 for votes and 0.9 for codes.
 
     Returns:
       The selection.
@@ -122,7 +122,7 @@ def select_gaussians(
       match: Its regions, from `match_regions`.
       by: "votes": the share of all chosen regions in a Gaussian (`share_of`), an estimate of the probability that a
         pixel of it belongs to them. "code": cosine of its code with that of the best region (the paper).
-      similarity_threshold: On that similarity; None takes 0.5 for votes and 0.9 for codes.
+      similarity_threshold: Smallest similarity of a selected Gaussian; None takes 0.5 for votes and 0.9 for codes.
       codes: `unit_codes(field.codes)`, made once for many queries by "code".
 
     Returns:
@@ -139,12 +139,21 @@ def select_gaussians(
     if by == "votes":
         return select_by_share(jax.tree.map(jnp.asarray, field.votes), match, threshold)
     table, views = jnp.asarray(field.region_codes), jnp.asarray(field.votes.views)
-    return select_by_code(as_codes(field.codes if codes is None else codes), table, views, match, threshold)
+    return select_by_code(field.codes if codes is None else codes, table, views, match, threshold)
 
 
 @stored_jit
 def select_by_share(votes: Votes, match: RegionMatch, threshold: Number) -> Selection:
-    """`select_gaussians` by "votes", of the votes of any N Gaussians. Each row stands for itself."""
+    """`select_gaussians` by "votes" of any Gaussians. Pure; each row stands for itself.
+
+    Args:
+      votes: Votes of N Gaussians.
+      match: The matched regions.
+      threshold: Smallest share of the regions.
+
+    Returns:
+      The selection of the N Gaussians.
+    """
     share, known = share_of(votes, match.chosen)
     mask = known & (share >= threshold) & (match.region >= 0)
     return Selection(mask, share, match.region, match.score, match.quantile, match.confidence)
@@ -158,7 +167,18 @@ def select_by_code(
     match: RegionMatch,
     threshold: Number,
 ) -> Selection:
-    """`select_gaussians` by "code", of any N Gaussians with `Votes.views`. Each row stands for itself."""
+    """`select_gaussians` by "code" of any Gaussians. Pure; each row stands for itself.
+
+    Args:
+      codes: (N, d) codes of any length, or their `unit_codes`.
+      region_codes: (R, d) codes of the regions.
+      views: (N,) `Votes.views`; Gaussians that no view sees stay out.
+      match: The matched regions, of which only the best counts.
+      threshold: Smallest cosine with its code.
+
+    Returns:
+      The selection of the N Gaussians.
+    """
     similarity, known = similarities(codes, region_codes[jnp.maximum(match.region, 0)])
     known &= (views > 0) & (match.region >= 0)
     mask = known & (similarity >= threshold)

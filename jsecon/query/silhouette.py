@@ -82,9 +82,9 @@ def fit_silhouette(
 
     Args:
       gaussians: Scene of N Gaussians.
-      cameras: Batch of views; VIEWS that see the object are rendered, LONG_SIDE px at most, in float32.
+      cameras: Batch of T views; VIEWS that see the object are rendered, LONG_SIDE px at most, in float32.
       share: (N,) in [0, 1].
-      threshold: On the share, to start from.
+      threshold: Smallest share of the Gaussians to start from.
       weights: (a, b). (0, 1) for an outline that must not touch other objects, (1, 0) for the solid core.
 
     Returns:
@@ -112,7 +112,16 @@ def fit_silhouette(
 
 
 def choose_views(gaussians: Gaussians, cameras: Camera, chosen: np.ndarray) -> Camera:
-    """Up to VIEWS cameras, evenly among those whose images hold the most centres of the chosen Gaussians."""
+    """Chooses up to VIEWS cameras, evenly among those whose images hold the most centres of the chosen Gaussians.
+
+    Args:
+      gaussians: Scene of N Gaussians.
+      cameras: Batch of T cameras.
+      chosen: (N,) bool.
+
+    Returns:
+      Batch of cameras, LONG_SIDE px at most.
+    """
     means = np.asarray(gaussians.means)[chosen]
     poses = np.asarray(cameras.world_to_camera)
     local = np.einsum("tij,nj->tni", poses[:, :3, :3], means) + poses[:, None, :3, 3]
@@ -130,9 +139,17 @@ def choose_views(gaussians: Gaussians, cameras: Camera, chosen: np.ndarray) -> C
 def footprints(
     gaussians: Gaussians, views: Camera, share: np.ndarray, candidates: np.ndarray, chosen: np.ndarray
 ) -> Footprints:
-    """What the Gaussians `candidates` (C,) absorb in `views`, padded so that texts share their programs.
+    """Computes what Gaussians absorb in views, padded so that texts share their programs. Host code.
 
-    Of the others the `chosen` ones (N,) are certainly taken.
+    Args:
+      gaussians: Scene of N Gaussians.
+      views: Batch of V cameras.
+      share: (N,) in [0, 1].
+      candidates: (C,) ids of the Gaussians that are decided on.
+      chosen: (N,) bool; those of them that are not candidates are certainly taken.
+
+    Returns:
+      The footprints of the candidates.
     """
     # One precision for all: jax.enable_x64 holds in its own thread alone, and views are planned in several.
     gaussians, views = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), (gaussians, views))
@@ -214,9 +231,17 @@ def ascend(
     count: int | Array,
     weights: Float[Array, " 2"] | tuple[float, float] = WEIGHTS,
 ) -> Bool[Array, " c"]:
-    """Computes which of C Gaussians are selected after SWEEPS sweeps, see `fit_silhouette`. Pure.
+    """Computes which candidates are selected after SWEEPS sweeps, see `fit_silhouette`. Pure.
 
-    The sweeps go over the first `count` Gaussians and start from `taken` (C,).
+    Args:
+      prints: Footprints of C Gaussians.
+      taken: (C,) those that are selected before.
+      views: V, number of views.
+      count: Number of Gaussians that the sweeps go over, the first ones.
+      weights: (a, b) of `fit_silhouette`.
+
+    Returns:
+      (C,) bool.
     """
     prints = jax.tree.map(jnp.asarray, prints)
     levels = jnp.asarray([-np.log1p(-t) for t in (ALPHA_THRESHOLD, VALA_THRESHOLD)], prints.absorbed.dtype)

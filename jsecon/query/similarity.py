@@ -53,14 +53,17 @@ def unit_codes(codes: Float[Array, "n d"]) -> UnitCodes:
     return UnitCodes(jnp.where(known[:, None], units, 0.0), known)
 
 
-def as_codes(codes: Array | UnitCodes) -> Array | UnitCodes:
-    """Codes as jax's arrays."""
-    return codes if isinstance(codes, UnitCodes) else jnp.asarray(codes)
-
-
 @functools.partial(jax.jit, inline=True)
 def similarities(codes: Codes, code: Float[Array, " d"]) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-    """Cosines (N,) of rows with one code, and which are known: both finite and not zero; 0 elsewhere."""
+    """Computes cosines of rows with one code. Pure.
+
+    Args:
+      codes: (N, d) rows of any length, or their `unit_codes`.
+      code: (d,) of any length.
+
+    Returns:
+      Cosines (N,), and whether they are known (N,): both finite and not zero; 0 if not.
+    """
     unit = normalize(code)
     usable = jnp.all(jnp.isfinite(unit)) & jnp.any(unit != 0)
     if isinstance(codes, UnitCodes):

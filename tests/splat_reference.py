@@ -59,15 +59,7 @@ def _rotation(quaternion: np.ndarray) -> np.ndarray:
 
 
 def weights_reference(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """Computes the weight alpha T of every Gaussian at every pixel; equal depths in index order.
-
-    Args:
-      gaussians: N Gaussians.
-      camera: One camera.
-
-    Returns:
-      (H, W, N) float64.
-    """
+    """Returns (H, W, N) the weight alpha T of every Gaussian at every pixel; equal depths in index order."""
     splats = project_reference(gaussians, camera)
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     weights = np.zeros((camera.height, camera.width, len(splats["depths"])))
@@ -88,15 +80,6 @@ def weights_reference(gaussians: Gaussians, camera: Camera) -> np.ndarray:
 
 
 def render_reference(gaussians: Gaussians, camera: Camera, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Renders features.
-
-    Args:
-      gaussians: N Gaussians.
-      camera: One camera.
-      features: (N, D).
-
-    Returns:
-      Image (H, W, D) and alpha (H, W), float64.
-    """
+    """Returns the image (H, W, D) of features (N, D), and alpha (H, W), in float64."""
     weights = weights_reference(gaussians, camera)
     return weights @ np.asarray(features, np.float64), weights.sum(-1)
