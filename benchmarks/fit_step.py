@@ -24,13 +24,13 @@ import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
 from jsecon.data.capture import load_capture
-from jsecon.fit.growth import pad_with_free_rows, padded_row_count
+from jsecon.fit.growth import pad_with_free_rows
 from jsecon.fit.photometric import l1, photometric_loss
 from jsecon.fit.schedule import LearningRates
 from jsecon.fit.start import starting_gaussians
 from jsecon.fit.step import StepConfig, StepRunner, TrainState, put_on_devices
 from jsecon.parallel import MESH_OPTIONS, host_mesh, map_rows
-from jsecon.splat.capacity import default_capacity
+from jsecon.splat.capacity import default_capacity, round_capacity
 from jsecon.splat.render import render, render_rgb
 from jsecon.splat.sh import colours_from_sh
 
@@ -44,7 +44,7 @@ def main() -> None:
     asked = parser.parse_args()
     capture = load_capture(asked.capture, long_side=asked.long_side, frames=9)
     gaussians, _ = starting_gaussians(capture, sh_degree=asked.sh_degree)
-    gaussians = pad_with_free_rows(jax.tree.map(np.asarray, gaussians), padded_row_count(gaussians.count))
+    gaussians = pad_with_free_rows(jax.tree.map(np.asarray, gaussians), round_capacity(gaussians.count))
     mesh = host_mesh()
     options: dict[str, Any] = {} if mesh is None else {"compiler_options": MESH_OPTIONS}
 

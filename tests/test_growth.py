@@ -12,12 +12,12 @@ from jsecon.fit.growth import (
     grow,
     in_use,
     pad_with_free_rows,
-    padded_row_count,
     sample_rows,
     split_in_two,
 )
 from jsecon.fit.resize import resize_frame, scale_cameras
 from jsecon.fit.schedule import LearningRates, Schedule, rates_at
+from jsecon.splat.capacity import round_capacity
 from jsecon.types import Camera, Gaussians
 
 
@@ -96,7 +96,7 @@ def test_grown_scenes_have_as_many_as_wanted_and_their_moments_begin_anew(target
     after, (first, second) = grow(whole, moments, votes, target, 2000, [0, 1])
     added = min(target - 30, 10)  # at most 0.3 of those there are, and one
     assert in_use(after).sum() == 30 + added
-    assert after.count == padded_row_count(64)  # both, as few rows as there can be
+    assert after.count == round_capacity(64)  # both, as few rows as there can be
     fresh = ~first.opacity_logits.astype(bool) & in_use(after)
     assert fresh.sum() == 2 * added
     assert not second.means[fresh].any()

@@ -65,7 +65,15 @@ class RefineOptions:
     """Rate at the last step, as a share of the first."""
 
     def rates(self, done: float, extent: float) -> Corrections:
-        """Returns the rates for one view at the share `done` of the fit; zero for what is not corrected."""
+        """Computes the step sizes of one view.
+
+        Args:
+          done: Share of the fit that is done, in [0, 1].
+          extent: Extent of the cameras, world units.
+
+        Returns:
+          One rate per number of a twist (6,) and one for the colour map; zero for what is not corrected.
+        """
         decay = self.final_rate_share**done
         pose = self.poses * self.pose_rate * decay
         colour = self.exposure * self.colour_rate * decay
@@ -73,12 +81,26 @@ class RefineOptions:
 
 
 def identity_corrections(views: int) -> Corrections:
-    """Returns corrections of `views` views without effect."""
+    """Makes corrections without effect.
+
+    Args:
+      views: T, number of views.
+
+    Returns:
+      Corrections of T views (NumPy).
+    """
     return Corrections(np.zeros((views, 6), np.float32), np.tile(np.eye(3, 4, dtype=np.float32), (views, 1, 1)))
 
 
 def init_corrections(views: int) -> CorrectionState:
-    """Returns the state of `views` views before the first step."""
+    """Makes the state before the first step.
+
+    Args:
+      views: T, number of views.
+
+    Returns:
+      Corrections without effect, and moments of zero.
+    """
     identity = identity_corrections(views)
     zeros = jax.tree.map(np.zeros_like, identity)
     return CorrectionState(identity, zeros, zeros)
@@ -125,7 +147,15 @@ def se3_exp(twist: Float[Array, "6"]) -> Float[Array, "4 4"]:
 
 
 def corrected_camera(camera: Camera, twist: Float[Array, "6"]) -> Camera:
-    """Moves a camera by a twist in its frame: exp(twist) world_to_camera."""
+    """Moves a camera by a twist in its frame: exp(twist) world_to_camera.
+
+    Args:
+      camera: One camera.
+      twist: (6,) rotation in radians, then translation in world units.
+
+    Returns:
+      The moved camera.
+    """
     motion, pose = se3_exp(twist), camera.world_to_camera
     # Multiply-and-sum: exact float32 on every backend.
     moved = (motion[:, :, None] * pose[None, :, :].astype(motion.dtype)).sum(1)
@@ -133,7 +163,15 @@ def corrected_camera(camera: Camera, twist: Float[Array, "6"]) -> Camera:
 
 
 def apply_exposure(image: Float[Array, "h w 3"], colour: Float[Array, "3 4"]) -> Float[Array, "h w 3"]:
-    """Applies the colour map of a view to rendered colours; the result is not clamped."""
+    """Applies the colour map of a view to rendered colours.
+
+    Args:
+      image: (H, W, 3) rendered colours.
+      colour: (3, 4) map from r, g, b and 1.
+
+    Returns:
+      (H, W, 3), not clamped.
+    """
     r, g, b = image[..., 0], image[..., 1], image[..., 2]
     return jnp.stack([row[0] * r + row[1] * g + row[2] * b + row[3] for row in colour], axis=-1)
 

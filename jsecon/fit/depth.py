@@ -28,7 +28,14 @@ class DepthPoints(NamedTuple):
 
 
 def require_depths(capture: Capture) -> None:
-    """Raises InputError unless the capture has depth frames."""
+    """Checks that a capture has depth frames.
+
+    Args:
+      capture: The capture.
+
+    Raises:
+      InputError: It has none.
+    """
     if capture.depths is None:
         raise InputError("capture", "no depth frames", "RGB-D frames", "Use sparse points, or triangulate points.")
 
@@ -66,7 +73,15 @@ def _voxel_ids(points: np.ndarray, voxel: float) -> np.ndarray:
 
 
 def voxel_for(points: Float[Array, "s 3"], max_points: int) -> float:
-    """Finds the smallest voxel edge (to 2 %) that leaves at most `max_points` voxels of the points (S, 3) occupied."""
+    """Finds the smallest edge of a voxel, to 2 %, with few occupied voxels.
+
+    Args:
+      points: (S, 3), world units.
+      max_points: Maximum number of occupied voxels.
+
+    Returns:
+      Edge, world units.
+    """
     points = np.asarray(points, np.float64)
     high = float(np.max(np.ptp(points, axis=0))) * 1.001 + 1e-9
     low = high / 2**20

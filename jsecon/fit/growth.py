@@ -29,23 +29,40 @@ deviation. As 0.6^2 + 0.8^2 = 1, both halves together have the variance of their
 
 
 def in_use(gaussians: Gaussians) -> Bool[np.ndarray, " n"]:
-    """Returns (N,) bool: the rows that hold a visible Gaussian."""
+    """Finds the rows that hold a visible Gaussian.
+
+    Args:
+      gaussians: N rows.
+
+    Returns:
+      (N,) bool.
+    """
     return np.asarray(gaussians.opacity_logits) >= math.log(MIN_OPACITY / (1 - MIN_OPACITY))
 
 
 def drop_free_rows(gaussians: Gaussians) -> Gaussians:
-    """Returns the Gaussians without the free rows."""
+    """Removes the free rows.
+
+    Args:
+      gaussians: N rows.
+
+    Returns:
+      The visible Gaussians (NumPy).
+    """
     keep = in_use(gaussians)
     return jax.tree.map(lambda a: np.asarray(a)[keep], gaussians)
 
 
-def padded_row_count(count: int) -> int:
-    """Returns a number of rows that holds `count` Gaussians, one of a few sizes, so that few programs are compiled."""
-    return round_capacity(count)
-
-
 def pad_rows(tree: Any, rows: int) -> Any:
-    """Pads every array of a tree with zeros to `rows` rows."""
+    """Pads every array of a tree with zeros.
+
+    Args:
+      tree: Tree of arrays (N, ...).
+      rows: Number of rows afterwards, at least N.
+
+    Returns:
+      Tree of arrays (rows, ...), NumPy.
+    """
 
     def fill(a):
         return np.concatenate([a, np.zeros((rows - len(a), *a.shape[1:]), a.dtype)])
@@ -54,7 +71,15 @@ def pad_rows(tree: Any, rows: int) -> Any:
 
 
 def pad_with_free_rows(gaussians: Gaussians, rows: int) -> Gaussians:
-    """Pads Gaussians with free rows to `rows` rows."""
+    """Pads Gaussians with free rows.
+
+    Args:
+      gaussians: N Gaussians.
+      rows: Number of rows afterwards, at least N.
+
+    Returns:
+      The rows (NumPy).
+    """
     padded = pad_rows(gaussians, rows)
     for name, value in _FREE_ROW.items():
         getattr(padded, name)[gaussians.count :] = value
@@ -143,8 +168,8 @@ def grow(
     count = int(used.sum())
     added = min(max(target - count, 0), int(MAX_GROWTH * count) + 1)
     if count + added > len(used):
-        doubled = min(padded_row_count(max_gaussians), padded_row_count(2 * len(used)))
-        rows = max(padded_row_count(count + added), doubled)
+        doubled = min(round_capacity(max_gaussians), round_capacity(2 * len(used)))
+        rows = max(round_capacity(count + added), doubled)
         gaussians = pad_with_free_rows(gaussians, rows)
         moments, votes = pad_rows((moments, np.asarray(votes)), rows)
         used = in_use(gaussians)

@@ -15,10 +15,11 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from jsecon.errors import InputError, require
 from jsecon.fit.corrections import CorrectionState, RefineOptions, init_corrections
-from jsecon.fit.growth import drop_free_rows, grow, pad_with_free_rows, padded_row_count
+from jsecon.fit.growth import drop_free_rows, grow, pad_with_free_rows
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.step import StepConfig, StepRunner, TrainState, put_on_devices, to_host
 from jsecon.parallel import host_mesh
+from jsecon.splat.capacity import round_capacity
 from jsecon.splat.strips import BLOCK
 from jsecon.splat.tiles import TILE
 from jsecon.types import Array, Capture, Gaussians, Progress, record
@@ -99,7 +100,7 @@ def init_fit_state(gaussians: Gaussians, corrected_frames: int | None = None, *,
       The state.
     """
     count = np.asarray(gaussians.count)
-    rows = padded_row_count(max(int(count), min_rows))
+    rows = round_capacity(max(int(count), min_rows))
     gaussians = pad_with_free_rows(jax.tree.map(lambda a: np.asarray(a, np.float32), gaussians), rows)
     zeros, zero = jax.tree.map(np.zeros_like, gaussians), np.zeros((), np.float64)
     return FitState(
@@ -168,7 +169,7 @@ def fit_gaussians(
     frames = len(runner.views(1.0).frame_indices)
     if start is not None:
         divisor = 1 if schedule.max_gaussians <= ALLOCATED_AT_START else 2
-        min_rows = schedule.max_gaussians // divisor if schedule.grows(start.count) else 0
+        min_rows = schedule.max_gaussians // divisor if schedule.max_gaussians > start.count else 0
         state = init_fit_state(start, None if refine is None else len(capture.names), min_rows=min_rows)
     assert state is not None
     _check_resumable(state, steps, refine)

@@ -50,7 +50,14 @@ def _blur_once(image, axis: int):
 
 @jax.custom_vjp
 def gaussian_blur(image: Float[Array, "h w c"]) -> Float[Array, "h w c"]:
-    """Blurs an image (H, W, C) with the SSIM window, with zeros outside of the image. Reverse mode only."""
+    """Blurs an image with the SSIM window, with zeros outside of the image. Reverse mode only.
+
+    Args:
+      image: (H, W, C).
+
+    Returns:
+      (H, W, C).
+    """
     return _blur_once(_blur_once(image, 0), 1)
 
 
@@ -64,7 +71,18 @@ def _same_shape(image, target) -> None:
 
 
 def l1(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[Array, ""]:
-    """Computes the mean absolute difference () of two images (H, W, C)."""
+    """Computes the mean absolute difference of two images.
+
+    Args:
+      image: (H, W, C).
+      target: Image of the same shape.
+
+    Returns:
+      () loss.
+
+    Raises:
+      ValueError: The shapes differ.
+    """
     _same_shape(image, target)
     return jnp.mean(jnp.abs(image - target))
 
@@ -94,7 +112,18 @@ def ssim_map(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Flo
 
 
 def ssim(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[Array, ""]:
-    """Computes the mean () of `ssim_map` over pixels and channels."""
+    """Computes the mean of `ssim_map` over pixels and channels.
+
+    Args:
+      image: (H, W, C) in [0, 1].
+      target: Image of the same shape.
+
+    Returns:
+      () in [-1, 1].
+
+    Raises:
+      ValueError: The shapes differ.
+    """
     return jnp.mean(ssim_map(image, target))
 
 

@@ -60,14 +60,16 @@ def measure_quality(
     if long_side is not None:
         cameras = shrink_cameras(cameras, long_side)
 
+    def compare(t: int) -> list[float]:
+        image = render_rgb(gaussians, cameras[int(t)]).features
+        frame = resize_frame(np.asarray(capture.frames[t]), cameras)
+        counted = np.ones(frame.shape[:2], bool)
+        if capture.ignored is not None:
+            counted = ~resize_mask(np.asarray(capture.ignored[t]), cameras)
+        return [float(value) for value in _compare(image, frame, counted)]
+
     def rows(positions: Sequence[int]) -> Iterator[list[float]]:
-        for t in chosen[list(positions)]:
-            image = render_rgb(gaussians, cameras[int(t)]).features
-            frame = resize_frame(np.asarray(capture.frames[t]), cameras)
-            counted = np.ones(frame.shape[:2], bool)
-            if capture.ignored is not None:
-                counted = ~resize_mask(np.asarray(capture.ignored[t]), cameras)
-            yield [float(value) for value in _compare(image, frame, counted)]
+        return map(compare, chosen[list(positions)])
 
     by_frame = np.array(map_over_processes(len(chosen), rows, progress)).reshape(-1, 2)
     return Quality(chosen, by_frame[:, 0], by_frame[:, 1])

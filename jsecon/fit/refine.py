@@ -276,7 +276,7 @@ def refine_capture(
         corrections = prober.align(capture, scene, corrections, ~train, refine, FINE_SIZE, ALIGN_VISITS)
     # In the world and the colours of the probe.
     as_probed = _apply(capture, corrections, refine, keep_world=False)
-    dropped = weak_frames(scene, as_probed) if drop_weak else np.zeros(0, int)
+    dropped = _weak_frames(scene, as_probed) if drop_weak else np.zeros(0, int)
     refined = _apply(capture, corrections, refine)
     prober.report(prober.total)
     notes = (*original.notes, *notes, *_describe(original, refined, corrections, refine, by_depth=by_depth))
@@ -461,7 +461,7 @@ def _describe(
     return notes
 
 
-def weak_frames(gaussians: Gaussians, capture: Capture) -> np.ndarray:
+def _weak_frames(gaussians: Gaussians, capture: Capture) -> np.ndarray:
     """Returns the indices of the training frames that a scene fitted to them does not explain (`is_weak`)."""
     train = np.flatnonzero(~np.asarray(capture.held_out))
     result = measure_quality(gaussians, capture, frames=train, long_side=QUICK_LONG_SIDE)

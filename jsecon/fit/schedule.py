@@ -84,24 +84,49 @@ class Schedule:
         require(ordered, "growth_start, growth_end", got, "0 <= start < end <= 1", "")
 
     def size(self, done: float) -> float:
-        """Returns the size of the frames as a share of their full size."""
+        """Returns the size of the frames.
+
+        Args:
+          done: Share of the fit that is done, in [0, 1].
+
+        Returns:
+          Share of their full size.
+        """
         return next(size for size, end in self.sizes if done < end or end == 1.0)
 
     def next_size(self, done: float) -> float | None:
-        """Returns the size that follows the one at that share of the fit, or None."""
+        """Returns the size of the frames that follows.
+
+        Args:
+          done: Share of the fit that is done, in [0, 1].
+
+        Returns:
+          Share of their full size, or None if the present size is the last.
+        """
         return next((later for (_, end), (later, _) in pairwise(self.sizes) if done < end), None)
 
     def degree(self, done: float) -> int:
-        """Returns the highest degree of the spherical harmonics that learns."""
+        """Returns the degree of colour.
+
+        Args:
+          done: Share of the fit that is done, in [0, 1].
+
+        Returns:
+          Highest degree of the spherical harmonics that learns; it may exceed the scene's.
+        """
         return int(done / self.degree_interval) if self.degree_interval > 0 else 3
 
-    def grows(self, start: int) -> bool:
-        """Returns whether a fit that starts with `start` Gaussians adds any."""
-        return self.max_gaussians > start
-
     def count(self, done: float, start: int) -> int | None:
-        """Returns the number of Gaussians at this time, or None outside of the growth phase."""
-        if not self.growth_start <= done <= self.growth_end or not self.grows(start):
+        """Returns the number of Gaussians.
+
+        Args:
+          done: Share of the fit that is done, in [0, 1].
+          start: Number of Gaussians at the start.
+
+        Returns:
+          The number to grow to, or None outside of the growth phase.
+        """
+        if not self.growth_start <= done <= self.growth_end or self.max_gaussians <= start:
             return None
         share = (done - self.growth_start) / (self.growth_end - self.growth_start)
         return round(start + share * (self.max_gaussians - start))

@@ -136,8 +136,8 @@ def view_loss(
       correction: Corrections of this view, or None.
       view: Camera, frame, depth and ignored pixels.
       extent: () cameras' extent, world units.
-      capacity: As for `render`.
-      mesh: As for `render`.
+      capacity: Number of (block, Gaussian) pairs, see `render`.
+      mesh: Devices to divide the work among, or None.
 
     Returns:
       The value to descend; and the loss without votes, and the number of pairs that overflowed.
@@ -215,8 +215,8 @@ def step(
       state: Scene, moments, votes and corrections.
       view: View to fit to.
       inputs: Numbers of this step.
-      capacity: As for `render`.
-      mesh: As for `render`.
+      capacity: Number of (block, Gaussian) pairs, see `render`.
+      mesh: Devices to divide the work among, or None.
 
     Returns:
       The state after the step, the loss before it, and the number of pairs that overflowed.
@@ -275,7 +275,15 @@ def _shardings(mesh: Mesh) -> TrainState:
 
 
 def put_on_devices(state: TrainState, mesh: Mesh | None) -> TrainState:
-    """Moves a state to the devices of a mesh, padded with free rows so that all devices have the same number."""
+    """Moves a state to devices.
+
+    Args:
+      state: State of N rows.
+      mesh: Devices that divide the rows, or None for the first one.
+
+    Returns:
+      The state, padded with free rows so that all devices have the same number.
+    """
     if mesh is None:
         return jax.device_put(state)
     rows = -(-state.gaussians.count // mesh.size) * mesh.size
@@ -286,7 +294,15 @@ def put_on_devices(state: TrainState, mesh: Mesh | None) -> TrainState:
 
 
 def to_host(state: TrainState, rows: int) -> TrainState:
-    """Copies a state to NumPy arrays, without the rows beyond `rows` that `put_on_devices` added."""
+    """Copies a state to NumPy arrays.
+
+    Args:
+      state: State on devices.
+      rows: Number of rows to keep; the others are those that `put_on_devices` added.
+
+    Returns:
+      The state.
+    """
     host = jax.tree.map(np.asarray, state)
     return jax.tree.map(lambda a: a[:rows], host._replace(corrections=None))._replace(corrections=host.corrections)
 
@@ -306,13 +322,25 @@ class StepRunner:
         self._compiler = ThreadPoolExecutor(2)
 
     def views(self, size: float) -> TrainingViews:
-        """Returns the training frames at a size, as a share of their full size."""
+        """Returns the training frames at a size.
+
+        Args:
+          size: Share of their full size.
+
+        Returns:
+          The frames, made once.
+        """
         if size not in self._views:
             self._views[size] = TrainingViews(self._capture, size)
         return self._views[size]
 
     def compile(self, state: TrainState, size: float, config: StepConfig) -> Future:
-        """Starts to compile the program of steps at that size in another thread, unless that has begun.
+        """Starts to compile the program of steps in another thread, unless that has begun.
+
+        Args:
+          state: State whose number of rows counts.
+          size: Size of the frames, as a share of their full size.
+          config: Settings of the steps.
 
         Returns:
           The program, once it is compiled.
@@ -331,7 +359,19 @@ class StepRunner:
     def take(
         self, state: TrainState, size: float, view: int, index: int, done: float, config: StepConfig
     ) -> tuple[TrainState, Array, Array]:
-        """Takes step number `index` on the view at that position; see `step`."""
+        """Takes one step, see `step`.
+
+        Args:
+          state: State before the step.
+          size: Size of the frame, as a share of its full size.
+          view: Position of the view among the training frames.
+          index: Number of earlier steps.
+          done: Share of the fit that is done, in [0, 1].
+          config: Settings of the step.
+
+        Returns:
+          The state after the step, the loss before it, and the number of pairs that overflowed.
+        """
         program = self.compile(state, size, config).result()
         return program(jax.tree.leaves((state, *self._arguments(size, view, index, done, config))))
 
@@ -351,6 +391,12 @@ class StepRunner:
         return jax.device_put((views[view], inputs), sharding)
 
     def widen(self, state: TrainState, size: float, overflow: int) -> None:
-        """Raises the capacity of views of this size by `overflow` pairs."""
+        """Raises the capacity of views.
+
+        Args:
+          state: State whose number of rows counts.
+          size: Size of the frames, as a share of their full size.
+          overflow: Number of pairs that found no room.
+        """
         shape = state.gaussians.count, size
         self._capacity[shape] = enough_capacity(self._capacity[shape], np.array([overflow]))
