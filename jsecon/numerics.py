@@ -64,26 +64,25 @@ def safe_scale(size: Array) -> Array:
     return jax.lax.stop_gradient(factor.astype(size.dtype))
 
 
-@functools.partial(jax.jit, static_argnames=("axis", "keepdims"), inline=True)
-def safe_norm(x: Array, axis: int = -1, keepdims: bool = False) -> Array:
+@functools.partial(jax.jit, static_argnames="keepdims", inline=True)
+def safe_norm(x: Array, keepdims: bool = False) -> Array:
     """Computes Euclidean lengths, right over the whole float range (1e-30 and 1e30 alike).
 
     Args:
-      x: Vectors.
-      axis: Their axis.
-      keepdims: Keep that axis, with one entry.
+      x: (..., d) vectors.
+      keepdims: Keep the last axis, with one entry.
 
     Returns:
       The lengths; the gradient at a zero vector is zero.
     """
     x = jnp.asarray(x)
-    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True, initial=0.0))
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=-1, keepdims=True, initial=0.0))
     usable = (largest > 0) & jnp.isfinite(largest)
     factor = safe_scale(largest)
     scaled = jnp.where(usable, x * factor, 0.0)
-    squares = jnp.sum(scaled * scaled, axis=axis, keepdims=True)
+    squares = jnp.sum(scaled * scaled, axis=-1, keepdims=True)
     length = jnp.where(usable, jnp.sqrt(jnp.where(usable, squares, 1.0)) * (1 / factor), largest)
-    return length if keepdims else jnp.squeeze(length, axis)
+    return length if keepdims else jnp.squeeze(length, -1)
 
 
 @functools.partial(jax.jit, static_argnames="axis", inline=True)

@@ -268,9 +268,7 @@ def _states_of_all(state: Any) -> list[Any]:
 
 
 def map_over_processes(
-    count: int,
-    rows: Callable[[Sequence[int]], Iterable[Any]],
-    progress: Progress | None = None,
+    count: int, rows: Callable[[Sequence[int]], Iterable[Any]], progress: Progress | None = None
 ) -> list[Any]:
     """Maps a host function over indices, each process with its part of them.
 

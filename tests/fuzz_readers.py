@@ -276,7 +276,7 @@ def image(folder: Path) -> Iterator[Case]:
 
     def read(file: Path):
         found = images.read_image(file)
-        return found, images.image_size(file)
+        return found, images.image_header(file).upright
 
     def whole(found) -> None:
         (picture, _), (width, height) = found

@@ -81,16 +81,16 @@ def test_equal_values_give_equal_bytes(scene, cameras, tmp_path):
 ], ids=["cut", "empty", "overwritten", "other"])  # fmt: skip
 def test_a_damaged_file_is_said_and_computed_again(tmp_path, damage):
     value = np.random.default_rng(0).normal(size=500)
-    cache.fetch(cache.path_of(tmp_path, "stage", "k"), lambda: value)
-    path = cache.path_of(tmp_path, "stage", "k")
+    cache.fetch(tmp_path / "stage-k.safetensors", lambda: value)
+    path = tmp_path / "stage-k.safetensors"
     path.write_bytes(damage(path.read_bytes()))
     said = []
-    kept = cache.fetch(cache.path_of(tmp_path, "stage", "k"), lambda: value, note=said.append)
+    kept = cache.fetch(tmp_path / "stage-k.safetensors", lambda: value, note=said.append)
     assert kept.fresh
     np.testing.assert_array_equal(kept.value, value)
     assert len(said) == 1
     assert "stage is computed again" in said[0]
-    assert not cache.fetch(cache.path_of(tmp_path, "stage", "k"), lambda: value).fresh
+    assert not cache.fetch(tmp_path / "stage-k.safetensors", lambda: value).fresh
 
 
 def test_a_failed_computation_leaves_nothing_behind(tmp_path):
@@ -98,7 +98,7 @@ def test_a_failed_computation_leaves_nothing_behind(tmp_path):
         raise InputError("x", problem="a", expected="b", remedy="c")
 
     with pytest.raises(InputError):
-        cache.fetch(cache.path_of(tmp_path, "stage", "k"), fail)
+        cache.fetch(tmp_path / "stage-k.safetensors", fail)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -11,7 +11,7 @@ from small_field import REGIONS, make_field, shares, true_regions
 import jsecon
 from jsecon.app import cli
 from jsecon.data.gaussians.files import load_gaussians
-from jsecon.data.gaussians.ply import read_vertices
+from jsecon.data.gaussians.ply import read_elements
 from jsecon.errors import InputError
 from jsecon.language.field import save_field
 from jsecon.types import Regions, Votes
@@ -193,7 +193,7 @@ def test_exported_objects_and_labels_are_those_of_the_catalogue(field, file, tmp
     labels = np.load(ids)
     assert labels.dtype == np.int32
     np.testing.assert_array_equal(labels, catalogue.labels)
-    vertices = read_vertices(scene)
+    vertices = read_elements(scene)[1]["vertex"]
     np.testing.assert_array_equal(vertices["object_id"], labels)
     whole = load_gaussians(scene)
     np.testing.assert_array_equal(whole.means, field.gaussians.means)
@@ -211,7 +211,7 @@ def test_only_and_without_part_the_scene_bit_for_bit(field, file, tmp_path, caps
         ids = tmp_path / f"{name}.npy"
         assert run("export", file, f"--{name}", "red thing", "--out", paths[name], "--labels", ids) == 0
         assert len(np.load(ids)) == load_gaussians(paths[name]).count
-    rows = {name: [row.tobytes() for row in read_vertices(path)] for name, path in paths.items()}
+    rows = {name: [row.tobytes() for row in read_elements(path)[1]["vertex"]] for name, path in paths.items()}
     assert sorted(rows["only"] + rows["without"]) == sorted(rows["scene"])
     assert 0 < len(rows["only"]) < len(rows["scene"])
     assert rows["only"] == [row for row in rows["scene"] if row in set(rows["only"])]

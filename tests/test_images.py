@@ -11,7 +11,7 @@ import PIL.ImageOps
 import pytest
 from capture_files import png, refused
 
-from jsecon.data.images import apply_orientation, image_size, read_depth, read_image, read_label_image, write_image
+from jsecon.data.images import apply_orientation, image_header, read_depth, read_image, read_label_image, write_image
 from jsecon.data.lens import Lens, distort, undistorted_pinhole, undistortion_maps
 from jsecon.errors import InputError
 
@@ -24,7 +24,7 @@ def test_png_comes_back_exactly(tmp_path):
     image, transparent = read_image(tmp_path / "a.png")
     np.testing.assert_array_equal(image, FRAME)
     assert not transparent
-    assert image_size(tmp_path / "a.png") == (17, 13)
+    assert image_header(tmp_path / "a.png").upright == (17, 13)
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
 
 
@@ -33,7 +33,7 @@ def test_jpeg_comes_back_nearly(tmp_path):
     write_image(tmp_path / "a.jpg", smooth)
     image, _ = read_image(tmp_path / "a.jpg")
     assert np.abs(image.astype(int) - smooth).mean() < 4
-    assert image_size(tmp_path / "a.jpg") == (170, 130)
+    assert image_header(tmp_path / "a.jpg").upright == (170, 130)
 
 
 def test_grey_16_bits_and_transparency(tmp_path):
@@ -103,7 +103,7 @@ def with_orientation(image, orientation):
 def test_images_come_upright(tmp_path, ending, orientation):
     file, image = tmp_path / f"a{ending}", corners()
     stored_as(image, orientation, file)
-    assert image_size(file) == (48, 32)
+    assert image_header(file).upright == (48, 32)
     read, _ = read_image(file)
     assert np.abs(read.astype(int) - image).mean() < (6 if ending == ".jpg" else 0.1)
     stored, _ = read_image(file, upright=False)
@@ -120,7 +120,7 @@ def test_a_heic_is_turned_once(tmp_path):
     stored = np.rot90(corners(96, 64))
     photo = pillow_heif.from_pillow(PIL.Image.fromarray(np.ascontiguousarray(stored)))
     photo.save(tmp_path / "a.heic", quality=95, exif=tags.tobytes())
-    assert image_size(tmp_path / "a.heic") == (96, 64)
+    assert image_header(tmp_path / "a.heic").upright == (96, 64)
     assert np.abs(read_image(tmp_path / "a.heic")[0].astype(int) - corners(96, 64)).mean() < 6
 
 
@@ -140,7 +140,7 @@ def test_too_large_images_are_shrunk_or_say_the_limit(tmp_path, monkeypatch):
         read_image(tmp_path / "big.png")
     monkeypatch.setattr("jsecon.data.images.MAX_PIXELS", 101 * 61)
     PIL.Image.fromarray(corners(201, 121)).save(tmp_path / "big.jpg", quality=95)
-    assert image_size(tmp_path / "big.jpg") == (101, 61)
+    assert image_header(tmp_path / "big.jpg").upright == (101, 61)
     image, _ = read_image(tmp_path / "big.jpg")
     assert image.shape == (61, 101, 3)
     assert np.abs(image[:60, :100].astype(int) - corners(100, 60)).mean() < 6
@@ -199,7 +199,7 @@ def test_damaged_png_missing_file_and_no_image(tmp_path):
         read_image(tmp_path / "none.png")
     (tmp_path / "text.png").write_text("no image at all, but long enough to look at")
     with refused("text.png", "unknown kind"):
-        image_size(tmp_path / "text.png")
+        image_header(tmp_path / "text.png")
     with refused("a.xyz", "'.xyz'"):
         write_image(tmp_path / "a.xyz", FRAME)
 
@@ -327,7 +327,7 @@ def test_heic_comes_back_nearly_and_damage_and_absence_are_told(tmp_path, monkey
     image, transparent = read_image(tmp_path / "a.heic")
     assert np.abs(image.astype(int) - smooth).mean() < 4
     assert not transparent
-    assert image_size(tmp_path / "a.heic") == (136, 104)
+    assert image_header(tmp_path / "a.heic").upright == (136, 104)
     data = (tmp_path / "a.heic").read_bytes()
     (tmp_path / "cut.heic").write_bytes(data[: len(data) // 2])
     with refused("cut.heic", "decoded"):

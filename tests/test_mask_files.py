@@ -51,15 +51,6 @@ def test_order_on_disk_does_not_matter(tmp_path):
     np.testing.assert_array_equal(swapped, slow(IDS)[0][[1, 2, 0]])
 
 
-@pytest.mark.parametrize("background", [None, 7, 99])
-def test_background_is_a_choice(tmp_path, background):
-    write_masks(tmp_path, IDS)
-    labels, ids, _ = load_labels(tmp_path, NAMES, SIZE, background=background)
-    expected, expected_ids = slow(IDS, background)
-    np.testing.assert_array_equal(labels, expected)
-    assert ids == expected_ids
-
-
 def test_palette_indices_not_colours(tmp_path):
     """As DAVIS and its trackers write them; the palette repeats colours on purpose."""
     indices = RNG.integers(0, 4, (3, *SIZE))

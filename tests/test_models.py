@@ -8,7 +8,7 @@ from sam_files import write_sam
 
 from jsecon.app import cli
 from jsecon.errors import InputError
-from jsecon.pipeline.models import inspect_models, report_lines, unusable
+from jsecon.pipeline.models import inspect_models
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def test_what_a_folder_is_good_for(folders, model, words):
         if name != model:
             assert "expected" in use.summary
             assert "huggingface.co" in use.summary or "github.com" in use.summary
-    assert unusable(findings) == []
+    assert findings.errors == []
 
 
 def test_every_graph_is_told_with_its_tensors(folders, capsys):
@@ -55,7 +55,7 @@ def test_every_graph_is_told_with_its_tensors(folders, capsys):
         assert line in told.splitlines()
     findings = inspect_models(folders["SAM"])
     assert len(findings.graphs) == 2
-    assert any("input_points float32[1, batch, points, 2]" in line for line in report_lines(findings))
+    assert any("input_points float32[1, batch, points, 2]" in line for line in findings.lines)
 
 
 def test_damage_and_emptiness_end_in_exit_code_2(tmp_path, capsys):

@@ -12,7 +12,7 @@ from jsecon.errors import InputError
 from jsecon.language.field import load_field, save_field
 from jsecon.pipeline.networks import field_embedder
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.sources import locate_sources, relative_folders
+from jsecon.pipeline.sources import locate_sources, provenance
 from jsecon.vision.colours import ColourEmbedder
 
 CLIP = "clip-0123456789abcdef"
@@ -31,7 +31,7 @@ def test_hints_are_relative_to_the_field_and_are_followed_from_its_file(field, t
     out, model = tmp_path / "runs" / "a", tmp_path / "models" / "clip"
     for folder in (out, model, tmp_path / "capture"):
         folder.mkdir(parents=True)
-    hints = relative_folders(Options(tmp_path / "capture", embedder=model), out)
+    hints = json.loads(provenance(Options(tmp_path / "capture", embedder=model), {}, CLIP, out))["folders"]
     assert hints == {"capture": "../../capture", "embedder": "../../models/clip"}
     own = told(field, folders=hints, embedder=CLIP)
     save_field(out / "field.safetensors", own)

@@ -14,7 +14,7 @@ from jsecon.data.capture import load_capture
 from jsecon.data.labels import load_lerf_labels
 from jsecon.data.masks import load_labels
 from jsecon.demo import raycast, render_views, room_cameras, room_capture, write_room
-from jsecon.demo.raycast import lamp_points, lamp_visibility, texture_pattern, trace_rays
+from jsecon.demo.raycast import lamp_visibility, texture_pattern, trace_rays
 from jsecon.demo.room import (
     ARCH_COLOUR,
     BEAM_COLOUR,
@@ -36,7 +36,6 @@ from jsecon.demo.shapes import (
     frustum,
     normals,
     place,
-    radius_about_axis,
     ray_interval,
     rotation,
 )
@@ -130,7 +129,7 @@ def test_normals_point_out_of_the_solid(name):
 @pytest.mark.parametrize("shape", PLAIN_SHAPES)
 def test_bounding_spheres_and_reach_hold_the_shape(shape):
     parts = PLAIN_SHAPES[shape](np.random.default_rng(4))
-    radius = max(radius_about_axis(solid) for solid, _, _ in parts)
+    radius = max(solid.radius_about_axis for solid, _, _ in parts)
     assert 0.04 < radius < 0.2
     grid = np.stack(np.meshgrid(*[np.linspace(-0.3, 0.3, 61)] * 2, np.linspace(-0.05, 0.4, 46))).reshape(3, -1)
     grid = grid.astype(np.float32)
@@ -199,7 +198,7 @@ def test_lamp_visibility_equals_all_rays_to_all_parts():
     rng = np.random.default_rng(0)
     points = np.stack([rng.uniform(-0.68, 0.68, 600), rng.uniform(-0.56, 0.56, 600), np.full(600, 1e-3)])
     points = points.astype(np.float32)
-    lamps = lamp_points(room)
+    lamps = room.lamp_points
     blocked = np.zeros((lamps.shape[1], 600), bool)
     for part in room.parts:
         for k in range(lamps.shape[1]):

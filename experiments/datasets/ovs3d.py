@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float
 
 from experiments.datasets.benchmark import Benchmark, hold_out, no_points, require_count, twin_of
 from jsecon.data.capture import load_capture
-from jsecon.data.colmap import find_model
+from jsecon.data.colmap import find_models
 from jsecon.data.frames import PosedImage, PosedImages, build_capture
-from jsecon.data.images import IMAGE_SUFFIXES, image_size, read_image, write_image
+from jsecon.data.images import IMAGE_SUFFIXES, image_header, read_image, write_image
 from jsecon.data.labels import LabelledFrame
 from jsecon.data.lens import Lens
 from jsecon.errors import InputError
@@ -43,7 +43,7 @@ def load_ovs3d(root: str | Path, scene: str, *, downscale: float | int | None = 
     pairs = sum(len(frame.objects) for frame in frames)
     expected = OVS3D_PAIRS.get(scene, pairs) if told is None else told["pairs"]
     require_count(folder / "segmentations", pairs, expected, "(frame, query) pairs")
-    if find_model(folder) is not None:
+    if find_models(folder):
         capture = load_capture(folder, downscale=downscale, holdout=0)
     else:
         capture = _from_poses(folder, files, downscale)
@@ -185,6 +185,6 @@ def _from_poses(folder: Path, files: list[Path], downscale: float | int | None) 
     shots = []
     for file, pose, (height, width, focal) in zip(files, poses, sizes):
         lens = Lens(int(width), int(height), focal, focal, width / 2, height / 2)
-        shots.append(PosedImage(file.name, file, lens.resized(*image_size(file)), pose))
+        shots.append(PosedImage(file.name, file, lens.resized(*image_header(file).upright), pose))
     note = "Poses are those of poses_bounds.npy: one focal length, the principal point in the middle, no points."
     return build_capture(PosedImages(shots, folder, notes=(note,)), downscale=downscale, holdout=0)

@@ -186,16 +186,16 @@ def _remove_models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
 def _check_models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
     """Lists the graphs of models on this machine, and what jsecon can use them for."""
     with console.progress("start"):
-        from jsecon.pipeline.models import inspect_models, report_lines, unusable
+        from jsecon.pipeline.models import inspect_models
 
     results, errors = [], []
     for name in verb.names:
         with console.progress("graphs"):
             report = inspect_models(_cached_model(name))
-        for line in report_lines(report):
+        for line in report.lines:
             console.say(line)
         results.append(dataclasses.asdict(report))
-        errors += unusable(report)
+        errors += report.errors
     return {"models": results, "errors": errors}
 
 

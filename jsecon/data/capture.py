@@ -8,13 +8,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from jsecon.data.colmap import find_models, read_colmap
-from jsecon.data.frames import (
-    CaptureExtent,
-    PosedImages,
-    build_capture,
-    check_capture_options,
-    planned_extent,
-)
+from jsecon.data.frames import CaptureExtent, PosedImages, build_capture, check_capture_options, planned_extent
 from jsecon.data.nerfstudio import read_nerfstudio
 from jsecon.data.rgbd import find_rgbd
 from jsecon.data.sfm import list_photographs

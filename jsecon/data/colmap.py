@@ -87,18 +87,6 @@ def _models_in(folder: Path) -> list[Path]:
     return sorted(models, key=_count_images, reverse=True) if len(models) > 1 else models
 
 
-def find_model(path: str | Path) -> Path | None:
-    """Finds the largest COLMAP model of a capture.
-
-    Args:
-      path: As in `find_models`.
-
-    Returns:
-      Its folder, or None.
-    """
-    return next(iter(find_models(path)), None)
-
-
 def _model_file(model: Path, kind: str) -> Path | None:
     """The binary or text file of a kind, or None."""
     return next((model / (kind + ending) for ending in (".bin", ".txt") if (model / (kind + ending)).is_file()), None)

@@ -257,21 +257,6 @@ def image_header(path: str | Path) -> ImageHeader:
     return ImageHeader((-(-width // shrink), -(-height // shrink)), orientation)
 
 
-def image_size(path: str | Path) -> tuple[int, int]:
-    """Reads the upright size of an image file.
-
-    Args:
-      path: An image file.
-
-    Returns:
-      (width, height), px.
-
-    Raises:
-      InputError: As in `image_header`.
-    """
-    return image_header(path).upright
-
-
 def read_pixels(path: Path, *, upright: bool = True) -> np.ndarray:
     """Reads an image file without a conversion of its values.
 

@@ -88,7 +88,7 @@ def _read(file: Path) -> LabelledFrame:
         category = _get(file, entry, "category", str, where)
         polygon = _numbers(file, _get(file, entry, "segmentation", list, where), (-1, 2), f"segmentation of {where}")
         box = _numbers(file, _get(file, entry, "bbox", list, where), (1, 4), f"bbox of {where}").astype(np.float32)
-        mask = polygon_mask(polygon, width, height)
+        mask = _polygon_mask(polygon, width, height)
         if category in objects:
             before, boxes = objects[category]
             mask = mask | before
@@ -109,17 +109,8 @@ def _numbers(file: Path, values: list, shape: tuple[int, int], what: str) -> np.
     return array
 
 
-def polygon_mask(corners: Real[np.ndarray, "k 2"], width: int, height: int) -> Bool[np.ndarray, "{height} {width}"]:
-    """Draws a polygon, its edges included; corners are cut to integers, as LangSplat does.
-
-    Args:
-      corners: (K, 2) x y, px.
-      width: Width of the image, px.
-      height: Height of the image, px.
-
-    Returns:
-      (height, width) mask.
-    """
+def _polygon_mask(corners: Real[np.ndarray, "k 2"], width: int, height: int) -> Bool[np.ndarray, "{height} {width}"]:
+    """Draws a polygon, its edges included; corners are cut to integers, as LangSplat does."""
     canvas = np.zeros((height, width), np.uint8)
     cv2.fillPoly(canvas, [np.asarray(corners).astype(np.int32)], 1)
     return canvas.astype(bool)
@@ -147,7 +138,7 @@ def write_lerf_labels(folder: str | Path, frames: Iterable[LabelledFrame], *, im
             got = f"mask {mask.shape} with {int(mask.sum())} pixels, {len(boxes)} boxes"
             expected = f"({frame.height}, {frame.width}), with pixels and a box"
             require(fits, f"{frame.name}: {category}", got, expected, "Leave out what the frame does not show.")
-            for polygon, box in _with_boxes(mask_polygons(mask), np.asarray(boxes, np.float64)):
+            for polygon, box in _with_boxes(_mask_polygons(mask), np.asarray(boxes, np.float64)):
                 shape = {"segmentation": polygon.astype(float).tolist(), "area": float(mask.sum()), "layer": 1.0}
                 rest = {"bbox": box.tolist(), "iscrowd": 0, "note": ""}
                 objects.append({"category": category, "group": group} | shape | rest)
@@ -155,15 +146,8 @@ def write_lerf_labels(folder: str | Path, frames: Iterable[LabelledFrame], *, im
         write_text(path_within(Path(folder), f"{frame.name}.json"), json.dumps({"info": info, "objects": objects}))
 
 
-def mask_polygons(mask: Bool[np.ndarray, "h w"]) -> list[np.ndarray]:
-    """Outlines a mask by polygons without holes, whose `polygon_mask`s OR-ed are the mask exactly.
-
-    Args:
-      mask: (H, W) mask.
-
-    Returns:
-      Polygons (K, 2), integer x y, px.
-    """
+def _mask_polygons(mask: Bool[np.ndarray, "h w"]) -> list[np.ndarray]:
+    """Outlines a mask by polygons without holes, whose polygon masks OR-ed are the mask exactly."""
     polygons = []
     image = np.ascontiguousarray(mask, np.uint8)
     _, labels = cv2.connectedComponents(image, connectivity=8)
@@ -186,8 +170,8 @@ def mask_polygons(mask: Bool[np.ndarray, "h w"]) -> list[np.ndarray]:
         x, y, width, height = cv2.boundingRect(outline)
         piece = labels[y : y + height, x : x + width] == labels[outline[0, 1], outline[0, 0]]
         upper, lower = piece[: cut - y], piece[cut - y :]
-        polygons += [polygon + np.array([x, y]) for polygon in mask_polygons(upper)]
-        polygons += [polygon + np.array([x, cut]) for polygon in mask_polygons(lower)]
+        polygons += [polygon + np.array([x, y]) for polygon in _mask_polygons(upper)]
+        polygons += [polygon + np.array([x, cut]) for polygon in _mask_polygons(lower)]
     return polygons
 
 

@@ -58,7 +58,7 @@ def load_features(
       InputError: A frame has no file, its two files disagree, or embeddings are not finite.
     """
     every = order if order is not None else names
-    kinds = find_masks(folder, every, ("_s.npy", "_f.npy"), lambda path: False, files=files)
+    kinds = find_masks(folder, every, ("_s.npy", "_f.npy"), files=files)
     by_suffix = {kind.suffix: kind.path for kind in kinds}
 
     def path_of(name: str, suffix: str) -> Path:

@@ -13,7 +13,7 @@ import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Int, Int16
@@ -35,6 +35,7 @@ MAX_DEPTH = 4
 SAMPLED_MASKS = 64
 """masks whose values are read to tell cameras from objects"""
 _LEVELS_SUFFIX = "_s.npy"
+_LANGSPLAT = (_LEVELS_SUFFIX, "_f.npy")
 _WORD = r"masks?|seg|segs|segmentations?|labels?|ids?|instances?|objects?|annotations?"
 _AFFIX = re.compile(rf"(?:(?:{_WORD})[_.-])?(.+?)(?:[_.-](?:{_WORD}))?", re.IGNORECASE)
 """a frame's name within that of its mask"""
@@ -186,7 +187,6 @@ def find_masks(
     folder: Path,
     names: Sequence[str],
     suffixes: Sequence[str],
-    is_black_and_white: Callable[[Path], bool],
     *,
     files: Mapping[str, ImageFile] | None = None,
     numbered: bool = False,
@@ -197,8 +197,6 @@ def find_masks(
       folder: Where the masks are.
       names: All frames of the capture.
       suffixes: Suffixes of masks, the longer before the shorter.
-      is_black_and_white: Whether a file holds the mask of one object: it tells folders of objects from those of cameras
-        if their names do not.
       files: The frames' images, whose folders are those of the cameras.
       numbered: If no file is named like a frame, take number n for the n-th frame, if all frames have one.
 
@@ -239,7 +237,7 @@ def find_masks(
         count = sum(map(len, unmatched.values()))
         problem = f"it holds {count} masks{', none of which is called like a frame' if count else ''}"
         raise InputError(folder, problem, expected, "Name each mask like its frame.")
-    return [_arrange(suffix, some, unmatched[suffix], is_black_and_white) for suffix, some in matched.items()]
+    return [_arrange(suffix, some, unmatched[suffix]) for suffix, some in matched.items()]
 
 
 def _unsupported(path: Path) -> InputError:
@@ -250,12 +248,7 @@ def _unsupported(path: Path) -> InputError:
     return InputError(path, f"masks are not read from {path.suffix.lower()} files", "a PNG or .npy", "Convert it.")
 
 
-def _arrange(
-    suffix: str,
-    matches: list[_Match],
-    unmatched: list[tuple[Path, tuple[str, ...]]],
-    is_black_and_white: Callable[[Path], bool],
-) -> MaskFiles:
+def _arrange(suffix: str, matches: list[_Match], unmatched: list[tuple[Path, tuple[str, ...]]]) -> MaskFiles:
     """Arranges the files of one suffix, as one of each frame or one of each object in it."""
     plain = [match for match in matches if not match.extra]
     others = [match for match in matches if match.extra]
@@ -267,7 +260,7 @@ def _arrange(
         verb = "belongs" if len(unmatched) == 1 else "belong"
         example = unmatched[0][0].name
         notes = [f"{len(unmatched)} of the {suffix} files {verb} to no frame of this capture (the first: {example})."]
-    if _are_objects(plain, others, by_frame, is_black_and_white):
+    if _are_objects(plain, others, by_frame):
         folders = sorted({_object_of(match) for match in matches}, key=_natural_order)
         notes = [f"The folders {_shorten(folders)} are read as objects: each has black and white masks of one.", *notes]
         by_object = {frame: {_object_of(m): m.path for m in reversed(some)} for frame, some in by_frame.items()}
@@ -284,12 +277,7 @@ def _arrange(
     return MaskFiles({frame: match.path for frame, match in best.items()}, {}, suffix, tuple(notes))
 
 
-def _are_objects(
-    plain: list[_Match],
-    others: list[_Match],
-    by_frame: Mapping[str, list[_Match]],
-    is_black_and_white: Callable[[Path], bool],
-) -> bool:
+def _are_objects(plain: list[_Match], others: list[_Match], by_frame: Mapping[str, list[_Match]]) -> bool:
     """Whether the subfolders stand for objects, not for cameras."""
     if not others or any(not match.folders for match in plain):
         return False
@@ -300,7 +288,7 @@ def _are_objects(
     if several and not plain:
         return True
     paths = [match.path for some in by_frame.values() for match in some]
-    return all(is_black_and_white(path) for path in paths[:: -(-len(paths) // SAMPLED_MASKS)])
+    return all(_is_black_and_white(path) for path in paths[:: -(-len(paths) // SAMPLED_MASKS)])
 
 
 def _object_of(match: _Match) -> str:
@@ -342,7 +330,6 @@ def load_labels(
     names: Sequence[str],
     size: tuple[int, int],
     *,
-    background: int | None = 0,
     level: str | int = "l",
     shared: bool | None = None,
     order: Sequence[str] | None = None,
@@ -351,9 +338,10 @@ def load_labels(
 ) -> TrackedMasks:
     """Reads masks whose ids mean the same object in every frame.
 
-    A mask has an id per pixel: 8 or 16 bit grey, a palette PNG (its indices), RGB (each colour an id), or whole numbers
-    in a `.npy`, as Gaussian Grouping's object_mask and SAM 2's PNGs; or LangSplat's `<name>_s.npy` (4, H, W). Files are
-    named, and subfolders read, as this module says; where masks of objects overlap, the lower id lies on top.
+    A mask has an id per pixel, 0 for no region: 8 or 16 bit grey, a palette PNG (its indices), RGB (each colour an id),
+    or whole numbers in a `.npy`, as Gaussian Grouping's object_mask and SAM 2's PNGs; or LangSplat's `<name>_s.npy`
+    (4, H, W). Files are named, and subfolders read, as this module says; where masks of objects overlap, the lower id
+    lies on top.
 
     Masks must be of the frames as the capture was loaded, undistorted. Other sizes of the same aspect are resized
     (nearest), and masks of stored pixels are turned like their images. A frame without a mask is -1 everywhere.
@@ -362,7 +350,6 @@ def load_labels(
       folder: The masks.
       names: T frames.
       size: (H, W) of the labels.
-      background: Id that is not a region; None: every id is one.
       level: LangSplat's level, a name of LEVELS or its index.
       shared: Whether an id means the same object in every frame. By default so for all but `_s.npy`: LangSplat numbers
         the masks of each frame afresh, and each is a region of its own.
@@ -389,7 +376,7 @@ def load_labels(
         frame_ids.append(ids)
         if progress is not None:
             progress(index + 1, len(names))
-    frame_ids = reader.without_background(folder, frame_ids, background)
+    frame_ids = reader.without_background(folder, frame_ids)
     if shared:
         ids = np.unique(np.concatenate(frame_ids))
         ids = ids[ids >= 0]
@@ -404,17 +391,11 @@ def load_labels(
         raise InputError(folder, f"there are {len(ids)} regions", f"at most {MAX_REGIONS}", remedy)
     for frame, table in zip(labels, tables):
         frame[:] = np.append(table, -1).astype(np.int16)[frame]
-    return TrackedMasks(labels, reader.file_ids(ids), (*reader.notes(background, shared), *masks.notes))
+    return TrackedMasks(labels, reader.file_ids(ids), (*reader.notes(shared), *masks.notes))
 
 
 def check_labels(
-    folder: str | Path,
-    names: Sequence[str],
-    size: tuple[int, int],
-    *,
-    level: str | int = "l",
-    order: Sequence[str] | None = None,
-    files: Mapping[str, ImageFile] | None = None,
+    folder: str | Path, names: Sequence[str], size: tuple[int, int], *, order: Sequence[str] | None, **options: Any
 ) -> None:
     """Checks masks by their names and the first of them.
 
@@ -422,16 +403,15 @@ def check_labels(
       folder: As in `load_labels`.
       names: As in `load_labels`.
       size: As in `load_labels`.
-      level: As in `load_labels`.
       order: As in `load_labels`.
-      files: As in `load_labels`.
+      **options: Further options of `load_labels`.
 
     Raises:
       InputError: As in `load_labels`, but for damage in other files than the first.
     """
-    masks = _find_one_kind(Path(folder), names, order, files)
+    masks = _find_one_kind(Path(folder), names, order, options.get("files"))
     first = next(name for name in names if masks.path(name) is not None)
-    load_labels(folder, [first], size, level=level, order=order, files=files)
+    load_labels(folder, [first], size, order=order, **options)
 
 
 def _find_one_kind(
@@ -440,7 +420,7 @@ def _find_one_kind(
     """Finds the mask files of the frames, which must be of one kind."""
     every = order if order is not None else names
     suffixes = (".png", _LEVELS_SUFFIX, ".npy")
-    kinds = find_masks(folder, every, suffixes, is_black_and_white, files=files, numbered=order is not None)
+    kinds = find_masks(folder, every, suffixes, files=files, numbered=order is not None)
     if len(kinds) > 1:
         problem = f"there are both {kinds[0].suffix} and {kinds[1].suffix} masks of these frames"
         raise InputError(folder, problem, "one kind", "Put each kind into a folder of its own.")
@@ -450,18 +430,10 @@ def _find_one_kind(
     return kinds[0]
 
 
-def is_black_and_white(path: Path) -> bool:
-    """Whether a label image holds the mask of one object.
-
-    Args:
-      path: A .png or .npy file.
-
-    Returns:
-      True if it has only the values 0 and 1, or 0 and the largest of its type.
-
-    Raises:
-      InputError: The file is damaged or of another kind.
-    """
+def _is_black_and_white(path: Path) -> bool:
+    """Whether a file holds the mask of one object: only the values 0 and 1, or 0 and the largest of its type."""
+    if path.name.endswith(_LANGSPLAT):
+        return False
     image, is_colour = read_label_image(path)
     values = np.unique(image)
     values = values // GREY_COLOUR if is_colour and not (values % GREY_COLOUR).any() else values
@@ -524,8 +496,8 @@ class _LabelReader:
         ids = np.unique(labels[labels >= 0]).astype(np.int64)
         return ids, np.where(labels >= 0, np.searchsorted(ids, labels), -1).astype(np.int16)
 
-    def without_background(self, folder: Path, frame_ids: list[np.ndarray], background: int | None) -> list[np.ndarray]:
-        """Replaces the background's id by -1, and colours that are all grey by their grey values."""
+    def without_background(self, folder: Path, frame_ids: list[np.ndarray]) -> list[np.ndarray]:
+        """Replaces the background's id, 0, by -1, and colours that are all grey by their grey values."""
         if self.masks.objects or self.masks.suffix == _LEVELS_SUFFIX:
             return frame_ids
         colours = [self.is_colour.get(self.masks.path(name), False) for name in self.names]
@@ -536,15 +508,13 @@ class _LabelReader:
         if 0 < count < len(self.is_colour):
             problem = f"there are {count} colour images among {len(self.is_colour)} masks"
             raise InputError(folder, problem, "ids in all, or colours in all", "Write all as 16 bit grey PNGs.")
-        if background is None or (self.has_negative and background == 0):
-            return frame_ids
-        return [np.where(ids == background, -1, ids) for ids in frame_ids]
+        return frame_ids if self.has_negative else [np.where(ids == 0, -1, ids) for ids in frame_ids]
 
     def file_ids(self, ids: np.ndarray) -> tuple[int, ...]:
         """The ids as the files, or the folders of objects, have them."""
         return tuple(self.object_ids[self.folders[int(i)]] if self.masks.objects else int(i) for i in ids)
 
-    def notes(self, background: int | None, shared: bool) -> list[str]:
+    def notes(self, shared: bool) -> list[str]:
         """What was skipped or changed."""
         notes, paths = [], {name: self.masks.path(name) for name in self.names}
         if missing := [name for name, path in paths.items() if path is None]:
@@ -553,7 +523,7 @@ class _LabelReader:
         notes += self.fit.notes
         if any(self.is_colour.values()):
             notes.append("The masks are colour images: each colour is a region, numbered R*65536 + G*256 + B.")
-        if self.has_negative and background == 0:
+        if self.has_negative:
             notes.append("The masks hold negative ids: these count as unlabelled, and 0 as a region.")
         for name, path in paths.items():
             if path and path.stem.isdecimal() and name != path.stem and not name.endswith(f"_{path.stem}"):
@@ -631,10 +601,7 @@ class MaskFitter:
     """
 
     def __init__(
-        self,
-        files: Mapping[str, ImageFile],
-        size: tuple[int, int],
-        shape: Callable[[str], tuple[int, ...] | None],
+        self, files: Mapping[str, ImageFile], size: tuple[int, int], shape: Callable[[str], tuple[int, ...] | None]
     ):
         self.files, (self.height, self.width) = files, size
         self.count: collections.Counter[str] = collections.Counter()

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from jsecon.data.images import MAX_PIXELS, read_label_image
-from jsecon.data.masks import FrameNames, MaskFiles, MaskFitter, find_masks, is_black_and_white, read_level
+from jsecon.data.masks import FrameNames, MaskFiles, MaskFitter, find_masks, read_level
 from jsecon.errors import InputError
 from jsecon.files import READ_ERRORS, map_npy, read_json, reading
 from jsecon.types import ImageFile
@@ -161,7 +161,7 @@ def load_proposals(
     if dataset is not None:
         available, notes = _read_dataset(*dataset, frame_names, names, size, files), []
     else:
-        kinds = find_masks(folder, every, SUFFIXES, is_black_and_white, files=files, numbered=order is not None)
+        kinds = find_masks(folder, every, SUFFIXES, files=files, numbered=order is not None)
         kinds = sorted(kinds, key=lambda kind: SUFFIXES.index(kind.suffix))
         by_name = {name: kind for kind in reversed(kinds) for name in names if kind.path(name) is not None}
         frames = {name: _frame_size(files.get(name), size) for name in by_name}

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from jsecon.data.coordinates import invert_pose
 from jsecon.data.frames import MIN_FOCAL, PosedImage, PosedImages
-from jsecon.data.images import MAX_PIXELS, image_header, image_size
+from jsecon.data.images import MAX_PIXELS, image_header
 from jsecon.data.lens import Lens
 from jsecon.errors import InputError
 from jsecon.files import parse_json, read_text, reading
@@ -135,7 +135,7 @@ def _read_scannet(path: Path) -> PosedImages:
         if file.is_file() and first.is_file():
             k = _numbers(file, 4, 4)
             with _parsing(file):
-                lenses[kind] = _lens(*image_size(first), k[0, 0], k[1, 1], k[0, 2], k[1, 2])
+                lenses[kind] = _lens(*image_header(first).upright, k[0, 0], k[1, 1], k[0, 2], k[1, 2])
     posed = []
     for image in images:
         pose = _numbers(path / "pose" / f"{image.stem}.txt", 4, 4)
@@ -176,7 +176,7 @@ def _read_tum(path: Path) -> PosedImages:
             raise ValueError(f"{len(distortion)} numbers after fx fy cx cy, at most k1 k2 p1 p2 k3 k4 k5 k6 can be")
         has_depth = (path / "depth.txt").is_file()
         depth_times, depths = _read_tum_list(path / "depth.txt") if has_depth else (np.zeros(0), [])
-        lens = Lens(*image_size(images[0]), fx, fy, cx + 0.5, cy + 0.5, tuple(distortion))
+        lens = Lens(*image_header(images[0]).upright, fx, fy, cx + 0.5, cy + 0.5, tuple(distortion))
     posed = []
     pose_of, depth_of = _nearest_times(poses[:, 0], times), _nearest_times(depth_times, times)
     for image, row, depth in zip(images, pose_of, depth_of):
@@ -260,7 +260,7 @@ def _read_record3d(path: Path) -> PosedImages:
             if n < len(poses):
                 pose = _matrix(Rotation.from_quat(poses[n, :4]), poses[n, 4:]) @ _PHONE_AXES
                 has_size = "w" in metadata and "h" in metadata
-                size = (metadata["w"], metadata["h"]) if has_size else image_size(image)
+                size = (metadata["w"], metadata["h"]) if has_size else image_header(image).upright
                 posed.append(_posed_image(image, _lens(*size, *intrinsics[n]), pose))
     return _posed_images(path, posed, len(images), "Record3D's depth was not read: its compression is not supported.")
 

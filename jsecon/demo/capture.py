@@ -174,12 +174,7 @@ def _sees(pose, depth, focal, middle, world):
 
 
 def write_room(
-    folder: str | Path,
-    room: Room,
-    *,
-    holdout: int = 5,
-    progress: Progress | None = None,
-    **options: int,
+    folder: str | Path, room: Room, *, holdout: int = 5, progress: Progress | None = None, **options: int
 ) -> Path:
     """Writes a room as a COLMAP capture (images/, sparse/0/) with its ground truth beside it.
 

@@ -19,24 +19,8 @@ from jsecon.types import Camera, Progress
 
 SKY_RADIANCE, LAMP_RADIANCE = 0.84, 0.48
 """Radiance of a white surface under the whole sky, and facing the lamp. Their sum keeps the lightness of a colour."""
-_LAMP_SIDE = 6
-"""The lamp is a grid of this many points a side."""
 SHADOW_OFFSET_M = np.float32(1e-3)
 """Distance from a surface at which its shadow rays start, m."""
-
-
-def lamp_points(room: Room) -> Float32[np.ndarray, "3 m"]:
-    """Spreads end points of shadow rays over the lamp.
-
-    Args:
-      room: The room.
-
-    Returns:
-      (3, M) float32 points, world.
-    """
-    ticks = ((np.arange(_LAMP_SIDE) + 0.5) / _LAMP_SIDE * 2 - 1) * room.light_half
-    x, y = np.meshgrid(ticks, ticks)
-    return (room.light[:, None] + np.stack([x.ravel(), y.ravel(), 0 * x.ravel()])).astype(np.float32)
 
 
 def lamp_visibility(
@@ -259,7 +243,7 @@ def _flat(room, draw, origin, width, depth, normal, texel, shadow_texel, paint):
         coarse, cu, _ = _grid(origin, right, back, width, depth, shadow_texel)
         on_table = bool(abs(origin[2]) < 1e-6)
         lifted = coarse + SHADOW_OFFSET_M * normal[:, None]
-        seen = lamp_visibility(room, lifted, lamps=lamp_points(room), skip_furniture=on_table).reshape(cu.shape)
+        seen = lamp_visibility(room, lifted, lamps=room.lamp_points, skip_furniture=on_table).reshape(cu.shape)
         if on_table:
             upward = np.broadcast_to(normal[:, None], coarse.shape)
             light *= _stretch(_sky_visibility(room, coarse, upward).reshape(cu.shape), u.shape)
@@ -435,7 +419,7 @@ def render_views(
       Frames, instances (index of the object, -1 = background) and z-depths (m).
     """
     baked = bake_room(room)
-    lamps = lamp_points(room)
+    lamps = room.lamp_points
     owners = np.array([part.owner for part in room.parts] + [-1], np.int16)
     count = int(np.asarray(cameras.fx).shape[0])
     frames, instances, depths = [], [], []

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jsecon.demo.shapes import SHAPES, Body, Solid, box, place, radius_about_axis, rotation
+from jsecon.demo.shapes import SHAPES, Body, Solid, box, place, rotation
 
 TABLE_HALF = (0.68, 0.56)
 """Half the width and depth of the table top, m."""
@@ -23,6 +23,8 @@ TABLE_WOOD = (155, 146, 132)
 """sRGB of the table."""
 OBJECT_GAP_M = 0.025
 """Least distance between the footprints of two objects, and to the edge of the table, m."""
+_LAMP_SIDE = 6
+"""The lamp is a grid of this many points a side."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,6 +91,13 @@ class Room:
     """Whether a chequered cloth lies on the table."""
 
     @property
+    def lamp_points(self) -> np.ndarray:
+        """(3, M) float32 end points of shadow rays on the lamp, world."""
+        ticks = ((np.arange(_LAMP_SIDE) + 0.5) / _LAMP_SIDE * 2 - 1) * self.light_half
+        x, y = np.meshgrid(ticks, ticks)
+        return (self.light[:, None] + np.stack([x.ravel(), y.ravel(), 0 * x.ravel()])).astype(np.float32)
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of the objects, in order."""
         return tuple(item.name for item in self.objects)
@@ -139,7 +148,7 @@ def footprint_radius(body: Body) -> float:
     Returns:
       Radius of a circle around it, m.
     """
-    return max(radius_about_axis(solid) for solid, _, _ in body)
+    return max(solid.radius_about_axis for solid, _, _ in body)
 
 
 def scatter_circles(

@@ -39,6 +39,15 @@ class Solid:
     nappe: float = 0.0
     """dr/dz of a cone, to exclude its mirror image beyond the apex; 0 for other solids."""
 
+    @property
+    def radius_about_axis(self) -> float:
+        """Radius of the smallest cylinder about z around the solid, m. A grid makes it too large by up to one cell."""
+        steps, cell = np.linspace(-1, 1, 25, dtype=np.float32), self.bound[3] / 12
+        grid = np.stack(np.meshgrid(steps, steps, steps)).reshape(3, -1)
+        points = self.bound[:3, None] + self.bound[3] * grid
+        points = points[:, contains(self, points, margin=float(cell))]
+        return float(np.hypot(points[0], points[1]).max())
+
 
 def _solid(quadric, planes, radius: float, middle=(0.0, 0.0, 0.0), nappe: float = 0.0) -> Solid:
     """A solid at the origin whose bounding sphere has this radius and middle."""
@@ -312,22 +321,6 @@ def normals(solid: Solid, hollow: Solid | None, points: Float[np.ndarray, "3 n"]
 
 Body: TypeAlias = Sequence[tuple[Solid, Solid | None, float]]
 """(solid, hollow or None, tone) of each part. The tone scales the named colour: 1.4 is lighter, 0.5 darker."""
-
-
-def radius_about_axis(solid: Solid) -> float:
-    """Computes the radius of the smallest cylinder about z around a solid.
-
-    Args:
-      solid: The solid.
-
-    Returns:
-      Metres, too large by up to one cell of a grid of 25 a side.
-    """
-    steps, cell = np.linspace(-1, 1, 25, dtype=np.float32), solid.bound[3] / 12
-    grid = np.stack(np.meshgrid(steps, steps, steps)).reshape(3, -1)
-    points = solid.bound[:3, None] + solid.bound[3] * grid
-    points = points[:, contains(solid, points, margin=float(cell))]
-    return float(np.hypot(points[0], points[1]).max())
 
 
 def _ball(draw):

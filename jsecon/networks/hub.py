@@ -231,18 +231,18 @@ def _refused(row: NamedModel, precision: Precision) -> InputError:
     return InputError("--precision", problem, "", f"Use {' or '.join(row.megabytes)}.")
 
 
-def named_model(folder: Path, role: Role) -> NamedModel | None:
-    """Finds the row of the catalogue whose files a folder holds.
+def model_name(folder: Path, role: Role) -> str:
+    """Names the model of a folder.
 
     Args:
-      folder: A folder of the hub's cache.
+      folder: A folder, in the hub's cache or elsewhere.
       role: What the model is for.
 
     Returns:
-      The row; None for another folder or repository.
+      Its name in the catalogue, or that of the folder.
     """
     repository = (cached_address(folder) or "").removeprefix(PREFIX).partition("@")[0]
-    return next((row for row in catalogue() if (row.role, row.repository) == (role, repository)), None)
+    return next((row.name for row in catalogue() if (row.role, row.repository) == (role, repository)), folder.name)
 
 
 def choose_files(model: HubModel, paths: Sequence[str]) -> tuple[str, ...]:

@@ -38,6 +38,8 @@ POINTERS = 16
 """object pointers that a frame attends to, the prompted one among them"""
 MASK_LOGIT = 10.0
 """logit of a pixel of a mask prompt; its negative outside"""
+KEPT_FRAMES = 16
+"""frames whose features a tracker keeps for later calls, about 16 MiB each at 1024 px"""
 CONSTANTS = "constants.json"
 PUBLISHED = (
     "Folders of this kind are published on huggingface.co: square-zero-labs/sam2.1-tiny-video-onnx, "
@@ -47,44 +49,26 @@ PUBLISHED = (
 Shape = tuple[int | str | None, ...]
 # Letters are sizes that must agree across the files: S image, G grid of the coarsest features, T = G^2, C channels, M
 # numbers of a memory token; None is free.
+_FINE, _COARSE = (1, None, None, None), (1, "C", "G", "G")
 SIGNATURES: Mapping[str, tuple[Mapping[str, Shape], Mapping[str, Shape]]] = {
     "vision_encoder": (
         {"pixel_values": (1, 3, "S", "S")},
-        {
-            "feats0": (1, None, None, None),
-            "feats1": (1, None, None, None),
-            "feats2": (1, "C", "G", "G"),
-            "feats2_no_mem": (1, "C", "G", "G"),
-            "vision_pos_embed": (1, "C", "G", "G"),
-        },
+        {"feats0": _FINE, "feats1": _FINE}
+        | {name: _COARSE for name in ("feats2", "feats2_no_mem", "vision_pos_embed")},
     ),
     "mask_decoder": (
-        {
-            "feats0": (1, None, None, None),
-            "feats1": (1, None, None, None),
-            "feats2_cond": (1, "C", "G", "G"),
-            "input_points": (1, 1, None, 2),
-            "input_labels": (1, 1, None),
-        },
+        {"feats0": _FINE, "feats1": _FINE, "feats2_cond": _COARSE}
+        | {"input_points": (1, 1, None, 2), "input_labels": (1, 1, None)},
         {"low_res_mask": (1, 1, None, None), "high_res_mask": (1, 1, "S", "S"), "object_pointer": (1, 1, "C")},
     ),
     "memory_encoder": (
-        {
-            "feats2": (1, "C", "G", "G"),
-            "high_res_mask": (1, 1, "S", "S"),
-            "object_score_logits": (1, 1),
-            "binarize": (),
-        },
+        {"feats2": _COARSE, "high_res_mask": (1, 1, "S", "S"), "object_score_logits": (1, 1), "binarize": ()},
         {"memory_tokens": (None, 1, "M"), "memory_pos": (None, 1, "M")},
     ),
     "memory_attention": (
-        {
-            "current_vision_features": ("T", 1, "C"),
-            "current_vision_position_embeddings": ("T", 1, "C"),
-            "memory": (None, 1, "M"),
-            "memory_pos": (None, 1, "M"),
-        },
-        {"conditioned_feats": (1, "C", "G", "G")},
+        {"current_vision_features": ("T", 1, "C"), "current_vision_position_embeddings": ("T", 1, "C")}
+        | {"memory": (None, 1, "M"), "memory_pos": (None, 1, "M")},
+        {"conditioned_feats": _COARSE},
     ),
     "pointer_tpos": ({"normalized_diffs": (None,)}, {"pointer_pos": (None, "M")}),
 }
@@ -325,7 +309,6 @@ class Sam2Tracker:
     Args:
       folder: The model folder.
       hole_area: Holes of at most this many pixels of the low-resolution mask are filled.
-      keep: Number of frames whose features are kept for later calls, about 16 MiB each at 1024 px.
       threads: Number of cores of one run, as for `Graph`.
 
     Attributes:
@@ -335,13 +318,12 @@ class Sam2Tracker:
       InputError: A file is missing. Methods raise it if the files do not make one model.
     """
 
-    def __init__(self, folder: Path, *, hole_area: int = 8, keep: int = 16, threads: int | None = None):
+    def __init__(self, folder: Path, *, hole_area: int = 8, threads: int | None = None):
         files = _sam2_files(folder)
         graphs = [part for name in SIGNATURES for part in graph_files(files[f"{name}.onnx"])]
         self.name = f"sam2-{content_digest([*graphs, files[CONSTANTS]], extra=repr(hole_area))}"
         self.hole_area = hole_area
         self._folder = folder
-        self._keep = keep
         self._threads = threads
 
     @functools.cached_property
@@ -351,7 +333,7 @@ class Sam2Tracker:
 
     @functools.cached_property
     def _encode(self) -> "FrameEncoder":
-        return FrameEncoder(self.graphs, keep=self._keep)
+        return FrameEncoder(self.graphs, keep=KEPT_FRAMES)
 
     def check(self) -> None:
         """Opens the graphs.
@@ -495,13 +477,7 @@ def _resize(image: np.ndarray, side: int) -> np.ndarray:
 
 
 def _tracked(
-    graphs: Sam2Graphs,
-    features: FrameFeatures,
-    bank: Bank,
-    t: int,
-    step: int,
-    count: int,
-    position: np.ndarray | None,
+    graphs: Sam2Graphs, features: FrameFeatures, bank: Bank, t: int, step: int, count: int, position: np.ndarray | None
 ) -> _Prediction:
     """Predicts the object of a bank in frame t of `count`; `position` (K, M) is the spatial code of a memory."""
     memories, pointers = bank.attended(t, step, count)

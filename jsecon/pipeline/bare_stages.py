@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jsecon.data.colmap import find_model, read_cameras, read_images
+from jsecon.data.colmap import find_models, read_cameras, read_images
 from jsecon.data.coordinates import make_rigid, transform_poses
 from jsecon.data.frames import downscaled_size, frame_names
 from jsecon.data.nerfstudio import read_poses
@@ -53,15 +53,25 @@ def require_options_apply(options: Options, *, bare: bool) -> None:
         raise InputError("--gaussians", problem, "", "Leave out --gaussians, or give the folder of the photographs.")
 
 
-def planned_views(context: RunContext) -> Stage:
-    """Plans the stage "load" of a bare scene: virtual views, or given cameras, rendered as its frames.
+def bare_stages(context: RunContext) -> dict[str, Stage]:
+    """Plans what a bare scene has in place of the stages of photographs.
 
     Args:
       context: The run.
 
     Returns:
-      The stage; its key has the options of the views or the file of poses.
+      "load": virtual views, or given cameras, rendered as frames. "gaussians": those of the file, in the world of these
+      frames. "held_out": the quality of no frame, as the frames are renders.
     """
+    path = context.options.capture
+    skipped = {"photometric fit": f"the scene's Gaussians are given ({path.name})"}
+    scene = Stage("gaussians", f"read from {path.name}", _read_scene, after=("load",), files=path, skipped=skipped)
+    held_out = Stage("held_out", "no photograph to compare with", _quality_of_no_frame)
+    return {"load": _planned_views(context), "gaussians": scene, "held_out": held_out}
+
+
+def _planned_views(context: RunContext) -> Stage:
+    """Plans the stage "load"."""
     options = context.options
     skipped = {"photographs": "the scene comes without any"}
     if options.cameras is not None:
@@ -131,7 +141,7 @@ def _load_poses(path: Path, long_side: int) -> tuple[Camera, tuple[str, ...]]:
     `path` is the folder of a COLMAP model (.bin or .txt) or of a capture that has one, or a transforms.json. All
     cameras get the size of the first lens, shrunk to `long_side`, each with its field of view and without distortion.
     """
-    model = find_model(path) if path.is_dir() else None
+    model = next(iter(find_models(path)), None) if path.is_dir() else None
     file = path / "transforms.json" if path.is_dir() else path
     if model is not None:
         lenses = read_cameras(model)
@@ -154,33 +164,10 @@ def _load_poses(path: Path, long_side: int) -> tuple[Camera, tuple[str, ...]]:
     return cameras, frame_names([name for name, _, _ in posed], path)
 
 
-def scene_itself(context: RunContext) -> Stage:
-    """Plans the stage "gaussians" of a bare scene.
-
-    Args:
-      context: The run.
-
-    Returns:
-      The stage, which reads the scene into the world of the planned views.
-    """
-    path = context.options.capture
-    skipped = {"photometric fit": f"the scene's Gaussians are given ({path.name})"}
-    return Stage("gaussians", f"read from {path.name}", _read_scene, after=("load",), files=path, skipped=skipped)
-
-
 def _read_scene(stage: StageInput) -> StageResult:
     source, notes = read_scene(stage.context.options.capture)
     return StageResult(_into_world(source, np.asarray(stage.results.load.to_source, np.float64)), notes=notes)
 
 
-def no_photographs() -> Stage:
-    """Plans the stage "held_out" of a bare scene, whose frames are its own renders.
-
-    Returns:
-      The stage, whose result is the quality of no frame.
-    """
-
-    def quality_of_no_frame(stage):
-        return StageResult(Quality(np.zeros(0, int), np.zeros(0), np.zeros(0)))
-
-    return Stage("held_out", "no photograph to compare with", quality_of_no_frame)
+def _quality_of_no_frame(stage: StageInput) -> StageResult:
+    return StageResult(Quality(np.zeros(0, int), np.zeros(0), np.zeros(0)))

@@ -124,32 +124,6 @@ def source_digest() -> str:
     return digest.hexdigest()
 
 
-def path_of(folder: Path, stage: str, key: str) -> Path:
-    """Names the file of a stage's result.
-
-    Args:
-      folder: Folder of the cache.
-      stage: Name of the stage.
-      key: Its key, from `key_of`.
-
-    Returns:
-      The path.
-    """
-    return folder / f"{stage}-{key}.safetensors"
-
-
-def record_path_of(path: Path) -> Path:
-    """Names the file of the checkpoint that a stage writes while it computes its result.
-
-    Args:
-      path: File of the result.
-
-    Returns:
-      A path beside it.
-    """
-    return path.with_suffix(".checkpoint.safetensors")
-
-
 def prepare(folder: Path) -> None:
     """Makes the folder of a cache, marks it for backup programs, and removes half-written files of killed runs.
 

@@ -1,7 +1,7 @@
 """Inspects a folder of models: the signature of every graph, and what jsecon can use the folder for."""
 
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 
 from jsecon.errors import InputError
@@ -41,6 +41,25 @@ class ModelReport:
     graphs: dict[str, str]
     uses: tuple[Use, ...]
 
+    @property
+    def lines(self) -> list[str]:
+        """The content as lines of text."""
+        lines = [f"{self.folder}: {len(self.graphs)} graphs"]
+        for path, signature in self.graphs.items():
+            lines += [f"  {path}", *(f"    {line}" for line in signature.splitlines())]
+        for use in self.uses:
+            lines += [f"{use.model}: {'usable' if use.usable else 'not usable'}", f"  {use.summary}"]
+        return lines
+
+    @property
+    def errors(self) -> list[InputError]:
+        """One error if no model of the folder can be used, else none."""
+        if any(use.usable for use in self.uses):
+            return []
+        expected = f"{' or '.join(use.model for use in self.uses)} as ONNX graphs"
+        remedy = "See above for what is missing and where such exports are published."
+        return [InputError(self.folder, "no model that can be used", expected, remedy)]
+
 
 def inspect_models(folder: str | Path) -> ModelReport:
     """Opens every graph of a folder, and tries the folder as each kind of model.
@@ -59,40 +78,6 @@ def inspect_models(folder: str | Path) -> ModelReport:
         raise InputError(folder, "no such folder", "a folder of models", "Check the path.")
     graphs = {path.relative_to(folder).as_posix(): _signature(path) for path in sorted(folder.rglob("*.onnx"))}
     return ModelReport(folder, graphs, tuple(_tried(model, use, folder) for model, use in _KINDS.items()))
-
-
-def report_lines(findings: ModelReport) -> Iterable[str]:
-    """Formats a report.
-
-    Args:
-      findings: From `inspect_models`.
-
-    Yields:
-      Lines of text.
-    """
-    yield f"{findings.folder}: {len(findings.graphs)} graphs"
-    for path, signature in findings.graphs.items():
-        yield f"  {path}"
-        yield from (f"    {line}" for line in signature.splitlines())
-    for use in findings.uses:
-        yield f"{use.model}: {'usable' if use.usable else 'not usable'}"
-        yield f"  {use.summary}"
-
-
-def unusable(findings: ModelReport) -> list[InputError]:
-    """Says whether no model of a folder can be used.
-
-    Args:
-      findings: From `inspect_models`.
-
-    Returns:
-      One error, or an empty list if a model can be used.
-    """
-    if any(use.usable for use in findings.uses):
-        return []
-    expected = f"{' or '.join(use.model for use in findings.uses)} as ONNX graphs"
-    remedy = "See above for what is missing and where such exports are published."
-    return [InputError(findings.folder, "no model that can be used", expected, remedy)]
 
 
 def _signature(path: Path) -> str:

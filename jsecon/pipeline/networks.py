@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NoReturn
 import numpy as np
 
 from jsecon.errors import InputError
-from jsecon.networks.hub import HubModel, Role, cached_folder, get_command, named_model, parse_model
+from jsecon.networks.hub import HubModel, cached_folder, get_command, parse_model
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.sources import Sources, locate_sources
 from jsecon.types import LanguageField
@@ -114,21 +114,6 @@ def open_networks(options: Options, store: Path) -> Networks:
 
         model = find_clip(options.embedder, options.precision)
     return Networks(open_embedder(name, folder=model, store=store / "embeddings"), segmenter, tracker)
-
-
-def describe_model(options: Options, role: Role) -> str:
-    """Names a model of a run for its plan.
-
-    Args:
-      options: Options of the run, which have a folder for the role.
-      role: What the model is for.
-
-    Returns:
-      Its name in the catalogue, or that of its folder.
-    """
-    folder = getattr(options, role)
-    row = named_model(folder, role)
-    return folder.name if row is None else row.name
 
 
 def open_embedder(

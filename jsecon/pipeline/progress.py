@@ -41,7 +41,14 @@ class Step:
 
 
 class Listener:
-    """Receives the messages of a run. This base class ignores them; tests and the command line override methods."""
+    """Receives the messages of a run. Each becomes a line for `say`, which this base class ignores."""
+
+    def say(self, text: str) -> None:
+        """Receives a line of results.
+
+        Args:
+          text: The line.
+        """
 
     def steps(self, title: str, steps: Sequence[Step]) -> None:
         """Receives all that is known before the first stage runs.
@@ -50,13 +57,17 @@ class Listener:
           title: Input and output of the run.
           steps: Stages in order, then the parts that are left out.
         """
+        self.say(title)
+        for step in steps:
+            self.step(step)
 
     def step(self, step: Step) -> None:
-        """Receives a step that only the data could settle.
+        """Receives a step, also one that only the data could settle.
 
         Args:
           step: The step.
         """
+        self.say(f"  {step.name:<16} {step.status:<9} {step.why}".rstrip())
 
     def done(self, name: str, seconds: float, fresh: bool) -> None:
         """Receives the end of a stage.
@@ -66,6 +77,8 @@ class Listener:
           seconds: Wall time of its computation.
           fresh: True if it was computed in this run, False if its result was read from the cache.
         """
+        if fresh:
+            self.say(f"  {name:<16} {'done':<9} {seconds:.1f} s")
 
     def note(self, text: str) -> None:
         """Receives a note.
@@ -73,13 +86,7 @@ class Listener:
         Args:
           text: A sentence about the input or the run.
         """
-
-    def say(self, text: str) -> None:
-        """Receives a line of results.
-
-        Args:
-          text: The line.
-        """
+        self.say(f"  note: {text}")
 
     @contextlib.contextmanager
     def progress(self, name: str) -> Iterator[Callable[[int, int], None]]:
@@ -106,36 +113,6 @@ class Console(Listener):
         self._out = out or sys.stdout
         self._err = err or sys.stderr
 
-    def steps(self, title: str, steps: Sequence[Step]) -> None:
-        """Prints the stages, one a line.
-
-        Args:
-          title: Line above them.
-          steps: The stages.
-        """
-        self.say(title)
-        for step in steps:
-            self.step(step)
-
-    def step(self, step: Step) -> None:
-        """Prints a line for a step.
-
-        Args:
-          step: The step.
-        """
-        self.say(f"  {step.name:<16} {step.status:<9} {step.why}".rstrip())
-
-    def done(self, name: str, seconds: float, fresh: bool) -> None:
-        """Prints the wall time of a stage that was computed in this run.
-
-        Args:
-          name: Name of the stage.
-          seconds: Its wall time.
-          fresh: Whether it was computed in this run.
-        """
-        if fresh:
-            self.say(f"  {name:<16} {'done':<9} {seconds:.1f} s")
-
     def say(self, text: str) -> None:
         """Prints a line, above the bar if one is drawn.
 
@@ -144,14 +121,6 @@ class Console(Listener):
         """
         with _Bar.external_write_mode(file=self._out):
             print(text, file=self._out, flush=True)
-
-    def note(self, text: str) -> None:
-        """Prints a sentence behind the word "note".
-
-        Args:
-          text: The sentence.
-        """
-        self.say(f"  note: {text}")
 
     @contextlib.contextmanager
     def progress(self, name: str) -> Iterator[Callable[[int, int], None]]:

@@ -31,10 +31,9 @@ from typing import Any
 import jax
 import numpy as np
 
-import jsecon
 from jsecon.data.capture import capture_extent
 from jsecon.data.frames import CaptureExtent, downscaled_size, evenly_spaced, frame_names, holdout_mask
-from jsecon.data.images import image_size
+from jsecon.data.images import image_header
 from jsecon.data.langsplat import load_features
 from jsecon.data.masks import check_labels
 from jsecon.data.proposals import load_proposals
@@ -59,7 +58,7 @@ from jsecon.pipeline.results import (
     vision_frames,
 )
 from jsecon.pipeline.scene_files import read_scene
-from jsecon.pipeline.sources import hub_addresses, relative_folders
+from jsecon.pipeline.sources import provenance
 from jsecon.process import compilation_counts
 from jsecon.types import Capture, Gaussians, ImageFile, LanguageField, Quality
 from jsecon.vision.classical import require_contrib
@@ -152,7 +151,7 @@ def _plan(context: RunContext, stage_list: list[Stage], folder: Path) -> _Plan:
     for stage in stage_list:
         files[stage.name] = stage.files_digest(context)
         keys[stage.name] = stage.key(keys, files[stage.name])
-    paths = {name: cache.path_of(folder, name, key) for name, key in keys.items()}
+    paths = {name: folder / f"{name}-{key}.safetensors" for name, key in keys.items()}
     stale = [stage.name for stage in stage_list if not _owns_output(stage, stage_list, paths)]
     cached = {name for name, path in paths.items() if path.exists() and name not in stale}
     steps = [Step(stage.name, "cached" if stage.name in cached else "run", stage.how) for stage in stage_list]
@@ -198,9 +197,14 @@ def _owns_output(stage: Stage, stage_list: list[Stage], paths: dict[str, Path]) 
     if stage.output_dir is None:
         return True
     file = stage.output_dir / KEY_FILE
-    if file.is_file() and file.read_text() == cache.record_path_of(paths[stage.name]).stem:
+    if file.is_file() and file.read_text() == _checkpoint_file(paths[stage.name]).stem:
         return True
     return all(paths[other.name].exists() for other in stage_list if stage.name in other.after)
+
+
+def _checkpoint_file(path: Path) -> Path:
+    """The file of the checkpoint that a stage writes while it computes the result at `path`."""
+    return path.with_suffix(".checkpoint.safetensors")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -292,7 +296,7 @@ def _compute_stage(
 ) -> None:
     """Computes one stage or reads it from the cache, and adds it to `computed`."""
     path, before = plan.paths[stage.name], compilation_counts()
-    checkpoint = Checkpoint(cache.record_path_of(path))
+    checkpoint = Checkpoint(_checkpoint_file(path))
 
     def compute(progress: Any) -> StageResult:
         coordinator.broadcast(stage, computed.results)
@@ -355,7 +359,7 @@ def run(
     results, embedder = computed.results, context.networks.embedder
     started = time.monotonic()
     with listener.progress("field"):
-        field = stages.field_of(results, embedder, _provenance(options, computed.keys, embedder.name, out), options)
+        field = stages.field_of(results, embedder, provenance(options, computed.keys, embedder.name, out), options)
         save_field(out / FIELD_FILE, field)
     computed.seconds["field"] = time.monotonic() - started
     listener.done("field", computed.seconds["field"], True)
@@ -392,10 +396,10 @@ def current_field(options: Options, out: Path) -> Path | None:
     context = RunContext(options, networks.open_networks(options, out / "cache"), out)
     keys = _plan(context, stages.run_stages(context), out / "cache").keys
     try:
-        provenance = json.loads(load_field(path, mapped=True).provenance)
+        origin = json.loads(load_field(path, mapped=True).provenance)
     except (InputError, ValueError):  # damaged: the run writes it anew
         return None
-    return path if provenance.get("keys") == keys else None
+    return path if origin.get("keys") == keys else None
 
 
 def run_worker(options: Options, out: Path) -> None:
@@ -491,7 +495,7 @@ def _extent(context: RunContext, running: Collection[str], results: Mapping[str,
     photos = list_photographs(options.capture)
     paths = check_photographs(photos, options.capture)
     names = frame_names(paths, options.capture)
-    sizes = [image_size(photo) for photo in photos]
+    sizes = [image_header(photo).upright for photo in photos]
     chosen = evenly_spaced(len(photos), options.frames)
     size = downscaled_size(max(set(sizes), key=sizes.count), options.downscale, options.long_side)
     files = tuple(ImageFile(paths[i], *sizes[i]) for i in chosen)
@@ -534,12 +538,3 @@ def fit(options: Options, out: Path, *, listener: Listener | None = None) -> tup
 def _since(before: dict[str, int]) -> dict[str, int]:
     """Compilations since earlier counts."""
     return {name: count - before[name] for name, count in compilation_counts().items()}
-
-
-def _provenance(options: Options, keys: dict[str, str], embedder: str, out: Path) -> str:
-    """JSON of where a field comes from; `jsecon.pipeline.sources` reads "embedder" and "folders"."""
-    values = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
-    models = hub_addresses(options)
-    origin = {"jsecon": jsecon.__version__, "options": values | models, "keys": keys, "embedder": embedder}
-    places = {"folders": relative_folders(options, out), "models": models}
-    return json.dumps(origin | places, sort_keys=True)

@@ -4,10 +4,12 @@ A field may come from anybody. So its hints are paths relative to its file, abso
 is used only if the name that follows from its content is the one that the run used.
 """
 
+import json
 import os
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, NamedTuple
 
+import jsecon
 from jsecon.errors import InputError
 from jsecon.files import parse_json
 from jsecon.networks.hub import SUFFIXES, Precision, cached_address
@@ -30,16 +32,28 @@ class Sources(NamedTuple):
     """of its graphs; None for the default"""
 
 
-def relative_folders(options: Options, out: Path) -> dict[str, str]:
-    """Makes the hints of a run for its field.
+def provenance(options: Options, keys: dict[str, str], embedder: str, out: Path) -> str:
+    """Writes where the field of a run comes from.
 
     Args:
       options: Options of the run.
-      out: Its output folder.
+      keys: Key of each stage.
+      embedder: Name of the embedder.
+      out: Output folder.
 
     Returns:
-      Option ("embedder", "capture") -> its folder relative to `out`; models of the hub are left out.
+      JSON for `LanguageField.provenance`, with hints for `locate_sources`.
     """
+    values = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
+    folders = {name: getattr(options, name) for name in ("segmenter", "tracker", "embedder")}
+    addresses = {name: cached_address(folder) for name, folder in folders.items() if folder is not None}
+    models = {name: address for name, address in addresses.items() if address is not None}
+    origin = {"jsecon": jsecon.__version__, "options": values | models, "keys": keys, "embedder": embedder}
+    return json.dumps(origin | {"folders": _relative_folders(options, out), "models": models}, sort_keys=True)
+
+
+def _relative_folders(options: Options, out: Path) -> dict[str, str]:
+    """Folders of options, relative to the output folder."""
     folders = {}
     for name in ("embedder", "capture"):
         folder = getattr(options, name)
@@ -49,20 +63,6 @@ def relative_folders(options: Options, out: Path) -> dict[str, str]:
             except ValueError:  # another drive of Windows: the user must name the folder again
                 continue
     return folders
-
-
-def hub_addresses(options: Options) -> dict[str, str]:
-    """Finds the models of a run that come from the hub.
-
-    Args:
-      options: Options of the run.
-
-    Returns:
-      Option -> "hub:owner/name@commit".
-    """
-    folders = {name: getattr(options, name) for name in ("segmenter", "tracker", "embedder")}
-    addresses = {name: cached_address(folder) for name, folder in folders.items() if folder is not None}
-    return {name: address for name, address in addresses.items() if address is not None}
 
 
 def locate_sources(field: LanguageField, beside: Path | None = None) -> Sources:

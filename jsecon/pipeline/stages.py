@@ -41,8 +41,8 @@ from jsecon.language.distill import distill_votes
 from jsecon.language.regions import Embed, embeddings_of_masks, region_embeddings, scene_parts
 from jsecon.language.streaming import codes_in_blocks, finish_votes_in_blocks, region_votes_in_blocks
 from jsecon.language.votes import region_votes, votes_memory
-from jsecon.pipeline.bare_stages import no_photographs, planned_views, require_options_apply, scene_itself
-from jsecon.pipeline.networks import describe_model
+from jsecon.networks.hub import model_name
+from jsecon.pipeline.bare_stages import bare_stages, require_options_apply
 from jsecon.pipeline.options import Options, is_bare_scene
 from jsecon.pipeline.results import (
     KEY_FILE,
@@ -133,7 +133,7 @@ def capture_stages(context: RunContext) -> list[Stage]:
     bare = _is_bare(context)
     require_options_apply(context.options, bare=bare)
     if bare:
-        return [planned_views(context)]
+        return [bare_stages(context)["load"]]
     if context.load is not None or not _is_unposed(context.options.capture):
         return [_plan_load(context)]
     stage = _plan_poses(context)
@@ -294,7 +294,7 @@ def _fit_steps(options: Options, capture: Capture) -> float:
 def _plan_gaussians(context: RunContext) -> Stage:
     """Plans the scene's Gaussians: of a file, brought into the capture's world, or fitted to the training frames."""
     if _is_bare(context):
-        return scene_itself(context)
+        return bare_stages(context)["gaussians"]
     options, path = context.options, context.options.gaussians
     if path is not None:
         transform = path.parent / "dataparser_transforms.json"
@@ -356,7 +356,7 @@ def _fit_gaussians(stage: StageInput) -> StageResult:
 def _plan_held_out(context: RunContext) -> Stage:
     """Plans PSNR and SSIM of the held-out frames."""
     if _is_bare(context):
-        return no_photographs()
+        return bare_stages(context)["held_out"]
     how = "PSNR and SSIM of the rendered colours"
     return Stage("held_out", how, _measure, after=("load", "gaussians"), distributed=True)
 
@@ -400,7 +400,9 @@ def _plan_masklets(context: RunContext) -> Stage:
         crops = f" and {options.crop_layers} layers of crops" if options.crop_layers else ""
         grid = f"at {options.points_per_side}x{options.points_per_side} points"
         asked = "at points in regions by colour" if options.prompts == "guided" else grid
-        how = f"proposals of level {options.level} by {describe_model(options, 'segmenter')}, asked {asked}{crops}"
+        how = (
+            f"proposals of level {options.level} by {model_name(options.segmenter, 'segmenter')}, asked {asked}{crops}"
+        )
         key_options = {"model": networks.segmenter.name}
     else:
         how = f"{options.granularity} proposals by colour and texture"
@@ -409,7 +411,7 @@ def _plan_masklets(context: RunContext) -> Stage:
         how += ", what the views agree on"
         key_options |= context.key_options("agreement", "seed", "centre")
     else:
-        by = "through the Gaussians" if options.tracker is None else f"by {describe_model(options, 'tracker')}"
+        by = "through the Gaussians" if options.tracker is None else f"by {model_name(options.tracker, 'tracker')}"
         how += f", followed {by}"
         key_options |= context.key_options("iou_threshold")
     tracker = None if networks.tracker is None else networks.tracker.name

@@ -197,18 +197,8 @@ def read_header(path: Path) -> Header:
         return _parse_header(path, data)
 
 
-def read_vertices(path: Path) -> np.ndarray:
-    """Reads the vertices of a .ply.
-
-    Args:
-      path: The file.
-
-    Returns:
-      (N,) structured array of the properties that are not lists.
-
-    Raises:
-      InputError: The file is not a .ply with vertices, or is truncated.
-    """
+def _read_vertices(path: Path) -> np.ndarray:
+    """(N,) structured array of the vertices' properties that are not lists."""
     return next(_vertex_blocks(path, read_header(path), sys.maxsize)[1])
 
 
@@ -646,7 +636,7 @@ def load_point_cloud(path: str | Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[
       InputError: The file is damaged, or has no x y z.
     """
     path = Path(path)
-    vertices = read_vertices(path)
+    vertices = _read_vertices(path)
     names = vertices.dtype.names or ()
     if missing := [name for name in _POSITION if name not in names]:
         raise ply_error(path, f"its vertices have no {', '.join(missing)}", "a point cloud with x y z")
