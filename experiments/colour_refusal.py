@@ -2,8 +2,9 @@
 
     python -m experiments.colour_refusal DEMO [DEMO ...]        (folders that `jsecon demo` wrote)
 
-A colour counts as absent if its embedding has a cosine below 0.8 with the name of every object. Refused are texts whose
-quantile among unrelated words is below the default of `jsecon query`.
+A colour counts as absent if its embedding, and that of each of its shades, has a cosine below 0.8 with the name of
+every object. Refused are texts that `jsecon query` refuses by default. Beside them stand basic terms of which a room
+has only shades ("blue" beside a dark blue vase): right is the answer to the name of one of these objects.
 """
 
 import sys
@@ -14,10 +15,10 @@ import numpy as np
 
 import jsecon
 from experiments import results
+from jsecon.app.ask import ask_text
 from jsecon.data.labels import load_lerf_labels
 from jsecon.numerics import cosine_matrix
-from jsecon.query.rules import QUANTILE
-from jsecon.vision.colours import ColourEmbedder
+from jsecon.vision.colours import BASIC, ColourEmbedder
 
 COLOURS = "red orange yellow green blue purple pink brown turquoise teal cyan magenta violet olive navy maroon"
 COLOURS += " beige lime gold crimson salmon lavender indigo"
@@ -25,23 +26,33 @@ NEAR = 0.8
 """cosine from which two names are about one colour"""
 
 
+def room_counts(demo: Path, embedder: ColourEmbedder) -> tuple[int, ...]:
+    """Counts texts kept of those present, texts refused of those absent, and bare terms right of those with shades."""
+    field = jsecon.load_field(demo / "field.safetensors")
+    texts = sorted({name for frame in load_lerf_labels(demo / "capture" / "label") for name in frame.objects})
+    present = jnp.asarray(embedder.embed_text(texts))
+    absent = []
+    for text in (f"{colour} thing" for colour in COLOURS.split()):
+        words = jnp.asarray(embedder.embed_text([text, *embedder.narrower(text)]))
+        if np.asarray(cosine_matrix(words, present)).max() < NEAR:
+            absent.append(text)
+    bare = [basic for basic in BASIC if not any(text.split()[0] == basic for text in texts)]
+    shades = {b: [text for text in texts if f"dark {b}" in text or f"light {b}" in text] for b in bare}
+    shades = {basic: names for basic, names in shades.items() if names}
+    asked = {*texts, *absent, *shades}
+    region = {text: int(ask_text(field, embedder, text).selection.region) for text in asked}
+    kept = sum(region[text] >= 0 for text in texts)
+    refused = sum(region[text] < 0 for text in absent)
+    right = sum(region[basic] in [region[name] for name in names] for basic, names in shades.items())
+    return kept, len(texts), refused, len(absent), right, len(shades)
+
+
 def main(demos: list[str]) -> list[tuple]:
-    """Prints a row of each room: texts kept of those present, refused of those absent."""
-    embedder, rows = ColourEmbedder(), []
-    names = [f"{colour} thing" for colour in COLOURS.split()]
-    for demo in demos:
-        field = jsecon.load_field(Path(demo) / "field.safetensors")
-        texts = sorted({name for frame in load_lerf_labels(Path(demo) / "capture" / "label") for name in frame.objects})
-        present, others = (jnp.asarray(embedder.embed_text(words)) for words in (texts, names))
-        absent = others[np.asarray(cosine_matrix(others, present)).max(1) < NEAR]
-        answered = [
-            np.array([float(jsecon.match_regions(field, text[None], jsecon.QueryRules()).quantile) for text in group])
-            >= QUANTILE
-            for group in (present, absent)
-        ]
-        rows.append((Path(demo).name, answered[0].sum(), len(present), (~answered[1]).sum(), len(absent)))
+    """Prints a row of each room (`room_counts`), and their sums."""
+    embedder = ColourEmbedder()
+    rows = [(Path(demo).name, *room_counts(Path(demo), embedder)) for demo in demos]
     rows.append(("all", *np.sum([row[1:] for row in rows], axis=0)))
-    print(results.table(("room", "kept", "of present", "refused", "of absent"), rows))
+    print(results.table(("room", "kept", "of present", "refused", "of absent", "by shades", "of bare terms"), rows))
     return rows
 
 

@@ -129,6 +129,24 @@ def test_a_negation_is_refused(embedder):
         embedder.embed_text(["the cup that isn't red"])
 
 
+@pytest.mark.parametrize(
+    ("text", "narrower"),
+    [
+        ("Green mug", ["dark green mug", "light green mug"]),
+        ("a gray box", ["a dark grey box", "a light grey box"]),
+        ("the blue one", ["the dark blue one", "the light blue one", "the navy one"]),
+        ("white wall", []),
+        ("dark blue mug", []),
+        ("bright red mug", []),
+        ("teal mug", []),
+        ("reddish mug", []),
+        ("red and white box", []),
+    ],
+)
+def test_only_a_bare_basic_term_has_narrower_texts(embedder, text, narrower):
+    assert embedder.narrower(text) == narrower
+
+
 def test_canonical_phrases_lose_to_the_right_colour_and_win_over_wrong_ones(embedder):
     regions = np.stack([of_ball(embedder, PALETTE[n]) for n in BASIC if n != "grey"])
     right = np.diagonal(embedder.embed_text([n for n in BASIC if n != "grey"]) @ regions.T)

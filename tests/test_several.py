@@ -6,9 +6,12 @@ import jax
 import numpy as np
 import pytest
 from small_field import make_field, shares, unit_rows
+from table_field import table_field
 
 from jsecon.app.ask import ask_text, with_phrases
 from jsecon.app.outputs import write_answer
+from jsecon.app.relations import query_relation
+from jsecon.app.viewer.candidates import candidates
 from jsecon.errors import InputError
 from jsecon.query.composite import parse_query
 from jsecon.query.match import match_regions
@@ -134,3 +137,47 @@ def test_a_field_without_phrases_takes_those_of_who_reads_the_text(field):
     bare = dataclasses.replace(field, canonical=np.zeros((0, 12), np.float32))
     np.testing.assert_array_equal(with_phrases(bare, words).canonical, np.asarray(words.canonical, np.float32))
     np.testing.assert_array_equal(with_phrases(field, words).canonical, field.canonical)
+
+
+SHADES = ("dark blue vase", "light blue kettle", "red mug", "dark green bottle", "white plate")
+
+
+@pytest.fixture(scope="module")
+def shades():
+    """A table without anything of the typical blue, but with a dark and a light blue thing; its embedder."""
+    places = ((-0.6, 0.0, 0.1), (0.6, 0.0, 0.1), (0.0, 0.6, 0.05), (0.0, -0.6, 0.1), (0.0, 0.0, 0.05))
+    return table_field([(name, place, (0.05, 0.05, 0.05)) for name, place in zip(SHADES, places)])
+
+
+@pytest.mark.parametrize(
+    ("text", "several", "things"),
+    [
+        ("blue", True, {0, 1}),
+        ("Blue thing", True, {0, 1}),
+        ("dark blue", True, {0}),
+        ('"blue" but not "dark blue"', False, {1}),
+        ('"white" or "light blue" but not "blue"', False, {4}),
+        ("pink", True, set()),
+        ("purple thing", True, set()),
+    ],
+)
+def test_a_bare_colour_is_answered_by_its_shades(shades, text, several, things):
+    field, embedder = shades
+    answer = ask_text(field, embedder, text, several=several)
+    assert set(np.flatnonzero(answer.selection.mask) // 120) == things
+
+
+def test_one_shade_answers_where_one_thing_is_asked_for(shades):
+    field, embedder = shades
+    answer = ask_text(field, embedder, "blue")
+    best = int(answer.selection.region)
+    assert best in (0, 1)
+    assert set(np.flatnonzero(answer.selection.mask) // 120) == {best}
+    assert answer.quantile >= ask_text(field, embedder, "blue", quantile=0.0).quantile
+    assert {candidate.region for candidate in candidates(field, embedder, "blue")[:2]} == {0, 1}
+
+
+def test_relations_count_the_shades_of_a_bare_colour(shades):
+    field, embedder = shades
+    assert query_relation(field, "how many blue things", embedder).count == 2
+    assert [o.regions for o in query_relation(field, "the blue thing left of the red mug", embedder).objects] == [(0,)]

@@ -271,6 +271,8 @@ def _match_text(
     # Of an embedder trained to tell whether a text is true of an image; the cosines of all others only rank.
     rules = dataclasses.replace(rules, logits=getattr(embedder, "logits", None))
     several = rules.all_of_kind or len(included + excluded) > 1
+    included = narrow_texts(field, embedder, included, rules, every=rules.all_of_kind or bool(excluded))
+    excluded = narrow_texts(field, embedder, excluded, rules, every=True)
     if several and by == "code":
         problem = "codes cannot select several regions"
         raise InputError(f"query {text!r}", problem, remedy="Ask by votes or silhouette, or for one thing.")
@@ -285,6 +287,47 @@ def _match_text(
         if parts is not None:
             return _Match(text, regions, PARTS_ANSWER, presence=parts.presence_prob, parts=parts)
     return _Match(text, regions, {}, presence=presence)
+
+
+def narrow_texts(
+    field: LanguageField, embedder: Any, texts: Sequence[str], rules: QueryRules, *, every: bool
+) -> list[str]:
+    """Replaces texts that no region matches by narrower ones that some region does.
+
+    Among colours "blue" is a family, and a room may have nothing of its typical colour but a dark and a light blue
+    thing. Each is far from the word and near to its own shade.
+
+    Args:
+      field: The field.
+      embedder: Its embedder. Its `narrower(text)`, if it has one, lists texts that name a part of what the text names.
+      texts: The texts.
+      rules: How texts match. Each of n narrower texts may lose to an n-th of the unrelated words that a text may lose to.
+      every: Whether all narrower texts that match replace a text, instead of the best of them.
+
+    Returns:
+      The texts, in order.
+
+    Raises:
+      InputError: The embedder has no words for a text.
+    """
+    if not hasattr(embedder, "narrower"):
+        return list(texts)
+
+    def score(text: str, rules: QueryRules) -> float:
+        match = match_regions(field, jnp.asarray(embedder.embed_text([text])), rules)
+        return float(match.score) if int(match.region) >= 0 else -np.inf
+
+    replaced: list[str] = []
+    for text in texts:
+        narrower = embedder.narrower(text)
+        best: list[str] = []
+        if narrower and np.isinf(score(text, rules)):
+            # Of n attempts one succeeds by chance as often as one attempt that is n times as strict.
+            strict = dataclasses.replace(rules, quantile=1 - (1 - rules.quantile) / len(narrower))
+            scores = {option: score(option, strict) for option in narrower}
+            best = [option for option in sorted(narrower, key=scores.__getitem__) if scores[option] > -np.inf]
+        replaced.extend(best[0 if every else -1 :] or [text])
+    return replaced
 
 
 def _match_pixel(field: LanguageField, frame: int | str, x: int, y: int) -> _Match:

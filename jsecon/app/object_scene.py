@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsecon.app.ask import frame_index, with_phrases
+from jsecon.app.ask import frame_index, narrow_texts, with_phrases
 from jsecon.app.catalogue import Catalogue, objects as list_objects
 from jsecon.app.locate import gaussian_rows
 from jsecon.data.capture import may_have_depth
@@ -90,7 +90,8 @@ class ObjectScene:
           InputError: The embedder has no words for the phrase.
         """
         if phrase not in self._phrases:
-            embedded = jax.device_put(self.embedder.embed_text([phrase]))
+            texts = narrow_texts(self.field, self.embedder, [phrase], self.rules, every=True)
+            embedded = jax.device_put(self.embedder.embed_text(texts))
             match = match_regions(self.field, embedded, self.rules)
             regions = np.flatnonzero(np.asarray(match.chosen)) if int(match.region) >= 0 else np.zeros(0, int)
             made = [(group, self._object(group)) for group in join_pieces(regions, self._overlap)]

@@ -162,6 +162,25 @@ class ColourEmbedder:
             row[:] = _joined(self._mean(*_spread(points, weights)), surrounds)
         return out
 
+    def narrower(self, text: str) -> list[str]:
+        """Lists texts for the shades of a bare basic colour term.
+
+        Args:
+          text: A text, such as "blue mug".
+
+        Returns:
+          One text for each shade ("dark blue mug", "light blue mug", "navy mug"); empty if the text has several
+          colours, or one that is not a bare basic term.
+
+        Raises:
+          InputError: The text has no colour word, or a negation.
+        """
+        phrases = self._phrases(text)
+        word, basic = phrases[0][0], self._base(phrases[0][0])[0]
+        if len(phrases) > 1 or not self._is_bare(phrases[0]):
+            return []
+        return [re.sub(rf"\b{word}\b", shade, text.lower()) for shade in _SHADES[str(basic)]]
+
     def _mean(self, points: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
         """Unit kernel mean of CIELAB points (n, 3), optionally weighted, in the span of the palette."""
         likeness = _kernel(points, self._points)
@@ -182,10 +201,14 @@ class ColourEmbedder:
 
     def _distribution(self, phrase: list[str]) -> tuple[np.ndarray, np.ndarray]:
         """CIELAB points (P, 3) and weights (P,) of a run of modifiers and colour words."""
-        base, ish = self._base(phrase[0])
-        if len(phrase) == 1 and base in self._families and not ish:
-            return self._families[base]
+        if self._is_bare(phrase):
+            return self._families[str(self._base(phrase[0])[0])]
         return self._colour(phrase)[None], np.ones(1, np.float32)
+
+    def _is_bare(self, phrase: list[str]) -> bool:
+        """Whether a run of modifiers and colour words is a basic term alone."""
+        base, ish = self._base(phrase[0])
+        return len(phrase) == 1 and base in BASIC and not ish
 
     def _phrases(self, text: str) -> list[list[str]]:
         """Splits a text into runs of modifiers and colour words, one run per colour."""

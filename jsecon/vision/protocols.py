@@ -79,7 +79,8 @@ class Embedder(Protocol):
 
     An embedder may also have `reference`, (W, E) float32 unit: embeddings of texts unrelated to any scene. Without it
     `REFERENCE_WORDS` are embedded (`reference_words.reference_of`). Texts in a tuple `vocabulary` are the names that a
-    catalogue gives to objects by default, and `softmax_scale` scales their cosines before a softmax.
+    catalogue gives to objects by default, and `softmax_scale` scales their cosines before a softmax. A function
+    `narrower(text) -> list[str]` lists texts that answer in place of one that no region matches.
     """
 
     name: str

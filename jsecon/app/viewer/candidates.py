@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from jsecon.app.ask import with_phrases
+from jsecon.app.ask import narrow_texts, with_phrases
 from jsecon.app.outputs import main_regions
 from jsecon.app.pictures import Renderer, crop_to_points
 from jsecon.language.regions import mean_residuals
@@ -62,7 +62,7 @@ def candidates(field: LanguageField, embedder: Any, query: str | int, count: int
         field = with_phrases(field, embedder)
         reference = reference_words(field)
         weight = np.ones_like(weight) if reference is None else weight  # the plain cosine ranks without evidence
-        included, excluded = parse_query(query)
+        included, excluded = (narrow_texts(field, embedder, texts, RULES, every=True) for texts in parse_query(query))
         texts = jnp.asarray(embedder.embed_text(included + excluded))
         matches = [_similarities(table, text, reference, RULES.retrieval) for text in texts]
         scores = np.stack([score for score, _ in matches])
