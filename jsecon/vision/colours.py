@@ -84,7 +84,14 @@ EXTENT_FULL = 0.25
 
 
 def lab_of(rgb: np.ndarray) -> Float32[np.ndarray, "n 3"]:
-    """Converts sRGB (n, 3) in 0 .. 255 to CIELAB (n, 3) float32 (D65)."""
+    """Converts sRGB to CIELAB (D65).
+
+    Args:
+      rgb: (n, 3) in 0 .. 255.
+
+    Returns:
+      (n, 3): L in 0 .. 100, a and b about 0.
+    """
     pixels = np.asarray(rgb, np.float32).reshape(-1, 1, 3) / 255.0
     return cv2.cvtColor(pixels, cv2.COLOR_RGB2LAB).reshape(-1, 3)
 
@@ -136,7 +143,18 @@ class ColourEmbedder:
     def embed_regions(
         self, frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m _ _"]
     ) -> Float32[np.ndarray, "m e"]:
-        """Embeds masks (M, H, W) bool of a frame (H, W, 3) uint8: (M, E) float32 unit, zero for an empty mask."""
+        """Embeds masks of a frame.
+
+        Args:
+          frame: (H, W, 3) RGB.
+          masks: (M, H, W).
+
+        Returns:
+          (M, E) unit rows, zero for an empty mask.
+
+        Raises:
+          ValueError: The masks have another size than the frame.
+        """
         require_shape("masks", masks, ("M", *frame.shape[:2]), "Pass masks of the size of the frame.")
         lab = cv2.cvtColor(np.ascontiguousarray(frame).astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
 
@@ -153,7 +171,17 @@ class ColourEmbedder:
         return out
 
     def embed_text(self, texts: list[str]) -> Float32[np.ndarray, "q e"]:
-        """Embeds Q texts: (Q, E) float32 unit. Raises InputError for a text without colour words or with a negation."""
+        """Embeds texts.
+
+        Args:
+          texts: Q texts with colour words.
+
+        Returns:
+          (Q, E) unit rows.
+
+        Raises:
+          InputError: A text has no colour word, or a negation.
+        """
         out = np.zeros((len(texts), self.dim), np.float32)
         for row, text in zip(out, texts):
             named = [self._distribution(phrase) for phrase in self._phrases(text)]
