@@ -1,7 +1,7 @@
 """Runs experiments in small, one after the other in this process: python .ci/tables.py FOLDER NAME ...
 
-They share imports and programs, which are compiled fast as those of the tests. Of several processes with the same folder
-each takes the next experiment that no other has taken.
+They share imports and programs, which are compiled fast as those of the tests. Of several processes with the same
+folder each takes the next experiment that no other has taken.
 Each experiment leaves its results in FOLDER/NAME and its output in FOLDER/NAME.log.
 """
 

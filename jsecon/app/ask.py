@@ -301,7 +301,7 @@ def narrow_texts(
       field: The field.
       embedder: Its embedder. Its `narrower(text)`, if it has one, lists texts that name a part of what the text names.
       texts: The texts.
-      rules: How texts match. Each of n narrower texts may lose to an n-th of the unrelated words that a text may lose to.
+      rules: How texts match. Each of n narrower texts may lose to an n-th of the unrelated words that one may lose to.
       every: Whether all narrower texts that match replace a text, instead of the best of them.
 
     Returns:
