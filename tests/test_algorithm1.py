@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy import sparse
 
-from jsecon.association.algorithm1 import clean_masklets, iou_matrix, masklets
+from jsecon.association.algorithm1 import clean_masklets, masklets
 from jsecon.association.run_lengths import encode_masks, encode_rows, memoized_masks
 from jsecon.pipeline import cache
 
@@ -180,17 +180,6 @@ def test_bad_shapes_are_refused():
         masklets(frames_of(truth), lambda f, i: np.ones((1, 3, 3), bool), tracker(truth))
     with pytest.raises(ValueError, match="track"):
         masklets(frames_of(truth), segmenter(truth), lambda f, i, p: np.zeros((1, 40, 40), np.int16))
-
-
-@settings(deadline=None, max_examples=25)
-@given(st.integers(0, 2**32 - 1))
-def test_iou_matrix_equals_the_definition(seed):
-    rng = np.random.default_rng(seed)
-    a, b = rng.random((4, 60)) < rng.random(), rng.random((3, 60)) < rng.random()
-    expected = [[(x & y).sum() / (x | y).sum() if (x | y).any() else 0.0 for y in b] for x in a]
-    np.testing.assert_allclose(iou_matrix(a, b), expected, atol=1e-6)
-    np.testing.assert_allclose(iou_matrix(b, a), iou_matrix(a, b).T)
-    assert iou_matrix(a, b[:0]).shape == (4, 0)
 
 
 @settings(deadline=None, max_examples=25)

@@ -2,8 +2,8 @@ import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from mask_overlaps import iou_matrix
 
-from jsecon.association.algorithm1 import iou_matrix
 from jsecon.vision.classical import ClassicalSegmenter, adapt_exposure, oversegment
 from jsecon.vision.protocols import Segmenter
 from jsecon.vision.region_graph import merge_regions, region_borders

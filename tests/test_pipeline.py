@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 import pytest
 from capture_files import transforms
+from mask_overlaps import iou_matrix
 
 import jsecon
 from jsecon.app import cli
-from jsecon.association.algorithm1 import iou_matrix
 from jsecon.data.gaussians.ply import save_ply
 from jsecon.errors import InputError
 from jsecon.files import write_arrays

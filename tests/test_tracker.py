@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 from balls import HEIGHT, VIEWS, WIDTH, ious, ring_of_balls
 from conftest import look_at
+from mask_overlaps import iou_matrix
 
-from jsecon.association.algorithm1 import clean_masklets, iou_matrix, masklets
+from jsecon.association.algorithm1 import clean_masklets, masklets
 from jsecon.association.atoms import image_atoms
 from jsecon.association.tracker import GeometricTracker
 from jsecon.types import Camera

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int16
+from jaxtyping import Int, Int16
 from scipy import sparse
 
 from jsecon.association.atoms import Sparse, one_hot
@@ -49,7 +49,7 @@ def masklets(
     whole sequence. Proposals of one frame that repeat each other count once, the better first.
 
     Parts: two masklets are joined if more than `join_rate` of the frames that show both have a proposal that contains
-    both (`joined`). Overlaps: the support of a masklet is its mean best IoU with the proposals of the frames that show
+    both. Overlaps: the support of a masklet is its mean best IoU with the proposals of the frames that show
     it. A pixel belongs to the smallest masklet (in mean area) with a support of at least `min_support`, else to the
     best supported. So objects that are proposed repeatedly are cut out of their surroundings, and single fragments and
     mergers have no influence. Finally `clean_masklets` is applied.
@@ -61,9 +61,9 @@ def masklets(
       iou_threshold: The paper's kappa.
       min_area: Least area of a proposal, as a share of the frame.
       max_masklets: Maximum number of tracked prompts.
-      min_views: As for `clean_masklets`.
-      min_support: See above.
-      join_rate: See above; 1 joins no masklets.
+      min_views: Least number of frames that show a masklet.
+      min_support: Least support of a masklet that goes before larger ones.
+      join_rate: Share of frames above which two masklets are parts of one object; 1 joins none.
       state: State of a stopped call with the same frames and options, to resume after its last frame.
       on_checkpoint: Called after each frame with a function that makes the state, which has the size of all masks.
       progress: Called with the number of frames done and of all.
@@ -101,25 +101,17 @@ def masklets(
             progress(t + 1, count)
     if not layers.size(0):
         return np.full((count, height, width), -1, np.int16)
-    whole, area, support = joined(layers, proposals, join_rate=join_rate)
+    whole, area, support = _joined(layers, proposals, join_rate=join_rate)
     order = np.lexsort((np.where(support >= min_support, area, -support), support < min_support))
     return clean_masklets(whole.flatten(order), min_area=min_area, min_views=min_views)
 
 
-def joined(layers: "_Layers", proposals: "_Layers", *, join_rate: float) -> tuple["_Layers", np.ndarray, np.ndarray]:
-    """Joins masklets that are parts of one object.
+def _joined(layers: "_Layers", proposals: "_Layers", *, join_rate: float) -> tuple["_Layers", np.ndarray, np.ndarray]:
+    """Joins masklets that are parts of one object; returns them, their mean areas (R,) in px and their support (R,).
 
     Two masklets are one object in a frame if a proposal there covers more than half of each. They are joined if that
     holds in more than `join_rate` of the frames (at least two) that show both, best pairs first: view consensus (Yan et
     al., CVPR 2024) between tracks instead of single masks.
-
-    Args:
-      layers: Masklets of all frames.
-      proposals: Proposals of all frames.
-      join_rate: Share of frames.
-
-    Returns:
-      The joined masklets, their mean areas (R,) in px and their support (R,).
     """
     tables: list[tuple[np.ndarray, ...]] = [_overlaps(layers.at(t), proposals.at(t)) for t in range(layers.count)]
     while True:
@@ -161,11 +153,6 @@ def _agreement(tables: list[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, np.nda
         area, views = area + size, views + shown
         support += overlap.max(1, initial=0.0)
     return together, both, area / np.maximum(views, 1.0), support / np.maximum(views, 1.0)
-
-
-def iou_matrix(first: Bool[np.ndarray, "a p"], second: Bool[np.ndarray, "b p"]) -> Float[np.ndarray, "a b"]:
-    """Computes the IoU (A, B) of masks (A, P) and (B, P) over P pixels; 0 if both are empty."""
-    return _overlaps(sparse.csr_matrix(first, dtype=np.float32), sparse.csr_matrix(second, dtype=np.float32))[2]
 
 
 def _overlaps(first: Sparse, second: Sparse) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

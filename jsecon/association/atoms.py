@@ -58,29 +58,47 @@ def image_atoms(
 def atom_coverage(
     atoms: Int32[np.ndarray, "h w"], masks: Bool[np.ndarray, "m h w"], count: int
 ) -> Float32[np.ndarray, "m a"]:
-    """Returns (M, A) float32 the share of the pixels of each atom, of `count`, that lie in each mask."""
+    """Computes how far atoms lie in masks.
+
+    Args:
+      atoms: (H, W) int32 atoms 0 .. A-1.
+      masks: (M, H, W) bool.
+      count: A.
+
+    Returns:
+      (M, A) float32 share of the pixels of each atom that lie in each mask.
+    """
     area = np.bincount(atoms.reshape(-1), minlength=count)
     inside = [np.bincount(atoms[mask], minlength=count) for mask in masks]
     return (np.asarray(inside, np.float32).reshape(len(masks), count) / np.maximum(area, 1)).astype(np.float32)
 
 
 def sum_entries(entries: list[tuple[np.ndarray, np.ndarray, np.ndarray]], shape: tuple[int, int]) -> Sparse:
-    """Builds a sparse matrix from parts (values, rows, columns); repeated entries are added up."""
+    """Builds a sparse matrix; repeated entries are added up.
+
+    Args:
+      entries: Parts of values, rows and columns.
+      shape: Shape of the matrix.
+
+    Returns:
+      Sparse matrix.
+    """
     values, rows, columns = (np.concatenate(parts) for parts in zip(*entries))
     return sparse.csr_matrix((values, (rows, columns)), shape=shape)
 
 
 def one_hot(labels: Int[np.ndarray, " a"], count: int) -> Sparse:
-    """Encodes labels (A,), -1 for no label, as a sparse matrix (A, `count`) of float32 ones."""
+    """Encodes labels.
+
+    Args:
+      labels: (A,) labels, -1 for none.
+      count: C, number of labels.
+
+    Returns:
+      Sparse matrix (A, C) of float32 ones.
+    """
     rows = np.flatnonzero(labels >= 0)
     return sparse.csr_matrix((np.ones(len(rows), np.float32), (rows, labels[rows])), shape=(len(labels), count))
-
-
-def label_shares(atoms: np.ndarray, labels: np.ndarray, rows: int, columns: int) -> Sparse:
-    """Returns a sparse matrix (`rows`, `columns`): the share of the pixels of each atom that carry each label."""
-    inside = labels >= 0
-    weights = 1.0 / np.bincount(atoms.reshape(-1), minlength=rows)[atoms[inside]]
-    return sparse.csr_matrix((weights.astype(np.float32), (atoms[inside], labels[inside])), shape=(rows, columns))
 
 
 def atom_votes(
@@ -101,7 +119,7 @@ def atom_votes(
       camera: Camera of the view.
       atoms: (H, W) int32 atoms 0 .. A-1.
       negligible: Share of the total of a Gaussian up to which entries are removed.
-      centre: As for `region_votes`.
+      centre: In [0, 1], weight of a Gaussian's centre against its footprint, see `region_votes`.
 
     Returns:
       Sparse matrix (N, A).

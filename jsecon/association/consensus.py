@@ -91,10 +91,10 @@ def scene_pieces(
     of squares of k-means++ and mini-batches (bonsai, replica_apartment_0), in a tenth to a third of the time.
 
     Args:
-      membership: As for `group_by_consensus`.
-      visible: As for `group_by_consensus`.
-      weights: As for `group_by_consensus`.
-      means: As for `group_by_consensus`.
+      membership: (N, M) share of each Gaussian in each mask, times its visibility there.
+      visible: (N, T) visibility of each Gaussian in each frame, in [0, 1].
+      weights: (N,) total rendering weight of each Gaussian.
+      means: (N, 3) centres, world units.
       pieces: Maximum number of pieces.
       seed: Seed of the random projection.
 
@@ -168,10 +168,10 @@ def average_linkage(
     end in the same groups as repeatedly joining the best pair.
 
     Args:
-      together: w (K, K).
-      both: v (K, K).
+      together: (K, K) w.
+      both: (K, K) v.
       least_ratio: Similarity below which groups stay separate.
-      least_shared: See above.
+      least_shared: Least V_ab in units of sqrt(V_aa V_bb).
 
     Returns:
       (K,) group of each item, 0 .. R-1.
@@ -234,9 +234,9 @@ def consensus_masklets(
     Args:
       frames: (T, H, W, 3) uint8.
       scene: Scene, cameras and proposals of these frames.
-      agreement: As for `group_by_consensus`.
-      abstain_if_unlabelled: As for `mask_signatures`.
-      seed: As for `group_by_consensus`.
+      agreement: Probability of a common mask above which Gaussians are grouped.
+      abstain_if_unlabelled: Whether a frame abstains on Gaussians that lie in no mask of it, see `mask_signatures`.
+      seed: Seed of the random projection.
       progress: Called with the number of frames done and of all.
 
     Returns:
@@ -270,7 +270,7 @@ def pieces_on_masks(
     Args:
       frames: (T, H, W, 3) uint8.
       scene: Scene, cameras and proposals of these frames.
-      seed: As for `group_by_consensus`.
+      seed: Seed of the random projection.
       progress: Called with the number of frames done and of all.
 
     Returns:

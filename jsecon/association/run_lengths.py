@@ -25,7 +25,11 @@ class RunLengthMasks:
     """P, pixels of an image."""
 
     def rows(self) -> Sparse:
-        """Returns the masks as a sparse matrix (R, P) of float32 ones."""
+        """Decodes the masks.
+
+        Returns:
+          Sparse matrix (R, P) of float32 ones.
+        """
         lengths = (self.stops - self.starts).astype(np.int64)
         ends = np.concatenate([[0], np.cumsum(lengths)])
         columns = np.arange(ends[-1]) + np.repeat(self.starts - ends[:-1], lengths)
@@ -34,17 +38,39 @@ class RunLengthMasks:
         return sparse.csr_matrix((np.ones(len(columns), np.float32), columns.astype(np.int32), ends), shape=shape)
 
     def masks(self, height: int, width: int) -> Bool[np.ndarray, "r h w"]:
-        """Returns the masks as an array (R, H, W) bool, where P = H W."""
+        """Decodes the masks into images.
+
+        Args:
+          height: H, px.
+          width: W, px; P = H W.
+
+        Returns:
+          (R, H, W) bool.
+        """
         return self.rows().astype(bool).toarray().reshape(len(self.counts), height, width)
 
     def concatenate(self, others: "RunLengthMasks") -> "RunLengthMasks":
-        """Appends other masks over the same pixels."""
+        """Appends masks.
+
+        Args:
+          others: Masks over the same pixels.
+
+        Returns:
+          The masks, then the others.
+        """
         starts, stops = (np.concatenate(pair) for pair in zip((self.starts, self.stops), (others.starts, others.stops)))
         return RunLengthMasks(starts, stops, np.concatenate([self.counts, others.counts]), self.pixels)
 
 
 def encode_rows(rows: Sparse) -> RunLengthMasks:
-    """Encodes the nonzeros of a csr_matrix (R, P) with sorted indices."""
+    """Encodes masks that are rows of a sparse matrix.
+
+    Args:
+      rows: csr_matrix (R, P) with sorted indices, whose nonzeros are the masks.
+
+    Returns:
+      R masks.
+    """
     new = np.ones(rows.nnz, bool)
     new[1:] = np.diff(rows.indices) != 1
     new[rows.indptr[:-1][np.diff(rows.indptr) > 0]] = True
@@ -56,7 +82,14 @@ def encode_rows(rows: Sparse) -> RunLengthMasks:
 
 
 def encode_masks(masks: Bool[np.ndarray, "r h w"]) -> RunLengthMasks:
-    """Encodes masks (R, H, W) bool, P = H W."""
+    """Encodes masks.
+
+    Args:
+      masks: (R, H, W) bool.
+
+    Returns:
+      R masks over P = H W pixels.
+    """
     return encode_rows(sparse.csr_matrix(masks.reshape(len(masks), masks.shape[1] * masks.shape[2])))
 
 

@@ -7,8 +7,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int16, UInt8
+from scipy import sparse
 
-from jsecon.association.atoms import atom_coverage, label_shares, one_hot, sum_entries
+from jsecon.association.atoms import Sparse, atom_coverage, one_hot, sum_entries
 from jsecon.association.views import FrameView, SceneViews, claim_atoms
 from jsecon.errors import require_shape
 from jsecon.types import Camera, Gaussians
@@ -24,10 +25,10 @@ class GeometricTracker:
     its clarity in the visited frames, fully from half of its clarity in the present frame.
 
     Args:
-      gaussians: As for `SceneViews`.
-      cameras: As for `SceneViews`.
-      proposals: As for `SceneViews`.
-      atoms_per_frame: As for `SceneViews`.
+      gaussians: Scene of N Gaussians.
+      cameras: Batch of T cameras, one per frame.
+      proposals: Masks (M, H, W) bool of each frame, see `SceneViews`.
+      atoms_per_frame: Approximate number of superpixels per frame before the cut along proposals.
     """
 
     def __init__(
@@ -122,7 +123,7 @@ class GeometricTracker:
         for _ in range(4 if count else 0):  # a merger may affect other regions; rarely more than two rounds
             entries = []
             for t, view in enumerate(self.views.all(frames)):
-                shares = label_shares(view.atoms, labels[t], view.votes.shape[1], count)
+                shares = _label_shares(view.atoms, labels[t], view.votes.shape[1], count)
                 cast = (view.votes @ shares).tocoo()
                 entries.append((cast.data, view.seen[cast.row], cast.col))
             votes = sum_entries(entries, (self.views.count, count))
@@ -170,6 +171,13 @@ class GeometricTracker:
         votes = view.votes[rows]
         owner = claim_atoms(view, votes.T @ owned[:, classes], votes.T @ known[rows])
         return np.where(owner >= 0, classes[owner], -1)
+
+
+def _label_shares(atoms: np.ndarray, labels: np.ndarray, rows: int, columns: int) -> Sparse:
+    """Returns a sparse matrix (`rows`, `columns`): the share of the pixels of each atom that carry each label."""
+    inside = labels >= 0
+    weights = 1.0 / np.bincount(atoms.reshape(-1), minlength=rows)[atoms[inside]]
+    return sparse.csr_matrix((weights.astype(np.float32), (atoms[inside], labels[inside])), shape=(rows, columns))
 
 
 def _evidence(view: FrameView, owner: Int[np.ndarray, " a"], count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

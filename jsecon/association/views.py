@@ -63,7 +63,8 @@ class SceneViews:
       proposals: Masks (M, H, W) bool of each frame, which may overlap: a sequence, or a function of the index of a
         frame, which is called in several threads.
       atoms_per_frame: Approximate number of superpixels per frame before the cut along proposals.
-      centre: As for `region_votes`; above 0 if answers are judged at the centres of Gaussians.
+      centre: Weight of a Gaussian's centre against its footprint, see `region_votes`; above 0 if answers are judged at
+        the centres of Gaussians.
     """
 
     def __init__(

@@ -61,7 +61,7 @@ def measure_quality(
         cameras = shrink_cameras(cameras, long_side)
 
     def compare(t: int) -> list[float]:
-        image = render_rgb(gaussians, cameras[int(t)]).features
+        image = render_rgb(gaussians, cameras[t]).features
         frame = resize_frame(np.asarray(capture.frames[t]), cameras)
         counted = np.ones(frame.shape[:2], bool)
         if capture.ignored is not None:
@@ -69,7 +69,7 @@ def measure_quality(
         return [float(value) for value in _compare(image, frame, counted)]
 
     def rows(positions: Sequence[int]) -> Iterator[list[float]]:
-        return map(compare, chosen[list(positions)])
+        return map(compare, chosen[list(positions)].tolist())
 
     by_frame = np.array(map_over_processes(len(chosen), rows, progress)).reshape(-1, 2)
     return Quality(chosen, by_frame[:, 0], by_frame[:, 1])

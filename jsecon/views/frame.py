@@ -71,7 +71,14 @@ class SceneFrame:
         return 2 * float(np.linalg.norm(self.half))
 
     def to_world(self, local: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
-        """Maps points in the box, -1 to 1 along each axis, into the world."""
+        """Maps points in the box into the world.
+
+        Args:
+          local: (..., 3), -1 to 1 along each axis.
+
+        Returns:
+          (..., 3) points, world.
+        """
         return (np.asarray(local) * self.half) @ self.axes + self.centre
 
 

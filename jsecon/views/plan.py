@@ -72,7 +72,11 @@ class PlannedViews:
     candidates: int
 
     def describe(self) -> str:
-        """Says what was planned, in one line."""
+        """Describes the plan.
+
+        Returns:
+          One line: number of views, kind of scene, coverage and up axis.
+        """
         up = ", ".join(f"{number:.2f}" for number in self.frame.axes[2])
         trust = "" if self.frame.sure else "; not sure, --up X Y Z sets it"
         return (

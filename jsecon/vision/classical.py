@@ -26,7 +26,11 @@ needs depth to separate objects."""
 
 
 def require_contrib() -> None:
-    """Raises InputError if OpenCV has no contrib modules: its packages overwrite each other's folder."""
+    """Checks that OpenCV has its contrib modules.
+
+    Raises:
+      InputError: It has none, because OpenCV's packages overwrite each other's folder.
+    """
     if not hasattr(getattr(cv2, "ximgproc", None), "createSuperpixelSLIC"):
         remedy = (
             "Run: pip uninstall opencv-python opencv-python-headless opencv-contrib-python; then: "
@@ -84,7 +88,7 @@ class ClassicalSegmenter:
         """
         fits = frame.ndim == 3 and frame.shape[2] == 3 and frame.dtype == np.uint8
         require(fits, "frame", (frame.shape, frame.dtype), "(H, W, 3) uint8", "Pass RGB frames as 8-bit arrays.")
-        features = colour_features(frame, lightness_weight=self.lightness_weight, smoothing=self.smoothing)
+        features = _colour_features(frame, lightness_weight=self.lightness_weight, smoothing=self.smoothing)
         minimum = self.min_area * frame.shape[0] * frame.shape[1]
         surface = None if self.surfaces is None else self.surfaces(index)
         if surface is not None:
@@ -117,7 +121,7 @@ class ClassicalSegmenter:
         return np.concatenate([colour, turned], -1), np.concatenate([colour, 0.5 * turned, depth], -1)
 
 
-def colour_features(
+def _colour_features(
     frame: UInt8[np.ndarray, "h w 3"], *, lightness_weight: float, smoothing: float
 ) -> Float32[np.ndarray, "h w 3"]:
     """Computes weighted L, a and b (H, W, 3) float32, CIELAB units, of a smoothed frame (H, W, 3) uint8."""
@@ -159,7 +163,16 @@ def adapt_exposure(
 def oversegment(
     features: Float32[np.ndarray, "h w c"], *, scale: float = 30.0, min_size: int = 16
 ) -> Int32[np.ndarray, "h w"]:
-    """Segments features (H, W, C) into small connected regions (H, W) int32 (Felzenszwalb & Huttenlocher 2004)."""
+    """Segments features into small connected regions (Felzenszwalb & Huttenlocher 2004).
+
+    Args:
+      features: (H, W, C) float32.
+      scale: Dissimilarity below which single pixels join, over their number: larger means larger regions.
+      min_size: Least area of a region, px.
+
+    Returns:
+      (H, W) int32 regions.
+    """
     graph = cv2.ximgproc.segmentation.createGraphSegmentation(sigma=0.5, k=scale, min_size=min_size)
     return np.asarray(graph.processImage(np.ascontiguousarray(features)), np.int32)
 

@@ -55,7 +55,11 @@ class Network(Protocol):
     """Identifies content and settings."""
 
     def check(self) -> None:
-        """Raises InputError if it cannot work."""
+        """Checks that it can work.
+
+        Raises:
+          InputError: It cannot.
+        """
         ...
 
     def close(self) -> None:
@@ -91,11 +95,29 @@ class Embedder(Protocol):
     """(C, E) float32 unit embeddings that a query must exceed, such as those of `CANONICAL`."""
 
     def embed_regions(self, frame: np.ndarray, masks: np.ndarray) -> np.ndarray:
-        """Embeds masks (M, H, W) bool of a frame (H, W, 3) uint8: (M, E) float32 unit, zero for an empty mask."""
+        """Embeds masks of a frame.
+
+        Args:
+          frame: (H, W, 3) uint8 RGB.
+          masks: (M, H, W) bool.
+
+        Returns:
+          (M, E) float32 unit embeddings, zero for an empty mask.
+        """
         ...
 
     def embed_text(self, texts: list[str]) -> np.ndarray:
-        """Embeds Q texts: (Q, E) float32 unit. Raises InputError for a text that this space cannot represent."""
+        """Embeds texts.
+
+        Args:
+          texts: Q texts.
+
+        Returns:
+          (Q, E) float32 unit embeddings.
+
+        Raises:
+          InputError: This space cannot represent a text.
+        """
         ...
 
 
@@ -117,7 +139,14 @@ class Networks:
     """None: through the Gaussians."""
 
     def require_ready(self, stages: Collection[str]) -> None:
-        """Raises InputError if a network cannot serve these stages, before the long work starts."""
+        """Checks the networks before the long work starts.
+
+        Args:
+          stages: Names of the stages that will run.
+
+        Raises:
+          InputError: A network cannot serve them.
+        """
         for stage, used in (("masklets", self.segmenter), ("masklets", self.tracker), ("regions", self.embedder)):
             check = getattr(used, "check", None)
             if stage in stages and check is not None:

@@ -178,7 +178,14 @@ def merge_regions(
 
 
 def relabel_sequential(ids: Int[np.ndarray, "*shape"]) -> Int64[np.ndarray, "*shape"]:
-    """Renumbers small ids >= 0 to 0 .. K-1 in the same order, like the inverse of np.unique but without sorting."""
+    """Renumbers ids without gaps, in the same order: the inverse of np.unique without sorting.
+
+    Args:
+      ids: Small ids >= 0, of any shape; at least one.
+
+    Returns:
+      Ids 0 .. K-1 of the same shape.
+    """
     used = np.zeros(int(ids.max()) + 1, bool)
     used[ids] = True
     return (np.cumsum(used) - 1)[ids]

@@ -27,7 +27,14 @@ class EmbeddingStore:
     """Identifies the model by its content."""
 
     def read(self, frame: UInt8[np.ndarray, "h w 3"]) -> dict[bytes, np.ndarray]:
-        """Returns the vectors (E,) float32 of a frame by mask key; empty if the file cannot be read."""
+        """Reads the cached vectors of a frame.
+
+        Args:
+          frame: (H, W, 3) uint8 RGB.
+
+        Returns:
+          Vectors (E,) float32 by `mask_key`; empty if the file cannot be read.
+        """
         try:
             _, stored = read_arrays(self._path(frame))
             pairs = zip(stored["keys"], stored["vectors"], strict=True)
@@ -36,14 +43,22 @@ class EmbeddingStore:
             return {}
 
     def write(self, frame: UInt8[np.ndarray, "h w 3"], vectors: dict[bytes, np.ndarray]) -> None:
-        """Replaces the cached vectors of a frame. Raises InputError if the file cannot be written."""
+        """Replaces the cached vectors of a frame.
+
+        Args:
+          frame: (H, W, 3) uint8 RGB.
+          vectors: Vectors (E,) float32 by `mask_key`.
+
+        Raises:
+          InputError: The file cannot be written.
+        """
         if not vectors:
             return
         keys = np.stack([np.frombuffer(key, np.uint8) for key in vectors])
         _write(self._path(frame), keys=keys, vectors=np.stack(list(vectors.values())))
 
     def _path(self, frame: np.ndarray) -> Path:
-        return self.folder / f"{frame_digest(self.model, frame)}.safetensors"
+        return self.folder / f"{_frame_digest(self.model, frame)}.safetensors"
 
 
 def _write(path: Path, **arrays: np.ndarray) -> None:
@@ -51,7 +66,7 @@ def _write(path: Path, **arrays: np.ndarray) -> None:
         write_arrays(temporary, arrays)
 
 
-def frame_digest(model: str, frame: UInt8[np.ndarray, "h w 3"]) -> str:
+def _frame_digest(model: str, frame: UInt8[np.ndarray, "h w 3"]) -> str:
     """Returns 32 hex digits that identify a frame (H, W, 3) for one model."""
     digest = hashlib.blake2b(f"{model} {frame.shape}".encode(), digest_size=16)
     digest.update(np.ascontiguousarray(frame).data)
@@ -59,7 +74,14 @@ def frame_digest(model: str, frame: UInt8[np.ndarray, "h w 3"]) -> str:
 
 
 def mask_key(mask: Bool[np.ndarray, "h w"]) -> bytes:
-    """Returns 16 bytes that identify a mask (H, W)."""
+    """Identifies a mask by its content.
+
+    Args:
+      mask: (H, W) bool.
+
+    Returns:
+      16 bytes.
+    """
     return hashlib.blake2b(np.packbits(mask).tobytes(), digest_size=16).digest()
 
 
@@ -93,14 +115,25 @@ class StoredSegmenter:
         return masks
 
     def has(self, frame: UInt8[np.ndarray, "h w 3"]) -> bool:
-        """Returns whether the masks of a frame (H, W, 3) uint8 are cached."""
+        """Finds out whether the masks of a frame are cached.
+
+        Args:
+          frame: (H, W, 3) uint8 RGB.
+
+        Returns:
+          True if there is a file of them.
+        """
         return self._path(frame).is_file()
 
     def _path(self, frame: np.ndarray) -> Path:
-        return self._folder / f"{frame_digest(self.name, frame)}.safetensors"
+        return self._folder / f"{_frame_digest(self.name, frame)}.safetensors"
 
     def check(self) -> None:
-        """Raises InputError if the segmenter cannot work."""
+        """Checks that the segmenter can work.
+
+        Raises:
+          InputError: It cannot.
+        """
         self._segmenter.check()
 
     def close(self) -> None:

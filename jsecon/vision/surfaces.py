@@ -36,9 +36,13 @@ def smooth_depth(depth: Float32[np.ndarray, "h w"], *, noise: float = 0.06, roun
 
 
 def log_depth(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w 1"]:
-    """Computes the logarithm (H, W, 1) of z-depth (H, W), where 0 is unknown.
+    """Computes the logarithm of z-depth.
 
-    Unknown pixels are filled from the nearest known pixel, with 0 if there is none.
+    Args:
+      depth: (H, W), 0 = unknown.
+
+    Returns:
+      (H, W, 1) float32; unknown pixels are filled from the nearest known one, with 0 if there is none.
     """
     known = np.asarray(depth > 0)
     depth = fill_nearest(depth, known) if known.any() else np.ones_like(depth)
@@ -46,7 +50,15 @@ def log_depth(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w 1"]
 
 
 def fill_nearest(values: Shaped[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]) -> Shaped[np.ndarray, "h w"]:
-    """Fills unknown pixels of `values` (H, W) from the nearest of the `known` ones (H, W) bool."""
+    """Fills unknown pixels from the nearest known one.
+
+    Args:
+      values: (H, W).
+      known: (H, W) bool, true somewhere.
+
+    Returns:
+      (H, W) values.
+    """
     _, nearest = cv2.distanceTransformWithLabels(
         (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
@@ -146,7 +158,15 @@ def surfaces_from_depth(
 
 
 def camera_points(depth: Float32[np.ndarray, "h w"], camera: Camera) -> Float64[np.ndarray, "h w 3"]:
-    """Back-projects z-depth (H, W) to points (H, W, 3) in camera axes; pixel centres lie at halves."""
+    """Back-projects z-depth; pixel centres lie at halves.
+
+    Args:
+      depth: (H, W) z-depth, world units.
+      camera: One camera of that image size.
+
+    Returns:
+      (H, W, 3) float64 points in camera axes, world units.
+    """
     rows, columns = np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5
     x = (columns - float(camera.cx)) / float(camera.fx)
     y = (rows - float(camera.cy)) / float(camera.fy)
