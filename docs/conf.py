@@ -97,7 +97,7 @@ class CommandHelp(SphinxDirective):
         """Returns the sections."""
         os.environ["COLUMNS"] = "92"
         sections = []
-        for verb in cli.verbs():
+        for verb in cli.VERB_NAMES:
             printed = io.StringIO()
             with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
                 cli.parse([verb, "--help-all"])

@@ -396,7 +396,7 @@ def default_field(room: Room, folder: Path) -> LanguageField:
     return pipeline.run(options, folder, listener=Console()).field
 
 
-def ask_room(seed: int, vision: str, rooms: Path, **thresholds: float) -> list[tuple[str, int, int, bool, str]]:
+def ask_room(seed: int, vision: str, rooms: Path) -> list[tuple[str, int, int, bool, str]]:
     """Asks the expressions of a room, whose field is kept in a folder.
 
     Returns:
@@ -410,7 +410,7 @@ def ask_room(seed: int, vision: str, rooms: Path, **thresholds: float) -> list[t
         folder.mkdir(parents=True, exist_ok=True)
         save_field(folder / "field.safetensors", field)
     field = load_field(folder / "field.safetensors")
-    scene = ObjectScene(field, ColourEmbedder(), **thresholds)
+    scene = ObjectScene(field, ColourEmbedder())
     everything = KDTree(np.concatenate(truth.points))
     owner = np.repeat(np.arange(len(truth.points)), [len(cloud) for cloud in truth.points])
     means = np.asarray(field.gaussians.means, np.float64)

@@ -9,7 +9,8 @@ from small_field import make_field
 
 from jsecon.app.ask import ask_text
 from jsecon.app.outputs import main_regions
-from jsecon.app.viewer.candidates import RegionPictures, candidates, region_along
+from jsecon.app.pictures import Renderer
+from jsecon.app.viewer.candidates import candidates, region_along
 from jsecon.errors import InputError
 from jsecon.query.pixel import region_at
 from jsecon.vision.colours import BASIC, ColourEmbedder
@@ -63,10 +64,10 @@ def test_a_field_without_regions_has_no_candidates(field):
 
 
 def test_a_region_is_pictured_where_its_gaussians_are(field):
-    pictures = RegionPictures(field)
-    photo = pictures.renderer.photo(1)
+    renderer, regions = Renderer(field.gaussians, field.cameras), main_regions(field)
+    photo = renderer.photo(1)
     for region in range(5):
-        part = pictures.region(region, 1)
+        part = renderer.crop(1, regions == region)
         height, width = part.shape[:2]
         assert height <= photo.shape[0]
         assert width <= photo.shape[1]
@@ -77,7 +78,7 @@ def test_a_region_is_pictured_where_its_gaussians_are(field):
             if (photo[i : i + height, j : j + width] == part).all()
         ]
         assert places, "a part of the frame"
-    np.testing.assert_array_equal(pictures.region(99, 1), photo)
+    np.testing.assert_array_equal(renderer.crop(1, regions == 99), photo)
 
 
 @pytest.mark.parametrize("frame", [0, 2])

@@ -231,7 +231,7 @@ def test_help_of_every_verb_has_words_for_every_option(capsys, monkeypatch):
         assert not any("None" in row or "[STR" in row for row in rows)
 
 
-@pytest.mark.parametrize("verb", cli.verbs())
+@pytest.mark.parametrize("verb", cli.VERB_NAMES)
 def test_help_of_a_verb_fits_a_screen_and_its_examples_parse(verb, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
     assert _run(verb, "--help") == 0

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import shutil
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,7 +11,7 @@ from clip_files import COLOURS
 from sam3_files import write_sam3
 
 from jsecon.app import cli
-from jsecon.app.phrases import find_capture, lift_phrase, load_frames
+from jsecon.app.phrases import lift_phrase, load_frames
 from jsecon.data.gaussians.ply import load_ply
 from jsecon.errors import InputError
 from jsecon.language.field import load_field
@@ -79,23 +78,23 @@ def test_a_frame_without_masks_has_its_say(room_run):
 
 def test_frames_are_those_of_the_field_at_the_size_of_their_files(room_run, room, tmp_path):
     field = load_field(room_run[1] / "field.safetensors")
-    assert find_capture(field, room_run[1]) == Path(room)
-    frames = load_frames(field, room, 3)
+    frames = load_frames(field, room_run[1], 3)
     assert list(frames) == [0, 4, 7]
     np.testing.assert_array_equal(frames[4], room_run[0].capture.frames[4])
     (tmp_path / "poses").mkdir()
-    assert find_capture(field, tmp_path) == tmp_path / "poses"
+    with pytest.raises(InputError, match="poses"):
+        load_frames(field, tmp_path, 3)
     another = dataclasses.replace(field, names=(*field.names[:7], "another"))
     with pytest.raises(InputError, match="no frame called another among the 8"):
-        load_frames(another, room, 3)
+        load_frames(another, room_run[1], 3, room)
     wide = dataclasses.replace(field, cameras=dataclasses.replace(field.cameras, width=200))
     with pytest.raises(InputError, match="frames of 160x120, expected 200x120, or the same shape"):
-        load_frames(wide, room, 3)
+        load_frames(wide, room_run[1], 3, room)
     moved = dataclasses.replace(field, provenance="{}")
     with pytest.raises(InputError, match="--images DIR"):
-        find_capture(moved, room_run[1])
+        load_frames(moved, room_run[1], 3)
     with pytest.raises(InputError, match="--looks"):
-        load_frames(field, room, 0)
+        load_frames(field, room_run[1], 0)
 
 
 @pytest.mark.parametrize(("options", "says"), [

@@ -105,7 +105,7 @@ def _check_jsecon(words, *, whole):
         except jsecon.InputError as error:
             if whole or "Missing:" not in error.problem:
                 raise
-    if not whole and words[0] in cli.verbs():
+    if not whole and words[0] in cli.VERB_NAMES:
         printed = io.StringIO()
         with contextlib.suppress(SystemExit), contextlib.redirect_stdout(printed):
             cli.parse([words[0], "--help-all"])

@@ -9,6 +9,7 @@ import sys
 import time
 import urllib.request
 import zipfile
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -160,7 +161,12 @@ def test_an_error_inside_is_told_and_the_viewer_goes_on(viewer, capsys):
 def test_files_of_the_answers(viewer, tmp_path):
     answer = viewer.answer(view_state.ViewQuery(1))
     assert isinstance(answer, Answer)
-    with zipfile.ZipFile(io.BytesIO(viewer.zipped([answer]))) as archive:
+    sent = []
+    client = SimpleNamespace(send_file_download=lambda name, content, **_: sent.append((name, content)))
+    settled(viewer, lambda: viewer.then(lambda _: ViewState((1,))))
+    settled(viewer, lambda: viewer.export(client))
+    assert sent[0][0] == "region-1.zip"
+    with zipfile.ZipFile(io.BytesIO(sent[0][1])) as archive:
         names = archive.namelist()
         archive.extractall(tmp_path)
     assert {"region-1.json", "region-1.ply"} <= set(names)

@@ -43,8 +43,6 @@ METHODS = ("votes", "silhouette", "code")
 """how a region selects Gaussians: by their votes, by these and the outline in the views, or by their codes"""
 PARTS_ANSWER = {"regions": "no region holds the object, so the parts that match the text were selected"}
 """why a text is answered by parts"""
-POINTED = {"text encoder": "the region under the pixel is the query"}
-"""why a pixel needs no text encoder"""
 MIN_BLOCK_ROWS = 1 << 12
 """rows of an answer to a mapped field are padded to powers of two from here on, so that few sizes are compiled"""
 
@@ -89,6 +87,13 @@ class Answer:
         return None if share is None or np.isnan(share) else round(float(share), 4)
 
     @property
+    def quantile_words(self) -> str:
+        """The quantile in words, in whole percent and rounded down; "" if it is unknown."""
+        if self.quantile is None:
+            return ""
+        return f"more similar than {int(100 * self.quantile + 1e-6)} % of unrelated words"
+
+    @property
     def confidence(self) -> float | None:
         """Estimated probability that the answer shows what the text names; None if it is unknown."""
         confidence = self.selection.confidence
@@ -112,18 +117,6 @@ class _Match(NamedTuple):
     presence: float | None = None
     parts: PartsAnswer | None = None
     """answer in place of the regions"""
-
-
-def quantile_message(quantile: float) -> str:
-    """Describes how a text compares with unrelated words.
-
-    Args:
-      quantile: Share of unrelated words that are less similar to the scene, 0 to 1.
-
-    Returns:
-      A clause with whole percent, rounded down.
-    """
-    return f"more similar than {int(100 * quantile + 1e-6)} % of unrelated words"
 
 
 def ask_text(
@@ -163,14 +156,7 @@ def ask_text(
 
 
 def ask_pixel(
-    field: LanguageField,
-    frame: int | str,
-    x: int,
-    y: int,
-    *,
-    by: str = "votes",
-    threshold: float | None = None,
-    outliers: bool = True,
+    field: LanguageField, frame: int | str, x: int, y: int, *, by: str = "votes", threshold: float | None = None
 ) -> Answer:
     """Selects the Gaussians of what lies under a pixel.
 
@@ -181,15 +167,14 @@ def ask_pixel(
       y: Row.
       by: One of METHODS.
       threshold: Threshold of the method; None is its default.
-      outliers: Whether to drop outliers.
 
     Returns:
-      The answer.
+      The answer, without outliers.
 
     Raises:
       InputError: The field has no such frame or pixel, or no region lies there.
     """
-    return _select(field, _match_pixel(field, frame, x, y), by, threshold, outliers)
+    return _select(field, _match_pixel(field, frame, x, y), by, threshold, True)
 
 
 def ask_region(
@@ -338,7 +323,8 @@ def _match_pixel(field: LanguageField, frame: int | str, x: int, y: int) -> _Mat
         remedy = "Choose another pixel or frame: report.html of the run shows the regions."
         raise InputError(f"frame {field.names[index]}", f"no region lies under column {x}, row {y}", remedy=remedy)
     name = f"at {field.names[index]} {x} {y}"
-    return _Match(name, match_region(field, region), POINTED, key=name)
+    skipped = {"text encoder": "the region under the pixel is the query"}
+    return _Match(name, match_region(field, region), skipped, key=name)
 
 
 def _select(field: LanguageField, match: _Match, by: str, threshold: float | None, outliers: bool) -> Answer:

@@ -191,15 +191,6 @@ def _first_sentence(text: str) -> str:
     return text if end is None else text[: end.start()] + "."
 
 
-def verbs() -> tuple[str, ...]:
-    """Lists the verbs.
-
-    Returns:
-      Their names.
-    """
-    return tuple(_VERBS)
-
-
 def _all_verbs() -> Any:
     """Returns the union of the verbs, of which tyro makes subcommands, with the first line of each description."""
     kinds = []
@@ -302,3 +293,5 @@ _VERBS: dict[str, tuple[Callable[[Any, Console], VerbResult], type[Verb]]] = {
     **{kind.__name__.lower(): (_act(module), kind) for kind, module in VERBS.items()},
     "completion": (_completion, Completion),
 }
+VERB_NAMES = tuple(_VERBS)
+"""in the order of the help"""

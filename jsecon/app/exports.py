@@ -215,7 +215,6 @@ def _page(field: LanguageField, catalogue: Catalogue, listener: Listener) -> str
     renderer = pictures.Renderer(field.gaussians, field.cameras)
     cameras = jax.tree.map(np.asarray, field.cameras)
     gaussians = jax.device_put(field.gaussians)
-    means = np.asarray(field.gaussians.means)
     cards: dict[bool, list[str]] = {False: [], True: []}
     with listener.progress("pictures") as progress:
         for n in range(len(catalogue)):
@@ -226,11 +225,10 @@ def _page(field: LanguageField, catalogue: Catalogue, listener: Listener) -> str
                 seen = np.asarray(selection_mask(gaussians, cameras[t], mask))
                 figures.append(report.figure(pictures.selection_overlay(renderer.photo(t), seen), field.names[t]))
             best = frames[0] if frames else 0
-            crop = pictures.crop_to_points(renderer.photo(best), cameras[best], means[mask])
             parent = catalogue.parent[n]
             cards[bool(catalogue.surroundings[n])].append(
                 report.card(
-                    pictures.fitted(crop, THUMBNAIL_PX),
+                    pictures.fitted(renderer.crop(best, mask), THUMBNAIL_PX),
                     _title(catalogue, n),
                     f"{n} · {_size(catalogue, n)}" + (f" · part of {parent}" if parent >= 0 else ""),
                     report.grid(figures, 3),

@@ -61,25 +61,6 @@ class Place:
         }
 
 
-def locate_single(field: LanguageField, answer: Answer) -> Place:
-    """Locates the object that an answer selected: the box of several would have its centre between them.
-
-    Args:
-      field: As for `locate_answer`.
-      answer: As for `locate_answer`.
-
-    Returns:
-      As `locate_answer`.
-
-    Raises:
-      InputError: No Gaussian is selected, or more than one object.
-    """
-    if answer.objects > 1:
-        remedy = "Say which, as in 'the red mug left of the green bottle', or point at it."
-        raise InputError(f"query {answer.query!r}", f"it names {answer.objects} objects", "one object", remedy)
-    return locate_answer(field, answer)
-
-
 def locate_answer(field: LanguageField, answer: Answer) -> Place:
     """Locates what an answer selected.
 

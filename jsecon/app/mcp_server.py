@@ -16,10 +16,10 @@ import numpy as np
 from jsecon.app import pictures, verbs
 from jsecon.app.ask import frame_index
 from jsecon.app.exports import object_records
-from jsecon.app.locate import Place, locate_single
+from jsecon.app.locate import Place
 from jsecon.app.models import with_models
 from jsecon.app.outputs import best_frames
-from jsecon.app.relations import locate_relation, measure, query_relation, relation_answer
+from jsecon.app.relations import locate, measure, query_relation, relation_answer
 from jsecon.app.server.scenes import Scene, SceneQuery, open_scenes
 from jsecon.errors import InputError
 from jsecon.pipeline.progress import Console
@@ -70,10 +70,7 @@ class _Tools:
     def locate(self, text: str, frame: str | None = None, field: str | None = None) -> dict[str, Any]:
         """Locates one thing: oriented box, and the middle of its top, where a gripper from above would close."""
         scene = self.scene(field)
-        if is_expression(text):
-            place = locate_relation(scene.object_scene, query_relation(scene.object_scene, text, frame=frame))
-        else:
-            place = locate_single(scene.field, scene.answer(SceneQuery(_words(text))))
+        place = locate(scene.object_scene, _words(text), frame=frame)
         return place.as_dict() | {"top": np.round(_top_of(scene, place), 6).tolist()}
 
     def measure(self, a: str, b: str, frame: str | None = None, field: str | None = None) -> dict[str, Any]:

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from jsecon.app import pictures, report
-from jsecon.app.ask import Answer, quantile_message
+from jsecon.app.ask import Answer
 from jsecon.app.locate import decimals, gaussian_rows, rounded, selected_centers
 from jsecon.data.gaussians.files import save_gaussians
 from jsecon.data.gaussians.ply import save_ply
@@ -150,8 +150,7 @@ def _record(field: LanguageField, answer: Answer) -> dict[str, Any]:
     place = None
     probability = {} if answer.presence is None else {"presence": round(answer.presence, 4)}
     if len(means):
-        low = means.min(0)
-        high = means.max(0)
+        low, high = means.min(0), means.max(0)
         size = float(np.linalg.norm(high - low))
         box = {"min": rounded(low, size), "max": rounded(high, size)}
         place = {"centroid": rounded(means.mean(0), size), "bounding_box": box}
@@ -183,13 +182,7 @@ def _record(field: LanguageField, answer: Answer) -> dict[str, Any]:
 
 
 def write_answers(
-    field: LanguageField,
-    answers: Sequence[Answer],
-    out: Path,
-    listener: Listener,
-    *,
-    views: int,
-    ending: str = "ply",
+    field: LanguageField, answers: Sequence[Answer], out: Path, listener: Listener, *, views: int, ending: str = "ply"
 ) -> dict[str, Any]:
     """Writes the files of answers and OUT/answers.html, and prints a line for each.
 
@@ -214,7 +207,7 @@ def write_answers(
             written = {t: masks[t] for t in list(masks)[:views]}
             record = write_answer(field, answer, out, written, ending=ending)
             records.append(record)
-            line = _line(record)
+            line = _line(answer, record)
             listener.say(f"{answer.query!r}: {line}")
             outliers = _outliers_message(record["outliers"])
             if outliers:
@@ -230,13 +223,12 @@ def write_answers(
     return {"written": {"folder": out, "pictures": out / "answers.html"}, "answers": records}
 
 
-def _line(record: Mapping[str, Any]) -> str:
-    """Returns the record of an answer as one line."""
+def _line(answer: Answer, record: Mapping[str, Any]) -> str:
+    """Returns an answer and its record as one line."""
     parts = [f"{record['count']} of {record['gaussians']} Gaussians"]
     parts += [f"{record['objects']} objects"] if record["objects"] > 1 else []
     parts.append(f"score {record['score']:.3f}")
-    if record["quantile"] is not None:
-        parts.append(quantile_message(record["quantile"]))
+    parts += [answer.quantile_words] if answer.quantile_words else []
     if record["confidence"] is not None and record["region"] is not None:
         parts.append(f"confidence {int(100 * record['confidence'])} %")
     if record["region"] is not None:

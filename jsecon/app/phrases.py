@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 
 from jsecon.app import verbs
 from jsecon.app.ask import Answer, collect, drop_outliers
@@ -24,22 +25,30 @@ from jsecon.query.select import query_region
 from jsecon.types import LanguageField
 
 
-def load_frames(field: LanguageField, capture: Path, count: int) -> dict[int, np.ndarray]:
+def load_frames(
+    field: LanguageField, folder: Path, count: int, capture: Path | None = None
+) -> dict[int, UInt8[np.ndarray, "h w 3"]]:
     """Reads frames of a field again from its capture, evenly spaced, at the size that SAM 3 takes.
 
     Args:
       field: The field.
-      capture: The capture that it was made from.
+      folder: Its folder.
       count: Number of frames.
+      capture: The capture that it was made from; None finds it: the poses that its run estimated, else the run's input.
 
     Returns:
       Index of a frame -> its image.
 
     Raises:
-      InputError: It is another capture, or cannot be read, or `count` is not positive.
+      InputError: It is missing, another capture, or cannot be read, or `count` is not positive.
     """
     if count < 1:
         raise InputError("--looks", str(count), "at least 1", "8 is the default.")
+    if capture is None:
+        capture = folder / "poses" if (folder / "poses").exists() else locate_sources(field, folder).capture
+    if capture is None:
+        problem = "the capture that the field was made from is missing"
+        raise InputError("--phrases", problem, remedy="Give --images DIR.")
     indices = [int(t) for t in evenly_spaced(len(field.names), count)]
     names = [field.names[t] for t in indices]
     loaded = load_capture(capture, long_side=IMAGE_SIDE, holdout=None, only=names)
@@ -50,29 +59,6 @@ def load_frames(field: LanguageField, capture: Path, count: int) -> dict[int, np
         expected = f"{field_width}x{field_height}, or the same shape at another size"
         raise InputError(capture, problem, expected, "Give the capture that the field was made from.")
     return {t: np.asarray(loaded.frames[loaded.names.index(name)]) for t, name in zip(indices, names)}
-
-
-def find_capture(field: LanguageField, folder: Path) -> Path:
-    """Finds the capture that a field was made from: the poses that its run estimated, else the run's input.
-
-    Args:
-      field: The field.
-      folder: Its folder.
-
-    Returns:
-      Path of the capture.
-
-    Raises:
-      InputError: Neither exists.
-    """
-    poses = folder / "poses"
-    if poses.exists():
-        return poses
-    capture = locate_sources(field, folder).capture
-    if capture is None:
-        problem = "the capture that the field was made from is missing"
-        raise InputError("--phrases", problem, remedy="Give --images DIR.")
-    return capture
 
 
 def ask_phrases(field: LanguageField, verb: verbs.Query, console: Console) -> tuple[list[Answer], list[InputError]]:
@@ -92,7 +78,7 @@ def ask_phrases(field: LanguageField, verb: verbs.Query, console: Console) -> tu
     assert verb.phrases is not None
     with console.progress("phrases") as progress:
         sam3 = Sam3(verb.phrases)
-        frames = load_frames(field, verb.images or find_capture(field, verb.field.parent), verb.looks)
+        frames = load_frames(field, verb.field.parent, verb.looks, verb.images)
         words, errors = collect([lambda text=text: (text, sam3.read(text)) for text in verb.texts])
         masks: dict[str, dict[int, PhraseMasks]] = {text: {} for text, _ in words}
         for n, (t, frame) in enumerate(frames.items() if words else ()):

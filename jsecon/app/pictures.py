@@ -42,22 +42,19 @@ def palette(count: int) -> UInt8[np.ndarray, "n 3"]:
     return (np.asarray(colours, np.float64).reshape(count, 3) * 255).astype(np.uint8)
 
 
-def label_overlay(
-    frame: UInt8[np.ndarray, "h w 3"], labels: Int[np.ndarray, "h w"], *, opacity: float = 0.72
-) -> UInt8[np.ndarray, "h w 3"]:
+def label_overlay(frame: UInt8[np.ndarray, "h w 3"], labels: Int[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
     """Paints regions over a frame.
 
     Args:
       frame: RGB of the frame.
       labels: Region ids of its pixels, -1 outside of regions.
-      opacity: Share of the region's colour in a pixel.
 
     Returns:
       The frame in grey, with each region in its colour (`palette`) and a dark line between regions.
     """
     grey = np.repeat(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=2).astype(np.float32)
     colours = palette(int(labels.max(initial=0)) + 1)[np.maximum(labels, 0)]
-    image = np.where((labels >= 0)[..., None], (1 - opacity) * grey + opacity * colours, 0.55 * grey)
+    image = np.where((labels >= 0)[..., None], 0.28 * grey + 0.72 * colours, 0.55 * grey)
     border = np.zeros(labels.shape, bool)
     border[1:] |= labels[1:] != labels[:-1]
     border[:, 1:] |= labels[:, 1:] != labels[:, :-1]
@@ -150,38 +147,6 @@ def masklet_strip(
     return np.concatenate(tiles[:-1], axis=1)
 
 
-def crop_to_points(
-    photo: UInt8[np.ndarray, "h w 3"], camera: Camera, points: Float[np.ndarray, "m 3"]
-) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Cuts out the part of a photograph that shows points.
-
-    Args:
-      photo: The photograph.
-      camera: Its camera.
-      points: Points in the camera's world.
-
-    Returns:
-      A square with a margin around all but 3 % of the points on each side, as far as the photograph reaches; the whole
-      photograph if it shows none of them.
-    """
-    height, width = photo.shape[:2]
-    pose = np.asarray(camera.world_to_camera)
-    points = points @ pose[:3, :3].T + pose[:3, 3]
-    points = points[points[:, 2] > 1e-6]
-    fx, fy, cx, cy = (float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy"))
-    u = fx * points[:, 0] / points[:, 2] + cx
-    v = fy * points[:, 1] / points[:, 2] + cy
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    if not inside.any():
-        return photo
-    (left, right), (top, bottom) = (np.quantile(a[inside], (0.03, 0.97)) for a in (u, v))
-    half = max(right - left, bottom - top, MIN_CROP_PX) * (0.5 + MARGIN)
-    x = (left + right) / 2
-    y = (top + bottom) / 2
-    rows = slice(int(max(y - half, 0)), int(min(y + half, height)) + 1)
-    return photo[rows, int(max(x - half, 0)) : int(min(x + half, width)) + 1]
-
-
 def fitted(image: UInt8[np.ndarray, "h w 3"], side: int) -> UInt8[np.ndarray, "h2 w2 3"]:
     """Scales an image.
 
@@ -212,8 +177,8 @@ def code_colours(field: LanguageField) -> Float[np.ndarray, "n 3"]:
       field: The field.
 
     Returns:
-      (N, 3) RGB in [0, 1]: the first three principal components of the codes, stretched over the regions. A Gaussian
-      without a code is grey.
+      RGB in [0, 1]: the first three principal components of the codes, stretched over the regions. A Gaussian without
+      a code is grey.
     """
     table = np.asarray(field.region_codes, np.float64)
     codes = np.asarray(field.codes, np.float64)
@@ -232,12 +197,11 @@ def code_colours(field: LanguageField) -> Float[np.ndarray, "n 3"]:
     return rgb
 
 
-def side_by_side(panels: Mapping[str, UInt8[np.ndarray, "h w 3"]], *, gap: int = 6) -> UInt8[np.ndarray, "h2 w2 3"]:
+def side_by_side(panels: Mapping[str, UInt8[np.ndarray, "h w 3"]]) -> UInt8[np.ndarray, "h2 w2 3"]:
     """Puts pictures side by side on white.
 
     Args:
       panels: Caption -> picture; all have one height.
-      gap: Distance of the pictures, px.
 
     Returns:
       One picture, with the caption under each panel.
@@ -247,7 +211,7 @@ def side_by_side(panels: Mapping[str, UInt8[np.ndarray, "h w 3"]], *, gap: int =
     for caption, image in panels.items():
         under = np.full((caption_height, image.shape[1], 3), 255, np.uint8)
         under = cv2.putText(under, caption, (2, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (40, 40, 40), 1, cv2.LINE_AA)
-        columns += [np.concatenate([image, under]), np.full((len(image) + caption_height, gap, 3), 255, np.uint8)]
+        columns += [np.concatenate([image, under]), np.full((len(image) + caption_height, 6, 3), 255, np.uint8)]
     return np.concatenate(columns[:-1], axis=1)
 
 
@@ -286,6 +250,32 @@ class Renderer:
           The picture, uint8.
         """
         return _to_bytes(render(self._gaussians, self._cameras[view], np.asarray(rgb, np.float32)).features)
+
+    def crop(self, view: int, mask: Bool[np.ndarray, " n"]) -> UInt8[np.ndarray, "h2 w2 3"]:
+        """Cuts out the part of a view that shows some Gaussians.
+
+        Args:
+          view: Index of the view.
+          mask: The Gaussians.
+
+        Returns:
+          A square with a margin around all but 3 % of their centres on each side, as far as the view reaches; the whole
+          view if it shows none of them.
+        """
+        photo, camera = self.photo(view), self._cameras[view]
+        pose = np.asarray(camera.world_to_camera)
+        points = np.asarray(self._gaussians.means)[mask] @ pose[:3, :3].T + pose[:3, 3]
+        points = points[points[:, 2] > 1e-6]
+        u = float(camera.fx) * points[:, 0] / points[:, 2] + float(camera.cx)
+        v = float(camera.fy) * points[:, 1] / points[:, 2] + float(camera.cy)
+        inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        if not inside.any():
+            return photo
+        (left, right), (top, bottom) = (np.quantile(a[inside], (0.03, 0.97)) for a in (u, v))
+        half = max(right - left, bottom - top, MIN_CROP_PX) * (0.5 + MARGIN)
+        x, y = (left + right) / 2, (top + bottom) / 2
+        rows = slice(int(max(y - half, 0)), int(min(y + half, camera.height)) + 1)
+        return photo[rows, int(max(x - half, 0)) : int(min(x + half, camera.width)) + 1]
 
 
 def _to_bytes(image: Array) -> np.ndarray:

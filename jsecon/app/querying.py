@@ -52,31 +52,27 @@ def query_verb(verb: verbs.Query, console: Console) -> verbs.VerbResult:
         from jsecon.app.phrases import ask_phrases  # SAM 3 runs on ONNX Runtime, which other queries may not need
 
         answers, errors = ask_phrases(field, verb, console)
-    expressions = [text for text in texts if is_expression(text)]
-    texts = [text for text in texts if text not in expressions]
-    if expressions and large:
-        problem = f"{expressions[0]!r} has a relation, an order or a number, which needs the whole field in memory"
+    expression = next(filter(is_expression, texts), None)
+    if expression is not None and large:
+        problem = f"{expression!r} has a relation, an order or a number, which needs the whole field in memory"
         raise InputError(verb.field, problem, remedy="Raise JSECON_MEMORY (GiB), or put the text in quotes.")
-    if expressions:
-        answers, errors = ask_relations(field, embedder, expressions, console, frame=verb.from_frame, up=verb.up)
+    outline: dict[str, Any] = {"threshold": verb.threshold, "outliers": not verb.keep_outliers}
+    options = outline | {"by": verb.by, "several": verb.all, "quantile": verb.quantile}
+    options |= {"pixels": verb.at, "frame": verb.from_frame, "up": verb.up}
+    outlines = [lambda pairs=pairs: _ask_masks(field, pairs, **outline) for pairs in verb.mask]
+    outlines += [lambda box=box: _ask_box(field, *box, **outline) for box in verb.box]
+    more, refused = ask_texts(field, embedder, texts, console, **options)
     with console.progress("answers"):
-        outline: dict[str, Any] = {"threshold": verb.threshold, "outliers": not verb.keep_outliers}
-        options = outline | {"by": verb.by, "several": verb.all, "quantile": verb.quantile}
-        outlines = [lambda pairs=pairs: _ask_masks(field, pairs, **outline) for pairs in verb.mask]
-        outlines += [lambda box=box: _ask_box(field, *box, **outline) for box in verb.box]
-        for more, refused in (
-            ask.ask_each(field, embedder, texts=texts, pixels=verb.at, **options),
-            ask.collect(outlines),
-        ):
-            answers += more
-            errors += refused
+        outlined, failed = ask.collect(outlines)
+        answers += more + outlined
+        errors += refused + failed
         answers = ask.edit_answers(field, answers, grow=verb.grow, shrink=verb.shrink, invert=verb.invert)
     files = {"views": verb.views, "ending": verb.format}
     result = write_answers(field, answers, verb.out, console, **files) if answers else {"answers": []}
     return result | {"errors": errors}
 
 
-def ask_relations(
+def ask_texts(
     field: LanguageField,
     embedder: Any,
     texts: Sequence[str],
@@ -84,30 +80,39 @@ def ask_relations(
     *,
     frame: str | None = None,
     up: Sequence[float] | None = None,
+    **options: Any,
 ) -> tuple[list[Answer], list[InputError]]:
-    """Answers texts with relations, orders or numbers, and prints how each was read.
+    """Answers texts. Of those with relations, orders or numbers it prints how each was read.
 
     Args:
       field: The field.
       embedder: Its embedder.
       texts: The texts.
-      console: Receives progress and how each text was read.
+      console: Receives progress and how texts were read.
       frame: Frame from which directions are seen, as for `query_relation`.
       up: Up axis in the capture's world, as for `query_relation`.
+      **options: Options of `ask_each` for the other texts.
 
     Returns:
-      The answers, and the errors of texts that are not understood.
+      The answers, those with relations first, and the errors of the other texts.
     """
-    with console.progress("relations"):
-        from jsecon.app import relations  # late: plain texts need none of it
+    expressions = [text for text in texts if is_expression(text)]
+    answers, errors = [], []
+    if expressions:
+        with console.progress("relations"):
+            from jsecon.app import relations  # late: plain texts need none of it
 
-        scene = relations.open_scene(field, embedder, up)
-        queries = [lambda text=text: relations.query_relation(scene, text, frame=frame) for text in texts]
-        answers, errors = ask.collect(queries)
-    for answer in answers:
-        console.say(f"{answer.text!r}: {answer.describe()}")
-        console.note("Words in quotes are searched for as they stand, without relations.")
-    return [relations.relation_answer(answer) for answer in answers], errors
+            scene = relations.open_scene(field, embedder, up)
+            queries = [lambda text=text: relations.query_relation(scene, text, frame=frame) for text in expressions]
+            found, errors = ask.collect(queries)
+        for answer in found:
+            console.say(f"{answer.text!r}: {answer.describe()}")
+            console.note("Words in quotes are searched for as they stand, without relations.")
+        answers = [relations.relation_answer(answer) for answer in found]
+    with console.progress("answers"):
+        plain = [text for text in texts if text not in expressions]
+        more, refused = ask.ask_each(field, embedder, texts=plain, **options)
+    return answers + more, errors + refused
 
 
 def _field_of_scene(verb: verbs.Query, console: Console) -> Path:

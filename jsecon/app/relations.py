@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from jsecon.app.ask import Answer, ask_text
-from jsecon.app.locate import Place, locate_answer, locate_single, rounded
+from jsecon.app.locate import Place, locate_answer, rounded
 from jsecon.app.object_scene import ObjectScene, open_scene
 from jsecon.errors import InputError, require
 from jsecon.query.expressions import is_expression, parse_expression
@@ -270,35 +270,24 @@ def locate(
             from jsecon.pipeline.networks import field_embedder
 
             embedder = field_embedder(field)
-        return locate_single(field, ask_text(field, embedder, text, **options))
+        answer = ask_text(field, embedder, text, **options)
+        if answer.objects > 1:  # their box would have its centre between them
+            remedy = "Say which, as in 'the red mug left of the green bottle', or point at it."
+            raise InputError(f"query {text!r}", f"it names {answer.objects} objects", "one object", remedy)
+        return locate_answer(field, answer)
     require(not options, f"locate {text!r}", sorted(options), "no options of a plain text", "Leave them out.")
     scene = open_scene(field, embedder, up)
-    return locate_relation(scene, query_relation(scene, text, frame=frame))
+    return locate_answer(scene.field, relation_answer(_query_single(scene, text, frame)))
 
 
-def locate_relation(scene: ObjectScene, answer: RelationAnswer) -> Place:
-    """Locates the one object of an expression.
-
-    Args:
-      scene: The scene that was asked.
-      answer: Its answer.
-
-    Returns:
-      As `locate_answer`.
-
-    Raises:
-      InputError: The answer has no object, or several.
-    """
-    _require_single(answer)
-    return locate_answer(scene.field, relation_answer(answer))
-
-
-def _require_single(answer: RelationAnswer) -> None:
-    """Raises InputError unless an answer has one object."""
+def _query_single(scene: ObjectScene, text: str, frame: int | str | None) -> RelationAnswer:
+    """Returns the answer to an expression, or raises InputError unless it has one object."""
+    answer = query_relation(scene, text, frame=frame)
     if answer.count != 1:
         problem = f"it names {answer.count} objects" + (f": {answer.reason}" if answer.reason else "")
         remedy = answer.question or "Name one object."
         raise InputError(f"query {answer.text!r}", problem, "one object", remedy[:1].upper() + remedy[1:])
+    return answer
 
 
 def measure(
@@ -327,12 +316,7 @@ def measure(
       InputError: As for `query_relation`; or an expression names no object, or several.
     """
     scene = open_scene(field, embedder, up)
-    found = []
-    for text in (a, b):
-        answer = query_relation(scene, text, frame=frame)
-        _require_single(answer)
-        found.append(answer.objects[0])
-    one, other = found
+    one, other = (_query_single(scene, text, frame).objects[0] for text in (a, b))
     means = np.asarray(scene.field.gaussians.means, np.float64)
     surfaces = float(KDTree(means[one.rows]).query(means[other.rows])[0].min())
     line = other.shape.center[0] - one.shape.center[0]

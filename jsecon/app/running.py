@@ -93,7 +93,7 @@ def _write_run(run: Run, out: Path, listener: Listener) -> dict[str, Any]:
     warnings = [note.removeprefix(WARNING) for note in run.notes if note.startswith(WARNING)]
     with listener.progress("report"):
         parts = [report.section("Warning", note) for note in warnings]
-        parts += [report.tiles(_tiles(metrics)), *scene_parts(run), *work_parts(run)]
+        parts += [report.tiles(_tiles(metrics)), *run_parts(run)]
         title = f"Language field of {run.options.capture.resolve().name}"
         write_text(out / "report.html", report.page(title, "Made by jsecon from posed frames.", parts))
     _print_quality(run.held_out, listener)
@@ -157,15 +157,20 @@ def _tiles(metrics: dict[str, Any]) -> dict[str, str]:
     }
 
 
-def scene_parts(run: Run) -> list[str]:
-    """Makes the parts of a page that show frames, masklets, codes and the rendered scene.
+def run_parts(run: Run) -> list[str]:
+    """Makes the parts of a page that show a run.
 
     Args:
       run: The run.
 
     Returns:
-      Sections (`jsecon.app.report`).
+      Sections (`jsecon.app.report`): frames, masklets, codes, held-out frames, seconds, stages and settings.
     """
+    return [*_scene_parts(run), *_work_parts(run)]
+
+
+def _scene_parts(run: Run) -> list[str]:
+    """Returns the parts that show frames, masklets, codes and the rendered scene."""
     train = vision_frames(run.capture, run.options)
     renderer = pictures.Renderer(run.field.gaussians, run.field.cameras)
     colours = pictures.code_colours(run.field)
@@ -214,15 +219,8 @@ def _masklet_part(run: Run, train: np.ndarray) -> str:
     return report.section("Masklets through the frames", words, *rows)
 
 
-def work_parts(run: Run) -> list[str]:
-    """Makes the parts of a page that show seconds, stages, notes and settings.
-
-    Args:
-      run: The run.
-
-    Returns:
-      Sections (`jsecon.app.report`).
-    """
+def _work_parts(run: Run) -> list[str]:
+    """Returns the parts that show seconds, stages, notes and settings."""
     steps = [(step.name, step.status, step.why) for step in run.steps]
     stages = report.table(["step", "", "how, or why not"], steps, numbers_from=9)
     notes = report.table(["notes"], [[note] for note in run.notes], numbers_from=9) if run.notes else ""

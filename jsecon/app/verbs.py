@@ -72,10 +72,7 @@ class Demo(Verb):
       steps: Number of optimisation steps of the photometric fit.
     """
 
-    examples = (
-        "jsecon demo",
-        "jsecon demo --seed 3 --out room_3",
-    )
+    examples = ("jsecon demo", "jsecon demo --seed 3 --out room_3")
 
     seed: Option[int] = 0
     out: Option[Path] = Path("jsecon-demo")
@@ -420,11 +417,7 @@ class Models(Verb):
       yes: Fetches the models without asking first.
     """
 
-    examples = (
-        "jsecon models list",
-        "jsecon models get auto",
-        "jsecon models check my_models",
-    )
+    examples = ("jsecon models list", "jsecon models get auto", "jsecon models check my_models")
 
     action: Positional[Literal["list", "get", "check", "remove"]]
     names: Positional[list[str]] = dataclasses.field(default_factory=list)
@@ -445,10 +438,7 @@ class Doctor(Verb):
       models: Folder with .onnx files, or of such folders, to examine.
     """
 
-    examples = (
-        "jsecon doctor",
-        "jsecon doctor --models my_models",
-    )
+    examples = ("jsecon doctor", "jsecon doctor --models my_models")
 
     models: Option[Path | None] = None
 

@@ -204,8 +204,7 @@ def _page(
         report.section("How well", words, table),
         _iou_section(results),
         _query_section(run, results["anchored"][0], results["true_masks"][0], queries, labels),
-        *running.scene_parts(run),
-        *running.work_parts(run),
+        *running.run_parts(run),
     ]
     lead = "A made-up room as an ordinary capture: frames, poses and sparse points in, answers to texts out, "
     lead += "on a plain CPU and without any learned weights."

@@ -221,7 +221,7 @@ def application(
 
     @app.get("/healthz", summary="The fields and their frames")
     async def health() -> Response:
-        return _AsciiResponse({"status": "ok", "fields": [scene.description() for scene in scenes.values()]})
+        return _AsciiResponse({"status": "ok", "fields": [scene.description for scene in scenes.values()]})
 
     @app.get("/", include_in_schema=False)
     async def page() -> Response:

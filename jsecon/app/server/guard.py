@@ -76,14 +76,11 @@ class Workers:
 
 
 class Guard:
-    """Middleware in front of the application.
-
-    With a token, requests must carry it. Without one they must name this machine in their Host header, so that a page
-    of another site cannot send requests under another name (DNS rebinding).
+    """Middleware in front of the application, which refuses requests by the rules of `jsecon.app.access`.
 
     Args:
       app: The ASGI application.
-      token: The token, or "".
+      token: Token that requests must carry; "" takes requests that name this machine.
       limits: Limits of a request.
       hosts: Names of this machine besides those of loopback.
     """

@@ -137,12 +137,9 @@ class Scene:
             save_ply(file, gaussian_rows(self.field.gaussians, answer.mask), similarity=self.field.to_source)
             return file.read_bytes()
 
+    @property
     def description(self) -> dict[str, Any]:
-        """Describes the field.
-
-        Returns:
-          Plain values: name, numbers of Gaussians and regions, frames and their size.
-        """
+        """Plain values: name, numbers of Gaussians, regions and unrelated words, frames and their size."""
         return {
             "name": self.name,
             "gaussians": self.field.gaussians.count,

@@ -29,13 +29,7 @@ REMEDY = 'pip install "jsecon[serve]"'
 
 
 def prepare(
-    files: list[Path],
-    *,
-    host: str,
-    port: int,
-    token: str,
-    embedder: Path | None,
-    hosts: Collection[str] = (),
+    files: list[Path], *, host: str, port: int, token: str, embedder: Path | None, hosts: Collection[str] = ()
 ) -> tuple[dict[str, Any], Callable[[], None]]:
     """Loads fields and listens.
 
@@ -67,7 +61,7 @@ def prepare(
     app = application(scenes, token=token, hosts=(host, *hosts))
     config = uvicorn.Config(app, log_level="warning", timeout_keep_alive=5, ws="none", server_header=False)
     address = f"http://{bracketed(host)}:{listening.getsockname()[1]}"
-    description = {"address": address, "fields": [scene.description() for scene in scenes.values()]}
+    description = {"address": address, "fields": [scene.description for scene in scenes.values()]}
     return description, lambda: uvicorn.Server(config).run(sockets=[listening])
 
 

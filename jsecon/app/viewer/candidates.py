@@ -1,4 +1,4 @@
-"""Other regions that an answer might be, each with a picture; and the region that a ray meets."""
+"""Other regions that an answer might be, and the region that a ray meets."""
 
 import dataclasses
 from typing import Any
@@ -6,11 +6,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 
 from jsecon.app.ask import narrow_texts, with_phrases
-from jsecon.app.outputs import main_regions
-from jsecon.app.pictures import Renderer, crop_to_points
 from jsecon.language.regions import mean_residuals
 from jsecon.query.composite import parse_query
 from jsecon.query.match import ROUNDING, RULES, evidence, reference_words, region_similarities
@@ -87,37 +85,6 @@ def _region_similarity(embeddings, region):
     residuals, known = mean_residuals(embeddings)
     cosines, measured = similarities(residuals, residuals[region])
     return jnp.where(measured, cosines, 0.0), known & measured
-
-
-class RegionPictures:
-    """Pictures of a field's frames and regions, rendered from its Gaussians.
-
-    Args:
-      field: The field.
-
-    Attributes:
-      renderer: Renders the frames.
-      regions: (N,) main region of each Gaussian, or -1.
-    """
-
-    def __init__(self, field: LanguageField):
-        self.renderer = Renderer(field.gaussians, field.cameras)
-        self.regions = main_regions(field)
-        self._means = np.asarray(field.gaussians.means)
-        self._cameras = jax.tree.map(np.asarray, field.cameras)
-
-    def region(self, region: int, frame: int) -> UInt8[np.ndarray, "h w 3"]:
-        """Cuts a region out of a frame.
-
-        Args:
-          region: Id of the region.
-          frame: Index of the frame.
-
-        Returns:
-          The part of the frame that shows the region's Gaussians; the whole frame if it shows none of them.
-        """
-        points = self._means[self.regions == region]
-        return crop_to_points(self.renderer.photo(frame), self._cameras[frame], points)
 
 
 def region_along(

@@ -1,16 +1,15 @@
 """The viewer's panel: its controls, and messages and candidates as HTML."""
 
-import base64
 import html
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import cv2
 import numpy as np
 
-from jsecon.app.ask import Answer, quantile_message
+from jsecon.app.ask import Answer
 from jsecon.app.pictures import fitted
+from jsecon.app.report import data_uri
 from jsecon.app.viewer import view_state
 from jsecon.app.viewer.candidates import Candidate
 from jsecon.app.viewer.view_state import COLOURINGS, ViewState, answer_colours
@@ -275,8 +274,8 @@ def messages(field: LanguageField, state: ViewState, answers: Sequence[Answer | 
 
 def _refusal(answer: Answer) -> str:
     """Returns the measure by which a query has no match, and its threshold."""
-    if answer.quantile is not None:
-        return f"{quantile_message(answer.quantile)}, and {100 * QUANTILE:.0f} % are required"
+    if answer.quantile_words:
+        return f"{answer.quantile_words}, and {100 * QUANTILE:.0f} % are required"
     if answer.presence is not None:
         return f"the probability that it is there is {answer.presence:.2g}, and {PRESENCE_THRESHOLD} is required"
     return f"the best score is {float(answer.selection.score):.2f}, and {RETRIEVAL_THRESHOLD} is required"
@@ -296,13 +295,12 @@ def candidate_grid(
     """
     cells = []
     for number, (place, candidate, picture) in enumerate(pictured):
-        small = fitted(picture, THUMBNAIL)
-        data = base64.b64encode(cv2.imencode(".jpg", small[..., ::-1])[1].tobytes()).decode()
+        data = data_uri(fitted(picture, THUMBNAIL))
         answer = answers[place]
         selected = not isinstance(answer, InputError) and int(answer.selection.region) == candidate.region
         edge = _colour(place) if selected else "transparent"
         cells.append(
-            f'<figure style="margin:0;text-align:center;font-size:.75em"><img src="data:image/jpeg;base64,{data}" '
+            f'<figure style="margin:0;text-align:center;font-size:.75em"><img src="{data}" '
             f'style="border:3px solid {edge};border-radius:4px;max-width:100%"><figcaption>{_swatch(place)} '
             f"{number + 1}: {candidate.score:.2f}{', selected' if selected else ''}</figcaption></figure>"
         )

@@ -36,6 +36,7 @@ class FieldScene:
     Attributes:
       scale: Units of the window per unit of the field.
       photo: (N, 3) uint8 colours of degree 0.
+      regions: (N,) main region of each Gaussian, or -1.
       frustums: Index of a frame -> its camera in the window.
     """
 
@@ -60,7 +61,8 @@ class FieldScene:
         covariances = roots @ roots.transpose(0, 2, 1)
         centers = where_usable(gaussians.means) * np.float32(self.scale)
         self._groups = []
-        order = np.argsort(main_regions(field), kind="stable")
+        self.regions = main_regions(field)
+        order = np.argsort(self.regions, kind="stable")
         for k, rows in enumerate(np.array_split(order, max(min(GROUPS, len(order)), 1))):
             handle = server.scene.add_gaussian_splats(
                 f"/field/{k}",

@@ -16,17 +16,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jsecon.app import verbs
-from jsecon.app.ask import Answer, ask_each
+from jsecon.app.ask import Answer
 from jsecon.app.models import open_embedder
 from jsecon.app.outputs import main_regions
-from jsecon.app.querying import ask_relations
+from jsecon.app.querying import ask_texts
 from jsecon.errors import InputError
 from jsecon.files import write_text
 from jsecon.language.field import load_field
 from jsecon.numerics import sigmoid
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console
-from jsecon.query.expressions import is_expression
 from jsecon.splat.sh import C0
 from jsecon.types import Gaussians, LanguageField
 
@@ -60,10 +59,7 @@ def export_page(verb: verbs.View, file: Path, console: Console) -> verbs.VerbRes
     with console.progress("page"):
         field = load_field(verb.field)
         embedder = open_embedder(field, verb, console) if verb.texts else None
-        expressions = [text for text in verb.texts if is_expression(text)]
-        answers, errors = ask_relations(field, embedder, expressions, console) if expressions else ([], [])
-        more, refused = ask_each(field, embedder, texts=[text for text in verb.texts if text not in expressions])
-        answers, errors = answers + more, errors + refused
+        answers, errors = ask_texts(field, embedder, verb.texts, console)
         write_text(file, page(field, answers, title=verb.field.resolve().parent.name))
     count, size = field.gaussians.count, file.stat().st_size
     console.say(f"{count} Gaussians, texts answered: {len(answers)}, {size / 2**20:.1f} MiB  {file}")

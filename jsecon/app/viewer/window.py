@@ -25,11 +25,11 @@ from jsecon.app.ask import Answer, ask_region, ask_text, edit_answers
 from jsecon.app.models import open_embedder
 from jsecon.app.object_scene import ObjectScene
 from jsecon.app.outputs import answer_masks, file_stem, write_answer
-from jsecon.app.pictures import UNKNOWN, code_colours, palette
+from jsecon.app.pictures import UNKNOWN, Renderer, code_colours, palette
 from jsecon.app.relations import query_relation, relation_answer
 from jsecon.app.viewer import view_state
 from jsecon.app.viewer.access import guarded_pages
-from jsecon.app.viewer.candidates import Candidate, RegionPictures, candidates, region_along
+from jsecon.app.viewer.candidates import Candidate, candidates, region_along
 from jsecon.app.viewer.panel import Panel, candidate_grid, messages
 from jsecon.app.viewer.scene import FieldScene
 from jsecon.app.viewer.static_page import export_page
@@ -85,9 +85,9 @@ class Viewer:
         self._thread = threading.Thread(target=self._work, daemon=True)
 
     @functools.cached_property
-    def pictures(self) -> RegionPictures:
-        """Pictures of the frames and regions."""
-        return RegionPictures(self.field)
+    def renderer(self) -> Renderer:
+        """Renders the frames."""
+        return Renderer(self.field.gaussians, self.field.cameras)
 
     @functools.cached_property
     def objects(self) -> ObjectScene:
@@ -111,7 +111,7 @@ class Viewer:
         answers = [self.answer(query) for query in example.view_queries]
         messages(self.field, example, answers)
         self._find_candidates(example, answers)
-        self.do(lambda: self.pictures.renderer.photo(0))
+        self.do(lambda: self.renderer.photo(0))
         self.do(lambda: self._describe(self.history.state))
         self.do(self._prepare_objects)
         self._thread.start()
@@ -216,8 +216,8 @@ class Viewer:
         def act() -> None:
             if client is not None:
                 self.scene.fly(client, frame)
-            photo = self.pictures.renderer.photo(frame)
-            regions = self.pictures.renderer.colours(frame, self._base_colours("region") / np.float32(255))
+            photo = self.renderer.photo(frame)
+            regions = self.renderer.colours(frame, self._base_colours("region") / np.float32(255))
             self.panel.show_frame(frame, np.concatenate([photo, (photo * 0.35 + regions * 0.65).astype(np.uint8)]))
 
         self.do(act)
@@ -235,19 +235,12 @@ class Viewer:
             if not answers:
                 self.panel.show_notice("No Gaussian is selected, so there is no file to export.")
             else:
-                client.send_file_download(f"{file_stem(answers[0])}.zip", self.zipped(answers), save_immediately=True)
+                client.send_file_download(f"{file_stem(answers[0])}.zip", self._zipped(answers), save_immediately=True)
 
         self.do(act)
 
-    def zipped(self, answers: Sequence[Answer]) -> bytes:
-        """Packs the files of answers.
-
-        Args:
-          answers: The answers.
-
-        Returns:
-          Content of the .zip.
-        """
+    def _zipped(self, answers: Sequence[Answer]) -> bytes:
+        """Returns a .zip of the files of answers."""
         packed = io.BytesIO()
         options: dict[str, Any] = {"strict_timestamps": False}  # clocks before 1980
         options["compression"] = zipfile.ZIP_DEFLATED
@@ -331,7 +324,7 @@ class Viewer:
             return (255 * code_colours(self.field)).astype(np.uint8)
         if colouring == "region":
             table = np.concatenate([palette(self.field.regions.count), np.full((1, 3), 255 * UNKNOWN, np.uint8)])
-            return table[self.pictures.regions]
+            return table[self.scene.regions]
         return self.scene.photo
 
     def _paint(self, state: ViewState) -> None:
@@ -357,7 +350,8 @@ class Viewer:
         for place, candidate in self._candidates:
             if not self._steps.empty():
                 return
-            pictured.append((place, candidate, self.pictures.region(candidate.region, candidate.frame)))
+            picture = self.renderer.crop(candidate.frame, self.scene.regions == candidate.region)
+            pictured.append((place, candidate, picture))
         self.panel.show_candidates(candidate_grid(answers, pictured), len(pictured))
 
     def _find_candidates(self, state: ViewState, answers: Sequence[Answer | InputError]) -> list[tuple[int, Candidate]]:
