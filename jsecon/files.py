@@ -9,6 +9,7 @@ import codecs
 import contextlib
 import dataclasses
 import errno
+import importlib
 import json
 import math
 import os
@@ -392,7 +393,23 @@ def _crc32(array: np.ndarray) -> int:
     return zlib.crc32(array.data if array.size else b"")
 
 
-def pack_tree(node: Any, path: str, arrays: dict[str, np.ndarray], name_of: Callable[[type], str | None]) -> dict:
+def _name_of_record(kind: type) -> str | None:
+    """Module and name of one of jsecon's records; None for any other type."""
+    ours = dataclasses.is_dataclass(kind) and kind.__module__.startswith("jsecon.")
+    return f"{kind.__module__}:{kind.__qualname__}" if ours else None
+
+
+def _record_of_name(name: str) -> type:
+    module, _, kind = name.partition(":")
+    record = getattr(importlib.import_module(module), kind) if module.startswith("jsecon.") else None
+    if not (isinstance(record, type) and dataclasses.is_dataclass(record)):
+        raise ValueError(f"{name} is not a record of jsecon")
+    return record
+
+
+def pack_tree(
+    node: Any, path: str, arrays: dict[str, np.ndarray], name_of: Callable[[type], str | None] = _name_of_record
+) -> dict:
     """Describes a tree of plain values, arrays, dicts, lists, tuples and records as JSON.
 
     A node is one of: {"value": JSON value}, a list of them for a tuple; {"list": [...]}, {"tuple": [...]}, {"dict":
@@ -402,7 +419,7 @@ def pack_tree(node: Any, path: str, arrays: dict[str, np.ndarray], name_of: Call
       node: The tree.
       path: Path of its root.
       arrays: Receives the arrays by their paths.
-      name_of: Returns the name of a type of record, None for any other type.
+      name_of: Returns the name of a type of record, None for any other type; by default of any of jsecon's records.
 
     Returns:
       The description.
@@ -433,7 +450,7 @@ def pack_tree(node: Any, path: str, arrays: dict[str, np.ndarray], name_of: Call
     return {"array": path, "shape": list(array.shape), "dtype": array.dtype.name}
 
 
-def unpack_tree(node: Any, arrays: Mapping[str, np.ndarray], kind_of: Callable[[str], type]) -> Any:
+def unpack_tree(node: Any, arrays: Mapping[str, np.ndarray], kind_of: Callable[[str], type] = _record_of_name) -> Any:
     """Builds the tree that `pack_tree` described.
 
     Args:

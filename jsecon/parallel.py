@@ -311,13 +311,13 @@ def allgather_tree(tree: Any) -> list[Any]:
     """Exchanges trees between the processes, without pickle: all call it, minutes apart if need be.
 
     Args:
-      tree: Tree of arrays, plain values, dicts, lists and tuples of this process.
+      tree: Tree of arrays, plain values, dicts, lists, tuples and jsecon's records of this process.
 
     Returns:
       The tree of each process, in their order, with NumPy arrays.
     """
     arrays: dict[str, np.ndarray] = {}
-    description = json.dumps(pack_tree(tree, "root", arrays, lambda kind: None)).encode()
+    description = json.dumps(pack_tree(tree, "root", arrays)).encode()
     stream = io.BytesIO()
     np.savez(stream, allow_pickle=False, **{_TREE: np.frombuffer(description, np.uint8)}, **arrays)
     return [_deserialize(data) for data in _allgather_bytes(stream.getvalue())]
@@ -327,7 +327,7 @@ def _deserialize(data: bytes) -> Any:
     """The tree in the bytes of one process."""
     with np.load(io.BytesIO(data)) as file:
         arrays = {name: file[name] for name in file.files}
-    return unpack_tree(json.loads(arrays.pop(_TREE).tobytes()), arrays, lambda name: dict)
+    return unpack_tree(json.loads(arrays.pop(_TREE).tobytes()), arrays)
 
 
 def _allgather_bytes(data: bytes) -> list[bytes]:

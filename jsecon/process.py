@@ -244,11 +244,6 @@ def compilation_counts() -> dict[str, int]:
     return dict(_counts)
 
 
-def show_full_tracebacks() -> None:
-    """Keeps jax's frames in tracebacks; call it before jax is imported."""
-    os.environ.setdefault("JAX_TRACEBACK_FILTERING", "off")
-
-
 def clear_programs(*, above: int = 25_000) -> bool:
     """Frees jax's compiled programs if the process has many memory maps.
 

@@ -205,7 +205,7 @@ class Stopped(Exception):
 
 
 @pytest.mark.parametrize("stop", [1, 2, 4])
-def test_goes_on_in_the_middle_of_the_sequence_to_the_same_result(stop):
+def test_goes_on_in_the_middle_of_the_sequence_to_the_same_result(stop, tmp_path):
     truth = squares(6)
     truth[3:, 30:38, 30:38] = 3  # comes into view later
     whole = tracker(truth)
@@ -220,7 +220,7 @@ def test_goes_on_in_the_middle_of_the_sequence_to_the_same_result(stop):
 
     with pytest.raises(Stopped):
         masklets(frames_of(truth), segmenter(truth), tracker(truth), on_checkpoint=keep)
-    tree, arrays = cache.pack(kept[-1])
+    cache.save(tmp_path / "state.safetensors", kept[-1])
     seen, track, told = [], tracker(truth), []
 
     def segment(frame, index):
@@ -231,7 +231,7 @@ def test_goes_on_in_the_middle_of_the_sequence_to_the_same_result(stop):
         frames_of(truth),
         segment,
         track,
-        state=cache.unpack(tree, arrays),
+        state=cache.load(tmp_path / "state.safetensors"),
         progress=lambda done, total: told.append((done, total)),
     )
     np.testing.assert_array_equal(found, wanted)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from jsecon.errors import InputError
+from jsecon.files import unpack_tree
 from jsecon.language.autoencoder import Autoencoder
 from jsecon.language.codes import Rotation
 from jsecon.pipeline import cache
@@ -113,7 +114,7 @@ def test_pickles_are_neither_written_nor_read(tmp_path):
 def test_only_records_of_jsecon_are_made():
     for record in ("os:system", "jsecon.pipeline.cache:fetch", "jsecon.files:Path"):
         with pytest.raises((ValueError, AttributeError)):
-            cache.unpack({"record": record, "fields": {}}, {})
+            unpack_tree({"record": record, "fields": {}}, {})
 
 
 def test_keys_follow_stage_and_parts():

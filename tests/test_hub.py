@@ -49,7 +49,7 @@ def get(model) -> set[str]:
 
 def test_a_name_brings_its_files_and_no_others(local):
     model = slimsam()
-    assert hub.cached_folder(model) is None
+    assert model.cached_folder is None
     plan = hub.plan_download(model)
     assert {file.path for file in plan.files} == NEEDED
     assert plan.size == 2 * len(GRAPH) + 2
@@ -68,10 +68,10 @@ def test_a_model_in_the_cache_is_used_without_a_request(local, monkeypatch):
     local.requests.clear()
     for offline in (False, True):
         monkeypatch.setattr(constants, "HF_HUB_OFFLINE", offline)
-        folder = hub.cached_folder(slimsam())
+        folder = slimsam().cached_folder
         assert folder is not None
-        assert hub.cached_folder(hub.parse_model(hub.cached_address(folder), "segmenter")) == folder
-        assert hub.cached_folder(slimsam("fp16")) is None
+        assert hub.parse_model(hub.cached_address(folder), "segmenter").cached_folder == folder
+        assert slimsam("fp16").cached_folder is None
     assert local.requests == []
 
 
@@ -87,7 +87,7 @@ def test_a_file_of_another_content_is_refused_and_removed(local):
     local.repositories[NAME].corrupt = frozenset({"onnx/vision_encoder.onnx"})
     with pytest.raises(InputError, match="hash"):
         get(slimsam())
-    assert hub.cached_folder(slimsam()) is None
+    assert slimsam().cached_folder is None
     local.repositories[NAME].corrupt = frozenset()
     assert get(slimsam()) == NEEDED
 
@@ -131,13 +131,13 @@ def test_a_hub_that_is_away(local, monkeypatch):
 
 def test_a_branch_that_moved_keeps_the_cached_commit_until_it_is_fetched(local):
     get(slimsam())
-    first = hub.cached_folder(slimsam())
+    first = slimsam().cached_folder
     local.repositories[NAME].files["preprocessor_config.json"] = b'{"size": 1024}'
-    assert hub.cached_folder(slimsam()) == first
+    assert slimsam().cached_folder == first
     get(slimsam())
-    second = hub.cached_folder(slimsam())
+    second = slimsam().cached_folder
     assert second != first
-    assert hub.cached_folder(hub.parse_model(hub.cached_address(first), "segmenter")) == first
+    assert hub.parse_model(hub.cached_address(first), "segmenter").cached_folder == first
 
 
 def fetch_at_once(endpoint, cache, barrier):
@@ -157,7 +157,7 @@ def test_two_processes_fetch_at_once(local, tmp_path):
     for process in both:
         process.join()
     assert [process.exitcode for process in both] == [0, 0]
-    assert hub.cached_folder(slimsam()) is not None
+    assert slimsam().cached_folder is not None
 
 
 def test_a_full_disk_is_named(local, monkeypatch):
@@ -181,7 +181,7 @@ def test_a_cache_that_cannot_be_written_is_named(local, tmp_path):
 def test_removing_frees_the_cache(local):
     get(slimsam())
     assert hub.remove(slimsam()) >= 2 * len(GRAPH)
-    assert hub.cached_folder(slimsam()) is None
+    assert slimsam().cached_folder is None
     assert hub.remove(slimsam()) == 0
 
 

@@ -145,7 +145,7 @@ def test_a_run_that_is_stopped_while_sam_2_tracks_goes_on_at_its_frame(room, spl
         for stage in run_stages(work)[:3]:
             checkpoint = Checkpoint(folder / f"{stage.name}.safetensors")
             given = StageInput(work, results, lambda done, total: None, checkpoint)
-            results.add(stage.name, stage.compute(given).value)
+            setattr(results, stage.name, stage.compute(given).value)
         return results.masklets
 
     monkeypatch.setattr(Sam2Tracker, "__call__", counted)
@@ -200,7 +200,7 @@ def test_regions_take_their_embeddings_from_langsplat_s_files(room, splat, model
     given = StageInput(work, results, lambda done, total: None, Checkpoint(tmp_path / "none.safetensors"))
     assert "read from language_features, level l" in stage.how
     assert "embedder" in stage.skipped
-    results.add("masklets", planned["masklets"].compute(given).value)
+    results.masklets = planned["masklets"].compute(given).value
     found = stage.compute(given)
     np.testing.assert_allclose(found.value.embeddings, rows, atol=1e-6)
     assert found.notes == (f"{len(rows)} embeddings in the files",)

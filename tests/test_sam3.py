@@ -27,7 +27,7 @@ from sam_files import write_sam
 from scipy.special import expit
 
 from jsecon.errors import InputError
-from jsecon.networks.sam3 import MASK_IOU, SCORE_THRESHOLD, Sam3, find_sam3
+from jsecon.networks.sam3 import MASK_IOU, SCORE_THRESHOLD, Sam3
 from jsecon.networks.session import Graph
 
 
@@ -117,14 +117,14 @@ def test_folders_that_lack_something(folder, tmp_path):
     write_sam(tmp_path / "sam")
     for other, told in ((tmp_path / "nowhere", "no such folder"), (tmp_path / "sam", "no .onnx file")):
         with pytest.raises(InputError, match=rf"{told}.*expected SAM 3's graphs, one \*image_encoder.onnx"):
-            find_sam3(other)
+            Sam3(other)
     (folder / "tokenizer.json").rename(folder / "vocabulary.json")
     with pytest.raises(InputError, match=r"without a tokenizer, expected CLIP's tokenizer\.json"):
-        find_sam3(folder)
+        Sam3(folder)
     (folder / "vocabulary.json").rename(folder / "tokenizer.json")
     shutil.copy(folder / "sam3_decoder.onnx", folder / "second_decoder.onnx")
     with pytest.raises(InputError, match=r"one \*decoder.onnx"):
-        find_sam3(folder)
+        Sam3(folder)
 
 
 def _edited(path, edit):

@@ -11,6 +11,7 @@ import importlib
 import inspect
 import io
 import json
+import os
 import re
 import shutil
 import sys
@@ -29,7 +30,6 @@ from jsecon.app.verbs import VERBS, Completion, Output, Run, Verb, VerbResult
 from jsecon.errors import InputError, describe_error
 from jsecon.pipeline.options import ADVANCED
 from jsecon.pipeline.progress import Console
-from jsecon.process import show_full_tracebacks
 
 ABOUT = """Finds things in 3D Gaussian scenes by text, at the level of points, on a plain CPU.
 
@@ -81,7 +81,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         verb = parse(argv)
         output = verb.output
         if output.debug:
-            show_full_tracebacks()
+            os.environ.setdefault("JAX_TRACEBACK_FILTERING", "off")  # before jax is imported
         act, _ = _VERBS[argv[0]]
         console = Console(sys.stderr if output.json else None)
         result = act(verb, console)

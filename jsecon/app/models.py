@@ -52,7 +52,7 @@ def _folders_of_models(
     folders: dict[Role, Path] = {}
     missing: dict[Role, HubModel] = {}
     for role, model in models.items():
-        folder = model if isinstance(model, Path) else None if fresh else hub.cached_folder(model)
+        folder = model if isinstance(model, Path) else None if fresh else model.cached_folder
         if folder is not None:
             folders[role] = folder
         elif isinstance(model, HubModel):
@@ -64,7 +64,7 @@ def _folders_of_models(
     for _, download in downloads:
         console.note(f"needs {download}" if not yes else f"fetching {download}")
     if not yes:
-        commands = "; ".join(hub.get_command(model) for model in missing.values())
+        commands = "; ".join(model.get_command for model in missing.values())
         where = " ".join(model.address for model in missing.values())
         if not sys.stdin.isatty():
             raise InputError(where, "not on this machine", "", f"Fetch with: {commands}. Or add --yes.")
@@ -205,9 +205,9 @@ def _cached_model(name: str) -> Path:
         return Path(name)
     models = _models_of(name, None, None)
     exact = [dataclasses.replace(model, precision=p) for model in models for p in get_args(Precision)]
-    folder = next(filter(None, map(hub.cached_folder, exact)), None)
+    folder = next(filter(None, (model.cached_folder for model in exact)), None)
     if folder is None:
-        raise InputError(name, "this model is not on this machine", "", f"Fetch it with: {hub.get_command(models[0])}")
+        raise InputError(name, "this model is not on this machine", "", f"Fetch it with: {models[0].get_command}")
     return folder
 
 

@@ -152,6 +152,33 @@ class HubModel:
         """The model as a user can type it: "hub:owner/name@revision"."""
         return f"{PREFIX}{self.repository}@{self.revision}"
 
+    @property
+    def get_command(self) -> str:
+        """The command that fetches the model."""
+        rows = [row for row in catalogue() if (row.repository, row.role) == (self.repository, self.role)]
+        name = rows[0].name if rows and self.revision == rows[0].revision else self.address
+        precision = "" if self.precision == "fp32" else f" --precision {self.precision}"
+        return f"jsecon models get {name} --role {self.role}{precision} --yes"
+
+    @property
+    def cached_folder(self) -> Path | None:
+        """Folder of its files in the hub's cache, looked up without a request; None if one of them is not there."""
+        from huggingface_hub import snapshot_download
+        from huggingface_hub.errors import LocalEntryNotFoundError
+
+        for layout in LAYOUTS[self.role]:
+            required = _named(layout.required, self.precision)
+            patterns = [*required, *_named(layout.optional, self.precision), *(f"{name}_data*" for name in required)]
+            try:
+                folder = snapshot_download(
+                    self.repository, revision=self.revision, local_files_only=True, allow_patterns=patterns
+                )
+            except (LocalEntryNotFoundError, ValueError):  # ValueError: no name of a repository
+                continue
+            if all((Path(folder) / name).is_file() for name in required):
+                return Path(folder)
+        return None
+
 
 @dataclasses.dataclass(frozen=True)
 class HubFile:
@@ -273,32 +300,6 @@ def choose_files(model: HubModel, paths: Sequence[str]) -> tuple[str, ...]:
     raise NoSuchFilesError(model.address, problem, "", remedy)
 
 
-def cached_folder(model: HubModel) -> Path | None:
-    """Looks for a model in the hub's cache, without any request.
-
-    Args:
-      model: The model.
-
-    Returns:
-      The folder of its files, or None if one of them is not there.
-    """
-    from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import LocalEntryNotFoundError
-
-    for layout in LAYOUTS[model.role]:
-        required = _named(layout.required, model.precision)
-        patterns = [*required, *_named(layout.optional, model.precision), *(f"{name}_data*" for name in required)]
-        try:
-            folder = snapshot_download(
-                model.repository, revision=model.revision, local_files_only=True, allow_patterns=patterns
-            )
-        except (LocalEntryNotFoundError, ValueError):  # ValueError: no name of a repository
-            continue
-        if all((Path(folder) / name).is_file() for name in required):
-            return Path(folder)
-    return None
-
-
 def _named(templates: Sequence[str], precision: Precision) -> tuple[str, ...]:
     """Returns the names of a layout's files in one precision."""
     return tuple(template.format(p=SUFFIXES[precision]) for template in templates)
@@ -360,7 +361,7 @@ def fetch(download: Download) -> Path:
             broken.resolve().unlink()
             broken.unlink(missing_ok=True)
             problem = "its content differs from the hash that the hub gives for it, so it was removed"
-            raise InputError(f"{model.address} {file.path}", problem, "", f"Fetch it again: {get_command(model)}")
+            raise InputError(f"{model.address} {file.path}", problem, "", f"Fetch it again: {model.get_command}")
     return folder
 
 
@@ -422,23 +423,8 @@ def catalogue_rows() -> Iterator[dict[str, Any]]:
     """
     for row in catalogue():
         models = [HubModel(row.role, row.repository, row.revision, precision) for precision in row.megabytes]
-        cached = [model.precision for model in models if cached_folder(model) is not None]
+        cached = [model.precision for model in models if model.cached_folder is not None]
         yield dataclasses.asdict(row) | {"cached": cached}
-
-
-def get_command(model: HubModel) -> str:
-    """Writes the command that fetches a model.
-
-    Args:
-      model: The model.
-
-    Returns:
-      The command line.
-    """
-    named = [row for row in catalogue() if row.repository == model.repository and row.role == model.role]
-    name = named[0].name if named and model.revision == named[0].revision else model.address
-    precision = "" if model.precision == "fp32" else f" --precision {model.precision}"
-    return f"jsecon models get {name} --role {model.role}{precision} --yes"
 
 
 @contextlib.contextmanager
@@ -460,14 +446,14 @@ def _explain(model: HubModel, error: BaseException) -> tuple[str, str]:
     from huggingface_hub import constants, errors
 
     page = f"{constants.ENDPOINT}/{model.repository}"
-    again = f"Run it again: {get_command(model)}"
+    again = f"Run it again: {model.get_command}"
     if isinstance(error, errors.OfflineModeIsEnabled):
         return (
             "not in the cache, and HF_HUB_OFFLINE forbids requests",
-            f"Unset HF_HUB_OFFLINE, then {get_command(model)}",
+            f"Unset HF_HUB_OFFLINE, then {model.get_command}",
         )
     if isinstance(error, errors.GatedRepoError):
-        remedy = f"Accept its licence on {page}, set HF_TOKEN to a token of your account, then {get_command(model)}"
+        remedy = f"Accept its licence on {page}, set HF_TOKEN to a token of your account, then {model.get_command}"
         return "its owner grants access to accounts only", remedy
     if isinstance(error, errors.RevisionNotFoundError):
         return f"the repository has no revision {model.revision}", f"See {page}/commits/main for those it has."
@@ -479,7 +465,7 @@ def _explain(model: HubModel, error: BaseException) -> tuple[str, str]:
         cause = error.__cause__
         if cause is not None and not isinstance(cause, errors.LocalEntryNotFoundError):
             return _explain(model, cause)
-        return f"{constants.ENDPOINT} cannot be reached", f"Check the network or HF_ENDPOINT, then {get_command(model)}"
+        return f"{constants.ENDPOINT} cannot be reached", f"Check the network or HF_ENDPOINT, then {model.get_command}"
     if isinstance(error, errors.HfHubHTTPError):
         status = error.response.status_code
         return f"the hub answers with HTTP status {status}", f"Wait a minute. {again}"

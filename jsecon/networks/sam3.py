@@ -96,18 +96,8 @@ class PhraseMasks(NamedTuple):
     """SCORE_THRESHOLD to 1"""
 
 
-def find_sam3(folder: str | Path) -> Sam3Files:
-    """Finds the files of the SAM 3 model in a folder.
-
-    Args:
-      folder: The folder.
-
-    Returns:
-      The files.
-
-    Raises:
-      InputError: A file is missing, or there are several.
-    """
+def _find_sam3(folder: str | Path) -> Sam3Files:
+    """Finds the files of the SAM 3 model in a folder."""
     folder = Path(folder)
     graphs = sorted(folder.glob("*.onnx"))
     matches = [[path for path in graphs if path.name.endswith(ending)] for ending in _GRAPHS]
@@ -139,7 +129,7 @@ class Sam3:
     """
 
     def __init__(self, model: str | Path | Sam3Files, *, threads: int | None = None):
-        self.files = model if isinstance(model, Sam3Files) else find_sam3(model)
+        self.files = model if isinstance(model, Sam3Files) else _find_sam3(model)
         self._threads = threads
 
     def __call__(self, frame: UInt8[np.ndarray, "h w 3"], phrase: str) -> PhraseMasks:

@@ -11,7 +11,6 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
-import importlib
 import json
 import os
 import time
@@ -171,10 +170,9 @@ def fetch(path: Path, compute: Callable[[], Any], *, note: Callable[[str], None]
     value = compute()
     jax.block_until_ready(value)
     seconds = time.monotonic() - started
-    tree, arrays = pack(value)
-    _write(path, tree, arrays, seconds)
+    tree, arrays = _write(path, value, seconds)
     is_mapped = any(isinstance(array, np.memmap) for array in arrays.values())
-    return CachedResult(_read(path)[0] if is_mapped else unpack(tree, arrays), seconds, fresh=True)
+    return CachedResult(_read(path)[0] if is_mapped else unpack_tree(tree, arrays), seconds, fresh=True)
 
 
 def save(path: Path, value: Any) -> None:
@@ -187,7 +185,7 @@ def save(path: Path, value: Any) -> None:
     Raises:
       InputError: The file cannot be written.
     """
-    _write(path, *pack(value), seconds=0.0)
+    _write(path, value, 0.0)
 
 
 def load(path: Path) -> Any:
@@ -205,58 +203,20 @@ def load(path: Path) -> Any:
     return _read(path)[0]
 
 
-def _write(path: Path, tree: Any, arrays: dict[str, np.ndarray], seconds: float) -> None:
+def _write(path: Path, value: Any, seconds: float) -> tuple[dict, dict[str, np.ndarray]]:
+    """Writes a file; returns the description of its tree, and its arrays."""
+    arrays: dict[str, np.ndarray] = {}
+    tree = pack_tree(value, "root", arrays)
     with atomic_write(path) as temporary:
         write_arrays(temporary, arrays, {"tree": tree, "seconds": seconds})
         with open(temporary, "r+b") as file:
             os.fsync(file.fileno())  # a rename may reach the disk before the content does
+    return tree, arrays
 
 
 def _read(path: Path) -> tuple[Any, float]:
     try:
         description, arrays = read_arrays(path, memory_map_above=MAPPED)
-        return unpack(description["tree"], arrays), float(description["seconds"])
+        return unpack_tree(description["tree"], arrays), float(description["seconds"])
     except READ_ERRORS as error:
         raise CorruptCacheError(describe_error(error)) from error
-
-
-def pack(value: Any) -> tuple[Any, dict[str, np.ndarray]]:
-    """Splits a tree into its description and its arrays.
-
-    Args:
-      value: Tree of plain values, arrays and jsecon's records.
-
-    Returns:
-      A JSON value, and the arrays by their paths in the tree.
-    """
-    arrays: dict[str, np.ndarray] = {}
-
-    def name_of(kind: type) -> str | None:
-        ours = dataclasses.is_dataclass(kind) and kind.__module__.startswith("jsecon.")
-        return f"{kind.__module__}:{kind.__qualname__}" if ours else None
-
-    return pack_tree(value, "root", arrays, name_of), arrays
-
-
-def unpack(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """Joins what `pack` split.
-
-    Args:
-      tree: The description.
-      arrays: Arrays by path.
-
-    Returns:
-      The tree.
-
-    Raises:
-      Exception: One of READ_ERRORS, if `pack` did not write the tree.
-    """
-
-    def kind_of(name: str) -> type:
-        module, _, kind = name.partition(":")
-        record = getattr(importlib.import_module(module), kind) if module.startswith("jsecon.") else None
-        if not (isinstance(record, type) and dataclasses.is_dataclass(record)):
-            raise ValueError(f"{name} is not a record of jsecon")
-        return record
-
-    return unpack_tree(tree, arrays, kind_of)

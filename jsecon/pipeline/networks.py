@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NoReturn
 import numpy as np
 
 from jsecon.errors import InputError
-from jsecon.networks.hub import HubModel, cached_folder, get_command, parse_model
+from jsecon.networks.hub import HubModel, parse_model
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.sources import Sources, locate_sources
 from jsecon.types import LanguageField
@@ -185,7 +185,7 @@ def field_embedder(field: LanguageField, folder: Path | None = None, *, template
         model = _model_of_field(sources)
         if model is None and (missing := _hub_model(sources)) is not None:
             problem = f"its texts need the model {missing.address}, which is not on this machine"
-            raise InputError("field", problem, "", f"Fetch it with: {get_command(missing)}. Or add --yes.")
+            raise InputError("field", problem, "", f"Fetch it with: {missing.get_command}. Or add --yes.")
     return open_embedder(field.embedder, folder=model, templates=templates)
 
 
@@ -215,7 +215,7 @@ def _model_of_field(sources: Sources) -> "ClipFiles | None":
     from jsecon.networks.clip import find_clip
 
     model = _hub_model(sources)
-    for folder in (sources.model, None if model is None else cached_folder(model)):
+    for folder in (sources.model, None if model is None else model.cached_folder):
         if folder is not None:
             with contextlib.suppress(InputError):  # another model is there now
                 files = find_clip(folder, sources.precision)

@@ -10,7 +10,6 @@ Every command starts its processes as children and watches them: if one dies, th
 
 import atexit
 import contextlib
-import json
 import os
 import signal
 import socket
@@ -23,7 +22,6 @@ from collections.abc import Callable, Iterator, Sequence
 import jsecon
 from jsecon.errors import InputError
 from jsecon.parallel import allgather_tree, cache_worker_programs
-from jsecon.pipeline import cache
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import Checkpoint, Results, RunContext, Stage, StageInput
 from jsecon.process import WORKER, cores
@@ -210,8 +208,7 @@ class Coordinator:
         if self._several and stage.distributed:
             news = {name: getattr(results, name) for name in stage.after if name not in self._sent}
             self._sent |= set(news)
-            tree, arrays = cache.pack(news)
-            allgather_tree({"stage": stage.name, "tree": json.dumps(tree), "arrays": arrays})
+            allgather_tree({"stage": stage.name, "results": news})
 
     def shutdown(self) -> None:
         """Ends the work of the others."""
@@ -229,8 +226,8 @@ def run_worker(context: RunContext, stages: Sequence[Stage]) -> None:
     """
     by_name, results = {stage.name: stage for stage in stages}, Results()
     while (call := allgather_tree(None)[0])["stage"]:
-        for name, value in cache.unpack(json.loads(call["tree"]), call["arrays"]).items():
-            results.add(name, value)
+        for name, value in call["results"].items():
+            setattr(results, name, value)
         checkpoint = Checkpoint(context.out / "worker")
         by_name[call["stage"]].compute(StageInput(context, results, lambda done, total: None, checkpoint))
     _disconnect()

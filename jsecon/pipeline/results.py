@@ -54,18 +54,7 @@ class Results:
     """report of structure from motion, if the capture had no poses"""
 
     def __init__(self, **results: Any):
-        for name, value in results.items():
-            self.add(name, value)
-
-    def add(self, stage: str, value: Any) -> None:
-        """Adds the result of a stage.
-
-        Args:
-          stage: Name of the stage.
-          value: Its result.
-        """
-        assert stage in Results.__annotations__, stage
-        setattr(self, stage, value)
+        vars(self).update(results)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -311,7 +311,7 @@ def _compute_stage(
                 raise InputError(f"stage {stage.name}", problem, "more memory", remedy) from error
             raise
     result: StageResult = cached.value
-    computed.results.add(stage.name, result.value)
+    setattr(computed.results, stage.name, result.value)
     computed.seconds[stage.name] = cached.seconds
     computed.compilations[stage.name] = _since(before)
     checkpoint.remove()
