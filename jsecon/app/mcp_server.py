@@ -10,21 +10,17 @@ from collections.abc import Callable
 from typing import Annotated, Any
 
 import cv2
-import jax.numpy as jnp
 import numpy as np
 
 from jsecon.app import pictures, verbs
-from jsecon.app.ask import frame_index
 from jsecon.app.exports import object_records
 from jsecon.app.locate import Place
 from jsecon.app.models import with_models
-from jsecon.app.outputs import best_frames
 from jsecon.app.relations import locate, measure, query_relation, relation_answer
 from jsecon.app.server.scenes import Scene, SceneQuery, open_scenes
 from jsecon.errors import InputError
 from jsecon.pipeline.progress import Console
 from jsecon.query.expressions import is_expression
-from jsecon.query.render import selection_mask
 
 REMEDY = 'pip install "jsecon[mcp]"'
 INSTRUCTIONS = (
@@ -90,11 +86,8 @@ class _Tools:
             answer = relation_answer(query_relation(scene.object_scene, text, frame=frame))
         else:
             answer = scene.answer(SceneQuery(_words(text)))
-        best = [*best_frames(scene.field, answer, 1), 0][0]
-        index = best if frame is None else frame_index(scene.field, frame)
+        index, mask = scene.mask(answer, frame)
         photo = pictures.Renderer(scene.field.gaussians, scene.field.cameras).photo(index)
-        camera = scene.cameras[index]
-        mask = np.asarray(selection_mask(scene.gaussians, camera, jnp.asarray(answer.mask)))
         image = cv2.cvtColor(pictures.selection_overlay(photo, mask), cv2.COLOR_RGB2BGR)
         return cv2.imencode(".png", image)[1].tobytes()
 

@@ -8,9 +8,12 @@ import contextlib
 import functools
 import json
 import re
+import tempfile
 from collections.abc import AsyncIterator, Callable, Collection
+from pathlib import Path
 from typing import Annotated, Any
 
+import cv2
 import numpy as np
 from fastapi import FastAPI, HTTPException, Query, Request
 from fastapi.exceptions import RequestValidationError
@@ -21,10 +24,12 @@ from starlette.exceptions import HTTPException as AnyHTTPException
 import jsecon
 from jsecon.app.ask import frame_index
 from jsecon.app.exports import object_records
+from jsecon.app.locate import gaussian_rows
 from jsecon.app.relations import Measure, measure, query_relation
 from jsecon.app.server.guard import LIMITS, Guard, Limits, Workers
 from jsecon.app.server.scenes import Scene, SceneQuery
 from jsecon.app.verbs import By
+from jsecon.data.gaussians.ply import save_ply
 from jsecon.errors import InputError
 from jsecon.process import cores
 
@@ -204,7 +209,11 @@ def application(
             answer = scene.answer(SceneQuery(request.text, by=request.by))
             if not answer.mask.any():
                 raise InputError(f"query {answer.query!r}", "no Gaussian is selected", remedy="Ask with other words.")
-            return scene.ply(answer)
+            with tempfile.TemporaryDirectory() as folder:
+                file = Path(folder) / "selection.ply"
+                selected = gaussian_rows(scene.field.gaussians, answer.mask)
+                save_ply(file, selected, similarity=scene.field.to_source)
+                return file.read_bytes()
 
         return Response(await computed(work, "text"), media_type="application/octet-stream")
 
@@ -216,8 +225,10 @@ def application(
         except InputError as error:
             raise _wrong("frame", str(error)) from error
         scene_query = SceneQuery(request.text, by=request.by)
-        name, image = await computed(lambda: scene.mask(scene.answer(scene_query), frame), "text")
-        return Response(image, media_type="image/png", headers={"x-frame": re.sub("[^ -~]", "?", name)})
+        index, pixels = await computed(lambda: scene.mask(scene.answer(scene_query), frame), "text")
+        image = cv2.imencode(".png", pixels.astype(np.uint8) * 255)[1].tobytes()
+        name = re.sub("[^ -~]", "?", scene.field.names[index])
+        return Response(image, media_type="image/png", headers={"x-frame": name})
 
     @app.get("/healthz", summary="The fields and their frames")
     async def health() -> Response:

@@ -2,20 +2,18 @@
 
 import contextlib
 import functools
-import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool
 
-from jsecon.app.ask import Answer, ask_pixel, ask_text
-from jsecon.app.locate import gaussian_rows, locate_answer
+from jsecon.app.ask import Answer, ask_pixel, ask_text, frame_index
+from jsecon.app.locate import locate_answer
 from jsecon.app.object_scene import ObjectScene
 from jsecon.app.outputs import best_frames
-from jsecon.data.gaussians.ply import save_ply
 from jsecon.errors import InputError
 from jsecon.language.field import load_field
 from jsecon.pipeline.networks import field_embedder
@@ -109,33 +107,22 @@ class Scene:
         """The field as relations read it."""
         return ObjectScene(self.field, self.embedder)
 
-    def mask(self, answer: Answer, frame: int | None) -> tuple[str, bytes]:
+    def mask(self, answer: Answer, frame: int | str | None) -> tuple[int, Bool[np.ndarray, "h w"]]:
         """Renders an answer alone in a frame.
 
         Args:
           answer: The answer.
-          frame: Index of the frame; None is the one that shows most of it.
+          frame: Name or index of the frame; None is the one that shows most of it.
 
         Returns:
-          Name of the frame, and the mask as a PNG.
+          Index of the frame, and the pixels of the answer.
+
+        Raises:
+          InputError: There is no such frame.
         """
-        frames = [frame] if frame is not None else best_frames(self.field, answer, 1) or [0]
-        shown = selection_mask(self.gaussians, self.cameras[frames[0]], jnp.asarray(answer.mask))
-        return self.field.names[frames[0]], cv2.imencode(".png", np.asarray(shown, np.uint8) * 255)[1].tobytes()
-
-    def ply(self, answer: Answer) -> bytes:
-        """Makes a .ply of the selected Gaussians.
-
-        Args:
-          answer: The answer.
-
-        Returns:
-          Content of the file, in the capture's world.
-        """
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "selection.ply"
-            save_ply(file, gaussian_rows(self.field.gaussians, answer.mask), similarity=self.field.to_source)
-            return file.read_bytes()
+        best = [*best_frames(self.field, answer, 1), 0][0]
+        index = best if frame is None else frame_index(self.field, frame)
+        return index, np.asarray(selection_mask(self.gaussians, self.cameras[index], jnp.asarray(answer.mask)))
 
     @property
     def description(self) -> dict[str, Any]:
