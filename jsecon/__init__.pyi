@@ -28,6 +28,7 @@ from .language.distill import distill_l1 as distill_l1, distill_votes as distill
 from .language.field import check_field as check_field, load_field as load_field, save_field as save_field
 from .language.membership import (
     finish_votes as finish_votes,
+    finish_votes_in_blocks as finish_votes_in_blocks,
     membership_probability as membership_probability,
     with_overlap as with_overlap,
     with_shown as with_shown,
@@ -35,7 +36,6 @@ from .language.membership import (
 from .language.regions import region_embeddings as region_embeddings
 from .language.streaming import (
     codes_in_blocks as codes_in_blocks,
-    finish_votes_in_blocks as finish_votes_in_blocks,
     region_votes_in_blocks as region_votes_in_blocks,
 )
 from .language.votes import region_votes as region_votes, scan_region_votes as scan_region_votes

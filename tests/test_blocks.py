@@ -15,8 +15,8 @@ from jsecon.errors import InputError
 from jsecon.language import columns, streaming, votes as votes_module
 from jsecon.language.distill import distill_votes
 from jsecon.language.field import load_field, save_field
-from jsecon.language.membership import finish_votes, with_overlap
-from jsecon.language.streaming import codes_in_blocks, finish_votes_in_blocks, region_votes_in_blocks, strongest
+from jsecon.language.membership import finish_votes, finish_votes_in_blocks, with_overlap
+from jsecon.language.streaming import codes_in_blocks, region_votes_in_blocks, strongest
 from jsecon.language.votes import region_votes
 from jsecon.query.blocks import query_in_blocks
 from jsecon.query.select import query_anchored

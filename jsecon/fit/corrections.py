@@ -92,20 +92,6 @@ def identity_corrections(views: int) -> Corrections:
     return Corrections(np.zeros((views, 6), np.float32), np.tile(np.eye(3, 4, dtype=np.float32), (views, 1, 1)))
 
 
-def init_corrections(views: int) -> CorrectionState:
-    """Makes the state before the first step.
-
-    Args:
-      views: T, number of views.
-
-    Returns:
-      Corrections without effect, and moments of zero.
-    """
-    identity = identity_corrections(views)
-    zeros = jax.tree.map(np.zeros_like, identity)
-    return CorrectionState(identity, zeros, zeros)
-
-
 def _series(squared: Array, first: int) -> Array:
     """The sum over k of (-squared)^k / (2 k + first)!."""
     total = jnp.zeros_like(squared)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from jsecon.errors import InputError, require
-from jsecon.fit.corrections import CorrectionState, RefineOptions, init_corrections
+from jsecon.fit.corrections import CorrectionState, RefineOptions, identity_corrections
 from jsecon.fit.growth import drop_free_rows, grow, pad_with_free_rows
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.step import StepConfig, StepRunner, TrainState, put_on_devices, to_host
@@ -103,6 +103,11 @@ def init_fit_state(gaussians: Gaussians, corrected_frames: int | None = None, *,
     rows = round_capacity(max(int(count), min_rows))
     gaussians = pad_with_free_rows(jax.tree.map(lambda a: np.asarray(a, np.float32), gaussians), rows)
     zeros, zero = jax.tree.map(np.zeros_like, gaussians), np.zeros((), np.float64)
+    corrections = None
+    if corrected_frames is not None:
+        identity = identity_corrections(corrected_frames)
+        no_moments = jax.tree.map(np.zeros_like, identity)
+        corrections = CorrectionState(identity, no_moments, no_moments)
     return FitState(
         gaussians,
         zeros,
@@ -113,7 +118,7 @@ def init_fit_state(gaussians: Gaussians, corrected_frames: int | None = None, *,
         seconds=zero,
         started=count,
         losses=np.zeros(0, np.float32),
-        corrections=None if corrected_frames is None else init_corrections(corrected_frames),
+        corrections=corrections,
     )
 
 

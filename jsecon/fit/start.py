@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from jsecon.errors import require
 from jsecon.fit.depth import points_from_depth
 from jsecon.fit.triangulate import MIN_POINTS, triangulated_points
-from jsecon.splat.sh import sh_from_rgb
+from jsecon.splat.sh import C0
 from jsecon.types import Array, Capture, Gaussians, Progress
 
 MIN_SQUARED_DISTANCE = 1e-7
@@ -130,7 +130,7 @@ def gaussians_from_points(
         deviations = np.minimum(deviations, max_scale)
     count = len(points)
     sh = np.zeros((count, (sh_degree + 1) ** 2, 3), np.float32)
-    sh[:, :1] = sh_from_rgb(colors.astype(np.float64) / 255.0)
+    sh[:, 0] = (colors.astype(np.float64) / 255.0 - 0.5) / C0
     return Gaussians(
         means=points.astype(np.float32),
         log_scales=np.repeat(np.log(deviations)[:, None], 3, axis=1).astype(np.float32),

@@ -186,7 +186,7 @@ def region_codes(embeddings: Float[Array, "r e"], *, latent: int | str, key: Key
 
 def _smallest_codes(units: Array) -> RegionCodes:
     count, dim = units.shape
-    distinct = int(distinct_pairs(units).sum()) // 2
+    distinct = int(_distinct_pairs(units).sum()) // 2
     for latent in (size for size in LATENTS if size < dim):
         for kind, make in (("a rotation", _rotated), ("spread codes", _spread_out)):
             codes, coder = make(units, latent)
@@ -207,15 +207,8 @@ def _spread_out(units: Array, latent: int) -> tuple[Array, Spread]:
     return codes, Spread(units, codes)
 
 
-def distinct_pairs(units: Float[Array, "r e"]) -> Bool[np.ndarray, "r r"]:
-    """Finds pairs of regions that are two things: their cosine is below DISTINCT_COSINE.
-
-    Args:
-      units: (R, E) unit embeddings; zero rows are in no pair.
-
-    Returns:
-      (R, R) bool, symmetric.
-    """
+def _distinct_pairs(units: Float[Array, "r e"]) -> Bool[np.ndarray, "r r"]:
+    """Finds pairs (R, R) of regions with an embedding that are two things: their cosine is below DISTINCT_COSINE."""
     exact = np.asarray(units, np.float64)
     known = np.any(exact != 0, axis=1)
     return (exact @ exact.T < DISTINCT_COSINE) & known[:, None] & known[None]
@@ -232,7 +225,7 @@ def confused_pairs(units: Float[Array, "r e"], codes: Float[Array, "r d"]) -> in
       Number of pairs.
     """
     exact = np.asarray(codes, np.float64)
-    return int((distinct_pairs(units) & (exact @ exact.T >= CODE_THRESHOLD)).sum()) // 2
+    return int((_distinct_pairs(units) & (exact @ exact.T >= CODE_THRESHOLD)).sum()) // 2
 
 
 def principal_rotation(units: Float[Array, "r e"], latent: int) -> Rotation:
@@ -279,7 +272,7 @@ def spread_codes(units: Float[Array, "r e"], latent: int, *, separation: float =
     start[:, :kept] = (left * sizes)[:, :kept]
     # Equal rows, and rows of fewer directions than numbers, part by a little noise that only depends on their place.
     start += 1e-3 * np.random.default_rng(0).standard_normal(start.shape)
-    distinct = distinct_pairs(units)
+    distinct = _distinct_pairs(units)
     alike = ~distinct & known[:, None] & known[None]
     start, target = jnp.asarray(start, units.dtype), jnp.asarray(target, units.dtype)
     codes = _spread(start, target, jnp.asarray(distinct), jnp.asarray(alike), separation)

@@ -4,7 +4,6 @@ With the geometry frozen the rendered map is linear in the Gaussians' features, 
 casts on each Gaussian) hold what a closed form needs. `distill_l1` is the paper's path, Adam on the rendered L1.
 """
 
-import dataclasses
 import functools
 from typing import Any, NamedTuple
 
@@ -15,7 +14,7 @@ from jaxtyping import Float, Int, Shaped
 from jsecon.errors import require, require_one_of, require_shape
 from jsecon.numerics import is_traced, normalize, require_labels, safe_norm
 from jsecon.splat.capacity import plan_capacity
-from jsecon.splat.plan import ViewPlan, plan_view, plan_views, render_plan
+from jsecon.splat.plan import plan_view, plan_views, render_plan
 from jsecon.types import Array, Camera, Gaussians, Key, Progress, Votes
 
 ADAM_EPS = 1e-15
@@ -108,10 +107,8 @@ def _median(values: Array, weight: Array) -> Array:
 _REDUCTIONS = {"mean": _mean, "median": _median, "mode": _mode}
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class DistillState:
-    """Where `distill_l1` stands: what a checkpoint holds."""
+class _State(NamedTuple):
+    """Where `distill_l1` stands."""
 
     features: Array
     """(N, d) before normalisation."""
@@ -177,18 +174,17 @@ def distill_l1(
       ValueError: Shapes disagree, or labels are no integers; outside a trace also for such a NaN and for labels of R
         and more.
     """
-    inputs = gaussians, cameras, labels, region_codes
     require_labels(labels, len(region_codes))
-    start = start_distillation(*inputs, steps=steps, key=key, init=init)
+    start = _start(gaussians, cameras, labels, region_codes, steps=steps, key=key, init=init)
+    # Regions in multiples of 256, the last without a code: scenes share their compiled programs.
+    table = jnp.pad(jnp.asarray(region_codes), ((0, -len(region_codes) % 256), (0, 0)))
     stretch = steps if progress is None else max(1, -(-steps // 100))
     state, plans = start, plan_views(gaussians, cameras, capacity=capacity)
     if plans is None and capacity is None and not is_traced((gaussians, cameras)):
         capacity = plan_capacity(gaussians, cameras, margin=1.0)
     for begin in range(0, steps, stretch):
         stop = min(begin + stretch, steps)
-        state = continue_distillation(
-            state, *inputs, until=stop, learning_rate=learning_rate, capacity=capacity, plans=plans
-        )
+        state = _descend(state, gaussians, cameras, labels, table, plans, stop, learning_rate, capacity)
         if progress is not None:
             jax.block_until_ready(state.step)
             progress(stop, steps)
@@ -204,7 +200,7 @@ def distill_l1(
     return Distillation(codes, state.history)
 
 
-def start_distillation(
+def _start(
     gaussians: Gaussians,
     cameras: Camera,
     labels: Int[Array, "t h w"],
@@ -212,25 +208,9 @@ def start_distillation(
     *,
     steps: int,
     key: Key,
-    init: str | Float[Array, "n d"] = "zero",
-) -> DistillState:
-    """Makes the state before the first step of `distill_l1`.
-
-    Args:
-      gaussians: Scene of N Gaussians.
-      cameras: Batch of T cameras.
-      labels: (T, H, W) integer region ids, -1 where a pixel belongs to no region.
-      region_codes: (R, d) codes of the regions.
-      steps: Number of steps of the whole run.
-      key: Random key of the order of views and of random codes.
-      init: "zero", "random" or (N, d) codes, see `distill_l1`.
-
-    Returns:
-      The state.
-
-    Raises:
-      ValueError: Shapes disagree, there is nothing to distill, or `init` is unknown.
-    """
+    init: str | Float[Array, "n d"],
+) -> _State:
+    """Makes the state before the first step, and checks the shapes."""
     views, count, size = labels.shape[0], gaussians.count, region_codes.shape[1]
     expected = (*cameras.world_to_camera.shape[:-2], cameras.height, cameras.width)
     require_shape("labels", labels, expected, "Pass the labels and the cameras of the same views at the same size.")
@@ -249,42 +229,7 @@ def start_distillation(
         features = jnp.asarray(init, dtype)
     rounds = jax.random.split(order_key, -(-steps // views))
     order = jax.vmap(lambda k: jax.random.permutation(k, views))(rounds).reshape(-1)[:steps].astype(jnp.int32)
-    return DistillState(
-        features, _optimizer(0.0).init(features), order, jnp.zeros(steps, dtype), jnp.zeros((), jnp.int32)
-    )
-
-
-def continue_distillation(
-    state: DistillState,
-    gaussians: Gaussians,
-    cameras: Camera,
-    labels: Int[Array, "t h w"],
-    region_codes: Float[Array, "r d"],
-    *,
-    until: int,
-    capacity: int | None = None,
-    learning_rate: float = 0.0025,
-    plans: ViewPlan | None = None,
-) -> DistillState:
-    """Takes steps of `distill_l1`. Many calls give the same result as one, with one compilation.
-
-    Args:
-      state: Where to start.
-      gaussians: Scene of N Gaussians.
-      cameras: Batch of T cameras.
-      labels: (T, H, W) integer region ids, -1 where a pixel belongs to no region.
-      region_codes: (R, d) codes of the regions.
-      until: Number of steps that are taken in the end, those of `state` included.
-      capacity: Number of (block, Gaussian) pairs of a view, see `render`.
-      learning_rate: Learning rate of Adam.
-      plans: Result of `splat.plan.plan_views`; without it each step plans its view.
-
-    Returns:
-      The state after the last step.
-    """
-    # Regions in multiples of 256, the last without a code: scenes share their compiled programs.
-    table = jnp.pad(jnp.asarray(region_codes), ((0, -len(region_codes) % 256), (0, 0)))
-    return _descend(state, gaussians, cameras, labels, table, plans, until, learning_rate, capacity)
+    return _State(features, _optimizer(0.0).init(features), order, jnp.zeros(steps, dtype), jnp.zeros((), jnp.int32))
 
 
 def _optimizer(learning_rate: Any) -> Any:
@@ -294,7 +239,7 @@ def _optimizer(learning_rate: Any) -> Any:
 
 
 @functools.partial(jax.jit, static_argnames="capacity")
-def _descend(state, gaussians, cameras, labels, region_codes, plans, until, learning_rate, capacity) -> DistillState:
+def _descend(state, gaussians, cameras, labels, region_codes, plans, until, learning_rate, capacity) -> _State:
     optimizer = _optimizer(learning_rate)
     codes = normalize(region_codes)
     known = jnp.any(codes != 0, axis=-1)
@@ -316,6 +261,6 @@ def _descend(state, gaussians, cameras, labels, region_codes, plans, until, lear
         updates, moments = optimizer.update(gradient, state.moments)
         features = state.features + updates
         history = state.history.at[index].set(jnp.where(overflow > 0, jnp.nan, value))
-        return DistillState(features, moments, state.order, history, jnp.asarray(index + 1, jnp.int32))
+        return _State(features, moments, state.order, history, jnp.asarray(index + 1, jnp.int32))
 
     return jax.lax.fori_loop(state.step, until, step, state)

@@ -23,6 +23,7 @@ from jax.scipy.special import betainc
 from jaxtyping import Bool, Float, Int
 
 from jsecon.errors import require
+from jsecon.language.columns import row_slices, votes_of_rows
 from jsecon.language.regions import ALIKE_THRESHOLD, mean_residuals
 from jsecon.numerics import FULL_PRECISION, cosine_matrix
 from jsecon.programs import stored_jit
@@ -70,7 +71,36 @@ def finish_votes(votes: Votes, regions: Regions) -> Votes:
     return with_overlap(with_shown(votes, regions))
 
 
-def with_shown(votes: Votes, regions: Regions, *, alike_threshold: float = ALIKE_THRESHOLD) -> Votes:
+def finish_votes_in_blocks(votes: Votes, regions: Regions) -> Votes:
+    """`finish_votes` of memory-mapped votes, block by block. Host code.
+
+    Args:
+      votes: Votes of N Gaussians, cast `by_view`; votes in memory are one block.
+      regions: Regions made from the labels that voted.
+
+    Returns:
+      The votes with `shown` (N, K), in memory, and `overlap` (R, R), without `by_view`.
+
+    Raises:
+      ValueError: The votes have no `by_view`.
+    """
+    shows = _views_that_show(regions)
+    sums = jnp.zeros((regions.count, regions.count), jnp.float32)
+    shown = [np.zeros((0, votes.regions.shape[1]), np.float32)]
+    by_view = votes.by_view
+    if by_view is None:
+        raise ValueError(
+            "finish_votes_in_blocks: got votes without by_view, expected by_view (T, N). Cast them with it."
+        )
+    for rows in row_slices(votes, len(votes.views)):
+        block = dataclasses.replace(votes_of_rows(votes, rows), by_view=np.asarray(by_view[:, rows]))
+        block = _add_shown(block, shows)
+        sums += _overlap_sums(jnp.asarray(block.regions), vote_shares(block), regions.count)
+        shown.append(np.asarray(block.shown))
+    return dataclasses.replace(votes, by_view=None, shown=np.concatenate(shown), overlap=_soft_iou(sums))
+
+
+def with_shown(votes: Votes, regions: Regions) -> Votes:
     """Replaces `by_view` by `shown`: the weight with which the views that show a vote's region see the Gaussian. Pure.
 
     The share that follows is the object posterior of B3-Seg: weight inside over inside and outside, over the views that
@@ -79,7 +109,6 @@ def with_shown(votes: Votes, regions: Regions, *, alike_threshold: float = ALIKE
     Args:
       votes: Votes of N Gaussians, cast `by_view`.
       regions: Regions made from the labels that voted.
-      alike_threshold: Cosine of `mean_residuals` from which regions are shown together, as queries join them.
 
     Returns:
       The votes with `shown` (N, K).
@@ -94,38 +123,21 @@ def with_shown(votes: Votes, regions: Regions, *, alike_threshold: float = ALIKE
     expected = "the pixels (R, T) of the same regions in the same views"
     same = views == regions.pixels.shape[1] and votes.num_regions == regions.count
     require(same, "with_shown", sizes, expected, "Give the regions that were made from the labels that voted.")
-    shows = views_that_show(regions, alike_threshold=alike_threshold)
-    return add_shown(votes, shows)
+    return _add_shown(votes, _views_that_show(regions))
 
 
-@functools.partial(jax.jit, static_argnames="alike_threshold")
-def views_that_show(regions: Regions, *, alike_threshold: float = ALIKE_THRESHOLD) -> Bool[Array, "r t"]:
-    """Finds the views that show a region, or one that is alike. Pure.
-
-    Args:
-      regions: R regions with their pixels in T views.
-      alike_threshold: Cosine of `mean_residuals` from which two regions are alike.
-
-    Returns:
-      (R, T) bool.
-    """
+@jax.jit
+def _views_that_show(regions: Regions) -> Bool[Array, "r t"]:
+    """Finds the views (R, T) that show a region, or one that is alike: regions that queries join are shown together."""
     apart, known = mean_residuals(jnp.asarray(regions.embeddings))
-    alike = cosine_matrix(apart, apart) >= alike_threshold
+    alike = cosine_matrix(apart, apart) >= ALIKE_THRESHOLD
     alike = (alike & known[:, None] & known[None]) | jnp.eye(regions.count, dtype=bool)
     return (alike.astype(jnp.float32) @ (jnp.asarray(regions.pixels) > 0).astype(jnp.float32)) > 0
 
 
 @jax.jit
-def add_shown(votes: Votes, shows: Bool[Array, "r t"]) -> Votes:
-    """Replaces `by_view` by `shown`, see `with_shown`. Pure; Gaussian by Gaussian.
-
-    Args:
-      votes: Votes of N Gaussians, cast `by_view`.
-      shows: (R, T) result of `views_that_show`.
-
-    Returns:
-      The votes with `shown` (N, K).
-    """
+def _add_shown(votes: Votes, shows: Bool[Array, "r t"]) -> Votes:
+    """Replaces `by_view` by `shown`, with the (R, T) views that show a region; Gaussian by Gaussian."""
     by_view, regions = jnp.asarray(votes.by_view), jnp.asarray(votes.regions)
     count = regions.shape[0]
     block = min(_BLOCK, max(count, 1))
@@ -159,22 +171,13 @@ def with_overlap(votes: Votes) -> Votes:
     Returns:
       The votes with `overlap`.
     """
-    sums = overlap_sums(jnp.asarray(votes.regions), vote_shares(votes), votes.num_regions)
-    return dataclasses.replace(votes, overlap=soft_iou(sums))
+    sums = _overlap_sums(jnp.asarray(votes.regions), vote_shares(votes), votes.num_regions)
+    return dataclasses.replace(votes, overlap=_soft_iou(sums))
 
 
 @functools.partial(jax.jit, static_argnums=2)
-def overlap_sums(regions: Int[Array, "n k"], share: Float[Array, "n k"], count: int) -> Float[Array, "r r"]:
-    """Adds up the smaller share of two regions over the Gaussians. Pure.
-
-    Args:
-      regions: (N, K) region of each vote, -1 for none.
-      share: (N, K) share of each vote, see `vote_shares`.
-      count: R.
-
-    Returns:
-      (R, R) sum_n min(p_nr, p_ns), of each n at [r, s] where r is the stronger of the two.
-    """
+def _overlap_sums(regions: Int[Array, "n k"], share: Float[Array, "n k"], count: int) -> Float[Array, "r r"]:
+    """Sums min(p_nr, p_ns) over n to (R, R); for each n at [r, s] where r is the stronger of the two."""
     valid = (regions >= 0) & (regions < count) & jnp.isfinite(share)
     place, share = jnp.where(valid, regions, count).T, jnp.where(valid, share, 0.0).T  # one past the end: dropped
     first, second = jnp.triu_indices(regions.shape[1])
@@ -187,15 +190,8 @@ def overlap_sums(regions: Int[Array, "n k"], share: Float[Array, "n k"], count: 
 
 
 @jax.jit
-def soft_iou(both: Float[Array, "r r"]) -> Float[Array, "r r"]:
-    """Computes the overlap of `with_overlap`. Pure.
-
-    Args:
-      both: (R, R) `overlap_sums`, which add up over blocks of Gaussians.
-
-    Returns:
-      (R, R) soft IoU, symmetric.
-    """
+def _soft_iou(both: Float[Array, "r r"]) -> Float[Array, "r r"]:
+    """Computes the overlap of `with_overlap` from the sums, which add up over blocks of Gaussians."""
     size = jnp.diagonal(both)
     both = jnp.where(jnp.eye(len(both), dtype=bool), both, both + both.T)
     either = size[:, None] + size - both

@@ -6,7 +6,6 @@ that follow are functions of rows, applied block by block.
 """
 
 import contextlib
-import dataclasses
 import os
 import shutil
 import tempfile
@@ -15,20 +14,18 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy import sparse
 
 from jsecon.errors import InputError, require, require_shape
 from jsecon.files import atomic_write, map_npy, write_npy
-from jsecon.language.columns import ROWS, row_slices, vote_blocks, votes_of_rows
+from jsecon.language.columns import ROWS, vote_blocks
 from jsecon.language.distill import MIN_LABELLED, distill_votes
-from jsecon.language.membership import add_shown, overlap_sums, soft_iou, views_that_show, vote_shares
 from jsecon.language.votes import dense_votes, region_blocks
 from jsecon.numerics import NEAR, require_labels
 from jsecon.splat.visible import geometry_of_rows, visible_rows
-from jsecon.types import Array, Camera, Gaussians, Progress, Regions, Votes
+from jsecon.types import Array, Camera, Gaussians, Progress, Votes
 
 _PAIR = np.dtype([("gaussian", "<u4"), ("region", "<i4"), ("weight", "<f4")])
 """The weight that a view's region casts on a Gaussian."""
@@ -113,35 +110,6 @@ def region_votes_in_blocks(
         sums = (_sum_block(scratch, views, block, num_regions, top_kept, by_view) for block in blocks)
         columns = _write_columns(Path(folder), sums, kinds | ({"by_view": ("<f4", (views,))} if by_view else {}), count)
     return Votes(**columns, overflow=np.asarray(overflow, np.int32), num_regions=num_regions)
-
-
-def finish_votes_in_blocks(votes: Votes, regions: Regions) -> Votes:
-    """`finish_votes` of memory-mapped votes, block by block. Host code.
-
-    Args:
-      votes: Votes of N Gaussians, cast `by_view`; votes in memory are one block.
-      regions: Regions made from the labels that voted.
-
-    Returns:
-      The votes with `shown` (N, K), in memory, and `overlap` (R, R), without `by_view`.
-
-    Raises:
-      ValueError: The votes have no `by_view`.
-    """
-    shows = views_that_show(regions)
-    sums = jnp.zeros((regions.count, regions.count), jnp.float32)
-    shown = [np.zeros((0, votes.regions.shape[1]), np.float32)]
-    by_view = votes.by_view
-    if by_view is None:
-        raise ValueError(
-            "finish_votes_in_blocks: got votes without by_view, expected by_view (T, N). Cast them with it."
-        )
-    for rows in row_slices(votes, len(votes.views)):
-        block = dataclasses.replace(votes_of_rows(votes, rows), by_view=np.asarray(by_view[:, rows]))
-        block = add_shown(block, shows)
-        sums += overlap_sums(jnp.asarray(block.regions), vote_shares(block), regions.count)
-        shown.append(np.asarray(block.shown))
-    return dataclasses.replace(votes, by_view=None, shown=np.concatenate(shown), overlap=soft_iou(sums))
 
 
 def codes_in_blocks(

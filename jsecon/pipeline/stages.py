@@ -38,8 +38,9 @@ from jsecon.language.autoencoder import Autoencoder
 from jsecon.language.codes import region_codes
 from jsecon.language.columns import is_mapped
 from jsecon.language.distill import distill_votes
+from jsecon.language.membership import finish_votes_in_blocks
 from jsecon.language.regions import Embed, embeddings_of_masks, region_embeddings, scene_parts
-from jsecon.language.streaming import codes_in_blocks, finish_votes_in_blocks, region_votes_in_blocks
+from jsecon.language.streaming import codes_in_blocks, region_votes_in_blocks
 from jsecon.language.votes import region_votes, votes_memory
 from jsecon.networks.hub import model_name
 from jsecon.pipeline.bare_stages import bare_stages, require_options_apply

@@ -121,15 +121,3 @@ def colours_from_sh(gaussians: Gaussians, camera: Camera) -> Float[Array, "n 3"]
         away = jnp.where(jnp.isfinite(away).all(1, keepdims=True), away, 0.0)
         rgb = _colours(normalize(away), sh)
     return jnp.where(finite, jnp.maximum(rgb + 0.5, 0.0), jnp.nan)
-
-
-def sh_from_rgb(rgb: Float[Array, "n 3"]) -> Float[Array, "n 1 3"]:
-    """Converts colours to spherical harmonics of degree 0.
-
-    Args:
-      rgb: (N, 3) in [0, 1].
-
-    Returns:
-      (N, 1, 3) coefficients.
-    """
-    return ((rgb - 0.5) / C0)[:, None, :]
