@@ -138,10 +138,7 @@ def _joined(layers: "_Layers", proposals: "_Layers", *, join_rate: float) -> tup
 
 
 def _agreement(tables: list[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(R, R) frames that hold both masklets in one proposal and frames that show both; (R,) mean area; (R,) support.
-
-    `tables` holds each frame's `_overlaps` of masklets and proposals.
-    """
+    """(R, R) frames with both masklets in one proposal, and that show both; (R,) mean area; (R,) support."""
     count = len(tables[0][0])
     together, both = np.zeros((count, count)), np.zeros((count, count))
     area, support, views = np.zeros(count), np.zeros(count), np.zeros(count)

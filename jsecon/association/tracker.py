@@ -153,11 +153,7 @@ class GeometricTracker:
     def _match(
         self, view: FrameView, evidence: Float[np.ndarray, "n c"], best: Float[np.ndarray, " n"]
     ) -> Int[np.ndarray, " a"]:
-        """Classifies each atom of a view; returns (A,) ids, -1 if unassigned.
-
-        The evidence is (n, B + C) of the Gaussians of the view, and their best clarity (n,) in the frames of the
-        evidence.
-        """
+        """Classifies each atom; returns (A,) ids or -1. `best` (n,) is the clarity in the best frame so far."""
         # A Gaussian on an outline overlaps its neighbours and is counted with them, in view after view. So it counts
         # only if another view has seen about as much of it as this one does, and has assigned it.
         assigned = evidence.sum(1) / np.maximum(view.totals * view.clarity, 1e-6)

@@ -161,10 +161,7 @@ def _level(capture: Capture, chosen: Int[np.ndarray, " c"], side: int) -> _Level
 
 
 def _planes(depth: Float[np.ndarray, "h w"], camera: Camera) -> Float[np.ndarray, "_ _ 3"]:
-    """Fits a least-squares plane n x = 1 to the surface around each pixel; 1 / z is linear in pixels.
-
-    n is zero if the window does not hold one plane, or too little of its depth is known.
-    """
+    """Fits a plane n x = 1 to the surface around each pixel (1 / z is linear in pixels); n is 0 without a plane."""
     width, height = camera.width, camera.height
     down, across = depth.shape[0] / height, depth.shape[1] / width
     # Nearest depth, at its exact ray: between two depths there may be no surface.

@@ -284,10 +284,7 @@ def refine_capture(
 
 
 def _align_by_depth(capture: Capture, train: Bool[np.ndarray, " t"], others: Bool[np.ndarray, " t"]) -> Capture | None:
-    """Aligns the training cameras to each other by colour and depth, then the others to them.
-
-    They stay in the same world. None if they do not agree better so.
-    """
+    """Aligns the training cameras to each other, then the others to them, in one world; None if it does not help."""
     poses = np.asarray(capture.cameras.world_to_camera, np.float64)
     moved = align_cameras(capture, train)
     if moved is None:

@@ -99,10 +99,7 @@ def _match(a: _Features, b: _Features, fundamental: np.ndarray) -> np.ndarray:
 
 
 def _tracks(edges: np.ndarray, views: np.ndarray) -> list[np.ndarray]:
-    """Groups the features that `edges` (M, 2) connect; `views` is the view of each feature.
-
-    Groups with two features of one view are dropped.
-    """
+    """Groups the features that `edges` (M, 2) connect, without groups with two features of one view (`views`)."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

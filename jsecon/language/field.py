@@ -227,10 +227,7 @@ def _disagreement(field: LanguageField) -> str | None:
 
 
 def _oddity(field: LanguageField, checked: bool = True) -> str | None:
-    """What is wrong with the numbers or texts of a field whose shapes agree, in words, or None.
-
-    What is mapped is not read unless it is to be `checked`.
-    """
+    """What is wrong with the numbers or texts, in words, or None; mapped columns are read only if `checked`."""
     sizes = {"votes.regions": field.regions.count, "parts.part": field.parts and len(field.parts.weight)}
     for place, leaf in jax.tree_util.tree_leaves_with_path(field):
         if isinstance(leaf, np.memmap) and not checked:

@@ -131,10 +131,7 @@ def _classes(embeddings, texts, pixels, votes, reference, rules: QueryRules, sta
 
 
 def _standardised(table: Array, known: Array, pixels: Array) -> Array:
-    """Converts similarities (R, Q) to standard deviations from each text's mean over the known regions.
-
-    Regions count by their evidence. The result is 0 where a text's similarities are all alike.
-    """
+    """Converts similarities (R, Q) to deviations from each text's mean over the known regions, weighted by evidence."""
     weight = jnp.where(known, evidence(pixels).astype(table.dtype), 0.0)[:, None]
     weight = weight / jnp.maximum(jnp.sum(weight), jnp.finfo(table.dtype).tiny)
     apart = jnp.where(known[:, None], table - jnp.sum(weight * table, axis=0), 0.0)

@@ -138,10 +138,7 @@ def _upright_axes(points: np.ndarray, spreads: np.ndarray, up: np.ndarray) -> np
 
 
 def _box_ends(points: np.ndarray, spreads: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the ends (A,) of the Gaussians along each of A columns of `axes`, without strays.
-
-    They reach to one standard deviation.
-    """
+    """Returns the ends (A,) of the Gaussians, to one deviation and without strays, along A columns of `axes`."""
     reach = np.linalg.norm(axes.T @ spreads, axis=2)
     along = points @ axes
     return np.quantile(along - reach, BOX_TAIL, axis=0), np.quantile(along + reach, 1 - BOX_TAIL, axis=0)

@@ -116,11 +116,7 @@ def _rotation(w: Array, x: Array, y: Array, z: Array) -> list[list[Array]]:
 
 
 def _covariance_root(w2c: Array, unit: list[Array], log_scales: Array, rays: tuple) -> tuple[list[Array], list[Array]]:
-    """Computes two rows, three (N,) each, of the 2x3 matrix M = J R S.
-
-    M M^T is the 2D covariance, J the Jacobian of the ray, R the rotation from the axes of the Gaussian to those of the
-    camera, and S its scales.
-    """
+    """Computes the rows, three (N,) each, of M = J R S, with M M^T the 2D covariance, J the Jacobian of the ray."""
     rotation = _rotation(*unit)
     x_ratio, y_ratio, focal_x, focal_y = rays
     row_1, row_2 = [], []

@@ -73,10 +73,7 @@ def tile_grid(width: int, height: int, tile: int) -> tuple[int, int]:
 
 
 def _rectangles(projection: Projection, width: int, height: int, edge: int, strip: Strip):
-    """Computes the range (x0, x1, y0, y1) of the strip's blocks of `edge` px that each splat's box touches.
-
-    Ranges are half-open, and empty if the splat is invisible.
-    """
+    """Computes the half-open range (x0, x1, y0, y1) of the strip's blocks of `edge` px that each splat touches."""
     across, down = tile_grid(width, height, edge)
     ranges = []
     for axis, limit in ((0, across), (1, down)):

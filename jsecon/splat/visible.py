@@ -56,14 +56,7 @@ def _is_visible(gaussians: Gaussians, camera: Camera, near: float) -> Array:
 
 
 def _padded_size(count: int) -> int:
-    """Rounds a number of rows up, so that views share compiled programs.
-
-    Args:
-      count: Number of Gaussians.
-
-    Returns:
-      A multiple of an eighth of a power of two, at least 4,096.
-    """
+    """Rounds a count up to an eighth of a power of two, at least 4,096, so that views share compiled programs."""
     step = max(4096, 1 << max(count.bit_length() - 4, 0))
     return max(-(-count // step), 1) * step
 
