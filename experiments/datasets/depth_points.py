@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from jsecon.fit.depth import DepthPoints, back_project_frame, require_depths
+from jsecon.fit.depth import DepthPoints, back_project_frame
 from jsecon.types import Array, Capture
 
 
@@ -21,7 +21,6 @@ def confirmed_depths(
     and compared (by default those that are not held out); the depths of the others are returned as they are. Raises
     InputError where the capture has no depth.
     """
-    require_depths(capture)
     depths = np.array(capture.depths, np.float32)
     chosen = np.flatnonzero(~np.asarray(capture.held_out)) if frames is None else np.asarray(frames)
     height, width = depths.shape[1:]

@@ -410,7 +410,7 @@ def edit_answers(
     for answer in answers:
         if answer.mask.any():
             mask = answer.mask if near is None else edits.shrink(edits.grow(answer.mask, near, grow), near, shrink)
-            mask = np.asarray(edits.invert(mask) if invert else mask)
+            mask = np.asarray(~mask if invert else mask)
             selection = dataclasses.replace(answer.selection, mask=mask)
             objects = 1 if invert else answer.objects
             answer = dataclasses.replace(answer, selection=selection, mask=mask, objects=objects)

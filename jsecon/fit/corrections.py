@@ -7,13 +7,11 @@ offset). Each view has a row, which Adam moves when that view is drawn, with sep
 
 import dataclasses
 import math
-from typing import Any, cast
+from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from jsecon.types import Array, Camera, record
 
@@ -24,7 +22,6 @@ COLOUR_WEIGHT = 1e-3
 """Weight of the squared change of the colour map (shares of the colour range) in the loss of a view."""
 _SERIES_TERMS = 9
 """Terms of the series of sine and cosine: exact to float64 for squared angles up to 1."""
-_ADAM = optax.scale_by_adam(eps=1e-15)
 
 
 @record
@@ -176,26 +173,3 @@ def correction_penalty(correction: Corrections, extent: Float[Array, ""]) -> Flo
     shift = correction.twists[3:] / jnp.where(extent > 0, extent, 1.0)
     poses = jnp.sum(correction.twists[:3] ** 2) + jnp.sum(shift**2)
     return POSE_WEIGHT * poses + COLOUR_WEIGHT * jnp.sum((correction.colours - jnp.eye(3, 4)) ** 2)
-
-
-def update_corrections(
-    state: CorrectionState, view: Int[Array, ""], gradient: Corrections, visits: Int[Array, ""], rates: Corrections
-) -> CorrectionState:
-    """Takes one Adam step for one view.
-
-    Args:
-      state: Corrections of all T views and their moments.
-      view: () index of the view.
-      gradient: Gradient of the loss with respect to the corrections of that view.
-      visits: () number of earlier steps of that view.
-      rates: Step sizes.
-
-    Returns:
-      The state with a new row for that view.
-    """
-    row = jax.tree.map(lambda a: a[view], state)
-    moments: Any = optax.ScaleByAdamState(*cast(Any, (visits, row.first_moment, row.second_moment)))
-    direction, moments = _ADAM.update(cast(Any, gradient), moments)
-    corrected = jax.tree.map(lambda p, u, r: p - r * u, row.current, direction, rates)
-    row = CorrectionState(corrected, moments.mu, moments.nu)
-    return jax.tree.map(lambda a, new: a.at[view].set(new), state, row)

@@ -27,19 +27,6 @@ class DepthPoints(NamedTuple):
     """(S,) int32 the point that the sample belongs to."""
 
 
-def require_depths(capture: Capture) -> None:
-    """Checks that a capture has depth frames.
-
-    Args:
-      capture: The capture.
-
-    Raises:
-      InputError: It has none.
-    """
-    if capture.depths is None:
-        raise InputError("capture", "no depth frames", "RGB-D frames", "Use sparse points, or triangulate points.")
-
-
 def back_project_frame(capture: Capture, frame: int, stride: int):
     """Back-projects the known depths of one frame.
 
@@ -50,9 +37,13 @@ def back_project_frame(capture: Capture, frame: int, stride: int):
 
     Returns:
       World points (S, 3) float64, their colours (S, 3) uint8 and pixels (S, 2) row, column.
+
+    Raises:
+      InputError: The capture has no depth.
     """
     camera = capture.cameras[frame]
-    assert capture.depths is not None
+    if capture.depths is None:
+        raise InputError("capture", "no depth frames", "RGB-D frames", "Use sparse points, or triangulate points.")
     depth = np.asarray(capture.depths[frame], np.float64)[::stride, ::stride]
     rows, columns = np.nonzero(np.isfinite(depth) & (depth > 0))
     z = depth[rows, columns]
@@ -117,7 +108,6 @@ def points_from_depth(
     """
     exclusive = (voxel is None) != (max_points is None)
     require(exclusive, "voxel, max_points", (voxel, max_points), "exactly one of the two", "voxel is in world units.")
-    require_depths(capture)
     chosen = np.flatnonzero(~np.asarray(capture.held_out)) if frames is None else np.asarray(frames)
     parts = [back_project_frame(capture, int(t), stride) for t in chosen]
     if not any(len(world) for world, _, _ in parts):

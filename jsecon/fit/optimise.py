@@ -17,7 +17,7 @@ from jsecon.errors import InputError, require
 from jsecon.fit.corrections import CorrectionState, RefineOptions, identity_corrections
 from jsecon.fit.growth import drop_free_rows, grow, pad_with_free_rows
 from jsecon.fit.schedule import LearningRates, Schedule
-from jsecon.fit.step import StepConfig, StepRunner, TrainState, put_on_devices, to_host
+from jsecon.fit.step import StepConfig, StepRunner, TrainState, put_on_devices
 from jsecon.parallel import host_mesh
 from jsecon.splat.capacity import round_capacity
 from jsecon.splat.strips import BLOCK
@@ -196,7 +196,7 @@ def fit_gaussians(
         shares = done + pace * np.arange(count)
         train_state, new_losses = _run_chunk(train_state, runner, size, order, first, shares, config)
         losses = np.concatenate([state.losses, np.asarray(new_losses, np.float32)])
-        host = to_host(train_state, state.gaussians.count)
+        host = _to_host(train_state, state.gaussians.count)
         # A Gaussian that is not finite is invisible: the loss alone does not show it.
         arrays = jax.tree.leaves((losses[-1], host.gaussians, host.corrections))
         if not all(np.isfinite(array).all() for array in arrays):
@@ -241,6 +241,12 @@ def _check_resumable(state: FitState, steps: int | None, refine: RefineOptions |
 
 def _train_state(state: FitState) -> TrainState:
     return TrainState(state.gaussians, state.first_moment, state.second_moment, state.votes, state.corrections)
+
+
+def _to_host(state: TrainState, rows: int) -> TrainState:
+    """Copies a state to NumPy arrays, without the rows beyond `rows` that `put_on_devices` added."""
+    host = jax.tree.map(np.asarray, state)
+    return jax.tree.map(lambda a: a[:rows], host._replace(corrections=None))._replace(corrections=host.corrections)
 
 
 def _run_chunk(

@@ -117,22 +117,6 @@ def ssim_map(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Flo
     return numerator / ((mean_i * mean_i + mean_t * mean_t + C1) * (variance_i + variance_t + C2))
 
 
-def ssim(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[Array, ""]:
-    """Computes the mean of `ssim_map` over pixels and channels.
-
-    Args:
-      image: (H, W, C) in [0, 1].
-      target: Image of the same shape.
-
-    Returns:
-      () in [-1, 1].
-
-    Raises:
-      ValueError: The shapes differ.
-    """
-    return jnp.mean(ssim_map(image, target))
-
-
 SSIM_SHARE = 0.2
 """Share of SSIM in the loss (Kerbl et al. 2023)."""
 
@@ -155,7 +139,7 @@ def photometric_loss(
     """
     _same_shape(image, target)
     if mesh is None:
-        return (1 - SSIM_SHARE) * l1(image, target) + SSIM_SHARE * (1 - ssim(image, target))
+        return (1 - SSIM_SHARE) * l1(image, target) + SSIM_SHARE * (1 - jnp.mean(ssim_map(image, target)))
     return _over_mesh(image, target, mesh)
 
 

@@ -18,7 +18,6 @@ from jsecon.fit.corrections import (
     apply_exposure,
     corrected_camera,
     correction_penalty,
-    update_corrections,
 )
 from jsecon.fit.growth import pad_rows, pad_with_free_rows
 from jsecon.fit.photometric import photometric_loss
@@ -243,13 +242,25 @@ def step(
     gaussians, first, second = map_rows(update, rows, (inputs.step, rate), mesh)
     if corrections is not None:
         assert inputs.correction_rates is not None
-        corrections = update_corrections(
+        corrections = _update_corrections(
             corrections, inputs.frame, correction_gradient, inputs.visits, inputs.correction_rates
         )
     after = TrainState(gaussians, first, second, votes + vote_gradient[:, 0], corrections)
     if mesh is not None:  # the same shardings as before: one program serves every step
         after = TrainState(*map(jax.lax.with_sharding_constraint, after, _shardings(mesh)))
     return after, value, overflow
+
+
+def _update_corrections(
+    state: CorrectionState, view: Array, gradient: Corrections, visits: Array, rates: Corrections
+) -> CorrectionState:
+    """Takes one Adam step for one view, at those rates; `visits` is the number of its earlier steps."""
+    row = jax.tree.map(lambda a: a[view], state)
+    moments: Any = optax.ScaleByAdamState(*cast(Any, (visits, row.first_moment, row.second_moment)))
+    direction, moments = _ADAM.update(cast(Any, gradient), moments)
+    corrected = jax.tree.map(lambda p, u, r: p - r * u, row.current, direction, rates)
+    row = CorrectionState(corrected, moments.mu, moments.nu)
+    return jax.tree.map(lambda a, new: a.at[view].set(new), state, row)
 
 
 def _step_of_leaves(leaves: list[Array], treedef: Any, capacity: int, mesh: Mesh | None):
@@ -291,20 +302,6 @@ def put_on_devices(state: TrainState, mesh: Mesh | None) -> TrainState:
         first, second, votes = pad_rows((state.first_moment, state.second_moment, state.votes), rows)
         state = TrainState(pad_with_free_rows(state.gaussians, rows), first, second, votes, state.corrections)
     return TrainState(*map(jax.device_put, state, _shardings(mesh)))
-
-
-def to_host(state: TrainState, rows: int) -> TrainState:
-    """Copies a state to NumPy arrays.
-
-    Args:
-      state: State on devices.
-      rows: Number of rows to keep; the others are those that `put_on_devices` added.
-
-    Returns:
-      The state.
-    """
-    host = jax.tree.map(np.asarray, state)
-    return jax.tree.map(lambda a: a[:rows], host._replace(corrections=None))._replace(corrections=host.corrections)
 
 
 class StepRunner:

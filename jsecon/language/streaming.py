@@ -11,7 +11,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import jax
 import numpy as np
@@ -35,23 +35,10 @@ _MAX_CASTS = 1 << 26
 """Weights, each of a view on a Gaussian, that are added up at once."""
 
 
-@runtime_checkable
-class Images(Protocol):
-    """Sequence of images: an array, or an object that reads them one at a time."""
-
-    def __len__(self) -> int:
-        """Returns the number of items."""
-        ...
-
-    def __getitem__(self, t: int, /) -> Any:
-        """Returns item `t`."""
-        ...
-
-
 def region_votes_in_blocks(
     gaussians: Gaussians,
     cameras: Camera,
-    labels: Images,
+    labels: Any,
     num_regions: int,
     *,
     folder: str | os.PathLike,
@@ -71,7 +58,7 @@ def region_votes_in_blocks(
     Args:
       gaussians: Scene of N Gaussians, such as `load_field(path, mapped=True).gaussians`.
       cameras: Batch of T cameras.
-      labels: T label images (H, W) that are read one at a time; -1 where a pixel belongs to no region.
+      labels: T label images (H, W), of which `labels[t]` reads one at a time; -1 where a pixel belongs to no region.
       num_regions: R. Labels must be smaller.
       folder: New or empty folder for the columns of the votes; they stay as long as its files do.
       top: Number of strongest regions, of the sums over all views, that each Gaussian keeps.

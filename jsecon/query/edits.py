@@ -103,15 +103,3 @@ def shrink(mask: Bool[Array, " n"], near: Int[Array, "n k"], shells: int = 1) ->
       ValueError: `shells` is negative.
     """
     return ~grow(~jnp.asarray(mask), near, shells)
-
-
-def invert(mask: Bool[Array, " n"]) -> Bool[Array, " n"]:
-    """Selects what is not selected.
-
-    Args:
-      mask: (N,) the selected Gaussians.
-
-    Returns:
-      (N,) mask.
-    """
-    return ~jnp.asarray(mask)
