@@ -52,7 +52,7 @@ def test_no_product_of_matrices_is_left_to_the_device(scene, cameras):
     programs = {
         "cosines": lambda *_: cosine_matrix(rows, rows),
         "similarities": lambda *_: similarities(unit_codes(rows), rows[0])[0],
-        "code": lambda *_: coder.decode(coder.encode(rows)),
+        "code": lambda *_: coder.encode(rows),
         "gradients": lambda g, c, _: jax.grad(image, argnums=(0, 2))(g, c, jnp.ones((64, 40))),
         "votes": lambda g, c, x: jsecon.region_votes(g, c, x, 3, capacity=4096).weights,
     }

@@ -47,7 +47,6 @@ def test_a_rotation_keeps_every_cosine(regions, latent):
     assert "without loss" in reason
     assert codes.shape == (regions, latent)
     np.testing.assert_allclose(np.asarray(codes) @ np.asarray(codes).T, embeddings @ embeddings.T, atol=2e-6)
-    np.testing.assert_allclose(coder.decode(codes), embeddings, atol=2e-6)
     np.testing.assert_allclose(encode(coder, embeddings), codes, atol=1e-6)
 
 
@@ -112,8 +111,6 @@ def test_a_spread_coder_knows_its_regions_and_places_a_text_beside_its_region():
     coder = Spread(units, codes)
     own = np.asarray(coder.encode(units))
     assert ((own @ np.asarray(codes).T).argmax(1) == np.arange(30)).all()
-    back = np.asarray(coder.decode(codes))
-    assert ((back @ units.T).argmax(1) == np.arange(30)).all()
     text = unit_rows_of(units + 0.2 * unit_rows(np.random.default_rng(5), 30, 64))
     found = np.asarray(jax.jit(jax.vmap(coder.encode))(jnp.asarray(text)))
     np.testing.assert_allclose(found, coder.encode(text), atol=1e-5)

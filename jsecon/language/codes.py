@@ -1,6 +1,6 @@
 """Small codes for the regions: which kind, of how many numbers, and why.
 
-A coder has `.encode` and `.decode`: `Rotation` (principal directions; exact where the regions' span fits), `Spread`
+A coder has `.encode`: `Rotation` (principal directions; exact where the regions' span fits), `Spread`
 (a code per region, placed on the sphere so that distinct regions stay apart), LangSplat's `Autoencoder`
 (jsecon.language.autoencoder), or None (the embeddings themselves). `region_codes` chooses.
 """
@@ -53,17 +53,6 @@ class Rotation:
         """
         return normalize(jnp.matmul(normalize(jnp.asarray(embeddings)), self.basis, precision=FULL_PRECISION))
 
-    def decode(self, codes: Float[Array, "*batch d"]) -> Float[Array, "*batch e"]:
-        """Decodes codes.
-
-        Args:
-          codes: (..., d) of any length.
-
-        Returns:
-          (..., E) unit embeddings inside the span.
-        """
-        return normalize(jnp.matmul(jnp.asarray(codes), jnp.asarray(self.basis).T, precision=FULL_PRECISION))
-
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
@@ -88,17 +77,6 @@ class Spread:
           (..., d) unit codes; zero for a zero embedding.
         """
         return _among(jnp.asarray(embeddings), jnp.asarray(self.embeddings), jnp.asarray(self.codes))
-
-    def decode(self, codes: Float[Array, "*batch d"]) -> Float[Array, "*batch e"]:
-        """Decodes codes by the embeddings of the regions with the most similar codes.
-
-        Args:
-          codes: (..., d) of any length.
-
-        Returns:
-          (..., E) unit embeddings; zero for a zero code.
-        """
-        return _among(jnp.asarray(codes), jnp.asarray(self.codes), jnp.asarray(self.embeddings))
 
 
 Coder: TypeAlias = Autoencoder | Rotation | Spread | None

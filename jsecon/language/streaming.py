@@ -22,7 +22,7 @@ from jsecon.errors import InputError, require, require_shape
 from jsecon.files import atomic_write, map_npy, write_npy
 from jsecon.language.columns import ROWS, vote_blocks
 from jsecon.language.distill import MIN_LABELLED, distill_votes
-from jsecon.language.votes import dense_votes, region_blocks
+from jsecon.language.votes import dense_votes
 from jsecon.numerics import NEAR, require_labels
 from jsecon.splat.visible import geometry_of_rows, visible_rows
 from jsecon.types import Array, Camera, Gaussians, Progress, Votes
@@ -157,12 +157,12 @@ def _cast_view(
     # A view knows its own regions alone, up to a power of two: views share compiled programs.
     local = np.where(labels >= 0, np.searchsorted(names, np.maximum(labels, 0)), -1).astype(np.int32)
     size, overflow = 1 << max(len(names) - 1, 0).bit_length(), 0
-    for b, block in enumerate(region_blocks(part.means.shape[0], size)):
-        state, _, _ = dense_votes(part, cameras, local[None], block, centre=centre, near=near)
+    blocks = dense_votes(part, cameras, local[None], size, centre=centre, near=near)
+    for b, (first, state) in enumerate(blocks):
         weights = np.asarray(state["votes"])[: len(ids)]
         row, place = np.nonzero(weights)
         pairs = np.empty(len(row), _PAIR)
-        pairs["gaussian"], pairs["region"], pairs["weight"] = ids[row], names[block.start + place], weights[row, place]
+        pairs["gaussian"], pairs["region"], pairs["weight"] = ids[row], names[first + place], weights[row, place]
         np.save(f"{path}-{b}.npy", pairs)
         if b == 0:
             seen = np.flatnonzero(np.asarray(state["total"])[: len(ids)])

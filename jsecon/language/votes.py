@@ -6,6 +6,7 @@ targets take only R values. The N x R votes therefore hold all that distillation
 
 import dataclasses
 import functools
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -75,21 +76,12 @@ def region_votes(
         options = {"top": top, "by_view": by_view, "centre": centre, "capacity": capacity, "near": near}
         return scan_region_votes(gaussians, cameras, labels, num_regions, **options)
     _require_views(cameras, labels, num_regions)
-    blocks = region_blocks(gaussians.count, num_regions)
-    kept, labelled, totals, state = _none_kept(np, gaussians), None, None, {}
-    for b, block in enumerate(blocks):
-        report = None if progress is None else functools.partial(_report_block, progress, b, len(blocks))
-        options = {"by_view": by_view, "centre": centre, "near": near, "progress": report}
-        state, totals, size = dense_votes(gaussians, cameras, labels, block, capacity=capacity, **options)
-        capacity = size if capacity is None and size > _default_capacity(gaussians, cameras) else capacity
-        kept, weight = _keep_strongest(kept, state.pop("votes"), block.start, min(top, max(num_regions, 1)))
+    kept, labelled, state = _none_kept(np, gaussians), None, {}
+    options = {"by_view": by_view, "centre": centre, "capacity": capacity, "near": near, "progress": progress}
+    for first, state in dense_votes(gaussians, cameras, labels, num_regions, **options):
+        kept, weight = _keep_strongest(kept, state.pop("votes"), first, min(top, max(num_regions, 1)))
         labelled = weight if labelled is None else labelled + weight
-    return _as_votes(kept, labelled, state, totals if by_view else None, num_regions)
-
-
-def _report_block(progress: Progress, block: int, blocks: int, done: int, total: int) -> None:
-    """Reports the views of one of several blocks of regions."""
-    progress(block * total + done, blocks * total)
+    return _as_votes(kept, labelled, state, state["by_view"], num_regions)
 
 
 def scan_region_votes(
@@ -127,7 +119,7 @@ def scan_region_votes(
     _require_views(cameras, labels, num_regions)
     static = _default_capacity(gaussians, cameras) if capacity is None else capacity, by_view, centre
     kept, labelled, totals, state = _none_kept(jnp, gaussians), None, None, {}
-    for block in region_blocks(gaussians.count, num_regions):
+    for block in _region_blocks(gaussians.count, num_regions):
         regions = np.array([block.start, min(block.stop, num_regions)], np.int32)
         common = _without_colour(gaussians), regions, jnp.asarray(near, gaussians.means.dtype)
 
@@ -145,57 +137,57 @@ def dense_votes(
     gaussians: Gaussians,
     cameras: Camera,
     labels: Shaped[Array, "t h w"],
-    regions: range,
+    num_regions: int,
     *,
     by_view: bool = False,
     centre: float = 0.0,
     capacity: int | None = None,
     near: float = NEAR,
     progress: Progress | None = None,
-) -> tuple[dict[str, Array], Array | None, int]:
-    """Computes the votes of a block of regions. Host code; other arguments as for `region_votes`.
+) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Computes the votes in blocks of regions whose dense (N, block) votes fit into 1 GiB. Host code.
 
     Args:
       gaussians: Scene of N Gaussians.
       cameras: Batch of T cameras.
       labels: (T, H, W) integer region ids, -1 where a pixel belongs to no region.
-      regions: Consecutive region ids of the block.
+      num_regions: R.
       by_view: Whether to keep each view's total.
       centre: In [0, 1], weight of a Gaussian's centre against its footprint.
       capacity: Number of (block, Gaussian) pairs of a view; None finds one that suffices.
       near: Near plane, world units.
-      progress: Called as progress(done, total), in views.
+      progress: Called as progress(done, total), in views of all blocks.
 
-    Returns:
-      {"votes" (N, len(regions)), "total", "peak", "views" (N,), "overflow"}; the total of each view (T, N) or None; and
-      the capacity that was used.
+    Yields:
+      The first region of a block; and {"votes" (N, block), "total", "peak", "views" (N,), "overflow", "by_view" (T, N)
+      or None}.
     """
-    size = _default_capacity(gaussians, cameras) if capacity is None else capacity
-    ids = np.array([regions.start, regions.stop], np.int32)
     # One program serves every near plane, which `plan_views` chooses by the scene's size.
-    common = _without_colour(gaussians), ids, np.asarray(near, gaussians.means.dtype)
-    start = _empty(np, gaussians.count, len(regions), gaussians.means.dtype)
-    while True:
-        static = size, by_view, centre
-        state, totals = accumulate_over_views(
-            _add_view, start, _merge, common, (cameras, labels), prepare=_plan_view, static=static, progress=progress
-        )
-        missing = np.asarray(state["missing"])
-        if capacity is not None or not missing:
-            return state, totals, size
-        size = enough_capacity(size, missing[None])
+    scene, near_plane = _without_colour(gaussians), np.asarray(near, gaussians.means.dtype)
+    size = _default_capacity(gaussians, cameras) if capacity is None else capacity
+    blocks = _region_blocks(gaussians.count, num_regions)
+    for b, block in enumerate(blocks):
+        common = scene, np.array([block.start, block.stop], np.int32), near_plane
+        start = _empty(np, gaussians.count, len(block), gaussians.means.dtype)
+        report = None if progress is None else functools.partial(_report_block, progress, b, len(blocks))
+        while True:
+            options = {"prepare": _plan_view, "static": (size, by_view, centre), "progress": report}
+            state, totals = accumulate_over_views(_add_view, start, _merge, common, (cameras, labels), **options)
+            missing = np.asarray(state["missing"])
+            if capacity is not None or not missing:
+                break
+            size = enough_capacity(size, missing[None])
+        state["by_view"] = totals if by_view else None
+        yield block.start, state  # whoever takes the votes out of it frees them before the next block
 
 
-def region_blocks(count: int, regions: int) -> list[range]:
-    """Divides region ids into blocks of one length whose dense (N, block) votes fit into 1 GiB.
+def _report_block(progress: Progress, block: int, blocks: int, done: int, total: int) -> None:
+    """Reports the views of one of several blocks of regions."""
+    progress(block * total + done, blocks * total)
 
-    Args:
-      count: N, number of Gaussians.
-      regions: R.
 
-    Returns:
-      The ids of each block, at least one block; the last may reach beyond R.
-    """
+def _region_blocks(count: int, regions: int) -> list[range]:
+    """The region ids of each block, at least one, all of one length: the last may reach beyond the regions."""
     size = _block_size(count, regions)
     return [range(first, first + size) for first in range(0, max(regions, 1), size)]
 
