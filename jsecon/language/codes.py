@@ -226,16 +226,15 @@ def principal_rotation(units: Float[Array, "r e"], latent: int) -> Rotation:
     return Rotation(jnp.asarray(basis, units.dtype))
 
 
-def spread_codes(units: Float[Array, "r e"], latent: int, *, separation: float = CODE_THRESHOLD) -> Float[Array, "r d"]:
+def spread_codes(units: Float[Array, "r e"], latent: int) -> Float[Array, "r d"]:
     """Places a unit code (R, d) for each region so that cosines are kept and distinct regions stay apart. Host code.
 
     Adam starts at the principal directions and minimises the mean squared error of the centred cosines, and the squares
-    by which distinct pairs exceed the separation and alike ones fall short of it.
+    by which distinct pairs exceed CODE_THRESHOLD and alike ones fall short of it.
 
     Args:
       units: (R, E) unit embeddings; a zero row gets a zero code.
       latent: d.
-      separation: Cosine below which codes of distinct regions stay.
 
     Returns:
       The codes, the same in every run.
@@ -253,7 +252,7 @@ def spread_codes(units: Float[Array, "r e"], latent: int, *, separation: float =
     distinct = _distinct_pairs(units)
     alike = ~distinct & known[:, None] & known[None]
     start, target = jnp.asarray(start, units.dtype), jnp.asarray(target, units.dtype)
-    codes = _spread(start, target, jnp.asarray(distinct), jnp.asarray(alike), separation)
+    codes = _spread(start, target, jnp.asarray(distinct), jnp.asarray(alike), CODE_THRESHOLD)
     return jnp.where(jnp.asarray(known)[:, None], codes, 0.0)
 
 

@@ -29,18 +29,17 @@ def is_mapped(tree: Any) -> bool:
     return any(isinstance(leaf, np.memmap) for leaf in jax.tree.leaves(tree))
 
 
-def row_slices(tree: Any, count: int, rows: int | None = None) -> Iterator[slice]:
+def row_slices(tree: Any, count: int) -> Iterator[slice]:
     """Divides rows into consecutive slices, so that at most one block of mapped columns is in memory.
 
     Args:
       tree: Tree of arrays with rows.
       count: N, number of rows.
-      rows: Number of rows of a slice if the tree has mapped arrays, by default ROWS.
 
     Returns:
-      The slices; a single one if no array is mapped.
+      The slices, of ROWS rows if the tree has mapped arrays; else a single one.
     """
-    step = (ROWS if rows is None else rows) if is_mapped(tree) else max(count, 1)
+    step = ROWS if is_mapped(tree) else max(count, 1)
     return (slice(first, min(first + step, count)) for first in range(0, count, step))
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from jsecon.language.membership import SHARE_THRESHOLD, ratio, vote_columns
 from jsecon.query.match import RULES, match_region
-from jsecon.query.rules import MIN_PIECE_OVERLAP, QueryRules
+from jsecon.query.rules import MIN_PIECE_OVERLAP
 from jsecon.types import Array, LanguageField, Votes
 
 
@@ -23,12 +23,11 @@ class SameObject(NamedTuple):
     """They look the same, as two pieces or two objects of a kind do (`alike_threshold`)."""
 
 
-def same_object(field: LanguageField, rules: QueryRules = RULES) -> SameObject:
+def same_object(field: LanguageField) -> SameObject:
     """Finds the pairs of regions that show one object by the rules of queries, and those that look as if they did.
 
     Args:
       field: Field of R regions.
-      rules: Rules of which `piece_threshold` and `alike_threshold` are read.
 
     Returns:
       The pairs. Without `Votes.overlap` no two regions are joined.
@@ -37,12 +36,12 @@ def same_object(field: LanguageField, rules: QueryRules = RULES) -> SameObject:
     itself = ids[:, None] == ids
     if not len(ids):
         return SameObject(itself, itself)
-    alike_rules = dataclasses.replace(rules, piece_threshold=None)
+    alike_rules = dataclasses.replace(RULES, piece_threshold=None)
     alike = jax.vmap(lambda region: match_region(field, region, alike_rules).chosen)(ids)
     alike = itself | (alike & alike.T)
     if field.votes.overlap is None:
         return SameObject(itself, alike)
-    joins = jax.vmap(lambda region: match_region(field, region, rules).chosen)(ids)
+    joins = jax.vmap(lambda region: match_region(field, region, RULES).chosen)(ids)
     overlaps = jnp.asarray(field.votes.overlap) >= MIN_PIECE_OVERLAP
     return SameObject(itself | (joins & joins.T & overlaps), alike)
 
@@ -62,10 +61,8 @@ def containment(overlap: Float[Array, "r r"], size: Float[Array, " r"]) -> Float
     return jnp.where(size[:, None] > 0, both / jnp.where(size > 0, size, 1.0)[:, None], 0.0)
 
 
-@functools.partial(jax.jit, static_argnames="threshold")
-def objects_of_gaussians(
-    votes: Votes, objects: Int[Array, " r"], *, threshold: float = SHARE_THRESHOLD
-) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
+@jax.jit
+def objects_of_gaussians(votes: Votes, objects: Int[Array, " r"]) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
     """Assigns each Gaussian to the object with the largest share in it.
 
     The share is that of all regions of the object together (`share_of`), so a query for exactly these regions selects
@@ -74,10 +71,9 @@ def objects_of_gaussians(
     Args:
       votes: Votes of N Gaussians on R regions.
       objects: (R,) object of each region, -1 for none.
-      threshold: Smallest share.
 
     Returns:
-      (N,) object, -1 for none, and (N,) its share; 0 without votes. Each row stands for itself.
+      (N,) object, -1 for shares below SHARE_THRESHOLD, and (N,) its share; 0 without votes. Each row stands for itself.
     """
     columns = list(vote_columns(votes))
     owners = [jnp.where(region >= 0, objects[jnp.maximum(region, 0)], -1) for region, _, _ in columns]
@@ -93,4 +89,4 @@ def objects_of_gaussians(
         share = jnp.nan_to_num(ratio(weight, seen))
         better = (owner >= 0) & (votes.views > 0) & (share > best_share)
         best, best_share = jnp.where(better, owner, best), jnp.where(better, share, best_share)
-    return jnp.where(best_share >= threshold, best, -1).astype(jnp.int32), best_share
+    return jnp.where(best_share >= SHARE_THRESHOLD, best, -1).astype(jnp.int32), best_share

@@ -87,22 +87,19 @@ def _rectangles(projection: Projection, width: int, height: int, edge: int, stri
     return x0, x1, strip.first_row(y0), strip.first_row(y1)
 
 
-def pair_counts(
-    projection: Projection, width: int, height: int, *, tile: int = TILE, strip: Strip = FULL_IMAGE
-) -> Int[Array, " n"]:
+def pair_counts(projection: Projection, width: int, height: int, *, strip: Strip = FULL_IMAGE) -> Int[Array, " n"]:
     """Counts the blocks of BLOCK x BLOCK tiles that each splat touches.
 
     Args:
       projection: N splats.
       width: Width of the image, px.
       height: Height of the image, px.
-      tile: Edge of a tile, px.
       strip: Strip whose blocks count.
 
     Returns:
       (N,) int32.
     """
-    x0, x1, y0, y1 = _rectangles(projection, width, height, BLOCK * tile, strip)
+    x0, x1, y0, y1 = _rectangles(projection, width, height, BLOCK * TILE, strip)
     return (x1 - x0) * (y1 - y0)
 
 

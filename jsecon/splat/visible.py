@@ -82,13 +82,12 @@ def geometry_of_rows(gaussians: Gaussians, ids: Int[np.ndarray, " m"]) -> Gaussi
     return dataclasses.replace(part, sh=np.zeros((size, 1, 3), np.float32))
 
 
-def render_in_blocks(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> Float[np.ndarray, "h w 3"]:
+def render_in_blocks(gaussians: Gaussians, camera: Camera) -> Float[np.ndarray, "h w 3"]:
     """Renders the features of `render_rgb` of N Gaussians whose columns may be memory-mapped.
 
     Args:
       gaussians: The scene. Its numbers must be finite.
       camera: The view.
-      near: Near plane, world units.
 
     Returns:
       The image.
@@ -97,7 +96,7 @@ def render_in_blocks(gaussians: Gaussians, camera: Camera, *, near: float = NEAR
       ValueError: Shapes disagree.
     """
     camera = jax.tree.map(np.asarray, camera)
-    ids = visible_rows(gaussians, camera, near=near)
+    ids = visible_rows(gaussians, camera)
     colours = np.zeros((_padded_size(len(ids)), 3), np.float32)
     for first in range(0, len(ids), ROWS):
         rows = ids[first : first + ROWS]
@@ -105,7 +104,7 @@ def render_in_blocks(gaussians: Gaussians, camera: Camera, *, near: float = NEAR
         colours[first : first + len(rows)] = _colours(part, camera)
     if not len(ids):
         return np.zeros((camera.height, camera.width, 3), np.float32)
-    return np.asarray(render(geometry_of_rows(gaussians, ids), camera, jnp.asarray(colours), near=near).features)
+    return np.asarray(render(geometry_of_rows(gaussians, ids), camera, jnp.asarray(colours)).features)
 
 
 _colours = jax.jit(colours_from_sh)

@@ -260,13 +260,7 @@ def blend_weights(transmittance: Array, alpha: Array) -> tuple[Array, Array]:
 
 
 def walk(
-    table: Array,
-    lists: TileLists,
-    batches: Batches,
-    tiles: Array,
-    body: Callable,
-    state: Any,
-    left: Array | None = None,
+    table: Array, lists: TileLists, batches: Batches, tiles: Array, body: Callable, state: Any
 ) -> tuple[Any, Array]:
     """Walks down the lists of one batch, until the longest ends or every pixel is opaque.
 
@@ -277,7 +271,6 @@ def walk(
       tiles: (B,) tiles of this batch.
       body: `transmittance, state = body(transmittance, state, chunk)`, with transmittance (B, pixels).
       state: Initial state.
-      left: (B, pixels) initial transmittance, by default 1.
 
     Returns:
       The last state, and (B,) int32 the visible length of each list.
@@ -305,6 +298,6 @@ def walk(
         transmittance, state = body(transmittance, state, chunk)
         return first + CHUNK, transmittance, seen, state
 
-    pixels = jnp.ones((tiles.shape[0], batches.tile**2), table.dtype) if left is None else left
+    pixels = jnp.ones((tiles.shape[0], batches.tile**2), table.dtype)
     _, _, seen, state = lax.while_loop(unfinished, step, (jnp.int32(0), pixels, jnp.zeros_like(tiles), state))
     return state, jnp.minimum(seen, length[:, 0])

@@ -24,6 +24,11 @@ GRANULARITIES: dict[str, dict[str, Any]] = {
 """Settings of ClassicalSegmenter by the size of its regions. The coarse one joins the colours of an object, and so
 needs depth to separate objects."""
 
+DARK, LIGHT = 0.22, 0.3
+"""Medians of the linear luminance up to which a frame is brightened, and down to which it is darkened."""
+MAX_GAIN = 8.0
+"""Largest factor on the odds of a luminance, and inverse of the smallest."""
+
 
 def require_contrib() -> None:
     """Checks that OpenCV has its contrib modules.
@@ -133,9 +138,7 @@ def _colour_features(
     return lab * np.asarray([lightness_weight, 1.0, 1.0], np.float32)
 
 
-def adapt_exposure(
-    frame: UInt8[np.ndarray, "h w 3"], *, dark: float = 0.22, light: float = 0.3, most: float = 8.0
-) -> UInt8[np.ndarray, "h w 3"]:
+def adapt_exposure(frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     """Brightens dark frames and darkens bright ones, by the median of their linear luminance.
 
     Steps in CIELAB are those of an eye adapted to the white of the scene: they are too small between dark objects of a
@@ -144,9 +147,6 @@ def adapt_exposure(
 
     Args:
       frame: (H, W, 3) uint8 RGB.
-      dark: Median below which a frame is brightened to it (a mid grey).
-      light: Median above which a frame is darkened to it.
-      most: Largest g, and inverse of the smallest.
 
     Returns:
       (H, W, 3) uint8.
@@ -154,26 +154,23 @@ def adapt_exposure(
     linear = (np.arange(256, dtype=np.float32) / 255.0) ** 2.2
     luminance = linear[frame] @ np.asarray([0.2126, 0.7152, 0.0722], np.float32)
     middle = min(max(float(np.median(luminance)), 1e-6), 1.0 - 1e-6)
-    target = min(max(middle, dark), light)
-    gain = min(max(target * (1.0 - middle) / (middle * (1.0 - target)), 1.0 / most), most)
+    target = min(max(middle, DARK), LIGHT)
+    gain = min(max(target * (1.0 - middle) / (middle * (1.0 - target)), 1.0 / MAX_GAIN), MAX_GAIN)
     table = np.round(255.0 * (gain * linear / (1.0 + (gain - 1.0) * linear)) ** (1.0 / 2.2)).astype(np.uint8)
     return table[frame]
 
 
-def oversegment(
-    features: Float32[np.ndarray, "h w c"], *, scale: float = 30.0, min_size: int = 16
-) -> Int32[np.ndarray, "h w"]:
+def oversegment(features: Float32[np.ndarray, "h w c"], *, min_size: int = 16) -> Int32[np.ndarray, "h w"]:
     """Segments features into small connected regions (Felzenszwalb & Huttenlocher 2004).
 
     Args:
       features: (H, W, C) float32.
-      scale: Dissimilarity below which single pixels join, over their number: larger means larger regions.
       min_size: Least area of a region, px.
 
     Returns:
       (H, W) int32 regions.
     """
-    graph = cv2.ximgproc.segmentation.createGraphSegmentation(sigma=0.5, k=scale, min_size=min_size)
+    graph = cv2.ximgproc.segmentation.createGraphSegmentation(sigma=0.5, k=30.0, min_size=min_size)
     return np.asarray(graph.processImage(np.ascontiguousarray(features)), np.int32)
 
 

@@ -15,6 +15,8 @@ from jaxtyping import Float32, Int, Int32, Int64
 
 from jsecon.vision.surfaces import Surface
 
+MAX_STEP = 40.0
+"""Largest step of shape per pixel, so that one distant background does not outweigh the rest of an outline."""
 BORDER_SHARE = 0.4
 """Weight of the step across the border in a dissimilarity; the rest is the difference of the means."""
 GROWN_AREA = 0.006
@@ -43,7 +45,6 @@ def region_borders(
     shape: Float32[np.ndarray, "h w c"] | Surface | None,
     *,
     steepness: float = 1.0,
-    most: float = 40.0,
 ) -> RegionBorders:
     """Measures the borders between regions.
 
@@ -54,7 +55,6 @@ def region_borders(
       features: (H, W, D) colour features.
       shape: (H, W, C) features of shape, or the surface of the frame, or None.
       steepness: Factor on the distance from a surface's plane.
-      most: Largest step of shape per pixel, so that one distant background does not outweigh the rest of an outline.
 
     Returns:
       The borders of all neighbours.
@@ -75,9 +75,9 @@ def region_borders(
         if shape is None:
             shapes.append(np.zeros(len(colours[-1])))
         elif isinstance(shape, Surface):
-            shapes.append(np.minimum(steepness * shape.off_plane(axis, inner, outer)[cut], most))
+            shapes.append(np.minimum(steepness * shape.off_plane(axis, inner, outer)[cut], MAX_STEP))
         else:
-            shapes.append(np.minimum(step(shape), most))
+            shapes.append(np.minimum(step(shape), MAX_STEP))
     count = int(atoms.max()) + 1
     first, second = np.concatenate(keys).T.astype(np.int64)
     pairs, inverse = np.unique(first * count + second, return_inverse=True)

@@ -15,13 +15,11 @@ from scipy.spatial import KDTree
 from jsecon.types import Camera
 
 
-def smooth_depth(depth: Float32[np.ndarray, "h w"], *, noise: float = 0.06, rounds: int = 3) -> np.ndarray:
+def smooth_depth(depth: Float32[np.ndarray, "h w"]) -> np.ndarray:
     """Removes noise from rendered z-depth and keeps its jumps: a median, then bilateral filters of its logarithm.
 
     Args:
       depth: (H, W), 0 = unknown.
-      noise: Relative step up to which differences are noise.
-      rounds: Number of bilateral filters.
 
     Returns:
       (H, W) with unknown pixels filled from the nearest known one; unchanged if all are unknown.
@@ -30,8 +28,8 @@ def smooth_depth(depth: Float32[np.ndarray, "h w"], *, noise: float = 0.06, roun
     if not known.any():
         return depth
     logarithm = cv2.medianBlur(log_depth(depth)[..., 0], 5)
-    for _ in range(rounds):
-        logarithm = cv2.bilateralFilter(logarithm, 9, noise, 4)
+    for _ in range(3):
+        logarithm = cv2.bilateralFilter(logarithm, 9, 0.06, 4)  # steps up to 6 % are noise
     return np.exp(logarithm)
 
 
@@ -99,7 +97,7 @@ class Surface(NamedTuple):
         return np.minimum(*off) / np.maximum(np.minimum(a[..., 2], b[..., 2]), 1e-6)
 
 
-def cloud_normals(points: Float[np.ndarray, "p 3"], *, neighbours: int = NEIGHBOURS) -> Float64[np.ndarray, "p 3"]:
+def cloud_normals(points: Float[np.ndarray, "p 3"]) -> Float64[np.ndarray, "p 3"]:
     """Estimates the normals of a point cloud.
 
     A normal is the direction of least spread of the nearest points. Rounds of averaging weigh neighbours by agreement,
@@ -107,13 +105,12 @@ def cloud_normals(points: Float[np.ndarray, "p 3"], *, neighbours: int = NEIGHBO
 
     Args:
       points: (P, 3) surface points, P >= 3.
-      neighbours: Number of nearest points.
 
     Returns:
       (P, 3) unit normals of either sign.
     """
     points = np.asarray(points, np.float64)
-    near = np.asarray(KDTree(points).query(points, k=min(neighbours, len(points)), workers=-1)[1])
+    near = np.asarray(KDTree(points).query(points, k=min(NEIGHBOURS, len(points)), workers=-1)[1])
     normals = np.empty_like(points)
     for part in np.array_split(np.arange(len(points)), len(points) // 65536 + 1):
         spread = points[near[part]] - points[near[part]].mean(1, keepdims=True)
