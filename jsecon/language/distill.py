@@ -144,7 +144,7 @@ def distill_l1(
     capacity: int | None = None,
     progress: Progress | None = None,
 ) -> Distillation:
-    """The paper's distillation (as LangSplat's, train.py): Adam on the L1 between rendered and target codes.
+    """Distills as the paper does (LangSplat, train.py): Adam on the L1 between rendered and target codes.
 
     One view a step, all views before any repeats, in an order drawn from `key`. The loss is the mean over all H W d
     numbers of `|F m - G m|`: F the rendering of `f / (|f| + 1e-9)` without background or renormalisation, G the code of

@@ -72,7 +72,7 @@ def finish_votes(votes: Votes, regions: Regions) -> Votes:
 
 
 def finish_votes_in_blocks(votes: Votes, regions: Regions) -> Votes:
-    """`finish_votes` of memory-mapped votes, block by block. Host code.
+    """Finishes memory-mapped votes as `finish_votes` does, block by block. Host code.
 
     Args:
       votes: Votes of N Gaussians, cast `by_view`; votes in memory are one block.

@@ -136,7 +136,7 @@ def _unit_rows(rows: np.ndarray) -> np.ndarray:
 
 @functools.partial(jax.jit, inline=True)
 def mean_residuals(embeddings: Float[Array, "r e"]) -> tuple[Float[Array, "r e"], Bool[Array, " r"]]:
-    """What sets each of R regions apart from the others. Pure.
+    """Computes what sets each of R regions apart from the others. Pure.
 
         e_r - n / (n + 1) mean_q e_q
 

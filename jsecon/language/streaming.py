@@ -49,7 +49,7 @@ def region_votes_in_blocks(
     rows: int = ROWS,
     progress: Progress | None = None,
 ) -> Votes:
-    """`region_votes` of Gaussians in memory-mapped columns, equal up to float32's rounding of the sums.
+    """Casts the votes of `region_votes` on memory-mapped Gaussians, equal up to float32's rounding of the sums.
 
     Memory: the geometry of the Gaussians that one view sees, their tile lists, a dense block of their votes, and one
     block of rows. Disk, until it returns: 12 bytes for each view, Gaussian and region with weight, and 12 for each view
@@ -107,7 +107,7 @@ def codes_in_blocks(
     *,
     min_labelled: float = MIN_LABELLED,
 ) -> Float[np.ndarray, "n d"]:
-    """`distill_votes` of memory-mapped votes, block by block. Host code.
+    """Distills memory-mapped votes as `distill_votes` does, block by block. Host code.
 
     Args:
       votes: Votes of N Gaussians.

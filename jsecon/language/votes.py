@@ -96,7 +96,7 @@ def scan_region_votes(
     capacity: int | None = None,
     near: float = NEAR,
 ) -> Votes:
-    """`region_votes` as a pure function: it scans the views on one device, under jit and vmap.
+    """Casts the votes of `region_votes` as a pure function: it scans the views on one device, under jit and vmap.
 
     Args:
       gaussians: Scene of N Gaussians.

@@ -66,7 +66,7 @@ def select_in_blocks(
     *,
     similarity_threshold: Number | None = None,
 ) -> list[SparseSelection]:
-    """`select_gaussians` of several matches in one pass over the columns of a field.
+    """Selects the Gaussians of several matches in one pass over the columns of a field.
 
     Args:
       field: Field of R regions, such as `load_field(path, mapped=True)`.

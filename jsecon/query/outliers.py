@@ -91,7 +91,7 @@ def split_outliers(
     keep: str = "largest",
     weight: Float[Array, " n"] | None = None,
 ) -> OutlierResult:
-    """`remove_outliers` that also counts the clusters.
+    """Removes outliers as `remove_outliers` does, and counts the clusters.
 
     Args:
       means: (N, 3) centres, world units.

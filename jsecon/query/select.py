@@ -144,7 +144,7 @@ def select_gaussians(
 
 @stored_jit
 def select_by_share(votes: Votes, match: RegionMatch, threshold: Number) -> Selection:
-    """`select_gaussians` by "votes" of any Gaussians. Pure; each row stands for itself.
+    """Selects any Gaussians by "votes", as `select_gaussians` does. Pure; each row stands for itself.
 
     Args:
       votes: Votes of N Gaussians.
@@ -167,7 +167,7 @@ def select_by_code(
     match: RegionMatch,
     threshold: Number,
 ) -> Selection:
-    """`select_gaussians` by "code" of any Gaussians. Pure; each row stands for itself.
+    """Selects any Gaussians by "code", as `select_gaussians` does. Pure; each row stands for itself.
 
     Args:
       codes: (N, d) codes of any length, or their `unit_codes`.
