@@ -235,7 +235,7 @@ def _role_of_repository(address: str) -> Role:
     """Returns the first role whose files a repository has, on this machine or on the hub."""
     models = [model for role in hub.LAYOUTS if isinstance(model := hub.parse_model(address, role), HubModel)]
     for model in models:
-        if hub.cached_folder(model) is not None:
+        if model.cached_folder is not None:
             return model.role
     for model in models:
         with contextlib.suppress(hub.NoSuchFilesError):
