@@ -8,7 +8,7 @@ from hypothesis import given, settings, strategies as st
 
 from experiments.datasets.depth_points import labels_of_points
 from jsecon.errors import InputError
-from jsecon.fit.depth import points_from_depth, voxel_for
+from jsecon.fit.depth import points_from_depth
 from jsecon.fit.start import gaussians_from_points, neighbour_distances, starting_gaussians
 from jsecon.splat.sh import C0
 from jsecon.types import Camera, Capture
@@ -117,11 +117,7 @@ def test_points_from_depth_project_back_onto_their_pixels():
 
 
 def test_max_points_is_kept_and_nearly_reached():
-    points = np.random.default_rng(0).random((5000, 3))
-    voxel = voxel_for(points, 400)
-    occupied = len(np.unique(np.floor((points - points.min(0)) / voxel), axis=0))
-    assert 300 < occupied <= 400
-    assert len(points_from_depth(wall_capture(), max_points=50).points) <= 50
+    assert 40 <= len(points_from_depth(wall_capture(), max_points=50).points) <= 50
 
 
 def test_labels_of_points_take_the_majority():

@@ -5,7 +5,7 @@ import pytest
 
 from jsecon.types import Camera
 from jsecon.vision.classical import ClassicalSegmenter
-from jsecon.vision.surfaces import Surface, camera_points, cloud_normals, surfaces_from_depth
+from jsecon.vision.surfaces import Surface, cloud_normals, surfaces_from_depth
 
 
 def corridor(height=60, width=80, focal=40.0):
@@ -19,6 +19,13 @@ def corridor(height=60, width=80, focal=40.0):
 def camera_of(height, width, focal, poses):
     lens = [np.full(len(poses), number, np.float32) for number in (focal, focal, width / 2, height / 2)]
     return Camera(np.asarray(poses, np.float32), *lens, width=width, height=height)
+
+
+def camera_points(depth, camera):
+    """Points of z-depths in camera axes."""
+    rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
+    rays = [(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(depth.shape)]
+    return np.stack(rays, -1) * depth[..., None].astype(np.float64)
 
 
 def angles(found, wanted):

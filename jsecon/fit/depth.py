@@ -63,16 +63,8 @@ def _voxel_ids(points: np.ndarray, voxel: float) -> np.ndarray:
     return np.unique(np.ravel_multi_index(tuple(cells.T), tuple(size)), return_inverse=True)[1]
 
 
-def voxel_for(points: Float[Array, "s 3"], max_points: int) -> float:
-    """Finds the smallest edge of a voxel, to 2 %, with few occupied voxels.
-
-    Args:
-      points: (S, 3), world units.
-      max_points: Maximum number of occupied voxels.
-
-    Returns:
-      Edge, world units.
-    """
+def _voxel_for(points: Float[Array, "s 3"], max_points: int) -> float:
+    """Finds the smallest voxel edge (to 2 %) that leaves at most `max_points` voxels of the points (S, 3) occupied."""
     points = np.asarray(points, np.float64)
     high = float(np.max(np.ptp(points, axis=0))) * 1.001 + 1e-9
     low = high / 2**20
@@ -116,7 +108,7 @@ def points_from_depth(
     frame = np.repeat(chosen, [len(world) for world, _, _ in parts])
     if voxel is None:
         assert max_points is not None
-        voxel = voxel_for(points, max_points)
+        voxel = _voxel_for(points, max_points)
     ids = _voxel_ids(points, voxel)
     counts = np.bincount(ids)
     mean, color = (np.stack([np.bincount(ids, a) for a in v.T], axis=1) / counts[:, None] for v in (points, colors))

@@ -98,7 +98,7 @@ class ClassicalSegmenter:
         surface = None if self.surfaces is None else self.surfaces(index)
         if surface is not None:
             features, seeds = self._with_surface(features, surface)
-            atoms = oversegment(seeds)
+            atoms = _oversegment(seeds)
             edges = region_borders(atoms, features, surface, steepness=self.merge_distance / self.depth_jump)
             return merge_regions(atoms, features, edges, distance=self.merge_distance, min_area=minimum)
         shape = None
@@ -106,7 +106,7 @@ class ClassicalSegmenter:
             depth = self.depths(index)
             require_shape("depths", depth, frame.shape[:2], "Pass depth of the size of the frame.")
             shape = log_depth(depth) * np.float32(self.merge_distance / np.log1p(self.depth_jump))
-        atoms = oversegment(features if shape is None else np.concatenate([features, shape], -1))
+        atoms = _oversegment(features if shape is None else np.concatenate([features, shape], -1))
         return merge_regions(
             atoms, features, region_borders(atoms, features, shape), distance=self.merge_distance, min_area=minimum
         )
@@ -160,17 +160,9 @@ def adapt_exposure(frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 
     return table[frame]
 
 
-def oversegment(features: Float32[np.ndarray, "h w c"], *, min_size: int = 16) -> Int32[np.ndarray, "h w"]:
-    """Segments features into small connected regions (Felzenszwalb & Huttenlocher 2004).
-
-    Args:
-      features: (H, W, C) float32.
-      min_size: Least area of a region, px.
-
-    Returns:
-      (H, W) int32 regions.
-    """
-    graph = cv2.ximgproc.segmentation.createGraphSegmentation(sigma=0.5, k=30.0, min_size=min_size)
+def _oversegment(features: Float32[np.ndarray, "h w c"]) -> Int32[np.ndarray, "h w"]:
+    """Segments features (H, W, C) into small connected regions (H, W) int32 (Felzenszwalb & Huttenlocher 2004)."""
+    graph = cv2.ximgproc.segmentation.createGraphSegmentation(sigma=0.5, k=30.0, min_size=16)
     return np.asarray(graph.processImage(np.ascontiguousarray(features)), np.int32)
 
 

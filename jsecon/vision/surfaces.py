@@ -143,7 +143,7 @@ def surfaces_from_depth(
         if not (depths[t] > 0).any():
             return None
         rotation, camera = poses[t, :3, :3], cameras[t]
-        here = camera_points(smooth_depth(np.asarray(depths[t], np.float32)), camera)
+        here = _camera_points(smooth_depth(np.asarray(depths[t], np.float32)), camera)
         # Normals change slowly: every second pixel in each direction is enough.
         sampled = here[::2, ::2].reshape(-1, 3)
         normal = normals[tree.query((sampled - poses[t, :3, 3]) @ rotation, workers=-1)[1]] @ rotation.T
@@ -154,16 +154,8 @@ def surfaces_from_depth(
     return surface_of
 
 
-def camera_points(depth: Float32[np.ndarray, "h w"], camera: Camera) -> Float64[np.ndarray, "h w 3"]:
-    """Back-projects z-depth; pixel centres lie at halves.
-
-    Args:
-      depth: (H, W) z-depth, world units.
-      camera: One camera of that image size.
-
-    Returns:
-      (H, W, 3) float64 points in camera axes, world units.
-    """
+def _camera_points(depth: Float32[np.ndarray, "h w"], camera: Camera) -> Float64[np.ndarray, "h w 3"]:
+    """Back-projects z-depth (H, W) to points (H, W, 3) in camera axes; pixel centres lie at halves."""
     rows, columns = np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5
     x = (columns - float(camera.cx)) / float(camera.fx)
     y = (rows - float(camera.cy)) / float(camera.fy)
