@@ -184,8 +184,7 @@ def _print_catalogue(catalogue: Catalogue, listener: Listener) -> None:
 
 def _write_catalogue(field: LanguageField, catalogue: Catalogue, out: Path, listener: Listener) -> dict[str, Path]:
     """Writes OUT/objects.json, OUT/objects.csv and OUT/catalogue.html; returns the files."""
-    files = {name: out / f"{name}.{ending}" for name, ending in (("objects", "json"), ("catalogue", "html"))}
-    files["table"] = out / "objects.csv"
+    files = {"objects": out / "objects.json", "catalogue": out / "catalogue.html", "table": out / "objects.csv"}
     content = {"frame": "the capture's world", "up": catalogue.up.round(6).tolist()}
     content |= {"objects": object_records(catalogue)}
     write_text(files["objects"], json.dumps(content, indent=2) + "\n")

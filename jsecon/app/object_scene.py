@@ -57,7 +57,7 @@ class ObjectScene:
         self._given_up = up
         self._votes = jax.tree.map(jnp.asarray, field.votes)
         self._overlap = None if field.votes.overlap is None else np.asarray(field.votes.overlap)
-        self._objects: dict[tuple[int, ...], tuple[np.ndarray, ObjectShapes] | None] = {}
+        self._object = functools.cache(self._measure_object)
         self._phrases: dict[str, tuple[list[FoundObject], float]] = {}
 
     def prepare(self) -> None:
@@ -99,24 +99,21 @@ class ObjectScene:
             self._phrases[phrase] = objects, float(match.quantile)
         return self._phrases[phrase]
 
-    def _object(self, regions: tuple[int, ...]) -> tuple[np.ndarray, ObjectShapes] | None:
+    def _measure_object(self, regions: tuple[int, ...]) -> tuple[np.ndarray, ObjectShapes] | None:
         """Returns Gaussians and shape of the object of some regions; None if it has no Gaussian."""
-        if regions not in self._objects:
-            chosen = np.zeros(self.field.regions.count, bool)
-            chosen[list(regions)] = True
-            match = RegionMatch(chosen, np.asarray(regions[0], np.int32), np.asarray(1.0, np.float32))
-            selection = select_by_share(self._votes, match, SHARE_THRESHOLD)
-            rows = np.flatnonzero(selection.mask)
-            taken = gaussian_rows(dataclasses.replace(self.field.gaussians, sh=None), rows)
-            weight = np.clip(np.asarray(selection.similarity)[rows], 0, 1) * np.asarray(self.field.votes.total)[rows]
-            kept = split_outliers(taken.means, np.ones(len(rows), bool), keep="supported", weight=weight).mask
-            self._objects[regions] = None
-            if kept.any():
-                taken = gaussian_rows(taken, kept)
-                labels = np.zeros(taken.count, int)
-                shape = object_shapes(taken.means, labels, self.up, spreads=gaussian_spreads(taken))
-                self._objects[regions] = rows[kept], shape
-        return self._objects[regions]
+        chosen = np.zeros(self.field.regions.count, bool)
+        chosen[list(regions)] = True
+        match = RegionMatch(chosen, np.asarray(regions[0], np.int32), np.asarray(1.0, np.float32))
+        selection = select_by_share(self._votes, match, SHARE_THRESHOLD)
+        rows = np.flatnonzero(selection.mask)
+        taken = gaussian_rows(dataclasses.replace(self.field.gaussians, sh=None), rows)
+        weight = np.clip(np.asarray(selection.similarity)[rows], 0, 1) * np.asarray(self.field.votes.total)[rows]
+        kept = split_outliers(taken.means, np.ones(len(rows), bool), keep="supported", weight=weight).mask
+        if not kept.any():
+            return None
+        taken = gaussian_rows(taken, kept)
+        shape = object_shapes(taken.means, np.zeros(taken.count, int), self.up, spreads=gaussian_spreads(taken))
+        return rows[kept], shape
 
     def view(self, frame: int | str | None, camera: Camera | None) -> tuple[Viewpoint, str]:
         """Chooses from where directions are seen.

@@ -25,8 +25,6 @@ SAME_CLICK_SECONDS = 0.5
 SAME_CLICK_ANGLE = 0.02
 """largest difference of the directions of these two rays"""
 
-Step = Callable[[ViewState], ViewState]
-
 
 class Panel:
     """The controls, and the events by which they act on the viewer.
@@ -101,11 +99,7 @@ class Panel:
 
     def _press(self, event: Any) -> None:
         """Handles a button."""
-        steps: dict[str, Step] = {
-            "isolate": ViewState.isolate,
-            "hide": ViewState.hide,
-            "show all": ViewState.show_all,
-        }
+        steps = {"isolate": ViewState.isolate, "hide": ViewState.hide, "show all": ViewState.show_all}
         button = event.target.value
         if button in steps:
             self._viewer.then(steps[button], update_controls=True)
