@@ -15,7 +15,6 @@ from jsecon.language.membership import SHARE_THRESHOLD, ratio, share_of, vote_co
 from jsecon.query.match import (
     RULES,
     evidence,
-    fixed_threshold,
     presence,
     reference_similarities,
     reference_words,
@@ -101,7 +100,7 @@ def _classes(embeddings, texts, pixels, votes, reference, rules: QueryRules, sta
         judged = plain
         if (logits := rules.logits) is not None:
             judged = jax.vmap(lambda text: presence(embeddings, text, logits), out_axes=1)(texts)
-        accepted = of_best(judged) >= fixed_threshold(rules)
+        accepted = of_best(judged) >= rules.fixed_threshold
     accepted &= known & jnp.any(valid)
     count = votes.regions.shape[0]
 

@@ -26,9 +26,7 @@ from jsecon.query.rules import (
     EVIDENCE_PRIOR_VIEWS,
     MIN_PIECE_OVERLAP,
     PIECE_THRESHOLD,
-    PRESENCE_THRESHOLD,
     REFERENCE_CUT,
-    RETRIEVAL_THRESHOLD,
     QueryRules,
 )
 from jsecon.query.similarity import Number, similarities
@@ -385,22 +383,8 @@ def score_text(
         accepted = quantile >= rules.quantile
     else:
         judged = similarity if rules.logits is None else presence(embeddings, text, rules.logits)
-        accepted = judged[anchor] >= fixed_threshold(rules)
+        accepted = judged[anchor] >= rules.fixed_threshold
     return TextScores(similarity, known, anchor, accepted, quantile, confidence)
-
-
-def fixed_threshold(rules: QueryRules) -> Number:
-    """Chooses the threshold on the best region of a text where no quantile decides.
-
-    Args:
-      rules: How texts match.
-
-    Returns:
-      A cosine; a probability if the rules have logits.
-    """
-    if rules.retrieval_threshold is not None:
-        return rules.retrieval_threshold
-    return RETRIEVAL_THRESHOLD if rules.logits is None else PRESENCE_THRESHOLD
 
 
 def _answering_regions(

@@ -19,7 +19,6 @@ from jsecon.language.membership import SHARE_THRESHOLD
 from jsecon.numerics import normalize
 from jsecon.query.match import (
     RULES,
-    fixed_threshold,
     presence,
     quantile_among,
     reference_similarities,
@@ -128,7 +127,7 @@ def parts_fallback(
     if rules.retrieval_threshold is None and reference is not None:
         accepted = float(quantile) >= float(rules.quantile)
     else:
-        accepted = (similar if presence_prob is None else presence_prob) >= float(fixed_threshold(rules))
+        accepted = (similar if presence_prob is None else presence_prob) >= float(rules.fixed_threshold)
     if not mask.any() or float(score) >= MIN_REGION_RATIO * similar or not accepted:
         return None
     region, similar = jnp.asarray(-1, jnp.int32), jnp.asarray(similar, jnp.float32)

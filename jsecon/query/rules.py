@@ -61,6 +61,13 @@ class QueryRules:
     logits: Logits | None = None
     """Scale and bias of an embedder that was trained to tell whether a text is true of an image."""
 
+    @property
+    def fixed_threshold(self) -> Number:
+        """Threshold on the best region of a text where no quantile decides; a probability where there are `logits`."""
+        if self.retrieval_threshold is not None:
+            return self.retrieval_threshold
+        return RETRIEVAL_THRESHOLD if self.logits is None else PRESENCE_THRESHOLD
+
     def __post_init__(self):
         """Raises ValueError for an unknown retrieval."""
         require_one_of("QueryRules", self.retrieval, RETRIEVALS, f"{RETRIEVALS[0]!r} is the default.")
