@@ -223,7 +223,7 @@ def ask_outline(
       outlines: Index or name of a frame -> mask (H, W), or what `jsecon.query.outline.box_mask` makes.
       threshold: Share of a Gaussian that must lie inside; None is 0.5.
       outliers: Whether to drop outliers.
-      key: Key of the answer; None is its name.
+      key: What tells it from other answers in file names (`Answer.key`); None is its name.
 
     Returns:
       The answer.

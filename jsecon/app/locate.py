@@ -128,7 +128,7 @@ def decimals(size: float, part: float) -> int:
 
     Args:
       size: Size of the thing.
-      part: Share of the size, by which coordinates can still be told apart.
+      part: Smallest difference that the decimals show, as a share of the size.
 
     Returns:
       The number of decimals; 6 for a size of 0 or one that is not finite.

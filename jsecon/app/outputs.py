@@ -307,7 +307,7 @@ def _frame_stem(field: LanguageField, frame: int) -> str:
 
 
 def slug(text: str) -> str:
-    """Makes a part of a file name of a text.
+    """Writes a text as a part of a file name.
 
     Args:
       text: The text.

@@ -40,7 +40,7 @@ def section(title: str, words: str, *parts: str) -> str:
       *parts: Its elements.
 
     Returns:
-      The element.
+      Its HTML.
     """
     paragraph = f'<p class="soft">{_escaped(words)}</p>' if words else ""
     return f"<section><h2>{_escaped(title)}</h2>{paragraph}{''.join(parts)}</section>"
@@ -53,7 +53,7 @@ def tiles(figures: Mapping[str, str]) -> str:
       figures: Name -> value with its unit.
 
     Returns:
-      The element.
+      Its HTML.
     """
     tile = '<div class="tile"><b>{}</b><span>{}</span></div>'
     return f'<div class="tiles">{"".join(tile.format(_escaped(v), _escaped(k)) for k, v in figures.items())}</div>'
@@ -68,7 +68,7 @@ def table(header: Sequence[str], rows: Iterable[Sequence[object]], *, numbers_fr
       numbers_from: Index of the first column that is aligned to the right.
 
     Returns:
-      The element.
+      Its HTML.
     """
 
     def cells(tag: str, row: Sequence[object]) -> str:
@@ -87,7 +87,7 @@ def shades(header: Sequence[str], rows: Iterable[tuple[str, Sequence[float | Non
       rows: Name and values (0 to 1) of each row; None is a gap.
 
     Returns:
-      The element.
+      Its HTML.
     """
 
     def cell(value: float | None) -> str:
@@ -106,7 +106,7 @@ def bars(seconds: Mapping[str, float], notes: Mapping[str, str] | None = None) -
       notes: Stage -> what stands beside its bar.
 
     Returns:
-      The element, with a sum.
+      Its HTML, with a sum.
     """
     longest = max(seconds.values(), default=0.0) or 1.0
     rows = "".join(
@@ -129,7 +129,7 @@ def figure(image: np.ndarray, caption: str, *, strong: str = "", sharp: bool = F
       wide: Lets a narrow screen scroll the image sideways.
 
     Returns:
-      The element.
+      Its HTML.
     """
     picture = _image(image, f"{strong} {caption}", sharp, " tabindex=0")
     element = f"<figure>{picture}{_caption(caption, strong)}</figure>"
@@ -144,7 +144,7 @@ def film(webp: bytes, caption: str) -> str:
       caption: The caption.
 
     Returns:
-      The element.
+      Its HTML.
     """
     data = base64.b64encode(webp).decode()
     image = f'<img alt="{_escaped(caption)}" src="data:image/webp;base64,{data}" tabindex=0>'
@@ -161,7 +161,7 @@ def pair(before: np.ndarray, after: np.ndarray, caption: str, *, strong: str = "
       strong: Bold words before the caption.
 
     Returns:
-      The element.
+      Its HTML.
     """
     both = _image(before, "before") + _image(after, f"{strong} {caption}", attributes=' class="after"')
     slider = '<input type="range" value="25" aria-label="how much of each picture is shown">'
@@ -176,7 +176,7 @@ def grid(figures: Iterable[str], columns: int) -> str:
       columns: Number of columns on a wide screen.
 
     Returns:
-      The element.
+      Its HTML.
     """
     return f'<div class="grid" style="--columns:{columns}">{"".join(figures)}</div>'
 
@@ -186,10 +186,10 @@ def cards(elements: Iterable[str], search: str = "") -> str:
 
     Args:
       elements: The cards (`card`).
-      search: Words in a box above them, in which one types what to search for on the page; "" leaves it out.
+      search: Hint in a search box above them; "" leaves the box out.
 
     Returns:
-      The element. The box hides the cards of the page whose `search` lacks one of its words.
+      Its HTML. The box hides the cards of the page whose `search` lacks one of its words.
     """
     words = _escaped(search)
     box = f'<input id="search" type="search" placeholder="{words}" aria-label="{words}">' if search else ""
@@ -207,7 +207,7 @@ def card(image: np.ndarray, title: str, words: str, *parts: str, search: str) ->
       search: Text in which a search box looks for its words.
 
     Returns:
-      The element.
+      Its HTML.
     """
     summary = f"<summary>{_image(image, title)}<b>{_escaped(title)}</b><span>{_escaped(words)}</span></summary>"
     return f'<details class="card" data-search="{_escaped(search.lower())}">{summary}{"".join(parts)}</details>'
@@ -221,7 +221,7 @@ def folded(title: str, *parts: str) -> str:
       *parts: The elements.
 
     Returns:
-      The element.
+      Its HTML.
     """
     return f"<details><summary>{_escaped(title)}</summary>{''.join(parts)}</details>"
 

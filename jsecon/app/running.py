@@ -39,7 +39,7 @@ def run_verb(verb: verbs.Run, console: Console) -> verbs.VerbResult:
       console: Receives the stages, the notes and the figures.
 
     Returns:
-      The metrics, and the files under "written". Process 0 of several returns them; with --dry-run it is the plan.
+      The metrics, and the files under "written"; with --dry-run the plan. Of several processes the others return {}.
 
     Raises:
       InputError: The capture or an option cannot be used, or a model is missing.

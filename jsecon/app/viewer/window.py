@@ -413,7 +413,7 @@ def view_verb(verb: verbs.View, console: Console) -> verbs.VerbResult:
       console: Receives the address.
 
     Returns:
-      Nothing once the viewer is stopped; with --export as `export_page`.
+      {} once the viewer is stopped; with --export as `export_page`.
 
     Raises:
       InputError: As `open_viewer` and `export_page`, or the link, the field or its model cannot be read.
