@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from capture_files import refused
 
-from jsecon.data.video import is_video, sharpest_frames, write_frames
+from jsecon.data.video import is_video, write_frames
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import RunContext
 from jsecon.pipeline.stages import capture_stages
@@ -42,11 +42,6 @@ def test_the_sharpest_frame_of_each_stretch_is_taken(video, tmp_path):
 
 def test_a_short_video_gives_each_of_its_frames(video, tmp_path):
     assert len(write_frames(video, tmp_path)) == 30
-
-
-def test_stretches_cover_the_whole_video():
-    assert sharpest_frames([1.0, 3.0, 2.0, 0.0, 5.0, 4.0, 9.0], 3) == [1, 4, 6]
-    assert sharpest_frames([2.0, 1.0], 5) == [0, 1]
 
 
 def test_what_is_no_video_is_refused(tmp_path):

@@ -256,18 +256,8 @@ def _lens_at_size(image: PosedImage, width: int, height: int) -> Lens:
     return lens.resized(width, height)
 
 
-def allocate_frames(shape: tuple[int, ...]) -> np.ndarray:
-    """Allocates frames, from MAX_IN_MEMORY on in an unnamed temporary file, of which the system caches what is in use.
-
-    Args:
-      shape: Shape of the frames.
-
-    Returns:
-      Uninitialised uint8.
-
-    Raises:
-      InputError: The disk is full.
-    """
+def _allocate_frames(shape: tuple[int, ...]) -> np.ndarray:
+    """Allocates uint8 frames, from MAX_IN_MEMORY on in a temporary file, of which the system caches what is in use."""
     if (size := math.prod(shape)) < MAX_IN_MEMORY:
         return np.empty(shape, np.uint8)
     with tempfile.TemporaryFile() as file:
@@ -458,7 +448,7 @@ def build_capture(
         notes.append(f"{odd} images were resized to {width}x{height}, the commonest size, with their intrinsics.")
     width, height = downscaled_size((width, height), downscale, long_side)
 
-    pixels = allocate_frames((len(images), height, width, 3))
+    pixels = _allocate_frames((len(images), height, width, 3))
     has_depth = any(image.depth for image in images)
     depth_maps = np.zeros((len(images), height, width), np.float32) if has_depth else None
     maps = functools.lru_cache(maxsize=4)(undistortion_maps)

@@ -50,16 +50,8 @@ def video_size(path: Path) -> tuple[int, int]:
         reader.release()
 
 
-def sharpest_frames(sharpness: list[float], count: int) -> list[int]:
-    """Chooses the sharpest frame of each of several stretches of equal length.
-
-    Args:
-      sharpness: Sharpness of each frame.
-      count: Most stretches.
-
-    Returns:
-      Ascending indices.
-    """
+def _sharpest_frames(sharpness: list[float], count: int) -> list[int]:
+    """Chooses the sharpest frame of each of several stretches of equal length."""
     edges = np.linspace(0, len(sharpness), min(count, len(sharpness)) + 1).round().astype(int)
     return [int(a + np.argmax(sharpness[a:b])) for a, b in itertools.pairwise(edges)]
 
@@ -92,7 +84,7 @@ def write_frames(
     if not sharpness:
         remedy = "Copy it again, or convert it (ffmpeg -i VIDEO walk.mp4)."
         raise InputError(video, "OpenCV can read no frame of it", "a video", remedy)
-    chosen, written = set(sharpest_frames(sharpness, frames or DEFAULT_VIDEO_FRAMES)), []
+    chosen, written = set(_sharpest_frames(sharpness, frames or DEFAULT_VIDEO_FRAMES)), []
     for number, (image, _) in enumerate(_decode(video)):
         if number in chosen:
             written.append(folder / f"frame_{number:06d}.jpg")

@@ -100,16 +100,8 @@ class Sam2Graphs:
     constants: Constants
     sizes: Mapping[str, int]
 
-    def run(self, name: str, **feeds: np.ndarray) -> dict[str, np.ndarray]:
-        """Runs a graph.
-
-        Args:
-          name: Its name in SIGNATURES.
-          **feeds: Its inputs by name.
-
-        Returns:
-          Its outputs by name.
-        """
+    def _run(self, name: str, **feeds: np.ndarray) -> dict[str, np.ndarray]:
+        """Runs a graph by name."""
         return self.graphs[name].run(feeds)
 
 
@@ -397,7 +389,7 @@ class FrameEncoder:
             side, constants = self._graphs.sizes["S"], self._graphs.constants
             small = np.asarray(Image.fromarray(frame).resize((side, side), Image.Resampling.BICUBIC))
             image = ((small / 255.0).astype(np.float32) - constants.mean) / constants.std
-            outputs = self._graphs.run("vision_encoder", pixel_values=image.transpose(2, 0, 1)[None])
+            outputs = self._graphs._run("vision_encoder", pixel_values=image.transpose(2, 0, 1)[None])
             self._known[key] = FrameFeatures(*(outputs[name] for name in FrameFeatures._fields))
         self._known.move_to_end(key)
         while len(self._known) > self._keep:
@@ -483,11 +475,11 @@ def _tracked(
     memories, pointers = bank.attended(t, step, count)
     width = graphs.sizes["M"]
     distances = np.array([distance for distance, _ in pointers], np.float32) / max(min(count, POINTERS) - 1, 1)
-    ages = graphs.run("pointer_tpos", normalized_diffs=distances)["pointer_pos"]
+    ages = graphs._run("pointer_tpos", normalized_diffs=distances)["pointer_pos"]
     pointer_tokens = np.array([pointer for _, pointer in pointers], np.float32).reshape(-1, width)
     tokens = [np.asarray(array, np.float32) for _, array in memories]
     codes = [position + graphs.constants.temporal_code[row] for row, _ in memories]
-    conditioned = graphs.run(
+    conditioned = graphs._run(
         "memory_attention",
         current_vision_features=_as_tokens(features.feats2),
         current_vision_position_embeddings=_as_tokens(features.vision_pos_embed),
@@ -501,7 +493,7 @@ def _decode(
     graphs: Sam2Graphs, features: FrameFeatures, image: np.ndarray, points: np.ndarray, labels: np.ndarray
 ) -> _Prediction:
     """Runs the mask decoder with points (P, 2) in px of the square image; it chooses among its masks by itself."""
-    outputs = graphs.run(
+    outputs = graphs._run(
         "mask_decoder",
         feats0=features.feats0,
         feats1=features.feats1,
@@ -519,7 +511,7 @@ def _memorize(
     graphs: Sam2Graphs, features: FrameFeatures, prediction: _Prediction, *, binarize: bool
 ) -> tuple[Memory, np.ndarray]:
     """Encodes the memory of an object in a frame, binary if it was prompted there; also returns its spatial code."""
-    outputs = graphs.run(
+    outputs = graphs._run(
         "memory_encoder",
         feats2=features.feats2,
         high_res_mask=prediction.high_res[None, None],
