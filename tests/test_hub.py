@@ -7,6 +7,7 @@ import pytest
 from hub_server import Hub, Repository, running_hub, use_hub
 
 from jsecon import InputError
+from jsecon.app import cli
 from jsecon.networks import hub
 
 GRAPH = bytes(range(256)) * 40
@@ -59,6 +60,12 @@ def test_a_name_brings_its_files_and_no_others(local):
     assert (folder / "onnx/vision_encoder.onnx").read_bytes() == GRAPH
     assert hub.cached_address(folder) == f"hub:{NAME}@{plan.commit}"
     assert not (folder / "README.md").exists()
+
+
+def test_the_role_of_an_address_is_that_of_its_files(local, capsys):
+    for _ in ("on the hub", "in the cache"):
+        assert cli.main(["models", "get", f"hub:{NAME}", "--yes"]) == 0
+        assert f"hub:{NAME}  segmenter  " in capsys.readouterr().out
 
 
 def test_a_model_in_the_cache_is_used_without_a_request(local, monkeypatch):
