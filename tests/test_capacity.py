@@ -5,7 +5,6 @@ import functools
 import jax
 import numpy as np
 import pytest
-from splat_reference import render_reference
 
 from jsecon.language.votes import region_votes
 from jsecon.parallel import host_mesh
@@ -13,6 +12,7 @@ from jsecon.process import compilation_counts
 from jsecon.query.render import selection_mask
 from jsecon.splat.capacity import default_capacity, enough_capacity, plan_capacity
 from jsecon.splat.plan import plan_views, render_plan
+from jsecon.splat.reference import render_reference
 from jsecon.splat.render import render, render_depth
 from jsecon.types import Gaussians
 

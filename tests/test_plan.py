@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from splat_reference import project_reference, weights_reference
 
 from jsecon.parallel import host_mesh
 from jsecon.splat.plan import plan_view, render_plan
+from jsecon.splat.reference import project_reference, weights_reference
 from jsecon.splat.render import render, render_depth
 from jsecon.splat.walk import cumulative
 

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import look_at
-from splat_reference import project_reference, render_reference
 
 from jsecon.splat.project import project
+from jsecon.splat.reference import project_reference, render_reference
 from jsecon.splat.render import render, render_depth, render_rgb
 from jsecon.types import Camera, Gaussians
 

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from splat_reference import project_reference
 
 from jsecon.splat.capacity import plan_capacity, round_capacity
 from jsecon.splat.project import project
+from jsecon.splat.reference import project_reference
 from jsecon.splat.strips import BLOCK, FULL_IMAGE, Strip, join_strips, split_into_strips, tile_rows
 from jsecon.splat.tiles import (
     WORD,

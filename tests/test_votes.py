@@ -4,12 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from splat_reference import weights_reference
 
 from jsecon.association.atoms import atom_votes
 from jsecon.language.votes import region_votes, votes_memory
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.plan import plan_view
+from jsecon.splat.reference import weights_reference
 
 REGIONS = 11
 

@@ -47,6 +47,7 @@ def project_reference(gaussians: Gaussians, camera: Camera) -> dict[str, np.ndar
 
 
 def _rotation(quaternion: np.ndarray) -> np.ndarray:
+    """Returns the rotation matrix (3, 3) of a quaternion wxyz; the identity for zero."""
     length = np.linalg.norm(quaternion)
     w, x, y, z = quaternion / length if length > 0 else (1.0, 0.0, 0.0, 0.0)
     return np.array(
@@ -59,7 +60,15 @@ def _rotation(quaternion: np.ndarray) -> np.ndarray:
 
 
 def weights_reference(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """Returns (H, W, N) the weight alpha T of every Gaussian at every pixel; equal depths in index order."""
+    """Composites Gaussians, one at a time; those of equal depth in index order.
+
+    Args:
+      gaussians: N Gaussians.
+      camera: One camera.
+
+    Returns:
+      (H, W, N) weight alpha T of every Gaussian at every pixel.
+    """
     splats = project_reference(gaussians, camera)
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     weights = np.zeros((camera.height, camera.width, len(splats["depths"])))
@@ -80,6 +89,15 @@ def weights_reference(gaussians: Gaussians, camera: Camera) -> np.ndarray:
 
 
 def render_reference(gaussians: Gaussians, camera: Camera, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the image (H, W, D) of features (N, D), and alpha (H, W), in float64."""
+    """Renders features.
+
+    Args:
+      gaussians: N Gaussians.
+      camera: One camera.
+      features: (N, D).
+
+    Returns:
+      The image (H, W, D) and alpha (H, W), float64.
+    """
     weights = weights_reference(gaussians, camera)
     return weights @ np.asarray(features, np.float64), weights.sum(-1)
