@@ -10,7 +10,7 @@ import pytest
 from experiments.datasets.lerf_ovs import LERF_PAIRS
 from jsecon.data.labels import LabelledFrame
 from jsecon.errors import InputError
-from jsecon.evaluate.lerf import VALA_THRESHOLD, evaluate_at_thresholds, evaluate_point_level_rendered
+from jsecon.evaluate.lerf import ALPHA_THRESHOLD, VALA_THRESHOLD, evaluate_at_thresholds
 from jsecon.fit.resize import resize_camera
 from jsecon.query.render import selection_mask
 from jsecon.types import Selection
@@ -44,6 +44,11 @@ def labelled(scene, cameras):
     return frames
 
 
+def evaluate(*scene, alpha_threshold=ALPHA_THRESHOLD, **options):
+    """Rows and summary at one threshold."""
+    return evaluate_at_thresholds(*scene, alpha_thresholds=(alpha_threshold,), **options)[alpha_threshold]
+
+
 @pytest.fixture(scope="module")
 def views(cameras):
     return {f"view_{t}": cameras[t] for t in range(4)}
@@ -56,9 +61,7 @@ def test_a_perfect_selection_scores_one(scene, views, labelled):
         asked.append(query)
         return selection(members(scene)[query])
 
-    rows, summary = evaluate_point_level_rendered(
-        scene, views, labelled, select, expected_pairs=5, progress=lambda *c: calls.append(c)
-    )
+    rows, summary = evaluate(scene, views, labelled, select, expected_pairs=5, progress=lambda *c: calls.append(c))
     assert [(row.frame, row.query) for row in rows] == [
         ("view_0", "left"),
         ("view_0", "right"),
@@ -78,7 +81,7 @@ def test_a_perfect_selection_scores_one(scene, views, labelled):
 
 def test_missing_answers_count_as_nothing_found(scene, views, labelled):
     answers = {"left": selection(members(scene)["left"]), "right": None, "top": selection(np.zeros(64, bool))}
-    rows, summary = evaluate_point_level_rendered(scene, views, labelled, answers.get)
+    rows, summary = evaluate(scene, views, labelled, answers.get)
     assert [row.iou for row in rows] == [1, 0, 0, 1, 0]
     assert summary["missing"] == 3
     assert summary["pairs"] == 5
@@ -88,7 +91,7 @@ def test_missing_answers_count_as_nothing_found(scene, views, labelled):
 
 def test_iou_is_of_the_selected_alone(scene, views, labelled):
     wrong = members(scene)["right"]
-    rows, _ = evaluate_point_level_rendered(scene, views, labelled[:1], lambda query: selection(wrong))
+    rows, _ = evaluate(scene, views, labelled[:1], lambda query: selection(wrong))
     for row in rows:
         predicted = np.asarray(selection_mask(scene, views["view_0"], wrong))
         true = labelled[0].objects[row.query][0]
@@ -97,10 +100,8 @@ def test_iou_is_of_the_selected_alone(scene, views, labelled):
 
 
 def test_the_threshold_of_the_silhouette_is_an_option(scene, views, labelled):
-    strict, _ = evaluate_point_level_rendered(
-        scene, views, labelled[:1], lambda query: selection(members(scene)[query])
-    )
-    lenient, summary = evaluate_point_level_rendered(
+    strict, _ = evaluate(scene, views, labelled[:1], lambda query: selection(members(scene)[query]))
+    lenient, summary = evaluate(
         scene, views, labelled[:1], lambda query: selection(members(scene)[query]), alpha_threshold=VALA_THRESHOLD
     )
     assert all(a.mask.sum() < b.mask.sum() for a, b in zip(strict, lenient, strict=True))
@@ -112,7 +113,7 @@ def test_the_point_is_the_maximum_of_the_similarity(scene, views, labelled):
     left, right = members(scene)["left"], members(scene)["right"]
     for strong, other, query in ((left, right, "left"), (right, left, "right")):
         answer = selection(strong | other, np.where(strong, 1.0, np.where(other, 0.1, 0.0)).astype(np.float32))
-        rows, _ = evaluate_point_level_rendered(scene, views, labelled[:1], lambda _, answer=answer: answer)
+        rows, _ = evaluate(scene, views, labelled[:1], lambda _, answer=answer: answer)
         row = next(row for row in rows if row.query == query)
         x, y = row.point
         assert labelled[0].objects[query][0][y, x]
@@ -126,7 +127,7 @@ def test_both_thresholds_from_one_rendering(scene, views, labelled):
     both = evaluate_at_thresholds(scene, views, labelled[:1], select)
     assert list(both) == [0.7, VALA_THRESHOLD]
     for threshold, (rows, told) in both.items():
-        alone, summary = evaluate_point_level_rendered(scene, views, labelled[:1], select, alpha_threshold=threshold)
+        alone, summary = evaluate(scene, views, labelled[:1], select, alpha_threshold=threshold)
         assert rows == alone
         assert told == summary
 
@@ -136,7 +137,7 @@ def test_localisation_by_the_mask_takes_any_of_its_inmost_pixels(scene, views, l
     largest part of it lies in."""
     left, right = members(scene)["left"], members(scene)["right"]
     similar = np.where(right, 1.0, np.where(left, 0.1, 0.0)).astype(np.float32)
-    rows, told = evaluate_point_level_rendered(scene, views, labelled[:1], lambda _: selection(left | right, similar))
+    rows, told = evaluate(scene, views, labelled[:1], lambda _: selection(left | right, similar))
     by_query = {row.query: row for row in rows}
     assert by_query["right"].located
     assert not by_query["left"].located
@@ -148,7 +149,7 @@ def test_localisation_by_the_box_is_spoilt_by_a_floater(scene, views, labelled):
     """The middle of a mask's bounding box lies in the thing's; with the other group selected too, between the two."""
     groups = members(scene)
     for chosen, right in ((lambda query: groups[query], True), (lambda _: groups["left"] | groups["right"], False)):
-        rows, told = evaluate_point_level_rendered(scene, views, labelled[:1], lambda q, c=chosen: selection(c(q)))
+        rows, told = evaluate(scene, views, labelled[:1], lambda q, c=chosen: selection(c(q)))
         assert told["loc_box"] == right
         assert all(row.centred == right for row in rows)
 
@@ -157,7 +158,7 @@ def test_labels_of_another_size_are_evaluated_at_their_own(scene, views, labelle
     camera = resize_camera(views["view_0"], 96, 80)
     mask = np.asarray(selection_mask(scene, jax.tree.map(jnp.asarray, camera), members(scene)["left"]))
     frame = LabelledFrame("view_0", 96, 80, {"left": (mask, box_of(mask))})
-    rows, _ = evaluate_point_level_rendered(scene, views, [frame], lambda query: selection(members(scene)[query]))
+    rows, _ = evaluate(scene, views, [frame], lambda query: selection(members(scene)[query]))
     assert rows[0].iou == 1
     assert rows[0].mask.shape == (80, 96)
     small = np.asarray(selection_mask(scene, views["view_0"], members(scene)["left"]))
@@ -167,7 +168,7 @@ def test_labels_of_another_size_are_evaluated_at_their_own(scene, views, labelle
 
 def test_wrong_denominators_names_and_sizes_are_told(scene, views, labelled):
     def run(frames, **options):
-        return evaluate_point_level_rendered(scene, views, frames, lambda query: None, **options)
+        return evaluate(scene, views, frames, lambda query: None, **options)
 
     with pytest.raises(InputError, match=r"5 \(frame, query\) pairs, expected 56"):
         run(labelled, expected_pairs=LERF_PAIRS["figurines"])

@@ -13,7 +13,7 @@ from jsecon.app.ask import ask_text, with_phrases
 from jsecon.app.models import open_embedder
 from jsecon.data.labels import LabelledFrame, load_lerf_labels
 from jsecon.errors import InputError
-from jsecon.evaluate.lerf import Row, evaluate_point_level_rendered
+from jsecon.evaluate.lerf import Row, evaluate_at_thresholds
 from jsecon.files import write_text
 from jsecon.language.codes import encode
 from jsecon.language.field import load_field
@@ -21,6 +21,7 @@ from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console, Listener
 from jsecon.query.baselines import query_canonical, query_one_step
 from jsecon.query.composite import parse_query
+from jsecon.query.render import ALPHA_THRESHOLD
 from jsecon.types import LanguageField, Selection
 
 Evaluation: TypeAlias = dict[str, tuple[list[Row], dict[str, Any]]]
@@ -74,7 +75,9 @@ def evaluate(
             return dataclasses.replace(answer.selection, mask=answer.mask)
 
         with listener.progress(f"evaluate {kind}") as progress:
-            results[kind] = evaluate_point_level_rendered(field.gaussians, cameras, labels, select, progress=progress)
+            options = {"alpha_thresholds": (ALPHA_THRESHOLD,), "progress": progress}
+            measured = evaluate_at_thresholds(field.gaussians, cameras, labels, select, **options)
+            results[kind] = measured[ALPHA_THRESHOLD]
     return results
 
 

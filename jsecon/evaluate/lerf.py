@@ -7,7 +7,6 @@ mAcc@0.25 (strict) are over all pairs; a pair without prediction counts as 0.
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import cv2
 import jax
@@ -51,35 +50,6 @@ class Row:
     """Score of the query."""
     mask: np.ndarray = dataclasses.field(repr=False, compare=False)
     """(H, W) bool mask of the rendered selection, for pictures."""
-
-
-def evaluate_point_level_rendered(
-    gaussians: Gaussians,
-    cameras: Mapping[str, Camera],
-    labels: Sequence[LabelledFrame],
-    select: Callable[[str], Selection | None],
-    *,
-    alpha_threshold: float = ALPHA_THRESHOLD,
-    **options: Any,
-) -> tuple[list[Row], dict]:
-    """Calls `evaluate_at_thresholds` with one threshold, by default that of the protocol.
-
-    Args:
-      gaussians: As in `evaluate_at_thresholds`.
-      cameras: As in `evaluate_at_thresholds`.
-      labels: As in `evaluate_at_thresholds`.
-      select: As in `evaluate_at_thresholds`.
-      alpha_threshold: The threshold.
-      **options: Further options of `evaluate_at_thresholds`.
-
-    Returns:
-      Its rows and summary.
-
-    Raises:
-      InputError: As in `evaluate_at_thresholds`.
-    """
-    results = evaluate_at_thresholds(gaussians, cameras, labels, select, alpha_thresholds=(alpha_threshold,), **options)
-    return results[alpha_threshold]
 
 
 def evaluate_at_thresholds(

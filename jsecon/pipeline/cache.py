@@ -11,10 +11,9 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
-import json
 import os
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -60,20 +59,6 @@ class CachedResult:
     value: Any
     seconds: float
     fresh: bool
-
-
-def key_of(stage: str, parts: Mapping[str, Any]) -> str:
-    """Hashes all that a stage's result depends on.
-
-    Args:
-      stage: Name of the stage.
-      parts: Plain values: numbers, texts, None, lists, dicts.
-
-    Returns:
-      16 hex digits.
-    """
-    text = json.dumps([stage, parts], sort_keys=True)
-    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 
 _WRITTEN = (".spz", ".glb", ".splat", ".sog", ".html")

@@ -300,7 +300,13 @@ def _compute_stage(
 
     def compute(progress: Any) -> StageResult:
         coordinator.broadcast(stage, computed.results)
-        return stage.run(StageInput(context, computed.results, progress, checkpoint), plan.files[stage.name])
+        result = stage.compute(StageInput(context, computed.results, progress, checkpoint))
+        if plan.files[stage.name] != stage.files_digest(context):  # then the key does not describe the result
+            where = stage.files if isinstance(stage.files, Path) else context.options.capture
+            problem = f"files that changed while stage {stage.name} read them"
+            remedy = "Run the same command again when no program writes there; finished stages are kept."
+            raise InputError(where, problem, "files that stay as they are during a run", remedy)
+        return result
 
     with listener.progress(stage.name) as progress:
         try:

@@ -19,7 +19,7 @@ from experiments.rivals.opengaussian import Schedule, train_instances, train_ope
 from experiments.simulated_vision.embeddings import made_text_space
 from jsecon.data.labels import LabelledFrame
 from jsecon.errors import InputError
-from jsecon.evaluate.lerf import evaluate_point_level_rendered
+from jsecon.evaluate.lerf import ALPHA_THRESHOLD, evaluate_at_thresholds
 from jsecon.splat.plan import plan_view
 from jsecon.splat.project import project
 from jsecon.vision.protocols import CANONICAL
@@ -48,9 +48,8 @@ def world():
 
 def miou(world, select):
     evidence, frames, views, *_ = world
-    _, told = evaluate_point_level_rendered(
-        evidence.gaussians, views, frames, lambda query: select(QUERIES.index(query))
-    )
+    both = evaluate_at_thresholds(evidence.gaussians, views, frames, lambda query: select(QUERIES.index(query)))
+    _, told = both[ALPHA_THRESHOLD]
     assert told["pairs"] == sum(len(frame.objects) for frame in frames) >= 4
     return told["miou"]
 
