@@ -82,7 +82,8 @@ def test_weights_at_the_centre(scene, cameras, labels, tmp_path):
 @pytest.mark.parametrize("opaque", [0.0, pytest.param(4.0, marks=pytest.mark.long)])
 def test_equal_at_many_gaussians(tmp_path, monkeypatch, opaque):
     """4,000, all visible; opaque, most lie behind what stopped every pixel. Dense blocks hold two regions each."""
-    monkeypatch.setattr(votes_module, "_DENSE_BYTES", 4 * 2 * 4096)
+    for module in (votes_module, streaming):
+        monkeypatch.setattr(module, "DENSE_BYTES", 4 * 2 * 4096)
     scene, cameras = ball(4000, 3, 160, 120, opaque=opaque)
     labels = blocky(np.random.default_rng(1), 3, 120, 160, 7)
     memory = region_votes(scene, cameras, labels, 7, top=3)

@@ -122,7 +122,7 @@ def test_what_they_take_is_told_beforehand(monkeypatch):
 def test_regions_in_blocks_are_the_same_votes(monkeypatch, cast, scene, cameras, labels):
     from jsecon.language import votes as module
 
-    monkeypatch.setattr(module, "_DENSE_BYTES", 4 * 4 * scene.count)  # four regions a pass
+    monkeypatch.setattr(module, "DENSE_BYTES", 4 * 4 * scene.count)  # four regions a pass
     blocks = region_votes(scene, cameras, labels, REGIONS, top=REGIONS)
     np.testing.assert_allclose(blocks.dense(), cast.dense(), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(blocks.labelled, cast.labelled, rtol=1e-5)

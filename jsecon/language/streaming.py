@@ -31,6 +31,8 @@ _PAIR = np.dtype([("gaussian", "<u4"), ("region", "<i4"), ("weight", "<f4")])
 """The weight that a view's region casts on a Gaussian."""
 _SEEN = np.dtype([("gaussian", "<u4"), ("weight", "<f4"), ("peak", "<f4")])
 """The weight that a view casts on a Gaussian in all, and the largest of a pixel."""
+DENSE_BYTES = 1 << 29
+"""The dense block of votes of a view; it is in memory about four times."""
 _MAX_CASTS = 1 << 26
 """Weights, each of a view on a Gaussian, that are added up at once."""
 
@@ -157,7 +159,7 @@ def _cast_view(
     # A view knows its own regions alone, up to a power of two: views share compiled programs.
     local = np.where(labels >= 0, np.searchsorted(names, np.maximum(labels, 0)), -1).astype(np.int32)
     size, overflow = 1 << max(len(names) - 1, 0).bit_length(), 0
-    blocks = dense_votes(part, cameras, local[None], size, centre=centre, near=near)
+    blocks = dense_votes(part, cameras, local[None], size, centre=centre, near=near, dense_bytes=DENSE_BYTES)
     for b, (first, state) in enumerate(blocks):
         weights = np.asarray(state["votes"])[: len(ids)]
         row, place = np.nonzero(weights)
@@ -171,6 +173,8 @@ def _cast_view(
             total["peak"] = np.asarray(state["peak"])[seen]
             np.save(f"{path}-seen.npy", total)
             overflow = int(state["overflow"])
+        if first + weights.shape[1] >= len(names):  # the rest of the power of two
+            break
     return overflow
 
 
