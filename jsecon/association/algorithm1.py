@@ -63,7 +63,7 @@ def masklets(
       max_masklets: Maximum number of tracked prompts.
       min_views: Least number of frames that show a masklet.
       min_support: Least support of a masklet that goes before larger ones.
-      join_rate: Share of frames above which two masklets are parts of one object; 1 joins none.
+      join_rate: Share of frames above which two masklets are parts of one object; 1 joins no two.
       state: State of a stopped call with the same frames and options, to resume after its last frame.
       on_checkpoint: Called after each frame with a function that makes the state, which has the size of all masks.
       progress: Called with the number of frames done and of all.

@@ -91,7 +91,7 @@ def one_hot(labels: Int[np.ndarray, " a"], count: int) -> Sparse:
     """Encodes labels.
 
     Args:
-      labels: (A,) labels, -1 for none.
+      labels: (A,) labels, -1 for no region.
       count: C, number of labels.
 
     Returns:

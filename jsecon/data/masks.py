@@ -472,7 +472,7 @@ class _LabelReader:
         return image
 
     def read(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """The ids of a frame, ascending, and its labels (H, W) as indices into them, -1 = none."""
+        """The ids of a frame, ascending, and its labels (H, W) as indices into them, -1 for no region."""
         if name in self.masks.objects:
             return self._read_objects(name, self.masks.objects[name])
         if name not in self.masks.files:
@@ -545,7 +545,7 @@ def read_level(path: Path, level: str | int) -> Int[np.ndarray, "h w"]:
       level: A name of LEVELS, or its index.
 
     Returns:
-      (H, W) ids, -1 = none.
+      (H, W) ids, -1 for no region.
 
     Raises:
       InputError: The level is unknown, or the file is damaged or of another kind.
@@ -564,7 +564,7 @@ def read_level(path: Path, level: str | int) -> Int[np.ndarray, "h w"]:
         image = np.asarray(image[LEVELS.index(level) if isinstance(level, str) else level], np.float64)
     if not ((image >= -MAX_ID) & (image < MAX_ID) & (image == image.round())).all():
         problem = "the array has numbers that are no integers or too large"
-        raise InputError(path, problem, "ids, -1 = none", "Write the masks again.")
+        raise InputError(path, problem, "ids, -1 for no region", "Write the masks again.")
     return image.astype(np.int64)
 
 
@@ -665,10 +665,10 @@ def compact_ids(path: Path, image: np.ndarray) -> tuple[np.ndarray, Int16[np.nda
 
     Args:
       path: Its file, for errors.
-      image: (H, W) ids, negative = none.
+      image: (H, W) ids, negative for no region.
 
     Returns:
-      The ids, ascending, and (H, W) indices into them, -1 = none.
+      The ids, ascending, and (H, W) indices into them, -1 for no region.
 
     Raises:
       InputError: There are more ids than regions can be.

@@ -136,7 +136,7 @@ def place(solid: Solid, centre, axes=None) -> Solid:
     Args:
       solid: The solid.
       centre: (3,) shift, applied last, m.
-      axes: (3, 3) rotation; None: none.
+      axes: (3, 3) rotation; None is the identity.
 
     Returns:
       The moved solid.

@@ -368,7 +368,7 @@ def distinct_labels(tiles: Int[Array, "n p"], slots: int) -> Int[Array, "n q"]:
     """Finds the distinct labels of each tile.
 
     Args:
-      tiles: (N, P) labels of the pixels, -1 for none.
+      tiles: (N, P) labels of the pixels, -1 for no region.
       slots: Number of additional columns.
 
     Returns:

@@ -53,7 +53,7 @@ class ModelReport:
 
     @property
     def errors(self) -> list[InputError]:
-        """One error if no model of the folder can be used, else none."""
+        """One error if no model of the folder can be used, else an empty list."""
         if any(use.usable for use in self.uses):
             return []
         expected = f"{' or '.join(use.model for use in self.uses)} as ONNX graphs"

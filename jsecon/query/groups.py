@@ -70,7 +70,7 @@ def objects_of_gaussians(votes: Votes, objects: Int[Array, " r"]) -> tuple[Int[A
 
     Args:
       votes: Votes of N Gaussians on R regions.
-      objects: (R,) object of each region, -1 for none.
+      objects: (R,) object of each region, -1 for no object.
 
     Returns:
       (N,) object, -1 for shares below SHARE_THRESHOLD, and (N,) its share; 0 without votes. Each row stands for itself.

@@ -103,7 +103,7 @@ def match_regions(
       field: Field of R regions with embeddings of E numbers.
       queries: (Q, E) embeddings of the texts, Q >= 1.
       rules: How texts match.
-      excluded: (U, E) embeddings of texts whose regions are left out; None leaves out none.
+      excluded: (U, E) embeddings of texts whose regions are left out; None is an empty list.
 
     Returns:
       The match.
@@ -165,7 +165,7 @@ def match_region(field: LanguageField, region: int | Int[Array, ""], rules: Quer
     Args:
       field: Field of R regions.
       region: Id of the region.
-      rules: Which regions join it, its embedding in place of a text's; by default none.
+      rules: Which regions join it, its embedding in place of a text's; by default only that region.
 
     Returns:
       The match, with score 1. For a region that the field does not have, such as -1, its region is -1 and its score 0.

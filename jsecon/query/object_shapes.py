@@ -67,7 +67,7 @@ def object_shapes(
 
     Args:
       means: (N, 3) centres of Gaussians.
-      labels: (N,) object of each Gaussian, 0 .. K-1, or -1 for none. Every object has a Gaussian.
+      labels: (N,) object of each Gaussian, 0 .. K-1, or -1 for no object. Every object has a Gaussian.
       up: (3,) up axis; boxes stand upright along it, turned so that their footprint is smallest. None takes the
         principal axes of each object.
       spreads: (N, 3, 3) `gaussian_spreads` of the Gaussians; None takes them as points.

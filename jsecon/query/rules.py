@@ -51,9 +51,9 @@ class QueryRules:
     retrieval_threshold: Number | None = None
     """Smallest similarity of the best region, in place of `quantile`; a probability where there are `logits`."""
     alike_threshold: Number | None = ALIKE_THRESHOLD
-    """Cosine from which two regions are one object seen twice, and both answer; None joins none."""
+    """Cosine from which two regions are one object seen twice, and both answer; None disables it."""
     piece_threshold: Number | None = PIECE_THRESHOLD
-    """Relative score from which a region that overlaps the best is a piece of it, and joins it; None joins none."""
+    """Relative score from which a region that overlaps the best is a piece of it, and joins it; None disables it."""
     all_of_kind: bool = static(default=False)
     """Whether all regions of the best one's kind answer."""
     kind_threshold: Number = KIND_THRESHOLD

@@ -67,7 +67,7 @@ def query_several(
     Args:
       field: The field.
       queries: (Q, E) embeddings of the texts, Q >= 1.
-      excluded: (U, E) embeddings of texts whose regions are left out (`match_regions`); None leaves out none.
+      excluded: (U, E) embeddings of texts whose regions are left out (`match_regions`); None is an empty list.
       rules: How texts match regions; by default all regions of a kind match.
       similarity_threshold: Smallest share of votes; None takes 0.5.
 
@@ -94,7 +94,7 @@ def query_region(
     Args:
       field: The field.
       region: Its id. An id that the field does not have, such as -1, selects no Gaussian.
-      rules: Which regions join it; by default none.
+      rules: Which regions join it; by default only that region.
       by: "votes" or "code", see `select_gaussians`.
       similarity_threshold: Smallest similarity; None takes 0.5 for votes and 0.9 for codes.
 

@@ -164,7 +164,7 @@ def save_gaussians(
       path: The file; its suffix names the format.
       gaussians: N Gaussians.
       codes: (N, D) codes, written to a .glb only.
-      regions: (N,) region ids, -1 = none, written to a .glb only.
+      regions: (N,) region ids, -1 for no region, written to a .glb only.
       similarity: (4, 4) transform into the world of the file.
 
     Raises:

@@ -70,7 +70,7 @@ def save_glb(
       path: The file.
       gaussians: N Gaussians, at least one.
       codes: (N, D), written as the attributes _CODE_0, _CODE_1 ... of four numbers each.
-      regions: (N,) region ids, -1 = none, written as the attribute _REGION.
+      regions: (N,) region ids, -1 for no region, written as the attribute _REGION.
       similarity: (4, 4) transform into the world of the file.
 
     Raises:

@@ -592,7 +592,7 @@ def needs_float64(gaussians: Gaussians, similarity: Float[Array, "4 4"] | None =
 
     Args:
       gaussians: N Gaussians; may be memory-mapped.
-      similarity: (4, 4) transform that is applied first; None: none.
+      similarity: (4, 4) transform that is applied first; None is the identity.
 
     Returns:
       False for float32 centres without a transform.
