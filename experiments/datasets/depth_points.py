@@ -8,11 +8,7 @@ from jsecon.types import Array, Capture
 
 
 def confirmed_depths(
-    capture: Capture,
-    *,
-    tolerance: float,
-    min_views: int = 2,
-    frames: Int[np.ndarray, " f"] | None = None,
+    capture: Capture, *, tolerance: float, min_views: int = 2, frames: Int[np.ndarray, " f"] | None = None
 ) -> Float[np.ndarray, "t h w"]:
     """The depths without those that the other views do not confirm: sensor noise, and pixels that mix two surfaces.
 

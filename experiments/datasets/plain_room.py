@@ -142,12 +142,5 @@ def _toy_car(draw):
     ]
 
 
-PLAIN_SHAPES = SHAPES | {
-    "book": _book,
-    "cone": _cone,
-    "duck": _duck,
-    "pig": _pig,
-    "lamp": _lamp,
-    "toy car": _toy_car,
-}
+PLAIN_SHAPES = SHAPES | {"book": _book, "cone": _cone, "duck": _duck, "pig": _pig, "lamp": _lamp, "toy car": _toy_car}
 """Functions that draw the parts of a shape from a random source."""

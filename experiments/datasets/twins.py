@@ -162,13 +162,7 @@ def write_replica_twin(
 
 
 def _scanned(
-    seed: int,
-    names: tuple[str, ...],
-    width: int,
-    height: int,
-    num_objects: int,
-    fine: float,
-    coarse: float,
+    seed: int, names: tuple[str, ...], width: int, height: int, num_objects: int, fine: float, coarse: float
 ) -> tuple[Room, Capture, Int[np.ndarray, "t h w"], Mesh]:
     room = make_room(seed, num_objects=num_objects)
     cameras = room_cameras(room, views=len(names), width=width, height=height)
@@ -191,12 +185,7 @@ def _forward_cameras(room: Room, views: int, width: int, height: int) -> Camera:
 
 
 def _labelled_capture(
-    folder: Path,
-    room: Room,
-    cameras: Camera,
-    names: tuple[str, ...],
-    out: Bool[np.ndarray, " t"],
-    label_pixels: int,
+    folder: Path, room: Room, cameras: Camera, names: tuple[str, ...], out: Bool[np.ndarray, " t"], label_pixels: int
 ) -> tuple[Capture, Int[np.ndarray, "t h w"], list[LabelledFrame]]:
     """The room seen by `cameras`, written for COLMAP; its instances, and the labels of the frames `out`."""
     capture, instances = render_capture(room, cameras, names, out, points=200 * len(names))

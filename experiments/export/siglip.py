@@ -143,12 +143,7 @@ def _write_joint(path: Path, model: torch.nn.Module, ids: torch.Tensor, images: 
 
 
 def _half(
-    path: Path,
-    module: torch.nn.Module,
-    name: str,
-    given: torch.Tensor,
-    outputs: str | tuple[str, ...],
-    threads: int,
+    path: Path, module: torch.nn.Module, name: str, given: torch.Tensor, outputs: str | tuple[str, ...], threads: int
 ) -> Agreement:
     names = [outputs] if isinstance(outputs, str) else list(outputs)
     free = {name: {0: "batch"}} | {output: {0: "batch"} for output in names}

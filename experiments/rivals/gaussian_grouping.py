@@ -112,10 +112,7 @@ def train_gaussian_grouping(
 
 @functools.cache
 def _optimizer(identity: float, classifier: float) -> optax.GradientTransformation:
-    rates: dict[Any, Any] = {
-        "identity": optax.adam(identity, eps=1e-15),
-        "classifier": optax.adam(classifier),
-    }
+    rates: dict[Any, Any] = {"identity": optax.adam(identity, eps=1e-15), "classifier": optax.adam(classifier)}
     return optax.multi_transform(rates, {"identity": "identity", "kernel": "classifier", "bias": "classifier"})
 
 

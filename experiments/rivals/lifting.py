@@ -73,11 +73,7 @@ def train_backprojection(evidence: Evidence) -> Lifted:
     blocks = []
     for t in range(len(local)):
         votes = region_votes(
-            gaussians,
-            cameras[t : t + 1],
-            jnp.asarray(local[t : t + 1]),
-            names.shape[1],
-            top=names.shape[1],
+            gaussians, cameras[t : t + 1], jnp.asarray(local[t : t + 1]), names.shape[1], top=names.shape[1]
         )
         weights, slots = np.asarray(votes.weights), np.asarray(votes.regions)
         rows, places = np.nonzero(weights > 0)

@@ -178,11 +178,7 @@ def measure(setting: Setting, answers: Answers) -> dict:
     if not bench.frames:
         opacity = 1 / (1 + np.exp(-np.asarray(setting.evidence.gaussians.opacity_logits)))
         rows, figures = evaluate_points(
-            answers.classes(),
-            bench.point_classes,
-            bench.queries,
-            expected_classes=bench.pairs,
-            opacities=opacity,
+            answers.classes(), bench.point_classes, bench.queries, expected_classes=bench.pairs, opacities=opacity
         )
         texts = {row.query: [round(row.iou, DIGITS)] for row in rows}
         return {name: figures[name] for name in KEPT if name in figures} | {"texts": texts}

@@ -12,11 +12,7 @@ from jaxtyping import Float
 from experiments.protocols.opengaussian import most_similar_text, select_leaf, select_text, without_stragglers
 from experiments.rivals import lifting
 from experiments.rivals.evidence import Evidence
-from experiments.rivals.gaussian_grouping import (
-    GaussianGrouping,
-    query_gaussian_grouping,
-    train_gaussian_grouping,
-)
+from experiments.rivals.gaussian_grouping import GaussianGrouping, query_gaussian_grouping, train_gaussian_grouping
 from experiments.rivals.langsplat import LangSplat, train_langsplat
 from experiments.rivals.opengaussian import OpenGaussian, Schedule, train_instances, train_opengaussian
 from experiments.tables.answers import Answers, Method, Steps, by_selection

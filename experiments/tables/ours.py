@@ -35,12 +35,7 @@ AGREEMENT = 0.4
 
 
 def association(
-    setting: Setting,
-    by: str,
-    *,
-    labels: np.ndarray | None = None,
-    centre: float = 0.0,
-    agreement: float = AGREEMENT,
+    setting: Setting, by: str, *, labels: np.ndarray | None = None, centre: float = 0.0, agreement: float = AGREEMENT
 ) -> Association:
     """The regions of a setting: by "tracks", "consensus" ("outspoken": in which a view speaks on what lies in none of
     its masks), or any other name with its `labels`. `centre` and `agreement` are
@@ -94,13 +89,7 @@ def field_of(
         codes = distill_votes(votes, table)
     else:
         codes, _ = distill_l1(
-            with_room(evidence.gaussians),
-            evidence.cameras,
-            found,
-            table,
-            steps=steps.paper,
-            key=key,
-            init="random",
+            with_room(evidence.gaussians), evidence.cameras, found, table, steps=steps.paper, key=key, init="random"
         )
         codes = codes[: evidence.gaussians.count]
     return LanguageField(

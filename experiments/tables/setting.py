@@ -54,10 +54,7 @@ class Setting:
     """what methods have in common."""
 
 
-FIT: Any = {
-    "schedule": Schedule(max_gaussians=0),
-    "rates": LearningRates(means=2e-3, means_last=2e-5),
-}
+FIT: Any = {"schedule": Schedule(max_gaussians=0), "rates": LearningRates(means=2e-3, means_last=2e-5)}
 """of the scenes without Gaussians: few steps, one Gaussian for each point of the start"""
 
 

@@ -44,11 +44,7 @@ PERFECT = Faults(0, 2, 0, 0, 0, 0, 0, 0, object_noise=1.0, view_noise=0)
 """true masks that agree in all views, each object embedded alike in all; texts and images lie apart, as in CLIP"""
 KIND = 2
 """of twin: raised where what the writers write changes, so that nothing measured on another kind is taken for it"""
-WRITERS = {
-    "lerf": twins.write_lerf_twin,
-    "ovs3d": twins.write_ovs3d_twin,
-    "replica": twins.write_replica_twin,
-}
+WRITERS = {"lerf": twins.write_lerf_twin, "ovs3d": twins.write_ovs3d_twin, "replica": twins.write_replica_twin}
 
 
 LVIS = "clip_vitb32_lvis.npy", "lvis_names.json"

@@ -101,10 +101,7 @@ _share = jax.jit(lambda votes, chosen: tuple(share_of(votes, chosen)))
 
 
 def point_scores(
-    features: Float[np.ndarray, "n e"],
-    texts: Float[np.ndarray, "q e"],
-    canonical: Float[np.ndarray, "c e"],
-    kind: str,
+    features: Float[np.ndarray, "n e"], texts: Float[np.ndarray, "q e"], canonical: Float[np.ndarray, "c e"], kind: str
 ) -> Float[np.ndarray, "q n"]:
     """Scores of all texts with all Gaussians, "cosine" or "relevancy"; -inf where a feature is zero."""
     known, table = np.asarray(features).any(axis=1), texts @ features.T
