@@ -113,7 +113,7 @@ def relation_room(seed: int) -> tuple[Room, dict[int, tuple[str, int]]]:
     spots = dict(zip(free, scatter_circles(draw, radii, gap=0.012)))
     spots |= {k: np.array([*spots[other][:2], heights[other]]) for k, (_, other) in held.items()}
     objects = [
-        place_object(draw, k, colour, shape, SRGB[colour], body, footprint_radius(body), spots[k])
+        place_object(draw, k, colour, shape, SRGB[colour], body, spots[k])
         for k, (colour, shape, body) in enumerate(kinds)
     ]
     return build_room(draw, tuple(objects), seed), held

@@ -4,8 +4,13 @@ from pathlib import Path
 
 import numpy as np
 
-from jsecon.data.gaussians.ply import ORDERS, ply_error, read_ply_file
+from jsecon.data.gaussians.ply import ORDERS, read_ply_file
+from jsecon.errors import InputError
 from jsecon.files import atomic_write
+
+
+def _error(path: Path, problem: str, expected: str) -> InputError:
+    return InputError(path, problem, expected, "Export the file again.")
 
 
 def read_faces(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -19,11 +24,11 @@ def read_faces(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     form, elements, offset = header.form, header.elements, header.start
     names = [element.name for element in elements]
     if form == "ascii" or "face" not in names or "vertex" not in names:
-        raise ply_error(path, f"{form} elements {', '.join(names) or 'none'}", "binary elements vertex and face")
+        raise _error(path, f"{form} elements {', '.join(names) or 'none'}", "binary elements vertex and face")
     before, face = elements[: names.index("face")], elements[names.index("face")]
     kinds = [kind for element in elements for kind in element.lists.values()]
     if not all(element.fixed for element in before) or len(kinds) != 1 or face.fixed:
-        raise ply_error(path, "list properties elsewhere than in one property of the faces", "faces with one list")
+        raise _error(path, "list properties elsewhere than in one property of the faces", "faces with one list")
     offset += sum(element.count * element.dtype(ORDERS[form]).itemsize for element in before)
     order, (size, index) = ORDERS[form], kinds[0]
     if not face.count:
@@ -37,14 +42,14 @@ def read_faces(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         fields += [] if kind == "list" else [(name, order + kind)]
     dtype = np.dtype(fields)
     if offset + face.count * dtype.itemsize > len(data):
-        raise ply_error(path, f"fewer than {face.count} faces of {corners} corners", "faces of one number of corners")
+        raise _error(path, f"fewer than {face.count} faces of {corners} corners", "faces of one number of corners")
     table = np.frombuffer(data, dtype, face.count, offset)
     if (table["corners"] != corners).any():
-        raise ply_error(path, "faces of several numbers of corners", "triangles only, or quads only")
+        raise _error(path, "faces of several numbers of corners", "triangles only, or quads only")
     vertices = table["vertices"].astype(np.int64)
     count = elements[names.index("vertex")].count
     if vertices.min() < 0 or vertices.max() >= count:
-        raise ply_error(path, f"a face with vertex {vertices.max()}", f"vertices 0 to {count - 1}")
+        raise _error(path, f"a face with vertex {vertices.max()}", f"vertices 0 to {count - 1}")
     return vertices, {name: table[name] for name, kind in face.fields if kind != "list"}
 
 

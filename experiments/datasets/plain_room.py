@@ -64,7 +64,7 @@ def make_room(seed: int, *, num_objects: int = 12) -> Room:
     bodies = [PLAIN_SHAPES[shape](draw) for shape in shapes]
     radii = [footprint_radius(body) for body in bodies]
     spots = scatter_circles(draw, radii)
-    rows = zip(colours, shapes, map(PALETTE.__getitem__, colours), bodies, radii, spots)
+    rows = zip(colours, shapes, map(PALETTE.__getitem__, colours), bodies, spots)
     objects = tuple(place_object(draw, k, *row) for k, row in enumerate(rows))
     return build_room(draw, objects, seed)
 

@@ -330,7 +330,7 @@ def load_labels(
     names: Sequence[str],
     size: tuple[int, int],
     *,
-    level: str | int = "l",
+    level: str = "l",
     shared: bool | None = None,
     order: Sequence[str] | None = None,
     files: Mapping[str, ImageFile] | None = None,
@@ -350,7 +350,7 @@ def load_labels(
       folder: The masks.
       names: T frames.
       size: (H, W) of the labels.
-      level: LangSplat's level, a name of LEVELS or its index.
+      level: LangSplat's level, a name of LEVELS.
       shared: Whether an id means the same object in every frame. By default so for all but `_s.npy`: LangSplat numbers
         the masks of each frame afresh, and each is a region of its own.
       order: All frames of the capture. If no file is named like a frame and the files are numbered from 0 to
@@ -447,7 +447,7 @@ class _LabelReader:
         self,
         masks: MaskFiles,
         names: Sequence[str],
-        level: str | int,
+        level: str,
         files: Mapping[str, ImageFile],
         size: tuple[int, int],
     ):
@@ -537,12 +537,12 @@ class _LabelReader:
         return notes
 
 
-def read_level(path: Path, level: str | int) -> Int[np.ndarray, "h w"]:
+def read_level(path: Path, level: str) -> Int[np.ndarray, "h w"]:
     """Reads one level of LangSplat's `_s.npy`.
 
     Args:
       path: The file.
-      level: A name of LEVELS, or its index.
+      level: A name of LEVELS.
 
     Returns:
       (H, W) ids, -1 for no region.
@@ -550,7 +550,7 @@ def read_level(path: Path, level: str | int) -> Int[np.ndarray, "h w"]:
     Raises:
       InputError: The level is unknown, or the file is damaged or of another kind.
     """
-    if level not in (*LEVELS, 0, 1, 2, 3):
+    if level not in LEVELS:
         raise InputError("level", f"there is no level {level!r}", f"one of {', '.join(LEVELS)}", "l is the coarsest.")
     expected = f"a .npy of shape ({len(LEVELS)}, H, W)"
     with reading(path, expected, "Write the masks again.", problem="the array is damaged or missing"):
@@ -561,7 +561,7 @@ def read_level(path: Path, level: str | int) -> Int[np.ndarray, "h w"]:
             path, f"the array has shape {image.shape}", expected, "Give _s.npy files, not the _f.npy ones."
         )
     with np.errstate(invalid="ignore"):  # of a signalling NaN
-        image = np.asarray(image[LEVELS.index(level) if isinstance(level, str) else level], np.float64)
+        image = np.asarray(image[LEVELS.index(level)], np.float64)
     if not ((image >= -MAX_ID) & (image < MAX_ID) & (image == image.round())).all():
         problem = "the array has numbers that are no integers or too large"
         raise InputError(path, problem, "ids, -1 for no region", "Write the masks again.")

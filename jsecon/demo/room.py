@@ -191,7 +191,6 @@ def place_object(
     shape: str,
     srgb: tuple[int, int, int],
     body: Body,
-    radius: float,
     spot: Sequence[float] | np.ndarray,
     yaw: float | None = None,
 ) -> RoomObject:
@@ -204,7 +203,6 @@ def place_object(
       shape: Second part of its name.
       srgb: Its colour, 0..255.
       body: Its shape.
-      radius: Radius of its footprint, m.
       spot: Place under it, x y or x y z, m.
       yaw: Rotation about z, radians; None: random.
 
@@ -224,7 +222,7 @@ def place_object(
         return Part(place(solid, centre, axes), inner, index, np.minimum(albedo * np.float32(tone), 0.95))
 
     parts = tuple(part(*row) for row in body)
-    return RoomObject(f"{colour} {shape}".strip(), colour, shape, centre, axes, float(radius), texture, parts)
+    return RoomObject(f"{colour} {shape}".strip(), colour, shape, centre, axes, footprint_radius(body), texture, parts)
 
 
 def _table():
@@ -290,12 +288,10 @@ def crowded_room(seed: int) -> Room:
     for k, body in enumerate(bodies):
         colour = colours[k] if k < len(colours) else ""
         srgb = CROWDED_OBJECTS[colour][0] if colour else CLUTTER_COLOURS[k - len(colours)]
-        objects.append(place_object(draw, k, colour, shapes.get(colour, ""), srgb, body, radii[k], spots[k]))
+        objects.append(place_object(draw, k, colour, shapes.get(colour, ""), srgb, body, spots[k]))
     beam, arch = (BEAM_COLOUR, "beam", (54, 190, 182), _beam(long)), (ARCH_COLOUR, "arch", (122, 72, 38), _arch())
     for colour, shape, srgb, body in (beam, arch):
-        objects.append(
-            place_object(draw, len(objects), colour, shape, srgb, body, footprint_radius(body), middle, turn)
-        )
+        objects.append(place_object(draw, len(objects), colour, shape, srgb, body, middle, turn))
     return build_room(draw, tuple(objects), seed, cloth=True)
 
 

@@ -33,7 +33,6 @@ from jsecon.data.gaussians.gltf import read_glb, save_glb
 from jsecon.data.gaussians.ply import (
     drawable_gaussians,
     in_float32,
-    ply_error,
     read_elements,
     read_header,
     read_ply,
@@ -504,15 +503,15 @@ def _load_compressed_ply(path: Path) -> Gaussians:
     missing = [name for name in (*_BOUNDS, *(_COLOUR_BOUNDS if has_colours else ())) if name not in bounds]
     missing += [name for name in _PACKED if name not in packed]
     if missing:
-        raise ply_error(path, f"it has no properties {', '.join(missing)}", remedy=_PLY_REMEDY)
+        raise InputError(path, f"it has no properties {', '.join(missing)}", remedy=_PLY_REMEDY)
     for name in _PACKED:
         kind = vertices.dtype[name]
         if kind.kind not in "iu" or kind.itemsize != 4:
-            raise ply_error(path, f"{name} is of type {kind.name}", "uint", _PLY_REMEDY)
+            raise InputError(path, f"{name} is of type {kind.name}", "uint", _PLY_REMEDY)
     count = len(vertices)
     if len(chunks) * _CHUNK < count:
         problem = f"it has {len(chunks)} chunks for {count} Gaussians"
-        raise ply_error(path, problem, f"a chunk for each {_CHUNK}", _PLY_REMEDY)
+        raise InputError(path, problem, f"a chunk for each {_CHUNK}", _PLY_REMEDY)
     position, rotation, scale, colour = (vertices[name].astype(np.uint32) for name in _PACKED)
 
     def between(kinds: str | tuple[str, ...], share: np.ndarray) -> np.ndarray:
@@ -547,11 +546,11 @@ def _harmonics(path: Path, rest: np.ndarray, count: int) -> np.ndarray:
     names = rest.dtype.names or ()
     if len(names) not in (0, 9, 24, 45) or any(f"f_rest_{index}" not in names for index in range(len(names))):
         problem = f"its element sh has {len(names)} properties"
-        raise ply_error(path, problem, "0, 9, 24 or 45 of them, from f_rest_0 on", _PLY_REMEDY)
+        raise InputError(path, problem, "0, 9, 24 or 45 of them, from f_rest_0 on", _PLY_REMEDY)
     if not names:
         return np.zeros((count, 0, 3))
     if len(rest) != count:
-        raise ply_error(path, f"it has {len(rest)} rows of sh for {count} Gaussians", remedy=_PLY_REMEDY)
+        raise InputError(path, f"it has {len(rest)} rows of sh for {count} Gaussians", remedy=_PLY_REMEDY)
     numbers = np.stack([rest[f"f_rest_{index}"].astype(np.float64) for index in range(len(names))], axis=1)
     share = np.where(numbers <= 0, 0.0, np.where(numbers >= 255, 1.0, (numbers + 0.5) / 256))
     return ((share - 0.5) * 8).reshape(count, 3, len(names) // 3).transpose(0, 2, 1)

@@ -56,18 +56,8 @@ _REST_COUNTS = (0, 9, 24, 45)
 _LAYOUT = "3D Gaussians in INRIA's layout (x y z, f_dc_0..2, opacity, scale_0..2, rot_0..3)"
 
 
-def ply_error(path: Path, problem: str, expected: str = "", remedy: str = "Export the file again.") -> InputError:
-    """Makes the error of a .ply that cannot be read.
-
-    Args:
-      path: The file.
-      problem: What is wrong, as in InputError.
-      expected: What should be there.
-      remedy: What to do about it.
-
-    Returns:
-      The error.
-    """
+def _error(path: Path, problem: str, expected: str = "", remedy: str = "Export the file again.") -> InputError:
+    """The error of a .ply that cannot be read."""
     return InputError(path, problem, expected, remedy)
 
 
@@ -119,7 +109,7 @@ def _parse_header(path: Path, data: bytes) -> Header:
     end = _END.search(data)
     if not data.startswith(b"ply") or end is None:
         problem = "it has no .ply header" if data else "the file is empty"
-        raise ply_error(path, problem, "a file that starts with 'ply' and a header")
+        raise _error(path, problem, "a file that starts with 'ply' and a header")
     form, elements, comments = "", [], []
     for line in data[: end.start()].decode("ascii", "replace").splitlines()[1:]:
         words = line.split()
@@ -142,12 +132,12 @@ def _parse_header(path: Path, data: bytes) -> Header:
             else:
                 raise ValueError(words[0])
         except (IndexError, KeyError, ValueError) as error:
-            raise ply_error(path, f"the header line {line.strip()!r} is not valid") from error
+            raise _error(path, f"the header line {line.strip()!r} is not valid") from error
     if form not in ORDERS:
-        raise ply_error(path, f"its format is {form!r}", f"one of {', '.join(ORDERS)}")
+        raise _error(path, f"its format is {form!r}", f"one of {', '.join(ORDERS)}")
     for element in elements:
         if len({name for name, _ in element.fields}) < len(element.fields):
-            raise ply_error(path, f"its element {element.name} has two properties of one name")
+            raise _error(path, f"its element {element.name} has two properties of one name")
     return Header(form, elements, tuple(comments), end.end())
 
 
@@ -158,7 +148,7 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
         with path.open("rb") as file:
             yield file
     except OSError as error:
-        raise ply_error(path, describe_error(error), remedy="Check the path.") from error
+        raise _error(path, describe_error(error), remedy="Check the path.") from error
 
 
 def read_ply_file(path: Path) -> tuple[bytes, Header]:
@@ -209,13 +199,13 @@ def _vertex_blocks(path: Path, header: Header, rows: int) -> tuple[_Element, Ite
     """
     names = [element.name for element in header.elements]
     if "vertex" not in names:
-        raise ply_error(path, f"its elements are {', '.join(names) or 'missing'}", "an element vertex")
+        raise _error(path, f"its elements are {', '.join(names) or 'missing'}", "an element vertex")
     vertex = header.elements[names.index("vertex")]
     if header.is_compressed:
         remedy = f"Read it with jsecon.load_gaussians, or run: npx @playcanvas/splat-transform {path.name} plain.ply"
-        raise ply_error(path, "it is compressed (SuperSplat's packed chunks)", remedy=remedy)
+        raise _error(path, "it is compressed (SuperSplat's packed chunks)", remedy=remedy)
     if not vertex.names:
-        raise ply_error(path, "its element vertex has no properties", "x y z and more")
+        raise _error(path, "its element vertex has no properties", "x y z and more")
     before = header.elements[: names.index("vertex")]
     if header.form == "ascii" or not all(element.fixed for element in [*before, vertex]):
         table = _read_irregular(path, before, vertex)
@@ -265,7 +255,7 @@ def read_elements(path: Path) -> tuple[Header, dict[str, np.ndarray]]:
     """
     data, header = read_ply_file(path)
     if header.form == "ascii":
-        raise ply_error(path, "its format is ascii", "a binary .ply")
+        raise _error(path, "its format is ascii", "a binary .ply")
     tables, offset = {}, header.start
     for element in header.elements:
         tables[element.name], offset = _parse_rows(path, data, offset, element, ORDERS[header.form])
@@ -292,7 +282,7 @@ def _parse_rows(path: Path, data: bytes, offset: int, element: _Element, order: 
                     raise _truncated(path, row, element.count, element.name)
                 count = int(np.frombuffer(data, length, 1, offset)[0])
                 if count < 0:
-                    raise ply_error(path, f"a list of its element {element.name} has a length of {count}")
+                    raise _error(path, f"a list of its element {element.name} has a length of {count}")
                 size = length.itemsize + count * item.itemsize
             offset += size
             if offset > len(data):
@@ -303,7 +293,7 @@ def _parse_rows(path: Path, data: bytes, offset: int, element: _Element, order: 
 def _truncated(path: Path, there: int, count: int, name: str = "vertex") -> InputError:
     """The error of a file that ends before its last row."""
     rows = "vertices" if name == "vertex" else f"rows of its element {name}"
-    return ply_error(path, f"the file is cut short: it holds {max(there, 0)} of {count} {rows}")
+    return _error(path, f"the file is cut short: it holds {max(there, 0)} of {count} {rows}")
 
 
 def _parse_text(path: Path, body: bytes, skip: int, vertex: _Element) -> np.ndarray:
@@ -316,7 +306,7 @@ def _parse_text(path: Path, body: bytes, skip: int, vertex: _Element) -> np.ndar
         numbers = np.array(rows, np.float64).reshape(len(rows), len(vertex.names))
     except (ValueError, IndexError) as error:
         problem = f"a vertex line does not have {len(vertex.names)} numbers, or the file is cut short"
-        raise ply_error(path, problem) from error
+        raise _error(path, problem) from error
     if len(lines) < vertex.count:
         raise _truncated(path, len(lines), vertex.count)
     result = np.empty(vertex.count, vertex.dtype("="))
@@ -325,7 +315,7 @@ def _parse_text(path: Path, body: bytes, skip: int, vertex: _Element) -> np.ndar
         with np.errstate(over="ignore", invalid="ignore"):  # checked below, and infinite numbers by the caller
             result[name] = numbers[:, column]
         if kind.kind != "f" and (result[name] != numbers[:, column]).any():
-            raise ply_error(path, f"numbers of {name} do not fit its type {kind.name}")
+            raise _error(path, f"numbers of {name} do not fit its type {kind.name}")
     return result
 
 
@@ -403,13 +393,13 @@ def read_ply(path: Path, header: Header | None = None) -> Gaussians:
     colours = _RGB if has_rgb else _DC
     if missing := [name for name in (*_POSITION, *colours, *_OPACITY, *scales, *_ROTATION) if name not in names]:
         remedy = "A plain point cloud is not enough: export the trained Gaussians as an uncompressed .ply."
-        raise ply_error(path, f"its vertices have no {', '.join(missing)}", _LAYOUT, remedy)
+        raise _error(path, f"its vertices have no {', '.join(missing)}", _LAYOUT, remedy)
     rest = sum(name.startswith("f_rest_") for name in names)
     rest_names = [f"f_rest_{index}" for index in range(rest)]
     if rest not in _REST_COUNTS or any(name not in names for name in rest_names):
         expected = "0, 9, 24 or 45 of them, counted from f_rest_0 (spherical harmonics of degree 0 to 3)"
         remedy = "Export the file again, with harmonics of degree 3 or less."
-        raise ply_error(path, f"its vertices have {rest} properties f_rest", expected, remedy)
+        raise _error(path, f"its vertices have {rest} properties f_rest", expected, remedy)
     filters = [name for name in _FILTERS if name in names][:1]
     exact = all(types[name] in _EXACT_IN_FLOAT32 for name in _POSITION)
     arrays: dict[str, np.ndarray] = {name: np.empty((count, size), np.float32) for name, size in _SIZES.items()}
@@ -455,7 +445,7 @@ def _fuse_filter(path: Path, arrays: dict[str, np.ndarray], deviation: np.ndarra
     """
     if not (np.isfinite(deviation) & (deviation >= 0)).all():
         problem = "numbers of filter_3D are negative or not finite"
-        raise ply_error(path, problem, "standard deviations", "Train again.")
+        raise _error(path, problem, "standard deviations", "Train again.")
     before = arrays["log_scales"].astype(np.float64)
     after = 0.5 * np.logaddexp(2 * before, 2 * np.log(deviation.astype(np.float64))[:, None])
     shrink = np.exp(np.where(after == before, 0.0, before - after).sum(axis=1))
@@ -502,7 +492,7 @@ def in_float32(path: Path, gaussians: Gaussians, similarity: Float[Array, "4 4"]
         place = ", ".join(f"{number:.10g}" for number in np.median(gaussians.means, axis=0))
         remedy = "Give load_gaussians a similarity that brings them near 0, as numpy.linalg.inv(capture.to_source)."
         problem = f"the Gaussians lie about ({place}), where float32 does not tell them apart"
-        raise ply_error(path, problem, remedy=remedy)
+        raise _error(path, problem, remedy=remedy)
     return jax.tree.map(jnp.asarray, gaussians)
 
 
@@ -639,10 +629,10 @@ def load_point_cloud(path: str | Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[
     vertices = _read_vertices(path)
     names = vertices.dtype.names or ()
     if missing := [name for name in _POSITION if name not in names]:
-        raise ply_error(path, f"its vertices have no {', '.join(missing)}", "a point cloud with x y z")
+        raise _error(path, f"its vertices have no {', '.join(missing)}", "a point cloud with x y z")
     points = _columns(vertices, _POSITION, np.float64)
     if not is_finite_and_bounded(points):
-        raise ply_error(path, "its points have NaN, infinite or absurd coordinates")
+        raise _error(path, "its points have NaN, infinite or absurd coordinates")
     if not all(name in names for name in _RGB):
         return points, np.full((len(points), 3), GREY, np.uint8)
     colours = np.stack([vertices[name] for name in _RGB], axis=-1)
