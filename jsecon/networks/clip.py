@@ -65,29 +65,25 @@ _PROJECTION = "Export the graph with its projection."
 
 @dataclasses.dataclass(frozen=True)
 class ClipFiles:
-    """Files and settings of a CLIP model.
-
-    Attributes:
-      visual: Graph of images: (B, 3, S, S) to (B, E).
-      textual: Graph of texts: token ids (B, L) to (B, E).
-      tokenizer: The tokenizer.json.
-      mean: Mean of RGB in 0..1.
-      std: Standard deviation of RGB in 0..1.
-      size: S in px; None to take it from the graph, else DEFAULT_SIDE.
-      layout: immich, transformers.js, flat, or separate if the files were named one by one.
-      rules: How the model takes its texts; None for CLIP.
-      logits: File with the scale and bias of a model trained with a sigmoid, or None.
-    """
+    """Files and settings of a CLIP model."""
 
     visual: Path
+    """Graph of images: (B, 3, S, S) to (B, E)."""
     textual: Path
+    """Graph of texts: token ids (B, L) to (B, E)."""
     tokenizer: Path
     mean: tuple[float, ...] = CLIP_MEAN
+    """Mean of RGB in 0..1."""
     std: tuple[float, ...] = CLIP_STD
+    """Standard deviation of RGB in 0..1."""
     size: int | None = None
+    """S in px; None to take it from the graph, else DEFAULT_SIDE."""
     layout: str = "separate"
+    """immich, transformers.js, flat, or separate if the files were named one by one."""
     rules: TextRules | None = None
+    """How the model takes its texts; None for CLIP."""
     logits: Path | None = None
+    """File with the scale and bias of a model trained with a sigmoid, or None."""
 
     @functools.cached_property
     def name(self) -> str:

@@ -84,34 +84,31 @@ LAYOUTS: Mapping[Role, tuple[_FileSet, ...]] = {
 
 @dataclasses.dataclass(frozen=True)
 class NamedModel:
-    """A row of the catalogue.
-
-    Attributes:
-      name: What a user types.
-      role: What it does in jsecon.
-      repository: "owner/name" on the hub.
-      revision: Commit that is fetched, or a branch.
-      megabytes: Size of the files by precision. Precisions that are missing are not offered.
-      licence: Licence of the weights.
-      purpose: What it is good for, in one sentence.
-      seconds: Seconds of a frame by precision, on two cores of a Xeon with AVX-512: of a segmenter with 70 guided
-        prompts, of an embedder for 40 regions, of a tracker for one object. Those not measured are missing.
-      precision: Precision that is taken unless the user asks for another.
-      sha256: File -> hash of the content, where it is known from elsewhere than the hub.
-      refused: Precision -> why it is not offered.
-    """
+    """A row of the catalogue."""
 
     name: str
+    """What a user types."""
     role: Role
+    """What it does in jsecon."""
     repository: str
+    """"owner/name" on the hub."""
     megabytes: Mapping[Precision, int]
+    """Size of the files by precision. Precisions that are missing are not offered."""
     licence: str
+    """Licence of the weights."""
     purpose: str
+    """What it is good for, in one sentence."""
     revision: str = "main"
+    """Commit that is fetched, or a branch."""
     seconds: Mapping[Precision, float] = dataclasses.field(default_factory=dict)
+    """Seconds of a frame by precision, on two cores of a Xeon with AVX-512: of a segmenter with 70 guided prompts, of
+    an embedder for 40 regions, of a tracker for one object. Those not measured are missing."""
     precision: Precision = "fp32"
+    """Precision that is taken unless the user asks for another."""
     sha256: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """File -> hash of the content, where it is known from elsewhere than the hub."""
     refused: Mapping[Precision, str] = dataclasses.field(default_factory=dict)
+    """Precision -> why it is not offered."""
 
 
 RECOMMENDED: Mapping[Role, str] = {"segmenter": "edgetam", "embedder": "siglip2"}
@@ -131,21 +128,18 @@ def catalogue() -> tuple[NamedModel, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class HubModel:
-    """A model on the hub.
-
-    Attributes:
-      role: What it does in jsecon.
-      repository: "owner/name".
-      revision: Commit, branch or tag.
-      precision: Precision of its graphs.
-      sha256: File -> hash of its content, where it is known beforehand.
-    """
+    """A model on the hub."""
 
     role: Role
+    """What it does in jsecon."""
     repository: str
+    """"owner/name"."""
     revision: str = "main"
+    """Commit, branch or tag."""
     precision: Precision = "fp32"
+    """Precision of its graphs."""
     sha256: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """File -> hash of its content, where it is known beforehand."""
 
     @property
     def address(self) -> str:
@@ -191,19 +185,15 @@ class HubFile:
 
 @dataclasses.dataclass(frozen=True)
 class Download:
-    """What has to be fetched for a model.
-
-    Attributes:
-      model: The model.
-      commit: Commit that its revision names now.
-      files: Files of the commit that the model needs.
-      licence: Licence by the repository's own card, or "not stated".
-    """
+    """What has to be fetched for a model."""
 
     model: HubModel
     commit: str
+    """Commit that its revision names now."""
     files: tuple[HubFile, ...]
+    """Files of the commit that the model needs."""
     licence: str
+    """Licence by the repository's own card, or "not stated"."""
 
     @property
     def size(self) -> int:

@@ -62,21 +62,18 @@ TOKENS: dict[str, tuple[int, ...]] = {"default": (0, 1, 2), "s": (0,), "m": (1,)
 
 @dataclasses.dataclass(frozen=True)
 class SamFiles:
-    """Files and settings of a SAM model.
-
-    Attributes:
-      encoder: Graph of frames.
-      decoder: Graph of prompts.
-      colours: Mean and standard deviation of RGB in 0..1 if they differ from SAM's, else None.
-      configured: Whether the folder has a preprocessor_config.json.
-      side: Side of the square image in px by that file, or None.
-    """
+    """Files and settings of a SAM model."""
 
     encoder: Path
+    """Graph of frames."""
     decoder: Path
+    """Graph of prompts."""
     colours: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    """Mean and standard deviation of RGB in 0..1 if they differ from SAM's, else None."""
     configured: bool = False
+    """Whether the folder has a preprocessor_config.json."""
     side: int | None = None
+    """Side of the square image in px by that file, or None."""
 
 
 def find_sam(folder: str | Path, precision: Precision | None = None) -> SamFiles:
@@ -279,39 +276,36 @@ class _Candidate(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class SamSettings:
-    """Settings of the automatic mask generator. The defaults are LangSplat's (preprocess.py), except for the prompts.
-
-    Attributes:
-      level: Level of the masks that a call returns.
-      prompts: Where the points are: "guided", in regions by colour and in what their masks leave unexplained
-        (`GuidedPrompts`), or "grid", SAM's own.
-      points_per_side: Points along each side of the grid of a crop.
-      predicted_iou: A mask must be predicted to be better than this.
-      stability: Least IoU of the masks at logits of +- `stability_offset`.
-      stability_offset: Offset in logits.
-      box_iou: Boxes with a higher IoU repeat each other.
-      crop_layers: Layers of 4^k crops beside the whole frame. A frame takes 1 + 4 + ... 4^layers runs of the encoder
-        and as many grids of prompts: without crops a fifth of LangSplat's time.
-      crop_overlap: Overlap of neighbouring crops, as a share of the frame's shorter side.
-      least_area: px; smaller holes are filled, smaller islands removed.
-      mask_iou: As in `langsplat_nms`.
-      mask_score: As in `langsplat_nms`.
-      mask_inner: As in `langsplat_nms`.
-    """
+    """Settings of the mask generator. The defaults are LangSplat's (preprocess.py), except for the prompts."""
 
     level: Level = "l"
+    """Level of the masks that a call returns."""
     prompts: Prompts = "guided"
+    """Where the points are: "guided", in regions by colour and in what their masks leave unexplained (`GuidedPrompts`),
+    or "grid", SAM's own."""
     points_per_side: int = 32
+    """Points along each side of the grid of a crop."""
     predicted_iou: float = 0.7
+    """A mask must be predicted to be better than this."""
     stability: float = 0.85
+    """Least IoU of the masks at logits of +- `stability_offset`."""
     stability_offset: float = 1.0
+    """Offset in logits."""
     box_iou: float = 0.7
+    """Boxes with a higher IoU repeat each other."""
     crop_layers: int = 1
+    """Layers of 4^k crops beside the whole frame. A frame takes 1 + 4 + ... 4^layers runs of the encoder and as many
+    grids of prompts: without crops a fifth of LangSplat's time."""
     crop_overlap: float = 512 / 1500
+    """Overlap of neighbouring crops, as a share of the frame's shorter side."""
     least_area: int = 100
+    """px; smaller holes are filled, smaller islands removed."""
     mask_iou: float = 0.8
+    """As in `langsplat_nms`."""
     mask_score: float = 0.7
+    """As in `langsplat_nms`."""
     mask_inner: float = 0.5
+    """As in `langsplat_nms`."""
 
 
 class SamSegmenter:

@@ -88,17 +88,14 @@ class Constants(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Sam2Graphs:
-    """The graphs of one model.
-
-    Attributes:
-      graphs: By name, as in SIGNATURES.
-      constants: Content of constants.json.
-      sizes: Sizes of the letters of SIGNATURES.
-    """
+    """The graphs of one model."""
 
     graphs: Mapping[str, Graph]
+    """By name, as in SIGNATURES."""
     constants: Constants
+    """Content of constants.json."""
     sizes: Mapping[str, int]
+    """Sizes of the letters of SIGNATURES."""
 
     def _run(self, name: str, **feeds: np.ndarray) -> dict[str, np.ndarray]:
         """Runs a graph by name."""
@@ -185,17 +182,14 @@ class FrameFeatures(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Prompt:
-    """What points out an object in a frame: a mask, or points.
-
-    Attributes:
-      mask: (H, W) bool, or None.
-      points: (P, 2) x, y in px of the frame, or None.
-      labels: (P,) 1 inside, 0 outside, 2 and 3 the corners of a box (top left, bottom right).
-    """
+    """What points out an object in a frame: a mask, or points."""
 
     mask: np.ndarray | None = None
+    """(H, W) bool, or None."""
     points: np.ndarray | None = None
+    """(P, 2) x, y in px of the frame, or None."""
     labels: np.ndarray | None = None
+    """(P,) 1 inside, 0 outside, 2 and 3 the corners of a box (top left, bottom right)."""
 
     def __post_init__(self):
         """Checks that the graphs fit each other."""
@@ -228,17 +222,14 @@ class Memory(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Bank:
-    """The memories of one object.
-
-    Attributes:
-      start: The prompted frame.
-      prompted: Its memory.
-      tracked: Memories of tracked frames that a later frame can still reach, by frame.
-    """
+    """The memories of one object."""
 
     start: int
+    """The prompted frame."""
     prompted: Memory
+    """Its memory."""
     tracked: Mapping[int, Memory] = dataclasses.field(default_factory=dict)
+    """Memories of tracked frames that a later frame can still reach, by frame."""
 
     def attended(
         self, t: int, step: int, count: int

@@ -63,19 +63,16 @@ _TOGETHER = "Take the three graphs from one export."
 
 @dataclasses.dataclass(frozen=True)
 class Sam3Files:
-    """Files of a SAM 3 model.
-
-    Attributes:
-      image: Graph of frames.
-      language: Graph of phrases.
-      decoder: Graph of masks.
-      tokenizer: CLIP's tokenizer.json.
-    """
+    """Files of a SAM 3 model."""
 
     image: Path
+    """Graph of frames."""
     language: Path
+    """Graph of phrases."""
     decoder: Path
+    """Graph of masks."""
     tokenizer: Path
+    """CLIP's tokenizer.json."""
 
 
 class Sam3Frame(NamedTuple):

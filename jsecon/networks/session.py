@@ -53,17 +53,13 @@ Size = int | str | None
 
 @dataclasses.dataclass(frozen=True)
 class Tensor:
-    """An input or output of a graph, as its file declares it.
-
-    Attributes:
-      name: Name of the tensor.
-      dtype: NumPy's name of the type, or ONNX Runtime's if NumPy has no such type.
-      shape: Sizes of the axes; None if the file does not declare them.
-    """
+    """An input or output of a graph, as its file declares it."""
 
     name: str
     dtype: str
+    """NumPy's name of the type, or ONNX Runtime's if NumPy has no such type."""
     shape: tuple[Size, ...] | None
+    """Sizes of the axes; None if the file does not declare them."""
 
     def __str__(self) -> str:
         """Returns the name and shape for messages."""

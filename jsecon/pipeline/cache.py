@@ -48,17 +48,14 @@ class CorruptCacheError(Exception):
 
 @dataclasses.dataclass(frozen=True)
 class CachedResult:
-    """The result of a stage.
-
-    Attributes:
-      value: The result, with NumPy arrays.
-      seconds: Wall time of its computation, also of one in an earlier run.
-      fresh: Whether it was computed in this run, and not read from the cache.
-    """
+    """The result of a stage."""
 
     value: Any
+    """The result, with NumPy arrays."""
     seconds: float
+    """Wall time of its computation, also of one in an earlier run."""
     fresh: bool
+    """Whether it was computed in this run, and not read from the cache."""
 
 
 _WRITTEN = (".spz", ".glb", ".splat", ".sog", ".html")

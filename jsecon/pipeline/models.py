@@ -14,32 +14,25 @@ from jsecon.networks.session import Graph, describe
 
 @dataclasses.dataclass(frozen=True)
 class Use:
-    """A kind of model that a folder may hold.
-
-    Attributes:
-      model: CLIP, SAM, SAM 2 or SAM 3.
-      usable: Whether the folder holds one.
-      summary: How to use it, or what is wrong with the folder.
-    """
+    """A kind of model that a folder may hold."""
 
     model: str
+    """CLIP, SAM, SAM 2 or SAM 3."""
     usable: bool
+    """Whether the folder holds one."""
     summary: str
+    """How to use it, or what is wrong with the folder."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ModelReport:
-    """Content of a folder.
-
-    Attributes:
-      folder: The folder.
-      graphs: Inputs and outputs of each .onnx file by its path within the folder, or why it cannot be opened.
-      uses: What the folder can be used for.
-    """
+    """Content of a folder."""
 
     folder: Path
     graphs: dict[str, str]
+    """Inputs and outputs of each .onnx file by its path within the folder, or why it cannot be opened."""
     uses: tuple[Use, ...]
+    """What the folder can be used for."""
 
     @property
     def lines(self) -> list[str]:

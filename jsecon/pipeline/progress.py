@@ -27,17 +27,14 @@ LINE_SECONDS = 15.0
 
 @dataclasses.dataclass(frozen=True)
 class Step:
-    """A stage of a run, or a part of a stage that the run leaves out.
-
-    Attributes:
-      name: Name of the stage or part.
-      status: Whether it runs, is read from the cache, or is left out.
-      why: How it is computed, or why it is left out.
-    """
+    """A stage of a run, or a part of a stage that the run leaves out."""
 
     name: str
+    """Name of the stage or part."""
     status: Status
+    """Whether it runs, is read from the cache, or is left out."""
     why: str
+    """How it is computed, or why it is left out."""
 
 
 class Listener:

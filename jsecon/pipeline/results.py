@@ -61,34 +61,28 @@ class Results:
 
 @dataclasses.dataclass(frozen=True)
 class StageResult:
-    """Output of a stage.
-
-    Attributes:
-      value: The result, a tree of arrays and records.
-      skipped: Parts that were not needed, each with the reason.
-      notes: What the user should know, a sentence each.
-    """
+    """Output of a stage."""
 
     value: Any
+    """The result, a tree of arrays and records."""
     skipped: dict[str, str] = dataclasses.field(default_factory=dict)
+    """Parts that were not needed, each with the reason."""
     notes: tuple[str, ...] = ()
+    """What the user should know, a sentence each."""
 
 
 @dataclasses.dataclass(frozen=True)
 class RunContext:
-    """What the stages of one run share.
-
-    Attributes:
-      options: Options of the run.
-      networks: Models of the run.
-      out: Output folder. It does not count as input if it lies inside of an input folder.
-      load: Replaces the loader of captures, for data with an unusual layout.
-    """
+    """What the stages of one run share."""
 
     options: Options
+    """Options of the run."""
     networks: Networks
+    """Models of the run."""
     out: Path
+    """Output folder. It does not count as input if it lies inside of an input folder."""
     load: Callable[[], Capture] | None = None
+    """Replaces the loader of captures, for data with an unusual layout."""
 
     def key_options(self, *names: str) -> dict[str, Any]:
         """Picks options for the key of a stage.
@@ -155,30 +149,27 @@ class StageInput(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """One stage of a run, as it is planned.
-
-    Attributes:
-      name: Name of the stage, and of its result in `Results`.
-      how: What it will do, for the plan that a run prints first.
-      compute: Computes the result.
-      after: Stages whose results it reads.
-      key_options: Options and models that the result depends on; models by their content, not by the place of files.
-      files: Input file or folder, or a function that lists the input files.
-      skipped: Parts that the options make needless, each with the reason.
-      distributed: Whether several processes compute it together, each a part of the views.
-      output_dir: Folder that it writes for later stages, with its key in KEY_FILE; it runs again if another run wrote
-        that folder.
-    """
+    """One stage of a run, as it is planned."""
 
     name: str
+    """Name of the stage, and of its result in `Results`."""
     how: str
+    """What it will do, for the plan that a run prints first."""
     compute: Callable[[StageInput], StageResult]
+    """Computes the result."""
     after: tuple[str, ...] = ()
+    """Stages whose results it reads."""
     key_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Options and models that the result depends on; models by their content, not by the place of files."""
     files: Path | Callable[[], Sequence[Path]] | None = None
+    """Input file or folder, or a function that lists the input files."""
     skipped: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """Parts that the options make needless, each with the reason."""
     distributed: bool = False
+    """Whether several processes compute it together, each a part of the views."""
     output_dir: Path | None = None
+    """Folder that it writes for later stages, with its key in KEY_FILE; it runs again if another run wrote that
+    folder."""
 
     def key(self, keys: Mapping[str, str], files: str | None) -> str:
         """Hashes all that the result depends on.

@@ -92,31 +92,26 @@ OUT_OF_MEMORY = "Take smaller frames (--long-side), fewer (--frames), or fewer G
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """A finished run.
-
-    Attributes:
-      field: The language field.
-      capture: The capture.
-      labels: (T, H, W) int16 masklets of the training frames that vision uses.
-      held_out: PSNR and SSIM of the held-out frames.
-      seconds: Wall time of each stage, also of one that was computed in an earlier run.
-      steps: Stages, and what was skipped.
-      notes: What the user should know, a sentence each.
-      options: Options of the run.
-      programs: Number of programs that jax compiled ("all"), and of those that it read from disk ("from_disk").
-      compilations: The same for each stage.
-    """
+    """A finished run."""
 
     field: LanguageField
     capture: Capture
     labels: np.ndarray
+    """(T, H, W) int16 masklets of the training frames that vision uses."""
     held_out: Quality
+    """PSNR and SSIM of the held-out frames."""
     seconds: dict[str, float]
+    """Wall time of each stage, also of one that was computed in an earlier run."""
     steps: tuple[Step, ...]
+    """Stages, and what was skipped."""
     notes: tuple[str, ...]
+    """What the user should know, a sentence each."""
     options: Options
+    """Options of the run."""
     programs: dict[str, int]
+    """Number of programs that jax compiled ("all"), and of those that it read from disk ("from_disk")."""
     compilations: dict[str, dict[str, int]]
+    """The same for each stage."""
 
     @property
     def psnr(self) -> np.ndarray:
