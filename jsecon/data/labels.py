@@ -6,34 +6,32 @@ belong to the mask), the objects of a category OR-ed, their boxes side by side.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import cv2
-import jax
 import numpy as np
 from jaxtyping import Bool, Real
 
 from jsecon.data.images import MAX_PIXELS
 from jsecon.errors import InputError, require
 from jsecon.files import path_within, read_json, write_text
+from jsecon.types import record, static
 
 _REMEDY = "Label the frame again (LangSplat's format, as its LERF-OVS labels have it)."
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@record
 class LabelledFrame:
-    """The annotation of one frame; a pytree."""
+    """The annotation of one frame."""
 
-    name: str = dataclasses.field(metadata={"static": True})
+    name: str = static()
     """the frame's name without ending, as in Capture.names."""
-    width: int = dataclasses.field(metadata={"static": True})
+    width: int = static()
     """px."""
-    height: int = dataclasses.field(metadata={"static": True})
+    height: int = static()
     """px."""
     objects: dict[str, tuple[np.ndarray, np.ndarray]]
     """category -> mask bool (H, W), boxes float32 (B, 4) x1 y1 x2 y2 in px, ends included."""

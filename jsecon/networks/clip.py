@@ -271,7 +271,6 @@ class ClipEmbedder:
       store: Folder that caches embeddings of regions by content, and of the reference words; or None.
 
     Attributes:
-      files: The model's files.
       name: Name of the space. It follows from the content of the files, so that models are told apart.
 
     Raises:

@@ -320,8 +320,6 @@ class SamSegmenter:
       threads: Number of cores of one run, as for `Graph`.
 
     Attributes:
-      files: The model's files.
-      settings: Settings of the mask generator.
       name: Follows from the content of the files and the settings.
 
     Raises:
@@ -517,8 +515,7 @@ def langsplat_nms(
     A mask is kept if its score is high enough, no better mask repeats it, and it lies inside of no other: at least 0.85
     of it in a mask of which that is less than half, with 1 - (share of it) * (share of the other) above
     1 - `inner_threshold`. A mask that is itself dropped still suppresses. Of equal scores the earlier counts as better.
-    Empty masks are dropped. LangSplat compares every pair of masks pixel by pixel; here the shared areas are one
-    product of sparse matrices.
+    Empty masks are dropped.
 
     Args:
       masks: (M, H, W).

@@ -118,9 +118,6 @@ class Sam3:
       model: The model folder, or its files.
       threads: Number of cores of one run, as for `Graph`.
 
-    Attributes:
-      files: The model's files.
-
     Raises:
       InputError: The folder holds no such model. Methods raise it if a graph has other tensors than SAM 3.
     """

@@ -444,8 +444,7 @@ def dry_run(options: Options, out: Path, *, scene_only: bool = False, listener: 
 def _check_inputs(context: RunContext, running: Collection[str], results: Mapping[str, Path]) -> None:
     """Raises InputError for inputs that a run would refuse, as its stages check them before their long work.
 
-    Of the stages that would not run, inputs are not checked. `results` are the cache files of all stages; those of
-    stages that would run need not exist. It reads no more than headers and a few files.
+    Those of stages that would run are checked, by headers and a few files. `results` are the cache files of all stages.
     """
     options = context.options
     _require_place(context.out)

@@ -218,10 +218,8 @@ def _training_worlds(
     gsplat (examples/datasets/normalize.py): the cameras' up to -y by the smallest turn, the median of the points of
     their axes nearest to the origin to the origin, the median camera to distance 1; then the points' principal axes,
     whose signs are open. nerfstudio (auto_orient_and_center_poses, "up" and "poses"): the cameras' up to z, their mean
-    to the origin, the largest coordinate of one to 1.
-
-    Takes the cameras (T, 4, 4) and sparse points (P, 3) in the world of the poses, float64. Returns for each world the
-    program and the (4, 4) similarity from the world of the poses.
+    to the origin, the largest coordinate of one to 1. Returns for each world the program and the (4, 4) similarity from
+    the world of the poses, that of the arguments.
     """
     turns, centres = cameras_to_world[:, :3, :3], cameras_to_world[:, :3, 3]
     up = -turns[:, :, 1].mean(0)

@@ -168,8 +168,9 @@ def save_gaussians(
 
     Raises:
       ValueError: Shapes disagree.
-      InputError: The format cannot be written, a Gaussian cannot be drawn, positions or sizes lie outside of what a
-        .spz holds, or the folder cannot be written.
+      InputError: The format cannot be written, a Gaussian cannot be drawn, or the folder cannot be written. Of a .spz:
+        one lies farther than 4,194,303 units from the origin, or most are smaller than the rounding of their positions;
+        one is larger than exp(5.9) units, or more than 1 % are smaller than exp(-10).
     """
     path = Path(path)
     require_writable_format(path)
@@ -227,12 +228,7 @@ def _antialiasing_note(path: Path) -> tuple[str, ...]:
 
 
 def _save_spz(path: str | Path, gaussians: Gaussians, *, similarity: Float[Array, "4 4"] | None = None) -> None:
-    """Writes a .spz in blocks. Packed columns lie beside the file until it is complete, 20 to 65 bytes a Gaussian.
-
-    Raises InputError also if one lies farther than 4,194,303 units from the origin, or so far that most are smaller
-    than the rounding of their positions; if one is larger than exp(5.9) units, or more than 1 % are smaller
-    than exp(-10).
-    """
+    """Writes a .spz in blocks. Packed columns lie beside the file until it is complete, 20 to 65 bytes a Gaussian."""
     into = SPZ_AXES if similarity is None else SPZ_AXES @ np.asarray(similarity, np.float64)
     bits = _fraction_bits(path, gaussians, into)
     if gaussians.count >= 1 << 32:

@@ -193,10 +193,7 @@ def _read_vertices(path: Path) -> np.ndarray:
 
 
 def _vertex_blocks(path: Path, header: Header, rows: int) -> tuple[_Element, Iterator[np.ndarray]]:
-    """Returns the element of the vertices, and the vertices in blocks of `rows` at most, one block at least.
-
-    A binary file without lists before or in its vertices is read block by block.
-    """
+    """Returns the element of the vertices, and the vertices in blocks of `rows` at most, one block at least."""
     names = [element.name for element in header.elements]
     if "vertex" not in names:
         raise _error(path, f"its elements are {', '.join(names) or 'missing'}", "an element vertex")
