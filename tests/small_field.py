@@ -96,6 +96,13 @@ def shares(field, regions):
     return np.divide(weight, seen, out=np.zeros_like(weight), where=seen > 0)
 
 
+def lone_votes(regions, count: int) -> Votes:
+    """Votes of Gaussians that three views show, each with all of its weight on one of `count` regions."""
+    ones = np.ones(len(regions), np.float32)
+    views = np.full(len(regions), 3, np.int32)
+    return Votes(np.int32(regions)[:, None], ones[:, None], ones, ones, ones, views, np.int32(0), count)
+
+
 def field_of(votes: Votes, regions: Regions) -> LanguageField:
     """A field of votes and regions; its Gaussians and codes mean nothing."""
     count = votes.regions.shape[0]

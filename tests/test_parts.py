@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from small_field import field_of, unit_rows
+from small_field import field_of, lone_votes, unit_rows
 
 from jsecon.app.ask import ask_each, ask_text
 from jsecon.language import field as field_file
@@ -13,7 +13,7 @@ from jsecon.language.field import load_field, save_field
 from jsecon.query.parts import MIN_REGION_RATIO, PART_THRESHOLD, best_cluster, part_scores, parts_fallback
 from jsecon.query.rules import QueryRules
 from jsecon.query.select import query_anchored
-from jsecon.types import Parts, Regions, Votes
+from jsecon.types import Parts, Regions
 from jsecon.vision.protocols import Logits
 
 
@@ -104,10 +104,8 @@ def unit_rows_near(rows, rng):
 
 def field_of_rows_of(means, thing, embeddings):
     """Votes give each Gaussian the region of its thing, and the fifth thing to the fourth region."""
-    count, regions = len(means), len(embeddings)
-    own = np.minimum(thing, regions - 1).astype(np.int32)[:, None]
-    one = np.ones(count, np.float32)
-    votes = Votes(own, one[:, None], one, one, one, np.ones(count, np.int32), np.zeros((), np.int32), regions)
+    regions = len(embeddings)
+    votes = lone_votes(np.minimum(thing, regions - 1), regions)
     field = field_of(votes, Regions(embeddings, np.full((regions, 2), 500, np.int32)))
     return dataclasses.replace(field, gaussians=dataclasses.replace(field.gaussians, means=means))
 

@@ -73,6 +73,7 @@ def test_several_regions_take_their_pieces_with_them(broken):
     apart = with_other(broken, np.eye(5, dtype=np.float32))
     for field, options, regions in (
         (broken, {"all_of_kind": False}, [0, 1]),
+        (broken, {"all_of_kind": False, "piece_threshold": 1.0}, [0]),
         (apart, {"all_of_kind": False}, [0]),
         (apart, {"kind_threshold": 0.8}, [0, 1]),
         (broken, {"kind_threshold": 0.99}, [0, 1]),
@@ -104,9 +105,3 @@ def test_a_region_takes_its_pieces_with_it_where_that_is_asked_for(broken):
         atol=1e-6,
     )
     assert int(query_region(broken, 99, rules=QueryRules(piece_threshold=0.5, alike_threshold=None)).region) == -1
-
-
-def test_several_regions_leave_their_pieces_where_that_is_asked_for(broken):
-    text = broken.regions.embeddings[:1]
-    alone = query_several(broken, text, rules=QueryRules(piece_threshold=1.0))
-    np.testing.assert_allclose(alone.similarity, shares(broken, [0]), atol=1e-6)

@@ -84,11 +84,6 @@ def test_words_from_outside_are_escaped(page):
     assert "&lt;b&gt;x&lt;/b&gt;" in page
 
 
-def test_the_page_is_legible_in_light_and_dark(page):
-    assert "prefers-color-scheme: dark" in page
-    assert "color-scheme: light dark" in page
-
-
 @pytest.mark.parametrize("sharp", [True, False])
 def test_pictures_inside_the_page_are_the_pictures_given(sharp):
     image = np.repeat(np.repeat(_image()[:6, :8], 8, 0), 8, 1)

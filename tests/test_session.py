@@ -1,5 +1,7 @@
 """ONNX graphs: signatures as the file has them, and a message that names file or tensor for whatever does not fit."""
 
+from pathlib import Path
+
 import numpy as np
 import onnx
 import onnxruntime
@@ -70,27 +72,15 @@ def test_requirements_name_the_tensor_and_what_was_wanted(affine):
         graph.require("output", "y", (None, 512), "CLIP's image encoder")
 
 
-def _damage(kind, path):
-    if kind == "missing":
-        path.unlink()
-    elif kind == "empty":
-        path.write_bytes(b"")
-    elif kind == "cut":
-        path.write_bytes(path.read_bytes()[:100])
-    elif kind == "page":
-        path.write_bytes(b"<!DOCTYPE html><html>not found</html>")
-    elif kind == "pointer":
-        path.write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 12\n")
-    elif kind == "torch":
-        path.write_bytes(b"PK\x03\x04" + bytes(200))
-
-
-@pytest.mark.parametrize(("kind", "words"), [
-    ("missing", "No such file"), ("empty", "an empty file"), ("cut", "cannot open"), ("page", "cannot open"),
-    ("pointer", "Git LFS pointer"), ("torch", "cannot open"),
-])  # fmt: skip
-def test_a_file_that_is_no_graph_is_refused_by_name(affine, kind, words):
-    _damage(kind, affine)
+@pytest.mark.parametrize(("damage", "words"), [
+    (Path.unlink, "No such file"), (lambda path: path.write_bytes(b""), "an empty file"),
+    (lambda path: path.write_bytes(path.read_bytes()[:100]), "cannot open"),
+    (lambda path: path.write_bytes(b"<!DOCTYPE html><html>not found</html>"), "cannot open"),
+    (lambda path: path.write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n"), "Git LFS pointer"),
+    (lambda path: path.write_bytes(b"PK\x03\x04" + bytes(200)), "cannot open"),
+], ids=["missing", "empty", "cut", "page", "pointer", "torch"])  # fmt: skip
+def test_a_file_that_is_no_graph_is_refused_by_name(affine, damage, words):
+    damage(affine)
     with pytest.raises(InputError, match=words) as caught:
         Graph(affine, threads=1)
     assert str(affine) in caught.value.where

@@ -142,16 +142,6 @@ def test_any_number_of_regions(count):
         np.testing.assert_allclose(share_of(votes, chosen).share, exact_share(votes, chosen), rtol=1e-6)
 
 
-@pytest.mark.long
-def test_jit_is_eager():
-    votes = known_votes(300)
-    for chosen in (np.arange(REGIONS) < 3, np.zeros(REGIONS, bool)):
-        compiled = share_of(votes, chosen), vote_shares(votes), with_overlap(votes).overlap
-        with jax.disable_jit():
-            eager = share_of(votes, chosen), vote_shares(votes), with_overlap(votes).overlap
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), compiled, eager)
-
-
 def test_numbers_that_are_not_finite_are_not_known_where_they_are_asked_for():
     votes = Votes(
         np.int32([[0, 1], [1, 0], [-1, 5], [1, 1], [0, -1]]),

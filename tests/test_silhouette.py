@@ -139,14 +139,6 @@ def test_equals_the_slow_twin(seed):
     np.testing.assert_array_equal(got, slow_twin(found, views, taken, weights))
 
 
-@pytest.mark.long
-def test_jit_is_eager():
-    found, views, taken = made_up(0, count=2)
-    with jax.disable_jit():
-        eager = ascend(found, jnp.asarray(taken), views, 2)
-    np.testing.assert_array_equal(eager, ascend(found, jnp.asarray(taken), views, 2))
-
-
 def test_nothing_to_choose_from_stays_nothing(world):
     gaussians, cameras, share = world
     assert not np.asarray(fit_silhouette(gaussians, cameras, np.zeros_like(share))).any()

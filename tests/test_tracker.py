@@ -26,13 +26,10 @@ def prompts_at(truth, t):
     return truth[t][None] == np.arange(1, 4)[:, None, None]
 
 
-def test_is_a_tracker(tracker):
-    assert isinstance(tracker, Tracker)
-
-
 @pytest.mark.parametrize("start", [10, 12])
 def test_follows_each_ball_around_the_ring(world, tracker, start):
     _, _, frames, truth, _ = world
+    assert isinstance(tracker, Tracker)
     labels = tracker(frames, start, prompts_at(truth, start))
     assert labels.shape == truth.shape
     assert labels.dtype == np.int16

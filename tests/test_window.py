@@ -17,7 +17,7 @@ import test_distill as of_distill
 import test_retrieval as of_retrieval
 import test_shares as of_shares
 from conftest import look_at
-from small_field import seen_of, unit_rows
+from small_field import shares, unit_rows
 from test_direct import exact_cosines, exact_relevancy
 
 from jsecon.fit.photometric import l1, psnr
@@ -37,12 +37,7 @@ from jsecon.types import Camera, Gaussians
 
 pytestmark = [pytest.mark.as_shipped, pytest.mark.long]
 
-REGIONS = of_classes.REGIONS
-
-
-@pytest.fixture(params=[40_000])
-def count(request) -> int:
-    return request.param
+COUNT = 40_000
 
 
 def normal(*shape):
@@ -54,8 +49,8 @@ def compiled(function, batch, *given):
     return jax.jit(jax.vmap(function, in_axes=(0, *(None for _ in given))))(batch, *given)
 
 
-def test_one_step(count):
-    codes, texts = normal(count, 3), normal(2, 3)
+def test_one_step():
+    codes, texts = normal(COUNT, 3), normal(2, 3)
     expected = np.stack([exact_cosines(codes, text) for text in texts])
     np.testing.assert_allclose(query_one_step(codes, texts[0], 0.5).similarity, expected[0], atol=1e-6)
     found = compiled(lambda text, codes: query_one_step(codes, text, 0.5), texts, codes)
@@ -67,8 +62,8 @@ def test_one_step(count):
     np.testing.assert_allclose(by_row, expected[0], atol=1e-6)
 
 
-def test_canonical(count):
-    features, texts, phrases = normal(count, 8), normal(2, 8), normal(4, 8)
+def test_canonical():
+    features, texts, phrases = normal(COUNT, 8), normal(2, 8), normal(4, 8)
     expected = np.stack([exact_relevancy(features, text, phrases) for text in texts])
 
     def ask(text, features, phrases):
@@ -81,8 +76,8 @@ def test_canonical(count):
     np.testing.assert_allclose(query_canonical(features, texts[1], phrases, 0.5).similarity, expected[1], atol=3e-6)
 
 
-def test_unit_codes(count):
-    codes, texts = normal(count, 40), normal(2, 40)
+def test_unit_codes():
+    codes, texts = normal(COUNT, 40), normal(2, 40)
     codes[:3] = [[0] * 40, [np.nan] * 40, [1e30] * 40]
     units = unit_codes(codes)
     found = compiled(lambda text, units: query_one_step(units, text, 0.1), texts, units)
@@ -94,17 +89,10 @@ def test_unit_codes(count):
 
 
 @pytest.fixture
-def field(count):
+def field():
     """Random votes and codes for six regions."""
-    made = of_classes.made_field(count)
-    return dataclasses.replace(made, codes=unit_rows(np.random.default_rng(1), count, 4))
-
-
-def share(field, regions):
-    """(N,) float64: the regions' votes as a part of what they are shares of."""
-    chosen = np.isin(field.votes.regions, regions)
-    weight, seen = (np.where(chosen, a, 0).astype(np.float64) for a in (field.votes.weights, seen_of(field.votes)))
-    return np.divide(weight.sum(1), seen.max(1), out=np.zeros(len(weight)), where=chosen.any(1)).clip(max=1)
+    made = of_classes.made_field(COUNT)
+    return dataclasses.replace(made, codes=unit_rows(np.random.default_rng(1), COUNT, 4))
 
 
 def test_anchored(field):
@@ -114,7 +102,7 @@ def test_anchored(field):
     by_votes = compiled(lambda text, field: query_anchored(field, text, **ask).similarity, texts, field)
     by_code = compiled(lambda text, field: query_anchored(field, text, by="code", **ask).similarity, texts, field)
     for n, region in enumerate(asked):
-        np.testing.assert_allclose(by_votes[n], share(field, [region]), atol=1e-6)
+        np.testing.assert_allclose(by_votes[n], shares(field, [region]).clip(max=1), atol=1e-6)
         np.testing.assert_allclose(by_code[n], exact_cosines(field.codes, field.region_codes[region]), atol=1e-6)
 
 
@@ -123,15 +111,15 @@ def test_several(field):
     ask = {"rules": QueryRules(retrieval="cosine")}
     found = compiled(lambda texts, field: query_several(field, texts, **ask).similarity, sets, field)
     for n, regions in enumerate(([0, 3], [1, 2])):
-        np.testing.assert_allclose(found[n], share(field, regions), atol=1e-6)
+        np.testing.assert_allclose(found[n], shares(field, regions).clip(max=1), atol=1e-6)
 
 
-def test_classes_of_all(field, count):
+def test_classes_of_all(field):
     sets = unit_rows(np.random.default_rng(2), 10, of_classes.SIZE).reshape(2, 5, -1)
     rules = QueryRules(retrieval="cosine", retrieval_threshold=-1.0)
     ask = {"rules": rules, "standardise": False, "every": True}
     labels, found = compiled(lambda texts, field: query_classes(field, texts, **ask), sets, field)
-    rows = np.unique(np.linspace(0, count - 1, 2_000).astype(int))
+    rows = np.unique(np.linspace(0, COUNT - 1, 2_000).astype(int))
     few = dataclasses.replace(
         field, votes=jax.tree.map(lambda a: np.asarray(a)[rows] if np.ndim(a) else a, field.votes)
     )
@@ -144,9 +132,9 @@ def test_classes_of_all(field, count):
         np.testing.assert_array_equal(np.asarray(labels)[n][rows][clear], expected.argmax(1)[clear])
 
 
-def test_similarities_of_many_regions(count):
+def test_similarities_of_many_regions():
     rng = np.random.default_rng(3)
-    embeddings, texts, words = (unit_rows(rng, n, of_retrieval.SIZE) for n in (count, 3, 4))
+    embeddings, texts, words = (unit_rows(rng, n, of_retrieval.SIZE) for n in (COUNT, 3, 4))
 
     def ask(text, embeddings, words):
         return region_similarities(embeddings, text, words, "apart")
@@ -158,36 +146,36 @@ def test_similarities_of_many_regions(count):
 
 
 @pytest.mark.parametrize("shown", [True, False])
-def test_shares(count, shown):
-    votes = jax.tree.map(jnp.asarray, of_shares.known_votes(count, shown=shown))
+def test_shares(shown):
+    votes = jax.tree.map(jnp.asarray, of_shares.known_votes(COUNT, shown=shown))
     chosen = np.random.default_rng(1).random((3, of_shares.REGIONS)) < 0.5
     found = compiled(lambda one, votes: share_of(votes, one), chosen, votes)
-    rows = np.unique(np.linspace(0, count - 1, 2_000).astype(int))
+    rows = np.unique(np.linspace(0, COUNT - 1, 2_000).astype(int))
     few = jax.tree.map(lambda a: a if a.ndim == 0 else np.asarray(a)[rows], votes)
     for n, one in enumerate(chosen):
         np.testing.assert_allclose(found.share[n][rows], of_shares.exact_share(few, one), atol=1e-6)
 
 
-def test_shown_and_overlap(count):
-    votes, regions = of_shares.cast(count)
+def test_shown_and_overlap():
+    votes, regions = of_shares.cast(COUNT)
     found = with_shown(votes, regions)
     np.testing.assert_allclose(found.shown, of_shares.exact_shown(votes, regions), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(with_overlap(found).overlap, of_shares.exact_overlap(found), rtol=2e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("reduce", ["median", "mean", "mode"])
-def test_reductions_of_votes(count, reduce):
+def test_reductions_of_votes(reduce):
     rng = np.random.default_rng(0)
     small, tables = of_distill.random_votes(rng, 100, 4, 8), np.stack([unit_rows(rng, 8, 3) for _ in range(2)])
-    rows = np.arange(count) % 100
+    rows = np.arange(COUNT) % 100
     votes = jax.tree.map(lambda a: a[rows] if np.ndim(a) else a, small)
     found = compiled(lambda table, votes: distill_votes(votes, table, reduce), tables, votes)
     for n, table in enumerate(tables):
         np.testing.assert_allclose(found[n], of_distill.exact(small, table, reduce)[rows], atol=3e-5)
 
 
-def test_coders(count):
-    units, many = unit_rows(np.random.default_rng(0), 5, 12), unit_rows(np.random.default_rng(1), count, 12)
+def test_coders():
+    units, many = unit_rows(np.random.default_rng(0), 5, 12), unit_rows(np.random.default_rng(1), COUNT, 12)
     basis = np.linalg.qr(normal(12, 4))[0]
     expected = many.astype(np.float64) @ basis
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
@@ -211,15 +199,15 @@ def test_coders(count):
 
 
 @pytest.fixture
-def cloud(count):
+def cloud():
     """Gaussians in a cube, and a camera before it."""
-    rng = np.random.default_rng(count)
+    rng = np.random.default_rng(COUNT)
     gaussians = Gaussians(
-        rng.uniform(-1, 1, (count, 3)).astype(np.float32),
-        rng.uniform(-5, -2, (count, 3)).astype(np.float32),
-        rng.normal(size=(count, 4)).astype(np.float32),
-        rng.normal(size=count).astype(np.float32),
-        rng.normal(size=(count, 4, 3)).astype(np.float32),
+        rng.uniform(-1, 1, (COUNT, 3)).astype(np.float32),
+        rng.uniform(-5, -2, (COUNT, 3)).astype(np.float32),
+        rng.normal(size=(COUNT, 4)).astype(np.float32),
+        rng.normal(size=COUNT).astype(np.float32),
+        rng.normal(size=(COUNT, 4, 3)).astype(np.float32),
     )
     lens = (np.float32(number) for number in (300, 310, 160, 120))
     return gaussians, Camera(look_at((0.3, -0.5, -3.0)), *lens, 320, 240)
@@ -254,8 +242,8 @@ def test_another_world(cloud):
     np.testing.assert_allclose(moved.means, expected, atol=2e-6)
 
 
-def test_losses_of_many_pixels(count):
-    image, target = np.random.default_rng(0).random((2, count, 1, 3)).astype(np.float32)
+def test_losses_of_many_pixels():
+    image, target = np.random.default_rng(0).random((2, COUNT, 1, 3)).astype(np.float32)
     error = np.float64(image) - target
     stacked = np.stack([image, target])
     np.testing.assert_allclose(compiled(l1, stacked, target)[0], np.abs(error).mean(), rtol=1e-5)

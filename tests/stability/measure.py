@@ -29,8 +29,6 @@ class Row:
     """the pixels that are not finite are those that a Gaussian with a bad feature touches, and no other"""
     value_error: float
     """largest error of image (in units of the largest feature) and alpha, over pixels where no cut is in doubt"""
-    in_doubt: float
-    """share of pixels where a cut is in doubt"""
     doubtful_error: float
     """largest error there beyond what the cut in doubt can cause"""
     gradient_finite: bool
@@ -155,7 +153,6 @@ def evaluate(case: Case, *, ulp: bool = True) -> Row:
         value_finite=bool(finite[~poisoned].all()),
         contained=bool((~finite)[undoubted_poison].all() and finite[~poisoned & (jump == 0)].all()),
         value_error=float(error[clear].max(initial=0)),
-        in_doubt=float((jump > 0).mean()),
         doubtful_error=float((error - jump)[(jump > 0) & ~poisoned].max(initial=0)),
         gradient_finite=all(bool(np.isfinite(g).all()) for g in gradients.values()),
         gradient_errors={k: relative(gradients, k) for k in ARGUMENTS},
