@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from onnx_files import node, write_graph
+from onnx_files import Sketch
 from tokenizers import pre_tokenizers
 
 from jsecon.networks.clip import CLIP_MEAN, CLIP_STD
@@ -60,15 +60,10 @@ OTHER_MEAN, OTHER_STD = [0.5, 0.4, 0.3], [0.2, 0.25, 0.3]
 
 def write_visual(path: Path, names: tuple[str, str], batch: int | str, mean=CLIP_MEAN, std=CLIP_STD) -> Path:
     """Images -> mean RGB in 0..1, 3 numbers: the normalisation is undone inside, so a wrong one shows."""
-    nodes = [
-        node("Mul", [names[0], "std"], ["scaled"]),
-        node("Add", ["scaled", "mean"], ["rgb"]),
-        node("ReduceMean", ["rgb"], [names[1]], axes=[2, 3], keepdims=0),
-    ]
-    constants = {k: np.asarray(v, np.float32).reshape(1, 3, 1, 1) for k, v in (("mean", mean), ("std", std))}
-    return write_graph(
-        path, nodes, {names[0]: ("float32", [batch, 3, SIZE, SIZE])}, {names[1]: ("float32", [batch, 3])}, constants
-    )
+    g = Sketch()
+    rgb = g("Add", g("Mul", names[0], np.reshape(std, (1, 3, 1, 1))), np.reshape(mean, (1, 3, 1, 1)))
+    g("ReduceMean", rgb, axes=[2, 3], keepdims=0, into=names[1])
+    return g.save(path, {names[0]: ("float32", [batch, 3, SIZE, SIZE])}, {names[1]: ("float32", [batch, 3])})
 
 
 def write_textual(path: Path, names: tuple[str, str], batch: int | str, kind: str, *, mask: bool = False) -> Path:
@@ -81,18 +76,14 @@ def write_textual(path: Path, names: tuple[str, str], batch: int | str, kind: st
     for word, colour in COLOURS.items():
         table[load_tokens([word])[0]] = colour
     table[[vocab["<|startoftext|>"], vocab["<|endoftext|>"], 0]] = 0
-    nodes = [node("Gather", ["table", names[0]], ["rows"])]
+    g = Sketch()
+    rows = g("Gather", table, names[0])
     inputs = {names[0]: (kind, [batch, LENGTH])}
     if mask:
         inputs["attention_mask"] = (kind, [batch, LENGTH])
-        nodes += [
-            node("Cast", ["attention_mask"], ["ones"], to=1),
-            node("Unsqueeze", ["ones", "last"], ["column"]),
-            node("Mul", ["rows", "column"], ["left"]),
-        ]
-    nodes.append(node("ReduceSum", ["left" if mask else "rows", "axis"], [names[1]], keepdims=0))
-    constants = {"table": table, "axis": np.asarray([1])} | ({"last": np.asarray([2])} if mask else {})
-    return write_graph(path, nodes, inputs, {names[1]: ("float32", [batch, 3])}, constants)
+        rows = g("Mul", rows, g("Unsqueeze", g("Cast", "attention_mask", to=1), [2]))
+    g("ReduceSum", rows, [1], keepdims=0, into=names[1])
+    return g.save(path, inputs, {names[1]: ("float32", [batch, 3])})
 
 
 def load_tokens(texts: list[str]) -> list[int]:

@@ -145,8 +145,8 @@ def scene() -> Gaussians:
     )
 
 
-def look_at(centre, target=(0.0, 0.0, 0.0), up=(0.0, -1.0, 0.0)) -> np.ndarray:
-    """(4, 4) float32 world_to_camera, OpenCV axes, of a camera at `centre` that looks at `target`."""
+def look_at(centre, target=(0.0, 0.0, 0.0), up=(0.0, -1.0, 0.0), dtype=np.float32) -> np.ndarray:
+    """(4, 4) world_to_camera, OpenCV axes, of a camera at `centre` that looks at `target`."""
     centre, target, up = (np.asarray(v, np.float64) for v in (centre, target, up))
     z = (target - centre) / np.linalg.norm(target - centre)
     x = np.cross(-up, z) / np.linalg.norm(np.cross(up, z))
@@ -154,7 +154,7 @@ def look_at(centre, target=(0.0, 0.0, 0.0), up=(0.0, -1.0, 0.0)) -> np.ndarray:
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([x, y, z])
     matrix[:3, 3] = -matrix[:3, :3] @ centre
-    return matrix.astype(np.float32)
+    return matrix.astype(dtype)
 
 
 @pytest.fixture(scope="session")

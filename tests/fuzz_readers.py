@@ -17,7 +17,7 @@ from sam2_files import write_sam2
 from sam3_files import KINDS as SAM3_KINDS, write_sam3
 from sam_files import write_sam
 from siglip_files import write_siglip
-from splat_files import compressed_ply, scene, sog, splat, spz
+from splat_files import compressed_ply, ply_columns, scene, sog, splat, spz, write_ply
 from test_proposal_files import records
 from test_rgbd import FORMATS as RGBD
 
@@ -81,43 +81,17 @@ def _whole_gaussians(found: Gaussians) -> None:
     assert (np.linalg.norm(np.asarray(found.quaternions, np.float64), axis=1) > 0).all()
 
 
-def _write_ply(path: Path, columns: dict[str, np.ndarray], form: str, more: str = "") -> Path:
-    """As another program writes it: with a comment, doubles, perhaps ascii, perhaps other elements."""
-    names = {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort"}
-    order = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}[form]
-    kinds = {name: array.dtype.str[1:] for name, array in columns.items()}
-    table = np.empty(len(next(iter(columns.values()))), [(name, order + kind) for name, kind in kinds.items()])
-    for name, array in columns.items():
-        table[name] = array
-    head = ["ply", f"format {form} 1.0", "comment of mine", f"element vertex {len(table)}"]
-    head += [f"property {names[kind]} {name}" for name, kind in kinds.items()]
-    body = "".join(" ".join(repr(v.item()) for v in row) + "\n" for row in table).encode()
-    path.write_bytes(
-        "\n".join([*head, f"{more}end_header\n"]).encode() + (body if form == "ascii" else table.tobytes())
-    )
-    return path
-
-
 def ply(folder: Path) -> Iterator[Case]:
     """Gaussians."""
     files = []
     for count, basis in ((20, 1), (9, 4), (0, 16)):
         save_ply(folder / f"{count}.ply", _gaussians(count, basis))
         files.append(folder / f"{count}.ply")
-    parts = _gaussians(6, 1)
-    columns = {
-        f"{kind}{axis}": np.asarray(array)[:, n]
-        for kind, axes, array in (
-            ("", "xyz", parts.means),
-            ("f_dc_", "012", parts.sh[:, 0]),
-            ("scale_", "012", parts.log_scales),
-            ("rot_", "0123", parts.quaternions),
-        )
-        for n, axis in enumerate(axes)
-    }
-    columns |= {"opacity": np.float64(parts.opacity_logits), "red": np.arange(6, dtype=np.uint8)}
     face = "element face 0\nproperty list uchar int vertex_indices\n"
-    files += [_write_ply(folder / f"{form}.ply", columns, form, face) for form in ("ascii", "binary_big_endian")]
+    for form in ("ascii", "binary_big_endian"):
+        files.append(folder / f"{form}.ply")
+        columns = ply_columns(6) | {"red": np.arange(6)}
+        write_ply(files[-1], columns, form, {"opacity": "double", "red": "uchar"}, face)
     for file in files:
         yield Case([file], lambda file=file: load_ply(file), _whole_gaussians)
 
@@ -143,12 +117,12 @@ def _whole_points(found: tuple[np.ndarray, np.ndarray]) -> None:
 
 def points(folder: Path) -> Iterator[Case]:
     """Point clouds (.ply)."""
-    xyz, rng = {axis: np.linspace(-1, 1, 30, dtype=np.float32) for axis in "xyz"}, np.random.default_rng(0)
+    xyz, rng = {axis: np.linspace(-1, 1, 30) for axis in "xyz"}, np.random.default_rng(0)
     for form in ("ascii", "binary_little_endian"):
-        for kind in (np.uint8, np.uint16, np.float32, None):
+        for kind in ("uchar", "ushort", "float", None):
             colours = {c: rng.random(30) * 200 for c in ("red", "green", "blue")} if kind else {}
-            columns = xyz | {name: array.astype(kind) for name, array in colours.items()}
-            file = _write_ply(folder / f"{form}{len(list(folder.iterdir()))}.ply", columns, form)
+            file = folder / f"{form}-{kind}.ply"
+            write_ply(file, xyz | colours, form, dict.fromkeys(colours, kind))
             yield Case([file], lambda file=file: load_point_cloud(file), _whole_points)
 
 
@@ -242,8 +216,8 @@ def nerfstudio(folder: Path) -> Iterator[Case]:
                 file = folder / name / entry["depth_file_path"]
                 np.save(file, depth / 1000.0) if n == 1 else cv2.imwrite(str(file), depth)
                 files.append(file)
-            columns = {axis: np.linspace(-1, 1, 5, dtype=np.float32) for axis in "xyz"}
-            files.append(_write_ply(folder / name / "cloud.ply", columns, "ascii"))
+            files.append(folder / name / "cloud.ply")
+            write_ply(files[-1], {axis: np.linspace(-1, 1, 5) for axis in "xyz"}, "ascii")
         write_transforms(capture, folder / name, content)
         files = [files[0]] * 6 + files[1:]
         yield Case(files, lambda name=name: load_capture(folder / name), _whole_capture)

@@ -21,6 +21,29 @@ def node(op: str, inputs: list[str], outputs: list[str], **attributes) -> onnx.N
     return helper.make_node(op, inputs, outputs, **attributes)
 
 
+class Sketch:
+    """A graph in the making: a call adds an operation and returns the name of its result. What is no name among its
+    inputs becomes a constant."""
+
+    def __init__(self):
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: dict[str, np.ndarray] = {}
+
+    def constant(self, value) -> str:
+        array, name = np.asarray(value), f"c{len(self.constants)}"
+        self.constants[name] = array.astype(np.float32) if array.dtype == np.float64 else array
+        return name
+
+    def __call__(self, op: str, *inputs, into: str | None = None, **attributes) -> str:
+        names = [given if isinstance(given, str) else self.constant(given) for given in inputs]
+        name = into or f"x{len(self.nodes)}"
+        self.nodes.append(node(op, names, [name], **attributes))
+        return name
+
+    def save(self, path: Path, inputs: dict, outputs: dict) -> Path:
+        return write_graph(path, self.nodes, inputs, outputs, self.constants)
+
+
 def write_graph(
     path: Path,
     nodes: list[onnx.NodeProto],

@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+from conftest import look_at
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 290.0
 # corner, edge, edge of each board, from the farthest to the nearest
@@ -22,15 +23,9 @@ def _texture(draw, size=512):
 
 def photo_poses(count: int, spread: float = 0.7) -> np.ndarray:
     """(count, 4, 4) float64 world-to-camera on an arc of `spread` radians about the boards."""
-    poses, target = np.tile(np.eye(4), (count, 1, 1)), np.array([0, 0, 3.6])
-    for pose, angle in zip(poses, np.linspace(-spread / 2, spread / 2, count)):
-        centre = target + np.array([3.4 * np.sin(angle), 0.25 * np.sin(7 * angle) - 0.5, -3.4 * np.cos(angle)])
-        forward = (target - centre) / np.linalg.norm(target - centre)
-        right = np.cross((0, 1, 0), forward)
-        right /= np.linalg.norm(right)
-        pose[:3, :3] = right, np.cross(forward, right), forward
-        pose[:3, 3] = -pose[:3, :3] @ centre
-    return poses
+    target, angles = np.array([0, 0, 3.6]), np.linspace(-spread / 2, spread / 2, count)
+    away = [np.array([3.4 * np.sin(a), 0.25 * np.sin(7 * a) - 0.5, -3.4 * np.cos(a)]) for a in angles]
+    return np.stack([look_at(target + offset, target, dtype=float) for offset in away])
 
 
 def photo_images(poses: np.ndarray) -> list[np.ndarray]:

@@ -7,38 +7,32 @@ import json
 from pathlib import Path
 
 import numpy as np
-from onnx_files import node, write_graph
+from onnx_files import Sketch
 
 SIZE, GRID, LOW, CHANNELS, MEMORY = 64, 4, 16, 8, 4
 TOKENS, SLOTS, POINTERS = GRID * GRID, 7, 16
 MEAN, STD = [0.485, 0.456, 0.406], [0.229, 0.224, 0.225]
 
 
-class Sketch:
-    """Nodes and weights of a graph in the making."""
+class RandomSketch(Sketch):
+    """A sketch with random weights."""
 
     def __init__(self, rng: np.random.Generator):
-        self.rng, self.nodes, self.weights = rng, [], {}
+        super().__init__()
+        self.rng = rng
 
     def weight(self, *shape: int, scale: float | None = None) -> str:
         """The name of random numbers; by default of the deviation that keeps a layer's size."""
         return self.constant(self.rng.normal(size=shape) * (scale or np.prod(shape[1:]) ** -0.5))
 
-    def constant(self, array, dtype=np.float32) -> str:
-        self.weights[f"w{len(self.weights)}"] = np.asarray(array, dtype)
-        return f"w{len(self.weights) - 1}"
+    def save(self, path: Path, inputs: dict, outputs: dict) -> Path:
+        """`inputs` and `outputs` have shapes alone."""
 
-    def __call__(self, kind: str, *inputs: str, into: str | None = None, **attributes) -> str:
-        name = into or f"x{len(self.nodes)}"
-        self.nodes.append(node(kind, list(inputs), [name], **attributes))
-        return name
-
-    def save(self, path: Path, inputs: dict, outputs: dict) -> None:
         def kind(name):
-            return "int32" if name in ("input_labels",) else "float32"
+            return "int32" if name == "input_labels" else "float32"
 
         typed = [{name: (kind(name), list(shape)) for name, shape in side.items()} for side in (inputs, outputs)]
-        write_graph(path, self.nodes, *typed, self.weights)
+        return super().save(path, *typed)
 
 
 def write_sam2(folder: Path, *, seed: int = 1, memory: int = MEMORY) -> Path:
@@ -47,7 +41,7 @@ def write_sam2(folder: Path, *, seed: int = 1, memory: int = MEMORY) -> Path:
     rng = np.random.default_rng(seed)
     image, fine = (1, CHANNELS, GRID, GRID), {"feats0": (1, 1, LOW, LOW), "feats1": (1, 2, LOW // 2, LOW // 2)}
 
-    g = Sketch(rng)
+    g = RandomSketch(rng)
     for level, (out, stride) in enumerate(((1, 4), (2, 8), (CHANNELS, 16))):
         weight = g.weight(out, 3, stride, stride, scale=0.7 / stride)
         g("Conv", "pixel_values", weight, kernel_shape=[stride] * 2, strides=[stride] * 2, into=f"feats{level}")
@@ -57,8 +51,8 @@ def write_sam2(folder: Path, *, seed: int = 1, memory: int = MEMORY) -> Path:
     outputs = fine | dict.fromkeys(("feats2", "feats2_no_mem", "vision_pos_embed"), coarsest)
     g.save(folder / "onnx" / "vision_encoder.onnx", {"pixel_values": (1, 3, SIZE, SIZE)}, outputs)
 
-    g = Sketch(rng)
-    label = g("Unsqueeze", g("Cast", "input_labels", to=1), g.constant([3], np.int64))  # (1, 1, N, 1)
+    g = RandomSketch(rng)
+    label = g("Unsqueeze", g("Cast", "input_labels", to=1), [3])  # (1, 1, N, 1)
     label = g("Mul", label, g.weight(CHANNELS, scale=0.3))
     prompt = g("Add", g("MatMul", "input_points", g.weight(2, CHANNELS, scale=0.02)), label)
     prompt = g("ReduceMean", prompt, axes=[1, 2], keepdims=0)  # (1, C)
@@ -68,17 +62,17 @@ def write_sam2(folder: Path, *, seed: int = 1, memory: int = MEMORY) -> Path:
         "ConvTranspose", "feats2_cond", g.weight(CHANNELS, 1, 4, 4, scale=0.3), kernel_shape=[4] * 2, strides=[4] * 2
     )
     middle = g("ConvTranspose", "feats1", g.weight(2, 1, 2, 2), kernel_shape=[2, 2], strides=[2, 2])
-    turned = g("Reshape", g("MatMul", both, g.weight(CHANNELS, 1)), g.constant([1, 1, 1, 1], np.int64))
+    turned = g("Reshape", g("MatMul", both, g.weight(CHANNELS, 1)), [1, 1, 1, 1])
     mask = g("Add", g("Add", g("Add", coarse, middle), turned), "feats0")
-    score = g("Add", g("MatMul", g("Tanh", seen), g.weight(CHANNELS, 1, scale=1.5)), g.constant([0.3]))
-    g("Reshape", score, g.constant([1, 1, 1], np.int64), into="object_score_logits")
-    present = g("Greater", score, g.constant(0.0))
-    shown = g("Reshape", present, g.constant([1, 1, 1, 1], np.int64))
-    g("Where", shown, mask, g.constant(-1024.0), into="low_res_mask")
-    scales = g.constant([1, 1, SIZE / LOW, SIZE / LOW])
+    score = g("Add", g("MatMul", g("Tanh", seen), g.weight(CHANNELS, 1, scale=1.5)), [0.3])
+    g("Reshape", score, [1, 1, 1], into="object_score_logits")
+    present = g("Greater", score, 0.0)
+    shown = g("Reshape", present, [1, 1, 1, 1])
+    g("Where", shown, mask, -1024.0, into="low_res_mask")
+    scales = [1, 1, SIZE / LOW, SIZE / LOW]
     g("Resize", "low_res_mask", "", scales, mode="linear", into="high_res_mask")
     pointer = g("Where", present, g("MatMul", both, g.weight(CHANNELS, CHANNELS)), g.weight(1, CHANNELS))
-    g("Reshape", pointer, g.constant([1, 1, CHANNELS], np.int64), into="object_pointer")
+    g("Reshape", pointer, [1, 1, CHANNELS], into="object_pointer")
     g("Tanh", g("MatMul", both, g.weight(CHANNELS, 1)), into="iou")
     g.save(
         folder / "onnx" / "mask_decoder.onnx",
@@ -92,17 +86,17 @@ def write_sam2(folder: Path, *, seed: int = 1, memory: int = MEMORY) -> Path:
         },
     )
 
-    g = Sketch(rng)
-    hard = g("Cast", g("Greater", "high_res_mask", g.constant(0.0)), to=1)
-    binary = g("Greater", "binarize", g.constant(0.5))
+    g = RandomSketch(rng)
+    hard = g("Cast", g("Greater", "high_res_mask", 0.0), to=1)
+    binary = g("Greater", "binarize", 0.5)
     mask = g("Where", binary, hard, g("Sigmoid", "high_res_mask"))
-    mask = g("Sub", g("Mul", mask, g.constant(20.0)), g.constant(10.0))
+    mask = g("Sub", g("Mul", mask, 20.0), 10.0)
     mask = g("Conv", mask, g.weight(memory, 1, 16, 16, scale=0.01), kernel_shape=[16, 16], strides=[16, 16])
     features = g("Add", mask, g("Conv", "feats2", g.weight(memory, CHANNELS, 1, 1)))
-    occluded = g("Cast", g("LessOrEqual", "object_score_logits", g.constant(0.0)), to=1)
-    occluded = g("Reshape", occluded, g.constant([1, 1, 1, 1], np.int64))
+    occluded = g("Cast", g("LessOrEqual", "object_score_logits", 0.0), to=1)
+    occluded = g("Reshape", occluded, [1, 1, 1, 1])
     features = g("Add", features, g("Mul", occluded, g.weight(1, memory, 1, 1)))
-    flat = g("Reshape", features, g.constant([memory, TOKENS, 1], np.int64))
+    flat = g("Reshape", features, [memory, TOKENS, 1])
     g("Transpose", flat, perm=[1, 2, 0], into="memory_tokens")
     g("Identity", g.weight(TOKENS, 1, memory, scale=0.5), into="memory_pos")
     tokens = (TOKENS, 1, memory)
@@ -112,7 +106,7 @@ def write_sam2(folder: Path, *, seed: int = 1, memory: int = MEMORY) -> Path:
         {"memory_tokens": tokens, "memory_pos": tokens},
     )
 
-    g = Sketch(rng)
+    g = RandomSketch(rng)
     keys = g("MatMul", g("Add", "memory", "memory_pos"), g.weight(MEMORY, CHANNELS, scale=0.7))
     keys = g("Transpose", keys, perm=[1, 2, 0])  # (1, C, K)
     queries = g("Add", "current_vision_features", "current_vision_position_embeddings")
@@ -120,7 +114,7 @@ def write_sam2(folder: Path, *, seed: int = 1, memory: int = MEMORY) -> Path:
     values = g("Transpose", g("MatMul", "memory", g.weight(MEMORY, CHANNELS, scale=1.0)), perm=[1, 0, 2])
     read = g("Transpose", g("MatMul", weights, values), perm=[0, 2, 1])  # (1, C, T)
     current = g("Transpose", "current_vision_features", perm=[1, 2, 0])
-    g("Reshape", g("Add", current, read), g.constant(image, np.int64), into="conditioned_feats")
+    g("Reshape", g("Add", current, read), image, into="conditioned_feats")
     rows = SLOTS * TOKENS + POINTERS * (CHANNELS // MEMORY)
     current = {
         name: (TOKENS, 1, CHANNELS) for name in ("current_vision_features", "current_vision_position_embeddings")
@@ -128,8 +122,8 @@ def write_sam2(folder: Path, *, seed: int = 1, memory: int = MEMORY) -> Path:
     memories = {name: (rows, 1, MEMORY) for name in ("memory", "memory_pos")}
     g.save(folder / "onnx" / "memory_attention.onnx", current | memories, {"conditioned_feats": image})
 
-    g = Sketch(rng)
-    column = g("Unsqueeze", "normalized_diffs", g.constant([1], np.int64))
+    g = RandomSketch(rng)
+    column = g("Unsqueeze", "normalized_diffs", [1])
     waves = g("Sin", g("MatMul", column, g.weight(1, CHANNELS, scale=5.0)))
     g("MatMul", waves, g.weight(CHANNELS, MEMORY, scale=0.6), into="pointer_pos")
     g.save(

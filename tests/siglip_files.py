@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from clip_files import COLOURS, SIZE, write_visual
-from onnx_files import node, write_graph
+from onnx_files import Sketch
 
 LENGTH = 12
 HALF = (0.5, 0.5, 0.5)
@@ -64,12 +64,12 @@ def write_textual(
     path: Path, name: str, outputs: tuple[str, ...], batch: int | str, length: int | str, kind: str
 ) -> Path:
     """Texts -> the sum of their tokens' colours; the last of `outputs` is it, one before it the tokens'."""
-    rows = outputs[0] if len(outputs) > 1 else "rows"
-    nodes = [node("Gather", ["table", name], [rows]), node("ReduceSum", [rows, "axis"], [outputs[-1]], keepdims=0)]
+    g = Sketch()
+    rows = g("Gather", table(), name, into=outputs[0] if len(outputs) > 1 else None)
+    g("ReduceSum", rows, [1], keepdims=0, into=outputs[-1])
     declared = {outputs[-1]: ("float32", [batch, 3])}
     declared |= {rows: ("float32", [batch, length, 3])} if len(outputs) > 1 else {}
-    given = {name: (kind, [batch, length])}
-    return write_graph(path, nodes, given, declared, {"table": table(), "axis": np.asarray([1])})
+    return g.save(path, {name: (kind, [batch, length])}, declared)
 
 
 def write_siglip(folder: Path, layout: str, *, logits: bool = True) -> Path:

@@ -14,6 +14,35 @@ RUB = np.array([1, -1, -1])
 """the signs of x, y, z between a .ply's axes and .spz's"""
 
 
+PLY_NAMES = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+PLY_NAMES += [*(f"scale_{n}" for n in range(3)), *(f"rot_{n}" for n in range(4))]
+"""the properties of INRIA's .ply, without f_rest_*"""
+
+
+def ply_columns(count: int = 6, rest: int = 0) -> dict:
+    rng = np.random.default_rng(count)
+    return {
+        name: rng.normal(size=count).astype(np.float32) for name in [*PLY_NAMES, *(f"f_rest_{n}" for n in range(rest))]
+    }
+
+
+def write_ply(
+    path, columns: dict, form: str = "binary_little_endian", types: dict | None = None, extra: str = "", cut: int = 0
+) -> None:
+    """A .ply of these columns, header and all, apart from the writer under test."""
+    order = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}[form]
+    kinds = {name: (types or {}).get(name, "float") for name in columns}
+    numpy = {"float": "f4", "double": "f8", "uchar": "u1", "ushort": "u2"}
+    table = np.empty(len(next(iter(columns.values()))), [(name, order + numpy[kind]) for name, kind in kinds.items()])
+    for name, values in columns.items():
+        table[name] = values
+    header = ["ply", f"format {form} 1.0", "comment of mine", f"element vertex {len(table)}"]
+    header += [f"property {kind} {name}" for name, kind in kinds.items()]
+    text = "\n".join(" ".join(repr(value.item()) for value in row) for row in table) + "\n"
+    body = text.encode() if form == "ascii" else table.tobytes()
+    path.write_bytes("\n".join([*header, f"{extra}end_header\n"]).encode() + body[: len(body) - cut])
+
+
 def scene(count: int, basis: int = 4) -> dict:
     """Arrays as jsecon's Gaussians name them, within what every format can hold."""
     rng = np.random.default_rng(count + basis)

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from capture_files import refused, small_capture, transforms, write_images, write_transforms
+from splat_files import write_ply
 
 from jsecon.data.capture import load_capture
 
@@ -114,10 +115,10 @@ def test_depth_maps(tmp_path):
 
 
 def test_points_from_a_ply(tmp_path):
-    properties = [f"property float {axis}" for axis in "xyz"]
-    properties += [f"property uchar {colour}" for colour in ("red", "green", "blue")]
-    lines = ["ply", "format ascii 1.0", "element vertex 2", *properties, "end_header", "1 2 3 4 5 6", "-1 0.5 0 7 8 9"]
-    (tmp_path / "sparse.ply").write_text("\n".join([*lines, ""]))
+    rows = np.array([[1, 2, 3, 4, 5, 6], [-1, 0.5, 0, 7, 8, 9]])
+    colours = ("red", "green", "blue")
+    columns = dict(zip((*"xyz", *colours), rows.T))
+    write_ply(tmp_path / "sparse.ply", columns, "ascii", dict.fromkeys(colours, "uchar"))
     loaded = load_changed(tmp_path, lambda content: content.update(ply_file_path="sparse.ply"))
     np.testing.assert_array_equal(loaded.points, np.array([[1, 2, 3], [-1, 0.5, 0]], np.float32))
     np.testing.assert_array_equal(loaded.point_colors, [[4, 5, 6], [7, 8, 9]])

@@ -9,10 +9,9 @@ import pytest
 import splat_files
 from capture_files import refused
 from scipy.spatial.transform import Rotation
-from splat_files import C0, opacity, scene
+from splat_files import C0, opacity, ply_columns, scene, write_ply
 from test_gaussian_files import STEPS, compare, gaussians
 from test_gltf import NAME, rewritten
-from test_ply import columns, write
 
 import jsecon
 from jsecon.app import cli
@@ -176,7 +175,7 @@ RGB = ("red", "green", "blue")
 
 @pytest.mark.parametrize("third", [None, np.full(40, -np.inf)])
 def test_a_flat_gaussian_has_no_thickness(tmp_path, third):
-    write(tmp_path / "a.PLY", plys(PLAIN, scale_2=third))
+    write_ply(tmp_path / "a.PLY", plys(PLAIN, scale_2=third))
     found = jsecon.load_gaussians(tmp_path / "a.PLY")
     assert np.isneginf(found.log_scales[:, 2]).all()
     np.testing.assert_array_equal(found.log_scales[:, :2], PLAIN["log_scales"][:, :2].astype(np.float32))
@@ -188,7 +187,7 @@ def test_mip_splattings_filter_is_fused_as_it_fuses_it(tmp_path, name):
     width[:2] = 0
     given = PLAIN | {"log_scales": PLAIN["log_scales"].copy()}
     given["log_scales"][:2, 2] = -np.inf
-    write(tmp_path / "a.ply", plys(given, **{name: width}))
+    write_ply(tmp_path / "a.ply", plys(given, **{name: width}))
     found = jsecon.load_gaussians(tmp_path / "a.ply")
     squares = np.exp(given["log_scales"]) ** 2
     fused = squares + width[:, None] ** 2
@@ -196,7 +195,7 @@ def test_mip_splattings_filter_is_fused_as_it_fuses_it(tmp_path, name):
     ratio = np.where(width > 0, np.sqrt(squares.prod(1) / np.where(width > 0, fused.prod(1), 1)), 1)
     alpha = opacity({"opacity_logits": np.asarray(found.opacity_logits, np.float64)})
     np.testing.assert_allclose(alpha, opacity(PLAIN) * ratio, rtol=1e-4, atol=1e-9)
-    write(tmp_path / "a.ply", plys(PLAIN, **{name: np.where(np.arange(40) == 3, -1, width)}))
+    write_ply(tmp_path / "a.ply", plys(PLAIN, **{name: np.where(np.arange(40) == 3, -1, width)}))
     with refused("a.ply", "filter_3D are negative"):
         jsecon.load_gaussians(tmp_path / "a.ply")
 
@@ -208,18 +207,18 @@ def test_colours_in_place_of_coefficients(tmp_path, kind, most):
     rgb = np.random.default_rng(0).integers(0, 256, (40, 3)) / 255
     numbers = {name: np.rint(rgb[:, n] * most) if "u" in kind[:2] else rgb[:, n] * most for n, name in enumerate(RGB)}
     without = dict.fromkeys(("f_dc_0", "f_dc_1", "f_dc_2"))
-    write(tmp_path / "a.ply", plys(PLAIN, **without, **numbers), types=dict.fromkeys(RGB, kind))
+    write_ply(tmp_path / "a.ply", plys(PLAIN, **without, **numbers), types=dict.fromkeys(RGB, kind))
     found = jsecon.load_gaussians(tmp_path / "a.ply")
     np.testing.assert_allclose(found.sh[:, 0], (rgb - 0.5) / C0, atol=1e-5)
     # Beside coefficients, they are a viewer's.
-    write(tmp_path / "a.ply", plys(PLAIN, **numbers), types=dict.fromkeys(RGB, kind))
+    write_ply(tmp_path / "a.ply", plys(PLAIN, **numbers), types=dict.fromkeys(RGB, kind))
     np.testing.assert_array_equal(jsecon.load_gaussians(tmp_path / "a.ply").sh, PLAIN["sh"].astype(np.float32))
 
 
 @pytest.mark.parametrize("ends", ["\n", "\r\n", "\r"])
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
 def test_lists_and_elements_before_the_vertices_and_any_ends_of_lines(tmp_path, form, ends):
-    given = columns(rest=9)
+    given = ply_columns(rest=9)
     order, rows, body = {"b": "<", "a": ""}.get(form[0], "<"), [], b""
     order = ">" if "big" in form else order
     names = list(given)
@@ -256,14 +255,14 @@ def test_lists_and_elements_before_the_vertices_and_any_ends_of_lines(tmp_path, 
 
 @pytest.mark.parametrize("rest", [1, 3, 6, 12, 44, 48, 72])
 def test_numbers_of_harmonics_of_no_whole_degree_are_named(tmp_path, rest):
-    write(tmp_path / "a.ply", columns(rest=rest))
+    write_ply(tmp_path / "a.ply", ply_columns(rest=rest))
     with refused("a.ply", f"{rest} properties f_rest", "degree"):
         jsecon.load_gaussians(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize("comment", ["SplatRenderMode: mip", "antialiased 1"])
 def test_a_ply_that_was_trained_with_antialiasing_says_so(tmp_path, comment):
-    write(tmp_path / "a.ply", plys(PLAIN))
+    write_ply(tmp_path / "a.ply", plys(PLAIN))
     plain = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "a.ply").write_bytes(plain.replace(b"comment of mine", b"comment " + comment.encode()))
     with pytest.warns(UserWarning, match="antialiasing"):

@@ -5,6 +5,7 @@ import dataclasses
 import cv2
 import numpy as np
 import pytest
+from conftest import look_at
 
 from jsecon.errors import InputError
 from jsecon.fit.start import starting_gaussians
@@ -14,23 +15,9 @@ from jsecon.types import Camera, Capture
 WIDTH, HEIGHT, FOCAL = 240, 180, 200.0
 
 
-def look_at(centre, target):
-    forward = (target - centre) / np.linalg.norm(target - centre)
-    right = np.cross([0.0, 1, 0], forward)
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ centre
-    return pose
-
-
 def poses(count):
-    return np.array(
-        [
-            look_at(np.array([0.9 * np.sin(a), 0.1 * np.cos(3 * a), -2 * np.cos(a)]), np.zeros(3))
-            for a in np.linspace(-0.5, 0.5, count)
-        ]
-    )
+    angles = np.linspace(-0.5, 0.5, count)
+    return np.array([look_at((0.9 * np.sin(a), 0.1 * np.cos(3 * a), -2 * np.cos(a)), dtype=float) for a in angles])
 
 
 INTRINSICS = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])

@@ -1,9 +1,11 @@
 """Scenes without photographs: their up axis, their planned views, and a run and a question on one."""
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
+from capture_files import small_capture, transforms, write_text_model
 from scipy.spatial.transform import Rotation
 
 import jsecon
@@ -194,8 +196,6 @@ def test_a_room_is_seen_from_inside_and_an_object_from_around(room, object_alone
     (lambda g: {"log_scales": np.full_like(g.log_scales, 5.0)}, "wide"),
 ], ids=["transparent", "one place", "fog"])  # fmt: skip
 def test_a_scene_that_cannot_be_judged_is_refused(object_alone, change, clause):
-    import dataclasses
-
     with pytest.raises(jsecon.InputError, match=clause):
         plan_views(dataclasses.replace(object_alone, **change(object_alone)))
 
@@ -224,19 +224,14 @@ def test_given_cameras_take_the_place_of_planned_views(object_alone, around, tmp
     planned = around.cameras[:4]
     poses = np.array(planned.world_to_camera, np.float64) @ np.linalg.inv(similarity)
     poses[:, :3] /= np.linalg.norm(poses[:, :1, :3], axis=2, keepdims=True)
-    lens = {"w": 160, "h": 120, "fl_x": float(planned.fx[0]), "fl_y": float(planned.fy[0])}
+    given = dataclasses.replace(
+        small_capture(4), cameras=dataclasses.replace(planned, world_to_camera=poses), names=("a0", "a1", "a2", "a3")
+    )
+    cameras = tmp_path / ("transforms.json" if kind == "transforms" else "sparse")
     if kind == "transforms":
-        cameras = tmp_path / "transforms.json"
-        matrices = np.linalg.inv(poses) @ np.diag([1, -1, -1, 1])
-        frames = [{"file_path": f"a{k}.png", "transform_matrix": pose.tolist()} for k, pose in enumerate(matrices)]
-        cameras.write_text(json.dumps(lens | {"frames": frames}))
+        cameras.write_text(json.dumps(transforms(given)))
     else:
-        cameras = tmp_path / "sparse"
-        cameras.mkdir()
-        (cameras / "cameras.txt").write_text(f"1 PINHOLE 160 120 {lens['fl_x']} {lens['fl_y']} 80 60\n")
-        quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
-        rows = [(k + 1, *quaternions[k], *poses[k, :3, 3], 1, f"a{k}.png") for k in range(4)]
-        (cameras / "images.txt").write_text("".join(" ".join(map(str, row)) + "\n\n" for row in rows))
+        write_text_model(given, cameras)
     out = tmp_path / "field"
     assert main(["run", str(tmp_path / "scene.ply"), "--cameras", str(cameras), "--out", str(out)]) == 0
     field = jsecon.load_field(out / "field.safetensors")
