@@ -22,7 +22,7 @@ from jsecon.query.blocks import query_in_blocks
 from jsecon.query.select import query_anchored
 from jsecon.splat.render import render_rgb
 from jsecon.splat.visible import geometry_of_rows, render_in_blocks, visible_rows
-from jsecon.types import Camera, Gaussians, Regions, Votes
+from jsecon.types import Camera, Gaussians, Regions
 
 
 def ball(count, views, width, height, *, opaque=0.0, seed=0):
@@ -40,6 +40,20 @@ def blocky(rng, views, height, width, regions):
     return rng.integers(-1, regions, (views, -(-height // 20), -(-width // 20))).repeat(20, 1).repeat(20, 2)[
         :, :height, :width
     ].astype(np.int32)  # fmt: skip
+
+
+class Streamed:
+    """Labels, a view at a time; keeps which were asked for."""
+
+    def __init__(self, labels):
+        self.labels, self.asked = labels, []
+
+    def __len__(self):
+        return len(self.labels)
+
+    def __getitem__(self, t):
+        self.asked.append(t)
+        return self.labels[t]
 
 
 def assert_alike(blocks, memory, *, pixels=0):
@@ -66,17 +80,23 @@ def test_equal_to_votes_in_memory_and_to_the_oracle(scene, cameras, labels, expe
     np.testing.assert_allclose(cast.total, total.sum(0), rtol=2e-4, atol=0.02)
     np.testing.assert_allclose(cast.peak, peak, atol=1e-4)
     np.testing.assert_array_equal(cast.views, views)
+    assert cast.weights.flags.writeable is False
+    assert with_overlap(cast).overlap.shape == (REGIONS, REGIONS)
     assert sorted(file.name for file in (tmp_path / "v").iterdir()) == sorted(
         f"{name}.npy" for name in ("regions", "weights", "labelled", "total", "peak", "views")
     )
 
 
-def test_weights_at_the_centre(scene, cameras, labels, tmp_path):
+def test_weights_at_the_centre_of_labels_that_are_read_one_at_a_time(scene, cameras, labels, tmp_path):
     how = {"top": REGIONS, "centre": 0.7}
     memory = region_votes(scene, cameras, labels, REGIONS, **how)
-    cast = region_votes_in_blocks(scene, cameras, labels, REGIONS, **how, folder=tmp_path / "v", rows=16)
+    told, streamed = [], Streamed(labels)
+    how |= {"rows": 16, "progress": lambda *count: told.append(count)}
+    cast = region_votes_in_blocks(scene, cameras, streamed, REGIONS, folder=tmp_path / "v", **how)
     assert_alike(cast, memory)
     np.testing.assert_array_equal(cast.regions, memory.regions)
+    assert streamed.asked == [0, 1, 2, 3]  # one at a time
+    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
 @pytest.mark.parametrize("opaque", [0.0, pytest.param(4.0, marks=pytest.mark.long)])
@@ -153,26 +173,6 @@ def test_no_regions_no_gaussians_and_labels_of_nothing(scene, cameras, labels, t
         region_votes_in_blocks(scene, cameras, labels, 3, folder=tmp_path / "b")
     empty, few = jax.tree.map(lambda a: a[:0], scene), np.minimum(labels, 2)
     assert region_votes_in_blocks(empty, cameras, few, 3, folder=tmp_path / "c").regions.shape == (0, 3)
-
-
-def test_labels_are_read_one_at_a_time_and_progress_counts(scene, cameras, labels, tmp_path):
-    class Streamed:
-        def __init__(self):
-            self.asked = []
-
-        def __len__(self):
-            return len(labels)
-
-        def __getitem__(self, t):
-            self.asked.append(t)
-            return labels[t]
-
-    told, streamed = [], Streamed()
-    region_votes_in_blocks(
-        scene, cameras, streamed, REGIONS, folder=tmp_path / "v", progress=lambda *own: told.append(own)
-    )
-    assert streamed.asked == [0, 1, 2, 3]
-    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
 def test_what_does_not_fit_raises(scene, cameras, camera, labels, tmp_path):
@@ -256,10 +256,3 @@ def test_queries_of_a_mapped_field_are_those_in_memory(fields, by):
         query_in_blocks(mapped, texts[:, 1:])
     none = dataclasses.replace(mapped, regions=Regions(np.zeros((0, 12), np.float32), np.zeros((0, 4), np.int32)))
     assert [own.region for own in query_in_blocks(none, texts)] == [-1] * len(texts)
-
-
-def test_votes_cast_in_blocks_make_a_field(scene, cameras, labels, tmp_path):
-    cast = region_votes_in_blocks(scene, cameras, labels, REGIONS, folder=tmp_path / "v")
-    assert isinstance(cast, Votes)
-    assert cast.weights.flags.writeable is False
-    assert with_overlap(cast).overlap.shape == (REGIONS, REGIONS)
