@@ -51,10 +51,12 @@ def _same(a, b):
         assert a == b or (a != a and b != b)
 
 
-def test_what_is_kept_comes_back(scene, cameras, tmp_path):
+def test_what_is_kept_comes_back_and_equal_values_give_equal_bytes(scene, cameras, tmp_path):
     tree = _tree(scene, cameras)
-    cache.save(tmp_path / "x.safetensors", tree)
-    _same(cache.load(tmp_path / "x.safetensors"), tree)
+    for name in ("a.safetensors", "b.safetensors"):
+        cache.save(tmp_path / name, _tree(scene, cameras))
+    _same(cache.load(tmp_path / "a.safetensors"), tree)
+    assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
 
 
 def test_fresh_and_cached_are_the_same_numpy_trees(tmp_path):
@@ -68,12 +70,6 @@ def test_fresh_and_cached_are_the_same_numpy_trees(tmp_path):
     assert isinstance(fresh.value["a"], np.ndarray)
     _same(fresh.value, again.value)
     assert again.seconds == fresh.seconds
-
-
-def test_equal_values_give_equal_bytes(scene, cameras, tmp_path):
-    for name in ("a.safetensors", "b.safetensors"):
-        cache.save(tmp_path / name, _tree(scene, cameras))
-    assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
 
 
 @pytest.mark.parametrize("damage", [
@@ -103,15 +99,12 @@ def test_a_failed_computation_leaves_nothing_behind(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_pickles_are_neither_written_nor_read(tmp_path):
+def test_pickles_are_neither_written_nor_read_and_only_records_of_jsecon_are_made(tmp_path):
     with pytest.raises(ValueError, match=r"root\.a: got builtins\.object .* expected plain numbers"):
         cache.save(tmp_path / "x.safetensors", {"a": object()})
     np.savez(tmp_path / "y.npz", a=np.array([object()], object), allow_pickle=True)
     with pytest.raises(cache.CorruptCacheError):
         cache.load(tmp_path / "y.npz")
-
-
-def test_only_records_of_jsecon_are_made():
     for record in ("os:system", "jsecon.pipeline.cache:fetch", "jsecon.files:Path"):
         with pytest.raises((ValueError, AttributeError)):
             unpack_tree({"record": record, "fields": {}}, {})
@@ -154,13 +147,18 @@ def test_files_digest_passes_over_what_goes_while_it_looks(tmp_path, monkeypatch
     assert cache.files_digest([tmp_path]) == left
 
 
-def test_files_digest_leaves_out_the_output_and_hidden_files(tmp_path):
+def test_files_digest_leaves_out_the_output_and_hidden_files_but_not_a_capture_in_the_output(tmp_path):
+    capture, out = tmp_path / "out" / "capture", tmp_path / "out"
     (tmp_path / "a.png").write_bytes(b"one")
-    before = cache.files_digest([tmp_path], exclude=tmp_path / "out")
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "field.safetensors").write_bytes(b"result")
+    before = cache.files_digest([tmp_path], exclude=out)
+    capture.mkdir(parents=True)
+    (capture / "a.png").write_bytes(b"one")
     (tmp_path / ".DS_Store").write_bytes(b"x")
-    assert cache.files_digest([tmp_path], exclude=tmp_path / "out") == before
+    assert cache.files_digest([tmp_path], exclude=out) == before
+    before = cache.files_digest([capture], exclude=out)
+    assert before == cache.files_digest([capture], exclude=tmp_path / "elsewhere")
+    (capture / "a.png").write_bytes(b"other")
+    assert cache.files_digest([capture], exclude=out) != before
 
 
 def test_files_digest_of_names_that_are_no_utf8_and_of_linked_folders(tmp_path):
@@ -175,16 +173,6 @@ def test_files_digest_of_names_that_are_no_utf8_and_of_linked_folders(tmp_path):
     before = cache.files_digest([tmp_path / "capture"])
     (tmp_path / "elsewhere" / "deep" / "a.png").write_bytes(b"one")
     assert cache.files_digest([tmp_path / "capture"]) != before
-
-
-def test_files_digest_counts_a_capture_that_lies_in_the_output_folder(tmp_path):
-    capture = tmp_path / "out" / "capture"
-    capture.mkdir(parents=True)
-    (capture / "a.png").write_bytes(b"one")
-    before = cache.files_digest([capture], exclude=tmp_path / "out")
-    assert before == cache.files_digest([capture], exclude=tmp_path / "elsewhere")
-    (capture / "a.png").write_bytes(b"other")
-    assert cache.files_digest([capture], exclude=tmp_path / "out") != before
 
 
 def test_a_key_follows_the_source_that_a_stage_can_import_and_no_other(tmp_path, monkeypatch, request):
