@@ -11,7 +11,6 @@ from experiments.datasets.feature_files import load_text_features, write_feature
 from jsecon.data.images import write_image
 from jsecon.data.langsplat import embedding_size, load_features
 from jsecon.data.masks import LEVELS, load_labels
-from jsecon.errors import InputError
 from jsecon.vision.protocols import CANONICAL
 
 NAMES = ("b", "a", "c")
@@ -35,35 +34,28 @@ def slow(images, none=0):
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_integers(tmp_path, dtype):
+    """Frames are in another order than their files."""
     images = IDS * (1 if dtype == np.uint8 else 250)
     write_masks(tmp_path, images, dtype=dtype)
-    labels, ids, notes = load_labels(tmp_path, NAMES, SIZE)
+    calls = []
+    labels, ids, notes = load_labels(tmp_path, NAMES, SIZE, progress=lambda *call: calls.append(call))
     expected, expected_ids = slow(images)
     np.testing.assert_array_equal(labels, expected)
     assert labels.dtype == np.int16
     assert ids == expected_ids
     assert notes == ()
+    assert calls == [(1, 3), (2, 3), (3, 3)]
 
 
-def test_order_on_disk_does_not_matter(tmp_path):
-    write_masks(tmp_path, IDS)
-    swapped, _, _ = load_labels(tmp_path, ("a", "c", "b"), SIZE)
-    np.testing.assert_array_equal(swapped, slow(IDS)[0][[1, 2, 0]])
-
-
-def test_palette_indices_not_colours(tmp_path):
-    """As DAVIS and its trackers write them; the palette repeats colours on purpose."""
+def test_colours_are_ids_and_indices_of_a_palette_are_too(tmp_path):
+    """Palettes as DAVIS and its trackers write them; this one repeats colours on purpose."""
     indices = RNG.integers(0, 4, (3, *SIZE))
     for name, image in zip(NAMES, indices):
         (tmp_path / f"{name}.png").write_bytes(png(image, bits=2, colour_type=3, palette=bytes([0, 0, 0, 9, 9, 9] * 2)))
     labels, ids, _ = load_labels(tmp_path, NAMES, SIZE)
     np.testing.assert_array_equal(labels, slow(indices)[0])
     assert ids == (1, 2, 3)
-
-
-def test_colours_are_ids(tmp_path):
     palette = np.array([[0, 0, 0], [255, 0, 0], [0, 0, 255], [1, 2, 3]], np.uint8)
-    indices = RNG.integers(0, 4, (3, *SIZE))
     for name, image in zip(NAMES, indices):
         write_image(tmp_path / f"{name}.png", palette[image])
     labels, ids, notes = load_labels(tmp_path, NAMES, SIZE)
@@ -140,15 +132,10 @@ def test_langsplat_ids_are_a_frames_own(tmp_path):
     """Unless said otherwise, id 0 of one frame is not id 0 of another."""
     for name in NAMES:
         np.save(tmp_path / f"{name}_s.npy", np.tile(np.float32([0, 1, -1]), (4, 12, 6)))
-    labels, ids, notes = load_labels(tmp_path, NAMES, SIZE)
+    labels, ids, notes = load_labels(tmp_path, [f"{name}.001" for name in NAMES], SIZE)  # cut at the first dot
     np.testing.assert_array_equal(labels[:, 0, :3], [[0, 1, -1], [2, 3, -1], [4, 5, -1]])
     assert ids == (0, 1, 0, 1, 0, 1)
     assert "regions of their own" in notes[0]
-
-
-def test_langsplat_cuts_names_at_the_first_dot(tmp_path):
-    np.save(tmp_path / "view_s.npy", np.zeros((4, *SIZE), np.float32))
-    assert (load_labels(tmp_path, ("view.001",), SIZE).labels == 0).all()
 
 
 def test_langsplat_misfits(tmp_path):
@@ -162,12 +149,10 @@ def test_langsplat_misfits(tmp_path):
     np.save(path, np.zeros((4, *SIZE)))
     with refused("level", "'xl'"):
         load_labels(tmp_path, NAMES, SIZE, level="xl")
-    path.write_bytes(path.read_bytes()[:300])
-    with refused("b_s.npy", "damaged or missing"):
-        load_labels(tmp_path, NAMES, SIZE)
-    path.write_bytes(b"")
-    with refused("b_s.npy", "damaged or missing"):
-        load_labels(tmp_path, NAMES, SIZE)
+    for length in (300, 0):
+        path.write_bytes(path.read_bytes()[:length])
+        with refused("b_s.npy", "damaged or missing"):
+            load_labels(tmp_path, NAMES, SIZE)
     write_masks(tmp_path, IDS)
     with refused("both .png and _s.npy"):
         load_labels(tmp_path, NAMES, SIZE)
@@ -184,69 +169,11 @@ def test_too_many_regions(tmp_path):
     assert len(load_labels(tmp_path, NAMES, (100, 120), shared=True).ids) == 12000
 
 
-def test_damaged_mask_and_progress(tmp_path):
+def test_damaged_mask(tmp_path):
     write_masks(tmp_path, IDS)
-    calls = []
-    load_labels(tmp_path, NAMES, SIZE, progress=lambda *call: calls.append(call))
-    assert calls == [(1, 3), (2, 3), (3, 3)]
     (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:-20])
     with refused("a.png", "damaged"):
         load_labels(tmp_path, NAMES, SIZE)
-
-
-OBJECT_NAMES = ("b", "c", "e")
-OBJECT_SIZE = (12, 16)
-
-
-def write(path, mask):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), mask.astype(np.uint8))
-
-
-@pytest.fixture
-def masks():
-    """Object 2 lies under object 10 in places."""
-    found = np.zeros((2, *OBJECT_SIZE), bool)
-    found[0, 1:8, 2:9] = found[1, 5:11, 6:14] = True
-    return found
-
-
-def test_objects_in_folders_of_their_own(tmp_path, masks):
-    for name in OBJECT_NAMES:
-        write(tmp_path / "002" / f"{name}.png", 255 * masks[0])
-    write(tmp_path / "010" / "c.png", 255 * masks[1])
-    (tmp_path / "other").mkdir()
-    (tmp_path / "011").mkdir()
-    labels, ids, notes = load_labels(tmp_path, (*OBJECT_NAMES, "f"), OBJECT_SIZE)
-    assert ids == (2, 10)
-    expected = np.where(masks[0], 0, np.where(masks[1], 1, -1))  # the lower id lies on top
-    np.testing.assert_array_equal(labels[1], expected)
-    np.testing.assert_array_equal(labels[0] == 0, masks[0])
-    assert (labels[3] == -1).all()
-    assert "1 of 4 frames" in notes[0]
-
-
-def test_masks_of_unlike_sizes_are_refused(tmp_path, masks):
-    write(tmp_path / "1" / "b.png", masks[0])
-    write(tmp_path / "2" / "b.png", masks[1][:6])
-    with pytest.raises(InputError, match="16x12"):
-        load_labels(tmp_path, OBJECT_NAMES, OBJECT_SIZE)
-
-
-def test_numbered_masks_are_taken_in_order_where_they_are_as_many_as_the_frames(tmp_path, masks):
-    order = ("a", "b", "c", "d", "e")  # a and d are held out
-    for n in range(5):
-        write(tmp_path / f"{n:05}.png", (n + 1) * masks[0])
-    labels, ids, notes = load_labels(tmp_path, OBJECT_NAMES, OBJECT_SIZE, order=order)
-    assert ids == (2, 3, 5)
-    for t in range(3):
-        np.testing.assert_array_equal(labels[t] == t, masks[0])
-    assert notes == ("The masks are numbered, and taken in the order of the frames: 00001.png is b.",)
-    with pytest.raises(InputError, match="none of which"):
-        load_labels(tmp_path, OBJECT_NAMES, OBJECT_SIZE)
-    (tmp_path / "00003.png").unlink()
-    with pytest.raises(InputError, match="a PNG for each number from 0 to 4"):
-        load_labels(tmp_path, OBJECT_NAMES, OBJECT_SIZE, order=order)
 
 
 @pytest.fixture
@@ -277,17 +204,11 @@ def test_what_is_missing_or_disagrees_is_told(written):
     folder, _, rows = written
     with refused("frame_2_f.npy", "cannot be read"):
         load_features(folder, ["frame_0", "frame_2"], (12, 16))
-    np.save(folder / "frame_1_f.npy", rows[1][:2])
-    with refused("frame_1_f.npy", "(2, 5) for ids up to 2"):
-        load_features(folder, ["frame_0", "frame_1"], (12, 16))
-
-
-def test_frames_of_two_models_are_refused(written):
-    folder, _, rows = written
     assert embedding_size(folder) == 5
-    np.save(folder / "frame_1_f.npy", rows[1][:, :4])
-    with refused("frame_1_f.npy", "rows of 4 numbers"):
-        load_features(folder, ["frame_0", "frame_1"], (12, 16))
+    for wrong, said in ((rows[1][:2], "(2, 5) for ids up to 2"), (rows[1][:, :4], "rows of 4 numbers")):
+        np.save(folder / "frame_1_f.npy", wrong)
+        with refused("frame_1_f.npy", said):
+            load_features(folder, ["frame_0", "frame_1"], (12, 16))
 
 
 def test_a_folder_without_embeddings_is_refused(tmp_path):

@@ -59,14 +59,9 @@ def test_folders_like_those_of_the_images_are_cameras(tmp_path, folders, alike, 
     read, _ = load_proposals(tmp_path, tuple(files), SIZE, files=files)
     for t, image in enumerate(images):
         np.testing.assert_array_equal(read(t), [image == id for id in range(1, 5)])
-
-
-@pytest.mark.parametrize("alike", [False, True])
-def test_black_and_white_masks_of_cameras_are_one_object(tmp_path, alike):
-    files = photographs("0/a.jpg", "0/b.jpg", "1/a.jpg" if alike else "1/c.jpg", "1/d.jpg")
-    images = [black_and_white() for _ in files]
-    for file, image in zip(files.values(), images):
-        write(tmp_path / file.path.replace(".jpg", ".png"), image)
+    images = [black_and_white() for _ in paths]  # one object
+    for path, image in zip(paths, images):
+        write(tmp_path / f"{path}.png", image)
     labels, ids, _ = load_labels(tmp_path, tuple(files), SIZE, files=files)
     np.testing.assert_array_equal(labels, np.stack(images) // 255 - 1)
     assert ids == (255,)
@@ -126,6 +121,42 @@ def test_objects_called_by_words_are_numbered(tmp_path):
     assert ids == (1, 2)
     np.testing.assert_array_equal(labels[0], masks["mug"])
     assert any("bowl is 1, mug is 2" in note for note in notes)
+
+
+def test_objects_are_in_some_of_the_frames_and_the_lower_id_lies_on_top(tmp_path):
+    low, high = np.zeros((2, *SIZE), bool)
+    low[1:8, 2:9] = high[5:11, 6:14] = True
+    for name in "bce":
+        write(tmp_path / "002" / f"{name}.png", 255 * low)
+    write(tmp_path / "010" / "c.png", 255 * high)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "011").mkdir()
+    labels, ids, notes = load_labels(tmp_path, tuple("bcef"), SIZE)
+    assert ids == (2, 10)
+    np.testing.assert_array_equal(labels[1], np.where(low, 0, np.where(high, 1, -1)))
+    np.testing.assert_array_equal(labels[0] == 0, low)
+    assert (labels[3] == -1).all()
+    assert "1 of 4 frames" in notes[0]
+    write(tmp_path / "010" / "b.png", 255 * high[:6])
+    with refused("16x12"):
+        load_labels(tmp_path, tuple("bcef"), SIZE)
+
+
+def test_numbered_masks_are_taken_in_order_where_they_are_as_many_as_the_frames(tmp_path):
+    frames, order = tuple("bce"), tuple("abcde")  # a and d are held out
+    mask = np.eye(12, 16, dtype=int)
+    for n in range(5):
+        write(tmp_path / f"{n:05}.png", (n + 1) * mask)
+    labels, ids, notes = load_labels(tmp_path, frames, SIZE, order=order)
+    assert ids == (2, 3, 5)
+    for t in range(3):
+        np.testing.assert_array_equal(labels[t] == t, mask)
+    assert notes == ("The masks are numbered, and taken in the order of the frames: 00001.png is b.",)
+    with refused("none of which"):
+        load_labels(tmp_path, frames, SIZE)
+    (tmp_path / "00003.png").unlink()
+    with refused("a PNG for each number from 0 to 4"):
+        load_labels(tmp_path, frames, SIZE, order=order)
 
 
 def test_ids_above_float32_stay_apart_when_resized(tmp_path):
