@@ -46,6 +46,14 @@ def tracker(truth):
     return track
 
 
+def track_still(frames, index, prompts):
+    """Nothing moves: a prompt is the mask of every frame."""
+    labels = np.full(frames.shape[:3], -1, np.int16)
+    for b, prompt in enumerate(prompts):
+        labels[:, prompt] = b
+    return labels
+
+
 def canonical(labels):
     """Labels renumbered by first appearance, so that partitions can be compared."""
     ids, first = np.unique(labels, return_index=True)
@@ -53,13 +61,14 @@ def canonical(labels):
     return np.vectorize(name.get)(labels)
 
 
-def test_finds_each_object_once():
-    truth = squares()
+def test_finds_each_object_once_and_progress_counts_frames():
+    truth, told = squares(), []
     track = tracker(truth)
-    labels = masklets(frames_of(truth), segmenter(truth), track)
+    labels = masklets(frames_of(truth), segmenter(truth), track, progress=lambda *count: told.append(count))
     assert labels.dtype == np.int16
     np.testing.assert_array_equal(canonical(labels), canonical(truth))
     assert track.calls == [(0, 3)]  # what is tracked is not prompted again
+    assert told == [(t, 5) for t in range(1, 6)]
 
 
 @settings(deadline=None, max_examples=15)
@@ -112,13 +121,7 @@ def test_a_fragment_found_once_gives_way_and_a_part_found_always_stays():
             parts = [half[index], square[index] & ~half[index]] if index in split else [square[index]]
             return np.stack([truth[index] == 0, truth[index] == 2, *parts])
 
-        def track(frames, index, prompts):
-            labels = np.full(truth.shape, -1, np.int16)
-            for b, prompt in enumerate(prompts):
-                labels[:, prompt] = b  # nothing moves
-            return labels
-
-        labels = masklets(frames_of(truth), segment, track)
+        labels = masklets(frames_of(truth), segment, track_still)
         assert len(np.unique(labels[labels >= 0])) == regions
         np.testing.assert_array_equal(labels[2] == labels[2, 30, 8], (square if regions == 3 else half)[2])
 
@@ -130,46 +133,26 @@ def test_parts_that_most_frames_hold_together_are_joined():
     half = square.copy()
     half[:, 12:] = False
 
-    def track(frames, index, prompts):
-        labels = np.full(truth.shape, -1, np.int16)
-        for b, prompt in enumerate(prompts):
-            labels[:, prompt] = b
-        return labels
-
     for split, rate, regions in ((2, 0.5, 2), (6, 0.5, 3), (2, 1.0, 3)):
 
         def segment(frame, index, split=split):
             return np.stack([truth[index] == 0, *([half, square & ~half] if index < split else [square])])
 
-        labels = masklets(frames_of(truth), segment, track, join_rate=rate, min_support=0.0)
+        labels = masklets(frames_of(truth), segment, track_still, join_rate=rate, min_support=0.0)
         assert len(np.unique(labels[labels >= 0])) == regions, (split, rate)
 
 
-def test_specks_and_glimpses_are_dropped():
+def test_specks_and_glimpses_are_dropped_and_what_is_beyond_the_number_wanted():
     truth = squares()
     truth[2, 0, 0] = 3  # a speck
     truth[3, 38:, 20:] = 4  # a glimpse: one frame
-    labels = masklets(frames_of(truth), segmenter(truth), tracker(truth), min_area=0.005)
+    frames, segment = frames_of(truth), segmenter(truth)
+    labels = masklets(frames, segment, tracker(truth), min_area=0.005)
     assert labels.max() == 2
     assert labels[2, 0, 0] == -1
     assert (labels[3, 38:, 20:] == -1).all()
-
-
-def test_at_most_so_many():
-    truth = squares()
-    assert masklets(frames_of(truth), segmenter(truth), tracker(truth), max_masklets=2).max() == 1
-
-
-def test_nothing_proposed_is_nothing_found():
-    truth = squares()
-    labels = masklets(frames_of(truth), lambda frame, index: np.zeros((0, 40, 40), bool), tracker(truth))
-    assert (labels == -1).all()
-
-
-def test_progress_counts_frames():
-    truth, told = squares(frames=3), []
-    masklets(frames_of(truth), segmenter(truth), tracker(truth), progress=lambda *c: told.append(c))
-    assert told == [(1, 3), (2, 3), (3, 3)]
+    assert masklets(frames, segment, tracker(truth), max_masklets=2).max() == 1
+    assert (masklets(frames, lambda frame, index: np.zeros((0, 40, 40), bool), tracker(truth)) == -1).all()
 
 
 def test_bad_shapes_are_refused():
