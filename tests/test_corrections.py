@@ -90,8 +90,11 @@ def hat_exp(twist):
     return expm(np.array([[0, -z, y, a], [z, 0, -x, b], [-y, x, 0, c], [0, 0, 0, 0]]))
 
 
-def hat_exp_of(twists):
-    return np.stack([hat_exp(twist) for twist in twists])
+def errors(seed=4):
+    """Twists and gains of a rough capture."""
+    rng = np.random.default_rng(seed)
+    twists = np.concatenate([0.009 * rng.normal(size=(VIEWS, 3)), 0.02 * rng.normal(size=(VIEWS, 3))], axis=1)
+    return {"twists": twists, "gains": rng.uniform(0.8, 1.0, VIEWS)}
 
 
 def same(a, b):
@@ -114,8 +117,7 @@ def test_exponential_is_smooth_everywhere(x64):
     slope = jax.jit(jax.jacfwd(se3_exp))
     back = jax.jit(jax.jacrev(se3_exp))
     for twist in (np.zeros(6), np.array([1e-20, 0, 0, 1, 2, 3]), np.array([0.6, -0.6, 0.529, 1, 2, 3]), np.ones(6)):
-        steps = 1e-6 * np.eye(6)
-        by = np.stack([(hat_exp(twist + h) - hat_exp(twist - h)) / 2e-6 for h in steps], axis=-1)
+        by = np.stack([(hat_exp(twist + h) - hat_exp(twist - h)) / 2e-6 for h in 1e-6 * np.eye(6)], axis=-1)
         np.testing.assert_allclose(slope(twist), by, atol=1e-8)
         np.testing.assert_allclose(back(twist), by, atol=1e-8)
 
@@ -177,21 +179,20 @@ def test_what_not_to_fit_has_no_part_in_the_fit(capture, truth):
 
 def test_a_known_twist_and_gain_are_found(capture, truth):
     """The scene is known: each frame's correction is its own problem."""
-    rng = np.random.default_rng(3)
-    twists = np.concatenate([0.009 * rng.normal(size=(VIEWS, 3)), 0.02 * rng.normal(size=(VIEWS, 3))], axis=1)
-    gains = rng.uniform(0.8, 1.0, VIEWS)
-    told, states = rough(capture, twists=twists, gains=gains), []
+    wrong, states = errors(3), []
+    told = rough(capture, **wrong)
     given = GIVEN | {"rates": FROZEN, "refine": RefineOptions(pose_rate=2e-3), "on_checkpoint": states.append}
     fit_gaussians(told, start=truth, steps=40 * 5, **given)
     found, pixels = jax.tree.map(np.asarray, states[-1].corrections.current), []
-    for poses in (capture.cameras.world_to_camera, hat_exp_of(found.twists) @ told.cameras.world_to_camera):
+    put_right = np.stack([hat_exp(twist) for twist in found.twists]) @ told.cameras.world_to_camera
+    for poses in (capture.cameras.world_to_camera, put_right):
         x, y, z = np.moveaxis(truth.means @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3], -1, 0)
         pixels.append(30 * np.stack([x / z, y / z]))
     train = ~capture.held_out
     assert not found.twists[2].any()
     assert np.median(np.abs(pixels[1] - pixels[0])[:, train]) < 0.05
     assert np.abs(pixels[1] - pixels[0])[:, train].max() < 0.3
-    np.testing.assert_allclose(found.colours[train, :, :3], gains[train, None, None] * np.eye(3), atol=0.05)
+    np.testing.assert_allclose(found.colours[train, :, :3], wrong["gains"][train, None, None] * np.eye(3), atol=0.05)
 
 
 @pytest.mark.long
@@ -217,46 +218,24 @@ def test_a_refining_fit_goes_on_from_a_checkpoint_to_the_same_result(capture, tr
         fit_gaussians(capture, state=stopped, steps=30, **GIVEN)
 
 
-@pytest.mark.long
-def test_a_settled_capture_is_nearer_to_the_truth_and_its_held_out_frames_have_no_part_in_it(capture, truth):
-    rng = np.random.default_rng(4)
-    twists = np.concatenate([0.009 * rng.normal(size=(VIEWS, 3)), 0.02 * rng.normal(size=(VIEWS, 3))], axis=1)
-    told = rough(capture, twists=twists, gains=rng.uniform(0.8, 1.0, VIEWS))
-    start = dataclasses.replace(truth, opacity_logits=np.zeros(40, np.float32))
-    better = refine_capture(told, start, key=KEY, visits=15, probes=2)
-    assert "poses refined" in " ".join(better.notes)
-    assert "held-out" in better.notes[-1]
+@pytest.mark.parametrize("decide", [True, pytest.param(False, marks=pytest.mark.long)])
+def test_a_rough_capture_is_corrected_and_its_held_out_frames_have_no_part_in_it(capture, truth, decide):
+    told = rough(capture, **errors())
+    start = truth if decide else dataclasses.replace(truth, opacity_logits=np.zeros(40, np.float32))
+    given = {"key": KEY, "visits": 15, "probes": 2, "decide": decide}
+    better = refine_capture(told, start, **given)
+    assert ("are corrected" if decide else "poses refined") in " ".join(better.notes)
+    assert decide or "held-out" in better.notes[-1]
     assert same(better.cameras.fx, told.cameras.fx)
     assert measure_quality(truth, better).psnr[0] > measure_quality(truth, told).psnr[0] + 2.5
     frames = told.frames.copy()
     frames[2] = 255 - frames[2]
-    other = refine_capture(dataclasses.replace(told, frames=frames), start, key=KEY, visits=15, probes=2)
-    train = ~told.held_out
-    assert same(other.cameras[train], better.cameras[train])
-    assert same(other.frames[train], better.frames[train])
-    assert refine_capture(told, start, key=KEY, refine=None) is told
-
-
-def errors(seed=4):
-    """Twists and gains of a rough capture."""
-    rng = np.random.default_rng(seed)
-    twists = np.concatenate([0.009 * rng.normal(size=(VIEWS, 3)), 0.02 * rng.normal(size=(VIEWS, 3))], axis=1)
-    return {"twists": twists, "gains": rng.uniform(0.8, 1.0, VIEWS)}
-
-
-def test_a_rough_capture_is_corrected_and_its_held_out_frames_have_no_part_in_the_decision(capture, truth):
-    told = rough(capture, **errors())
-    given = {"key": KEY, "visits": 15, "probes": 2, "decide": True}
-    better = refine_capture(told, truth, **given)
-    assert "are corrected" in " ".join(better.notes)
-    assert measure_quality(truth, better).psnr[0] > measure_quality(truth, told).psnr[0] + 2.5
-    frames = told.frames.copy()
-    frames[2] = 255 - frames[2]
-    other = refine_capture(dataclasses.replace(told, frames=frames), truth, **given)
+    other = refine_capture(dataclasses.replace(told, frames=frames), start, **given)
     train = ~told.held_out
     assert same(other.cameras[train], better.cameras[train])
     assert same(other.frames[train], better.frames[train])
     assert other.notes[0] == better.notes[0]
+    assert refine_capture(told, start, key=KEY, refine=None) is told
 
 
 def test_an_exact_capture_stays_as_it_is_bit_by_bit(capture, truth):

@@ -29,28 +29,17 @@ SCHEDULE = Schedule(max_gaussians=0, degree_interval=0.25)
 FITTED = {"steps": STEPS, "key": KEY, "schedule": SCHEDULE, "rates": RATES, "chunk": 10}
 """options of the fit that several tests look at"""
 WHOLE = Schedule(sizes=((1.0, 1.0),), max_gaussians=0)
-INRIA_RATES = LearningRates(
-    means=1.6e-4,
-    means_last=1.6e-6,
-    log_scales=5e-3,
-    quaternions=1e-3,
-    opacity_logits=5e-2,
-    colors=2.5e-3,
-    rest_last=1.0,
-)
-"""Kerbl et al. 2023"""
 
 
 @pytest.fixture(scope="module")
 def truth():
     rng = np.random.default_rng(0)
-    count = COUNT
     return Gaussians(
-        rng.uniform(-0.7, 0.7, (count, 3)).astype(np.float32),
-        np.log(rng.uniform(0.1, 0.25, (count, 3))).astype(np.float32),
-        rng.normal(size=(count, 4)).astype(np.float32),
-        rng.uniform(0, 3, count).astype(np.float32),
-        rng.uniform(-1.5, 1.5, (count, 1, 3)).astype(np.float32),
+        rng.uniform(-0.7, 0.7, (COUNT, 3)).astype(np.float32),
+        np.log(rng.uniform(0.1, 0.25, (COUNT, 3))).astype(np.float32),
+        rng.normal(size=(COUNT, 4)).astype(np.float32),
+        rng.uniform(0, 3, COUNT).astype(np.float32),
+        rng.uniform(-1.5, 1.5, (COUNT, 1, 3)).astype(np.float32),
     )
 
 
@@ -206,7 +195,10 @@ def test_view_order_takes_every_view_once_a_round_and_can_be_entered_anywhere():
 
 def test_first_step_is_adams_sign_step_at_the_stated_rates(capture, start):
     """Adam's first update is rate * sign(gradient), whatever the gradient's size: this pins each group's rate."""
-    rates, extent = INRIA_RATES, cameras_extent(capture.cameras[np.array([0, 1, 3, 4])])
+    rates = LearningRates(
+        means=1.6e-4, log_scales=5e-3, quaternions=1e-3, opacity_logits=5e-2, colors=2.5e-3, rest_last=1.0
+    )
+    extent = cameras_extent(capture.cameras[np.array([0, 1, 3, 4])])
     after, _ = fit_gaussians(capture, steps=1, key=KEY, start=start, rates=rates, schedule=WHOLE)
     moved = jax.tree.map(lambda a, b: np.abs(np.asarray(a) - b).max(), after, start)
     assert float(moved.means) == pytest.approx(1.6e-4 * extent, rel=1e-2)
@@ -222,9 +214,8 @@ def test_first_step_is_adams_sign_step_at_the_stated_rates(capture, start):
 
 
 def test_extent_is_inrias():
-    assert cameras_extent(
-        Camera(np.stack([look_at((x, 0, -2)) for x in (-1.0, 0.0, 1.0)]), *(np.ones(3),) * 4, 4, 4)
-    ) == pytest.approx(1.1)
+    poses = np.stack([look_at((x, 0, -2)) for x in (-1.0, 0.0, 1.0)])
+    assert cameras_extent(Camera(poses, *(np.ones(3),) * 4, 4, 4)) == pytest.approx(1.1)
 
 
 def test_wrong_fits_are_refused(capture, start):
