@@ -8,8 +8,6 @@ import pytest
 from jsecon.app.access import is_allowed_host, listen, token_for
 from jsecon.errors import InputError
 
-IPV6 = socket.has_ipv6
-
 
 @pytest.mark.parametrize(("header", "fits"), [
     ("127.0.0.1:8765", True), ("localhost", True), ("LOCALHOST.:80", True), ("[::1]:8765", True),

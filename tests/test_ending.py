@@ -13,10 +13,6 @@ PARTS = {"where": "mug.png", "problem": "text", "expected": "a picture", "remedy
 ERROR = PARTS | {"message": "mug.png: text, expected a picture. Draw one."}
 
 
-def _errors():
-    return [InputError("cup.png", "nothing", "a picture", "Draw it."), InputError(*PARTS.values())]
-
-
 @pytest.fixture
 def end(monkeypatch):
     """Runs a verb that has a given result or raises a given error."""
@@ -41,12 +37,13 @@ def test_figures_and_paths_are_one_object(end, capsys):
 
 
 def test_what_was_refused_is_told_beside_what_was_not(end, capsys):
-    assert end({"answers": [1], "errors": _errors()}, "--json") == 2
+    errors = [InputError("cup.png", "nothing", "a picture", "Draw it."), InputError(*PARTS.values())]
+    assert end({"answers": [1], "errors": errors}, "--json") == 2
     out, err = capsys.readouterr()
     told = json.loads(out)
     assert told["error"] == told["errors"][1] == ERROR
     assert (told["errors"][0]["where"], told["answers"], err) == ("cup.png", [1], "")
-    assert end({"errors": _errors()}) == 2
+    assert end({"errors": errors}) == 2
     out, err = capsys.readouterr()
     assert out == ""
     assert [line.split(":")[1] for line in err.splitlines()] == [" cup.png", " mug.png"]
@@ -87,10 +84,8 @@ def test_a_stop_and_a_bug_are_error_objects_with_their_own_codes(end, capsys):
 
     for error in (KeyboardInterrupt(), within(KeyboardInterrupt())):
         assert end(error, "--json") == 130
-        assert (
-            json.loads(capsys.readouterr().out)["error"]["message"]
-            == "interrupted. Run the same command again to resume."
-        )
+        message = json.loads(capsys.readouterr().out)["error"]["message"]
+        assert message == "interrupted. Run the same command again to resume."
     assert end(within(None), "--json") == 2
     assert json.loads(capsys.readouterr().out)["error"]["problem"] == "half of it"
     with pytest.raises(ZeroDivisionError):
@@ -101,10 +96,7 @@ def test_a_stop_and_a_bug_are_error_objects_with_their_own_codes(end, capsys):
 @pytest.mark.parametrize(
     ("error", "message"),
     [
-        (
-            InputError("images.txt", "line 7 has 9 fields", "10", "Export it again."),
-            "line 7 has 9 fields, expected 10.",
-        ),
+        (InputError("images.txt", "line 7 has 9 fields", "10", "Export."), "line 7 has 9 fields, expected 10."),
         (InputError("mug.png", "the file is cut short.", remedy="Copy it again."), "mug.png: the file is cut short. C"),
         (InputError("", "interrupted", remedy="Run it again."), "interrupted. Run it again."),
     ],

@@ -1,6 +1,5 @@
 """The film: a WebP of a quarter of a minute, on a way around what the cameras look at, in which answers light up."""
 
-import jax
 import numpy as np
 from conftest import look_at
 from PIL import Image
@@ -52,9 +51,4 @@ def test_an_answer_is_dark_before_its_turn_and_bright_after(scene, cameras, tmp_
             frames.append(np.asarray(found.convert("RGB"), float).mean())
     # Bright at first, dark but for nothing as the first answer's turn comes, then brighter with each.
     assert frames[0] > frames[-1] > frames[5]
-
-
-def test_a_scene_without_answers_has_a_film_too(scene, cameras, tmp_path, monkeypatch):
-    monkeypatch.setattr(film, "SECONDS", 1)
-    field, _ = make_field(jax.tree.map(np.asarray, scene), cameras)
-    assert film.write_film(field, [], tmp_path / "film.webp") > 500
+    assert film.write_film(field, [], tmp_path / "film.webp") > 500  # without answers there is one too
