@@ -42,9 +42,8 @@ def two_rooms():
         np.zeros((count, 1, 3), np.float32),
     )
     sides = [(-2.0, y, 0.1) for y in (-0.3, 0.0, 0.3)] + [(2.0, y, 0.1) for y in (-0.3, 0.0, 0.3)]
-    focal = np.full(6, 40, np.float32)
-    centre = np.full(6, 16, np.float32)
-    cameras = Camera(np.stack([look_at(eye) for eye in sides]), focal, focal, centre, centre, width=32, height=32)
+    lens = (np.full(6, value, np.float32) for value in (40, 40, 16, 16))
+    cameras = Camera(np.stack([look_at(eye) for eye in sides]), *lens, width=32, height=32)
     one_hot = jnp.asarray(np.eye(3, dtype=np.float32)[thing])
     images = [np.asarray(jsecon.render(scene, cameras[t], one_hot).features) for t in range(6)]
     labels = np.stack([np.where(image.sum(-1) > 0.5, image.argmax(-1), -1) for image in images]).astype(np.int32)
@@ -110,10 +109,7 @@ def test_a_thing_in_two_pieces_stays_whole_and_what_is_dropped_is_told(scene, ca
     save_field(tmp_path / "field.safetensors", one_region(scene, cameras, means))
     told = ask(tmp_path / "field.safetensors", tmp_path / "out")
     assert told["count"] == 58
-    assert told["outliers"]["dropped"] == 6
-    assert told["outliers"] == {
-        "dropped": 6, "selected": 64, "clusters_kept": 2, "clusters_dropped": 0,
-    }  # fmt: skip
+    assert told["outliers"] == {"dropped": 6, "selected": 64, "clusters_kept": 2, "clusters_dropped": 0}
     printed = capsys.readouterr().out
     assert "6 of 64" in printed
     assert "--keep-outliers" in printed

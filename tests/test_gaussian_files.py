@@ -122,9 +122,8 @@ def test_a_spz_of_a_wide_scene_of_sure_opacities_and_of_nothing(tmp_path):
     save_gaussians(tmp_path / "a.spz", gaussians(wide))
     found = load_gaussians(tmp_path / "a.spz")
     np.testing.assert_allclose(found.means, wide["means"], atol=5e4 / 2**22)
-    np.testing.assert_allclose(
-        opacity({"opacity_logits": np.asarray(found.opacity_logits)}), [0] * 25 + [1] * 25, atol=2e-6
-    )
+    alpha = opacity({"opacity_logits": np.asarray(found.opacity_logits)})
+    np.testing.assert_allclose(alpha, [0] * 25 + [1] * 25, atol=2e-6)
     save_gaussians(tmp_path / "none.spz", gaussians(scene(0, 1)))
     assert load_gaussians(tmp_path / "none.spz").count == 0
     wide["means"] *= 1e4
@@ -145,14 +144,11 @@ def test_files_cut_short_are_refused(tmp_path, name):
             load_gaussians(tmp_path / name)
 
 
-def test_a_compressed_ply_with_too_few_chunks(tmp_path):
-    whole = splat_files.compressed_ply(SCENE).replace(b"element chunk 3", b"element chunk 2")
-    (tmp_path / "a.ply").write_bytes(whole)
+def test_too_few_chunks_of_a_compressed_ply_and_a_short_codebook_of_a_sog(tmp_path):
+    few = splat_files.compressed_ply(SCENE).replace(b"element chunk 3", b"element chunk 2")
+    (tmp_path / "a.ply").write_bytes(few)
     with refused("a.ply", "2 chunks for 600 Gaussians"):
         load_gaussians(tmp_path / "a.ply")
-
-
-def test_a_sog_with_a_short_codebook(tmp_path):
     (tmp_path / "whole.sog").write_bytes(splat_files.sog(PLAIN))
     with zipfile.ZipFile(tmp_path / "whole.sog") as whole, zipfile.ZipFile(tmp_path / "a.sog", "w") as short:
         for name in whole.namelist():
