@@ -41,21 +41,17 @@ def shapes_of(size, latent):
     return jax.eval_shape(train, KEY)
 
 
-def test_layers_are_langsplats():
+def test_layers_are_langsplats_and_wider_latents_are_no_bottleneck():
     coder = shapes_of(512, 3)
     assert layers(coder, "encoder") == [(512, 256), (256, 128), (128, 64), (64, 32), (32, 3)]
     decoder = [(3, 16), (16, 32), (32, 64), (64, 128), (128, 256), (256, 256), (256, 512)]
     assert layers(coder, "decoder") == decoder
     assert sorted(coder.encoder["batch_stats"]) == [f"BatchNorm_{i}" for i in range(4)]
     assert "batch_stats" not in coder.decoder
-    assert coder.latent == 3
-    assert coder.dim == 512
-
-
-def test_latents_wider_than_langsplats_layers_are_no_bottleneck():
-    coder = shapes_of(50, 40)
-    assert min(width for part in ("encoder", "decoder") for _, width in layers(coder, part)) >= 40
-    assert coder.latent == 40
+    assert (coder.latent, coder.dim) == (3, 512)
+    wide = shapes_of(50, 40)
+    assert min(width for part in ("encoder", "decoder") for _, width in layers(wide, part)) >= 40
+    assert wide.latent == 40
 
 
 def test_regions_come_back_from_three_numbers(trained):
@@ -95,9 +91,8 @@ def test_forward_pass_equals_numpy_float64(trained):
     params, x = jax.tree.map(lambda a: np.asarray(a, np.float64), coder.decoder["params"]), codes
     for layer in range(7):
         x = (np.maximum(x, 0) if layer else x) @ params[f"Dense_{layer}"]["kernel"] + params[f"Dense_{layer}"]["bias"]
-    np.testing.assert_allclose(
-        coder.decode(codes.astype(np.float32)), x / np.linalg.norm(x, axis=1, keepdims=True), atol=1e-5
-    )
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    np.testing.assert_allclose(coder.decode(codes.astype(np.float32)), x, atol=1e-5)
 
 
 def test_one_vector_a_batch_a_vmap_and_a_jit_agree(trained):
@@ -112,12 +107,15 @@ def test_one_vector_a_batch_a_vmap_and_a_jit_agree(trained):
     np.testing.assert_allclose(jax.jit(lambda c, x: c.encode(x))(coder, 1e30 * embeddings[:40]), codes[:40], atol=1e-5)
 
 
-def test_zero_is_unknown_and_nan_stays_nan(trained):
-    _embeddings, coder, _ = trained
-    rows = np.stack([np.zeros(48), np.full(48, np.nan)]).astype(np.float32)
-    codes = np.asarray(coder.encode(rows))
+def test_zero_is_unknown_nan_stays_nan_and_codes_of_other_sizes_are_told(trained):
+    _, coder, _ = trained
+    codes = np.asarray(coder.encode(np.float32([[0.0] * 48, [np.nan] * 48])))
     assert (codes[0] == 0).all()
     assert np.isnan(codes[1]).all()
+    with pytest.raises(ValueError, match=r"\.\.\., 48"):
+        coder.encode(np.ones((2, 47), np.float32))
+    with pytest.raises(ValueError, match=r"\.\.\., 3"):
+        coder.decode(np.ones((2, 4), np.float32))
 
 
 def test_the_key_decides_everything(trained):
@@ -153,22 +151,11 @@ def test_sound_for_equal_embeddings_beside_an_unknown_one():
 
 
 def test_what_cannot_be_trained_on_is_told():
-    for rows, match in (
-        (np.zeros((4, 8)), "all zero"),
-        (np.zeros((0, 8)), "0 rows"),
-        (np.full((2, 8), np.nan), "not finite"),
-    ):
+    none = {"all zero": np.zeros((4, 8)), "0 rows": np.zeros((0, 8)), "not finite": np.full((2, 8), np.nan)}
+    for match, rows in none.items():
         with pytest.raises(ValueError, match=match):
             train_autoencoder(rows.astype(np.float32), latent=3, key=KEY)
     good = unit_rows(np.random.default_rng(0), 4, 8)
     for options in ({"latent": 0}, {"latent": 3, "batch": 0}, {"latent": 3, "epochs": 0}):
         with pytest.raises(ValueError, match="train_autoencoder"):
             train_autoencoder(good, key=KEY, **options)
-
-
-def test_codes_of_other_sizes_are_told(trained):
-    _, coder, _ = trained
-    with pytest.raises(ValueError, match=r"\.\.\., 48"):
-        coder.encode(np.ones((2, 47), np.float32))
-    with pytest.raises(ValueError, match=r"\.\.\., 3"):
-        coder.decode(np.ones((2, 4), np.float32))

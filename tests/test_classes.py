@@ -150,14 +150,13 @@ def test_a_region_that_is_none_of_the_classes_speaks_where_no_other_does():
     votes = dataclasses.replace(field.votes, regions=ids, weights=weights, **seen)
     field = dataclasses.replace(field, regions=known, votes=votes)
     texts = np.float32(np.stack([known.embeddings[0], known.embeddings[1] + 0.05 * known.embeddings[2]]))
-    labels, found = query_classes(field, texts, rules=QueryRules(retrieval="cosine"), every=True)
+    rules = QueryRules(retrieval="cosine")
+    labels, found = query_classes(field, texts, rules=rules, every=True)
     np.testing.assert_array_equal(labels, [0, 1, 1])  # the second was seen in the region of no class alone
-    np.testing.assert_array_equal(query_classes(field, texts, rules=QueryRules(retrieval="cosine"))[0], [0, -1, 1])
+    np.testing.assert_array_equal(query_classes(field, texts, rules=rules)[0], [0, -1, 1])
     np.testing.assert_allclose(found[0], [1, 0], atol=1e-6)
     without = dataclasses.replace(field, votes=dataclasses.replace(votes, shown=None))
-    np.testing.assert_array_equal(
-        query_classes(without, texts, rules=QueryRules(retrieval="cosine"), every=True)[0], [0, 1, 1]
-    )
+    np.testing.assert_array_equal(query_classes(without, texts, rules=rules, every=True)[0], [0, 1, 1])
 
 
 def test_a_probability_refuses_classes_as_it_refuses_texts():

@@ -20,14 +20,14 @@ from jsecon.language.codes import (
 KEY = jax.random.key(0)
 
 
+def unit_rows_of(rows):
+    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+
+
 def crowded(count, size=64, common=2.0, seed=0):
     """Unit rows with much in common, as CLIP's are: cosines around common^2 / (1 + common^2)."""
     rng = np.random.default_rng(seed)
     return unit_rows_of(common * unit_rows(rng, 1, size) + unit_rows(rng, count, size))
-
-
-def unit_rows_of(rows):
-    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
 
 
 def test_no_coder_where_embeddings_are_short():
@@ -59,7 +59,7 @@ def test_equal_and_unknown_embeddings_fit_in_one_number():
     np.testing.assert_allclose(np.abs(np.delete(np.asarray(codes), 5, axis=0)), 1, atol=1e-6)
 
 
-def test_an_autoencoder_where_regions_do_not_fit():
+def test_an_autoencoder_where_regions_do_not_fit_and_what_is_refused():
     embeddings = unit_rows(np.random.default_rng(0), 12, 40)
     codes, coder, reason = region_codes(embeddings, latent=3, key=KEY, epochs=50, cosine_weight=0.01)
     assert isinstance(coder, Autoencoder)
@@ -67,6 +67,9 @@ def test_an_autoencoder_where_regions_do_not_fit():
     np.testing.assert_allclose(encode(coder, embeddings), codes, atol=1e-6)
     with pytest.raises(ValueError, match="not finite"):
         region_codes(np.full((3, 40), np.inf, np.float32), latent=3, key=KEY)
+    for latent in (0, "some"):
+        with pytest.raises(ValueError, match="region_codes"):
+            region_codes(np.eye(4, dtype=np.float32), latent=latent, key=KEY)
 
 
 @pytest.mark.parametrize(("count", "latent"), [(40, 3), pytest.param(300, 6, marks=pytest.mark.long)])
@@ -141,9 +144,3 @@ def test_pairs_that_must_stay_apart():
     units = unit_rows_of(np.asarray([[1.0, 0, 0], [1, 0.01, 0], [0, 1, 0], [0, 0, 0.0001]]))
     units[3] = 0
     assert confused_pairs(units, np.ones((4, 1), np.float32)) == 2
-
-
-def test_an_unknown_choice_is_told():
-    for latent in (0, "some"):
-        with pytest.raises(ValueError, match="region_codes"):
-            region_codes(np.eye(4, dtype=np.float32), latent=latent, key=KEY)

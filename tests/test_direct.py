@@ -15,24 +15,14 @@ def exact_cosines(codes, code):
     return codes @ code / np.linalg.norm(codes, axis=1) / np.linalg.norm(code)
 
 
-def test_wide_features_equal_float64():
-    rng = np.random.default_rng(0)
-    features, text = rng.normal(size=(2_000, 512)).astype(np.float32), rng.normal(size=512).astype(np.float32)
-    np.testing.assert_allclose(query_one_step(features, text, 0.1).similarity, exact_cosines(features, text), atol=1e-6)
-
-
 @pytest.mark.parametrize("scale", [1e-30, 1e-12, 1.0, 1e12, 1e30, 3e38])
 def test_only_directions_count(scale):
     codes = jnp.asarray(np.array([[1, 0, 0], [0.6, 0.8, 0], [-1, 0, 0]]) * scale, jnp.float32)
     got = query_one_step(codes, jnp.asarray([1.0, 0, 0]), 0.5)
     np.testing.assert_allclose(got.similarity, [1, 0.6, -1], rtol=1e-6)
     assert got.mask.tolist() == [True, True, False]
-    scale = min(scale, 1e37)
-    assert query_one_step(jnp.eye(3), jnp.asarray([scale, 0, 0], jnp.float32), 0.5).mask.tolist() == [
-        True,
-        False,
-        False,
-    ]
+    text = jnp.asarray([min(scale, 1e37), 0, 0], jnp.float32)
+    assert query_one_step(jnp.eye(3), text, 0.5).mask.tolist() == [True, False, False]
 
 
 @pytest.mark.parametrize("threshold", [-1.0, 0.0, 0.5])
@@ -50,19 +40,20 @@ def test_what_is_unknown_is_never_selected(threshold):
         assert float(nothing.score) == 0
 
 
-def test_nan_threshold_and_no_gaussians_select_nothing():
+def test_nan_threshold_and_no_gaussians_select_nothing_and_sizes_that_disagree_are_told():
     assert not query_one_step(jnp.eye(3), jnp.ones(3), np.nan).mask.any()
     empty = query_one_step(jnp.zeros((0, 3)), jnp.ones(3), 0.5)
     assert empty.mask.shape == (0,)
     assert float(empty.score) == 0
-
-
-def test_sizes_that_disagree_are_told():
     with pytest.raises(ValueError, match=r"got \(4,\), expected \(3,\)"):
         query_one_step(jnp.eye(3), jnp.ones(4), 0.5)
+    with pytest.raises(ValueError, match="C >= 1"):
+        query_canonical(jnp.eye(3), jnp.ones(3), jnp.zeros((0, 3)), 0.5)
+    with pytest.raises(ValueError, match="text"):
+        query_canonical(jnp.eye(3), jnp.ones(2), jnp.ones((1, 3)), 0.5)
 
 
-@pytest.mark.parametrize("size", [3, 40])
+@pytest.mark.parametrize("size", [3, 512])
 def test_unit_codes_answer_as_codes_do_under_jit_and_vmap(size):
     rng = np.random.default_rng(size)
     codes, texts = (rng.normal(size=(n, size)).astype(np.float32) for n in (300, 2))
@@ -94,9 +85,7 @@ def exact_relevancy(features, text, canonical):
 def test_relevancy_equals_the_softmax_in_float64():
     rng = np.random.default_rng(0)
     features, texts, canonical = (rng.normal(size=s).astype(np.float32) for s in ((300, 8), (2, 8), (4, 8)))
-    got = jax.jit(jax.vmap(lambda text: query_canonical(jnp.asarray(features), text, jnp.asarray(canonical), 0.5)))(
-        texts
-    )
+    got = jax.jit(jax.vmap(lambda text: query_canonical(features, text, canonical, 0.5)))(texts)
     for row, text in enumerate(texts):
         expected = exact_relevancy(features, text, canonical)
         np.testing.assert_allclose(got.similarity[row], expected, atol=3e-6)
@@ -119,10 +108,3 @@ def test_unknown_features_are_never_selected_and_broken_phrases_select_nothing()
     for broken in (jnp.zeros((1, 3)), jnp.full((1, 3), jnp.nan)):
         assert not query_canonical(features, text, broken, 0.0).mask.any()
     assert not query_canonical(features, jnp.zeros(3), phrases, 0.0).mask.any()
-
-
-def test_no_phrases_or_other_sizes_are_told():
-    with pytest.raises(ValueError, match="C >= 1"):
-        query_canonical(jnp.eye(3), jnp.ones(3), jnp.zeros((0, 3)), 0.5)
-    with pytest.raises(ValueError, match="text"):
-        query_canonical(jnp.eye(3), jnp.ones(2), jnp.ones((1, 3)), 0.5)

@@ -19,9 +19,8 @@ KEY = jax.random.key(0)
 def make_votes(regions, weights, num_regions):
     regions, weights = np.asarray(regions, np.int32), np.asarray(weights, np.float32)
     total = weights.sum(-1)
-    return Votes(
-        regions, weights, total, total, np.zeros_like(total), (total > 0).astype(np.int32), np.int32(0), num_regions
-    )
+    views = (total > 0).astype(np.int32)
+    return Votes(regions, weights, total, total, np.zeros_like(total), views, np.int32(0), num_regions)
 
 
 def random_votes(rng, count, top, num_regions):
@@ -94,12 +93,9 @@ def test_what_is_mostly_unlabelled_is_unknown():
     np.testing.assert_array_equal(distill_votes(votes, codes, min_labelled=0.9), [[1, 0], [0, 0], [0, 0]])
 
 
-def test_no_regions_at_all():
-    votes = make_votes(np.zeros((7, 0)), np.zeros((7, 0)), 0)
-    assert (np.asarray(distill_votes(votes, np.zeros((0, 3), np.float32))) == np.zeros((7, 3))).all()
-
-
-def test_wrong_options_and_tables_are_told():
+def test_no_regions_and_wrong_options_and_tables():
+    nothing = make_votes(np.zeros((7, 0)), np.zeros((7, 0)), 0)
+    np.testing.assert_array_equal(distill_votes(nothing, np.zeros((0, 3), np.float32)), np.zeros((7, 3)))
     votes = make_votes([[0, 1]], [[1, 1]], 2)
     with pytest.raises(ValueError, match="expected 'mean' or"):
         distill_votes(votes, np.eye(2, dtype=np.float32), "sum")
@@ -113,14 +109,8 @@ def task(scene, cameras):
     scene, cameras = jax.tree.map(jnp.asarray, (scene, cameras))
     members = true_regions(scene)
     labels = jnp.asarray(labels_of(scene, cameras, members))
-    return (
-        scene,
-        cameras,
-        labels,
-        jnp.asarray(unit_rows(np.random.default_rng(1), REGIONS, 3)),
-        members,
-        plan_capacity(scene, cameras),
-    )
+    codes = jnp.asarray(unit_rows(np.random.default_rng(1), REGIONS, 3))
+    return scene, cameras, labels, codes, members, plan_capacity(scene, cameras)
 
 
 def dense_weights(scene, cameras):
@@ -161,11 +151,9 @@ def test_steps_equal_the_definition_in_float64(task):
 
 def test_random_and_given_starts_learn_and_zero_is_the_trap(task):
     scene, cameras, labels, codes, members, capacity = task
-    options = {"steps": 240, "key": KEY, "capacity": capacity}
-    calls = []
-    at_random, history = distill_l1(
-        scene, cameras, labels, codes, init="random", progress=lambda *c: calls.append(c), **options
-    )
+    options, calls = {"steps": 240, "key": KEY, "capacity": capacity}, []
+    told = {"progress": lambda *count: calls.append(count)}
+    at_random, history = distill_l1(scene, cameras, labels, codes, init="random", **told, **options)
     assert calls[-1] == (240, 240)
     assert float(history[-20:].mean()) < 0.6 * float(history[:4].mean())
     right = np.argmax(np.asarray(at_random) @ np.asarray(codes).T, axis=1) == members
@@ -183,36 +171,28 @@ def test_random_and_given_starts_learn_and_zero_is_the_trap(task):
 def test_unseen_gaussians_get_no_code_and_unlabelled_pixels_count_in_the_denominator_alone(task):
     scene, cameras, labels, codes, _, capacity = task
     behind = dataclasses.replace(scene, means=scene.means.at[0].set(jnp.asarray([0.0, 50.0, 0.0])))
-    got, _ = distill_l1(behind, cameras, labels, codes, steps=3, key=KEY, init="random", capacity=capacity)
+    options = {"steps": 3, "key": KEY, "capacity": capacity}
+    got, _ = distill_l1(behind, cameras, labels, codes, init="random", **options)
     assert (np.asarray(got[0]) == 0).all()
-    kept, _ = distill_l1(
-        behind,
-        cameras,
-        labels,
-        codes,
-        steps=3,
-        key=KEY,
-        init=jnp.asarray(unit_rows(np.random.default_rng(0), 64, 3)),
-        capacity=capacity,
-    )
+    start = jnp.asarray(unit_rows(np.random.default_rng(0), 64, 3))
+    kept, _ = distill_l1(behind, cameras, labels, codes, init=start, **options)
     assert np.linalg.norm(kept[0]) == pytest.approx(1, abs=1e-5)
-    _, history = distill_l1(
-        scene, cameras, jnp.full_like(labels, -1), codes, steps=3, key=KEY, init="random", capacity=capacity
-    )
+    _, history = distill_l1(scene, cameras, jnp.full_like(labels, -1), codes, init="random", **options)
     assert (np.asarray(history) == 0).all()
 
 
 @pytest.mark.long
 def test_under_jit_too_small_a_capacity_is_data_and_outside_an_error(task):
     """In every run test_capacity has what exceeds a capacity."""
-    scene, cameras, labels, codes, _, _capacity = task
-    assert plan_capacity(scene, cameras) > 64
+    scene, cameras, labels, codes, _, enough = task
+    assert enough > 64
+
+    def losses(key):
+        return distill_l1(scene, cameras, labels, codes, steps=2, key=key, init="random", capacity=64)[1]
+
     with pytest.raises(ValueError, match="capacity=64"):
-        distill_l1(scene, cameras, labels, codes, steps=2, key=KEY, init="random", capacity=64)
-    run = jax.jit(
-        lambda key: distill_l1(scene, cameras, labels, codes, steps=2, key=key, init="random", capacity=64)[1]
-    )
-    assert np.isnan(run(KEY)).all()
+        losses(KEY)
+    assert np.isnan(jax.jit(losses)(KEY)).all()
 
 
 def test_shapes_that_disagree_are_told(task):

@@ -1,10 +1,10 @@
-"""What a fit does when; and growth: halves keep what the whole was, rows stay where they are, and the draw follows the
-votes."""
+"""The schedule of a fit; and growth: halves keep what the whole was, rows stay in place, the draw follows the votes."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jsecon.fit.growth import (
     MIN_OPACITY,
@@ -33,14 +33,7 @@ def scene(count=30, seed=0):
 
 
 def covariance(gaussians):
-    w, x, y, z = (gaussians.quaternions / np.linalg.norm(gaussians.quaternions, axis=1, keepdims=True)).T
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    ).transpose(2, 0, 1)
+    rotation = Rotation.from_quat(gaussians.quaternions, scalar_first=True).as_matrix()
     return np.einsum("nij,nj,nkj->nik", rotation, np.exp(2 * gaussians.log_scales), rotation)
 
 
@@ -73,8 +66,7 @@ def test_free_rows_are_not_in_use_and_go_when_compacted():
     longer = pad_with_free_rows(whole, 64)
     assert longer.count == 64
     np.testing.assert_array_equal(in_use(longer), np.arange(64) < 30)
-    for a, b in zip(jax.tree.leaves(drop_free_rows(longer)), jax.tree.leaves(whole), strict=True):
-        np.testing.assert_array_equal(a, b)
+    jax.tree.map(np.testing.assert_array_equal, drop_free_rows(longer), whole)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(longer))
 
 
@@ -105,35 +97,25 @@ def test_grown_scenes_have_as_many_as_wanted_and_their_moments_begin_anew(target
     np.testing.assert_array_equal(after.means[untouched], whole.means[: after.count][untouched[:32]])
 
 
-def test_faint_gaussians_make_room():
+def test_faint_gaussians_make_room_and_nothing_is_added_where_nothing_is_wrong():
     whole = scene()
     whole.opacity_logits[:5] = np.log(MIN_OPACITY / 2)
     moments = jax.tree.map(np.zeros_like, whole), jax.tree.map(np.zeros_like, whole)
     after, _ = grow(whole, moments, np.ones(30, np.float32), 30, 30, [0])
     assert after.count == 30
     assert in_use(after).all()
-
-
-def test_nothing_is_added_where_nothing_is_wrong():
     whole = pad_with_free_rows(scene(), 64)
     moments = jax.tree.map(np.zeros_like, whole), jax.tree.map(np.zeros_like, whole)
     after, _ = grow(whole, moments, np.zeros(64, np.float32), 60, 60, [0])
-    for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(whole), strict=True):
-        np.testing.assert_array_equal(a, b)
+    jax.tree.map(np.testing.assert_array_equal, after, whole)
 
 
-def test_sizes_follow_each_other():
+def test_sizes_follow_each_other_the_number_rises_evenly_and_degrees_open_one_after_another():
     schedule = Schedule(sizes=((0.25, 0.2), (0.5, 0.5), (1.0, 1.0)))
     assert [schedule.size(done) for done in (0.0, 0.19, 0.2, 0.49, 0.5, 1.0)] == [0.25, 0.25, 0.5, 0.5, 1.0, 1.0]
-
-
-def test_the_number_of_gaussians_rises_evenly_and_stops():
     schedule = Schedule(max_gaussians=300, growth_start=0.1, growth_end=0.6)
     assert [schedule.count(done, 100) for done in (0.05, 0.1, 0.35, 0.6, 0.61)] == [None, 100, 200, 300, None]
     assert schedule.count(0.3, 400) is None
-
-
-def test_degrees_open_one_after_another():
     schedule = Schedule(degree_interval=0.1)
     assert [schedule.degree(done) for done in (0.0, 0.09, 0.11, 0.35)] == [0, 0, 1, 3]
 
