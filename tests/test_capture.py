@@ -10,7 +10,7 @@ from scipy.optimize import linprog
 from jsecon.data.capture import check_views_overlap, load_capture
 from jsecon.data.colmap import write_colmap
 from jsecon.data.coordinates import camera_jumps
-from jsecon.data.frames import evenly_spaced, holdout_mask
+from jsecon.data.frames import evenly_spaced
 from jsecon.types import Camera
 
 CAPTURE = small_capture()
@@ -81,11 +81,6 @@ def test_spread(count, wanted):
     assert len(chosen) == 1 or chosen[-1] == count - 1
     gaps = np.diff(chosen)
     assert len(gaps) == 0 or (gaps.min() >= 1 and gaps.max() - gaps.min() <= 1)
-
-
-def test_held_out_follows_the_custom():
-    np.testing.assert_array_equal(np.flatnonzero(holdout_mask(20, 8)), [0, 8, 16])
-    assert not holdout_mask(20, 0).any()
 
 
 def with_cameras(poses, **more):
@@ -170,21 +165,17 @@ def walk(count=40):
     return poses, [f"frame_{t:03d}" for t in range(count)]
 
 
-def test_poses_that_jump_are_told():
+def test_poses_that_jump_are_told_and_frames_that_do_not_move_or_have_no_order_do_not_jump():
     poses, names = walk()
     assert camera_jumps(poses, names) == []
-    poses[12:15, :3, 3] -= poses[12:15, :3, :3] @ [15 / 40, 0, 0]  # the centres move along x
-    (note,) = camera_jumps(poses, names)
-    assert "2 places" in note
-    assert "frame_011 to frame_012, frame_014 to frame_015)" in note
-
-
-def test_frames_that_do_not_move_or_have_no_order_do_not_jump():
-    poses, names = walk()
     order = np.random.default_rng(2).permutation(len(poses))
     assert camera_jumps(poses[order], names) == []
     assert camera_jumps(np.tile(np.eye(4), (9, 1, 1)), names) == []
     assert camera_jumps(poses[:1], names) == []
+    poses[12:15, :3, 3] -= poses[12:15, :3, :3] @ [15 / 40, 0, 0]  # the centres move along x
+    (note,) = camera_jumps(poses, names)
+    assert "2 places" in note
+    assert "frame_011 to frame_012, frame_014 to frame_015)" in note
 
 
 def test_a_loaded_capture_says_where_its_poses_jump(tmp_path):

@@ -16,6 +16,7 @@ from jsecon.errors import InputError
 from jsecon.language.field import save_field
 from jsecon.types import Regions, Votes
 from jsecon.vision.colours import ColourEmbedder
+from jsecon.vision.reference_words import REFERENCE_WORDS
 
 EMBEDDER = ColourEmbedder()
 COLOURS = ["red", "green", "blue", "orange", "pink"]
@@ -141,18 +142,12 @@ def test_names_come_from_the_vocabulary_that_is_given(field):
 
 
 def test_a_field_of_words_or_without_a_model_needs_none(field):
-    words = np.tile(np.array(EMBEDDER.reference[:1], np.float16), (len(jsecon_words()), 1))
+    words = np.tile(np.array(EMBEDDER.reference[:1], np.float16), (len(REFERENCE_WORDS), 1))
     named = jsecon.objects(dataclasses.replace(field, embedder="clip-x", reference=words))
-    assert set(named.names[:, 0]) <= set(jsecon_words())
+    assert set(named.names[:, 0]) <= set(REFERENCE_WORDS)
     bare = jsecon.objects(dataclasses.replace(field, embedder=f"given-{EMBEDDER.dim}", reference=words[:0]))
     assert (bare.names == "").all()
     assert len(bare) == len(named)
-
-
-def jsecon_words():
-    from jsecon.vision.reference_words import REFERENCE_WORDS
-
-    return REFERENCE_WORDS
 
 
 def test_a_field_without_regions_has_an_empty_catalogue(field):

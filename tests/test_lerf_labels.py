@@ -17,23 +17,13 @@ SQUARE = [[2.9, 3.0], [8.0, 3.0], [8.0, 6.7], [2.0, 6.0]]
 
 
 def label(**changes):
-    entry = {
-        "category": "mug",
-        "group": 1,
-        "segmentation": SQUARE,
-        "area": 1.0,
-        "bbox": [2.0, 3.0, 8.0, 6.0],
-        "iscrowd": False,
-    }
-    return {**entry, **changes}
+    shape = {"segmentation": SQUARE, "area": 1.0, "bbox": [2.0, 3.0, 8.0, 6.0]}
+    return {"category": "mug", "group": 1, **shape, "iscrowd": False, **changes}
 
 
 def write(folder, *objects, name="frame_00041.jpg", **info):
-    content = {
-        "info": {"name": name, "width": 20, "height": 14, "depth": 3, "note": "", **info},
-        "objects": list(objects),
-    }
-    (folder / (name.split(".")[0] + ".json")).write_text(json.dumps(content))
+    info = {"name": name, "width": 20, "height": 14, "depth": 3, "note": "", **info}
+    (folder / (name.split(".")[0] + ".json")).write_text(json.dumps({"info": info, "objects": list(objects)}))
 
 
 def test_reading(tmp_path):
@@ -97,10 +87,9 @@ def test_polygons_are_the_mask(seed, height, width, share, smooth):
     np.testing.assert_array_equal(pieces(mask), mask)
 
 
-def test_rings_within_rings():
+def test_rings_within_rings_and_no_gap_at_all():
     y, x = np.mgrid[:60, :80]
-    radius = np.hypot(x - 41, y - 28)
-    mask = (radius.astype(int) // 5) % 2 == 0
+    mask = (np.hypot(x - 41, y - 28).astype(int) // 5) % 2 == 0
     np.testing.assert_array_equal(pieces(mask), mask)
     np.testing.assert_array_equal(pieces(np.ones((4, 5), bool)), True)
 
@@ -128,12 +117,6 @@ def test_round_trip(tmp_path):
     assert all(entry["iscrowd"] == 0 for entry in content["objects"])
 
 
-def test_nothing_to_write(tmp_path):
-    empty = LabelledFrame("a", 5, 4, {"mug": (np.zeros((4, 5), bool), np.zeros((1, 4), np.float32))})
-    with pytest.raises(ValueError, match="Leave out what the frame does not show"):
-        write_lerf_labels(tmp_path, [empty])
-
-
 @pytest.mark.parametrize(("entry", "info", "said"), [
     (label(segmentation=[]), {}, "segmentation of object 0"),
     (label(segmentation=[[1, 2, 3]]), {}, "segmentation of object 0"),
@@ -149,13 +132,14 @@ def test_damage_is_told(tmp_path, entry, info, said):
         load_lerf_labels(tmp_path)
 
 
-def test_no_labels_and_no_json(tmp_path):
+def test_no_labels_no_json_and_nothing_or_nowhere_to_write(tmp_path):
     with refused(tmp_path, "no .json file"):
         load_lerf_labels(tmp_path)
     (tmp_path / "a.json").write_text("{")
     with refused("a.json", "not JSON"):
         load_lerf_labels(tmp_path)
-    (tmp_path / "file").write_text("")
-    frame = LabelledFrame("a", 5, 4, {})
     with pytest.raises(InputError):
-        write_lerf_labels(tmp_path / "file" / "deeper", [frame])
+        write_lerf_labels(tmp_path / "a.json" / "deeper", [LabelledFrame("a", 5, 4, {})])
+    empty = LabelledFrame("a", 5, 4, {"mug": (np.zeros((4, 5), bool), np.zeros((1, 4), np.float32))})
+    with pytest.raises(ValueError, match="Leave out what the frame does not show"):
+        write_lerf_labels(tmp_path, [empty])
