@@ -81,9 +81,8 @@ def test_a_text_like_a_region_finds_it_and_its_gaussians(field, region):
     got = query_anchored(field, text)
     assert int(got.region) == region
     cosine = exact_cosine(field.regions.embeddings[[region]], text)[0]
-    assert float(query_anchored(field, text, rules=QueryRules(retrieval="cosine")).score) == pytest.approx(
-        cosine, abs=1e-6
-    )
+    by_cosine = query_anchored(field, text, rules=QueryRules(retrieval="cosine"))
+    assert float(by_cosine.score) == pytest.approx(cosine, abs=1e-6)
     share = shares(field, [region])
     np.testing.assert_allclose(got.similarity, share, atol=1e-6)
     np.testing.assert_array_equal(got.mask, share >= 0.5)
@@ -151,10 +150,8 @@ def test_regions_that_are_alike_count_as_one(field):
     pixels = np.array(field.regions.pixels)
     embeddings[4], pixels[4] = embeddings[1], pixels[1]  # of two that are as well known the first is the anchor
     twin = dataclasses.replace(field, regions=Regions(embeddings, pixels))
-    alone, both = (
-        query_anchored(twin, embeddings[1], rules=QueryRules(alike_threshold=None)),
-        query_anchored(twin, embeddings[1]),
-    )
+    alone = query_anchored(twin, embeddings[1], rules=QueryRules(alike_threshold=None))
+    both = query_anchored(twin, embeddings[1])
     np.testing.assert_allclose(alone.similarity, shares(field, [1]), atol=1e-6)
     np.testing.assert_allclose(both.similarity, shares(field, [1, 4]), atol=1e-6)
     np.testing.assert_allclose(query_region(twin, 4).similarity, shares(field, [4]), atol=1e-6)
@@ -164,32 +161,21 @@ def test_regions_that_are_alike_count_as_one(field):
     np.testing.assert_allclose(unlike.similarity, alone.similarity, atol=1e-6)  # the anchor itself always counts
 
 
-def with_votes(field, **changes):
-    return dataclasses.replace(field, votes=dataclasses.replace(field.votes, **changes))
-
-
 @pytest.mark.parametrize("by", ["votes", "code"])
 @pytest.mark.parametrize("threshold", [-2.0, 0.0, 0.5])
 def test_what_was_never_seen_is_never_selected(field, by, threshold):
     unseen = np.arange(64) % 2 == 0
-    gone = {
-        name: np.where(unseen, 0, np.asarray(getattr(field.votes, name)))
-        for name in ("labelled", "total", "views", "peak")
-    }
-    votes = Votes(
-        np.where(unseen[:, None], -1, field.votes.regions),
-        np.where(unseen[:, None], 0, field.votes.weights),
-        overflow=np.int32(0),
-        num_regions=REGIONS,
-        **gone,
-    )
-    got = query_region(dataclasses.replace(field, votes=votes), 1, by=by, similarity_threshold=threshold)
-    assert not np.asarray(got.mask)[unseen].any()
+    names = "labelled", "total", "views", "peak"
+    gone = {name: np.where(unseen, 0, np.asarray(getattr(field.votes, name))) for name in names}
+    gone["regions"] = np.where(unseen[:, None], -1, field.votes.regions)
+    gone["weights"] = np.where(unseen[:, None], 0, field.votes.weights)
+    votes = dataclasses.replace(field.votes, **gone)
     codes = np.where(unseen[:, None], 0, field.codes)
-    if by == "code":
-        assert not np.asarray(
-            query_region(dataclasses.replace(field, codes=codes), 1, by=by, similarity_threshold=threshold).mask
-        )[unseen].any()
+    without = [{"votes": votes}, *([{"codes": codes}] if by == "code" else [])]
+    for columns in without:
+        hidden = dataclasses.replace(field, **columns)
+        got = query_region(hidden, 1, by=by, similarity_threshold=threshold)
+        assert not np.asarray(got.mask)[unseen].any()
 
 
 def test_a_view_that_lost_the_region_says_nothing_against_it():
@@ -228,7 +214,8 @@ def test_numbers_that_are_not_finite_never_select(field):
     total[3] *= 1e30
     labelled = np.array(field.votes.labelled)
     labelled[3] *= 1e30
-    broken = with_votes(field, weights=weights, total=total, labelled=labelled)
+    votes = dataclasses.replace(field.votes, weights=weights, total=total, labelled=labelled)
+    broken = dataclasses.replace(field, votes=votes)
     for region in range(REGIONS):
         got, sound = query_region(broken, region), query_region(field, region)
         assert not got.mask[:3].any()
@@ -246,34 +233,22 @@ def test_broken_texts_and_regions_select_nothing(field, by):
     embeddings = np.array(field.regions.embeddings)
     text = embeddings[1].copy()
     embeddings[0], embeddings[1] = np.nan, 0  # neither can be retrieved
-    got = query_anchored(
-        dataclasses.replace(field, regions=Regions(embeddings, field.regions.pixels)),
-        text,
-        rules=QueryRules(retrieval_threshold=-1.0),
-        by=by,
-    )
+    lost = dataclasses.replace(field, regions=Regions(embeddings, field.regions.pixels))
+    got = query_anchored(lost, text, rules=QueryRules(retrieval_threshold=-1.0), by=by)
     assert int(got.region) in (2, 3, 4)
     for value in (0.0, np.nan):
         table = np.array(field.region_codes)
         table[1] = value
-        assert not query_region(
-            dataclasses.replace(field, region_codes=table), 1, by="code", similarity_threshold=-1.0
-        ).mask.any()
+        lost = dataclasses.replace(field, region_codes=table)
+        assert not query_region(lost, 1, by="code", similarity_threshold=-1.0).mask.any()
     assert not query_region(field, 1, by=by, similarity_threshold=np.nan).mask.any()
 
 
 def test_a_field_without_regions_answers_nothing(field):
-    votes = Votes(
-        np.full((64, 0), -1, np.int32),
-        np.zeros((64, 0), np.float32),
-        *np.zeros((3, 64), np.float32),
-        np.ones(64, np.int32),
-        np.int32(0),
-        0,
-    )
+    columns = np.full((64, 0), -1, np.int32), np.zeros((64, 0), np.float32), *np.zeros((3, 64), np.float32)
     empty = dataclasses.replace(
         field,
-        votes=votes,
+        votes=Votes(*columns, np.ones(64, np.int32), np.int32(0), 0),
         regions=Regions(np.zeros((0, 12), np.float32), np.zeros((0, 4), np.int32)),
         region_codes=np.zeros((0, 8), np.float32),
     )
@@ -287,23 +262,24 @@ def test_a_field_without_regions_answers_nothing(field):
 def test_wrong_arguments_are_told(field):
     with pytest.raises(ValueError, match=r"expected \(12,\).*random"):
         query_anchored(field, np.ones(11, np.float32))
-    for call in (
-        lambda: query_anchored(field, np.ones(12, np.float32), by="x"),
-        lambda: query_region(field, 1, by="x"),
-    ):
+    for query, asked in ((query_anchored, np.ones(12, np.float32)), (query_region, 1)):
         with pytest.raises(ValueError, match="'votes' or 'code'"):
-            call()
+            query(field, asked, by="x")
 
 
-def test_weights_of_a_pixel_equal_the_renderers(field, cameras):
-    onehot = jnp.eye(64)
+def dense_weights(gaussians, camera, x, y):
+    """(N,) `pixel_weights`, 0 for the Gaussians that it leaves out; and how many it has."""
+    ids, weights = pixel_weights(gaussians, camera, x, y)
+    dense = np.zeros(gaussians.count)
+    dense[ids] = weights
+    return dense, len(ids)
+
+
+def test_weights_of_a_pixel_equal_the_renderers(field):
     for view, x, y in ((0, 25, 20), (1, 18, 25), (2, 30, 15), (3, 0, 0)):
         camera = field.cameras[view]
-        expected = np.asarray(render(field.gaussians, camera, onehot).features[y, x])
-        ids, weights = pixel_weights(field.gaussians, camera, x, y)
-        got = np.zeros(64)
-        got[ids] = weights
-        np.testing.assert_allclose(got, expected, atol=2e-6)
+        expected = render(field.gaussians, camera, jnp.eye(64)).features[y, x]
+        np.testing.assert_allclose(dense_weights(field.gaussians, camera, x, y)[0], expected, atol=2e-6)
 
 
 def test_an_opaque_stack_stops_where_the_renderer_stops(field):
@@ -319,37 +295,26 @@ def test_an_opaque_stack_stops_where_the_renderer_stops(field):
     )
     expected = np.asarray(render(jax.tree.map(jnp.asarray, chosen), field.cameras[0], jnp.eye(8)).features)
     y, x = np.unravel_index(expected.sum(-1).argmax(), expected.shape[:2])
-    ids, weights = pixel_weights(chosen, field.cameras[0], int(x), int(y))
-    got = np.zeros(8)
-    got[ids] = weights
+    got, count = dense_weights(chosen, field.cameras[0], int(x), int(y))
     np.testing.assert_allclose(got, expected[y, x], atol=2e-6)
-    assert len(ids) < 8
+    assert count < 8
 
 
 def test_the_region_under_a_pixel_is_the_labelled_one(field, made):
+    """And shares of the regions there are the shares of votes rendered as features, the definition."""
     labels = made[1]
-    agree, clear = 0, 0
+    dense = dataclasses.replace(field.votes, weights=vote_shares(field.votes)).dense()
+    rendered = [np.asarray(render(field.gaussians, field.cameras[view], dense).features) for view in range(4)]
+    agree = []
     for view, y, x in np.random.default_rng(0).permutation(np.argwhere(labels >= 0))[:40]:
         shares = region_shares_seen(field, field.cameras[int(view)], int(x), int(y))
-        rendered = _rendered_shares(field, int(view))[y, x]
-        np.testing.assert_allclose(shares, rendered, atol=1e-5)
+        np.testing.assert_allclose(shares, rendered[view][y, x], atol=1e-5)
         found = region_at(field, int(view), int(x), int(y))
         assert found == (shares.argmax() if shares.max() >= 0.05 else -1)
-        agree, clear = agree + (found == labels[view, y, x]), clear + 1
-    assert agree / clear > 0.8
+        agree.append(found == labels[view, y, x])
+    assert np.mean(agree) > 0.8
     assert (labels[0, 0, 0] == -1) == (region_at(field, 0, 0, 0) == -1)
     assert region_at(field, 0, 0, 0, min_share=1.1) == -1
-
-
-_CACHE = {}
-
-
-def _rendered_shares(field, view):
-    """(H, W, R): the shares of votes rendered as features, the definition."""
-    if view not in _CACHE:
-        shares = dataclasses.replace(field.votes, weights=vote_shares(field.votes)).dense()
-        _CACHE[view] = np.asarray(render(field.gaussians, field.cameras[view], shares).features)
-    return _CACHE[view]
 
 
 @pytest.mark.parametrize(
