@@ -1,7 +1,7 @@
 """A bare splat against the same scene with its photographs.
 
-    python -m experiments.bare_splat [--seeds 1 2 3 4 5] [--demos FOLDER] [--views 24] [--out FOLDER]
-    python -m experiments.bare_splat --field FIELD [--out FOLDER]       (a field of `jsecon run` on a capture)
+    python -m experiments.bare_splat [--seeds 1 2 3 4 5] [--demos FOLDER]
+    python -m experiments.bare_splat --field FIELD       (a field of `jsecon run` on a capture)
 
 Each made-up room comes from `jsecon demo --seed S`, kept in DEMOS/demoS. Its fitted Gaussians are written to a .ply,
 turned, scaled by 0.01 to 100 and shifted at random, and `jsecon run scene.ply` makes a field without photographs.
@@ -13,7 +13,6 @@ turned, scaled by 0.01 to 100 and shifted at random, and `jsecon run scene.ply` 
   field matches by an IoU of at least 0.5.
 """
 
-import argparse
 import dataclasses
 import json
 import subprocess
@@ -39,7 +38,7 @@ class Options:
     demos: str = "jsecon-demos"
     field: str = ""
     views: int = 24
-    out: str = str(results.HOME / "results" / "bare_splat")
+    out: str = ""
 
 
 def strongest_regions(field: jsecon.LanguageField) -> np.ndarray:
@@ -123,12 +122,4 @@ def main(options: Options) -> dict[str, dict]:
 
 
 if __name__ == "__main__":
-    defaults = Options()
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", nargs="+", type=int, default=list(defaults.seeds))
-    parser.add_argument("--demos", default=defaults.demos)
-    parser.add_argument("--field", default=defaults.field)
-    parser.add_argument("--views", type=int, default=defaults.views)
-    parser.add_argument("--out", default=defaults.out)
-    arguments = parser.parse_args()
-    main(Options(tuple(arguments.seeds), arguments.demos, arguments.field, arguments.views, arguments.out))
+    main(results.read_options(Options, "bare_splat", __doc__))

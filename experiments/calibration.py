@@ -1,7 +1,6 @@
 """The confidence of an answer against how often it is right: fitted on some simulated rooms, measured on others.
 
-    python -m experiments.calibration [--scenes NAME ...] [--fitted 0 1] [--seeds 10 11 ...]
-                                      [--levels medium high shared ...] [--quick] [--out FOLDER]
+    python -m experiments.calibration [--quick]
 
 Twins of LERF, regions of the simulated tracker. Every name of a thing in the room is asked, and 200 names that nothing
 in it has; the first weigh as much as the second in all. An answer is right if its region shows the thing. Answers that
@@ -9,7 +8,6 @@ the default quantile refuses do not count. `OFFSET` and `SLOPE` of jsecon.query.
 `--fitted` by the likelihood. The expected calibration error has ten bins of equal width.
 """
 
-import argparse
 import dataclasses
 from pathlib import Path
 from typing import NamedTuple
@@ -17,6 +15,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tyro
 from jaxtyping import Float
 from scipy.optimize import minimize
 
@@ -48,23 +47,21 @@ class Bin(NamedTuple):
 class Options:
     """What the experiment can vary."""
 
-    data: twins.Data = lerf.PLAN.data
+    data: tyro.conf.Suppress[twins.Data] = lerf.PLAN.data
     scenes: tuple[str, ...] = lerf.PLAN.data.scenes
+    """Twins of LERF."""
     fitted: tuple[int, ...] = (0, 1)
-    """seeds of the rooms to fit on; their vision has seeds from FITTED_VISION on"""
+    """Seeds of the rooms to fit on; their vision has seeds from FITTED_VISION on."""
     seeds: tuple[int, ...] = (10, 11, 12, 13, 14)
+    """Seeds to report."""
     levels: tuple[str, ...] = ("medium", "high", "shared")
-    out: str = str(results.HOME / "results" / "calibration")
+    quick: bool = False
+    """Run one tiny scene at one level."""
+    out: str = ""
 
 
-QUICK = Options(
-    lerf.QUICK.data,
-    lerf.QUICK.data.scenes,
-    (0,),
-    (1,),
-    ("shared",),
-    str(results.HOME / "results" / "quick" / "calibration"),
-)
+QUICK = {"data": lerf.QUICK.data, "scenes": lerf.QUICK.data.scenes, "fitted": (0,), "seeds": (1,)}
+QUICK |= {"levels": ("shared",)}
 
 
 class Answered(NamedTuple):
@@ -138,7 +135,7 @@ def fit(told: Answered) -> tuple[float, float]:
     return float(offset), float(slope)
 
 
-def main(options: Options = Options()) -> dict:
+def main(options: Options) -> dict:
     """Runs the experiment, writes its results and returns the figures."""
     file, both = Path(options.out) / "run" / "cells.jsonl", {}
     for seeds in (options.fitted, options.seeds):
@@ -168,14 +165,4 @@ def main(options: Options = Options()) -> dict:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--scenes", nargs="+", default=list(Options.scenes), help="twins of LERF")
-    parser.add_argument("--fitted", nargs="+", type=int, default=list(Options.fitted), help="seeds to fit on")
-    parser.add_argument("--seeds", nargs="+", type=int, default=list(Options.seeds), help="seeds to report")
-    parser.add_argument("--levels", nargs="+", default=list(Options.levels))
-    parser.add_argument("--quick", action="store_true", help="one tiny scene, one level")
-    parser.add_argument("--out", default="", help="where the results go")
-    given = parser.parse_args()
-    values = {name: tuple(getattr(given, name)) for name in ("scenes", "fitted", "seeds", "levels")}
-    chosen = QUICK if given.quick else dataclasses.replace(Options(), **values)
-    main(dataclasses.replace(chosen, out=given.out) if given.out else chosen)
+    main(results.read_options(Options, "calibration", __doc__, QUICK))

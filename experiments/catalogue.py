@@ -1,6 +1,6 @@
 """The catalogue of a made-up room against its true objects: how many are found, once each, where, and by which colour.
 
-    python -m experiments.catalogue [--seeds 0 1 ...] [--rooms FOLDER] [--quick] [--out FOLDER]
+    python -m experiments.catalogue [--seeds 0 1 ...] [--quick]
 
 The rooms are those of `jsecon demo`, with its options: default vision, colours, 24 of 30 frames. The true object of a
 Gaussian is the one with most of its weight in the true masks of these frames, or none where the background has more.
@@ -13,7 +13,6 @@ centre and grasp are its median distances to the middle and to the middle of the
 the constants.
 """
 
-import argparse
 import dataclasses
 import json
 import time
@@ -50,9 +49,10 @@ class Options:
 
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     quick: bool = False
+    """Run one tiny room."""
     rooms: str = str(results.HOME.parent / "demos")
     """Folder that keeps the rooms and their fields."""
-    out: str = str(results.HOME / "results" / "catalogue")
+    out: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -229,11 +229,4 @@ def main(options: Options) -> str:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--seeds", nargs="+", type=int, default=list(Options.seeds))
-    parser.add_argument("--rooms", default=Options.rooms)
-    parser.add_argument("--quick", action="store_true", help="one tiny room")
-    parser.add_argument("--out", default="")
-    given = parser.parse_args()
-    place = given.out or str(results.HOME / "results" / ("quick/catalogue" if given.quick else "catalogue"))
-    main(Options((0,) if given.quick else tuple(given.seeds), given.quick, given.rooms, place))
+    main(results.read_options(Options, "catalogue", __doc__, {"seeds": (0,)}))

@@ -1,6 +1,6 @@
 """Claims of the paper beside its tables: averages over views vary less and compress better, retraining moves little.
 
-    python -m experiments.claims [--seeds 10 11 12] [--retrained 5] [--quick] [--out FOLDER]
+    python -m experiments.claims [--quick]
 
 Twins of LERF's figurines at medium noise, regions by the ids of the tracker. Spread: 1 - cosine between the mean of
 half of a region's views and a view of the other half, or the mean of the other half. Compression: LangSplat's
@@ -8,7 +8,6 @@ autoencoder to 3 numbers, trained on the masks of all views or on the averages o
 averages, and share of texts whose region (by the cosine) stays the same.
 """
 
-import argparse
 import dataclasses
 from pathlib import Path
 
@@ -37,10 +36,12 @@ class Options:
 
     seeds: tuple[int, ...] = (10, 11, 12)
     retrained: int = 5
+    """Number of trainings of the paper's path on the last twin."""
     scene: str = "figurines"
     level: str = "medium"
     quick: bool = False
-    out: str = str(results.HOME / "results" / "claims")
+    """Run one tiny scene with few training steps."""
+    out: str = ""
 
 
 def views_of_regions(setting: Setting) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -113,13 +114,4 @@ def main(options: Options) -> str:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--seeds", nargs="+", type=int, default=list(Options.seeds))
-    parser.add_argument("--retrained", type=int, default=Options.retrained)
-    parser.add_argument("--quick", action="store_true", help="one tiny scene, a few training steps")
-    parser.add_argument("--out", default="")
-    given = parser.parse_args()
-    place = given.out or str(results.HOME / "results" / ("quick/claims" if given.quick else "claims"))
-    quick = {"seeds": (0,), "retrained": 2} if given.quick else {}
-    chosen = {"seeds": tuple(given.seeds), "retrained": given.retrained} | quick
-    main(Options(quick=given.quick, out=place, **chosen))
+    main(results.read_options(Options, "claims", __doc__, {"seeds": (0,), "retrained": 2}))

@@ -1,7 +1,7 @@
 """Exports CLIP, SigLIP and SAM from their official packages as ONNX graphs, and checks ONNX Runtime against PyTorch.
 
     pip install -e ".[export]"
-    python -m experiments.export_models --out models --clip-weights laion2b_s34b_b88k --sam-weights sam_vit_b.pth
+    python -m experiments.export_models --out models --clip-weights laion2b_s34b_b88k
 
 Without weights the true architectures are written with random ones in every parameter, which is what a check needs:
 every graph's outputs. SigLIP, SigLIP 2 and MobileCLIP are put through jsecon's embedder too, from texts and crops to
@@ -10,11 +10,13 @@ tracks a clip by jsecon over the five graphs of SAM 2.1 with memory, and by PyTo
 figures of the others, and of other models of a part, are kept.
 """
 
-import argparse
 import contextlib
 import dataclasses
 import json
 from pathlib import Path
+from typing import Literal
+
+import tyro
 
 from experiments import results
 
@@ -22,7 +24,7 @@ TOLERANCE = 1e-3
 """of every output, masks as logits"""
 SAME_PIXELS = 0.999
 """of a mask"""
-PARTS = ("clip", "siglip", "mobileclip", "sam", "sam_images", "sam2_video")
+PARTS = ("clip", "siglip", "mobileclip", "sam_images", "sam2_video")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,9 +32,9 @@ class Options:
     """What is exported, and where to."""
 
     out: str = "models"
-    """folder of the graphs: clip/, sam/, and one of each further model."""
+    """Folder of the graphs: clip/, and one of each further model."""
     results: str = str(results.HOME / "results" / "export_models")
-    only: tuple[str, ...] = PARTS
+    only: tuple[Literal["clip", "siglip", "mobileclip", "sam_images", "sam2_video"], ...] = PARTS
     clip: str = "ViT-B-16"
     clip_weights: str | None = None
     """an open_clip tag or a file; None: random."""
@@ -40,9 +42,6 @@ class Options:
     """of open_clip, in immich's layout; the last of transformers, in that of transformers.js. Random weights."""
     mobileclip: tuple[str, ...] = ("MobileCLIP-S1", "MobileCLIP2-S0")
     """of open_clip; random weights."""
-    sam: str = "vit_b"
-    """vit_b, vit_l, vit_h, or slimsam."""
-    sam_weights: str | None = None
     sam_images: tuple[str, ...] = ("sam2.1-hiera-tiny", "edgetam")
     """of transformers, in the layout of transformers.js; random weights."""
     seed: int = 0
@@ -72,7 +71,8 @@ def _clip(options: Options) -> list[dict]:
 
     model = clip.official(options.clip, options.clip_weights, seed=options.seed)
     folder = Path(options.out) / "clip"
-    return _rows(clip.export(model, options.clip, folder, seed=options.seed, threads=options.threads))
+    agreements = clip.export(model, options.clip, folder, seed=options.seed, threads=options.threads)
+    return [dataclasses.asdict(agreement) for agreement in agreements]
 
 
 def _siglip(options: Options) -> dict[str, dict]:
@@ -99,15 +99,6 @@ def _mobileclip(options: Options) -> dict[str, dict]:
     return found
 
 
-def _sam(options: Options) -> list[dict]:
-    from experiments.export import sam
-
-    weights = None if options.sam_weights is None else Path(options.sam_weights)
-    model = sam.official(options.sam, weights, seed=options.seed)
-    folder = Path(options.out) / ("sam" if options.sam == "vit_b" else options.sam)
-    return _rows(sam.export(model, folder, seed=options.seed, threads=options.threads))
-
-
 def _sam_images(options: Options) -> dict[str, dict]:
     from experiments.export import sam_images
 
@@ -127,15 +118,11 @@ def _sam2_video(options: Options) -> dict[str, dict]:
     return {folder.name: sam2_video.export(model, folder, seed=options.seed, threads=options.threads)}
 
 
-def _rows(agreements) -> list[dict]:
-    return [dataclasses.asdict(agreement) for agreement in agreements]
-
-
 def _versions() -> dict[str, str]:
     from importlib.metadata import PackageNotFoundError, version
 
     found = {}
-    for name in ("torch", "onnxruntime", "open_clip_torch", "timm", "transformers", "segment-anything"):
+    for name in ("torch", "onnxruntime", "open_clip_torch", "timm", "transformers"):
         with contextlib.suppress(PackageNotFoundError):  # of a part that was not asked for
             found[name] = version(name)
     return found
@@ -145,10 +132,7 @@ def table(metrics: dict) -> str:
     """Markdown: a row per graph."""
     rows = []
     groups = {"clip": metrics.get("clip", [])}
-    for part in ("siglip", "mobileclip"):
-        groups |= {name: found["graphs"] for name, found in metrics.get(part, {}).items()}
-    groups |= {"sam": metrics.get("sam", [])}
-    for part in ("sam_images", "sam2_video"):
+    for part in PARTS[1:]:
         groups |= {name: found["graphs"] for name, found in metrics.get(part, {}).items()}
     for model, graphs in groups.items():
         for graph in graphs:
@@ -160,33 +144,12 @@ def table(metrics: dict) -> str:
     return results.table(header, rows)
 
 
-_MADE = {
-    "clip": _clip,
-    "siglip": _siglip,
-    "mobileclip": _mobileclip,
-    "sam": _sam,
-    "sam_images": _sam_images,
-    "sam2_video": _sam2_video,
-}
+_MADE = dict(zip(PARTS, (_clip, _siglip, _mobileclip, _sam_images, _sam2_video)))
 
 
 def _verdict(worst: float, same: float) -> str:
     return "yes" if worst <= TOLERANCE and same >= SAME_PIXELS else "no"
 
 
-def parsed(arguments: list[str] | None = None) -> Options:
-    """Options of the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for field in dataclasses.fields(Options):
-        name = "--" + field.name.replace("_", "-")
-        if isinstance(field.default, tuple):
-            choices = PARTS if field.name == "only" else None
-            parser.add_argument(name, nargs="+", default=field.default, choices=choices)
-        else:
-            parser.add_argument(name, type=int if isinstance(field.default, int) else str, default=field.default)
-    values = vars(parser.parse_args(arguments))
-    return Options(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
-
-
 if __name__ == "__main__":
-    main(parsed())
+    main(tyro.cli(Options, description=__doc__))

@@ -1,9 +1,6 @@
 """Tables 1 to 3 by the same rules for all: every method asked in every way, chosen on some seeds, reported on others.
 
-    python -m experiments.fair [--tables lerf ovs3d replica] [--scenes NAME ...] [--levels medium high]
-                               [--seeds 10 11 ...] [--choosing 0 ...] [--seeds-trained ...] [--choosing-trained ...]
-                               [--scenes-trained NAME ...] [--methods NAME ...] [--read READING ...]
-                               [--read-as FILE] [--quick] [--out FOLDER] [--processes N]
+    python -m experiments.fair [--tables lerf ovs3d replica] [--levels medium high] [--quick] [--processes N] ...
 
 Each method is read by every text rule and way of choosing Gaussians (`experiments.tables.rows`), and none may refuse a
 text. A method's reading is the one that is best on the seeds `--choosing` at the level of noise, for each figure its
@@ -14,13 +11,13 @@ ours is compared with each on its own ("ours there"). `--read-as` takes the read
 chooses none.
 """
 
-import argparse
 import contextlib
 import dataclasses
 import json
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -29,7 +26,6 @@ from experiments.tables.fill import Plan, fill
 from experiments.tables.rows import TRAINED, WITH_PARTS, rows_of
 from jsecon.process import cores
 
-CHOOSING, REPORTED = (0, 1, 2), (10, 11, 12, 13, 14)
 TABLES = {"lerf": (lerf.PLAN, lerf.QUICK), "ovs3d": (ovs3d.PLAN, ovs3d.QUICK), "replica": (replica.PLAN, replica.QUICK)}
 RESAMPLED = 2000
 BESIDE = "macc", "loc_box"
@@ -46,28 +42,39 @@ MINE, ONE_READING, PUBLISHED = (WITH_PARTS, "ours, consensus"), ", one reading",
 
 
 @dataclasses.dataclass(frozen=True)
-class Asked:
-    """What the command line asked for."""
+class Options:
+    """What the experiment can vary."""
 
-    tables: tuple[str, ...]
-    scenes: tuple[str, ...]
-    """empty: all of a table."""
-    levels: tuple[str, ...]
-    seeds: tuple[int, ...]
-    choosing: tuple[int, ...]
-    seeds_trained: tuple[int, ...]
-    """of `seeds`, those that the methods which train are reported on."""
-    choosing_trained: tuple[int, ...]
-    scenes_trained: tuple[str, ...]
-    """the scenes of those methods; empty: the same as the others'."""
-    methods: tuple[str, ...]
-    """empty: all."""
-    read: tuple[str, ...]
-    """the readings that are chosen from, without the methods' own constants; empty: all."""
-    read_as: str
-    """a metrics.json whose readings are taken; empty: they are chosen."""
-    quick: bool
-    out: str
+    tables: tuple[Literal["lerf", "ovs3d", "replica"], ...] = ()
+    """Tables to measure; empty: all, or LERF in a quick run."""
+    scenes: tuple[str, ...] = ()
+    """Scenes of the one table; empty: all."""
+    levels: tuple[str, ...] = ("medium", "high")
+    seeds: tuple[int, ...] = (10, 11, 12, 13, 14)
+    """Seeds that are reported."""
+    choosing: tuple[int, ...] = (0, 1, 2)
+    """Seeds that readings are chosen on."""
+    seeds_trained: tuple[int, ...] = ()
+    """`seeds` of methods that train; empty: the same."""
+    choosing_trained: tuple[int, ...] = ()
+    """`choosing` of methods that train; empty: the same."""
+    scenes_trained: tuple[str, ...] = ()
+    """`scenes` of methods that train; empty: the same."""
+    methods: tuple[str, ...] = ()
+    """Methods that are compared, ours among them; empty: all."""
+    read: tuple[str, ...] = ()
+    """Readings that are chosen from, without the methods' own constants; empty: all."""
+    read_as: str = ""
+    """A metrics.json of another run, whose readings are taken; empty: they are chosen."""
+    quick: bool = False
+    """Run one tiny scene of one table with one seed."""
+    out: str = ""
+    processes: int = cores()
+    """Number of processes that share the settings; 0: a helper of another."""
+
+
+QUICK = {"levels": ("medium",), "seeds": (0,), "choosing": (0,)}
+"""A quick run reports on the seed that it chose on; 3D-OVS has the rows of LERF."""
 
 
 def by_text(cells: list[dict], figure: int) -> dict[tuple, float]:
@@ -102,15 +109,15 @@ def chosen(cells: list[dict], seeds: tuple[int, ...], figures: tuple[str, ...]) 
     return best
 
 
-def taken(name: str, asked: Asked) -> dict[str, dict[str, str]]:
+def taken(name: str, options: Options) -> dict[str, dict[str, str]]:
     """The readings that `--read-as` names for a table, of the methods that are compared; none where it names none."""
-    if not asked.read_as:
+    if not options.read_as:
         return {}
-    every = json.loads(Path(asked.read_as).read_text())
+    every = json.loads(Path(options.read_as).read_text())
     best: dict[str, dict[str, str]] = {}
     for key, told in next(told for level, told in every.items() if level.startswith(f"{name} ")).items():
         method, figure = key.rsplit(", ", 1)
-        if not method.endswith(ONE_READING) and (not asked.methods or method in asked.methods):
+        if not method.endswith(ONE_READING) and (not options.methods or method in options.methods):
             best.setdefault(method, {})[figure] = told["row"]
     return best
 
@@ -121,13 +128,13 @@ def mine_of(cells: list[dict]) -> str:
     return next((method for method in MINE if method in known), MINE[-1])
 
 
-def report(name: str, level: str, cells: list[dict], asked: Asked) -> tuple[str, dict]:
+def report(name: str, level: str, cells: list[dict], options: Options) -> tuple[str, dict]:
     """A Markdown table of one table and level, and its figures."""
     figures = figures_of(name)
     here = [cell for cell in cells if cell["level"] == level]
-    best = taken(name, asked) or chosen(here, asked.choosing, figures)
+    best = taken(name, options) or chosen(here, options.choosing, figures)
     ours_is = mine_of(cells)
-    held = [cell for cell in cells if cell["seed"] in asked.seeds]
+    held = [cell for cell in cells if cell["seed"] in options.seeds]
 
     def of(row):
         return [cell for cell in held if cell["method"] == row]
@@ -193,28 +200,28 @@ def figures_of(table: str) -> tuple[str, ...]:
     return ("miou",) if table == "replica" else ("miou", "miou_vala")
 
 
-def plan_of(name: str, level: str, asked: Asked, processes: int, seeds: tuple[int, ...], rows: list[str]) -> Plan:
+def plan_of(name: str, level: str, options: Options, seeds: tuple[int, ...], rows: list[str]) -> Plan:
     """Some rows of a table, which all train or none, at a level of noise, on some seeds."""
-    table = TABLES[name][1 if asked.quick else 0]
-    trained = asked.scenes_trained if rows[0].split(": ")[0] in TRAINED else ()
-    data = dataclasses.replace(table.data, seeds=seeds, scenes=trained or asked.scenes or table.data.scenes)
-    place = {"out": asked.out, "cells": str(Path(asked.out) / "cells.jsonl")}
+    table = TABLES[name][1 if options.quick else 0]
+    trained = options.scenes_trained if rows[0].split(": ")[0] in TRAINED else ()
+    data = dataclasses.replace(table.data, seeds=seeds, scenes=trained or options.scenes or table.data.scenes)
+    place = {"out": options.out, "cells": str(Path(options.out) / "cells.jsonl")}
     return dataclasses.replace(
-        table, data=data, methods=tuple(rows), level=level, sweep=(), processes=processes, **place
+        table, data=data, methods=tuple(rows), level=level, sweep=(), processes=options.processes, **place
     )
 
 
-def cells_of(name: str, level: str, asked: Asked, processes: int) -> list[dict]:
+def cells_of(name: str, level: str, options: Options) -> list[dict]:
     """All rows on the seeds to choose on, and of the seeds to report the rows that were best there."""
     methods = rows_of(name == "replica")
-    rows = [row for row in methods if not asked.methods or row.split(": ")[0] in asked.methods]
-    if asked.quick:
+    rows = [row for row in methods if not options.methods or row.split(": ")[0] in options.methods]
+    if options.quick:
         left_out = set(TRAINED) - set(_QUICK_TRAINED)
         rows = [row for row in rows if row.split(": ")[1] in QUICK_READ and row.split(": ")[0] not in left_out]
-    rows = [row for row in rows if not asked.read or reading_of(row) in (*asked.read, PUBLISHED)]
+    rows = [row for row in rows if not options.read or reading_of(row) in (*options.read, PUBLISHED)]
 
     def filled(rows: list[str], seeds: tuple[int, ...]) -> list[dict]:
-        plan = plan_of(name, level, asked, processes, seeds, rows)
+        plan = plan_of(name, level, options, seeds, rows)
 
         def tell(line):
             return print(line, flush=True)
@@ -229,67 +236,32 @@ def cells_of(name: str, level: str, asked: Asked, processes: int) -> list[dict]:
         if not own:
             continue
         choosing: list[dict] = []
-        if asked.read_as:
-            readings = taken(name, asked)
+        if options.read_as:
+            readings = taken(name, options)
         else:
-            choosing = filled(own, asked.choosing_trained if trains else asked.choosing)
+            choosing = filled(own, options.choosing_trained or options.choosing if trains else options.choosing)
             readings = chosen(choosing, tuple(cell["seed"] for cell in choosing), figures_of(name))
         best = {row for ways in readings.values() for row in ways.values()}
         kept = [row for row in own if row in best or row.endswith(f": {PUBLISHED}")]
-        cells += choosing + filled(kept, asked.seeds_trained if trains else asked.seeds)
+        cells += choosing + filled(kept, options.seeds_trained or options.seeds if trains else options.seeds)
     return cells
 
 
-def main(asked: Asked, processes: int) -> str:
+def main(options: Options) -> str:
     """The tables, written."""
     parts, kept = [], {}
-    for name in asked.tables:
-        for level in asked.levels:
-            cells = cells_of(name, level, asked, processes)
-            if processes:  # not a helper
-                text, kept[f"{name} {level}"] = report(name, level, cells, asked)
+    for name in options.tables or (("lerf",) if options.quick else TABLES):
+        for level in options.levels:
+            cells = cells_of(name, level, options)
+            if options.processes:  # not a helper
+                text, kept[f"{name} {level}"] = report(name, level, cells, options)
                 parts.append(text)
                 print(text, flush=True)
     text = "\n\n".join(parts)
-    if processes:
-        results.save(Path(asked.out), asked, kept, text)
+    if options.processes:
+        results.save(Path(options.out), options, kept, text)
     return text
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--tables", nargs="+", choices=TABLES, help="default: all")
-    parser.add_argument("--scenes", nargs="+", default=[], help="of the one table asked for; default: all")
-    parser.add_argument("--levels", nargs="+", default=["medium", "high"])
-    parser.add_argument("--seeds", nargs="+", type=int, default=list(REPORTED), help="that are reported")
-    parser.add_argument("--choosing", nargs="+", type=int, default=list(CHOOSING), help="that readings are chosen on")
-    parser.add_argument("--seeds-trained", nargs="+", type=int, help="of them, for methods that train; default: all")
-    parser.add_argument("--choosing-trained", nargs="+", type=int, help="of them, for methods that train; default: all")
-    parser.add_argument("--scenes-trained", nargs="+", default=[], help="of the one table asked for, for those methods")
-    parser.add_argument("--methods", nargs="+", default=[], help="that are compared, ours among them; default: all")
-    parser.add_argument("--read", nargs="+", default=[], help="readings that are chosen from; default: all")
-    parser.add_argument("--read-as", default="", help="a metrics.json of another run: take its readings, choose none")
-    parser.add_argument("--quick", action="store_true", help="one tiny scene of one table, one seed: half a minute")
-    parser.add_argument("--out", default="")
-    parser.add_argument("--processes", type=int, default=cores(), help="that share the settings; default: one per core")
-    given = parser.parse_args()
-    # A quick run reports on the seed that it chose on; 3D-OVS has the rows of LERF.
-    seeds, choosing = ((0,), (0,)) if given.quick else (tuple(given.seeds), tuple(given.choosing))
-    levels = ("medium",) if given.quick else tuple(given.levels)
-    place = given.out or str(results.HOME / "results" / ("quick/fair" if given.quick else "fair"))
-    asked = Asked(
-        tuple(given.tables or (("lerf",) if given.quick else TABLES)),
-        tuple(given.scenes),
-        levels,
-        seeds,
-        choosing,
-        tuple(given.seeds_trained or seeds),
-        tuple(given.choosing_trained or choosing),
-        tuple(given.scenes_trained),
-        tuple(given.methods),
-        tuple(given.read),
-        given.read_as,
-        given.quick,
-        place,
-    )
-    main(asked, given.processes)
+    main(results.read_options(Options, "fair", __doc__, QUICK))

@@ -1,6 +1,6 @@
 """Referring expressions against rooms whose solids are known: is the answer the right 0, 1 or several objects?
 
-    python -m experiments.relations [--seeds 50 51 ...] [--vision true|default] [--rooms FOLDER] [--out FOLDER]
+    python -m experiments.relations [--seeds 50 51 ...] [--vision true|default]
 
 With true masks the rooms are of the demo's shapes, most kinds occur several times, and things stand on, in and under
 others; Gaussians come from true depth. With the default vision they are the rooms of `jsecon demo`, and the fields what
@@ -11,11 +11,11 @@ are measured. An answer is right if it holds exactly the true objects. Threshold
 chosen on the seeds 40 to 49.
 """
 
-import argparse
 import dataclasses
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -433,12 +433,14 @@ class Options:
     """What the experiment can vary."""
 
     seeds: tuple[int, ...] = tuple(range(50, 70))
-    vision: str = "true"
+    vision: Literal["true", "default"] = "true"
+    """Whose masks."""
     rooms: str = "experiments/data/relations"
-    out: str = str(results.HOME / "results" / "relations")
+    """Folder that keeps the fields."""
+    out: str = ""
 
 
-def main(options: Options = Options()) -> dict:
+def main(options: Options) -> dict:
     """Asks all rooms, writes the table and returns the figures."""
     out = Path(f"{options.out}_{options.vision}")
     file = out / "run" / "cells.jsonl"
@@ -467,10 +469,4 @@ def main(options: Options = Options()) -> dict:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--seeds", nargs="+", type=int, default=list(Options.seeds), help="rooms")
-    parser.add_argument("--vision", choices=("true", "default"), default="true", help="whose masks")
-    parser.add_argument("--rooms", default=Options.rooms, help="where the fields of the default vision are kept")
-    parser.add_argument("--out", default=Options.out, help="where the results go")
-    given = parser.parse_args()
-    main(Options(tuple(given.seeds), given.vision, given.rooms, given.out))
+    main(results.read_options(Options, "relations", __doc__))

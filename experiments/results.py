@@ -6,6 +6,8 @@ import os
 from pathlib import Path
 from typing import Any
 
+import tyro
+
 from jsecon.files import atomic_write, write_text
 
 HOME = Path(__file__).resolve().parent
@@ -13,6 +15,27 @@ CAPTURES = HOME.parent.parent / "shared" / "captures"
 """Real captures, beside the checkout."""
 FIGURE_QUALITY = 90
 """Quality of figures as WebP, 0 to 100: a tenth of the bytes of a PNG where a figure shows frames."""
+
+
+def read_options(kind: type, name: str, description: str, quick: dict[str, Any] | None = None) -> Any:
+    """Reads the options of an experiment from the command line.
+
+    Args:
+      kind: Dataclass of the options. The docstrings of its fields are their help texts.
+      name: Name of the experiment. Its results go to results/NAME, those of a quick run to results/quick/NAME, unless
+        `--out` says otherwise.
+      description: Description of the experiment.
+      quick: Values of a quick run, if there is one.
+
+    Returns:
+      The options.
+    """
+    options = tyro.cli(kind, description=description, config=(tyro.conf.FlagCreatePairsOff,))
+    folder = HOME / "results" / name
+    if quick and options.quick:
+        options = dataclasses.replace(options, **quick)
+        folder = HOME / "results" / "quick" / name
+    return dataclasses.replace(options, out=options.out or str(folder))
 
 
 def save(folder: Path, options: Any, metrics: dict, table: str, figure: Any = None) -> None:

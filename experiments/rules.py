@@ -1,6 +1,6 @@
 """Each rule of retrieval on and off, at several levels: which of them hold where views share their errors?
 
-    python -m experiments.rules [--scenes NAME ...] [--seeds 0 1] [--levels medium high shared] [--quick] [--out FOLDER]
+    python -m experiments.rules [--scenes NAME ...] [--seeds 0 1] [--levels medium high shared] [--quick]
 
 Twins of LERF, their points as Gaussians, one each: nothing is fitted or rendered. A row changes one rule of
 `jsecon query`. The first row has all rules as they are, and refuses no text. An answer is judged at the points: its IoU
@@ -12,7 +12,6 @@ reference words in the same field. One half of the absent names are the referenc
 The rows "jsecon query" refuse as the command does, by its own unrelated words and all absent names.
 """
 
-import argparse
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
@@ -21,6 +20,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tyro
 
 from experiments import lerf, results
 from experiments.cells import append_cell, read_cells
@@ -56,16 +56,17 @@ CONSTANTS = {"cosine": RETRIEVAL_THRESHOLD}
 class Options:
     """What the experiment can vary."""
 
-    data: twins.Data = lerf.PLAN.data
+    data: tyro.conf.Suppress[twins.Data] = lerf.PLAN.data
     scenes: tuple[str, ...] = lerf.PLAN.data.scenes
+    """Twins of LERF."""
     seeds: tuple[int, ...] = (0, 1)
     levels: tuple[str, ...] = ("medium", "high", "shared")
-    out: str = str(results.HOME / "results" / "rules")
+    quick: bool = False
+    """Run one tiny scene at one level."""
+    out: str = ""
 
 
-QUICK = Options(
-    lerf.QUICK.data, lerf.QUICK.data.scenes, (0,), ("shared",), str(results.HOME / "results" / "quick" / "rules")
-)
+QUICK = {"data": lerf.QUICK.data, "scenes": lerf.QUICK.data.scenes, "seeds": (0,), "levels": ("shared",)}
 
 
 def on_points(data: twins.Data, scene: str, seed: int, level: str) -> tuple[Setting, np.ndarray]:
@@ -225,7 +226,7 @@ def report(found: dict[tuple, dict], level: str) -> tuple[str, dict]:
     return f"{text}\n\n{second}\n\nA present text is above an absent one: {ordered}.", kept
 
 
-def main(options: Options = Options()) -> dict:
+def main(options: Options) -> dict:
     """Runs what is not measured yet, writes the tables and returns the figures by level."""
     file = Path(options.out) / "cells.jsonl"
     kept, parts, found = {}, [], {}
@@ -245,13 +246,4 @@ def main(options: Options = Options()) -> dict:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--scenes", nargs="+", default=list(Options.scenes), help="twins of LERF")
-    parser.add_argument("--seeds", nargs="+", type=int, default=list(Options.seeds))
-    parser.add_argument("--levels", nargs="+", default=list(Options.levels))
-    parser.add_argument("--quick", action="store_true", help="one tiny scene, one level")
-    parser.add_argument("--out", default="", help="where the results go")
-    given = parser.parse_args()
-    wanted = {"scenes": tuple(given.scenes), "seeds": tuple(given.seeds), "levels": tuple(given.levels)}
-    chosen = QUICK if given.quick else dataclasses.replace(Options(), **wanted)
-    main(dataclasses.replace(chosen, out=given.out) if given.out else chosen)
+    main(results.read_options(Options, "rules", __doc__, QUICK))

@@ -1,7 +1,6 @@
 """Errors that all views of an object share: what they do to simulated embeddings, against a real embedder.
 
-    python -m experiments.shared_errors [--scenes NAME ...] [--seeds 0 1 2] [--strengths 0 0.25 ...]
-                                        [--noise medium] [--quick] [--out FOLDER]
+    python -m experiments.shared_errors [--quick]
 
 Twins of LERF at a level of noise, `World.shared` at each strength. Regions are those of the simulated tracker, each
 with the mean of its masks' embeddings by their pixels. Measured are cosines between texts, masks and regions; how many
@@ -12,13 +11,13 @@ not measured here: ConSE of a 631-class image labeller under MiniLM's text vecto
 replica_apartment_0, 15 classes among 44 texts.
 """
 
-import argparse
 import dataclasses
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+import tyro
 
 from experiments import lerf, results
 from experiments.datasets.benchmark import Benchmark
@@ -57,22 +56,18 @@ def unit(rows: np.ndarray) -> np.ndarray:
 class Options:
     """What the experiment can vary."""
 
-    data: twins.Data = lerf.PLAN.data
+    data: tyro.conf.Suppress[twins.Data] = lerf.PLAN.data
     scenes: tuple[str, ...] = lerf.PLAN.data.scenes
+    """Twins of LERF."""
     seeds: tuple[int, ...] = (0, 1, 2)
     strengths: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, SHARED_STRENGTH, 1.0)
-    noise: str = "medium"
-    out: str = str(results.HOME / "results" / "shared_errors")
+    noise: Literal["low", "medium", "high"] = "medium"
+    quick: bool = False
+    """Run one tiny scene with two strengths."""
+    out: str = ""
 
 
-QUICK = Options(
-    lerf.QUICK.data,
-    lerf.QUICK.data.scenes,
-    (0,),
-    (0.0, 1.0),
-    "medium",
-    str(results.HOME / "results" / "quick" / "shared_errors"),
-)
+QUICK = {"data": lerf.QUICK.data, "scenes": lerf.QUICK.data.scenes, "seeds": (0,), "strengths": (0.0, 1.0)}
 
 
 class Pooled(NamedTuple):
@@ -171,7 +166,7 @@ def figures_of(found: Pooled) -> dict[str, float]:
     return {name: float(told[name]) for name in REAL}
 
 
-def main(options: Options = Options()) -> dict:
+def main(options: Options) -> dict:
     """Runs the experiment, writes its results and returns the figures of each strength."""
     told: dict[float, list[dict[str, float]]] = {strength: [] for strength in options.strengths}
     for scene in options.scenes:
@@ -199,15 +194,4 @@ def report(told: dict[float, list[dict[str, float]]], options: Options) -> dict:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--scenes", nargs="+", default=list(Options.scenes), help="twins of LERF")
-    parser.add_argument("--seeds", nargs="+", type=int, default=list(Options.seeds))
-    parser.add_argument("--strengths", nargs="+", type=float, default=list(Options.strengths), help="0 to 1")
-    parser.add_argument("--noise", default="medium", help="low, medium or high")
-    parser.add_argument("--quick", action="store_true", help="one tiny scene, two strengths")
-    parser.add_argument("--out", default="", help="where the results go")
-    given = parser.parse_args()
-    wanted = {"scenes": tuple(given.scenes), "seeds": tuple(given.seeds), "strengths": tuple(given.strengths)}
-    wanted |= {"noise": given.noise}
-    chosen = QUICK if given.quick else dataclasses.replace(Options(), **wanted)
-    main(dataclasses.replace(chosen, out=given.out) if given.out else chosen)
+    main(results.read_options(Options, "shared_errors", __doc__, QUICK))

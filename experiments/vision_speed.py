@@ -8,7 +8,6 @@ every graph in a folder of models, adds up a frame, and compares lower precision
 precision; the machine should do nothing else.
 """
 
-import argparse
 import dataclasses
 import itertools
 import json
@@ -48,26 +47,26 @@ TEXTS = ("a red mug", "grey sofa", "the small green plant on the window sill", "
 class Options:
     """What is measured."""
 
-    graphs: str | None = None
-    """folder with models of true size; None counts masks instead"""
-    roles: tuple[str, ...] = ("segmenter", "embedder", "tracker")
-    """which of them are timed"""
+    graphs: str = ""
+    """Folder with models of true size; empty: masks are counted instead."""
+    roles: tuple[Role, ...] = ("segmenter", "embedder", "tracker")
+    """Which of them are timed."""
     prepare: bool = False
     """Writes the graphs in lower precisions first, and times nothing."""
-    results: str = str(results.HOME / "results" / "vision_speed")
     rooms: tuple[int, ...] = (0, 1, 2)
-    """seeds, of crowded and of plain rooms each"""
+    """Seeds, of crowded and of plain rooms each."""
     views: int = 3
     width: int = 400
     height: int = 300
+    out: str = ""
 
 
 def main(options: Options) -> dict:
     """Measures, adds to metrics.json and writes table.md."""
-    folder = Path(options.results)
+    folder = Path(options.out)
     kept = folder / "metrics.json"
     metrics = json.loads(kept.read_text()) if kept.exists() else {}
-    if options.graphs is None:
+    if not options.graphs:
         metrics["masks"] = count_masks(options)
     elif options.prepare:
         write_precisions(Path(options.graphs))
@@ -281,18 +280,5 @@ def table(metrics: dict) -> str:
     return "\n\n".join(parts)
 
 
-def parsed(arguments: list[str] | None = None) -> Options:
-    """Reads the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--graphs", default=None)
-    parser.add_argument("--results", default=Options.results)
-    parser.add_argument("--rooms", nargs="+", type=int, default=list(Options.rooms))
-    parser.add_argument("--roles", nargs="+", default=list(Options.roles), choices=Options.roles)
-    parser.add_argument("--prepare", action="store_true")
-    parser.add_argument("--views", type=int, default=Options.views)
-    values = vars(parser.parse_args(arguments))
-    return Options(**values | {"rooms": tuple(values["rooms"]), "roles": tuple(values["roles"])})
-
-
 if __name__ == "__main__":
-    main(parsed())
+    main(results.read_options(Options, "vision_speed", __doc__))

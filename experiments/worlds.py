@@ -1,8 +1,6 @@
 """Worlds that fight back: every fault that real vision has and the tables' does not, swept alone and together.
 
-    python -m experiments.worlds [--scenes figurines teatime] [--seeds 10 11] [--choosing 0] [--only FAULT ...]
-                                 [--values 1 0.5] [--scenes-trained figurines] [--seeds-trained 10] [--quick]
-                                 [--out FOLDER] [--processes N]
+    python -m experiments.worlds [--scenes-trained figurines] [--seeds-trained 10] [--quick] [--processes N]
 
 Twins of LERF at medium noise. The rows are those of `experiments.fair` that need no training, each read as its paper
 does (by the relevancy) and by the contrast or "apart" with a threshold or an ascent, for > 0.7 or > 10/255 (the rivals'
@@ -20,9 +18,10 @@ import numpy as np
 
 from experiments import fair, lerf, results
 from experiments.simulated_vision.worlds import World
-from experiments.tables.fill import Plan, fill, results_folder, twins_parser
+from experiments.tables.fill import Plan, fill
 from experiments.tables.readings import SHARP
 from experiments.tables.rows import TRAINED, WITH_PARTS, rows_of
+from jsecon.process import cores
 
 HARD, HALF = 1.0, 0.5
 APART = "names", "shared"
@@ -49,21 +48,29 @@ FIGURES = ("miou", "miou_vala")
 
 
 @dataclasses.dataclass(frozen=True)
-class Asked:
-    """What the command line asked for."""
+class Options:
+    """What the experiment can vary."""
 
-    scenes: tuple[str, ...]
-    seeds: tuple[int, ...]
-    choosing: tuple[int, ...]
-    only: tuple[str, ...]
-    values: tuple[float, ...]
-    """how hard"""
-    scenes_trained: tuple[str, ...]
-    """of `scenes`, and"""
-    seeds_trained: tuple[int, ...]
-    """of `seeds`: where methods that train are measured too."""
-    quick: bool
-    out: str
+    scenes: tuple[str, ...] = ("figurines", "teatime")
+    seeds: tuple[int, ...] = (10, 11)
+    """Seeds to report."""
+    choosing: tuple[int, ...] = (0,)
+    """Seeds that readings are chosen on."""
+    only: tuple[str, ...] = FAULTS
+    values: tuple[float, ...] = (HARD, HALF)
+    """How hard the faults are, 0 to 1."""
+    scenes_trained: tuple[str, ...] = ()
+    """Scenes on which methods that train are measured too."""
+    seeds_trained: tuple[int, ...] = ()
+    """Seeds that they have there; empty: the first of `seeds`."""
+    quick: bool = False
+    """Run one tiny scene with two faults."""
+    out: str = ""
+    processes: int = cores()
+    """Number of processes that share the settings."""
+
+
+QUICK = {"seeds": (0,), "choosing": (0,), "only": ("parts", "kinds"), "values": (HARD,)}
 
 
 def worlds(only: tuple[str, ...], values: tuple[float, ...]) -> dict[tuple[str, float], tuple[str, dict]]:
@@ -82,22 +89,21 @@ def worlds(only: tuple[str, ...], values: tuple[float, ...]) -> dict[tuple[str, 
     return found
 
 
-def plan_of(level: str, size: dict, asked: Asked, processes: int, trained: bool) -> Plan:
+def plan_of(level: str, changes: dict, options: Options, trained: bool) -> Plan:
     """Every row that needs no training on every scene and seed of a world, or the others where they are asked for."""
-    table = lerf.QUICK if asked.quick else lerf.PLAN
-    data = table.data
-    options = tuple({**dict(data.size), **size}.items())
-    seeds = asked.seeds_trained if trained else tuple(dict.fromkeys((*asked.choosing, *asked.seeds)))
-    scenes = asked.scenes_trained if trained else asked.scenes
+    table = lerf.QUICK if options.quick else lerf.PLAN
+    data, size = table.data, tuple({**dict(table.data.size), **changes}.items())
+    seeds = options.seeds_trained if trained else tuple(dict.fromkeys((*options.choosing, *options.seeds)))
+    scenes = options.scenes_trained if trained else options.scenes
     return dataclasses.replace(
         table,
-        data=dataclasses.replace(data, seeds=seeds, scenes=data.scenes if asked.quick else scenes, size=options),
-        methods=tuple(row for row in rows_of(points=False) if is_read(row, trained, asked.quick)),
+        data=dataclasses.replace(data, seeds=seeds, scenes=data.scenes if options.quick else scenes, size=size),
+        methods=tuple(row for row in rows_of(points=False) if is_read(row, trained, options.quick)),
         level=level,
         sweep=(),
-        processes=processes,
-        out=asked.out,
-        cells=str(Path(asked.out) / "cells.jsonl"),
+        processes=options.processes,
+        out=options.out,
+        cells=str(Path(options.out) / "cells.jsonl"),
     )
 
 
@@ -161,54 +167,39 @@ def curves(found: dict[tuple[str, float], dict[str, dict[str, float]]], trained:
     return figure
 
 
-def main(asked: Asked, processes: int) -> str:
+def main(options: Options) -> str:
     """The tables, written."""
+    options = dataclasses.replace(options, seeds_trained=options.seeds_trained or options.seeds[:1])
     methods, found, trained = rows_of(points=False), {}, {}
 
     def filled(name: tuple[str, float], trained: bool) -> list[dict]:
-        plan = plan_of(*worlds(asked.only, asked.values)[name], asked, processes, trained)
+        plan = plan_of(*worlds(options.only, options.values)[name], options, trained)
         with contextlib.suppress(SystemExit):  # of a helper, which has no table to write
             return fill(plan, methods, tell=lambda line: print(line, flush=True))
         return []
 
-    for name in worlds(asked.only, asked.values):
+    for name in worlds(options.only, options.values):
         own = filled(name, trained=False)
-        training = filled(name, trained=True) if asked.scenes_trained and name[1] in (0.0, HARD) else []
+        training = filled(name, trained=True) if options.scenes_trained and name[1] in (0.0, HARD) else []
         if own:
-            found[name] = of_world(own, asked.choosing, asked.seeds)
+            found[name] = of_world(own, options.choosing, options.seeds)
             print(name, found[name], flush=True)
         if training:
-            here = [cell for cell in own if cell["scene"] in asked.scenes_trained]
-            trained[name] = of_world(here, asked.choosing, asked.seeds_trained)
-            trained[name] |= of_world(training, asked.seeds_trained, asked.seeds_trained)
-    if not processes:
+            here = [cell for cell in own if cell["scene"] in options.scenes_trained]
+            trained[name] = of_world(here, options.choosing, options.seeds_trained)
+            trained[name] |= of_world(training, options.seeds_trained, options.seeds_trained)
+    if not options.processes:
         return ""
     text = layout(found)
     if trained:
-        where = f"{', '.join(asked.scenes_trained)}, seed {', '.join(map(str, asked.seeds_trained))}"
+        where = f"{', '.join(options.scenes_trained)}, seed {', '.join(map(str, options.seeds_trained))}"
         text += f"\n\nWith the methods that train, at {where} alone:\n\n{layout(trained)}"
     metrics = {f"{fault} {value:g}": told for (fault, value), told in found.items()}
     metrics |= {f"{fault} {value:g}, with those that train": told for (fault, value), told in trained.items()}
-    results.save(Path(asked.out), asked, metrics, text, curves(found, trained))
+    results.save(Path(options.out), options, metrics, text, curves(found, trained))
     print(text)
     return text
 
 
 if __name__ == "__main__":
-    parser = twins_parser("worlds", "one tiny scene, two faults")
-    parser.add_argument("--choosing", nargs="+", type=int, default=[0], help="that readings are chosen on")
-    parser.add_argument("--only", nargs="+", default=list(FAULTS), choices=FAULTS)
-    parser.add_argument("--values", nargs="+", type=float, default=[HARD, HALF], help="how hard, 0 to 1")
-    parser.add_argument("--scenes-trained", nargs="+", default=[], help="that methods which train are measured on too")
-    parser.add_argument("--seeds-trained", nargs="+", type=int, default=[], help="and the seeds that they have there")
-    given = parser.parse_args()
-    seeds, choosing, only = tuple(given.seeds), tuple(given.choosing), tuple(given.only)
-    if given.quick:
-        seeds, choosing, only = (0,), (0,), ("parts", "kinds")
-    values = (HARD,) if given.quick else tuple(given.values)
-    there = tuple(given.scenes_trained), tuple(given.seeds_trained) or seeds[:1]
-    out = results_folder(given, "worlds")
-    asked = Asked(
-        tuple(given.scenes), seeds, choosing, only, values, *there, given.quick, results_folder(given, "worlds")
-    )
-    main(asked, given.processes)
+    main(results.read_options(Options, "worlds", __doc__, QUICK))

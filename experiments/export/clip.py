@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from experiments.export.embedder import TEXTS, agreements, told
-from experiments.export.graph import Agreement, declare_missing_operators, shake, write_graph
+from experiments.export.graph import Agreement, Wrapped, declare_missing_operators, shake, write_graph
 from jsecon.files import write_text
 
 
@@ -90,23 +90,15 @@ def _tokenizer(name: str):
     return open_clip.get_tokenizer(name)
 
 
-class Image(torch.nn.Module):
+class Image(Wrapped):
     """Images to unit embeddings."""
-
-    def __init__(self, model):
-        super().__init__()
-        self.model = model
 
     def forward(self, image):
         return self.model.encode_image(image, normalize=True)
 
 
-class Text(torch.nn.Module):
+class Text(Wrapped):
     """Token ids to unit embeddings."""
-
-    def __init__(self, model):
-        super().__init__()
-        self.model = model
 
     def forward(self, text):
         return self.model.encode_text(text.long(), normalize=True)

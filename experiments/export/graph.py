@@ -46,6 +46,18 @@ def shake(model: torch.nn.Module, seed: int) -> None:
                 parameter.copy_(around + 0.1 * torch.randn(parameter.shape, generator=generator))
 
 
+STRETCH = 30.0
+"""of random mask logits, which an untrained decoder keeps near 0"""
+
+
+class Wrapped(torch.nn.Module):
+    """A part of a model, as a module of its own for the tracer."""
+
+    def __init__(self, model: torch.nn.Module):
+        super().__init__()
+        self.model = model
+
+
 @dataclasses.dataclass(frozen=True)
 class Agreement:
     """How far ONNX Runtime is from PyTorch on one graph."""

@@ -14,8 +14,7 @@ import cv2
 import numpy as np
 import torch
 
-from experiments.export.graph import Agreement, declare_missing_operators, shake, write_graph
-from experiments.export.sam import STRETCH
+from experiments.export.graph import STRETCH, Agreement, Wrapped, declare_missing_operators, shake, write_graph
 from jsecon.files import write_text
 from jsecon.networks.sam2 import CONSTANTS, POINTERS, SLOTS, Prompt, Sam2Graphs, at_size, follow, open_sam2
 
@@ -146,12 +145,8 @@ def export(model: Any, folder: Path, *, seed: int, threads: int) -> dict:
     return {"graphs": [dataclasses.asdict(row) for row in (*agreements, tracked)], "tracking": tracking}
 
 
-class VisionEncoder(torch.nn.Module):
+class VisionEncoder(Wrapped):
     """Image to features at three scales, and the coarsest as a prompted frame's."""
-
-    def __init__(self, model: Any):
-        super().__init__()
-        self.model = model
 
     def forward(self, pixel_values):
         output = self.model.forward_image(pixel_values)
@@ -160,12 +155,8 @@ class VisionEncoder(torch.nn.Module):
         return first, second, third, without_memory, output["vision_pos_enc"][-1]
 
 
-class MaskDecoder(torch.nn.Module):
+class MaskDecoder(Wrapped):
     """Points to the best of three masks, and the object pointer."""
-
-    def __init__(self, model: Any):
-        super().__init__()
-        self.model = model
 
     def forward(self, feats0, feats1, feats2_cond, input_points, input_labels):
         _, _, scores, low, high, pointer, present = self.model._forward_sam_heads(
@@ -177,12 +168,8 @@ class MaskDecoder(torch.nn.Module):
         return low, high, scores.max(-1, keepdim=True).values, present[None], pointer[None]
 
 
-class MemoryEncoder(torch.nn.Module):
+class MemoryEncoder(Wrapped):
     """The features and the mask of a frame to memory tokens and their spatial code."""
-
-    def __init__(self, model: Any):
-        super().__init__()
-        self.model = model
 
     def forward(self, feats2, high_res_mask, object_score_logits, binarize):
         model = self.model
@@ -196,12 +183,8 @@ class MemoryEncoder(torch.nn.Module):
         return features.flatten(2).permute(2, 0, 1), position.flatten(2).permute(2, 0, 1)
 
 
-class PointerCodes(torch.nn.Module):
+class PointerCodes(Wrapped):
     """Distances of object pointers in time to their codes."""
-
-    def __init__(self, model: Any):
-        super().__init__()
-        self.model = model
 
     def forward(self, normalized_diffs):
         from sam2.modeling.sam2_utils import get_1d_sine_pe

@@ -14,8 +14,7 @@ import torch
 from PIL import Image
 
 from experiments.export.embedder import regions
-from experiments.export.graph import Agreement, declare_missing_operators, shake, write_graph
-from experiments.export.sam import STRETCH
+from experiments.export.graph import STRETCH, Agreement, Wrapped, declare_missing_operators, shake, write_graph
 from jsecon.files import write_text
 from jsecon.networks.sam import CONFIG, SamGraphs, find_sam
 
@@ -78,23 +77,15 @@ def export(model: Any, folder: Path, *, seed: int, threads: int) -> dict:
     return {"graphs": [dataclasses.asdict(row) for row in (*rows, _asked(model, folder, side, threads))]}
 
 
-class Encoder(torch.nn.Module):
+class Encoder(Wrapped):
     """Image to the three feature maps that the decoder takes."""
-
-    def __init__(self, model):
-        super().__init__()
-        self.model = model
 
     def forward(self, pixel_values):
         return tuple(self.model.get_image_embeddings(pixel_values))
 
 
-class Decoder(torch.nn.Module):
+class Decoder(Wrapped):
     """Points to three masks."""
-
-    def __init__(self, model):
-        super().__init__()
-        self.model = model
 
     def forward(self, input_points, input_labels, input_boxes, first, second, third):
         found = self.model(

@@ -11,7 +11,7 @@ import torch
 
 from experiments.export.clip import Image, Text
 from experiments.export.embedder import FRAMES, TEXTS, agreements, told
-from experiments.export.graph import OPSET, Agreement, declare_missing_operators, shake, write_graph
+from experiments.export.graph import OPSET, Agreement, Wrapped, declare_missing_operators, shake, write_graph
 from experiments.export.vocabulary import write_vocabulary
 from jsecon.files import atomic_write, write_text
 from jsecon.networks.clip import LOGITS, ClipEmbedder
@@ -100,24 +100,16 @@ def export_transformers(model: Any, folder: Path, *, seed: int, threads: int) ->
     return told(rows, found) | {"logits": logits}
 
 
-class Pooled(torch.nn.Module):
+class Pooled(Wrapped):
     """One of transformers' SigLIP encoders: hidden states and what its pooler makes of them."""
 
-    def __init__(self, encoder):
-        super().__init__()
-        self.encoder = encoder
-
     def forward(self, given):
-        found = self.encoder(given)
+        found = self.model(given)
         return found.last_hidden_state, found.pooler_output
 
 
-class Joint(torch.nn.Module):
+class Joint(Wrapped):
     """Both encoders with scale and bias, as transformers' own forward gives them."""
-
-    def __init__(self, model):
-        super().__init__()
-        self.model = model
 
     def forward(self, input_ids, pixel_values):
         found = self.model(input_ids=input_ids, pixel_values=pixel_values)

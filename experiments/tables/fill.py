@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments import results
 from experiments.cells import append_cell, exclusive_lock, read_cells, run_helpers
 from experiments.datasets.benchmark import Benchmark
 from experiments.protocols.points import evaluate_points
@@ -62,22 +61,6 @@ def options_of(plan: Plan, quick: Plan, words: list[str] | None = None) -> Plan:
         data = dataclasses.replace(chosen.data, root=options.root, seeds=chosen.data.seeds[:1])
         chosen = dataclasses.replace(chosen, data=data)
     return dataclasses.replace(chosen, out=options.out, cells="") if options.out else chosen
-
-
-def twins_parser(name: str, quick: str) -> argparse.ArgumentParser:
-    """Parser of experiments that report a few scenes and seeds of twins in results/`name`."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--scenes", nargs="+", default=["figurines", "teatime"])
-    parser.add_argument("--seeds", nargs="+", type=int, default=[10, 11], help="seeds to report")
-    parser.add_argument("--quick", action="store_true", help=quick)
-    parser.add_argument("--out", default="", help=f"folder of the results (default: results/{name})")
-    parser.add_argument("--processes", type=int, default=cores(), help="number of processes (default: one per core)")
-    return parser
-
-
-def results_folder(options: argparse.Namespace, name: str) -> str:
-    """Folder of the results of an experiment with `twins_parser`."""
-    return options.out or str(results.HOME / "results" / (f"quick/{name}" if options.quick else name))
 
 
 def fill(plan: Plan, methods: Mapping[str, Method], *, tell: Callable[[str], None]) -> list[dict]:

@@ -58,8 +58,8 @@ def test_each_method_is_read_as_suits_each_figure_and_ours_also_by_one_reading()
     assert best["VALA"] == {"miou": "VALA: cosine", "miou_vala": "VALA: contrast"}
     assert best["ours, consensus"] == {"miou": "ours, consensus: x", "miou_vala": "ours, consensus: y"}
     assert set(best["ours, consensus" + fair.ONE_READING].values()) == {"ours, consensus: y"}
-    asked = fair.Asked(("lerf",), (), ("medium",), (10,), (0,), (10,), (0,), (), (), (), "", False, "")
-    text, told = fair.report("lerf", "medium", cells, asked)
+    options = fair.Options(seeds=(10,), choosing=(0,))
+    text, told = fair.report("lerf", "medium", cells, options)
     assert told["VALA, miou"]["ahead"] == pytest.approx((0.2, 0.2, 0.2))
     assert told["VALA, miou_vala"]["ahead"] == pytest.approx((0.1, 0.1, 0.1))
     assert "| VALA | 0.400 | 0.600 | 1.000 | cosine | 0.800 | +0.200 [+0.200, +0.200] |" in text
@@ -69,8 +69,8 @@ def test_ours_is_compared_with_a_method_on_the_scenes_and_seeds_that_it_has():
     cells = [cell("VALA: cosine", seed, 0.5, 0.4) for seed in (0, 10)]
     cells += [cell("ours, consensus: x", seed, value, 0.5) for seed, value in ((0, 0.7), (10, 0.7), (11, 0.9))]
     cells += [cell("ours, consensus: x", 10, 0.1, 0.5) | {"scene": "another"}]
-    asked = fair.Asked(("lerf",), (), ("medium",), (10, 11), (0,), (10,), (0,), ("s",), (), (), "", False, "")
-    _, told = fair.report("lerf", "medium", cells, asked)
+    options = fair.Options(seeds=(10, 11), choosing=(0,), seeds_trained=(10,), scenes_trained=("s",))
+    _, told = fair.report("lerf", "medium", cells, options)
     assert told["VALA, miou"]["ours there"] == pytest.approx(0.7)
     assert told["VALA, miou"]["scenes"] == ["s"]
     assert told["VALA, miou"]["seeds"] == [10]
@@ -86,8 +86,8 @@ def test_readings_are_taken_from_another_run(tmp_path):
     rows |= {f"ours, consensus{fair.ONE_READING}, miou": "ours, consensus: x"}
     file = tmp_path / "metrics.json"
     file.write_text(json.dumps({"lerf medium": {key: {"row": row} for key, row in rows.items()}}))
-    asked = fair.Asked(("lerf",), (), ("medium",), (10,), (0,), (10,), (0,), (), (), (), str(file), False, "")
-    text, told = fair.report("lerf", "medium", cells, asked)
+    options = fair.Options(seeds=(10,), choosing=(0,), read_as=str(file))
+    text, told = fair.report("lerf", "medium", cells, options)
     assert set(told) == {key for key in rows if fair.ONE_READING not in key}
     assert told["VALA, miou"]["mean"] == pytest.approx(0.5)
     assert told["VALA, miou"]["ahead"] == pytest.approx((0.2, 0.2, 0.2))

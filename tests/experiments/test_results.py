@@ -4,6 +4,7 @@ experiments; and the verdicts of the export (the export itself needs torch, and 
 import dataclasses
 import json
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -59,12 +60,26 @@ def test_the_readme_names_every_experiment_and_no_other():
     assert set(re.findall(r"python -m experiments\.(\w+)", TEXT)) == runnable
 
 
-def test_options_come_from_the_command_line():
-    assert export_models.parsed([]) == export_models.Options()
-    found = export_models.parsed(["--only", "sam", "siglip", "--threads", "2", "--sam", "vit_l", "--out", "there"])
-    assert (found.only, found.threads, found.sam, found.out) == (("sam", "siglip"), 2, "vit_l", "there")
-    with pytest.raises(SystemExit):
-        export_models.parsed(["--only", "sam3"])
+@dataclasses.dataclass(frozen=True)
+class RoomOptions:
+    seeds: tuple[int, ...] = (1, 2)
+    quick: bool = False
+    out: str = ""
+
+
+@pytest.mark.parametrize(
+    ("words", "seeds", "folder"),
+    [
+        ("", (1, 2), results.HOME / "results" / "rooms"),
+        ("--seeds 3 4 5", (3, 4, 5), results.HOME / "results" / "rooms"),
+        ("--seeds 3 4 --quick", (0,), results.HOME / "results" / "quick" / "rooms"),
+        ("--quick --out there", (0,), "there"),
+    ],
+)
+def test_options_come_from_the_command_line(words, seeds, folder, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["rooms", *words.split()])
+    options = results.read_options(RoomOptions, "rooms", "Rooms.", {"seeds": (0,)})
+    assert options == RoomOptions(seeds, "--quick" in words, str(folder))
 
 
 def test_the_table_says_what_is_within_the_bounds():

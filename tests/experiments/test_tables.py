@@ -11,7 +11,7 @@ import pytest
 
 from experiments import lerf, ovs3d, replica, threshold_sweep
 from experiments.datasets.replica import REPLICA_SCENES
-from experiments.tables import fill, layout, published, twins
+from experiments.tables import fill, layout, published
 from experiments.tables.methods import METHODS, RECOMMENDED
 from experiments.tables.setting import levels_of, prepare
 from jsecon.data.gaussians.ply import load_ply, save_ply
@@ -80,16 +80,6 @@ def test_table_1_and_its_resumption(folder, monkeypatch):
         return [{k: v for k, v in c.items() if k not in ("seconds", "peak_memory_mib")} for c in cells]
 
     assert strip(again["cells"]) == strip(metrics["cells"])
-
-
-@pytest.mark.long
-def test_scannet_goes_through_the_same_code(folder):
-    size = (("views", 6), ("width", 64), ("height", 48), ("num_objects", 4), ("fine_m", 0.03), ("coarse_m", 0.2))
-    data = twins.Data("scannet", scenes=("scene0000_00",), seeds=(0,), size=size, twins=str(folder / "twins"))
-    plan = fill.Plan(data, (TRACKED,), level="perfect", sweep=(), out=str(folder / "scannet"))
-    (cell,) = fill.fill(plan, METHODS, tell=lambda _: None)
-    assert cell["miou"] > 0.5
-    assert cell["pairs"] >= 5
 
 
 @pytest.mark.long

@@ -23,7 +23,6 @@ from experiments.simulated_vision.masks import LEVELS
 from experiments.simulated_vision.worlds import World, seen_in, world_of
 from experiments.tables import twins
 from experiments.tables.rows import TRAINED
-from experiments.worlds import Asked, main
 from jsecon.data.labels import LabelledFrame
 from jsecon.demo.room import TABLE_WOOD, srgb_to_linear
 from jsecon.errors import InputError
@@ -255,11 +254,12 @@ def test_every_fault_has_its_worlds_and_methods_are_read_as_suits_them_there():
     found = worlds.worlds(worlds.FAULTS, (1.0, 0.5))
     assert {fault for fault, _ in found} == {"none", "together", *worlds.FAULTS}
     assert all(world_of(level)[0] == "medium" for level, _ in found.values())
-    asked = worlds.Asked(("ramen",), (10,), (0,), ("kinds",), (1.0,), ("ramen",), (10,), False, "nowhere")
-    plan = worlds.plan_of(*worlds.worlds(asked.only, asked.values)["kinds", 1.0], asked, 1, trained=False)
+    there = {"scenes": ("ramen",), "seeds": (10,), "scenes_trained": ("ramen",), "seeds_trained": (10,)}
+    options = worlds.Options(only=("kinds",), values=(1.0,), out="nowhere", **there)
+    plan = worlds.plan_of(*worlds.worlds(options.only, options.values)["kinds", 1.0], options, trained=False)
     assert dict(plan.data.size)["kinds"]
     assert plan.data.seeds == (0, 10)
-    training = worlds.plan_of("medium", {}, asked, 1, trained=True)
+    training = worlds.plan_of("medium", {}, options, trained=True)
     rows, seeds = training.methods, training.data.seeds
     assert seeds == (10,)
     assert {row.split(": ")[0] for row in rows} == set(TRAINED)
@@ -269,7 +269,7 @@ def test_every_fault_has_its_worlds_and_methods_are_read_as_suits_them_there():
     for seed, value in ((0, 0.1), (10, 0.3)):
         cell = {"seed": seed, "scene": "ramen"}
         cells += [cell | {"method": m, "miou": at + value, "miou_vala": at - value} for m, at in own.items()]
-    told = worlds.of_world(cells, asked.choosing, asked.seeds)
+    told = worlds.of_world(cells, options.choosing, options.seeds)
     assert told["VALA"] == {"miou": pytest.approx(0.8), "miou_vala": pytest.approx(0.2)}
     text = worlds.layout({("none", 0.0): told, ("kinds", 1.0): told | {"VALA": {"miou": 0.99, "miou_vala": 0.0}}})
     assert "| kinds 1 | 0.990 | 0.900 | -0.090 |" in text
@@ -278,7 +278,7 @@ def test_every_fault_has_its_worlds_and_methods_are_read_as_suits_them_there():
 
 @pytest.mark.long
 def test_a_quick_run_measures_every_method_in_the_plain_world_and_under_two_faults(tmp_path):
-    main(Asked((), (0,), (0,), ("parts", "kinds"), (1.0,), (), (0,), True, str(tmp_path)), processes=1)
+    worlds.main(worlds.Options(**worlds.QUICK, quick=True, out=str(tmp_path), processes=1))
     worlds_of = json.loads((tmp_path / "metrics.json").read_text())
     assert set(worlds_of) == {"none 0", "parts 1", "kinds 1"}
     for methods in worlds_of.values():
