@@ -41,7 +41,7 @@ libraries that its wheel brings along or has linked in, and copyleft licences wh
 
 EXPORT = """\
 The extra `export` is not installed for this table. By their own word torch and torchvision are under BSD-3-Clause
-(on Linux they bring NVIDIA's proprietary libraries), open_clip_torch under MIT, segment-anything, sam2 and onnx under
+(on Linux they bring NVIDIA's proprietary libraries), open_clip_torch under MIT, transformers and onnx under
 Apache-2.0. Nothing of it is needed to run jsecon."""
 
 

@@ -36,7 +36,7 @@ EXTRAS = {
     "docs": (("sphinx", "myst_nb", "furo"), "building the documentation"),
     "figures": (("matplotlib",), "jsecon.show, figures of the experiments"),
     "words": (("ai_edge_litert",), "the experiment on real words"),
-    "export": (("torch", "open_clip", "segment_anything", "sam2", "onnx"), "SAM, SAM 2 and CLIP from checkpoints"),
+    "export": (("torch", "open_clip", "transformers", "onnx"), "CLIP, SigLIP and SAM 2.1 from checkpoints"),
 }
 """extra -> the modules that it installs, and what it is for"""
 
