@@ -1,5 +1,6 @@
 """Answers and whole fields as files of every format, from the command line, against the field that they come from."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -19,8 +20,6 @@ from jsecon.query.select import query_region
 @pytest.fixture(scope="module")
 def saved(scene, cameras, tmp_path_factory):
     """A small field whose source lies 2 units to the side of its world, and its file."""
-    import dataclasses
-
     moved = np.eye(4)
     moved[0, 3] = 2
     field = dataclasses.replace(make_field(scene, cameras)[0], to_source=moved)
@@ -67,8 +66,9 @@ def test_a_selection_is_written_in_every_format(saved, tmp_path, ending):
     assert {path.suffix for path in tmp_path.iterdir()} == {f".{ending}", ".json", ".png", ".html"}
 
 
-def test_an_ending_that_cannot_be_written_is_refused_before_anything_is_read(tmp_path, capsys):
-    assert run("export", tmp_path / "none.safetensors", "--out", tmp_path / "scene.sog") == 2
+@pytest.mark.parametrize("verb", ["export", "fit"])
+def test_an_ending_that_cannot_be_written_is_refused_before_anything_is_read(tmp_path, capsys, verb):
+    assert run(verb, tmp_path / "nowhere", "--out", tmp_path / "scene.sog") == 2
     told = capsys.readouterr().err
     assert "scene.sog" in told
     assert "npx @playcanvas/splat-transform" in told

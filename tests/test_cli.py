@@ -15,7 +15,7 @@ from capture_files import ROOM_FIT
 from jsecon.app import cli, verbs
 from jsecon.app.ask import METHODS
 from jsecon.data.gaussians.ply import load_ply
-from jsecon.pipeline import progress, run as pipeline
+from jsecon.pipeline import progress
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Console
 from jsecon.process import peak_memory_mib
@@ -39,24 +39,36 @@ def capture(room, tmp_path):
 # What the verbs do
 
 
+def _object(capsys, *arguments):
+    """What a verb prints with --json: one object and nothing else; and its words, on standard error."""
+    assert _run(*arguments, "--json") == 0
+    out, err = capsys.readouterr()
+    assert out.count("\n") == 1
+    return json.loads(out), err
+
+
 def test_run_writes_field_metrics_and_report_and_tells_its_plan(room, room_run, tmp_path, capsys):
-    _, out = room_run
+    run, out = room_run
     shutil.copytree(out / "cache", tmp_path / "out" / "cache")  # the stages are cached: only the verb itself is tested
     options = "--masks", room / "masks", *FITTED, "--sh-degree", 2
     line = "run", room, "--out", tmp_path / "out", *options
-    assert _run(*line, "--dry-run") == 0
-    plan = capsys.readouterr().out.partition("Nothing was written.")[0].splitlines()[1:]
-    assert _run(*line) == 0
-    told = capsys.readouterr().out
-    assert told.splitlines()[1 : len(plan) + 1] == plan
+    told, words = _object(capsys, *line, "--dry-run")
+    assert {stage["status"] for stage in told["stages"]} == {"cached", "skipped"}
+    assert not (tmp_path / "out" / "field.safetensors").exists()
+    plan = words.partition("Nothing was written.")[0].splitlines()[1:]
+    assert len(plan) > 8
+    told, words = _object(capsys, *line)
+    assert words.splitlines()[1 : len(plan) + 1] == plan
+    assert told["gaussians"] == run.field.gaussians.count
+    assert all(Path(file).exists() for file in told["written"])
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert metrics["regions"] >= 10
     assert metrics["held_out_psnr"] > 10
     assert set(metrics["seconds"]) >= {"load", "gaussians", "votes"}
     assert "segmenter" in metrics["skipped"]
     assert 0.5 < metrics["peak_memory_mib"] / peak_memory_mib() < 1.001  # tests before it may have taken more
-    for words in ("gaussians        cached", "segmenter        skipped ", "held-out PSNR", "report.html"):
-        assert words in told
+    for text in ("gaussians        cached", "segmenter        skipped ", "held-out PSNR", "report.html"):
+        assert text in words
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count("data:image/") >= 24
     assert "Held-out frames" in page
@@ -66,16 +78,17 @@ def test_run_writes_field_metrics_and_report_and_tells_its_plan(room, room_run, 
 def test_fit_writes_a_scene_in_the_captures_world_and_says_how_good_it_is(room, room_run, tmp_path, capsys):
     run, out = room_run
     shutil.copytree(out / "cache", tmp_path / "scene" / "cache")  # a run into the folder, gone on with
-    asked = "fit", room, "--out", tmp_path / "scene.ply", *FITTED
-    assert _run(*asked) == 0
-    told = capsys.readouterr().out
-    assert "gaussians        cached" in told
-    assert f"held-out PSNR {run.psnr.mean():.2f} dB, SSIM 0." in told
-    scene = load_ply(tmp_path / "scene.ply")
+    line = "fit", room, "--out", tmp_path / "scene.ply", *FITTED
+    assert _run(*line) == 0
+    words = capsys.readouterr().out
+    assert "gaussians        cached" in words
+    assert f"held-out PSNR {run.psnr.mean():.2f} dB, SSIM 0." in words
+    told, _ = _object(capsys, *line)
+    assert told["held_out_psnr"] == pytest.approx(run.psnr.mean(), abs=1e-3)
+    scene = load_ply(told["written"]["scene"])
+    assert scene.count == told["gaussians"]
     expected = transform_gaussians(run.field.gaussians, run.capture.to_source)
     np.testing.assert_allclose(scene.means, expected.means, atol=1e-5)
-    assert _run(*asked[:3], tmp_path / "scene.sog") == 2
-    assert "expected .ply or .spz or .glb" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("by", METHODS)
@@ -106,50 +119,46 @@ def test_query_writes_a_ply_a_json_and_masks_for_each_text(room_run, tmp_path, c
     assert "data:image/" in (tmp_path / "answers.html").read_text()
 
 
-def test_query_at_a_pixel_selects_the_object_under_it(room_run, room, tmp_path):
-    run, out = room_run
-    name = run.capture.names[1]
-    masks = cv2.imread(str(room / "masks" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
-    largest = np.bincount(masks[masks > 0]).argmax()
-    inside = cv2.distanceTransform((masks == largest).astype(np.uint8), cv2.DIST_L2, 5)
+@pytest.fixture(scope="module")
+def largest(room_run, room):
+    """(names of two frames, masks of the largest object of the first in them, number of its region)."""
+    names = room_run[0].capture.names[1:3]
+    ids = {path.stem: cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in (room / "masks").glob("*.png")}
+    largest = np.bincount(ids[names[0]][ids[names[0]] > 0]).argmax()
+    region = np.flatnonzero(np.unique(list(ids.values())) == largest)[0] - 1
+    return names, [ids[name] == largest for name in names], region
+
+
+def test_query_at_a_pixel_selects_the_object_under_it(room_run, largest, tmp_path):
+    names, masks, region = largest
+    inside = cv2.distanceTransform(masks[0].astype(np.uint8), cv2.DIST_L2, 5)
     y, x = np.unravel_index(inside.argmax(), inside.shape)
-    assert _run("query", out / "field.safetensors", "--at", name, x, y, "--out", tmp_path) == 0
+    assert _run("query", room_run[1] / "field.safetensors", "--at", names[0], x, y, "--out", tmp_path) == 0
     answer = json.loads(next(tmp_path.glob("*.json")).read_text())
     assert answer["count"] > 0
     assert "text encoder" in answer["skipped"]
-    assert answer["region"] == np.flatnonzero(np.unique(masks_of_all(room)) == largest)[0] - 1
+    assert answer["region"] == region
 
 
-def test_query_by_what_is_outlined(room_run, room, tmp_path):
+def test_query_by_what_is_outlined(room_run, largest, tmp_path):
     """The largest object by its masks in two frames, and by a box around one of them."""
-    run, out = room_run
-    names = run.capture.names[1:3]
-    images = [cv2.imread(str(room / "masks" / f"{name}.png"), cv2.IMREAD_UNCHANGED) for name in names]
-    largest = np.bincount(images[0][images[0] > 0]).argmax()
-    for name, image in zip(names, images):
-        cv2.imwrite(str(tmp_path / f"thing {name}.png"), 255 * (image == largest).astype(np.uint8))
-    rows, columns = np.nonzero(images[0] == largest)
-    files = [item for name in names for item in (name, tmp_path / f"thing {name}.png")]
-    box = [columns.min(), rows.min(), columns.max(), rows.max()]
-    assert (
-        _run("query", out / "field.safetensors", "--mask", *files, "--box", names[0][-3:], *box, "--out", tmp_path) == 0
-    )
-    region = np.flatnonzero(np.unique(masks_of_all(room)) == largest)[0] - 1
+    names, masks, region = largest
+    files = []
+    for name, mask in zip(names, masks):
+        cv2.imwrite(str(tmp_path / f"thing {name}.png"), 255 * mask.astype(np.uint8))
+        files += [name, tmp_path / f"thing {name}.png"]
+    rows, columns = np.nonzero(masks[0])
+    box = names[0][-3:], columns.min(), rows.min(), columns.max(), rows.max()
+    field = room_run[1] / "field.safetensors"
+    assert _run("query", field, "--mask", *files, "--box", *box, "--out", tmp_path) == 0
     answers = [json.loads(file.read_text()) for file in sorted(tmp_path.glob("*.json"))]
     assert len(answers) == 2
     for answer in answers:
         assert answer["by"] == "outline"
         assert answer["region"] == region
         assert answer["count"] > 0
-    small = np.zeros((50, 160), np.uint8)
-    cv2.imwrite(str(tmp_path / "small.png"), small)
-    assert _run("query", out / "field.safetensors", "--mask", names[0], tmp_path / "small.png", "--out", tmp_path) == 2
-
-
-def masks_of_all(room):
-    return np.concatenate(
-        [cv2.imread(str(p), cv2.IMREAD_UNCHANGED).ravel() for p in sorted((room / "masks").glob("*.png"))]
-    )
+    cv2.imwrite(str(tmp_path / "small.png"), np.zeros((50, 160), np.uint8))
+    assert _run("query", field, "--mask", names[0], tmp_path / "small.png", "--out", tmp_path) == 2
 
 
 def test_eval_prints_the_table_and_writes_every_pair(room_run, room, tmp_path, capsys):
@@ -159,50 +168,26 @@ def test_eval_prints_the_table_and_writes_every_pair(room_run, room, tmp_path, c
     content = json.loads(label.read_text())
     content["objects"] = content["objects"][:4]
     (tmp_path / "one" / label.name).write_text(json.dumps(content))
-    asked = "eval", out / "field.safetensors", "--labels", tmp_path / "one", "--out", tmp_path
-    assert _run(*asked) == 0
-    told = capsys.readouterr().out
+    line = "eval", out / "field.safetensors", "--labels", tmp_path / "one", "--out", tmp_path
+    told, words = _object(capsys, *line)
     found = json.loads((tmp_path / "evaluation.json").read_text())
     assert set(found) == {"anchored", "silhouette", "all", "anchored_code", "one_step", "canonical"}
     for kind, summary in found.items():
-        assert kind in told
+        assert kind in words
         assert len(summary["rows"]) == summary["pairs"] > 0
         assert summary["miou"] == pytest.approx(np.mean([row["iou"] for row in summary["rows"]]), abs=1e-3)
-    assert "mAcc@0.25" in told
-    assert "alpha > 0.7" in told
-    told, _ = _object(capsys, *asked)
+    assert "mAcc@0.25" in words
+    assert "alpha > 0.7" in words
     assert 0 <= told["anchored"]["miou"] <= 1
 
 
-def _object(capsys, *arguments):
-    """What a verb prints with --json: one object and nothing else."""
-    assert _run(*arguments, "--json") == 0
-    out, err = capsys.readouterr()
-    assert out.count("\n") == 1
-    return json.loads(out), err
-
-
-def test_every_verb_tells_what_it_wrote_as_one_object(room_run, room, tmp_path, capsys):
-    run, out = room_run
-    shutil.copytree(out / "cache", tmp_path / "out" / "cache")
-    field = out / "field.safetensors"
-    line = ["run", room, "--out", tmp_path / "out", "--masks", room / "masks", *FITTED]
-    told, _ = _object(capsys, *line, "--dry-run")
-    assert {stage["status"] for stage in told["stages"]} == {"cached", "skipped"}
-    assert not (tmp_path / "out" / "field.safetensors").exists()
-    told, err = _object(capsys, *line)
-    assert told["gaussians"] == run.field.gaussians.count
-    assert "gaussians        cached" in err
-    assert all(Path(file).exists() for file in told["written"])
-    (tmp_path / "scene").symlink_to(tmp_path / "out")
-    told, _ = _object(capsys, "fit", room, "--out", tmp_path / "scene.ply", *FITTED)
-    assert told["held_out_psnr"] == pytest.approx(run.psnr.mean(), abs=1e-3)
-    assert load_ply(told["written"]["scene"]).count == told["gaussians"]
+def test_other_verbs_too_tell_what_they_wrote_as_one_object(room_run, tmp_path, capsys):
+    field = room_run[1] / "field.safetensors"
     told, _ = _object(capsys, "query", field, "red", "--out", tmp_path / "answers", "--views", 1)
     assert [answer["query"] for answer in told["answers"]] == ["red"]
     told, _ = _object(capsys, "view", field, "red", "--export", tmp_path / "page.html")
     assert (told["written"]["page"], told["answers"]) == (str(tmp_path / "page.html"), ["red"])
-    told, err = _object(capsys, "completion", "bash")
+    told, _ = _object(capsys, "completion", "bash")
     assert told["script"].count("jsecon") > 10
     assert _run("query", field, "red", "zzz", "--out", tmp_path / "answers", "--json") == 2
     told = json.loads(capsys.readouterr().out)
@@ -210,29 +195,8 @@ def test_every_verb_tells_what_it_wrote_as_one_object(room_run, room, tmp_path, 
     assert told["error"]["problem"]
 
 
-VERB_NAMES = ("demo", "run", "fit", "query", "objects", "export", "view", "eval", "serve", "models", "doctor")
-VERB_NAMES += ("completion",)
-
-
-def test_help_of_every_verb_has_words_for_every_option(capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "200")
-    assert _run("--help") == 0
-    told = capsys.readouterr().out
-    assert "jsecon run my_capture --out my_field" in told, "examples"
-    for verb in VERB_NAMES:
-        assert re.search(rf"^\W+{verb} +[A-Z]", told, re.MULTILINE)
-        capsys.readouterr()
-        assert _run(verb, "--help-all") == 0
-        rows = [line.strip("│| ") for line in capsys.readouterr().out.splitlines()]
-        options = [n for n, row in enumerate(rows) if re.match("-h|--[a-z][a-z-]*( |,|$)|FIELD |CAPTURE ", row)]
-        assert len(options) >= 3
-        for n in options:  # words follow on the same row, or on the next one
-            assert len(rows[n].split()) > 4 or len(rows[n + 1].split()) > 2, rows[n]
-        assert not any("None" in row or "[STR" in row for row in rows)
-
-
 @pytest.mark.parametrize("verb", cli.VERB_NAMES)
-def test_help_of_a_verb_fits_a_screen_and_its_examples_parse(verb, capsys, monkeypatch):
+def test_help_of_a_verb_fits_a_screen_its_examples_parse_and_every_option_has_words(verb, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
     assert _run(verb, "--help") == 0
     short = capsys.readouterr().out
@@ -246,17 +210,27 @@ def test_help_of_a_verb_fits_a_screen_and_its_examples_parse(verb, capsys, monke
     flags = [set(re.findall(r"^\W+(--[a-z][a-z-]*)", told, re.MULTILINE)) for told in (short, whole)]
     assert flags[0] <= flags[1]
     assert {"--json", "--debug"} <= flags[1]
+    monkeypatch.setenv("COLUMNS", "200")
+    assert _run(verb, "--help-all") == 0
+    rows = [line.strip("│| ") for line in capsys.readouterr().out.splitlines()]
+    options = [n for n, row in enumerate(rows) if re.match("-h|--[a-z][a-z-]*( |,|$)|FIELD |CAPTURE ", row)]
+    assert len(options) >= 3
+    for n in options:  # words follow on the same row, or on the next one
+        assert len(rows[n].split()) > 4 or len(rows[n + 1].split()) > 2, rows[n]
+    assert not any("None" in row or "[STR" in row for row in rows)
 
 
-def test_the_short_help_leaves_out_advanced_options(capsys):
+def test_help_has_examples_and_leaves_advanced_options_to_the_long_one_which_groups_them(capsys):
+    assert _run("--help") == 0
+    told = capsys.readouterr().out
+    assert "jsecon run my_capture --out my_field" in told
+    for verb in cli.VERB_NAMES:
+        assert re.search(rf"^\W+{verb} +[A-Z]", told, re.MULTILINE)
     assert _run("run", "--help") == 0
     told = capsys.readouterr().out
     assert "--masks" in told
     assert "--agreement" not in told
     assert "jsecon run --help-all" in told
-
-
-def test_options_of_a_run_are_grouped(capsys):
     assert _run("run", "--help-all") == 0
     told = capsys.readouterr().out
     order = ["--out", "scene options", "--downscale", "masks options", "--granularity", "models options", "--segmenter"]
@@ -307,24 +281,6 @@ def test_a_wrong_line_is_one_sentence_and_exit_code_2(capsys, line, says):
     assert says in told
 
 
-def test_a_stop_by_the_user_is_exit_code_130_and_says_that_it_can_go_on(room, tmp_path, monkeypatch, capsys):
-    def stop(*_, **__):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(pipeline, "run", stop)
-    assert _run("run", room, "--out", tmp_path) == 130
-    assert "again to resume" in capsys.readouterr().err
-
-
-def test_an_unexpected_error_keeps_its_traceback(room, tmp_path, monkeypatch):
-    def fail(*_, **__):
-        raise RuntimeError("a bug")
-
-    monkeypatch.setattr(pipeline, "run", fail)
-    with pytest.raises(RuntimeError, match="a bug"):
-        _run("run", room, "--out", tmp_path)
-
-
 # Bad input: one message each, with file, found, expected, remedy
 
 
@@ -337,12 +293,6 @@ def _refused(capsys, *arguments, says=()):
     assert "Traceback" not in told
     for word in says:
         assert word in message[0]
-
-
-def _refused_run(capsys, capture, tmp_path, *options, says=()):
-    _refused(capsys, "run", capture, "--out", tmp_path / "out", "--holdout", 4, "--steps", 5, *options, says=says)
-    left = {path.name for path in (tmp_path / "out").rglob("*.safetensors")} if (tmp_path / "out").exists() else set()
-    assert not any("partial" in name or name == "field.safetensors" for name in left)
 
 
 def _image(capture):
@@ -376,29 +326,17 @@ def test_a_damaged_capture_is_one_message(capture, tmp_path, capsys, damage, opt
     """The tests of each reader have all kinds of damage."""
     damage(capture)
     given = {"masks": ["--masks", capture / "masks"], "gaussians": ["--gaussians", capture / "scene.ply"]}
-    _refused_run(capsys, capture, tmp_path, *given.get(option, []), says=[says])
+    out = tmp_path / "out"
+    _refused(capsys, "run", capture, "--out", out, "--holdout", 4, "--steps", 5, *given.get(option, []), says=[says])
+    left = {path.name for path in out.rglob("*.safetensors")}
+    assert not any("partial" in name or name == "field.safetensors" for name in left)
 
 
 def test_an_output_folder_that_cannot_be_written(capture, room_run, tmp_path, capsys):
     (tmp_path / "file").write_text("not a folder")
-    _refused(capsys, "run", capture, "--out", tmp_path / "file" / "out", says=["out"])
-    _refused(capsys, "demo", "--out", tmp_path / "file" / "out", says=["out"])
-    _refused(
-        capsys, "query", room_run[1] / "field.safetensors", "red", "--out", tmp_path / "file" / "out", says=["out"]
-    )
-    _refused(
-        capsys,
-        "eval",
-        room_run[1] / "field.safetensors",
-        "--labels",
-        capture,
-        "--out",
-        tmp_path / "file",
-        says=["file"],
-    )
-
-
-def test_the_capture_itself_as_the_output_folder(capture, capsys):
+    field, out = room_run[1] / "field.safetensors", tmp_path / "file" / "out"
+    for line in (("run", capture), ("demo",), ("query", field, "red"), ("eval", field, "--labels", capture)):
+        _refused(capsys, *line, "--out", out, says=["out"])
     _refused(capsys, "run", capture, "--out", capture, says=["own folder"])
 
 
@@ -428,10 +366,8 @@ def test_queries_that_cannot_be(room_run, tmp_path, capsys, options, says):
 def test_a_field_that_is_damaged_or_not_there(room_run, tmp_path, capsys):
     data = (room_run[1] / "field.safetensors").read_bytes()
     (tmp_path / "field.safetensors").write_bytes(data[: len(data) // 2])
-    _refused(
-        capsys, "query", tmp_path / "field.safetensors", "red", "--out", tmp_path / "o", says=["field.safetensors"]
-    )
-    _refused(capsys, "query", tmp_path / "none.safetensors", "red", "--out", tmp_path / "o", says=["none.safetensors"])
+    for name in ("field.safetensors", "none.safetensors"):
+        _refused(capsys, "query", tmp_path / name, "red", "--out", tmp_path / "o", says=[name])
 
 
 # What is said while it works
@@ -451,43 +387,44 @@ class _Terminal:
         pass
 
 
+def _wait_for(sign, err):
+    for _ in range(200):
+        if sign in err.text:
+            break
+        time.sleep(0.02)
+    assert sign in err.text
+
+
 def _drawn(err, steps, sign):
     """Progress of a step that reports these counts, and goes on until `sign` is shown."""
     with Console(err=err).progress("votes") as progress:
         for done, total in steps:
             progress(done, total)
-        for _ in range(200):
-            if sign in err.text:
-                break
-            time.sleep(0.02)
-    assert sign in err.text
+        _wait_for(sign, err)
 
 
-def test_progress_is_a_bar_on_a_terminal_and_lines_elsewhere(monkeypatch):
+@pytest.fixture
+def soon(monkeypatch):
+    """Progress is shown after a hundredth of a second."""
     monkeypatch.setattr(progress, "QUIET_SECONDS", 0.01)
+
+
+def test_progress_is_a_bar_on_a_terminal_and_lines_elsewhere(soon):
     bar, log = _Terminal(True), _Terminal(False)
     _drawn(bar, [(1, 4), (3, 4)], "votes:  75%|")
     assert bar.text.endswith("\r")  # the bar is gone
     _drawn(log, [(1, 4), (4, 4), (1, 3), (2, 3)], "votes: 2 of 3, about 0 s left\n")
     assert "\r" not in log.text
-
-
-def test_a_step_that_reports_no_count_shows_its_time(monkeypatch):
-    monkeypatch.setattr(progress, "QUIET_SECONDS", 0.01)
-    _drawn(_Terminal(True), [], "votes: 0it [00:00")
+    _drawn(_Terminal(True), [], "votes: 0it [00:00")  # a step that reports no count shows its time
     _drawn(_Terminal(False), [], "votes: 0 s so far\n")
 
 
-def test_a_note_stands_above_the_bar(monkeypatch):
-    monkeypatch.setattr(progress, "QUIET_SECONDS", 0.01)
+def test_a_note_stands_above_the_bar(soon):
     terminal = _Terminal(True)
     console = Console(terminal, terminal)
     with console.progress("votes") as count:
         count(1, 4)
-        for _ in range(200):
-            if "25%|" in terminal.text:
-                break
-            time.sleep(0.02)
+        _wait_for("25%|", terminal)
         console.note("a file is read again")
         assert "\r  note: a file is read again\n" in terminal.text
 
