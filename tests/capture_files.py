@@ -33,9 +33,8 @@ def ring_poses(count: int, radius: float = 3.0) -> np.ndarray:
     poses = np.tile(np.eye(4), (count, 1, 1))
     for index, angle in enumerate(np.linspace(0, 2 * np.pi, count, endpoint=False)):
         turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-        roll = np.array(
-            [[np.cos(0.3 * index), -np.sin(0.3 * index), 0], [np.sin(0.3 * index), np.cos(0.3 * index), 0], [0, 0, 1]]
-        )
+        cosine, sine = np.cos(0.3 * index), np.sin(0.3 * index)
+        roll = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
         poses[index, :3, :3] = roll @ turn
         poses[index, :3, 3] = 0, 0, radius
     return poses
@@ -123,21 +122,17 @@ def write_transforms(capture: Capture, folder, content: dict | None = None) -> N
     (folder / "transforms.json").write_text(json.dumps(transforms(capture) if content is None else content))
 
 
+def png_chunk(kind: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+
 def png(rows: np.ndarray, *, bits: int, colour_type: int, palette: bytes = b"") -> bytes:
     """A PNG of one channel, packed here by hand: OpenCV writes no palettes and no 2 or 4 bit files."""
-
-    def chunk(kind: bytes, body: bytes) -> bytes:
-        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-
     height, width = rows.shape
     binary = (rows[..., None] >> np.arange(bits)[::-1]) & 1
     packed = np.packbits(binary.reshape(height, width * bits).astype(np.uint8), axis=1)
     scanlines = b"".join(b"\0" + row.tobytes() for row in packed)
-    header = struct.pack(">IIBBBBB", width, height, bits, colour_type, 0, 0, 0)
-    chunks = [
-        (b"IHDR", header),
-        *([(b"PLTE", palette)] if palette else []),
-        (b"IDAT", zlib.compress(scanlines)),
-        (b"IEND", b""),
-    ]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*pair) for pair in chunks)
+    header = png_chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, colour_type, 0, 0, 0))
+    colours = png_chunk(b"PLTE", palette) if palette else b""
+    pixels = png_chunk(b"IDAT", zlib.compress(scanlines))
+    return b"\x89PNG\r\n\x1a\n" + header + colours + pixels + png_chunk(b"IEND", b"")
