@@ -130,11 +130,6 @@ def test_claims_without_a_class_or_a_proposal(world, scene):
     assert (claim_atoms(view, total, total)[covered] == 0).all()
 
 
-def test_frames_of_other_cameras_are_refused(world, scene):
-    with pytest.raises(ValueError, match="frames"):
-        consensus_masklets(world[2][1:], scene)
-
-
 def joined_pair_by_pair(together, both, least):
     """The slow twin: the best pair of all, again and again."""
     groups = [[k] for k in range(len(together))]
@@ -172,7 +167,7 @@ def test_average_linkage_joins_what_the_slow_twin_joins(seed, count, least):
     np.testing.assert_array_equal(np.unique(got), np.arange(got.max() + 1))
 
 
-def test_average_linkage_ends_on_ties_and_at_large_sums():
+def test_average_linkage_of_ties_large_sums_and_pairs_that_are_hardly_seen_together():
     for scale in (1e-20, 1.0, 1e20):
         both = np.full((40, 40), scale)
         assert average_linkage(both, both, least_ratio=1.0).max() == 0  # all pairs alike
@@ -181,10 +176,7 @@ def test_average_linkage_ends_on_ties_and_at_large_sums():
     rows = rng.random((300, 30)).astype(np.float32) * 1e-3
     both = rows @ rows.T  # as float32 products come: not exactly symmetric sums
     assert average_linkage(0.9 * both, both, least_ratio=0.5).max() == 0
-
-
-def test_pairs_that_are_hardly_seen_together_stay_apart():
-    both = np.asarray([[1.0, 0.01], [0.01, 1.0]])
+    both = np.asarray([[1.0, 0.01], [0.01, 1.0]])  # hardly seen together
     assert average_linkage(both, both, least_ratio=0.5, least_shared=0.0).max() == 0
     assert average_linkage(both, both, least_ratio=0.5, least_shared=0.02).max() == 1
 
@@ -204,22 +196,22 @@ def made_scene(views=12, wrong=0, seed=0):
 
 
 @pytest.mark.parametrize("wrong", [0, 4])
-def test_views_that_merge_everything_are_outvoted(wrong):
+def test_views_that_merge_everything_are_outvoted_in_any_order_of_frames_and_masks(wrong):
     membership, visible, weights, means, truth = made_scene(wrong=wrong)
     assert same_partition(group_by_consensus(membership, visible, weights, means, pieces=24), truth)
-
-
-def test_most_views_decide():
-    membership, visible, weights, means, _ = made_scene(wrong=8)  # of 12
-    assert group_by_consensus(membership, visible, weights, means, pieces=24).max() == 0
-    assert group_by_consensus(membership, visible, weights, means, pieces=24, agreement=0.7).max() == 2
-
-
-def test_order_of_the_frames_and_of_their_masks_does_not_matter():
-    membership, visible, weights, means, truth = made_scene(wrong=3)
     order = np.random.default_rng(1).permutation(membership.shape[1])
     got = group_by_consensus(membership[:, order], visible[:, ::-1], weights, means, pieces=24)
     assert same_partition(got, truth)
+
+
+def test_most_views_decide_and_rows_and_frames_that_disagree_are_refused(world, scene):
+    membership, visible, weights, means, _ = made_scene(wrong=8)  # of 12
+    assert group_by_consensus(membership, visible, weights, means, pieces=24).max() == 0
+    assert group_by_consensus(membership, visible, weights, means, pieces=24, agreement=0.7).max() == 2
+    with pytest.raises(ValueError, match="N rows"):
+        group_by_consensus(membership[1:], visible, weights, means)
+    with pytest.raises(ValueError, match="frames"):
+        consensus_masklets(world[2][1:], scene)
 
 
 def test_what_is_never_seen_belongs_to_nothing():
@@ -269,9 +261,3 @@ def test_equal_points_share_a_cell():
     cell = split_cells(points, 100)
     np.testing.assert_array_equal(cell.reshape(3, 50), cell[::50, None].repeat(50, 1))
     assert len(np.unique(cell)) == 3
-
-
-def test_rows_that_disagree_are_refused():
-    membership, visible, weights, means, _ = made_scene()
-    with pytest.raises(ValueError, match="N rows"):
-        group_by_consensus(membership[1:], visible, weights, means)
