@@ -11,13 +11,19 @@ import pytest
 import jsecon
 
 PACKAGE = Path(jsecon.__file__).parent
+MODULES = {
+    path: ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in sorted(PACKAGE.rglob("*.py"))
+}
 
 
 def test_every_public_name_can_be_had_and_none_is_hidden_by_a_room():
     """Once imported, a room becomes an attribute of the package, in the place of a public name that is called alike."""
-    for path in PACKAGE.rglob("*.py"):
+    for path, module in MODULES.items():
         if path.stem not in ("__init__", "__main__"):
-            importlib.import_module(".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts))
+            importlib.import_module(module)
+        if path.name != "process.py":  # global configuration is its alone
+            assert "jax.config.update" not in path.read_text(), path
+            assert "os.environ[" not in path.read_text(), path
     for name in jsecon.__all__:
         assert callable(getattr(jsecon, name)), name
         assert name in dir(jsecon)
@@ -28,9 +34,6 @@ def test_names_that_outside_code_relies_on_are_there():
         train_autoencoder masklets region_embeddings query_one_step query_canonical query_anchored remove_outliers iou
         mean_iou accuracy_at localization_accuracy load_field save_field check_backend"""
     assert set(promised.split()) <= set(jsecon.__all__)
-
-
-def test_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="no_such_name"):
         jsecon.no_such_name  # noqa: B018
 
@@ -67,7 +70,7 @@ def test_packages_import_downwards_only():
     assert packages == set(LAYERS)
     modules = {path.stem for path in PACKAGE.glob("*.py")}
     assert modules == {*GROUND, "__init__", "__main__"}
-    for path in PACKAGE.rglob("*.py"):
+    for path in MODULES:
         package = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
         if package in ("__init__", "__main__"):  # the table of contents, and the program
             continue
@@ -80,10 +83,8 @@ def test_packages_import_downwards_only():
 
 def test_modules_import_without_circles():
     """No module imports itself by way of others, imports inside functions included."""
-    names = {path: ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in PACKAGE.rglob("*.py")}
-    known = set(names.values())
-    graph = {}
-    for path, name in names.items():
+    known, graph = set(MODULES.values()), {}
+    for path, name in MODULES.items():
         found = {n if n in known else n.rpartition(".")[0] for n in jsecon_imports(path)}
         graph[name] = (found & known) - {"jsecon.__init__"}
     done, path = set(), []
@@ -100,12 +101,3 @@ def test_modules_import_without_circles():
 
     for name in sorted(set(graph) - {"jsecon.__init__"}):
         visit(name)
-
-
-def test_no_module_touches_global_configuration():
-    for path in PACKAGE.rglob("*.py"):
-        if path.name == "process.py":
-            continue
-        text = path.read_text()
-        assert "jax.config.update" not in text, path
-        assert "os.environ[" not in text, path

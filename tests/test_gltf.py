@@ -112,8 +112,12 @@ def rewritten(file, change):
     file.write_bytes(head + text + behind)
 
 
+def primitive(told):
+    return told["meshes"][0]["primitives"][0]
+
+
 def extension(told):
-    return told["meshes"][0]["primitives"][0]["extensions"][NAME]
+    return primitive(told)["extensions"][NAME]
 
 
 def test_other_writers_ways(tmp_path):
@@ -126,7 +130,7 @@ def test_other_writers_ways(tmp_path):
         shift = np.eye(4)
         shift[:3, 3] = 5, 0, 0
         told["nodes"] = [outer, {"mesh": 0}, {"mesh": 0, "matrix": shift.T.ravel().tolist()}]
-        names = told["meshes"][0]["primitives"][0]["attributes"]
+        names = primitive(told)["attributes"]
         alpha = told["accessors"][names[f"{NAME}:OPACITY"]]
         colour = told["accessors"][names["COLOR_0"]]
         alpha |= {"bufferView": colour["bufferView"], "byteOffset": 3, "componentType": 5121, "normalized": True}
@@ -150,12 +154,9 @@ def test_other_writers_ways(tmp_path):
         (lambda told: told["accessors"][0].update(sparse={}), "sparse"),
         (lambda told: told["bufferViews"][0].update(byteOffset=-4), "from -4 on"),
         (lambda told: told["bufferViews"][0].update(byteStride=0), "rows of 0 bytes"),
-        (lambda told: told["meshes"][0]["primitives"][0]["extensions"].clear(), "no primitive of its scene"),
-        (
-            lambda told: told["meshes"][0]["primitives"][0]["attributes"].pop(f"{NAME}:SCALE"),
-            f"no attribute {NAME}:SCALE",
-        ),
-        (lambda told: told["meshes"][0]["primitives"][0]["attributes"].pop(f"{NAME}:SH_DEGREE_1_COEF_1"), "3 coeff"),
+        (lambda told: primitive(told)["extensions"].clear(), "no primitive of its scene"),
+        (lambda told: primitive(told)["attributes"].pop(f"{NAME}:SCALE"), f"no attribute {NAME}:SCALE"),
+        (lambda told: primitive(told)["attributes"].pop(f"{NAME}:SH_DEGREE_1_COEF_1"), "3 coeff"),
         (lambda told: told["nodes"][0].update(children=[0]), "node 0 is in its scene twice"),
         (lambda told: told["nodes"][0].update(scale=[1, 2, 1]), "node 0 scales its axes unequally, by 1, 2, 1"),
         (lambda told: told["nodes"][0].update(scale=[1, 1, -1]), "mirrors"),
@@ -165,10 +166,7 @@ def test_other_writers_ways(tmp_path):
         (lambda told: extension(told).update(projection="fisheye"), "projection of its Gaussians is fisheye"),
         (lambda told: extension(told).update(extensions={"EXT_x": {}}), "use the extension EXT_x"),
         (lambda told: told["accessors"][2].update(componentType=5121), "not normalised"),
-        (
-            lambda told: told["meshes"][0]["primitives"][0]["extensions"][NAME].update(kernel="cube"),
-            "kernel of its Gaussians is cube",
-        ),
+        (lambda told: extension(told).update(kernel="cube"), "kernel of its Gaussians is cube"),
         (lambda told: told["accessors"][4].update(bufferView=0, byteOffset=0), "not finite"),
         (lambda told: told.update(extensionsRequired=["KHR_materials_unlit", NAME, "KHR_x"]), "extension KHR_x"),
     ],
