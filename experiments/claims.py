@@ -16,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import lerf, results
+from experiments.rivals.evidence import unit
 from experiments.tables.answers import Steps
-from experiments.tables.association import overlaps, unit
+from experiments.tables.association import overlaps
 from experiments.tables.fill import measure
 from experiments.tables.ours import paper
 from experiments.tables.setting import Setting, prepare

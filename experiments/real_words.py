@@ -1,6 +1,6 @@
 """Real words on real pictures: which rule finds what a text names, where embeddings err as real ones do?
 
-    python -m experiments.real_words [--model FOLDER] [--out FOLDER] [--cache FOLDER]
+    python -m experiments.real_words [--model FOLDER] [--out FOLDER]
 
 The embedder is ConSE (`experiments.words.conse`): a labeller of 631 classes, whose probabilities weight the text
 vectors of its classes' names. Both lie in ../shared/words, and so do the named points. `--model` is the folder of the
@@ -18,10 +18,8 @@ texts. Rendered: the selected Gaussians alone, alpha > 0.7, in two of those view
     recognition     the regions that a rule finds by the text
 """
 
-import argparse
 import dataclasses
 import functools
-import hashlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -34,22 +32,12 @@ from scipy import sparse
 from experiments import results
 from experiments.calibration import Bin, calibration_error
 from experiments.cells import append_cell, read_cells
-from experiments.rivals.lifting import READOUT
+from experiments.rivals.evidence import unit
+from experiments.rivals.lifting import READOUT, smoothed
 from experiments.words import rules
 from experiments.words.absent import absent_names
-from experiments.words.conse import WORDS, Conse, Crop, Labeller, TextVectors, class_weights, conse
-from experiments.words.scenes import (
-    DEFAULT,
-    GIVEN,
-    RIVALS,
-    Sources,
-    WordScene,
-    load_scene,
-    rival_weights,
-    scores_of,
-    things_of,
-)
-from jsecon.errors import InputError
+from experiments.words.conse import Conse, Crop, Labeller, TextVectors, class_weights, conse
+from experiments.words.scenes import DEFAULT, GIVEN, RIVALS, WordScene, load_scene, rival_weights, scores_of
 from jsecon.evaluate.metrics import iou
 from jsecon.language.membership import finish_votes
 from jsecon.query.classes import query_classes
@@ -67,13 +55,12 @@ CROPS = tuple(
     for surroundings in ("kept", "greyed", "masked")
 )
 CHOOSING = (("apc_bin", GIVEN), ("apc_bin", DEFAULT), ("bonsai", DEFAULT))
-"""what crops and rules are chosen on"""
+"""what rules are chosen on; crops on the first and the last"""
 REPORTED = (("replica_apartment_0", GIVEN), ("replica_apartment_0", DEFAULT))
-GIVEN_FLAT, DEFAULT_FLAT = (f"{name}, {masks}" for name, masks in REPORTED)
+CASES = {f"{name}, {masks}": (name, masks) for name, masks in (*CHOOSING, *REPORTED)}
+GIVEN_FLAT, DEFAULT_FLAT = tuple(CASES)[len(CHOOSING) :]
 VARIANTS = ("probability", "log-odds")
-"""of the embedder, see `variants_of`"""
-ALONE = ("probability",)
-"""variants that Gaussians are also asked alone with"""
+"""of the embedder: the paper's weights, and log-odds. Gaussians alone are asked by the first"""
 CLASS_LIST = "class list"
 """of the ways: each region under its best text"""
 RENDERED = 2
@@ -83,54 +70,12 @@ GRID = np.linspace(0, 1, 51)
 
 
 @dataclasses.dataclass(frozen=True)
-class Options(Sources):
+class Options:
     """What the experiment can vary."""
 
-    labeller: str = str(WORDS / "object_labeler.tflite")
-    vectors: str = str(WORDS / "minilm_vectors.npz")
     model: str = ""
-    """folder of the model that made the vectors, for texts that are not among them"""
-    cache: str = str(results.HOME / "results" / "real_words" / "run")
-    """folder of what takes long: scenes, votes and the labeller's scores"""
-    out: str = str(results.HOME / "results" / "real_words")
-    scenes: str = "replica_apartment_0 apc_bin bonsai"
-    """scenes to measure, blanks between them"""
-    only_kept: str = "no"
-    """"yes" prints what is measured already, and measures nothing"""
-
-
-Kept = Callable[[str, Callable[[], Any]], Any]
-"""(key, what measures it) -> the figure, measured once and kept on disk"""
-
-
-def kept_in(file: Path, *, only: bool = False) -> Kept:
-    """Figures kept in a file of cells, which a run that was stopped goes on from. `only`: nothing more is measured, and
-    what is missing is None."""
-
-    def kept(key: str, measure: Callable[[], Any]) -> Any:
-        cells = read_cells(file)
-        if only:
-            return cells.get(key)
-        if key not in cells:
-            append_cell(file, key, measure())
-            cells = read_cells(file)
-        return cells[key]
-
-    return kept
-
-
-def digest_of(options: Options) -> str:
-    """A digest of the data, the labeller and the vectors, without which a kept figure is another's."""
-    digest = hashlib.sha256(repr(locate_sources(options)).encode())
-    weights = Path(options.model, "model.safetensors") if options.model else None
-    for file in (options.labeller, options.vectors, weights):
-        digest.update(Path(file).read_bytes() if file and Path(file).is_file() else b"")
-    return digest.hexdigest()[:12]
-
-
-def locate_sources(options: Options) -> Sources:
-    """The options' data alone."""
-    return Sources(*(getattr(options, own.name) for own in dataclasses.fields(Sources)))
+    """Folder of the model that made the vectors, for texts that are not among them."""
+    out: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,29 +97,27 @@ class Case:
         return rules.scores(embeddings, self.texts, canonical, words, pixels, kind)
 
 
-def embedder_of(options: Options, crop: Crop | None = None, weights: str = "probability") -> Conse:
-    """ConSE of the options' files."""
-    texts = TextVectors(options.vectors, options.model or None)
-    return Conse(Labeller(options.labeller), texts, crop=crop or Crop(), weights=weights)
+def open_embedder(options: Options, crop: Crop | None = None) -> Conse:
+    """Opens ConSE of the files in ../shared/words."""
+    return Conse(Labeller(), TextVectors(model=options.model or None), crop=crop or Crop())
 
 
-def case_of(options: Options, scene: WordScene, embedder: Conse) -> Case:
-    """A scene with the embeddings of `embedder`, as a field that jsecon's queries take."""
-    found = class_weights(scores_of(options.cache, scene, embedder, locate_sources(options)), embedder.weights)
-    crops = conse(found, embedder.class_vectors, top=embedder.top)
+def case_of(scene: WordScene, embedder: Conse, variant: str) -> Case:
+    """A scene with the embeddings of `embedder` by one of VARIANTS, as a field that jsecon's queries take."""
+    weights = class_weights(scores_of(scene, embedder), variant)
+    crops = conse(weights, embedder.class_vectors, top=embedder.top)
     regions = scene.regions(crops)
-    count, regions_count = scene.gaussians.count, regions.count
     field = LanguageField(
         gaussians=scene.gaussians,
-        codes=np.zeros((count, 1), np.float32),
-        votes=finish_votes(jax.tree.map(jnp.asarray, scene.votes), regions),
+        codes=np.zeros((scene.gaussians.count, 1), np.float32),
+        votes=finish_votes(scene.votes, regions),
         regions=regions,
-        region_codes=np.zeros((regions_count, 1), np.float32),
+        region_codes=np.zeros((regions.count, 1), np.float32),
         autoencoder=None,
         cameras=scene.cameras,
         canonical=embedder.canonical,
         to_source=np.eye(4),
-        names=tuple(map(str, range(len(scene.pixels[0])))),
+        names=tuple(map(str, range(len(scene.frames)))),
         embedder=embedder.name,
         reference=reference_of(embedder),
     )
@@ -228,43 +171,35 @@ RULES: dict[str, Chooser] = {f"{kind}, {way}": _by_regions(kind, way) for kind i
 ROWS = PRODUCT | RULES
 
 
-def features_of(case: Case, weights: sparse.csr_matrix) -> np.ndarray:
-    """(N, E) unit features of the Gaussians by the weights (N, C) of a method; zero where no mask holds one."""
-    total = np.asarray(weights @ case.crops, np.float64)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.where(length > 0, total / np.where(length > 0, length, 1.0), 0.0).astype(np.float32)
-
-
-def alone(case: Case, weights: sparse.csr_matrix) -> dict[str, np.ndarray]:
-    """reading -> (Q,) IoUs by T2 of each Gaussian compared with the texts alone: at thresholds that are fixed, and at
-    those that are best on this very scene."""
-    features, truth, asked = features_of(case, weights), case.scene.truth["T2"], case.scene.asked
-    cosine = rules.point_scores(features, case.texts, case.field.canonical, "cosine")
-    relevancy = rules.point_scores(features, case.texts, case.field.canonical, "relevancy")
-    smooth = rules.smoothed(case.scene.gaussians.means, relevancy)
-    return {
-        f"relevancy, smoothed, {READOUT}": rules.ious(smooth > READOUT, truth, asked),
-        "relevancy 0.5": rules.ious(relevancy >= 0.5, truth, asked),
-        f"cosine {RETRIEVAL_THRESHOLD}": rules.ious(cosine >= RETRIEVAL_THRESHOLD, truth, asked),
-        CLASS_LIST: rules.ious(rules.best_text(cosine), truth, asked),
-        f"{CLASS_LIST}, standardised": rules.ious(rules.best_text(rules.standardised(cosine)), truth, asked),
-        "cosine, best threshold": rules.best_threshold(cosine, truth, asked, GRID)[1],
-        "relevancy, smoothed, best threshold": rules.best_threshold(smooth, truth, asked, GRID)[1],
-    }
-
-
-READINGS = (
-    f"relevancy, smoothed, {READOUT}",
-    "relevancy 0.5",
-    f"cosine {RETRIEVAL_THRESHOLD}",
-    CLASS_LIST,
-    f"{CLASS_LIST}, standardised",
-    "cosine, best threshold",
-    "relevancy, smoothed, best threshold",
-)
-"""of `alone`"""
 FIXED = (f"relevancy, smoothed, {READOUT}", "relevancy 0.5", f"cosine {RETRIEVAL_THRESHOLD}")
 """of `alone`: thresholds of others and of the paper"""
+
+
+def alone(case: Case, weights: sparse.csr_matrix) -> dict[str, list[float]]:
+    """Compares each Gaussian with the texts alone.
+
+    Args:
+      case: The scene and the texts.
+      weights: (N, C) of each crop on each Gaussian, of a method of RIVALS.
+
+    Returns:
+      reading -> (Q,) IoUs by T2: at thresholds that are fixed (FIXED), and at those that are best on this very scene.
+    """
+    features, truth, asked = (
+        unit(np.asarray(weights @ case.crops, np.float64)),
+        case.scene.truth["T2"],
+        case.scene.asked,
+    )
+    cosine = rules.point_scores(features, case.texts, case.field.canonical, "cosine")
+    relevancy = rules.point_scores(features, case.texts, case.field.canonical, "relevancy")
+    smooth = smoothed(case.scene.gaussians.means, relevancy)
+    chosen = (smooth > READOUT, relevancy >= 0.5, cosine >= RETRIEVAL_THRESHOLD)
+    found = {reading: rules.ious(own, truth, asked) for reading, own in zip(FIXED, chosen)}
+    found[CLASS_LIST] = rules.ious(rules.best_text(cosine), truth, asked)
+    found[STANDARDISED[0]] = rules.ious(rules.best_text(rules.standardised(cosine)), truth, asked)
+    found["cosine, best threshold"] = rules.best_threshold(cosine, truth, asked, GRID)[1]
+    found["relevancy, smoothed, best threshold"] = rules.best_threshold(smooth, truth, asked, GRID)[1]
+    return {reading: own.tolist() for reading, own in found.items()}
 
 
 def true_regions(scene: WordScene) -> np.ndarray:
@@ -315,40 +250,16 @@ def crop_quality(embedder: Conse, pictures: tuple, texts: np.ndarray) -> dict[st
     }
 
 
-def chosen_of(options: Options, cases: tuple[tuple[str, str], ...]) -> list[tuple[str, str]]:
-    """The cases (scene, masks) whose scene the options name."""
-    return [(name, masks) for name, masks in cases if name in options.scenes.split()]
-
-
-def compare_crops(options: Options, kept: Kept) -> list[dict]:
-    """A row for each of CROPS: its quality on each scene that chooses."""
-    names = [name for name, _ in chosen_of(options, CHOOSING[::2])]
-    pictures = functools.cache(functools.partial(_outlined, options))
-    rows = []
-    for crop in CROPS:
-
-        def measure(crop: Crop = crop) -> dict:
-            embedder, found = embedder_of(options, crop), {}
-            for name in names:
-                texts, given = pictures(name)
-                found[name] = crop_quality(embedder, given, embedder.embed_text(list(texts)))
-            return found
-
-        told = dataclasses.asdict(crop)
-        scenes = kept(f"crop {tuple(told.values())}", measure)
-        if scenes is not None:
-            rows.append({"crop": told, "scenes": scenes})
-    return rows
-
-
-def _outlined(options: Options, name: str) -> tuple[tuple[str, ...], tuple]:
-    """The texts of a scene that chooses, and its outlined things as `crop_quality` takes them."""
-    masks = dict(CHOOSING[::-1])[name]
-    scene = load_scene(options.cache, name, masks, locate_sources(options))
-    frames, things, names = things_of(options.cache, name, masks, locate_sources(options))
-    place = np.full(len(scene.names) + 2, -1)
-    place[scene.asked] = np.arange(len(scene.asked))
-    return scene.texts, (frames, things, place[names])
+def measure_crop(options: Options, crop: Crop) -> dict[str, dict[str, float]]:
+    """The quality of a way to cut out crops, on the scenes that choose it."""
+    embedder, found = open_embedder(options, crop), {}
+    for name, masks in CHOOSING[::2]:
+        scene = load_scene(name, masks)
+        place = np.full(len(scene.names) + 2, -1)
+        place[scene.asked] = np.arange(len(scene.asked))
+        pictures = scene.shown, scene.things, place[scene.thing_names]
+        found[name] = crop_quality(embedder, pictures, embedder.embed_text(list(scene.texts)))
+    return found
 
 
 def lifting_and_rendering(scene: WordScene) -> list[dict]:
@@ -367,7 +278,7 @@ def lifting_and_rendering(scene: WordScene) -> list[dict]:
 def _votes_without_embeddings(scene: WordScene) -> Votes:
     """The votes as queries read them, where no two regions are alike."""
     regions = Regions(np.eye(len(scene.pixels), dtype=np.float32), scene.pixels)
-    return finish_votes(jax.tree.map(jnp.asarray, scene.votes), regions)
+    return finish_votes(scene.votes, regions)
 
 
 def refusal(case: Case, embedder: Conse) -> dict[str, Any]:
@@ -395,138 +306,118 @@ def refusal(case: Case, embedder: Conse) -> dict[str, Any]:
     return found
 
 
+def measure_case(scene: WordScene, embedder: Conse, variant: str) -> dict:
+    """All figures of a scene by a variant of the embedder."""
+    case = case_of(scene, embedder, variant)
+    selected = {row: choose(case) for row, choose in ROWS.items()}
+    points = {
+        truth: {row: rules.ious(own, values, scene.asked).tolist() for row, own in selected.items()}
+        for truth, values in scene.truth.items()
+    }
+    return {"points": points, "refusal": refusal(case, embedder)}
+
+
+def main(options: Options) -> dict:
+    """Runs the experiment, writes its results and returns the metrics."""
+    file = Path(options.out) / "run" / f"cells{'-model' if options.model else ''}.jsonl"
+    embedder = functools.cache(functools.partial(open_embedder, options))
+
+    def kept(key: str, measure: Callable[[], Any]) -> Any:
+        """The figure `key`, measured once and kept on disk."""
+        if key not in read_cells(file):
+            append_cell(file, key, measure())
+            print(f"{key}: measured", flush=True)
+        return read_cells(file)[key]
+
+    metrics: dict[str, Any] = {"crops": [], "cases": {}, "parts": {}}
+    for crop in CROPS:
+        told = dataclasses.asdict(crop)
+        found = kept(f"crop {tuple(told.values())}", functools.partial(measure_crop, options, crop))
+        metrics["crops"].append({"crop": told, "scenes": found})
+    for k, (name, masks) in CASES.items():
+        for variant in VARIANTS:
+
+            def measure(name: str = name, masks: str = masks, variant: str = variant) -> dict:
+                return measure_case(load_scene(name, masks), embedder(), variant)
+
+            figures = kept(f"{k}, {variant}", measure)
+            error, curve = calibration(figures["refusal"])
+            figures["refusal"] = {k: v for k, v in figures["refusal"].items() if k != "confidence"}
+            figures["refusal"] |= {"calibration error": error, "reliability": curve}
+            metrics["cases"][f"{k}, {variant}"] = figures | {"alone": {}}
+        for method in RIVALS:
+
+            def measure_alone(name: str = name, masks: str = masks, method: str = method) -> dict:
+                scene = load_scene(name, masks)
+                return alone(case_of(scene, embedder(), VARIANTS[0]), rival_weights(scene, method))
+
+            key = f"{k}, {VARIANTS[0]}"
+            metrics["cases"][key]["alone"][method] = kept(f"{key}, {method}", measure_alone)
+    metrics["chosen_on"] = list(CASES)[: len(CHOOSING)]
+    score = rule_scores(metrics)
+    metrics["best_rule"] = list(max(score, key=lambda key: score[key]))
+    for k, (name, masks) in CASES.items():
+
+        def measure_parts(name: str = name, masks: str = masks) -> list[dict]:
+            return lifting_and_rendering(load_scene(name, masks))
+
+        metrics["parts"][k] = kept(f"{k}, parts", measure_parts)
+    text = "\n\n".join(tables(metrics))
+    results.save(Path(options.out), options, metrics, text)
+    print(text)
+    return metrics
+
+
+def rule_scores(metrics: dict) -> dict[tuple[str, str], float]:
+    """Mean IoU of each rule and variant over the cases that rules are chosen on."""
+
+    def mean(k, variant, row):
+        return np.mean(metrics["cases"][f"{k}, {variant}"]["points"]["T2"][row])
+
+    pairs = [(row, variant) for variant in VARIANTS for row in ROWS]
+    return {
+        (row, variant): float(np.mean([mean(k, variant, row) for k in metrics["chosen_on"]])) for row, variant in pairs
+    }
+
+
 def _mean(values: Any) -> str:
     """A mean with the middle 95 % under resampling."""
     low, high = rules.interval(np.asarray(values))
     return f"{np.mean(values):.3f} ({low:.3f} to {high:.3f})"
 
 
-def measured(options: Options, name: str, masks: str, variant: str) -> dict:
-    """All figures of a scene with its masks, by a variant of the embedder."""
-    embedder = variants_of(options)[variant]
-    scene = load_scene(options.cache, name, masks, locate_sources(options))
-    case = case_of(options, scene, embedder)
-    selected = {row: choose(case) for row, choose in ROWS.items()}
-    return {
-        "points": {
-            truth: {row: rules.ious(own, values, scene.asked).tolist() for row, own in selected.items()}
-            for truth, values in scene.truth.items()
-        },
-        "refusal": refusal(case, embedder),
-    }
-
-
-def measured_alone(options: Options, name: str, masks: str, variant: str, method: str) -> dict[str, list[float]]:
-    """IoUs of a scene's texts by each reading of a method of RIVALS."""
-    scene = load_scene(options.cache, name, masks, locate_sources(options))
-    case = case_of(options, scene, variants_of(options)[variant])
-    cast = rival_weights(options.cache, scene, method, locate_sources(options))
-    return {reading: own.tolist() for reading, own in alone(case, cast).items()}
-
-
-def variants_of(options: Options) -> dict[str, Conse]:
-    """Embedders of one labeller: the paper's, and by log-odds."""
-    labeller, texts = Labeller(options.labeller), TextVectors(options.vectors, options.model or None)
-    return {variant: Conse(labeller, texts, weights=variant) for variant in VARIANTS}
-
-
-def main(options: Options = Options(), tell: Callable[[str], None] = print) -> dict:
-    """Runs the experiment, writes its results and returns the metrics."""
-    kept = kept_in(Path(options.cache) / f"cells-{digest_of(options)}.jsonl", only=options.only_kept == "yes")
-    choosing = chosen_of(options, CHOOSING)
-    told = {f"{name}, {masks}": (name, masks) for name, masks in (*choosing, *chosen_of(options, REPORTED))}
-    metrics: dict[str, Any] = {"crops": compare_crops(options, kept), "cases": {}, "parts": {}}
-    for k, (name, masks) in told.items():
-        for variant in VARIANTS:
-            own = f"{k}, {variant}"
-            given = options, name, masks, variant
-            figures = kept(own, functools.partial(measured, *given))
-            if figures is None:
-                continue
-            error, curve = calibration(figures["refusal"])
-            figures["refusal"] = {k: v for k, v in figures["refusal"].items() if k != "confidence"}
-            figures["refusal"] |= {"calibration error": error, "reliability": curve}
-            figures["alone"] = {}
-            for method in RIVALS if variant in ALONE else ():
-                ious = kept(f"{own}, {method}", functools.partial(measured_alone, *given, method))
-                if ious is not None:
-                    figures["alone"][method] = ious
-            metrics["cases"][own] = figures
-            tell(f"{own}: measured")
-    chosen_on = [f"{name}, {masks}" for name, masks in choosing]
-    chosen_on = [k for k in chosen_on if all(f"{k}, {variant}" in metrics["cases"] for variant in VARIANTS)]
-    if not chosen_on:
-        remedy = "Run it without --only-kept, and with a scene that chooses."
-        raise InputError(
-            options.cache, "no rule can be chosen: nothing of apc_bin and bonsai is measured", remedy=remedy
-        )
-    metrics["chosen_on"] = chosen_on
-    score = {
-        (row, variant): float(
-            np.mean([np.mean(metrics["cases"][f"{k}, {variant}"]["points"]["T2"][row]) for k in chosen_on])
-        )
-        for variant in VARIANTS
-        for row in ROWS
-    }
-    rule, variant = max(score, key=lambda key: score[key])
-    metrics["best_rule"] = [rule, variant]
-    for k, (name, masks) in told.items():
-
-        def parts(name: str = name, masks: str = masks) -> list[dict]:
-            return lifting_and_rendering(load_scene(options.cache, name, masks, locate_sources(options)))
-
-        found = kept(f"{k}, parts", parts)
-        if found is not None:
-            metrics["parts"][k] = found
-    text = "\n\n".join(tables(metrics, list(told), score))
-    results.save(Path(options.out), options, metrics, text)
-    tell(text)
-    return metrics
-
-
-def tables(metrics: dict, told: list[str], score: dict) -> list[str]:
-    """All tables and what the library must reach, in Markdown; "" where nothing is measured yet."""
-    cases = metrics["cases"]
-
-    def of_case(k: str, variant: str, *keys: str) -> str:
-        found = cases.get(f"{k}, {variant}", {})
-        for key in keys:
-            found = found.get(key, {})
-        return _mean(found) if found else ""
-
-    scenes = list(metrics["crops"][0]["scenes"]) if metrics["crops"] else []
-
-    def quality(own):
-        return f"{own['words']:.3f} / {own['first']:.2f}"
-
-    rows = [(*row["crop"].values(), *(quality(row["scenes"][s]) for s in scenes)) for row in metrics["crops"]]
+def tables(metrics: dict) -> list[str]:
+    """All tables and what the library must reach, in Markdown."""
+    cases, score, scenes = metrics["cases"], rule_scores(metrics), list(metrics["crops"][0]["scenes"])
     text = [
         "Crops of outlined things: share of all words less similar than the own name / own name first in the scene."
     ]
+    rows = []
+    for row in metrics["crops"]:
+        qualities = [row["scenes"][scene] for scene in scenes]
+        rows.append((*row["crop"].values(), *(f"{own['words']:.3f} / {own['first']:.2f}" for own in qualities)))
     text.append(results.table(("margin", "shape", "surroundings", *scenes), rows))
     rows = []
-    for variant in VARIANTS:
-        for row in ROWS:
-            chosen_by = f"{score[row, variant]:.3f}" if (row, variant) in score else ""
-            own = [of_case(k, variant, "points", "T2", row) for k in told]
-            rows.append((row, variant, chosen_by, *own, of_case(GIVEN_FLAT, variant, "points", "T1", row)))
+    for (row, variant), chosen_by in score.items():
+        points = {k: cases[f"{k}, {variant}"]["points"] for k in CASES}
+        own = [_mean(points[k]["T2"][row]) for k in CASES]
+        rows.append((row, variant, chosen_by, *own, _mean(points[GIVEN_FLAT]["T1"][row])))
     text.append("Rules, IoU at the points by T2, mean over the texts (95 % under resampling of the texts).")
-    text.append(results.table(("rule", "embedder", "mean where chosen", *told, f"{GIVEN_FLAT}, T1"), rows))
+    text.append(results.table(("rule", "embedder", "mean where chosen", *CASES, f"{GIVEN_FLAT}, T1"), rows))
+    every = {k: cases[f"{k}, {VARIANTS[0]}"]["alone"] for k in CASES}
     rows = []
     for method in RIVALS:
-        for reading in READINGS:
-            for variant in ALONE:
-                rows.append((method, reading, variant, *(of_case(k, variant, "alone", method, reading) for k in told)))
+        for reading in every[GIVEN_FLAT][method]:
+            rows.append((method, reading, VARIANTS[0], *(_mean(every[k][method][reading]) for k in CASES)))
     text.append("Each Gaussian alone, IoU at the points by T2; the best thresholds are chosen by the truth.")
-    text.append(results.table(("method", "reading", "embedder", *told), rows))
+    text.append(results.table(("method", "reading", "embedder", *CASES), rows))
     rows = []
     for k, parts in metrics["parts"].items():
         for own in parts:
             drawn = [v for v in own["rendered"] if np.isfinite(v)]
             rows.append((k, own["part"], _mean(own["T2"]), _mean(own["T1"]) if "T1" in own else "", _mean(drawn)))
-    text.append(
-        f"The error in three parts; recognition by {', '.join(metrics['best_rule'])}, best where rules are chosen."
-    )
+    best = ", ".join(metrics["best_rule"])
+    text.append(f"The error in three parts; recognition by {best}, best where rules are chosen.")
     text.append(results.table(("scene", "part", "T2", "T1", "rendered"), rows))
     rows = []
     for k, figures in cases.items():
@@ -536,10 +427,8 @@ def tables(metrics: dict, told: list[str], score: dict) -> list[str]:
         f"Present and absent names by `query_anchored`, which answers above the quantile {QUANTILE}; the calibration "
         "error of its confidence, both kinds weighing the same in all."
     )
-    text.append(
-        results.table(("scene, masks, embedder", "absent", "AUC", "kept", "refused", "calibration error"), rows)
-    )
-    return [*text, "  \n".join(acceptance(metrics))]
+    header = ("scene, masks, embedder", "absent", "AUC", "kept", "refused", "calibration error")
+    return [*text, results.table(header, rows), "  \n".join(acceptance(metrics))]
 
 
 def calibration(refused: dict[str, Any]) -> tuple[float, list[Bin]]:
@@ -551,38 +440,27 @@ def calibration(refused: dict[str, Any]) -> tuple[float, list[Bin]]:
 
 
 def acceptance(metrics: dict) -> list[str]:
-    """What the library must reach, a line each, as far as it is measured."""
-    (rule, variant), cases, lines = metrics["best_rule"], metrics["cases"], []
-
-    def lifted(k):
-        return float(np.mean(next(row for row in metrics["parts"][k] if row["part"] == "lifting")["T2"]))
-
-    def real(k):
-        return float(np.mean(cases[f"{k}, {variant}"]["points"]["T2"][rule]))
-
-    if GIVEN_FLAT in metrics["parts"]:
-        lines.append(f"(a) {GIVEN_FLAT} masks, true names, T2: {lifted(GIVEN_FLAT):.3f} (0.75)")
-    if f"{GIVEN_FLAT}, {variant}" in cases:
-        fixed = {
-            f"{method}, {reading}, {own}": float(np.mean(ious[reading]))
-            for own in ALONE
-            for method, ious in cases.get(f"{GIVEN_FLAT}, {own}", {"alone": {}})["alone"].items()
-            for reading in FIXED
-        }
-        line = f"(b) the same, real words, {rule}, {variant}: {real(GIVEN_FLAT):.3f} (0.30)"
-        if fixed:
-            best = max(fixed, key=fixed.__getitem__)
-            line += f"; above {best}: {real(GIVEN_FLAT) - fixed[best]:.3f} (0.10)"
-        lines.append(line)
-    if DEFAULT_FLAT in metrics["parts"]:
-        lines.append(f"(c) {DEFAULT_FLAT} masks, true names: {lifted(DEFAULT_FLAT):.3f} (0.42)")
-    if f"{DEFAULT_FLAT}, {variant}" in cases:
-        lines.append(f"(c) {DEFAULT_FLAT} masks, real words: {real(DEFAULT_FLAT):.3f} (0.18)")
-    return lines
+    """What the library must reach, a line each."""
+    (rule, variant), cases = metrics["best_rule"], metrics["cases"]
+    lifted = {
+        k: np.mean(next(row for row in parts if row["part"] == "lifting")["T2"])
+        for k, parts in metrics["parts"].items()
+    }
+    real = {k: np.mean(cases[f"{k}, {variant}"]["points"]["T2"][rule]) for k in CASES}
+    fixed = {
+        f"{method}, {reading}, {VARIANTS[0]}": np.mean(ious[reading])
+        for method, ious in cases[f"{GIVEN_FLAT}, {VARIANTS[0]}"]["alone"].items()
+        for reading in FIXED
+    }
+    best = max(fixed, key=fixed.__getitem__)
+    return [
+        f"(a) {GIVEN_FLAT} masks, true names, T2: {lifted[GIVEN_FLAT]:.3f} (0.75)",
+        f"(b) the same, real words, {rule}, {variant}: {real[GIVEN_FLAT]:.3f} (0.30); above {best}: "
+        f"{real[GIVEN_FLAT] - fixed[best]:.3f} (0.10)",
+        f"(c) {DEFAULT_FLAT} masks, true names: {lifted[DEFAULT_FLAT]:.3f} (0.42)",
+        f"(c) {DEFAULT_FLAT} masks, real words: {real[DEFAULT_FLAT]:.3f} (0.18)",
+    ]
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    for option in dataclasses.fields(Options):
-        parser.add_argument(f"--{option.name.replace('_', '-')}", default=option.default)
-    main(Options(**vars(parser.parse_args())))
+    main(results.read_options(Options, "real_words", __doc__))

@@ -42,15 +42,11 @@ def main(plan: Sweep) -> str:
     """Sweeps, writes the table and the figure, returns the table."""
 
     def at(way: str, threshold: float):
-        return lambda setting, steps: ask_field(setting, _field(setting), way, clean=False, threshold=threshold)
+        def ask(setting, steps):
+            field = setting.shared.get("field", lambda: field_of(setting))
+            return ask_field(setting, field, way, clean=False, threshold=threshold)
 
-    fields: dict[int, object] = {}
-
-    def _field(setting):
-        if id(setting) not in fields:
-            fields.clear()
-            fields[id(setting)] = field_of(setting)
-        return fields[id(setting)]
+        return ask
 
     methods = {f"{way} {threshold:g}": at(way, threshold) for way in WAYS for threshold in plan.thresholds}
     cells = fill(dataclasses.replace(plan, methods=tuple(methods)), methods, tell=print)

@@ -7,18 +7,15 @@ from jsecon.fit.depth import DepthPoints, back_project_frame
 from jsecon.types import Array, Capture
 
 
-def confirmed_depths(
-    capture: Capture, *, tolerance: float, min_views: int = 2, frames: Int[np.ndarray, " f"] | None = None
-) -> Float[np.ndarray, "t h w"]:
+def confirmed_depths(capture: Capture, *, tolerance: float, min_views: int) -> Float[np.ndarray, "t h w"]:
     """The depths without those that the other views do not confirm: sensor noise, and pixels that mix two surfaces.
 
     A depth stays where at least `min_views` other views measure the same point, to within `tolerance` (relative to
-    their depth), and no more views look past it than do; everything else becomes 0, unknown. Only `frames` are filtered
-    and compared (by default those that are not held out); the depths of the others are returned as they are. Raises
-    InputError where the capture has no depth.
+    their depth), and no more views look past it than do; everything else becomes 0, unknown. Only frames that are not
+    held out are filtered and compared.
     """
     depths = np.array(capture.depths, np.float32)
-    chosen = np.flatnonzero(~np.asarray(capture.held_out)) if frames is None else np.asarray(frames)
+    chosen = np.flatnonzero(~np.asarray(capture.held_out))
     height, width = depths.shape[1:]
     filtered = depths.copy()
     for t in chosen:

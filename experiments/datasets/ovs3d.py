@@ -1,4 +1,4 @@
-"""3D-OVS: ROOT/<scene>/{images, sparse/0, poses_bounds.npy, segmentations/{classes.txt, <frame number>/<class>.png}}.
+"""3D-OVS: ROOT/<scene>/{images, sparse/0, segmentations/{classes.txt, <frame number>/<class>.png}}.
 
 A folder of `segmentations` is called by its frame's place in the sorted list of images (Kunhao-Liu/3D-OVS,
 dataLoader/llff.py). LangSplat and the paper ask every class of every labelled frame as a query of its own; so does this
@@ -15,14 +15,10 @@ from jaxtyping import Bool, Float
 
 from experiments.datasets.benchmark import Benchmark, hold_out, no_points, require_count, twin_of
 from jsecon.data.capture import load_capture
-from jsecon.data.colmap import find_models
-from jsecon.data.frames import PosedImage, PosedImages, build_capture
-from jsecon.data.images import IMAGE_SUFFIXES, image_header, read_image, write_image
+from jsecon.data.images import IMAGE_SUFFIXES, read_image, write_image
 from jsecon.data.labels import LabelledFrame
-from jsecon.data.lens import Lens
 from jsecon.errors import InputError
-from jsecon.files import atomic_write, write_text
-from jsecon.types import Capture
+from jsecon.files import write_text
 
 OVS3D_PAIRS = {"bed": 30, "bench": 35, "lawn": 30, "room": 30, "sofa": 30}
 """(frame, query) pairs: five labelled frames of six or seven classes"""
@@ -31,7 +27,7 @@ ON = 128
 
 
 def load_ovs3d(root: str | Path, scene: str, *, downscale: float | int | None = None) -> Benchmark:
-    """A scene of 3D-OVS with its labelled frames held out; poses from sparse/0, or else from poses_bounds.npy.
+    """A scene of 3D-OVS with its labelled frames held out.
 
     Raises InputError where a labelled frame lacks a class's mask or has one of a class that classes.txt does not name,
     where a folder's number is no image's, and where the number of pairs is not the protocol's.
@@ -43,10 +39,7 @@ def load_ovs3d(root: str | Path, scene: str, *, downscale: float | int | None = 
     pairs = sum(len(frame.objects) for frame in frames)
     expected = OVS3D_PAIRS.get(scene, pairs) if told is None else told["pairs"]
     require_count(folder / "segmentations", pairs, expected, "(frame, query) pairs")
-    if find_models(folder):
-        capture = load_capture(folder, downscale=downscale, holdout=0)
-    else:
-        capture = _from_poses(folder, files, downscale)
+    capture = load_capture(folder, downscale=downscale, holdout=0)
     return Benchmark(
         hold_out(capture, frames, folder / "segmentations"),
         tuple(frames),
@@ -143,48 +136,3 @@ def write_segmentations(
         for name in classes:
             mask = frame.objects.get(name, (empty, None))[0]
             write_image(place / f"{name}.png", np.repeat(np.uint8(255) * mask[..., None], 3, axis=2))
-
-
-def read_poses_bounds(
-    path: Path,
-) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 2"]]:
-    """LLFF's poses_bounds.npy: world-to-camera (N, 4, 4) in OpenCV axes, (height, width, focal) and depth bounds.
-
-    A row holds a 3x5 matrix (axes down, right, backwards, then centre, then height width focal) and near, far. Raises
-    InputError where the file is no such array.
-    """
-    try:
-        table = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(path, str(error), "an (N, 17) array", "Copy the file again.") from error
-    if table.ndim != 2 or table.shape[1] != 17:
-        raise InputError(path, f"shape {table.shape}", "(N, 17)", "Use LLFF's poses_bounds.npy.")
-    matrices = table[:, :15].astype(np.float64).reshape(-1, 3, 5)
-    down, right, back, centre, sizes = (matrices[..., k] for k in range(5))
-    rotation = np.stack([right, down, -back], axis=1)  # rows: the camera's axes in the world
-    poses = np.tile(np.eye(4), (len(table), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = rotation, -np.einsum("nij,nj->ni", rotation, centre)
-    return poses, sizes, table[:, 15:]
-
-
-def write_poses_bounds(
-    path: Path, poses: Float[np.ndarray, "n 4 4"], sizes: Float[np.ndarray, "n 3"], bounds: Float[np.ndarray, "n 2"]
-) -> None:
-    """Writes what `read_poses_bounds` reads."""
-    rotation = poses[:, :3, :3]
-    centre = -np.einsum("nji,nj->ni", rotation, poses[:, :3, 3])
-    columns = [rotation[:, 1], rotation[:, 0], -rotation[:, 2], centre, sizes]
-    table = np.concatenate([np.stack(columns, axis=2).reshape(-1, 15), bounds], axis=1)
-    with atomic_write(path) as temporary:
-        np.save(temporary.with_suffix(".npy"), table)
-
-
-def _from_poses(folder: Path, files: list[Path], downscale: float | int | None) -> Capture:
-    poses, sizes, _ = read_poses_bounds(folder / "poses_bounds.npy")
-    require_count(folder / "poses_bounds.npy", len(poses), len(files), "poses")
-    shots = []
-    for file, pose, (height, width, focal) in zip(files, poses, sizes):
-        lens = Lens(int(width), int(height), focal, focal, width / 2, height / 2)
-        shots.append(PosedImage(file.name, file, lens.resized(*image_header(file).upright), pose))
-    note = "Poses are those of poses_bounds.npy: one focal length, the principal point in the middle, no points."
-    return build_capture(PosedImages(shots, folder, notes=(note,)), downscale=downscale, holdout=0)

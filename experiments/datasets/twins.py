@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from experiments.datasets.benchmark import TWIN_FILE
-from experiments.datasets.mesh import SURROUNDINGS, Mesh, mesh_of, surfaces_of
+from experiments.datasets.mesh import SURROUNDINGS, mesh_of, surfaces_of
 from experiments.datasets.mesh_files import write_mesh
-from experiments.datasets.ovs3d import write_poses_bounds, write_segmentations
+from experiments.datasets.ovs3d import write_segmentations
 from experiments.datasets.plain_room import make_room
 from jsecon.data.colmap import write_colmap
 from jsecon.data.images import write_image
@@ -102,11 +102,6 @@ def write_ovs3d_twin(
     names = tuple(f"{view:02d}" for view in range(views))
     out = np.isin(np.arange(views), np.linspace(0, views - 1, labelled_frames + 2).round()[1:-1])
     capture, instances, frames = _labelled_capture(root / scene, room, cameras, names, out, 1)
-    assert capture.depths is not None
-    sizes = np.tile([height, width, float(cameras.fx[0])], (views, 1))
-    bounds = np.stack([capture.depths.min((1, 2)), capture.depths.max((1, 2))], axis=1)
-    poses = np.asarray(cameras.world_to_camera, np.float64)
-    write_poses_bounds(root / scene / "poses_bounds.npy", poses, sizes, bounds)
     write_segmentations(root / scene / "segmentations", frames, names, room.names)
     pairs, queries = len(frames) * num_objects, sorted(room.names)
     _, owners = surfaces_of(room, capture, instances)
@@ -130,7 +125,11 @@ def write_replica_twin(
     """A room as a scene of Replica in NICE-SLAM's rendering. Classes are the objects' shapes, wall, floor, ceiling and
     table, in habitat's semantic mesh."""
     names = tuple(f"frame{view:06d}" for view in range(views))
-    room, capture, owners, mesh = _scanned(seed, names, width, height, num_objects, fine_m, coarse_m)
+    room = make_room(seed, num_objects=num_objects)
+    cameras = room_cameras(room, views=views, width=width, height=height)
+    capture, instances = render_capture(room, cameras, names, np.zeros(views, bool), points=100)
+    surfaces, owners = surfaces_of(room, capture, instances)
+    mesh = mesh_of(surfaces, owners, capture.frames, num_objects, fine=fine_m, coarse=coarse_m)
     classes = [item.shape for item in room.objects] + list(SURROUNDINGS)
     table = {name: n for n, name in enumerate(sorted(set(classes)), start=1)}
     scale, fx = 6553.5, float(capture.cameras.fx[0])
@@ -159,16 +158,6 @@ def write_replica_twin(
     pairs = len(occurring)
     _finish(root, scene, capture, owners, seed=seed, pairs=pairs, queries=queries, objects=classes)
     return root
-
-
-def _scanned(
-    seed: int, names: tuple[str, ...], width: int, height: int, num_objects: int, fine: float, coarse: float
-) -> tuple[Room, Capture, Int[np.ndarray, "t h w"], Mesh]:
-    room = make_room(seed, num_objects=num_objects)
-    cameras = room_cameras(room, views=len(names), width=width, height=height)
-    capture, instances = render_capture(room, cameras, names, np.zeros(len(names), bool), points=100)
-    points, owners = surfaces_of(room, capture, instances)
-    return room, capture, owners, mesh_of(points, owners, capture.frames, num_objects, fine=fine, coarse=coarse)
 
 
 def _forward_cameras(room: Room, views: int, width: int, height: int) -> Camera:

@@ -30,39 +30,21 @@ def export(model: torch.nn.Module, name: str, folder: Path, *, seed: int, thread
     generator = torch.Generator().manual_seed(seed)
     size, length = model.visual.image_size[0], model.context_length
     images = torch.randn(5, 3, size, size, generator=generator)
-    rows = [
-        write_graph(
-            folder / "visual" / "model.onnx",
-            Image(model),
-            {"image": images[:2]},
-            ["embedding"],
-            free={"image": {0: "batch"}, "embedding": {0: "batch"}},
-            other={"image": images},
-            threads=threads,
-        )
-    ]
     tokenizer = _tokenizer(name)
     texts = ["a photo of a red mug", "sofa", "thé à la menthe", "", "the small green plant on the window sill " * 5]
     ids = tokenizer(texts, context_length=length).to(torch.int32)
-    rows.append(
-        write_graph(
-            folder / "textual" / "model.onnx",
-            Text(model),
-            {"text": ids[:2]},
-            ["embedding"],
-            free={"text": {0: "batch"}, "embedding": {0: "batch"}},
-            other={"text": ids},
-            threads=threads,
-        )
-    )
+    rows = [
+        write_half(folder / "visual" / "model.onnx", Image(model), "image", images, "embedding", threads),
+        write_half(folder / "textual" / "model.onnx", Text(model), "text", ids, "embedding", threads),
+    ]
     preprocessing = {"size": [size, size], "mode": "RGB", "interpolation": "bicubic", "resize_mode": "shortest"}
     preprocessing |= {"mean": list(model.visual.image_mean), "std": list(model.visual.image_std)}
     write_text(folder / "visual" / "preprocess_cfg.json", json.dumps(preprocessing, indent=2) + "\n")
     merges = [list(pair) for pair, _ in sorted(tokenizer.bpe_ranks.items(), key=lambda item: item[1])]
-    model = {"type": "BPE", "end_of_word_suffix": "</w>", "vocab": tokenizer.encoder, "merges": merges}
-    vocabulary = {"model": model}
+    pairs = {"type": "BPE", "end_of_word_suffix": "</w>", "vocab": tokenizer.encoder, "merges": merges}
+    vocabulary = {"model": pairs}
     write_text(folder / "textual" / "tokenizer.json", json.dumps(vocabulary, ensure_ascii=False) + "\n")
-    return [dataclasses.replace(row, graph=f"{half}/model.onnx") for row, half in zip(rows, ("visual", "textual"))]
+    return rows
 
 
 def export_mobile(model: torch.nn.Module, name: str, folder: Path, *, seed: int, threads: int) -> dict:
@@ -82,6 +64,16 @@ def export_mobile(model: torch.nn.Module, name: str, folder: Path, *, seed: int,
     numbers = {"mean": list(usual["mean"]), "std": list(usual["std"]), "size": list(model.visual.image_size)}
     found = agreements(folder, encode, model.encode_text(ids, normalize=True), ids, numbers, threads)
     return told(rows, found)
+
+
+def write_half(
+    path: Path, module: torch.nn.Module, name: str, given: torch.Tensor, outputs: str | tuple[str, ...], threads: int
+) -> Agreement:
+    """Writes the graph of one encoder for batches of any size; it is compared on all of `given`, the input `name`."""
+    names = [outputs] if isinstance(outputs, str) else list(outputs)
+    free = {name: {0: "batch"}} | {output: {0: "batch"} for output in names}
+    row = write_graph(path, module, {name: given[:2]}, names, free=free, other={name: given}, threads=threads)
+    return dataclasses.replace(row, graph=f"{path.parent.name}/{path.name}")
 
 
 def _tokenizer(name: str):

@@ -1,7 +1,6 @@
 """SigLIP and SigLIP 2 as folders of both layouts: of open_clip in immich's (immich-app/ml-models,
 immich_model_exporter), of transformers in that of transformers.js; each with a small vocabulary of its kind."""
 
-import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -9,11 +8,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from experiments.export.clip import Image, Text
+from experiments.export.clip import Image, Text, write_half
 from experiments.export.embedder import FRAMES, TEXTS, agreements, told
-from experiments.export.graph import OPSET, Agreement, Wrapped, declare_missing_operators, shake, write_graph
+from experiments.export.graph import Wrapped, declare_missing_operators, shake, write_graph
 from experiments.export.vocabulary import write_vocabulary
-from jsecon.files import atomic_write, write_text
+from jsecon.files import write_text
 from jsecon.networks.clip import LOGITS, ClipEmbedder
 
 SCALE, BIAS = 117.330795, -12.932437
@@ -33,8 +32,8 @@ def export_open_clip(model: torch.nn.Module, name: str, folder: Path, *, seed: i
     tokenizer = open_clip.tokenizer.HFTokenizer(str(folder / "textual"), context_length=length, clean=clean)
     ids = tokenizer(TEXTS).to(torch.int32)
     rows = [
-        _half(folder / "visual" / "model.onnx", Image(model), "image", images, "image_embedding", threads),
-        _half(folder / "textual" / "model.onnx", Text(model), "text", ids, "text_embedding", threads),
+        write_half(folder / "visual" / "model.onnx", Image(model), "image", images, "image_embedding", threads),
+        write_half(folder / "textual" / "model.onnx", Text(model), "text", ids, "text_embedding", threads),
     ]
     usual = open_clip.get_pretrained_cfg(name, "webli")
     preprocessing = {"size": [size, size], "mode": "RGB", "mean": list(usual["mean"]), "std": list(usual["std"])}
@@ -79,10 +78,15 @@ def export_transformers(model: Any, folder: Path, *, seed: int, threads: int) ->
     images = torch.randn(3, 3, size, size, generator=torch.Generator().manual_seed(seed))
     onnx, outputs = folder / "onnx", ("last_hidden_state", "pooler_output")
     rows = [
-        _half(onnx / "vision_model.onnx", Pooled(model.vision_model), "pixel_values", images, outputs, threads),
-        _half(onnx / "text_model.onnx", Pooled(model.text_model), "input_ids", ids, outputs, threads),
+        write_half(onnx / "vision_model.onnx", Pooled(model.vision_model), "pixel_values", images, outputs, threads),
+        write_half(onnx / "text_model.onnx", Pooled(model.text_model), "input_ids", ids, outputs, threads),
     ]
-    _write_joint(onnx / "model.onnx", model, ids[:2], images[:2])
+    joint = ["logits_per_image", "logits_per_text", "text_embeds", "image_embeds"]
+    free = {"input_ids": {0: "texts"}, "pixel_values": {0: "images"}}
+    free |= {"text_embeds": {0: "texts"}, "image_embeds": {0: "images"}}
+    given = {"input_ids": ids[:2], "pixel_values": images[:2]}
+    # Scale and bias are what is read from this graph, and those are compared.
+    write_graph(onnx / "model.onnx", Joint(model), given, joint, free=free, threads=threads)
     preprocessing: dict[str, Any] = {"do_normalize": True, "do_rescale": True, "rescale_factor": 1 / 255}
     half = [0.5, 0.5, 0.5]
     preprocessing |= {"image_mean": half, "image_std": half, "size": {"height": size, "width": size}}
@@ -114,33 +118,6 @@ class Joint(Wrapped):
     def forward(self, input_ids, pixel_values):
         found = self.model(input_ids=input_ids, pixel_values=pixel_values)
         return found.logits_per_image, found.logits_per_text, found.text_embeds, found.image_embeds
-
-
-def _write_joint(path: Path, model: torch.nn.Module, ids: torch.Tensor, images: torch.Tensor) -> None:
-    """Without a comparison of its own: scale and bias are what is read from it, and those are compared."""
-    outputs = ["logits_per_image", "logits_per_text", "text_embeds", "image_embeds"]
-    free = {"input_ids": {0: "texts"}, "pixel_values": {0: "images"}}
-    free |= {"text_embeds": {0: "texts"}, "image_embeds": {0: "images"}}
-    with torch.inference_mode(), atomic_write(path) as temporary:
-        torch.onnx.export(
-            Joint(model),
-            (ids, images),
-            str(temporary),
-            input_names=["input_ids", "pixel_values"],
-            output_names=outputs,
-            dynamic_axes=free,
-            opset_version=OPSET,
-            dynamo=False,
-        )
-
-
-def _half(
-    path: Path, module: torch.nn.Module, name: str, given: torch.Tensor, outputs: str | tuple[str, ...], threads: int
-) -> Agreement:
-    names = [outputs] if isinstance(outputs, str) else list(outputs)
-    free = {name: {0: "batch"}} | {output: {0: "batch"} for output in names}
-    row = write_graph(path, module, {name: given[:2]}, names, free=free, other={name: given}, threads=threads)
-    return dataclasses.replace(row, graph=f"{path.parent.name}/{path.name}")
 
 
 def _corpus() -> list[str]:

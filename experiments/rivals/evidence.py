@@ -37,6 +37,12 @@ class Evidence:
     """(T, H, W) int32 the same regions under a tracker's ids, alike in all frames; -1 = none."""
 
 
+def unit(rows: np.ndarray) -> np.ndarray:
+    """Rows of unit length; zero rows stay zero."""
+    length = np.linalg.norm(rows, axis=-1, keepdims=True)
+    return np.where(length > 0, rows / np.where(length > 0, length, 1), 0).astype(np.float32)
+
+
 def local_masks(evidence: Evidence) -> tuple[Int[np.ndarray, "t h w"], Int[np.ndarray, "t k"]]:
     """The masks counted from 0 in each frame (T, H, W), -1 = none; and the rows (T, K) that the counts stand for, -1
     past a frame's last. K is a multiple of 8: scenes share their compiled programs."""

@@ -20,6 +20,7 @@ from jsecon.types import Array
 
 STEPS = 30_000
 LATENT = 3
+RATE = 0.0025
 
 
 @jax.tree_util.register_dataclass
@@ -43,33 +44,15 @@ class LangSplat:
         return jnp.where(jnp.any(codes != 0, axis=-1, keepdims=True), decoded, 0.0)
 
 
-def train_langsplat(
-    evidence: Evidence,
-    *,
-    key: Array,
-    steps: int = STEPS,
-    latent: int = LATENT,
-    init: str = "zero",
-    learning_rate: float = 0.0025,
-    **training: Any,
-) -> LangSplat:
-    """Trains the autoencoder on all masks' embeddings, then the Gaussians' codes.
+def train_langsplat(evidence: Evidence, *, key: Array, steps: int = STEPS, **training: Any) -> LangSplat:
+    """Trains the autoencoder on all masks' embeddings, then the Gaussians' codes from random ones.
 
-    init="zero" is LangSplat's own and needs some 18,000 steps to leave it, as the gradient through f / (|f| + 1e-9) at
-    0 fills Adam's second moment; "random" gets there in hundreds. `training` goes to `train_autoencoder`.
-    Raises ValueError where there is no mask.
+    LangSplat starts at zero and needs some 18,000 steps to leave it, as the gradient through f / (|f| + 1e-9) at 0
+    fills Adam's second moment; random codes get there in hundreds. `training` goes to `train_autoencoder`.
     """
     coder_key, code_key = jax.random.split(key)
-    autoencoder = train_autoencoder(jnp.asarray(evidence.embeddings), latent=latent, key=coder_key, **training)
+    autoencoder = train_autoencoder(jnp.asarray(evidence.embeddings), latent=LATENT, key=coder_key, **training)
     table = autoencoder.encode(jnp.asarray(evidence.embeddings))
-    codes, history = distill_l1(
-        with_room(evidence.gaussians),
-        evidence.cameras,
-        jnp.asarray(evidence.masks),
-        table,
-        steps=steps,
-        key=code_key,
-        init=init,
-        learning_rate=learning_rate,
-    )
+    given = with_room(evidence.gaussians), evidence.cameras, jnp.asarray(evidence.masks), table
+    codes, history = distill_l1(*given, steps=steps, key=code_key, init="random", learning_rate=RATE)
     return LangSplat(codes[: evidence.gaussians.count], autoencoder, history)

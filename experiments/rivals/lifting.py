@@ -150,17 +150,18 @@ def _lifted(weights: sparse.csr_matrix, evidence: Evidence) -> Lifted:
     return Lifted(np.where(length > 0, summed / np.where(length > 0, length, 1.0), 0.0), weights)
 
 
-def smoothed(means: Float[Array, "n 3"], score: Float[Array, " n"]) -> Float[np.ndarray, " n"]:
+def smoothed(means: Float[Array, "n 3"], score: Float[Array, "*texts n"]) -> Float[np.ndarray, "*texts n"]:
     """VALA's readout of a score: the mean with that over the NEIGHBOURS nearest Gaussians, brought to 0 .. 1 over the
-    scene, 2 r - 1 clipped at 0. Where the score is NaN: 0, and nobody's neighbour."""
-    score, similarity = np.asarray(score), np.zeros(len(score), np.float32)
-    there = np.flatnonzero(np.isfinite(score))
+    scene, 2 r - 1 clipped at 0. Where a score is not finite: 0, and nobody's neighbour."""
+    score = np.asarray(score)
+    similarity = np.zeros(score.shape, np.float32)
+    there = np.flatnonzero(np.isfinite(score).reshape(-1, score.shape[-1]).all(0))
     if len(there):
-        points, own = np.asarray(means, np.float64)[there], score[there]
+        points, own = np.asarray(means, np.float64)[there], score[..., there]
         near = KDTree(points).query(points, k=min(NEIGHBOURS + 1, len(there)))[1].reshape(len(there), -1)[:, 1:]
-        smooth = 0.5 * (own + own[near].mean(1)) if near.shape[1] else own
-        spread = (smooth - smooth.min()) / max(float(np.ptp(smooth)), 1e-9)
-        similarity[there] = np.clip(2 * spread - 1, 0, 1)
+        smooth = 0.5 * (own + own[..., near].mean(-1)) if near.shape[1] else own
+        low, spread = smooth.min(-1, keepdims=True), np.ptp(smooth, axis=-1, keepdims=True)
+        similarity[..., there] = np.clip(2 * (smooth - low) / np.maximum(spread, 1e-9) - 1, 0, 1)
     return similarity
 
 

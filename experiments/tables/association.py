@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.rivals.evidence import Evidence
+from experiments.rivals.evidence import Evidence, unit
 from jsecon.association.algorithm1 import clean_masklets
 from jsecon.association.consensus import consensus_masklets
 from jsecon.association.views import SceneViews
@@ -102,12 +102,6 @@ def overlaps(labels: np.ndarray, masks: np.ndarray, count: int) -> np.ndarray:
     both = (labels >= 0) & (masks >= 0)
     joint = np.bincount(labels[both].astype(np.int64) * count + masks[both], minlength=regions * count)
     return joint.reshape(regions, count)
-
-
-def unit(rows: np.ndarray) -> np.ndarray:
-    """Rows of unit length; zero rows stay zero."""
-    length = np.linalg.norm(rows, axis=-1, keepdims=True)
-    return np.where(length > 0, rows / np.where(length > 0, length, 1), 0).astype(np.float32)
 
 
 class Shared:

@@ -45,7 +45,7 @@ def langsplat(setting: Setting, steps: Steps) -> Answers:
 def langsplat_of(setting: Setting, evidence: Evidence, steps: Steps) -> LangSplat:
     """LangSplat trained on the masks of one level."""
     key = jax.random.key(setting.seed)
-    return train_langsplat(evidence, key=key, steps=steps.langsplat, init="random", epochs=steps.epochs)
+    return train_langsplat(evidence, key=key, steps=steps.langsplat, epochs=steps.epochs)
 
 
 def gaussian_grouping(setting: Setting, steps: Steps) -> Answers:

@@ -5,8 +5,6 @@ scene, so that synonyms and near kinds are left out, and where it is none of ALW
 scenes is or has, and phrases that name no thing. It may still be there unseen, as a thing that nobody labelled.
 """
 
-import numpy as np
-
 from experiments.words.conse import TextVectors
 from jsecon.vision.protocols import CANONICAL
 
@@ -34,9 +32,3 @@ def absent_names(texts: TextVectors, scene: str, present: tuple[str, ...], *, le
     nearest = (texts.vectors @ texts.embed(known).T).max(axis=1)
     left_out = ALWAYS | set(known)
     return tuple(name for name, near in zip(texts.names, nearest) if near < least and name not in left_out)
-
-
-def halves(names: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Every other name: the first half may choose a rule, the second measures it."""
-    order = tuple(np.array(sorted(names)))
-    return tuple(map(str, order[::2])), tuple(map(str, order[1::2]))

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from experiments import results
+from experiments.rivals.evidence import unit
 from experiments.words.minilm import MiniLM
 from jsecon.errors import InputError, describe_error, require_one_of, require_shape
 from jsecon.vision.protocols import CANONICAL
@@ -227,9 +228,7 @@ def conse(
         kept = np.zeros_like(weights)
         np.put_along_axis(kept, order, np.take_along_axis(weights, order, axis=1), axis=1)
         weights = kept
-    total = weights @ np.asarray(vectors, np.float64)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.where(length > 0, total / np.where(length > 0, length, 1.0), 0.0).astype(np.float32)
+    return unit(weights @ np.asarray(vectors, np.float64))
 
 
 class Conse:

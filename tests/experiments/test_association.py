@@ -8,8 +8,8 @@ import pytest
 from balls import ring_of_balls
 from twin_files import evidence_of_tracks
 
-from experiments.rivals.evidence import Evidence
-from experiments.tables.association import ROWS, Shared, associated, by_consensus, overlaps, unit
+from experiments.rivals.evidence import Evidence, unit
+from experiments.tables.association import ROWS, Shared, associated, by_consensus, overlaps
 from jsecon.types import Camera
 
 

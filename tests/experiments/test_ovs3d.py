@@ -5,10 +5,10 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from capture_files import refused, ring_poses
+from capture_files import refused
 from twin_files import ovs3d_twin, rooms_instances
 
-from experiments.datasets.ovs3d import OVS3D_PAIRS, box_of, load_ovs3d, read_poses_bounds, write_poses_bounds
+from experiments.datasets.ovs3d import OVS3D_PAIRS, box_of, load_ovs3d
 from experiments.datasets.plain_room import make_room
 
 
@@ -36,35 +36,6 @@ def test_every_field_comes_back(twin):
             true = instances[int(frame.name)] == room.names.index(name)
             assert (mask != true).sum() <= 2
             np.testing.assert_array_equal(boxes, box_of(mask))
-
-
-def test_poses_without_a_model(copy):
-    """The same cameras from poses_bounds.npy, at the images' size; no points."""
-    before = load_ovs3d(copy, "bed").capture
-    shutil.rmtree(copy / "bed" / "sparse")
-    after = load_ovs3d(copy, "bed").capture
-    np.testing.assert_allclose(after.cameras.world_to_camera, before.cameras.world_to_camera, atol=2e-6)
-    for name in ("fx", "fy", "cx", "cy"):
-        np.testing.assert_allclose(getattr(after.cameras, name), getattr(before.cameras, name), rtol=1e-5)
-    assert after.names == before.names
-    assert len(after.points) == 0
-    np.testing.assert_array_equal(after.held_out, before.held_out)
-
-
-def test_poses_bounds_round_trip(tmp_path):
-    poses, sizes = ring_poses(5), np.tile([30.0, 40.0, 35.5], (5, 1))
-    bounds = np.random.default_rng(0).uniform(1, 9, (5, 2))
-    write_poses_bounds(tmp_path / "poses_bounds.npy", poses, sizes, bounds)
-    again = read_poses_bounds(tmp_path / "poses_bounds.npy")
-    for found, given in zip(again, (poses, sizes, bounds), strict=True):
-        np.testing.assert_allclose(found, given, atol=1e-12)
-    matrix = np.load(tmp_path / "poses_bounds.npy")[1, :15].reshape(3, 5)
-    axes = matrix[:, :3]  # down, right, backwards: the camera looks along minus the third
-    np.testing.assert_allclose(np.cross(axes[:, 1], axes[:, 0]), -axes[:, 2], atol=1e-12)
-    np.testing.assert_allclose(-axes[:, 2], -matrix[:, 3] / 3, atol=1e-12)  # the ring looks at the origin
-    np.save(tmp_path / "poses_bounds.npy", np.zeros((5, 15)))
-    with refused("(N, 17)"):
-        read_poses_bounds(tmp_path / "poses_bounds.npy")
 
 
 def test_a_missing_or_misnamed_mask_is_told(copy):

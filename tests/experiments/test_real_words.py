@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from experiments.words import rules
-from experiments.words.absent import absent_names, halves
+from experiments.words.absent import absent_names
 from experiments.words.conse import Conse, Crop, Labeller, TextVectors, class_weights, conse, cut_out
 from experiments.words.minilm import MiniLM
 from jsecon.errors import InputError
@@ -184,7 +184,6 @@ def test_what_is_missing_is_named(embedder, tmp_path):
 def test_absent_names_are_far_from_all_that_is_there(embedder):
     assert absent_names(embedder.texts, "", ("red",)) == ("green", "blue", "dark ink")
     assert absent_names(embedder.texts, "", ("blue",)) == ("red", "green")
-    assert halves(("b", "a", "c")) == (("a", "c"), ("b",))
 
 
 def test_rules_on_a_table():

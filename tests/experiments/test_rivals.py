@@ -61,7 +61,7 @@ def by_most_similar_text(world, features):
 
 @pytest.mark.long
 def test_langsplat(world):
-    model = train_langsplat(world[0], key=jax.random.key(0), steps=100, init="random", epochs=300)
+    model = train_langsplat(world[0], key=jax.random.key(0), steps=100, epochs=300)
     assert np.isfinite(model.history).all()
     assert model.history[-20:].mean() < 0.7 * model.history[:3].mean()
     assert by_most_similar_text(world, model.features()) >= 0.6
@@ -141,7 +141,7 @@ def test_codebooks_share_their_first_stage(world):
 
 
 ROOMY = {
-    "langsplat": lambda world: train_langsplat(world[0], key=jax.random.key(0), steps=8, init="random", epochs=3),
+    "langsplat": lambda world: train_langsplat(world[0], key=jax.random.key(0), steps=8, epochs=3),
     "grouping": lambda world: train_gaussian_grouping(world[0], key=jax.random.key(0), steps=8, classes=32),
     "opengaussian": lambda world: train_opengaussian(
         world[0],
