@@ -23,14 +23,9 @@ REMOTE = re.compile(r"(?:https?:)?//", re.IGNORECASE)
 
 
 class Page(HTMLParser):
-    """The targets and the anchors of a page.
-
-    Args:
-      path: The page.
-    """
+    """The targets and the anchors of a page."""
 
     def __init__(self, path: Path):
-        """Reads the page."""
         super().__init__()
         self.loaded: list[str] = []
         self.links: list[str] = []
@@ -38,7 +33,6 @@ class Page(HTMLParser):
         self.feed(path.read_text())
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Notes an element."""
         values = {name: value or "" for name, value in attrs}
         self.anchors |= {values[name] for name in ("id", "name") if name in values}
         target = values.get(LOADED.get(tag, ""), "")
@@ -49,14 +43,7 @@ class Page(HTMLParser):
 
 
 def faults(folder: Path) -> list[str]:
-    """Finds what is wrong with the pages of a folder.
-
-    Args:
-      folder: Output of sphinx-build.
-
-    Returns:
-      A sentence for each fault.
-    """
+    """A sentence for each fault of the pages that sphinx-build wrote to a folder."""
     pages = {path.resolve(): Page(path) for path in folder.rglob("*.html")}
     found = [f"{style} loads {url}" for style in folder.rglob("*.css") for url in _remote_urls(style.read_text())]
     for path, page in pages.items():

@@ -8,7 +8,7 @@ import dataclasses
 import hashlib
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -79,28 +79,28 @@ class Hub:
             return JSONResponse({"error": "Revision not found"}, 404, {"X-Error-Code": "RevisionNotFound"})
         return repository
 
-    async def info(self, request: Request) -> Response:
+    def answer(self, handler: Callable) -> Callable:
+        """A route's function: `handler` of a request and its repository, or why there is none."""
+
+        async def answer(request: Request) -> Response:
+            repository = self._find(request)
+            return repository if isinstance(repository, Response) else handler(request, repository)
+
+        return answer
+
+    def info(self, request: Request, repository: Repository) -> Response:
         """GET /api/models/OWNER/NAME/revision/REVISION."""
-        repository = self._find(request)
-        if isinstance(repository, Response):
-            return repository
         name = f"{request.path_params['owner']}/{request.path_params['name']}"
         siblings = [{"rfilename": path} for path in sorted(repository.files)]
         tags = [f"license:{repository.licence}"]
         return JSONResponse({"id": name, "sha": repository.commit, "siblings": siblings, "tags": tags})
 
-    async def tree(self, request: Request) -> Response:
+    def tree(self, request: Request, repository: Repository) -> Response:
         """GET /api/models/OWNER/NAME/tree/REVISION."""
-        repository = self._find(request)
-        if isinstance(repository, Response):
-            return repository
         return JSONResponse([repository.entry(path) for path in sorted(repository.files)])
 
-    async def resolve(self, request: Request) -> Response:
+    def resolve(self, request: Request, repository: Repository) -> Response:
         """HEAD and GET /OWNER/NAME/resolve/REVISION/PATH."""
-        repository = self._find(request)
-        if isinstance(repository, Response):
-            return repository
         path = request.path_params["path"]
         if path not in repository.files:
             return Response(status_code=404, headers={"X-Error-Code": "EntryNotFound"})
@@ -136,10 +136,10 @@ def running_hub() -> Iterator[Hub]:
     home = "/{owner}/{name}"
     app = Starlette(
         routes=[
-            Route(f"/api/models{home}", hub.info),
-            Route(f"/api/models{home}/revision/{{revision:path}}", hub.info),
-            Route(f"/api/models{home}/tree/{{revision}}", hub.tree),
-            Route(f"{home}/resolve/{{revision}}/{{path:path}}", hub.resolve, methods=["GET", "HEAD"]),
+            Route(f"/api/models{home}", hub.answer(hub.info)),
+            Route(f"/api/models{home}/revision/{{revision:path}}", hub.answer(hub.info)),
+            Route(f"/api/models{home}/tree/{{revision}}", hub.answer(hub.tree)),
+            Route(f"{home}/resolve/{{revision}}/{{path:path}}", hub.answer(hub.resolve), methods=["GET", "HEAD"]),
         ]
     )
     server = uvicorn.Server(uvicorn.Config(app, host="127.0.0.1", port=0, log_level="critical"))

@@ -1,5 +1,7 @@
 """A complete small field made by the library itself: the 64 Gaussians of `scene`, five regions, votes of four views."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -48,6 +50,18 @@ def make_field(scene, cameras, *, dim=12, latent=8):
     return _made[key][2], _made[key][3].copy()
 
 
+def colour_field(scene, cameras) -> LanguageField:
+    """A field whose texts are colours, as `jsecon run` without models makes it."""
+    return dataclasses.replace(make_field(scene, cameras, dim=ColourEmbedder().dim)[0], embedder=ColourEmbedder().name)
+
+
+def rows_of_a_kind() -> np.ndarray:
+    """(5, 12) unit: 0 and 1 are two of a kind (cosine 0.9), 2 a little like them (0.3), 3 and 4 something else."""
+    axes = np.eye(12, dtype=np.float32)
+    rows = np.stack([axes[0], 0.9 * axes[0] + 0.435 * axes[1], 0.3 * axes[0] + 0.954 * axes[2], axes[3], axes[4]])
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
 def _make_field(scene, cameras, dim, latent):
     rng = np.random.default_rng(5)
     scene, cameras = jax.tree.map(jnp.asarray, (scene, cameras))
@@ -76,6 +90,20 @@ def _make_field(scene, cameras, dim, latent):
         reference=np.zeros((0, dim), np.float32),
     )
     return field, labels
+
+
+class KnownTexts:
+    """An embedder of the texts of `rows`, text -> embedding; `more` are further attributes, such as logits."""
+
+    name = "known"
+
+    def __init__(self, rows, **more):
+        self.rows, self.dim = rows, len(next(iter(rows.values())))
+        self.canonical = np.zeros((0, self.dim), np.float32)
+        vars(self).update(more)
+
+    def embed_text(self, texts):
+        return np.stack([self.rows[text] for text in texts])
 
 
 def seen_of(votes):

@@ -7,7 +7,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from small_field import make_field
+from small_field import colour_field
 
 from jsecon.app.ask import Answer, ask_pixel, ask_region, ask_text
 from jsecon.app.cli import main
@@ -27,9 +27,7 @@ HOSTILE = ("/../../evil", "..", "C:\\evil", "a/b", "a\0b", "x" * 4000, "nul", "f
 
 @pytest.fixture(scope="module")
 def field(scene, cameras):
-    """A small field whose texts are colours, and whose frames, in four views, have names that no path may have."""
-    field, _ = make_field(scene, cameras, dim=ColourEmbedder().dim)
-    return dataclasses.replace(field, embedder=ColourEmbedder().name)
+    return colour_field(scene, cameras)
 
 
 @pytest.fixture(scope="module")

@@ -247,15 +247,11 @@ def test_two_sources_of_masks_are_refused(room, models, tmp_path):
 def test_proposals_are_kept_by_content(models, tmp_path):
     frame = np.zeros((60, 80, 3), np.uint8)
     frame[10:40, 10:50] = (200, 30, 30)
-    stored = StoredSegmenter(
-        SamSegmenter(models[0], SamSettings(prompts="grid", points_per_side=4, crop_layers=0)), tmp_path
-    )
+    settings = SamSettings(prompts="grid", points_per_side=4, crop_layers=0)
+    stored, failing = (StoredSegmenter(SamSegmenter(models[0], settings), tmp_path) for _ in range(2))
     assert isinstance(stored, NamedSegmenter)
     masks = stored(frame, 0)
     assert len(masks) >= 1
-    failing = StoredSegmenter(
-        SamSegmenter(models[0], SamSettings(prompts="grid", points_per_side=4, crop_layers=0)), tmp_path
-    )
     failing._segmenter = None  # whatever is asked of it now must come from disk
     np.testing.assert_array_equal(failing(frame, 5), masks)
     with pytest.raises(TypeError):
@@ -263,8 +259,7 @@ def test_proposals_are_kept_by_content(models, tmp_path):
     path = next(tmp_path.glob("*.safetensors"))
     path.write_bytes(path.read_bytes()[:60])
     np.testing.assert_array_equal(stored(frame, 0), masks)
-    finer = SamSegmenter(models[0], SamSettings(prompts="grid", points_per_side=5, crop_layers=0))
-    assert finer.name != stored.name
+    assert SamSegmenter(models[0], dataclasses.replace(settings, points_per_side=5)).name != stored.name
 
 
 def test_models_by_name_are_fetched_once_and_found_again_for_a_moved_field(

@@ -7,7 +7,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
-from small_field import make_field
+from small_field import KnownTexts, make_field
 
 import jsecon
 from jsecon.app import notebook
@@ -60,19 +60,10 @@ def test_a_selection_shows_how_far_the_selected_are_from_the_others():
     assert "Selection of 0 of 0" in empty._repr_html_()
 
 
-class _Known:
-    """An embedder of one text: the first region."""
-
-    def __init__(self, field):
-        self._row = np.asarray(field.regions.embeddings)[:1]
-
-    def embed_text(self, texts):
-        return np.repeat(self._row, len(texts), 0)
-
-
 def test_show_draws_each_frame_and_what_is_selected_in_it(field, monkeypatch):
     pytest.importorskip("matplotlib").use("Agg")
-    axes = jsecon.show(field, "the first", embedder=_Known(field), views=2)
+    known = KnownTexts({"the first": np.asarray(field.regions.embeddings)[0]})
+    axes = jsecon.show(field, "the first", embedder=known, views=2)
     assert axes.shape == (2, 2)
     above, below = (axis.images[0].get_array() for axis in axes[:, 0])
     assert above.shape == below.shape == (40, 48, 3)
@@ -81,4 +72,4 @@ def test_show_draws_each_frame_and_what_is_selected_in_it(field, monkeypatch):
     assert re.match(r"the first: \d+ Gaussians, score [01]\.\d\d", axes[0, 0].figure.get_suptitle())
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
     with pytest.raises(jsecon.InputError, match=r"pip install 'jsecon\[figures\]'"):
-        jsecon.show(field, "the first", embedder=_Known(field))
+        jsecon.show(field, "the first", embedder=known)

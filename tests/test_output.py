@@ -1,6 +1,5 @@
 """Output whose reader goes away, as in `jsecon query ... | head -1`, and texts that are not UTF-8."""
 
-import dataclasses
 import errno
 import io
 import json
@@ -9,7 +8,7 @@ import subprocess
 import sys
 
 import pytest
-from small_field import make_field
+from small_field import colour_field
 
 from jsecon.__main__ import UNREAD, Output
 from jsecon.app.ask import ask_text
@@ -22,8 +21,7 @@ from jsecon.vision.colours import ColourEmbedder
 @pytest.fixture(scope="module")
 def saved(scene, cameras, tmp_path_factory):
     """A small field whose texts are colours, and its file."""
-    field, _ = make_field(scene, cameras, dim=ColourEmbedder().dim)
-    field = dataclasses.replace(field, embedder=ColourEmbedder().name)
+    field = colour_field(scene, cameras)
     file = tmp_path_factory.mktemp("field") / "field.safetensors"
     save_field(file, field)
     return field, file

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from small_field import make_field
+from small_field import colour_field
 
 from jsecon.app.ask import ask_region, ask_text
 from jsecon.app.viewer.candidates import Candidate
@@ -18,7 +18,7 @@ EMBEDDER = ColourEmbedder()
 
 @pytest.fixture(scope="module")
 def field(scene, cameras):
-    return make_field(scene, cameras, dim=EMBEDDER.dim)[0]
+    return colour_field(scene, cameras)
 
 
 def test_an_answer_is_told_with_how_many_and_how_sure(field):

@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from small_field import field_of, lone_votes, unit_rows
+from small_field import KnownTexts, field_of, lone_votes, unit_rows
 
 from jsecon.app.ask import ask_each, ask_text
 from jsecon.language import field as field_file
@@ -70,14 +70,6 @@ def test_the_best_cluster_stays_and_specks_do_not_rule():
     np.testing.assert_array_equal(best_cluster(few, scores, means), few)
     means[0] = np.nan
     assert not best_cluster(np.ones(515, bool), scores, means)[0]
-
-
-class Embedder:
-    def __init__(self, rows):
-        self.rows = rows
-
-    def embed_text(self, texts):
-        return np.stack([self.rows[text] for text in texts])
 
 
 @pytest.fixture(scope="module")
@@ -165,7 +157,7 @@ def test_a_higher_threshold_takes_fewer_and_a_probability_decides_where_there_is
 
 def test_a_text_that_no_region_answers_is_answered_by_parts_in_memory_and_in_blocks(unheld, tmp_path, monkeypatch):
     field, directions, thing = unheld
-    embedder = Embedder({"fifth": directions[4], "first": directions[0]})
+    embedder = KnownTexts({"fifth": directions[4], "first": directions[0]})
     answer = ask_text(field, embedder, "fifth")
     np.testing.assert_array_equal(answer.mask, thing == 4)
     assert "parts" in answer.skipped["regions"]

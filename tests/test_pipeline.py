@@ -39,13 +39,10 @@ class Recorder(Listener):
     """Keeps what it is told."""
 
     def __init__(self):
-        self.planned, self.fresh, self.notes, self.told = {}, {}, [], []
+        self.planned, self.fresh, self.notes = {}, {}, []
 
     def steps(self, title, steps):
         self.planned = {step.name: step for step in steps}
-
-    def step(self, step):
-        self.told.append(step)
 
     def done(self, name, seconds, fresh):
         self.fresh[name] = fresh

@@ -40,6 +40,13 @@ def test_a_home_that_cannot_be_written_leaves_out_the_compiled_programs(tmp_path
     assert "JAX_COMPILATION_CACHE_DIR" not in settings({"XDG_CACHE_HOME": str(tmp_path / "file" / "x")}, 1, frozenset())
 
 
+def run(program, home):
+    """A program in a process of its own, whose compiled programs are kept in `home`."""
+    environ = {key: value for key, value in os.environ.items() if key not in ("XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR")}
+    environ |= {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(home)}
+    return subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True, env=environ)
+
+
 @pytest.mark.parametrize("kept", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_a_prepared_process_has_a_device_a_core(tmp_path, kept):
     program = (
@@ -48,10 +55,7 @@ def test_a_prepared_process_has_a_device_a_core(tmp_path, kept):
         "import os, jax\n"
         "print(jax.local_device_count(), 'JAX_COMPILATION_CACHE_DIR' in os.environ)"
     )
-    environ = {key: value for key, value in os.environ.items() if key not in ("XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR")}
-    environ |= {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)}
-    done = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True, env=environ)
-    assert done.stdout.split() == [str(len(os.sched_getaffinity(0))), str(kept)]
+    assert run(program, tmp_path).stdout.split() == [str(len(os.sched_getaffinity(0))), str(kept)]
 
 
 @pytest.mark.long
@@ -65,19 +69,13 @@ def test_a_program_that_was_cut_short_on_disk_is_compiled_and_kept_anew_without_
         "print(jax.jit(lambda x: 3 * x)(7), compilation_counts())\n"
         "warnings.warn('of another kind')"
     )
-    environ = {key: value for key, value in os.environ.items() if key != "JAX_COMPILATION_CACHE_DIR"}
-    environ |= {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)}
-
-    def run():
-        return subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True, env=environ)
-
-    first = run()
+    first = run(program, tmp_path)
     kept = {file: file.read_bytes() for file in tmp_path.rglob("*-cache")}
     assert len(kept) == ast.literal_eval(first.stdout.split(" ", 1)[1])["all"] > 0
     for file, data in kept.items():
         file.write_bytes(data[: len(data) // 2])
     for from_disk in (0, len(kept)):
-        done = run()
+        done = run(program, tmp_path)
         assert done.stdout == f"21 { ({'all': len(kept), 'from_disk': from_disk}) }\n"
         assert re.findall(r"\w+Warning: .*", done.stderr) == ["UserWarning: of another kind"]
         assert set(tmp_path.rglob("*-cache")) == set(kept)

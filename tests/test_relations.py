@@ -131,22 +131,19 @@ def test_predicates_are_pure_jitted_and_batched():
     assert values["largest"].argmin() == values["tallest"].argmin() == values["rightmost"].argmin() == 1
 
 
-@pytest.mark.parametrize(
-    ("text", "thing", "conditions", "order"),
-    [
-        ("the red mug to the left of the bottle", "red mug", ["left of bottle"], None),
-        ("the mug on the table left of the bottle", "mug", ["on table", "left of bottle"], None),
-        ("how many bottles are in the box?", "bottles", ["in box"], None),
-        ("the second mug from the left", "mug", [], ("leftmost", 2)),
-        ("the 3rd largest box", "box", [], ("largest", 3)),
-        ("ball between the red and white plate and the bowl", "ball", ["between red and white plate and bowl"], None),
-        ("the nearest mug to the bottle", "mug", ["nearest to bottle"], None),
-        ("the nearest mug", "mug", [], ("nearest", 1)),
-        ('"tea in a glass" on the "table left of it"', "tea in a glass", ["on table left of it"], None),
-        ("two red mugs", "red mugs", [], None),
-        ("the chest of drawers under the window", "chest of drawers", ["under window"], None),
-    ],
-)
+@pytest.mark.parametrize(("text", "thing", "conditions", "order"), [
+    ("the red mug to the left of the bottle", "red mug", ["left of bottle"], None),
+    ("the mug on the table left of the bottle", "mug", ["on table", "left of bottle"], None),
+    ("how many bottles are in the box?", "bottles", ["in box"], None),
+    ("the second mug from the left", "mug", [], ("leftmost", 2)),
+    ("the 3rd largest box", "box", [], ("largest", 3)),
+    ("ball between the red and white plate and the bowl", "ball", ["between red and white plate and bowl"], None),
+    ("the nearest mug to the bottle", "mug", ["nearest to bottle"], None),
+    ("the nearest mug", "mug", [], ("nearest", 1)),
+    ('"tea in a glass" on the "table left of it"', "tea in a glass", ["on table left of it"], None),
+    ("two red mugs", "red mugs", [], None),
+    ("the chest of drawers under the window", "chest of drawers", ["under window"], None),
+])  # fmt: skip
 def test_the_grammar(text, thing, conditions, order):
     if text.startswith("ball between"):
         text = text.replace("red and white plate", '"red and white plate"')
@@ -169,24 +166,21 @@ def test_every_spelling_is_understood_and_quotes_protect():
     assert not parse_expression("a glass").thing.every
 
 
-@pytest.mark.parametrize(
-    ("text", "problem"),
-    [
-        ("", "is empty"),
-        ("  ", "is empty"),
-        ("word " * 5000, "5000 words"),
-        ("mug across from the plate", "'across'"),
-        ("the widest mug", "'widest'"),
-        ("mug near the left plate", "'left'"),
-        ("left of the plate", "no object stands before 'left of'"),
-        ("mug left of", "an object is missing"),
-        ("mug between the plate and", "an object is missing"),
-        ("mug in box on plate near bowl", "3 relations"),
-        ("red mug or bowl on the plate", '"or"'),
-        ("second mug", "needs an order"),
-        ("caf\udce9 on the plate", "not UTF-8"),
-    ],
-)
+@pytest.mark.parametrize(("text", "problem"), [
+    ("", "is empty"),
+    ("  ", "is empty"),
+    ("word " * 5000, "5000 words"),
+    ("mug across from the plate", "'across'"),
+    ("the widest mug", "'widest'"),
+    ("mug near the left plate", "'left'"),
+    ("left of the plate", "no object stands before 'left of'"),
+    ("mug left of", "an object is missing"),
+    ("mug between the plate and", "an object is missing"),
+    ("mug in box on plate near bowl", "3 relations"),
+    ("red mug or bowl on the plate", '"or"'),
+    ("second mug", "needs an order"),
+    ("caf\udce9 on the plate", "not UTF-8"),
+])  # fmt: skip
 def test_what_is_not_understood_is_named(text, problem):
     with pytest.raises(InputError, match=problem):
         parse_expression(text)
@@ -209,26 +203,23 @@ def test_one_object_and_what_it_was_compared_with(scene):
     assert jsecon.query_relation(scene, "the red mug near the dark blue box").viewpoint == ""
 
 
-@pytest.mark.parametrize(
-    ("text", "regions"),
-    [
-        ("the red mug right of the dark green bottle", [1]),
-        ("the orange ball on the white plate", [4]),
-        ("the white plate under the orange ball", [3]),
-        ("the dark green bottle between the red mugs", [2]),
-        ("the dark blue box behind the dark green bottle", [5]),
-        ("the leftmost red mug", [0]),
-        ("the second red mug from the left", [1]),
-        ("the red mug nearest to the dark blue box", [1]),
-        ("the red mug farthest from the dark blue box", [0]),
-        ("two red mugs", [0, 1]),
-        ("all red mugs", [0, 1]),
-        ("the red mug left of the dark green bottle and far from the dark blue box", [0]),
-        ("the orange ball on the white plate in front of the dark green bottle", [4]),
-        ("the dark blue box on the white plate", []),
-        ("third red mug from the left", []),
-    ],
-)
+@pytest.mark.parametrize(("text", "regions"), [
+    ("the red mug right of the dark green bottle", [1]),
+    ("the orange ball on the white plate", [4]),
+    ("the white plate under the orange ball", [3]),
+    ("the dark green bottle between the red mugs", [2]),
+    ("the dark blue box behind the dark green bottle", [5]),
+    ("the leftmost red mug", [0]),
+    ("the second red mug from the left", [1]),
+    ("the red mug nearest to the dark blue box", [1]),
+    ("the red mug farthest from the dark blue box", [0]),
+    ("two red mugs", [0, 1]),
+    ("all red mugs", [0, 1]),
+    ("the red mug left of the dark green bottle and far from the dark blue box", [0]),
+    ("the orange ball on the white plate in front of the dark green bottle", [4]),
+    ("the dark blue box on the white plate", []),
+    ("third red mug from the left", []),
+])  # fmt: skip
 def test_answers_of_no_one_and_several_objects(scene, text, regions):
     answer = jsecon.query_relation(scene, text)
     assert sorted(r for found in answer.objects for r in found.regions) == regions
@@ -308,7 +299,8 @@ def test_query_answers_expressions_and_says_so(tmp_path, capsys):
     field, _ = table_field()
     save_field(tmp_path / "field.safetensors", field)
     texts = "the leftmost red mug", "the dark blue box near", '"red mug" or "dark blue box"', "how many red mugs"
-    line = ["query", str(tmp_path / "field.safetensors"), *texts, "--from", "frame_0", "--out", str(tmp_path / "out")]
+    line = ["query", str(tmp_path / "field.safetensors"), *texts, "--views", "0"]
+    line += ["--from", "frame_0", "--out", str(tmp_path / "out")]
     assert cli.main([*line, "--up", "0", "0", "1"]) == 2
     told = capsys.readouterr()
     assert "read as 'red mug', leftmost, as seen from frame_0: 1 object (red mug)" in told.out

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_field import field_of, lone_votes, make_field, unit_rows
+from jax.test_util import check_grads
+from small_field import KnownTexts, field_of, lone_votes, make_field, unit_rows
 
 from jsecon.app import cli
 from jsecon.app.ask import ask_text
@@ -78,19 +79,10 @@ def test_jit_and_vmap_over_texts_equal_the_loop_for_many_regions():
         np.testing.assert_allclose(got, exact(embeddings, text, words), atol=5e-6)
 
 
-def test_gradient_equals_central_differences(rows):
-    with jax.enable_x64(True):
-        given = tuple(jnp.asarray(a, jnp.float64) for a in rows)
-        weights = jnp.asarray(np.random.default_rng(0).normal(size=7))
-
-        @jax.jit
-        def total(*given):
-            return jnp.sum(weights * region_similarities(*given, "apart")[0])
-
-        for place, gradient in enumerate(jax.jit(jax.grad(total, (0, 1, 2)))(*given)):
-            step = np.random.default_rng(place).normal(size=given[place].shape) * 1e-6
-            moved = [total(*(a + s * step if i == place else a for i, a in enumerate(given))) for s in (1, -1)]
-            assert float(jnp.sum(gradient * step)) == pytest.approx(float(moved[0] - moved[1]) / 2, rel=1e-5)
+def test_gradient_equals_central_differences(rows, x64):
+    given = tuple(jnp.asarray(a, jnp.float64) for a in rows)
+    similar = jax.jit(lambda *given: region_similarities(*given, "apart")[0])
+    check_grads(similar, given, order=1, modes=["rev"], rtol=1e-5, atol=0, eps=1e-6)
 
 
 def test_a_query_finds_its_region_by_the_one_or_the_other(worded):
@@ -266,15 +258,12 @@ def test_the_command_line_says_the_quantile_and_what_an_old_field_lacks(worded, 
     field, texts = worded
     shares = [exact_quantile(field.regions.embeddings, text, field.reference) for text in texts]
     rows = {"seen": texts[int(np.argmax(shares))], "unseen": texts[int(np.argmin(shares))]}
-
-    class Words:
-        canonical = field.canonical
-        embed_text = staticmethod(lambda asked: np.stack([rows[text] for text in asked]))
-
-    monkeypatch.setattr(networks, "field_embedder", lambda *a, **k: Words())
+    words = KnownTexts(rows, canonical=field.canonical)
+    monkeypatch.setattr(networks, "field_embedder", lambda *a, **k: words)
 
     def asked(name, *options):
-        assert cli.main(["query", str(tmp_path / name), "seen", "unseen", "--out", str(tmp_path), *options]) == 0
+        line = ["query", str(tmp_path / name), "seen", "unseen", "--views", "0", "--out", str(tmp_path), *options]
+        assert cli.main(line) == 0
         told = [json.loads((tmp_path / f"{text}.json").read_text()) for text in ("seen", "unseen")]
         return told, capsys.readouterr().out
 
@@ -300,9 +289,6 @@ def test_the_command_line_says_the_quantile_and_what_an_old_field_lacks(worded, 
     assert out.count("earlier version") == 1
     cosine = query_anchored(dataclasses.replace(field, reference=None), rows["seen"])
     assert seen["score"] == pytest.approx(float(cosine.score), abs=1e-5)
-
-    class Templated(Words):
-        templates = ("a photo of a {}.",)
-        reference = -np.asarray(field.reference)
-
-    assert ask_text(field, Templated(), "seen").quantile != ask_text(field, Words(), "seen").quantile
+    more = {"templates": ("a photo of a {}.",), "reference": -np.asarray(field.reference)}
+    templated = KnownTexts(rows, canonical=field.canonical, **more)
+    assert ask_text(field, templated, "seen").quantile != ask_text(field, words, "seen").quantile

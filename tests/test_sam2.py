@@ -227,25 +227,22 @@ def change_constants(folder, **changes):
     (folder / "constants.json").write_text(json.dumps(content))
 
 
-@pytest.mark.parametrize(
-    ("damage", "said"),
-    [
-        (lambda f: (f / "onnx" / "memory_encoder.onnx").unlink(), "memory_encoder"),
-        (lambda f: (f / "constants.json").unlink(), r"constants\.json"),
-        (lambda f: (f / "constants.json").write_bytes(b"PK\x03\x04 cut"), "not JSON"),
-        (lambda f: change_constants(f, image_std=None), "image_std"),
-        (lambda f: change_constants(f, memory_temporal_positional_encoding=[[0.0] * 4] * 3), r"\(3, 4\)"),
-        (lambda f: change_constants(f, image_mean=["a"] * 3), "cannot be read"),
-        (lambda f: shutil.copy(f / "onnx" / "pointer_tpos.onnx", f / "onnx" / "mask_decoder.onnx"), "feats2_cond"),
-        (lambda f: shutil.copy(write_sam2(f / "o", memory=6) / "onnx" / "memory_encoder.onnx", f / "onnx"), "tokens"),
-        (
-            lambda f: (f / "onnx" / "vision_encoder.onnx").write_bytes(
-                (f / "onnx" / "vision_encoder.onnx").read_bytes()[:999]
-            ),
-            r"vision_encoder\.onnx",
+@pytest.mark.parametrize(("damage", "said"), [
+    (lambda f: (f / "onnx" / "memory_encoder.onnx").unlink(), "memory_encoder"),
+    (lambda f: (f / "constants.json").unlink(), r"constants\.json"),
+    (lambda f: (f / "constants.json").write_bytes(b"PK\x03\x04 cut"), "not JSON"),
+    (lambda f: change_constants(f, image_std=None), "image_std"),
+    (lambda f: change_constants(f, memory_temporal_positional_encoding=[[0.0] * 4] * 3), r"\(3, 4\)"),
+    (lambda f: change_constants(f, image_mean=["a"] * 3), "cannot be read"),
+    (lambda f: shutil.copy(f / "onnx" / "pointer_tpos.onnx", f / "onnx" / "mask_decoder.onnx"), "feats2_cond"),
+    (lambda f: shutil.copy(write_sam2(f / "o", memory=6) / "onnx" / "memory_encoder.onnx", f / "onnx"), "tokens"),
+    (
+        lambda f: (f / "onnx" / "vision_encoder.onnx").write_bytes(
+            (f / "onnx" / "vision_encoder.onnx").read_bytes()[:999]
         ),
-    ],
-)
+        r"vision_encoder\.onnx",
+    ),
+])  # fmt: skip
 def test_a_wrong_folder_is_named(damage, said, tmp_path):
     model = write_sam2(tmp_path / "model")
     damage(model)

@@ -33,16 +33,13 @@ def test_a_box_holds_the_outermost_pixels():
     assert box_of(mask) == (3, 2, 7, 4)
 
 
-@pytest.mark.parametrize(
-    ("box", "cut"),
-    [
-        ((25, 100, 125, 200), False),  # well inside, to the frame's left
-        ((5, 100, 60, 200), False),  # at an edge that is the frame's own
-        ((120, 100, 185, 200), True),  # 15 px from the crop's right edge
-        ((120, 100, 179, 200), False),
-        ((30, 250, 100, 285), True),
-    ],
-)
+@pytest.mark.parametrize(("box", "cut"), [
+    ((25, 100, 125, 200), False),  # well inside, to the frame's left
+    ((5, 100, 60, 200), False),  # at an edge that is the frame's own
+    ((120, 100, 185, 200), True),  # 15 px from the crop's right edge
+    ((120, 100, 179, 200), False),
+    ((30, 250, 100, 285), True),
+])  # fmt: skip
 def test_a_box_near_a_crops_own_edge_is_cut(box, cut):
     assert cut_by_crop(box, Crop(0, 0, 200, 300, 1), 400, 600) is cut
     assert not cut_by_crop(box, Crop(0, 0, 200, 300, 0), 200, 300)

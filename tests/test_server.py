@@ -1,7 +1,6 @@
 """The server: what it answers, and that odd input has an error of its own kind and nothing crashes."""
 
 import asyncio
-import dataclasses
 import json
 import random
 import socket
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("fastapi", reason="the extra serve is not installed")
-from small_field import make_field
+from small_field import colour_field
 from starlette.exceptions import HTTPException
 from starlette.testclient import TestClient
 from table_field import table_field
@@ -34,7 +33,7 @@ HERE, JSON = "http://127.0.0.1:8765", {"content-type": "application/json"}
 
 @pytest.fixture(scope="module")
 def scenes(scene, cameras):
-    field, _ = make_field(scene, cameras, dim=ColourEmbedder().dim)
+    field = colour_field(scene, cameras)
     return {name: Scene(name, field, ColourEmbedder()) for name in ("desk", "shelf")}
 
 
@@ -252,8 +251,7 @@ def test_a_token_is_asked_for_where_one_is_set(scenes, tmp_path):
 
 
 def test_its_address_is_told_and_a_port_in_use_is_refused(scenes, tmp_path):
-    field = dataclasses.replace(scenes["desk"].field, embedder=ColourEmbedder().name)
-    save_field(tmp_path / "field.safetensors", field)
+    save_field(tmp_path / "field.safetensors", scenes["desk"].field)
     given = {"host": "127.0.0.1", "token": "", "embedder": None}
     told, _ = prepare([tmp_path / "field.safetensors"], port=0, **given)
     port = int(told["address"].removeprefix("http://127.0.0.1:"))
@@ -330,14 +328,10 @@ def test_clients_at_once_get_the_same_answers(client):
 
 
 def test_fields_are_opened_by_their_folders_names(scene, cameras, tmp_path):
-    field, _ = make_field(scene, cameras, dim=ColourEmbedder().dim)
-    from dataclasses import replace
-
-    field = replace(field, embedder=ColourEmbedder().name)
     files = [tmp_path / name / "field.safetensors" for name in ("a", "b")]
     for file in files:
         file.parent.mkdir()
-        save_field(file, field)
+        save_field(file, colour_field(scene, cameras))
     assert list(open_scenes(files, None)) == ["a", "b"]
     with pytest.raises(InputError, match="a second field named 'a'"):
         open_scenes([files[0], files[0]], None)

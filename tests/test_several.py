@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from small_field import make_field, shares, unit_rows
+from small_field import KnownTexts, make_field, rows_of_a_kind, shares, unit_rows
 from table_field import table_field
 
 from jsecon.app.ask import ask_text, with_phrases
@@ -22,12 +22,8 @@ from jsecon.types import Regions
 
 @pytest.fixture(scope="module")
 def field(scene, cameras):
-    """Regions 0 and 1 are two of a kind (cosine 0.9), 2 a little like them (0.3), 3 and 4 something else."""
     field, _ = make_field(scene, cameras)
-    axes = np.eye(12, dtype=np.float32)
-    rows = [axes[0], 0.9 * axes[0] + 0.435 * axes[1], 0.3 * axes[0] + 0.954 * axes[2], axes[3], axes[4]]
-    rows = np.stack([row / np.linalg.norm(row) for row in rows])
-    return dataclasses.replace(field, regions=Regions(rows, field.regions.pixels))
+    return dataclasses.replace(field, regions=Regions(rows_of_a_kind(), field.regions.pixels))
 
 
 def test_all_of_a_kind_are_found_and_no_others(field):
@@ -106,21 +102,14 @@ def test_questions_come_apart():
             parse_query(bad)
 
 
-class Words:
+@pytest.fixture
+def words(field):
     """An embedder of two words."""
-
-    name, dim = "words", 12
-    canonical = unit_rows(np.random.default_rng(8), 4, 12)
-
-    def __init__(self, rows):
-        self.rows = {"chair": rows[0], "stool": rows[1]}
-
-    def embed_text(self, texts):
-        return np.stack([self.rows[text] for text in texts])
+    chair, stool = field.regions.embeddings[:2]
+    return KnownTexts({"chair": chair, "stool": stool}, canonical=unit_rows(np.random.default_rng(8), 4, 12))
 
 
-def test_a_question_put_to_a_field(field, tmp_path):
-    words = Words(field.regions.embeddings)
+def test_a_question_put_to_a_field(field, words, tmp_path):
     every = ask_text(field, words, "chair", several=True, outliers=False)
     np.testing.assert_array_equal(every.mask, shares(field, [0, 1]) >= 0.5)
     but = ask_text(field, words, "chair but not stool", outliers=False)
@@ -131,8 +120,7 @@ def test_a_question_put_to_a_field(field, tmp_path):
         ask_text(field, words, "chair but not stool", by="code")
 
 
-def test_a_field_without_phrases_takes_those_of_who_reads_the_text(field):
-    words = Words(field.regions.embeddings)
+def test_a_field_without_phrases_takes_those_of_who_reads_the_text(field, words):
     bare = dataclasses.replace(field, canonical=np.zeros((0, 12), np.float32))
     np.testing.assert_array_equal(with_phrases(bare, words).canonical, np.asarray(words.canonical, np.float32))
     np.testing.assert_array_equal(with_phrases(field, words).canonical, field.canonical)
@@ -148,18 +136,15 @@ def shades():
     return table_field([(name, place, (0.05, 0.05, 0.05)) for name, place in zip(SHADES, places)])
 
 
-@pytest.mark.parametrize(
-    ("text", "several", "things"),
-    [
-        ("blue", True, {0, 1}),
-        ("Blue thing", True, {0, 1}),
-        ("dark blue", True, {0}),
-        ('"blue" but not "dark blue"', False, {1}),
-        ('"white" or "light blue" but not "blue"', False, {4}),
-        ("pink", True, set()),
-        ("purple thing", True, set()),
-    ],
-)
+@pytest.mark.parametrize(("text", "several", "things"), [
+    ("blue", True, {0, 1}),
+    ("Blue thing", True, {0, 1}),
+    ("dark blue", True, {0}),
+    ('"blue" but not "dark blue"', False, {1}),
+    ('"white" or "light blue" but not "blue"', False, {4}),
+    ("pink", True, set()),
+    ("purple thing", True, set()),
+])  # fmt: skip
 def test_a_bare_colour_is_answered_by_its_shades(shades, text, several, things):
     field, embedder = shades
     answer = ask_text(field, embedder, text, several=several)

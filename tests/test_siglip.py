@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from clip_files import COLOURS, write_clip
 from siglip_files import BIAS, LENGTH, SCALE, embedded, write_json, write_siglip, write_unigram
-from small_field import make_field, unit_rows
+from small_field import KnownTexts, make_field, unit_rows
 
 from experiments.export.vocabulary import write_vocabulary
 from jsecon.app import cli
@@ -189,17 +189,6 @@ def _told(folder) -> str:
 # The probability in place of the cosine's threshold
 
 
-class Told:
-    """An embedder of given texts, that knows how likely they are true."""
-
-    def __init__(self, texts, logits):
-        self.texts, self.logits = texts, logits
-        self.canonical = np.zeros((0, 12), np.float32)
-
-    def embed_text(self, texts):
-        return np.stack([self.texts[text] for text in texts])
-
-
 @pytest.fixture(scope="module")
 def field(scene, cameras):
     return make_field(scene, cameras)[0]
@@ -251,7 +240,7 @@ def test_presence_is_the_sigmoid_of_the_cosine_also_under_jit_and_vmap(field):
 def test_the_answer_says_how_likely_the_text_is_there(field, tmp_path, monkeypatch):
     units = np.asarray(field.regions.embeddings) / np.linalg.norm(field.regions.embeddings, axis=1, keepdims=True)
     texts = {"mug": units[0], "cup": units[1], "ghost": -units.sum(0)}
-    embedder = Told(texts, Logits(20.0, -18.0))
+    embedder = KnownTexts(texts, logits=Logits(20.0, -18.0))
     mug = ask_text(field, embedder, "mug")
     assert int(mug.selection.region) == 0
     np.testing.assert_allclose(mug.presence, 1 / (1 + np.exp(-2.0)), rtol=1e-4)
@@ -260,15 +249,16 @@ def test_the_answer_says_how_likely_the_text_is_there(field, tmp_path, monkeypat
     ghost = ask_text(field, embedder, "ghost")
     assert int(ghost.selection.region) == -1
     assert 0 <= ghost.presence < PRESENCE_THRESHOLD
-    silent = ask_text(field, Told(texts, None), "mug")
+    silent = ask_text(field, KnownTexts(texts), "mug")
     assert silent.presence is None
 
     save_field(tmp_path / "field.safetensors", dataclasses.replace(field, embedder="told"))
     told = {}
-    for name, known in (("with", embedder), ("without", Told(texts, None))):
+    for name, known in (("with", embedder), ("without", KnownTexts(texts))):
         monkeypatch.setattr(networks, "field_embedder", lambda *a, known=known, **k: known)
         out = tmp_path / name
-        assert cli.main(["query", str(tmp_path / "field.safetensors"), "mug", "ghost", "--out", str(out)]) == 0
+        line = ["query", str(tmp_path / "field.safetensors"), "mug", "ghost", "--views", "0", "--out", str(out)]
+        assert cli.main(line) == 0
         told[name] = [json.loads((out / f"{text}.json").read_text()) for text in ("mug", "ghost")]
     assert set(told["with"][0]["probability"]) == {"presence", "mean", "percentile_10"}
     assert list(told["with"][1]["probability"]) == ["presence"]

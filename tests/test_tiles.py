@@ -52,8 +52,21 @@ def listed(scene, camera, tile: int):
     return jax.tree.map(np.asarray, _listed(scene, camera, tile))
 
 
-@pytest.mark.parametrize("tile", [4, 8])
-def test_every_tile_lists_what_reaches_it_front_to_back(scene, cameras, tile):
+def needles(count: int, seed: int) -> Gaussians:
+    """Aspect 1000 in every orientation, larger than the scene."""
+    rng = np.random.default_rng(seed)
+    return Gaussians(
+        rng.uniform(-1, 1, (count, 3)).astype(np.float32),
+        np.log(np.tile(np.float32([2.0, 0.002, 0.002]), (count, 1))),
+        rng.normal(size=(count, 4)).astype(np.float32),
+        rng.uniform(-5, 5, count).astype(np.float32),
+        np.zeros((count, 4, 3), np.float32),
+    )
+
+
+@pytest.mark.parametrize(("kind", "tile"), [("blobs", 4), ("blobs", 8), ("needles", 8)])
+def test_every_tile_lists_what_reaches_it_front_to_back(scene, cameras, kind, tile):
+    scene = needles(64, 0) if kind == "needles" else scene  # of one size: one compilation
     for t in range(4):
         splats, lists = listed(scene, cameras[t], tile)
         assert int(lists.overflow.sum()) == 0
@@ -67,33 +80,12 @@ def test_every_tile_lists_what_reaches_it_front_to_back(scene, cameras, tile):
             assert set(np.flatnonzero(touched)) <= set(got)
             spare += len(got) - touched.sum()
         # Tight: what a list holds in vain is an ellipse that passes between pixel centres.
-        assert spare < 0.06 * expected.sum()
+        assert spare < 0.06 * expected.sum() or kind == "needles"
 
 
 @jax.jit
 def counted(scene, camera):
     return pair_counts(project(scene, camera), camera.width, camera.height).sum()
-
-
-def needles(count: int, seed: int) -> Gaussians:
-    """Aspect 1000 in every orientation, larger than the scene."""
-    rng = np.random.default_rng(seed)
-    return Gaussians(
-        rng.uniform(-1, 1, (count, 3)).astype(np.float32),
-        np.log(np.tile(np.float32([2.0, 0.002, 0.002]), (count, 1))),
-        rng.normal(size=(count, 4)).astype(np.float32),
-        rng.uniform(-5, 5, count).astype(np.float32),
-        np.zeros((count, 4, 3), np.float32),
-    )
-
-
-def test_no_tile_of_a_needle_is_missed(cameras):
-    scene = needles(64, 0)  # as many as the other tests have: one compilation
-    for t in range(4):
-        _, lists = listed(scene, cameras[t], 8)
-        for k, touched in enumerate(reaches(scene, cameras[t], 8)):
-            got = lists.gaussians[lists.starts[k] : lists.starts[k] + lists.lengths[k]]
-            assert set(np.flatnonzero(touched)) <= set(got)
 
 
 def test_both_sorts_of_pairs_agree():

@@ -6,26 +6,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jsecon.splat.render import render_rgb
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Gaussians
 
-ANGLES = np.radians([20.0, -70.0, 130.0])
-
-
-def _rotation(angles):
-    (a, b, c), turn = angles, np.eye(3)
-    for i, j, angle in ((0, 1, a), (1, 2, b), (0, 2, c)):
-        step = np.eye(3)
-        step[[i, i, j, j], [i, j, i, j]] = np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)
-        turn = turn @ step
-    return turn
+TURN = Rotation.from_euler("ZXY", [20, -70, 130], degrees=True).as_matrix()
 
 
 def _similarity(scale=2.5):
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = scale * _rotation(ANGLES), (0.3, -4.0, 1.5)
+    matrix[:3, :3], matrix[:3, 3] = scale * TURN, (0.3, -4.0, 1.5)
     return matrix
 
 

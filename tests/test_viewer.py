@@ -17,7 +17,7 @@ import pytest
 
 pytest.importorskip("viser", reason="the extra viewer is not installed")
 from browser import CHROMIUM, opened, until
-from small_field import make_field
+from small_field import colour_field
 
 from jsecon.app.ask import Answer
 from jsecon.app.cli import main
@@ -42,8 +42,8 @@ def free_port() -> int:
 
 @pytest.fixture(scope="module")
 def viewer(scene, cameras):
-    field, _ = make_field(scene, cameras, dim=ColourEmbedder().dim)
-    field = dataclasses.replace(field, votes=with_overlap(field.votes), embedder=ColourEmbedder.name)
+    field = colour_field(scene, cameras)
+    field = dataclasses.replace(field, votes=with_overlap(field.votes))
     port, state = free_port(), ViewState().with_texts(START)
     viewer = open_viewer(field, ColourEmbedder(), host="127.0.0.1", port=port, name="<desk>", state=state)
     yield viewer
