@@ -6,15 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jsecon.fit.growth import (
-    MIN_OPACITY,
-    drop_free_rows,
-    grow,
-    in_use,
-    pad_with_free_rows,
-    sample_rows,
-    split_in_two,
-)
+from jsecon.fit.growth import MIN_OPACITY, drop_free_rows, grow, in_use, pad_with_free_rows, sample_rows, split_in_two
 from jsecon.fit.resize import resize_frame, scale_cameras
 from jsecon.fit.schedule import LearningRates, Schedule, rates_at
 from jsecon.splat.capacity import round_capacity
