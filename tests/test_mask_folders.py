@@ -106,14 +106,7 @@ def test_folders_that_divide_flat_images_are_told_by_their_values(tmp_path):
     assert any("objects" in note for note in notes)
 
 
-def test_objects_of_many_values_are_refused(tmp_path):
-    for folder in ("003", "004"):
-        write(tmp_path / folder / "a.png", ids_image())
-    with refused("a.png", "4 values", "003"):
-        load_labels(tmp_path, ("a",), SIZE)
-
-
-def test_objects_called_by_words_are_numbered(tmp_path):
+def test_objects_called_by_words_are_numbered_and_those_of_many_values_refused(tmp_path):
     masks = {"mug": np.eye(12, 16), "bowl": 1 - np.eye(12, 16)}
     for folder, mask in masks.items():
         write(tmp_path / folder / "a.png", 255 * mask)
@@ -121,6 +114,9 @@ def test_objects_called_by_words_are_numbered(tmp_path):
     assert ids == (1, 2)
     np.testing.assert_array_equal(labels[0], masks["mug"])
     assert any("bowl is 1, mug is 2" in note for note in notes)
+    write(tmp_path / "mug" / "a.png", ids_image())
+    with refused("a.png", "4 values", "mug"):
+        load_labels(tmp_path, ("a",), SIZE)
 
 
 def test_objects_are_in_some_of_the_frames_and_the_lower_id_lies_on_top(tmp_path):
