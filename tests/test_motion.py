@@ -26,7 +26,7 @@ from jsecon.data.sfm import find_poses, list_photographs
 from jsecon.pipeline import run as pipeline
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Listener
-from jsecon.pipeline.results import KEY_FILE, Checkpoint, RunContext
+from jsecon.pipeline.results import KEY_FILE, RunContext
 from jsecon.pipeline.stages import capture_stages
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
@@ -50,8 +50,14 @@ def found(photos, tmp_path_factory):
     return motion_found, capture, work, told
 
 
-def test_poses_are_found_up_to_a_similarity(photos, found):
-    told, folder, _, _ = found
+def poses_are_true(found, true):
+    distances, degrees = apart(np.asarray(found, np.float64), true)
+    assert distances.max() < 0.005
+    assert degrees.max() < 0.3
+
+
+def test_poses_are_found_up_to_a_similarity_and_progress_counts(photos, found):
+    told, folder, _, counts = found
     assert len(told.registered) == COUNT
     assert not told.skipped
     assert told.error_px < 0.5
@@ -59,10 +65,12 @@ def test_poses_are_found_up_to_a_similarity(photos, found):
     assert capture.names == tuple(f"photo {n:02d}" for n in range(COUNT))  # names with spaces
     assert capture.frames.shape[1:] == (HEIGHT, WIDTH, 3)
     assert len(capture.points) == told.points > 200
-    distances, degrees = apart(np.asarray(capture.cameras.world_to_camera, np.float64), photos[1])
-    assert distances.max() < 0.005
-    assert degrees.max() < 0.3
+    poses_are_true(capture.cameras.world_to_camera, photos[1])
     np.testing.assert_allclose(capture.cameras.fx, FOCAL, rtol=0.03)
+    pairs = COUNT * (COUNT - 1) // 2
+    assert (pairs, pairs) in counts
+    assert counts[-1] == (COUNT, COUNT)
+    assert all(0 <= done <= total for done, total in counts)
 
 
 def test_an_incremental_model_replaces_a_global_one_that_fails(photos, found, tmp_path, monkeypatch):
@@ -77,31 +85,7 @@ def test_an_incremental_model_replaces_a_global_one_that_fails(photos, found, tm
     result = json.loads((work / "result.json").read_text())
     assert (len(result["registered"]), result["models"]) == (COUNT, 1)
     poses = {name: pose for name, _, pose in read_images(work / "capture" / "sparse" / "0")}
-    distances, degrees = apart(np.stack([poses[name] for name in sorted(poses)]), photos[1])
-    assert distances.max() < 0.005
-    assert degrees.max() < 0.3
-
-
-def test_progress_counts_photographs_pairs_and_registrations(found):
-    told = found[3]
-    pairs = COUNT * (COUNT - 1) // 2
-    assert (COUNT, COUNT) in told
-    assert (pairs, pairs) in told
-    assert told[-1] == (COUNT, COUNT)
-    assert all(0 <= done <= total for done, total in told)
-
-
-def test_what_was_stopped_goes_on_with_what_was_found(photos, found, tmp_path):
-    """Features and pairs of a process that was killed are not looked for again; nothing is left of what it half did."""
-    shutil.copytree(found[2], tmp_path / "work", symlinks=True)
-    told = []
-    (tmp_path / "work" / "result.json").unlink()
-    seconds = found[0].seconds
-    more, _ = find_poses(list_photographs(photos[0]), tmp_path / "work", progress=lambda *at: told.append(at))
-    assert {total for _, total in told} == {COUNT}  # no pairs
-    assert more.seconds["features"] < 0.5 * seconds["features"] + 0.5
-    assert more.registered == found[0].registered
-    assert more.error_px == pytest.approx(found[0].error_px, rel=0.05)
+    poses_are_true(np.stack([poses[name] for name in sorted(poses)]), photos[1])
 
 
 def test_photographs_are_those_of_images_or_of_the_folder_itself(tmp_path):
@@ -141,8 +125,7 @@ def test_many_photographs_are_matched_with_neighbours_and_with_those_that_look_a
                 camera = once.read_camera(image.camera_id)
                 camera_id = db.write_camera(camera)
             for turn in range(2):
-                copy = pycolmap.Image(name=f"{turn}{image.name}", camera_id=camera_id)
-                number = db.write_image(copy)
+                number = db.write_image(pycolmap.Image(name=f"{turn}{image.name}", camera_id=camera_id))
                 db.write_keypoints(number, once.read_keypoints(image.image_id))
                 db.write_descriptors(number, once.read_descriptors(image.image_id))
         names = {image.image_id: image.name for image in db.read_all_images()}
@@ -201,20 +184,26 @@ def test_photographs_that_are_damaged_or_called_the_same_are_refused(photos, tmp
         find_poses(list_photographs(folder), tmp_path / "work")
 
 
-def test_photographs_in_subfolders_with_names_that_are_no_utf8(photos, found, tmp_path):
-    """Two folders, photographs of the same names in each, one folder's name in Latin-1."""
+def test_what_was_stopped_goes_on_with_what_was_found_though_the_photographs_have_moved(photos, found, tmp_path):
+    """Into two folders, with the same names in each, one folder's name in Latin-1. Features and pairs of a process that
+    was killed are not looked for again; nothing is left of what it half did."""
     folders = [tmp_path / "walk" / name for name in ("cam 0", os.fsdecode(b"c\xe9 #1"))]
     for number, photo in enumerate(list_photographs(photos[0])):
         folder = folders[number // 4]
         folder.mkdir(parents=True, exist_ok=True)
         shutil.copy(photo, folder / f"{number % 4}.png")
-    shutil.copytree(found[2], tmp_path / "work", symlinks=True)  # features and matches are there
-    told, capture = find_poses(list_photographs(tmp_path / "walk"), tmp_path / "work")
-    assert told.registered == tuple(f"{folder.name}/{n}.png" for folder in folders for n in range(4))
-    loaded_capture = load_capture(capture, holdout=0)
-    assert loaded_capture.names == tuple(f"{folder.name}_{n}" for folder in folders for n in range(4))
-    plain = load_capture(found[1], holdout=0)
-    np.testing.assert_array_equal(loaded_capture.frames, plain.frames)
+    shutil.copytree(found[2], tmp_path / "work", symlinks=True)
+    (tmp_path / "work" / "result.json").unlink()
+    told, seconds = [], found[0].seconds
+    photographs = list_photographs(tmp_path / "walk")
+    more, capture = find_poses(photographs, tmp_path / "work", progress=lambda *at: told.append(at))
+    assert {total for _, total in told} == {COUNT}  # no pairs
+    assert more.seconds["features"] < 0.5 * seconds["features"] + 0.5
+    assert more.error_px == pytest.approx(found[0].error_px, rel=0.05)
+    assert more.registered == tuple(f"{folder.name}/{n}.png" for folder in folders for n in range(4))
+    moved, plain = load_capture(capture, holdout=0), load_capture(found[1], holdout=0)
+    assert moved.names == tuple(f"{folder.name}_{n}" for folder in folders for n in range(4))
+    np.testing.assert_array_equal(moved.frames, plain.frames)
 
 
 def test_photographs_in_subfolders_are_told_from_masks_and_from_output(photos, tmp_path):
@@ -362,14 +351,6 @@ def test_colmap_is_given_a_png_for_a_heic(photos, tmp_path):
     np.testing.assert_array_equal(
         cv2.imread(tmp_path / "links" / "000000.png")[..., ::-1], read_image(tmp_path / "IMG_1.HEIC")[0]
     )
-
-
-def test_a_stage_on_files_has_a_folder_until_its_result_is_kept(tmp_path):
-    record = Checkpoint(tmp_path / "poses-12.checkpoint.safetensors")
-    (record.folder / "half").mkdir(parents=True)
-    assert record.folder == tmp_path / "poses-12.checkpoint"
-    record.remove()
-    assert not record.folder.exists()
 
 
 @pytest.mark.long
