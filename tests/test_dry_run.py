@@ -42,13 +42,6 @@ def test_the_extent_is_that_of_the_loaded_capture(room, given):
     assert extent == CaptureExtent(len(capture.names), size, capture.names, capture.files)
 
 
-def test_photographs_without_poses_are_listed_too(room, tmp_path, capsys):
-    shutil.copytree(room / "images", tmp_path / "photos")
-    _, stages = _dry(capsys, "run", tmp_path / "photos", "--out", tmp_path / "out")
-    assert stages["poses"]["status"] == stages["gaussians"]["status"] == "run"
-    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
-
-
 def test_a_video_is_listed_with_the_frames_that_are_taken_of_it(tmp_path, capsys):
     writer = cv2.VideoWriter(str(tmp_path / "walk.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
     for _ in range(5):
@@ -107,11 +100,14 @@ def test_a_dry_run_refuses_what_a_run_would_refuse_at_once(room, tmp_path, capsy
     assert not (tmp_path / "out").exists()
 
 
-def test_a_dry_run_on_photographs_needs_what_finds_their_poses(room, tmp_path, capsys, monkeypatch):
+def test_a_dry_run_on_photographs_lists_their_poses_and_needs_what_finds_them(room, tmp_path, capsys, monkeypatch):
     shutil.copytree(room / "images", tmp_path / "photos")
     line = ["run", tmp_path / "photos", "--out", tmp_path / "out"]
-    _dry(capsys, *line, "--masks", room / "masks")
-    assert cli.main([*map(str, line), "--dry-run", *_wrong_masks(room, tmp_path)[:1], str(tmp_path / "wrong")]) == 2
+    _, stages = _dry(capsys, *line, "--masks", room / "masks")
+    assert stages["poses"]["status"] == stages["gaussians"]["status"] == "run"
+    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+    assert cli.main([*map(str, [*line, *_wrong_masks(room, tmp_path)]), "--dry-run"]) == 2
+    assert "wrong" in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     assert cli.main([*map(str, line), "--dry-run"]) == 2
     assert "jsecon[sfm]" in capsys.readouterr().err
