@@ -145,7 +145,7 @@ def accumulate_over_views(
     Args:
       step: Pure function `state, out = step(state, common, view, *static)`, traced under shard_map.
       start: Neutral state of `merge`.
-      merge: Joins the states of two lanes.
+      merge: Joins the states of two lanes. It may donate the first.
       common: Tree of arrays that each step gets whole.
       views: Tree of arrays with the views along their leading axes.
       prepare: If present, the step gets `prepare(common, view, *static)` in place of the view, from a separate program
@@ -168,7 +168,7 @@ def accumulate_over_views(
     # XLA reads NumPy's memory in place if it is aligned like its memory: all devices share one copy.
     common = jax.tree.map(lambda a: np.asarray(jax.device_put(a, may_alias=True)), common)
     common = jax.device_put(common, replicated)
-    merged = jax.device_put(start, may_alias=False)  # merging donates it
+    merged = None
     outs: list[Any] = []  # of all views, once the first step has given their shape
     dispatched: deque[tuple[list[int], Any]] = deque()
     done = 0
@@ -207,7 +207,10 @@ def accumulate_over_views(
         for place in range(width):
             state = jax.tree.map(lambda a, place=place: np.asarray(a.addressable_data(place))[0], states)
             for part in [state] if world == 1 else _states_of_all(state):
-                merged = merge(merged, jax.device_put(part, may_alias=True))
+                if merged is None:
+                    merged = jax.device_put(part, may_alias=lanes == 1)  # merging donates it
+                else:
+                    merged = merge(merged, jax.device_put(part, may_alias=True))
         del states
     if not outs:  # a process without views
         view = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), views)
