@@ -69,12 +69,8 @@ def parse_cameras(text: str) -> tuple[np.ndarray, np.ndarray]:
     poses = {t.rsplit("-", 1)[1]: m for t, m in blocks.items() if t.startswith("Camera-to-world")}
     shapes = {np.shape(m) for m in poses.values()}
     if np.shape(intrinsics) != (3, 3) or shapes != {(4, 4)}:
-        raise InputError(
-            "cam.info.txt",
-            f"the matrices {sorted(blocks)}",
-            "a 3x3 colour intrinsic matrix and a 4x4 camera-to-world matrix a frame",
-            "Give the file as the APC toolbox writes it.",
-        )
+        problem = "lacks the 3x3 colour intrinsic matrix or a 4x4 camera-to-world matrix of each frame"
+        raise InputError("cam.info.txt", problem, remedy="Give the file as the APC toolbox writes it.")
     return np.array(intrinsics), np.array([poses[k] for k in sorted(poses)])
 
 
@@ -83,10 +79,11 @@ def decode_depth(raw: np.ndarray) -> np.ndarray:
     return (((raw >> 3) | (raw << 13)) & 0xFFFF).astype(np.float32) / 10_000
 
 
-def _image(path: Path, flags: int) -> np.ndarray:
+def read_png(path: Path, flags: int) -> np.ndarray:
+    """Reads a PNG by the flags of cv2.imread. Raises InputError where it cannot be read."""
     image = cv2.imread(str(path), flags)
     if image is None:
-        raise InputError(path, "no readable image", "a PNG", "Fetch the capture again.")
+        raise InputError(path, "is no readable image", remedy="Fetch the capture again.")
     return image
 
 
@@ -96,14 +93,13 @@ def load_apc(folder: str | Path, *, held_out_every: int, nearest_m: float) -> tu
     try:
         intrinsics, poses = parse_cameras((folder / "cam.info.txt").read_text())
     except OSError as error:
-        raise InputError(
-            folder / "cam.info.txt", str(error.strerror), "the cameras", "Give the folder scene-0000 of apc_bin."
-        ) from error
+        remedy = "Give the folder scene-0000 of apc_bin."
+        raise InputError(folder / "cam.info.txt", str(error.strerror), remedy=remedy) from error
     names = tuple(f"frame-{t:06d}" for t in range(len(poses)))
-    frames = np.stack([_image(folder / f"{n}.color.png", cv2.IMREAD_COLOR)[..., ::-1] for n in names])
-    depths = np.stack([decode_depth(_image(folder / f"{n}.depth.png", cv2.IMREAD_UNCHANGED)) for n in names])
+    frames = np.stack([read_png(folder / f"{n}.color.png", cv2.IMREAD_COLOR)[..., ::-1] for n in names])
+    depths = np.stack([decode_depth(read_png(folder / f"{n}.depth.png", cv2.IMREAD_UNCHANGED)) for n in names])
     depths[depths < nearest_m] = 0
-    segments = np.stack([_image(folder / "segm" / f"{n}.segm.png", cv2.IMREAD_UNCHANGED) for n in names])
+    segments = np.stack([read_png(folder / "segm" / f"{n}.segm.png", cv2.IMREAD_UNCHANGED) for n in names])
     labels = np.full(segments.shape, len(OBJECTS), np.int16)
     for index, number in enumerate(OBJECTS):
         labels[segments == number] = index
@@ -175,16 +171,8 @@ def evaluate(
             for t in np.flatnonzero(capture.held_out):
                 camera = jax.tree.map(jnp.asarray, capture.cameras[int(t)])
                 mask = np.asarray(selection_mask(field.gaussians, camera, chosen))
-                true = labels[t] == index
-                rows.append(
-                    {
-                        "by": way,
-                        "object": name,
-                        "frame": capture.names[t],
-                        "selected": int(chosen.sum()),
-                        "iou": float(iou(mask, true)),
-                    }
-                )
+                row = {"by": way, "object": name, "frame": capture.names[t], "selected": int(chosen.sum())}
+                rows.append(row | {"iou": float(iou(mask, labels[t] == index))})
     return rows
 
 

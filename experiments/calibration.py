@@ -64,14 +64,6 @@ QUICK = {"data": lerf.QUICK.data, "scenes": lerf.QUICK.data.scenes, "fitted": (0
 QUICK |= {"levels": ("shared",)}
 
 
-class Answered(NamedTuple):
-    """Texts that a scene answers."""
-
-    confidence: np.ndarray
-    right: np.ndarray
-    weight: np.ndarray
-
-
 def calibration_error(
     confidence: Float[np.ndarray, " a"], right: Float[np.ndarray, " a"], weight: Float[np.ndarray, " a"]
 ) -> tuple[float, list[Bin]]:
@@ -118,18 +110,14 @@ def answered(options: Options, scene: str, seed: int, level: str, vision: int) -
     return rows
 
 
-def joined(parts: list[Answered]) -> Answered:
-    """The answers of several rooms."""
-    return Answered(*(np.concatenate(own) for own in zip(*parts)))
-
-
-def fit(told: Answered) -> tuple[float, float]:
+def fit(told: Float[np.ndarray, "3 a"]) -> tuple[float, float]:
     """OFFSET and SLOPE of the largest likelihood, from confidences that the present ones gave."""
-    ratio = (np.log(told.confidence) - np.log1p(-told.confidence) - OFFSET) / SLOPE
+    confidence, right, weight = told
+    ratio = (np.log(confidence) - np.log1p(-confidence) - OFFSET) / SLOPE
 
     def loss(line: np.ndarray) -> float:
         logit = line[0] + line[1] * ratio
-        return float(np.average(np.logaddexp(0, logit) - told.right * logit, weights=told.weight))
+        return float(np.average(np.logaddexp(0, logit) - right * logit, weights=weight))
 
     offset, slope = minimize(loss, np.array([OFFSET, SLOPE])).x
     return float(offset), float(slope)
@@ -147,15 +135,15 @@ def main(options: Options) -> dict:
                 if key not in read_cells(file):
                     append_cell(file, key, answered(options, scene, seed, level, vision))
                 rows += read_cells(file)[key]
-            both[seeds, level] = Answered(*np.array(rows).reshape(-1, 3).T)
-    offset, slope = fit(joined([both[options.fitted, level] for level in options.levels]))
+            both[seeds, level] = np.array(rows).reshape(-1, 3).T
+    offset, slope = fit(np.concatenate([both[options.fitted, level] for level in options.levels], axis=1))
     kept, rows = {"fit": [offset, slope], "in jsecon": [OFFSET, SLOPE], "levels": {}}, []
     own = {level: both[options.seeds, level] for level in options.levels}
-    for level, told in {**own, "all": joined(list(own.values()))}.items():
+    for level, told in {**own, "all": np.concatenate(list(own.values()), axis=1)}.items():
         error, curve = calibration_error(*told)
-        kept["levels"][level] = {"error": error, "curve": curve, "answers": len(told.right)}
-        said, right = (float(np.average(part, weights=told.weight)) for part in (told.confidence, told.right))
-        rows.append((level, len(told.right), f"{error:.3f}", f"{said:.3f}", f"{right:.3f}"))
+        kept["levels"][level] = {"error": error, "curve": curve, "answers": told.shape[1]}
+        said, right = (float(np.average(part, weights=told[2])) for part in told[:2])
+        rows.append((level, told.shape[1], f"{error:.3f}", f"{said:.3f}", f"{right:.3f}"))
     table = results.table(("level", "answers", "calibration error", "mean confidence", "right"), rows)
     curve = results.table(("confidence", "right", "weight"), kept["levels"]["all"]["curve"])
     text = f"{table}\n\nReliability, all levels:\n\n{curve}\n\nFitted: offset {offset:.2f}, slope {slope:.2f}."

@@ -55,27 +55,6 @@ class Options:
     out: str = ""
 
 
-@dataclasses.dataclass(frozen=True)
-class Figures:
-    """Figures of one room."""
-
-    objects: int
-    rows: int
-    found: float
-    found_named: float
-    """`found` of the objects with a name; the others are boxes of 3 to 6 cm."""
-    one_row: float
-    box: float
-    upright: float
-    named: float
-    located: float
-    centre: float
-    grasp: float
-    surroundings: float
-    """Share of the found objects that are taken for surroundings."""
-    seconds: float
-
-
 def field_of_room(folder: Path, seed: int, options: Options) -> LanguageField:
     """The field of a room, which is made unless the folder has it."""
     capture = folder / "capture"
@@ -162,8 +141,12 @@ def located(field: LanguageField, room: Room) -> tuple[float, float, float]:
 
 def compare(
     catalogue: Catalogue, field: LanguageField, truth: Int[np.ndarray, " n"], room: Room, seconds: float
-) -> Figures:
-    """Compares a catalogue with the objects of a room."""
+) -> dict[str, float]:
+    """Compares a catalogue with the objects of a room.
+
+    `found_named` counts the objects with a name; the others are boxes of 3 to 6 cm. `surroundings` is the share of the
+    found objects that are taken for surroundings.
+    """
     wholes = np.flatnonzero(catalogue.parent < 0)
     count = len(room.objects)
     table = np.zeros((len(catalogue) + 1, count + 1), int)
@@ -189,7 +172,7 @@ def compare(
         name = room.objects[k].name or "clutter"
         print(f"  not found: {name}, {table[:, k].sum()} Gaussians, IoU {iou[:, k].max():.2f}")
     share, centre, grasp = located(field, room)
-    return Figures(
+    return dict(
         objects=int(seen.sum()),
         rows=int((~catalogue.surroundings[wholes]).sum()),
         found=len(found) / int(seen.sum()),
@@ -217,7 +200,7 @@ def main(options: Options) -> str:
         catalogue = jsecon.objects(field)
         seconds = time.perf_counter() - started
         figures = compare(catalogue, field, true_objects(field, folder / "capture"), crowded_room(seed), seconds)
-        metrics[f"seed {seed}"] = dataclasses.asdict(figures)
+        metrics[f"seed {seed}"] = figures
         print(seed, figures, flush=True)
     names = list(next(iter(metrics.values())))
     rows = [(seed, *(row[name] for name in names)) for seed, row in metrics.items()]

@@ -53,12 +53,8 @@ def read_cells(file: Path) -> dict[str, Any]:
             cell = json.loads(line)
             cells[cell["key"]] = cell["value"]
         except (ValueError, KeyError, TypeError) as error:
-            raise InputError(
-                file,
-                f"line {number} is no cell: {line[:60]!r}",
-                '{"key": ..., "value": ...} in every line',
-                "Remove the line: if it was a cell, it will be computed again.",
-            ) from error
+            remedy = "Remove the line: if it was a cell, it will be computed again."
+            raise InputError(file, f"line {number} is no cell: {line[:60]!r}", remedy=remedy) from error
     return cells
 
 

@@ -57,7 +57,7 @@ def main(options: Options) -> dict:
     kept = folder / "metrics.json"
     metrics = json.loads(kept.read_text()) if kept.exists() else {}
     for part in options.only:
-        made = _MADE[part](options)
+        made = _export(part, options)
         metrics[part] = metrics.get(part, {}) | made if isinstance(made, dict) else made
         metrics["versions"] = metrics.get("versions", {}) | _versions()
         done = tuple(name for name in PARTS if name in metrics)
@@ -66,56 +66,39 @@ def main(options: Options) -> dict:
     return metrics
 
 
-def _clip(options: Options) -> list[dict]:
-    from experiments.export import clip
+def _export(part: str, options: Options) -> list[dict] | dict[str, dict]:
+    """Exports the models of a part.
 
-    model = clip.official(options.clip, options.clip_weights, seed=options.seed)
-    folder = Path(options.out) / "clip"
-    agreements = clip.export(model, options.clip, folder, seed=options.seed, threads=options.threads)
-    return [dataclasses.asdict(agreement) for agreement in agreements]
+    Returns:
+      The figures of each model by its name; of CLIP, those of its graphs.
+    """
+    folder, given = Path(options.out), {"seed": options.seed, "threads": options.threads}
+    if part == "sam_images":
+        from experiments.export import sam_images
 
+        def write(name):
+            return sam_images.export(sam_images.official(name, options.seed), folder / name, **given)
 
-def _siglip(options: Options) -> dict[str, dict]:
+        return {name: write(name) for name in options.sam_images}
+    if part == "sam2_video":
+        from experiments.export import sam2_video
+
+        name = "sam2.1-tiny-video"
+        return {name: sam2_video.export(sam2_video.official(options.seed), folder / name, **given)}
     from experiments.export import clip, siglip
 
-    found, given = {}, {"seed": options.seed, "threads": options.threads}
-    for name in options.siglip:
-        folder = Path(options.out) / name
-        if "SigLIP" in name:
-            model = clip.official(name, None, seed=options.seed)
-            found[name] = siglip.export_open_clip(model, name, folder, **given)
+    if part == "clip":
+        model = clip.official(options.clip, options.clip_weights, seed=options.seed)
+        return [dataclasses.asdict(row) for row in clip.export(model, options.clip, folder / "clip", **given)]
+    found = {}
+    for name in getattr(options, part):
+        if part == "siglip" and "SigLIP" not in name:
+            model = siglip.official_transformers(options.seed)
+            found[name] = siglip.export_transformers(model, folder / name, **given)
         else:
-            found[name] = siglip.export_transformers(siglip.official_transformers(options.seed), folder, **given)
+            export = siglip.export_open_clip if part == "siglip" else clip.export_mobile
+            found[name] = export(clip.official(name, None, seed=options.seed), name, folder / name, **given)
     return found
-
-
-def _mobileclip(options: Options) -> dict[str, dict]:
-    from experiments.export import clip
-
-    found, given = {}, {"seed": options.seed, "threads": options.threads}
-    for name in options.mobileclip:
-        model = clip.official(name, None, seed=options.seed)
-        found[name] = clip.export_mobile(model, name, Path(options.out) / name, **given)
-    return found
-
-
-def _sam_images(options: Options) -> dict[str, dict]:
-    from experiments.export import sam_images
-
-    exported = {}
-    for name in options.sam_images:
-        model = sam_images.official(name, options.seed)
-        folder = Path(options.out) / name
-        exported[name] = sam_images.export(model, folder, seed=options.seed, threads=options.threads)
-    return exported
-
-
-def _sam2_video(options: Options) -> dict[str, dict]:
-    from experiments.export import sam2_video
-
-    folder = Path(options.out) / "sam2.1-tiny-video"
-    model = sam2_video.official(options.seed)
-    return {folder.name: sam2_video.export(model, folder, seed=options.seed, threads=options.threads)}
 
 
 def _versions() -> dict[str, str]:
@@ -139,16 +122,10 @@ def table(metrics: dict) -> str:
             worst = max(graph["outputs"].values())
             same = min(graph["same_signs"].values())
             scale = max(graph["scales"].values())
-            rows.append((model, graph["graph"], f"{worst:.1e}", f"{scale:.3g}", f"{same:.5%}", _verdict(worst, same)))
+            within = "yes" if worst <= TOLERANCE and same >= SAME_PIXELS else "no"
+            rows.append((model, graph["graph"], f"{worst:.1e}", f"{scale:.3g}", f"{same:.5%}", within))
     header = ("model", "graph", "largest difference", "largest value", "same sign (least)", "within the bounds")
     return results.table(header, rows)
-
-
-_MADE = dict(zip(PARTS, (_clip, _siglip, _mobileclip, _sam_images, _sam2_video)))
-
-
-def _verdict(worst: float, same: float) -> str:
-    return "yes" if worst <= TOLERANCE and same >= SAME_PIXELS else "no"
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ import contextlib
 import dataclasses
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
@@ -139,9 +138,6 @@ def report(name: str, level: str, cells: list[dict], options: Options) -> tuple[
     def of(row):
         return [cell for cell in held if cell["method"] == row]
 
-    def mean(own, figure):
-        return by_scene(own, figure, lambda values: float(np.mean(values)))
-
     rows, told = [], {}
     for method, by_figure in best.items():
         row, settings = [method], 0
@@ -151,9 +147,9 @@ def report(name: str, level: str, cells: list[dict], options: Options) -> tuple[
             scenes = sorted({cell["scene"] for cell in own})
             mine = [cell for cell in of(best[ours_is][figure]) if cell["seed"] in seeds and cell["scene"] in scenes]
             difference = ahead(by_text(mine, n), by_text(own, n))
-            values, ours = mean(own, figure), mean(mine, figure)
+            values, ours = by_scene(own, figure), by_scene(mine, figure)
             wins = [scene for scene, value in values.items() if value > ours[scene]]
-            published = mean(of(f"{method}: {PUBLISHED}"), figure)
+            published = by_scene(of(f"{method}: {PUBLISHED}"), figure)
             settings = len(scenes) * len(seeds)
             told[f"{method}, {figure}"] = {
                 "row": by_figure[figure],
@@ -183,10 +179,10 @@ def report(name: str, level: str, cells: list[dict], options: Options) -> tuple[
     return results.table((f"{name}, {level}", *columns, "settings"), rows), told
 
 
-def by_scene(cells: list[dict], figure: str, fold: Callable[[list[float]], float]) -> dict[str, float]:
-    """A figure of each scene, folded over its seeds."""
+def by_scene(cells: list[dict], figure: str) -> dict[str, float]:
+    """A figure of each scene, the mean of its seeds."""
     scenes = sorted({cell["scene"] for cell in cells})
-    return {scene: fold([cell[figure] for cell in cells if cell["scene"] == scene]) for scene in scenes}
+    return {scene: float(np.mean([cell[figure] for cell in cells if cell["scene"] == scene])) for scene in scenes}
 
 
 def reading_of(row: str) -> str:

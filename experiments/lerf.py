@@ -15,8 +15,7 @@ from pathlib import Path
 
 from experiments.results import HOME
 from experiments.tables import layout, published, twins
-from experiments.tables.answers import QUICK_STEPS
-from experiments.tables.fill import Plan, options_of
+from experiments.tables.fill import Plan, options_of, quick_plan
 from experiments.tables.methods import METHODS, RECOMMENDED
 
 PLAN = Plan(
@@ -24,19 +23,7 @@ PLAN = Plan(
     tuple(METHODS),
     out=str(HOME / "results" / "lerf"),
 )
-QUICK = dataclasses.replace(
-    PLAN,
-    data=dataclasses.replace(
-        PLAN.data,
-        scenes=("figurines",),
-        seeds=(0,),
-        size=(("views", 8), ("width", 80), ("height", 60), ("num_objects", 4), ("annotated_every", 4)),
-    ),
-    steps=QUICK_STEPS,
-    fit_steps=80,
-    sweep=(),
-    out=str(HOME / "results" / "quick" / "lerf"),
-)
+QUICK = quick_plan(PLAN, "figurines", views=8, width=80, height=60, num_objects=4, annotated_every=4)
 FIGURES = ("miou", "macc", "miou_vala", "loc_acc", "loc_mask")
 NOTES = (
     "Point level, rendered: miou, macc (IoU > 0.25) at alpha > 0.7; miou_vala at alpha > 10/255; loc_acc by the peak "

@@ -6,14 +6,11 @@ Every class of every labelled frame is a query of its own, as LangSplat and the 
 `experiments.lerf`. Without --root: twins of the five scenes, three seeds.
 """
 
-import dataclasses
-
 from experiments.datasets.ovs3d import OVS3D_PAIRS
 from experiments.lerf import FIGURES, NOTES, WHY
 from experiments.results import HOME
 from experiments.tables import layout, published, twins
-from experiments.tables.answers import QUICK_STEPS
-from experiments.tables.fill import Plan, options_of
+from experiments.tables.fill import Plan, options_of, quick_plan
 from experiments.tables.methods import METHODS, RECOMMENDED
 
 PLAN = Plan(
@@ -21,19 +18,7 @@ PLAN = Plan(
     tuple(METHODS),
     out=str(HOME / "results" / "ovs3d"),
 )
-QUICK = dataclasses.replace(
-    PLAN,
-    data=dataclasses.replace(
-        PLAN.data,
-        scenes=("bed",),
-        seeds=(0,),
-        size=(("views", 8), ("width", 80), ("height", 60), ("num_objects", 4), ("labelled_frames", 2)),
-    ),
-    steps=QUICK_STEPS,
-    fit_steps=80,
-    sweep=(),
-    out=str(HOME / "results" / "quick" / "ovs3d"),
-)
+QUICK = quick_plan(PLAN, "bed", views=8, width=80, height=60, num_objects=4, labelled_frames=2)
 
 
 def main(plan: Plan) -> str:

@@ -25,6 +25,7 @@ from experiments.tables.methods import METHODS
 from experiments.tables.setting import Setting, prepare
 from jsecon.app.pictures import selection_overlay
 from jsecon.evaluate.metrics import iou
+from jsecon.files import atomic_write
 from jsecon.fit.resize import resize_camera
 from jsecon.query.render import selection_mask
 from jsecon.splat.render import render
@@ -127,7 +128,8 @@ def main(plan: Plan) -> str:
     results.save(out, plan, {"iou": {text: row[1:] for text, row in rows.items()}}, text, drawing)
     if not setting.bench.twin:
         (out / "figure.webp").unlink()
-        results.save_picture(out, "selections.png", drawing)
+        with atomic_write(out / "pictures" / "selections.png") as temporary:
+            drawing.savefig(temporary, dpi=110, bbox_inches="tight")
     print(text)
     return text
 

@@ -38,6 +38,7 @@ from experiments.words import rules
 from experiments.words.absent import absent_names
 from experiments.words.conse import Conse, Crop, Labeller, TextVectors, class_weights, conse
 from experiments.words.scenes import DEFAULT, GIVEN, RIVALS, WordScene, load_scene, rival_weights, scores_of
+from jsecon.data.frames import evenly_spaced
 from jsecon.evaluate.metrics import iou
 from jsecon.language.membership import finish_votes
 from jsecon.query.classes import query_classes
@@ -45,7 +46,7 @@ from jsecon.query.match import evidence, match_regions
 from jsecon.query.render import ALPHA_THRESHOLD, render_selection
 from jsecon.query.rules import KIND_THRESHOLD, QUANTILE, RETRIEVAL_THRESHOLD
 from jsecon.query.select import query_anchored, query_several
-from jsecon.types import LanguageField, Regions, Votes
+from jsecon.types import LanguageField, Regions, Selection
 from jsecon.vision.reference_words import reference_of
 
 CROPS = tuple(
@@ -146,12 +147,8 @@ def _by_regions(kind: str, way: str) -> Chooser:
     return choose
 
 
-def _anchored(case: Case) -> np.ndarray:
-    return np.stack([np.asarray(query_anchored(case.field, jnp.asarray(text)).mask) for text in case.texts])
-
-
-def _several(case: Case) -> np.ndarray:
-    return np.stack([np.asarray(query_several(case.field, jnp.asarray(text)[None]).mask) for text in case.texts])
+def _of_each_text(select: Callable[[LanguageField, jax.Array], Selection]) -> Chooser:
+    return lambda case: np.stack([np.asarray(select(case.field, jnp.asarray(text)).mask) for text in case.texts])
 
 
 def _classes(case: Case) -> np.ndarray:
@@ -160,8 +157,8 @@ def _classes(case: Case) -> np.ndarray:
 
 
 PRODUCT: dict[str, Chooser] = {
-    "jsecon: query_anchored": _anchored,
-    "jsecon: query_several": _several,
+    "jsecon: query_anchored": _of_each_text(query_anchored),
+    "jsecon: query_several": _of_each_text(lambda field, text: query_several(field, text[None])),
     "jsecon: query_classes": _classes,
 }
 """as the library has them, with its thresholds"""
@@ -202,16 +199,6 @@ def alone(case: Case, weights: sparse.csr_matrix) -> dict[str, list[float]]:
     return {reading: own.tolist() for reading, own in found.items()}
 
 
-def true_regions(scene: WordScene) -> np.ndarray:
-    """(Q, R) the regions whose true name is the text."""
-    return scene.region_names[None] == scene.asked[:, None]
-
-
-def true_gaussians(scene: WordScene) -> np.ndarray:
-    """(Q, N) by T2."""
-    return scene.truth["T2"][None] == scene.asked[:, None]
-
-
 def rendered(scene: WordScene, chosen: np.ndarray) -> np.ndarray:
     """(Q,) IoU of each text's Gaussians rendered alone with its outlines, mean over the judged views that show it."""
     gaussians, judged = jax.tree.map(jnp.asarray, (scene.gaussians, scene.judged))
@@ -219,7 +206,7 @@ def rendered(scene: WordScene, chosen: np.ndarray) -> np.ndarray:
     for q, name in enumerate(scene.asked):
         rows = []
         shown = np.flatnonzero((scene.outlines == name).any((1, 2)))
-        for t in shown[np.linspace(0, len(shown) - 1, min(len(shown), RENDERED)).round().astype(int)]:
+        for t in shown[evenly_spaced(len(shown), RENDERED)]:
             alpha = np.asarray(render_selection(gaussians, judged[int(t)], jnp.asarray(chosen[q])).alpha)
             counted = scene.outlines[t] >= 0
             rows.append(float(iou((alpha > ALPHA_THRESHOLD) & counted, scene.outlines[t] == name)))
@@ -264,21 +251,17 @@ def measure_crop(options: Options, crop: Crop) -> dict[str, dict[str, float]]:
 
 def lifting_and_rendering(scene: WordScene) -> list[dict]:
     """The parts of the error that no text plays a role in: IoUs at the points by each truth, and rendered."""
+    # The votes as queries read them, where no two regions are alike.
+    votes = finish_votes(scene.votes, Regions(np.eye(len(scene.pixels), dtype=np.float32), scene.pixels))
     given = {
-        "representation": true_gaussians(scene),
-        "lifting": rules.selected(_votes_without_embeddings(scene), true_regions(scene)),
+        "representation": scene.truth["T2"] == scene.asked[:, None],
+        "lifting": rules.selected(votes, scene.region_names == scene.asked[:, None]),
     }
     rows = []
     for part, own in given.items():
         at_points = {name: rules.ious(own, truth, scene.asked).tolist() for name, truth in scene.truth.items()}
         rows.append({"part": part, **at_points, "rendered": rendered(scene, own).tolist()})
     return rows
-
-
-def _votes_without_embeddings(scene: WordScene) -> Votes:
-    """The votes as queries read them, where no two regions are alike."""
-    regions = Regions(np.eye(len(scene.pixels), dtype=np.float32), scene.pixels)
-    return finish_votes(scene.votes, regions)
 
 
 def refusal(case: Case, embedder: Conse) -> dict[str, Any]:

@@ -83,10 +83,6 @@ def _box(draw: np.random.Generator, side: tuple[float, float], height: tuple[flo
     return [(box(draw.uniform(*side), draw.uniform(*side), draw.uniform(*height)), None, 1.0)]
 
 
-def _arch() -> Body:
-    return [(box(0.1, 0.26, 0.2), place(box(0.2, 0.18, 0.16), (0, 0, -0.01)), 1.0)]
-
-
 def relation_room(seed: int) -> tuple[Room, dict[int, tuple[str, int]]]:
     """Makes a room, and what holds some objects: index -> ("on", "in" or "under", index of the other)."""
     draw = np.random.default_rng([seed, 21])
@@ -99,7 +95,8 @@ def relation_room(seed: int) -> tuple[Room, dict[int, tuple[str, int]]]:
     kinds += [("orange", "ball", _balls(draw, (0.055, 0.065))), ("orange", "ball", _balls(draw, (0.04, 0.05)))]
     kinds += [("light green", "bowl", SHAPES["bowl"](draw))]
     kinds += [("purple", "ball", _balls(draw, (0.045, 0.052))), ("purple", "ball", _balls(draw, (0.06, 0.08)))]
-    kinds += [("brown", "arch", _arch())]
+    arch: Body = [(box(0.1, 0.26, 0.2), place(box(0.2, 0.18, 0.16), (0, 0, -0.01)), 1.0)]
+    kinds += [("brown", "arch", arch)]
     kinds += [
         ("turquoise", "box", _box(draw, (0.07, 0.09), (0.06, 0.1))),
         ("turquoise", "box", _box(draw, (0.1, 0.13), (0.09, 0.15))),
@@ -175,13 +172,8 @@ class Truth:
         if relation in ("above", "below", "under"):
             if self.held.get(upper) == ("on", lower) or self.held.get(lower) == ("under", upper):
                 return True
-            return (
-                None
-                if self.stacked[a, b]
-                and self.held.get(upper) != ("on", lower)
-                and "in" in (self.held.get(a, ("",))[0], self.held.get(b, ("",))[0])
-                else False
-            )
+            inside = "in" in (self.held.get(a, ("",))[0], self.held.get(b, ("",))[0])
+            return None if self.stacked[a, b] and inside else False
         if relation in ("on", "in"):
             if other == b:
                 return True if kind == relation else (None if kind != "under" else False)
@@ -206,7 +198,8 @@ class Truth:
         if key not in self._images:
             local = self.points[k] @ pose[:3, :3].T + pose[:3, 3]
             distance = np.linalg.norm((self.points[k] - np.asarray(camera.centres, np.float64))[:, :2], axis=1)
-            self._images[key] = np.array(_ends(local[:, 0] / local[:, 2])), np.array(_ends(distance))
+            column = local[:, 0] / local[:, 2]
+            self._images[key] = tuple(np.array([x.min(), x.max()]) for x in (column, distance))
         return self._images[key]
 
     def _offsets(self, a: int, b: int, camera: Camera) -> tuple[float, float]:
@@ -263,10 +256,6 @@ class Truth:
         ranked = sorted(members, key=lambda k: values[k])
         steps = np.diff(values[ranked])
         return ranked if (steps > step).all() else None
-
-
-def _ends(values: np.ndarray) -> tuple[float, float]:
-    return float(values.min()), float(values.max())
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,13 +8,10 @@ and the table. With it NICE-SLAM's rendering with the original semantics, and th
 not name its own.
 """
 
-import dataclasses
-
 from experiments.datasets.replica import REPLICA_SCENES
 from experiments.results import HOME
 from experiments.tables import layout, published, twins
-from experiments.tables.answers import QUICK_STEPS
-from experiments.tables.fill import Plan, options_of
+from experiments.tables.fill import Plan, options_of, quick_plan
 from experiments.tables.methods import METHODS, RECOMMENDED
 
 PLAN = Plan(
@@ -22,18 +19,7 @@ PLAN = Plan(
     tuple(METHODS),
     out=str(HOME / "results" / "replica"),
 )
-QUICK = dataclasses.replace(
-    PLAN,
-    data=dataclasses.replace(
-        PLAN.data,
-        scenes=("room0",),
-        seeds=(0,),
-        size=(("views", 8), ("width", 80), ("height", 48), ("num_objects", 4), ("fine_m", 0.02), ("coarse_m", 0.12)),
-    ),
-    steps=QUICK_STEPS,
-    sweep=(),
-    out=str(HOME / "results" / "quick" / "replica"),
-)
+QUICK = quick_plan(PLAN, "room0", views=8, width=80, height=48, num_objects=4, fine_m=0.02, coarse_m=0.12)
 FIGURES = ("miou", "macc")
 NOTES = (
     "At the ground-truth points: miou and macc (mean recall) over the classes that occur; points without an answer are "

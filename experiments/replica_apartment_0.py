@@ -21,6 +21,7 @@ import tyro
 from scipy.spatial.transform import Rotation
 
 from experiments import results
+from experiments.apc_bin import read_png
 from experiments.datasets.depth_points import labels_of_points
 from experiments.protocols.points import point_accuracy, point_class_means
 from jsecon.errors import InputError
@@ -72,12 +73,8 @@ def ids_of_colors(image: np.ndarray, where: object) -> np.ndarray:
     ids = order[place].astype(np.int16)
     foreign = PALETTE[ids] != key
     if foreign.any():
-        raise InputError(
-            where,
-            f"colour #{key[foreign][0]:06x}",
-            "the 40 colours of the d3-40 palette",
-            "Give the label images as they were drawn, without compression or resizing.",
-        )
+        remedy = "Give the label images as they were drawn, without compression or resizing."
+        raise InputError(where, f"colour #{key[foreign][0]:06x} is not in the d3-40 palette", remedy=remedy)
     return ids
 
 
@@ -97,42 +94,23 @@ def load_replica(folder: str | Path, *, voting_every: int) -> tuple[Capture, np.
     try:
         poses = np.load(folder / "GT_pose.npy")
     except (OSError, ValueError) as error:
-        raise InputError(
-            folder / "GT_pose.npy", str(error), "the poses (T, 7)", "Give the folder replica_apartment_0."
-        ) from error
+        raise InputError(folder / "GT_pose.npy", str(error), remedy="Give the folder replica_apartment_0.") from error
 
     def read(kind: str) -> list[np.ndarray]:
-        images = [cv2.imread(str(folder / kind / f"{t + 1}.png"), cv2.IMREAD_UNCHANGED) for t in range(len(poses))]
-        for t, image in enumerate(images):
-            if image is None:
-                raise InputError(
-                    folder / kind / f"{t + 1}.png", "no readable image", "a PNG a pose", "Fetch the capture again."
-                )
-        return images
+        return [read_png(folder / kind / f"{t + 1}.png", cv2.IMREAD_UNCHANGED) for t in range(len(poses))]
 
     frames = np.stack([image[..., 2::-1] for image in read("rgb")])
     depths = np.stack(read("depth")).astype(np.float32) / 255 * 10
-    labels = np.stack(
-        [
-            ids_of_colors(image[..., 2::-1], folder / "semantic" / f"{t + 1}.png")
-            for t, image in enumerate(read("semantic"))
-        ]
-    )
+    drawn = [image[..., 2::-1] for image in read("semantic")]
+    labels = np.stack([ids_of_colors(image, folder / "semantic" / f"{t + 1}.png") for t, image in enumerate(drawn)])
     count, height, width = depths.shape
     # f = 256, c = 255.5 with pixel centres at integers; from the upper left corner that is 256, which is also where the
     # views' depths agree best (95th of 98 in a hundred within 5 cm: see the module's test on the real capture).
     focal, centre = np.full(count, 256.0, np.float32), np.full(count, 256.0, np.float32)
     cameras = Camera(world_to_camera(poses), focal, focal, centre, centre, width=width, height=height)
     nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
-    return Capture(
-        frames,
-        cameras,
-        *nothing,
-        np.arange(count) % voting_every != 0,
-        depths,
-        np.eye(4),
-        tuple(str(t + 1) for t in range(count)),
-    ), labels
+    held_out, names = np.arange(count) % voting_every != 0, tuple(str(t + 1) for t in range(count))
+    return Capture(frames, cameras, *nothing, held_out, depths, np.eye(4), names), labels
 
 
 def points_as_gaussians(capture: Capture, options: Options) -> tuple[DepthPoints, Gaussians]:

@@ -97,9 +97,3 @@ def bars(labels: list[str], series: dict[str, list[float]], ylabel: str):
     axes.set_ylabel(ylabel)
     axes.legend(fontsize=8, loc="lower right")
     return figure
-
-
-def save_picture(folder: Path, name: str, figure: Any) -> None:
-    """Writes a picture that shows data of a capture to folder/pictures, which git ignores."""
-    with atomic_write(folder / "pictures" / name) as temporary:
-        figure.savefig(temporary, dpi=110, bbox_inches="tight")

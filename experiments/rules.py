@@ -112,16 +112,14 @@ def without_evidence(field: LanguageField) -> LanguageField:
 
 def every_region(setting: Setting, field: LanguageField, k: int) -> Any:
     """All regions that answer."""
-    return query_several(
-        field, jnp.asarray(setting.texts[k])[None], rules=QueryRules(all_of_kind=True, retrieval_threshold=NO_REFUSAL)
-    )
+    rules = QueryRules(all_of_kind=True, retrieval_threshold=NO_REFUSAL)
+    return query_several(field, jnp.asarray(setting.texts[k])[None], rules=rules)
 
 
 def instead(setting: Setting, field: LanguageField, k: int) -> Any:
     """The parts that answer where no region does."""
-    text = jnp.asarray(setting.texts[k])
-    found = query_anchored(field, text, rules=QueryRules(retrieval_threshold=NO_REFUSAL))
-    rules = QueryRules(retrieval_threshold=NO_REFUSAL)
+    text, rules = jnp.asarray(setting.texts[k]), QueryRules(retrieval_threshold=NO_REFUSAL)
+    found = query_anchored(field, text, rules=rules)
     other = parts_fallback(dataclasses.replace(field, parts=parts_of(setting)), text, found.score, rules)
     return found if other is None else other.selection
 
@@ -179,11 +177,7 @@ def default_refusal(setting: Setting, field: LanguageField, by: str) -> dict[str
 def best_scores(field: LanguageField, texts: np.ndarray, retrieval: str) -> np.ndarray:
     """(Q,) the similarity of each text's best region."""
     rules = QueryRules(retrieval=retrieval, retrieval_threshold=NO_REFUSAL)
-
-    def ask(text):
-        return match_regions(field, text[None], rules).score
-
-    return np.array([float(ask(jnp.asarray(text))) for text in texts])
+    return np.array([float(match_regions(field, jnp.asarray(text)[None], rules).score) for text in texts])
 
 
 def refusal(setting: Setting, field: LanguageField) -> dict[str, float]:

@@ -167,7 +167,7 @@ def figures_of(found: Pooled) -> dict[str, float]:
 
 
 def main(options: Options) -> dict:
-    """Runs the experiment, writes its results and returns the figures of each strength."""
+    """Runs the experiment, writes its results and returns the mean figures of each strength."""
     told: dict[float, list[dict[str, float]]] = {strength: [] for strength in options.strengths}
     for scene in options.scenes:
         for seed in options.seeds:
@@ -175,11 +175,6 @@ def main(options: Options) -> dict:
             bench = options.data.load(root, scene)
             for strength in options.strengths:
                 told[strength].append(figures_of(pooled(bench, root, f"{options.noise}+shared={strength:g}", seed)))
-    return report(told, options)
-
-
-def report(told: dict[float, list[dict[str, float]]], options: Options) -> dict:
-    """Writes the table of the figures of each strength; returns their means."""
 
     def mean(each):
         return {name: float(np.nanmean([figures[name] for figures in each])) for name in REAL}

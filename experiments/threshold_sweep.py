@@ -24,18 +24,16 @@ WAYS = ("one_step", "canonical", "code", "votes", "probability")
 class Sweep(Plan):
     """A plan whose cells are ways and thresholds."""
 
-    thresholds: tuple[float, ...] = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
+    thresholds: tuple[float, ...] = ()
 
 
-def _sweep(plan: Plan, name: str, **changes) -> Sweep:
-    given = {field.name: getattr(plan, field.name) for field in dataclasses.fields(plan)}
-    place = HOME / "quick" if plan.sweep == () else HOME
-    return Sweep(**(given | {"methods": WAYS, "sweep": (), "out": str(place / name)} | changes))
+def _sweep(plan: Plan, *thresholds: float) -> Sweep:
+    out = str(Path(plan.out).with_name("threshold_sweep"))
+    return Sweep(**vars(plan) | {"methods": WAYS, "sweep": (), "out": out}, thresholds=thresholds)
 
 
-HOME = results.HOME / "results"
-PLAN = _sweep(lerf.PLAN, "threshold_sweep")
-QUICK = _sweep(lerf.QUICK, "threshold_sweep", thresholds=(0.4, 0.9))
+PLAN = _sweep(lerf.PLAN, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
+QUICK = _sweep(lerf.QUICK, 0.4, 0.9)
 
 
 def main(plan: Sweep) -> str:
@@ -56,12 +54,11 @@ def main(plan: Sweep) -> str:
     header = ("asked by", *(f"{threshold:g}" for threshold in plan.thresholds), "spread")
     source = "twins in LERF-OVS's layout" if any(cell["twin"] for cell in cells) else "LERF-OVS"
     text = f"mIoU over the threshold, {source}; {lerf.NOTES}\n\n" + results.table(header, rows)
-    each = {way: rows for way in WAYS if len(rows := by_query(cells, way, plan.thresholds))}
+    each = {way: by_query(cells, way, plan.thresholds) for way in WAYS}
     apart = {way: best_thresholds(rows, plan.thresholds) for way, rows in each.items()}
     columns = ("asked by", "queries", "best threshold: median", "10 %", "90 %", "lost by one threshold for all")
-    if apart:
-        text += "\n\nQuery by query, where single texts are kept:\n\n"
-        text += results.table(columns, [(way, *told) for way, told in apart.items()])
+    text += "\n\nQuery by query, where single texts are kept:\n\n"
+    text += results.table(columns, [(way, *told) for way, told in apart.items()])
     figure = _figure(plan.thresholds, curves, each)
     told = {"curves": curves, "best thresholds": apart, "cells": totals(cells)}
     results.save(Path(plan.out), plan, told, text, figure)
@@ -70,14 +67,13 @@ def main(plan: Sweep) -> str:
 
 
 def by_query(cells: list[dict], way: str, thresholds: tuple[float, ...]) -> np.ndarray:
-    """(Q, K) IoU, the mean of its frames, of each (scene, seed, text) at each threshold. Cells that were measured
-    before single texts were kept have none."""
+    """(Q, K) IoU, the mean of its frames, of each (scene, seed, text) at each threshold."""
     found: dict[tuple, list[float]] = {}
     for threshold in thresholds:
         for cell in (cell for cell in cells if cell["method"] == f"{way} {threshold:g}"):
-            for text, (strict, _) in cell.get("texts", {}).items():
+            for text, (strict, _) in cell["texts"].items():
                 found.setdefault((cell["scene"], cell["seed"], text), []).append(float(np.mean(strict)))
-    return np.array([row for row in found.values() if len(row) == len(thresholds)])
+    return np.array(list(found.values()))
 
 
 def best_thresholds(each: np.ndarray, thresholds: tuple[float, ...]) -> tuple[float, ...]:

@@ -81,6 +81,7 @@ def main(options: Options) -> dict:
 def count_masks(options: Options) -> dict[str, dict[str, dict[str, Any]]]:
     """Counts the true masks that each kind of prompts finds, by kind of room and level."""
     kinds = {"crowded": crowded_room, "plain": make_room}
+    zeros = {"found": [0] * len(THRESHOLDS), "prompts": 0, "most_prompts": 0, "host_seconds": 0.0}
     counted: dict[str, dict[str, dict[str, Any]]] = {}
     for kind, seed in itertools.product(kinds, options.rooms):
         room = kinds[kind](seed)
@@ -89,14 +90,10 @@ def count_masks(options: Options) -> dict[str, dict[str, dict[str, Any]]]:
         for t, frame in enumerate(frames):
             labels = level_labels(room, cameras[t])
             for level in ("l", "default"):
-                row = counted.setdefault(kind, {}).setdefault(level, _empty())
+                empty = {"frames": 0, "true": 0, "guided": dict(zeros), "grid": dict(zeros)}
+                row = counted.setdefault(kind, {}).setdefault(level, empty)
                 _count_frame(row, frame, labels, level)
     return counted
-
-
-def _empty() -> dict[str, Any]:
-    zeros = {"found": [0] * len(THRESHOLDS), "prompts": 0, "most_prompts": 0, "host_seconds": 0.0}
-    return {"frames": 0, "true": 0, "guided": zeros | {"found": [0] * 5}, "grid": zeros | {"found": [0] * 5}}
 
 
 def _count_frame(row: dict[str, Any], frame: np.ndarray, labels: dict[str, np.ndarray], level: Level) -> None:
@@ -149,11 +146,8 @@ def role_of(model: Path) -> Role:
 
 def precisions_of(model: Path) -> list[Precision]:
     """Returns the precisions of the graphs in a folder."""
-    return [p for p, suffix in SUFFIXES.items() if any(model.rglob(f"{_first_graph(model)}{suffix}.onnx"))]
-
-
-def _first_graph(model: Path) -> str:
-    return "model" if role_of(model) == "embedder" else Path(ENCODER).stem
+    first = "model" if role_of(model) == "embedder" else Path(ENCODER).stem
+    return [p for p, suffix in SUFFIXES.items() if any(model.rglob(f"{first}{suffix}.onnx"))]
 
 
 def write_precisions(folder: Path) -> None:
@@ -175,32 +169,28 @@ def write_precisions(folder: Path) -> None:
         print(path, flush=True)
 
 
-def _best_seconds(call: Callable[[], Any], repeats: int = 1) -> float:
-    """Seconds of a call: the least of some, after one that is not counted.
+def _seconds(call: Callable[[], Any]) -> float:
+    """Seconds of a call, after one that is not counted.
 
     They are CPU seconds divided by the cores, so that other work on the machine counts little. Threads of ONNX Runtime
     that wait take no CPU time here, and its graphs keep all cores busy.
     """
     call()
-    seconds = []
-    for _ in range(repeats):
-        started = time.process_time()
-        call()
-        seconds.append((time.process_time() - started) / cores())
-    return min(seconds)
+    started = time.process_time()
+    call()
+    return (time.process_time() - started) / cores()
 
 
 def _time_segmenter(model: Path, precision: Precision, frame: np.ndarray) -> dict[str, Any]:
     graphs = SamGraphs(find_sam(model, precision))
-    encoder = _best_seconds(lambda: graphs.encode(frame))
+    encoder = _seconds(lambda: graphs.encode(frame))
     encoded = graphs.encode(frame)
     points = np.random.default_rng(0).uniform(0, 300, (8, 2)).astype(np.float32)
     list(graphs.decode(encoded, points[:2]))  # tries several prompts a run
-    together = graphs.batch > 1
     decoder = {}
-    for batch in (1, 8) if together else (1,):
+    for batch in (1, 8) if graphs.batch > 1 else (1,):
         graphs.batch = batch
-        decoder[batch] = _best_seconds(lambda: list(graphs.decode(encoded, points))) / len(points)
+        decoder[batch] = _seconds(lambda: list(graphs.decode(encoded, points))) / len(points)
     reference = SamGraphs(find_sam(model, "fp32")).encode(frame).features if precision != "fp32" else encoded.features
     cosines = [_cosine(encoded.features[name], reference[name]) for name in reference]
     prompt = min(decoder.values())
@@ -214,8 +204,8 @@ def _time_embedder(model: Path, precision: Precision, frame: np.ndarray, masks: 
 
     embedder = ClipEmbedder(find_clip(model, precision))
     regions, texts = embed(embedder)
-    crop = {n: _best_seconds(lambda n=n: embedder.embed_regions(frame, masks[:n])) / n for n in (1, len(masks))}
-    text = _best_seconds(lambda: embedder.embed_text([TEXTS[0]]))
+    crop = {n: _seconds(lambda n=n: embedder.embed_regions(frame, masks[:n])) / n for n in (1, len(masks))}
+    text = _seconds(lambda: embedder.embed_text([TEXTS[0]]))
     embedder.close()
     exact = (regions, texts) if precision == "fp32" else embed(ClipEmbedder(find_clip(model, "fp32")))
     cosines = [float((one * other).sum(1).min()) for one, other in zip((regions, texts), exact)]
@@ -231,7 +221,7 @@ def _time_tracker(model: Path, precision: Precision, frame: np.ndarray) -> dict[
     prompt = Prompt(points=np.array([[200.0, 150.0]], np.float32), labels=np.array([1], np.int32))
     seconds = []
     encode = FrameEncoder(graphs, keep=3)
-    encoder = _best_seconds(lambda: FrameEncoder(graphs)(frames[0]))
+    encoder = _seconds(lambda: FrameEncoder(graphs)(frames[0]))
     for each in frames:
         encode(each)
     started = time.process_time()

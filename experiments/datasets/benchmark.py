@@ -1,4 +1,4 @@
-"""A scene of a benchmark as every dataset's loader returns it: one pytree, whatever its files look like.
+"""A scene of a benchmark as every dataset's loader returns it, whatever its files look like.
 
 LERF and 3D-OVS have their truth in pixels (`frames`), Replica in points (`point_classes`).
 """
@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from jsecon.data.labels import LabelledFrame
@@ -22,12 +21,7 @@ TWIN_FILE = "twin.json"
 """at the root of a made-up dataset: what its generator put there, and that it is none of the real scenes"""
 
 
-def _static() -> Any:
-    return dataclasses.field(metadata={"static": True})
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Benchmark:
     """One scene with what is asked of it and what is true."""
 
@@ -35,31 +29,22 @@ class Benchmark:
     """its held-out frames are those that nothing may be fitted to."""
     frames: tuple[LabelledFrame, ...]
     """truth in pixels; empty where it is in points."""
-    points: Array
+    points: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 3), np.float32))
     """(P, 3) float32 labelled points, world, in the files' order; P = 0 where the truth is in pixels."""
-    point_colors: Array
+    point_colors: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 3), np.uint8))
     """(P, 3) uint8."""
-    point_classes: Array
+    point_classes: Array = dataclasses.field(default_factory=lambda: np.zeros(0, np.int32))
     """(P,) int32 index into `queries`; -1 = none of them, not evaluated."""
-    name: str = _static()
+    name: str
     """of the scene."""
-    dataset: str = _static()
+    dataset: str
     """lerf, ovs3d or replica."""
-    queries: tuple[str, ...] = _static()
+    queries: tuple[str, ...]
     """the texts."""
-    pairs: int = _static()
+    pairs: int
     """the protocol's denominator: (frame, query) pairs, or classes that occur, that the dataset defines."""
-    twin: bool = _static()
+    twin: bool
     """a made-up scene in this dataset's layout."""
-
-
-def no_points() -> dict[str, np.ndarray]:
-    """The fields of a benchmark without labelled points."""
-    return {
-        "points": np.zeros((0, 3), np.float32),
-        "point_colors": np.zeros((0, 3), np.uint8),
-        "point_classes": np.zeros(0, np.int32),
-    }
 
 
 def twin_of(root: str | Path, scene: str) -> dict[str, Any] | None:
@@ -72,12 +57,8 @@ def twin_of(root: str | Path, scene: str) -> dict[str, Any] | None:
         told = json.loads(file.read_text(encoding="utf-8"))["scenes"]
         return told[scene]
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            file,
-            f"nothing readable about {scene!r} ({error})",
-            "what the generator wrote of each scene",
-            "Make the twin again, or remove the file if these are real data.",
-        ) from error
+        remedy = "Make the twin again, or remove the file if these are real data."
+        raise InputError(file, f"nothing readable about {scene!r} ({error})", remedy=remedy) from error
 
 
 def hold_out(capture: Capture, frames: Sequence[LabelledFrame], where: Path) -> Capture:
@@ -86,12 +67,8 @@ def hold_out(capture: Capture, frames: Sequence[LabelledFrame], where: Path) -> 
     index = {name: t for t, name in enumerate(capture.names)}
     for frame in frames:
         if frame.name not in index:
-            raise InputError(
-                where,
-                f"labels of {frame.name}, which is not among the {len(index)} frames of the capture",
-                f"frames of the capture, such as {capture.names[0]}",
-                "Keep images, poses and labels of one scene together; take none of its labelled frames away.",
-            )
+            problem = f"labels of {frame.name}, which is not among the {len(index)} frames of the capture"
+            raise InputError(where, problem, remedy="Keep images, poses and labels of one scene together.")
     out = np.zeros(len(capture.names), bool)
     out[[index[frame.name] for frame in frames]] = True
     return dataclasses.replace(capture, held_out=out)
@@ -101,9 +78,5 @@ def require_count(where: Path, found: int, expected: int, what: str) -> None:
     """Raises InputError where a dataset does not hold what its protocol counts: a smaller denominator measures
     something else."""
     if found != expected:
-        raise InputError(
-            where,
-            f"{found} {what}",
-            f"{expected}, the protocol's denominator",
-            "Use the dataset's own label files, all of them.",
-        )
+        problem = f"has {found} {what}, where the protocol counts {expected}"
+        raise InputError(where, problem, remedy="Use the dataset's own label files, all of them.")

@@ -31,12 +31,8 @@ def load_text_features(file: Path, queries: Sequence[str]) -> tuple[Float[np.nda
         table = json.loads(file.read_text(encoding="utf-8"))
         missing = [text for text in (*queries, *CANONICAL) if text not in table]
         if missing:
-            raise InputError(
-                file,
-                f"no vector of {', '.join(missing)}",
-                "every query and the four canonical phrases",
-                "Embed them with the text encoder of the embedder that made the masks' features.",
-            )
+            remedy = "Embed every query and canonical phrase with the embedder that made the masks' features."
+            raise InputError(file, f"no vector of {', '.join(missing)}", remedy=remedy)
         found = [np.array([table[text] for text in texts], np.float32) for texts in (queries, CANONICAL)]
     except (OSError, json.JSONDecodeError, TypeError, AttributeError) as error:
         raise InputError(file, str(error), "a JSON of text -> vector", "Write it again.") from error

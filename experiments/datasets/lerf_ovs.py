@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from experiments.datasets.benchmark import Benchmark, hold_out, no_points, require_count, twin_of
+from experiments.datasets.benchmark import Benchmark, hold_out, require_count, twin_of
 from jsecon.data.capture import load_capture
 from jsecon.data.labels import load_lerf_labels
 from jsecon.errors import InputError
@@ -37,20 +37,14 @@ def load_lerf_ovs(root: str | Path, scene: str, *, downscale: float | int | None
     names = tuple(f"frame_{n:05d}" for n in LERF_FRAMES.get(scene, ())) if told is None else tuple(told["frames"])
     missing = sorted(set(names) - {frame.name for frame in frames})
     if missing:
-        raise InputError(
-            folder,
-            f"no label of {', '.join(missing)}",
-            f"{len(names)} annotated frames",
-            "Copy the scene's label files, all of them.",
-        )
+        raise InputError(folder, f"no label of {', '.join(missing)}", remedy="Copy all of the scene's label files.")
     pairs = sum(len(frame.objects) for frame in frames)
     expected = LERF_PAIRS.get(scene, pairs) if told is None else told["pairs"]
     require_count(folder, pairs, expected, "(frame, query) pairs")
     capture = load_capture(root / scene, downscale=downscale, holdout=0)
     return Benchmark(
-        hold_out(capture, frames, folder),
-        tuple(frames),
-        **no_points(),
+        capture=hold_out(capture, frames, folder),
+        frames=tuple(frames),
         name=scene,
         dataset="lerf",
         queries=tuple(sorted({query for frame in frames for query in frame.objects})),

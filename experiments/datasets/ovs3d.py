@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from experiments.datasets.benchmark import Benchmark, hold_out, no_points, require_count, twin_of
+from experiments.datasets.benchmark import Benchmark, hold_out, require_count, twin_of
 from jsecon.data.capture import load_capture
 from jsecon.data.images import IMAGE_SUFFIXES, read_image, write_image
 from jsecon.data.labels import LabelledFrame
@@ -34,30 +34,23 @@ def load_ovs3d(root: str | Path, scene: str, *, downscale: float | int | None = 
     """
     root, told = Path(root), twin_of(root, scene)
     folder = root / scene
-    files = image_files(folder / "images")
+    files = sorted(file for file in (folder / "images").glob("*") if file.suffix in IMAGE_SUFFIXES)
+    if not files:
+        raise InputError(folder / "images", "no image", remedy="Check the path.")
     frames, classes = load_segmentations(folder / "segmentations", [file.stem for file in files])
     pairs = sum(len(frame.objects) for frame in frames)
     expected = OVS3D_PAIRS.get(scene, pairs) if told is None else told["pairs"]
     require_count(folder / "segmentations", pairs, expected, "(frame, query) pairs")
     capture = load_capture(folder, downscale=downscale, holdout=0)
     return Benchmark(
-        hold_out(capture, frames, folder / "segmentations"),
-        tuple(frames),
-        **no_points(),
+        capture=hold_out(capture, frames, folder / "segmentations"),
+        frames=tuple(frames),
         name=scene,
         dataset="ovs3d",
         queries=classes,
         pairs=pairs,
         twin=told is not None,
     )
-
-
-def image_files(folder: Path) -> list[Path]:
-    """The images of a scene in the order that the numbers of `segmentations` count. Raises InputError for none."""
-    files = sorted(file for file in folder.glob("*") if file.suffix in IMAGE_SUFFIXES)
-    if not files:
-        raise InputError(folder, "no image", "the scene's frames", "Check the path.")
-    return files
 
 
 def load_segmentations(folder: Path, names: Sequence[str]) -> tuple[list[LabelledFrame], tuple[str, ...]]:
@@ -72,38 +65,21 @@ def load_segmentations(folder: Path, names: Sequence[str]) -> tuple[list[Labelle
     except OSError as error:
         raise InputError(file, error.strerror or "an error", "one class per line", "Check the path.") from error
     if not classes or len(set(classes)) < len(classes):
-        raise InputError(
-            file,
-            f"{len(classes)} classes, {len(set(classes))} distinct",
-            "one class per line, each once",
-            "Use the dataset's own file.",
-        )
+        problem = "must have one class per line, each once"
+        raise InputError(file, problem, remedy="Use the dataset's own file.")
     frames = []
     for place in sorted((entry for entry in folder.iterdir() if entry.is_dir()), key=lambda entry: entry.name):
         if not place.name.isdigit() or int(place.name) >= len(names):
-            raise InputError(
-                place,
-                f"a folder called {place.name}",
-                f"the number of one of the {len(names)} images, 00 to {len(names) - 1:02d}",
-                "Folders count the sorted list of images from 0.",
-            )
+            problem = f"a folder called {place.name}, which is the number of none of the {len(names)} images"
+            raise InputError(place, problem, remedy="Folders count the sorted list of images from 0.")
         found = {mask.stem for mask in place.glob("*.png")}
         missing, unknown = sorted(set(classes) - found), sorted(found - set(classes))
         if missing or unknown:
-            raise InputError(
-                place,
-                "; ".join(
-                    text
-                    for text, which in (
-                        (f"no mask of {', '.join(missing)}", missing),
-                        (f"masks of {', '.join(unknown)}, which classes.txt does not name", unknown),
-                    )
-                    if which
-                ),
-                f"one .png for each of {', '.join(classes)}",
-                "Name each mask like its class; a class that a frame does not show has an all-black one.",
-            )
-        objects = {name: _mask(place / f"{name}.png") for name in classes}
+            without, beyond = (", ".join(names) or "none" for names in (missing, unknown))
+            problem = f"classes without a mask: {without}; masks of no class: {beyond}"
+            remedy = "Name each mask like its class; a class that a frame does not show has an all-black one."
+            raise InputError(place, problem, remedy=remedy)
+        objects = {name: read_image(place / f"{name}.png")[0][..., 0] >= ON for name in classes}
         shapes = {mask.shape for mask in objects.values()}
         if len(shapes) > 1:
             raise InputError(place, f"masks of {len(shapes)} sizes", "one size", "Export the masks again.")
@@ -111,10 +87,6 @@ def load_segmentations(folder: Path, names: Sequence[str]) -> tuple[list[Labelle
         boxed = {name: (mask, box_of(mask)) for name, mask in objects.items()}
         frames.append(LabelledFrame(names[int(place.name)], width, height, boxed))
     return frames, classes
-
-
-def _mask(path: Path) -> Bool[np.ndarray, "h w"]:
-    return read_image(path)[0][..., 0] >= ON
 
 
 def box_of(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "b 4"]:

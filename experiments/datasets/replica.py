@@ -51,12 +51,8 @@ def load_replica(
     queries = tuple(classes or (REPLICA_CLASSES if told is None else told["queries"]))
     unknown = sorted(set(queries) - set(names.values()))
     if unknown:
-        raise InputError(
-            root / scene,
-            f"classes {', '.join(unknown)} asked for",
-            f"names of the scene's own table, such as {', '.join(sorted(names.values())[:5])}",
-            "Spell them as the table does.",
-        )
+        problem = f"classes {', '.join(unknown)} asked for, which the scene's own table does not have"
+        raise InputError(root / scene, problem, remedy=f"It has {', '.join(sorted(names.values())[:5])} and so on.")
     index = {number: queries.index(name) for number, name in names.items() if name in queries}
     numbers, place = np.unique(ids, return_inverse=True)
     table = np.array([index.get(int(number), -1) for number in numbers], np.int32)
@@ -65,11 +61,11 @@ def load_replica(
     if told is not None:
         require_count(root / scene, occurring, told["pairs"], "classes that occur")
     return Benchmark(
-        capture,
-        (),
-        points,
-        colors,
-        point_classes,
+        capture=capture,
+        frames=(),
+        points=points,
+        point_colors=colors,
+        point_classes=point_classes,
         name=scene,
         dataset="replica",
         queries=queries,
@@ -102,12 +98,7 @@ def load_frames(root: Path, scene: str, *, every: int, downscale: float | int | 
         number = image.stem.removeprefix("frame")
         depth = image.with_name(f"depth{number}.png")
         if not number.isdigit() or int(number) >= len(poses) or not depth.is_file():
-            raise InputError(
-                image,
-                f"no {depth.name} beside it, or no pose",
-                "frame, depth and pose of one number",
-                "Copy the rendering again.",
-            )
+            raise InputError(image, f"no {depth.name} beside it, or no pose", remedy="Copy the rendering again.")
         shots.append(PosedImage(image.name, image, lens, poses[int(number)], depth, 1.0 / camera["scale"]))
     return build_capture(PosedImages(shots, root / scene), downscale=downscale, holdout=0)
 
@@ -127,12 +118,8 @@ def load_semantics(
         names = {int(entry["id"]): str(entry["name"]) for entry in info["classes"]}
         of_object = {int(entry["id"]): int(entry["class_id"]) for entry in info["objects"]}
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            habitat / "info_semantic.json",
-            f"no usable {error}",
-            "classes (id, name) and objects (id, class_id)",
-            "Copy it again.",
-        ) from error
+        problem = f"no usable {error}: classes need id and name, objects id and class_id"
+        raise InputError(habitat / "info_semantic.json", problem, remedy="Copy it again.") from error
     return points, colors, vertex_classes(len(points), faces, properties["object_id"], of_object), names
 
 

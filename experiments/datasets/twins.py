@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Int
 
@@ -28,7 +27,7 @@ from jsecon.data.images import write_image
 from jsecon.data.labels import LabelledFrame, write_lerf_labels
 from jsecon.demo.capture import label_frame, look_at, render_capture, room_cameras, write_label_image
 from jsecon.demo.room import TABLE_WOOD, Part, Room, srgb_to_linear
-from jsecon.files import atomic_write, write_text
+from jsecon.files import write_text
 from jsecon.types import Camera, Capture
 
 
@@ -141,7 +140,8 @@ def write_replica_twin(
     assert capture.depths is not None
     for t in range(views):
         write_image(root / scene / "results" / f"frame{t:06d}.jpg", capture.frames[t])
-        _write_png16(root / scene / "results" / f"depth{t:06d}.png", np.rint(capture.depths[t] * scale))
+        depth = np.rint(capture.depths[t] * scale).astype(np.uint16)
+        write_label_image(root / scene / "results" / f"depth{t:06d}.png", depth)
     write_mesh(root / f"{scene}_mesh.ply", mesh.vertices, mesh.faces)
     habitat = root / f"{scene[:-1]}_{scene[-1]}" / "habitat"
     numbers = mesh.face_owners.astype(np.int32) + 1
@@ -198,8 +198,3 @@ def _finish(
     scenes = json.loads(file.read_text())["scenes"] if file.exists() else {}
     told |= {"frames": [frame.name for frame in frames]}
     write_text(file, json.dumps({"scenes": scenes | {scene: told}}, indent=1) + "\n")
-
-
-def _write_png16(path: Path, values: np.ndarray) -> None:
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(cv2.imencode(".png", values.astype(np.uint16))[1].tobytes())

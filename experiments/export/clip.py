@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from experiments.export.embedder import TEXTS, agreements, told
+from experiments.export.embedder import TEXTS, compared
 from experiments.export.graph import Agreement, Wrapped, declare_missing_operators, shake, write_graph
 from jsecon.files import write_text
 
@@ -27,10 +27,12 @@ def official(name: str, weights: str | None, *, seed: int) -> torch.nn.Module:
 
 def export(model: torch.nn.Module, name: str, folder: Path, *, seed: int, threads: int) -> list[Agreement]:
     """Writes both graphs, the preprocessing and the vocabulary into `folder`; each graph is compared on five inputs."""
+    import open_clip
+
     generator = torch.Generator().manual_seed(seed)
     size, length = model.visual.image_size[0], model.context_length
     images = torch.randn(5, 3, size, size, generator=generator)
-    tokenizer = _tokenizer(name)
+    tokenizer = open_clip.get_tokenizer(name)
     texts = ["a photo of a red mug", "sofa", "thé à la menthe", "", "the small green plant on the window sill " * 5]
     ids = tokenizer(texts, context_length=length).to(torch.int32)
     rows = [
@@ -56,14 +58,13 @@ def export_mobile(model: torch.nn.Module, name: str, folder: Path, *, seed: int,
     model.visual.image_mean, model.visual.image_std = usual["mean"], usual["std"]
     rows = export(model, name, folder, seed=seed, threads=threads)
     write_text(folder / "config.json", json.dumps(open_clip.get_model_config(name), indent=2) + "\n")
-    ids = _tokenizer(name)(TEXTS, context_length=model.context_length)
+    ids = open_clip.get_tokenizer(name)(TEXTS, context_length=model.context_length)
 
     def encode(pixels):
         return model.encode_image(pixels, normalize=True)
 
     numbers = {"mean": list(usual["mean"]), "std": list(usual["std"]), "size": list(model.visual.image_size)}
-    found = agreements(folder, encode, model.encode_text(ids, normalize=True), ids, numbers, threads)
-    return told(rows, found)
+    return compared(rows, folder, encode, model.encode_text(ids, normalize=True), ids, numbers, threads)
 
 
 def write_half(
@@ -74,12 +75,6 @@ def write_half(
     free = {name: {0: "batch"}} | {output: {0: "batch"} for output in names}
     row = write_graph(path, module, {name: given[:2]}, names, free=free, other={name: given}, threads=threads)
     return dataclasses.replace(row, graph=f"{path.parent.name}/{path.name}")
-
-
-def _tokenizer(name: str):
-    import open_clip
-
-    return open_clip.get_tokenizer(name)
 
 
 class Image(Wrapped):

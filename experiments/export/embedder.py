@@ -4,7 +4,6 @@ and normalisation included."""
 import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,25 +22,30 @@ TEXTS = [
 FRAMES = ("orange ball", "blue box on a brown table", "where nothing is, nothing is found")
 
 
-class Found(NamedTuple):
-    """What was compared."""
-
-    rows: list[Agreement]
-    tokens: dict[str, float]
-    """how many texts have the same ids, and how far apart the embeddings of different texts and regions are: as a
-    random model sees them, which says what a difference of embeddings is worth."""
-
-
-def agreements(
+def compared(
+    rows: list[Agreement],
     folder: Path,
     encode: Callable[[torch.Tensor], torch.Tensor],
     texts: torch.Tensor,
     ids: torch.Tensor,
     numbers: Mapping[str, list],
     threads: int,
-) -> Found:
-    """Rows of the embedder over `folder`: its TEXTS against the unit embeddings `texts` of the ids `ids`, and regions
-    of a patterned frame against `encode` of the same crops, normalised by `numbers` (mean, std, size)."""
+) -> dict:
+    """Compares the embedder over a folder.
+
+    Args:
+      rows: Agreements of its graphs.
+      folder: The folder.
+      encode: Unit embeddings of crops of a patterned frame, normalised by `numbers` (mean, std, size).
+      texts: Unit embeddings of TEXTS.
+      ids: Their tokens.
+      numbers: The preprocessing.
+      threads: Number of cores of ONNX Runtime.
+
+    Returns:
+      {"graphs": all agreements, "tokens": how many texts have the same ids, and how far apart the embeddings of
+      different texts and regions are: as a random model sees them, which says what a difference is worth}.
+    """
     embedder = ClipEmbedder(folder, threads=threads)
     with torch.inference_mode():
         frame, masks = regions()
@@ -53,14 +57,11 @@ def agreements(
     looked = embedder.embed_regions(frame, masks)
     same = embedder._tokenizer(TEXTS, ids.shape[1]) == ids.numpy()
     embedder.close()
-    rows = [_row(f"{len(masks)} regions by ClipEmbedder", looked, seen), _row("6 texts by ClipEmbedder", said, wanted)]
+    rows = [*rows, _row(f"{len(masks)} regions by ClipEmbedder", looked, seen)]
+    rows.append(_row("6 texts by ClipEmbedder", said, wanted))
     told = {"texts": len(TEXTS), "same_ids": int(same.all(1).sum()), "ids_in_texts": int(np.unique(ids.numpy()).size)}
-    return Found(rows, told | {"texts_apart": _apart(wanted), "regions_apart": _apart(seen)})
-
-
-def told(rows: list[Agreement], found: Found) -> dict:
-    """Rows of graphs and of the embedder as plain figures."""
-    return {"graphs": [dataclasses.asdict(row) for row in (*rows, *found.rows)], "tokens": found.tokens}
+    told |= {"texts_apart": _apart(wanted), "regions_apart": _apart(seen)}
+    return {"graphs": [dataclasses.asdict(row) for row in rows], "tokens": told}
 
 
 def regions() -> tuple[np.ndarray, np.ndarray]:

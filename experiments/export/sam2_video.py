@@ -116,7 +116,7 @@ def export(model: Any, folder: Path, *, seed: int, threads: int) -> dict:
             MemoryAttention(model, grid),
             current | memories,
             ["conditioned_feats"],
-            {"reference": lambda given: [_attended(model, grid, given)]},
+            {"reference": lambda given: [_attended(model, grid, *given.values(), POINTERS * channels // memory)]},
         ),
         "pointer_tpos": (
             PointerCodes(model),
@@ -231,15 +231,10 @@ class MemoryAttention(torch.nn.Module):
         return module.out_proj(torch.cat(blocks))
 
 
-def _attended(model: Any, grid: int, given: Any) -> torch.Tensor:
+def _attended(model: Any, grid: int, current, current_pos, memory, memory_pos, pointers: int) -> torch.Tensor:
     """The package's own memory attention."""
-    tokens = model.memory_attention(
-        curr=given["current_vision_features"],
-        curr_pos=given["current_vision_position_embeddings"],
-        memory=given["memory"],
-        memory_pos=given["memory_pos"],
-        num_obj_ptr_tokens=POINTERS * model.hidden_dim // model.mem_dim,
-    )
+    inputs = {"curr": current, "curr_pos": current_pos, "memory": memory, "memory_pos": memory_pos}
+    tokens = model.memory_attention(**inputs, num_obj_ptr_tokens=pointers)
     return tokens[:, 0].T.reshape(1, -1, grid, grid)
 
 
@@ -256,14 +251,8 @@ class DistinctMemories(torch.nn.Module):
         spatial = _distinct(rows[:split], self.grid**2)
         pointers = _distinct(rows[split:], self.model.hidden_dim // self.model.mem_dim)
         values, codes = torch.cat([spatial, pointers]).chunk(2, -1)
-        tokens = self.model.memory_attention(
-            curr=current_vision_features,
-            curr_pos=current_vision_position_embeddings,
-            memory=values,
-            memory_pos=codes,
-            num_obj_ptr_tokens=len(pointers),
-        )
-        return tokens[:, 0].T.reshape(1, -1, self.grid, self.grid)
+        current = current_vision_features, current_vision_position_embeddings
+        return _attended(self.model, self.grid, *current, values, codes, len(pointers))
 
 
 def _distinct(rows: torch.Tensor, size: int) -> torch.Tensor:

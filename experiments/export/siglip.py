@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from experiments.export.clip import Image, Text, write_half
-from experiments.export.embedder import FRAMES, TEXTS, agreements, told
+from experiments.export.embedder import FRAMES, TEXTS, compared
 from experiments.export.graph import Wrapped, declare_missing_operators, shake, write_graph
 from experiments.export.vocabulary import write_vocabulary
 from jsecon.files import write_text
@@ -45,8 +45,8 @@ def export_open_clip(model: torch.nn.Module, name: str, folder: Path, *, seed: i
     def encode(pixels):
         return model.encode_image(pixels, normalize=True)
 
-    found = agreements(folder, encode, model.encode_text(ids.long(), normalize=True), ids, preprocessing, threads)
-    return told(rows, found)
+    wanted = model.encode_text(ids.long(), normalize=True)
+    return compared(rows, folder, encode, wanted, ids, preprocessing, threads)
 
 
 def official_transformers(seed: int) -> torch.nn.Module:
@@ -98,10 +98,10 @@ def export_transformers(model: Any, folder: Path, *, seed: int, threads: int) ->
         return torch.nn.functional.normalize(model.vision_model(pixel_values=pixels).pooler_output, dim=-1)
 
     numbers = {"mean": half, "std": half, "size": [size, size]}
-    found = agreements(folder, encode, wanted, ids, numbers, threads)
+    found = compared(rows, folder, encode, wanted, ids, numbers, threads)
     scale, bias = ClipEmbedder(folder, threads=threads).logits or (np.nan, np.nan)
     logits = {"scale": [scale, SCALE], "bias": [bias, BIAS]}
-    return told(rows, found) | {"logits": logits}
+    return found | {"logits": logits}
 
 
 class Pooled(Wrapped):

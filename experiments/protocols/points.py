@@ -65,12 +65,9 @@ def evaluate_points(
         for k, (own, recall) in class_scores(predicted, true).items()
     ]
     if not rows or (expected_classes is not None and len(rows) != expected_classes):
-        raise InputError(
-            "labelled points",
-            f"{len(rows)} classes among {len(true)} counted points ({faint} left out as faint)",
-            f"{expected_classes or 'at least one'}",
-            "Evaluate on all labelled points of the scene, with the protocol's class set.",
-        )
+        problem = f"{len(rows)} classes among {len(true)} counted points ({faint} left out as faint)"
+        remedy = "Evaluate on all labelled points of the scene, with the protocol's class set."
+        raise InputError("labelled points", problem, f"{expected_classes or 'at least one'}", remedy)
     return rows, {
         "protocol": "points: most similar class; means over the classes that occur of IoU and of recall",
         "pairs": len(rows),

@@ -98,15 +98,8 @@ def train_gaussian_grouping(
     nearest = KDTree(means).query(means, k=min(KL_NEIGHBOURS, count))[1].reshape(count, -1).astype(np.int32)
     nearest = np.pad(nearest, ((0, rows - count), (0, 0)))
     data = plans, jnp.asarray(evidence.tracks) + 1, jnp.asarray(nearest), jnp.asarray(count)
-    params, history = descend(
-        _loss,
-        params,
-        data,
-        views=len(evidence.masks),
-        steps=steps,
-        optimizer=_optimizer(identity_rate, classifier_rate),
-        key=key,
-    )
+    optimizer, views = _optimizer(identity_rate, classifier_rate), len(evidence.masks)
+    params, history = descend(_loss, params, data, views=views, steps=steps, optimizer=optimizer, key=key)
     return GaussianGrouping(**params | {"identity": params["identity"][:count]}), history
 
 

@@ -36,12 +36,8 @@ class LangSplat:
 
     def features(self) -> Float[Array, "n e"]:
         """(N, E) decoded codes; zero where the code is unknown."""
-        return self.decode(self.codes)
-
-    def decode(self, codes: Float[Array, "... d"]) -> Float[Array, "... e"]:
-        """Codes (..., d), of Gaussians or of rendered pixels -> unit embeddings (..., E); a zero code stays zero."""
-        decoded = self.autoencoder.decode(codes)
-        return jnp.where(jnp.any(codes != 0, axis=-1, keepdims=True), decoded, 0.0)
+        decoded = self.autoencoder.decode(self.codes)
+        return jnp.where(jnp.any(self.codes != 0, axis=-1, keepdims=True), decoded, 0.0)
 
 
 def train_langsplat(evidence: Evidence, *, key: Array, steps: int = STEPS, **training: Any) -> LangSplat:

@@ -54,12 +54,7 @@ def load_text_space(vectors: str | Path, names: str | Path) -> TextSpace:
     except (OSError, ValueError) as error:
         raise InputError(vectors, str(error), "text vectors and their names", "Use made_text_space instead.") from error
     if rows.ndim != 2 or len(rows) != len(texts):
-        raise InputError(
-            vectors,
-            f"vectors {rows.shape} beside {len(texts)} names",
-            "a row per name",
-            "Give the two files of one space.",
-        )
+        raise InputError(vectors, f"has vectors {rows.shape} for {len(texts)} names", remedy="Give files of one space.")
     return TextSpace(tuple(texts), _unit(rows))
 
 
@@ -186,12 +181,7 @@ class SimulatedEmbedder:
         frame that is not among those whose content is known."""
         t = self._frames.get(_digest(frame))
         if t is None:
-            raise InputError(
-                "SimulatedEmbedder",
-                "a frame without true labels",
-                f"one of the {len(self._frames)} frames it was made with",
-                "Simulated vision sees only what it was told.",
-            )
+            raise InputError("SimulatedEmbedder", "the frame is none of those whose true labels are known")
         found = np.zeros((len(masks), self.dim))
         for m, mask in enumerate(masks):
             shown = self._labels[t][mask]

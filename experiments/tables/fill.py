@@ -14,7 +14,7 @@ from experiments.cells import append_cell, exclusive_lock, read_cells, run_helpe
 from experiments.datasets.benchmark import Benchmark
 from experiments.protocols.points import evaluate_points
 from experiments.tables import twins
-from experiments.tables.answers import Answers, Method, Steps
+from experiments.tables.answers import QUICK_STEPS, Answers, Method, Steps
 from experiments.tables.setting import Setting, prepare
 from jsecon.evaluate.lerf import ALPHA_THRESHOLD, VALA_THRESHOLD, evaluate_at_thresholds
 from jsecon.process import clear_programs, cores, peak_memory_mib
@@ -43,6 +43,13 @@ class Plan:
     processes: int = 1
     """Processes that share the settings, each on its own cores. 1: this process computes all on all cores. 0: this
     process is a helper, which computes free settings and ends."""
+
+
+def quick_plan(plan: Plan, scene: str, **size: int | float) -> Plan:
+    """The quick run of a table: one tiny twin of a scene, few steps; its figures say nothing."""
+    data = dataclasses.replace(plan.data, scenes=(scene,), seeds=(0,), size=tuple(size.items()))
+    out = Path(plan.out).parent / "quick" / Path(plan.out).name
+    return dataclasses.replace(plan, data=data, steps=QUICK_STEPS, fit_steps=80, sweep=(), out=str(out))
 
 
 def options_of(plan: Plan, quick: Plan, words: list[str] | None = None) -> Plan:

@@ -104,28 +104,11 @@ def make(
     why: dict[str, str] | None = None,
     published: str = "",
 ) -> str:
-    """Fills, writes and prints a table; returns its text."""
-    cells = fill(plan, methods, tell=lambda line: print(line, flush=True))
-    text = write(plan, cells, figures, notes=notes, ours=ours, why=why, published=published)
-    print(text)
-    return text
-
-
-def write(
-    plan: Plan,
-    cells: list[dict],
-    figures: tuple[str, ...],
-    *,
-    notes: str,
-    ours: str = "",
-    why: dict[str, str] | None = None,
-    published: str = "",
-) -> str:
-    """Writes the results of a table.
+    """Fills, writes and prints a table.
 
     Args:
       plan: The table.
-      cells: Its cells.
+      methods: Methods by the names of the rows.
       figures: Names of the columns.
       notes: How the figures are measured.
       ours: Row that is compared with the other methods; empty: no comparison.
@@ -135,6 +118,7 @@ def write(
     Returns:
       The text of table.md.
     """
+    cells = fill(plan, methods, tell=lambda line: print(line, flush=True))
     twin = any(cell["twin"] for cell in cells)
     source = f"made-up twins in {plan.data.dataset}'s layout, simulated vision ({plan.level})" if twin else "real data"
     parts = [f"Measured on {source}. {notes}", "", summarise(cells, plan.data.scenes, plan.level, figures), ""]
@@ -150,4 +134,5 @@ def write(
     for label in figure.axes[0].get_xticklabels():
         label.set(rotation=20, ha="right", rotation_mode="anchor")
     results.save(Path(plan.out), plan, {"means": averages, "cells": totals(cells)}, text, figure)
+    print(text)
     return text

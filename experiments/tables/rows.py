@@ -144,18 +144,15 @@ def _chosen(setting: Setting, answers: Answers, chooser: str, cut: float | None)
     return dataclasses.replace(answers, select=select)
 
 
-def _langsplat(setting: Setting, steps: Steps) -> Any:
-    return [langsplat_of(setting, setting.evidence, steps).features()]
-
-
 def _langsplat_row(rule: str, chooser: str) -> Method:
-    if rule:
-        return reading("LangSplat-m", _langsplat, rule, chooser)
+    def row(setting: Setting, steps: Steps) -> Answers:
+        def train():
+            return [langsplat_of(setting, setting.evidence, steps).features()]
 
-    def published(setting, steps):
-        return setting.shared.get("LangSplat-m", lambda: _langsplat(setting, steps))
+        features = setting.shared.get("LangSplat-m", train)
+        return read(setting, features, rule, chooser) if rule else by_features(setting, features[0], relevancy=False)
 
-    return lambda setting, steps: by_features(setting, published(setting, steps)[0], relevancy=False)
+    return row
 
 
 def _opengaussian_row(codebook: str, rule: str, chooser: str) -> Method:

@@ -53,41 +53,6 @@ ABSENT = 200
 """names that nothing in a twin has: to refuse, and for errors that views share to lean to"""
 
 
-def faults_of(level: str) -> Faults:
-    """Of a named level of noise: perfect, low, medium, high or shared; what follows a "+" is `world_of`'s."""
-    noise, _ = world_of(level)
-    return PERFECT if noise == "perfect" else NOISE[noise]
-
-
-def load(dataset: str, root: Path, scene: str, *, every: int = 1, downscale: float | None = None) -> Benchmark:
-    """A scene of any of the datasets, real or twin; `every` and `downscale` are for long, large captures."""
-    if dataset == "lerf":
-        return load_lerf_ovs(root, scene, downscale=downscale)
-    if dataset == "ovs3d":
-        return load_ovs3d(root, scene, downscale=downscale)
-    return load_replica(root, scene, every=every, downscale=downscale)
-
-
-def make(dataset: str, root: Path, scene: str, seed: int, level: str, size: dict) -> Path:
-    """A twin of `scene` under `root` with simulated vision of `level`, made where it is not there yet; its root.
-
-    Each (seed, level, size) has a root of its own: a scene's vision lies beside its frames, and twins of another size
-    have other labelled frames. One process at a time writes to a root.
-    """
-    kind = json.dumps({"size": size, "kind": KIND}, sort_keys=True)
-    place = root / f"{dataset}-seed{seed}-{level}-{hashlib.sha1(kind.encode()).hexdigest()[:8]}"
-    marker = place / scene / "made.json"
-    if marker.exists():
-        return place
-    with exclusive_lock(place / "twin.lock", wait=True):
-        if not marker.exists():
-            number = sum(map(ord, scene))  # the scenes of a dataset are rooms of their own
-            WRITERS[dataset](place, scene, 1000 * seed + number, **size)
-            look(load(dataset, place, scene), place, level, seed)
-            write_text(marker, kind)
-    return place
-
-
 class Sight(NamedTuple):
     """What simulated vision sees of a twin's frames that may be learnt from."""
 
@@ -109,7 +74,8 @@ def sight(bench: Benchmark, root: Path, level: str, seed: int) -> Sight:
     images = [cv2.imread(str(root / "truth" / bench.name / f"{name}.png"), cv2.IMREAD_UNCHANGED) for name in names]
     truth, frames = np.stack(images).astype(np.int16) - 1, np.asarray(bench.capture.frames)[shown]
     words = sorted({*told["objects"], *bench.queries})
-    faults, (_, world) = faults_of(level), world_of(level)
+    noise, world = world_of(level)
+    faults = PERFECT if noise == "perfect" else NOISE[noise]
     cameras = bench.capture.cameras[shown]
     seen = Seen(truth, truth, np.arange(len(told["objects"])))
     if world.parts or world.groups or world.shadow or world.levels:
@@ -209,13 +175,33 @@ class Data:
 
     def load(self, root: Path, scene: str) -> Benchmark:
         """The scene under the root that `place` gave."""
-        return load(self.dataset, root, scene, every=self.every if self.root else 1, downscale=self.downscale)
+        if self.dataset == "lerf":
+            return load_lerf_ovs(root, scene, downscale=self.downscale)
+        if self.dataset == "ovs3d":
+            return load_ovs3d(root, scene, downscale=self.downscale)
+        return load_replica(root, scene, every=self.every if self.root else 1, downscale=self.downscale)
 
     def place(self, scene: str, seed: int, level: str) -> Path:
-        """The root that holds the scene."""
+        """The root that holds the scene: a twin with simulated vision of `level` is made where it is not there yet.
+
+        Each (seed, level, size) has a root of its own: a scene's vision lies beside its frames, and twins of another
+        size have other labelled frames. One process at a time writes to a root.
+        """
         if self.root:
             return Path(self.root)
-        return make(self.dataset, results.HOME.parent / self.twins, scene, seed, level, dict(self.size))
+        kind = json.dumps({"size": dict(self.size), "kind": KIND}, sort_keys=True)
+        name = f"{self.dataset}-seed{seed}-{level}-{hashlib.sha1(kind.encode()).hexdigest()[:8]}"
+        root = results.HOME.parent / self.twins / name
+        marker = root / scene / "made.json"
+        if marker.exists():
+            return root
+        with exclusive_lock(root / "twin.lock", wait=True):
+            if not marker.exists():
+                number = sum(map(ord, scene))  # the scenes of a dataset are rooms of their own
+                WRITERS[self.dataset](root, scene, 1000 * seed + number, **dict(self.size))
+                look(self.load(root, scene), root, level, seed)
+                write_text(marker, kind)
+        return root
 
     def kept(self, root: Path, scene: str) -> Path:
         """Where Gaussians fitted to the scene are kept: twins of all levels of noise share them."""

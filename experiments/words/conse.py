@@ -164,9 +164,8 @@ class TextVectors:
                 names, vectors = [str(name) for name in table["names"]], np.asarray(table["vectors"], np.float64)
         except (OSError, ValueError, KeyError) as error:
             remedy = "Give an .npz with `names` (N,) and `vectors` (N, E)."
-            raise InputError(
-                self.file, f"not a readable table of vectors ({describe_error(error)})", remedy=remedy
-            ) from error
+            problem = f"not a readable table of vectors ({describe_error(error)})"
+            raise InputError(self.file, problem, remedy=remedy) from error
         if vectors.ndim != 2 or len(names) != len(vectors) or not np.isfinite(vectors).all():
             found, expected = f"{len(names)} names and vectors {vectors.shape}", "a finite vector for each name"
             raise InputError(self.file, found, expected, "Give an .npz with `names` (N,) and `vectors` (N, E).")
@@ -240,7 +239,6 @@ class Conse:
         texts: TextVectors | None = None,
         *,
         crop: Crop = Crop(),
-        weights: str = "probability",
         top: int | None = TOP,
     ):
         """Opens the files and makes the space.
@@ -249,22 +247,20 @@ class Conse:
           labeller: Of the crops; by default that of ../shared/words.
           texts: Vectors of the classes' names and of the texts that are asked; by default those of ../shared/words.
           crop: What the labeller sees of a region.
-          weights: What weights a class's vector, one of WEIGHTS.
           top: Number of classes that an embedding is made of; None for all.
 
         Raises:
           InputError: A file is missing, or the table has no vector for a class of the labeller.
         """
-        require_one_of("weights", weights, WEIGHTS, "'probability' is the paper's.")
         self.labeller, self.texts = labeller or Labeller(), texts or TextVectors()
-        self.crop, self.weights, self.top = crop, weights, top
+        self.crop, self.top = crop, top
         self.class_vectors = self.texts.embed(list(self.labeller.names))
         self.canonical = self.embed_text(list(CANONICAL))
         # Without a model for the vectors the table lacks some of the words: those that it has are enough.
         self.reference = self.embed_text([word for word in REFERENCE_WORDS if word in self.texts])
         self.dim = self.class_vectors.shape[1]
         digest = hashlib.sha256(self.class_vectors.tobytes() + self.labeller.file.read_bytes()).hexdigest()[:12]
-        told = f"{crop.margin:g}-{crop.shape}-{crop.surroundings}-{weights}-{top or 'all'}"
+        told = f"{crop.margin:g}-{crop.shape}-{crop.surroundings}-{top or 'all'}"
         self.name = f"conse-{digest}-{told}"
 
     def scores(self, frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m _ _"]) -> UInt8[np.ndarray, "m k"]:
@@ -280,7 +276,7 @@ class Conse:
         self, frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m _ _"]
     ) -> Float[np.ndarray, "m e"]:
         """frame (H, W, 3) uint8, masks (M, H, W) bool -> (M, E) float32 unit; zero for an empty mask."""
-        return conse(class_weights(self.scores(frame, masks), self.weights), self.class_vectors, top=self.top)
+        return conse(class_weights(self.scores(frame, masks)), self.class_vectors, top=self.top)
 
     def embed_text(self, texts: list[str]) -> Float[np.ndarray, "q e"]:
         """Q texts -> (Q, E) float32 unit. Raises InputError on a text without a vector."""

@@ -32,6 +32,7 @@ from experiments.rivals.evidence import Evidence, unit
 from experiments.words.conse import WORDS, Conse
 from jsecon.association.atoms import atom_votes
 from jsecon.data.capture import load_capture
+from jsecon.data.frames import evenly_spaced
 from jsecon.errors import InputError
 from jsecon.fit.start import starting_gaussians
 from jsecon.language.votes import region_votes
@@ -178,13 +179,6 @@ def _named(ids: Int[np.ndarray, "..."], name_of: Int[np.ndarray, " r"]) -> Int[n
     return np.where(ids >= 0, name_of[np.maximum(ids, 0)], -1)
 
 
-def _some(frames: Int[np.ndarray, " f"]) -> Int[np.ndarray, " g"]:
-    """JUDGED of the frames, evenly spaced."""
-    if len(frames) <= JUDGED:
-        return frames
-    return frames[np.linspace(0, len(frames) - 1, JUDGED).round().astype(int)]
-
-
 def _replica(masks: str) -> WordScene:
     capture, ids = load_replica(Scan.capture, voting_every=Scan.voting_every)
     objects = connected_parts(capture, ids)
@@ -200,7 +194,8 @@ def _replica(masks: str) -> WordScene:
     object_of = labels_of_points(points, silent, count)
     by_silent = names_of_objects(object_of, near, count, len(names))
     by_all = names_of_objects(labels_of_points(points, objects, count), near, count, len(names))
-    voting, judged = np.flatnonzero(~capture.held_out), _some(np.flatnonzero(capture.held_out))
+    voting, judged = np.flatnonzero(~capture.held_out), np.flatnonzero(capture.held_out)
+    judged = judged[evenly_spaced(len(judged), JUDGED)]
     labels, region_names = objects[voting], by_all
     if masks == DEFAULT:
         labels = _default_masks(capture, gaussians)
@@ -254,20 +249,15 @@ def _apc(masks: str) -> WordScene:
     )
 
 
-def _bonsai_frames() -> Capture:
-    """bonsai's frames that are held out, and every BONSAI_EVERY-th of the others."""
+def _bonsai(masks: str) -> WordScene:
+    assert masks == DEFAULT
     options = RunOptions(results.CAPTURES / "bonsai")
     capture = load_capture(options.capture, long_side=options.long_side, holdout=options.holdout)
     held = np.asarray(capture.held_out)
     kept = np.sort(np.concatenate([np.flatnonzero(held), np.flatnonzero(~held)[::BONSAI_EVERY]]))
     own = {"frames": capture.frames[kept], "cameras": capture.cameras[kept], "held_out": held[kept]}
-    names, files = (tuple(values[t] for t in kept) for values in (capture.names, capture.files))
-    return dataclasses.replace(capture, names=names, files=files, **own)
-
-
-def _bonsai(masks: str) -> WordScene:
-    assert masks == DEFAULT
-    capture = _bonsai_frames()
+    own |= {"names": tuple(capture.names[t] for t in kept), "files": tuple(capture.files[t] for t in kept)}
+    capture = dataclasses.replace(capture, **own)
     gaussians = starting_gaussians(capture)[0]
     names = tuple(dict.fromkeys(BONSAI_TEXTS.values()))
     things = bonsai_outlines.outlines(capture)

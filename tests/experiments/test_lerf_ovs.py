@@ -4,7 +4,6 @@ import json
 import shutil
 
 import cv2
-import jax
 import numpy as np
 import pytest
 from capture_files import refused
@@ -55,15 +54,6 @@ def test_every_field_comes_back(twin):
         assert (np.where(owners < len(room.names), owners, -1) != instances[t]).sum() <= 2
 
 
-def test_a_scene_is_a_pytree(twin):
-    scene = load_lerf_ovs(twin, "figurines")
-    leaves, shape = jax.tree.flatten(scene)
-    assert all(isinstance(leaf, np.ndarray) for leaf in leaves)
-    again = jax.tree.unflatten(shape, leaves)
-    assert again.frames[0].name == scene.frames[0].name
-    assert again.queries == scene.queries
-
-
 def test_frames_belong_to_labels_by_name(copy):
     """Without another frame's image in the model, positions shift; the labels stay with their frames."""
     before = load_lerf_ovs(copy, "figurines")
@@ -98,7 +88,7 @@ def test_fewer_pairs_than_generated_are_refused(copy):
     category = content["objects"][0]["category"]
     content["objects"] = [entry for entry in content["objects"] if entry["category"] != category]
     file.write_text(json.dumps(content))
-    with refused("(frame, query) pairs", "denominator"):
+    with refused("(frame, query) pairs", "the protocol counts"):
         load_lerf_ovs(copy, "figurines")
 
 
@@ -117,7 +107,7 @@ def test_a_polygon_outside_the_image_keeps_its_pair(copy):
 
 def test_real_scenes_are_held_to_the_published_frames(copy):
     (copy / "twin.json").unlink()
-    with refused("no label of frame_00041", "4 annotated frames"):
+    with refused("no label of frame_00041"):
         load_lerf_ovs(copy, "figurines")
     assert set(LERF_FRAMES) == set(LERF_PAIRS)
     assert sum(map(len, LERF_FRAMES.values())) == 22

@@ -44,10 +44,10 @@ def test_a_missing_or_misnamed_mask_is_told(copy):
     mask = next(place.glob("*.png"))
     kept = mask.read_bytes()
     mask.unlink()
-    with refused(place, f"no mask of {mask.stem}"):
+    with refused(place, f"without a mask: {mask.stem}"):
         load_ovs3d(copy, "bed")
     mask.with_name("no such thing.png").write_bytes(kept)
-    with refused(f"no mask of {mask.stem}", "no such thing, which classes.txt does not name"):
+    with refused(f"without a mask: {mask.stem}", "masks of no class: no such thing"):
         load_ovs3d(copy, "bed")
 
 

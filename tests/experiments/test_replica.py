@@ -63,7 +63,7 @@ def test_every_nth_frame(twin):
 
 
 def test_what_is_missing_or_unknown_is_told(copy):
-    with refused("classes no such class", "own table, such as"):
+    with refused("classes no such class", "own table"):
         load_replica(copy, "room0", classes=("table", "no such class"))
     (copy / "room0" / "results" / "depth000003.png").unlink()
     with refused("no depth000003.png"):
