@@ -17,7 +17,7 @@ FIGURE_QUALITY = 90
 """Quality of figures as WebP, 0 to 100: a tenth of the bytes of a PNG where a figure shows frames."""
 
 
-def read_options(kind: type, name: str, description: str, quick: dict[str, Any] | None = None) -> Any:
+def read_options(kind: type, name: str, description: str | None, quick: dict[str, Any] | None = None) -> Any:
     """Reads the options of an experiment from the command line.
 
     Args:
