@@ -58,11 +58,18 @@ def test_metrics_have_every_figure_that_is_promised(finished):
     assert metrics["peak_memory_mib"] == pytest.approx(peak_memory_mib(), rel=0.05)
 
 
-def test_the_fields_and_the_answers_are_on_disk(finished):
+def test_both_fields_and_the_answers_are_on_disk(finished):
+    """The two runs share frames and Gaussians; the default one knows nothing of masks."""
     metrics, out, _ = finished
-    field = load_field(out / "field.safetensors")
+    field, true = (load_field(out / name / "field.safetensors") for name in (".", "true_masks"))
     assert field.regions.count == metrics["regions"]
-    assert load_field(out / "true_masks" / "field.safetensors").regions.count >= 10
+    assert true.regions.count >= 10
+    np.testing.assert_array_equal(field.gaussians.means, true.gaussians.means)
+    for stage in ("gaussians", "load"):
+        assert len(list((out / "cache").glob(f"{stage}-*.safetensors"))) == 1
+    options = json.loads(field.provenance)["options"]
+    assert options["masks"] is None
+    assert options["gaussians"] is None
     told = [json.loads(path.read_text()) for path in (out / "queries").glob("*.json")]
     assert len(told) >= 10
     for answer in told:
@@ -70,37 +77,14 @@ def test_the_fields_and_the_answers_are_on_disk(finished):
             assert load_ply(out / "queries" / answer["ply"]).count == answer["count"]
 
 
-def test_the_two_runs_share_frames_and_gaussians(finished):
-    _, out, _ = finished
-    assert len(list((out / "cache").glob("gaussians-*.safetensors"))) == 1
-    assert len(list((out / "cache").glob("load-*.safetensors"))) == 1
-    a, b = (load_field(out / name / "field.safetensors").gaussians for name in (".", "true_masks"))
-    np.testing.assert_array_equal(a.means, b.means)
-
-
-def test_only_frames_poses_and_points_reach_the_default_run(finished):
-    """The default field knows nothing of masks, labels or names: its options name none of them."""
-    _, out, _ = finished
-    options = json.loads(load_field(out / "field.safetensors").provenance)["options"]
-    assert options["masks"] is None
-    assert options["gaussians"] is None
-
-
 def test_the_report_shows_every_query_and_stands_alone(finished):
     _, out, _ = finished
     page = (out / "report.html").read_text()
-    for path in (out / "queries").glob("*.json"):
-        assert json.loads(path.read_text())["query"] in page
-    for words in (
-        "true masks given",
-        "Seconds of each stage",
-        "this scene does not need",
-        "Held-out frames",
-        "mAcc@0.25",
-        "Settings",
-    ):
-        assert words in page
-    assert page.count('class="pair"') == len(list((out / "queries").glob("*.json")))
+    queries = [json.loads(path.read_text())["query"] for path in (out / "queries").glob("*.json")]
+    words = "true masks given", "Seconds of each stage", "this scene does not need", "Held-out frames", "Settings"
+    for text in (*queries, *words, "mAcc@0.25"):
+        assert text in page
+    assert page.count('class="pair"') == len(queries)
     assert page.count('class="wide"') > 3  # masklets through the frames
     assert re.search(r"<td>gaussians</td>.*?<td>\d+ \(\d+\)</td>", page)  # programs compiled
     assert "http" not in page
