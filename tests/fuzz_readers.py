@@ -415,33 +415,23 @@ def _field(coder: Any = None) -> LanguageField:
         return rng.random(shape).astype(np.float32)
 
     votes = Votes(
-        rng.integers(-1, r, (n, k)).astype(np.int32),
-        positive(n, k),
-        positive(n),
-        positive(n) + 1,
-        positive(n),
-        np.full(n, t, np.int32),
-        np.int32(0),
-        r,
-        shown=positive(n, k),
-        overlap=positive(r, r),
-    )
-    camera = Camera(np.tile(np.eye(4, dtype=np.float32), (t, 1, 1)), *np.full((4, t), 20, np.float32), 24, 16)
-    parts = Parts((np.arange(n) % (p + 1) - 1).astype(np.int32), unit(p, e), positive(p))
+        rng.integers(-1, r, (n, k)).astype(np.int32), positive(n, k), positive(n), positive(n) + 1, positive(n),
+        np.full(n, t, np.int32), np.int32(0), r, shown=positive(n, k), overlap=positive(r, r),
+    )  # fmt: skip
     return LanguageField(
-        _gaussians(n, 4),
-        unit(n, d),
-        votes,
-        Regions(unit(r, e), rng.integers(0, 9, (r, t)).astype(np.int32)),
-        unit(r, d),
-        coder,
-        camera,
-        unit(4, e),
-        np.eye(4),
-        ("a", "b"),
-        "colours",
-        '{"jsecon": "1", "options": {"embedder": null}}',
-        parts,
+        gaussians=_gaussians(n, 4),
+        codes=unit(n, d),
+        votes=votes,
+        regions=Regions(unit(r, e), rng.integers(0, 9, (r, t)).astype(np.int32)),
+        region_codes=unit(r, d),
+        autoencoder=coder,
+        cameras=Camera(np.tile(np.eye(4, dtype=np.float32), (t, 1, 1)), *np.full((4, t), 20, np.float32), 24, 16),
+        canonical=unit(4, e),
+        to_source=np.eye(4),
+        names=("a", "b"),
+        embedder="colours",
+        provenance='{"jsecon": "1", "options": {"embedder": null}}',
+        parts=Parts((np.arange(n) % (p + 1) - 1).astype(np.int32), unit(p, e), positive(p)),
     )
 
 
