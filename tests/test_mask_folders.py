@@ -272,16 +272,6 @@ def test_masks_of_photographs_of_another_aspect_follow_them(tmp_path):
         load_labels(tmp_path, ("a",), SIZE)
 
 
-def coco(names, size, polygons):
-    images = [
-        {"id": 7 + n, "file_name": f"{name}.jpg", "height": size[0], "width": size[1]} for n, name in enumerate(names)
-    ]
-    annotations = [
-        {"image_id": 7 + n, "segmentation": each, "category_id": 1} for n, some in enumerate(polygons) for each in some
-    ]
-    return {"images": images, "annotations": annotations, "categories": [{"id": 1, "name": "thing"}]}
-
-
 SQUARE = [1, 1, 9, 1, 9, 9, 1, 9]
 HOLE = [3, 3, 7, 3, 7, 7, 3, 7]
 APART = [11, 2, 14, 2, 14, 6, 11, 6]
@@ -312,7 +302,10 @@ def test_polygons_are_filled(tmp_path, polygons, boxes):
 
 
 def test_one_coco_file_of_all_frames(tmp_path):
-    content = coco(("a", "b", "other"), (24, 32), [[[SQUARE], [APART]], [], [[SQUARE]]])
+    names, shapes = ("a", "b", "other"), ((7, SQUARE), (7, APART), (9, SQUARE))
+    images = [{"id": 7 + n, "file_name": f"{name}.jpg", "height": 24, "width": 32} for n, name in enumerate(names)]
+    annotations = [{"image_id": image, "segmentation": [shape], "category_id": 1} for image, shape in shapes]
+    content = {"images": images, "annotations": annotations, "categories": [{"id": 1, "name": "thing"}]}
     (tmp_path / "instances.json").write_text(json.dumps(content))
     for place in (tmp_path, tmp_path / "instances.json"):
         read, notes = load_proposals(place, ("a", "b", "c"), SIZE)
