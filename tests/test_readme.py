@@ -164,6 +164,8 @@ def test_the_readme_is_short():
     assert len(text.split()) <= MAX_WORDS
     sentences = [s for s in re.split(r"(?<=[.:?!])\s+|\n\s*\n|\n- ", _prose(text)) if len(s.split()) > 2]
     assert sum(len(s.split()) for s in sentences) / len(sentences) <= MAX_SENTENCE
+    for section in re.split(r"^## ", text, flags=re.MULTILINE):
+        assert re.search(r"^(\||!\[)", section, re.MULTILINE), f"no table or picture: {section.splitlines()[0]}"
     pictures = {HOME / path for path in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text)}
     assert sum(picture.stat().st_size for picture in pictures) <= 2e6
 
