@@ -32,7 +32,7 @@ _PAIR = np.dtype([("gaussian", "<u4"), ("region", "<i4"), ("weight", "<f4")])
 _SEEN = np.dtype([("gaussian", "<u4"), ("weight", "<f4"), ("peak", "<f4")])
 """The weight that a view casts on a Gaussian in all, and the largest of a pixel."""
 DENSE_BYTES = 1 << 29
-"""The dense block of votes of a view; it is in memory about four times."""
+"""Bytes of the dense block of votes of a view, which is in memory two or three times."""
 _MAX_CASTS = 1 << 26
 """Weights, each of a view on a Gaussian, that are added up at once."""
 

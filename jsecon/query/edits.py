@@ -1,4 +1,6 @@
-"""Selections grown, shrunk and combined. Pure functions of masks, but for the search for neighbours.
+"""Selections grown and shrunk. Pure functions of masks, but for the search for neighbours.
+
+Other edits are operators of arrays: `a | b` joins two masks, `a & ~b` subtracts one, `~a` inverts one.
 
 The shells are those of a symmetric graph of neighbours, so growing and then shrinking closes gaps and never loses a
 selected Gaussian.
