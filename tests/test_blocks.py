@@ -12,7 +12,7 @@ from small_field import make_field
 from test_votes import REGIONS, expected, labels  # noqa: F401
 
 from jsecon.errors import InputError
-from jsecon.language import columns, streaming, votes as votes_module
+from jsecon.language import columns, view_votes, votes as votes_module
 from jsecon.language.distill import distill_votes
 from jsecon.language.field import load_field, save_field
 from jsecon.language.membership import finish_votes, finish_votes_in_blocks, with_overlap
@@ -101,9 +101,11 @@ def test_weights_at_the_centre_of_labels_that_are_read_one_at_a_time(scene, came
 
 @pytest.mark.parametrize("opaque", [0.0, pytest.param(4.0, marks=pytest.mark.long)])
 def test_equal_at_many_gaussians(tmp_path, monkeypatch, opaque):
-    """4,000, all visible; opaque, most lie behind what stopped every pixel. Dense blocks hold two regions each."""
-    for module in (votes_module, streaming):
-        monkeypatch.setattr(module, "DENSE_BYTES", 4 * 2 * 4096)
+    """4,000, all visible; opaque, most lie behind what stopped every pixel. Votes in memory take blocks of two regions,
+    and those of a view cut lists and parts of these."""
+    monkeypatch.setattr(votes_module, "DENSE_BYTES", 4 * 2 * 4096)
+    monkeypatch.setattr(view_votes, "MAX_SLOT_BYTES", 0)
+    monkeypatch.setattr(view_votes, "PAIRS", 1000)
     scene, cameras = ball(4000, 3, 160, 120, opaque=opaque)
     labels = blocky(np.random.default_rng(1), 3, 120, 160, 7)
     memory = region_votes(scene, cameras, labels, 7, top=3)
@@ -198,7 +200,7 @@ def test_a_full_disk_is_told_and_the_scratch_folder_removed(scene, cameras, labe
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(streaming.np, "save", full)
+    monkeypatch.setattr(np, "save", full)
     with pytest.raises(InputError, match="No space left"):
         region_votes_in_blocks(scene, cameras, labels, REGIONS, folder=tmp_path / "v")
     assert not list((tmp_path / "v").iterdir())

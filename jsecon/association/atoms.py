@@ -1,32 +1,17 @@
 """Atoms: superpixels of a frame, cut along its edges and its proposals, and the votes of Gaussians on them."""
 
-import functools
-from typing import Any, TypeAlias
-
 import cv2
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Bool, Float32, Int, Int32, UInt8
 from scipy import sparse
 
-from jsecon.language.votes import at_centre, distinct_labels
-from jsecon.numerics import FULL_PRECISION
-from jsecon.splat.fusion import materialize
-from jsecon.splat.plan import ViewPlan, plan_view
-from jsecon.splat.walk import blend_weights, make_batches, make_table, to_tiles, walk
-from jsecon.types import Array, Camera, Gaussians
+from jsecon.language.view_votes import Sparse, view_votes
+from jsecon.types import Camera, Gaussians
 from jsecon.vision.region_graph import relabel_sequential
 from jsecon.vision.surfaces import fill_nearest
 
-Sparse: TypeAlias = Any
-"""scipy.sparse.csr_matrix, which type checkers cannot resolve."""
 MIN_ATOM_PX = 12
 """Least size in px; smaller pieces are slivers along an edge."""
-_SLOTS = 8
-"""Number of labels of a tile counted by one walk; for the few tiles of 8x8 pixels with more, the view is walked
-again."""
 
 
 def image_atoms(
@@ -111,9 +96,6 @@ def atom_votes(
 ) -> Sparse:
     """Adds up the rendering weights alpha T of each Gaussian on each atom of one view. Host code.
 
-    Unlike `region_votes` it suits many regions of which a Gaussian touches few: sums are kept per pair of a tile and a
-    Gaussian, without a dense (N, A) array, and one program serves any number of atoms.
-
     Args:
       gaussians: Scene of N Gaussians.
       camera: Camera of the view.
@@ -124,53 +106,8 @@ def atom_votes(
     Returns:
       Sparse matrix (N, A).
     """
-    plan = plan_view(gaussians, camera)
-    lists = plan.lists
-    starts, lengths, ids = (np.asarray(a) for a in (lists.starts, lists.lengths, lists.gaussians))
-    tile_of_pair = np.repeat(np.arange(len(lengths)), lengths)
-    places = np.arange(len(tile_of_pair)) + np.repeat(starts - (np.cumsum(lengths) - lengths), lengths)
-    distinct = np.asarray(_distinct_atoms(atoms, lists.tile))
-    entries = []
-    for first in range(0, max(int((distinct >= 0).sum(1).max()), 1), _SLOTS):
-        sums = np.asarray(_sums_by_pair(plan, atoms, first, centre))[places]
-        pair, slot = np.nonzero(sums)
-        entries.append((sums[pair, slot], ids[places[pair]], distinct[tile_of_pair[pair], first + slot]))
-    votes = sum_entries(entries, (gaussians.count, int(atoms.max()) + 1))
+    votes = view_votes(gaussians, camera, atoms, int(atoms.max()) + 1, centre=centre).weights[:, :-1]
     total = np.repeat(np.asarray(votes.sum(1)).ravel(), np.diff(votes.indptr))
     votes.data[votes.data <= negligible * total] = 0.0
     votes.eliminate_zeros()
     return votes
-
-
-@functools.partial(jax.jit, static_argnums=1)
-def _distinct_atoms(atoms: Array, tile: int) -> Array:
-    return distinct_labels(to_tiles(atoms + 1, tile) - 1, _SLOTS)
-
-
-@functools.partial(jax.jit, static_argnums=3)
-def _sums_by_pair(plan: ViewPlan, atoms: Array, first: Array | int, centre: float) -> Array:
-    """Sums the weight of each pair of the tile lists on `_SLOTS` atoms of its tile.
-
-    The atoms are the distinct ones `first`, `first` + 1, ...; the result is (pairs, _SLOTS).
-    """
-    splats, lists = plan.splats, plan.lists
-    batches = make_batches(lists, plan.width)
-    tiles = to_tiles(atoms + 1, lists.tile) - 1
-    slots = lax.dynamic_slice_in_dim(distinct_labels(tiles, _SLOTS), first, _SLOTS, axis=1)
-    table = make_table(splats)
-
-    def one_batch(sums, ids_of_tiles):
-        is_slot = tiles[ids_of_tiles][:, :, None] == slots[ids_of_tiles][:, None, :]
-        corners = batches.corners(ids_of_tiles, splats.dtype)
-
-        def body(transmittance, sums, chunk):
-            weight, transmittance = materialize(chunk.always, blend_weights, transmittance, chunk.alpha)
-            if centre:
-                weight = weight * (1 - centre + centre * at_centre(chunk.attributes, corners, lists.tile))
-            rows = jnp.einsum("bcp,bps->bcs", weight, is_slot.astype(splats.dtype), precision=FULL_PRECISION)
-            return transmittance, sums.at[chunk.places].set(rows, mode="drop")
-
-        return walk(table, lists, batches, ids_of_tiles, body, sums)[0], None
-
-    empty = jnp.zeros((lists.gaussians.shape[0], _SLOTS), splats.dtype)
-    return lax.scan(one_batch, empty, batches.tiles)[0]

@@ -22,8 +22,9 @@ from jsecon.errors import InputError, require, require_shape
 from jsecon.files import atomic_write, map_npy, write_npy
 from jsecon.language.columns import ROWS, vote_blocks
 from jsecon.language.distill import MIN_LABELLED, distill_votes
-from jsecon.language.votes import dense_votes
+from jsecon.language.view_votes import view_votes
 from jsecon.numerics import NEAR, require_labels
+from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.visible import geometry_of_rows, visible_rows
 from jsecon.types import Array, Camera, Gaussians, Progress, Votes
 
@@ -31,8 +32,6 @@ _PAIR = np.dtype([("gaussian", "<u4"), ("region", "<i4"), ("weight", "<f4")])
 """The weight that a view's region casts on a Gaussian."""
 _SEEN = np.dtype([("gaussian", "<u4"), ("weight", "<f4"), ("peak", "<f4")])
 """The weight that a view casts on a Gaussian in all, and the largest of a pixel."""
-DENSE_BYTES = 1 << 29
-"""Bytes of the dense block of votes of a view, which is in memory two or three times."""
 _MAX_CASTS = 1 << 26
 """Weights, each of a view on a Gaussian, that are added up at once."""
 
@@ -53,7 +52,7 @@ def region_votes_in_blocks(
 ) -> Votes:
     """Casts the votes of `region_votes` on memory-mapped Gaussians, equal up to float32's rounding of the sums.
 
-    Memory: the geometry of the Gaussians that one view sees, their tile lists, a dense block of their votes, and one
+    Memory: the geometry of the Gaussians that one view sees, their tile lists with the weights of each entry, and one
     block of rows. Disk, until it returns: 12 bytes for each view, Gaussian and region with weight, and 12 for each view
     and Gaussian. One device, one process.
 
@@ -90,7 +89,9 @@ def region_votes_in_blocks(
             image = np.asarray(labels[t])
             require_shape(f"labels[{t}]", image, (cameras.height, cameras.width), "Give images of the camera's size.")
             require_labels(image, num_regions)
-            overflow += _cast_view(gaussians, cameras[t], image, scratch / str(t), centre=centre, near=near)
+            overflow += _cast_view(
+                gaussians, cameras[t], image, num_regions, scratch / str(t), centre=centre, near=near
+            )
             if progress is not None:
                 progress(t + 1, views)
         kinds = {"regions": ("<i4", (top_kept := min(top, max(num_regions, 1)),)), "weights": ("<f4", (top_kept,))}
@@ -150,31 +151,25 @@ def _scratch_folder(folder: Path) -> Iterator[Path]:
 
 
 def _cast_view(
-    gaussians: Gaussians, camera: Camera, labels: np.ndarray, path: Path, *, centre: float, near: float
+    gaussians: Gaussians, camera: Camera, labels: np.ndarray, regions: int, path: Path, *, centre: float, near: float
 ) -> int:
-    """Casts one view into PATH-seen.npy and PATH-<block>.npy, in the order of Gaussians; returns the overflow."""
+    """Casts one view into PATH-seen.npy and PATH-cast.npy, in the order of Gaussians; returns the overflow."""
     ids = visible_rows(gaussians, camera, near=near)
-    part, cameras = geometry_of_rows(gaussians, ids), jax.tree.map(lambda a: a[None], camera)
-    names = np.unique(labels[labels >= 0])
-    # A view knows its own regions alone, up to a power of two: views share compiled programs.
-    local = np.where(labels >= 0, np.searchsorted(names, np.maximum(labels, 0)), -1).astype(np.int32)
-    size, overflow = 1 << max(len(names) - 1, 0).bit_length(), 0
-    blocks = dense_votes(part, cameras, local[None], size, centre=centre, near=near, dense_bytes=DENSE_BYTES)
-    for b, (first, state) in enumerate(blocks):
-        weights = np.asarray(state["votes"])[: len(ids)]
-        row, place = np.nonzero(weights)
-        pairs = np.empty(len(row), _PAIR)
-        pairs["gaussian"], pairs["region"], pairs["weight"] = ids[row], names[first + place], weights[row, place]
-        np.save(f"{path}-{b}.npy", pairs)
-        if b == 0:
-            seen = np.flatnonzero(np.asarray(state["total"])[: len(ids)])
-            total = np.empty(len(seen), _SEEN)
-            total["gaussian"], total["weight"] = ids[seen], np.asarray(state["total"])[seen]
-            total["peak"] = np.asarray(state["peak"])[seen]
-            np.save(f"{path}-seen.npy", total)
-            overflow = int(state["overflow"])
-        if first + weights.shape[1] >= len(names):  # the rest of the power of two
-            break
+    part = geometry_of_rows(gaussians, ids)
+    capacity = max(plan_capacity(part, camera, margin=1.0, devices=1, near=near), 1)
+    options = {"centre": centre, "near": near, "capacity": capacity, "with_peak": True}
+    weights, peak, overflow = view_votes(part, camera, labels, regions, **options)
+    assert peak is not None
+    total = np.asarray(weights.sum(1)).ravel()
+    cast = weights.indices < regions
+    pairs = np.empty(np.count_nonzero(cast), _PAIR)
+    pairs["gaussian"] = np.repeat(ids, np.diff(weights.indptr)[: len(ids)])[cast]
+    pairs["region"], pairs["weight"] = weights.indices[cast], weights.data[cast]
+    np.save(f"{path}-cast.npy", pairs)
+    rows = np.flatnonzero(total)
+    seen = np.empty(len(rows), _SEEN)
+    seen["gaussian"], seen["weight"], seen["peak"] = ids[rows], total[rows], peak[rows]
+    np.save(f"{path}-seen.npy", seen)
     return overflow
 
 
@@ -188,8 +183,8 @@ def _rows_of(path: Path, rows: slice) -> np.ndarray:
 def _sum_block(scratch: Path, views: int, rows: slice, regions: int, top: int, by_view: bool) -> dict[str, Any]:
     """The columns of one block of Gaussians, summed over the views."""
     count = rows.stop - rows.start
-    paths = [path for t in range(views) for path in sorted(scratch.glob(f"{t}-[0-9]*.npy"))]
-    pairs = np.concatenate([np.zeros(0, _PAIR), *(_rows_of(path, rows) for path in paths)])
+    cast = (_rows_of(scratch / f"{t}-cast.npy", rows) for t in range(views))
+    pairs = np.concatenate([np.zeros(0, _PAIR), *cast])
     place = (pairs["gaussian"] - rows.start).astype(np.int64), pairs["region"]
     votes = sparse.csr_array((pairs["weight"].astype(np.float64), place), shape=(count, max(regions, 1)))
     votes.sum_duplicates()

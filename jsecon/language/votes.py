@@ -143,7 +143,6 @@ def dense_votes(
     centre: float = 0.0,
     capacity: int | None = None,
     near: float = NEAR,
-    dense_bytes: int | None = None,
     progress: Progress | None = None,
 ) -> Iterator[tuple[int, dict[str, Any]]]:
     """Computes the votes in blocks of regions. Host code.
@@ -157,7 +156,6 @@ def dense_votes(
       centre: In [0, 1], weight of a Gaussian's centre against its footprint.
       capacity: Number of (block, Gaussian) pairs of a view; None finds one that suffices.
       near: Near plane, world units.
-      dense_bytes: Size of the dense (N, block) votes of a block, by default 1 GiB. They are in memory several times.
       progress: Called as progress(done, total), in views of all blocks.
 
     Yields:
@@ -167,7 +165,7 @@ def dense_votes(
     # One program serves every near plane, which `plan_views` chooses by the scene's size.
     scene, near_plane = _without_colour(gaussians), np.asarray(near, gaussians.means.dtype)
     size = _default_capacity(gaussians, cameras) if capacity is None else capacity
-    blocks = _region_blocks(gaussians.count, num_regions, dense_bytes)
+    blocks = _region_blocks(gaussians.count, num_regions)
     for b, block in enumerate(blocks):
         common = scene, np.array([block.start, block.stop], np.int32), near_plane
         start = _empty(np, gaussians.count, len(block), gaussians.means.dtype)
@@ -188,16 +186,15 @@ def _report_block(progress: Progress, block: int, blocks: int, done: int, total:
     progress(block * total + done, blocks * total)
 
 
-def _region_blocks(count: int, regions: int, dense_bytes: int | None = None) -> list[range]:
+def _region_blocks(count: int, regions: int) -> list[range]:
     """The region ids of each block, at least one, all of one length: the last may reach beyond the regions."""
-    size = _block_size(count, regions, dense_bytes)
+    size = _block_size(count, regions)
     return [range(first, first + size) for first in range(0, max(regions, 1), size)]
 
 
-def _block_size(count: int, regions: int, dense_bytes: int | None = None) -> int:
+def _block_size(count: int, regions: int) -> int:
     """Number of regions of a block."""
-    most = (DENSE_BYTES if dense_bytes is None else dense_bytes) // max(4 * count, 1)
-    return max(1, min(max(regions, 1), most))
+    return max(1, min(max(regions, 1), DENSE_BYTES // max(4 * count, 1)))
 
 
 def _require_views(cameras: Camera, labels: Array, num_regions: int) -> None:

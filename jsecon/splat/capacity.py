@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
+from jsecon.numerics import NEAR
 from jsecon.splat.project import project
 from jsecon.splat.strips import BLOCK, Strip
 from jsecon.splat.tiles import TILE, WORD, pair_counts, tile_grid
@@ -17,9 +18,9 @@ PAIRS_PER_GAUSSIAN, PAIRS_PER_BLOCK = 2, 256
 
 
 @functools.partial(jax.jit, static_argnums=2)
-def _pairs_in_view(gaussians: Gaussians, camera: Camera, strips: int) -> Array:
+def _pairs_in_view(gaussians: Gaussians, camera: Camera, strips: int, near: float | Array) -> Array:
     """(2,) pairs of the image as one strip, and as `strips` strips that are all as long as the longest."""
-    splats = project(gaussians, camera)
+    splats = project(gaussians, camera, near=near)
 
     def longest(count: int) -> Array:
         counts = [pair_counts(splats, camera.width, camera.height, strip=Strip(k, count)) for k in range(count)]
@@ -82,7 +83,9 @@ def enough_capacity(capacity: int, overflow: Int[Array, " strips"]) -> int:
     return overflow.shape[0] << (per_strip - 1).bit_length()
 
 
-def plan_capacity(gaussians: Gaussians, cameras: Camera, *, margin: float = 1.25, devices: int | None = None) -> int:
+def plan_capacity(
+    gaussians: Gaussians, cameras: Camera, *, margin: float = 1.25, devices: int | None = None, near: float = NEAR
+) -> int:
     """Measures the capacity with which no view overflows. Host code; needs concrete arrays.
 
     It is needed for scenes that overflow the default inside of jit, and to save memory. It projects every view, which
@@ -93,6 +96,7 @@ def plan_capacity(gaussians: Gaussians, cameras: Camera, *, margin: float = 1.25
       cameras: One camera or a batch.
       margin: Factor for Gaussians that still move.
       devices: Number of devices that share a view; by default all devices of this process.
+      near: Near plane, world units.
 
     Returns:
       Number of pairs, rounded up (`round_capacity`).
@@ -102,7 +106,7 @@ def plan_capacity(gaussians: Gaussians, cameras: Camera, *, margin: float = 1.25
     compiled_strips, column = (local, 0) if strips == 1 else (strips, 1)
     views = cameras if cameras.world_to_camera.ndim == 3 else jax.tree.map(lambda a: jnp.asarray(a)[None], cameras)
     pairs = max(
-        (float(_pairs_in_view(gaussians, view, compiled_strips)[column]) for view in views),
+        (float(_pairs_in_view(gaussians, view, compiled_strips, near)[column]) for view in views),
         default=0.0,
     )
     return round_capacity(int(np.ceil(pairs * margin * (1 + 1e-6))))  # the sum is a float32
