@@ -140,6 +140,47 @@ def test_up_is_right_where_the_largest_plane_is_no_floor(place, seed):
         assert not (frame.sure and place == "no floor")
 
 
+def block(draw, low, high, count=500):
+    """Points in a box."""
+    return draw.uniform(low, high, (count, 3))
+
+
+def table(draw, tops):
+    """Points of a table without a floor, twelve times as large as tables are: a board, legs, and things on it."""
+    x, y, z = np.diag([18.0, 10.0, 8.0])
+    legs = [block(draw, [a, b, 0], [a + 0.6, b + 0.6, 8], 300) for a in (0.4, 17) for b in (0.4, 9)]
+    things = [block(draw, [3 + 3.5 * k, 4, 8], [5 + 3.5 * k, 6, 8 + top]) for k, top in enumerate(tops)]
+    return np.concatenate([sheet(z, x, y), sheet(z - [0.0, 0.0, 0.3], x, y), *legs, *things])
+
+
+def corridor(draw, tops):
+    """Points of a corridor whose walls are three times as large as its floor, and of things on the floor."""
+    things = [block(draw, [2 + 3 * k, 0.6, 0], [2.8 + 3 * k, 1.4, top]) for k, top in enumerate(tops)]
+    return np.concatenate([*walls_of(14.0, 2.0, 6.0), *things])
+
+
+@pytest.mark.parametrize("make", [table, corridor])
+@pytest.mark.parametrize("seed", range(3))
+def test_up_is_right_where_gravity_alone_tells(make, seed):
+    """A table has things on one side and legs on the other; a corridor's floor is the smallest of its planes."""
+    draw = np.random.default_rng(seed)
+    points = make(draw, draw.uniform(0.8, 3.0, 4))
+    turn = Rotation.random(random_state=seed).as_matrix()
+    frame = scene_frame(points @ turn.T)
+    np.testing.assert_allclose(frame.axes[2], turn[:, 2], atol=0.03)
+    assert frame.sure
+
+
+def test_a_wrong_up_axis_is_never_sure():
+    """A crate has six sides, and things that float have none."""
+    draw = np.random.default_rng(0)
+    crate = draw.uniform(-1, 1, (4000, 3))
+    crate[np.arange(4000), np.arange(4000) % 3] = np.where(np.arange(4000) % 2 == 0, -1, 1)
+    floating = np.concatenate([ball_points(centre) for centre in draw.uniform(-1, 1, (6, 3))])
+    for points in (crate, floating):
+        assert not scene_frame(points).sure
+
+
 def test_the_up_axis_can_be_given(room):
     frame = scene_frame(surface_points(room), np.array([0.0, 2.0, 0.0]))
     np.testing.assert_allclose(frame.axes[2], [0, 1, 0])

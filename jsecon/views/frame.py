@@ -12,35 +12,17 @@ from typing import Any
 import cv2
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import KDTree
 
 from jsecon.errors import InputError
 from jsecon.types import Camera, Gaussians, LanguageField
+from jsecon.views.upright import TRIM, find_up
 
-SAMPLES = 6000
+SAMPLES = 20_000
 """points that stand for the scene's surface, drawn by opacity times area"""
 VISIBLE_OPACITY = 0.1
 """opacity from which a Gaussian counts as surface"""
-TRIM = 0.02
-"""share of the surface that lies outside the robust bounds on each side of an axis: floaters and far background"""
 WIDEST = 0.1
 """largest standard deviation of a surface Gaussian, in units of the scene's diagonal: wider ones are sky or fog"""
-TRIPLES = 2000
-"""planes that are tried, each through three points"""
-PLANE_TOLERANCE = 0.01
-"""distance of a plane's points from it, in units of the scene's diagonal"""
-RIVAL = 0.5
-"""share of the largest plane's surface from which another plane may be the ground"""
-SURE_SHARE = 0.1
-"""share of the surface in the ground plane from which its direction is trusted"""
-ONE_SIDED = 0.85
-"""share of the remaining surface on one side of a plane from which it may be the ground"""
-MARGIN = 2.0
-"""ratio of another such plane's score to that of the ground from which the choice is trusted"""
-NEIGHBOURS = 32
-"""points that tell which way the surface around a point faces"""
-DISTINCT = np.cos(np.radians(20))
-"""cosine below which two planes have different normals"""
 PARALLEL = 0.01
 """share of the cameras' x axes off their common line up to which they tell the up axis only up to their tilt"""
 SAME_WAY = 0.7
@@ -120,14 +102,9 @@ def surface_points(gaussians: Gaussians) -> Float[np.ndarray, "p 3"]:
 def scene_frame(points: Float[np.ndarray, "p 3"], up: np.ndarray | None = None) -> SceneFrame:
     """Finds the robust box of a scene and its up axis.
 
-    The ground is a large plane with nearly all of the scene on one side, which is up. Of several such planes (floor,
-    ceiling, walls) it is the one with the smallest product of two lengths: the scene's height above it, and the median
-    height of what lies in none of them. Without such a plane, up is the direction that fewest surfaces face, as walls
-    do not; it is then not trusted.
-
     Args:
       points: (P, 3) points of the surface (`surface_points`).
-      up: (3,) the up axis where it is known.
+      up: (3,) the up axis where it is known; None finds it (`find_up`).
 
     Returns:
       The frame.
@@ -136,7 +113,7 @@ def scene_frame(points: Float[np.ndarray, "p 3"], up: np.ndarray | None = None) 
       InputError: `up` has no direction.
     """
     if up is None:
-        up, sure, evidence = _ground_normal(points)
+        up, sure, evidence = find_up(points)
     else:
         up, sure, evidence = _direction(up), True, "given"
     up = up / np.linalg.norm(up)
@@ -155,74 +132,6 @@ def scene_frame(points: Float[np.ndarray, "p 3"], up: np.ndarray | None = None) 
     low, high = np.quantile(local, [TRIM, 1 - TRIM], axis=0)
     half = np.maximum((high - low) / 2, 1e-3 * np.linalg.norm(high - low))
     return SceneFrame(axes, ((low + high) / 2) @ axes, half, sure, evidence)
-
-
-def _ground_normal(points: np.ndarray) -> tuple[np.ndarray, bool, str]:
-    """Returns the normal of the ground, or what walls tell of it; whether it is trusted, and on what evidence."""
-    low, high = np.quantile(points, [TRIM, 1 - TRIM], axis=0)
-    tolerance = PLANE_TOLERANCE * float(np.linalg.norm(high - low))
-    normals, offsets, shares = _planes(points, tolerance)
-    grounds: list[tuple[np.ndarray, np.ndarray, float]] = []  # normal, heights of the points, share of the rest above
-    for index in np.argsort(-shares):
-        if shares[index] < RIVAL * shares.max():
-            break
-        normal, offset = _refined(points, normals[index], float(offsets[index]), tolerance)
-        heights = points @ normal - offset
-        rest = heights[np.abs(heights) > tolerance]
-        above = float((rest > 0).mean()) if len(rest) else 1.0
-        if above < 0.5:
-            normal, heights, above = -normal, -heights, 1 - above
-        if above >= ONE_SIDED and all(normal @ other < DISTINCT for other, _, _ in grounds):
-            grounds.append((normal, heights, above))
-    if not grounds:
-        return _along_walls(points), False, "walls: fewest surfaces face it, as no plane has the scene on one side"
-    outside = np.all([np.abs(heights) > tolerance for _, heights, _ in grounds], axis=0)
-    things = outside if outside.any() else slice(None)
-    spans = [np.subtract(*np.quantile(heights, [1 - TRIM, TRIM])) for _, heights, _ in grounds]
-    scores = [span * np.median(np.abs(heights[things])) for span, (_, heights, _) in zip(spans, grounds)]
-    best = int(np.argmin(scores))
-    normal, heights, above = grounds[best]
-    share = float((np.abs(heights) <= tolerance).mean())
-    clear = outside.any() and (np.delete(scores, best) >= MARGIN * scores[best]).all()
-    evidence = f"a plane with {share:.0%} of the surface, and {above:.0%} of the rest above it"
-    evidence += f", of {len(grounds)} such planes the one nearest to the things" if len(grounds) > 1 else ""
-    return normal, bool(share >= SURE_SHARE and clear), evidence
-
-
-def _along_walls(points: np.ndarray) -> np.ndarray:
-    """Returns the direction that fewest surfaces face, on the side of the sparser half of the points."""
-    unique = np.unique(points, axis=0)
-    near = unique[KDTree(unique).query(unique, min(NEIGHBOURS, len(unique)))[1]]
-    centred = near - near.mean(1, keepdims=True)
-    spread, axes = np.linalg.eigh(centred.mT @ centred)
-    flatness = (spread[:, 1] - spread[:, 0]) / spread[:, 2]
-    normals = axes[:, :, 0]
-    up = np.linalg.eigh((flatness[:, None] * normals).T @ normals)[1][:, 0]
-    low, middle, high = np.quantile(points @ up, [TRIM, 0.5, 1 - TRIM])
-    return up if 2 * middle <= low + high else -up
-
-
-def _planes(points: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns planes through random triples of points: normals, offsets, and the share of points near each."""
-    rng = np.random.default_rng(1)
-    triples = points[rng.integers(len(points), size=(TRIPLES, 3))]
-    normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
-    lengths = np.linalg.norm(normals, axis=1)
-    proper = lengths > 0
-    normals = normals[proper] / lengths[proper, None]
-    offsets = (triples[proper, 0] * normals).sum(1)
-    sample = points[:: max(len(points) // 2000, 1)]
-    near = np.abs(sample @ normals.T - offsets) <= tolerance
-    return normals, offsets, near.mean(0)
-
-
-def _refined(points: np.ndarray, normal: np.ndarray, offset: float, tolerance: float) -> tuple[np.ndarray, float]:
-    """Fits a plane to the points near it, by principal components."""
-    near = points[np.abs(points @ normal - offset) <= tolerance]
-    middle = near.mean(0)
-    fitted = np.linalg.svd(near - middle, full_matrices=False)[2][2]
-    fitted *= np.sign(fitted @ normal) or 1.0
-    return fitted, float(middle @ fitted)
 
 
 def _direction(up: Any) -> np.ndarray:

@@ -1,0 +1,301 @@
+"""Which way is up in a scene, from points of its surface alone. Host functions on NumPy arrays.
+
+Both directions of every plane's normal are candidates. Each gets a score, a sum of log-odds, from what gravity does:
+
+- things rest on a plane or on the lowest level, and do not hang in the air;
+- the scene rests on a wide base, not on an edge;
+- most of what lies in no plane is low;
+- where three things or more end at one level, as the legs of a table do, that level is below;
+- a wide plane above the scene is a ceiling, and then there is a wide one below.
+
+All of it follows a scene that is turned, scaled or shifted.
+"""
+
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+TRIM = 0.02
+"""share of the surface that lies outside the robust bounds on each side of an axis: floaters and far background"""
+PLANE_TOLERANCE = 0.01
+"""distance of a plane's points from it, in units of the scene's size"""
+TRIPLES = 2000
+"""planes that are tried, each through three points: half through neighbours, which find small planes"""
+PLANE_SAMPLES = 2000
+"""points that planes are searched among"""
+LOCAL = 100
+"""neighbours among which two points of such a triple are drawn"""
+MAX_PLANES, MAX_TRIES = 10, 60
+"""planes that are kept, and that are fitted at most"""
+MIN_SHARE = 0.04
+"""share of the points in a plane"""
+SHARP, ROUGHLY_SHARP = 2.2, 1.6
+"""ratio of the points near a plane to those in the next layer as thick, from which it is a surface and no cut through
+things; and the same before the plane is fitted"""
+CELLS, FILLED = 8, 0.6
+"""cells along each side of a plane, and the share of them that has points: a cut through things is mostly empty"""
+TILTED = (0.9, 0.998)
+"""cosines between the normals of two planes of which the smaller is a cut through things on the larger"""
+LEVEL = 0.985
+"""cosine of a plane's normal with a direction from which the plane is level"""
+DISTINCT = np.cos(np.radians(20))
+"""cosine below which two directions differ"""
+THING_POINTS = 12
+"""points of a thing"""
+THING_LINKS = 12
+"""nearest points that a point of a thing is linked with"""
+RESTS, HANGS = 1.1, -1.95
+"""log-odds of a direction for a thing that rests on something, and for one that hangs in the air, if 0.9 of the things
+rest along the true direction and 0.3 along another"""
+MOST_THINGS = 6
+"""number of things that count at most: what is on one table is not independent"""
+STABLE = 0.2
+"""share of the scene's footprint that its base covers"""
+WIDE = 0.5
+"""share of the footprint from which a plane is a floor or a ceiling"""
+FEET, FEET_BASE = 3, 0.4
+"""number of things that end at one level where no plane is, and the share of the footprint between them, from which
+they are legs"""
+UPSIDE_DOWN, ROOF_ONLY = -2.0, -1.5
+"""log-odds of a direction in which legs point up, and in which there is a ceiling without a floor"""
+LOW, FLAT = 1.0, 0.3
+"""weights of the log of the things' median height and of the scene's height"""
+LIKELY = 0.5
+"""score from which a direction is taken"""
+SURE = 2.0
+"""difference of the best two scores from which the direction is trusted, if at least half of the things rest; twice as
+much where there are fewer than FEET things"""
+NEIGHBOURS = 32
+"""points that tell which way the surface around a point faces"""
+
+
+class Upright(NamedTuple):
+    """The up axis of a scene."""
+
+    up: np.ndarray
+    """(3,) unit vector, world."""
+    sure: bool
+    """Whether it is trusted."""
+    evidence: str
+    """What it was taken from, in words."""
+
+
+class _Plane(NamedTuple):
+    normal: np.ndarray
+    offset: float
+    points: np.ndarray
+    """(M, 3) points near it"""
+
+
+class _Candidate(NamedTuple):
+    """A direction, and what speaks for it."""
+
+    up: np.ndarray
+    score: float
+    legs: bool
+    """whether things end at one level where no plane is"""
+    resting: int
+    carries: bool
+    """whether the scene has a base in this direction"""
+
+
+def find_up(points: np.ndarray) -> Upright:
+    """Finds the up axis of a scene.
+
+    Args:
+      points: (P, 3) points of the surface.
+
+    Returns:
+      The axis. Without a plane that the scene may rest on it is the direction that fewest surfaces face, as walls do
+      not, and it is not trusted.
+    """
+    size = 2 * float(np.quantile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 1 - TRIM))
+    tolerance = PLANE_TOLERANCE * size
+    planes = _planes(points, tolerance)
+    outside = np.all([np.abs(points @ plane.normal - plane.offset) > 1.5 * tolerance for plane in planes], axis=0)
+    loose = points[outside] if planes and outside.any() else points
+    distinct = np.unique(points, axis=0)
+    spacing = float(np.median(KDTree(distinct).query(distinct[::3], min(4, len(distinct)))[0][:, -1]))
+    things = _things(loose, max(2 * tolerance, 3 * spacing)) if planes else []
+    candidates: list[_Candidate] = []
+    for normal in (sign * plane.normal for plane in planes for sign in (1, -1)):
+        if all(normal @ other.up < DISTINCT for other in candidates):
+            candidates.append(_judge(normal, points, planes, loose, things, size, spacing))
+    scores = []
+    for one in candidates:
+        inverted = any(other.legs and other.up @ one.up < -DISTINCT for other in candidates)
+        scores.append(one.score + UPSIDE_DOWN * inverted if one.carries else -np.inf)
+    order = np.argsort(scores)[::-1]
+    if not len(order) or scores[order[0]] < LIKELY:
+        return Upright(_along_walls(points), False, "walls: fewest surfaces face it, as no plane carries the scene")
+    best = candidates[order[0]]
+    margin = scores[order[0]] - scores[order[1]] if len(order) > 1 else np.inf
+    count = len(things)
+    sure = 2 * best.resting >= count > 0 and margin >= (SURE if count >= FEET else 2 * SURE)
+    evidence = f"{best.resting} of {count} thing{'s' * (count != 1)} that rest{'s' * (count == 1)} on what is below"
+    return Upright(best.up, bool(sure), evidence if count else "the base on which the scene is widest and lowest")
+
+
+def _judge(
+    up: np.ndarray,
+    points: np.ndarray,
+    planes: list[_Plane],
+    loose: np.ndarray,
+    things: list[np.ndarray],
+    size: float,
+    spacing: float,
+) -> _Candidate:
+    """Judges a direction by what would rest on what."""
+    tolerance = PLANE_TOLERANCE * size
+    touch = 1.5 * (tolerance + spacing)
+    heights = points @ up
+    low, high = np.quantile(heights, [0.005, 1 - TRIM])
+    whole = max(_footprint(points[(heights >= low) & (heights <= high)], up), 1e-30)
+    base = _footprint(points[heights <= low + 1.5 * tolerance], up) / whole
+    level = [plane for plane in planes if abs(plane.normal @ up) > LEVEL]
+    places = [float(np.sign(plane.normal @ up) * plane.offset) for plane in level]
+    covered = [_footprint(plane.points, up) / whole for plane in level]
+    wide = [place for place, share in zip(places, covered) if share >= WIDE]
+    roof_only = any(place >= high - 3 * tolerance for place in wide) and not any(
+        place <= low + 3 * tolerance for place in wide
+    )
+    on_ground = any(abs(place - low) <= 2 * tolerance for place in places)
+    trees = [KDTree(plane.points) for plane in level]
+    rests, weights, feet = [], [], 0
+    for thing in things:
+        own = thing @ up
+        bottom = float(np.partition(own, 4)[4])  # a few strays may lie below
+        foot = thing[own <= bottom + tolerance]
+        stands = bottom <= low + touch and base >= STABLE
+        feet += stands and not on_ground
+        for place, tree in zip(places, trees):
+            stands = stands or (abs(bottom - place) <= touch and tree.query(foot)[0].min() <= 2 * touch)
+        rests.append(stands)
+        weights.append(np.sqrt(len(thing)))
+    share = float(np.average(rests, weights=weights)) if things else 0.0
+    score = min(len(things), MOST_THINGS) * (RESTS * share + HANGS * (1 - share)) + ROOF_ONLY * roof_only
+    score -= LOW * np.log(np.median(np.maximum(loose @ up - low, 0)) / max(high - low, 1e-30) + 0.1)
+    score -= FLAT * np.log(max(high - low, 1e-30) / size)
+    widest = max([base, *covered])
+    score += np.log(max(widest, 1e-3))
+    carries = widest >= STABLE
+    return _Candidate(up, float(score), feet >= FEET and widest > FEET_BASE, int(sum(rests)), carries)
+
+
+def _things(points: np.ndarray, reach: float) -> list[np.ndarray]:
+    """Returns the points of each thing: those that steps of at most `reach` connect."""
+    points = np.unique(points, axis=0)
+    distance, near = KDTree(points).query(points, THING_LINKS)
+    linked = np.asarray(distance) <= reach
+    ends = np.asarray(near)[linked], np.concatenate([[0], np.cumsum(linked.sum(1))])
+    graph = csr_array((np.ones(len(ends[0])), *ends), shape=(len(points), len(points)))
+    count, thing = connected_components(graph, directed=False)
+    sizes = np.bincount(thing, minlength=count)
+    return [points[thing == k] for k in np.flatnonzero(sizes >= THING_POINTS)]
+
+
+def _footprint(points: np.ndarray, up: np.ndarray) -> float:
+    """Area of the convex hull of points seen along a direction."""
+    if len(points) < 3:
+        return 0.0
+    first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    first /= np.linalg.norm(first)
+    flat = points @ np.stack([first, np.cross(up, first)], axis=1)
+    flat -= flat.mean(0)
+    size = float(np.abs(flat).max()) or 1.0
+    return size**2 * cv2.contourArea(cv2.convexHull((flat / size).astype(np.float32)))
+
+
+def _planes(points: np.ndarray, tolerance: float) -> list[_Plane]:
+    """Finds planes, the largest first; the points of one count for no other."""
+    sample = points[:: max(len(points) // PLANE_SAMPLES, 1)]
+    normals, offsets = _trial_planes(sample)
+    distance = np.abs(sample @ normals.T - offsets)
+    sharp = _is_sharp(distance, tolerance, ROUGHLY_SHARP)
+    normals, offsets, near = normals[sharp], offsets[sharp], distance[:, sharp] <= tolerance
+    left = np.ones(len(sample), bool)
+    counts = near.sum(0)
+    planes: list[_Plane] = []
+    for _ in range(MAX_TRIES if len(counts) else 0):
+        trial = int(counts.argmax())
+        if counts[trial] < MIN_SHARE * len(sample) or len(planes) == MAX_PLANES:
+            break
+        normal, offset = normals[trial], float(offsets[trial])
+        for _ in range(2):
+            normal, offset = _refined(sample[left], normal, offset, tolerance)
+        distance = np.abs(sample @ normal - offset)
+        inside = left & (distance <= tolerance)
+        tilted = any(TILTED[0] < abs(normal @ other.normal) < TILTED[1] for other in planes)
+        is_surface = inside.sum() >= MIN_SHARE * len(sample) and bool(_is_sharp(distance[left], tolerance, SHARP))
+        if tilted or not is_surface or _filled(sample[inside], normal) < FILLED:
+            counts[trial] = 0
+            continue
+        taken = left & (distance <= 1.5 * tolerance)
+        left &= ~taken
+        counts = counts - near[taken].sum(0)
+        planes.append(_Plane(normal, offset, points[np.abs(points @ normal - offset) <= tolerance]))
+    return planes
+
+
+def _trial_planes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns normals and offsets of planes through random triples of points, of which half are neighbours."""
+    draw = np.random.default_rng(1)
+    count = len(points)
+    first = draw.integers(count, size=TRIPLES)
+    others = draw.integers(count, size=(TRIPLES, 2))
+    near = np.asarray(KDTree(points).query(points[first[1::2]], min(LOCAL, count))[1])
+    picks = draw.integers(near.shape[1], size=(len(near), 2))
+    others[1::2] = np.take_along_axis(near, picks, axis=1)
+    corners = points[first], points[others[:, 0]], points[others[:, 1]]
+    normals = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    lengths = np.linalg.norm(normals, axis=1)
+    proper = lengths > 0
+    normals = normals[proper] / lengths[proper, None]
+    return normals, (corners[0][proper] * normals).sum(1)
+
+
+def _is_sharp(distance: np.ndarray, tolerance: float, ratio: float) -> Any:
+    """Whether the points near a plane, of distances (M, ...), are `ratio` times those in the layer around them.
+
+    At the tolerance or at half of it: the two faces of a board are two layers.
+    """
+    half, near, around = ((distance <= times * tolerance).sum(0) for times in (0.5, 1, 2))
+    return (near >= ratio * (around - near)) | (half >= ratio * (near - half))
+
+
+def _refined(points: np.ndarray, normal: np.ndarray, offset: float, tolerance: float) -> tuple[np.ndarray, float]:
+    """Fits a plane to the points near it, by principal components."""
+    near = points[np.abs(points @ normal - offset) <= tolerance]
+    if len(near) < 3:
+        return normal, offset
+    middle = near.mean(0)
+    fitted = np.linalg.svd(near - middle, full_matrices=False)[2][2]
+    fitted *= np.sign(fitted @ normal) or 1.0
+    return fitted, float(middle @ fitted)
+
+
+def _filled(points: np.ndarray, normal: np.ndarray) -> float:
+    """Share of the cells of a grid over points of a plane that have points."""
+    offsets = points - points.mean(0)
+    offsets -= (offsets @ normal)[:, None] * normal
+    flat = offsets @ np.linalg.eigh(offsets.T @ offsets)[1][:, 1:]
+    ends = np.quantile(flat, [TRIM, 1 - TRIM], axis=0)
+    cells = np.histogram2d(*flat.T, bins=CELLS, range=ends.T)[0]
+    return float((cells > 0).mean())
+
+
+def _along_walls(points: np.ndarray) -> np.ndarray:
+    """Returns the direction that fewest surfaces face, on the side of the sparser half of the points."""
+    unique = np.unique(points, axis=0)
+    near = unique[KDTree(unique).query(unique, min(NEIGHBOURS, len(unique)))[1]]
+    centred = near - near.mean(1, keepdims=True)
+    spread, axes = np.linalg.eigh(centred.mT @ centred)
+    flatness = (spread[:, 1] - spread[:, 0]) / spread[:, 2]
+    normals = axes[:, :, 0]
+    up = np.linalg.eigh((flatness[:, None] * normals).T @ normals)[1][:, 0]
+    low, middle, high = np.quantile(points @ up, [TRIM, 0.5, 1 - TRIM])
+    return up if 2 * middle <= low + high else -up
