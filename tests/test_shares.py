@@ -21,6 +21,7 @@ from jsecon.language.membership import (
     membership_probability,
     probability_inside,
     share_of,
+    share_of_regions,
     vote_shares,
     with_overlap,
     with_shown,
@@ -131,6 +132,18 @@ def test_share_is_the_definition_under_jit_and_vmap(count, shown):
         np.testing.assert_array_equal(alone.share, together.share[n])
         np.testing.assert_array_equal(alone.known, np.asarray(alone.share) > 0)  # of random votes none is for nothing
         np.testing.assert_allclose(alone.share, exact_share(votes, one), atol=1e-6)
+
+
+@pytest.mark.parametrize("shown", [False, True])
+def test_the_share_of_a_few_regions_without_a_program_has_the_same_bits(shown):
+    votes = known_votes(700, shown=shown)
+    weights = np.array(votes.weights)
+    weights[::50, 0] = np.nan
+    votes = dataclasses.replace(votes, weights=weights, views=np.arange(700, dtype=np.int32) % 9)
+    for regions in ([], [0], [2, 1], range(REGIONS)):
+        chosen = np.isin(np.arange(REGIONS), list(regions))
+        expected = share_of(jax.tree.map(jnp.asarray, votes), chosen).share
+        np.testing.assert_array_equal(share_of_regions(votes, list(regions)), expected)
 
 
 @pytest.mark.parametrize("count", [1, 33, 257])

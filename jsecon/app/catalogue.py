@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
+from scipy.special import softmax
 
 from jsecon.app.locate import gaussian_rows
 from jsecon.errors import InputError
 from jsecon.language.columns import vote_blocks
 from jsecon.language.membership import SHARE_THRESHOLD, membership_probability, vote_shares
-from jsecon.numerics import normalize
 from jsecon.query.groups import containment, objects_of_gaussians, same_object
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.outliers import MIN_SAMPLES
@@ -226,8 +226,9 @@ def _name(embeddings: np.ndarray, names: _Names) -> tuple[Int[np.ndarray, "k m"]
     """
     if not names.texts:
         return np.zeros((len(embeddings), NAMES), int), np.zeros((len(embeddings), NAMES))
-    cosines = np.asarray(normalize(jnp.asarray(embeddings)) @ normalize(jnp.asarray(names.embeddings)).T)
-    probability = np.asarray(jax.nn.softmax(names.scale * cosines.reshape(-1, len(names.texts)), axis=1))
+    rows, columns = (np.asarray(table, np.float64) for table in (embeddings, names.embeddings))
+    lengths = np.linalg.norm(rows, axis=1)[:, None] * np.linalg.norm(columns, axis=1)
+    probability = softmax(names.scale * (rows @ columns.T) / np.where(lengths > 0, lengths, 1.0), axis=1)
     order = np.argsort(-probability, axis=1, kind="stable")[:, :NAMES]
     missing = ((0, 0), (0, NAMES - order.shape[1]))
     best = np.pad(np.take_along_axis(probability, order, axis=1), missing)

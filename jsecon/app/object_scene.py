@@ -15,15 +15,15 @@ from jsecon.app.catalogue import Catalogue, objects as list_objects
 from jsecon.app.locate import gaussian_rows
 from jsecon.data.capture import may_have_depth
 from jsecon.errors import InputError
-from jsecon.language.membership import SHARE_THRESHOLD
+from jsecon.language.columns import votes_of_rows
+from jsecon.language.membership import SHARE_THRESHOLD, share_of_regions
 from jsecon.pipeline.sources import locate_sources
-from jsecon.query.match import RegionMatch, join_pieces, match_regions
+from jsecon.query.match import join_pieces, match_regions
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.outliers import split_outliers
 from jsecon.query.referring import FoundObject
 from jsecon.query.relations import Viewpoint, viewpoint
 from jsecon.query.rules import QueryRules
-from jsecon.query.select import select_by_share
 from jsecon.types import Camera, LanguageField
 from jsecon.views.frame import field_up
 
@@ -55,8 +55,7 @@ class ObjectScene:
         self.scale = float(np.cbrt(abs(np.linalg.det(self.to_source[:3, :3]))))
         self.rules = QueryRules(all_of_kind=True, logits=getattr(embedder, "logits", None))
         self._given_up = up
-        self._votes = jax.tree.map(jnp.asarray, field.votes)
-        self._overlap = None if field.votes.overlap is None else np.asarray(field.votes.overlap)
+        self._votes = jax.tree.map(np.asarray, field.votes)
         self._object = functools.cache(self._measure_object)
         self._phrases: dict[str, tuple[list[FoundObject], float]] = {}
 
@@ -94,20 +93,28 @@ class ObjectScene:
             embedded = jax.device_put(self.embedder.embed_text(texts))
             match = match_regions(self.field, embedded, self.rules)
             regions = np.flatnonzero(np.asarray(match.chosen)) if int(match.region) >= 0 else np.zeros(0, int)
-            made = [(group, self._object(group)) for group in join_pieces(regions, self._overlap)]
+            made = [(group, self._object(group)) for group in join_pieces(regions, self._votes.overlap)]
             objects = [FoundObject(phrase, group, *parts) for group, parts in made if parts is not None]
             self._phrases[phrase] = objects, float(match.quantile)
         return self._phrases[phrase]
 
+    @functools.cached_property
+    def _voters(self) -> list[np.ndarray]:
+        """The Gaussians that have votes for each region, rising."""
+        regions = self._votes.regions
+        count = self.field.regions.count
+        owners = np.where((regions >= 0) & (regions < count), regions, count).ravel()
+        order = np.argsort(owners.astype(np.uint16 if count < 1 << 16 else np.int32), kind="stable")
+        ends = np.cumsum(np.bincount(owners, minlength=count + 1))[:count]
+        return np.split(order // regions.shape[1], ends)[:count]
+
     def _measure_object(self, regions: tuple[int, ...]) -> tuple[np.ndarray, ObjectShapes] | None:
         """Returns Gaussians and shape of the object of some regions; None if it has no Gaussian."""
-        chosen = np.zeros(self.field.regions.count, bool)
-        chosen[list(regions)] = True
-        match = RegionMatch(chosen, np.asarray(regions[0], np.int32), np.asarray(1.0, np.float32))
-        selection = select_by_share(self._votes, match, SHARE_THRESHOLD)
-        rows = np.flatnonzero(selection.mask)
+        voters = np.unique(np.concatenate([self._voters[region] for region in regions]))
+        share = share_of_regions(votes_of_rows(self._votes, voters), regions)
+        rows, share = voters[share >= SHARE_THRESHOLD], share[share >= SHARE_THRESHOLD]
         taken = gaussian_rows(dataclasses.replace(self.field.gaussians, sh=None), rows)
-        weight = np.clip(np.asarray(selection.similarity)[rows], 0, 1) * np.asarray(self.field.votes.total)[rows]
+        weight = share * self._votes.total[rows]
         kept = split_outliers(taken.means, np.ones(len(rows), bool), keep="supported", weight=weight).mask
         if not kept.any():
             return None

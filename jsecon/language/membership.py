@@ -12,7 +12,7 @@ is the share of several regions together.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import jax
@@ -198,7 +198,7 @@ def _soft_iou(both: Float[Array, "r r"]) -> Float[Array, "r r"]:
     return jnp.where(either > 0, jnp.minimum(both / jnp.where(either > 0, either, 1.0), 1.0), 0.0)
 
 
-@jax.jit
+@stored_jit
 def vote_shares(votes: Votes) -> Float[Array, "n k"]:
     """Computes the share p_nr of each vote. Pure.
 
@@ -274,6 +274,26 @@ def share_of(votes: Votes, chosen: Bool[Array, " r"]) -> Share:
     known = (votes.views > 0) & (seen > 0) & jnp.isfinite(seen) & jnp.isfinite(weight)
     # Written out, not by `ratio`: XLA then keeps the two sums instead of gathering them anew for each use.
     return Share(jnp.where(known, jnp.clip(weight / jnp.where(known, seen, 1.0), 0.0, 1.0), 0.0), known)
+
+
+def share_of_regions(votes: Votes, regions: Sequence[int]) -> Float[np.ndarray, " n"]:
+    """Computes `share_of` a few regions with NumPy, for a few Gaussians. Host code, which compiles no program.
+
+    Args:
+      votes: Votes of N Gaussians.
+      regions: Ids of regions.
+
+    Returns:
+      (N,) the share, the same bits; 0 where it is not known.
+    """
+    inside = np.isin(votes.regions, regions)
+    weights, total = np.asarray(votes.weights), np.asarray(votes.total)
+    least = np.maximum(np.float32(LABELLED_PART) * np.asarray(votes.labelled), np.float32(SEEN_PART) * total)
+    seen = total[:, None] if votes.shown is None else np.maximum(votes.shown, least[:, None])
+    seen = np.where(inside, seen, 0).max(1)
+    weight = functools.reduce(np.add, np.where(inside, weights, 0).T)  # in the order of `share_of`
+    known = (np.asarray(votes.views) > 0) & (seen > 0) & np.isfinite(seen) & np.isfinite(weight)
+    return np.where(known, np.clip(weight / np.where(known, seen, 1), 0, 1), 0)
 
 
 def _lookup(chosen: Bool[Array, " r"]) -> Callable[[Array], Array]:

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
 from jsecon.language.membership import SHARE_THRESHOLD, ratio, vote_columns
-from jsecon.query.match import RULES, match_region
-from jsecon.query.rules import MIN_PIECE_OVERLAP
+from jsecon.programs import stored_jit
+from jsecon.query.match import RULES, match_embedding
+from jsecon.query.rules import MIN_PIECE_OVERLAP, QueryRules
 from jsecon.types import Array, LanguageField, Votes
 
 
@@ -32,21 +33,29 @@ def same_object(field: LanguageField) -> SameObject:
     Returns:
       The pairs. Without `Votes.overlap` no two regions are joined.
     """
-    ids = jnp.arange(field.regions.count)
+    if not field.regions.count:
+        return SameObject(jnp.zeros((0, 0), bool), jnp.zeros((0, 0), bool))
+    overlap = None if field.votes.overlap is None else jnp.asarray(field.votes.overlap)
+    return SameObject(*_same_object(jnp.asarray(field.regions.embeddings), overlap))
+
+
+@stored_jit
+def _same_object(embeddings: Array, overlap: Array | None) -> tuple[Array, Array]:
+    """Returns the pairs of `same_object` of regions by their embeddings and overlap."""
+    ids = jnp.arange(len(embeddings))
     itself = ids[:, None] == ids
-    if not len(ids):
-        return SameObject(itself, itself)
-    alike_rules = dataclasses.replace(RULES, piece_threshold=None)
-    alike = jax.vmap(lambda region: match_region(field, region, alike_rules).chosen)(ids)
-    alike = itself | (alike & alike.T)
-    if field.votes.overlap is None:
-        return SameObject(itself, alike)
-    joins = jax.vmap(lambda region: match_region(field, region, RULES).chosen)(ids)
-    overlaps = jnp.asarray(field.votes.overlap) >= MIN_PIECE_OVERLAP
-    return SameObject(itself | (joins & joins.T & overlaps), alike)
+
+    def matched(rules: QueryRules) -> Array:
+        chosen = jax.vmap(lambda region: match_embedding(embeddings, overlap, region, rules).chosen)(ids)
+        return chosen & chosen.T
+
+    alike = itself | matched(dataclasses.replace(RULES, piece_threshold=None))
+    if overlap is None:
+        return itself, alike
+    return itself | (matched(RULES) & (overlap >= MIN_PIECE_OVERLAP)), alike
 
 
-@jax.jit
+@stored_jit
 def containment(overlap: Float[Array, "r r"], size: Float[Array, " r"]) -> Float[Array, "r r"]:
     """Computes how much of a region lies in another: sum_n min(p_nr, p_ns) / sum_n p_nr, with p the shares.
 
@@ -61,7 +70,7 @@ def containment(overlap: Float[Array, "r r"], size: Float[Array, " r"]) -> Float
     return jnp.where(size[:, None] > 0, both / jnp.where(size > 0, size, 1.0)[:, None], 0.0)
 
 
-@jax.jit
+@stored_jit
 def objects_of_gaussians(votes: Votes, objects: Int[Array, " r"]) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
     """Assigns each Gaussian to the object with the largest share in it.
 

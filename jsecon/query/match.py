@@ -172,11 +172,24 @@ def match_region(field: LanguageField, region: int | Int[Array, ""], rules: Quer
     """
     if field.regions.count == 0:
         return NO_REGIONS
-    return _match_region(jnp.asarray(field.regions.embeddings), field.votes.overlap, jnp.asarray(region), rules)
+    return match_embedding(jnp.asarray(field.regions.embeddings), field.votes.overlap, jnp.asarray(region), rules)
 
 
 @jax.jit
-def _match_region(embeddings: Array, overlap: Array | None, region: Array, rules: QueryRules) -> RegionMatch:
+def match_embedding(
+    embeddings: Float[Array, "r e"], overlap: Float[Array, "r r"] | None, region: Int[Array, ""], rules: QueryRules
+) -> RegionMatch:
+    """Matches one region in place of a text, as `match_region` does. Pure.
+
+    Args:
+      embeddings: (R, E) of the regions, R >= 1.
+      overlap: (R, R) `Votes.overlap`, or None.
+      region: Id of the region.
+      rules: Which regions join it.
+
+    Returns:
+      The match.
+    """
     valid = (region >= 0) & (region < embeddings.shape[0])
     chosen = jnp.arange(embeddings.shape[0]) == region
     if rules.piece_threshold is not None and overlap is not None:

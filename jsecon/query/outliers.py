@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
+from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
@@ -121,8 +121,11 @@ def split_outliers(
     chosen, points = chosen[finite], points[finite]
     if len(chosen) < min_samples:
         return OutlierResult(mask, f"fewer than {min_samples} Gaussians are selected", 0, 0)
-    eps = default_eps(points) if eps is None else eps
-    if _one_component(points, eps):  # then nothing lies apart, and DBSCAN is not needed
+    links = _links(points) if len(points) <= _EXACT_POINTS else None
+    if eps is None:  # the links tell, unless more than half of the points coincide
+        eps = EPS_SPACINGS * float(np.median(links[0][:, min(3, len(points) - 1)])) if links else 0.0
+        eps = eps or default_eps(points)
+    if _one_component(points, eps, links):  # then nothing lies apart, and DBSCAN is not needed
         return OutlierResult(mask, "the selection is one component", 1, 0)
     labels = dbscan(points, eps, min_samples)
     if labels.max() < 0:
@@ -183,15 +186,22 @@ def dbscan(points: Float[Array, "m 3"], eps: float, min_samples: int) -> Int[np.
     return DBSCAN(eps=eps, min_samples=min_samples).fit(places, sample_weight=weight).labels_[voxel]
 
 
-def _one_component(points: Float[Array, "m 3"], eps: float) -> bool:
-    """Finds out whether steps of at most eps lead from each of the points (M, 3) to every other."""
-    if not len(points):
-        return False
-    places, _, _ = _places(np.asarray(points, np.float64), eps)
-    near = np.asarray(KDTree(places).query(places, k=_LINKS, distance_upper_bound=eps)[1])
-    linked = near < len(places)
-    ends = np.nonzero(linked)[0], near[linked]
-    graph = coo_array((np.ones(len(ends[0]), bool), ends), shape=(len(places), len(places)))
+def _links(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distances and ids (M, _LINKS) of the nearest of M points, each point itself first; infinite beyond the last."""
+    distance, near = KDTree(points, balanced_tree=False).query(points, k=_LINKS)
+    return np.asarray(distance), np.asarray(near)
+
+
+def _one_component(points: np.ndarray, eps: float, links: tuple[np.ndarray, np.ndarray] | None) -> bool:
+    """Finds out whether steps of at most eps lead from each of the points (M, 3), M >= 1, to every other.
+
+    `links` are those of the points, where each is a place of its own.
+    """
+    places, _, _ = _places(points, eps)
+    distance, near = _links(places) if links is None else links
+    linked = distance <= eps
+    ends = near[linked], np.concatenate([[0], np.cumsum(linked.sum(1))])
+    graph = csr_array((np.ones(len(ends[0])), *ends), shape=(len(places), len(places)))
     count, component = connected_components(graph, directed=False)
     # The nearest links are enough where the points are evenly spaced, and spare the import of scikit-learn; also where
     # a component is so small that the links of its points show all that is near.
