@@ -78,7 +78,7 @@ def region_votes(
     _require_views(cameras, labels, num_regions)
     kept, labelled, state = _none_kept(np, gaussians), None, {}
     options = {"by_view": by_view, "centre": centre, "capacity": capacity, "near": near, "progress": progress}
-    for first, state in dense_votes(gaussians, cameras, labels, num_regions, **options):
+    for first, state in _dense_votes(gaussians, cameras, labels, num_regions, **options):
         kept, weight = _keep_strongest(kept, state.pop("votes"), first, min(top, max(num_regions, 1)))
         labelled = weight if labelled is None else labelled + weight
     return _as_votes(kept, labelled, state, state["by_view"], num_regions)
@@ -133,7 +133,7 @@ def scan_region_votes(
     return _as_votes(kept, labelled, state, totals if by_view else None, num_regions)
 
 
-def dense_votes(
+def _dense_votes(
     gaussians: Gaussians,
     cameras: Camera,
     labels: Shaped[Array, "t h w"],
@@ -145,22 +145,10 @@ def dense_votes(
     near: float = NEAR,
     progress: Progress | None = None,
 ) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Computes the votes in blocks of regions. Host code.
+    """Yields the votes in blocks of regions; arguments as for `region_votes`. Host code.
 
-    Args:
-      gaussians: Scene of N Gaussians.
-      cameras: Batch of T cameras.
-      labels: (T, H, W) integer region ids, -1 where a pixel belongs to no region.
-      num_regions: R.
-      by_view: Whether to keep each view's total.
-      centre: In [0, 1], weight of a Gaussian's centre against its footprint.
-      capacity: Number of (block, Gaussian) pairs of a view; None finds one that suffices.
-      near: Near plane, world units.
-      progress: Called as progress(done, total), in views of all blocks.
-
-    Yields:
-      The first region of a block; and {"votes" (N, block), "total", "peak", "views" (N,), "overflow", "by_view" (T, N)
-      or None}.
+    That is the first region of a block; and {"votes" (N, block), "total", "peak", "views" (N,), "overflow", "by_view"
+    (T, N) or None}.
     """
     # One program serves every near plane, which `plan_views` chooses by the scene's size.
     scene, near_plane = _without_colour(gaussians), np.asarray(near, gaussians.means.dtype)
