@@ -1,6 +1,7 @@
 """Exports CLIP, SigLIP and SAM from their official packages as ONNX graphs, and checks ONNX Runtime against PyTorch.
 
     pip install -e ".[export]"
+    pip install --no-build-isolation sam2
     python -m experiments.export_models --out models --clip-weights laion2b_s34b_b88k
 
 Without weights the true architectures are written with random ones in every parameter, which is what a check needs:
@@ -12,6 +13,7 @@ figures of the others, and of other models of a part, are kept.
 
 import contextlib
 import dataclasses
+import importlib.util
 import json
 from pathlib import Path
 from typing import Literal
@@ -45,14 +47,14 @@ class Options:
     sam_images: tuple[str, ...] = ("sam2.1-hiera-tiny", "edgetam")
     """of transformers, in the layout of transformers.js; random weights."""
     seed: int = 0
-    threads: int = 1
 
 
 def main(options: Options) -> dict:
     """Exports and checks the parts asked for, writes config.json, metrics.json and table.md."""
-    import torch
-
-    torch.set_num_threads(options.threads)
+    if "sam2_video" in options.only and importlib.util.find_spec("sam2") is None:
+        raise SystemExit(
+            "sam2_video needs Meta's package: pip install --no-build-isolation sam2 (or leave it out: --only)"
+        )
     folder = Path(options.results)
     kept = folder / "metrics.json"
     metrics = json.loads(kept.read_text()) if kept.exists() else {}
@@ -72,7 +74,7 @@ def _export(part: str, options: Options) -> list[dict] | dict[str, dict]:
     Returns:
       The figures of each model by its name; of CLIP, those of its graphs.
     """
-    folder, given = Path(options.out), {"seed": options.seed, "threads": options.threads}
+    folder, given = Path(options.out), {"seed": options.seed}
     if part == "sam_images":
         from experiments.export import sam_images
 

@@ -27,8 +27,8 @@ from jsecon.demo.raycast import render_views
 from jsecon.demo.room import crowded_room
 from jsecon.networks.clip import ClipEmbedder, find_clip
 from jsecon.networks.hub import SUFFIXES, Precision, Role
-from jsecon.networks.sam import ENCODER, Level, Prompts, SamGraphs, SamSettings, find_sam
-from jsecon.networks.sam2 import FrameEncoder, Prompt, follow, open_sam2
+from jsecon.networks.sam import Level, Prompts, SamGraphs, SamSettings, find_sam
+from jsecon.networks.sam2 import FrameEncoder, follow, open_sam2
 from jsecon.process import cores
 
 THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9)
@@ -141,12 +141,12 @@ def role_of(model: Path) -> Role:
     """Returns what a folder of a model is for, by its files."""
     if (model / "onnx" / "memory_encoder.onnx").is_file():
         return "tracker"
-    return "segmenter" if (model / "onnx" / ENCODER).is_file() else "embedder"
+    return "segmenter" if (model / "onnx" / "vision_encoder.onnx").is_file() else "embedder"
 
 
 def precisions_of(model: Path) -> list[Precision]:
     """Returns the precisions of the graphs in a folder."""
-    first = "model" if role_of(model) == "embedder" else Path(ENCODER).stem
+    first = "model" if role_of(model) == "embedder" else "vision_encoder"
     return [p for p, suffix in SUFFIXES.items() if any(model.rglob(f"{first}{suffix}.onnx"))]
 
 
@@ -218,7 +218,7 @@ def _time_embedder(model: Path, precision: Precision, frame: np.ndarray, masks: 
 def _time_tracker(model: Path, precision: Precision, frame: np.ndarray) -> dict[str, Any]:
     graphs = open_sam2(model)
     frames = np.stack([np.roll(frame, 3 * t, 1) for t in range(3)])
-    prompt = Prompt(points=np.array([[200.0, 150.0]], np.float32), labels=np.array([1], np.int32))
+    prompt = np.array([[200.0, 150.0]], np.float32), np.array([1], np.int32)
     seconds = []
     encode = FrameEncoder(graphs, keep=3)
     encoder = _seconds(lambda: FrameEncoder(graphs)(frames[0]))

@@ -10,7 +10,6 @@ import numpy as np
 from onnx_files import Sketch
 from tokenizers import pre_tokenizers
 
-from jsecon.networks.clip import CLIP_MEAN, CLIP_STD
 from jsecon.networks.tokenizer import TextTokenizer
 
 
@@ -52,6 +51,7 @@ def write_tokenizer(path: Path) -> Path:
     return path
 
 
+CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 COLOURS = {"red": (0.9, 0.1, 0.1), "green": (0.1, 0.8, 0.2), "blue": (0.1, 0.2, 0.9), "yellow": (0.9, 0.8, 0.1)}
 SIZE = 32
 LENGTH = 77
@@ -94,14 +94,14 @@ def load_tokens(texts: list[str]) -> list[int]:
 
 
 def write_clip(folder: Path, layout: str) -> Path:
-    """A CLIP folder that knows colours, in one of the three layouts, each with its own signature."""
+    """A CLIP folder that knows colours, in the layout of immich or of transformers.js, each with its own signature."""
     if layout == "immich":
         write_visual(folder / "visual" / "model.onnx", ("image", "embedding"), 1)
         write_textual(folder / "textual" / "model.onnx", ("text", "embedding"), 1, "int32")
         write_tokenizer(folder / "textual" / "tokenizer.json")
         config = {"size": [SIZE, SIZE], "mode": "RGB", "mean": CLIP_MEAN, "std": CLIP_STD, "interpolation": "bicubic"}
         (folder / "visual" / "preprocess_cfg.json").write_text(json.dumps(config))
-    elif layout == "transformers.js":
+    else:
         write_visual(
             folder / "onnx" / "vision_model.onnx", ("pixel_values", "image_embeds"), "batch", OTHER_MEAN, OTHER_STD
         )
@@ -109,8 +109,4 @@ def write_clip(folder: Path, layout: str) -> Path:
         write_tokenizer(folder / "tokenizer.json")
         config = {"crop_size": {"height": SIZE, "width": SIZE}, "image_mean": OTHER_MEAN, "image_std": OTHER_STD}
         (folder / "preprocessor_config.json").write_text(json.dumps(config))
-    else:
-        write_visual(folder / "clip_image.onnx", ("x", "y"), 4)
-        write_textual(folder / "clip_text.onnx", ("ids", "features"), 4, "int64")
-        write_tokenizer(folder / "tokenizer.json")
     return folder

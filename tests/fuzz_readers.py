@@ -38,7 +38,7 @@ from jsecon.language.autoencoder import Autoencoder
 from jsecon.language.codes import Rotation
 from jsecon.language.field import check_field, load_field, save_field
 from jsecon.networks.clip import MAX_BIAS, MAX_SCALE, ClipEmbedder
-from jsecon.networks.sam import SamSegmenter, SamSettings
+from jsecon.networks.sam import SamSegmenter, SamSettings, find_sam
 from jsecon.networks.sam2 import Sam2Tracker
 from jsecon.networks.sam3 import PhraseMasks, Sam3
 from jsecon.networks.tokenizer import CLIP_LENGTH, TextTokenizer
@@ -567,17 +567,17 @@ def _nothing(found: object) -> None:
 
 def clip(folder: Path) -> Iterator[Case]:
     """CLIP folders, put to the test as before a run."""
-    for layout in ("immich", "transformers.js", "flat"):
+    for layout in ("immich", "transformers.js"):
         write_clip(folder / layout, layout)
         files = _inputs_of(folder / layout)
-        yield Case(files, lambda layout=layout: ClipEmbedder(folder / layout, threads=1).check(), _nothing)
+        yield Case(files, lambda layout=layout: ClipEmbedder(folder / layout).check(), _nothing)
 
 
 def siglip(folder: Path) -> Iterator[Case]:
     """SigLIP folders, put to the test as before a run, with their scale and bias."""
 
     def read(layout: str) -> object:
-        embedder = ClipEmbedder(folder / layout, threads=1)
+        embedder = ClipEmbedder(folder / layout)
         embedder.check()
         return embedder.logits
 
@@ -594,7 +594,7 @@ def sam(folder: Path) -> Iterator[Case]:
     frame = np.zeros((24, 32, 3), np.uint8)
 
     def read(name: str) -> np.ndarray:
-        segmenter = SamSegmenter(folder / name, SamSettings(points_per_side=2), threads=1)
+        segmenter = SamSegmenter(find_sam(folder / name), SamSettings(points_per_side=2))
         segmenter.check()
         return segmenter(frame, 0)
 
@@ -612,7 +612,7 @@ def sam2(folder: Path) -> Iterator[Case]:
     frames, prompt = np.zeros((2, 16, 16, 3), np.uint8), np.ones((1, 16, 16), bool)
 
     def read() -> np.ndarray:
-        tracker = Sam2Tracker(folder, threads=1)
+        tracker = Sam2Tracker(folder)
         tracker.check()
         return tracker(frames, 0, prompt)
 
@@ -629,7 +629,7 @@ def sam3(folder: Path) -> Iterator[Case]:
     frame = np.full((24, 32, 3), (230, 26, 26), np.uint8)
 
     def read(name: str) -> PhraseMasks:
-        model = Sam3(folder / name, threads=1)
+        model = Sam3(folder / name)
         model.check()
         return model(frame, "red mug")
 

@@ -30,14 +30,14 @@ class Repository:
     Attributes:
       files: Path -> content.
       licence: Licence on its card.
-      gated: Answers 403 with GatedRepo.
+      gated: Status of its answers with GatedRepo: 401 to who is nobody, 403 to who has no access; 0 if it is open.
       corrupt: Paths whose content is sent with its first byte changed.
       breaks: Path -> number of transfers that break in the middle.
     """
 
     files: dict[str, bytes]
     licence: str = "mit"
-    gated: bool = False
+    gated: int = 0
     corrupt: frozenset[str] = frozenset()
     breaks: dict[str, int] = dataclasses.field(default_factory=dict)
 
@@ -73,7 +73,7 @@ class Hub:
         if repository is None:
             return JSONResponse({"error": "Repository not found"}, 404, {"X-Error-Code": "RepoNotFound"})
         if repository.gated:
-            return JSONResponse({"error": "gated"}, 403, {"X-Error-Code": "GatedRepo"})
+            return JSONResponse({"error": "gated"}, repository.gated, {"X-Error-Code": "GatedRepo"})
         revision = request.path_params.get("revision", "main")
         if revision not in ("main", repository.commit):
             return JSONResponse({"error": "Revision not found"}, 404, {"X-Error-Code": "RevisionNotFound"})
@@ -91,7 +91,13 @@ class Hub:
     def info(self, request: Request, repository: Repository) -> Response:
         """GET /api/models/OWNER/NAME/revision/REVISION."""
         name = f"{request.path_params['owner']}/{request.path_params['name']}"
-        siblings = [{"rfilename": path} for path in sorted(repository.files)]
+        entries = [repository.entry(path) for path in sorted(repository.files)]
+        siblings = [{"rfilename": e["path"], "size": e["size"], "blobId": e["oid"]} for e in entries]
+        for sibling, entry in zip(siblings, entries):
+            if "blobs" not in request.query_params:
+                del sibling["size"], sibling["blobId"]
+            elif "lfs" in entry:
+                sibling["lfs"] = {"sha256": entry["lfs"]["oid"], "size": entry["size"], "pointerSize": 130}
         tags = [f"license:{repository.licence}"]
         return JSONResponse({"id": name, "sha": repository.commit, "siblings": siblings, "tags": tags})
 

@@ -12,6 +12,8 @@ WIDTHS = (0.02, 0.01, 0.02, 0.08)
 """squared distance of normalised colour: of the single mask, then of s, m, l"""
 SHARPNESS = 400.0
 IOUS = (0.99, 0.90, 0.92, 0.94)
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""of RGB in 0..1, as SAM was trained with"""
 
 
 def write_encoder(path: Path, side: int, outputs: tuple[str, ...] = ("image_embeddings",)) -> Path:
@@ -67,10 +69,12 @@ def write_sam(folder: Path, kind: str = "sam", *, side: int = 256, batch: int | 
     encoder, decoder = folder / "onnx" / "vision_encoder.onnx", folder / "onnx" / "prompt_encoder_mask_decoder.onnx"
     if kind == "sam2":
         write_encoder(encoder, side, tuple(f"image_embeddings.{n}" for n in range(3)))
-        content = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225], "rescale_factor": 1 / 255}
-        content |= {"do_normalize": True, "do_rescale": True, "size": {"height": side, "width": side}}
-        (folder / "preprocessor_config.json").write_text(json.dumps(content))
+        size = {"height": side, "width": side}
     else:
         write_encoder(encoder, side, ("image_embeddings", "image_positional_embeddings"))
+        size = {"longest_edge": side}
+    content = {"image_mean": MEAN, "image_std": STD, "rescale_factor": 1 / 255}
+    content |= {"do_normalize": True, "do_rescale": True, "size": size}
+    (folder / "preprocessor_config.json").write_text(json.dumps(content))
     write_decoder(decoder, side, kind, batch)
     return folder

@@ -23,7 +23,7 @@ def folders(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("model", "words"), [
-    ("CLIP", ["images of 32x32 px", "3 numbers", "layout immich", "--embedder"]),
+    ("CLIP", ["images of 32x32 px", "3 numbers", "--embedder"]),
     ("SAM", ["decoder of SAM, 4 prompts per run", "images of 256 px", "--segmenter"]),
     ("SAM 2", ["images of 64 px", "--tracker"]),
     ("SAM 3", ["a phrase of 32 tokens", "raw decoder, images of 112 px", "--phrases"]),
@@ -36,7 +36,7 @@ def test_what_a_folder_is_good_for(folders, model, words):
         assert word in told[model].summary
     for name, use in told.items():
         if name != model:
-            assert "expected" in use.summary
+            assert "since it lacks onnx/" in use.summary or "expected SAM 3's graphs" in use.summary
             assert "huggingface.co" in use.summary or "github.com" in use.summary
     assert findings.errors == []
 

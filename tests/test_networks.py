@@ -23,7 +23,7 @@ from jsecon.errors import InputError
 from jsecon.fit.start import starting_gaussians
 from jsecon.language.field import load_field, save_field
 from jsecon.networks.hub import catalogue
-from jsecon.networks.sam import SamSegmenter, SamSettings
+from jsecon.networks.sam import SamSegmenter, SamSettings, find_sam
 from jsecon.networks.sam2 import Sam2Tracker
 from jsecon.pipeline import networks, run as pipeline
 from jsecon.pipeline.networks import ExternalSpace
@@ -240,7 +240,7 @@ def test_templates_are_for_clip():
 def test_two_sources_of_masks_are_refused(room, models, tmp_path):
     with pytest.raises(InputError, match="--masks --segmenter"):
         pipeline.run(Options(room, masks=room / "masks", segmenter=models[0]), tmp_path)
-    with pytest.raises(InputError, match="SAM folders"):
+    with pytest.raises(InputError, match=r"no such folder\. .*EdgeTAM-ONNX"):
         pipeline.run(Options(room, segmenter=tmp_path / "nowhere"), tmp_path)
 
 
@@ -248,7 +248,7 @@ def test_proposals_are_kept_by_content(models, tmp_path):
     frame = np.zeros((60, 80, 3), np.uint8)
     frame[10:40, 10:50] = (200, 30, 30)
     settings = SamSettings(prompts="grid", points_per_side=4, crop_layers=0)
-    stored, failing = (StoredSegmenter(SamSegmenter(models[0], settings), tmp_path) for _ in range(2))
+    stored, failing = (StoredSegmenter(SamSegmenter(find_sam(models[0]), settings), tmp_path) for _ in range(2))
     assert isinstance(stored, NamedSegmenter)
     masks = stored(frame, 0)
     assert len(masks) >= 1
@@ -259,7 +259,7 @@ def test_proposals_are_kept_by_content(models, tmp_path):
     path = next(tmp_path.glob("*.safetensors"))
     path.write_bytes(path.read_bytes()[:60])
     np.testing.assert_array_equal(stored(frame, 0), masks)
-    assert SamSegmenter(models[0], dataclasses.replace(settings, points_per_side=5)).name != stored.name
+    assert SamSegmenter(find_sam(models[0]), dataclasses.replace(settings, points_per_side=5)).name != stored.name
 
 
 def test_models_by_name_are_fetched_once_and_found_again_for_a_moved_field(
@@ -293,6 +293,18 @@ def test_models_by_name_are_fetched_once_and_found_again_for_a_moved_field(
     commit = hub.repositories["onnx-community/siglip2-base-patch16-224-ONNX"].commit
     assert f"siglip2-base-patch16-224-ONNX@{commit}" in capsys.readouterr().err
     assert cli.main([*query, "--yes"]) == 0
+
+
+def test_models_of_masks_stay_in_full_precision_where_there_is_no_other(room, hub, tmp_path, monkeypatch):
+    files = hub.repositories["onnx-community/siglip2-base-patch16-224-ONNX"].files
+    for name in ("onnx/vision_model.onnx", "onnx/text_model.onnx"):
+        files[name.replace(".onnx", "_quantized.onnx")] = files.pop(name)
+    use_hub(hub, tmp_path / "cache", monkeypatch)
+    command = ["run", str(room), "--out", str(tmp_path / "out"), "--models", "auto", "--yes", "--dry-run"]
+    assert cli.main([*command, "--precision", "int8"]) == 0
+    fetched = {path.name for path in (tmp_path / "cache").rglob("*.onnx")}
+    assert {"vision_model_quantized.onnx", "vision_encoder.onnx"} <= fetched
+    assert cli.main([*command, "--precision", "fp16"]) == 2  # of the embedder, whose repository has no such graphs
 
 
 def test_models_are_listed_fetched_checked_and_removed_by_name(hub, tmp_path, monkeypatch, capsys):

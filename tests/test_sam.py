@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from clip_files import write_clip
 from onnx_files import node, write_graph
-from sam_files import IOUS, write_decoder, write_encoder, write_sam
+from sam_files import IOUS, MEAN, STD, write_decoder, write_encoder, write_sam
 from scipy import ndimage
 
 from jsecon.errors import InputError
 from jsecon.networks.sam import (
-    MEAN_STD,
     TOKENS,
     SamFiles,
     SamGraphs,
@@ -49,13 +48,13 @@ def folders(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def segmenter(folders):
-    return SamSegmenter(folders["sam", "batch"], SamSettings(prompts="grid", points_per_side=8), threads=1)
+    return SamSegmenter(find_sam(folders["sam", "batch"]), SamSettings(prompts="grid", points_per_side=8))
 
 
 def by_definition(folder, frame, token_of_level, side=8):
     """SAM's automatic mask generator with LangSplat's levels, one point a call, without any packing: masks and scores
     of one level."""
-    graphs = SamGraphs(find_sam(folder), batch=1, threads=1)
+    graphs = SamGraphs(find_sam(folder), batch=1)
     height, width = frame.shape[:2]
     found = []
     for crop in crops_of(height, width, 1, 512 / 1500):
@@ -97,7 +96,8 @@ def by_definition(folder, frame, token_of_level, side=8):
 
 @pytest.mark.parametrize("level", ["l", "default"])
 def test_masks_are_those_of_the_definition(folders, frame, segmenter, level):
-    masks, scores = segmenter.levels(frame, (level,))[level]
+    of_level = dataclasses.replace(segmenter.settings, level=level)
+    masks, scores = SamSegmenter(segmenter.files, of_level).segment(frame)
     expected, expected_scores = by_definition(folders["sam", "batch"], frame, TOKENS[level])
     assert len(masks) >= 3
     np.testing.assert_array_equal(masks, expected)
@@ -107,7 +107,7 @@ def test_masks_are_those_of_the_definition(folders, frame, segmenter, level):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_dialect_and_batch_finds_the_same_things(folders, frame, segmenter, kind):
-    other = SamSegmenter(folders[kind], SamSettings(prompts="grid", points_per_side=8), threads=1, batch=5)
+    other = SamSegmenter(find_sam(folders[kind]), SamSettings(prompts="grid", points_per_side=8), batch=5)
     assert isinstance(other, Segmenter)
     masks = other(frame, 0)
     red, green = frame[..., 0] == 200, frame[..., 1] == 160
@@ -123,57 +123,57 @@ def test_guided_prompts_find_the_things_of_the_grid_with_a_tenth_of_the_points(f
     decode = SamGraphs.decode
     monkeypatch.setattr(SamGraphs, "decode", lambda self, *a: asked.append(len(a[1])) or decode(self, *a))
     settings = SamSettings(crop_layers=0)
-    guided = SamSegmenter(folders["sam", "batch"], settings, threads=1)(frame, 0)
+    guided = SamSegmenter(find_sam(folders["sam", "batch"]), settings)(frame, 0)
     prompts, asked[:] = sum(asked), []
-    grid = SamSegmenter(folders["sam", "batch"], dataclasses.replace(settings, prompts="grid"), threads=1)(frame, 0)
+    grid = SamSegmenter(find_sam(folders["sam", "batch"]), dataclasses.replace(settings, prompts="grid"))(frame, 0)
     assert prompts <= sum(asked) / 10
     for mask in grid:
         assert max((mask & other).sum() / (mask | other).sum() for other in guided) > 0.9
 
 
 def test_sam_2_takes_a_frame_stretched_to_a_square_and_one_prompt_a_run(folders, frame):
-    graphs = SamGraphs(find_sam(folders["sam2", "batch"]), threads=1)
+    graphs = SamGraphs(find_sam(folders["sam2", "batch"]))
     assert (graphs.batch, graphs.side, graphs.stretched) == (1, 256, True)
     encoded = graphs.encode(frame)
     assert encoded.scaled == (256, 256)
-    cells = encoded.features["image_embeddings.2"][0, :3] * MEAN_STD[1][:, None, None] + MEAN_STD[0][:, None, None]
-    np.testing.assert_allclose(cells[:, 5, 5], frame[40, 50], atol=1)  # (5.5 / 16) of height and width
+    cell = encoded.features["image_embeddings.2"][0, :3, 5, 5] * STD + MEAN
+    np.testing.assert_allclose(255 * cell, frame[40, 50], atol=1)  # (5.5 / 16) of height and width
     found = list(graphs.decode(encoded, np.float32([[40, 40], [120, 80], [5, 5]])))
     assert [masks.shape for masks, _ in found] == [(1, 3, 64, 64)] * 3
 
 
 def test_sam_3_scales_colours_as_its_configuration_says(frame, tmp_path):
     folder = write_sam(tmp_path / "sam3", "sam2", side=64)
-    plain, name = SamGraphs(find_sam(folder), threads=1).encode(frame), SamSegmenter(folder).name
+    plain, name = SamGraphs(find_sam(folder)).encode(frame), SamSegmenter(find_sam(folder)).name
     config = folder / "preprocessor_config.json"
     content = json.loads(config.read_text())
     config.write_text(json.dumps(content | {"image_mean": [0.5] * 3, "image_std": [0.5] * 3}))
-    assert SamSegmenter(folder).name != name
-    found = SamGraphs(find_sam(folder), threads=1).encode(frame).features["image_embeddings.2"][0, :3]
-    mean, std = MEAN_STD[:, :, None, None]
+    assert SamSegmenter(find_sam(folder)).name != name
+    found = SamGraphs(find_sam(folder)).encode(frame).features["image_embeddings.2"][0, :3]
+    mean, std = (np.reshape(numbers, (3, 1, 1)) for numbers in (MEAN, STD))
     expected = plain.features["image_embeddings.2"][0, :3] * std + mean
-    np.testing.assert_allclose(found, (expected / 255 - 0.5) / 0.5, atol=1e-5)
+    np.testing.assert_allclose(found, (expected - 0.5) / 0.5, atol=1e-5)
     config.write_text(json.dumps({key: content[key] for key in content if key != "image_mean"}))
     with pytest.raises(InputError, match=r"preprocessor_config\.json.*cannot be read"):
         find_sam(folder)
     config.unlink()
-    with pytest.raises(InputError, match=r"decoder\.onnx: a decoder of SAM 2.*Fetch preprocessor_conf"):
-        SamGraphs(find_sam(folder))
+    with pytest.raises(InputError, match=r"lacks preprocessor_config\.json"):
+        find_sam(folder)
 
 
-def test_levels_are_the_three_masks_of_a_point(frame, segmenter):
-    found = segmenter.levels(frame)
-    assert list(found) == ["default", "s", "m", "l"]
+def test_a_level_is_one_of_the_three_masks_of_a_point(frame, segmenter):
     for level, token in (("s", 1), ("m", 2), ("l", 3)):
-        assert found[level][1].max() <= IOUS[token] + 1e-6
-        np.testing.assert_array_equal(segmenter.levels(frame, (level,))[level][0], found[level][0])
+        of_level = SamSegmenter(segmenter.files, dataclasses.replace(segmenter.settings, level=level))
+        masks, scores = of_level.segment(frame)
+        assert len(masks) >= 1
+        assert scores.max() <= IOUS[token] + 1e-6
 
 
 def test_without_crops_the_frame_is_encoded_once(folders, frame, monkeypatch):
     calls = []
     encode = SamGraphs.encode
     monkeypatch.setattr(SamGraphs, "encode", lambda self, part: calls.append(part.shape) or encode(self, part))
-    SamSegmenter(folders["sam2", "batch"], SamSettings(crop_layers=0), threads=1)(frame, 0)
+    SamSegmenter(find_sam(folders["sam2", "batch"]), SamSettings(crop_layers=0))(frame, 0)
     assert calls == [(120, 160, 3)]
 
 
@@ -184,7 +184,7 @@ def test_graphs_can_be_closed_and_opened_again(segmenter, frame):
 
 
 def test_a_frame_without_anything_good_gives_no_masks(folders, frame):
-    strict = SamSegmenter(folders["sam", "batch"], SamSettings(predicted_iou=0.999), threads=1)
+    strict = SamSegmenter(find_sam(folders["sam", "batch"]), SamSettings(predicted_iou=0.999))
     assert strict(frame, 0).shape == (0, 120, 160)
 
 
@@ -192,10 +192,10 @@ def test_a_frame_without_anything_good_gives_no_masks(folders, frame):
 
 
 def test_folders_without_sam_say_what_they_hold(tmp_path):
-    with pytest.raises(InputError, match=r"no \.onnx file.*expected SAM's graphs"):
+    with pytest.raises(InputError, match=r"lacks onnx/vision_encoder\.onnx, onnx/prompt_enc"):
         find_sam(tmp_path)
     write_clip(tmp_path / "clip", "transformers.js")
-    with pytest.raises(InputError, match=r"onnx/text_model\.onnx, onnx/vision_model\.onnx") as caught:
+    with pytest.raises(InputError, match=r"no segmenter, since it lacks onnx/vision_encoder\.onnx") as caught:
         find_sam(tmp_path / "clip")
     assert "huggingface.co" in str(caught.value)
 
@@ -215,21 +215,21 @@ def test_tensors_that_do_not_fit_are_named(tmp_path):
     decoder = write_decoder(tmp_path / "decoder.onnx", 256, "sam", "batch")
 
     with pytest.raises(InputError, match=r"decoder\.onnx, input 'pixel_values'.*input_points"):
-        SamGraphs(SamFiles(decoder, decoder))
+        SamGraphs(SamFiles(decoder, decoder, MEAN, STD))
     with pytest.raises(InputError, match=r"encoder\.onnx, input 'input_points': no such input"):
-        SamGraphs(SamFiles(encoder, encoder))
+        SamGraphs(SamFiles(encoder, encoder, MEAN, STD))
 
     smaller = write_encoder(tmp_path / "small.onnx", 128, names)
     with pytest.raises(InputError, match=r"small\.onnx, output 'image_embeddings': .*8, 8\], expected .*16, 16\]"):
-        SamGraphs(SamFiles(smaller, decoder))
+        SamGraphs(SamFiles(smaller, decoder, MEAN, STD))
 
     single = write_decoder(tmp_path / "single.onnx", 256, "sam", "batch", masks=1)
     with pytest.raises(InputError, match=r"output 'pred_masks'.*3 or 4 masks"):
-        SamGraphs(SamFiles(encoder, single))
+        SamGraphs(SamFiles(encoder, single, MEAN, STD))
 
     other = write_encoder(tmp_path / "other.onnx", 256)
-    with pytest.raises(InputError, match=r"input 'image_positional_embeddings': no such output of other"):
-        SamGraphs(SamFiles(other, decoder))
+    with pytest.raises(InputError, match=r"other\.onnx, output 'image_positional_embeddings': no such output"):
+        SamGraphs(SamFiles(other, decoder, MEAN, STD))
 
     flat = write_graph(
         tmp_path / "flat.onnx",
@@ -238,4 +238,4 @@ def test_tensors_that_do_not_fit_are_named(tmp_path):
         {"y": ("float32", [1, 5])},
     )
     with pytest.raises(InputError, match=r"flat\.onnx, input 'pixel_values': pixel_values float32\[1, 5\], expected"):
-        SamGraphs(SamFiles(flat, decoder))
+        SamGraphs(SamFiles(flat, decoder, MEAN, STD))

@@ -13,7 +13,7 @@ from PIL import Image
 from sam2_files import CHANNELS, MEAN, MEMORY, POINTERS, SIZE, SLOTS, STD, write_sam2
 
 from jsecon.errors import InputError
-from jsecon.networks.sam2 import Bank, Memory, Prompt, Sam2Tracker, at_size, fill_holes, follow, open_sam2
+from jsecon.networks.sam2 import HOLE_AREA, Bank, Memory, Sam2Tracker, fill_holes, follow, open_sam2
 from jsecon.networks.session import Graph
 from jsecon.vision.protocols import Tracker
 
@@ -62,14 +62,16 @@ class Twin:
 
     def prompt(self, t, prompt):
         seen = self.encode(t)
-        points, labels = prompt.points, prompt.labels
-        if prompt.mask is not None:
-            rows, columns = np.nonzero(prompt.mask)
+        is_mask = isinstance(prompt, np.ndarray)
+        if is_mask:
+            rows, columns = np.nonzero(prompt)
             points, labels = [[columns.min(), rows.min()], [columns.max() + 1, rows.max() + 1]], [2, 3]
+        else:
+            points, labels = prompt
         points = np.asarray(points) / [WIDTH, HEIGHT] * SIZE
         low, high, pointer, score = self.decode(seen, seen["feats2_no_mem"], points, labels)
-        if prompt.mask is not None:
-            mask = Image.fromarray(prompt.mask.astype(np.float32)).resize((SIZE, SIZE), Image.Resampling.BILINEAR)
+        if is_mask:
+            mask = Image.fromarray(prompt.astype(np.float32)).resize((SIZE, SIZE), Image.Resampling.BILINEAR)
             high = np.where(np.asarray(mask) >= 0.5, 10, -10).astype(np.float32)
             low = np.asarray(Image.fromarray(high).resize(low.shape, Image.Resampling.BILINEAR))
             high, score = high[None, None], 10.0
@@ -120,11 +122,11 @@ class Twin:
 def test_frames_forward_and_backward_equal_the_twin(folder):
     frames, start = a_clip(24), 9
     prompts = [
-        Prompt(a_mask(3, 4, 15, 13)),
-        Prompt(points=np.array([[12, 6], [25, 18]], np.float32), labels=np.array([2, 3], np.int32)),
-        Prompt(points=np.array([[6.0, 9.0]], np.float32), labels=np.array([1], np.int32)),
+        a_mask(3, 4, 15, 13),
+        (np.array([[12, 6], [25, 18]], np.float32), np.array([2, 3], np.int32)),
+        (np.array([[6.0, 9.0]], np.float32), np.array([1], np.int32)),
     ]
-    found = dict(follow(open_sam2(folder), frames, start, prompts, hole_area=0))
+    found = dict(follow(open_sam2(folder), frames, start, prompts))
     assert list(found) == [*range(start, 24), *range(start - 1, -1, -1)]
     signs, changed = set(), 0.0
     for number, prompt in enumerate(prompts):
@@ -142,7 +144,7 @@ def test_frames_forward_and_backward_equal_the_twin(folder):
 def test_absent_objects_leave_no_pixel_and_their_own_memory(folder):
     frames = a_clip(24)
     twin = Twin(folder, frames)
-    wanted = twin(Prompt(a_mask(3, 4, 15, 13)), 0)
+    wanted = twin(a_mask(3, 4, 15, 13), 0)
     absent = [t for t, out in twin.outputs.items() if out["score"] <= 0]
     assert absent
     labels = Sam2Tracker(folder)(frames, 0, a_mask(3, 4, 15, 13)[None])
@@ -153,14 +155,14 @@ def test_absent_objects_leave_no_pixel_and_their_own_memory(folder):
 def test_tracker_gives_each_pixel_to_the_highest_logit(folder):
     frames = a_clip(6)
     prompts = np.stack([a_mask(3, 4, 15, 13), np.zeros((HEIGHT, WIDTH), bool), a_mask(10, 6, 25, 18)])
-    tracker = Sam2Tracker(folder, hole_area=0)
+    tracker = Sam2Tracker(folder)
     assert isinstance(tracker, Tracker)
     labels = tracker(frames, 2, prompts)
     assert labels.shape == frames.shape[:3]
     assert labels.dtype == np.int16
     assert set(np.unique(labels)) <= {-1, 0, 2}
-    for t, logits in follow(tracker.graphs, frames, 2, [Prompt(prompts[0]), Prompt(prompts[2])], hole_area=0):
-        whole = np.stack([at_size(low, (HEIGHT, WIDTH)) for low in logits])
+    for t, logits in follow(tracker.graphs, frames, 2, [prompts[0], prompts[2]]):
+        whole = np.stack([cv2.resize(fill_holes(low, HOLE_AREA), (WIDTH, HEIGHT)) for low in logits])
         wanted = np.where(whole.max(0) > 0, np.array([0, 2])[whole.argmax(0)], -1)
         np.testing.assert_array_equal(labels[t], wanted)
     assert (tracker(frames, 2, prompts[1:2]) == -1).all()
@@ -171,7 +173,7 @@ def test_the_name_follows_the_content_and_the_graphs_can_be_dropped(tmp_path):
     other = write_sam2(tmp_path / "other", seed=5)
     tracker = Sam2Tracker(one)
     assert tracker.name == Sam2Tracker(same).name
-    assert len({tracker.name, Sam2Tracker(other).name, Sam2Tracker(one, hole_area=0).name}) == 3
+    assert tracker.name != Sam2Tracker(other).name
     frames, prompts = a_clip(3), a_mask(3, 4, 15, 13)[None]
     before = tracker(frames, 1, prompts)
     tracker.close()
@@ -189,7 +191,7 @@ def test_four_hundred_frames_hold_no_more_than_a_hundred(folder, tmp_path):
         path = tmp_path / f"{count}.npy"
         np.save(path, np.broadcast_to(a_clip(1), (count, HEIGHT, WIDTH, 3)))
         frames = np.load(path, mmap_mode="r")
-        prompts = [Prompt(a_mask(3, 4, 15, 13))]
+        prompts = [a_mask(3, 4, 15, 13)]
         for t, _ in follow(sam2, frames[:3], 1, prompts):  # what is made once
             assert t < 3
         tracemalloc.start()
@@ -213,11 +215,11 @@ def test_holes_are_filled_up_to_their_area():
 
 def test_prompts_outside_the_sequence_are_refused(folder):
     with pytest.raises(ValueError, match="a frame below 3"):
-        next(follow(open_sam2(folder), a_clip(3), 3, [Prompt(a_mask(0, 0, 4, 4))]))
+        next(follow(open_sam2(folder), a_clip(3), 3, [a_mask(0, 0, 4, 4)]))
     with pytest.raises(ValueError, match="frames' size"):
         Sam2Tracker(folder)(a_clip(3), 0, np.zeros((1, 4, 4), bool))
-    with pytest.raises(ValueError, match="Prompt"):
-        Prompt(a_mask(0, 0, 4, 4), points=np.zeros((1, 2)))
+    with pytest.raises(ValueError, match="an empty mask"):
+        next(follow(open_sam2(folder), a_clip(3), 0, [a_mask(0, 0, 0, 0)]))
 
 
 def change_constants(folder, **changes):

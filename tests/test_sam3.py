@@ -75,7 +75,7 @@ def by_definition(frame, phrase, kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_phrase_finds_every_thing_that_it_names(folders, frame, kind):
-    sam3 = Sam3(folders[kind], threads=1)
+    sam3 = Sam3(folders[kind])
     seen = sam3.encode(frame)
     counts = []
     for phrase in ("a red mug", "Blue", "green", "thing"):
@@ -93,17 +93,17 @@ def test_a_phrase_finds_every_thing_that_it_names(folders, frame, kind):
 
 
 def test_the_published_sizes_are_read_from_the_graphs(tmp_path, frame):
-    sam3 = Sam3(write_sam3(tmp_path, **TRUE), threads=1)
+    sam3 = Sam3(write_sam3(tmp_path, **TRUE))
     found = sam3(frame, "red mug")
     assert found.masks.sum((1, 2)).tolist() == pytest.approx([550, 500, 1050], abs=60)
     assert sam3.summary == "masks of what a phrase of 32 tokens names; raw decoder, images of 1008 px"
-    image = Graph(sam3.files.image, optimise=False)
+    image = Graph(sam3._image_path, optimise=False)
     assert str(image.inputs["image"]) == "image uint8[3, 1008, 1008]"
     assert image.outputs["backbone_fpn_0"].shape == (1, 256, 288, 288)
 
 
 def test_phrases_that_cannot_be_asked(folders, frame):
-    sam3 = Sam3(folders["samexporter"], threads=1)
+    sam3 = Sam3(folders["samexporter"])
     with pytest.raises(InputError, match="expected a noun phrase"):
         sam3.read(" ")
     with pytest.raises(InputError, match="at most 32, start and end among them"):
@@ -156,35 +156,35 @@ def _sized(name, axis, size):
 @pytest.mark.parametrize(("file", "edit", "says"), [
     ("sam3_image_encoder.onnx", _renamed("image", "pixels"), "image_encoder.onnx, input 'image'"),
     ("sam3_image_encoder.onnx", _sized("image", 1, 1 << 40), "an input 'image' of"),
-    ("sam3_image_encoder.onnx", _renamed("backbone_fpn_1", "fpn"), "decoder.onnx, input 'backbone_fpn_1'"),
+    ("sam3_image_encoder.onnx", _renamed("backbone_fpn_1", "fpn"), "image_encoder.onnx, output 'backbone_fpn_1'"),
     ("sam3_language_encoder.onnx", _renamed("tokens", "ids"), "language_encoder.onnx, input 'tokens'"),
     ("sam3_language_encoder.onnx", _renamed("text_memory", "memory"), "output 'text_memory'"),
     ("sam3_language_encoder.onnx", _sized("tokens", 1, 1 << 30), "an input 'tokens' of"),
     ("sam3_decoder.onnx", _renamed("box_masks", "boxes_masks"), "decoder.onnx, input 'box_masks'"),
     ("sam3_decoder.onnx", _renamed("language_features", "words"), "input 'language_features'"),
-    ("sam3_decoder.onnx", _renamed("vision_pos_enc_2", "where"), "input 'where'"),
+    ("sam3_decoder.onnx", _renamed("vision_pos_enc_2", "where"), "image_encoder.onnx, output 'where'"),
     ("sam3_decoder.onnx", _renamed("presence_logit_dec", "there_at_all"), "output 'presence_logit_dec'"),
     ("sam3_decoder.onnx", _renamed("pred_logits", "logits"), "output 'scores'"),
-    ("sam3_decoder.onnx", _sized("backbone_fpn_2", 1, CHANNELS + 1), "input 'backbone_fpn_2'"),
+    ("sam3_decoder.onnx", _sized("backbone_fpn_2", 1, CHANNELS + 1), "output 'backbone_fpn_2'"),
 ])  # fmt: skip
 def test_graphs_of_another_kind_are_refused_by_the_tensor(folder, file, edit, says):
     _edited(folder / file, edit)
     with pytest.raises(InputError, match=says):
-        Sam3(folder, threads=1).check()
+        Sam3(folder).check()
 
 
 def test_an_encoder_that_scales_no_colours_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"image float32\[3, 112, 112\], expected image uint8"):
-        Sam3(write_sam3(tmp_path, image="float32"), threads=1).check()
+        Sam3(write_sam3(tmp_path, image="float32")).check()
 
 
 def test_damaged_files_are_refused(folder, frame):
-    Sam3(folder, threads=1).check()
+    Sam3(folder).check()
     for name in ("sam3_decoder.onnx", "tokenizer.json"):
         whole = (folder / name).read_bytes()
         (folder / name).write_bytes(whole[: len(whole) // 2])
         with pytest.raises(InputError, match=name):
-            Sam3(folder, threads=1).check()
+            Sam3(folder).check()
         (folder / name).write_bytes(whole)
 
 
@@ -201,4 +201,4 @@ def test_what_a_decoder_gives_is_not_trusted(folder, frame, scores, masks, says)
     told = {"scores": ("float32", ["n"]), "masks": ("float32", ["m", 1, "h", "w"])}
     write_graph(folder / "sam3_decoder.onnx", nodes, given, told, {"these": scores, "those": masks})
     with pytest.raises(InputError, match=says):
-        Sam3(folder, threads=1)(frame, "red")
+        Sam3(folder)(frame, "red")

@@ -22,7 +22,7 @@ def affine(tmp_path):
 
 
 def test_the_signature_is_that_of_the_file(affine):
-    graph = Graph(affine, threads=1, optimise=False)
+    graph = Graph(affine, optimise=False)
     assert graph.inputs == {"x": Tensor("x", "float32", ("batch", 3))}
     assert list(graph.outputs) == ["y", "z"]
     assert describe(graph.outputs.values()) == "y float32[batch, 2], z float32[batch, 2]"
@@ -33,18 +33,18 @@ def test_the_signature_is_that_of_the_file(affine):
 
 def test_it_runs_by_name_and_converts_within_a_kind(affine):
     x = np.asarray([[1.0, 2.0, 3.0]])  # float64
-    found = Graph(affine, threads=1).run({"x": x}, ["z", "y"])
+    found = Graph(affine).run({"x": x}, ["z", "y"])
     assert list(found) == ["z", "y"]
     np.testing.assert_allclose(found["y"], x @ np.arange(6).reshape(3, 2) + 1)
     np.testing.assert_array_equal(found["z"], 2 * found["y"])
     assert found["y"].dtype == np.float32
-    assert list(Graph(affine, threads=1).run({"x": x})) == ["y", "z"]
+    assert list(Graph(affine).run({"x": x})) == ["y", "z"]
 
 
 def test_a_scalar_stays_one(tmp_path):
     """SAM 3's decoder takes a frame's height so; ONNX Runtime takes no row of one number for it."""
     path = write_graph(tmp_path / "a.onnx", [node("Neg", ["h"], ["y"])], {"h": ("int64", [])}, {"y": ("int64", [])})
-    found = Graph(path, threads=1).run({"h": np.asarray(7, np.int32)})["y"]
+    found = Graph(path).run({"h": np.asarray(7, np.int32)})["y"]
     assert (found.shape, int(found)) == ((), -7)
 
 
@@ -57,13 +57,13 @@ def test_a_scalar_stays_one(tmp_path):
 ])  # fmt: skip
 def test_a_tensor_that_does_not_fit_is_named(affine, feeds, outputs, named):
     with pytest.raises(InputError) as caught:
-        Graph(affine, threads=1).run(feeds, outputs)
+        Graph(affine).run(feeds, outputs)
     for words in ("affine.onnx", *named):
         assert words in str(caught.value)
 
 
 def test_requirements_name_the_tensor_and_what_was_wanted(affine):
-    graph = Graph(affine, threads=1)
+    graph = Graph(affine)
     assert graph.require("input", "x", (None, 3), "a test").dtype == "float32"
     assert graph.require("output", "y", (4, 2), "a test").name == "y"
     with pytest.raises(InputError, match=r"input 'image'.*no such input.*x float32\[batch, 3\].*CLIP's image encoder"):
@@ -82,7 +82,7 @@ def test_requirements_name_the_tensor_and_what_was_wanted(affine):
 def test_a_file_that_is_no_graph_is_refused_by_name(affine, damage, words):
     damage(affine)
     with pytest.raises(InputError, match=words) as caught:
-        Graph(affine, threads=1)
+        Graph(affine)
     assert str(affine) in caught.value.where
 
 
@@ -90,7 +90,7 @@ def test_a_graph_that_fails_at_run_time_is_named(tmp_path):
     inputs = {"a": ("float32", ["n"]), "b": ("float32", ["m"])}
     path = write_graph(tmp_path / "sum.onnx", [node("Add", ["a", "b"], ["c"])], inputs, {"c": ("float32", ["k"])})
     with pytest.raises(InputError, match=r"sum.onnx: a graph that fails on a float32\[2\], b float32\[3\]"):
-        Graph(path, threads=1).run({"a": np.zeros(2), "b": np.zeros(3)})
+        Graph(path).run({"a": np.zeros(2), "b": np.zeros(3)})
 
 
 def test_external_data_belongs_to_the_graph(tmp_path):
@@ -109,13 +109,13 @@ def test_external_data_belongs_to_the_graph(tmp_path):
     assert content_digest(graph_files(path)) == content_digest(graph_files(write("three", 1.0)))
     (path.parent / "g.bin").unlink()
     with pytest.raises(InputError, match=r"g\.onnx.*g\.bin"):
-        Graph(path, threads=1)
+        Graph(path)
 
 
 def test_half_precision_is_met_with_half_precision(tmp_path):
     half = {"x": ("float16", ["n"])}, {"y": ("float16", ["n"])}
     path = write_graph(tmp_path / "half.onnx", [node("Add", ["x", "x"], ["y"])], *half)
-    found = Graph(path, threads=1).run({"x": np.ones(3, np.float32)})
+    found = Graph(path).run({"x": np.ones(3, np.float32)})
     assert found["y"].dtype == np.float16
 
 
@@ -143,7 +143,7 @@ def test_the_optimiser_that_half_precision_crashes_is_left_out_of_such_graphs(tm
         return opened(*args, **options)
 
     monkeypatch.setattr(onnxruntime, "InferenceSession", noted)
-    found = Graph(path, threads=1).run({"x": np.ones((1, 3, 8, 8), np.float32)})
+    found = Graph(path).run({"x": np.ones((1, 3, 8, 8), np.float32)})
     np.testing.assert_array_equal(found["y"], np.full((1, 8, 6, 6), 27))
     assert disabled == [None, None if place is None else ["NchwcTransformer"]]
 

@@ -25,7 +25,7 @@ def official(name: str, weights: str | None, *, seed: int) -> torch.nn.Module:
     return model.eval().requires_grad_(False)
 
 
-def export(model: torch.nn.Module, name: str, folder: Path, *, seed: int, threads: int) -> list[Agreement]:
+def export(model: torch.nn.Module, name: str, folder: Path, *, seed: int) -> list[Agreement]:
     """Writes both graphs, the preprocessing and the vocabulary into `folder`; each graph is compared on five inputs."""
     import open_clip
 
@@ -36,8 +36,8 @@ def export(model: torch.nn.Module, name: str, folder: Path, *, seed: int, thread
     texts = ["a photo of a red mug", "sofa", "thé à la menthe", "", "the small green plant on the window sill " * 5]
     ids = tokenizer(texts, context_length=length).to(torch.int32)
     rows = [
-        write_half(folder / "visual" / "model.onnx", Image(model), "image", images, "embedding", threads),
-        write_half(folder / "textual" / "model.onnx", Text(model), "text", ids, "embedding", threads),
+        write_half(folder / "visual" / "model.onnx", Image(model), "image", images, "embedding"),
+        write_half(folder / "textual" / "model.onnx", Text(model), "text", ids, "embedding"),
     ]
     preprocessing = {"size": [size, size], "mode": "RGB", "interpolation": "bicubic", "resize_mode": "shortest"}
     preprocessing |= {"mean": list(model.visual.image_mean), "std": list(model.visual.image_std)}
@@ -49,14 +49,14 @@ def export(model: torch.nn.Module, name: str, folder: Path, *, seed: int, thread
     return rows
 
 
-def export_mobile(model: torch.nn.Module, name: str, folder: Path, *, seed: int, threads: int) -> dict:
+def export_mobile(model: torch.nn.Module, name: str, folder: Path, *, seed: int) -> dict:
     """MobileCLIP: `export`, with the means and deviations of its published weights and its config.json, as immich's
     exporter writes it; tokens and embeddings are compared with open_clip's too."""
     import open_clip
 
     usual = open_clip.get_pretrained_cfg(name, open_clip.list_pretrained_tags_by_model(name)[0])
     model.visual.image_mean, model.visual.image_std = usual["mean"], usual["std"]
-    rows = export(model, name, folder, seed=seed, threads=threads)
+    rows = export(model, name, folder, seed=seed)
     write_text(folder / "config.json", json.dumps(open_clip.get_model_config(name), indent=2) + "\n")
     ids = open_clip.get_tokenizer(name)(TEXTS, context_length=model.context_length)
 
@@ -64,16 +64,16 @@ def export_mobile(model: torch.nn.Module, name: str, folder: Path, *, seed: int,
         return model.encode_image(pixels, normalize=True)
 
     numbers = {"mean": list(usual["mean"]), "std": list(usual["std"]), "size": list(model.visual.image_size)}
-    return compared(rows, folder, encode, model.encode_text(ids, normalize=True), ids, numbers, threads)
+    return compared(rows, folder, encode, model.encode_text(ids, normalize=True), ids, numbers)
 
 
 def write_half(
-    path: Path, module: torch.nn.Module, name: str, given: torch.Tensor, outputs: str | tuple[str, ...], threads: int
+    path: Path, module: torch.nn.Module, name: str, given: torch.Tensor, outputs: str | tuple[str, ...]
 ) -> Agreement:
     """Writes the graph of one encoder for batches of any size; it is compared on all of `given`, the input `name`."""
     names = [outputs] if isinstance(outputs, str) else list(outputs)
     free = {name: {0: "batch"}} | {output: {0: "batch"} for output in names}
-    row = write_graph(path, module, {name: given[:2]}, names, free=free, other={name: given}, threads=threads)
+    row = write_graph(path, module, {name: given[:2]}, names, free=free, other={name: given})
     return dataclasses.replace(row, graph=f"{path.parent.name}/{path.name}")
 
 

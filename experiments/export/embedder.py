@@ -29,7 +29,6 @@ def compared(
     texts: torch.Tensor,
     ids: torch.Tensor,
     numbers: Mapping[str, list],
-    threads: int,
 ) -> dict:
     """Compares the embedder over a folder.
 
@@ -40,13 +39,12 @@ def compared(
       texts: Unit embeddings of TEXTS.
       ids: Their tokens.
       numbers: The preprocessing.
-      threads: Number of cores of ONNX Runtime.
 
     Returns:
       {"graphs": all agreements, "tokens": how many texts have the same ids, and how far apart the embeddings of
       different texts and regions are: as a random model sees them, which says what a difference is worth}.
     """
-    embedder = ClipEmbedder(folder, threads=threads)
+    embedder = ClipEmbedder(folder)
     with torch.inference_mode():
         frame, masks = regions()
         crops = np.stack([masked_crop(frame, mask, numbers["size"][0]) for mask in masks])

@@ -81,7 +81,6 @@ def write_graph(
     free: Mapping[str, Mapping[int, str]] | None = None,
     other: Mapping[str, torch.Tensor] | None = None,
     reference: Callable[[Mapping[str, torch.Tensor]], list[torch.Tensor]] | None = None,
-    threads: int = 1,
 ) -> Agreement:
     """Writes `module` as an ONNX file and compares what it gives with PyTorch.
 
@@ -106,7 +105,7 @@ def write_graph(
     with torch.inference_mode():
         wanted = reference(given) if reference is not None else module(*given.values())
     wanted = [wanted] if isinstance(wanted, torch.Tensor) else list(wanted)
-    found = Graph(path, threads=threads).run({name: tensor.numpy() for name, tensor in given.items()}, outputs)
+    found = Graph(path).run({name: tensor.numpy() for name, tensor in given.items()}, outputs)
     return Agreement(
         path.name,
         {name: _largest(found[name] - tensor.numpy()) for name, tensor in zip(outputs, wanted, strict=True)},

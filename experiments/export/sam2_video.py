@@ -16,7 +16,7 @@ import torch
 
 from experiments.export.graph import STRETCH, Agreement, Wrapped, declare_missing_operators, shake, write_graph
 from jsecon.files import write_text
-from jsecon.networks.sam2 import CONSTANTS, POINTERS, SLOTS, Prompt, Sam2Graphs, at_size, follow, open_sam2
+from jsecon.networks.sam2 import POINTERS, SLOTS, Sam2Graphs, follow, open_sam2
 
 CONFIG = "sam2.1/sam2.1_hiera_t"
 CENTRE = 4.22
@@ -51,14 +51,13 @@ def official(seed: int) -> Any:
     return model.requires_grad_(False)
 
 
-def export(model: Any, folder: Path, *, seed: int, threads: int) -> dict:
+def export(model: Any, folder: Path, *, seed: int) -> dict:
     """Writes the folder, compares each graph with its module, and the tracking of a clip with the predictor's.
 
     Args:
       model: The predictor.
       folder: Where to write.
       seed: Seed of the inputs that are compared.
-      threads: Number of cores of ONNX Runtime.
 
     Returns:
       {"graphs": agreements, "tracking": figures of the clip}.
@@ -129,7 +128,7 @@ def export(model: Any, folder: Path, *, seed: int, threads: int) -> dict:
         ),
     }
     agreements = [
-        write_graph(folder / "onnx" / f"{name}.onnx", module, inputs, outputs, threads=threads, **options)
+        write_graph(folder / "onnx" / f"{name}.onnx", module, inputs, outputs, **options)
         for name, (module, inputs, outputs, options) in parts.items()
     ]
     codes = model.maskmem_tpos_enc.detach().numpy().reshape(SLOTS, memory).tolist()
@@ -139,7 +138,7 @@ def export(model: Any, folder: Path, *, seed: int, threads: int) -> dict:
         "image_std": [0.229, 0.224, 0.225],
         "memory_temporal_positional_encoding": codes,
     }
-    write_text(folder / CONSTANTS, json.dumps(constants) + "\n")
+    write_text(folder / "constants.json", json.dumps(constants) + "\n")
     modules = {name: (part[0], list(part[1]), part[2]) for name, part in parts.items()}
     tracked, tracking = _tracked(model, modules, folder)
     return {"graphs": [dataclasses.asdict(row) for row in (*agreements, tracked)], "tracking": tracking}
@@ -281,7 +280,7 @@ def _tracked(model: Any, modules: dict[str, tuple], folder: Path, *, count: int 
     with the predictor without the repeats.
     """
     frames, point = _moving_disc(count)
-    prompt = Prompt(points=point, labels=np.array([1], np.int32))
+    prompt = point, np.array([1], np.int32)
     opened = open_sam2(folder)
     in_torch = Sam2Graphs(
         {name: _TorchGraph(*parts) for name, parts in modules.items()}, opened.constants, opened.sizes
@@ -291,8 +290,8 @@ def _tracked(model: Any, modules: dict[str, tuple], folder: Path, *, count: int 
     logits, seconds = {}, {}
     for name, graphs in (("onnxruntime", opened), ("torch", in_torch), ("distinct", distinct)):
         started = time.perf_counter()
-        tracked = dict(follow(graphs, frames, 0, [prompt], hole_area=0))
-        logits[name] = np.stack([at_size(tracked[t][0], frames.shape[1:3]) for t in range(count)])
+        tracked = dict(follow(graphs, frames, 0, [prompt]))
+        logits[name] = np.stack([cv2.resize(tracked[t][0], frames.shape[2:0:-1]) for t in range(count)])
         seconds[name] = time.perf_counter() - started
     logits["predictor"] = _by_predictor(model, frames, point)
 

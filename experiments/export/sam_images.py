@@ -16,7 +16,7 @@ from PIL import Image
 from experiments.export.embedder import regions
 from experiments.export.graph import STRETCH, Agreement, Wrapped, declare_missing_operators, shake, write_graph
 from jsecon.files import write_text
-from jsecon.networks.sam import CONFIG, SamGraphs, find_sam
+from jsecon.networks.sam import SamGraphs, find_sam
 
 FEATURES = ["image_embeddings.0", "image_embeddings.1", "image_embeddings.2"]
 POINTS = np.array([[40, 40], [120, 60], [60, 95], [3, 110]], np.float32)
@@ -50,14 +50,12 @@ def _edgetam_config() -> Any:
     return EdgeTamConfig(vision_config=EdgeTamVisionConfig(backbone_config=backbone))
 
 
-def export(model: Any, folder: Path, *, seed: int, threads: int) -> dict:
+def export(model: Any, folder: Path, *, seed: int) -> dict:
     """Writes the folder; compares its graphs, and the masks that jsecon asks of them for points of a frame with those
     of the model."""
     side, onnx = model.prompt_encoder.input_image_size, folder / "onnx"
     image = torch.randn(1, 3, side, side, generator=torch.Generator().manual_seed(seed))
-    rows = [
-        write_graph(onnx / "vision_encoder.onnx", Encoder(model), {"pixel_values": image}, FEATURES, threads=threads)
-    ]
+    rows = [write_graph(onnx / "vision_encoder.onnx", Encoder(model), {"pixel_values": image}, FEATURES)]
     with torch.inference_mode():
         features = dict(zip(FEATURES, model.get_image_embeddings(image)))
     points = torch.from_numpy(POINTS)[None, :, None] * 4
@@ -71,10 +69,17 @@ def export(model: Any, folder: Path, *, seed: int, threads: int) -> dict:
     free = {"input_points": {1: "prompts", 2: "points"}, "input_labels": {1: "prompts", 2: "points"}}
     free |= {"input_boxes": {1: "boxes"}} | {name: {1: "prompts"} for name in outputs}
     decoder = onnx / "prompt_encoder_mask_decoder.onnx"
-    rows.append(write_graph(decoder, Decoder(model), given(2), outputs, free=free, other=given(1), threads=threads))
-    told = {"do_normalize": True, "do_rescale": True, "rescale_factor": 1 / 255, "image_mean": MEAN, "image_std": STD}
-    write_text(folder / CONFIG, json.dumps(told | {"size": {"height": side, "width": side}}, indent=2) + "\n")
-    return {"graphs": [dataclasses.asdict(row) for row in (*rows, _asked(model, folder, side, threads))]}
+    rows.append(write_graph(decoder, Decoder(model), given(2), outputs, free=free, other=given(1)))
+    told: dict[str, Any] = {
+        "do_normalize": True,
+        "do_rescale": True,
+        "rescale_factor": 1 / 255,
+        "image_mean": MEAN,
+        "image_std": STD,
+    }
+    told |= {"size": {"height": side, "width": side}}
+    write_text(folder / "preprocessor_config.json", json.dumps(told, indent=2) + "\n")
+    return {"graphs": [dataclasses.asdict(row) for row in (*rows, _asked(model, folder, side))]}
 
 
 class Encoder(Wrapped):
@@ -97,10 +102,10 @@ class Decoder(Wrapped):
         return found.iou_scores, found.pred_masks, found.object_score_logits
 
 
-def _asked(model: Any, folder: Path, side: int, threads: int) -> Agreement:
+def _asked(model: Any, folder: Path, side: int) -> Agreement:
     """Points of a frame put to the folder as SAM's proposals put them, and to the model."""
     frame = regions()[0]
-    graphs = SamGraphs(find_sam(folder), threads=threads)
+    graphs = SamGraphs(find_sam(folder))
     found = list(graphs.decode(graphs.encode(frame), POINTS))
     pixels = np.asarray(Image.fromarray(frame).resize((side, side), Image.Resampling.BILINEAR), np.float64) / 255
     image = torch.from_numpy(((pixels - MEAN) / STD).astype(np.float32)).permute(2, 0, 1)[None]

@@ -19,7 +19,7 @@ SCALE, BIAS = 117.330795, -12.932437
 """put into the random model: about those of the published ones"""
 
 
-def export_open_clip(model: torch.nn.Module, name: str, folder: Path, *, seed: int, threads: int) -> dict:
+def export_open_clip(model: torch.nn.Module, name: str, folder: Path, *, seed: int) -> dict:
     """Writes the folder of an open_clip model and compares graphs, tokens and embeddings with open_clip."""
     import open_clip
 
@@ -32,8 +32,8 @@ def export_open_clip(model: torch.nn.Module, name: str, folder: Path, *, seed: i
     tokenizer = open_clip.tokenizer.HFTokenizer(str(folder / "textual"), context_length=length, clean=clean)
     ids = tokenizer(TEXTS).to(torch.int32)
     rows = [
-        write_half(folder / "visual" / "model.onnx", Image(model), "image", images, "image_embedding", threads),
-        write_half(folder / "textual" / "model.onnx", Text(model), "text", ids, "text_embedding", threads),
+        write_half(folder / "visual" / "model.onnx", Image(model), "image", images, "image_embedding"),
+        write_half(folder / "textual" / "model.onnx", Text(model), "text", ids, "text_embedding"),
     ]
     usual = open_clip.get_pretrained_cfg(name, "webli")
     preprocessing = {"size": [size, size], "mode": "RGB", "mean": list(usual["mean"]), "std": list(usual["std"])}
@@ -46,7 +46,7 @@ def export_open_clip(model: torch.nn.Module, name: str, folder: Path, *, seed: i
         return model.encode_image(pixels, normalize=True)
 
     wanted = model.encode_text(ids.long(), normalize=True)
-    return compared(rows, folder, encode, wanted, ids, preprocessing, threads)
+    return compared(rows, folder, encode, wanted, ids, preprocessing)
 
 
 def official_transformers(seed: int) -> torch.nn.Module:
@@ -63,7 +63,7 @@ def official_transformers(seed: int) -> torch.nn.Module:
     return model.eval().requires_grad_(False)
 
 
-def export_transformers(model: Any, folder: Path, *, seed: int, threads: int) -> dict:
+def export_transformers(model: Any, folder: Path, *, seed: int) -> dict:
     """Writes the folder of a transformers model, with the graph of both encoders, and compares graphs, tokens,
     embeddings, and the scale and bias that jsecon finds in it."""
     import transformers
@@ -78,15 +78,15 @@ def export_transformers(model: Any, folder: Path, *, seed: int, threads: int) ->
     images = torch.randn(3, 3, size, size, generator=torch.Generator().manual_seed(seed))
     onnx, outputs = folder / "onnx", ("last_hidden_state", "pooler_output")
     rows = [
-        write_half(onnx / "vision_model.onnx", Pooled(model.vision_model), "pixel_values", images, outputs, threads),
-        write_half(onnx / "text_model.onnx", Pooled(model.text_model), "input_ids", ids, outputs, threads),
+        write_half(onnx / "vision_model.onnx", Pooled(model.vision_model), "pixel_values", images, outputs),
+        write_half(onnx / "text_model.onnx", Pooled(model.text_model), "input_ids", ids, outputs),
     ]
     joint = ["logits_per_image", "logits_per_text", "text_embeds", "image_embeds"]
     free = {"input_ids": {0: "texts"}, "pixel_values": {0: "images"}}
     free |= {"text_embeds": {0: "texts"}, "image_embeds": {0: "images"}}
     given = {"input_ids": ids[:2], "pixel_values": images[:2]}
     # Scale and bias are what is read from this graph, and those are compared.
-    write_graph(onnx / "model.onnx", Joint(model), given, joint, free=free, threads=threads)
+    write_graph(onnx / "model.onnx", Joint(model), given, joint, free=free)
     preprocessing: dict[str, Any] = {"do_normalize": True, "do_rescale": True, "rescale_factor": 1 / 255}
     half = [0.5, 0.5, 0.5]
     preprocessing |= {"image_mean": half, "image_std": half, "size": {"height": size, "width": size}}
@@ -98,8 +98,8 @@ def export_transformers(model: Any, folder: Path, *, seed: int, threads: int) ->
         return torch.nn.functional.normalize(model.vision_model(pixel_values=pixels).pooler_output, dim=-1)
 
     numbers = {"mean": half, "std": half, "size": [size, size]}
-    found = compared(rows, folder, encode, wanted, ids, numbers, threads)
-    scale, bias = ClipEmbedder(folder, threads=threads).logits or (np.nan, np.nan)
+    found = compared(rows, folder, encode, wanted, ids, numbers)
+    scale, bias = ClipEmbedder(folder).logits or (np.nan, np.nan)
     logits = {"scale": [scale, SCALE], "bias": [bias, BIAS]}
     return found | {"logits": logits}
 

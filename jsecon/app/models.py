@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -41,7 +41,7 @@ def with_models(options: T, console: Console, *, yes: bool) -> T:
     for role in get_args(Role):
         value = getattr(options, role, None) or recommended.get(role)
         if value is not None:
-            models[role] = hub.parse_model(str(value), role, precision)
+            models[role] = hub.parse_model(Path(value).as_posix(), role, precision)
     return dataclasses.replace(options, **_folders_of_models(models, console, yes=yes))
 
 
@@ -52,17 +52,18 @@ def _folders_of_models(
     folders: dict[Role, Path] = {}
     missing: dict[Role, HubModel] = {}
     for role, model in models.items():
-        folder = model if isinstance(model, Path) else None if fresh else model.cached_folder
-        if folder is not None:
-            folders[role] = folder
-        elif isinstance(model, HubModel):
+        if isinstance(model, Path):
+            folders[role] = model
+        elif not fresh and (cached := model.cached_folder) is not None:
+            folders[role] = cached
+        else:
             missing[role] = model
     if not missing:
         return folders
     with console.progress("hub"):
-        downloads: list[tuple[Role, hub.Download]] = [(role, hub.plan_download(m)) for role, m in missing.items()]
-    for _, download in downloads:
-        console.note(f"needs {download}" if not yes else f"fetching {download}")
+        downloads: dict[Role, hub.Download] = {role: hub.plan_download(model) for role, model in missing.items()}
+    for download in downloads.values():
+        console.note(f"fetching {download}" if yes else f"needs {download}")
     if not yes:
         commands = "; ".join(model.get_command for model in missing.values())
         where = " ".join(model.address for model in missing.values())
@@ -70,7 +71,7 @@ def _folders_of_models(
             raise InputError(where, "not on this machine", "", f"Fetch with: {commands}. Or add --yes.")
         if input("Fetch now? [y/N] ").strip().lower() not in ("y", "yes"):
             raise InputError(where, "not fetched", "", f"To fetch later: {commands}.")
-    for role, download in downloads:
+    for role, download in downloads.items():
         folders[role] = hub.fetch(download)
     return folders
 
@@ -94,24 +95,24 @@ def open_embedder(field: Any, verb: verbs.FieldVerb, console: Console) -> Any:
     if field.reference is None:
         console.note(OLD_FIELD)
     folder = with_models(verb, console, yes=verb.yes).embedder
-    if folder is None and verb.yes and (missing := networks.missing_model_of_field(field)) is not None:
-        _folders_of_models({"embedder": missing}, console, yes=True)
+    if folder is None and (verb.yes or sys.stdin.isatty()):
+        missing = networks.find_model(field)
+        if isinstance(missing, HubModel):
+            folder = _folders_of_models({"embedder": missing}, console, yes=verb.yes)["embedder"]
     return networks.field_embedder(field, folder, templates=verb.template or ("{}",))
 
 
 AUTO = "auto"
 """in place of a name: the recommended models"""
 TABLE_HEAD = f"{'name':<11} {'role':<10} {'MB':>5} {'s/frame':>7}"
-TABLE_NOTE = (
-    "MB and seconds are of the default precision: a frame of 400x300 on two cores, 40 regions or one object in it."
-)
+TABLE_NOTE = "MB and seconds are of fp32: a frame of 400x300 on two cores, 40 regions or one object in it."
 
 
 def _table_lines() -> Iterator[str]:
     """Yields name, role, size and seconds of each named model, under TABLE_HEAD."""
     for row in hub.catalogue():
-        seconds = f"{row.seconds[row.precision]:.1f}" if row.precision in row.seconds else "-"
-        yield f"{row.name:<11} {row.role:<10} {row.megabytes[row.precision]:>5} {seconds:>7}"
+        seconds = "-" if row.seconds is None else f"{row.seconds:.1f}"
+        yield f"{row.name:<11} {row.role:<10} {row.megabytes['fp32']:>5} {seconds:>7}"
 
 
 def help_table() -> str:
@@ -148,11 +149,12 @@ def models_verb(verb: verbs.Models, console: Console) -> verbs.VerbResult:
 
 def _list_models(console: Console) -> verbs.VerbResult:
     """Prints the catalogue: name, role, size, licence, whether it is on this machine, and what it is good for."""
-    rows = list(hub.catalogue_rows())
+    rows = []
     console.say(f"{TABLE_HEAD:<34}  {'here':<10} {'licence':<25} adds")
-    for row, line in zip(rows, _table_lines()):
-        here = " ".join(row["cached"]) or "-"
-        console.say(f"{line:<34}  {here:<10} {row['licence']:<25} {row['purpose']}")
+    for row, line in zip(hub.catalogue(), _table_lines()):
+        cached = [each for each in row.megabytes if row.in_precision(each).cached_folder is not None]
+        console.say(f"{line:<34}  {' '.join(cached) or '-':<10} {row.licence:<25} {row.purpose}")
+        rows.append(dataclasses.asdict(row) | {"cached": cached})
     console.say(TABLE_NOTE)
     console.say("jsecon models get NAME fetches one; hub:owner/name names any other repository of huggingface.co.")
     return {"models": rows}
@@ -161,24 +163,23 @@ def _list_models(console: Console) -> verbs.VerbResult:
 def _get_models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
     """Fetches models, also if an older revision of them is on this machine. One that fails does not stop the others."""
     folders, errors = {}, []
-    models = [(name, model) for name in verb.names for model in _models_of(name, verb.role, verb.precision)]
-    for name, model in models:
-        try:
-            folder = _folders_of_models({model.role: model}, console, yes=verb.yes, fresh=True)[model.role]
-        except InputError as error:
-            errors.append(error)
-            continue
-        console.say(f"{name}  {model.role}  {folder}")
-        folders[f"{name} ({model.role})"] = folder
+    for name in verb.names:
+        models = _candidates(name, verb.role, verb.precision)
+        for model in [_usable(models)] if name.startswith(hub.PREFIX) and verb.role is None else models:
+            try:
+                folder = _folders_of_models({model.role: model}, console, yes=verb.yes, fresh=True)[model.role]
+            except InputError as error:
+                errors.append(error)
+                continue
+            console.say(f"{name}  {model.role}  {folder}")
+            folders[f"{name} ({model.role})"] = folder
     return {"models": folders, "errors": errors}
 
 
 def _remove_models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
     """Removes models from the hub's cache, and prints how much was freed."""
-    freed = 0
-    for name in verb.names:
-        repositories = {model.repository: model for model in _models_of(name, None, None)}
-        freed += sum(hub.remove(model) for model in repositories.values())
+    repositories = {model.repository for name in verb.names for model in _candidates(name, verb.role, None)}
+    freed = sum(map(hub.remove, repositories))
     console.say(f"{freed / 1e6:.0f} MB freed")
     return {"freed": freed}
 
@@ -203,42 +204,32 @@ def _cached_model(name: str) -> Path:
     """Returns the folder of a model that is on this machine, by its name, address or folder."""
     if Path(name).exists():
         return Path(name)
-    models = _models_of(name, None, None)
-    exact = [dataclasses.replace(model, precision=p) for model in models for p in get_args(Precision)]
-    folder = next(filter(None, (model.cached_folder for model in exact)), None)
-    if folder is None:
-        raise InputError(name, "this model is not on this machine", "", f"Fetch it with: {models[0].get_command}")
-    return folder
+    for model in _candidates(name, None, None):
+        for precision in get_args(Precision):
+            if (folder := dataclasses.replace(model, precision=precision).cached_folder) is not None:
+                return folder
+    raise InputError(name, "this model is not on this machine", "", f"Fetch it with: jsecon models get {name}")
 
 
-def _models_of(name: str, role: Role | None, precision: Precision | None) -> list[HubModel]:
-    """Returns the models of a name, one for each of its roles."""
-    if name == AUTO:
-        recommended: list[Role] = [each for each in hub.RECOMMENDED if role is None or each == role]
-        return [model for each in recommended for model in _models_of(hub.RECOMMENDED[each], each, precision)]
+def _candidates(name: str, role: Role | None, precision: Precision | None) -> list[HubModel]:
+    """Returns the models of a name, one for each of its roles; of an address one for each role that it may have."""
     if name.startswith(hub.PREFIX):
-        roles: list[Role] = [role or _role_of_repository(name)]
-    else:
-        roles = [row.role for row in hub.catalogue() if row.name == name and role in (None, row.role)]
-        if not roles:
-            known = ", ".join(dict.fromkeys(row.name for row in hub.catalogue() if role in (None, row.role)))
-            raise InputError(name, "no known model", "", f"Known names: {known}. Or give hub:owner/name.")
-    models = [hub.parse_model(name, each, precision) for each in roles]
-    on_hub = [model for model in models if isinstance(model, HubModel)]
-    if len(on_hub) < len(models):
-        remedy = "Run this in another folder, or name hub:owner/name."
-        raise InputError(name, "a folder of this name lies here", "", remedy)
-    return on_hub
+        return [hub.parse_address(name, each, precision) for each in get_args(Role) if role in (None, each)]
+    if name != AUTO:
+        return [row.in_precision(precision) for row in hub.rows_of_name(name, role)]
+    rows = [hub.rows_of_name(each, of)[0] for of, each in hub.RECOMMENDED.items() if role in (None, of)]
+    return [row.in_precision(precision) for row in rows]
 
 
-def _role_of_repository(address: str) -> Role:
-    """Returns the first role whose files a repository has, on this machine or on the hub."""
-    models = [model for role in hub.LAYOUTS if isinstance(model := hub.parse_model(address, role), HubModel)]
+def _usable(models: Sequence[HubModel]) -> HubModel:
+    """Returns the first of the models of a repository that has its files on this machine, else on the hub."""
     for model in models:
         if model.cached_folder is not None:
-            return model.role
+            return model
     for model in models:
         with contextlib.suppress(hub.NoSuchFilesError):
             hub.plan_download(model)
-            return model.role
-    raise InputError(address, "it holds no model that jsecon reads", "", "jsecon models list has models that work.")
+            return model
+    remedy = "jsecon models list has models that work."
+    problem = f"it holds no model in {models[0].precision} that jsecon reads"
+    raise InputError(models[0].address, problem, "", remedy)

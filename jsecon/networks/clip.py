@@ -1,10 +1,7 @@
 """CLIP, MobileCLIP, SigLIP and SigLIP 2 on ONNX Runtime: a joint space of images and texts.
 
-A model folder has one of three layouts:
-    immich            visual/model.onnx, textual/model.onnx, visual/preprocess_cfg.json, textual/tokenizer.json
-    transformers.js   onnx/vision_model.onnx, onnx/text_model.onnx, preprocessor_config.json, tokenizer.json
-    flat              two .onnx files, which differ in their inputs, with those JSON files beside them
-MobileCLIP has CLIP's vocabulary. SigLIP and SigLIP 2 are recognised by config.json (`tokenizer.read_text_rules`).
+A model folder has the layout of immich or of transformers.js (`hub.LAYOUTS`). MobileCLIP has CLIP's vocabulary. SigLIP
+and SigLIP 2 are recognised by config.json (`tokenizer.read_text_rules`).
 
 A region is embedded as LangSplat does it: masked, cropped to its box, padded to a black square. A text is embedded as
 it is; with several templates its embedding is the mean over them.
@@ -22,27 +19,18 @@ from jaxtyping import Bool, Float32, UInt8
 
 from jsecon.errors import InputError, require
 from jsecon.files import read_json, reading
-from jsecon.networks.hub import Precision, graph_variants
-from jsecon.networks.session import Graph, Tensor, batches, content_digest, describe, graph_files
+from jsecon.networks.hub import Precision, find_files
+from jsecon.networks.session import Graph, Tensor, batches, content_digest, graph_files
 from jsecon.networks.tokenizer import CLIP_LENGTH, TextRules, TextTokenizer, read_text_rules
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.vision.protocols import CANONICAL, Logits
 from jsecon.vision.reference_words import cached_reference
 from jsecon.vision.stores import EmbeddingStore, mask_key
 
-CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
-"""mean and deviation of RGB in 0..1, for folders that do not state them"""
-LAYOUTS = {
-    "immich": ("visual/model.onnx", "textual/model.onnx"),
-    "transformers.js": ("onnx/vision_model.onnx", "onnx/text_model.onnx"),
-}
-"""layout -> graph of images, graph of texts"""
 DEFAULT_SIDE = 224
 """px of an image if neither the configuration nor the graph fixes it"""
 MAX_SIDE = 4096
 """px of an image"""
-CONFIGS = ("visual/preprocess_cfg.json", "preprocess_cfg.json", "preprocessor_config.json", "open_clip_config.json")
-TOKENIZERS = ("textual/tokenizer.json", "tokenizer.json")
 LOGITS = "logits.json"
 MAX_SCALE, MAX_BIAS = 1e4, 1e3
 """far above trained values: published SigLIP models have scales near 110 and biases near -15"""
@@ -50,17 +38,11 @@ LOGITS_REMEDY = (
     f'Write {LOGITS} into the folder, {{"scale": ..., "bias": ...}}: exp of the checkpoint\'s logit_scale, and its '
     "logit_bias."
 )
-PUBLISHED = (
-    "CLIP folders are published on huggingface.co: immich-app/ViT-B-32__laion2b-s34b-b79k and others of immich-app, "
-    "Xenova/clip-vit-base-patch16, Xenova/mobileclip_s0, Xenova/siglip-base-patch16-224, "
-    "onnx-community/siglip2-base-patch16-224-ONNX and others of theirs."
-)
 _VISUAL_OUTPUTS = ("embedding", "image_embeds", "image_features", "image_embedding")
 _TEXTUAL_OUTPUTS = ("embedding", "text_embeds", "text_features", "text_embedding")
 _SIGLIP_OUTPUT = "pooler_output"
-"""of a SigLIP by transformers, whose pooler is the last step and includes the projection"""
-_VISUAL, _TEXTUAL = "CLIP's graph of images", "CLIP's graph of texts"
-_PROJECTION = "Export the graph with its projection."
+"""of a SigLIP by transformers, whose pooler is the last step and includes the projection. CLIP's lies before it"""
+_VISUAL, _TEXTUAL = "CLIP's graph of images with its projection", "CLIP's graph of texts with its projection"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,14 +54,12 @@ class ClipFiles:
     textual: Path
     """Graph of texts: token ids (B, L) to (B, E)."""
     tokenizer: Path
-    mean: tuple[float, ...] = CLIP_MEAN
+    mean: tuple[float, ...]
     """Mean of RGB in 0..1."""
-    std: tuple[float, ...] = CLIP_STD
+    std: tuple[float, ...]
     """Standard deviation of RGB in 0..1."""
     size: int | None = None
     """S in px; None to take it from the graph, else DEFAULT_SIDE."""
-    layout: str = "separate"
-    """immich, transformers.js, flat, or separate if the files were named one by one."""
     rules: TextRules | None = None
     """How the model takes its texts; None for CLIP."""
     logits: Path | None = None
@@ -107,71 +87,22 @@ def find_clip(folder: str | Path, precision: Precision | None = None) -> ClipFil
     Raises:
       InputError: A file is missing or cannot be read.
     """
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise InputError(folder, "no such folder", "a folder with a CLIP model", PUBLISHED)
-    layout, visual, textual = _find_graphs(folder, precision)
-    tokenizer = next((folder / name for name in TOKENIZERS if (folder / name).is_file()), None)
-    if tokenizer is None:
-        raise InputError(folder, f"graphs in the layout of {layout}, no tokenizer", TOKENIZERS[1], PUBLISHED)
-    config = next((folder / name for name in CONFIGS if (folder / name).is_file()), None)
-    rules = read_text_rules(folder, tokenizer)
-    if config is None and rules is not None:
-        problem = "a SigLIP model that does not state how it takes images"
-        raise InputError(folder, problem, f"{CONFIGS[0]} or {CONFIGS[2]}", f"Fetch the missing file. {PUBLISHED}")
-    numbers = (CLIP_MEAN, CLIP_STD, None) if config is None else read_preprocessing(config, complete=rules is not None)
-    logits = folder / LOGITS if rules is not None and (folder / LOGITS).is_file() else None
-    return ClipFiles(visual, textual, tokenizer, *numbers, layout, rules, logits)
+    visual, textual, config, tokenizer = find_files(folder, "embedder", precision)
+    rules = read_text_rules(Path(folder), tokenizer)
+    logits = Path(folder) / LOGITS
+    return ClipFiles(
+        *(visual, textual, tokenizer),
+        *read_preprocessing(config),
+        rules,
+        logits if rules is not None and logits.is_file() else None,
+    )
 
 
-def _find_graphs(folder: Path, precision: Precision | None) -> tuple[str, Path, Path]:
-    """Returns the layout, the graph of images and the graph of texts."""
-    for layout, plain in LAYOUTS.items():
-        halves = []
-        for names in graph_variants(plain, precision):
-            present = [name for name in names if (folder / name).is_file()]
-            if len(present) == 2:
-                return layout, folder / names[0], folder / names[1]
-            halves += present
-        if halves:
-            expected = f"{' and '.join(plain)}, the layout of {layout}"
-            problem = f"{halves[0]} without its other half"
-            raise InputError(folder, problem, expected, f"Fetch the missing file. {PUBLISHED}")
-    graphs = {path: Graph(path, threads=1, optimise=False) for path in sorted(folder.glob("*.onnx"))}
-    visual = [path for path, graph in graphs.items() if _is_visual(graph)]
-    textual = [path for path, graph in graphs.items() if _is_textual(graph)]
-    if len(visual) != 1 or len(textual) != 1:
-        inputs = "; ".join(f"{path.name} takes {describe(graph.inputs.values())}" for path, graph in graphs.items())
-        known = ", or ".join(" and ".join(names) for names in LAYOUTS.values())
-        expected = f"one graph of images and one of texts: {known}, or two .onnx files"
-        raise InputError(folder, inputs or "no .onnx file in a place known", expected, PUBLISHED)
-    return "flat", visual[0], textual[0]
-
-
-def _has_vectors(graph: Graph) -> bool:
-    return any(tensor.shape is not None and len(tensor.shape) == 2 for tensor in graph.outputs.values())
-
-
-def _is_visual(graph: Graph) -> bool:
-    """Whether a graph could embed images: its only input is (B, 3, S, S), and an output is (B, E)."""
-    images = [t for t in graph.inputs.values() if t.fits((None, 3, None, None)) and t.dtype.startswith("float")]
-    return len(graph.inputs) == len(images) == 1 and _has_vectors(graph)
-
-
-def _is_textual(graph: Graph) -> bool:
-    """Whether a graph could embed texts: it takes token ids (B, L), perhaps with a mask, and an output is (B, E)."""
-    ids = [t for t in graph.inputs.values() if t.fits((None, None)) and t.dtype in ("int32", "int64")]
-    return 1 <= len(ids) == len(graph.inputs) <= 2 and _has_vectors(graph)
-
-
-def read_preprocessing(
-    path: Path, *, complete: bool = False
-) -> tuple[tuple[float, ...], tuple[float, ...], int | None]:
+def read_preprocessing(path: Path) -> tuple[tuple[float, ...], tuple[float, ...], int | None]:
     """Reads how a model takes images.
 
     Args:
-      path: A preprocess_cfg.json, preprocessor_config.json or open_clip_config.json.
-      complete: Whether mean and deviation must be stated; else those of CLIP are the defaults.
+      path: A preprocess_cfg.json of open_clip or a preprocessor_config.json of transformers.
 
     Returns:
       Mean and standard deviation of RGB in 0..1 (0 and 1 if the file says not to normalise), and the side of the square
@@ -184,9 +115,8 @@ def read_preprocessing(
     remedy = "Fetch the file again."
     content = read_json(path, expected, remedy)
     with reading(path, expected, remedy):
-        content = content.get("preprocess_cfg", content)
-        mean = content.get("mean", content.get("image_mean", None if complete else CLIP_MEAN))
-        std = content.get("std", content.get("image_std", None if complete else CLIP_STD))
+        mean = content.get("mean", content.get("image_mean"))
+        std = content.get("std", content.get("image_std"))
         if content.get("do_normalize") is False:  # MobileCLIP
             mean, std = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
         rescale = float(content.get("rescale_factor", 1 / 255)) if content.get("do_rescale", True) else 1.0
@@ -267,7 +197,6 @@ class ClipEmbedder:
       model: The model folder, or its files.
       templates: Phrases with `{}` for the text, whose unit embeddings are averaged.
       batch: Number of crops or texts of one run, if the graph does not fix it.
-      threads: Number of cores of one run, as for `Graph`.
       store: Folder that caches embeddings of regions by content, and of the reference words; or None.
 
     Attributes:
@@ -284,7 +213,6 @@ class ClipEmbedder:
         *,
         templates: Sequence[str] = ("{}",),
         batch: int = 16,
-        threads: int | None = None,
         store: str | Path | None = None,
     ):
         if not templates or not all("{}" in template for template in templates):
@@ -295,7 +223,6 @@ class ClipEmbedder:
         self.templates = tuple(templates)
         self.name = self.files.name
         self._batch = batch
-        self._threads = threads
         self._store = None if store is None else EmbeddingStore(Path(store), self.name)
 
     @functools.cached_property
@@ -408,11 +335,11 @@ class ClipEmbedder:
 
     @functools.cached_property
     def _visual(self) -> Graph:
-        return Graph(self.files.visual, threads=self._threads)
+        return Graph(self.files.visual)
 
     @functools.cached_property
     def _textual(self) -> Graph:
-        return Graph(self.files.textual, threads=self._threads)
+        return Graph(self.files.textual)
 
     @functools.cached_property
     def _tokenizer(self) -> TextTokenizer:
@@ -420,17 +347,18 @@ class ClipEmbedder:
 
     @property
     def _visual_input(self) -> Tensor:
-        name = next(iter(self._visual.inputs), "image")
-        if len(self._visual.inputs) > 1:
-            name = next((n for n in ("image", "pixel_values") if n in self._visual.inputs), "image")
+        name = "pixel_values" if "pixel_values" in self._visual.inputs else "image"
         return self._visual.require("input", name, (None, 3, None, None), _VISUAL)
+
+    def _output(self, graph: Graph, names: tuple[str, ...], what: str) -> Tensor:
+        """Returns the output (B, E) of a graph: the first of `names` that it has."""
+        known = names if self.files.rules is None else (*names, _SIGLIP_OUTPUT)
+        name = next((name for name in known if name in graph.outputs), known[0])
+        return graph.require("output", name, (None, None), what)
 
     @property
     def _visual_output(self) -> Tensor:
-        return _embedding_output(self._visual, self._output_names(_VISUAL_OUTPUTS), _VISUAL)
-
-    def _output_names(self, names: tuple[str, ...]) -> tuple[str, ...]:
-        return names if self.files.rules is None else (*names, _SIGLIP_OUTPUT)
+        return self._output(self._visual, _VISUAL_OUTPUTS, _VISUAL)
 
     def _run_visual(self, crops: UInt8[np.ndarray, "b s s 3"]) -> np.ndarray:
         """(B, S, S, 3) RGB to (B, E), not normalised."""
@@ -446,7 +374,7 @@ class ClipEmbedder:
     def _embed_phrases(self, phrases: list[str]) -> Float32[np.ndarray, "p e"]:
         """(P, E) unit embeddings of phrases as they are."""
         graph = self._textual
-        output = _embedding_output(graph, self._output_names(_TEXTUAL_OUTPUTS), _TEXTUAL)
+        output = self._output(graph, _TEXTUAL_OUTPUTS, _TEXTUAL)
         masks = [name for name in graph.inputs if "mask" in name]
         names = [name for name in graph.inputs if name not in masks]
         tensor = graph.require("input", names[0] if len(names) == 1 else "input_ids", (None, None), _TEXTUAL)
@@ -464,28 +392,12 @@ class ClipEmbedder:
         return _normalize(rows, self.files.textual)
 
 
-def _embedding_output(graph: Graph, names: Sequence[str], what: str) -> Tensor:
-    """Returns the output (B, E) of a graph: the first of `names` that it has, else its only output with two axes.
-
-    A pooler's output counts only if it is named: CLIP's lies before the projection into the joint space.
-    """
-    for name in names:
-        if name in graph.outputs:
-            return graph.require("output", name, (None, None), what)
-    flat = [t for t in graph.outputs.values() if t.shape is not None and len(t.shape) == 2 and "pooler" not in t.name]
-    if len(flat) != 1:
-        where = f"{graph.path}, output {names[0]!r}"
-        expected = f"one output of two axes, as {what} has, called {', '.join(names)} or otherwise"
-        raise InputError(where, describe(graph.outputs.values()), expected, _PROJECTION)
-    return flat[0]
-
-
 def _run_rows(graph: Graph, feeds: dict[str, np.ndarray], output: str, count: int) -> np.ndarray:
     """Returns the first `count` rows (count, E) of an output."""
     rows = graph.run(feeds, [output])[output]
     if rows.ndim != 2 or len(rows) < count:
         where = f"{graph.path}, output {output!r}"
-        raise InputError(where, f"shape {rows.shape}", f"{count} embeddings", _PROJECTION)
+        raise InputError(where, f"shape {rows.shape}", f"{count} embeddings", "Export the graph again.")
     return rows[:count]
 
 

@@ -2,20 +2,20 @@
 
 A model is asked for by a name of catalogue.toml ("clip"), by repository ("hub:owner/name", "hub:owner/name@revision"),
 or by folder. huggingface_hub transfers the files and keeps the cache, so HF_HOME, HF_ENDPOINT, HF_HUB_OFFLINE and
-HF_TOKEN work as they do elsewhere. A transfer is planned first (`plan_download`: commit, files, size, licence), so
-that a user can be asked before anything is fetched. Afterwards each file is compared with the hub's hash.
+HF_TOKEN work as they do elsewhere. A transfer is planned first (`plan_download`: files, size, licence), so that a user
+can be asked before anything is fetched. Afterwards each file is compared with the hub's hash.
 """
 
 import contextlib
 import dataclasses
+import difflib
 import errno
 import functools
-import hashlib
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 from jsecon.errors import InputError, describe_error
 
@@ -28,25 +28,11 @@ SUFFIXES: Mapping[Precision, str] = {"fp32": "", "fp16": "_fp16", "int8": "_quan
 PREFIX = "hub:"
 
 
-def graph_variants(names: Sequence[str], precision: Precision | None = None) -> Iterator[tuple[str, ...]]:
-    """Names graphs in one precision after the other.
-
-    Args:
-      names: Names of the graphs in full precision, such as onnx/vision_model.onnx.
-      precision: The only precision to yield; None yields all, full precision first.
-
-    Yields:
-      The names in that precision, in the order of `names`.
-    """
-    for suffix in SUFFIXES.values() if precision is None else (SUFFIXES[precision],):
-        yield tuple(name.removesuffix(".onnx") + f"{suffix}.onnx" for name in names)
-
-
 class NoSuchFilesError(InputError):
-    """A repository has none of the layouts of a role."""
+    """A folder or repository lacks files of every layout of a role."""
 
 
-class _FileSet(NamedTuple):
+class Layout(NamedTuple):
     """The files of one public layout of a model. `{p}` stands for the suffix of the precision."""
 
     required: tuple[str, ...]
@@ -55,29 +41,33 @@ class _FileSet(NamedTuple):
     """files that are fetched where the repository has them"""
 
 
-_TEXTS = ("config.json", "tokenizer_config.json")
+def _in_precision(layout: Layout, precision: Precision) -> Layout:
+    """Returns the names of the files in one precision."""
+    suffix = SUFFIXES[precision]
+    return Layout(*(tuple(name.format(p=suffix) for name in names) for names in layout))
+
+
 _TRACKER = tuple(
     f"onnx/{part}.onnx"
     for part in ("vision_encoder", "mask_decoder", "memory_attention", "memory_encoder", "pointer_tpos")
 )
-LAYOUTS: Mapping[Role, tuple[_FileSet, ...]] = {
+LAYOUTS: Mapping[Role, tuple[Layout, ...]] = {
     "embedder": (
-        _FileSet(
+        Layout(
             ("onnx/vision_model{p}.onnx", "onnx/text_model{p}.onnx", "preprocessor_config.json", "tokenizer.json"),
-            (*_TEXTS, "logits.json"),
+            ("config.json", "tokenizer_config.json", "logits.json"),
         ),
-        _FileSet(
-            ("visual/model.onnx", "textual/model.onnx", "visual/preprocess_cfg.json", "textual/tokenizer.json"),
-            (*_TEXTS, "textual/tokenizer_config.json", "logits.json"),
+        Layout(
+            ("visual/model{p}.onnx", "textual/model{p}.onnx", "visual/preprocess_cfg.json", "textual/tokenizer.json"),
+            ("config.json", "textual/tokenizer_config.json", "logits.json"),
         ),
     ),
     "segmenter": (
-        _FileSet(
-            ("onnx/vision_encoder{p}.onnx", "onnx/prompt_encoder_mask_decoder{p}.onnx"),
-            ("preprocessor_config.json", "config.json"),
+        Layout(
+            ("onnx/vision_encoder{p}.onnx", "onnx/prompt_encoder_mask_decoder{p}.onnx", "preprocessor_config.json"),
         ),
     ),
-    "tracker": (_FileSet((*_TRACKER, "constants.json")), _FileSet((*_TRACKER, "onnx/constants.json"))),
+    "tracker": (Layout((*_TRACKER, "constants.json")), Layout((*_TRACKER, "onnx/constants.json"))),
 }
 """role -> the layouts that its public exports have. A graph's external data (`.onnx_data`) comes with the graph."""
 
@@ -100,15 +90,33 @@ class NamedModel:
     """What it is good for, in one sentence."""
     revision: str = "main"
     """Commit that is fetched, or a branch."""
-    seconds: Mapping[Precision, float] = dataclasses.field(default_factory=dict)
-    """Seconds of a frame by precision, on two cores of a Xeon with AVX-512: of a segmenter with 70 guided prompts, of
-    an embedder for 40 regions, of a tracker for one object. Those not measured are missing."""
-    precision: Precision = "fp32"
-    """Precision that is taken unless the user asks for another."""
+    seconds: float | None = None
+    """Seconds of a frame in fp32 on two cores of a Xeon with AVX-512: of a segmenter with 70 guided prompts, of an
+    embedder for 40 regions, of a tracker for one object. None if they were not measured."""
     sha256: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """File -> hash of the content, where it is known from elsewhere than the hub."""
     refused: Mapping[Precision, str] = dataclasses.field(default_factory=dict)
     """Precision -> why it is not offered."""
+
+    def in_precision(self, precision: Precision | None) -> "HubModel":
+        """The model with graphs in one precision.
+
+        Args:
+          precision: The precision; None takes fp32. Models of masks stay in fp32 if they are not offered in it.
+
+        Returns:
+          The model on the hub.
+
+        Raises:
+          InputError: The precision is not offered.
+        """
+        if precision is None or (self.role != "embedder" and precision not in self.megabytes):
+            precision = "fp32"
+        if precision not in self.megabytes:
+            reason = self.refused.get(precision, "Its repository has no such graphs.")
+            problem = f"{self.name} is not offered in {precision}. {reason}"
+            raise InputError("--precision", problem, "", f"Use {' or '.join(self.megabytes)}.")
+        return HubModel(self.role, self.repository, self.revision, precision, self.sha256)
 
 
 RECOMMENDED: Mapping[Role, str] = {"segmenter": "edgetam", "embedder": "siglip2"}
@@ -124,6 +132,19 @@ def catalogue() -> tuple[NamedModel, ...]:
     """
     rows = tomllib.loads(Path(__file__).with_name("catalogue.toml").read_text())["model"]
     return tuple(NamedModel(**row) for row in rows)
+
+
+def published(role: Role) -> str:
+    """Says where models are published.
+
+    Args:
+      role: What they are for.
+
+    Returns:
+      A sentence with the repositories of the catalogue.
+    """
+    names = ", ".join(row.repository for row in catalogue() if row.role == role)
+    return f"Such models are published on huggingface.co: {names}, and others of the same layout."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,8 +170,8 @@ class HubModel:
     @property
     def get_command(self) -> str:
         """The command that fetches the model."""
-        rows = [row for row in catalogue() if (row.repository, row.role) == (self.repository, self.role)]
-        name = rows[0].name if rows and self.revision == rows[0].revision else self.address
+        row = _row_of_repository(self.role, self.repository)
+        name = row.name if row is not None and self.revision == row.revision else self.address
         precision = "" if self.precision == "fp32" else f" --precision {self.precision}"
         return f"jsecon models get {name} --role {self.role}{precision} --yes"
 
@@ -161,26 +182,15 @@ class HubModel:
         from huggingface_hub.errors import LocalEntryNotFoundError
 
         for layout in LAYOUTS[self.role]:
-            required = _named(layout.required, self.precision)
-            patterns = [*required, *_named(layout.optional, self.precision), *(f"{name}_data*" for name in required)]
-            try:
+            required, optional = _in_precision(layout, self.precision)
+            patterns = [*required, *optional, *(f"{name}_data*" for name in required)]
+            with contextlib.suppress(LocalEntryNotFoundError, ValueError):  # ValueError: no name of a repository
                 folder = snapshot_download(
                     self.repository, revision=self.revision, local_files_only=True, allow_patterns=patterns
                 )
-            except (LocalEntryNotFoundError, ValueError):  # ValueError: no name of a repository
-                continue
-            if all((Path(folder) / name).is_file() for name in required):
-                return Path(folder)
+                if all((Path(folder) / name).is_file() for name in required):
+                    return Path(folder)
         return None
-
-
-@dataclasses.dataclass(frozen=True)
-class HubFile:
-    """A file of a repository: its path there, its bytes, and its hash (SHA-256, or that of a git blob)."""
-
-    path: str
-    size: int
-    digest: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -188,22 +198,15 @@ class Download:
     """What has to be fetched for a model."""
 
     model: HubModel
-    commit: str
-    """Commit that its revision names now."""
-    files: tuple[HubFile, ...]
-    """Files of the commit that the model needs."""
+    sizes: Mapping[str, int]
+    """Files that the model needs, with their bytes."""
     licence: str
     """Licence by the repository's own card, or "not stated"."""
 
-    @property
-    def size(self) -> int:
-        """Bytes of all files."""
-        return sum(file.size for file in self.files)
-
     def __str__(self) -> str:
-        """Returns the address as the command line takes it."""
-        megabytes = max(round(self.size / 1e6), 1)
-        return f"{self.model.address} ({len(self.files)} files, {megabytes:,} MB, licence: {self.licence})"
+        """Describes it on one line."""
+        megabytes = max(round(sum(self.sizes.values()) / 1e6), 1)
+        return f"{self.model.address} ({len(self.sizes)} files, {megabytes:,} MB, licence: {self.licence})"
 
 
 def parse_model(text: str, role: Role, precision: Precision | None = None) -> HubModel | Path:
@@ -212,7 +215,7 @@ def parse_model(text: str, role: Role, precision: Precision | None = None) -> Hu
     Args:
       text: A name of the catalogue, "hub:owner/name", "hub:owner/name@revision", or a folder.
       role: What the model is for.
-      precision: Precision of its graphs; None takes the model's default.
+      precision: Precision of its graphs; None takes fp32.
 
     Returns:
       The model on the hub, or the folder.
@@ -221,31 +224,65 @@ def parse_model(text: str, role: Role, precision: Precision | None = None) -> Hu
       InputError: It is none of these, or the precision is not offered.
     """
     if text.startswith(PREFIX):
-        address = re.fullmatch(r"([\w.-]+/[\w.-]+?)(?:@([\w./-]+))?", text.removeprefix(PREFIX))
-        if address is None:
-            raise InputError(text, "not the address of a model", "", "Write hub:owner/name or hub:owner/name@revision.")
-        row = next((row for row in catalogue() if (row.role, row.repository) == (role, address[1])), None)
-        if row is not None and precision is not None and precision in row.refused:
-            raise _refused(row, precision)
-        return HubModel(role, address[1], address[2] or "main", precision or "fp32")
+        return parse_address(text, role, precision)
     if Path(text).exists():
         return Path(text)
-    names = {row.name: row for row in catalogue() if row.role == role}
-    if text not in names:
-        remedy = f"Known names: {', '.join(names)}. Or give a folder, or hub:owner/name."
-        raise InputError(text, f"no folder and no known {role}", "", remedy)
-    row = names[text]
-    precision = precision or row.precision
-    if precision not in row.megabytes:
-        raise _refused(row, precision)
-    return HubModel(role, row.repository, row.revision, precision, row.sha256)
+    return rows_of_name(text, role)[0].in_precision(precision)
 
 
-def _refused(row: NamedModel, precision: Precision) -> InputError:
-    """Returns the error that a named model is not offered in a precision."""
-    reason = row.refused.get(precision, "Its repository has no such graphs.")
-    problem = f"{row.name} is not offered in {precision}. {reason}"
-    return InputError("--precision", problem, "", f"Use {' or '.join(row.megabytes)}.")
+def parse_address(text: str, role: Role, precision: Precision | None = None) -> HubModel:
+    """Reads the address of a model on the hub.
+
+    Args:
+      text: "hub:owner/name" or "hub:owner/name@revision".
+      role: What the model is for.
+      precision: Precision of its graphs; None takes fp32.
+
+    Returns:
+      The model.
+
+    Raises:
+      InputError: It is no such address, or the model is known not to work in this precision.
+    """
+    address = re.fullmatch(rf"{PREFIX}([\w.-]+/[\w.-]+?)(?:@([\w./-]+))?", text)
+    if address is None:
+        raise InputError(text, "not the address of a model", "", "Write hub:owner/name or hub:owner/name@revision.")
+    row = _row_of_repository(role, address[1])
+    if row is not None and precision in row.refused:
+        return row.in_precision(precision)
+    return HubModel(role, address[1], address[2] or "main", precision or "fp32")
+
+
+def rows_of_name(name: str, role: Role | None) -> list[NamedModel]:
+    """Looks up a name in the catalogue.
+
+    Args:
+      name: The name.
+      role: What the model is for; None for any role.
+
+    Returns:
+      Its rows, at least one.
+
+    Raises:
+      InputError: There is no such name.
+    """
+    rows = [row for row in catalogue() if role in (None, row.role)]
+    if matches := [row for row in rows if row.name == name]:
+        return matches
+    names = list(dict.fromkeys(row.name for row in rows))
+    similar = difflib.get_close_matches(name, names, 1)
+    similar += [f"the {row.role} {name}" for row in catalogue() if row.name == name]
+    if re.fullmatch(r"[\w-][\w.-]*/[\w.-]+(@[\w./-]+)?", name):
+        similar = [f"{PREFIX}{name}"]
+    meant = f"Did you mean {similar[0]}? " if similar else ""
+    remedy = f"{meant}Known names: {', '.join(names)}. Or give a folder, or hub:owner/name."
+    problem = f"no folder and no known {role or 'model'}"
+    raise InputError(name, "a folder, not a name" if Path(name).exists() else problem, "", remedy)
+
+
+def _row_of_repository(role: Role, repository: str) -> NamedModel | None:
+    """Returns the row of the catalogue that a repository has."""
+    return next((row for row in catalogue() if (row.role, row.repository) == (role, repository)), None)
 
 
 def model_name(folder: Path, role: Role) -> str:
@@ -259,40 +296,43 @@ def model_name(folder: Path, role: Role) -> str:
       Its name in the catalogue, or that of the folder.
     """
     repository = (cached_address(folder) or "").removeprefix(PREFIX).partition("@")[0]
-    return next((row.name for row in catalogue() if (row.role, row.repository) == (role, repository)), folder.name)
+    row = _row_of_repository(role, repository)
+    return folder.name if row is None else row.name
 
 
-def choose_files(model: HubModel, paths: Sequence[str]) -> tuple[str, ...]:
-    """Chooses the files that a model needs from those of its repository.
+def _present_layout(
+    role: Role, precision: Precision | None, exists: Callable[[str], object], where: object, remedy: str
+) -> Layout:
+    """Returns the first layout whose required files exist, in the precision or else in the highest that is there."""
+    missing = []
+    for each in SUFFIXES if precision is None else (precision,):
+        for layout in LAYOUTS[role]:
+            named = _in_precision(layout, each)
+            missing.append([name for name in named.required if not exists(name)])
+            if not missing[-1]:
+                return named
+    raise NoSuchFilesError(where, f"no {role}, since it lacks {', '.join(min(missing, key=len))}", "", remedy)
+
+
+def find_files(folder: str | Path, role: Role, precision: Precision | None = None) -> list[Path]:
+    """Finds the files of a model in a folder.
 
     Args:
-      model: The model.
-      paths: All files of the repository.
+      folder: The folder.
+      role: What the model is for.
+      precision: Precision of its graphs; None takes the highest that is there.
 
     Returns:
-      Their paths, sorted.
+      The required files of its layout, in the order of LAYOUTS.
 
     Raises:
-      NoSuchFilesError: The repository has none of the layouts that jsecon reads.
+      InputError: There is no such folder, or files are missing in it.
     """
-    known = set(paths)
-    missing = []
-    for layout in LAYOUTS[model.role]:
-        required = _named(layout.required, model.precision)
-        optional = _named(layout.optional, model.precision)
-        missing.append([name for name in required if name not in known])
-        if not missing[-1]:
-            data = [path for path in paths if any(path.startswith(f"{name}_data") for name in required)]
-            return tuple(sorted({*required, *known.intersection(optional), *data}))
-    fewest = min(missing, key=len)
-    problem = f"no {model.role} of {model.precision} that jsecon reads: {', '.join(fewest)} missing"
-    remedy = f"Choose another repository or --precision. `jsecon models list` has {model.role} models that work."
-    raise NoSuchFilesError(model.address, problem, "", remedy)
-
-
-def _named(templates: Sequence[str], precision: Precision) -> tuple[str, ...]:
-    """Returns the names of a layout's files in one precision."""
-    return tuple(template.format(p=SUFFIXES[precision]) for template in templates)
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(folder, "no such folder", "", published(role))
+    layout = _present_layout(role, precision, lambda name: (folder / name).is_file(), folder, published(role))
+    return [folder / name for name in layout.required]
 
 
 def plan_download(model: HubModel) -> Download:
@@ -302,26 +342,30 @@ def plan_download(model: HubModel) -> Download:
       model: The model.
 
     Returns:
-      The files, and the commit.
+      The files, and the licence.
 
     Raises:
-      InputError: The hub does not answer, or has no such repository, revision or files.
+      NoSuchFilesError: The repository lacks files of every layout that jsecon reads.
+      InputError: The hub does not answer, has no such repository or revision, or states another hash of a file than
+        the catalogue.
     """
     from huggingface_hub import HfApi
-    from huggingface_hub.hf_api import RepoFile
 
     with _hub_errors(model):
-        api = HfApi()
-        info = api.model_info(model.repository, revision=model.revision)
-        tree = api.list_repo_tree(model.repository, recursive=True, revision=info.sha)
-        files = {
-            entry.path: HubFile(entry.path, entry.size, entry.lfs.sha256 if entry.lfs else entry.blob_id)
-            for entry in tree
-            if isinstance(entry, RepoFile)
-        }
-    chosen = tuple(files[path] for path in choose_files(model, list(files)))
+        info = HfApi().model_info(model.repository, revision=model.revision, files_metadata=True)
+    files = {file.rfilename: file for file in info.siblings or ()}
+    remedy = f"Choose another repository or --precision. `jsecon models list` has {model.role} models that work."
+    required, optional = _present_layout(model.role, model.precision, files.__contains__, model.address, remedy)
+    data = tuple(f"{name}_data" for name in required)
+    chosen = [path for path in files if path in (*required, *optional) or path.startswith(data)]
+    for path in model.sha256.keys() & set(chosen):
+        stated = files[path].lfs
+        if stated is None or stated.sha256 != model.sha256[path]:
+            problem = "the hash that the hub states for it is not the one that jsecon knows"
+            raise InputError(f"{model.address} {path}", problem, "", "Choose another model: jsecon models list.")
     licences = [tag.removeprefix("license:") for tag in info.tags or () if tag.startswith("license:")]
-    return Download(model, str(info.sha), chosen, ", ".join(licences) or "not stated")
+    sizes = {path: files[path].size or 0 for path in chosen}
+    return Download(model, sizes, ", ".join(licences) or "not stated")
 
 
 def fetch(download: Download) -> Path:
@@ -338,28 +382,22 @@ def fetch(download: Download) -> Path:
     Raises:
       InputError: The transfer fails, or a file differs from its hash; that file is removed from the cache.
     """
-    from huggingface_hub import snapshot_download
+    from huggingface_hub import HfApi, snapshot_download
 
     model = download.model
-    names = [file.path for file in download.files]
     with _hub_errors(model):
+        names = list(download.sizes)
         folder = Path(snapshot_download(model.repository, revision=model.revision, allow_patterns=names))
-    for file in download.files:
-        expected = {file.digest} | ({model.sha256[file.path]} if file.path in model.sha256 else set())
-        if any(_content_hash(folder / file.path, digest) != digest for digest in expected):
-            broken = folder / file.path
-            broken.resolve().unlink()
-            broken.unlink(missing_ok=True)
-            problem = "its content differs from the hash that the hub gives for it, so it was removed"
-            raise InputError(f"{model.address} {file.path}", problem, "", f"Fetch it again: {model.get_command}")
+        check = HfApi().verify_repo_checksums(model.repository, revision=folder.name, local_dir=folder)
+    for mismatch in check.mismatches:
+        broken = folder / mismatch["path"]
+        broken.resolve().unlink()
+        broken.unlink(missing_ok=True)
+    if check.mismatches:
+        paths = ", ".join(mismatch["path"] for mismatch in check.mismatches)
+        problem = "its content differs from the hash that the hub gives for it, so it was removed"
+        raise InputError(f"{model.address} {paths}", problem, "", f"Fetch it again: {model.get_command}")
     return folder
-
-
-def _content_hash(path: Path, like: str) -> str:
-    """Returns the SHA-256 of a file in hexadecimal digits, or the hash of its git blob if `like` has 40 digits."""
-    digest = hashlib.sha256() if len(like) == 64 else hashlib.sha1(b"blob %d\0" % path.stat().st_size)
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, lambda: digest).hexdigest()
 
 
 def cached_address(folder: Path) -> str | None:
@@ -378,11 +416,11 @@ def cached_address(folder: Path) -> str | None:
     return f"{PREFIX}{parts[-3].removeprefix('models--').replace('--', '/')}@{parts[-1]}"
 
 
-def remove(model: HubModel) -> int:
+def remove(repository: str) -> int:
     """Removes a repository from the hub's cache, all its revisions.
 
     Args:
-      model: The model.
+      repository: "owner/name".
 
     Returns:
       Bytes that were freed; 0 if it was not there.
@@ -394,78 +432,60 @@ def remove(model: HubModel) -> int:
         cache = scan_cache_dir(constants.HF_HUB_CACHE)
     except CacheNotFound:
         return 0
-    commits = [
-        revision.commit_hash
-        for repository in cache.repos
-        if repository.repo_id == model.repository and repository.repo_type == "model"
-        for revision in repository.revisions
-    ]
-    plan = cache.delete_revisions(*commits)
+    revisions = (repo.revisions for repo in cache.repos if (repo.repo_type, repo.repo_id) == ("model", repository))
+    plan = cache.delete_revisions(*(revision.commit_hash for each in revisions for revision in each))
     plan.execute()
     return plan.expected_freed_size
-
-
-def catalogue_rows() -> Iterator[dict[str, Any]]:
-    """Lists the named models, and which of them are on this machine.
-
-    Yields:
-      A row of `jsecon models list`: the fields of `NamedModel`, and "cached", precisions in the hub's cache.
-    """
-    for row in catalogue():
-        models = [HubModel(row.role, row.repository, row.revision, precision) for precision in row.megabytes]
-        cached = [model.precision for model in models if model.cached_folder is not None]
-        yield dataclasses.asdict(row) | {"cached": cached}
 
 
 @contextlib.contextmanager
 def _hub_errors(model: HubModel) -> Iterator[None]:
     """Turns the errors of huggingface_hub and of the disk into an InputError with one sentence."""
+    from huggingface_hub.errors import LocalEntryNotFoundError
+
     try:
         yield
-    except InputError:
-        raise
     except Exception as error:
-        problem, remedy = _explain(model, error)
-        if not problem:
+        cause: BaseException = error
+        while isinstance(cause, LocalEntryNotFoundError) and cause.__cause__ is not None:
+            cause = cause.__cause__
+        explained = _explain(model, cause)
+        if explained is None:
             raise
+        problem, remedy = explained
         raise InputError(model.address, problem, "", remedy) from error
 
 
-def _explain(model: HubModel, error: BaseException) -> tuple[str, str]:
-    """Returns what is wrong and what to do, for an error during a request; empty for a fault of the program."""
+def _explain(model: HubModel, error: BaseException) -> tuple[str, str] | None:
+    """Returns what is wrong and what to do, for an error during a request; None for a fault of the program."""
     from huggingface_hub import constants, errors
 
-    page = f"{constants.ENDPOINT}/{model.repository}"
-    again = f"Run it again: {model.get_command}"
-    if isinstance(error, errors.OfflineModeIsEnabled):
-        return (
-            "not in the cache, and HF_HUB_OFFLINE forbids requests",
-            f"Unset HF_HUB_OFFLINE, then {model.get_command}",
-        )
-    if isinstance(error, errors.GatedRepoError):
-        remedy = f"Accept its licence on {page}, set HF_TOKEN to a token of your account, then {model.get_command}"
-        return "its owner grants access to accounts only", remedy
-    if isinstance(error, errors.RevisionNotFoundError):
-        return f"the repository has no revision {model.revision}", f"See {page}/commits/main for those it has."
-    if isinstance(error, errors.RepositoryNotFoundError):
-        return "the hub has no such repository, or it is private", "Check the name; for a private one set HF_TOKEN."
-    if isinstance(error, errors.RemoteEntryNotFoundError):
-        return "a file of the repository is missing on the hub", again
-    if isinstance(error, errors.LocalEntryNotFoundError):
-        cause = error.__cause__
-        if cause is not None and not isinstance(cause, errors.LocalEntryNotFoundError):
-            return _explain(model, cause)
-        return f"{constants.ENDPOINT} cannot be reached", f"Check the network or HF_ENDPOINT, then {model.get_command}"
-    if isinstance(error, errors.HfHubHTTPError):
-        status = error.response.status_code
-        return f"the hub answers with HTTP status {status}", f"Wait a minute. {again}"
-    library = type(error).__module__.partition(".")[0]
-    if isinstance(error, ConnectionError) or library in ("httpx", "httpx2"):  # by the version of huggingface_hub
+    page, get = f"{constants.ENDPOINT}/{model.repository}", model.get_command
+    again = f"Run it again: {get}"
+    match error:  # in this order: GatedRepoError is a RepositoryNotFoundError
+        case errors.OfflineModeIsEnabled():
+            return "not in the cache, and HF_HUB_OFFLINE forbids requests", f"Unset HF_HUB_OFFLINE, then {get}"
+        case errors.GatedRepoError():
+            remedy = f"Accept its licence on {page}, set HF_TOKEN to a token of your account, then {get}"
+            return "its owner grants access to accounts only", remedy
+        case errors.RevisionNotFoundError():
+            return f"the repository has no revision {model.revision}", f"See {page}/commits/main for those it has."
+        case errors.RepositoryNotFoundError():
+            remedy = "Check the name; for a private one set HF_TOKEN."
+            return "the hub has no such repository, or it is private", remedy
+        case errors.RemoteEntryNotFoundError():
+            return "a file of the repository is missing on the hub", again
+        case errors.HfHubHTTPError():
+            return f"the hub answers with HTTP status {error.response.status_code}", f"Wait a minute. {again}"
+        case errors.LocalEntryNotFoundError() | ConnectionError():
+            return f"{constants.ENDPOINT} cannot be reached or the transfer broke", f"Check the network. {again}"
+        case OSError(errno=errno.ENOSPC):
+            remedy = "Free some space, or set HF_HOME to another disk."
+            return f"no space left for it in {constants.HF_HUB_CACHE}", remedy
+        case OSError(errno=errno.EACCES | errno.EPERM | errno.EROFS):
+            return f"no permission to write in {constants.HF_HUB_CACHE}", "Set HF_HOME to a folder of yours."
+        case OSError():
+            return describe_error(error), again
+    if type(error).__module__.partition(".")[0] in ("httpx", "httpx2"):  # by the version of huggingface_hub
         return f"{constants.ENDPOINT} cannot be reached or the transfer broke", f"Check the network. {again}"
-    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
-        return f"no space left for it in {constants.HF_HUB_CACHE}", "Free some space, or set HF_HOME to another disk."
-    if isinstance(error, PermissionError) or (isinstance(error, OSError) and error.errno == errno.EROFS):
-        return f"no permission to write in {constants.HF_HUB_CACHE}", "Set HF_HOME to a folder of yours."
-    if isinstance(error, OSError):
-        return describe_error(error), again
-    return "", ""
+    return None

@@ -7,19 +7,19 @@ poor, that are not stable or that a crop cuts off are dropped, then repetitions 
 removed, then LangSplat's suppression of masks by masks follows (minghanqin/LangSplat, preprocess.py). The steps are
 those of facebookresearch/segment-anything, automatic_mask_generator.py. All of it runs on the host, on NumPy arrays.
 
-A model folder has onnx/vision_encoder.onnx and onnx/prompt_encoder_mask_decoder.onnx, as exported for transformers.js.
-The decoder takes input_points (1, B, P, 2) and input_labels (1, B, P) and gives iou_scores and pred_masks. There are
-two kinds, which differ in the decoder's other inputs:
+A model folder has onnx/vision_encoder.onnx and onnx/prompt_encoder_mask_decoder.onnx, as exported for transformers.js,
+and preprocessor_config.json, which states how colours are scaled. The decoder takes input_points (1, B, P, 2) and
+input_labels (1, B, P) and gives iou_scores and pred_masks. There are two kinds, which differ in its other inputs:
     SAM      image_embeddings of a frame that is scaled by its longer side and padded; a batch of prompts in one run
     SAM 2    image_embeddings.0, .1 and .2 of a frame that is stretched to a square, as EdgeTAM, SAM 2.1 and SAM 3 have;
-             input_boxes (1, 0, 4), so one prompt a run; preprocessor_config.json states how colours are scaled
+             input_boxes (1, 0, 4), so one prompt a run
 """
 
 import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -31,25 +31,14 @@ from scipy import sparse
 
 from jsecon.errors import InputError, require
 from jsecon.networks.clip import read_preprocessing
-from jsecon.networks.hub import Precision, graph_variants
+from jsecon.networks.hub import NoSuchFilesError, Precision, find_files
 from jsecon.networks.prompts import GuidedPrompts
-from jsecon.networks.session import Graph, batches, content_digest, describe, graph_files
+from jsecon.networks.session import Graph, batches, content_digest, graph_files
 
-MEAN_STD = np.array([[123.675, 116.28, 103.53], [58.395, 57.12, 57.375]], np.float32)
-"""SAM's mean and deviation of RGB in 0..255"""
 IMAGE_SIDE = 1024
-"""px of the encoder's square image, if its file does not fix it"""
+"""px of the encoder's square image, if neither its file nor the configuration fixes it"""
 EDGE = 20.0
 """px: a box this close to the edge of a crop was probably cut off by it"""
-ENCODER = "vision_encoder.onnx"
-DECODER = "prompt_encoder_mask_decoder.onnx"
-CONFIG = "preprocessor_config.json"
-PUBLISHED = (
-    "SAM folders are published on huggingface.co: Xenova/sam-vit-base, Xenova/slimsam-77-uniform (a batch of prompts a "
-    "run), onnx-community/EdgeTAM-ONNX, onnx-community/sam2.1-hiera-tiny-ONNX, onnx-community/sam3-tracker-ONNX."
-)
-_TOGETHER = "Take encoder and decoder from one export."
-
 BATCH = 4
 """prompts of one run, if the decoder does not fix it: of EdgeTAM's decoder on two cores, 8 take 42 ms each, one alone
 34 ms; 64 of SAM's take more than 1 GiB"""
@@ -60,52 +49,39 @@ TOKENS: dict[str, tuple[int, ...]] = {"default": (0, 1, 2), "s": (0,), "m": (1,)
 """level -> which of a point's three masks it takes"""
 
 
-@dataclasses.dataclass(frozen=True)
-class SamFiles:
+class SamFiles(NamedTuple):
     """Files and settings of a SAM model."""
 
     encoder: Path
-    """Graph of frames."""
+    """graph of frames"""
     decoder: Path
-    """Graph of prompts."""
-    colours: tuple[tuple[float, ...], tuple[float, ...]] | None = None
-    """Mean and standard deviation of RGB in 0..1 if they differ from SAM's, else None."""
-    configured: bool = False
-    """Whether the folder has a preprocessor_config.json."""
+    """graph of prompts"""
+    mean: tuple[float, ...]
+    """mean of RGB in 0..1"""
+    std: tuple[float, ...]
+    """standard deviation of RGB in 0..1"""
     side: int | None = None
-    """Side of the square image in px by that file, or None."""
+    """side of the square image in px, or None"""
 
 
 def find_sam(folder: str | Path, precision: Precision | None = None) -> SamFiles:
-    """Finds the graphs of the SAM model in a folder, or in its subfolder `onnx`.
+    """Finds the files of the SAM model in a folder.
 
     Args:
       folder: The folder.
-      precision: Precision of its graphs; None takes the highest that is there.
+      precision: Precision of its graphs, if the folder has such ones; else the highest that is there.
 
     Returns:
       The files, and how the model takes colours.
 
     Raises:
-      InputError: A graph is missing, or the configuration cannot be read.
+      InputError: A file is missing, or the configuration cannot be read.
     """
-    folder = Path(folder)
-    pairs = [
-        SamFiles(place / encoder, place / decoder)
-        for encoder, decoder in graph_variants((ENCODER, DECODER), precision)
-        for place in (folder, folder / "onnx")
-    ]
-    files = next((pair for pair in pairs if pair.encoder.is_file() and pair.decoder.is_file()), None)
-    if files is None:
-        graphs = [path for p in (folder, folder / "onnx") if p.is_dir() for path in sorted(p.glob("*.onnx"))]
-        problem = ", ".join(str(path.relative_to(folder)) for path in graphs) or "no .onnx file"
-        raise InputError(folder, problem, f"SAM's graphs {ENCODER} and {DECODER}", PUBLISHED)
-    if not (folder / CONFIG).is_file():
-        return files
-    mean, std, side = read_preprocessing(folder / CONFIG, complete=True)
-    is_default = np.allclose(np.multiply((mean, std), 255), MEAN_STD, rtol=1e-5)
-    colours = None if is_default else (mean, std)
-    return dataclasses.replace(files, colours=colours, configured=True, side=side)
+    try:
+        encoder, decoder, config = find_files(folder, "segmenter", precision)
+    except NoSuchFilesError:
+        encoder, decoder, config = find_files(folder, "segmenter")
+    return SamFiles(encoder, decoder, *read_preprocessing(config))
 
 
 class EncodedFrame(NamedTuple):
@@ -125,7 +101,6 @@ class SamGraphs:
     Args:
       files: The model's files.
       batch: Number of prompts of one run of the decoder, if it does not fix it.
-      threads: Number of cores of one run, as for `Graph`.
 
     Attributes:
       batch: Number of prompts of one run.
@@ -136,16 +111,13 @@ class SamGraphs:
       InputError: A graph has other tensors than SAM.
     """
 
-    def __init__(self, files: SamFiles, *, batch: int = BATCH, threads: int | None = None):
+    def __init__(self, files: SamFiles, *, batch: int = BATCH):
         self.files = files
-        self._encoder = Graph(files.encoder, threads=threads)
-        self._decoder = Graph(files.decoder, threads=threads)
+        self._encoder = Graph(files.encoder)
+        self._decoder = Graph(files.decoder)
         image = self._encoder.require("input", "pixel_values", (1, 3, None, None), "SAM's image encoder")
         inputs = self._decoder.inputs
         self.stretched = "image_embeddings.0" in inputs
-        if self.stretched and not files.configured:
-            problem, remedy = "a decoder of SAM 2", f"Fetch {CONFIG} into the model's folder."
-            raise InputError(files.decoder, problem, f"{CONFIG} in its folder: means and deviations", remedy)
         what = "SAM's mask decoder"
         points = self._decoder.require("input", "input_points", (1, None, None, 2), what)
         self._decoder.require("input", "input_labels", (1, None, None), what)
@@ -155,29 +127,17 @@ class SamGraphs:
             raise self._not_three_masks(str(masks))
         self._fixed_batch = 1 if "input_boxes" in inputs else points.fixed(1)
         self.batch = self._fixed_batch or batch
-        self.side = image.fixed(3) or (files.side if self.stretched else None) or IMAGE_SIDE
-        self._links = self._checked_links()
-        self._mean, self._std = MEAN_STD if files.colours is None else np.multiply(files.colours, 255).astype("f4")
+        self.side = image.fixed(3) or files.side or IMAGE_SIDE
+        self._links = [name for name in inputs if name not in ("input_points", "input_labels", "input_boxes")]
+        for name in self._links:
+            what = f"the encoder that {files.decoder.name} belongs to"
+            self._encoder.require("output", name, inputs[name].shape or (), what)
+        self._mean, self._std = 255 * np.asarray((files.mean, files.std), np.float32)
 
     def _not_three_masks(self, problem: str) -> InputError:
         expected = "3 or 4 masks per prompt, from the smallest part to the whole, each with its score"
         where = f"{self.files.decoder}, output 'pred_masks'"
         return InputError(where, problem, expected, "Export the decoder with all of its masks.")
-
-    def _checked_links(self) -> list[str]:
-        """Names of what the decoder takes from the encoder."""
-        prompts = ("input_points", "input_labels", "input_boxes")
-        links = [name for name in self._decoder.inputs if name not in prompts]
-        for name in links:
-            if name not in self._encoder.outputs:
-                outputs = describe(self._encoder.outputs.values())
-                problem = f"no such output of {self.files.encoder.name}, which gives {outputs}"
-                where = f"{self.files.decoder}, input {name!r}"
-                raise InputError(where, problem, str(self._decoder.inputs[name]), _TOGETHER)
-            shape = self._decoder.inputs[name].shape
-            if shape is not None:
-                self._encoder.require("output", name, shape, f"the encoder that {self.files.decoder.name} belongs to")
-        return links
 
     def encode(self, frame: UInt8[np.ndarray, "h w 3"]) -> EncodedFrame:
         """Encodes a frame.
@@ -209,24 +169,20 @@ class SamGraphs:
           points: (P, 2) points x, y in px of the frame.
 
         Yields:
-          Mask logits (B, 3, L, L) from part to whole, and predicted IoUs (B, 3).
+          Mask logits (B, 3, L, L) from part to whole, and predicted IoUs (B, 3). Of four masks the first is left out:
+          it is SAM's one mask for several points.
         """
         scaled = points * np.divide(encoded.scaled[::-1], encoded.size[::-1], dtype=np.float32)
-        for part, count in batches(scaled, self._fixed_batch, self.batch):
-            masks, scores = self._run_decoder(encoded, part)
-            yield masks[:count], scores[:count]
-
-    def _run_decoder(self, encoded: EncodedFrame, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mask logits (B, 3, L, L) and predicted IoUs (B, 3) of points (B, 2) in px of the encoder's square."""
-        labels_dtype = np.int64 if self._decoder.inputs["input_labels"].dtype.startswith("int") else np.float32
-        feeds = {"input_points": points[None, :, None], "input_labels": np.ones((1, len(points), 1), labels_dtype)}
+        feeds = dict(encoded.features)
         if "input_boxes" in self._decoder.inputs:
             feeds["input_boxes"] = np.zeros((1, 0, 4), np.float32)
-        outputs = self._decoder.run(encoded.features | feeds, ["pred_masks", "iou_scores"])
-        masks, scores = outputs["pred_masks"][0], outputs["iou_scores"][0]
-        if masks.shape[:2] != scores.shape or masks.shape[1] not in (3, 4):
-            raise self._not_three_masks(f"{list(masks.shape)} with scores {list(scores.shape)}")
-        return masks[:, -3:].astype(np.float32), scores[:, -3:].astype(np.float32)  # of 4, the first is SAM's best
+        for part, count in batches(scaled, self._fixed_batch, self.batch):
+            prompts = {"input_points": part[None, :, None], "input_labels": np.ones((1, len(part), 1), np.int64)}
+            outputs = self._decoder.run(feeds | prompts, ["pred_masks", "iou_scores"])
+            masks, scores = outputs["pred_masks"][0], outputs["iou_scores"][0]
+            if masks.shape[:2] != scores.shape or masks.shape[1] not in (3, 4):
+                raise self._not_three_masks(f"{list(masks.shape)} with scores {list(scores.shape)}")
+            yield masks[:count, -3:].astype(np.float32), scores[:count, -3:].astype(np.float32)
 
     def to_frame(self, logits: Float32[np.ndarray, "l l"], encoded: EncodedFrame) -> Float32[np.ndarray, "h w"]:
         """Resizes the logits of a mask to the frame, bilinearly, through the encoder's square as SAM does.
@@ -300,12 +256,6 @@ class SamSettings:
     """Overlap of neighbouring crops, as a share of the frame's shorter side."""
     least_area: int = 100
     """px; smaller holes are filled, smaller islands removed."""
-    mask_iou: float = 0.8
-    """As in `langsplat_nms`."""
-    mask_score: float = 0.7
-    """As in `langsplat_nms`."""
-    mask_inner: float = 0.5
-    """As in `langsplat_nms`."""
 
 
 class SamSegmenter:
@@ -314,33 +264,23 @@ class SamSegmenter:
     The graphs are opened when first needed and stay open until `close`.
 
     Args:
-      model: The model folder, or its files.
+      files: The model's files.
       settings: Settings of the mask generator.
       batch: Number of prompts of one run, as for `SamGraphs`.
-      threads: Number of cores of one run, as for `Graph`.
 
     Attributes:
       name: Follows from the content of the files and the settings.
 
     Raises:
-      InputError: The folder holds no SAM model. Methods raise it if a graph has other tensors than SAM.
+      InputError: A file cannot be read. Methods raise it if a graph has other tensors than SAM.
     """
 
-    def __init__(
-        self,
-        model: str | Path | SamFiles,
-        settings: SamSettings | None = None,
-        *,
-        batch: int = BATCH,
-        threads: int | None = None,
-    ):
-        self.files = model if isinstance(model, SamFiles) else find_sam(model)
+    def __init__(self, files: SamFiles, settings: SamSettings | None = None, *, batch: int = BATCH):
+        self.files = files
         self.settings = settings or SamSettings()
-        graphs = [*graph_files(self.files.encoder), *graph_files(self.files.decoder)]
-        extra = repr(self.settings) if self.files.colours is None else f"{self.settings}{self.files.colours}"
-        self.name = f"sam-{content_digest(graphs, extra=extra)}"
+        graphs = [*graph_files(files.encoder), *graph_files(files.decoder)]
+        self.name = f"sam-{content_digest(graphs, extra=f'{self.settings}{files.mean}{files.std}')}"
         self._batch = batch
-        self._threads = threads
 
     def __call__(self, frame: UInt8[np.ndarray, "h w 3"], index: int) -> Bool[np.ndarray, "m h w"]:
         """Segments a frame.
@@ -352,26 +292,34 @@ class SamSegmenter:
         Returns:
           (M, H, W) masks of the level, best score first; they may overlap.
         """
-        level = self.settings.level
-        return self.levels(frame, (level,))[level][0]
+        return self.segment(frame)[0]
 
-    def levels(
-        self, frame: UInt8[np.ndarray, "h w 3"], levels: Sequence[Level] = ("default", "s", "m", "l")
-    ) -> dict[str, tuple[Bool[np.ndarray, "m h w"], Float64[np.ndarray, " m"]]]:
-        """Segments a frame at several levels, with one run of the prompts.
+    def segment(self, frame: UInt8[np.ndarray, "h w 3"]) -> tuple[Bool[np.ndarray, "m h w"], Float64[np.ndarray, " m"]]:
+        """Segments a frame.
 
         Args:
           frame: (H, W, 3) RGB.
-          levels: The levels.
 
         Returns:
-          Masks (M, H, W) and scores (M,), stability times predicted IoU, of each level, best first.
+          Masks (M, H, W) and their scores (M,), stability times predicted IoU, best first.
         """
-        tokens = sorted({token for level in levels for token in TOKENS[level]})
+        settings = self.settings
         height, width = frame.shape[:2]
-        crops = crops_of(height, width, self.settings.crop_layers, self.settings.crop_overlap)
-        by_crop = [list(self._candidates(frame, crop, tokens)) for crop in crops]
-        return {level: self._filtered((height, width), by_crop, TOKENS[level]) for level in levels}
+        left: list[_Candidate] = []
+        for crop in crops_of(height, width, settings.crop_layers, settings.crop_overlap):
+            of_crop = list(self._candidates(frame, crop))
+            left += self._without_repetitions(of_crop, [c.iou for c in of_crop])
+        # Of what several crops show, the smaller crop's is the finer; one crop stays as it is.
+        left = self._without_repetitions(left, [1.0 / c.crop.area for c in left])
+        masks, changed = np.zeros((len(left), height, width), bool), np.zeros(len(left), bool)
+        for n, candidate in enumerate(left):
+            masks[n], changed[n] = remove_small_regions(_unpacked(candidate.bits, height, width), settings.least_area)
+        boxes = np.asarray([box_of(mask) for mask in masks], np.float64).reshape(-1, 4)
+        kept = np.sort(box_nms(boxes, 1.0 - changed, settings.box_iou))
+        masks = masks[kept]
+        scores = np.asarray([left[i].iou * left[i].stability for i in kept], np.float64)
+        kept = langsplat_nms(masks, scores)
+        return masks[kept], scores[kept]
 
     def check(self) -> None:
         """Opens and closes the graphs.
@@ -388,33 +336,38 @@ class SamSegmenter:
 
     @functools.cached_property
     def _graphs(self) -> SamGraphs:
-        return SamGraphs(self.files, batch=self._batch, threads=self._threads)
+        return SamGraphs(self.files, batch=self._batch)
 
-    def _candidates(self, frame: np.ndarray, crop: Crop, tokens: Sequence[int]) -> Iterable[_Candidate]:
+    def _without_repetitions(self, candidates: list[_Candidate], scores: list[float]) -> list[_Candidate]:
+        """Returns the candidates whose boxes do not repeat one of a higher score, best first."""
+        boxes = np.asarray([c.box for c in candidates], np.float64).reshape(-1, 4)
+        return [candidates[i] for i in box_nms(boxes, np.asarray(scores), self.settings.box_iou)]
+
+    def _candidates(self, frame: np.ndarray, crop: Crop) -> Iterator[_Candidate]:
         """Yields the masks of one crop that are good, stable and not cut off, in the order of the points."""
         part = np.ascontiguousarray(frame[crop.top : crop.bottom, crop.left : crop.right])
         encoded = self._graphs.encode(part)
         if self.settings.prompts == "grid":
             points = point_grid(self.settings.points_per_side) * np.array([part.shape[1], part.shape[0]], np.float32)
-            yield from (candidate for _, candidate in self._predicted(frame, crop, encoded, points, tokens))
+            yield from (candidate for _, candidate in self._predicted(frame, crop, encoded, points))
             return
+        tokens = TOKENS[self.settings.level]
         prompts = GuidedPrompts(part, len(tokens))
         while len(points := prompts.next_points()):
-            for number, candidate in self._predicted(frame, crop, encoded, points, tokens):
-                mask = np.unpackbits(candidate.bits, count=frame[..., 0].size).reshape(frame.shape[:2]).astype(bool)
-                shown = mask[crop.top : crop.bottom, crop.left : crop.right]
-                prompts.explain(tokens.index(candidate.token), points[number], shown)
+            for number, candidate in self._predicted(frame, crop, encoded, points):
+                mask = _unpacked(candidate.bits, *frame.shape[:2])[crop.top : crop.bottom, crop.left : crop.right]
+                prompts.explain(tokens.index(candidate.token), points[number], mask)
                 yield candidate
 
     def _predicted(
-        self, frame: np.ndarray, crop: Crop, encoded: EncodedFrame, points: np.ndarray, tokens: Sequence[int]
+        self, frame: np.ndarray, crop: Crop, encoded: EncodedFrame, points: np.ndarray
     ) -> Iterator[tuple[int, _Candidate]]:
         """Yields the masks of points (P, 2) in px of a crop, each with the number of its point."""
         height, width = frame.shape[:2]
         start = 0
         for logits, ious in self._graphs.decode(encoded, points):
             for prompt, token in zip(*np.nonzero(ious > self.settings.predicted_iou)):
-                if token not in tokens:
+                if token not in TOKENS[self.settings.level]:
                     continue
                 mask_logits = self._graphs.to_frame(logits[prompt, token], encoded)
                 steady = stability(mask_logits, self.settings.stability_offset)
@@ -428,38 +381,9 @@ class SamSegmenter:
                     yield start + prompt, _Candidate(np.packbits(mask), box, iou, steady, int(token), crop)
             start += len(ious)
 
-    def _filtered(
-        self, size: tuple[int, int], by_crop: list[list[_Candidate]], tokens: tuple[int, ...]
-    ) -> tuple[Bool[np.ndarray, "m h w"], Float64[np.ndarray, " m"]]:
-        """Filters the candidates of some tokens; returns masks and scores."""
-        settings = self.settings
-        left: list[_Candidate] = []
-        for candidates in by_crop:
-            mine = [c for c in candidates if c.token in tokens]
-            left += [mine[i] for i in box_nms(_boxes(mine), np.asarray([c.iou for c in mine]), settings.box_iou)]
-        # Of what several crops show, the smaller crop's is the finer; with one crop this changes nothing.
-        fineness = np.asarray([1.0 / c.crop.area for c in left])
-        left = [left[i] for i in box_nms(_boxes(left), fineness, settings.box_iou)]
-        masks, changed = np.zeros((len(left), *size), bool), np.zeros(len(left), bool)
-        for n, candidate in enumerate(left):
-            mask = np.unpackbits(candidate.bits, count=size[0] * size[1]).reshape(size).astype(bool)
-            masks[n], changed[n] = remove_small_regions(mask, settings.least_area)
-        boxes = np.asarray([box_of(mask) for mask in masks], np.float64).reshape(-1, 4)
-        kept = np.sort(box_nms(boxes, 1.0 - changed, settings.box_iou))
-        masks = masks[kept]
-        scores = np.asarray([left[i].iou * left[i].stability for i in kept], np.float64)
-        kept = langsplat_nms(
-            masks,
-            scores,
-            iou_threshold=settings.mask_iou,
-            score_threshold=settings.mask_score,
-            inner_threshold=settings.mask_inner,
-        )
-        return masks[kept], scores[kept]
 
-
-def _boxes(candidates: list[_Candidate]) -> Float64[np.ndarray, "m 4"]:
-    return np.asarray([c.box for c in candidates], np.float64).reshape(-1, 4)
+def _unpacked(bits: np.ndarray, height: int, width: int) -> Bool[np.ndarray, "h w"]:
+    return np.unpackbits(bits, count=height * width).reshape(height, width).astype(bool)
 
 
 def point_grid(side: int) -> Float32[np.ndarray, "p 2"]:
@@ -502,27 +426,17 @@ def crops_of(height: int, width: int, layers: int, overlap: float) -> list[Crop]
     return crops
 
 
-def langsplat_nms(
-    masks: Bool[np.ndarray, "m h w"],
-    scores: Float[np.ndarray, " _"],
-    *,
-    iou_threshold: float = 0.8,
-    score_threshold: float = 0.7,
-    inner_threshold: float = 0.5,
-) -> Int64[np.ndarray, " k"]:
+def langsplat_nms(masks: Bool[np.ndarray, "m h w"], scores: Float[np.ndarray, " _"]) -> Int64[np.ndarray, " k"]:
     """LangSplat's suppression of masks by masks.
 
-    A mask is kept if its score is high enough, no better mask repeats it, and it lies inside of no other: at least 0.85
-    of it in a mask of which that is less than half, with 1 - (share of it) * (share of the other) above
-    1 - `inner_threshold`. A mask that is itself dropped still suppresses. Of equal scores the earlier counts as better.
-    Empty masks are dropped.
+    A mask is kept if its score is above 0.7, no better mask has an IoU above 0.8 with it, and it lies inside of no
+    other: at least 0.85 of it in a mask of which that is less than half, with (share of it) * (share of the other)
+    below 0.5. A mask that is itself dropped still suppresses. Of equal scores the earlier counts as better. Empty masks
+    are dropped.
 
     Args:
       masks: (M, H, W).
       scores: (M,), stability times predicted IoU.
-      iou_threshold: A mask with a higher IoU with a better one is dropped.
-      score_threshold: A mask needs a higher score.
-      inner_threshold: Share for masks inside of others.
 
     Returns:
       (K,) indices of the masks that are kept, best score first.
@@ -540,10 +454,7 @@ def langsplat_nms(
     inside = (share.T >= 0.85) & (share < 0.5)  # [i, j]: j lies in i, and is less than half of it
     inner = np.where(inside, 1.0 - share * share.T, 0.0)
     kept = (
-        (overlap.max(0, initial=0.0) <= iou_threshold)
-        & (scores[order] > score_threshold)
-        & (inner.max(0, initial=0.0) <= 1.0 - inner_threshold)
-        & (area > 0)
+        (overlap.max(0, initial=0.0) <= 0.8) & (scores[order] > 0.7) & (inner.max(0, initial=0.0) <= 0.5) & (area > 0)
     )
     return order[kept]
 
@@ -557,10 +468,7 @@ def shared_areas(masks: Bool[np.ndarray, "m h w"]) -> Float64[np.ndarray, "m m"]
     Returns:
       (M, M) numbers of pixels; the diagonal has the areas.
     """
-    flat = masks.reshape(len(masks), masks.shape[1] * masks.shape[2])
-    columns = np.flatnonzero(flat) % max(flat.shape[1], 1)
-    ends = np.concatenate([[0], np.cumsum(np.count_nonzero(flat, axis=1))])
-    rows = sparse.csr_matrix((np.ones(len(columns), np.int32), columns, ends), shape=flat.shape)
+    rows = sparse.csr_matrix(masks.reshape(len(masks), masks.shape[1] * masks.shape[2])).astype(np.int32)
     return (rows @ rows.T).toarray().astype(np.float64)
 
 

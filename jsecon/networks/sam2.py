@@ -1,7 +1,7 @@
 """Tracker by SAM 2.1 or EdgeTAM on ONNX Runtime: masks of one frame are followed through all frames.
 
 The model folder is the public export of five graphs with constants.json (square-zero-labs/sam2.1-tiny-video-onnx,
-jax-image-tools/edgetam-video-onnx), the graphs in it or in its subfolder `onnx`:
+jax-image-tools/edgetam-video-onnx):
     vision_encoder     a frame -> its features at three scales, the coarsest also as a prompted frame's (feats2_no_mem)
     mask_decoder       features and points -> mask logits, score of the object's presence, object pointer
     memory_encoder     features and mask -> K memory tokens of M numbers
@@ -29,6 +29,7 @@ from PIL import Image
 
 from jsecon.errors import InputError, require
 from jsecon.files import read_json, reading
+from jsecon.networks.hub import find_files, published
 from jsecon.networks.session import Graph, content_digest, graph_files
 from jsecon.numerics import is_finite_and_bounded
 
@@ -38,13 +39,10 @@ POINTERS = 16
 """object pointers that a frame attends to, the prompted one among them"""
 MASK_LOGIT = 10.0
 """logit of a pixel of a mask prompt; its negative outside"""
+HOLE_AREA = 8
+"""pixels of a low-resolution mask: holes up to this size are filled"""
 KEPT_FRAMES = 16
 """frames whose features a tracker keeps for later calls, about 16 MiB each at 1024 px"""
-CONSTANTS = "constants.json"
-PUBLISHED = (
-    "Folders of this kind are published on huggingface.co: square-zero-labs/sam2.1-tiny-video-onnx, "
-    "jax-image-tools/edgetam-video-onnx."
-)
 
 Shape = tuple[int | str | None, ...]
 # Letters are sizes that must agree across the files: S image, G grid of the coarsest features, T = G^2, C channels, M
@@ -103,29 +101,15 @@ class Sam2Graphs:
 
 
 def _sam2_files(folder: Path) -> dict[str, Path]:
-    """Finds the five graphs and constants.json by name.
-
-    Raises:
-      InputError: A file is missing.
-    """
-    folder = Path(folder)
-    names = [*(f"{name}.onnx" for name in SIGNATURES), CONSTANTS]
-    files = {
-        path.name: path for place in (folder / "onnx", folder) for name in names if (path := place / name).is_file()
-    }
-    missing = [name for name in names if name not in files]
-    if missing:
-        problem = f"no {', '.join(missing)}"
-        raise InputError(folder, problem, "SAM 2's five graphs and constants.json", PUBLISHED)
-    return files
+    """Finds the five graphs and constants.json, by the names of the files without their endings."""
+    return {path.stem: path for path in find_files(folder, "tracker")}
 
 
-def open_sam2(folder: Path, *, threads: int | None = None) -> Sam2Graphs:
+def open_sam2(folder: Path) -> Sam2Graphs:
     """Opens the model in a folder.
 
     Args:
       folder: The folder.
-      threads: Number of cores of one run, as for `Graph`.
 
     Returns:
       The graphs, with the sizes that they agree on.
@@ -134,15 +118,17 @@ def open_sam2(folder: Path, *, threads: int | None = None) -> Sam2Graphs:
       InputError: A file is missing or damaged, or its tensors do not fit the rest of the folder.
     """
     files = _sam2_files(folder)
-    constants = _read_constants(files[CONSTANTS])
-    graphs = {name: Graph(files[f"{name}.onnx"], threads=threads) for name in SIGNATURES}
+    constants = _read_constants(files["constants"])
+    graphs = {name: Graph(files[name]) for name in SIGNATURES}
     encoder, decoder = graphs["vision_encoder"], graphs["mask_decoder"]
     image = encoder.require("input", "pixel_values", (1, 3, None, None), "SAM 2's vision encoder")
     # Sizes are those of inputs: PyTorch's exporter leaves some sizes of the encoder's outputs open.
     features = decoder.require("input", "feats2_cond", (1, None, None, None), "SAM 2's mask decoder")
     side, channels, grid = image.fixed(2), features.fixed(1), features.fixed(2)
     if side is None or channels is None or grid is None:
-        raise InputError(decoder.path, f"{image} and {features}", "an image and features of fixed sizes", PUBLISHED)
+        raise InputError(
+            decoder.path, f"{image} and {features}", "an image and features of fixed sizes", published("tracker")
+        )
     sizes = {"S": side, "C": channels, "G": grid, "T": grid * grid, "M": constants.temporal_code.shape[1]}
     for name, graph in graphs.items():
         for tensors, kind in zip(SIGNATURES[name], ("input", "output")):
@@ -154,48 +140,25 @@ def open_sam2(folder: Path, *, threads: int | None = None) -> Sam2Graphs:
 
 def _read_constants(path: Path) -> Constants:
     expected = f"image_mean, image_std and memory_temporal_positional_encoding of {SLOTS} rows"
-    content = read_json(path, expected, PUBLISHED)
-    with reading(path, expected, PUBLISHED):
+    remedy = published("tracker")
+    content = read_json(path, expected, remedy)
+    with reading(path, expected, remedy):
         names = ("image_mean", "image_std", "memory_temporal_positional_encoding")
         constants = Constants(*(np.asarray(content[name], np.float32) for name in names))
     shapes = [array.shape for array in constants]
     fits = shapes[:2] == [(3,), (3,)] and len(shapes[2]) == 2 and shapes[2][0] == SLOTS and shapes[2][1] > 0
     if not fits or not is_finite_and_bounded(*constants) or constants.std.min() <= 0:
-        raise InputError(path, f"shapes {shapes}, or numbers that are not finite", expected, PUBLISHED)
+        raise InputError(path, f"shapes {shapes}, or numbers that are not finite", expected, remedy)
     return constants
 
 
-class FrameFeatures(NamedTuple):
-    """Output of the vision encoder for a frame, shared by all objects."""
-
-    feats0: np.ndarray
-    """(1, C/8, 4 G, 4 G)"""
-    feats1: np.ndarray
-    """(1, C/4, 2 G, 2 G)"""
-    feats2: np.ndarray
-    """(1, C, G, G)"""
-    feats2_no_mem: np.ndarray
-    """(1, C, G, G) of a prompted frame"""
-    vision_pos_embed: np.ndarray
-    """(1, C, G, G), the same in every frame"""
+FrameFeatures = Mapping[str, np.ndarray]
+"""output of the vision encoder for a frame, by name, shared by all objects"""
 
 
-@dataclasses.dataclass(frozen=True)
-class Prompt:
-    """What points out an object in a frame: a mask, or points."""
-
-    mask: np.ndarray | None = None
-    """(H, W) bool, or None."""
-    points: np.ndarray | None = None
-    """(P, 2) x, y in px of the frame, or None."""
-    labels: np.ndarray | None = None
-    """(P,) 1 inside, 0 outside, 2 and 3 the corners of a box (top left, bottom right)."""
-
-    def __post_init__(self):
-        """Checks that the graphs fit each other."""
-        present = [value is not None for value in (self.mask, self.points, self.labels)]
-        fits = present in ([True, False, False], [False, True, True])
-        require(fits, "Prompt", f"mask, points, labels: {present}", "a mask, or points with labels", "Use one of both.")
+Points = tuple[np.ndarray, np.ndarray]
+"""(P, 2) x, y in px of the frame, and their labels (P,): 1 inside, 0 outside, 2 and 3 the corners of a box (top left,
+bottom right)"""
 
 
 class _Prediction(NamedTuple):
@@ -291,8 +254,6 @@ class Sam2Tracker:
 
     Args:
       folder: The model folder.
-      hole_area: Holes of at most this many pixels of the low-resolution mask are filled.
-      threads: Number of cores of one run, as for `Graph`.
 
     Attributes:
       name: Follows from the content of the files and the settings.
@@ -301,18 +262,16 @@ class Sam2Tracker:
       InputError: A file is missing. Methods raise it if the files do not make one model.
     """
 
-    def __init__(self, folder: Path, *, hole_area: int = 8, threads: int | None = None):
+    def __init__(self, folder: Path):
         files = _sam2_files(folder)
-        graphs = [part for name in SIGNATURES for part in graph_files(files[f"{name}.onnx"])]
-        self.name = f"sam2-{content_digest([*graphs, files[CONSTANTS]], extra=repr(hole_area))}"
-        self.hole_area = hole_area
+        graphs = [part for name in SIGNATURES for part in graph_files(files[name])]
+        self.name = f"sam2-{content_digest([*graphs, files['constants']], extra=repr(HOLE_AREA))}"
         self._folder = folder
-        self._threads = threads
 
     @functools.cached_property
     def graphs(self) -> Sam2Graphs:
         """The open graphs."""
-        return open_sam2(self._folder, threads=self._threads)
+        return open_sam2(self._folder)
 
     @functools.cached_property
     def _encode(self) -> "FrameEncoder":
@@ -324,7 +283,7 @@ class Sam2Tracker:
         Raises:
           InputError: The files do not make one model.
         """
-        open_sam2(self._folder, threads=self._threads)
+        open_sam2(self._folder)
 
     def close(self) -> None:
         """Closes the graphs and frees their memory; they are opened again when needed."""
@@ -354,9 +313,10 @@ class Sam2Tracker:
         if not objects:
             return labels
         numbers = np.array([*objects, -1], np.int16)
-        masks = [Prompt(prompts[b]) for b in objects]
-        for t, logits in follow(self.graphs, frames, index, masks, hole_area=self.hole_area, encode=self._encode):
-            labels[t] = numbers[_strongest(logits, (height, width))]
+        masks = [prompts[b] for b in objects]
+        for t, logits in follow(self.graphs, frames, index, masks, encode=self._encode):
+            filled = [fill_holes(each, HOLE_AREA) for each in logits]
+            labels[t] = numbers[_strongest(filled, (height, width))]
         return labels
 
 
@@ -381,7 +341,7 @@ class FrameEncoder:
             small = np.asarray(Image.fromarray(frame).resize((side, side), Image.Resampling.BICUBIC))
             image = ((small / 255.0).astype(np.float32) - constants.mean) / constants.std
             outputs = self._graphs._run("vision_encoder", pixel_values=image.transpose(2, 0, 1)[None])
-            self._known[key] = FrameFeatures(*(outputs[name] for name in FrameFeatures._fields))
+            self._known[key] = {name: outputs[name] for name in SIGNATURES["vision_encoder"][1]}
         self._known.move_to_end(key)
         while len(self._known) > self._keep:
             self._known.popitem(last=False)
@@ -392,9 +352,7 @@ def follow(
     graphs: Sam2Graphs,
     frames: np.ndarray,
     start: int,
-    prompts: Sequence[Prompt],
-    *,
-    hole_area: int = 8,
+    prompts: Sequence[np.ndarray | Points],
     encode: FrameEncoder | None = None,
 ) -> Iterator[tuple[int, list[np.ndarray]]]:
     """Follows objects from a prompted frame to the last, then back to the first.
@@ -403,8 +361,7 @@ def follow(
       graphs: The model.
       frames: (T, H, W, 3) uint8, anything that is indexed by frame and has a shape, such as a memory map.
       start: The prompted frame.
-      prompts: One prompt of each object.
-      hole_area: As for `Sam2Tracker`.
+      prompts: Mask (H, W) bool or points of each object in that frame.
       encode: Encoder that keeps features of frames; by default a new one.
 
     Yields:
@@ -424,7 +381,7 @@ def follow(
         memory, position = _memorize(graphs, features, prediction, binarize=True)
         banks.append(Bank(start, memory))
     require(position is not None, "follow", "no prompt", "at least one", "Prompt an object.")
-    yield start, [fill_holes(prediction.logits, hole_area) for prediction in first]
+    yield start, [prediction.logits for prediction in first]
     for step, order in ((1, range(start + 1, count)), (-1, range(start - 1, -1, -1))):
         for t in order:
             features = encode(frames[t])
@@ -433,22 +390,24 @@ def follow(
                 prediction = _tracked(graphs, features, bank, t, step, count, position)
                 memory, _ = _memorize(graphs, features, prediction, binarize=False)
                 banks[number] = bank.with_tracked(t, memory, step)
-                logits.append(fill_holes(prediction.logits, hole_area))
+                logits.append(prediction.logits)
             yield t, logits
 
 
-def _prompted(graphs: Sam2Graphs, features: FrameFeatures, prompt: Prompt, size: tuple[int, int]) -> _Prediction:
+def _prompted(
+    graphs: Sam2Graphs, features: FrameFeatures, prompt: np.ndarray | Points, size: tuple[int, int]
+) -> _Prediction:
     """Predicts the object of a prompt in a frame of size (H, W) from that frame alone."""
     side = graphs.sizes["S"]
     scale = np.array([side / size[1], side / size[0]], np.float32)
-    if prompt.mask is None:
-        points = np.asarray(prompt.points, np.float32) * scale
-        return _decode(graphs, features, features.feats2_no_mem, points, np.asarray(prompt.labels))
-    rows, columns = np.flatnonzero(prompt.mask.any(1)), np.flatnonzero(prompt.mask.any(0))
-    require(len(rows) > 0, "Prompt", "an empty mask", "at least one pixel", "Leave out empty masks.")
+    if isinstance(prompt, tuple):
+        points, labels = prompt
+        return _decode(graphs, features, features["feats2_no_mem"], np.asarray(points, np.float32) * scale, labels)
+    rows, columns = np.flatnonzero(prompt.any(1)), np.flatnonzero(prompt.any(0))
+    require(len(rows) > 0, "follow", "an empty mask", "at least one pixel", "Leave out empty masks.")
     box = np.array([[columns[0], rows[0]], [columns[-1] + 1, rows[-1] + 1]], np.float32) * scale
-    decoded = _decode(graphs, features, features.feats2_no_mem, box, np.array([2, 3]))
-    mask = np.where(_resize(prompt.mask.astype(np.float32), side) >= 0.5, MASK_LOGIT, -MASK_LOGIT).astype(np.float32)
+    decoded = _decode(graphs, features, features["feats2_no_mem"], box, np.array([2, 3]))
+    mask = np.where(_resize(prompt.astype(np.float32), side) >= 0.5, MASK_LOGIT, -MASK_LOGIT).astype(np.float32)
     return _Prediction(
         _resize(mask, len(decoded.logits)), mask, decoded.pointer, np.full((1, 1), MASK_LOGIT, np.float32)
     )
@@ -472,8 +431,8 @@ def _tracked(
     codes = [position + graphs.constants.temporal_code[row] for row, _ in memories]
     conditioned = graphs._run(
         "memory_attention",
-        current_vision_features=_as_tokens(features.feats2),
-        current_vision_position_embeddings=_as_tokens(features.vision_pos_embed),
+        current_vision_features=_as_tokens(features["feats2"]),
+        current_vision_position_embeddings=_as_tokens(features["vision_pos_embed"]),
         memory=np.concatenate([*tokens, pointer_tokens])[:, None],
         memory_pos=np.concatenate([*codes, np.repeat(ages, graphs.sizes["C"] // width, axis=0)])[:, None],
     )["conditioned_feats"]
@@ -486,8 +445,8 @@ def _decode(
     """Runs the mask decoder with points (P, 2) in px of the square image; it chooses among its masks by itself."""
     outputs = graphs._run(
         "mask_decoder",
-        feats0=features.feats0,
-        feats1=features.feats1,
+        feats0=features["feats0"],
+        feats1=features["feats1"],
         feats2_cond=image,
         input_points=points[None, None],
         input_labels=labels[None, None],
@@ -504,7 +463,7 @@ def _memorize(
     """Encodes the memory of an object in a frame, binary if it was prompted there; also returns its spatial code."""
     outputs = graphs._run(
         "memory_encoder",
-        feats2=features.feats2,
+        feats2=features["feats2"],
         high_res_mask=prediction.high_res[None, None],
         object_score_logits=prediction.score,
         binarize=np.asarray(binarize, np.float32),
@@ -528,8 +487,6 @@ def fill_holes(logits: np.ndarray, area: int) -> np.ndarray:
     Returns:
       (L, L) logits, 0.1 in the holes that were filled.
     """
-    if area <= 0:
-        return logits
     number, labels, stats, _ = cv2.connectedComponentsWithStats((logits <= 0).astype(np.uint8), connectivity=8)
     small = stats[:, cv2.CC_STAT_AREA] <= area
     small[0] = False  # label 0 is the object itself
@@ -540,20 +497,7 @@ def _strongest(logits: Sequence[np.ndarray], size: tuple[int, int]) -> np.ndarra
     """Returns (H, W) int16: the object with the highest of the logits (L, L) at each pixel, -1 if none is above 0."""
     best, label = np.zeros(size, np.float32), np.full(size, -1, np.int16)
     for number, low in enumerate(logits):
-        resized = at_size(low, size)
+        resized = cv2.resize(low, size[::-1])
         above = resized > best
         best[above], label[above] = resized[above], number
     return label
-
-
-def at_size(logits: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Resizes logits bilinearly.
-
-    Args:
-      logits: (L, L).
-      size: (H, W).
-
-    Returns:
-      (H, W) logits.
-    """
-    return cv2.resize(logits, size[::-1], interpolation=cv2.INTER_LINEAR)

@@ -15,7 +15,6 @@ The score of a query is sigmoid(pred_logits) sigmoid(presence_logit_dec), as in 
 It is tested on small graphs with these signatures, not on the published weights.
 """
 
-import dataclasses
 import functools
 from pathlib import Path
 from typing import NamedTuple
@@ -24,10 +23,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 from PIL import Image
+from scipy.special import expit
 
 from jsecon.errors import InputError, require
 from jsecon.networks.sam import shared_areas
-from jsecon.networks.session import Graph, Tensor, describe
+from jsecon.networks.session import Graph, Tensor
 from jsecon.networks.tokenizer import TextTokenizer
 
 IMAGE_SIDE = 1008
@@ -39,9 +39,8 @@ SCORE_THRESHOLD = 0.5
 MASK_IOU = 0.7
 """a mask with a higher IoU with a better one repeats it, as in samexporter"""
 PUBLISHED = (
-    "nrl-ai/samexporter-onnx-models on huggingface.co has such a folder, sam3, and samexporter.export_sam3 of "
-    "vietanhdev/samexporter on github.com writes one; put CLIP's tokenizer.json beside the graphs, such as that of "
-    "Xenova/clip-vit-base-patch16."
+    "vietanhdev/segment-anything-3-onnx-models and nrl-ai/samexporter-onnx-models (its folder sam3) of huggingface.co "
+    "have such graphs; put CLIP's tokenizer.json beside them, such as that of Xenova/clip-vit-base-patch16."
 )
 _GRAPHS = ("image_encoder.onnx", "language_encoder.onnx", "decoder.onnx")
 _WORDS = {"language_mask": "text_attention_mask", "language_features": "text_memory", "language_embeds": "text_embeds"}
@@ -59,20 +58,6 @@ _RAW: dict[str, tuple[int | None, ...]] = {
 }
 _FILTERED: dict[str, tuple[int | None, ...]] = {"scores": (None,), "masks": (None, 1, None, None)}
 _TOGETHER = "Take the three graphs from one export."
-
-
-@dataclasses.dataclass(frozen=True)
-class Sam3Files:
-    """Files of a SAM 3 model."""
-
-    image: Path
-    """Graph of frames."""
-    language: Path
-    """Graph of phrases."""
-    decoder: Path
-    """Graph of masks."""
-    tokenizer: Path
-    """CLIP's tokenizer.json."""
 
 
 class Sam3Frame(NamedTuple):
@@ -93,21 +78,6 @@ class PhraseMasks(NamedTuple):
     """SCORE_THRESHOLD to 1"""
 
 
-def _find_sam3(folder: str | Path) -> Sam3Files:
-    """Finds the files of the SAM 3 model in a folder."""
-    folder = Path(folder)
-    graphs = sorted(folder.glob("*.onnx"))
-    matches = [[path for path in graphs if path.name.endswith(ending)] for ending in _GRAPHS]
-    if any(len(paths) != 1 for paths in matches):
-        problem = ", ".join(path.name for path in graphs) or ("no .onnx file" if folder.is_dir() else "no such folder")
-        raise InputError(folder, problem, f"SAM 3's graphs, one *{', one *'.join(_GRAPHS)}", PUBLISHED)
-    tokenizer = folder / "tokenizer.json"
-    if not tokenizer.is_file():
-        raise InputError(folder, "SAM 3's graphs without a tokenizer", "CLIP's tokenizer.json", PUBLISHED)
-    (image,), (language,), (decoder,) = matches
-    return Sam3Files(image, language, decoder, tokenizer)
-
-
 class Sam3:
     """SAM 3 prompted by phrases: `sam3(frame, "red mug")`.
 
@@ -115,16 +85,25 @@ class Sam3:
     to encode a frame and 3 s per phrase on eight cores, and 8 to 13 GiB: encode a frame once for all phrases.
 
     Args:
-      model: The model folder, or its files.
-      threads: Number of cores of one run, as for `Graph`.
+      folder: The model folder.
 
     Raises:
       InputError: The folder holds no such model. Methods raise it if a graph has other tensors than SAM 3.
     """
 
-    def __init__(self, model: str | Path | Sam3Files, *, threads: int | None = None):
-        self.files = model if isinstance(model, Sam3Files) else _find_sam3(model)
-        self._threads = threads
+    def __init__(self, folder: str | Path):
+        folder = Path(folder)
+        graphs = sorted(folder.glob("*.onnx"))
+        matches = [[path for path in graphs if path.name.endswith(ending)] for ending in _GRAPHS]
+        if any(len(paths) != 1 for paths in matches):
+            names = ", ".join(path.name for path in graphs) or (
+                "no .onnx file" if folder.is_dir() else "no such folder"
+            )
+            raise InputError(folder, names, f"SAM 3's graphs, one *{', one *'.join(_GRAPHS)}", PUBLISHED)
+        (self._image_path,), (self._language_path,), (self._decoder_path,) = matches
+        self._tokenizer_path = folder / "tokenizer.json"
+        if not self._tokenizer_path.is_file():
+            raise InputError(folder, "SAM 3's graphs without a tokenizer", "CLIP's tokenizer.json", PUBLISHED)
 
     def __call__(self, frame: UInt8[np.ndarray, "h w 3"], phrase: str) -> PhraseMasks:
         """Returns the masks of what a noun phrase names in a frame (H, W, 3) RGB.
@@ -200,7 +179,7 @@ class Sam3:
             logits, presence = (
                 outputs[name].astype(np.float64).ravel() for name in ("pred_logits", "presence_logit_dec")
             )
-            scores, maps, level = _sigmoid(logits) * _sigmoid(presence), outputs["pred_masks"][0], 0.0
+            scores, maps, level = expit(logits) * expit(presence), outputs["pred_masks"][0], 0.0
         else:
             scores, maps, level = outputs["scores"], outputs["masks"][:, 0], 0.5
         order = np.argsort(-scores, kind="stable")
@@ -239,11 +218,11 @@ class Sam3:
 
     @functools.cached_property
     def _tokenizer(self) -> TextTokenizer:
-        return TextTokenizer(self.files.tokenizer)
+        return TextTokenizer(self._tokenizer_path)
 
     @functools.cached_property
     def _image(self) -> Graph:
-        graph = Graph(self.files.image, threads=self._threads)
+        graph = Graph(self._image_path)
         tensor = graph.require("input", "image", (3, None, None), "SAM 3's image encoder")
         if tensor.dtype != "uint8" or tensor.fixed(1) != tensor.fixed(2):
             where, expected = f"{graph.path}, input 'image'", "image uint8[3, S, S], as SAM 3's image encoder has"
@@ -252,7 +231,7 @@ class Sam3:
 
     @functools.cached_property
     def _language(self) -> Graph:
-        graph = Graph(self.files.language, threads=self._threads)
+        graph = Graph(self._language_path)
         graph.require("input", "tokens", (1, None), "SAM 3's language encoder")
         for name, shape in zip(_WORDS.values(), ((1, None), (None, 1, None), (None, 1, None))):
             graph.require("output", name, shape, "SAM 3's language encoder")
@@ -260,7 +239,7 @@ class Sam3:
 
     @functools.cached_property
     def _decoder(self) -> Graph:
-        graph, what = Graph(self.files.decoder, threads=self._threads), "SAM 3's decoder"
+        graph, what = Graph(self._decoder_path), "SAM 3's decoder"
         for name, shape in _BOXES.items():
             graph.require("input", name, shape, what)
         graph.require("input", "language_mask", (1, None), what)
@@ -268,10 +247,10 @@ class Sam3:
         for name, shape in (_RAW if "pred_logits" in graph.outputs else _FILTERED).items():
             graph.require("output", name, shape, what)
         for name, tensor in graph.inputs.items():
-            if name in _WORDS:
-                _check_link(tensor, graph, self._language, _WORDS[name])
-            elif name not in _BOXES and name not in _SIZE:
-                _check_link(tensor, graph, self._image, name)
+            if name not in _BOXES and name not in _SIZE:
+                encoder = self._language if name in _WORDS else self._image
+                what = f"the encoder that {graph.path.name} belongs to"
+                encoder.require("output", _WORDS.get(name, name), tensor.shape or (), what)
         return graph
 
     @property
@@ -282,7 +261,7 @@ class Sam3:
         """Raises InputError unless each query has a score and a mask, all finite."""
         counts = set()
         for name, shape in self._outputs.items():
-            array, where = outputs[name], f"{self.files.decoder}, output {name!r}"
+            array, where = outputs[name], f"{self._decoder_path}, output {name!r}"
             if array.ndim != len(shape) or not Tensor(name, "", shape).fits(array.shape):
                 raise InputError(where, f"shape {array.shape}", str(Tensor(name, "", shape)), _TOGETHER)
             if not np.isfinite(array).all():
@@ -291,15 +270,7 @@ class Sam3:
             counts |= {array.shape[axis] for axis, size in enumerate(shape[:2]) if size is None}
         if len(counts) != 1 or (counts != {0} and not all(array.size for array in outputs.values())):
             shapes = ", ".join(f"{name} {outputs[name].shape}" for name in self._outputs)
-            raise InputError(self.files.decoder, shapes, "a score and a mask of each query", _TOGETHER)
-
-
-def _check_link(tensor: Tensor, decoder: Graph, encoder: Graph, output: str) -> None:
-    """Raises InputError unless an encoder gives what an input of the decoder takes."""
-    source = encoder.outputs.get(output)
-    if source is None or not (tensor.shape is None or source.fits(tensor.shape)):
-        problem = f"{encoder.path.name}, which gives {describe(encoder.outputs.values())}"
-        raise InputError(f"{decoder.path}, input {tensor.name!r}", problem, str(tensor), _TOGETHER)
+            raise InputError(self._decoder_path, shapes, "a score and a mask of each query", _TOGETHER)
 
 
 def _without_repetitions(masks: Bool[np.ndarray, "m h w"]) -> np.ndarray:
@@ -312,7 +283,3 @@ def _without_repetitions(masks: Bool[np.ndarray, "m h w"]) -> np.ndarray:
         if area[n] > 0 and not (shared[n, kept] > MASK_IOU * union).any():
             kept.append(n)
     return np.asarray(kept, np.int64)
-
-
-def _sigmoid(x: np.ndarray) -> np.ndarray:
-    return 1.0 / (1.0 + np.exp(-np.clip(x.astype(np.float64), -80.0, 80.0)))

@@ -1,8 +1,8 @@
 """Runs ONNX graphs with ONNX Runtime on the CPU.
 
-The number of threads is bounded, signatures are read from the file, and tensors are passed by name. Code that needs a
-graph states which tensors it passes and reads (`Graph.require`). A graph with other tensors raises an InputError that
-names the file and the tensor.
+A run takes the cores that this process may use, signatures are read from the file, and tensors are passed by name.
+Code that needs a graph states which tensors it passes and reads (`Graph.require`). A graph with other tensors raises an
+InputError that names the file and the tensor.
 """
 
 import dataclasses
@@ -105,7 +105,6 @@ class Graph:
 
     Args:
       path: The .onnx file.
-      threads: Number of cores that one run takes; by default all that this process may use.
       optimise: Whether to optimise the graph; False opens it faster, for a look at its signature.
 
     Attributes:
@@ -117,13 +116,12 @@ class Graph:
         input of more than MAX_INPUT_NUMBERS, or uses what the installed ONNX Runtime does not know.
     """
 
-    def __init__(self, path: str | os.PathLike, *, threads: int | None = None, optimise: bool = True):
+    def __init__(self, path: str | os.PathLike, *, optimise: bool = True):
         self.path = Path(path)
-        self._threads = threads or cores()
         _check_bytes(self.path)
         self._session = self._open(optimise=False)
-        self.inputs = {node.name: _tensor(node) for node in self._session.get_inputs()}
-        self.outputs = {node.name: _tensor(node) for node in self._session.get_outputs()}
+        self.inputs = {tensor.name: tensor for tensor in map(_tensor, self._session.get_inputs())}
+        self.outputs = {tensor.name: tensor for tensor in map(_tensor, self._session.get_outputs())}
         for tensor in self.inputs.values():  # before the optimiser allocates constants of such sizes
             sizes = [size for size in tensor.shape or () if isinstance(size, int) and size > 0]
             if math.prod(sizes) > MAX_INPUT_NUMBERS:
@@ -136,7 +134,7 @@ class Graph:
 
     def _open(self, *, optimise: bool) -> onnxruntime.InferenceSession:
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = self._threads
+        options.intra_op_num_threads = cores()
         options.inter_op_num_threads = 1
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.log_severity_level = 4

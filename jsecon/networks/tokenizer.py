@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Int64
 
 from jsecon.errors import InputError, describe_error
-from jsecon.files import parse_json, read_json
+from jsecon.files import read_json
 
 CLIP_LENGTH = 77
-"""tokens of a text of CLIP, if the graph does not fix it"""
+"""tokens of a text of CLIP, if the graph does not fix it; and open_clip's default"""
 CLIP_ENDS = ("<|startoftext|>", "<|endoftext|>"), ("<start_of_text>", "<end_of_text>")
 """start and end of a text in the vocabularies of Hugging Face and of open_clip"""
 CLIP_WORDS = r"(?i)'s|'t|'re|'ve|'m|'ll|'d|\p{L}+|\p{N}|[^\s\p{L}\p{N}]+"
@@ -32,12 +32,8 @@ CLASSES = {"SiglipTokenizer": "canonicalize", "GemmaTokenizer": "lower", "Siglip
 (google-research/big_vision); its published files carry the class of Gemma, whose vocabulary it uses"""
 MAX_LENGTH = 4096
 """tokens of a text"""
-MAX_PAD_CHARACTERS = 100
-"""characters of the padding token"""
-OPEN_CLIP_LENGTH = 77
-"""tokens of a text if config.json does not state it: open_clip's default"""
-TRANSFORMERS_LENGTH = 64
-"""the same of transformers' SiglipTextConfig"""
+SIGLIP_LENGTH = 64
+"""tokens of a text of SigLIP if config.json does not state it: the default of transformers' SiglipTextConfig"""
 _FETCH = "Fetch the file again, from the folder that the graphs come from."
 
 
@@ -70,11 +66,7 @@ class TextTokenizer:
         self._rules = rules
         expected = "a tokenizer.json of Hugging Face's kind"
         with _tokenizer_errors(self._path, f"{expected} with the token {rules.pad!r}" if rules else expected):
-            text = self._path.read_text(encoding="utf-8")
-            content = parse_json(text)
-            _check_template(content.get("post_processor"))
-            _check_merges(content.get("model"))
-            self._tokenizer = Tokenizer.from_str(text)
+            self._tokenizer = Tokenizer.from_str(self._path.read_text(encoding="utf-8"))
             self._end = -1
             self._pad = 0 if rules is None else self._token_id(rules.pad)
             if rules is None:
@@ -179,33 +171,13 @@ def _repair(text: str) -> str:
     return " ".join(html.unescape(html.unescape(ftfy.fix_text(text))).split())
 
 
-def _check_merges(model: Any) -> None:
-    """Raises ValueError if a merge makes a token that the vocabulary lacks: `tokenizers` would abort."""
-    if not isinstance(model, dict) or not model.get("merges"):
-        return
-    vocabulary, prefix = model["vocab"], len(model.get("continuing_subword_prefix") or "")
-    for merge in model["merges"]:
-        first, second = merge.split(" ") if isinstance(merge, str) else merge
-        if len(second) < prefix or first + second[prefix:] not in vocabulary:
-            raise ValueError(f"the merge of {first!r} and {second!r} makes no token")
-
-
-def _check_template(processor: Any) -> None:
-    """Raises ValueError if a template names a token that it does not define: `tokenizers` would abort."""
-    for part in [processor, *processor.get("processors", [])] if processor else []:
-        named = [piece["SpecialToken"]["id"] for piece in part.get("single", []) if "SpecialToken" in piece]
-        unknown = set(named) - set(part.get("special_tokens", {}))
-        if unknown:
-            raise ValueError(f"special tokens {unknown} that are not defined")
-
-
 @contextlib.contextmanager
 def _tokenizer_errors(path: Path, expected: str) -> Iterator[None]:
     """Turns whatever `tokenizers` raises into an InputError: its exceptions have no base of their own."""
     try:
         yield
     except BaseException as error:
-        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":  # an abort in its Rust
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":  # of its Rust
             raise
         problem = f"it is no tokenizer of this model ({describe_error(error)})"
         remedy = "Fetch tokenizer.json again; for SigLIP also config.json and tokenizer_config.json."
@@ -238,7 +210,7 @@ def read_text_rules(folder: Path, tokenizer: Path) -> TextRules | None:
         options = text.get("tokenizer_kwargs") or {}
         if not isinstance(options, dict) or set(options) - {"clean"}:
             raise InputError(path, f"tokenizer_kwargs {options}", '{"clean": ...} or {}', "Take another model.")
-        length = text.get("context_length", OPEN_CLIP_LENGTH)
+        length = text.get("context_length", CLIP_LENGTH)
         clean = options.get("clean", "whitespace")
         pad = _read_padding(tokenizer)[0]
     elif str(content.get("model_type", "")).startswith("siglip"):
@@ -247,7 +219,7 @@ def read_text_rules(folder: Path, tokenizer: Path) -> TextRules | None:
             where = tokenizer.with_name("tokenizer_config.json")
             raise InputError(where, f"tokenizer_class {name!r}", " or ".join(CLASSES), _FETCH)
         text = content.get("text_config")
-        length = (text if isinstance(text, dict) else {}).get("max_position_embeddings", TRANSFORMERS_LENGTH)
+        length = (text if isinstance(text, dict) else {}).get("max_position_embeddings", SIGLIP_LENGTH)
         clean = CLASSES[name]
     else:
         return None
@@ -263,7 +235,7 @@ def _read_padding(tokenizer: Path) -> tuple[str, str]:
     content = _read_object(path)
     pad = content.get("pad_token")
     pad = pad.get("content") if isinstance(pad, dict) else pad  # a token is written with its options, or alone
-    if not isinstance(pad, str) or not 0 < len(pad) <= MAX_PAD_CHARACTERS:
+    if not isinstance(pad, str):
         raise InputError(path, f"pad_token {pad!r}", "the token that pads short texts, which SigLIP reads", _FETCH)
     return pad, str(content.get("tokenizer_class", "")).removesuffix("Fast")
 

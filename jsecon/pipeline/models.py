@@ -1,7 +1,6 @@
 """Inspects a folder of models: the signature of every graph, and what jsecon can use the folder for."""
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 
 from jsecon.errors import InputError
@@ -70,43 +69,37 @@ def inspect_models(folder: str | Path) -> ModelReport:
     if not folder.is_dir():
         raise InputError(folder, "no such folder", "a folder of models", "Check the path.")
     graphs = {path.relative_to(folder).as_posix(): _signature(path) for path in sorted(folder.rglob("*.onnx"))}
-    return ModelReport(folder, graphs, tuple(_tried(model, use, folder) for model, use in _KINDS.items()))
+    uses = []
+    for model, examine in (("CLIP", _clip), ("SAM", _sam), ("SAM 2", _sam2), ("SAM 3", _sam3)):
+        try:
+            uses.append(Use(model, True, examine(folder)))
+        except InputError as error:
+            uses.append(Use(model, False, str(error)))
+    return ModelReport(folder, graphs, tuple(uses))
 
 
 def _signature(path: Path) -> str:
     try:
-        graph = Graph(path, threads=1, optimise=False)
+        graph = Graph(path, optimise=False)
     except InputError as error:
         return f"cannot be opened: {error.sentence}"
     return f"in   {describe(graph.inputs.values())}\nout  {describe(graph.outputs.values())}"
-
-
-def _tried(model: str, use: Callable[[Path], str], folder: Path) -> Use:
-    try:
-        return Use(model, True, use(folder))
-    except InputError as error:
-        return Use(model, False, str(error))
 
 
 def _clip(folder: Path) -> str:
     embedder = ClipEmbedder(folder)
     embedder.check()
     size, files = embedder.size, embedder.files
-    summary = f"images of {size}x{size} px and texts to {embedder.dim} numbers; layout {files.layout}"
+    summary = f"images of {size}x{size} px and texts to {embedder.dim} numbers: jsecon run --embedder {folder}"
     embedder.close()
-    summary = f"{summary}, tokenizer {files.tokenizer.relative_to(folder)}: jsecon run --embedder {folder}"
     if files.rules is None:
         return summary
     length, pad, clean = files.rules
-    return f"{summary}\n  texts of {length} tokens, padded with {pad!r}, cleaned by {clean!r}; {_sigmoid(embedder)}"
-
-
-def _sigmoid(embedder: ClipEmbedder) -> str:
-    """How the probability of a text follows from its cosine, or what to do without it."""
-    logits, where = embedder.logits, embedder.files.logits
-    if logits is None or where is None:
-        return f"no scale and bias, so that a text is refused by its cosine. {LOGITS_REMEDY}"
-    return f"how likely a text is there: sigmoid({logits.scale:.4f} cosine {logits.bias:+.4f}), from {where.name}"
+    summary = f"{summary}\n  texts of {length} tokens, padded with {pad!r}, cleaned by {clean!r}"
+    if embedder.logits is None:
+        return f"{summary}; no scale and bias, so that a text is refused by its cosine. {LOGITS_REMEDY}"
+    scale, bias = embedder.logits
+    return f"{summary}; how likely a text is there: sigmoid({scale:.4f} cosine {bias:+.4f})"
 
 
 def _sam(folder: Path) -> str:
@@ -127,6 +120,3 @@ def _sam3(folder: Path) -> str:
     summary = sam3.summary
     sam3.check()
     return f"{summary}: jsecon query FIELD TEXT --phrases {folder}"
-
-
-_KINDS: dict[str, Callable[[Path], str]] = {"CLIP": _clip, "SAM": _sam, "SAM 2": _sam2, "SAM 3": _sam3}

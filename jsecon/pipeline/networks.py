@@ -13,7 +13,7 @@ import numpy as np
 from jsecon.errors import InputError
 from jsecon.networks.hub import HubModel, parse_model
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.sources import Sources, locate_sources
+from jsecon.pipeline.sources import locate_sources
 from jsecon.types import LanguageField
 from jsecon.vision.protocols import Embedder, Networks
 from jsecon.vision.stores import StoredSegmenter
@@ -38,22 +38,10 @@ class ExternalSpace:
         self.dim, self.name = dim, f"{_EXTERNAL}{dim}"
         self.canonical = self.reference = np.zeros((0, dim), np.float32)
 
-    def embed_regions(self, frame: np.ndarray, masks: np.ndarray) -> NoReturn:
-        """Raises InputError.
-
-        Args:
-          frame: Not used.
-          masks: Not used.
-        """
+    def _refuse(self, *_: object) -> NoReturn:
         raise _missing_model(self.dim)
 
-    def embed_text(self, texts: list[str]) -> NoReturn:
-        """Raises InputError.
-
-        Args:
-          texts: Not used.
-        """
-        raise _missing_model(self.dim)
+    embed_regions = embed_text = _refuse
 
 
 def external_dim(name: str | None) -> int | None:
@@ -100,19 +88,18 @@ def open_networks(options: Options, store: Path) -> Networks:
         from jsecon.networks.sam2 import Sam2Tracker
 
         tracker = Sam2Tracker(options.tracker)
-    external = None
-    if options.features is not None:
-        from jsecon.data.langsplat import embedding_size
-
-        external = ExternalSpace(embedding_size(options.features))
-        if options.embedder is None:
-            return Networks(external, segmenter, tracker)
-    name = None if external is None else external.name
-    model = None
+    name = model = None
     if options.embedder is not None:
         from jsecon.networks.clip import find_clip
 
         model = find_clip(options.embedder, options.precision)
+    if options.features is not None:
+        from jsecon.data.langsplat import embedding_size
+
+        external = ExternalSpace(embedding_size(options.features))
+        if model is None:
+            return Networks(external, segmenter, tracker)
+        name = external.name
     return Networks(open_embedder(name, folder=model, store=store / "embeddings"), segmenter, tracker)
 
 
@@ -179,46 +166,37 @@ def field_embedder(field: LanguageField, folder: Path | None = None, *, template
     Raises:
       InputError: The model is not on this machine, or is another one.
     """
-    model: Path | ClipFiles | None = folder
-    if folder is None:
-        sources = locate_sources(field)
-        model = _model_of_field(sources)
-        if model is None and (missing := _hub_model(sources)) is not None:
-            problem = f"its texts need the model {missing.address}, which is not on this machine"
-            raise InputError("field", problem, "", f"Fetch it with: {missing.get_command}. Or add --yes.")
+    model = find_model(field) if folder is None else folder
+    if isinstance(model, HubModel):
+        problem = f"its texts need the model {model.address}, which is not on this machine"
+        raise InputError("field", problem, "", f"Fetch it with: {model.get_command}. Or add --yes.")
     return open_embedder(field.embedder, folder=model, templates=templates)
 
 
-def missing_model_of_field(field: LanguageField) -> HubModel | None:
-    """Looks for the model that a field's texts need.
+def find_model(field: LanguageField) -> "ClipFiles | HubModel | None":
+    """Looks for the CLIP model that a field was made with, in its folder and in the hub's cache.
 
     Args:
       field: The field.
 
     Returns:
-      The model of the hub that is to be fetched; None if it is on this machine, or came from a folder.
+      Its files if they are on this machine, else the model of the hub that is to be fetched; None for a field without
+      a model, or if its model came from a folder that is not here.
+
+    Raises:
+      InputError: The provenance of the field is not what a run writes.
     """
     sources = locate_sources(field)
-    return None if _model_of_field(sources) is not None else _hub_model(sources)
-
-
-def _hub_model(sources: Sources) -> HubModel | None:
-    """The model of the hub that a field was made with, or None if its model was a folder."""
-    model = None if sources.address is None else parse_model(sources.address, "embedder", sources.precision)
-    return model if isinstance(model, HubModel) else None
-
-
-def _model_of_field(sources: Sources) -> "ClipFiles | None":
-    """The CLIP model that a field was made with, in its folder or in the hub's cache; None if it is at neither."""
     if not (sources.embedder or "").startswith("clip-"):
         return None
     from jsecon.networks.clip import find_clip
 
-    model = _hub_model(sources)
-    for folder in (sources.model, None if model is None else model.cached_folder):
+    model = None if sources.address is None else parse_model(sources.address, "embedder", sources.precision)
+    on_hub = model if isinstance(model, HubModel) else None
+    for folder in (sources.model, None if on_hub is None else on_hub.cached_folder):
         if folder is not None:
             with contextlib.suppress(InputError):  # another model is there now
                 files = find_clip(folder, sources.precision)
                 if files.name == sources.embedder:
                     return files
-    return None
+    return on_hub

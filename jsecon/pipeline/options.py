@@ -151,7 +151,8 @@ class ModelOptions:
         hub:owner/name, or a folder.
       vision_frames: Maximum number of training frames, evenly spaced, in which masks are found and embedded. The fit
         uses all of them. By default vision does too.
-      precision: Precision of the models' graphs. By default it is the one that is fastest on a CPU, fp32.
+      precision: Precision of the models' graphs. By default it is the one that is fastest on a CPU, fp32, in which
+        models of masks stay if they have no other.
       features: Folder language_features of LangSplat. Regions take their embeddings from <frame>_s.npy and _f.npy, and
         texts then need the CLIP model that made them (--embedder, here or of query).
     """
