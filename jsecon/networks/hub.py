@@ -270,8 +270,8 @@ def rows_of_name(name: str, role: Role | None) -> list[NamedModel]:
     if matches := [row for row in rows if row.name == name]:
         return matches
     names = list(dict.fromkeys(row.name for row in rows))
-    similar = difflib.get_close_matches(name, names, 1)
-    similar += [f"the {row.role} {name}" for row in catalogue() if row.name == name]
+    similar = [f"the {row.role} {name}" for row in catalogue() if row.name == name]
+    similar += difflib.get_close_matches(name, names, 1)
     if re.fullmatch(r"[\w-][\w.-]*/[\w.-]+(@[\w./-]+)?", name):
         similar = [f"{PREFIX}{name}"]
     meant = f"Did you mean {similar[0]}? " if similar else ""
@@ -303,7 +303,7 @@ def model_name(folder: Path, role: Role) -> str:
 def _present_layout(
     role: Role, precision: Precision | None, exists: Callable[[str], object], where: object, remedy: str
 ) -> Layout:
-    """Returns the first layout whose required files exist, in the precision or else in the highest that is there."""
+    """Returns the first layout whose required files exist: in the precision, of None in the highest that is there."""
     missing = []
     for each in SUFFIXES if precision is None else (precision,):
         for layout in LAYOUTS[role]:
@@ -391,7 +391,7 @@ def fetch(download: Download) -> Path:
         check = HfApi().verify_repo_checksums(model.repository, revision=folder.name, local_dir=folder)
     for mismatch in check.mismatches:
         broken = folder / mismatch["path"]
-        broken.resolve().unlink()
+        broken.resolve().unlink(missing_ok=True)
         broken.unlink(missing_ok=True)
     if check.mismatches:
         paths = ", ".join(mismatch["path"] for mismatch in check.mismatches)
