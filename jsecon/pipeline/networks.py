@@ -38,7 +38,7 @@ class ExternalSpace:
         self.dim, self.name = dim, f"{_EXTERNAL}{dim}"
         self.canonical = self.reference = np.zeros((0, dim), np.float32)
 
-    def _refuse(self, *_: object) -> NoReturn:
+    def _refuse(self, *args: object, **kwargs: object) -> NoReturn:
         raise _missing_model(self.dim)
 
     embed_regions = embed_text = _refuse
