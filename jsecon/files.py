@@ -14,6 +14,7 @@ import json
 import math
 import os
 import re
+import struct
 import sys
 import uuid
 import zipfile
@@ -30,7 +31,7 @@ from jsecon.errors import InputError, describe_error, require
 
 READ_ERRORS = (
     *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ImportError, RuntimeError),
-    *(ArithmeticError, zipfile.BadZipFile, zlib.error, SafetensorError),
+    *(ArithmeticError, struct.error, zipfile.BadZipFile, zlib.error, SafetensorError),
 )
 """exceptions that readers of damaged files raise"""
 MAX_NAME = 80

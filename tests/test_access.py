@@ -47,7 +47,7 @@ def test_addresses_of_both_families_are_listened_on():
 def pages():
     """(host, port, token) of viser servers: on loopback, on IPv6, and with a token."""
     viser = pytest.importorskip("viser", reason="the extra viewer is not installed")
-    from jsecon.app.viewer.access import guarded_pages
+    from jsecon.app.access import guarded_pages
 
     servers = []
     for host, token in (("127.0.0.1", ""), ("::1", ""), ("127.0.0.1", "s&cret ü")):

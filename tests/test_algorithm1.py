@@ -214,7 +214,7 @@ def test_goes_on_in_the_middle_of_the_sequence_to_the_same_result(stop, tmp_path
         frames_of(truth),
         segment,
         track,
-        state=cache.load(tmp_path / "state.safetensors"),
+        state=cache.load(tmp_path / "state.safetensors")[0],
         progress=lambda done, total: told.append((done, total)),
     )
     np.testing.assert_array_equal(found, wanted)

@@ -188,7 +188,7 @@ def test_exported_objects_and_labels_are_those_of_the_catalogue(field, file, tmp
     labels = np.load(ids)
     assert labels.dtype == np.int32
     np.testing.assert_array_equal(labels, catalogue.labels)
-    vertices = read_elements(scene)[1]["vertex"]
+    vertices = read_elements(scene)["vertex"]
     np.testing.assert_array_equal(vertices["object_id"], labels)
     whole = load_gaussians(scene)
     np.testing.assert_array_equal(whole.means, field.gaussians.means)
@@ -206,7 +206,7 @@ def test_only_and_without_part_the_scene_bit_for_bit(field, file, tmp_path, caps
         ids = tmp_path / f"{name}.npy"
         assert run("export", file, f"--{name}", "red thing", "--out", paths[name], "--labels", ids) == 0
         assert len(np.load(ids)) == load_gaussians(paths[name]).count
-    rows = {name: [row.tobytes() for row in read_elements(path)[1]["vertex"]] for name, path in paths.items()}
+    rows = {name: [row.tobytes() for row in read_elements(path)["vertex"]] for name, path in paths.items()}
     assert sorted(rows["only"] + rows["without"]) == sorted(rows["scene"])
     assert 0 < len(rows["only"]) < len(rows["scene"])
     assert rows["only"] == [row for row in rows["scene"] if row in set(rows["only"])]

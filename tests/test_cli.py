@@ -4,6 +4,7 @@ import json
 import re
 import shlex
 import shutil
+import sys
 import time
 from pathlib import Path
 
@@ -355,6 +356,20 @@ def test_a_text_that_is_not_understood_does_not_stop_the_others(room_run, tmp_pa
 ])  # fmt: skip
 def test_queries_that_cannot_be(room_run, tmp_path, capsys, options, says):
     _refused(capsys, "query", room_run[1] / "field.safetensors", *options, "--out", tmp_path, says=[says])
+
+
+@pytest.mark.parametrize(("verb", "module", "package"), [
+    ("serve", "jsecon.app.server.serve", "uvicorn"), ("mcp", "jsecon.app.mcp_server", "mcp"),
+])  # fmt: skip
+def test_a_verb_without_its_extra_names_it(tmp_path, capsys, monkeypatch, verb, module, package):
+    monkeypatch.delitem(sys.modules, module, raising=False)
+    for name in [name for name in sys.modules if name.split(".")[0] == package]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, package, None)
+    assert cli.main([verb, str(tmp_path / "field.safetensors")]) == 2
+    said = capsys.readouterr().err
+    assert f"the package {package} is missing" in said
+    assert f'pip install "jsecon[{verb}]"' in said
 
 
 def test_a_field_that_is_damaged_or_not_there(room_run, tmp_path, capsys):

@@ -1,7 +1,6 @@
 """`jsecon demo`, whole, on a room as small as it can be: what it writes, and that a second call finds it all done."""
 
 import json
-import re
 import time
 
 import cv2
@@ -86,7 +85,6 @@ def test_the_report_shows_every_query_and_stands_alone(finished):
         assert text in page
     assert page.count('class="pair"') == len(queries)
     assert page.count('class="wide"') > 3  # masklets through the frames
-    assert re.search(r"<td>gaussians</td>.*?<td>\d+ \(\d+\)</td>", page)  # programs compiled
     assert "http" not in page
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from jsecon.app import cli
 from jsecon.data.capture import capture_extent, load_capture
-from jsecon.data.frames import CaptureExtent
+from jsecon.data.frames import CaptureExtent, FrameOptions
 from jsecon.data.video import video_size
 
 STAGES = ["load", "gaussians", "masklets", "regions", "codes", "votes", "distil", "held_out"]
@@ -37,7 +37,7 @@ def test_a_dry_run_lists_every_stage_writes_nothing_and_refuses_bad_options(room
 
 @pytest.mark.parametrize("given", [{}, {"downscale": 2.0}, {"long_side": 50, "frames": 3}])
 def test_the_extent_is_that_of_the_loaded_capture(room, given):
-    capture, extent = load_capture(room, **given), capture_extent(room, **given)
+    capture, extent = load_capture(room, **given), capture_extent(room, FrameOptions(**given))
     size = capture.cameras.width, capture.cameras.height
     assert extent == CaptureExtent(len(capture.names), size, capture.names, capture.files)
 
@@ -82,7 +82,10 @@ WRONG = {
     "Gaussians of no known form": (lambda room, folder: ["--gaussians", room / "sparse/0/cameras.bin"], "cameras.bin"),
     "a pose that is none": (_broken_pose, "images.bin"),
     "too few frames": (lambda room, folder: ["--frames", 2, "--holdout", 2], "1 of 2 frames"),
-    "a file where the output should be": (lambda room, folder: ["--out", room / "sparse/0/cameras.bin/f"], "is a file"),
+    "a file where the output should be": (
+        lambda room, folder: ["--out", room / "sparse/0/cameras.bin/f"],
+        "a directory",
+    ),
     "the output is an input": (lambda room, folder: ["--out", folder / "capture/images"], "own folder"),
 }
 

@@ -58,9 +58,10 @@ def capture(tmp_path):
     return folder
 
 
-def test_want_of_memory_names_the_stage_and_what_helps(capture, tmp_path):
+def test_want_of_memory_names_the_stage_and_what_helps(capture, tmp_path, monkeypatch):
+    monkeypatch.setattr(pipeline.stages, "load_capture", lambda *_, **__: np.ones(1 << 50))
     with refused("stage load", "Unable to allocate", "--long-side"):
-        pipeline.run(pipeline.Options(capture), tmp_path / "out", load=lambda: np.ones(1 << 50))
+        pipeline.run(pipeline.Options(capture), tmp_path / "out")
 
 
 def test_an_opencv_without_its_contrib_modules_is_told_before_anything_runs(capture, tmp_path, monkeypatch):

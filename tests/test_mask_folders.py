@@ -52,17 +52,17 @@ def test_folders_like_those_of_the_images_are_cameras(tmp_path, folders, alike, 
     for path, image in zip(paths, images):
         write(tmp_path / f"{path}.png", image)
     files = photographs(*(f"{prefix}{path}.jpg" for path in paths))
-    labels, ids, notes = load_labels(tmp_path, tuple(files), SIZE, files=files)
+    labels, ids, notes = load_labels(tmp_path, tuple(files), SIZE, frames=files)
     np.testing.assert_array_equal(labels, expected(*images))
     assert ids == (1, 2, 3, 4)
     assert any("cameras" in note for note in notes)
-    read, _ = load_proposals(tmp_path, tuple(files), SIZE, files=files)
+    read, _ = load_proposals(tmp_path, tuple(files), SIZE, frames=files)
     for t, image in enumerate(images):
         np.testing.assert_array_equal(read(t), [image == id for id in range(1, 5)])
     images = [black_and_white() for _ in paths]  # one object
     for path, image in zip(paths, images):
         write(tmp_path / f"{path}.png", image)
-    labels, ids, _ = load_labels(tmp_path, tuple(files), SIZE, files=files)
+    labels, ids, _ = load_labels(tmp_path, tuple(files), SIZE, frames=files)
     np.testing.assert_array_equal(labels, np.stack(images) // 255 - 1)
     assert ids == (255,)
 
@@ -83,11 +83,11 @@ def test_other_folders_of_black_and_white_masks_are_objects(tmp_path, paths, pat
         for file, mask in zip(files.values(), frames):
             camera, _, name = file.path.removesuffix(".jpg").rpartition("/")
             write(tmp_path / (pattern.format(object=number, camera=camera, name=name) + ".png"), mask)
-    labels, ids, notes = load_labels(tmp_path, tuple(files), SIZE, files=files)
+    labels, ids, notes = load_labels(tmp_path, tuple(files), SIZE, frames=files)
     assert ids == (0, 1)
     np.testing.assert_array_equal(labels, np.where(masks[0] > 0, 0, np.where(masks[1] > 0, 1, -1)))
     assert any("objects" in note for note in notes)
-    read, _ = load_proposals(tmp_path, tuple(files), SIZE, files=files)
+    read, _ = load_proposals(tmp_path, tuple(files), SIZE, frames=files)
     np.testing.assert_array_equal(read(1), masks[:, 1] > 0)
 
 
@@ -143,7 +143,7 @@ def test_numbered_masks_are_taken_in_order_where_they_are_as_many_as_the_frames(
     mask = np.eye(12, 16, dtype=int)
     for n in range(5):
         write(tmp_path / f"{n:05}.png", (n + 1) * mask)
-    labels, ids, notes = load_labels(tmp_path, frames, SIZE, order=order)
+    labels, ids, notes = load_labels(tmp_path, frames, SIZE, frames=dict.fromkeys(order))
     assert ids == (2, 3, 5)
     for t in range(3):
         np.testing.assert_array_equal(labels[t] == t, mask)
@@ -152,7 +152,7 @@ def test_numbered_masks_are_taken_in_order_where_they_are_as_many_as_the_frames(
         load_labels(tmp_path, frames, SIZE)
     (tmp_path / "00003.png").unlink()
     with refused("a PNG for each number from 0 to 4"):
-        load_labels(tmp_path, frames, SIZE, order=order)
+        load_labels(tmp_path, frames, SIZE, frames=dict.fromkeys(order))
 
 
 def test_ids_above_float32_stay_apart_when_resized(tmp_path):
@@ -191,7 +191,7 @@ def test_what_a_mask_may_be_called(tmp_path, frame, file):
     write(tmp_path / file, image)
     write(tmp_path / "b.png", image)
     files = photographs("cam0/a.jpg", "cam1/a.jpg", "b.jpg") if frame == "cam0_a" else {}
-    labels, _, notes = load_labels(tmp_path, (frame, "b"), SIZE, files=files, order=tuple(files) or None)
+    labels, _, notes = load_labels(tmp_path, (frame, "b"), SIZE, frames=files or None)
     np.testing.assert_array_equal(labels, expected(image, image))
     assert not notes or "cameras" in notes[0]
 
@@ -205,13 +205,13 @@ def test_a_name_that_two_frames_share_up_to_the_dot_is_neithers(tmp_path):
 def test_masks_of_no_frame_are_told(tmp_path):
     for name in "abc":
         write(tmp_path / f"{name}.png", ids_image())
-    _, _, notes = load_labels(tmp_path, ("b",), SIZE, order=("a", "b"))
+    _, _, notes = load_labels(tmp_path, ("b",), SIZE, frames=dict.fromkeys("ab"))
     assert len(notes) == 1
     assert "1 of the .png files" in notes[0]
     assert "c.png" in notes[0]
     with refused(tmp_path, "none of the 1 frames"):
         (tmp_path / "b.png").unlink()
-        load_labels(tmp_path, ("b",), SIZE, order=("a", "b"))
+        load_labels(tmp_path, ("b",), SIZE, frames=dict.fromkeys("ab"))
 
 
 def test_kinds_that_are_not_read_are_named(tmp_path):
@@ -248,15 +248,15 @@ def test_masks_of_stored_pixels_are_turned_like_their_photographs(tmp_path):
     files = {"a": ImageFile("a.jpg", 16, 12, 6), "b": ImageFile("b.jpg", 16, 12, 3), "c": ImageFile("c.jpg", 16, 12, 1)}
     for name, image in zip("abc", upright):
         write(tmp_path / f"{name}.png", image)
-    labels, _, notes = load_labels(tmp_path, tuple("abc"), SIZE, files=files)
+    labels, _, notes = load_labels(tmp_path, tuple("abc"), SIZE, frames=files)
     np.testing.assert_array_equal(labels, expected(*upright))
     assert notes == ()
     for name, image in zip("abc", (np.rot90(upright[0]), upright[1][::-1, ::-1], upright[2])):
         write(tmp_path / f"{name}.png", image.repeat(2, 0).repeat(2, 1))
-    labels, _, notes = load_labels(tmp_path, tuple("abc"), SIZE, files=files)
+    labels, _, notes = load_labels(tmp_path, tuple("abc"), SIZE, frames=files)
     np.testing.assert_array_equal(labels, expected(*upright))
     assert any("2 masks were of the stored pixels" in note for note in notes)
-    read, _ = load_proposals(tmp_path, tuple("abc"), SIZE, files=files)
+    read, _ = load_proposals(tmp_path, tuple("abc"), SIZE, frames=files)
     np.testing.assert_array_equal(read(0), [upright[0] == id for id in range(1, 5)])
     np.testing.assert_array_equal(read(1), [upright[1] == id for id in range(1, 5)])
 
@@ -265,7 +265,7 @@ def test_masks_of_photographs_of_another_aspect_follow_them(tmp_path):
     """Frames have one size: a portrait photograph is squeezed into it, and so is its mask."""
     image = ids_image().T
     write(tmp_path / "a.png", image)
-    labels, _, _ = load_labels(tmp_path, ("a",), SIZE, files={"a": ImageFile("a.jpg", 12, 16)})
+    labels, _, _ = load_labels(tmp_path, ("a",), SIZE, frames={"a": ImageFile("a.jpg", 12, 16)})
     rows, columns = ((2 * np.arange(12) + 1) * 16 // 24), ((2 * np.arange(16) + 1) * 12 // 32)
     np.testing.assert_array_equal(labels[0], image[rows[:, None], columns] - 1)
     with refused("a.png", "12x16", "16x12"):
@@ -357,7 +357,7 @@ def test_embeddings_lie_in_the_cameras_folders(tmp_path):
         (tmp_path / camera).mkdir()
         np.save(tmp_path / camera / "a_s.npy", np.tile(np.arange(16) // 8, (4, 12, 1)).astype(np.float32))
         np.save(tmp_path / camera / "a_f.npy", rows[n])
-    found = load_features(tmp_path, tuple(files), SIZE, files=files)
+    found = load_features(tmp_path, tuple(files), SIZE, frames=files)
     np.testing.assert_array_equal(found.frame, [0, 0, 1, 1])
     np.testing.assert_array_equal(found.embeddings, rows.reshape(4, 3))
     np.testing.assert_array_equal(found.labels[1, 0], np.arange(16) // 8 + 2)

@@ -41,8 +41,8 @@ class Recorder(Listener):
     def __init__(self):
         self.planned, self.fresh, self.notes = {}, {}, []
 
-    def steps(self, title, steps):
-        self.planned = {step.name: step for step in steps}
+    def step(self, step):
+        self.planned.setdefault(step.name, step)
 
     def done(self, name, seconds, fresh):
         self.fresh[name] = fresh
@@ -225,16 +225,6 @@ def test_parts_of_the_scene_are_a_stage_of_their_own(room_run, tmp_path):
     assert run.field.parts is None
 
 
-def test_frames_can_come_from_an_adapter(on_given_gaussians, tmp_path):
-    given, _ = on_given_gaussians
-    darker = dataclasses.replace(given.capture, frames=given.capture.frames // 2)
-    listener = Recorder()
-    adapted = pipeline.run(given.options, tmp_path / "out", load=lambda: darker, listener=listener)
-    np.testing.assert_array_equal(adapted.capture.frames, darker.frames)
-    np.testing.assert_array_equal(adapted.field.votes.weights, given.field.votes.weights)
-    assert not np.array_equal(adapted.field.regions.embeddings, given.field.regions.embeddings)
-
-
 def test_default_vision_finds_regions_by_itself(room, room_run, tmp_path):
     """Segmenter, tracker and colours on the tiny room: the whole default path, on the Gaussians of the other run."""
     run, out = room_run
@@ -277,11 +267,8 @@ def test_gaussians_of_another_world_are_refused(room_run, tmp_path):
 
 def test_too_few_frames_to_work_with_are_refused(room_run, tmp_path):
     run, _ = room_run
-    one = run.capture
-    held = np.ones(len(one.names), bool)
-    held[0] = False
     with pytest.raises(InputError, match="at least 2"):
-        pipeline.run(run.options, tmp_path / "out", load=lambda: dataclasses.replace(one, held_out=held))
+        pipeline.run(dataclasses.replace(run.options, frames=2, holdout=2), tmp_path / "out")
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="Linux tells it there")

@@ -61,7 +61,7 @@ def settled(viewer: Viewer, act) -> ViewState:
     """The state once all that was to be done is done."""
     done = []
     act()
-    viewer.do(lambda: done.append(True))
+    viewer.then(lambda state: done.append(True) or state)
     until(lambda: done and viewer.drawn == viewer.history.state, "the viewer's thread comes to it")
     return viewer.history.state
 
@@ -99,7 +99,7 @@ def test_a_relation_lights_up_and_says_how_it_was_read(viewer):
     word = word_of(viewer)
     settled(viewer, lambda: viewer.then(lambda s: s.with_texts(f"the largest {word}; {word} across")))
     assert viewer.answer(view_state.ViewQuery(f"the largest {word}")).mask.any()
-    assert f"read as &#x27;{word}&#x27;, largest: 1 object" in viewer.panel._messages.content
+    assert f"read as &#x27;{word}&#x27;, largest: 1 object" in viewer.panel.messages.content
 
 
 def test_show_only_hide_and_undo(viewer):
@@ -136,19 +136,19 @@ def test_part_or_whole_changes_what_a_region_takes(viewer):
 def test_odd_texts_and_links_are_told_and_change_nothing(viewer):
     state = settled(viewer, lambda: viewer.then(lambda s: s.with_texts("the meaning of life; black or ''")))
     assert len(state.queries) == 2
-    told = viewer.panel._messages.content
+    told = viewer.panel.messages.content
     assert "no colour word" in told
     assert "a part without words" in told
     before = colours(viewer)
-    settled(viewer, lambda: viewer.restore('{"queries": [-1]}'))
+    settled(viewer, lambda: viewer.then(lambda _: view_state.from_link('{"queries": [-1]}')))
     assert viewer.panel._notice.visible
     assert "Copy the whole line" in viewer.panel._notice.content
     assert viewer.history.state == state
     np.testing.assert_array_equal(colours(viewer), before)
     settled(viewer, lambda: viewer.then(lambda s: s.with_texts("<script>alert(1)</script> red")))
-    assert "<script>" not in viewer.panel._messages.content
+    assert "<script>" not in viewer.panel.messages.content
     settled(viewer, lambda: viewer.then(lambda s: s.toggle_region(4000)))
-    assert "no match" in viewer.panel._messages.content
+    assert "no match" in viewer.panel.messages.content
 
 
 def test_an_error_inside_is_told_and_the_viewer_goes_on(viewer, capsys):
@@ -265,7 +265,7 @@ def click_a_region(viewer, page):
     """(region, its camera, left, top, width, height): clicks the region below the middle; the canvas's place, px."""
     width, height = page.js(f"(() => {{ const c = {CANVAS}; return [c.clientWidth, c.clientHeight]; }})()")
     x, y = round(0.4 * width), round(0.55 * height)
-    focal = height / 2 / np.tan(viewer.scene.fov(0) / 2)
+    focal = height / 2 / np.tan(viewer.scene.fovs[0] / 2)
     lens = (np.float32(v) for v in (focal, focal, width / 2, height / 2))
     seen_from = Camera(viewer.field.cameras.world_to_camera[0], *lens, width=width, height=height)
     region = int(region_shares_seen(viewer.field, seen_from, x, y).argmax())
@@ -323,7 +323,7 @@ def test_in_a_browser_it_does_what_a_person_tries(viewer, tmp_path):
         time.sleep(1)
         near = viewer.scene._centers[0] + 0.04 * viewer.scene.scale * viewer.scene._rotations[0].as_matrix()[:, 2]
         place = viewer.scene._rotations[2].inv().apply(near - centre)
-        focal = height / 2 / np.tan(viewer.scene.fov(2) / 2)
+        focal = height / 2 / np.tan(viewer.scene.fovs[2] / 2)
         things = viewer.history.state.queries
         page.click(left + width / 2 + focal * place[0] / place[2], top + height / 2 + focal * place[1] / place[2])
         until(lambda: viewer.panel._frame.value == "frame_0", "the camera of another frame is clicked")

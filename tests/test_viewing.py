@@ -17,7 +17,6 @@ from jsecon.app.viewer.view_state import (
     from_link,
     highlight,
     score_colours,
-    visible_gaussians,
 )
 from jsecon.errors import InputError
 
@@ -133,14 +132,6 @@ def test_tints_differ_and_stay():
     np.testing.assert_array_equal(answer_colours(3), many[:3])
     apart = np.abs(many[:, None] - many[None]).sum(-1)
     assert apart[~np.eye(12, dtype=bool)].min() > 40
-
-
-def test_what_is_seen():
-    a, b = np.array([1, 1, 0, 0], bool), np.array([0, 1, 1, 0], bool)
-    np.testing.assert_array_equal(visible_gaussians(4, [], []), [1, 1, 1, 1])
-    np.testing.assert_array_equal(visible_gaussians(4, [a, b], []), [1, 1, 1, 0])
-    np.testing.assert_array_equal(visible_gaussians(4, [], [b]), [1, 0, 0, 1])
-    np.testing.assert_array_equal(visible_gaussians(4, [a, b], [b]), [1, 0, 0, 0])
 
 
 def test_what_answers_lights_up_and_the_rest_dims():

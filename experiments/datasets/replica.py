@@ -18,7 +18,7 @@ from jaxtyping import Float, Int, UInt8
 
 from experiments.datasets.benchmark import Benchmark, require_count, twin_of
 from experiments.datasets.mesh_files import read_faces
-from jsecon.data.frames import PosedImage, PosedImages, build_capture
+from jsecon.data.frames import FrameOptions, PosedImage, PosedImages, build_capture
 from jsecon.data.gaussians.ply import load_point_cloud
 from jsecon.data.lens import Lens
 from jsecon.errors import InputError
@@ -100,7 +100,7 @@ def load_frames(root: Path, scene: str, *, every: int, downscale: float | int | 
         if not number.isdigit() or int(number) >= len(poses) or not depth.is_file():
             raise InputError(image, f"no {depth.name} beside it, or no pose", remedy="Copy the rendering again.")
         shots.append(PosedImage(image.name, image, lens, poses[int(number)], depth, 1.0 / camera["scale"]))
-    return build_capture(PosedImages(shots, root / scene), downscale=downscale, holdout=0)
+    return build_capture(PosedImages(shots, root / scene), FrameOptions(downscale))
 
 
 def load_semantics(

@@ -25,7 +25,7 @@ from experiments.datasets.plain_room import make_room
 from jsecon.data.colmap import write_colmap
 from jsecon.data.images import write_image
 from jsecon.data.labels import LabelledFrame, write_lerf_labels
-from jsecon.demo.capture import label_frame, look_at, render_capture, room_cameras, write_label_image
+from jsecon.demo.capture import label_frame, look_at, render_capture, room_cameras
 from jsecon.demo.room import TABLE_WOOD, Part, Room, srgb_to_linear
 from jsecon.files import write_text
 from jsecon.types import Camera, Capture
@@ -141,7 +141,7 @@ def write_replica_twin(
     for t in range(views):
         write_image(root / scene / "results" / f"frame{t:06d}.jpg", capture.frames[t])
         depth = np.rint(capture.depths[t] * scale).astype(np.uint16)
-        write_label_image(root / scene / "results" / f"depth{t:06d}.png", depth)
+        write_image(root / scene / "results" / f"depth{t:06d}.png", depth)
     write_mesh(root / f"{scene}_mesh.ply", mesh.vertices, mesh.faces)
     habitat = root / f"{scene[:-1]}_{scene[-1]}" / "habitat"
     numbers = mesh.face_owners.astype(np.int32) + 1
@@ -193,7 +193,7 @@ def _finish(
 ) -> None:
     """The truth of each pixel, and, last, what was written of the scene."""
     for name, image in zip(capture.names, owners):
-        write_label_image(root / "truth" / scene / f"{name}.png", (image + 1).astype(np.uint8))
+        write_image(root / "truth" / scene / f"{name}.png", (image + 1).astype(np.uint8))
     file = root / TWIN_FILE
     scenes = json.loads(file.read_text())["scenes"] if file.exists() else {}
     told |= {"frames": [frame.name for frame in frames]}

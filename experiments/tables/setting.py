@@ -67,7 +67,7 @@ def prepare(data: twins.Data, scene: str, seed: int, level: str, *, fit_steps: i
     shown = np.flatnonzero(~np.asarray(capture.held_out))
     names, size = tuple(capture.names[t] for t in shown), capture.frames.shape[1:3]
     masks = load_features(folder / "language_features", names, size)
-    tracks = load_labels(folder / "masks", names, size, shared=True).labels.astype(np.int32)
+    tracks = load_labels(folder / "masks", names, size).labels.astype(np.int32)
     texts, canonical = load_text_features(folder / "text_features.json", bench.queries)
     gaussians = gaussians_of(bench, folder, data.kept(root, scene), fit_steps)
     cameras = jax.tree.map(jnp.asarray, capture.cameras)

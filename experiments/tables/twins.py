@@ -33,8 +33,8 @@ from experiments.simulated_vision.embeddings import (
 )
 from experiments.simulated_vision.masks import LEVELS as NOISE, Faults, SimulatedMasks, simulated_masks
 from experiments.simulated_vision.worlds import Seen, World, seen_in, world_of
+from jsecon.data.images import write_image
 from jsecon.data.masks import LEVELS
-from jsecon.demo.capture import write_label_image
 from jsecon.demo.raycast import trace_rays
 from jsecon.files import write_text
 from jsecon.vision.protocols import CANONICAL
@@ -112,7 +112,7 @@ def look(bench: Benchmark, root: Path, level: str, seed: int) -> None:
                 rows.append(embedder.embed_regions(frame, image[None] == here[:, None, None]))
             found.append(first[id(level)])
         write_features(folder / "language_features", name, np.stack(found), np.concatenate(rows))
-        write_label_image(folder / "masks" / f"{name}.png", (masks.labels[t] + 1).astype(np.uint16))
+        write_image(folder / "masks" / f"{name}.png", (masks.labels[t] + 1).astype(np.uint16))
     vectors = np.concatenate([embedder.embed_text(list(bench.queries)), embedder.canonical])
     write_text_features(folder / "text_features.json", [*bench.queries, *CANONICAL], vectors)
 

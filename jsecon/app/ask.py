@@ -1,4 +1,4 @@
-"""Queries of a field: a text, a pixel, a region, or an outline. app/outputs writes the answers to files.
+"""Queries of a field: a text, a pixel, or a region. app/outputs writes the answers to files.
 
 A text passes these modules on the way to its .ply; splat/ renders for them.
 
@@ -30,7 +30,6 @@ from jsecon.query.blocks import SparseSelection, select_in_blocks
 from jsecon.query.composite import parse_query
 from jsecon.query.match import ONE_REGION, RegionMatch, best_presence, join_pieces, match_region, match_regions
 from jsecon.query.outliers import split_outliers
-from jsecon.query.outline import lift
 from jsecon.query.parts import PartsAnswer, parts_fallback
 from jsecon.query.pixel import region_at
 from jsecon.query.rules import PIECE_THRESHOLD, QUANTILE, QueryRules
@@ -206,48 +205,8 @@ def ask_region(
     return _select(field, match, "votes", threshold, True)
 
 
-def ask_outline(
-    field: LanguageField,
-    name: str,
-    outlines: Mapping[Any, np.ndarray],
-    *,
-    threshold: float | None = None,
-    outliers: bool = True,
-    key: str | None = None,
-) -> Answer:
-    """Selects the Gaussians of an object that is outlined in frames.
-
-    Args:
-      field: The field.
-      name: Name of the answer.
-      outlines: Index or name of a frame -> mask (H, W), or what `jsecon.query.outline.box_mask` makes.
-      threshold: Share of a Gaussian that must lie inside; None is 0.5.
-      outliers: Whether to drop outliers.
-      key: What tells it from other answers in file names (`Answer.key`); None is its name.
-
-    Returns:
-      The answer.
-
-    Raises:
-      InputError: The field has no such frame, or the masks outline no Gaussian.
-    """
-    frames = [frame_index(field, frame) for frame in outlines]
-    masks = np.stack([np.asarray(mask).astype(int) for mask in outlines.values()])
-    selection = lift(field, masks, frames, threshold=SHARE_THRESHOLD if threshold is None else threshold)
-    skipped = {"text encoder": "the outline is the query"}
-    key = name if key is None else key
-    answer = Answer(name, "outline", selection, np.asarray(selection.mask), skipped, key=key)
-    return drop_outliers(field, answer, outliers)
-
-
 def _match_text(
-    field: LanguageField,
-    embedder: Any,
-    text: str,
-    rules: QueryRules,
-    *,
-    by: str,
-    threshold: float | None,
+    field: LanguageField, embedder: Any, text: str, rules: QueryRules, *, by: str, threshold: float | None
 ) -> _Match:
     """Finds the regions that match a text, or the parts that answer in place of them."""
     require(by in METHODS, "by", by, f"one of {METHODS}", "votes is the default.")

@@ -282,8 +282,16 @@ def _act(module: str) -> Callable[[Any, Console], VerbResult]:
     """Returns the function that does the work of a verb; its module is imported when it is called."""
 
     def act(verb: Verb, console: Console) -> VerbResult:
+        name = type(verb).__name__.lower()
         with console.progress("start"):
-            work = getattr(importlib.import_module(f"jsecon.{module}"), f"{type(verb).__name__.lower()}_verb")
+            try:
+                work = importlib.import_module(f"jsecon.{module}").VERBS[type(verb)]
+            except ModuleNotFoundError as error:
+                if not verb.extra:
+                    raise
+                problem = f"the package {str(error.name).partition('.')[0]} is missing"
+                remedy = f'Run: pip install "jsecon[{verb.extra}]"'
+                raise InputError(f"jsecon {name}", problem, remedy=remedy) from error
         return work(verb, console)
 
     return act

@@ -75,19 +75,8 @@ def run_checks(models: Path | None = None) -> list[Check]:
     return [*checks, *_check_models(models), *map(_check_extra, EXTRAS)]
 
 
-def doctor_verb(verb: verbs.Doctor, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon doctor`.
-
-    Args:
-      verb: Its options.
-      console: Receives a line for each check.
-
-    Returns:
-      The checks, and an error for each that failed and that every run depends on.
-
-    Raises:
-      InputError: There is no such folder of models.
-    """
+def _doctor(verb: verbs.Doctor, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon doctor`; a check that fails and that every run depends on is an error."""
     with console.progress("checks"):
         checks = run_checks(verb.models)
     console.say("\n".join(f"{check.status:<8} {check.name:<10} {check.message}" for check in checks))
@@ -201,3 +190,7 @@ def _check_extra(name: str) -> Check:
 def _size(count: int) -> str:
     """Returns a number of bytes in GiB or MiB."""
     return f"{count / 2**30:.1f} GiB" if count >= 1 << 30 else f"{count / 2**20:.0f} MiB"
+
+
+VERBS = {verbs.Doctor: _doctor}
+"""what does the work of each verb"""

@@ -91,19 +91,8 @@ def _select_by_code(field: LanguageField, embedder: Any, text: str, kind: str) -
     return query_canonical(field.codes, code, canonical, CANONICAL_THRESHOLD)
 
 
-def eval_verb(verb: verbs.Eval, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon eval`: prints the table, and writes OUT/evaluation.json with every pair.
-
-    Args:
-      verb: Its options.
-      console: Receives the progress and the table.
-
-    Returns:
-      The summary of each kind of query, and the file under "written".
-
-    Raises:
-      InputError: The field or the labels cannot be read, a model is missing, or the folder cannot be written.
-    """
+def _eval(verb: verbs.Eval, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon eval`: prints the table, and writes OUT/evaluation.json with every pair."""
     out = verb.out or verb.field.parent
     require_writable(out)
     with console.progress("field"):
@@ -111,23 +100,16 @@ def eval_verb(verb: verbs.Eval, console: Console) -> verbs.VerbResult:
         embedder = open_embedder(field, verb, console)
     results = evaluate(field, embedder, load_lerf_labels(verb.labels), console)
     print_table(results, console)
-    pairs = {kind: summary | {"rows": [_pair(row) for row in rows]} for kind, (rows, summary) in results.items()}
+    pairs = {kind: summary | {"rows": [_plain(row) for row in rows]} for kind, (rows, summary) in results.items()}
     write_text(out / "evaluation.json", json.dumps(pairs, indent=2) + "\n")
     console.say(f"all pairs  {out / 'evaluation.json'}")
     return {"written": {"pairs": out / "evaluation.json"}} | {kind: summary for kind, (_, summary) in results.items()}
 
 
-def _pair(row: Row) -> dict[str, Any]:
+def _plain(row: Row) -> dict[str, Any]:
     """Returns a row without its mask as plain values."""
-    return {
-        "frame": row.frame,
-        "query": row.query,
-        "iou": round(row.iou, 4),
-        "located": row.located,
-        "selected": row.selected,
-        "region": row.region,
-        "score": round(row.score, 4),
-    }
+    values = {name: getattr(row, name) for name in ("frame", "query", "iou", "located", "selected", "region", "score")}
+    return values | {"iou": round(row.iou, 4), "score": round(row.score, 4)}
 
 
 def print_table(results: Evaluation, listener: Listener) -> None:
@@ -145,3 +127,7 @@ def print_table(results: Evaluation, listener: Listener) -> None:
     for kind, (_, summary) in results.items():
         shares = f"{summary['miou']:>6.3f} {summary['macc']:>10.3f} {summary['loc_acc']:>10.3f}"
         listener.say(f"  {kind:<14} {shares} {summary['missing']:>8}")
+
+
+VERBS = {verbs.Eval: _eval}
+"""what does the work of each verb"""

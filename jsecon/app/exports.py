@@ -39,43 +39,31 @@ def object_records(catalogue: Catalogue) -> list[dict[str, Any]]:
     Returns:
       Plain values of each object by name, in the capture's world. The columns of "axes" are the axes of the box.
     """
-    return [_object_record(catalogue, index) for index in range(len(catalogue))]
+    records = []
+    for n in range(len(catalogue)):
+        shape = catalogue.shapes[n]
+        length = float(np.linalg.norm(shape.high - shape.low))
+        names = zip(catalogue.names[n], catalogue.probability[n])
+        box = {"center": rounded(shape.center, length), "size": rounded(2 * shape.half_size, length)}
+        record = {
+            "id": n,
+            "names": [{"name": name, "probability": round(float(p), 4)} for name, p in names if name],
+            "surroundings": bool(catalogue.surroundings[n]),
+            "parent": int(catalogue.parent[n]) if catalogue.parent[n] >= 0 else None,
+            "gaussians": int(shape.count),
+            "confidence": round(float(catalogue.confidence[n]), 4),
+            "views": int(catalogue.views[n]),
+            "frames": [catalogue.frame_names[t] for t in catalogue.frames[n] if t >= 0],
+            "box": box | {"axes": np.round(shape.axes, 6).tolist()},
+            "low": rounded(shape.low, length),
+            "high": rounded(shape.high, length),
+        }
+        records.append(record)
+    return records
 
 
-def _object_record(catalogue: Catalogue, index: int) -> dict[str, Any]:
-    """Returns the record of an object."""
-    shape = catalogue.shapes[index]
-    length = float(np.linalg.norm(shape.high - shape.low))
-    names = zip(catalogue.names[index], catalogue.probability[index])
-    box = {"center": rounded(shape.center, length), "size": rounded(2 * shape.half_size, length)}
-    return {
-        "id": index,
-        "names": [{"name": name, "probability": round(float(p), 4)} for name, p in names if name],
-        "surroundings": bool(catalogue.surroundings[index]),
-        "parent": int(catalogue.parent[index]) if catalogue.parent[index] >= 0 else None,
-        "gaussians": int(shape.count),
-        "confidence": round(float(catalogue.confidence[index]), 4),
-        "views": int(catalogue.views[index]),
-        "frames": [catalogue.frame_names[t] for t in catalogue.frames[index] if t >= 0],
-        "box": box | {"axes": np.round(shape.axes, 6).tolist()},
-        "low": rounded(shape.low, length),
-        "high": rounded(shape.high, length),
-    }
-
-
-def objects_verb(verb: verbs.Objects, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon objects`.
-
-    Args:
-      verb: Its options.
-      console: Receives a line for each object.
-
-    Returns:
-      The records of the objects, and the files under "written".
-
-    Raises:
-      InputError: An input cannot be read, a model is missing, or the output folder cannot be written.
-    """
+def _objects(verb: verbs.Objects, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon objects`; the result has the records of the objects."""
     if verb.out is not None:
         require_writable(verb.out)
     with console.progress("field"):
@@ -104,19 +92,8 @@ def _read_vocabulary(file: Path) -> list[str]:
     return names
 
 
-def export_verb(verb: verbs.Export, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon export`.
-
-    Args:
-      verb: Its options.
-      console: Receives a line for each kind of file.
-
-    Returns:
-      The number of exported Gaussians, bytes of the scene, and the files under "written".
-
-    Raises:
-      InputError: Options cannot be combined, an input cannot be read, or a text selects no Gaussian.
-    """
+def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon export`; the result has the number of exported Gaussians and the bytes of the scene."""
     _check_export(verb)
     with console.progress("field"):
         if verb.out is not None:
@@ -283,3 +260,7 @@ def _center(catalogue: Catalogue, n: int) -> str:
     """Returns the centre of an object, to a hundredth of its size."""
     digits = decimals(2 * float(np.linalg.norm(catalogue.shapes.half_size[n])), 0.01)
     return ", ".join(f"{x:.{digits}f}" for x in catalogue.shapes.center[n])
+
+
+VERBS = {verbs.Objects: _objects, verbs.Export: _export}
+"""what does the work of each verb"""

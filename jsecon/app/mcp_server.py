@@ -4,13 +4,18 @@ Extra `mcp`. Every tool reads, none writes; a name in a call is never a path. Ba
 that tell the model what to change.
 """
 
+import functools
 import inspect
 import sys
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeAlias
 
 import cv2
 import numpy as np
+from mcp.server.mcpserver import Image, MCPServer
+from mcp.server.mcpserver.exceptions import ToolError
+from mcp.types import ToolAnnotations
+from pydantic import Field
 
 from jsecon.app import pictures, verbs
 from jsecon.app.exports import object_records
@@ -22,7 +27,6 @@ from jsecon.errors import InputError
 from jsecon.pipeline.progress import Console
 from jsecon.query.expressions import is_expression
 
-REMEDY = 'pip install "jsecon[mcp]"'
 INSTRUCTIONS = (
     "Finds things in 3D scenes. Coordinates are in the scene's own world, in metres where the capture has metres. "
     "Ask find for a thing by its name, relation for one told apart by where it is, such as "
@@ -30,10 +34,15 @@ INSTRUCTIONS = (
 )
 MAX_OBJECTS = 100
 """objects in an answer of the tool `objects`"""
+Words: TypeAlias = Annotated[str, Field(description="What is asked for, in words", min_length=1, max_length=500)]
+Frame: TypeAlias = Annotated[
+    str | None, Field(description="Name of the frame that it is seen from, or #3 for the fourth")
+]
+FieldName: TypeAlias = Annotated[str | None, Field(description="Name of the field; the first by default")]
 
 
 class _Tools:
-    """The work of the tools: plain values out, InputError for bad input. Models read the docstrings."""
+    """The tools: plain values out, InputError for bad input. Models read their docstrings and annotations."""
 
     def __init__(self, scenes: dict[str, Scene]):
         self.scenes = scenes
@@ -46,11 +55,11 @@ class _Tools:
             raise InputError(f"field {name!r}", "there is no such field", remedy=f"There are {', '.join(self.scenes)}.")
         return self.scenes[name]
 
-    def find(self, text: str, field: str | None = None) -> dict[str, Any]:
+    def find(self, text: Words, field: FieldName = None) -> dict[str, Any]:
         """Finds what a text names: number of Gaussians, score, centre and box. No relations in the text."""
         return self.scene(field).record(SceneQuery(_words(text)))
 
-    def relation(self, text: str, frame: str | None = None, field: str | None = None) -> dict[str, Any]:
+    def relation(self, text: Words, frame: Frame = None, field: FieldName = None) -> dict[str, Any]:
         """Finds things told apart by relations, orders or numbers: "the red mug left of the bottle".
 
         The answer has 0, 1 or several objects, alternatives, and a question where the text leaves open which is meant.
@@ -58,28 +67,28 @@ class _Tools:
         """
         return query_relation(self.scene(field).object_scene, text, frame=frame).as_dict()
 
-    def objects(self, field: str | None = None) -> dict[str, Any]:
+    def objects(self, field: FieldName = None) -> dict[str, Any]:
         """Lists the objects of a scene with names, sizes and places, the largest first."""
         rows = object_records(self.scene(field).object_scene.catalogue)
         return {"count": len(rows), "objects": rows[:MAX_OBJECTS]}
 
-    def locate(self, text: str, frame: str | None = None, field: str | None = None) -> dict[str, Any]:
+    def locate(self, text: Words, frame: Frame = None, field: FieldName = None) -> dict[str, Any]:
         """Locates one thing: oriented box, and the middle of its top, where a gripper from above would close."""
         scene = self.scene(field)
         place = locate(scene.object_scene, _words(text), frame=frame)
         return place.as_dict() | {"top": np.round(_top_of(scene, place), 6).tolist()}
 
-    def measure(self, a: str, b: str, frame: str | None = None, field: str | None = None) -> dict[str, Any]:
+    def measure(self, a: Words, b: Words, frame: Frame = None, field: FieldName = None) -> dict[str, Any]:
         """Measures the distance of two things: between surfaces, between centres, free gap, angle above horizontal."""
         return measure(self.scene(field).object_scene, a, b, frame=frame).as_dict()
 
-    def count(self, text: str, frame: str | None = None, field: str | None = None) -> dict[str, Any]:
+    def count(self, text: Words, frame: Frame = None, field: FieldName = None) -> dict[str, Any]:
         """Counts the things that a text names: "bottles", "red mugs on the table"."""
         text = text if is_expression(text) else f"how many {text}"
         answer = query_relation(self.scene(field).object_scene, text, frame=frame)
         return {"count": answer.count, "reading": answer.reading, "reason": answer.reason}
 
-    def render(self, text: str, frame: str | None = None, field: str | None = None) -> bytes:
+    def render(self, text: Words, frame: Frame = None, field: FieldName = None) -> Image:
         """Renders a frame with what a text names lit up, as a PNG; by default the frame that shows it best."""
         scene = self.scene(field)
         if is_expression(text):
@@ -89,7 +98,7 @@ class _Tools:
         index, mask = scene.mask(answer, frame)
         photo = pictures.Renderer(scene.field.gaussians, scene.field.cameras).photo(index)
         image = cv2.cvtColor(pictures.selection_overlay(photo, mask), cv2.COLOR_RGB2BGR)
-        return cv2.imencode(".png", image)[1].tobytes()
+        return Image(data=cv2.imencode(".png", image)[1].tobytes(), format="png")
 
 
 def _words(text: str) -> str:
@@ -106,80 +115,47 @@ def _top_of(scene: Scene, place: Place) -> np.ndarray:
     return place.center + (np.quantile(place.points @ up, 0.98) - place.center @ up) * up
 
 
-def make_server(scenes: dict[str, Scene]) -> Any:
+def make_server(scenes: dict[str, Scene]) -> MCPServer:
     """Makes the server of the Model Context Protocol.
 
     Args:
       scenes: Fields by name. The first is the default.
 
     Returns:
-      An `mcp.server.MCPServer` with the tools find, relation, objects, locate, measure, count and render.
-
-    Raises:
-      InputError: The extra is missing.
+      A server with the tools find, relation, objects, locate, measure, count and render.
     """
-    try:
-        from mcp.server.mcpserver import Image, MCPServer
-        from mcp.server.mcpserver.exceptions import ToolError
-        from mcp.types import ToolAnnotations
-        from pydantic import Field
-    except ImportError as error:
-        problem = f"the package {error.name} is missing"
-        raise InputError("jsecon mcp", problem, remedy=f"Run: {REMEDY}") from error
     server = MCPServer("jsecon", instructions=f"{INSTRUCTIONS} Fields: {', '.join(scenes)}.")
     tools = _Tools(scenes)
-    word = Annotated[str, Field(description="What is asked for, in words", min_length=1, max_length=500)]
-    frame = Annotated[str | None, Field(description="Name of the frame that it is seen from, or #3 for the fourth")]
-    field = Annotated[str | None, Field(description="Name of the field; the first by default")]
-    hints = {"text": word, "a": word, "b": word, "frame": frame, "field": field}
-
-    def add(method: Callable[..., Any], *, image: bool = False) -> None:
-        def call(**arguments: Any) -> Any:
-            try:
-                result = method(**arguments)
-            except InputError as error:
-                raise ToolError(str(error)) from error
-            return Image(data=result, format="png") if image else result
-
-        signature = inspect.signature(method)
-        parameters = [p.replace(annotation=hints[name]) for name, p in signature.parameters.items()]
-        answer = Image if image else dict[str, Any]
-        tool: Any = call
-        tool.__signature__ = signature.replace(parameters=parameters, return_annotation=answer)
-        tool.__annotations__ = {p.name: p.annotation for p in parameters} | {"return": answer}
-        annotations = ToolAnnotations(read_only_hint=True, open_world_hint=False, idempotent_hint=True)
-        server.add_tool(
-            tool,
-            name=method.__name__,
-            description=inspect.getdoc(method),
-            annotations=annotations,
-            structured_output=not image,
-        )
-
-    for method in (tools.find, tools.relation, tools.objects, tools.locate, tools.measure, tools.count):
-        add(method)
-    add(tools.render, image=True)
+    annotations = ToolAnnotations(read_only_hint=True, open_world_hint=False, idempotent_hint=True)
+    for method in (tools.find, tools.relation, tools.objects, tools.locate, tools.measure, tools.count, tools.render):
+        text = inspect.getdoc(method)
+        structured = method != tools.render
+        server.add_tool(_tool(method), description=text, annotations=annotations, structured_output=structured)
     return server
 
 
-def mcp_verb(verb: verbs.Mcp, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon mcp`.
+def _tool(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Makes the InputErrors of a method errors of a call."""
 
-    Args:
-      verb: Its options.
-      console: Gives way to one on standard error, since standard output belongs to the protocol.
+    @functools.wraps(method)
+    def call(*args: Any, **arguments: Any) -> Any:
+        try:
+            return method(*args, **arguments)
+        except InputError as error:
+            raise ToolError(str(error)) from error
 
-    Returns:
-      Under "then", the function that serves until standard input ends.
+    return call
 
-    Raises:
-      InputError: The extra or a model is missing, or a field cannot be read.
-    """
+
+def _mcp(verb: verbs.Mcp, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon mcp`; standard output belongs to the protocol, so the console is on standard error."""
     console = Console(sys.stderr)
     with console.progress("fields"):
-        embedder = with_models(verb, console, yes=False).embedder
-        make_server({})  # before the fields are loaded, since its extra may be missing
-        scenes = open_scenes(verb.fields, embedder)
+        scenes = open_scenes(verb.fields, with_models(verb, console, yes=False).embedder)
     for scene in scenes.values():
         console.say(f"{scene.name}: {scene.field.gaussians.count} Gaussians, {scene.field.regions.count} regions")
     return {"then": make_server(scenes).run}
+
+
+VERBS = {verbs.Mcp: _mcp}
+"""what does the work of each verb"""

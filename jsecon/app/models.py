@@ -125,19 +125,8 @@ def help_table() -> str:
     return "\n".join(["models", *(f"  {line}" for line in (f"{TABLE_HEAD}  adds", *lines, TABLE_NOTE))])
 
 
-def models_verb(verb: verbs.Models, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon models`.
-
-    Args:
-      verb: Its options.
-      console: Receives the lines of the action, and asks before it fetches.
-
-    Returns:
-      Rows, folders, freed bytes or reports, and the errors of the models that an action failed for.
-
-    Raises:
-      InputError: A name is missing or unknown, or the model is not on this machine.
-    """
+def _models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon models`; the result has rows, folders, freed bytes or reports, and errors by model."""
     if verb.action == "list":
         return _list_models(console)
     if not verb.names:
@@ -233,3 +222,7 @@ def _usable(models: Sequence[HubModel]) -> HubModel:
     remedy = "jsecon models list has models that work."
     problem = f"it holds no model in {models[0].precision} that jsecon reads"
     raise InputError(models[0].address, problem, "", remedy)
+
+
+VERBS = {verbs.Models: _models}
+"""what does the work of each verb"""

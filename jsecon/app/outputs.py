@@ -12,23 +12,22 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import jax
 import numpy as np
 from jaxtyping import Bool, Int
 
 from jsecon.app import pictures, report
 from jsecon.app.ask import Answer
-from jsecon.app.locate import decimals, gaussian_rows, rounded, selected_centers
+from jsecon.app.locate import decimals, rounded, selected_centers
 from jsecon.data.gaussians.files import save_gaussians
 from jsecon.data.gaussians.ply import save_ply
-from jsecon.files import atomic_write, write_text
+from jsecon.data.images import write_image
+from jsecon.files import write_text
 from jsecon.language.columns import vote_blocks
 from jsecon.language.field import subset_field
 from jsecon.language.membership import SHARE_THRESHOLD, probability_inside, vote_shares
 from jsecon.pipeline.progress import Listener
 from jsecon.query.render import selection_mask
-from jsecon.splat.transform import transform_gaussians_float64
 from jsecon.types import LanguageField
 
 MAX_SLUG_BYTES = 80
@@ -131,14 +130,10 @@ def write_answer(
     record = _record(part, answer) | {"gaussians": field.gaussians.count, ending: None, "masks": {}}
     if answer.mask.any():
         record[ending] = f"{stem}.{ending}"
-        columns = {"codes": np.asarray(part.codes), "regions": main_regions(part)} if ending == "glb" else {}
-        columns = {name: column[answer.mask] for name, column in columns.items()}
-        selected = transform_gaussians_float64(gaussian_rows(part.gaussians, answer.mask), part.to_source)
-        save_gaussians(out / record[ending], selected, **columns)
+        save_scene(part, out / record[ending], rows=np.flatnonzero(answer.mask))
         for t, mask in masks.items():
             record["masks"][field.names[t]] = file = f"{stem}-{_frame_stem(field, t)}.png"
-            with atomic_write(out / file) as temporary:
-                temporary.write_bytes(cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes())
+            write_image(out / file, mask.astype(np.uint8) * 255)
     write_text(out / f"{stem}.json", json.dumps(record, indent=2) + "\n")
     return record
 

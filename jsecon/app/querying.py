@@ -1,9 +1,11 @@
 """`jsecon query`: its checks, the answers to its texts, pixels and outlines, and their files."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from jsecon.app import ask, verbs
 from jsecon.app.ask import Answer
@@ -12,27 +14,17 @@ from jsecon.app.outputs import write_answers
 from jsecon.data.gaussians.files import require_writable_format
 from jsecon.errors import InputError
 from jsecon.language.field import check_field, load_field
+from jsecon.language.membership import SHARE_THRESHOLD
 from jsecon.pipeline.options import Options, is_bare_scene, require_writable
 from jsecon.pipeline.progress import Console
 from jsecon.process import MEMORY, memory_budget
 from jsecon.query.expressions import is_expression
-from jsecon.query.outline import box_mask
+from jsecon.query.outline import box_mask, lift
 from jsecon.types import LanguageField
 
 
-def query_verb(verb: verbs.Query, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon query`.
-
-    Args:
-      verb: Its options.
-      console: Receives a line for each answer.
-
-    Returns:
-      The records of the answers, the files under "written", and the errors of the queries that failed.
-
-    Raises:
-      InputError: Options cannot be combined, an input cannot be read, or a model is missing.
-    """
+def _query(verb: verbs.Query, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon query`; the result has the records of the answers, and the errors of failed queries."""
     _check_query(verb)
     require_writable(verb.out)
     verb = with_models(verb, console, yes=verb.yes)
@@ -200,10 +192,32 @@ def _ask_masks(field: LanguageField, pairs: Sequence[str], **options: Any) -> An
         raise InputError("--mask", "a frame has two masks", remedy="Give one mask of an object in each frame.")
     outlines = {name: ask.read_mask(Path(file), field) for name, file in zip(names, files)}
     key = "\0".join(("mask", *(part for pair in zip(names, files) for part in pair)))
-    return ask.ask_outline(field, Path(files[0]).stem, outlines, key=key, **options)
+    return _ask_outline(field, Path(files[0]).stem, key, outlines, **options)
 
 
 def _ask_box(field: LanguageField, frame: str, *ends: int, **options: Any) -> Answer:
     """Answers a box: the left, upper, right and lower end in a frame, px."""
     name = f"box {field.names[ask.frame_index(field, frame)]} {' '.join(map(str, ends))}"
-    return ask.ask_outline(field, name, {frame: box_mask(field, *ends)}, **options)
+    return _ask_outline(field, name, name, {frame: box_mask(field, *ends)}, **options)
+
+
+def _ask_outline(
+    field: LanguageField,
+    name: str,
+    key: str,
+    outlines: Mapping[str, np.ndarray],
+    *,
+    threshold: float | None,
+    outliers: bool,
+) -> Answer:
+    """Answers an object that is outlined in frames, by the masks (H, W) or `box_mask` of each frame."""
+    frames = [ask.frame_index(field, frame) for frame in outlines]
+    masks = np.stack([np.asarray(mask).astype(int) for mask in outlines.values()])
+    selection = lift(field, masks, frames, threshold=SHARE_THRESHOLD if threshold is None else threshold)
+    skipped = {"text encoder": "the outline is the query"}
+    answer = Answer(name, "outline", selection, np.asarray(selection.mask), skipped, key=key)
+    return ask.drop_outliers(field, answer, outliers)
+
+
+VERBS = {verbs.Query: _query}
+"""what does the work of each verb"""

@@ -98,12 +98,11 @@ def shades(header: Sequence[str], rows: Iterable[tuple[str, Sequence[float | Non
     return _scrolled(f'<table class="shades"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>')
 
 
-def bars(seconds: Mapping[str, float], notes: Mapping[str, str] | None = None) -> str:
+def bars(seconds: Mapping[str, float]) -> str:
     """Makes a bar for each stage.
 
     Args:
       seconds: Stage -> its seconds.
-      notes: Stage -> what stands beside its bar.
 
     Returns:
       Its HTML, with a sum.
@@ -111,10 +110,10 @@ def bars(seconds: Mapping[str, float], notes: Mapping[str, str] | None = None) -
     longest = max(seconds.values(), default=0.0) or 1.0
     rows = "".join(
         f'<tr><td>{_escaped(name)}</td><td class="n">{value:.1f} s</td><td class="length"><div class="bar" '
-        f'style="width:{100 * value / longest:.1f}%"></div></td><td>{_escaped((notes or {}).get(name, ""))}</td></tr>'
+        f'style="width:{100 * value / longest:.1f}%"></div></td></tr>'
         for name, value in seconds.items()
     )
-    total = f'<tr><td><b>all</b></td><td class="n"><b>{sum(seconds.values()):.1f} s</b></td><td></td><td></td></tr>'
+    total = f'<tr><td><b>all</b></td><td class="n"><b>{sum(seconds.values()):.1f} s</b></td><td></td></tr>'
     return _scrolled(f"<table><tbody>{rows}{total}</tbody></table>")
 
 

@@ -31,19 +31,8 @@ LARGE = 0.15
 """share of a frame; a masklet that fills more in some frame is not shown by itself"""
 
 
-def run_verb(verb: verbs.Run, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon run`.
-
-    Args:
-      verb: Its options.
-      console: Receives the stages, the notes and the figures.
-
-    Returns:
-      The metrics, and the files under "written"; with --dry-run the plan. Of several processes the others return {}.
-
-    Raises:
-      InputError: The capture or an option cannot be used, or a model is missing.
-    """
+def _run(verb: verbs.Run, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon run`; the result has the metrics, of a dry run the plan, of a worker nothing else."""
     options = with_models(verb.options, console, yes=verb.yes)
     if verb.dry_run:
         return pipeline.dry_run(options, verb.out, listener=console)
@@ -62,19 +51,8 @@ def run_verb(verb: verbs.Run, console: Console) -> verbs.VerbResult:
     return {"written": [verb.out / name for name in FILES]} | _write_run(run, verb.out, console)
 
 
-def fit_verb(verb: verbs.Fit, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon fit`: writes the scene in the world of the capture's files, and prints its figures.
-
-    Args:
-      verb: Its options.
-      console: Receives the stages and the figures.
-
-    Returns:
-      The number of Gaussians, PSNR (dB) and SSIM of the held-out frames, and the file under "written".
-
-    Raises:
-      InputError: The capture, an option or the output file cannot be used.
-    """
+def _fit(verb: verbs.Fit, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon fit`: writes the scene in the world of the capture's files, and prints its figures."""
     require_writable_format(verb.out)
     folder = verb.out.with_suffix("")
     if verb.dry_run:
@@ -231,13 +209,13 @@ def _work_parts(run: Run) -> list[str]:
     )
     provenance = f"<pre>{html.escape(json.dumps(json.loads(run.field.provenance), indent=2))}</pre>"
     folded = report.folded("settings at their defaults", default), report.folded("provenance of the field", provenance)
-    measured = (
-        "Wall time of each stage, also of those that an earlier run computed, and the number of programs that jax "
-        "compiled for it in this run (in brackets: read from disk)."
-    )
-    programs = {name: f"{n['all']} ({n['from_disk']})" if n["all"] else "" for name, n in run.compilations.items()}
+    measured = "Wall time of each stage, also of those that an earlier run computed."
     return [
-        report.section("Seconds of each stage", measured, report.bars(run.seconds, programs)),
+        report.section("Seconds of each stage", measured, report.bars(run.seconds)),
         report.section("Stages", "What ran, and what this scene does not need.", stages, notes),
         report.section("Settings", "", changed, *folded),
     ]
+
+
+VERBS = {verbs.Run: _run, verbs.Fit: _fit}
+"""what does the work of each verb"""

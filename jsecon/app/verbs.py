@@ -51,9 +51,10 @@ class Output:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Verb:
-    """Base of the verbs. The examples of a verb are command lines that its help shows."""
+    """Base of the verbs. Its help shows the examples, command lines; `extra` is the extra of jsecon that it needs."""
 
     examples: ClassVar[tuple[str, ...]]
+    extra: ClassVar[str] = ""
     output: Output = Output()
 
 
@@ -150,6 +151,25 @@ class Fit(Verb):
     def options(self) -> Options:
         """Options of the fit without the groups."""
         return Options(self.capture, **vars(self.scene))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ServerVerb(Verb):
+    """Options of the verbs that listen.
+
+    Attributes:
+      host: Address to listen on. Beyond loopback a token is required.
+      port: Port to listen on.
+      token: Token that requests must carry: a page in its address, as that is printed, others behind "Bearer" in the
+        header Authorization. By default it is JSECON_TOKEN of the environment, and without that no token is needed.
+      allow_host: Name by which clients reach this server besides localhost and --host, such as that of a proxy. Without
+        a token, requests by other names are refused.
+    """
+
+    host: Option[str] = "127.0.0.1"
+    port: Option[int] = 8765
+    token: Option[str] = ""
+    allow_host: RepeatedAdvanced[str] = dataclasses.field(default_factory=list)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -301,7 +321,7 @@ class Export(FieldVerb):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class View(FieldVerb):
+class View(ServerVerb, FieldVerb):
     """Shows a field in a browser and answers queries there.
 
     A page on loopback shows the Gaussians (extra viewer). A text highlights what it selects, a click what lies there.
@@ -312,11 +332,6 @@ class View(FieldVerb):
       texts: Texts to highlight.
       export: HTML file to write instead of opening a page.
       link: Link that the viewer showed, to restore its state.
-      host: Address to listen on. Beyond loopback a token is required.
-      port: Port to listen on.
-      token: Token that the page's address must carry, as the printed address does. By default it is JSECON_TOKEN of
-        the environment.
-      allow_host: Name by which browsers reach this server besides localhost and --host, such as that of a proxy.
     """
 
     examples = (
@@ -327,10 +342,7 @@ class View(FieldVerb):
     texts: Positional[list[str]]
     export: Option[Path | None] = None
     link: Advanced[str] = ""
-    host: Option[str] = "127.0.0.1"
     port: Option[int] = 8766
-    token: Option[str] = ""
-    allow_host: RepeatedAdvanced[str] = dataclasses.field(default_factory=list)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -353,7 +365,7 @@ class Eval(FieldVerb):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Serve(Verb):
+class Serve(ServerVerb):
     """Answers queries over HTTP, with fields that are loaded once.
 
     Answers POST /query {"text": "red mug"} with Content-Type application/json, and more: see GET / and /openapi.json
@@ -361,22 +373,13 @@ class Serve(Verb):
 
     Attributes:
       fields: Paths of field.safetensors files. Each field is known by the name of its folder.
-      host: Address to listen on. Beyond loopback a token is required.
-      port: Port to listen on.
-      token: Token that clients must send as "Authorization: Bearer TOKEN". By default it is JSECON_TOKEN of the
-        environment, and without that no token is needed.
-      allow_host: Name by which clients reach this server besides localhost and --host, such as that of a proxy. Without
-        a token, requests by other names are refused.
       embedder: Folder of the CLIP model that the fields were made with. By default it is where the runs had it.
     """
 
     examples = ("jsecon serve my_field/field.safetensors other_field/field.safetensors",)
+    extra = "serve"
 
     fields: Positional[list[Path]]
-    host: Option[str] = "127.0.0.1"
-    port: Option[int] = 8765
-    token: Option[str] = ""
-    allow_host: RepeatedAdvanced[str] = dataclasses.field(default_factory=list)
     embedder: Option[Path | None] = None
 
 
@@ -393,6 +396,7 @@ class Mcp(Verb):
     """
 
     examples = ("jsecon mcp my_field/field.safetensors",)
+    extra = "mcp"
 
     fields: Positional[list[Path]]
     embedder: Option[Path | None] = None
@@ -473,4 +477,5 @@ VERBS: dict[type[Verb], str] = {
     Models: "app.models",
     Doctor: "app.doctor",
 }
-"""A verb's options -> the module whose function NAME_verb does its work: of (verb, `Console`), to a `VerbResult`."""
+"""A verb's options -> the module whose table VERBS has the function that does its work: of (verb, `Console`), to a
+`VerbResult`. It raises InputError for bad input."""

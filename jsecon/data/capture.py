@@ -1,23 +1,16 @@
 """Captures of any known format, on the host, and whether their views can be used together."""
 
-import itertools
 from collections.abc import Callable, Collection
 from pathlib import Path
 
-import numpy as np
-from scipy.optimize import nnls
-
 from jsecon.data.colmap import find_models, read_colmap
-from jsecon.data.frames import CaptureExtent, PosedImages, build_capture, check_capture_options, planned_extent
+from jsecon.data.frames import CaptureExtent, FrameOptions, PosedImages, build_capture, planned_extent
 from jsecon.data.nerfstudio import read_nerfstudio
 from jsecon.data.rgbd import find_rgbd
 from jsecon.data.sfm import list_photographs
 from jsecon.errors import InputError
 from jsecon.files import is_output_folder
-from jsecon.types import Camera, Capture, Progress
-
-_POINT_BLOCK = 65536
-"""points that are projected at a time"""
+from jsecon.types import Capture, Progress
 
 
 def load_capture(
@@ -51,21 +44,16 @@ def load_capture(
     Raises:
       InputError: The path holds no capture, or a damaged one.
     """
-    check_capture_options(downscale, frames, holdout, long_side)
-    options = {"downscale": downscale, "long_side": long_side, "frames": frames, "holdout": holdout, "only": only}
-    return build_capture(_read(Path(path)), **options, progress=progress)
+    options = FrameOptions(downscale, long_side, frames, holdout)
+    return build_capture(_read(Path(path)), options, only=only, progress=progress)
 
 
-def capture_extent(
-    path: str | Path, *, downscale: float | None = None, long_side: int | None = None, frames: int | None = None
-) -> CaptureExtent:
+def capture_extent(path: str | Path, options: FrameOptions) -> CaptureExtent:
     """Computes what frames `load_capture` would load, from image headers only.
 
     Args:
       path: As in `load_capture`.
-      downscale: As in `load_capture`.
-      long_side: As in `load_capture`.
-      frames: As in `load_capture`.
+      options: Options of the frames.
 
     Returns:
       Number, size and names of the frames.
@@ -73,8 +61,7 @@ def capture_extent(
     Raises:
       InputError: As in `load_capture`, but for damaged pixels.
     """
-    check_capture_options(downscale, frames, None, long_side)
-    return planned_extent(_read(Path(path)), downscale, long_side, frames)
+    return planned_extent(_read(Path(path)), options)
 
 
 def _find_reader(path: Path) -> Callable[[], PosedImages] | None:
@@ -102,11 +89,6 @@ def _read(path: Path) -> PosedImages:
     return reader()
 
 
-def _has_poses(path: Path) -> bool:
-    """Whether a path is a capture with poses, of any known format."""
-    return _find_reader(path) is not None
-
-
 def may_have_depth(path: Path) -> bool:
     """Whether a capture can have depth maps, by its format and its transforms.json; reads no frame.
 
@@ -132,7 +114,7 @@ def unposed_photographs(path: Path) -> list[Path]:
     Returns:
       Paths of the photographs; empty if the folder has poses.
     """
-    if not path.is_dir() or _has_poses(path):
+    if not path.is_dir() or _find_reader(path) is not None:
         return []
     photos = list_photographs(path)
     is_nested = bool(photos) and photos[0].parent not in (path, path / "images")
@@ -142,7 +124,7 @@ def unposed_photographs(path: Path) -> list[Path]:
 def _inner_captures(path: Path) -> list[Path]:
     """The subfolders that are captures."""
     folders = sorted(child for child in path.iterdir() if child.is_dir() and not child.name.startswith("."))
-    return [child for child in folders if not is_output_folder(child) and _has_poses(child)]
+    return [child for child in folders if not is_output_folder(child) and _find_reader(child) is not None]
 
 
 def _no_capture(path: Path) -> InputError:
@@ -166,68 +148,3 @@ def _no_capture(path: Path) -> InputError:
         remedy = f"Give the transforms file itself, for example {files[0]}."
     names = ", ".join(child.name for child in entries[:5]) + (", ..." if len(entries) > 5 else "")
     return InputError(path, f"a folder without poses and photographs, but with {names}", expected, remedy)
-
-
-def check_views_overlap(capture: Capture) -> None:
-    """Checks that two views can see a thing in common, as tracking and fitting need.
-
-    With sparse points, a point must lie in two views' frusta; without, two frusta (unbounded pyramids) must meet. Both
-    are necessary for an overlap and ignore occlusion: views that pass may still overlap too little. A single view
-    passes if it has depth.
-
-    Args:
-      capture: The capture.
-
-    Raises:
-      InputError: No two views overlap.
-    """
-    count = len(capture.names)
-    if count < 2 and capture.depths is not None:
-        return
-    if count < 2:
-        problem = "it has a single view"
-    elif len(capture.points):
-        if _share_points(capture.cameras, np.asarray(capture.points)):
-            return
-        problem = f"no two of its {count} views see the same of {len(capture.points)} sparse points"
-    else:
-        cameras = [capture.cameras[index] for index in range(count)]
-        if any(_frusta_meet(a, b) for a, b in itertools.combinations(cameras, 2)):
-            return
-        problem = f"its {count} views look apart from each other"
-    remedy = "Check the poses and their axes (world-to-camera, OpenCV), and take views that overlap."
-    raise InputError(f"capture of {capture.names[0]} ...", problem, "two views of the same things", remedy)
-
-
-def _share_points(cameras: Camera, points: np.ndarray) -> bool:
-    """Whether a point lies in two frusta."""
-    for start in range(0, len(points), _POINT_BLOCK):
-        block = np.asarray(points[start : start + _POINT_BLOCK], np.float64)
-        views = np.zeros(len(block), np.int32)
-        for index in range(len(cameras.fx)):
-            pose = np.asarray(cameras.world_to_camera[index], np.float64)
-            x, y, z = pose[:3, :3] @ block.T + pose[:3, 3:]
-            z = np.where(z > 0, z, np.nan)
-            u, v = cameras.fx[index] * x / z + cameras.cx[index], cameras.fy[index] * y / z + cameras.cy[index]
-            views += (u >= 0) & (u <= cameras.width) & (v >= 0) & (v <= cameras.height)
-            if (views > 1).any():
-                return True
-    return False
-
-
-def _corner_rays(camera: Camera) -> np.ndarray:
-    """(4, 3) directions of the image's corners, world."""
-    corners = np.array([[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]], np.float64)
-    x, y = (corners[:, 0] - camera.cx) / camera.fx, (corners[:, 1] - camera.cy) / camera.fy
-    return np.stack([x, y, np.ones(4)], axis=-1) @ np.asarray(camera.world_to_camera, np.float64)[:3, :3]
-
-
-def _frusta_meet(a: Camera, b: Camera) -> bool:
-    """Whether two pyramids have a point in common.
-
-    They do exactly if b's apex - a's apex = (a ray of a) - (a ray of b), that is if it lies in the cone of a's corner
-    rays and b's negated ones: a sum of them with weights that are not negative.
-    """
-    rays = np.concatenate([_corner_rays(a), -_corner_rays(b)])
-    gap = np.asarray(b.centres, np.float64) - np.asarray(a.centres, np.float64)
-    return bool(nnls(rays.T, gap)[1] <= 1e-9 * max(1.0, np.abs(gap).max()))

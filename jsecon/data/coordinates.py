@@ -66,27 +66,6 @@ def make_rigid(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Floa
     return result
 
 
-def invert_pose(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Float[np.ndarray, "4 4"]:
-    """Inverts a pose: camera to world becomes world to camera.
-
-    Args:
-      pose: As in `make_rigid`.
-      where: As in `make_rigid`.
-      name: As in `make_rigid`.
-
-    Returns:
-      (4, 4) float64 inverse, rigid.
-
-    Raises:
-      InputError: As in `make_rigid`.
-    """
-    pose = make_rigid(pose, where, name)
-    result = np.eye(4)
-    result[:3, :3] = pose[:3, :3].T
-    result[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
-    return result
-
-
 def camera_jumps(poses: Float[np.ndarray, "t 4 4"], names: Sequence[str]) -> list[str]:
     """Reports places where neighbouring cameras lie more than JUMP median steps apart.
 

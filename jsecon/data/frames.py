@@ -9,10 +9,10 @@ import math
 import os
 import re
 import tempfile
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
@@ -83,29 +83,45 @@ class CaptureExtent(NamedTuple):
     """Image of each named frame."""
 
 
-def check_capture_options(
-    downscale: float | int | None, frames: int | None, holdout: int | None, long_side: int | None = None
-) -> None:
-    """Checks the options of `build_capture`.
+@dataclasses.dataclass(frozen=True)
+class FrameOptions:
+    """Which frames of a capture are loaded, and their size.
 
-    Args:
-      downscale: As in `build_capture`.
-      frames: As in `build_capture`.
-      holdout: As in `build_capture`; 1 would leave no frame to fit to.
-      long_side: As in `build_capture`.
-
-    Raises:
-      InputError: No capture can be loaded with one of them.
+    Attributes:
+      downscale: Divides width and height, at least 1.
+      long_side: Longest side of the frames, px, if `downscale` is None; None: no limit.
+      frames: Most frames, evenly spaced; None: all.
+      holdout: k holds out the frames 0, k, 2k, ...; 0 or None holds out no frame, and 1 would leave none to fit to.
     """
-    if downscale is not None and not (np.isfinite(downscale) and downscale >= 1):
-        raise InputError("downscale", str(downscale), "a number of at least 1", "2 halves width and height.")
-    if long_side is not None and long_side < 1:
-        raise InputError("long_side", str(long_side), "at least 1 px", "400 is the default.")
-    if frames is not None and frames < 1:
-        raise InputError("frames", str(frames), "at least 1", "Leave it out to take every frame.")
-    if holdout is not None and (holdout < 0 or holdout == 1):
-        remedy = "8 is the custom; 1 leaves no frame to fit to."
-        raise InputError("holdout", str(holdout), "0 (no frame), or at least 2 (every second)", remedy)
+
+    downscale: float | int | None = None
+    long_side: int | None = None
+    frames: int | None = None
+    holdout: int | None = None
+
+    def __post_init__(self) -> None:
+        """Raises InputError if no capture can be loaded with one of the options."""
+        if self.downscale is not None and not (np.isfinite(self.downscale) and self.downscale >= 1):
+            raise InputError("downscale", str(self.downscale), "a number of at least 1", "2 halves width and height.")
+        if self.long_side is not None and self.long_side < 1:
+            raise InputError("long_side", str(self.long_side), "at least 1 px", "400 is the default.")
+        if self.frames is not None and self.frames < 1:
+            raise InputError("frames", str(self.frames), "at least 1", "Leave it out to take every frame.")
+        if self.holdout is not None and (self.holdout < 0 or self.holdout == 1):
+            remedy = "8 is the custom; 1 leaves no frame to fit to."
+            raise InputError("holdout", str(self.holdout), "0 (no frame), or at least 2 (every second)", remedy)
+
+    def size(self, size: tuple[int, int]) -> tuple[int, int]:
+        """Computes the size of the frames.
+
+        Args:
+          size: (width, height) of the images, px.
+
+        Returns:
+          (width, height), px.
+        """
+        shrink = self.downscale or max(max(size) / (self.long_side or max(size)), 1.0)
+        return max(1, round(size[0] / shrink)), max(1, round(size[1] / shrink))
 
 
 def evenly_spaced(count: int, limit: int | None) -> np.ndarray:
@@ -271,16 +287,12 @@ def _allocate_frames(shape: tuple[int, ...]) -> np.ndarray:
             raise InputError(tempfile.gettempdir(), problem, remedy=remedy) from error
 
 
-def planned_extent(
-    posed: PosedImages, downscale: float | int | None, long_side: int | None, frames: int | None
-) -> CaptureExtent:
+def planned_extent(posed: PosedImages, options: FrameOptions) -> CaptureExtent:
     """Computes the extent of `build_capture`'s result; of the images, only headers are read.
 
     Args:
       posed: The posed images.
-      downscale: As in `build_capture`.
-      long_side: As in `build_capture`.
-      frames: As in `build_capture`.
+      options: Options of the frames.
 
     Returns:
       Number, size and names of the frames.
@@ -289,12 +301,12 @@ def planned_extent(
       InputError: As in `build_capture`, but for damaged pixels.
     """
     images, _, names = _in_order(posed)
-    chosen = evenly_spaced(len(images), frames)
+    chosen = evenly_spaced(len(images), options.frames)
     images = [images[i] for i in chosen]
     lenses, orientations, _ = _resolve_orientations(images)
     for lens in set(lenses):
         undistorted_pinhole(lens, posed.where)
-    size = downscaled_size(_commonest_size(lenses), downscale, long_side)
+    size = options.size(_commonest_size(lenses))
     return CaptureExtent(len(images), size, tuple(names[i] for i in chosen), _files(images, lenses, orientations))
 
 
@@ -320,76 +332,48 @@ def _commonest_size(lenses: Sequence[Lens]) -> tuple[int, int]:
     return collections.Counter((lens.width, lens.height) for lens in lenses).most_common(1)[0][0]
 
 
-def downscaled_size(size: tuple[int, int], downscale: float | int | None, long_side: int | None) -> tuple[int, int]:
-    """Computes the size of frames.
-
-    Args:
-      size: (width, height) of the images, px.
-      downscale: As in `build_capture`.
-      long_side: As in `build_capture`.
-
-    Returns:
-      (width, height) of the frames, px.
-    """
-    if downscale is None:
-        downscale = max(max(size) / long_side, 1.0) if long_side is not None else 1.0
-    return max(1, round(size[0] / downscale)), max(1, round(size[1] / downscale))
+Maps: TypeAlias = tuple[np.ndarray, np.ndarray]
+"""of `undistortion_maps`"""
 
 
-@dataclasses.dataclass(frozen=True)
-class _FrameReader:
-    """Reads the pixels and the depth of one frame."""
+def _read_pixels(
+    image: PosedImage, orientation: int, maps: Maps | None, size: tuple[int, int]
+) -> tuple[UInt8[np.ndarray, "h w 3"], bool]:
+    """The undistorted frame at `size` (width, height), and whether it had transparent pixels."""
+    pixels, transparent = read_image(image.image, upright=orientation != 1)
+    if maps is not None:
+        pixels = cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    if pixels.shape[1::-1] == size:
+        return pixels, transparent
+    shrinks = size[0] <= pixels.shape[1] and size[1] <= pixels.shape[0]
+    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR), transparent
 
-    image: PosedImage
-    lens: Lens
-    pinhole: Lens
-    orientation: int
-    size: tuple[int, int]
-    """(width, height) of the frames."""
-    unit: float
-    """World units of the capture per world unit of the files."""
-    maps: Callable[[Lens, Lens], tuple[np.ndarray, np.ndarray]]
-    """`undistortion_maps`, cached."""
 
-    def pixels(self) -> tuple[np.ndarray, bool]:
-        """The undistorted frame (H, W, 3), and whether it had transparent pixels."""
-        pixels, transparent = read_image(self.image.image, upright=self.orientation != 1)
-        if self.lens.distorted:
-            maps = self.maps(self.lens, self.pinhole)
-            pixels = cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        width, height = self.size
-        if pixels.shape[:2] == (height, width):
-            return pixels, transparent
-        shrinks = width <= pixels.shape[1] and height <= pixels.shape[0]
-        return cv2.resize(pixels, self.size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR), transparent
-
-    def depth(self) -> np.ndarray:
-        """The undistorted depth map (H, W)."""
-        assert self.image.depth is not None
-        depth = read_depth(self.image.depth, self.image.depth_unit * self.unit)
-        lens = self.lens
-        if self.image.depth_lens is not None:
-            depth = resample_depth(depth, self.image.depth_lens, lens)
-        elif not _fits(lens, *depth.shape[1::-1]) and self.orientation in TRANSPOSED:
-            depth = apply_orientation(depth, self.orientation)  # measured like the stored pixels
-        if abs(depth.shape[1] * lens.height / depth.shape[0] - lens.width) > 1:
-            problem = f"the depth map is {depth.shape[1]}x{depth.shape[0]}"
-            expected = f"the aspect of its image, {lens.width}x{lens.height}"
-            raise InputError(self.image.depth, problem, expected, "Register it to the image.")
-        # Nearest throughout: the mean of two depths lies on neither surface.
-        if lens.distorted:
-            depth = cv2.resize(depth, (lens.width, lens.height), interpolation=cv2.INTER_NEAREST_EXACT)
-            depth = cv2.remap(depth, *self.maps(lens, self.pinhole), cv2.INTER_NEAREST)
-        return cv2.resize(depth, self.size, interpolation=cv2.INTER_NEAREST_EXACT)
+def _read_depth(
+    file: Path, image: PosedImage, lens: Lens, orientation: int, maps: Maps | None, size: tuple[int, int], unit: float
+) -> Float[np.ndarray, "h w"]:
+    """The undistorted depth map at `size` (width, height), with `unit` for a world unit of the file."""
+    depth = read_depth(file, image.depth_unit * unit)
+    if image.depth_lens is not None:
+        depth = resample_depth(depth, image.depth_lens, lens)
+    elif not _fits(lens, *depth.shape[1::-1]) and orientation in TRANSPOSED:
+        depth = apply_orientation(depth, orientation)  # measured like the stored pixels
+    if abs(depth.shape[1] * lens.height / depth.shape[0] - lens.width) > 1:
+        problem = f"the depth map is {depth.shape[1]}x{depth.shape[0]}"
+        raise InputError(
+            file, problem, f"the aspect of its image, {lens.width}x{lens.height}", "Register it to the image."
+        )
+    # Nearest throughout: the mean of two depths lies on neither surface.
+    if maps is not None:
+        depth = cv2.resize(depth, (lens.width, lens.height), interpolation=cv2.INTER_NEAREST_EXACT)
+        depth = cv2.remap(depth, *maps, cv2.INTER_NEAREST)
+    return cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)
 
 
 def build_capture(
     posed: PosedImages,
+    options: FrameOptions,
     *,
-    downscale: float | int | None = None,
-    long_side: int | None = None,
-    frames: int | None = None,
-    holdout: int | None = 8,
     only: Collection[str] | None = None,
     progress: Progress | None = None,
 ) -> Capture:
@@ -402,10 +386,7 @@ def build_capture(
 
     Args:
       posed: The posed images.
-      downscale: Divides width and height, at least 1.
-      long_side: Longest side of the frames, px, if `downscale` is None; None: no limit.
-      frames: Most frames, evenly spaced; None: all.
-      holdout: k holds out the frames 0, k, 2k, ...; 0 or None holds out no frame.
+      options: Options of the frames.
       only: Names of the frames to read; None: all.
       progress: Called with (frames done, frames).
 
@@ -415,7 +396,6 @@ def build_capture(
     Raises:
       InputError: Images are missing, damaged or of another aspect, or poses are not finite and rigid.
     """
-    check_capture_options(downscale, frames, holdout, long_side)
     images, poses, names = _in_order(posed)
     deep = [image for image in images if image.depth is not None and not len(posed.points)]
     samples = [deep[index] for index in evenly_spaced(len(deep), DEPTH_SAMPLES)] if deep else []
@@ -430,7 +410,7 @@ def build_capture(
         kept = [i for i, name in enumerate(names) if name in only]
         images, poses, names = [images[i] for i in kept], poses[kept], tuple(names[i] for i in kept)
     notes = [*posed.notes, *world_notes, *camera_jumps(poses, names)]
-    chosen = evenly_spaced(len(images), frames)
+    chosen = evenly_spaced(len(images), options.frames)
     if len(chosen) < len(images):
         notes.append(f"{len(chosen)} of {len(images)} frames were taken, evenly spaced.")
     images, poses, names = [images[i] for i in chosen], poses[chosen], tuple(names[i] for i in chosen)
@@ -446,19 +426,19 @@ def build_capture(
     width, height = _commonest_size(lenses)
     if odd := sum(size != (width, height) for size in sizes):
         notes.append(f"{odd} images were resized to {width}x{height}, the commonest size, with their intrinsics.")
-    width, height = downscaled_size((width, height), downscale, long_side)
+    width, height = options.size((width, height))
 
     pixels = _allocate_frames((len(images), height, width, 3))
     has_depth = any(image.depth for image in images)
     depth_maps = np.zeros((len(images), height, width), np.float32) if has_depth else None
-    maps = functools.lru_cache(maxsize=4)(undistortion_maps)
+    cached_maps = functools.lru_cache(maxsize=4)(undistortion_maps)
 
     def read(index: int) -> bool:
-        image, lens = images[index], lenses[index]
-        reader = _FrameReader(image, lens, pinholes[lens], orientations[index], (width, height), world[0, 0], maps)
-        pixels[index], is_transparent = reader.pixels()
+        image, lens, orientation, size = images[index], lenses[index], orientations[index], (width, height)
+        maps = cached_maps(lens, pinholes[lens]) if lens.distorted else None
+        pixels[index], is_transparent = _read_pixels(image, orientation, maps, size)
         if image.depth is not None and depth_maps is not None:
-            depth_maps[index] = reader.depth()
+            depth_maps[index] = _read_depth(image.depth, image, lens, orientation, maps, size, world[0, 0])
         return is_transparent
 
     transparent = 0
@@ -473,7 +453,7 @@ def build_capture(
             raise
     if transparent:
         notes.append(f"{transparent} images have transparent pixels; they were laid over black.")
-    held_out = holdout_mask(len(images), holdout)
+    held_out = holdout_mask(len(images), options.holdout)
     if held_out.all():
         held_out[:] = False
         notes.append("No frame was held out, since there is only one.")

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int, UInt, UInt8
 from PIL import Image
 from PIL.BmpImagePlugin import BmpImageFile
 from PIL.ImageFile import ImageFile
@@ -309,19 +309,19 @@ def read_image(path: str | Path, *, upright: bool = True) -> tuple[UInt8[np.ndar
     return ((rgb.astype(np.uint16) * alpha + 127) // 255).astype(np.uint8), True
 
 
-def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Writes an RGB image atomically.
+def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"] | UInt[np.ndarray, "h w"]) -> None:
+    """Writes an image atomically.
 
     Args:
       path: The file; its suffix chooses the format.
-      image: (H, W, 3) uint8 RGB.
+      image: (H, W, 3) uint8 RGB, or (H, W) grey values of 8 or 16 bits.
 
     Raises:
       InputError: The suffix is not that of an image format, or the folder cannot be written.
     """
-    path = Path(path)
+    path, image = Path(path), np.asarray(image)
     try:
-        encoded, data = cv2.imencode(path.suffix, cv2.cvtColor(np.asarray(image), cv2.COLOR_RGB2BGR))
+        encoded, data = cv2.imencode(path.suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image)
     except cv2.error:
         encoded = False
     if not encoded:

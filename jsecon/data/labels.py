@@ -13,7 +13,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Real
+from jaxtyping import Bool
 
 from jsecon.data.images import MAX_PIXELS
 from jsecon.errors import InputError, require
@@ -86,7 +86,7 @@ def _read(file: Path) -> LabelledFrame:
         category = _get(file, entry, "category", str, where)
         polygon = _numbers(file, _get(file, entry, "segmentation", list, where), (-1, 2), f"segmentation of {where}")
         box = _numbers(file, _get(file, entry, "bbox", list, where), (1, 4), f"bbox of {where}").astype(np.float32)
-        mask = _polygon_mask(polygon, width, height)
+        mask = cv2.fillPoly(np.zeros((height, width), np.uint8), [polygon.astype(np.int32)], 1).astype(bool)
         if category in objects:
             before, boxes = objects[category]
             mask = mask | before
@@ -105,13 +105,6 @@ def _numbers(file: Path, values: list, shape: tuple[int, int], what: str) -> np.
     if not np.isfinite(array).all() or np.abs(array).max(initial=0) > 1e6 or not len(array):
         raise _error(file, f"the {what} is empty or out of all range", "pixels")
     return array
-
-
-def _polygon_mask(corners: Real[np.ndarray, "k 2"], width: int, height: int) -> Bool[np.ndarray, "{height} {width}"]:
-    """Draws a polygon, its edges included; corners are cut to integers, as LangSplat does."""
-    canvas = np.zeros((height, width), np.uint8)
-    cv2.fillPoly(canvas, [np.asarray(corners).astype(np.int32)], 1)
-    return canvas.astype(bool)
 
 
 def write_lerf_labels(folder: str | Path, frames: Iterable[LabelledFrame], *, image_ending: str = ".png") -> None:

@@ -6,17 +6,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from jsecon.data.masks import MaskFitter, compact_ids, find_masks, read_level
+from jsecon.data.masks import AllFrames, MaskFitter, compact_ids, find_masks, read_level
 from jsecon.errors import InputError
 from jsecon.files import map_npy, reading
 from jsecon.numerics import is_finite_and_bounded
-from jsecon.types import ImageFile
 
 
 class FrameMasks(NamedTuple):
@@ -36,8 +35,7 @@ def load_features(
     size: tuple[int, int],
     *,
     level: str = "l",
-    order: Sequence[str] | None = None,
-    files: Mapping[str, ImageFile] | None = None,
+    frames: AllFrames | None = None,
 ) -> FrameMasks:
     """Reads one level of the masks of frames, with their embeddings.
 
@@ -48,8 +46,7 @@ def load_features(
       names: T frames.
       size: (H, W) of the labels.
       level: A name of LEVELS.
-      order: All frames of the capture.
-      files: The image of each frame, by its name.
+      frames: All frames of the capture in order, each with its image.
 
     Returns:
       Labels, embeddings and the frame of each mask.
@@ -57,15 +54,14 @@ def load_features(
     Raises:
       InputError: A frame has no file, its two files disagree, or embeddings are not finite.
     """
-    every = order if order is not None else names
-    kinds = find_masks(folder, every, ("_s.npy", "_f.npy"), files=files)
-    by_suffix = {kind.suffix: kind.path for kind in kinds}
+    every = frames or dict.fromkeys(names)
+    by_suffix = {kind.suffix: kind.path for kind in find_masks(folder, every, ("_s.npy", "_f.npy"))}
 
     def path_of(name: str, suffix: str) -> Path:
         path = by_suffix[suffix](name) if suffix in by_suffix else None
         return folder / f"{name}{suffix}" if path is None else path  # a missing file is an error of its reader
 
-    fit = MaskFitter(files or {}, size, lambda name: read_level(path_of(name, "_s.npy"), level).shape)
+    fit = MaskFitter(every, size, lambda name: read_level(path_of(name, "_s.npy"), level).shape)
     labels = np.full((len(names), *size), -1, np.int32)
     rows: list[np.ndarray] = []
     frame: list[int] = []

@@ -13,7 +13,7 @@ import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Int, Int16
@@ -44,13 +44,15 @@ _UNSUPPORTED = (*sorted(_LOWER_SUFFIXES), ".npz", ".gif", ".exr")
 """suffixes of files that may be meant as masks and are not read as such"""
 
 
+AllFrames: TypeAlias = Mapping[str, ImageFile | None]
+"""all frames of a capture in order, by name, each with its image or None"""
+
+
 class MaskFiles(NamedTuple):
     """Mask files of one suffix by frame: either one file a frame, or one for each object in it."""
 
-    files: dict[str, Path]
-    """Frame -> file."""
-    objects: dict[str, dict[str, Path]]
-    """Frame -> folder of an object -> file."""
+    files: dict[str, dict[str, Path]]
+    """Frame -> folder of an object, or "" for the mask of all objects -> file."""
     suffix: str
     notes: tuple[str, ...]
     """How the files were understood, a sentence each."""
@@ -64,7 +66,7 @@ class MaskFiles(NamedTuple):
         Returns:
           Its file, or one of those of its objects; None if it has no mask.
         """
-        return self.files.get(name) or next(iter(self.objects.get(name, {}).values()), None)
+        return next(iter(self.files.get(name, {}).values()), None)
 
 
 class _Frame(NamedTuple):
@@ -91,15 +93,14 @@ class FrameNames:
     """Looks up frames by the name of a mask.
 
     Args:
-      names: All frames of the capture.
-      files: The frames' images, by frame name.
+      frames: All frames of the capture, each with its image.
     """
 
-    def __init__(self, names: Sequence[str], files: Mapping[str, ImageFile] | None = None):
-        frames = [_frame(name, (files or {}).get(name)) for name in names]
+    def __init__(self, frames: AllFrames):
+        named = [_frame(name, file) for name, file in frames.items()]
         self._by_name: dict[str, list[_Frame]] = collections.defaultdict(list)
         by_first_part: dict[str, list[_Frame]] = collections.defaultdict(list)
-        for frame in frames:
+        for frame in named:
             for key in {frame.name, frame.stem}:
                 self._by_name[key].append(frame)
             by_first_part[frame.stem.split(".")[0]].append(frame)
@@ -183,21 +184,13 @@ def _list_files(folder: Path) -> list[tuple[Path, tuple[str, ...]]]:
     return files
 
 
-def find_masks(
-    folder: Path,
-    names: Sequence[str],
-    suffixes: Sequence[str],
-    *,
-    files: Mapping[str, ImageFile] | None = None,
-    numbered: bool = False,
-) -> list[MaskFiles]:
+def find_masks(folder: Path, frames: AllFrames, suffixes: Sequence[str], *, numbered: bool = False) -> list[MaskFiles]:
     """Finds the masks of frames.
 
     Args:
       folder: Where the masks are.
-      names: All frames of the capture.
+      frames: All frames of the capture, each with its image, whose folders are those of the cameras.
       suffixes: Suffixes of masks, the longer before the shorter.
-      files: The frames' images, whose folders are those of the cameras.
       numbered: If no file is named like a frame, take number n for the n-th frame, if all frames have one.
 
     Returns:
@@ -209,7 +202,7 @@ def find_masks(
     if not folder.is_dir():
         problem = "this is a file" if folder.exists() else "there is no such folder"
         raise InputError(folder, problem, "a folder of masks", "Check the path.")
-    frame_names = FrameNames(names, files)
+    frame_names, names = FrameNames(frames), tuple(frames)
     matched: dict[str, list[_Match]] = collections.defaultdict(list)
     unmatched: dict[str, list[tuple[Path, tuple[str, ...]]]] = collections.defaultdict(list)
     others = []
@@ -265,7 +258,7 @@ def _arrange(suffix: str, matches: list[_Match], unmatched: list[tuple[Path, tup
         notes = [f"The folders {_shorten(folders)} are read as objects: each has black and white masks of one.", *notes]
         by_object = {frame: {_object_of(m): m.path for m in reversed(some)} for frame, some in by_frame.items()}
         objects = {frame: {name: some[name] for name in folders if name in some} for frame, some in by_object.items()}
-        return MaskFiles({}, objects, suffix, tuple(notes))
+        return MaskFiles(objects, suffix, tuple(notes))
     best = {frame: some[0] for frame, some in by_frame.items() if not (plain and some[0].extra)}
     if plain and others:
         places = _shorten(sorted({"/".join(match.folders) for match in others}))
@@ -274,7 +267,7 @@ def _arrange(suffix: str, matches: list[_Match], unmatched: list[tuple[Path, tup
         places = _shorten(["/".join(each) or "." for each in folders])
         reason = "they are named like those of the images" if plain else "their masks are not black and white"
         notes = [f"The folders {places} are read as cameras, not as objects: {reason}.", *notes]
-    return MaskFiles({frame: match.path for frame, match in best.items()}, {}, suffix, tuple(notes))
+    return MaskFiles({frame: {"": match.path} for frame, match in best.items()}, suffix, tuple(notes))
 
 
 def _are_objects(plain: list[_Match], others: list[_Match], by_frame: Mapping[str, list[_Match]]) -> bool:
@@ -331,12 +324,11 @@ def load_labels(
     size: tuple[int, int],
     *,
     level: str = "l",
-    shared: bool | None = None,
-    order: Sequence[str] | None = None,
-    files: Mapping[str, ImageFile] | None = None,
+    frames: AllFrames | None = None,
+    limit: int | None = None,
     progress: Progress | None = None,
 ) -> TrackedMasks:
-    """Reads masks whose ids mean the same object in every frame.
+    """Reads masks whose ids mean the same object in every frame, except for LangSplat's, which number each afresh.
 
     A mask has an id per pixel, 0 for no region: 8 or 16 bit grey, a palette PNG (its indices), RGB (each colour an id),
     or whole numbers in a `.npy`, as Gaussian Grouping's object_mask and SAM 2's PNGs; or LangSplat's `<name>_s.npy`
@@ -351,11 +343,9 @@ def load_labels(
       names: T frames.
       size: (H, W) of the labels.
       level: LangSplat's level, a name of LEVELS.
-      shared: Whether an id means the same object in every frame. By default so for all but `_s.npy`: LangSplat numbers
-        the masks of each frame afresh, and each is a region of its own.
-      order: All frames of the capture. If no file is named like a frame and the files are numbered from 0 to
-        len(order) - 1, as SAM 2 wants them, number n is the mask of order[n].
-      files: The image of each frame, by its name.
+      frames: All frames of the capture in order, each with its image. If no file is named like a frame and the files
+        are numbered from 0 to len(frames) - 1, as SAM 2 wants them, number n is the mask of the n-th frame.
+      limit: Most masks to read, for a check: other frames are left out.
       progress: Called with (frames done, frames).
 
     Returns:
@@ -366,9 +356,10 @@ def load_labels(
         MAX_REGIONS regions.
     """
     folder = Path(folder)
-    masks = _find_one_kind(folder, names, order, files)
-    shared = masks.suffix != _LEVELS_SUFFIX if shared is None else shared
-    reader = _LabelReader(masks, names, level, files or {}, size)
+    masks = _find_one_kind(folder, names, frames)
+    names = names if limit is None else [name for name in names if masks.path(name) is not None][:limit]
+    shared = masks.suffix != _LEVELS_SUFFIX  # of LangSplat each mask of a frame is a region of its own
+    reader = _LabelReader(masks, names, level, frames or {}, size)
     labels = np.full((len(names), *size), -1, np.int16)
     frame_ids: list[np.ndarray] = []
     for index, name in enumerate(names):
@@ -387,44 +378,21 @@ def load_labels(
         starts = np.cumsum([0, *(int(keep.sum()) for keep in kept)])
         tables = [np.where(keep, np.cumsum(keep) - 1 + start, -1) for keep, start in zip(kept, starts)]
     if len(ids) > MAX_REGIONS:
-        remedy = "Take a coarser level or fewer frames, or give shared=True if the ids are tracked."
+        remedy = "Take a coarser level or fewer frames."
         raise InputError(folder, f"there are {len(ids)} regions", f"at most {MAX_REGIONS}", remedy)
     for frame, table in zip(labels, tables):
         frame[:] = np.append(table, -1).astype(np.int16)[frame]
     return TrackedMasks(labels, reader.file_ids(ids), (*reader.notes(shared), *masks.notes))
 
 
-def check_labels(
-    folder: str | Path, names: Sequence[str], size: tuple[int, int], *, order: Sequence[str] | None, **options: Any
-) -> None:
-    """Checks masks by their names and the first of them.
-
-    Args:
-      folder: As in `load_labels`.
-      names: As in `load_labels`.
-      size: As in `load_labels`.
-      order: As in `load_labels`.
-      **options: Further options of `load_labels`.
-
-    Raises:
-      InputError: As in `load_labels`, but for damage in other files than the first.
-    """
-    masks = _find_one_kind(Path(folder), names, order, options.get("files"))
-    first = next(name for name in names if masks.path(name) is not None)
-    load_labels(folder, [first], size, order=order, **options)
-
-
-def _find_one_kind(
-    folder: Path, names: Sequence[str], order: Sequence[str] | None, files: Mapping[str, ImageFile] | None
-) -> MaskFiles:
+def _find_one_kind(folder: Path, names: Sequence[str], frames: AllFrames | None) -> MaskFiles:
     """Finds the mask files of the frames, which must be of one kind."""
-    every = order if order is not None else names
     suffixes = (".png", _LEVELS_SUFFIX, ".npy")
-    kinds = find_masks(folder, every, suffixes, files=files, numbered=order is not None)
+    kinds = find_masks(folder, frames or dict.fromkeys(names), suffixes, numbered=frames is not None)
     if len(kinds) > 1:
         problem = f"there are both {kinds[0].suffix} and {kinds[1].suffix} masks of these frames"
         raise InputError(folder, problem, "one kind", "Put each kind into a folder of its own.")
-    if not any(name in kinds[0].files or name in kinds[0].objects for name in names):
+    if not any(name in kinds[0].files for name in names):
         problem = f"it has masks, but of none of the {len(names)} frames in use"
         raise InputError(folder, problem, f"a mask of {names[0]} and others", "Name each mask like its frame.")
     return kinds[0]
@@ -443,21 +411,14 @@ def _is_black_and_white(path: Path) -> bool:
 class _LabelReader:
     """Reads the labels of frame after frame, and collects what the notes report."""
 
-    def __init__(
-        self,
-        masks: MaskFiles,
-        names: Sequence[str],
-        level: str,
-        files: Mapping[str, ImageFile],
-        size: tuple[int, int],
-    ):
+    def __init__(self, masks: MaskFiles, names: Sequence[str], level: str, frames: AllFrames, size: tuple[int, int]):
         self.masks, self.names, self.level, self.size = masks, names, level, size
-        folders = {folder for by_object in masks.objects.values() for folder in by_object}
+        folders = {folder for by_object in masks.files.values() for folder in by_object if folder}
         self.object_ids = _object_ids(sorted(folders))
         self.folders = sorted(folders, key=lambda folder: (self.object_ids[folder], folder))
         self.is_colour: dict[Path | None, bool] = {}
         self.has_negative = False
-        self.fit = MaskFitter(files, size, self._shape)
+        self.fit = MaskFitter(frames, size, self._shape)
 
     def _shape(self, name: str) -> tuple[int, ...] | None:
         path = self.masks.path(name)
@@ -473,11 +434,11 @@ class _LabelReader:
 
     def read(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """The ids of a frame, ascending, and its labels (H, W) as indices into them, -1 for no region."""
-        if name in self.masks.objects:
-            return self._read_objects(name, self.masks.objects[name])
-        if name not in self.masks.files:
+        if self.folders:
+            return self._read_objects(name, self.masks.files.get(name, {}))
+        path = self.masks.path(name)
+        if path is None:
             return np.zeros(0, np.int64), np.full(self.size, -1, np.int16)
-        path = self.masks.files[name]
         return compact_ids(path, self.fit(path, self._values(path), name))
 
     def _read_objects(self, name: str, paths: Mapping[str, Path]) -> tuple[np.ndarray, np.ndarray]:
@@ -498,7 +459,7 @@ class _LabelReader:
 
     def without_background(self, folder: Path, frame_ids: list[np.ndarray]) -> list[np.ndarray]:
         """Replaces the background's id, 0, by -1, and colours that are all grey by their grey values."""
-        if self.masks.objects or self.masks.suffix == _LEVELS_SUFFIX:
+        if self.folders or self.masks.suffix == _LEVELS_SUFFIX:
             return frame_ids
         colours = [self.is_colour.get(self.masks.path(name), False) for name in self.names]
         if not any((ids % GREY_COLOUR).any() for ids, colour in zip(frame_ids, colours) if colour):
@@ -512,7 +473,7 @@ class _LabelReader:
 
     def file_ids(self, ids: np.ndarray) -> tuple[int, ...]:
         """The ids as the files, or the folders of objects, have them."""
-        return tuple(self.object_ids[self.folders[int(i)]] if self.masks.objects else int(i) for i in ids)
+        return tuple(self.object_ids[self.folders[int(i)]] if self.folders else int(i) for i in ids)
 
     def notes(self, shared: bool) -> list[str]:
         """What was skipped or changed."""
@@ -594,16 +555,15 @@ class MaskFitter:
     """Brings masks to the size of the frames, and counts the changes.
 
     Args:
-      files: The frames' images by name. Masks have their size, upright or as stored, at any scale.
+      frames: The frames' images by name. Masks have their size, upright or as stored, at any scale.
       size: (H, W) of the frames.
       shape: Returns the shape (H, W) of a frame's mask by name, or None. If masks of images that lie on their side are
         of the stored pixels, so are those of images that stand on their head, whose size cannot tell.
     """
 
-    def __init__(
-        self, files: Mapping[str, ImageFile], size: tuple[int, int], shape: Callable[[str], tuple[int, ...] | None]
-    ):
-        self.files, (self.height, self.width) = files, size
+    def __init__(self, frames: AllFrames, size: tuple[int, int], shape: Callable[[str], tuple[int, ...] | None]):
+        self.files = files = {name: file for name, file in frames.items() if file is not None}
+        self.height, self.width = size
         self.count: collections.Counter[str] = collections.Counter()
         self.of_stored_pixels = False
         if any(1 < file.orientation < 5 for file in files.values()):
@@ -618,19 +578,7 @@ class MaskFitter:
         return stored and not _same_aspect(shape[0], shape[1], file.width, file.height)
 
     def __call__(self, path: Path, image: np.ndarray, name: str) -> np.ndarray:
-        """Turns and resizes the mask of a frame.
-
-        Args:
-          path: Its file, for errors.
-          image: (h, w) the mask.
-          name: The frame.
-
-        Returns:
-          (H, W) the mask at the frames' size; `image` itself if it has that.
-
-        Raises:
-          InputError: Its aspect is another.
-        """
+        """Turns and resizes the mask of a frame to (H, W); raises InputError, with its file, for another aspect."""
         file = self.files.get(name)
         upright = (self.width, self.height) if file is None else (file.width, file.height)
         orientation = 1 if file is None else file.orientation

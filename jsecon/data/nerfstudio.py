@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jsecon.data.coordinates import invert_pose, make_rigid
+from jsecon.data.coordinates import make_rigid
 from jsecon.data.frames import PosedImage, PosedImages
 from jsecon.data.gaussians.ply import load_point_cloud
 from jsecon.data.images import find_image, image_header
@@ -106,7 +106,7 @@ def read_nerfstudio(file: Path) -> PosedImages:
             if not os.path.isfile(depth):
                 problem = f"no such depth map, which is the depth_file_path of {name}"
                 raise InputError(depth, problem, remedy="Check the path.")
-        lens, world_to_camera = _lens(scene, entry, name, image), invert_pose(pose * [1, -1, -1, 1], file, name)
+        lens, world_to_camera = _lens(scene, entry, name, image), _world_to_camera(pose, file, name)
         images.append(PosedImage(_full_name(name, image), image, lens, world_to_camera, depth, unit))
     first = f" (the first: {missing[0]})" if missing else ""
     if missing:
@@ -145,8 +145,13 @@ def read_poses(file: Path) -> list[tuple[str, Lens, np.ndarray]]:
             raise scene.error(f"frame {index} is not an object", "frames with transform_matrix")
         name = str(entry.get("file_path", f"frame {index}"))
         pose = scene.matrix(entry, "transform_matrix", f"frame {index} ({name})")
-        poses.append((name, _lens(scene, entry, name, None), invert_pose(pose * [1, -1, -1, 1], file, name)))
+        poses.append((name, _lens(scene, entry, name, None), _world_to_camera(pose, file, name)))
     return poses
+
+
+def _world_to_camera(pose: np.ndarray, file: Path, name: str) -> np.ndarray:
+    """(4, 4) world-to-camera in OpenCV axes from camera-to-world in OpenGL axes."""
+    return np.linalg.inv(make_rigid(pose * [1, -1, -1, 1], file, name))
 
 
 def trained_to_source(file: Path) -> Float[np.ndarray, "4 4"]:

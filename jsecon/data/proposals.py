@@ -11,7 +11,7 @@ image; a polygon within another is a hole in it.
 """
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from jsecon.data.images import MAX_PIXELS, read_label_image
-from jsecon.data.masks import FrameNames, MaskFiles, MaskFitter, find_masks, read_level
+from jsecon.data.masks import AllFrames, FrameNames, MaskFiles, MaskFitter, find_masks, read_level
 from jsecon.errors import InputError
 from jsecon.files import READ_ERRORS, map_npy, read_json, reading
 from jsecon.types import ImageFile
@@ -132,8 +132,7 @@ def load_proposals(
     size: tuple[int, int],
     *,
     level: str = "l",
-    order: Sequence[str] | None = None,
-    files: Mapping[str, ImageFile] | None = None,
+    frames: AllFrames | None = None,
 ) -> Proposals:
     """Finds the masks of single frames.
 
@@ -146,8 +145,7 @@ def load_proposals(
       names: The frames.
       size: (H, W) of the masks.
       level: LangSplat's level.
-      order: All frames of the capture; without it, numbered files are not accepted.
-      files: The image of each frame, by its name.
+      frames: All frames of the capture in order, each with its image; without it, numbered files are not accepted.
 
     Returns:
       A reader of a frame's masks, and notes.
@@ -155,18 +153,18 @@ def load_proposals(
     Raises:
       InputError: No frame has a file.
     """
-    folder, every, files = Path(folder), order if order is not None else names, files or {}
-    frame_names = FrameNames(every, files)
+    folder, every = Path(folder), frames or dict.fromkeys(names)
+    frame_names = FrameNames(every)
     dataset = _find_dataset(folder, frame_names)
     if dataset is not None:
-        available, notes = _read_dataset(*dataset, frame_names, names, size, files), []
+        available, notes = _read_dataset(*dataset, frame_names, names, size, every), []
     else:
-        kinds = find_masks(folder, every, SUFFIXES, files=files, numbered=order is not None)
+        kinds = find_masks(folder, every, SUFFIXES, numbered=frames is not None)
         kinds = sorted(kinds, key=lambda kind: SUFFIXES.index(kind.suffix))
         by_name = {name: kind for kind in reversed(kinds) for name in names if kind.path(name) is not None}
-        frames = {name: _frame_size(files.get(name), size) for name in by_name}
+        sizes = {name: _frame_size(every.get(name), size) for name in by_name}
         available = {
-            name: lambda name=name, kind=kind: _read_files(kind, name, level, frames[name])
+            name: lambda name=name, kind=kind: _read_files(kind, name, level, sizes[name])
             for name, kind in by_name.items()
         }
         notes = [note for kind in kinds for note in kind.notes]
@@ -180,7 +178,7 @@ def load_proposals(
         masks = available[name]() if name in available else []
         return masks[0][1].shape if masks else None
 
-    fit = MaskFitter(files, size, shape)
+    fit = MaskFitter(every, size, shape)
 
     def read(index: int) -> Bool[np.ndarray, "m h w"]:
         name = names[index]
@@ -198,8 +196,7 @@ def _frame_size(file: ImageFile | None, size: tuple[int, int]) -> tuple[int, int
 
 def _read_files(kind: MaskFiles, name: str, level: str, frame: tuple[int, int]) -> list[tuple[Path, np.ndarray]]:
     """The masks of a frame, as they are stored, each with its file."""
-    paths = kind.objects[name].values() if name in kind.objects else [kind.files[name]]
-    return [(path, mask) for path in paths for mask in _read_file(path, level, frame)]
+    return [(path, mask) for path in kind.files[name].values() for mask in _read_file(path, level, frame)]
 
 
 def _read_file(path: Path, level: str, frame: tuple[int, int]) -> list[np.ndarray]:
@@ -293,7 +290,7 @@ def _read_dataset(
     frame_names: FrameNames,
     names: Sequence[str],
     size: tuple[int, int],
-    files: Mapping[str, ImageFile],
+    frames: AllFrames,
 ) -> dict[str, Callable[[], list[tuple[Path, np.ndarray]]]]:
     """Readers of the masks of a COCO file, by frame."""
     with reading(file, _JSON, _REMEDY, problem="it is not a COCO file"):
@@ -311,7 +308,7 @@ def _read_dataset(
 
     def reader(name: str) -> Callable[[], list[tuple[Path, np.ndarray]]]:
         number = images_of[name]
-        frame = _image_size(images[number]) or _frame_size(files.get(name), size)
+        frame = _image_size(images[number]) or _frame_size(frames.get(name), size)
         return lambda: list(zip(itertools.repeat(file), _decode_records(file, by_image[number], frame)))
 
     return {name: reader(name) for name in names if name in images_of}

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from jsecon.data.coordinates import invert_pose
+from jsecon.data.coordinates import make_rigid
 from jsecon.data.frames import MIN_FOCAL, PosedImage, PosedImages
 from jsecon.data.images import MAX_PIXELS, image_header
 from jsecon.data.lens import Lens
@@ -51,18 +51,14 @@ def find_rgbd(path: Path) -> Callable[[Path], PosedImages] | None:
     """
     for marks, reader in _FOLDERS.items():
         if all((path / mark).exists() for mark in marks):
-            return _with_input_errors(reader)
+            return functools.partial(_read, reader)
     return None
 
 
-def _with_input_errors(reader: Callable[[Path], PosedImages]) -> Callable[[Path], PosedImages]:
-    """Makes the errors of a reader InputErrors."""
-
-    def read(path: Path) -> PosedImages:
-        with _parsing(path), np.errstate(invalid="ignore", over="ignore"):
-            return reader(path)
-
-    return read
+def _read(reader: Callable[[Path], PosedImages], path: Path) -> PosedImages:
+    """Reads a folder, and makes the errors of its reader InputErrors."""
+    with _parsing(path), np.errstate(invalid="ignore", over="ignore"):
+        return reader(path)
 
 
 def _lines(file: Path) -> list[str]:
@@ -116,7 +112,8 @@ def _lens(width: Any, height: Any, *intrinsics: Any) -> Lens:
 def _posed_image(image: Path, lens: Lens, camera_to_world: np.ndarray, depth: Path | None = None) -> PosedImage:
     """A frame, with its depth map if that exists."""
     depth = None if depth is None or not depth.is_file() else depth
-    return PosedImage(image.name, image, lens, invert_pose(camera_to_world, image, image.name), depth)
+    world_to_camera = np.linalg.inv(make_rigid(camera_to_world, image, image.name))
+    return PosedImage(image.name, image, lens, world_to_camera, depth)
 
 
 def _posed_images(path: Path, images: list[PosedImage], count: int, *notes: str) -> PosedImages:

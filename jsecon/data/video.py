@@ -50,12 +50,6 @@ def video_size(path: Path) -> tuple[int, int]:
         reader.release()
 
 
-def _sharpest_frames(sharpness: list[float], count: int) -> list[int]:
-    """Chooses the sharpest frame of each of several stretches of equal length."""
-    edges = np.linspace(0, len(sharpness), min(count, len(sharpness)) + 1).round().astype(int)
-    return [int(a + np.argmax(sharpness[a:b])) for a, b in itertools.pairwise(edges)]
-
-
 def write_frames(
     video: Path, folder: Path, *, frames: int | None = None, progress: Progress | None = None
 ) -> list[Path]:
@@ -78,13 +72,18 @@ def write_frames(
     """
     sharpness = []
     for image, total in _decode(video):
-        sharpness.append(_sharpness(image))
+        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        shrink = min(1.0, SHARPNESS_SIDE / max(grey.shape))
+        small = cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+        sharpness.append(cv2.Laplacian(small, cv2.CV_32F).var())
         if progress is not None:
             progress(min(len(sharpness), total), 2 * total)
     if not sharpness:
         remedy = "Copy it again, or convert it (ffmpeg -i VIDEO walk.mp4)."
         raise InputError(video, "OpenCV can read no frame of it", "a video", remedy)
-    chosen, written = set(_sharpest_frames(sharpness, frames or DEFAULT_VIDEO_FRAMES)), []
+    count = min(frames or DEFAULT_VIDEO_FRAMES, len(sharpness))
+    edges = np.linspace(0, len(sharpness), count + 1).round().astype(int)
+    chosen, written = {int(a + np.argmax(sharpness[a:b])) for a, b in itertools.pairwise(edges)}, []
     for number, (image, _) in enumerate(_decode(video)):
         if number in chosen:
             written.append(folder / f"frame_{number:06d}.jpg")
@@ -107,11 +106,3 @@ def _decode(video: Path) -> Iterator[tuple[UInt8[np.ndarray, "h w 3"], int]]:
             yield image, total
     finally:
         reader.release()
-
-
-def _sharpness(image: UInt8[np.ndarray, "h w 3"]) -> float:
-    """Variance of the Laplacian of the grey values."""
-    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    shrink = min(1.0, SHARPNESS_SIDE / max(grey.shape))
-    small = cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-    return float(cv2.Laplacian(small, cv2.CV_32F).var())

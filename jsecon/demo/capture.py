@@ -7,17 +7,17 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Int16, UInt
+from jaxtyping import Bool, Int16
 
 from jsecon.data.colmap import write_colmap
-from jsecon.data.frames import check_capture_options, holdout_mask
+from jsecon.data.frames import FrameOptions, holdout_mask
+from jsecon.data.images import write_image
 from jsecon.data.labels import LabelledFrame, write_lerf_labels
 from jsecon.demo.raycast import render_views
 from jsecon.demo.room import Room
 from jsecon.errors import require
-from jsecon.files import atomic_write, write_text
+from jsecon.files import write_text
 from jsecon.types import Camera, Capture, Progress
 
 MIN_LABEL_PIXELS = 40
@@ -97,7 +97,7 @@ def room_capture(
       InputError: The options of the frames are invalid.
       ValueError: Fewer than two frames are not held out.
     """
-    check_capture_options(None, views, holdout)
+    FrameOptions(frames=views, holdout=holdout)  # checks both
     is_held_out = holdout_mask(views, holdout)
     got, remedy = f"{views} with every {holdout}. held out", "Sparse points are those that two views see: take more."
     require(int((~is_held_out).sum()) >= 2, "views", got, "2 that are not held out", remedy)
@@ -200,7 +200,7 @@ def write_room(
     capture, instances = room_capture(room, holdout=holdout, progress=progress, **options)
     write_colmap(capture, folder)
     for name, instance in zip(capture.names, instances):
-        write_label_image(folder / "masks" / f"{name}.png", (instance + 1).astype(np.uint8))
+        write_image(folder / "masks" / f"{name}.png", (instance + 1).astype(np.uint8))
     test_frames = np.flatnonzero(capture.held_out)
     labels = [label_frame(capture.names[t], instances[t], room.names, MIN_LABEL_PIXELS) for t in test_frames]
     write_lerf_labels(folder / "label", labels)
@@ -249,17 +249,3 @@ def label_frame(frame: str, instance: Int16[np.ndarray, "h w"], names: Sequence[
 def _box(mask):
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     return np.array([[columns[0], rows[0], columns[-1], rows[-1]]], np.float32)
-
-
-def write_label_image(path: Path, ids: UInt[np.ndarray, "h w"]) -> None:
-    """Writes a label image as a grey PNG, atomically.
-
-    Args:
-      path: The file.
-      ids: (H, W) ids of 8 or 16 bits.
-
-    Raises:
-      InputError: The file cannot be written.
-    """
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(cv2.imencode(".png", ids)[1].tobytes())

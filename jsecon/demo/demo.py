@@ -96,16 +96,8 @@ def run_demo(
     return metrics
 
 
-def demo_verb(verb: verbs.Demo, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon demo`.
-
-    Args:
-      verb: Options of the command.
-      console: Receives messages and progress.
-
-    Returns:
-      The metrics, and the paths of what was written.
-    """
+def _demo(verb: verbs.Demo, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon demo`."""
     names = (*running.FILES, "queries", "demo.jpg", "demo.webp")
     result = run_demo(verb.out, seed=verb.seed, steps=verb.steps, listener=console)
     return {"written": [verb.out / name for name in names]} | result
@@ -245,3 +237,7 @@ def _iou_section(results: Evaluation) -> str:
     return report.section(
         "IoU of each text", "Mean over the held-out views that show it.", report.shades(header, table)
     )
+
+
+VERBS = {verbs.Demo: _demo}
+"""what does the work of each verb"""

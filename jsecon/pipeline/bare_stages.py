@@ -7,7 +7,7 @@ import numpy as np
 
 from jsecon.data.colmap import find_models, read_cameras, read_images
 from jsecon.data.coordinates import make_rigid, transform_poses
-from jsecon.data.frames import downscaled_size, frame_names
+from jsecon.data.frames import FrameOptions, frame_names
 from jsecon.data.nerfstudio import read_poses
 from jsecon.errors import InputError
 from jsecon.pipeline.options import Options
@@ -77,13 +77,10 @@ def _planned_views(context: RunContext) -> Stage:
     if options.cameras is not None:
         how = f"the scene rendered from the poses of {options.cameras.name}"
         poses = options.cameras
-
-        def files():
-            return [poses, options.capture]
-
         key_options = context.key_options("long_side")
         skipped["planned views"] = f"the poses are given ({poses.name})"
-        return Stage("load", how, _render_poses, key_options=key_options, files=files, skipped=skipped)
+        both = [poses, options.capture]
+        return Stage("load", how, _render_poses, key_options=key_options, files=lambda: both, skipped=skipped)
     how = f"{options.views} virtual views, planned from the Gaussians of {options.capture.name}"
     key_options = context.key_options("views", "up", "long_side")
     return Stage("load", how, _render_views, key_options=key_options, files=options.capture, skipped=skipped)
@@ -153,7 +150,7 @@ def _load_poses(path: Path, long_side: int) -> tuple[Camera, tuple[str, ...]]:
         raise InputError(path, "it has no poses", expected, "Check the path.")
     if not posed:
         raise InputError(path, "it has no frame", "at least one pose", "Estimate the poses again.")
-    width, height = downscaled_size((posed[0][1].width, posed[0][1].height), None, long_side)
+    width, height = FrameOptions(long_side=long_side).size((posed[0][1].width, posed[0][1].height))
     sized = [lens.resized(width, height) for _, lens, _ in posed]
 
     def column(name):

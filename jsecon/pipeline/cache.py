@@ -126,9 +126,6 @@ def prepare(folder: Path) -> None:
 def fetch(path: Path, compute: Callable[[], Any], *, note: Callable[[str], None] | None = None) -> CachedResult:
     """Reads the result of a stage, or computes and stores it.
 
-    A fresh result passes through the same packing as a stored one, so that later stages see the same arrays after a
-    stop. A memory-mapped one is read back, so that its files may be deleted.
-
     Args:
       path: File of the result.
       compute: Computes the result if the file is missing or damaged.
@@ -142,7 +139,7 @@ def fetch(path: Path, compute: Callable[[], Any], *, note: Callable[[str], None]
     """
     if path.exists():
         try:
-            value, seconds = _read(path)
+            value, seconds = load(path)
             return CachedResult(value, seconds, fresh=False)
         except CorruptCacheError as error:
             if note is not None:
@@ -152,51 +149,46 @@ def fetch(path: Path, compute: Callable[[], Any], *, note: Callable[[str], None]
     value = compute()
     jax.block_until_ready(value)
     seconds = time.monotonic() - started
-    tree, arrays = _write(path, value, seconds)
-    is_mapped = any(isinstance(array, np.memmap) for array in arrays.values())
-    return CachedResult(_read(path)[0] if is_mapped else unpack_tree(tree, arrays), seconds, fresh=True)
+    return CachedResult(save(path, value, seconds), seconds, fresh=True)
 
 
-def save(path: Path, value: Any) -> None:
+def save(path: Path, value: Any, seconds: float = 0.0) -> Any:
     """Writes a tree to a file, atomically.
 
     Args:
       path: The file.
       value: Tree of plain values, arrays and jsecon's records.
+      seconds: Time that it took, to be kept with it.
+
+    Returns:
+      The tree as `load` gives it, so that later stages see the same arrays after a stop. A memory-mapped one is read
+      back, so that its files may be deleted.
 
     Raises:
       InputError: The file cannot be written.
     """
-    _write(path, value, 0.0)
-
-
-def load(path: Path) -> Any:
-    """Reads what `save` wrote.
-
-    Args:
-      path: The file.
-
-    Returns:
-      The tree; arrays of more than MAPPED bytes are memory-mapped.
-
-    Raises:
-      CorruptCacheError: The file cannot be read.
-    """
-    return _read(path)[0]
-
-
-def _write(path: Path, value: Any, seconds: float) -> tuple[dict, dict[str, np.ndarray]]:
-    """Writes a file; returns the description of its tree, and its arrays."""
     arrays: dict[str, np.ndarray] = {}
     tree = pack_tree(value, "root", arrays)
     with atomic_write(path) as temporary:
         write_arrays(temporary, arrays, {"tree": tree, "seconds": seconds})
         with open(temporary, "r+b") as file:
             os.fsync(file.fileno())  # a rename may reach the disk before the content does
-    return tree, arrays
+    is_mapped = any(isinstance(array, np.memmap) for array in arrays.values())
+    return load(path)[0] if is_mapped else unpack_tree(tree, arrays)
 
 
-def _read(path: Path) -> tuple[Any, float]:
+def load(path: Path) -> tuple[Any, float]:
+    """Reads what `save` wrote.
+
+    Args:
+      path: The file.
+
+    Returns:
+      The tree, whose arrays of more than MAPPED bytes are memory-mapped, and its seconds.
+
+    Raises:
+      CorruptCacheError: The file cannot be read.
+    """
     try:
         description, arrays = read_arrays(path, memory_map_above=MAPPED)
         return unpack_tree(description["tree"], arrays), float(description["seconds"])

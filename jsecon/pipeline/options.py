@@ -219,18 +219,20 @@ def is_bare_scene(capture: Path) -> bool:
     return capture.suffix.lower() in SPLATS and not capture.is_dir()
 
 
-def require_writable(folder: Path) -> None:
+def require_writable(folder: Path, *, create: bool = True) -> None:
     """Creates a folder, and checks that files can be created in it.
 
     Args:
       folder: The output folder.
+      create: False checks the nearest folder above that exists, and creates none.
 
     Raises:
       InputError: The folder cannot be created or written.
     """
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
+        if create:
+            folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=next(p for p in (folder, *folder.absolute().parents) if p.exists())).close()
     except OSError as error:
         remedy = "Choose another output folder, or mend its permissions."
         raise InputError(folder, describe_error(error), "a folder that can be written", remedy) from error

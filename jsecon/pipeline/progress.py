@@ -10,7 +10,7 @@ import io
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any, Literal, TypeAlias
 
 from tqdm import tqdm
@@ -47,19 +47,8 @@ class Listener:
           text: The line.
         """
 
-    def steps(self, title: str, steps: Sequence[Step]) -> None:
-        """Receives all that is known before the first stage runs.
-
-        Args:
-          title: Input and output of the run.
-          steps: Stages in order, then the parts that are left out.
-        """
-        self.say(title)
-        for step in steps:
-            self.step(step)
-
     def step(self, step: Step) -> None:
-        """Receives a step, also one that only the data could settle.
+        """Receives a step: first all that are planned, later also parts that only the data could settle.
 
         Args:
           step: The step.

@@ -81,8 +81,6 @@ class RunContext:
     """Models of the run."""
     out: Path
     """Output folder. It does not count as input if it lies inside of an input folder."""
-    load: Callable[[], Capture] | None = None
-    """Replaces the loader of captures, for data with an unusual layout."""
 
     def key_options(self, *names: str) -> dict[str, Any]:
         """Picks options for the key of a stage.
@@ -119,7 +117,7 @@ class Checkpoint:
           The state; None if there is none, or if its file cannot be read: the stage then starts again.
         """
         with contextlib.suppress(cache.CorruptCacheError):
-            return cache.load(self._path) if self._path.exists() else None
+            return cache.load(self._path)[0] if self._path.exists() else None
         return None
 
     def keep(self, state: Callable[[], Any]) -> None:
@@ -205,11 +203,11 @@ class Stage:
         return cache.files_digest(paths, exclude=context.out)
 
 
-def training_frames(capture: Capture) -> np.ndarray:
+def training_frames(held_out: Array) -> np.ndarray:
     """Lists the frames that may be fitted to.
 
     Args:
-      capture: The capture.
+      held_out: (T,) bool.
 
     Returns:
       Ascending indices.
@@ -217,8 +215,10 @@ def training_frames(capture: Capture) -> np.ndarray:
     Raises:
       InputError: There are fewer than two.
     """
-    train = np.flatnonzero(~np.asarray(capture.held_out))
-    require_training(len(train), len(capture.names))
+    train = np.flatnonzero(~np.asarray(held_out))
+    if len(train) < 2:
+        problem = f"{len(train)} of {len(held_out)} frames to work with"
+        raise InputError("frames", problem, "at least 2", "Hold out fewer frames (--holdout), or use more (--frames).")
     return train
 
 
@@ -235,20 +235,5 @@ def vision_frames(capture: Capture, options: Options) -> np.ndarray:
     Raises:
       InputError: There are fewer than two training frames.
     """
-    train = training_frames(capture)
+    train = training_frames(capture.held_out)
     return train[evenly_spaced(len(train), options.vision_frames)]
-
-
-def require_training(count: int, total: int) -> None:
-    """Checks that there are frames to fit to.
-
-    Args:
-      count: Number of training frames.
-      total: Number of frames.
-
-    Raises:
-      InputError: There are fewer than two training frames.
-    """
-    if count < 2:
-        problem = f"{count} of {total} frames to work with"
-        raise InputError("frames", problem, "at least 2", "Hold out fewer frames (--holdout), or use more (--frames).")

@@ -21,10 +21,9 @@ is skipped and why. These files are passed on the way, by default; behind each l
 import contextlib
 import dataclasses
 import functools
+import itertools
 import json
-import os
 import time
-from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +31,10 @@ import jax
 import numpy as np
 
 from jsecon.data.capture import capture_extent
-from jsecon.data.frames import CaptureExtent, downscaled_size, evenly_spaced, frame_names, holdout_mask
+from jsecon.data.frames import CaptureExtent, FrameOptions, evenly_spaced, frame_names, holdout_mask
 from jsecon.data.images import image_header
 from jsecon.data.langsplat import load_features
-from jsecon.data.masks import check_labels
+from jsecon.data.masks import load_labels
 from jsecon.data.proposals import load_proposals
 from jsecon.data.sfm import check_photographs, list_photographs, require_pycolmap
 from jsecon.data.video import DEFAULT_VIDEO_FRAMES, is_video, video_size
@@ -54,7 +53,7 @@ from jsecon.pipeline.results import (
     Stage,
     StageInput,
     StageResult,
-    require_training,
+    training_frames,
     vision_frames,
 )
 from jsecon.pipeline.scene_files import read_scene
@@ -91,27 +90,33 @@ OUT_OF_MEMORY = "Take smaller frames (--long-side), fewer (--frames), or fewer G
 
 
 @dataclasses.dataclass(frozen=True)
-class Run:
-    """A finished run."""
+class Computed:
+    """Output of stages."""
 
-    field: LanguageField
-    capture: Capture
-    labels: np.ndarray
-    """(T, H, W) int16 masklets of the training frames that vision uses."""
-    held_out: Quality
-    """PSNR and SSIM of the held-out frames."""
-    seconds: dict[str, float]
-    """Wall time of each stage, also of one that was computed in an earlier run."""
-    steps: tuple[Step, ...]
+    results: Results
+    keys: dict[str, str]
+    """Key of each stage."""
+    steps: list[Step]
     """Stages, and what was skipped."""
-    notes: tuple[str, ...]
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+    """Wall time of each stage, also of one that was computed in an earlier run."""
+    notes: list[str] = dataclasses.field(default_factory=list)
     """What the user should know, a sentence each."""
-    options: Options
-    """Options of the run."""
-    programs: dict[str, int]
-    """Number of programs that jax compiled ("all"), and of those that it read from disk ("from_disk")."""
-    compilations: dict[str, dict[str, int]]
-    """The same for each stage."""
+
+    @property
+    def capture(self) -> Capture:
+        """The capture, corrected if the options ask for that."""
+        return self.results.load
+
+    @property
+    def labels(self) -> np.ndarray:
+        """(T, H, W) int16 masklets of the training frames that vision uses."""
+        return self.results.masklets
+
+    @property
+    def held_out(self) -> Quality:
+        """PSNR and SSIM of the held-out frames."""
+        return self.results.held_out
 
     @property
     def psnr(self) -> np.ndarray:
@@ -124,6 +129,16 @@ class Run:
         return {step.name: step.why for step in self.steps if step.status == "skipped"}
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Run(Computed):
+    """A finished run."""
+
+    field: LanguageField
+    options: Options
+    programs: dict[str, int]
+    """Number of programs that jax compiled ("all"), and of those that it read "from_disk"."""
+
+
 @dataclasses.dataclass(frozen=True)
 class _Plan:
     """Which of the stages would run: their keys, digests of their input files, and cache files, by name."""
@@ -134,6 +149,11 @@ class _Plan:
     stale: list[str]
     """Stages whose result is stored and whose output folder is another run's."""
     steps: list[Step]
+
+    @property
+    def running(self) -> list[str]:
+        """Stages that would run."""
+        return [step.name for step in self.steps if step.status == "run"]
 
 
 def _plan(context: RunContext, stage_list: list[Stage], folder: Path) -> _Plan:
@@ -202,18 +222,6 @@ def _checkpoint_file(path: Path) -> Path:
     return path.with_suffix(".checkpoint.safetensors")
 
 
-@dataclasses.dataclass(frozen=True)
-class Computed:
-    """Output of stages, as in `Run`."""
-
-    results: Results
-    keys: dict[str, str]
-    steps: list[Step]
-    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
-    notes: list[str] = dataclasses.field(default_factory=list)
-    compilations: dict[str, dict[str, int]] = dataclasses.field(default_factory=dict)
-
-
 def compute_stages(
     context: RunContext,
     stage_list: list[Stage],
@@ -237,8 +245,7 @@ def compute_stages(
     Raises:
       InputError: An option or input is invalid, or memory is full.
     """
-    listener = listener or Listener()
-    coordinator = coordinator or Coordinator(several=False)
+    listener, coordinator = listener or Listener(), coordinator or Coordinator(several=False)
     with listener.progress("plan"):
         plan = _plan(context, stage_list, folder)
         require_writable(context.out)
@@ -246,14 +253,15 @@ def compute_stages(
         cache.prepare(folder)
         for name in plan.stale:
             plan.paths[name].unlink(missing_ok=True)
-        listener.steps(f"{context.options.capture} -> {context.out}", plan.steps)
-        running = [step.name for step in plan.steps if step.status == "run"]
-        context.networks.require_ready(running)
+        listener.say(f"{context.options.capture} -> {context.out}")
+        for step in plan.steps:
+            listener.step(step)
+        context.networks.require_ready(plan.running)
         computed = Computed(Results(), plan.keys, plan.steps)
         for stage in stage_list:
             _compute_stage(context, stage, plan, computed, listener, coordinator)
             if stage.name == "load":
-                _note_vision_time(context, computed.results.load, running, listener)
+                _note_vision_time(context, computed.capture, plan.running, listener)
     return computed
 
 
@@ -290,7 +298,7 @@ def _compute_stage(
     context: RunContext, stage: Stage, plan: _Plan, computed: Computed, listener: Listener, coordinator: Coordinator
 ) -> None:
     """Computes one stage or reads it from the cache, and adds it to `computed`."""
-    path, before = plan.paths[stage.name], compilation_counts()
+    path = plan.paths[stage.name]
     checkpoint = Checkpoint(_checkpoint_file(path))
 
     def compute(progress: Any) -> StageResult:
@@ -314,7 +322,6 @@ def _compute_stage(
     result: StageResult = cached.value
     setattr(computed.results, stage.name, result.value)
     computed.seconds[stage.name] = cached.seconds
-    computed.compilations[stage.name] = _since(before)
     checkpoint.remove()
     listener.done(stage.name, cached.seconds, cached.fresh)
     for part, why in result.skipped.items():
@@ -330,7 +337,6 @@ def run(
     out: Path,
     *,
     listener: Listener | None = None,
-    load: Callable[[], Capture] | None = None,
     cache_folder: Path | None = None,
     coordinator: Coordinator | None = None,
 ) -> Run:
@@ -342,8 +348,6 @@ def run(
       options: Options of the run.
       out: Output folder.
       listener: Receives plan, progress and notes.
-      load: Replaces the loader of captures, for data with an unusual layout. It may read no files but those beneath
-        `options.capture`.
       cache_folder: Folder of the cache; by default OUT/cache.
       coordinator: Calls the other processes of the run (`run_worker`), if there are any.
 
@@ -355,7 +359,7 @@ def run(
     """
     listener, before = listener or Listener(), compilation_counts()
     folder = cache_folder or out / "cache"
-    context = RunContext(options, networks.open_networks(options, folder), out, load)
+    context = _open_context(options, out, folder)
     computed = compute_stages(context, stages.run_stages(context), folder, listener=listener, coordinator=coordinator)
     results, embedder = computed.results, context.networks.embedder
     started = time.monotonic()
@@ -364,18 +368,13 @@ def run(
         save_field(out / FIELD_FILE, field)
     computed.seconds["field"] = time.monotonic() - started
     listener.done("field", computed.seconds["field"], True)
-    return Run(
-        field,
-        results.load,
-        results.masklets,
-        results.held_out,
-        computed.seconds,
-        tuple(computed.steps),
-        tuple(computed.notes),
-        options,
-        _since(before),
-        computed.compilations,
-    )
+    programs = {name: count - before[name] for name, count in compilation_counts().items()}
+    return Run(**vars(computed), field=field, options=options, programs=programs)
+
+
+def _open_context(options: Options, out: Path, cache_folder: Path | None = None) -> RunContext:
+    """Opens the models of a run."""
+    return RunContext(options, networks.open_networks(options, cache_folder or out / "cache"), out)
 
 
 def current_field(options: Options, out: Path) -> Path | None:
@@ -394,7 +393,7 @@ def current_field(options: Options, out: Path) -> Path | None:
     path = out / FIELD_FILE
     if not path.is_file():
         return None
-    context = RunContext(options, networks.open_networks(options, out / "cache"), out)
+    context = _open_context(options, out)
     keys = _plan(context, stages.run_stages(context), out / "cache").keys
     try:
         origin = json.loads(load_field(path, mapped=True).provenance)
@@ -410,7 +409,7 @@ def run_worker(options: Options, out: Path) -> None:
       options: Options of the run.
       out: Its output folder, where this process writes no file.
     """
-    context = RunContext(options, networks.open_networks(options, out / "cache"), out)
+    context = _open_context(options, out)
     processes.run_worker(context, stages.run_stages(context))
 
 
@@ -430,24 +429,25 @@ def dry_run(options: Options, out: Path, *, scene_only: bool = False, listener: 
       InputError: A run would refuse its options or inputs.
     """
     with listener.progress("plan"):
-        context = RunContext(options, networks.open_networks(options, out / "cache"), out)
+        context = _open_context(options, out)
         stage_list = stages.fit_stages(context) if scene_only else stages.run_stages(context)
         plan = _plan(context, stage_list, out / "cache")
-        running = [step.name for step in plan.steps if step.status == "run"]
-        context.networks.require_ready(running)
-        _check_inputs(context, running, plan.paths)
-    listener.steps(f"{options.capture} -> {out}, a dry run", plan.steps)
+        context.networks.require_ready(plan.running)
+        _check_inputs(context, plan)
+    listener.say(f"{options.capture} -> {out}, a dry run")
+    for step in plan.steps:
+        listener.step(step)
     listener.say("Nothing was written.")
     return {"stages": plan.steps}
 
 
-def _check_inputs(context: RunContext, running: Collection[str], results: Mapping[str, Path]) -> None:
+def _check_inputs(context: RunContext, plan: _Plan) -> None:
     """Raises InputError for inputs that a run would refuse, as its stages check them before their long work.
 
-    Those of stages that would run are checked, by headers and a few files. `results` are the cache files of all stages.
+    Those of stages that would run are checked, by headers and a few files.
     """
-    options = context.options
-    _require_place(context.out)
+    options, running = context.options, plan.running
+    require_writable(context.out, create=False)
     if "poses" in running:
         require_pycolmap(options.capture)
         if is_video(options.capture) and min(video_size(options.capture)) < 1:
@@ -456,9 +456,8 @@ def _check_inputs(context: RunContext, running: Collection[str], results: Mappin
     if is_bare_scene(options.capture):
         read_scene(options.capture)
         return
-    extent = _extent(context, running, results)
-    train = np.flatnonzero(~holdout_mask(extent.frames, options.holdout))
-    require_training(len(train) if extent.frames > 1 else extent.frames, extent.frames)
+    extent = _extent(context, plan)
+    train = training_frames(holdout_mask(extent.frames, options.holdout))
     if options.gaussians is not None and "gaussians" in running:
         read_scene(options.gaussians)
     if extent.names:
@@ -466,54 +465,40 @@ def _check_inputs(context: RunContext, running: Collection[str], results: Mappin
         _check_masks(options, running, extent, [extent.names[t] for t in seen])
 
 
-def _require_place(folder: Path) -> None:
-    """Raises InputError if an output folder cannot be created: a parent of it is a file, or cannot be written."""
-    parent = next(place for place in (folder, *folder.absolute().parents) if place.exists())
-    if not parent.is_dir():
-        raise InputError(folder, f"{parent} is a file", "a folder that can be written", "Choose another output folder.")
-    if not os.access(parent, os.W_OK | os.X_OK):
-        remedy = "Choose another output folder, or mend its permissions."
-        raise InputError(folder, f"{parent} cannot be written", "a folder that can be written", remedy)
-
-
-def _extent(context: RunContext, running: Collection[str], results: Mapping[str, Path]) -> CaptureExtent:
+def _extent(context: RunContext, plan: _Plan) -> CaptureExtent:
     """Returns number, size and names of the frames that a run would load. A video's frames have no names yet."""
     options = context.options
-    size_options = {name: getattr(options, name) for name in ("downscale", "long_side", "frames")}
-    if "load" not in running:
+    frame_options = FrameOptions(options.downscale, options.long_side, options.frames)
+    if "load" not in plan.running:
         with contextlib.suppress(cache.CorruptCacheError):  # a run would compute it again
-            capture = cache.load(results["load"]).value
+            capture = cache.load(plan.paths["load"])[0].value
             size = capture.cameras.width, capture.cameras.height
             return CaptureExtent(len(capture.names), size, capture.names, capture.files)
-    if "poses" not in results:
-        return capture_extent(options.capture, **size_options)
-    if "poses" not in running:
-        return capture_extent(context.out / "poses", **size_options)
+    if "poses" not in plan.running:
+        return capture_extent(context.out / "poses" if "poses" in plan.paths else options.capture, frame_options)
     if is_video(options.capture):
-        size = downscaled_size(video_size(options.capture), options.downscale, options.long_side)
+        size = frame_options.size(video_size(options.capture))
         return CaptureExtent(options.frames or DEFAULT_VIDEO_FRAMES, size)
     photos = list_photographs(options.capture)
     paths = check_photographs(photos, options.capture)
     names = frame_names(paths, options.capture)
     sizes = [image_header(photo).upright for photo in photos]
     chosen = evenly_spaced(len(photos), options.frames)
-    size = downscaled_size(max(set(sizes), key=sizes.count), options.downscale, options.long_side)
     files = tuple(ImageFile(paths[i], *sizes[i]) for i in chosen)
+    size = frame_options.size(max(set(sizes), key=sizes.count))
     return CaptureExtent(len(chosen), size, tuple(names[i] for i in chosen), files)
 
 
-def _check_masks(options: Options, running: Collection[str], extent: CaptureExtent, train_names: list[str]) -> None:
+def _check_masks(options: Options, running: list[str], extent: CaptureExtent, train_names: list[str]) -> None:
     """Checks that files of masks, proposals and features belong to the frames."""
-    width, height = extent.size
-    files = dict(zip(extent.names, extent.files))
-    layout = {"level": options.level, "order": extent.names, "files": files}
+    size = extent.size[1], extent.size[0]
+    layout = {"level": options.level, "frames": dict(itertools.zip_longest(extent.names, extent.files))}
     if options.masks is not None and "masklets" in running:
-        check_labels(options.masks, train_names, (height, width), **layout)
+        load_labels(options.masks, train_names, size, **layout, limit=1)
     if options.proposals is not None and "masklets" in running:
-        read, _ = load_proposals(options.proposals, train_names, (height, width), **layout)
-        read(0)
+        load_proposals(options.proposals, train_names, size, **layout).read(0)
     if options.features is not None and "regions" in running:
-        load_features(options.features, train_names[:1], (height, width), **layout)
+        load_features(options.features, train_names[:1], size, **layout)
 
 
 def fit(options: Options, out: Path, *, listener: Listener | None = None) -> tuple[Gaussians, Capture, Quality]:
@@ -530,11 +515,6 @@ def fit(options: Options, out: Path, *, listener: Listener | None = None) -> tup
     Raises:
       InputError: An option or input is invalid.
     """
-    context = RunContext(options, networks.open_networks(options, out / "cache"), out)
+    context = _open_context(options, out)
     results = compute_stages(context, stages.fit_stages(context), out / "cache", listener=listener).results
     return results.gaussians, results.load, results.held_out
-
-
-def _since(before: dict[str, int]) -> dict[str, int]:
-    """Compilations since earlier counts."""
-    return {name: count - before[name] for name, count in compilation_counts().items()}

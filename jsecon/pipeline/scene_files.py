@@ -102,6 +102,10 @@ class _Placement(NamedTuple):
     gaussians: Gaussians
     similarity: _PhotoSimilarity
 
+    def leads(self, other: "_Placement") -> bool:
+        """Whether it is clearly more like the photographs."""
+        return self.similarity.correlation > other.similarity.correlation + MIN_LEAD
+
 
 def place_in_capture(
     gaussians: Gaussians, capture: Capture, path: Path, trained: np.ndarray | None, progress: Progress
@@ -138,21 +142,18 @@ def place_in_capture(
         scene = jax.tree.map(jnp.asarray, moved)
         return _Placement(name, scene, _photo_similarity(scene, capture))
 
-    placements = []
+    best = None
     for n, (name, world) in enumerate(worlds):
-        placements.append(place(name, world))
+        other = place(name, world)
+        best = other if best is None or other.leads(best) else best
         progress(n + 1, len(worlds))
-    best = placements[0]
-    for other in placements[1:]:
-        if other.similarity.correlation > best.similarity.correlation + MIN_LEAD:
-            best = other
+    assert best is not None
     if not best.similarity.explained:
         cameras = np.linalg.inv(transform_poses(np.asarray(capture.cameras.world_to_camera, np.float64), to_poses))
         points = np.asarray(capture.points, np.float64) @ to_poses[:3, :3].T + to_poses[:3, 3]
         for name, world in _training_worlds(cameras, points):
-            name = f"the training, normalised as by {name}"
-            other = place(name, to_source @ np.linalg.inv(world @ to_poses))
-            if other.similarity.explained and other.similarity.correlation > best.similarity.correlation + MIN_LEAD:
+            other = place(f"the training, normalised as by {name}", to_source @ np.linalg.inv(world @ to_poses))
+            if other.similarity.explained and other.leads(best):
                 best = other
     figures = f"correlation with the frames {best.similarity.correlation:.2f}, {best.similarity.psnr:.1f} dB"
     note = f"The Gaussians were read in the world of {best.name} ({figures})."

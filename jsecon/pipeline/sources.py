@@ -7,7 +7,7 @@ is used only if the name that follows from its content is the one that the run u
 import json
 import os
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jsecon
 from jsecon.errors import InputError
@@ -81,29 +81,16 @@ def locate_sources(field: LanguageField, beside: Path | None = None) -> Sources:
     beside = getattr(field.provenance, "folder", None) if beside is None else beside
     try:
         provenance = parse_json(field.provenance or "{}")
-    except ValueError:
-        provenance = None
-    entries: list[Any] = [_entry(provenance, entry, kind) for entry, kind in _ENTRIES.items()]
-    folders, name, options, models = entries
-    hints = [] if None in entries else [*folders.values(), *models.values()]
-    if None in entries or not all(isinstance(hint, str) for hint in hints):
+        folders, models, options = (provenance.get(name, {}) for name in ("folders", "models", "options"))
+        name = provenance.get("embedder", "")
+        precisions: list[Precision] = [each for each in SUFFIXES if each == options.get("precision")]
+        if not all(isinstance(hint, str) for hint in (name, *folders.values(), *models.values())):
+            raise ValueError("a hint is not a text")
+    except (ValueError, TypeError, AttributeError) as error:
         remedy = "Give the folders yourself, with --embedder and --images, or run the capture again."
-        raise InputError("field", "its provenance is not what jsecon run writes", remedy=remedy)
-    precision: Precision | None = None
-    for name_of_precision in SUFFIXES:
-        if options.get("precision") == name_of_precision:
-            precision = name_of_precision
+        raise InputError("field", "its provenance is not what jsecon run writes", remedy=remedy) from error
     model, capture = (_resolve(beside, folders.get(kind)) for kind in ("embedder", "capture"))
-    return Sources(name or None, model, capture, models.get("embedder"), precision)
-
-
-_ENTRIES: dict[str, type] = {"folders": dict, "embedder": str, "options": dict, "models": dict}
-
-
-def _entry(provenance: Any, name: str, kind: type) -> Any:
-    """An entry of a provenance, empty if it is missing; None if it is of another kind."""
-    value = provenance.get(name, kind()) if isinstance(provenance, dict) else None
-    return value if isinstance(value, kind) else None
+    return Sources(name or None, model, capture, models.get("embedder"), next(iter(precisions), None))
 
 
 def _resolve(beside: Path | None, hint: str | None) -> Path | None:

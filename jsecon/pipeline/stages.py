@@ -7,11 +7,11 @@ Only `load`, `field_of` and the measurement of quality read held-out frames.
 
 import dataclasses
 import functools
+import itertools
 import shutil
 import threading
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from jsecon.association.consensus import consensus_masklets, pieces_on_masks
 from jsecon.association.run_lengths import memoized_masks
 from jsecon.association.tracker import GeometricTracker
 from jsecon.association.views import SceneViews
-from jsecon.data.capture import check_views_overlap, load_capture, may_have_depth, unposed_photographs
+from jsecon.data.capture import load_capture, may_have_depth, unposed_photographs
 from jsecon.data.langsplat import load_features
 from jsecon.data.masks import load_labels
 from jsecon.data.nerfstudio import trained_to_source
@@ -59,7 +59,7 @@ from jsecon.pipeline.results import (
 from jsecon.pipeline.scene_files import check_overlap, place_in_capture, read_scene
 from jsecon.process import memory_budget
 from jsecon.splat.render import render_depth
-from jsecon.types import Capture, Gaussians, LanguageField, Progress, Regions
+from jsecon.types import Camera, Capture, Gaussians, LanguageField, Progress, Regions
 from jsecon.vision.classical import GRANULARITIES, ClassicalSegmenter
 from jsecon.vision.protocols import Embedder, Segmenter
 from jsecon.vision.reference_words import reference_of
@@ -77,8 +77,6 @@ MAX_CLOUD_POINTS = 100_000
 """points from depth whose normals are estimated"""
 MIN_CLOUD_SPACING = 0.02
 """least distance between them, as a share of the median depth: closer points show a sensor's noise, not the surface"""
-
-Refinement = Literal["none", "poses", "exposure", "both", "auto"]
 
 
 def run_stages(context: RunContext) -> list[Stage]:
@@ -131,11 +129,12 @@ def capture_stages(context: RunContext) -> list[Stage]:
     Raises:
       InputError: An option is set that the input has no use for.
     """
-    bare = _is_bare(context)
+    bare = is_bare_scene(context.options.capture)
     require_options_apply(context.options, bare=bare)
     if bare:
         return [bare_stages(context)["load"]]
-    if context.load is not None or not _is_unposed(context.options.capture):
+    capture = context.options.capture
+    if not (is_video(capture) or unposed_photographs(capture)):
         return [_plan_load(context)]
     stage = _plan_poses(context)
     assert stage.output_dir is not None
@@ -148,16 +147,6 @@ def capture_stages(context: RunContext) -> list[Stage]:
         return plan.compute(stage_input._replace(context=posed))
 
     return [stage, dataclasses.replace(plan, compute=compute, after=("poses",), files=None)]
-
-
-def _is_bare(context: RunContext) -> bool:
-    """Whether a run's input is a scene without photographs."""
-    return context.load is None and is_bare_scene(context.options.capture)
-
-
-def _is_unposed(capture: Path) -> bool:
-    """Whether a path is a video, or a folder of photographs without a file of poses."""
-    return len(unposed_photographs(capture)) > 0 if capture.is_dir() else is_video(capture)
 
 
 def _plan_poses(context: RunContext) -> Stage:
@@ -205,8 +194,7 @@ def _plan_load(context: RunContext) -> Stage:
     count = "all frames" if options.frames is None else f"at most {options.frames} frames"
     held_out = f"1 in {options.holdout} held out" if options.holdout else "none held out"
     how = f"{count}, {_size_words(options)}, {held_out}"
-    key_options["loader"] = getattr(context.load, "__qualname__", None)
-    refine = _refinement(context)
+    refine = _refinement(options)
     if refine != "none" or options.drop_frames != "none":
         key_options |= context.key_options("drop_frames", "seed") | {"refine": refine}
         if refine == "auto":
@@ -227,40 +215,32 @@ def _size_words(options: Options) -> str:
     return "full size" if options.downscale == 1 else f"{options.downscale:g} times smaller"
 
 
-def _refinement(context: RunContext) -> Refinement:
+def _refinement(options: Options) -> str:
     """What a run corrects of poses and exposures: "auto" only if depth and the data can still decide it."""
-    options = context.options
     if options.refine != "auto":
         return options.refine
     if options.gaussians is not None:  # they belong to the poses as they are
         return "none"
-    return "auto" if context.load is not None or may_have_depth(options.capture) else "none"
+    return "auto" if may_have_depth(options.capture) else "none"
 
 
 def _load(stage: StageInput) -> StageResult:
-    context, options = stage.context, stage.context.options
-    size = "by its adapter"
-    if context.load is not None:
-        capture = context.load()
-    else:
-        size = _size_words(options)
-        sizes = context.key_options("downscale", "long_side", "frames", "holdout")
-        capture = load_capture(options.capture, **sizes, progress=stage.progress)
-    train = training_frames(capture)
-    check_views_overlap(capture)
+    options, sizes = stage.context.options, stage.context.key_options("downscale", "long_side", "frames", "holdout")
+    capture = load_capture(options.capture, **sizes, progress=stage.progress)
+    train = training_frames(capture.held_out)
     count, height, width = capture.frames.shape[:3]
-    frames = f"{count} frames of {width}x{height} ({size}), {count - len(train)} of them held out"
+    frames = f"{count} frames of {width}x{height} ({_size_words(options)}), {count - len(train)} of them held out"
     points = f"{len(capture.points)} sparse points{'' if capture.depths is None else ', depth'}"
     notes = (f"{frames}, {points}", *capture.notes)
-    refine = _refinement(context)
+    refine = _refinement(options)
     if refine == "none" and options.drop_frames == "none":
         return StageResult(capture, notes=notes)
     better = _refine(capture, options, refine, stage.progress)
-    training_frames(better)
+    training_frames(better.held_out)
     return StageResult(better, notes=(*notes, *better.notes[len(capture.notes) :]))
 
 
-def _refine(capture: Capture, options: Options, refine: Refinement, progress: Progress) -> Capture:
+def _refine(capture: Capture, options: Options, refine: str, progress: Progress) -> Capture:
     """Corrects poses and exposures by short fits, and leaves out the frames that these do not explain."""
     from jsecon.fit.corrections import RefineOptions  # late, like all that imports optax: a plan needs none of it
     from jsecon.fit.refine import refine_capture
@@ -294,7 +274,7 @@ def _fit_steps(options: Options, capture: Capture) -> float:
 
 def _plan_gaussians(context: RunContext) -> Stage:
     """Plans the scene's Gaussians: of a file, brought into the capture's world, or fitted to the training frames."""
-    if _is_bare(context):
+    if is_bare_scene(context.options.capture):
         return bare_stages(context)["gaussians"]
     options, path = context.options, context.options.gaussians
     if path is not None:
@@ -323,7 +303,7 @@ def _read_gaussians(stage: StageInput) -> StageResult:
     transform = path.parent / "dataparser_transforms.json"
     trained = trained_to_source(transform) if transform.is_file() else None
     placed, notes = place_in_capture(scene, capture, path, trained, stage.progress)
-    check_overlap(placed, capture.cameras[training_frames(capture)], str(path))
+    check_overlap(placed, capture.cameras[training_frames(capture.held_out)], str(path))
     return StageResult(placed, notes=(*notes, *read_notes))
 
 
@@ -335,7 +315,7 @@ def _fit_gaussians(stage: StageInput) -> StageResult:
     start, notes = None, ()
     if state is None:
         start, origin = starting_gaussians(capture, sh_degree=options.sh_degree, progress=stage.progress)
-        check_overlap(start, capture.cameras[training_frames(capture)], str(options.capture))
+        check_overlap(start, capture.cameras[training_frames(capture.held_out)], str(options.capture))
         notes = (f"start of the fit: {origin}",)
     pixels, minutes = capture.cameras.width * capture.cameras.height, options.minutes
     is_long = options.steps >= LONG_STEPS if minutes is None else minutes >= LONG_MINUTES
@@ -356,7 +336,7 @@ def _fit_gaussians(stage: StageInput) -> StageResult:
 
 def _plan_held_out(context: RunContext) -> Stage:
     """Plans PSNR and SSIM of the held-out frames."""
-    if _is_bare(context):
+    if is_bare_scene(context.options.capture):
         return bare_stages(context)["held_out"]
     how = "PSNR and SSIM of the rendered colours"
     return Stage("held_out", how, _measure, after=("load", "gaussians"), distributed=True)
@@ -432,19 +412,33 @@ def _plan_masklets(context: RunContext) -> Stage:
 
 
 def _read_masklets(stage: StageInput) -> StageResult:
-    options, capture = stage.context.options, stage.results.load
-    assert options.masks is not None
-    names = [capture.names[t] for t in vision_frames(capture, options)]
-    layout = _mask_layout(options, capture)
-    size = int(capture.frames.shape[1]), int(capture.frames.shape[2])
-    loaded = load_labels(options.masks, names, size, **layout, progress=stage.progress)
-    _require_regions(loaded.labels, str(options.masks))
+    folder, vision = stage.context.options.masks, _Vision(stage.results.load, stage.context.options)
+    assert folder is not None
+    loaded = load_labels(folder, vision.names, vision.size, **vision.mask_layout, progress=stage.progress)
+    _require_regions(loaded.labels, str(folder))
     return StageResult(loaded.labels, notes=(f"{len(loaded.ids)} regions in the masks", *loaded.notes))
 
 
-def _mask_layout(options: Options, capture: Capture) -> dict[str, Any]:
-    """How files of masks belong to the frames, for their readers."""
-    return {"level": options.level, "order": capture.names, "files": dict(zip(capture.names, capture.files))}
+class _Vision:
+    """The training frames in which masks are found and embedded."""
+
+    def __init__(self, capture: Capture, options: Options):
+        self.capture, self.train = capture, vision_frames(capture, options)
+        self.names = [capture.names[t] for t in self.train]
+        self.size = capture.cameras.height, capture.cameras.width
+        frames = dict(itertools.zip_longest(capture.names, capture.files))
+        self.mask_layout: dict[str, Any] = {"level": options.level, "frames": frames}
+        """How files of masks belong to the frames, for their readers."""
+
+    @property
+    def frames(self) -> np.ndarray:
+        """(T, H, W, 3) their pixels."""
+        return np.asarray(self.capture.frames)[self.train]
+
+    @property
+    def cameras(self) -> Camera:
+        """Their T cameras, on jax's device."""
+        return jax.tree.map(jnp.asarray, self.capture.cameras[self.train])
 
 
 def _find_masklets(stage: StageInput) -> StageResult:
@@ -472,12 +466,10 @@ def frame_proposals(
     Raises:
       InputError: The files of proposals belong to no frame.
     """
-    options, train = context.options, vision_frames(capture, context.options)
-    frames = np.asarray(capture.frames)[train]
+    options, vision = context.options, _Vision(capture, context.options)
     if options.proposals is not None:
-        names = [capture.names[t] for t in train]
-        return load_proposals(options.proposals, names, frames.shape[1:3], **_mask_layout(options, capture))
-    segmenter = context.networks.segmenter
+        return load_proposals(options.proposals, vision.names, vision.size, **vision.mask_layout)
+    segmenter, frames = context.networks.segmenter, vision.frames
     if segmenter is not None:  # it stores its masks on disk
         lock = threading.Lock()  # a network takes all cores for one frame
 
@@ -496,7 +488,8 @@ def _classical_segmenter(options: Options, capture: Capture, gaussians: Gaussian
     Surfaces come from the capture's depth. Without depth, the coarse granularity takes the depth that the Gaussians
     render; the finer ones do not, as rendered depth costs them more outline than it tells.
     """
-    train = vision_frames(capture, options)
+    vision = _Vision(capture, options)
+    train, cameras = vision.train, vision.cameras
     setting = GRANULARITIES[options.granularity]
     depths = None if capture.depths is None else np.asarray(capture.depths)[train]
     if depths is not None and depths[:, ::4, ::4].any():
@@ -505,11 +498,10 @@ def _classical_segmenter(options: Options, capture: Capture, gaussians: Gaussian
         cloud = points_from_depth(capture, voxel=spacing, stride=4)
         if len(cloud.points) > MAX_CLOUD_POINTS:
             cloud = points_from_depth(capture, max_points=MAX_CLOUD_POINTS, stride=4)
-        surfaces = surfaces_from_depth(depths, capture.cameras[train], cloud.points)
+        surfaces = surfaces_from_depth(depths, cameras, cloud.points)
         return ClassicalSegmenter(**setting, surfaces=surfaces)
     if options.granularity != "coarse":
         return ClassicalSegmenter(**setting)
-    cameras = jax.tree.map(jnp.asarray, capture.cameras[train])
 
     def rendered(t: int) -> np.ndarray:
         depth, alpha = (np.asarray(image) for image in render_depth(gaussians, cameras[t]))
@@ -539,8 +531,8 @@ def associate_masks(
     Returns:
       (T, H, W) int16 labels of the training frames, -1 for no region.
     """
-    options, train = context.options, vision_frames(capture, context.options)
-    frames, cameras = np.asarray(capture.frames)[train], jax.tree.map(jnp.asarray, capture.cameras[train])
+    options, vision = context.options, _Vision(capture, context.options)
+    frames, cameras = vision.frames, vision.cameras
     if options.associated_by == "consensus":
         scene = SceneViews(gaussians, cameras, proposals, centre=options.centre)
         labels = consensus_masklets(frames, scene, agreement=options.agreement, seed=options.seed, progress=progress)
@@ -591,20 +583,18 @@ def _plan_regions(context: RunContext) -> Stage:
 
 
 def _embed_regions(stage: StageInput) -> StageResult:
-    context, capture = stage.context, stage.results.load
-    frames = np.asarray(capture.frames)[vision_frames(capture, context.options)]
-    embed = context.networks.embedder.embed_regions
-    weighting = context.options.weighting
+    context, weighting = stage.context, stage.context.options.weighting
+    frames, embed = _Vision(stage.results.load, context.options).frames, context.networks.embedder.embed_regions
     embedded = region_embeddings(frames, stage.results.masklets, embed, weighting=weighting, progress=stage.progress)
     context.networks.close()
     return StageResult(embedded)
 
 
 def _read_regions(stage: StageInput) -> StageResult:
-    options, capture, labels = stage.context.options, stage.results.load, stage.results.masklets
+    options, labels = stage.context.options, stage.results.masklets
+    vision = _Vision(stage.results.load, options)
     assert options.features is not None
-    names = [capture.names[t] for t in vision_frames(capture, options)]
-    features = load_features(options.features, names, labels.shape[1:], **_mask_layout(options, capture))
+    features = load_features(options.features, vision.names, vision.size, **vision.mask_layout)
     if not len(features.embeddings):
         problem = f"no mask of level {options.level} in any frame"
         remedy = "Take another --level, or write the files again."
@@ -633,29 +623,27 @@ def _plan_parts(context: RunContext) -> Stage:
 
 
 def _find_parts(stage: StageInput) -> StageResult:
-    context, capture = stage.context, stage.results.load
-    options, train = context.options, vision_frames(capture, context.options)
-    frames, cameras = np.asarray(capture.frames)[train], jax.tree.map(jnp.asarray, capture.cameras[train])
+    context, options = stage.context, stage.context.options
+    vision = _Vision(stage.results.load, options)
+    frames = vision.frames
     masks, embed = _masks_with_embeddings(context, stage.results)
-    views = SceneViews(stage.results.gaussians, cameras, masks, centre=options.centre)
+    views = SceneViews(stage.results.gaussians, vision.cameras, masks, centre=options.centre)
     piece, weights = pieces_on_masks(frames, views, seed=options.seed, progress=stage.progress)
-    rows = np.concatenate([embed(t, masks(t)) for t in range(len(train))])
+    rows = np.concatenate([embed(t, masks(t)) for t in range(len(frames))])
     context.networks.close()
     return StageResult(scene_parts(piece, weights, rows))
 
 
 def _masks_with_embeddings(context: RunContext, results: Results) -> tuple[Callable[[int], np.ndarray], Embed]:
     """Masks (M, H, W) of the t-th training frame and their embeddings: of --features, of --masks, or proposals."""
-    options, capture = context.options, results.load
-    train = vision_frames(capture, options)
-    frames = np.asarray(capture.frames)[train]
+    options, vision = context.options, _Vision(results.load, context.options)
+    frames = vision.frames
 
     def by_model(t, masks):
         return context.networks.embedder.embed_regions(frames[t], masks)
 
     if options.features is not None:
-        names = [capture.names[t] for t in train]
-        features = load_features(options.features, names, frames.shape[1:3], **_mask_layout(options, capture))
+        features = load_features(options.features, vision.names, vision.size, **vision.mask_layout)
 
         def rows(t):
             return np.flatnonzero(np.asarray(features.frame) == t)
@@ -667,7 +655,7 @@ def _masks_with_embeddings(context: RunContext, results: Results) -> tuple[Calla
     if options.masks is not None:
         labels = results.masklets
         return lambda t: labels[t][None] == np.unique(labels[t][labels[t] >= 0])[:, None, None], by_model
-    return frame_proposals(context, capture, results.gaussians)[0], by_model
+    return frame_proposals(context, results.load, results.gaussians)[0], by_model
 
 
 # The codes

@@ -25,7 +25,7 @@ import jsecon
 from jsecon.app.ask import frame_index
 from jsecon.app.exports import object_records
 from jsecon.app.locate import gaussian_rows
-from jsecon.app.relations import Measure, measure, query_relation
+from jsecon.app.relations import measure, query_relation
 from jsecon.app.server.guard import LIMITS, Guard, Limits, Workers
 from jsecon.app.server.scenes import Scene, SceneQuery
 from jsecon.app.verbs import By
@@ -174,11 +174,8 @@ def application(
     @app.post("/measure", summary="Distances between two objects: surfaces, centres, free gap, angle")
     async def distance(request: MeasureQuery) -> Response:
         scene = scene_of(request.field)
-
-        def work() -> Measure:
-            return measure(scene.object_scene, request.a, request.b, frame=request.frame)
-
-        distances = await computed(work, "a or b")
+        a, b, frame = request.a, request.b, request.frame
+        distances = await computed(lambda: measure(scene.object_scene, a, b, frame=frame), "a or b")
         return _AsciiResponse({"field": scene.name} | distances.as_dict())
 
     @app.get("/objects", summary="The objects of a field: names, boxes, Gaussians")

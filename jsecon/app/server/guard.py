@@ -23,14 +23,12 @@ class Limits:
       seconds_to_send: Time to send the body, s.
       seconds: Time to compute an answer, s.
       waiting: Number of queries that are computed or wait for it.
-      requests: Number of requests at once, the cheap ones included.
     """
 
     body: int = 64 * 1024
     seconds_to_send: float = 10.0
     seconds: float = 30.0
     waiting: int = 64
-    requests: int = 256
 
 
 LIMITS = Limits()
@@ -90,7 +88,6 @@ class Guard:
         self.token = token
         self.limits = limits
         self.hosts = hosts
-        self.active = 0
 
     async def __call__(self, scope: dict, receive: Callable, send: Callable) -> None:
         """Answers a request that is refused, and passes the others on."""
@@ -103,16 +100,10 @@ class Guard:
             status, message = refusal
             response = JSONResponse({"error": message}, status, headers={"connection": "close"})
             return await response(scope, receive, send)
-        self.active += 1
-        try:
-            await self.app(scope, self._limited(receive), send)
-        finally:
-            self.active -= 1
+        await self.app(scope, self._limited(receive), send)
 
     def _refusal(self, headers: Headers, method: str) -> tuple[int, str] | None:
         """Returns the status and the message of a request that is refused, or None."""
-        if self.active >= self.limits.requests:
-            return 503, "Too many requests at once. Try again."
         if self.token:
             if not token_matches(headers.get("authorization", "").encode("latin-1"), f"Bearer {self.token}"):
                 return 401, "A token is required. Send the header Authorization: Bearer TOKEN."

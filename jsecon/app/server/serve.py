@@ -18,14 +18,17 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
+import uvicorn
+
 from jsecon.app import verbs
 from jsecon.app.access import bracketed, listen, token_for
 from jsecon.app.models import OLD_FIELD, with_models
+from jsecon.app.server.api import application
 from jsecon.app.server.scenes import open_scenes
-from jsecon.errors import InputError
 from jsecon.pipeline.progress import Console
 
-REMEDY = 'pip install "jsecon[serve]"'
+MAX_REQUESTS = 256
+"""number of requests at once, the cheap ones included; uvicorn refuses others (503)"""
 
 
 def prepare(
@@ -45,39 +48,21 @@ def prepare(
       {"address": ..., "fields": ...}, and the function that answers requests until it is stopped.
 
     Raises:
-      InputError: The extra is missing, the address cannot be listened on, others can reach it without a token, or a
-        field cannot be read.
+      InputError: The address cannot be listened on, others can reach it without a token, or a field cannot be read.
     """
-    try:
-        import uvicorn
-
-        from jsecon.app.server.api import application
-    except ImportError as error:
-        problem = f"the package {error.name} is missing"
-        raise InputError("jsecon serve", problem, remedy=f"Run: {REMEDY}") from error
     token = token_for(host, token)
     listening = listen(host, port)
     scenes = open_scenes(files, embedder)
     app = application(scenes, token=token, hosts=(host, *hosts))
-    config = uvicorn.Config(app, log_level="warning", timeout_keep_alive=5, ws="none", server_header=False)
+    options: dict[str, Any] = {"timeout_keep_alive": 5, "limit_concurrency": MAX_REQUESTS}
+    config = uvicorn.Config(app, log_level="warning", ws="none", server_header=False, **options)
     address = f"http://{bracketed(host)}:{listening.getsockname()[1]}"
     description = {"address": address, "fields": [scene.description for scene in scenes.values()]}
     return description, lambda: uvicorn.Server(config).run(sockets=[listening])
 
 
-def serve_verb(verb: verbs.Serve, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon serve`.
-
-    Args:
-      verb: Its options.
-      console: Receives the fields and the address.
-
-    Returns:
-      As the first of `prepare`, and under "then" the second.
-
-    Raises:
-      InputError: As `prepare`, or a model is missing.
-    """
+def _serve(verb: verbs.Serve, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon serve`; the result is as of `prepare`, with its function under "then"."""
     access = {"host": verb.host, "port": verb.port, "token": verb.token, "hosts": verb.allow_host}
     with console.progress("fields"):
         embedder = with_models(verb, console, yes=False).embedder
@@ -88,3 +73,7 @@ def serve_verb(verb: verbs.Serve, console: Console) -> verbs.VerbResult:
             console.note(f"{scene['name']}: {OLD_FIELD}")
     console.say(result["address"])
     return result | {"then": serve}
+
+
+VERBS = {verbs.Serve: _serve}
+"""what does the work of each verb"""

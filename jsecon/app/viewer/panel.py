@@ -10,9 +10,8 @@ import numpy as np
 from jsecon.app.ask import Answer
 from jsecon.app.pictures import fitted
 from jsecon.app.report import data_uri
-from jsecon.app.viewer import view_state
 from jsecon.app.viewer.candidates import Candidate
-from jsecon.app.viewer.view_state import COLOURINGS, ViewState, answer_colours
+from jsecon.app.viewer.view_state import COLOURINGS, MAX_SHELLS, ViewState, answer_colours, from_link
 from jsecon.errors import InputError
 from jsecon.language.membership import probability_inside
 from jsecon.query.rules import PRESENCE_THRESHOLD, QUANTILE, RETRIEVAL_THRESHOLD
@@ -33,6 +32,10 @@ class Panel:
       viewer: The viewer.
       server: The viser server.
       field: The field.
+
+    Attributes:
+      messages: HTML about the answers.
+      link: Text box of the view's link.
     """
 
     def __init__(self, viewer: Any, server: Any, field: LanguageField):
@@ -47,22 +50,23 @@ class Panel:
         with gui.add_form(None) as text_form:
             hint = "Text to find, then press enter. Separate several texts by semicolons; each has another colour."
             self._text = gui.add_text("find", "", hint=hint)
-        self._messages = gui.add_html("")
+        self.messages = gui.add_html("")
         self._notice = gui.add_html("", visible=False)
         hint = "Select every region that matches, not only the best one"
-        self._all_matches = gui.add_checkbox("all matches", default.all_matches, hint=hint)
+        all_matches = gui.add_checkbox("all matches", default.all_matches, hint=hint)
         hint = "Smallest share of a Gaussian that must lie in the matching regions"
-        self._threshold = gui.add_slider("threshold", 0.0, 1.0, 0.01, default.threshold, hint=hint)
+        threshold = gui.add_slider("threshold", 0.0, 1.0, 0.01, default.threshold, hint=hint)
         has_overlap = field.votes.overlap is not None
         hint = "0 selects the best region alone, 1 also all regions that overlap it and match better than most"
         hint = hint if has_overlap else "This field does not record which regions overlap"
-        self._part_vs_whole = gui.add_slider(
+        part_vs_whole = gui.add_slider(
             "part or whole", 0.0, 1.0, 0.05, default.part_vs_whole, disabled=not has_overlap, hint=hint
         )
-        most = view_state.MAX_SHELLS
         hint = "Shells of neighbouring Gaussians that each selection is grown by; below 0 it is shrunk"
-        self._shells = gui.add_slider("grow or shrink", -most, most, 1, default.shells, hint=hint)
-        self._colouring = gui.add_dropdown("colour", COLOURINGS, initial_value=default.colouring)
+        shells = gui.add_slider("grow or shrink", -MAX_SHELLS, MAX_SHELLS, 1, default.shells, hint=hint)
+        colouring = gui.add_dropdown("colour", COLOURINGS, initial_value=default.colouring)
+        self._controls = {"all_matches": all_matches, "threshold": threshold, "part_vs_whole": part_vs_whole}
+        self._controls |= {"shells": shells, "colouring": colouring}
         selection_buttons = gui.add_button_group("selection", ("isolate", "hide", "export"))
         view_buttons = gui.add_button_group("", ("show all", "undo"))
         with gui.add_folder("other candidates", expand_by_default=True) as self._candidate_folder:
@@ -76,12 +80,13 @@ class Panel:
             self._picture = gui.add_image(np.zeros((2, 2, 3), np.uint8), visible=False)
         with gui.add_form(None) as link_form:
             hint = "Copy this line to keep the view. Paste a line and press enter to restore it."
-            self._link = gui.add_text("link", "", hint=hint)
+            self.link = gui.add_text("link", "", hint=hint)
 
         text_form.on_submit(_in_order(lambda _: viewer.then(lambda s: s.with_texts(self._text.value))))
-        link_form.on_submit(_in_order(lambda _: viewer.restore(self._link.value)))
-        for name in ("all_matches", "threshold", "part_vs_whole", "shells", "colouring"):
-            control = getattr(self, f"_{name}")
+        link_form.on_submit(
+            _in_order(lambda _: viewer.then(lambda _: from_link(self.link.value), update_controls=True))
+        )
+        for name, control in self._controls.items():
             control.on_update(_in_order(lambda event, name=name: self._set_control(name, event.target.value)))
         for buttons in (selection_buttons, view_buttons):
             buttons.on_click(_in_order(self._press))
@@ -140,29 +145,17 @@ class Panel:
           state: State that they show.
         """
         self._text.value = state.text_line
-        self._all_matches.value = state.all_matches
-        self._colouring.value = state.colouring
-        self._threshold.value = state.threshold
-        self._part_vs_whole.value = state.part_vs_whole
-        self._shells.value = state.shells
-
-    def show_messages(self, content: str) -> None:
-        """Shows messages about the answers, and removes the notice.
-
-        Args:
-          content: HTML (`messages`).
-        """
-        self._messages.content = content
-        self._notice.visible = False
+        for name, control in self._controls.items():
+            control.value = getattr(state, name)
 
     def show_notice(self, text: str | InputError) -> None:
-        """Shows a notice above the answers.
+        """Shows a notice above the answers, or removes it.
 
         Args:
-          text: Plain text, or an error.
+          text: Plain text, or an error; "" removes the notice.
         """
         self._notice.content = _box(_error(text) if isinstance(text, InputError) else html.escape(text))
-        self._notice.visible = True
+        self._notice.visible = text != ""
 
     def show_candidates(self, content: str, count: int) -> None:
         """Shows candidates, with a button for each.
@@ -186,14 +179,6 @@ class Panel:
         self._frame.value = self._names[frame]
         self._picture.image = picture
         self._picture.visible = True
-
-    def show_link(self, link: str) -> None:
-        """Shows the link of the view.
-
-        Args:
-          link: The link (`ViewState.link`).
-        """
-        self._link.value = link
 
 
 def _in_order(act: Callable[[Any], Any]) -> Any:

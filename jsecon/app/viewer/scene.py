@@ -37,6 +37,7 @@ class FieldScene:
       scale: Units of the window per unit of the field.
       photo: (N, 3) uint8 colours of degree 0.
       regions: (N,) main region of each Gaussian, or -1.
+      fovs: (T,) vertical fields of view of the frames, radians.
       frustums: Index of a frame -> its camera in the window.
     """
 
@@ -53,7 +54,8 @@ class FieldScene:
         self.scale = 1 / float(np.median(positive)) if len(positive) else 1.0
         self.photo = (255 * np.clip(0.5 + C0 * np.asarray(gaussians.sh)[:, 0], 0, 1)).astype(np.uint8)
         self._server = server
-        self._cameras = field.cameras
+        self._aspect = field.cameras.width / field.cameras.height
+        self.fovs = 2 * np.arctan(field.cameras.height / 2 / np.asarray(field.cameras.fy, np.float64))
         opacity = np.nan_to_num(np.asarray(sigmoid(np.asarray(gaussians.opacity_logits))))
         self._opacity = np.rint(255 * np.where(usable, opacity, 0)).astype(np.uint8)
         rotations = Rotation.from_quat(where_usable(gaussians.quaternions), scalar_first=True).as_matrix()
@@ -89,20 +91,9 @@ class FieldScene:
         distance = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
         camera.position = self._centers[0]
         camera.look_at = self._centers[0] + distance * forward
-        camera.fov = self.fov(0)
+        camera.fov = float(self.fovs[0])
         camera.near = 0.01 * self.scale
         camera.far = 1e4 * self.scale
-
-    def fov(self, frame: int) -> float:
-        """Computes the field of view of a frame.
-
-        Args:
-          frame: Index of the frame.
-
-        Returns:
-          The vertical field of view, radians.
-        """
-        return 2 * float(np.arctan(self._cameras.height / 2 / np.asarray(self._cameras.fy)[frame]))
 
     def _add_frustums(self, server: Any) -> dict[int, Any]:
         """Adds the cameras of the frames to the window, invisible."""
@@ -112,8 +103,8 @@ class FieldScene:
         return {
             t: server.scene.add_camera_frustum(
                 f"/frames/{t}",
-                self.fov(t),
-                aspect=self._cameras.width / self._cameras.height,
+                float(self.fovs[t]),
+                aspect=self._aspect,
                 scale=size,
                 color=(150, 170, 200),
                 thickness=1.2,
@@ -184,6 +175,6 @@ class FieldScene:
                 client.camera.wxyz = rotation(step).as_quat(scalar_first=True)
             client.flush()
             time.sleep(FLIGHT_SECONDS / FLIGHT_STEPS)
-        client.camera.fov = self.fov(frame)
+        client.camera.fov = float(self.fovs[frame])
         self._frame = frame
         self.show_frames(self._frames_shown)

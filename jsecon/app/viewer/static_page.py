@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from jsecon.app import verbs
 from jsecon.app.ask import Answer
@@ -88,12 +88,17 @@ def page(field: LanguageField, answers: Sequence[Answer], *, title: str) -> str:
     largest = MAX_SIZE * np.linalg.norm(high - low)
     drawn &= np.asarray(gaussians.log_scales, np.float64).max(1) < np.log(largest)
     splats, size_range = _pack(gaussians, main_regions(field), opacity, drawn, low, high)
+    texts = []
+    for answer in answers:
+        mask = np.packbits(np.asarray(answer.mask)[drawn], bitorder="little").tobytes()
+        score = float(answer.selection.score)
+        texts.append({"text": answer.query, "score": score, "mask": base64.b64encode(mask).decode()})
     scene = {
         "count": int(drawn.sum()),
         "regions": field.regions.count,
         "low": low.tolist(),
         "span": (high - low).tolist(),
-        "texts": [_pack_answer(answer, drawn) for answer in answers],
+        "texts": texts,
         **_camera(field, means[drawn]),
         **size_range,
     }
@@ -101,13 +106,6 @@ def page(field: LanguageField, answers: Sequence[Answer], *, title: str) -> str:
     filled = template.replace("__TITLE__", html.escape(title))
     filled = filled.replace("__SCENE__", json.dumps(scene).replace("</", "<\\/"))
     return filled.replace("__SPLATS__", base64.b64encode(splats).decode())
-
-
-def _pack_answer(answer: Answer, drawn: Bool[np.ndarray, " n"]) -> dict[str, Any]:
-    """Returns an answer as the page reads it."""
-    bits = np.packbits(np.asarray(answer.mask)[drawn], bitorder="little")
-    mask = base64.b64encode(bits.tobytes()).decode()
-    return {"text": answer.query, "score": float(answer.selection.score), "mask": mask}
 
 
 def _camera(field: LanguageField, means: Float[np.ndarray, "n 3"]) -> dict[str, Any]:

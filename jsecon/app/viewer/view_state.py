@@ -31,8 +31,6 @@ MAX_QUERIES = 40
 """number of queries that are highlighted at once"""
 MAX_SHELLS = 5
 """shells of neighbours that a selection is grown or shrunk by"""
-MAX_TEXT = 4000
-"""letters of a text in a link"""
 MAX_UNDO = 100
 """number of states that undo goes back"""
 
@@ -55,6 +53,20 @@ class ViewQuery:
     part_vs_whole: float = 1 - PIECE_THRESHOLD
     all_matches: bool = False
     shells: int = 0
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for values that the viewer cannot produce, as a link may hold them."""
+        query = self.query
+        is_text = isinstance(query, str) and query.strip() != ""
+        valid = {
+            "query": is_text or (isinstance(query, int) and _is_number(query, 0)),
+            "threshold": _is_number(self.threshold, 0, 1),
+            "part_vs_whole": _is_number(self.part_vs_whole, 0, 1),
+            "all_matches": isinstance(self.all_matches, bool),
+            "shells": isinstance(self.shells, int) and _is_number(self.shells, -MAX_SHELLS, MAX_SHELLS),
+        }
+        if invalid := [name for name, fits in valid.items() if not fits]:
+            raise ValueError(f"invalid {', '.join(invalid)}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -238,52 +250,28 @@ def from_link(link: str) -> ViewState:
     """
     try:
         content = json.loads(link)
-        if not isinstance(content, dict):
-            raise ValueError("it is not a JSON object")
         fields: dict[str, Any] = {n: tuple(value) if isinstance(value, list) else value for n, value in content.items()}
-        for name in ("isolated", "hidden"):
-            if name in fields:
-                fields[name] = tuple(_checked_query(**query) for query in fields[name])
+        for name in {"isolated", "hidden"} & set(fields):
+            fields[name] = tuple(ViewQuery(**query) for query in fields[name])
         state = ViewState(**fields)
-        _check_fields(state)
-    except (ValueError, TypeError, RecursionError) as error:
+        dataclasses.replace(state, queries=(*state.queries, 0)).view_queries  # noqa: B018 (checks the queries)
+        valid = {
+            "queries": isinstance(state.queries, tuple),
+            "number of queries": max(len(state.queries), len(state.isolated), len(state.hidden)) <= MAX_QUERIES,
+            "colouring": state.colouring in COLOURINGS,
+            "camera": len(state.camera) in (0, 9) and all(map(_is_number, state.camera)),
+        }
+        if invalid := [name for name, fits in valid.items() if not fits]:
+            raise ValueError(f"invalid {', '.join(invalid)}")
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
         problem = f"{link[:60]!r} is not a line of the viewer ({describe_error(error)})"
         raise InputError("link", problem, remedy="Copy the whole line.") from error
     return state
 
 
-def _checked_query(**fields: Any) -> ViewQuery:
-    """Returns the query of a link, or raises ValueError."""
-    query = ViewQuery(**fields)
-    options = {field.name: getattr(query, field.name) for field in dataclasses.fields(ViewQuery)[1:]}
-    _check_fields(ViewState((query.query,), **options))
-    return query
-
-
-def _check_fields(state: ViewState) -> None:
-    """Raises ValueError if a field has a value that the viewer cannot produce."""
-
-    def is_int(value: Any) -> bool:
-        return isinstance(value, int) and not isinstance(value, bool)
-
-    def is_number(value: Any) -> bool:
-        return isinstance(value, float) or is_int(value)
-
-    def is_query(value: Any) -> bool:
-        return 0 < len(value.strip()) <= MAX_TEXT if isinstance(value, str) else is_int(value) and value >= 0
-
-    valid = {
-        "queries": isinstance(state.queries, tuple) and all(map(is_query, state.queries)),
-        "number of queries": max(len(state.queries), len(state.isolated), len(state.hidden)) <= MAX_QUERIES,
-        "threshold": is_number(state.threshold) and 0 <= state.threshold <= 1,
-        "part_vs_whole": is_number(state.part_vs_whole) and 0 <= state.part_vs_whole <= 1,
-        "all_matches": isinstance(state.all_matches, bool),
-        "shells": is_int(state.shells) and abs(state.shells) <= MAX_SHELLS,
-        "colouring": state.colouring in COLOURINGS,
-        "camera": len(state.camera) in (0, 9) and all(is_number(x) and abs(x) < 1e9 for x in state.camera),
-    }
-    if invalid := [name for name, fits in valid.items() if not fits]:
-        raise ValueError(f"invalid {', '.join(invalid)}")
+def _is_number(value: Any, low: float | int = -1e9, high: float | int = 1e9) -> bool:
+    """Whether a value is a number within bounds, and not a truth value."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high
 
 
 def answer_colours(count: int) -> UInt8[np.ndarray, "k 3"]:
@@ -297,23 +285,6 @@ def answer_colours(count: int) -> UInt8[np.ndarray, "k 3"]:
     """
     hues = (0.91 + GOLDEN_ANGLE * np.arange(count)) % 1.0
     return (255 * np.array([colorsys.hls_to_rgb(h, 0.6, 1.0) for h in hues]).reshape(count, 3)).astype(np.uint8)
-
-
-def visible_gaussians(
-    count: int, isolated: Sequence[Bool[np.ndarray, " n"]], hidden: Sequence[Bool[np.ndarray, " n"]]
-) -> Bool[np.ndarray, " n"]:
-    """Finds the visible Gaussians.
-
-    Args:
-      count: Number of Gaussians N.
-      isolated: Masks; if there are any, Gaussians outside of all are invisible.
-      hidden: Masks of invisible Gaussians.
-
-    Returns:
-      (N,) mask.
-    """
-    visible = np.any(isolated, axis=0) if len(isolated) else np.ones(count, bool)
-    return visible & ~np.any(hidden, axis=0) if len(hidden) else visible
 
 
 def highlight(

@@ -20,7 +20,7 @@ from urllib.parse import urlencode
 import numpy as np
 
 from jsecon.app import verbs
-from jsecon.app.access import bracketed, listen, token_for
+from jsecon.app.access import bracketed, guarded_pages, listen, token_for
 from jsecon.app.ask import Answer, ask_region, ask_text, edit_answers
 from jsecon.app.models import open_embedder
 from jsecon.app.object_scene import ObjectScene
@@ -28,7 +28,6 @@ from jsecon.app.outputs import answer_masks, file_stem, write_answer
 from jsecon.app.pictures import UNKNOWN, Renderer, code_colours, palette
 from jsecon.app.relations import query_relation, relation_answer
 from jsecon.app.viewer import view_state
-from jsecon.app.viewer.access import guarded_pages
 from jsecon.app.viewer.candidates import Candidate, candidates, region_along
 from jsecon.app.viewer.panel import Panel, candidate_grid, messages
 from jsecon.app.viewer.scene import FieldScene
@@ -79,7 +78,7 @@ class Viewer:
         self.panel = Panel(self, server, field)
         self.answer = functools.lru_cache(MAX_ANSWERS)(self._answer)
         self._base_colours = functools.cache(self._compute_base_colours)
-        self._steps: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._steps: queue.SimpleQueue[Callable[[], Any] | None] = queue.SimpleQueue()
         self._camera: tuple[float, ...] = ()
         self._candidates: list[tuple[int, Candidate]] = []
         self._thread = threading.Thread(target=self._work, daemon=True)
@@ -111,9 +110,8 @@ class Viewer:
         answers = [self.answer(query) for query in example.view_queries]
         messages(self.field, example, answers)
         self._find_candidates(example, answers)
-        self.do(lambda: self.renderer.photo(0))
-        self.do(lambda: self._describe(self.history.state))
-        self.do(self._prepare_objects)
+        for act in (lambda: self.renderer.photo(0), lambda: self._describe(self.history.state), self._prepare_objects):
+            self._steps.put(act)
         self._thread.start()
 
     def run(self) -> None:
@@ -137,14 +135,6 @@ class Viewer:
         """
         self._steps.put(lambda: self._set_state(step(self.history.state), update_controls=update_controls))
 
-    def do(self, act: Callable[[], Any]) -> None:
-        """Queues an act that does not change the state.
-
-        Args:
-          act: Is called without arguments.
-        """
-        self._steps.put(act)
-
     def undo(self) -> None:
         """Queues the step back to the state before."""
 
@@ -152,15 +142,7 @@ class Viewer:
             self.history = self.history.back()
             self.panel.show_state(self.history.state)
 
-        self.do(back)
-
-    def restore(self, link: str) -> None:
-        """Queues the state of a link.
-
-        Args:
-          link: The link. The panel shows what is wrong with it.
-        """
-        self.then(lambda _: view_state.from_link(link), update_controls=True)
+        self._steps.put(back)
 
     def set_camera(self, camera: Any) -> None:
         """Records where a client looks from, for the link.
@@ -220,7 +202,7 @@ class Viewer:
             regions = self.renderer.colours(frame, self._base_colours("region") / np.float32(255))
             self.panel.show_frame(frame, np.concatenate([photo, (photo * 0.35 + regions * 0.65).astype(np.uint8)]))
 
-        self.do(act)
+        self._steps.put(act)
 
     def export(self, client: Any) -> None:
         """Queues sending the highlighted answers as a .zip: .ply, .json and masks of each.
@@ -237,7 +219,7 @@ class Viewer:
             else:
                 client.send_file_download(f"{file_stem(answers[0])}.zip", self._zipped(answers), save_immediately=True)
 
-        self.do(act)
+        self._steps.put(act)
 
     def _zipped(self, answers: Sequence[Answer]) -> bytes:
         """Returns a .zip of the files of answers."""
@@ -282,7 +264,7 @@ class Viewer:
 
     def _update_link(self) -> None:
         """Shows the link of the state and the camera."""
-        self.panel.show_link(self.history.state.with_controls(camera=self._camera).link)
+        self.panel.link.value = self.history.state.with_controls(camera=self._camera).link
 
     def _answer(self, query: ViewQuery) -> Answer | InputError:
         """Answers a query that is not among the last ones."""
@@ -316,7 +298,8 @@ class Viewer:
     def _visible(self, state: ViewState) -> np.ndarray:
         """Returns the visible Gaussians of a state (N,)."""
         isolated, hidden = ([self._selection(q)[0] for q in queries] for queries in (state.isolated, state.hidden))
-        return view_state.visible_gaussians(self.field.gaussians.count, isolated, hidden)
+        visible = np.any(isolated, axis=0) if isolated else np.ones(self.field.gaussians.count, bool)
+        return visible & ~np.any(hidden, axis=0) if hidden else visible
 
     def _compute_base_colours(self, colouring: str) -> np.ndarray:
         """Returns the RGB (N, 3) of the Gaussians without an answer."""
@@ -343,7 +326,8 @@ class Viewer:
     def _describe(self, state: ViewState) -> None:
         """Shows messages and candidates of a state. It stops at the pictures if another step waits."""
         answers = [self.answer(query) for query in state.view_queries]
-        self.panel.show_messages(messages(self.field, state, answers))
+        self.panel.messages.content = messages(self.field, state, answers)
+        self.panel.show_notice("")
         self._update_link()
         self._candidates = self._find_candidates(state, answers)
         pictured = []
@@ -405,19 +389,8 @@ def open_viewer(
     return viewer
 
 
-def view_verb(verb: verbs.View, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon view`.
-
-    Args:
-      verb: Its options.
-      console: Receives the address.
-
-    Returns:
-      {} once the viewer is stopped; with --export as `export_page`.
-
-    Raises:
-      InputError: As `open_viewer` and `export_page`, or the link, the field or its model cannot be read.
-    """
+def _view(verb: verbs.View, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon view`; the result is {} once the viewer is stopped."""
     if verb.export is not None:
         return export_page(verb, verb.export, console)
     token = token_for(verb.host, verb.token)
@@ -437,3 +410,7 @@ def view_verb(verb: verbs.View, console: Console) -> verbs.VerbResult:
     console.say(f"http://{bracketed(verb.host)}:{viewer.server.get_port()}{query}")
     viewer.run()
     return {}
+
+
+VERBS = {verbs.View: _view}
+"""what does the work of each verb"""

@@ -34,13 +34,13 @@ from jsecon.data.gaussians.ply import (
     drawable_gaussians,
     in_float32,
     read_elements,
-    read_header,
     read_ply,
+    read_ply_file,
     save_ply,
     usable_blocks,
 )
 from jsecon.errors import InputError, describe_error
-from jsecon.files import atomic_write, parse_json
+from jsecon.files import atomic_write, parse_json, reading
 from jsecon.splat.project import check_gaussians
 from jsecon.splat.sh import C0
 from jsecon.splat.transform import transform_axes
@@ -335,17 +335,10 @@ class _SpzHeader:
 
 def _load_spz(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
     """Reads a .spz of version 1 to 4 (4 needs zstandard), degrees 0 to 3, from the axes that it names, else RUB."""
-    try:
+    with reading(path, remedy=_AGAIN, problem="the file is damaged or cut short"):
         data = path.read_bytes()
-    except OSError as error:
-        raise InputError(path, describe_error(error), remedy="Check the path.") from error
-    try:
         header, columns, records = (_read_gzip if data[:2] == b"\x1f\x8b" else _read_zstd)(path, data)
         axes, notes = _parse_records(path, records)
-    except (EOFError, zlib.error, struct.error, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(path, "the file is damaged or cut short", remedy=_AGAIN) from error
     if header.flags & _ANTIALIASED_FLAG:
         notes = (*notes, *_antialiasing_note(path))
     return transform_axes(_unpack(path, header, columns), axes), notes
@@ -491,7 +484,7 @@ def _unpack(path: Path, header: _SpzHeader, columns: list[np.ndarray]) -> Gaussi
 
 def _load_compressed_ply(path: Path) -> Gaussians:
     """Reads SuperSplat's compressed .ply."""
-    _, tables = read_elements(path)
+    tables = read_elements(path)
     empty = np.zeros(0, [])
     chunks, vertices, rest = (tables.get(name, empty) for name in ("chunk", "vertex", "sh"))
     bounds, packed = chunks.dtype.names or (), vertices.dtype.names or ()
@@ -605,9 +598,11 @@ def _load_sog(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
 
 def _read_ply(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
     """Reads a .ply, compressed or not."""
-    header = read_header(path)
+    header = read_ply_file(path)[1]
     notes = _antialiasing_note(path) if any(map(_names_antialiasing, header.comments)) else ()
-    return (_load_compressed_ply(path) if header.is_compressed else read_ply(path, header)), notes
+    if header.is_compressed and header.form == "ascii":
+        raise InputError(path, "its format is ascii", "a binary .ply", _PLY_REMEDY)
+    return (_load_compressed_ply(path) if header.is_compressed else read_ply(path)), notes
 
 
 def _names_antialiasing(comment: str) -> bool:

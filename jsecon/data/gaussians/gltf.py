@@ -22,8 +22,8 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from jsecon.data.gaussians.ply import drawable_gaussians, needs_float64, usable_blocks
-from jsecon.errors import InputError, describe_error
-from jsecon.files import READ_ERRORS, atomic_write, parse_json
+from jsecon.errors import InputError
+from jsecon.files import atomic_write, parse_json, reading
 from jsecon.splat.project import check_gaussians
 from jsecon.splat.sh import C0, COEFFICIENT_COUNTS
 from jsecon.splat.transform import transform_blocks, transform_gaussians_float64
@@ -186,21 +186,15 @@ def read_glb(path: Path) -> Gaussians:
         mirrors or scales its axes unequally.
     """
     parts, count = [], 0
-    try:
-        with path.open("rb") as file:
-            glb = _open(path, file)
-            for matrix, primitive in _primitives(glb):
-                arrays = _fields(glb, primitive)
-                count += len(arrays["means"])
-                if 12 * count > glb.length:
-                    raise glb.error(f"{count} Gaussians do not fit into {glb.length} bytes")
-                parts.append(transform_gaussians_float64(drawable_gaussians(path, arrays), _AXES @ matrix))
-    except InputError:
-        raise
-    except OSError as error:
-        raise InputError(path, describe_error(error), remedy="Check the path.") from error
-    except (*READ_ERRORS, struct.error) as error:
-        raise InputError(path, "its description (JSON) is damaged or incomplete", remedy=_REMEDY) from error
+    problem = "its description (JSON) is damaged or incomplete"
+    with reading(path, remedy=_REMEDY, problem=problem), path.open("rb") as file:
+        glb = _open(path, file)
+        for matrix, primitive in _primitives(glb):
+            arrays = _fields(glb, primitive)
+            count += len(arrays["means"])
+            if 12 * count > glb.length:
+                raise glb.error(f"{count} Gaussians do not fit into {glb.length} bytes")
+            parts.append(transform_gaussians_float64(drawable_gaussians(path, arrays), _AXES @ matrix))
     if not parts:
         raise InputError(path, f"no primitive of its scene holds Gaussians ({_EXTENSION})", remedy=_REMEDY)
     counts = {part.sh.shape[1] for part in parts}

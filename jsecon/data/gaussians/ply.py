@@ -7,13 +7,10 @@ layout of INRIA's 3D Gaussian Splatting and its relatives.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import re
-import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import BinaryIO
 
 import jax
 import jax.numpy as jnp
@@ -43,14 +40,13 @@ _END = re.compile(rb"[\r\n]end_header[ \t]*(?:\r\n|\n|\r|\Z)")
 _MAX_HEADER = 1 << 24
 """bytes searched for the end of a header"""
 _BLOCK = 1 << 18
-"""Gaussians read at a time"""
+"""Gaussians that are converted at a time"""
 _POSITION, _OPACITY, _RGB = ("x", "y", "z"), ("opacity",), ("red", "green", "blue")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALE = ("scale_0", "scale_1", "scale_2")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 _FILTERS = ("filter_3D", "filter_3d")
 """standard deviation of Mip-Splatting's 3D filter, world units: of its own training, and of other programs"""
-_EXACT_IN_FLOAT32 = ("i1", "u1", "i2", "u2", "f2", "f4")
 _SIZES = {"means": 3, "log_scales": 3, "quaternions": 4}
 _REST_COUNTS = (0, 9, 24, 45)
 _LAYOUT = "3D Gaussians in INRIA's layout (x y z, f_dc_0..2, opacity, scale_0..2, rot_0..3)"
@@ -104,14 +100,14 @@ class Header:
         return any(name == "packed_position" for element in self.elements for name, _ in element.fields)
 
 
-def _parse_header(path: Path, data: bytes) -> Header:
+def _parse_header(path: Path, data: memoryview) -> Header:
     """Parses the header at the start of some bytes."""
-    end = _END.search(data)
-    if not data.startswith(b"ply") or end is None:
-        problem = "it has no .ply header" if data else "the file is empty"
+    end = _END.search(data[:_MAX_HEADER]) if data[:3] == b"ply" else None
+    if end is None:
+        problem = "it has no .ply header" if len(data) else "the file is empty"
         raise _error(path, problem, "a file that starts with 'ply' and a header")
     form, elements, comments = "", [], []
-    for line in data[: end.start()].decode("ascii", "replace").splitlines()[1:]:
+    for line in bytes(data[: end.start()]).decode("ascii", "replace").splitlines()[1:]:
         words = line.split()
         try:
             if not words:
@@ -141,18 +137,8 @@ def _parse_header(path: Path, data: bytes) -> Header:
     return Header(form, elements, tuple(comments), end.end())
 
 
-@contextlib.contextmanager
-def _opened(path: Path) -> Iterator[BinaryIO]:
-    """Opens a file for reading."""
-    try:
-        with path.open("rb") as file:
-            yield file
-    except OSError as error:
-        raise _error(path, describe_error(error), remedy="Check the path.") from error
-
-
-def read_ply_file(path: Path) -> tuple[bytes, Header]:
-    """Reads a whole .ply.
+def read_ply_file(path: Path) -> tuple[memoryview, Header]:
+    """Maps a .ply into memory, and parses its header.
 
     Args:
       path: The file.
@@ -163,109 +149,64 @@ def read_ply_file(path: Path) -> tuple[bytes, Header]:
     Raises:
       InputError: It is not a .ply.
     """
-    with _opened(path) as file:
-        data = file.read()
+    try:
+        data = np.memmap(path, np.uint8, "r").data if path.stat().st_size else memoryview(b"")
+    except OSError as error:
+        raise _error(path, describe_error(error), remedy="Check the path.") from error
     return data, _parse_header(path, data)
 
 
-def read_header(path: Path) -> Header:
-    """Reads the header of a .ply and no more.
-
-    Args:
-      path: The file.
-
-    Returns:
-      The header.
-
-    Raises:
-      InputError: It is not a .ply.
-    """
-    with _opened(path) as file:
-        data = file.read(1 << 16)
-        while not _END.search(data) and len(data) < _MAX_HEADER and (more := file.read(len(data))):
-            data += more
-        return _parse_header(path, data)
-
-
 def _read_vertices(path: Path) -> np.ndarray:
-    """(N,) structured array of the vertices' properties that are not lists."""
-    return next(_vertex_blocks(path, read_header(path), sys.maxsize)[1])
-
-
-def _vertex_blocks(path: Path, header: Header, rows: int) -> tuple[_Element, Iterator[np.ndarray]]:
-    """Returns the element of the vertices, and the vertices in blocks of `rows` at most, one block at least."""
+    """(N,) structured array of the vertices' properties that are not lists; of a binary file, mapped into memory."""
+    header = read_ply_file(path)[1]
     names = [element.name for element in header.elements]
     if "vertex" not in names:
         raise _error(path, f"its elements are {', '.join(names) or 'missing'}", "an element vertex")
-    vertex = header.elements[names.index("vertex")]
     if header.is_compressed:
         remedy = f"Read it with jsecon.load_gaussians, or run: npx @playcanvas/splat-transform {path.name} plain.ply"
         raise _error(path, "it is compressed (SuperSplat's packed chunks)", remedy=remedy)
-    if not vertex.names:
+    if not header.elements[names.index("vertex")].names:
         raise _error(path, "its element vertex has no properties", "x y z and more")
-    before = header.elements[: names.index("vertex")]
-    if header.form == "ascii" or not all(element.fixed for element in [*before, vertex]):
-        table = _read_irregular(path, before, vertex)
-        return vertex, (table[n : n + rows] for n in range(0, max(vertex.count, 1), rows))
-    order = ORDERS[header.form]
-    offset = header.start + sum(element.count * element.dtype(order).itemsize for element in before)
-    dtype, size = vertex.dtype(order), path.stat().st_size
-    if offset + vertex.count * dtype.itemsize > size:
-        raise _truncated(path, (size - offset) // dtype.itemsize, vertex.count)
-    return vertex, _read_blocks(path, offset, dtype, vertex.count, rows)
+    return read_elements(path, "vertex")["vertex"]
 
 
-def _read_blocks(path: Path, offset: int, dtype: np.dtype, count: int, rows: int) -> Iterator[np.ndarray]:
-    """Reads binary rows of one length, block by block."""
-    with _opened(path) as file:
-        file.seek(offset)
-        for first in range(0, max(count, 1), rows):
-            size = min(rows, count - first) * dtype.itemsize
-            data = file.read(size)
-            if len(data) < size:  # truncated after its size was checked
-                raise _truncated(path, first + len(data) // dtype.itemsize, count)
-            yield np.frombuffer(data, dtype)
-
-
-def _read_irregular(path: Path, before: list[_Element], vertex: _Element) -> np.ndarray:
-    """Reads the vertices of a text file, or of one with lists before or in its vertices."""
-    data, header = read_ply_file(path)
-    if header.form == "ascii":
-        return _parse_text(path, data[header.start :], sum(element.count for element in before), vertex)
-    offset = header.start
-    for element in before:
-        _, offset = _parse_rows(path, data, offset, element, ORDERS[header.form])
-    return _parse_rows(path, data, offset, vertex, ORDERS[header.form])[0]
-
-
-def read_elements(path: Path) -> tuple[Header, dict[str, np.ndarray]]:
-    """Reads all elements of a binary .ply.
+def read_elements(path: Path, only: str = "") -> dict[str, np.ndarray]:
+    """Reads the elements of a .ply.
 
     Args:
       path: The file.
+      only: Name of the only element to read; "" reads all.
 
     Returns:
-      Its header, and by element a structured array of the properties that are not lists.
+      By element a structured array of the properties that are not lists.
 
     Raises:
-      InputError: The file is not a binary .ply, or is truncated.
+      InputError: The file is not a .ply, or is truncated.
     """
     data, header = read_ply_file(path)
+    tables, order = {}, ORDERS[header.form]
+    lines, position = [], header.start
     if header.form == "ascii":
-        raise _error(path, "its format is ascii", "a binary .ply")
-    tables, offset = {}, header.start
+        lines, position = [line for line in bytes(data[header.start :]).splitlines() if line.strip()], 0
     for element in header.elements:
-        tables[element.name], offset = _parse_rows(path, data, offset, element, ORDERS[header.form])
-    return header, tables
+        if header.form != "ascii":
+            tables[element.name], position = _parse_rows(path, data, position, element, order)
+        else:
+            if only in ("", element.name):
+                tables[element.name] = _parse_text(path, lines[position : position + element.count], element)
+            position += element.count
+        if only == element.name:
+            break
+    return tables
 
 
-def _parse_rows(path: Path, data: bytes, offset: int, element: _Element, order: str) -> tuple[np.ndarray, int]:
+def _parse_rows(path: Path, data: memoryview, offset: int, element: _Element, order: str) -> tuple[np.ndarray, int]:
     """Returns the rows of a binary element without their lists, and the offset of their end."""
     dtype = element.dtype(order)
     if element.fixed:
         end = offset + element.count * dtype.itemsize
         if end > len(data):
-            raise _truncated(path, (len(data) - offset) // max(dtype.itemsize, 1), element.count, element.name)
+            raise _truncated(path, (len(data) - offset) // max(dtype.itemsize, 1), element)
         return np.frombuffer(data, dtype, element.count, offset) if dtype.itemsize else np.empty(0, dtype), end
     fixed_parts = bytearray()
     for row in range(element.count):
@@ -276,38 +217,37 @@ def _parse_rows(path: Path, data: bytes, offset: int, element: _Element, order: 
             else:
                 length, item = (np.dtype(order + part) for part in element.lists[name])
                 if offset + length.itemsize > len(data):
-                    raise _truncated(path, row, element.count, element.name)
+                    raise _truncated(path, row, element)
                 count = int(np.frombuffer(data, length, 1, offset)[0])
                 if count < 0:
                     raise _error(path, f"a list of its element {element.name} has a length of {count}")
                 size = length.itemsize + count * item.itemsize
             offset += size
             if offset > len(data):
-                raise _truncated(path, row, element.count, element.name)
+                raise _truncated(path, row, element)
     return np.frombuffer(bytes(fixed_parts), dtype), offset
 
 
-def _truncated(path: Path, there: int, count: int, name: str = "vertex") -> InputError:
-    """The error of a file that ends before its last row."""
-    rows = "vertices" if name == "vertex" else f"rows of its element {name}"
-    return _error(path, f"the file is cut short: it holds {max(there, 0)} of {count} {rows}")
+def _truncated(path: Path, there: int, element: _Element) -> InputError:
+    """The error of a file that ends before the last row of an element."""
+    rows = "vertices" if element.name == "vertex" else f"rows of its element {element.name}"
+    return _error(path, f"the file is cut short: it holds {max(there, 0)} of {element.count} {rows}")
 
 
-def _parse_text(path: Path, body: bytes, skip: int, vertex: _Element) -> np.ndarray:
-    """Parses the vertices of a text file, whose first `skip` rows are those of other elements."""
-    lines = [line for line in body.splitlines() if line.strip()][skip : skip + vertex.count]
+def _parse_text(path: Path, lines: list[bytes], element: _Element) -> np.ndarray:
+    """Parses the lines of an element of a text file."""
     rows = [line.split() for line in lines]
     try:
-        if not vertex.fixed:
-            rows = [_without_lists(row, vertex) for row in rows]
-        numbers = np.array(rows, np.float64).reshape(len(rows), len(vertex.names))
+        if not element.fixed:
+            rows = [_without_lists(row, element) for row in rows]
+        numbers = np.array(rows, np.float64).reshape(len(rows), len(element.names))
     except (ValueError, IndexError) as error:
-        problem = f"a vertex line does not have {len(vertex.names)} numbers, or the file is cut short"
+        problem = f"a {element.name} line does not have {len(element.names)} numbers, or the file is cut short"
         raise _error(path, problem) from error
-    if len(lines) < vertex.count:
-        raise _truncated(path, len(lines), vertex.count)
-    result = np.empty(vertex.count, vertex.dtype("="))
-    for column, name in enumerate(vertex.names):
+    if len(lines) < element.count:
+        raise _truncated(path, len(lines), element)
+    result = np.empty(element.count, element.dtype("="))
+    for column, name in enumerate(element.names):
         kind = result.dtype[name]
         with np.errstate(over="ignore", invalid="ignore"):  # checked below, and infinite numbers by the caller
             result[name] = numbers[:, column]
@@ -353,7 +293,7 @@ def load_ply(path: str | Path, *, similarity: Float[Array, "4 4"] | None = None)
     - Colours red, green, blue replace f_dc (nerfstudio's --ply-color-mode rgb): whole numbers of 8 or 16 bits, or
       floats (0..1, or 0..255 if any is above 1).
 
-    Other properties and elements are ignored. Binary files are read in blocks.
+    Other properties and elements are ignored.
 
     Args:
       path: The file.
@@ -370,12 +310,11 @@ def load_ply(path: str | Path, *, similarity: Float[Array, "4 4"] | None = None)
     return in_float32(path, read_ply(path), similarity)
 
 
-def read_ply(path: Path, header: Header | None = None) -> Gaussians:
+def read_ply(path: Path) -> Gaussians:
     """Reads Gaussians as `load_ply` does, as NumPy arrays.
 
     Args:
       path: The file.
-      header: Its header, if it is already read.
 
     Returns:
       Its Gaussians; the means are float64 if the file has them finer than float32.
@@ -383,8 +322,8 @@ def read_ply(path: Path, header: Header | None = None) -> Gaussians:
     Raises:
       InputError: As in `load_ply`.
     """
-    vertex, blocks = _vertex_blocks(path, header or read_header(path), _BLOCK)
-    count, names, types = vertex.count, vertex.names, dict(vertex.fields)
+    table = _read_vertices(path)
+    count, names = len(table), table.dtype.names or ()
     scales = _SCALE if "scale_2" in names else _SCALE[:2]
     has_rgb = all(name in names for name in _RGB) and not any(name in names for name in _DC)
     colours = _RGB if has_rgb else _DC
@@ -398,15 +337,15 @@ def read_ply(path: Path, header: Header | None = None) -> Gaussians:
         remedy = "Export the file again, with harmonics of degree 3 or less."
         raise _error(path, f"its vertices have {rest} properties f_rest", expected, remedy)
     filters = [name for name in _FILTERS if name in names][:1]
-    exact = all(types[name] in _EXACT_IN_FLOAT32 for name in _POSITION)
+    exact = all(np.can_cast(table.dtype[name], np.float32) for name in _POSITION)
     arrays: dict[str, np.ndarray] = {name: np.empty((count, size), np.float32) for name, size in _SIZES.items()}
     arrays["means"] = np.empty((count, 3), np.float32 if exact else np.float64)
     arrays["opacity_logits"] = np.empty(count, np.float32)
     arrays["sh"] = np.empty((count, 1 + rest // 3, 3), np.float32)
-    first, brightest = 0, 1.0
-    for vertices in blocks:
-        rows = slice(first, first + len(vertices))
-        first = rows.stop
+    brightest = 1.0
+    for first in range(0, count, _BLOCK):
+        rows = slice(first, first + _BLOCK)
+        vertices = table[rows]
         arrays["means"][rows] = _columns(vertices, _POSITION, arrays["means"].dtype.type)
         arrays["log_scales"][rows, 2] = -np.inf
         arrays["log_scales"][rows, : len(scales)] = _columns(vertices, scales)
@@ -632,10 +571,5 @@ def load_point_cloud(path: str | Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[
         raise _error(path, "its points have NaN, infinite or absurd coordinates")
     if not all(name in names for name in _RGB):
         return points, np.full((len(points), 3), GREY, np.uint8)
-    colours = np.stack([vertices[name] for name in _RGB], axis=-1)
-    if colours.dtype.kind == "f":
-        scale = 255 if np.nanmax(colours, initial=0) <= 1 else 1
-        colours = np.clip(np.nan_to_num(colours) * scale, 0, 255).round()
-    elif colours.dtype.itemsize == 2:
-        colours = colours // 257
-    return points, colours.astype(np.uint8)
+    colours = np.stack([np.nan_to_num(vertices[name].astype(np.float64)) for name in _RGB], axis=-1)
+    return points, np.clip(colours * (255 / _brightest(vertices)), 0, 255).round().astype(np.uint8)
