@@ -171,6 +171,18 @@ def test_up_is_right_where_gravity_alone_tells(make, seed):
     assert frame.sure
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_up_is_right_in_a_room_whose_floaters_rest_on_nothing(seed):
+    """As in a fitted scene: most things are pieces of walls and what a fit leaves in the air."""
+    draw = np.random.default_rng(seed)
+    things = [block(draw, [0.6 + k, 1, 0], [1 + k, 1.4, 0.4]) for k in range(3)]
+    corners = [draw.uniform([0.3, 0.3, 0.5], [3.5, 2.5, 1.4]) for _ in range(7)]
+    floaters = [block(draw, corner, corner + 0.1, 60) for corner in corners]
+    turn = Rotation.random(random_state=seed).as_matrix()
+    frame = scene_frame(np.concatenate([*walls_of(4.0, 3.0, 2.0), *things, *floaters]) @ turn.T)
+    np.testing.assert_allclose(frame.axes[2], turn[:, 2], atol=0.03)
+
+
 def test_a_wrong_up_axis_is_never_sure():
     """A crate has six sides, and things that float have none."""
     draw = np.random.default_rng(0)

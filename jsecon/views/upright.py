@@ -65,7 +65,10 @@ UPSIDE_DOWN, ROOF_ONLY = -2.0, -1.5
 LOW, FLAT = 1.0, 0.3
 """weights of the log of the things' median height and of the scene's height"""
 LIKELY = 0.5
-"""score from which a direction is taken"""
+"""score from which a direction is taken; pieces of walls and floaters of a fitted room rest on nothing"""
+ONE_SIDED, RIVAL = 0.85, 0.5
+"""share of the remaining surface above a plane, and size in units of the largest one's, from which it may be the ground
+of such a scene"""
 SURE = 2.0
 """difference of the best two scores from which the direction is trusted, if at least half of the things rest; twice as
 much where there are fewer than FEET things"""
@@ -110,8 +113,9 @@ def find_up(points: np.ndarray) -> Upright:
       points: (P, 3) points of the surface.
 
     Returns:
-      The axis. Without a plane that the scene may rest on it is the direction that fewest surfaces face, as walls do
-      not, and it is not trusted.
+      The axis. Where too little rests, as in a fitted room with floaters, it is the normal of a large plane with nearly
+      all of the scene above it. Without such a plane it is the direction that fewest surfaces face, as walls do not, and
+      it is not trusted.
     """
     size = 2 * float(np.quantile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 1 - TRIM))
     tolerance = PLANE_TOLERANCE * size
@@ -121,23 +125,39 @@ def find_up(points: np.ndarray) -> Upright:
     distinct = np.unique(points, axis=0)
     spacing = float(np.median(KDTree(distinct).query(distinct[::3], min(4, len(distinct)))[0][:, -1]))
     things = _things(loose, max(2 * tolerance, 3 * spacing)) if planes else []
-    candidates: list[_Candidate] = []
-    for normal in (sign * plane.normal for plane in planes for sign in (1, -1)):
-        if all(normal @ other.up < DISTINCT for other in candidates):
-            candidates.append(_judge(normal, points, planes, loose, things, size, spacing))
+    normals = [sign * plane.normal for plane in planes for sign in (1, -1)]
+    candidates = [_judge(normal, points, planes, loose, things, size, spacing) for normal in normals]
     scores = []
     for one in candidates:
         inverted = any(other.legs and other.up @ one.up < -DISTINCT for other in candidates)
         scores.append(one.score + UPSIDE_DOWN * inverted if one.carries else -np.inf)
     order = np.argsort(scores)[::-1]
     if not len(order) or scores[order[0]] < LIKELY:
-        return Upright(_along_walls(points), False, "walls: fewest surfaces face it, as no plane carries the scene")
+        ground = _ground_normal(points, planes, loose, tolerance)
+        if ground is None:
+            return Upright(_along_walls(points), False, "walls: fewest surfaces face it, as no plane carries the scene")
+        agreed = len(order) > 0 and bool(candidates[order[0]].up @ ground > DISTINCT)
+        return Upright(ground, agreed, "a plane with nearly all of the scene above it, and low things")
     best = candidates[order[0]]
-    margin = scores[order[0]] - scores[order[1]] if len(order) > 1 else np.inf
+    rivals = [score for score, one in zip(scores, candidates) if one.up @ best.up < DISTINCT]
+    margin = scores[order[0]] - max(rivals, default=-np.inf)
     count = len(things)
     sure = 2 * best.resting >= count > 0 and margin >= (SURE if count >= FEET else 2 * SURE)
     evidence = f"{best.resting} of {count} thing{'s' * (count != 1)} that rest{'s' * (count == 1)} on what is below"
     return Upright(best.up, bool(sure), evidence if count else "the base on which the scene is widest and lowest")
+
+
+def _ground_normal(points: np.ndarray, planes: list[_Plane], loose: np.ndarray, tolerance: float) -> np.ndarray | None:
+    """Returns the normal of the plane that the scene is lowest above, if nearly all of it is on one side of any."""
+    best, lowest = None, np.inf
+    largest = max((len(plane.points) for plane in planes), default=0)
+    large = [plane for plane in planes if len(plane.points) >= RIVAL * largest]
+    for normal, offset in ((sign * plane.normal, sign * plane.offset) for plane in large for sign in (1, -1)):
+        heights = points @ normal - offset
+        if (heights[np.abs(heights) > tolerance] > 0).mean() >= ONE_SIDED:
+            height = np.subtract(*np.quantile(heights, [1 - TRIM, TRIM])) * np.median(np.abs(loose @ normal - offset))
+            best, lowest = (normal, height) if height < lowest else (best, lowest)
+    return best
 
 
 def _judge(
