@@ -114,8 +114,8 @@ def find_up(points: np.ndarray) -> Upright:
 
     Returns:
       The axis. Where too little rests, as in a fitted room with floaters, it is the normal of a large plane with nearly
-      all of the scene above it. Without such a plane it is the direction that fewest surfaces face, as walls do not, and
-      it is not trusted.
+      all of the scene above it. Without such a plane it is the direction that fewest surfaces face, as walls do not; it
+      is then not trusted.
     """
     size = 2 * float(np.quantile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 1 - TRIM))
     tolerance = PLANE_TOLERANCE * size
