@@ -1,6 +1,7 @@
 """The program `jsecon` (and `python -m jsecon`): the process first, before jax starts; then the command line."""
 
 import errno
+import gc
 import io
 import os
 import sys
@@ -105,6 +106,7 @@ def main() -> int:
         if several or code == STOPPED:  # jax would wait for the other processes; and end by SIGSEGV, as Python takes
             sys.stdout.flush()  # itself apart, where a stop fell into a compilation
             os._exit(code)
+        gc.freeze()  # else the interpreter collects three times at its end, for half a second
     return code
 
 

@@ -49,7 +49,8 @@ class ObjectScene:
         field = with_phrases(field, embedder)
         regions = jax.tree.map(jnp.asarray, field.regions)  # on the device once, not for each phrase
         reference = None if field.reference is None else jnp.asarray(field.reference)
-        self.field = dataclasses.replace(field, regions=regions, reference=reference)
+        cameras = jax.tree.map(np.asarray, field.cameras)  # on which jax would compile each step of a viewpoint
+        self.field = dataclasses.replace(field, regions=regions, reference=reference, cameras=cameras)
         self.embedder = embedder
         self.to_source = np.asarray(field.to_source, np.float64)
         self.scale = float(np.cbrt(abs(np.linalg.det(self.to_source[:3, :3]))))
@@ -149,7 +150,7 @@ class ObjectScene:
             frame = int(np.lexsort((pixels.sum(0), (pixels > 0).sum(0)))[-1])
         if camera is None:
             index = frame_index(self.field, frame if frame is not None else 0)
-            camera = jax.tree.map(np.asarray, self.field.cameras)[index]
+            camera = self.field.cameras[index]
             words = f"as seen from {self.field.names[index]}"
         return viewpoint(jax.tree.map(np.asarray, camera), self.up), words
 

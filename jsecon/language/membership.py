@@ -13,11 +13,12 @@ is the share of several regions together.
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jax import lax
 from jax.scipy.special import betainc
 from jaxtyping import Bool, Float, Int
@@ -341,7 +342,7 @@ def membership_probability(
 
 
 def probability_inside(share: Float[Array, " n"], votes: Votes, mask: Bool[Array, " n"]) -> Float[np.ndarray, " m"]:
-    """Computes `membership_probability` of selected Gaussians alone. Host code, compiled for a few sizes.
+    """Computes `membership_probability` of selected Gaussians alone, without a program. Host code.
 
     Args:
       share: (N,) in [0, 1].
@@ -351,17 +352,23 @@ def probability_inside(share: Float[Array, " n"], votes: Votes, mask: Bool[Array
     Returns:
       (M,) in [0, 1].
     """
-    chosen = np.flatnonzero(np.asarray(mask))
-    rows = np.resize(chosen, 1 << max(len(chosen) - 1, 0).bit_length()) if len(chosen) else np.zeros(1, int)
+    rows = np.flatnonzero(np.asarray(mask))
     picked = (np.asarray(a)[rows] for a in (share, votes.views, votes.total))
-    return np.asarray(_probability(*picked, CORRELATION))[: len(chosen)]
+    return _mass_above_half(*picked, CORRELATION, np, scipy.special.betainc)
 
 
 @stored_jit
 def _probability(share: Array, views: Array, total: Array, correlation: Array | float) -> Array:
-    known = (views > 0) & jnp.isfinite(share) & jnp.isfinite(total) & (total > 0)
-    count = jnp.where(known, jnp.minimum(views.astype(share.dtype), total), 1.0)
-    count = count / (1 + jnp.maximum(count - 1, 0.0) * correlation)
-    inside = jnp.clip(jnp.where(known, share, 0.5), 0.0, 1.0) * count
+    return _mass_above_half(share, views, total, correlation, jnp, betainc)
+
+
+def _mass_above_half(
+    share: Any, views: Any, total: Any, correlation: Any, xp: Any, betainc: Callable[[Any, Any, Any], Any]
+) -> Any:
+    """Computes `membership_probability` with the functions of a module, NumPy or jax.numpy."""
+    known = (views > 0) & xp.isfinite(share) & xp.isfinite(total) & (total > 0)
+    count = xp.where(known, xp.minimum(views.astype(share.dtype), total), 1)
+    count = count / (1 + xp.maximum(count - 1, 0) * correlation)
+    inside = xp.clip(xp.where(known, share, 0.5), 0, 1) * count
     # 1 - I_{1/2}(a, b) = I_{1/2}(b, a), without the cancellation.
-    return jnp.where(known, betainc(1 + count - inside, 1 + inside, 0.5), 0.0)
+    return xp.where(known, betainc(1 + count - inside, 1 + inside, 0.5), 0)

@@ -10,8 +10,8 @@ import re
 
 import cv2
 import numpy as np
+import scipy  # loads scipy.optimize on its first use, which most texts do without
 from jaxtyping import Bool, Float32, UInt8
-from scipy.optimize import nnls
 
 from jsecon.errors import InputError, require_shape
 
@@ -129,7 +129,7 @@ class ColourEmbedder:
         kept = values > 1e-3 * values[-1]
         self._projection = (vectors[:, kept] / np.sqrt(values[kept])).astype(np.float32)
         self.dim = int(kept.sum()) + 2
-        self._families = {basic: self._family(basic) for basic in BASIC}
+        self._family = functools.cache(self._make_family)
         neutral = lab_of(np.asarray([(128, 128, 128), (190, 182, 170), (64, 62, 60)]))
         colours = [self._mean(self._points), *(self._mean(point[None]) for point in neutral)]
         self.canonical = np.stack([_joined(c, angle) for c, angle in zip(colours, (0.25, 0.25, 0.5, 0.25))])
@@ -216,7 +216,7 @@ class ColourEmbedder:
         mean = (weights.astype(np.float32) @ likeness / weights.sum()) @ self._projection
         return mean / max(float(np.linalg.norm(mean)), 1e-12)
 
-    def _family(self, basic: str) -> tuple[Float32[np.ndarray, "p 3"], Float32[np.ndarray, " p"]]:
+    def _make_family(self, basic: str) -> tuple[Float32[np.ndarray, "p 3"], Float32[np.ndarray, " p"]]:
         """Colours of a bare basic term, and their weights.
 
         The weights are the least non-negative ones with a similarity of 1 to the typical colour and of SHADE to each
@@ -225,12 +225,12 @@ class ColourEmbedder:
         points = np.stack([self._by_name[name] for name in (basic, *_SHADES[basic])])
         shade = GREY_SHADE if basic == "grey" else SHADE
         similarity = np.where(np.arange(len(points)) == 0, 1.0, shade)
-        return points, nnls(_kernel(points, points).astype(np.float64), similarity)[0].astype(np.float32)
+        return points, scipy.optimize.nnls(_kernel(points, points).astype(np.float64), similarity)[0].astype(np.float32)
 
     def _distribution(self, phrase: list[str]) -> tuple[np.ndarray, np.ndarray]:
         """CIELAB points (P, 3) and weights (P,) of a run of modifiers and colour words."""
         if self._is_bare(phrase):
-            return self._families[str(self._base(phrase[0])[0])]
+            return self._family(str(self._base(phrase[0])[0]))
         return self._colour(phrase)[None], np.ones(1, np.float32)
 
     def _is_bare(self, phrase: list[str]) -> bool:
