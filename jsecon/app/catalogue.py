@@ -199,6 +199,19 @@ def objects(
     )
 
 
+def region_objects(field: LanguageField, up: np.ndarray) -> Int[np.ndarray, " r"]:
+    """Finds which regions show one object, by the rules of `objects`.
+
+    Args:
+      field: Field of R regions.
+      up: (3,) unit up axis in the field's world.
+
+    Returns:
+      (R,) a number for each region: those of one object have the same one.
+    """
+    return _groups(field, _sizes(field)[1], up)
+
+
 def _vocabulary(field: LanguageField, vocabulary: Sequence[str] | None, embedder: Any) -> _Names:
     """Returns the names to choose from, with their embeddings."""
     words_known = field.reference is not None and len(field.reference) == len(REFERENCE_WORDS)

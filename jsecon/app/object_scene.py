@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsecon.app.ask import frame_index, narrow_texts, with_phrases
-from jsecon.app.catalogue import Catalogue, objects as list_objects
+from jsecon.app.catalogue import Catalogue, objects as list_objects, region_objects
 from jsecon.app.locate import gaussian_rows
 from jsecon.data.capture import may_have_depth
 from jsecon.errors import InputError
@@ -66,8 +66,9 @@ class ObjectScene:
         Raises:
           InputError: The embedder has no names for objects.
         """
-        for region in range(self.field.regions.count):
-            self._object((region,))
+        for group in join_pieces(range(self.field.regions.count), self._joined):
+            for regions in {(region,) for region in group} | {group}:
+                self._object(regions)
         if self.field.regions.count:
             match_regions(self.field, self.field.regions.embeddings[:1], self.rules)  # compiles it
         _ = self.catalogue
@@ -78,7 +79,9 @@ class ObjectScene:
         return list_objects(self.field, None, self.embedder, up=self._given_up)
 
     def objects_of(self, phrase: str) -> tuple[list[FoundObject], float]:
-        """Finds the objects that a phrase names: regions that match it, pieces of one object joined.
+        """Finds the objects that a phrase names: regions that match it, those of one object joined.
+
+        These overlap, or are one object in the catalogue: the ends of a beam whose middle is hidden.
 
         Args:
           phrase: Free text for the embedder.
@@ -94,10 +97,17 @@ class ObjectScene:
             embedded = jax.device_put(self.embedder.embed_text(texts))
             match = match_regions(self.field, embedded, self.rules)
             regions = np.flatnonzero(np.asarray(match.chosen)) if int(match.region) >= 0 else np.zeros(0, int)
-            made = [(group, self._object(group)) for group in join_pieces(regions, self._votes.overlap)]
+            made = [(group, self._object(group)) for group in join_pieces(regions, self._joined)]
             objects = [FoundObject(phrase, group, *parts) for group, parts in made if parts is not None]
             self._phrases[phrase] = objects, float(match.quantile)
         return self._phrases[phrase]
+
+    @functools.cached_property
+    def _joined(self) -> np.ndarray:
+        """(R, R) overlap of the regions; 1 for those of one object."""
+        groups = region_objects(self.field, self.up)
+        same = (groups[:, None] == groups).astype(np.float32)
+        return same if self._votes.overlap is None else np.maximum(self._votes.overlap, same)
 
     @functools.cached_property
     def _voters(self) -> list[np.ndarray]:

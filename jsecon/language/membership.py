@@ -353,8 +353,8 @@ def probability_inside(share: Float[Array, " n"], votes: Votes, mask: Bool[Array
       (M,) in [0, 1].
     """
     rows = np.flatnonzero(np.asarray(mask))
-    picked = (np.asarray(a)[rows] for a in (share, votes.views, votes.total))
-    return _mass_above_half(*picked, CORRELATION, np, scipy.special.betainc)
+    share, views, total = (np.asarray(column)[rows] for column in (share, votes.views, votes.total))
+    return _mass_above_half(share, views, total, CORRELATION, np, scipy.special.betainc)
 
 
 @stored_jit

@@ -33,7 +33,7 @@ MAX_PLANES, MAX_TRIES = 10, 60
 """planes that are kept, and that are fitted at most"""
 MIN_SHARE = 0.04
 """share of the points in a plane"""
-SHARP, ROUGHLY_SHARP = 2.2, 1.6
+SHARP, ROUGHLY_SHARP = 2.4, 1.6
 """ratio of the points near a plane to those in the next layer as thick, from which it is a surface and no cut through
 things; and the same before the plane is fitted"""
 CELLS, FILLED = 8, 0.6
