@@ -109,6 +109,15 @@ def test_relations_of_known_places():
     assert between_scores(middle, *ends)[0, 0, 0] > 0.9 > 0.1 > between_scores(ends[0], middle, ends[1])[0, 0, 0]
 
 
+def test_what_crosses_beneath_is_under_and_what_passes_beside_is_not():
+    """A lintel over a long beam: each has few of its points over or under the other."""
+    beam, lintel = brick((0, 0, 0.03), (0.35, 0.03, 0.03)), brick((0.04, 0.02, 0.16), (0.02, 0.12, 0.02))
+    assert scores(beam, lintel)["under"] > 0.5
+    assert scores(lintel, beam)["above"] > 0.5
+    assert scores(lintel, beam)["next to"] < 0.5
+    assert scores(beam, brick((0.04, 0.2, 0.16), (0.02, 0.12, 0.02)))["under"] < 0.5
+
+
 def test_predicates_are_pure_jitted_and_batched():
     both = jax.tree.map(
         lambda *columns: jnp.concatenate(columns), brick((0, 0, 0), (0.1,) * 3), brick((1, 0, 0), (0.2,) * 3)
@@ -240,6 +249,13 @@ def test_an_open_question_is_asked_and_a_near_miss_is_named(scene):
     )
     three = jsecon.query_relation(scene, "three red mugs")
     assert "the text says 3 and 2 match" in three.reason
+
+
+def test_the_ends_of_a_beam_whose_middle_is_hidden_are_one_object():
+    ends = [("purple beam", (x, 0.3, 0.03), (0.15, 0.03, 0.03)) for x in (-0.16, 0.16)]
+    scene = ObjectScene(*table_field((*THINGS, *ends, ("purple ball", (0.9, -0.7, 0.05), (0.05, 0.05, 0.05)))))
+    answer = jsecon.query_relation(scene, "how many purple things")
+    assert sorted(found.regions for found in answer.objects) == [(6, 7), (8,)]
 
 
 def test_directions_follow_the_frame_and_cameras_around_take_the_fullest_frame():

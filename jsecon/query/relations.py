@@ -224,8 +224,22 @@ def _in_front_of(a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> Float[Arr
 
 
 def _overlap(a: ObjectShapes, b: ObjectShapes) -> Array:
-    """Share of the points of one object within the footprint of the other, of both ways the larger."""
-    return _module(a.points).maximum(_inside(a.points, b)[0].mean(-1), _inside(b.points, a)[0].mean(-1))
+    """Share of the points of one object within the footprint of the other, of both ways the larger.
+
+    Of two that cross, as an arch and a beam beneath it, each has few points there; the middle of one counts instead.
+    """
+    xp = _module(a.points)
+    shared = xp.maximum(_inside(a.points, b)[0].mean(-1), _inside(b.points, a)[0].mean(-1))
+    crossed = xp.maximum(_centred(a, b), _centred(b, a))
+    return xp.maximum(shared, OVER * (1.0 + crossed))
+
+
+def _centred(a: ObjectShapes, b: ObjectShapes) -> Array:
+    """How deep the middle of a lies in the footprint of b: 1 in its middle, 0 at its edge, at least -1."""
+    x, y, _ = _local_points(a.center[..., None, :], b)
+    xp = _module(x)
+    depth = 1.0 - xp.maximum(_over(x[..., 0], b.half_size[..., 0]), _over(y[..., 0], b.half_size[..., 1]))
+    return xp.maximum(depth, -1.0)
 
 
 def _local(a: ObjectShapes, b: ObjectShapes, share: float, otherwise: Array) -> Array:

@@ -44,8 +44,8 @@ LEVEL = 0.985
 """cosine of a plane's normal with a direction from which the plane is level"""
 DISTINCT = np.cos(np.radians(20))
 """cosine below which two directions differ"""
-THING_POINTS = 12
-"""points of a thing"""
+THING_POINTS, THING_SHARE = 12, 0.004
+"""points of a thing at least, and their share of all: less is what sticks out of a wall"""
 THING_LINKS = 12
 """nearest points that a point of a thing is linked with"""
 RESTS, HANGS = 1.1, -1.95
@@ -65,11 +65,12 @@ UPSIDE_DOWN, ROOF_ONLY = -2.0, -1.5
 LOW, FLAT = 1.0, 0.3
 """weights of the log of the things' median height and of the scene's height"""
 LIKELY = 0.5
-"""score from which a direction is taken; pieces of walls and floaters of a fitted room rest on nothing"""
+"""score from which a direction is taken, unless it is far ahead of all others; pieces of walls and floaters of a fitted
+room rest on nothing"""
 ONE_SIDED, RIVAL = 0.85, 0.5
 """share of the remaining surface above a plane, and size in units of the largest one's, from which it may be the ground
 of such a scene"""
-SURE = 2.0
+SURE = 2.5
 """difference of the best two scores from which the direction is trusted, if at least half of the things rest; twice as
 much where there are fewer than FEET things"""
 NEIGHBOURS = 32
@@ -102,6 +103,8 @@ class _Candidate(NamedTuple):
     legs: bool
     """whether things end at one level where no plane is"""
     resting: int
+    share: float
+    """of the things that rest, by the roots of their sizes"""
     carries: bool
     """whether the scene has a base in this direction"""
 
@@ -124,7 +127,8 @@ def find_up(points: np.ndarray) -> Upright:
     loose = points[outside] if planes and outside.any() else points
     distinct = np.unique(points, axis=0)
     spacing = float(np.median(KDTree(distinct).query(distinct[::3], min(4, len(distinct)))[0][:, -1]))
-    things = _things(loose, max(2 * tolerance, 3 * spacing)) if planes else []
+    least = max(THING_POINTS, THING_SHARE * len(distinct))
+    things = _things(loose, max(2 * tolerance, 3 * spacing), least) if planes else []
     normals = [sign * plane.normal for plane in planes for sign in (1, -1)]
     candidates = [_judge(normal, points, planes, loose, things, size, spacing) for normal in normals]
     scores = []
@@ -132,17 +136,17 @@ def find_up(points: np.ndarray) -> Upright:
         inverted = any(other.legs and other.up @ one.up < -DISTINCT for other in candidates)
         scores.append(one.score + UPSIDE_DOWN * inverted if one.carries else -np.inf)
     order = np.argsort(scores)[::-1]
-    if not len(order) or scores[order[0]] < LIKELY:
+    best = candidates[order[0]] if len(order) and np.isfinite(scores[order[0]]) else None
+    rivals = [score for score, one in zip(scores, candidates) if best is not None and one.up @ best.up < DISTINCT]
+    margin = 0.0 if best is None else scores[order[0]] - max(rivals, default=-np.inf)
+    if best is None or (scores[order[0]] < LIKELY and margin < SURE):
         ground = _ground_normal(points, planes, loose, tolerance)
         if ground is None:
             return Upright(_along_walls(points), False, "walls: fewest surfaces face it, as no plane carries the scene")
-        agreed = len(order) > 0 and bool(candidates[order[0]].up @ ground > DISTINCT)
+        agreed = best is not None and bool(best.up @ ground > DISTINCT)
         return Upright(ground, agreed, "a plane with nearly all of the scene above it, and low things")
-    best = candidates[order[0]]
-    rivals = [score for score, one in zip(scores, candidates) if one.up @ best.up < DISTINCT]
-    margin = scores[order[0]] - max(rivals, default=-np.inf)
     count = len(things)
-    sure = 2 * best.resting >= count > 0 and margin >= (SURE if count >= FEET else 2 * SURE)
+    sure = count and best.share >= 0.5 and margin >= (SURE if count >= FEET else 2 * SURE)
     evidence = f"{best.resting} of {count} thing{'s' * (count != 1)} that rest{'s' * (count == 1)} on what is below"
     return Upright(best.up, bool(sure), evidence if count else "the base on which the scene is widest and lowest")
 
@@ -203,11 +207,11 @@ def _judge(
     widest = max([base, *covered])
     score += np.log(max(widest, 1e-3))
     carries = widest >= STABLE
-    return _Candidate(up, float(score), feet >= FEET and widest > FEET_BASE, int(sum(rests)), carries)
+    return _Candidate(up, float(score), feet >= FEET and widest > FEET_BASE, int(sum(rests)), share, carries)
 
 
-def _things(points: np.ndarray, reach: float) -> list[np.ndarray]:
-    """Returns the points of each thing: those that steps of at most `reach` connect."""
+def _things(points: np.ndarray, reach: float, least: float | int) -> list[np.ndarray]:
+    """Returns the points of each thing: `least` or more that steps of at most `reach` connect."""
     points = np.unique(points, axis=0)
     distance, near = KDTree(points).query(points, THING_LINKS)
     linked = np.asarray(distance) <= reach
@@ -215,7 +219,7 @@ def _things(points: np.ndarray, reach: float) -> list[np.ndarray]:
     graph = csr_array((np.ones(len(ends[0])), *ends), shape=(len(points), len(points)))
     count, thing = connected_components(graph, directed=False)
     sizes = np.bincount(thing, minlength=count)
-    return [points[thing == k] for k in np.flatnonzero(sizes >= THING_POINTS)]
+    return [points[thing == k] for k in np.flatnonzero(sizes >= least)]
 
 
 def _footprint(points: np.ndarray, up: np.ndarray) -> float:
