@@ -143,8 +143,7 @@ def find_up(points: np.ndarray) -> Upright:
         ground = _ground_normal(points, planes, loose, tolerance)
         if ground is None:
             return Upright(_along_walls(points), False, "walls: fewest surfaces face it, as no plane carries the scene")
-        agreed = best is not None and bool(best.up @ ground > DISTINCT)
-        return Upright(ground, agreed, "a plane with nearly all of the scene above it, and low things")
+        return Upright(ground, False, "a plane with nearly all of the scene above it, and low things")
     count = len(things)
     sure = count and best.share >= 0.5 and margin >= (SURE if count >= FEET else 2 * SURE)
     evidence = f"{best.resting} of {count} thing{'s' * (count != 1)} that rest{'s' * (count == 1)} on what is below"
