@@ -35,7 +35,7 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 import jax
 import pytest
 from filelock import FileLock
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 from jaxtyping import install_import_hook
 
 HOME = Path(__file__).resolve().parent.parent
@@ -55,10 +55,10 @@ install_import_hook(
 
 compiling.install()
 
-# CI draws the same examples in every run.
-settings.register_profile("ci", derandomize=True, deadline=None)
-if os.environ.get("CI"):
-    settings.load_profile("ci")
+# A loaded machine, or hypothesis' first table of Unicode, is no fault of a test. CI draws the same examples each time.
+_SLOW = [HealthCheck.too_slow]
+settings.register_profile("jsecon", deadline=None, suppress_health_check=_SLOW, derandomize="CI" in os.environ)
+settings.load_profile("jsecon")
 
 import numpy as np  # noqa: E402
 

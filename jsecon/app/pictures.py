@@ -177,8 +177,8 @@ def code_colours(field: LanguageField) -> Float[np.ndarray, "n 3"]:
       field: The field.
 
     Returns:
-      RGB in [0, 1]: the first three principal components of the codes, stretched over the regions. A Gaussian without
-      a code is grey.
+      (N, 3) RGB in [0, 1]: the first three principal components of the codes, stretched over the regions. A Gaussian
+      without a code is grey.
     """
     table = np.asarray(field.region_codes, np.float64)
     codes = np.asarray(field.codes, np.float64)

@@ -29,7 +29,7 @@ def parse_query(query: str) -> QueryTexts:
         "tea or coffee" in quotes is one text.
 
     Returns:
-      The texts.
+      The texts to include, and those to exclude.
 
     Raises:
       InputError: A part is empty, or the query is not UTF-8.

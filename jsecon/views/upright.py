@@ -147,7 +147,15 @@ def find_up(points: np.ndarray) -> Upright:
     count = len(things)
     sure = count and best.share >= 0.5 and margin >= (SURE if count >= FEET else 2 * SURE)
     evidence = f"{best.resting} of {count} thing{'s' * (count != 1)} that rest{'s' * (count == 1)} on what is below"
-    return Upright(best.up, bool(sure), evidence if count else "the base on which the scene is widest and lowest")
+    evidence = evidence if count else "the base on which the scene is widest and lowest"
+    return Upright(_exact(best.up, planes, points, tolerance), bool(sure), evidence)
+
+
+def _exact(up: np.ndarray, planes: list[_Plane], points: np.ndarray, tolerance: float) -> np.ndarray:
+    """Returns the direction again, as all points of its largest level plane tell it."""
+    plane = max((plane for plane in planes if abs(plane.normal @ up) > LEVEL), key=lambda plane: len(plane.points))
+    normal, _ = _refined(points, plane.normal, plane.offset, tolerance)
+    return normal * np.sign(normal @ up)
 
 
 def _ground_normal(points: np.ndarray, planes: list[_Plane], loose: np.ndarray, tolerance: float) -> np.ndarray | None:
