@@ -4,9 +4,8 @@ import time
 
 import numpy as np
 import pytest
-from sklearn.cluster import DBSCAN
 
-from jsecon.query.outliers import dbscan, default_eps, remove_outliers, split_outliers
+from jsecon.query.outliers import default_eps, remove_outliers, split_outliers
 
 
 def test_one_component_is_seen_where_points_are_dense():
@@ -15,18 +14,6 @@ def test_one_component_is_seen_where_points_are_dense():
     for points, whole in ((sphere, True), (np.concatenate([sphere, [[1.5, 0, 0]]]), False), (sphere[:1], True)):
         found = split_outliers(points, np.ones(len(points), bool), eps=default_eps(sphere), min_samples=1)
         assert found.skipped == ("the selection is one component" if whole else "")
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_labels_are_those_of_scikit_learn(seed):
-    """Also of points at the border of several clusters, and of lattices, whose distances are eps exactly."""
-    draw = np.random.default_rng(seed)
-    blobs = draw.normal(draw.uniform(-2, 2, (6, 1, 3)), 0.4, (6, 120, 3)).reshape(-1, 3)
-    lattice = draw.permutation(np.stack(np.meshgrid(*[np.arange(6.0)] * 3), axis=-1).reshape(-1, 3))[:150]
-    for points, eps in ((blobs, draw.uniform(0.1, 0.4)), (lattice, 1.0)):
-        for min_samples in (1, 4, 10):
-            expected = DBSCAN(eps=eps, min_samples=min_samples).fit(points).labels_
-            np.testing.assert_array_equal(dbscan(points, eps, min_samples), expected)
 
 
 def two_blobs_and_strays(scale=1.0):

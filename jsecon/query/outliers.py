@@ -1,4 +1,4 @@
-"""Selected Gaussians that lie apart from the rest: DBSCAN on their centres (the paper's last step).
+"""Selected Gaussians that lie apart from the rest: scikit-learn's DBSCAN on their centres (the paper's last step).
 
 Host code. DBSCAN lists all neighbours of every point. Where thousands of splats lie within eps of each other, those
 lists are quadratic in time and memory. A large selection is therefore clustered by voxels: one point for each, with the
@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
@@ -166,7 +166,7 @@ def default_eps(points: Float[Array, "m 3"], *, spacings: float = EPS_SPACINGS) 
 
 
 def dbscan(points: Float[Array, "m 3"], eps: float, min_samples: int) -> Int[np.ndarray, " m"]:
-    """Clusters points by DBSCAN, with the labels of scikit-learn. Above 5,000 points those of one voxel have one label.
+    """Clusters points by scikit-learn's DBSCAN. Above 5,000 points those of one voxel have one label.
 
     Args:
       points: (M, 3), world units.
@@ -176,22 +176,14 @@ def dbscan(points: Float[Array, "m 3"], eps: float, min_samples: int) -> Int[np.
     Returns:
       (M,) cluster, counted from 0 in the order of their first core point; -1 for noise.
     """
+    from sklearn.cluster import DBSCAN
+
     points = np.asarray(points, np.float64)
     if not len(points):
         return np.full(0, -1)
     places, voxel, count = _places(points, eps)
-    pairs = KDTree(places).query_pairs(eps, output_type="ndarray")
-    both = np.concatenate([pairs, pairs[:, ::-1]])
-    core = count + np.bincount(both[:, 0], count[both[:, 1]], len(places)) >= min_samples
-    ends = pairs[core[pairs].all(1)].T
-    graph = coo_array((np.ones(len(ends[0]), bool), tuple(ends)), shape=(len(places), len(places)))
-    component = connected_components(graph, directed=False)[1]
-    _, first, number = np.unique(component[core], return_index=True, return_inverse=True)
-    cluster = np.full(len(places), len(places))
-    cluster[core] = np.argsort(np.argsort(first))[number]
-    reached = both[~core[both[:, 0]] & core[both[:, 1]]]  # points at the border of several clusters join the first
-    np.minimum.at(cluster, reached[:, 0], cluster[reached[:, 1]])
-    return np.where(cluster < len(places), cluster, -1)[voxel]
+    weight = count if len(places) < len(points) else None  # of ones it would add up each list of neighbours
+    return DBSCAN(eps=eps, min_samples=min_samples).fit(places, sample_weight=weight).labels_[voxel]
 
 
 def _links(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -211,8 +203,8 @@ def _one_component(points: np.ndarray, eps: float, links: tuple[np.ndarray, np.n
     ends = near[linked], np.concatenate([[0], np.cumsum(linked.sum(1))])
     graph = csr_array((np.ones(len(ends[0])), *ends), shape=(len(places), len(places)))
     count, component = connected_components(graph, directed=False)
-    # The nearest links are enough where the points are evenly spaced, and spare the list of all pairs; also where a
-    # component is so small that the links of its points show all that is near.
+    # The nearest links are enough where the points are evenly spaced, and spare the import of scikit-learn; also where
+    # a component is so small that the links of its points show all that is near.
     if count == 1 or np.bincount(component).min() < _LINKS:
         return count == 1
     return bool((dbscan(points, eps, 1) == 0).all())
