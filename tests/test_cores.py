@@ -119,7 +119,7 @@ prepare_process()
 import jsecon
 home = pathlib.Path(jsecon.__file__).parent
 for path in sorted(home.rglob("*.py")):
-    if path.stem != "__main__":
+    if path.stem not in ("__main__", "mcp_server"):  # the SDK of mcp asks for fcntl on what it takes for Unix
         importlib.import_module(".".join(path.relative_to(home.parent).with_suffix("").parts).removesuffix(".__init__"))
 import jax
 from test_cores import work
