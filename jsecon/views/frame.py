@@ -17,8 +17,8 @@ from jsecon.errors import InputError
 from jsecon.types import Camera, Gaussians, LanguageField
 from jsecon.views.upright import TRIM, find_up
 
-SAMPLES, BOX_SAMPLES = 20_000, 6000
-"""points that stand for the scene's surface, drawn by opacity times area; the first ones measure box and free places"""
+SAMPLES = 20_000
+"""points that stand for the scene's surface, drawn by opacity times area"""
 VISIBLE_OPACITY = 0.1
 """opacity from which a Gaussian counts as surface"""
 WIDEST = 0.1
@@ -116,7 +116,7 @@ def scene_frame(points: Float[np.ndarray, "p 3"], up: np.ndarray | None = None) 
         up, sure, evidence = find_up(points)
     else:
         up, sure, evidence = _direction(up), True, "given"
-    up, points = up / np.linalg.norm(up), points[:BOX_SAMPLES]
+    up = up / np.linalg.norm(up)
     side = np.eye(3)[np.argmin(np.abs(up))]
     first = np.cross(up, side)
     first /= np.linalg.norm(first)

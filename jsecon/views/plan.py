@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from jsecon.errors import InputError, require
 from jsecon.language.votes import region_votes
 from jsecon.types import Camera, Gaussians, Progress
-from jsecon.views.frame import BOX_SAMPLES, SceneFrame, scene_frame, surface_points
+from jsecon.views.frame import SceneFrame, scene_frame, surface_points
 
 FIELD_OF_VIEW = 60.0
 """degrees, horizontal"""
@@ -114,7 +114,7 @@ def plan_views(
     require(views >= 1, "views", views, ">= 1", "Ask for at least one view.")
     points = surface_points(gaussians)
     frame = scene_frame(points, up)
-    places = free_places(points[:BOX_SAMPLES], frame)
+    places = free_places(points, frame)
     inside = _interior_cameras(frame, places)
     orbits = _orbit_cameras(frame)
     counted = np.unique(np.linspace(0, gaussians.count - 1, min(gaussians.count, COVERED_GAUSSIANS)).astype(int))
