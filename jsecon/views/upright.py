@@ -165,7 +165,8 @@ def _ground_normal(points: np.ndarray, planes: list[_Plane], loose: np.ndarray, 
     large = [plane for plane in planes if len(plane.points) >= RIVAL * largest]
     for normal, offset in ((sign * plane.normal, sign * plane.offset) for plane in large for sign in (1, -1)):
         heights = points @ normal - offset
-        if (heights[np.abs(heights) > tolerance] > 0).mean() >= ONE_SIDED:
+        rest = heights[np.abs(heights) > tolerance]
+        if len(rest) and (rest > 0).mean() >= ONE_SIDED:
             height = np.subtract(*np.quantile(heights, [1 - TRIM, TRIM])) * np.median(np.abs(loose @ normal - offset))
             best, lowest = (normal, height) if height < lowest else (best, lowest)
     return best
