@@ -29,9 +29,9 @@ _SLOTS = 8
 """Number of labels of a tile counted by one walk; for the few tiles of 8x8 pixels with more, the view is walked
 again."""
 MAX_SLOT_BYTES = 1 << 28
-"""Bytes of the sums of all slots from which on the slots beyond the last pair are cut off, which may compile again."""
+"""Bytes of the sums above which the lists are first cut to the pairs in use. Each new length compiles a program."""
 PAIRS = 1 << 20
-"""Pairs whose sums are gathered at once."""
+"""Number of pairs whose sums are gathered at once."""
 
 
 class ViewVotes(NamedTuple):
