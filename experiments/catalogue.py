@@ -5,12 +5,11 @@
 The rooms are those of `jsecon demo`, with its options: default vision, colours, 24 of 30 frames. The true object of a
 Gaussian is the one with most of its weight in the true masks of these frames, or none where the background has more.
 Found: an object and a whole of the catalogue overlap by an IoU of at least 0.5 of their Gaussians. One row: of the
-objects to which most Gaussians of any row belong, those with exactly one such row. The true boxes are those of the
-solids. Box: along the axes of the world; upright: the box of the catalogue and the one along the object's own axes.
-Named: the best name of a found object is the colour that it was made with; objects without a name do not count.
-Located: of the objects with a name of their own, those for which the `center` of `jsecon.locate` lies in the true box;
-centre and grasp are its median distances to the middle and to the middle of the upper side, mm. Seeds 20 to 22 chose
-the constants.
+objects to which most Gaussians of any row belong, those with exactly one such row. Box: along the axes of the world,
+against that of the solids. Named: the best name of a found object is the colour that it was made with; objects without
+a name do not count. Located: of the objects with a name of their own, those for which the `center` of `jsecon.locate`
+lies in the true box; centre and grasp are its median distances to the middle and to the middle of the upper side, mm.
+Seeds 20 to 22 chose the constants.
 """
 
 import dataclasses
@@ -18,7 +17,6 @@ import json
 import time
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -99,26 +97,6 @@ def box_iou(low: np.ndarray, high: np.ndarray, points: np.ndarray) -> float:
     return float(both / (np.prod(high - low) + np.prod(np.ptp(points, axis=0)) - both))
 
 
-def upright_iou(catalogue: Catalogue, row: int, item: RoomObject, points: np.ndarray) -> float:
-    """IoU of an upright box and that of points along an object's own axes."""
-    shape = catalogue.shapes[row]
-    local = points @ item.axes
-    middle = item.axes @ ((local.min(0) + local.max(0)) / 2)
-    size = np.ptp(local, axis=0)
-
-    def footprint(center, axes, size):
-        degrees = np.degrees(np.arctan2(axes[1, 0], axes[0, 0]))
-        return tuple(map(float, center[:2])), tuple(map(float, size[:2])), float(degrees)
-
-    mine = footprint(shape.center, shape.axes, 2 * shape.half_size)
-    crossing = cv2.rotatedRectangleIntersection(mine, footprint(middle, item.axes, size))[1]
-    area = 0.0 if crossing is None else cv2.contourArea(cv2.convexHull(crossing))
-    tops = min(shape.center[2] + shape.half_size[2], middle[2] + size[2] / 2)
-    feet = max(shape.center[2] - shape.half_size[2], middle[2] - size[2] / 2)
-    both = area * max(tops - feet, 0)
-    return float(both / (np.prod(2 * shape.half_size) + np.prod(size) - both))
-
-
 def located(field: LanguageField, room: Room) -> tuple[float, float, float]:
     """Share of the objects with a name of their own that are located, and the median errors of centre and grasp, mm."""
     names = [item.name for item in room.objects]
@@ -158,19 +136,13 @@ def compare(
     seen = table[:, :count].sum(0) > 0
     found = np.flatnonzero(iou.max(0) >= FOUND)
     most = np.bincount(table[wholes].argmax(1), minlength=count + 1)[:count]
-    boxes, upright, named = [], [], []
+    boxes, named = [], []
     for k in found:
         row, item = int(wholes[best[k]]), room.objects[k]
         points = true_points(item)
         boxes.append(box_iou(catalogue.shapes.low[row], catalogue.shapes.high[row], points))
-        upright.append(upright_iou(catalogue, row, item, points))
         if item.name:
             named.append(catalogue.names[row, 0] == item.colour)
-            if not named[-1]:
-                print(f"  {item.name}: {list(zip(catalogue.names[row], catalogue.probability[row].round(2)))}")
-    for k in np.flatnonzero(seen & (iou.max(0) < FOUND)):
-        name = room.objects[k].name or "clutter"
-        print(f"  not found: {name}, {table[:, k].sum()} Gaussians, IoU {iou[:, k].max():.2f}")
     share, centre, grasp = located(field, room)
     return dict(
         objects=int(seen.sum()),
@@ -179,7 +151,6 @@ def compare(
         found_named=float((iou.max(0) >= FOUND)[seen & has_name].mean()),
         one_row=float((most[most > 0] == 1).mean()),
         box=float(np.median(boxes)),
-        upright=float(np.median(upright)),
         named=float(np.mean(named)),
         located=share,
         centre=centre,

@@ -6,14 +6,12 @@ Each method is read by every text rule and way of choosing Gaussians (`experimen
 text. A method's reading is the one that is best on the seeds `--choosing` at the level of noise, for each figure its
 own; one row of ours, "one reading", takes the same for both. Those readings alone, and the published one, are then
 measured on the seeds that `--seeds` names, on which nothing was chosen, with a paired bootstrap over (scene, seed,
-text) of ours against each. Methods that train take minutes a setting: they may be given fewer seeds and scenes, and
-ours is compared with each on its own ("ours there"). `--read-as` takes the readings of another run's metrics.json, and
-chooses none.
+text) of ours against each. Methods that train take minutes a setting: they may be given fewer seeds, and ours is
+compared with each on its own ("ours there").
 """
 
 import contextlib
 import dataclasses
-import json
 import re
 from pathlib import Path
 from typing import Literal
@@ -57,14 +55,10 @@ class Options:
     """`seeds` of methods that train; empty: the same."""
     choosing_trained: tuple[int, ...] = ()
     """`choosing` of methods that train; empty: the same."""
-    scenes_trained: tuple[str, ...] = ()
-    """`scenes` of methods that train; empty: the same."""
     methods: tuple[str, ...] = ()
     """Methods that are compared, ours among them; empty: all."""
     read: tuple[str, ...] = ()
     """Readings that are chosen from, without the methods' own constants; empty: all."""
-    read_as: str = ""
-    """A metrics.json of another run, whose readings are taken; empty: they are chosen."""
     quick: bool = False
     """Run one tiny scene of one table with one seed."""
     out: str = ""
@@ -108,19 +102,6 @@ def chosen(cells: list[dict], seeds: tuple[int, ...], figures: tuple[str, ...]) 
     return best
 
 
-def taken(name: str, options: Options) -> dict[str, dict[str, str]]:
-    """The readings that `--read-as` names for a table, of the methods that are compared; none where it names none."""
-    if not options.read_as:
-        return {}
-    every = json.loads(Path(options.read_as).read_text())
-    best: dict[str, dict[str, str]] = {}
-    for key, told in next(told for level, told in every.items() if level.startswith(f"{name} ")).items():
-        method, figure = key.rsplit(", ", 1)
-        if not method.endswith(ONE_READING) and (not options.methods or method in options.methods):
-            best.setdefault(method, {})[figure] = told["row"]
-    return best
-
-
 def mine_of(cells: list[dict]) -> str:
     """The method that is held against the others."""
     known = {cell["method"].split(": ")[0] for cell in cells}
@@ -131,7 +112,7 @@ def report(name: str, level: str, cells: list[dict], options: Options) -> tuple[
     """A Markdown table of one table and level, and its figures."""
     figures = figures_of(name)
     here = [cell for cell in cells if cell["level"] == level]
-    best = taken(name, options) or chosen(here, options.choosing, figures)
+    best = chosen(here, options.choosing, figures)
     ours_is = mine_of(cells)
     held = [cell for cell in cells if cell["seed"] in options.seeds]
 
@@ -199,8 +180,7 @@ def figures_of(table: str) -> tuple[str, ...]:
 def plan_of(name: str, level: str, options: Options, seeds: tuple[int, ...], rows: list[str]) -> Plan:
     """Some rows of a table, which all train or none, at a level of noise, on some seeds."""
     table = TABLES[name][1 if options.quick else 0]
-    trained = options.scenes_trained if rows[0].split(": ")[0] in TRAINED else ()
-    data = dataclasses.replace(table.data, seeds=seeds, scenes=trained or options.scenes or table.data.scenes)
+    data = dataclasses.replace(table.data, seeds=seeds, scenes=options.scenes or table.data.scenes)
     place = {"out": options.out, "cells": str(Path(options.out) / "cells.jsonl")}
     return dataclasses.replace(
         table, data=data, methods=tuple(rows), level=level, sweep=(), processes=options.processes, **place
@@ -231,12 +211,8 @@ def cells_of(name: str, level: str, options: Options) -> list[dict]:
         own = [row for row in rows if (row.split(": ")[0] in TRAINED) == trains]
         if not own:
             continue
-        choosing: list[dict] = []
-        if options.read_as:
-            readings = taken(name, options)
-        else:
-            choosing = filled(own, options.choosing_trained or options.choosing if trains else options.choosing)
-            readings = chosen(choosing, tuple(cell["seed"] for cell in choosing), figures_of(name))
+        choosing = filled(own, options.choosing_trained or options.choosing if trains else options.choosing)
+        readings = chosen(choosing, tuple(cell["seed"] for cell in choosing), figures_of(name))
         best = {row for ways in readings.values() for row in ways.values()}
         kept = [row for row in own if row in best or row.endswith(f": {PUBLISHED}")]
         cells += choosing + filled(kept, options.seeds_trained or options.seeds if trains else options.seeds)

@@ -9,11 +9,9 @@ absent names that the table lacks are left out, and figures differ by some hundr
 (`experiments.words.scenes`) are replica_apartment_0 (15 classes), apc_bin (four things) and bonsai (its nouns). Crops
 and rules are chosen on apc_bin and bonsai, and reported on replica.
 
-Truth at the points: T1, the name of the nearest named point within 0.10 m; T2, the name of the object that the views
-whose masks did not vote show there. IoU of the Gaussians selected for a text, over those with a truth, mean over the
-texts. Rendered: the selected Gaussians alone, alpha > 0.7, in two of those views. The error has three parts:
+Truth at the points is the name of the object that the views whose masks did not vote show there. IoU of the Gaussians
+selected for a text, over those with a truth, mean over the texts. The error has two parts:
 
-    representation  the true Gaussians, rendered (at the points nothing is lost by T2)
     lifting         the regions whose true name is the text's
     recognition     the regions that a rule finds by the text
 """
@@ -27,7 +25,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import sparse
 
 from experiments import results
 from experiments.calibration import Bin, calibration_error
@@ -38,12 +35,9 @@ from experiments.words import rules
 from experiments.words.absent import absent_names
 from experiments.words.conse import Conse, Crop, Labeller, TextVectors, class_weights, conse
 from experiments.words.scenes import DEFAULT, GIVEN, RIVALS, WordScene, load_scene, rival_weights, scores_of
-from jsecon.data.frames import evenly_spaced
-from jsecon.evaluate.metrics import iou
 from jsecon.language.membership import finish_votes
 from jsecon.query.classes import query_classes
 from jsecon.query.match import evidence, match_regions
-from jsecon.query.render import ALPHA_THRESHOLD, render_selection
 from jsecon.query.rules import KIND_THRESHOLD, QUANTILE, RETRIEVAL_THRESHOLD
 from jsecon.query.select import query_anchored, query_several
 from jsecon.types import LanguageField, Regions, Selection
@@ -59,13 +53,10 @@ CHOOSING = (("apc_bin", GIVEN), ("apc_bin", DEFAULT), ("bonsai", DEFAULT))
 """what rules are chosen on; crops on the first and the last"""
 REPORTED = (("replica_apartment_0", GIVEN), ("replica_apartment_0", DEFAULT))
 CASES = {f"{name}, {masks}": (name, masks) for name, masks in (*CHOOSING, *REPORTED)}
-GIVEN_FLAT, DEFAULT_FLAT = tuple(CASES)[len(CHOOSING) :]
 VARIANTS = ("probability", "log-odds")
 """of the embedder: the paper's weights, and log-odds. Gaussians alone are asked by the first"""
 CLASS_LIST = "class list"
 """of the ways: each region under its best text"""
-RENDERED = 2
-"""views, at most, evenly spaced, in which a text's selection is rendered"""
 GRID = np.linspace(0, 1, 51)
 """thresholds among which the best is looked for"""
 
@@ -172,24 +163,18 @@ FIXED = (f"relevancy, smoothed, {READOUT}", "relevancy 0.5", f"cosine {RETRIEVAL
 """of `alone`: thresholds of others and of the paper"""
 
 
-def alone(case: Case, weights: sparse.csr_matrix) -> dict[str, list[float]]:
-    """Compares each Gaussian with the texts alone.
-
-    Args:
-      case: The scene and the texts.
-      weights: (N, C) of each crop on each Gaussian, of a method of RIVALS.
+def alone(name: str, masks: str, embedder: Callable[[], Conse], method: str) -> dict[str, list[float]]:
+    """Compares each Gaussian with the texts alone, by a method of RIVALS.
 
     Returns:
-      reading -> (Q,) IoUs by T2: at thresholds that are fixed (FIXED), and at those that are best on this very scene.
+      reading -> (Q,) IoUs: at thresholds that are fixed (FIXED), and at those that are best on this very scene.
     """
-    features, truth, asked = (
-        unit(np.asarray(weights @ case.crops, np.float64)),
-        case.scene.truth["T2"],
-        case.scene.asked,
-    )
+    scene = load_scene(name, masks)
+    case, truth, asked = case_of(scene, embedder(), VARIANTS[0]), scene.truth, scene.asked
+    features = unit(np.asarray(rival_weights(scene, method) @ case.crops, np.float64))
     cosine = rules.point_scores(features, case.texts, case.field.canonical, "cosine")
     relevancy = rules.point_scores(features, case.texts, case.field.canonical, "relevancy")
-    smooth = smoothed(case.scene.gaussians.means, relevancy)
+    smooth = smoothed(scene.gaussians.means, relevancy)
     chosen = (smooth > READOUT, relevancy >= 0.5, cosine >= RETRIEVAL_THRESHOLD)
     found = {reading: rules.ious(own, truth, asked) for reading, own in zip(FIXED, chosen)}
     found[CLASS_LIST] = rules.ious(rules.best_text(cosine), truth, asked)
@@ -197,22 +182,6 @@ def alone(case: Case, weights: sparse.csr_matrix) -> dict[str, list[float]]:
     found["cosine, best threshold"] = rules.best_threshold(cosine, truth, asked, GRID)[1]
     found["relevancy, smoothed, best threshold"] = rules.best_threshold(smooth, truth, asked, GRID)[1]
     return {reading: own.tolist() for reading, own in found.items()}
-
-
-def rendered(scene: WordScene, chosen: np.ndarray) -> np.ndarray:
-    """(Q,) IoU of each text's Gaussians rendered alone with its outlines, mean over the judged views that show it."""
-    gaussians, judged = jax.tree.map(jnp.asarray, (scene.gaussians, scene.judged))
-    found = np.full(len(scene.asked), np.nan)
-    for q, name in enumerate(scene.asked):
-        rows = []
-        shown = np.flatnonzero((scene.outlines == name).any((1, 2)))
-        for t in shown[evenly_spaced(len(shown), RENDERED)]:
-            alpha = np.asarray(render_selection(gaussians, judged[int(t)], jnp.asarray(chosen[q])).alpha)
-            counted = scene.outlines[t] >= 0
-            rows.append(float(iou((alpha > ALPHA_THRESHOLD) & counted, scene.outlines[t] == name)))
-        if rows:
-            found[q] = np.mean(rows)
-    return found
 
 
 def crop_quality(embedder: Conse, pictures: tuple, texts: np.ndarray) -> dict[str, float]:
@@ -242,26 +211,22 @@ def measure_crop(options: Options, crop: Crop) -> dict[str, dict[str, float]]:
     embedder, found = open_embedder(options, crop), {}
     for name, masks in CHOOSING[::2]:
         scene = load_scene(name, masks)
+        assert scene.outlined is not None
+        frames, things, names = scene.outlined
         place = np.full(len(scene.names) + 2, -1)
         place[scene.asked] = np.arange(len(scene.asked))
-        pictures = scene.shown, scene.things, place[scene.thing_names]
+        pictures = frames, things, place[names]
         found[name] = crop_quality(embedder, pictures, embedder.embed_text(list(scene.texts)))
     return found
 
 
-def lifting_and_rendering(scene: WordScene) -> list[dict]:
-    """The parts of the error that no text plays a role in: IoUs at the points by each truth, and rendered."""
+def lifting(name: str, masks: str) -> list[float]:
+    """The IoUs of the regions whose true names are the texts': the part of the error that no text plays a role in."""
+    scene = load_scene(name, masks)
     # The votes as queries read them, where no two regions are alike.
     votes = finish_votes(scene.votes, Regions(np.eye(len(scene.pixels), dtype=np.float32), scene.pixels))
-    given = {
-        "representation": scene.truth["T2"] == scene.asked[:, None],
-        "lifting": rules.selected(votes, scene.region_names == scene.asked[:, None]),
-    }
-    rows = []
-    for part, own in given.items():
-        at_points = {name: rules.ious(own, truth, scene.asked).tolist() for name, truth in scene.truth.items()}
-        rows.append({"part": part, **at_points, "rendered": rendered(scene, own).tolist()})
-    return rows
+    chosen = rules.selected(votes, scene.region_names == scene.asked[:, None])
+    return rules.ious(chosen, scene.truth, scene.asked).tolist()
 
 
 def refusal(case: Case, embedder: Conse) -> dict[str, Any]:
@@ -289,15 +254,11 @@ def refusal(case: Case, embedder: Conse) -> dict[str, Any]:
     return found
 
 
-def measure_case(scene: WordScene, embedder: Conse, variant: str) -> dict:
+def measure_case(name: str, masks: str, embedder: Callable[[], Conse], variant: str) -> dict:
     """All figures of a scene by a variant of the embedder."""
-    case = case_of(scene, embedder, variant)
-    selected = {row: choose(case) for row, choose in ROWS.items()}
-    points = {
-        truth: {row: rules.ious(own, values, scene.asked).tolist() for row, own in selected.items()}
-        for truth, values in scene.truth.items()
-    }
-    return {"points": points, "refusal": refusal(case, embedder)}
+    case = case_of(load_scene(name, masks), embedder(), variant)
+    points = {row: rules.ious(of(case), case.scene.truth, case.scene.asked).tolist() for row, of in ROWS.items()}
+    return {"points": points, "refusal": refusal(case, embedder())}
 
 
 def main(options: Options) -> dict:
@@ -305,46 +266,32 @@ def main(options: Options) -> dict:
     file = Path(options.out) / "run" / f"cells{'-model' if options.model else ''}.jsonl"
     embedder = functools.cache(functools.partial(open_embedder, options))
 
-    def kept(key: str, measure: Callable[[], Any]) -> Any:
+    def kept(key: str, measure: Callable[..., Any], *args: Any) -> Any:
         """The figure `key`, measured once and kept on disk."""
         if key not in read_cells(file):
-            append_cell(file, key, measure())
+            append_cell(file, key, measure(*args))
             print(f"{key}: measured", flush=True)
         return read_cells(file)[key]
 
-    metrics: dict[str, Any] = {"crops": [], "cases": {}, "parts": {}}
+    metrics: dict[str, Any] = {"crops": [], "cases": {}, "lifting": {}}
     for crop in CROPS:
         told = dataclasses.asdict(crop)
-        found = kept(f"crop {tuple(told.values())}", functools.partial(measure_crop, options, crop))
+        found = kept(f"crop {tuple(told.values())}", measure_crop, options, crop)
         metrics["crops"].append({"crop": told, "scenes": found})
     for k, (name, masks) in CASES.items():
         for variant in VARIANTS:
-
-            def measure(name: str = name, masks: str = masks, variant: str = variant) -> dict:
-                return measure_case(load_scene(name, masks), embedder(), variant)
-
-            figures = kept(f"{k}, {variant}", measure)
+            figures = kept(f"{k}, {variant}", measure_case, name, masks, embedder, variant)
             error, curve = calibration(figures["refusal"])
             figures["refusal"] = {k: v for k, v in figures["refusal"].items() if k != "confidence"}
             figures["refusal"] |= {"calibration error": error, "reliability": curve}
             metrics["cases"][f"{k}, {variant}"] = figures | {"alone": {}}
         for method in RIVALS:
-
-            def measure_alone(name: str = name, masks: str = masks, method: str = method) -> dict:
-                scene = load_scene(name, masks)
-                return alone(case_of(scene, embedder(), VARIANTS[0]), rival_weights(scene, method))
-
             key = f"{k}, {VARIANTS[0]}"
-            metrics["cases"][key]["alone"][method] = kept(f"{key}, {method}", measure_alone)
+            metrics["cases"][key]["alone"][method] = kept(f"{key}, {method}", alone, name, masks, embedder, method)
+        metrics["lifting"][k] = kept(f"{k}, lifting", lifting, name, masks)
     metrics["chosen_on"] = list(CASES)[: len(CHOOSING)]
     score = rule_scores(metrics)
     metrics["best_rule"] = list(max(score, key=lambda key: score[key]))
-    for k, (name, masks) in CASES.items():
-
-        def measure_parts(name: str = name, masks: str = masks) -> list[dict]:
-            return lifting_and_rendering(load_scene(name, masks))
-
-        metrics["parts"][k] = kept(f"{k}, parts", measure_parts)
     text = "\n\n".join(tables(metrics))
     results.save(Path(options.out), options, metrics, text)
     print(text)
@@ -355,7 +302,7 @@ def rule_scores(metrics: dict) -> dict[tuple[str, str], float]:
     """Mean IoU of each rule and variant over the cases that rules are chosen on."""
 
     def mean(k, variant, row):
-        return np.mean(metrics["cases"][f"{k}, {variant}"]["points"]["T2"][row])
+        return np.mean(metrics["cases"][f"{k}, {variant}"]["points"][row])
 
     pairs = [(row, variant) for variant in VARIANTS for row in ROWS]
     return {
@@ -370,7 +317,7 @@ def _mean(values: Any) -> str:
 
 
 def tables(metrics: dict) -> list[str]:
-    """All tables and what the library must reach, in Markdown."""
+    """All tables in Markdown."""
     cases, score, scenes = metrics["cases"], rule_scores(metrics), list(metrics["crops"][0]["scenes"])
     text = [
         "Crops of outlined things: share of all words less similar than the own name / own name first in the scene."
@@ -383,26 +330,19 @@ def tables(metrics: dict) -> list[str]:
     rows = []
     for (row, variant), chosen_by in score.items():
         points = {k: cases[f"{k}, {variant}"]["points"] for k in CASES}
-        own = [_mean(points[k]["T2"][row]) for k in CASES]
-        rows.append((row, variant, chosen_by, *own, _mean(points[GIVEN_FLAT]["T1"][row])))
-    text.append("Rules, IoU at the points by T2, mean over the texts (95 % under resampling of the texts).")
-    text.append(results.table(("rule", "embedder", "mean where chosen", *CASES, f"{GIVEN_FLAT}, T1"), rows))
+        rows.append((row, variant, chosen_by, *(_mean(points[k][row]) for k in CASES)))
+    text.append("Rules, IoU at the points, mean over the texts (95 % under resampling of the texts).")
+    text.append(results.table(("rule", "embedder", "mean where chosen", *CASES), rows))
     every = {k: cases[f"{k}, {VARIANTS[0]}"]["alone"] for k in CASES}
     rows = []
     for method in RIVALS:
-        for reading in every[GIVEN_FLAT][method]:
+        for reading in next(iter(every.values()))[method]:
             rows.append((method, reading, VARIANTS[0], *(_mean(every[k][method][reading]) for k in CASES)))
-    text.append("Each Gaussian alone, IoU at the points by T2; the best thresholds are chosen by the truth.")
+    text.append("Each Gaussian alone, IoU at the points; the best thresholds are chosen by the truth.")
     text.append(results.table(("method", "reading", "embedder", *CASES), rows))
     rows = []
-    for k, parts in metrics["parts"].items():
-        for own in parts:
-            drawn = [v for v in own["rendered"] if np.isfinite(v)]
-            rows.append((k, own["part"], _mean(own["T2"]), _mean(own["T1"]) if "T1" in own else "", _mean(drawn)))
-    best = ", ".join(metrics["best_rule"])
-    text.append(f"The error in three parts; recognition by {best}, best where rules are chosen.")
-    text.append(results.table(("scene", "part", "T2", "T1", "rendered"), rows))
-    rows = []
+    text.append(f"{', '.join(metrics['best_rule'])} is best where rules are chosen. By the true names of the regions:")
+    text.append(results.table(tuple(metrics["lifting"]), [tuple(map(_mean, metrics["lifting"].values()))]))
     for k, figures in cases.items():
         own = figures["refusal"]
         rows.append((k, own["asked"][1], *(own[key] for key in ("auc", "kept", "refused", "calibration error"))))
@@ -411,7 +351,7 @@ def tables(metrics: dict) -> list[str]:
         "error of its confidence, both kinds weighing the same in all."
     )
     header = ("scene, masks, embedder", "absent", "AUC", "kept", "refused", "calibration error")
-    return [*text, results.table(header, rows), "  \n".join(acceptance(metrics))]
+    return [*text, results.table(header, rows)]
 
 
 def calibration(refused: dict[str, Any]) -> tuple[float, list[Bin]]:
@@ -420,29 +360,6 @@ def calibration(refused: dict[str, Any]) -> tuple[float, list[Bin]]:
     rows = [(*own, 1 / count) for kind, count in zip(refused["confidence"], refused["asked"]) for own in kind]
     said, right, weight = np.array(rows, float).reshape(-1, 3).T
     return calibration_error(said, right, weight)
-
-
-def acceptance(metrics: dict) -> list[str]:
-    """What the library must reach, a line each."""
-    (rule, variant), cases = metrics["best_rule"], metrics["cases"]
-    lifted = {
-        k: np.mean(next(row for row in parts if row["part"] == "lifting")["T2"])
-        for k, parts in metrics["parts"].items()
-    }
-    real = {k: np.mean(cases[f"{k}, {variant}"]["points"]["T2"][rule]) for k in CASES}
-    fixed = {
-        f"{method}, {reading}, {VARIANTS[0]}": np.mean(ious[reading])
-        for method, ious in cases[f"{GIVEN_FLAT}, {VARIANTS[0]}"]["alone"].items()
-        for reading in FIXED
-    }
-    best = max(fixed, key=fixed.__getitem__)
-    return [
-        f"(a) {GIVEN_FLAT} masks, true names, T2: {lifted[GIVEN_FLAT]:.3f} (0.75)",
-        f"(b) the same, real words, {rule}, {variant}: {real[GIVEN_FLAT]:.3f} (0.30); above {best}: "
-        f"{real[GIVEN_FLAT] - fixed[best]:.3f} (0.10)",
-        f"(c) {DEFAULT_FLAT} masks, true names: {lifted[DEFAULT_FLAT]:.3f} (0.42)",
-        f"(c) {DEFAULT_FLAT} masks, real words: {real[DEFAULT_FLAT]:.3f} (0.18)",
-    ]
 
 
 if __name__ == "__main__":

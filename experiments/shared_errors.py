@@ -15,7 +15,6 @@ import dataclasses
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 import tyro
 
@@ -23,7 +22,7 @@ from experiments import lerf, results
 from experiments.datasets.benchmark import Benchmark
 from experiments.simulated_vision.worlds import SHARED_STRENGTH
 from experiments.tables import twins
-from jsecon.query.match import evidence
+from experiments.words import rules
 
 REAL = {
     "text to text": "0.29 to 0.33",
@@ -37,19 +36,14 @@ REAL = {
     "own text is the best, by what sets it apart from words": "",
     "text finds its object, by cosine": "",
     "text finds its object, by contrast": "",
-    "text finds its object, by contrast times evidence": "",
-    "text finds its object, by contrast of equal weights": "",
     "text finds its object, by what sets it apart from words": "",
     "present above absent, by cosine": "0.92",
     "present above absent, by contrast": "0.84",
     "present above absent, by what sets it apart from words": "",
 }
 """what is measured, and the real embedder's figures where they are known"""
-
-
-def unit(rows: np.ndarray) -> np.ndarray:
-    """Rows of unit length; zero rows stay zero."""
-    return rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-12)
+RULES = {"cosine": "cosine", "contrast": "contrast", "what sets it apart from words": "apart"}
+"""names of some of `rules.SCORES` there"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,23 +96,11 @@ def pooled(bench: Benchmark, root: Path, level: str, seed: int) -> Pooled:
         here, pixels_here = np.unique(image[image >= 0], return_counts=True)
         pixels[here, t] = pixels_here
         masks[t, here] = embedder.embed_regions(frames[t], image[None] == here[:, None, None])
-    embeddings = unit(np.einsum("tre,rt->re", masks, pixels)).astype(np.float32)
+    embeddings = rules.unit(np.einsum("tre,rt->re", masks, pixels)).astype(np.float32)
     asked = np.array([names.index(query) for query in bench.queries])
     absent = twins.words_of(bench, root, level, seed).absent
     texts = embedder.embed_text(names)
     return Pooled(embeddings, pixels, labels.origin, masks, texts, asked, absent, embedder.canonical)
-
-
-def contrasts(found: Pooled, texts: np.ndarray, *, equal: bool = False) -> np.ndarray:
-    """(Q, R) the contrast of texts with regions, as `jsecon.query.match.contrasts` has it; with `equal` weights of
-    the regions in the scene's mean, in place of their pixels."""
-    weight = found.pixels.sum(1)
-    weight = (weight > 0).astype(float) if equal else weight
-    mean = weight @ found.embeddings / weight.sum()
-    count = int((weight > 0).sum())
-    apart = unit(np.where(weight[:, None] > 0, found.embeddings - count / (count + 1) * mean, 0))
-    cone = unit(found.canonical.mean(0))
-    return unit(texts - (texts @ cone)[:, None] * cone) @ apart.T
 
 
 def figures_of(found: Pooled) -> dict[str, float]:
@@ -144,25 +126,14 @@ def figures_of(found: Pooled) -> dict[str, float]:
     }
     every = np.concatenate([found.texts, found.absent])
     words = found.absent[: len(found.absent) // 2]
-    rules = {
-        "cosine": every @ found.embeddings.T,
-        "contrast": contrasts(found, every),
-        "what sets it apart from words": unit(every - words.mean(0)) @ found.embeddings.T,
-    }
-    for rule, scores in rules.items():
-        scores = np.where(found.pixels.sum(1) > 0, scores, -np.inf)
+    for rule, kind in RULES.items():
+        scores = rules.scores(found.embeddings, every, found.canonical, words, found.pixels, kind)
         texts, absent = scores[: len(found.texts)], scores[len(found.texts) + len(words) :]
         told[f"own text is the best, by {rule}"] = (texts[:, here].argmax(0) == own).mean()
         answer = texts[found.asked].argmax(1)
         told[f"text finds its object, by {rule}"] = (found.objects[answer] == found.asked).mean()
         above = texts[found.asked].max(1)[:, None] > absent.max(1)
         told[f"present above absent, by {rule}"] = above.mean()
-    standing = np.asarray(evidence(jnp.asarray(found.pixels)))
-    asked = contrasts(found, found.texts[found.asked])
-    weighed = np.where(asked > 0, asked * standing, asked).argmax(1)
-    told["text finds its object, by contrast times evidence"] = (found.objects[weighed] == found.asked).mean()
-    even = contrasts(found, found.texts[found.asked], equal=True).argmax(1)
-    told["text finds its object, by contrast of equal weights"] = (found.objects[even] == found.asked).mean()
     return {name: float(told[name]) for name in REAL}
 
 

@@ -8,6 +8,7 @@ and without a floor, shelves, a facade. Each is turned at random, and has noise 
 """
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -78,83 +79,76 @@ class Maker:
                 parts.append(self.cylinder([px, py, z + height / 2], 0.3 * s, height))
         return parts
 
-    def walled(self, x, y, z, walls, things, size, *, ceiling=False) -> Parts:
-        """A floor with some of four walls, and things on it."""
-        a, b, c = np.diag([x, y, z])
-        sides = [(0 * a, a, c), (0 * a, b, c), (b, a, c), (a, b, c)]
-        parts = [self.sheet(0 * a, a, b), *(self.sheet(*sides[k]) for k in self.draw.permutation(4)[:walls])]
-        parts += [self.sheet(c, a, b)] * ceiling
-        return parts + self.things(things, (0.2 * x, 0.8 * x), (0.2 * y, 0.8 * y), 0, size)
+    def beam(self, center, size) -> np.ndarray:
+        """Points of all faces of a leg or a board, as many as on the surfaces around it."""
+        return self.box(center, size, times=1, bottom=True)
 
     def table(self, things, *, underside=True) -> Parts:
         """A table with four legs, and things on it."""
         x, y, z = self.draw.uniform(0.8, 2), self.draw.uniform(0.6, 1), self.draw.uniform(0.5, 0.8)
         parts = [self.box([x / 2, y / 2, z - 0.02], [x, y, 0.04], times=1, bottom=underside)]
-        corners = [(a, b) for a in (0.06, x - 0.06) for b in (0.06, y - 0.06)]
-        parts += [self.box([a, b, z / 2 - 0.02], [0.05, 0.05, z - 0.04], times=1, bottom=True) for a, b in corners]
+        corners = itertools.product((0.06, x - 0.06), (0.06, y - 0.06))
+        parts += [self.beam([*corner, z / 2 - 0.02], [0.05, 0.05, z - 0.04]) for corner in corners]
         return parts + self.things(things, (0.15, x - 0.15), (0.15, y - 0.15), z, self.draw.uniform(0.1, 0.25))
 
 
-def _room(m: Maker) -> Parts:
-    x, y, z = m.draw.uniform([3, 3, 2.2], [6, 6, 3])
-    some = int(m.draw.integers(3, 10)), m.draw.uniform(0.2, 0.9)
-    return m.walled(x, y, z, int(m.draw.integers(2, 5)), *some, ceiling=m.draw.random() < 0.4)
+Kind = Callable[[Maker], Parts]
 
 
-def _corridor(m: Maker) -> Parts:
-    x, y, z = m.draw.uniform([5, 0.9, 2.4], [9, 1.5, 4])
-    some = int(m.draw.integers(3, 8)), m.draw.uniform(0.2, 0.5)
-    return m.walled(x, y, z, 4, *some, ceiling=m.draw.random() < 0.5)
+def _indoors(low, high, *, size, ceiling, walls=(4, 5), things=(3, 8), lamps=False) -> Kind:
+    """A floor with some of four walls, things on it, and a ceiling with a probability, with lamps on cords."""
+
+    def make(m: Maker) -> Parts:
+        x, y, z = m.draw.uniform(low, high)
+        count, length = m.draw.integers(*things), m.draw.uniform(*size)
+        number = m.draw.integers(*walls)
+        covered = ceiling == 1 or m.draw.random() < ceiling
+        a, b, c = np.diag([x, y, z])
+        sides = [(0 * a, a, c), (0 * a, b, c), (b, a, c), (a, b, c)]
+        parts = [m.sheet(0 * a, a, b), *(m.sheet(*sides[k]) for k in m.draw.permutation(4)[:number])]
+        parts += [m.sheet(c, a, b)] * covered
+        parts += m.things(count, (0.2 * x, 0.8 * x), (0.2 * y, 0.8 * y), 0, length)
+        for _ in range(m.draw.integers(1, 4) if lamps else 0):
+            px, py, cord = m.draw.uniform([0.5, 0.5, 0.2], [x - 0.5, y - 0.5, 0.5])
+            parts += [m.cylinder([px, py, z - cord / 2], 0.02, cord, 10), m.ball([px, py, z - cord - 0.1], 0.12)]
+        return parts
+
+    return make
 
 
-def _closet(m: Maker) -> Parts:
-    x, y, z = m.draw.uniform([0.8, 0.8, 2.4], [1.3, 1.3, 3.2])
-    return m.walled(x, y, z, 3, int(m.draw.integers(3, 7)), m.draw.uniform(0.15, 0.4), ceiling=m.draw.random() < 0.5)
+def _wall_with_floor(low, high, size, *, pictures=False) -> Kind:
+    def make(m: Maker) -> Parts:
+        x, y, z = m.draw.uniform(low, high)
+        parts = [m.sheet([0, 0, 0], [x, 0, 0], [0, y, 0]), m.sheet([0, 0, 0], [x, 0, 0], [0, 0, z])]
+        count, length = m.draw.integers(3, 8), m.draw.uniform(*size)
+        parts += m.things(count, (0.1 * x, 0.9 * x), (0.2 * y, 0.8 * y), 0, length)
+        if pictures:
+            x, z = parts[1].max(0)[[0, 2]]
+            sizes = m.draw.uniform([0.4, 0.06, 0.3], [0.9, 0.06, 0.8], (m.draw.integers(1, 4), 3))
+            places = m.draw.uniform([0.5, 0.04, 1.2], [x - 0.5, 0.04, z - 0.5], (len(sizes), 3))
+            parts += map(m.box, places, sizes)
+        return parts
 
-
-def _lamps(m: Maker) -> Parts:
-    x, y, z = m.draw.uniform([3, 3, 2.4], [6, 6, 3])
-    parts = m.walled(x, y, z, 4, int(m.draw.integers(3, 8)), m.draw.uniform(0.3, 0.9), ceiling=True)
-    for _ in range(m.draw.integers(1, 4)):
-        px, py, cord = m.draw.uniform([0.5, 0.5, 0.2], [x - 0.5, y - 0.5, 0.5])
-        parts += [m.cylinder([px, py, z - cord / 2], 0.02, cord, 10), m.ball([px, py, z - cord - 0.1], 0.12)]
-    return parts
-
-
-def _wall_with_floor(m: Maker, low, high, size) -> Parts:
-    x, y, z = m.draw.uniform(low, high)
-    parts = [m.sheet([0, 0, 0], [x, 0, 0], [0, y, 0]), m.sheet([0, 0, 0], [x, 0, 0], [0, 0, z])]
-    return parts + m.things(
-        int(m.draw.integers(3, 8)), (0.1 * x, 0.9 * x), (0.2 * y, 0.8 * y), 0, m.draw.uniform(*size)
-    )
-
-
-def _pictures(m: Maker) -> Parts:
-    parts = _wall_with_floor(m, [3, 0.8, 3], [6, 1.8, 5], (0.2, 0.5))
-    x, z = parts[1].max(0)[[0, 2]]
-    sizes = m.draw.uniform([0.4, 0.06, 0.3], [0.9, 0.06, 0.8], (int(m.draw.integers(1, 4)), 3))
-    places = m.draw.uniform([0.5, 0.04, 1.2], [x - 0.5, 0.04, z - 0.5], (len(sizes), 3))
-    return parts + [m.box(place, size) for place, size in zip(places, sizes)]
+    return make
 
 
 def _pedestal(m: Maker) -> Parts:
     r, z = m.draw.uniform(0.4, 0.7), m.draw.uniform(0.6, 0.9)
-    parts = [m.cylinder([0, 0, z - 0.02], r, 0.04, 1), m.cylinder([0, 0, z / 2], 0.05, z, 1)]
-    parts.append(m.cylinder([0, 0, 0.02], 0.3, 0.04, 1))
-    return parts + m.things(int(m.draw.integers(2, 6)), (-0.3, 0.3), (-0.3, 0.3), z, m.draw.uniform(0.1, 0.25))
+    discs = ((z - 0.02, r, 0.04), (z / 2, 0.05, z), (0.02, 0.3, 0.04))
+    parts = [m.cylinder([0, 0, middle], radius, height, 1) for middle, radius, height in discs]
+    return parts + m.things(m.draw.integers(2, 6), (-0.3, 0.3), (-0.3, 0.3), z, m.draw.uniform(0.1, 0.25))
 
 
 def _table_on_floor(m: Maker) -> Parts:
     r = m.draw.uniform(0.5, 1.5)
     floor = m.sheet([-r, -r, 0], [2 * r + 1.4, 0, 0], [0, 2 * r + 0.8, 0], m.draw.uniform(0.2, 1))
-    return [*m.table(int(m.draw.integers(2, 8))), floor]
+    return [*m.table(m.draw.integers(2, 8)), floor]
 
 
 def _desk_at_wall(m: Maker) -> Parts:
     x, y, z = m.draw.uniform([1.2, 0.5, 1], [2, 0.8, 2])
     parts = [m.sheet([0, 0, 0.75], [x, 0, 0], [0, y, 0]), m.sheet([-0.3, 0, 0.45], [x + 0.6, 0, 0], [0, 0, z])]
-    count, size = int(m.draw.integers(3, 8)), m.draw.uniform(0.1, 0.25)
-    return parts + m.things(count, (0.1, x - 0.1), (0.12, y - 0.1), 0.75, size)
+    return parts + m.things(m.draw.integers(3, 8), (0.1, x - 0.1), (0.12, y - 0.1), 0.75, m.draw.uniform(0.1, 0.25))
 
 
 def _shelf(m: Maker) -> Parts:
@@ -163,17 +157,16 @@ def _shelf(m: Maker) -> Parts:
     parts += [m.sheet([side, 0, 0], [0, y, 0], [0, 0, z]) for side in (0, x)]
     for level in np.linspace(0.05, z, 5):
         parts.append(m.sheet([0, 0, level], [x, 0, 0], [0, y, 0]))
-        count = int(m.draw.integers(2, 6)) if level < z - 0.1 else 0
+        count = m.draw.integers(2, 6) if level < z - 0.1 else 0
         parts += m.things(count, (0.1, x - 0.1), (0.1, y - 0.05), level, m.draw.uniform(0.1, 0.2))
     return parts
 
 
 def _chair(m: Maker) -> Parts:
     back = m.draw.uniform(0.4, 0.6)
-    parts = [m.box([0.22, 0.22, 0.45], [0.45, 0.45, 0.04], times=1, bottom=True)]
-    parts.append(m.box([0.22, 0.02, 0.45 + back / 2], [0.45, 0.03, back], times=1, bottom=True))
-    legs = [(a, b) for a in (0.03, 0.42) for b in (0.03, 0.42)]
-    return parts + [m.box([a, b, 0.225], [0.04, 0.04, 0.45], times=1, bottom=True) for a, b in legs]
+    parts = [m.beam([0.22, 0.22, 0.45], [0.45, 0.45, 0.04]), m.beam([0.22, 0.02, 0.45 + back / 2], [0.45, 0.03, back])]
+    corners = itertools.product((0.03, 0.42), repeat=2)
+    return parts + [m.beam([*corner, 0.225], [0.04, 0.04, 0.45]) for corner in corners]
 
 
 def _outdoors(m: Maker) -> Parts:
@@ -183,12 +176,12 @@ def _outdoors(m: Maker) -> Parts:
     sky[:, 2] = np.abs(sky[:, 2])
     sky *= r * m.draw.uniform(1, 1.6, (3200, 1)) / np.linalg.norm(sky, axis=1, keepdims=True)
     reach = -r / 3, r / 3
-    return [ground, sky, *m.things(int(m.draw.integers(2, 8)), reach, reach, 0, m.draw.uniform(0.4, 1.5))]
+    return [ground, sky, *m.things(m.draw.integers(2, 8), reach, reach, 0, m.draw.uniform(0.4, 1.5))]
 
 
 def _table_top(m: Maker) -> Parts:
     x, y = m.draw.uniform(0.8, 2), m.draw.uniform(0.6, 1)
-    things = m.things(int(m.draw.integers(2, 8)), (0.15, x - 0.15), (0.15, y - 0.15), 0, m.draw.uniform(0.1, 0.3))
+    things = m.things(m.draw.integers(2, 8), (0.15, x - 0.15), (0.15, y - 0.15), 0, m.draw.uniform(0.1, 0.3))
     return [m.sheet([0, 0, 0], [x, 0, 0], [0, y, 0]), *things]
 
 
@@ -204,20 +197,19 @@ def _board(m: Maker) -> Parts:
     return parts
 
 
-def _crate(m: Maker) -> Parts:
-    return [m.box([0, 0, 0], m.draw.uniform(0.3, 1, 3), times=1, bottom=True)]
-
-
-KINDS: dict[str, tuple[float, Callable[[Maker], Parts]]] = {
-    "room": (400, _room),
-    "room with lamps": (400, _lamps),
-    "corridor": (400, _corridor),
-    "closet": (1200, _closet),
-    "wall and a narrow floor": (400, lambda m: _wall_with_floor(m, [3, 0.8, 3], [6, 1.8, 5], (0.2, 0.5))),
-    "the same with pictures": (400, _pictures),
-    "facade": (120, lambda m: _wall_with_floor(m, [8, 1.5, 6], [14, 3, 10], (0.5, 1.2))),
-    "table with legs, no floor": (3600, lambda m: m.table(int(m.draw.integers(2, 8)))),
-    "the same from above": (3600, lambda m: m.table(int(m.draw.integers(2, 8)), underside=False)),
+KINDS: dict[str, tuple[float, Kind]] = {
+    "room": (400, _indoors((3, 3, 2.2), (6, 6, 3), size=(0.2, 0.9), ceiling=0.4, walls=(2, 5), things=(3, 10))),
+    "room with lamps": (400, _indoors((3, 3, 2.4), (6, 6, 3), size=(0.3, 0.9), ceiling=1, lamps=True)),
+    "corridor": (400, _indoors((5, 0.9, 2.4), (9, 1.5, 4), size=(0.2, 0.5), ceiling=0.5)),
+    "closet": (
+        1200,
+        _indoors((0.8, 0.8, 2.4), (1.3, 1.3, 3.2), size=(0.15, 0.4), ceiling=0.5, walls=(3, 4), things=(3, 7)),
+    ),
+    "wall and a narrow floor": (400, _wall_with_floor((3, 0.8, 3), (6, 1.8, 5), (0.2, 0.5))),
+    "the same with pictures": (400, _wall_with_floor((3, 0.8, 3), (6, 1.8, 5), (0.2, 0.5), pictures=True)),
+    "facade": (120, _wall_with_floor((8, 1.5, 6), (14, 3, 10), (0.5, 1.2))),
+    "table with legs, no floor": (3600, lambda m: m.table(m.draw.integers(2, 8))),
+    "the same from above": (3600, lambda m: m.table(m.draw.integers(2, 8), underside=False)),
     "table with one thing": (3600, lambda m: m.table(1)),
     "bare table": (3600, lambda m: m.table(0)),
     "table on a pedestal": (3600, _pedestal),
@@ -229,7 +221,7 @@ KINDS: dict[str, tuple[float, Callable[[Maker], Parts]]] = {
     "outdoors with sky": (240, _outdoors),
     "floating balls": (3200, _floating),
     "pictures on a wall": (1200, _board),
-    "crate": (8000, _crate),
+    "crate": (8000, lambda m: [m.beam([0, 0, 0], m.draw.uniform(0.3, 1, 3))]),
 }
 """kind -> points per square metre, and its maker"""
 UNKNOWABLE = ("floating balls", "pictures on a wall", "crate")

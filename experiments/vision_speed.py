@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.distance import pdist
+from scipy.spatial.distance import cosine, pdist
 
 from experiments import results
 from experiments.datasets.plain_room import make_room
@@ -192,10 +192,11 @@ def _time_segmenter(model: Path, precision: Precision, frame: np.ndarray) -> dic
         graphs.batch = batch
         decoder[batch] = _seconds(lambda: list(graphs.decode(encoded, points))) / len(points)
     reference = SamGraphs(find_sam(model, "fp32")).encode(frame).features if precision != "fp32" else encoded.features
-    cosines = [_cosine(encoded.features[name], reference[name]) for name in reference]
+    pairs = ([own[name].astype(np.float64).ravel() for own in (encoded.features, reference)] for name in reference)
+    cosines = [1 - cosine(*pair) for pair in pairs]
     prompt = min(decoder.values())
     frames = {"guided": encoder + GUIDED * prompt, "grid": encoder + GRID * prompt}
-    return {"encoder": encoder, "prompt": decoder, "frame": frames, "least_cosine": min(cosines)}
+    return {"encoder": encoder, "prompt": decoder, "frame": frames, "least_cosine": float(min(cosines))}
 
 
 def _time_embedder(model: Path, precision: Precision, frame: np.ndarray, masks: np.ndarray) -> dict[str, Any]:
@@ -229,11 +230,6 @@ def _time_tracker(model: Path, precision: Precision, frame: np.ndarray) -> dict[
         seconds.append((time.process_time() - started) / cores())
         started = time.process_time()
     return {"encoder": encoder, "object": min(seconds[1:]), "frame": encoder + min(seconds[1:])}
-
-
-def _cosine(one: np.ndarray, other: np.ndarray) -> float:
-    one, other = one.astype(np.float64).ravel(), other.astype(np.float64).ravel()
-    return float(one @ other / np.linalg.norm(one) / np.linalg.norm(other))
 
 
 def table(metrics: dict) -> str:

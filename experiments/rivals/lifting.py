@@ -21,7 +21,7 @@ from scipy import sparse
 from scipy.spatial import KDTree
 
 from experiments.rivals.evidence import Evidence, local_masks
-from jsecon.language.votes import region_votes
+from jsecon.association.atoms import atom_votes
 from jsecon.query.baselines import relevancies
 from jsecon.splat.fusion import materialize
 from jsecon.splat.plan import ViewPlan, plan_view
@@ -67,17 +67,13 @@ def train_vala(evidence: Evidence, **gate_of: float) -> Lifted:
 
 
 def train_backprojection(evidence: Evidence) -> Lifted:
-    """The full sum, one pass of votes over the views; exact: no mask of a view is left out."""
+    """The full sum, a pass of votes over each view; exact: no mask of a view is left out."""
     local, names = local_masks(evidence)
     gaussians, cameras = jax.tree.map(jnp.asarray, (evidence.gaussians, evidence.cameras))
     blocks = []
-    for t in range(len(local)):
-        votes = region_votes(
-            gaussians, cameras[t : t + 1], jnp.asarray(local[t : t + 1]), names.shape[1], top=names.shape[1]
-        )
-        weights, slots = np.asarray(votes.weights), np.asarray(votes.regions)
-        rows, places = np.nonzero(weights > 0)
-        blocks.append((weights[rows, places], rows, names[t][slots[rows, places]]))
+    for t, image in enumerate(local):
+        cast = atom_votes(gaussians, cameras[t], image, negligible=0.0).tocoo()
+        blocks.append((cast.data, cast.row, names[t][cast.col]))
     return _lifted(_sparse(blocks, evidence), evidence)
 
 

@@ -34,8 +34,6 @@ LEANING = 0.75
 the best of the scene's for about a quarter of the regions by the contrast (experiments/shared_errors.py)"""
 CONFUSED = 2
 """other classes of the scene in an object's mixture; where names that nothing has are given, as many of these too"""
-
-
 PLAIN = World()
 
 

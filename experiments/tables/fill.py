@@ -167,10 +167,10 @@ def measure(setting: Setting, answers: Answers) -> dict:
     bench: Benchmark = setting.bench
     if not bench.frames:
         opacity = 1 / (1 + np.exp(-np.asarray(setting.evidence.gaussians.opacity_logits)))
-        rows, figures = evaluate_points(
+        ious, figures = evaluate_points(
             answers.classes(), bench.point_classes, bench.queries, expected_classes=bench.pairs, opacities=opacity
         )
-        texts = {row.query: [round(row.iou, DIGITS)] for row in rows}
+        texts = {query: [round(iou, DIGITS)] for query, iou in ious.items()}
         return {name: figures[name] for name in KEPT if name in figures} | {"texts": texts}
     both = evaluate_at_thresholds(
         answers.gaussians or setting.evidence.gaussians,

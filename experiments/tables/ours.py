@@ -28,8 +28,6 @@ from jsecon.types import LanguageField, Parts, Regions, Selection, Votes
 
 BY_COSINE = {"retrieval": "cosine"}
 """the region of the largest cosine, as the paper finds it"""
-
-
 AGREEMENT = 0.4
 """of views, jsecon's default"""
 

@@ -45,8 +45,6 @@ PERFECT = Faults(0, 2, 0, 0, 0, 0, 0, 0, object_noise=1.0, view_noise=0)
 KIND = 2
 """of twin: raised where what the writers write changes, so that nothing measured on another kind is taken for it"""
 WRITERS = {"lerf": twins.write_lerf_twin, "ovs3d": twins.write_ovs3d_twin, "replica": twins.write_replica_twin}
-
-
 LVIS = "clip_vitb32_lvis.npy", "lvis_names.json"
 """text vectors of real names, in a folder `text` beside the captures"""
 ABSENT = 200

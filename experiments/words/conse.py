@@ -141,12 +141,6 @@ class Labeller:
             remedy = "Fetch the file again."
             raise InputError(self.file, f"not a readable labeller ({describe_error(error)})", remedy=remedy) from error
         (source,), (target,) = interpreter.get_input_details(), interpreter.get_output_details()
-        pictures = source["dtype"] == np.uint8 and len(source["shape"]) == 4 and source["shape"][3] == 3
-        scores = target["dtype"] == np.uint8 and tuple(target["shape"]) == (1, len(self.names))
-        if not (pictures and scores):
-            found = f"takes {tuple(source['shape'])} and gives {tuple(target['shape'])}"
-            expected = f"one uint8 picture and a uint8 score for each of its {len(self.names)} names"
-            raise InputError(self.file, found, expected, "Give a quantised labeller with its names.")
         return interpreter, source, target
 
 
@@ -166,9 +160,6 @@ class TextVectors:
             remedy = "Give an .npz with `names` (N,) and `vectors` (N, E)."
             problem = f"not a readable table of vectors ({describe_error(error)})"
             raise InputError(self.file, problem, remedy=remedy) from error
-        if vectors.ndim != 2 or len(names) != len(vectors) or not np.isfinite(vectors).all():
-            found, expected = f"{len(names)} names and vectors {vectors.shape}", "a finite vector for each name"
-            raise InputError(self.file, found, expected, "Give an .npz with `names` (N,) and `vectors` (N, E).")
         units = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
         self.names, self.vectors = tuple(names), units.astype(np.float32)
         self._rows = {name: row for row, name in enumerate(names)}
@@ -209,25 +200,23 @@ def class_weights(scores: UInt8[np.ndarray, "m k"], weights: str = "probability"
 
 
 def conse(
-    weights: Float[np.ndarray, "m k"], vectors: Float[np.ndarray, "k e"], *, top: int | None = TOP
+    weights: Float[np.ndarray, "m k"], vectors: Float[np.ndarray, "k e"], *, top: int = TOP
 ) -> Float[np.ndarray, "m e"]:
     """The unit embeddings of M crops from their classes' weights.
 
     Args:
       weights: Of each of K classes in each crop, 0 or more.
       vectors: Unit text vectors of the classes' names.
-      top: Number of classes, the heaviest, that count; None for all. Of equal weights the earlier class counts.
+      top: Number of classes, the heaviest, that count. Of equal weights the earlier class counts.
 
     Returns:
       (M, E) float32 of unit length; zero for a crop of which no class has any weight.
     """
     weights = np.asarray(weights, np.float64)
-    if top is not None and top < weights.shape[1]:
-        order = np.argsort(-weights, axis=1, kind="stable")[:, :top]
-        kept = np.zeros_like(weights)
-        np.put_along_axis(kept, order, np.take_along_axis(weights, order, axis=1), axis=1)
-        weights = kept
-    return unit(weights @ np.asarray(vectors, np.float64))
+    order = np.argsort(-weights, axis=1, kind="stable")[:, :top]
+    kept = np.zeros_like(weights)
+    np.put_along_axis(kept, order, np.take_along_axis(weights, order, axis=1), axis=1)
+    return unit(kept @ np.asarray(vectors, np.float64))
 
 
 class Conse:
@@ -239,7 +228,7 @@ class Conse:
         texts: TextVectors | None = None,
         *,
         crop: Crop = Crop(),
-        top: int | None = TOP,
+        top: int = TOP,
     ):
         """Opens the files and makes the space.
 
@@ -247,7 +236,7 @@ class Conse:
           labeller: Of the crops; by default that of ../shared/words.
           texts: Vectors of the classes' names and of the texts that are asked; by default those of ../shared/words.
           crop: What the labeller sees of a region.
-          top: Number of classes that an embedding is made of; None for all.
+          top: Number of classes that an embedding is made of.
 
         Raises:
           InputError: A file is missing, or the table has no vector for a class of the labeller.
@@ -260,8 +249,7 @@ class Conse:
         self.reference = self.embed_text([word for word in REFERENCE_WORDS if word in self.texts])
         self.dim = self.class_vectors.shape[1]
         digest = hashlib.sha256(self.class_vectors.tobytes() + self.labeller.file.read_bytes()).hexdigest()[:12]
-        told = f"{crop.margin:g}-{crop.shape}-{crop.surroundings}-{top or 'all'}"
-        self.name = f"conse-{digest}-{told}"
+        self.name = f"conse-{digest}-{crop.margin:g}-{crop.shape}-{crop.surroundings}-{top}"
 
     def scores(self, frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m _ _"]) -> UInt8[np.ndarray, "m k"]:
         """(M, K) the classes' scores of each region, in steps of 1/256; zeros for an empty mask."""

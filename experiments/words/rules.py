@@ -36,10 +36,10 @@ def scores(
         weight = pixels.sum(axis=1) * known
         mean = weight @ embeddings / max(weight.sum(), 1)
         residual = embeddings - known.sum() / (known.sum() + 1) * mean
-        cone = _units(_units(canonical).sum(axis=0)[None])
-        table = _units(texts - texts @ cone.T * cone) @ _units(residual).T
+        cone = unit(unit(canonical).sum(axis=0)[None])
+        table = unit(texts - texts @ cone.T * cone) @ unit(residual).T
     elif kind == "apart":
-        table = _units(_units(texts) - _units(words).mean(axis=0)) @ embeddings.T
+        table = unit(unit(texts) - unit(words).mean(axis=0)) @ embeddings.T
     else:
         table = texts @ embeddings.T
         if kind == "relevancy":
@@ -47,7 +47,8 @@ def scores(
     return np.where(known[None], table, -np.inf)
 
 
-def _units(rows: Float[np.ndarray, "n e"]) -> Float[np.ndarray, "n e"]:
+def unit(rows: Float[np.ndarray, "n e"]) -> Float[np.ndarray, "n e"]:
+    """Rows of unit length in their own precision; zero rows stay zero."""
     return rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-12)
 
 

@@ -30,9 +30,7 @@ from experiments.replica_apartment_0 import Options as Scan, load_replica, point
 from experiments.rivals import lifting
 from experiments.rivals.evidence import Evidence, unit
 from experiments.words.conse import WORDS, Conse
-from jsecon.association.atoms import atom_votes
 from jsecon.data.capture import load_capture
-from jsecon.data.frames import evenly_spaced
 from jsecon.errors import InputError
 from jsecon.fit.start import starting_gaussians
 from jsecon.language.votes import region_votes
@@ -48,31 +46,14 @@ GIVEN, DEFAULT = "given", "default"
 NAMED_POINTS = WORDS / "replica_apartment_0_named_points.npz"
 
 
-def back_projected(evidence: Evidence) -> sparse.csr_matrix:
-    """(N, M) the sum of alpha T of each Gaussian over the pixels of each mask: the weights of
-    `lifting.train_backprojection`, without a dense row for each Gaussian, as scenes here have many masks."""
-    masks, frame = np.asarray(evidence.masks), np.asarray(evidence.frame)
-    blocks = []
-    for t, image in enumerate(masks):
-        own = np.flatnonzero(frame == t)
-        place = np.full(len(frame) + 1, -1, np.int32)
-        place[own] = np.arange(len(own))
-        cast = atom_votes(evidence.gaussians, evidence.cameras[t], place[image], negligible=0.0).tocoo()
-        blocks.append((cast.data, cast.row, own[cast.col]))
-    values, rows, columns = (np.concatenate(parts) for parts in zip(*blocks))
-    return sparse.csr_matrix((values, (rows, columns)), shape=(evidence.gaussians.count, len(frame)))
-
-
 RIVALS: dict[str, Callable[[Evidence], sparse.csr_matrix]] = {
-    "weighted back-projection": back_projected,
-    "Occam's LGS": lambda evidence: lifting.train_occam(evidence).weights.tocsr(),
-    "VALA": lambda evidence: lifting.train_vala(evidence).weights.tocsr(),
+    "weighted back-projection": lambda evidence: lifting.train_backprojection(evidence).weights,
+    "Occam's LGS": lambda evidence: lifting.train_occam(evidence).weights,
+    "VALA": lambda evidence: lifting.train_vala(evidence).weights,
 }
 """what gives each Gaussian an embedding of its own"""
 BONSAI_EVERY = 3
 """of the frames that are not held out, every so many-th votes"""
-JUDGED = 20
-"""held-out views, at most, evenly spaced, in which selections are rendered"""
 APC_TEXTS = ("chenille stems", "children book", "tissue box", "joke book")
 """of `apc_bin.OBJECTS` in order: its names less the brands"""
 BONSAI_TEXTS = {
@@ -109,20 +90,13 @@ class WordScene:
     """what truth has names for."""
     asked: np.ndarray
     """(Q,) the names that are asked for."""
-    truth: dict[str, np.ndarray]
-    """"T1", "T2" -> (N,) name of each Gaussian; len(names) = something else, -1 = not judged."""
+    truth: np.ndarray
+    """(N,) name of each Gaussian by views that do not vote; len(names) = something else, -1 = not judged."""
     region_names: np.ndarray
     """(R,) the true name of each region; len(names) = something else, -1 = not known."""
-    judged: Camera
-    """F held-out views."""
-    outlines: np.ndarray
-    """(F, H, W) names; len(names) = something else, -1 = not judged."""
-    shown: np.ndarray
-    """(G, H, W, 3) frames in which things are outlined one by one."""
-    things: np.ndarray
-    """(G, H, W) things in them, -1 = none."""
-    thing_names: np.ndarray
-    """(X,) name of each thing, -1 = none that is asked for."""
+    outlined: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+    """Frames (G, H, W, 3) in which things are outlined one by one, the things in them (G, H, W), -1 = none, and the
+    name of each thing (X,), -1 = none that is asked for."""
 
     @property
     def texts(self) -> tuple[str, ...]:
@@ -194,29 +168,22 @@ def _replica(masks: str) -> WordScene:
     object_of = labels_of_points(points, silent, count)
     by_silent = names_of_objects(object_of, near, count, len(names))
     by_all = names_of_objects(labels_of_points(points, objects, count), near, count, len(names))
-    voting, judged = np.flatnonzero(~capture.held_out), np.flatnonzero(capture.held_out)
-    judged = judged[evenly_spaced(len(judged), JUDGED)]
+    voting = np.flatnonzero(~capture.held_out)
     labels, region_names = objects[voting], by_all
     if masks == DEFAULT:
         labels = _default_masks(capture, gaussians)
         named = _named(objects[voting], by_all)
         region_names = names_of_objects(labels.ravel(), named.ravel(), int(labels.max()) + 1, len(names))
-    frames = np.asarray(capture.frames)
     return WordScene(
         name="replica_apartment_0",
         gaussians=gaussians,
         cameras=capture.cameras[voting],
-        frames=frames[voting],
+        frames=np.asarray(capture.frames)[voting],
         labels=labels,
         names=names,
         asked=np.array([names.index(word) for word in CLASSES]),
-        truth={"T1": near, "T2": _named(object_of, by_silent)},
+        truth=_named(object_of, by_silent),
         region_names=region_names,
-        judged=capture.cameras[judged],
-        outlines=_named(objects[judged], by_silent),
-        shown=frames[judged],
-        things=objects[judged],
-        thing_names=by_silent,
     )
 
 
@@ -239,13 +206,9 @@ def _apc(masks: str) -> WordScene:
         labels=labels,
         names=APC_TEXTS,
         asked=np.arange(count),
-        truth={"T2": _names_by_views(gaussians, capture.cameras[judged], objects[judged], count + 1)},
+        truth=_names_by_views(gaussians, capture.cameras[judged], objects[judged], count + 1),
         region_names=region_names,
-        judged=capture.cameras[judged],
-        outlines=objects[judged],
-        shown=frames,
-        things=objects,
-        thing_names=np.where(np.arange(count + 1) < count, np.arange(count + 1), -1),
+        outlined=(frames, objects, np.array([*range(count), -1])),
     )
 
 
@@ -280,13 +243,9 @@ def _bonsai(masks: str) -> WordScene:
         labels=labels,
         names=names,
         asked=np.arange(len(names)),
-        truth={"T2": truth},
+        truth=truth,
         region_names=names_of_objects(strongest, truth, int(labels.max()) + 1, len(names) + 1),
-        judged=capture.cameras[frames],
-        outlines=outlines,
-        shown=np.asarray(capture.frames)[frames],
-        things=outlined,
-        thing_names=thing_names,
+        outlined=(np.asarray(capture.frames)[frames], outlined, thing_names),
     )
 
 

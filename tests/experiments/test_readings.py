@@ -1,7 +1,6 @@
 """Every method by every reading: what a cell holds, who is compared with whom, and what a reading does to a score."""
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
@@ -69,29 +68,12 @@ def test_ours_is_compared_with_a_method_on_the_scenes_and_seeds_that_it_has():
     cells = [cell("VALA: cosine", seed, 0.5, 0.4) for seed in (0, 10)]
     cells += [cell("ours, consensus: x", seed, value, 0.5) for seed, value in ((0, 0.7), (10, 0.7), (11, 0.9))]
     cells += [cell("ours, consensus: x", 10, 0.1, 0.5) | {"scene": "another"}]
-    options = fair.Options(seeds=(10, 11), choosing=(0,), seeds_trained=(10,), scenes_trained=("s",))
+    options = fair.Options(seeds=(10, 11), choosing=(0,), seeds_trained=(10,))
     _, told = fair.report("lerf", "medium", cells, options)
     assert told["VALA, miou"]["ours there"] == pytest.approx(0.7)
     assert told["VALA, miou"]["scenes"] == ["s"]
     assert told["VALA, miou"]["seeds"] == [10]
     assert told["ours, consensus, miou"]["mean"] == pytest.approx((0.1 + 0.8) / 2)
-
-
-def test_readings_are_taken_from_another_run(tmp_path):
-    """Those of the run's table, though others would be best on the cells."""
-    cells = [cell("VALA: cosine", 10, 0.6, 0.2), cell("VALA: contrast", 10, 0.5, 0.4)]
-    cells += [cell("ours, consensus: x", 10, 0.8, 0.3), cell("ours, consensus: y", 10, 0.7, 0.5)]
-    rows = {"VALA, miou": "VALA: contrast", "VALA, miou_vala": "VALA: contrast"}
-    rows |= {f"ours, consensus, {figure}": "ours, consensus: y" for figure in ("miou", "miou_vala")}
-    rows |= {f"ours, consensus{fair.ONE_READING}, miou": "ours, consensus: x"}
-    file = tmp_path / "metrics.json"
-    file.write_text(json.dumps({"lerf medium": {key: {"row": row} for key, row in rows.items()}}))
-    options = fair.Options(seeds=(10,), choosing=(0,), read_as=str(file))
-    text, told = fair.report("lerf", "medium", cells, options)
-    assert set(told) == {key for key in rows if fair.ONE_READING not in key}
-    assert told["VALA, miou"]["mean"] == pytest.approx(0.5)
-    assert told["VALA, miou"]["ahead"] == pytest.approx((0.2, 0.2, 0.2))
-    assert "| cosine |" not in text
 
 
 def test_the_interval_is_of_pairs():

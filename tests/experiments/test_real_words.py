@@ -103,7 +103,6 @@ def test_conse_is_the_weighted_mean_of_the_most_probable_classes():
         kept = sorted(range(30), key=lambda k: -own[k])[:10]
         total = sum((own[k] * vectors[k] for k in kept), np.zeros(8))
         np.testing.assert_allclose(row, total / np.linalg.norm(total), atol=1e-6)
-    np.testing.assert_allclose(conse(weights, vectors, top=None)[0], _unit(weights[0] @ vectors), atol=1e-6)
     assert not conse(np.zeros((1, 30)), vectors).any()
 
 
@@ -218,7 +217,7 @@ def test_scores_of_all_texts_are_those_of_the_library():
     regions, texts, canonical = (unit(shape).astype(np.float32) for shape in ((6, 12), (3, 12), (4, 12)))
     pixels = rng.integers(0, 500, (6, 5)).astype(np.int32)
     regions[2] = 0
-    words = rules._units(rng.standard_normal((9, regions.shape[1]))).astype(np.float32)
+    words = rules.unit(rng.standard_normal((9, regions.shape[1]))).astype(np.float32)
     found = {kind: rules.scores(regions, texts, canonical, words, pixels, kind) for kind in rules.SCORES}
     assert all((table[:, 2] == -np.inf).all() for table in found.values())
     known = np.arange(6) != 2
@@ -228,7 +227,7 @@ def test_scores_of_all_texts_are_those_of_the_library():
         np.testing.assert_allclose(found["apart"][q, known], apart[known], atol=1e-5)
         np.testing.assert_allclose(found["relevancy"][q, known], relevancy[known], atol=1e-5)
         np.testing.assert_allclose(found["cosine"][q, known], (regions @ text)[known], atol=1e-5)
-    moved = rules.scores(regions, rules._units(texts + canonical.mean(0)), canonical, words, pixels, "contrast")
+    moved = rules.scores(regions, rules.unit(texts + canonical.mean(0)), canonical, words, pixels, "contrast")
     np.testing.assert_allclose(moved[:, known], found["contrast"][:, known], atol=1e-5)  # phrases say nothing
 
 
