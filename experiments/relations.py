@@ -74,9 +74,9 @@ PER_RELATION = {1: 2, 0: 1, 2: 1}
 """expressions of a room for each relation, by whether one, none or several objects are right"""
 
 
-def _balls(draw: np.random.Generator, radii: tuple[float, float]) -> Body:
-    r = draw.uniform(*radii)
-    return [(place(ellipsoid(r, r, r), (0, 0, r)), None, 1.0)]
+def _balls(draw: np.random.Generator, *radii: tuple[float, float]) -> list[Body]:
+    drawn = (draw.uniform(*pair) for pair in radii)
+    return [[(place(ellipsoid(r, r, r), (0, 0, r)), None, 1.0)] for r in drawn]
 
 
 def _box(draw: np.random.Generator, side: tuple[float, float], height: tuple[float, float]) -> Body:
@@ -87,22 +87,20 @@ def relation_room(seed: int) -> tuple[Room, dict[int, tuple[str, int]]]:
     """Makes a room, and what holds some objects: index -> ("on", "in" or "under", index of the other)."""
     draw = np.random.default_rng([seed, 21])
     low = _box(draw, (0.12, 0.15), (0.05, 0.08))
-    kinds: list[tuple[str, str, Body]] = [("dark blue", "box", low)]
-    kinds += [("dark blue", "box", _box(draw, side, (0.06, 0.12))) for side in ((0.06, 0.08), (0.16, 0.19))]
-    kinds += [("red", "mug", SHAPES["mug"](draw)) for _ in range(3)]
-    kinds += [("yellow", "ball", _balls(draw, (0.045, 0.055))), ("yellow", "ball", _balls(draw, (0.065, 0.085)))]
-    kinds += [("white", "plate", SHAPES["plate"](draw))]
-    kinds += [("orange", "ball", _balls(draw, (0.055, 0.065))), ("orange", "ball", _balls(draw, (0.04, 0.05)))]
-    kinds += [("light green", "bowl", SHAPES["bowl"](draw))]
-    kinds += [("purple", "ball", _balls(draw, (0.045, 0.052))), ("purple", "ball", _balls(draw, (0.06, 0.08)))]
-    arch: Body = [(box(0.1, 0.26, 0.2), place(box(0.2, 0.18, 0.16), (0, 0, -0.01)), 1.0)]
-    kinds += [("brown", "arch", arch)]
-    kinds += [
-        ("turquoise", "box", _box(draw, (0.07, 0.09), (0.06, 0.1))),
-        ("turquoise", "box", _box(draw, (0.1, 0.13), (0.09, 0.15))),
-    ]
-    kinds += [("dark green", "bottle", SHAPES["bottle"](draw)) for _ in range(2)]
-    kinds += [("light blue", "vase", SHAPES["vase"](draw))]
+    bodies = (
+        ("dark blue", "box", [low, *(_box(draw, side, (0.06, 0.12)) for side in ((0.06, 0.08), (0.16, 0.19)))]),
+        ("red", "mug", [SHAPES["mug"](draw) for _ in range(3)]),
+        ("yellow", "ball", _balls(draw, (0.045, 0.055), (0.065, 0.085))),
+        ("white", "plate", [SHAPES["plate"](draw)]),
+        ("orange", "ball", _balls(draw, (0.055, 0.065), (0.04, 0.05))),
+        ("light green", "bowl", [SHAPES["bowl"](draw)]),
+        ("purple", "ball", _balls(draw, (0.045, 0.052), (0.06, 0.08))),
+        ("brown", "arch", [[(box(0.1, 0.26, 0.2), place(box(0.2, 0.18, 0.16), (0, 0, -0.01)), 1.0)]]),
+        ("turquoise", "box", [_box(draw, (0.07, 0.09), (0.06, 0.1)), _box(draw, (0.1, 0.13), (0.09, 0.15))]),
+        ("dark green", "bottle", [SHAPES["bottle"](draw) for _ in range(2)]),
+        ("light blue", "vase", [SHAPES["vase"](draw)]),
+    )
+    kinds = [(colour, shape, body) for colour, shape, own in bodies for body in own]
     held = {6: ("on", 0), 9: ("on", 8), 12: ("in", 11), 15: ("under", 14)}
     heights = {0: float(2 * low[0][0].bound[2]), 8: 0.008, 11: 0.018, 14: 0.0}
     free = [k for k in range(len(kinds)) if k not in held]

@@ -58,7 +58,7 @@ def select_text(labels: Int[Array, " n"], cosines: Float[Array, "n q"], query: i
     return Selection(mask, similarity, jnp.asarray(-1, jnp.int32), jnp.max(similarity, initial=0.0))
 
 
-@functools.partial(jax.jit, static_argnames=("siblings", "reach"))
+@functools.partial(jax.jit, static_argnames="siblings")
 def select_leaf(
     leaf_features: Float[Array, "l e"],
     leaf_codes: Float[Array, "l d"],
@@ -66,7 +66,6 @@ def select_leaf(
     text: Float[Array, " e"],
     *,
     siblings: int,
-    reach: float = LEAF_REACH,
 ) -> Selection:
     """The Gaussians of the leaf most similar to the text, without threshold, and of those of the next nine that are
     its siblings with a near code.
@@ -79,7 +78,7 @@ def select_leaf(
     cosines = jnp.where(known, cosine_matrix(leaf_features, text[None])[:, 0], -jnp.inf)
     order = jnp.argsort(-cosines)
     best, rest = order[0], order[1 : 1 + NEXT_BEST]
-    near = safe_norm(leaf_codes[rest] - leaf_codes[best]) < reach
+    near = safe_norm(leaf_codes[rest] - leaf_codes[best]) < LEAF_REACH
     along = (jnp.abs(rest - best) < siblings) & near & known[rest]
     chosen = jnp.zeros(len(leaf_features), bool).at[best].set(known[best]).at[rest].max(along)
     mask = (leaf_of >= 0) & chosen[jnp.maximum(leaf_of, 0)]

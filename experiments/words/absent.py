@@ -26,9 +26,9 @@ SEEN = {
 """what the pictures show or may show beside the names of their truth"""
 
 
-def absent_names(texts: TextVectors, scene: str, present: tuple[str, ...], *, least: float = LEAST) -> tuple[str, ...]:
+def absent_names(texts: TextVectors, scene: str, present: tuple[str, ...]) -> tuple[str, ...]:
     """The names of the table that are absent from a scene whose things have the names `present`."""
     known = [name for name in (*present, *SEEN.get(scene, "").split(", ")) if name in texts]
     nearest = (texts.vectors @ texts.embed(known).T).max(axis=1)
     left_out = ALWAYS | set(known)
-    return tuple(name for name, near in zip(texts.names, nearest) if near < least and name not in left_out)
+    return tuple(name for name, near in zip(texts.names, nearest) if near < LEAST and name not in left_out)

@@ -84,15 +84,13 @@ def best_text(table: Float[np.ndarray, "q r"]) -> Bool[np.ndarray, "q r"]:
     return (np.arange(len(table))[:, None] == table.argmax(axis=0)) & np.isfinite(table)
 
 
-def selected(
-    votes: Votes, chosen: Bool[np.ndarray, "q r"], threshold: float = SHARE_THRESHOLD
-) -> Bool[np.ndarray, "q n"]:
-    """The Gaussians that lie in the chosen regions with a share of at least `threshold`."""
+def selected(votes: Votes, chosen: Bool[np.ndarray, "q r"]) -> Bool[np.ndarray, "q n"]:
+    """The Gaussians that lie in the chosen regions with a share of at least `SHARE_THRESHOLD`."""
     votes = jax.tree.map(jnp.asarray, votes)
     rows = []
     for own in chosen:
         share, known = _share(votes, jnp.asarray(own))
-        rows.append(np.asarray(known & (share >= threshold)))
+        rows.append(np.asarray(known & (share >= SHARE_THRESHOLD)))
     return np.stack(rows)
 
 
@@ -138,9 +136,9 @@ def auc(present: Float[np.ndarray, " p"], absent: Float[np.ndarray, " a"]) -> fl
     return float(above + 0.5 * (present[:, None] == absent[None]).mean())
 
 
-def interval(values: Float[np.ndarray, " n"], *, seed: int = 0, draws: int = 10_000) -> tuple[float, float]:
+def interval(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
     """The middle 95 % of the mean under resampling of its values: classes, or (class, scene) pairs."""
-    rng = np.random.default_rng(seed)
-    means = np.asarray(values, float)[rng.integers(0, len(values), (draws, len(values)))].mean(axis=1)
+    drawn = np.random.default_rng(0).integers(0, len(values), (10_000, len(values)))
+    means = np.asarray(values, float)[drawn].mean(axis=1)
     low, high = np.quantile(means, (0.025, 0.975))
     return float(low), float(high)
