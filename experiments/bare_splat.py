@@ -8,6 +8,8 @@ turned, scaled by 0.01 to 100 and shifted at random, and `jsecon run scene.ply` 
 
 - label mIoU: for each true object (the demo's field of exact masks), the best IoU of its Gaussians with those of one
   region; a Gaussian belongs to its strongest region if that has half of its weight. The ratio is bare / photographs.
+- selection IoU: of the Gaussians of the regions that match a true object best in both fields, over all objects, over
+  those that both fields find (IoU of at least 0.5), and its median.
 - matched: share of the regions of the field with photographs (of at least 50 Gaussians) that a region of the bare
   field matches by an IoU of at least 0.5.
 """
@@ -47,22 +49,34 @@ def strongest_regions(field: jsecon.LanguageField) -> np.ndarray:
     return np.where(weights >= 0.5 * np.asarray(votes.total), regions, -1)
 
 
-def best_iou(labels: np.ndarray, members: np.ndarray) -> float:
-    """The largest IoU of a region of `labels` (N,) with a set of Gaussians (N,)."""
+def best_match(labels: np.ndarray, members: np.ndarray) -> tuple[float, int]:
+    """The region of `labels` (N,) with the largest IoU with a set of Gaussians (N,), and that IoU."""
     ids, shared = np.unique(labels[members & (labels >= 0)], return_counts=True)
+    if not len(ids):
+        return 0.0, -1
     sizes = np.array([(labels == region).sum() for region in ids])
-    return float((shared / (sizes + members.sum() - shared)).max(initial=0))
+    overlaps = shared / (sizes + members.sum() - shared)
+    return float(overlaps.max()), int(ids[overlaps.argmax()])
 
 
 def compare(photographs: np.ndarray, bare: np.ndarray, truth: np.ndarray | None) -> dict[str, float]:
     """The figures of one scene, from the strongest regions of its Gaussians (N,) in each field."""
     ids = [k for k in np.unique(photographs[photographs >= 0]) if (photographs == k).sum() >= SMALLEST]
-    figures = {"matched": float(np.mean([best_iou(bare, photographs == k) >= 0.5 for k in ids]))}
+    figures = {"matched": float(np.mean([best_match(bare, photographs == k)[0] >= 0.5 for k in ids]))}
     if truth is None:
         return figures
-    objects = [truth == k for k in np.unique(truth[truth >= 0])]
-    mine, other = (float(np.mean([best_iou(labels, own) for own in objects])) for labels in (photographs, bare))
-    return figures | {"photographs": mine, "bare": other, "ratio": other / mine}
+    rows = []
+    for k in np.unique(truth[truth >= 0]):
+        members = truth == k
+        with_photographs, region = best_match(photographs, members)
+        without, other = best_match(bare, members)
+        a, b = photographs == region, bare == other
+        rows.append((with_photographs, without, (a & b).sum() / max((a | b).sum(), 1)))
+    mine, theirs, shared = np.array(rows).T
+    figures |= {"photographs": mine.mean(), "bare": theirs.mean(), "ratio": theirs.mean() / mine.mean()}
+    both = np.minimum(mine, theirs) >= 0.5
+    figures |= {"selection_iou": shared.mean(), "of_both": shared[both].mean(), "median": np.median(shared)}
+    return {name: float(value) for name, value in figures.items()}
 
 
 def bare_field(field: jsecon.LanguageField, seed: int, folder: Path, views: int) -> tuple[jsecon.LanguageField, float]:

@@ -43,8 +43,6 @@ BLANK_ALPHA = 0.03
 """mean alpha below which a view shows no scene"""
 FULL_WEIGHT = 0.3
 """px of rendering weight, in a candidate, with which a Gaussian counts as seen"""
-SEEN_SHARE = 4
-"""each Gaussian shall be seen in one of this many views"""
 COVERED_GAUSSIANS = 100_000
 """Gaussians that the cover looks at, evenly spaced"""
 VIEWS_AT_ONCE = 64
@@ -170,8 +168,9 @@ def greedy_cover(
 ) -> tuple[np.ndarray, float]:
     """Chooses views that show the scene, one after the other, each time the one that adds most.
 
-    A view shows a Gaussian fully from `FULL_WEIGHT` on, and each Gaussian is wanted in one of `SEEN_SHARE` views. The
-    gain is submodular, so the choice is within 1 - 1/e of the best one.
+    What a Gaussian adds grows with the logarithm of its rendering weight in all chosen views, so that a near view of a
+    small thing still counts when others have shown it. This value is submodular: the choice is within 1 - 1/e of the
+    best one.
 
     Args:
       weights: (V, N) rendering weight of each Gaussian in each candidate, px.
@@ -181,9 +180,8 @@ def greedy_cover(
     Returns:
       Indices of the chosen candidates, at most `views`; and the share of the importance that they show at least once.
     """
-    shown = np.minimum(weights / FULL_WEIGHT, 1).astype(np.float32)
+    shown = (weights / FULL_WEIGHT).astype(np.float32)
     importance = importance.astype(np.float32)
-    target = max(views / SEEN_SHARE, 1.0)
     covered = np.zeros(weights.shape[1], np.float32)
     chosen: list[int] = []
     bound = np.full(len(shown), np.inf)
@@ -193,12 +191,12 @@ def greedy_cover(
         for index in np.argsort(-bound, kind="stable"):  # lazy: a gain never grows
             if bound[index] <= gain:
                 break
-            bound[index] = float(importance @ (np.minimum(covered + shown[index], target) - covered))
+            bound[index] = float(importance @ np.log1p(shown[index] / (1 + covered)))
             if bound[index] > gain:
                 best, gain = int(index), bound[index]
         chosen.append(best)
-        covered = np.minimum(covered + shown[best], target)
-    once = np.minimum(shown[chosen].sum(0), 1)
+        covered += shown[best]
+    once = np.minimum(covered, 1)
     return np.array(chosen), float(importance @ once / max(importance.sum(), 1e-30))
 
 
