@@ -245,6 +245,27 @@ def test_a_room_is_seen_from_inside_and_an_object_from_around(room, object_alone
         assert planned.coverage > 0.7
 
 
+def test_no_view_looks_through_fog():
+    """Wide Gaussians beside the balls fill the views from there, as floaters do in fitted scenes."""
+    fog = np.random.default_rng(0).uniform([2.0, -1.5, 0], [3.2, 1.5, 2.5], (600, 3))
+    scene = scene_of([*balls(), (fog, (0.5, 0.5, 0.5), 0.3)])
+
+    def most_fog():
+        cameras = plan_views(scene, views=16, width=160, height=120, up=np.array([0, 0, 1.0])).cameras
+        assert len(cameras) == 16
+        labels = np.full((16, 120, 160), -1, np.int32)
+        weights = np.asarray(jsecon.region_votes(scene, cameras, labels, 1, top=1, by_view=True).by_view)
+        depth = np.stack([camera.world_to_camera[2, :3] @ scene.means.T for camera in cameras])
+        depth += np.asarray(cameras.world_to_camera)[:, 2, 3:]
+        wide = np.exp(scene.log_scales[:, 0]) * cameras.fx[:, None] > 0.1 * 160 * depth
+        return ((weights * wide).sum(1) / weights.sum(1)).max()
+
+    assert most_fog() < 0.45
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plan, "FOG_SHARE", 2)
+        assert most_fog() > 0.9
+
+
 @pytest.mark.parametrize(("change", "clause"), [
     (lambda g: {"opacity_logits": np.full(g.count, -9.0, np.float32)}, "visible"),
     (lambda g: {"means": np.zeros_like(g.means)}, "one place"),

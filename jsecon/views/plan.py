@@ -41,6 +41,8 @@ BELOW = (-25.0, -50.0)
 """degrees of further orbits where the up axis is not sure"""
 BLANK_ALPHA = 0.03
 """mean alpha below which a view shows no scene"""
+FOG_WIDTH, FOG_SHARE = 0.1, 0.4
+"""a view is fog if Gaussians with a standard deviation above this share of its width have this share of its weight"""
 FULL_WEIGHT = 0.3
 """px of rendering weight, in a candidate, with which a Gaussian counts as seen"""
 COVERED_GAUSSIANS = 100_000
@@ -121,13 +123,15 @@ def plan_views(
     def report(start: int) -> Callable[[int], None]:
         return lambda done: None if progress is None else progress(start + done, total)
 
-    seen, alpha = _weights_by_view(gaussians, inside, counted, frame.diagonal, report(0))
+    seen, alpha, fog = _weights_by_view(gaussians, inside, counted, frame.diagonal, report(0))
     kind = "room" if _is_room(alpha, len(places)) else "object"
     candidates = inside
     if kind == "object":
         candidates = orbits
-        seen, alpha = _weights_by_view(gaussians, orbits, counted, frame.diagonal, report(len(inside)))
+        seen, alpha, fog = _weights_by_view(gaussians, orbits, counted, frame.diagonal, report(len(inside)))
     usable = np.flatnonzero(alpha >= BLANK_ALPHA)
+    clear = usable[fog[usable] < FOG_SHARE]
+    usable = clear if len(clear) >= views else usable  # a scene of few large Gaussians has no clear view
     if not len(usable):
         remedy = "Open it in a viewer to check it, or give cameras of your own with --cameras FILE."
         raise InputError("scene", "no virtual view shows it", "", remedy)
@@ -267,17 +271,24 @@ def _cameras(poses: np.ndarray, width: int, height: int) -> Camera:
 
 def _weights_by_view(
     gaussians: Gaussians, poses: np.ndarray, counted: np.ndarray, diagonal: float, report: Callable[[int], None]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the weight of some Gaussians in each small view (V, M), and the mean alpha of each view (V,)."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the weight of some Gaussians in each small view (V, M), and the mean alpha and the fog of each (V,)."""
     seen = np.zeros((len(poses), len(counted)), np.float32)
-    alpha = np.zeros(len(poses))
+    alpha, fog = np.zeros((2, len(poses)))
     cameras = _cameras(poses, CANDIDATE_WIDTH, CANDIDATE_HEIGHT)
     labels = np.full((VIEWS_AT_ONCE, CANDIDATE_HEIGHT, CANDIDATE_WIDTH), -1, np.int32)
+    means = np.asarray(gaussians.means, np.float64)[counted]
+    widest = np.exp(np.asarray(gaussians.log_scales, np.float64)[counted].max(1))
     for start in range(0, len(poses), VIEWS_AT_ONCE):
         rows = np.minimum(np.arange(start, start + VIEWS_AT_ONCE), len(poses) - 1)  # one program for all chunks
         votes = region_votes(gaussians, cameras[rows], labels, 1, top=1, by_view=True, near=NEAR * diagonal)
         by_view = np.asarray(votes.by_view)[: len(poses) - start]
-        seen[start : start + len(by_view)] = by_view[:, counted]
-        alpha[start : start + len(by_view)] = by_view.sum(1) / (CANDIDATE_WIDTH * CANDIDATE_HEIGHT)
+        for view, weights in enumerate(by_view, start):
+            seen[view] = weights[counted]
+            alpha[view] = weights.sum() / (CANDIDATE_WIDTH * CANDIDATE_HEIGHT)
+            with np.errstate(invalid="ignore"):  # centres that are not finite have no weight
+                depth = means @ poses[view, 2, :3] + poses[view, 2, 3]
+            wide = widest * cameras.fx[view] > FOG_WIDTH * CANDIDATE_WIDTH * depth
+            fog[view] = seen[view, wide].sum() / max(seen[view].sum(), 1e-30)
         report(min(start + VIEWS_AT_ONCE, len(poses)))
-    return seen, alpha
+    return seen, alpha, fog
