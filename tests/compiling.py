@@ -13,7 +13,7 @@ _KNOWN = tuple(map(int, importlib.metadata.version("jaxlib").split(".")[:2])) < 
 EMITTERS = {"xla_cpu_use_fusion_emitters": False} if _KNOWN else {}
 FAST = {**EMITTERS, "xla_backend_optimization_level": 0, "xla_cpu_parallel_codegen_split_count": 1}
 """options of most programs: a fifth of XLA's CPU time with its defaults. They stand in XLA_FLAGS, so that subprocesses
-share the compiled programs on disk."""
+compile fast too."""
 SHIPPED = {
     **{name: True for name in EMITTERS},
     "xla_backend_optimization_level": 3,
@@ -37,14 +37,19 @@ _state = {"shipped": False}
 def install() -> None:
     """Makes jax compile each further program of this process with the options of `choose`.
 
-    MLIR's dialects are loaded once for LOWERED programs of a thread, which takes a tenth of a small program's time. And
-    jnp.asarray copies NumPy's arrays itself, in place of a program for each shape.
+    MLIR's dialects are loaded once for LOWERED programs of a thread, which takes a tenth of a small program's time.
+    jnp.asarray copies NumPy's arrays itself, in place of a program for each shape. And `stored_jit` stores one program
+    of each function, see `_store_one`. Call it before modules are imported that use it.
     """
     import jax
     import jax._src.compiler as compiler
     import numpy as np
     from jax._src.interpreters import mlir
     from jax._src.lax import lax
+
+    from jsecon import programs
+
+    programs.stored_jit = _store_one(programs.stored_jit)
 
     if hasattr(lax, "stage_p"):  # of some versions of jax
         lax.stage_p.def_impl(lambda value: jax.device_put(value.copy() if isinstance(value, np.ndarray) else value))
@@ -71,10 +76,34 @@ def install() -> None:
     compiler.compile_or_get_cached = chosen
 
 
+def _store_one(stored_jit):
+    """`stored_jit` that stores the trace of a function for the first shapes alone, and all of them if `shipped`.
+
+    To store a trace takes as long as to trace and lower twice more. Elsewhere it is jax.jit, which shares XLA's work.
+    """
+    import jax
+    import numpy as np
+
+    @functools.wraps(stored_jit)
+    def store_one(function, *, static_argnums=()):
+        stored, plain = (jitted(function, static_argnums=static_argnums) for jitted in (stored_jit, jax.jit))
+        first = []
+
+        @functools.wraps(function)
+        def call(*args):
+            shapes = [np.shape(leaf) for leaf in jax.tree.leaves(args)]
+            first.extend([shapes] * (not first))
+            return (stored if _state["shipped"] or shapes == first[0] else plain)(*args)
+
+        return call
+
+    return store_one
+
+
 def choose(*, shipped: bool) -> None:
     """Sets the options of further programs: XLA's defaults if `shipped`, else FAST, with LOOPS for training loops.
 
-    A change of `shipped` clears the compiled programs. On disk, jax's keys tell both kinds apart.
+    A change of `shipped` clears the compiled programs.
     """
     import jax
 
