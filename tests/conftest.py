@@ -21,8 +21,13 @@ os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count=2 {c
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of a worker: threads of several wait by spinning
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-# glibc of workers and subprocesses: freed memory is used again without a search, 5 % of a small program's time
-os.environ.setdefault("GLIBC_TUNABLES", "glibc.malloc.tcache_count=4000")
+# glibc of workers and subprocesses: freed memory is used again without a search, 5 % of a small program's time, and
+# never goes back to the kernel, whose new pages take 1 % of a test's (as `prepare_process` sets it)
+os.environ.setdefault(
+    "GLIBC_TUNABLES",
+    "glibc.malloc.tcache_count=4000:glibc.malloc.mmap_threshold=2147483647:"
+    "glibc.malloc.trim_threshold=2147483647:glibc.malloc.top_pad=67108864",
+)
 os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")  # as the command line sets them
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
