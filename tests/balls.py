@@ -1,9 +1,9 @@
 """A small world that several test files look at: three balls on a disc, seen from a ring of cameras."""
 
 import numpy as np
-from conftest import look_at
+from conftest import gaussians_at, look_at
 
-from jsecon.types import Camera, Gaussians
+from jsecon.types import Camera
 
 WIDTH, HEIGHT, VIEWS = 96, 72, 24
 COLOURS = np.asarray([(150, 150, 150), (200, 40, 40), (40, 90, 200), (60, 160, 60)], np.uint8)
@@ -25,14 +25,7 @@ def ring_of_balls():
     floor = np.stack([away * np.cos(turn), np.zeros(2500), away * np.sin(turn)], -1)
     points = np.concatenate([floor, *(sphere(rng, centre, 0.92 * radius, 1500) for centre, radius in balls)])
     scales = np.concatenate([np.full(2500, 0.035), *(np.full(1500, 0.055 * radius) for _, radius in balls)])
-    count = len(points)
-    gaussians = Gaussians(
-        means=points.astype(np.float32),
-        log_scales=np.log(np.repeat(scales[:, None], 3, 1)).astype(np.float32),
-        quaternions=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
-        opacity_logits=np.full(count, 3.0, np.float32),
-        sh=np.zeros((count, 1, 3), np.float32),
-    )
+    gaussians = gaussians_at(points, scales[:, None])
     centres = [(2.2 * np.sin(a), -1.0, -2.2 * np.cos(a)) for a in 2 * np.pi * np.arange(VIEWS) / VIEWS]
     poses = np.stack([look_at(centre, (0.0, -0.2, 0.0)) for centre in centres])
     ones = np.ones(VIEWS, np.float32)

@@ -155,6 +155,13 @@ def scene() -> Gaussians:
     )
 
 
+def gaussians_at(means, size, *, turns=(1, 0, 0, 0), logit=3.0, sh=((0, 0, 0),)) -> Gaussians:
+    """Float32 Gaussians at `means` (N, 3); standard deviations, turns, opacities and harmonics of each or of all."""
+    shapes = (3,), (3,), (4,), (), np.shape(sh)[-2:]
+    columns = zip((means, np.log(size), turns, logit, sh), shapes)
+    return Gaussians(*(np.array(np.broadcast_to(a, (len(means), *shape)), np.float32) for a, shape in columns))
+
+
 def look_at(centre, target=(0.0, 0.0, 0.0), up=(0.0, -1.0, 0.0), dtype=np.float32) -> np.ndarray:
     """(4, 4) world_to_camera, OpenCV axes, of a camera at `centre` that looks at `target`."""
     centre, target, up = (np.asarray(v, np.float64) for v in (centre, target, up))

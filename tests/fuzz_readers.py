@@ -63,6 +63,18 @@ def _finite(*arrays) -> None:
         assert np.isfinite(np.asarray(array)).all(), "numbers that are not finite"
 
 
+def _array(shape: tuple[int | None, ...], kind: type, low: float = -np.inf, high: float = np.inf) -> Callable:
+    """The check of an array of finite numbers; None stands for any size."""
+
+    def whole(found: np.ndarray) -> None:
+        assert found.dtype == kind
+        assert found.shape == tuple(size or own for size, own in zip(shape, found.shape, strict=True))
+        _finite(found)
+        assert ((found >= low) & (found <= high)).all()
+
+    return whole
+
+
 def _gaussians(count: int, basis: int) -> Gaussians:
     rng = np.random.default_rng(count)
     shapes = [(count, 3), (count, 3), (count, 4), (count,), (count, basis, 3)]
@@ -263,14 +275,8 @@ def image(folder: Path) -> Iterator[Case]:
     cv2.imwrite(str(folder / "depth.png"), rng.integers(0, 60000, (30, 40)).astype(np.uint16))
     np.save(folder / "depth.npy", rng.random((30, 40, 1)))
 
-    def whole_depth(found) -> None:
-        assert found.ndim == 2
-        assert found.dtype == np.float32
-        _finite(found)
-        assert (found >= 0).all()
-
     for file in (folder / "depth.png", folder / "depth.npy"):
-        yield Case([file], lambda file=file: images.read_depth(file, 0.001), whole_depth)
+        yield Case([file], lambda file=file: images.read_depth(file, 0.001), _array((None, None), np.float32, 0))
 
 
 def masks(folder: Path) -> Iterator[Case]:
@@ -308,14 +314,9 @@ def masks(folder: Path) -> Iterator[Case]:
         np.save(folder / "levels" / f"{name}_s.npy", np.broadcast_to(image - 1, (4, 24, 36)).astype(np.float32))
     yield Case(sorted((folder / "levels").iterdir()), lambda: load_labels(folder / "levels", names, (24, 36)), whole)
     field = dataclasses.replace(_field(), cameras=Camera(np.eye(4)[None], *np.ones((4, 1)), 36, 24))
-
-    def whole_outline(found: np.ndarray) -> None:
-        assert found.shape == (24, 36)
-        assert found.dtype == bool
-
     for kind in ("grey", "colour", "bits"):
         file = folder / kind / "a.png"
-        yield Case([file], lambda file=file: ask.read_mask(file, field), whole_outline)
+        yield Case([file], lambda file=file: ask.read_mask(file, field), _array((24, 36), bool))
 
 
 def langsplat(folder: Path) -> Iterator[Case]:
@@ -366,8 +367,7 @@ def proposals(folder: Path) -> Iterator[Case]:
 
     def whole(found) -> None:
         for masks in found:
-            assert masks.dtype == bool
-            assert masks.shape == (len(masks), 20, 30)
+            _array((None, 20, 30), bool)(masks)
 
     files = sorted(folder.iterdir())
     yield Case(files[:2] * 3 + files[2:], read, whole)
@@ -375,14 +375,8 @@ def proposals(folder: Path) -> Iterator[Case]:
 
 def labels(folder: Path) -> Iterator[Case]:
     """LERF's labels as LangSplat has them."""
-    thing = {
-        "category": "red mug",
-        "group": 1,
-        "segmentation": [[1, 2], [9, 3], [5, 9.5]],
-        "area": 9.0,
-        "bbox": [1, 2, 9, 9],
-        "iscrowd": 0,
-    }
+    shape = {"segmentation": [[1, 2], [9, 3], [5, 9.5]], "area": 9.0, "bbox": [1, 2, 9, 9]}
+    thing = {"category": "red mug", "group": 1, "iscrowd": 0} | shape
     for name in ("frame_1", "frame_2"):
         content = {
             "info": {"name": f"{name}.jpg", "width": 30, "height": 20, "note": ""},
@@ -534,12 +528,7 @@ def kept(folder: Path) -> Iterator[Case]:
 
     stored = StoredSegmenter(Fixed(), folder / "masks")  # pyright: ignore[reportArgumentType]
     stored(frame, 0)
-
-    def whole_masks(found: np.ndarray) -> None:
-        assert found.shape[1:] == (6, 8)
-        assert found.dtype == bool
-
-    yield Case(sorted((folder / "masks").iterdir()), lambda: stored(frame, 0), whole_masks)
+    yield Case(sorted((folder / "masks").iterdir()), lambda: stored(frame, 0), _array((None, 6, 8), bool))
 
 
 def tokenizer(folder: Path) -> Iterator[Case]:
@@ -549,12 +538,7 @@ def tokenizer(folder: Path) -> Iterator[Case]:
     def read() -> np.ndarray:
         return TextTokenizer(folder / "tokenizer.json")(["a red mug's 12 handles", "", "é<end_of_text>"], CLIP_LENGTH)
 
-    def whole(found: np.ndarray) -> None:
-        assert found.shape == (3, 77)
-        assert found.dtype == np.int64
-        assert found.min() >= 0
-
-    yield Case([folder / "tokenizer.json"], read, whole)
+    yield Case([folder / "tokenizer.json"], read, _array((3, 77), np.int64, 0))
 
 
 def _inputs_of(folder: Path) -> list[Path]:
@@ -598,13 +582,9 @@ def sam(folder: Path) -> Iterator[Case]:
         segmenter.check()
         return segmenter(frame, 0)
 
-    def whole(found: np.ndarray) -> None:
-        assert found.shape[1:] == (24, 32)
-        assert found.dtype == bool
-
     for name in ("sam", "sam2"):
         write_sam(folder / name, name, side=64)
-        yield Case(_inputs_of(folder / name), lambda name=name: read(name), whole)
+        yield Case(_inputs_of(folder / name), lambda name=name: read(name), _array((None, 24, 32), bool))
 
 
 def sam2(folder: Path) -> Iterator[Case]:
@@ -616,12 +596,8 @@ def sam2(folder: Path) -> Iterator[Case]:
         tracker.check()
         return tracker(frames, 0, prompt)
 
-    def whole(found: np.ndarray) -> None:
-        assert found.shape == (2, 16, 16)
-        assert -1 <= found.min() <= found.max() < 1
-
     write_sam2(folder)
-    yield Case(_inputs_of(folder), read, whole)
+    yield Case(_inputs_of(folder), read, _array((2, 16, 16), np.int16, -1, 0))
 
 
 def sam3(folder: Path) -> Iterator[Case]:
@@ -634,9 +610,8 @@ def sam3(folder: Path) -> Iterator[Case]:
         return model(frame, "red mug")
 
     def whole(found: PhraseMasks) -> None:
-        assert found.masks.shape == (len(found.scores), 24, 32)
-        assert found.masks.dtype == bool
-        assert np.isfinite(found.scores).all()
+        _array((len(found.scores), 24, 32), bool)(found.masks)
+        _finite(found.scores)
 
     for name in SAM3_KINDS:
         write_sam3(folder / name, name, side=56)

@@ -131,8 +131,8 @@ def lone_votes(regions, count: int) -> Votes:
     return Votes(np.int32(regions)[:, None], ones[:, None], ones, ones, ones, views, np.int32(0), count)
 
 
-def field_of(votes: Votes, regions: Regions) -> LanguageField:
-    """A field of votes and regions; its Gaussians and codes mean nothing."""
+def field_of(votes: Votes, regions: Regions, **own) -> LanguageField:
+    """A field of votes and regions, and of its `own` parts; else its Gaussians and codes mean nothing."""
     count = votes.regions.shape[0]
     zeros = np.zeros((count, 3), np.float32)
     gaussians = Gaussians(zeros, zeros, np.ones((count, 4), np.float32), zeros[:, 0], zeros[:, None])
@@ -140,4 +140,5 @@ def field_of(votes: Votes, regions: Regions) -> LanguageField:
     camera = Camera(np.eye(4)[None], one, one, one, one, 4, 4)
     codes = np.ones((count, 2), np.float32)
     table, canonical = np.ones((regions.count, 2), np.float32), np.zeros((0, 8))
-    return LanguageField(gaussians, codes, votes, regions, table, None, camera, canonical, np.eye(4), ("a",))
+    made = LanguageField(gaussians, codes, votes, regions, table, None, camera, canonical, np.eye(4), ("a",))
+    return dataclasses.replace(made, **own)

@@ -4,9 +4,10 @@ World: z up; the cameras look along y, x is to the right.
 """
 
 import numpy as np
+from conftest import gaussians_at
 
 from jsecon.demo.capture import look_at
-from jsecon.types import Camera, Gaussians, LanguageField, Regions, Votes
+from jsecon.types import Camera, LanguageField, Regions, Votes
 from jsecon.vision.colours import ColourEmbedder
 
 THINGS = (
@@ -27,9 +28,7 @@ def table_field(things=THINGS, *, to_source=None, directions=((0.0, -2.0, 0.8),)
     points = [np.array(center) + np.array(half) * draw.uniform(-1, 1, (120, 3)) for _, center, half in things]
     count = 120 * len(things)
     means = np.concatenate(points).astype(np.float32)
-    scales = np.full((count, 3), np.log(2e-3), np.float32)
-    turns = np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1))
-    gaussians = Gaussians(means, scales, turns, np.full(count, 3, np.float32), np.zeros((count, 1, 3), np.float32))
+    gaussians = gaussians_at(means, 2e-3)
     member = np.repeat(np.arange(len(things), dtype=np.int32), 120)[:, None]
     ones = np.ones(count, np.float32)
     views = np.full(count, len(directions), np.int32)

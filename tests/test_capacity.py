@@ -5,6 +5,7 @@ import functools
 import jax
 import numpy as np
 import pytest
+from conftest import gaussians_at
 
 from jsecon.language.votes import region_votes
 from jsecon.parallel import host_mesh
@@ -24,13 +25,8 @@ COVERING = 1100
 def covering() -> Gaussians:
     """Faint Gaussians, each of which covers the whole image of any camera of the ring, all at other depths."""
     rng = np.random.default_rng(4)
-    return Gaussians(
-        means=rng.uniform(-0.3, 0.3, (COVERING, 3)).astype(np.float32),
-        log_scales=np.full((COVERING, 3), 1.5, np.float32),
-        quaternions=rng.normal(size=(COVERING, 4)).astype(np.float32),
-        opacity_logits=rng.uniform(-4.8, -4.0, COVERING).astype(np.float32),
-        sh=np.zeros((COVERING, 1, 3), np.float32),
-    )
+    means, turns = rng.uniform(-0.3, 0.3, (COVERING, 3)), rng.normal(size=(COVERING, 4))
+    return gaussians_at(means, np.exp(1.5), turns=turns, logit=rng.uniform(-4.8, -4.0, COVERING))
 
 
 def features_of(count, channels=3):

@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_field import seen_of, unit_rows
+from small_field import field_of, seen_of, unit_rows
 
 from jsecon.query import classes
 from jsecon.query.rules import QueryRules
-from jsecon.types import Camera, Gaussians, LanguageField, Regions, Votes
+from jsecon.types import Regions, Votes
 from jsecon.vision.protocols import Logits
 
 SIZE, REGIONS, KEPT = 12, 6, 3
@@ -29,16 +29,10 @@ def made_field(count, *, regions=REGIONS, seed=0):
     views, peak = np.full(count, 3, np.int32), np.full(count, 0.5, np.float32)
     shown = np.where(ids >= 0, weights * rng.uniform(1, 3, weights.shape), 0).astype(np.float32)
     votes = Votes(ids, weights, labelled, labelled + 1, peak, views, np.int32(0), regions, shown=shown)
-    zero = np.zeros((count, 3), np.float32)
-    gaussians = Gaussians(zero, zero, np.ones((count, 4), np.float32), zero[:, 0], np.zeros((count, 1, 3), np.float32))
-    one = np.ones(1, np.float32)
     table = unit_rows(rng, regions, 4)
     known = Regions(unit_rows(rng, regions, SIZE), rng.integers(1, 900, (regions, 2)).astype(np.int32))
-    return LanguageField(
-        gaussians, np.zeros((count, 4), np.float32), votes, known, table, None,
-        Camera(np.eye(4, dtype=np.float32)[None], one, one, one, one, width=4, height=4),
-        unit_rows(rng, 4, SIZE), np.eye(4), ("only",),
-    )  # fmt: skip
+    codes, canonical = np.zeros((count, 4), np.float32), unit_rows(rng, 4, SIZE)
+    return field_of(votes, known, codes=codes, region_codes=table, canonical=canonical)
 
 
 def exact(field, similarity, least):

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import look_at
+from conftest import gaussians_at, look_at
 from scipy.linalg import expm
 
 from jsecon.errors import InputError
@@ -27,7 +27,7 @@ from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.start import starting_gaussians
 from jsecon.fit.step import TrainingViews, cameras_extent, view_loss
 from jsecon.splat.render import render
-from jsecon.types import Camera, Capture, Gaussians
+from jsecon.types import Camera, Capture
 
 KEY, VIEWS = jax.random.key(0), 6
 FROZEN = LearningRates(means=0.0, means_last=0.0, log_scales=0.0, quaternions=0.0, opacity_logits=0.0, colors=0.0)
@@ -46,13 +46,9 @@ def _one_size(monkeypatch):
 @pytest.fixture(scope="module")
 def truth():
     rng = np.random.default_rng(0)
-    return Gaussians(
-        rng.uniform(-0.7, 0.7, (40, 3)).astype(np.float32),
-        np.log(rng.uniform(0.1, 0.25, (40, 3))).astype(np.float32),
-        rng.normal(size=(40, 4)).astype(np.float32),
-        rng.uniform(0, 3, 40).astype(np.float32),
-        rng.uniform(-1.5, 1.2, (40, 1, 3)).astype(np.float32),
-    )
+    means, sizes = rng.uniform(-0.7, 0.7, (40, 3)), rng.uniform(0.1, 0.25, (40, 3))
+    turns, logit = rng.normal(size=(40, 4)), rng.uniform(0, 3, 40)
+    return gaussians_at(means, sizes, turns=turns, logit=logit, sh=rng.uniform(-1.5, 1.2, (40, 1, 3)))
 
 
 def photographed(truth, poses):

@@ -93,14 +93,11 @@ def test_a_stop_and_a_bug_are_error_objects_with_their_own_codes(end, capsys):
     assert json.loads(capsys.readouterr().out)["error"]["problem"] == "internal error: a bug"
 
 
-@pytest.mark.parametrize(
-    ("error", "message"),
-    [
-        (InputError("images.txt", "line 7 has 9 fields", "10", "Export."), "line 7 has 9 fields, expected 10."),
-        (InputError("mug.png", "the file is cut short.", remedy="Copy it again."), "mug.png: the file is cut short. C"),
-        (InputError("", "interrupted", remedy="Run it again."), "interrupted. Run it again."),
-    ],
-)
+@pytest.mark.parametrize(("error", "message"), [
+    (InputError("images.txt", "line 7 has 9 fields", "10", "Export."), "line 7 has 9 fields, expected 10."),
+    (InputError("mug.png", "the file is cut short.", remedy="Copy it again."), "mug.png: the file is cut short. C"),
+    (InputError("", "interrupted", remedy="Run it again."), "interrupted. Run it again."),
+])  # fmt: skip
 def test_an_error_reads_as_sentences(error, message):
     assert message in str(error)
     assert ";" not in str(error)

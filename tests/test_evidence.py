@@ -6,14 +6,14 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import look_at
+from conftest import gaussians_at, look_at
 from small_field import field_of
 
 import jsecon
 from jsecon.app import cli
 from jsecon.language.field import save_field
 from jsecon.language.membership import finish_votes
-from jsecon.types import Camera, Gaussians, Regions, Votes
+from jsecon.types import Camera, Regions, Votes
 from jsecon.vision.colours import PALETTE, ColourEmbedder
 from jsecon.vision.reference_words import reference_of
 
@@ -33,14 +33,7 @@ def two_rooms():
     for what the wall lets through."""
     sheets = [sheet(-0.3, 0.3, 0.1, FRIDGE), sheet(0.0, 0.8, 0.1, WALL), sheet(0.3, 0.3, 0.1, SOFA)]
     means, thing = (np.concatenate(column) for column in zip(*sheets))
-    count = len(means)
-    scene = Gaussians(
-        means.astype(np.float32),
-        np.full((count, 3), np.log(0.05), np.float32),
-        np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
-        np.full(count, 2.5, np.float32),  # the sheets overlap: about a hundredth passes
-        np.zeros((count, 1, 3), np.float32),
-    )
+    scene = gaussians_at(means, 0.05, logit=2.5)  # the sheets overlap: about a hundredth passes
     sides = [(-2.0, y, 0.1) for y in (-0.3, 0.0, 0.3)] + [(2.0, y, 0.1) for y in (-0.3, 0.0, 0.3)]
     lens = (np.full(6, value, np.float32) for value in (40, 40, 16, 16))
     cameras = Camera(np.stack([look_at(eye) for eye in sides]), *lens, width=32, height=32)
@@ -87,8 +80,8 @@ def one_region(scene, cameras, means, *, unseen=()):
     )  # fmt: skip
     gaussians = dataclasses.replace(scene, means=np.asarray(means, np.float32))
     names = tuple(f"frame_{t}" for t in range(4))
-    field = field_of(votes, Regions(np.eye(1, 8, dtype=np.float32), np.full((1, 4), 500)))
-    return dataclasses.replace(field, gaussians=gaussians, cameras=cameras, names=names)
+    regions = Regions(np.eye(1, 8, dtype=np.float32), np.full((1, 4), 500))
+    return field_of(votes, regions, gaussians=gaussians, cameras=cameras, names=names)
 
 
 @pytest.mark.parametrize("options", [(), ("--threshold", 0)])
@@ -149,8 +142,8 @@ def asked_of(embeddings, pixels, text):
     own = np.arange(count, dtype=np.int32)[:, None]
     ones = np.ones(count, np.float32)
     votes = Votes(own, ones[:, None], ones, ones, ones, ones.astype(np.int32), np.int32(0), count)
-    field = field_of(votes, Regions(embeddings, np.repeat(pixels[:, None], 10, 1)))
-    field = dataclasses.replace(field, canonical=COLOURS.canonical, reference=reference_of(COLOURS))
+    own = {"canonical": COLOURS.canonical, "reference": reference_of(COLOURS)}
+    field = field_of(votes, Regions(embeddings, np.repeat(pixels[:, None], 10, 1)), **own)
     rules = jsecon.QueryRules(quantile=0.0)  # all colours but one are there, so most other words match as well
     found = jsecon.query_anchored(field, jnp.asarray(COLOURS.embed_text([text])[0]), rules=rules)
     return int(found.region), float(found.score)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import look_at
+from conftest import gaussians_at, look_at
 
 from jsecon.errors import InputError
 from jsecon.fit import step as one_step
@@ -16,7 +16,7 @@ from jsecon.fit.quality import measure_quality
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.step import cameras_extent
 from jsecon.splat.render import render, render_rgb
-from jsecon.types import Camera, Capture, Gaussians
+from jsecon.types import Camera, Capture
 
 KEY = jax.random.key(0)
 RATES = LearningRates(means=1e-3, means_last=1e-4, log_scales=0.02, colors=0.02, quaternions=0.01)
@@ -34,13 +34,9 @@ WHOLE = Schedule(sizes=((1.0, 1.0),), max_gaussians=0)
 @pytest.fixture(scope="module")
 def truth():
     rng = np.random.default_rng(0)
-    return Gaussians(
-        rng.uniform(-0.7, 0.7, (COUNT, 3)).astype(np.float32),
-        np.log(rng.uniform(0.1, 0.25, (COUNT, 3))).astype(np.float32),
-        rng.normal(size=(COUNT, 4)).astype(np.float32),
-        rng.uniform(0, 3, COUNT).astype(np.float32),
-        rng.uniform(-1.5, 1.5, (COUNT, 1, 3)).astype(np.float32),
-    )
+    means, sizes = rng.uniform(-0.7, 0.7, (COUNT, 3)), rng.uniform(0.1, 0.25, (COUNT, 3))
+    turns, logit = rng.normal(size=(COUNT, 4)), rng.uniform(0, 3, COUNT)
+    return gaussians_at(means, sizes, turns=turns, logit=logit, sh=rng.uniform(-1.5, 1.5, (COUNT, 1, 3)))
 
 
 @pytest.fixture(scope="module")

@@ -146,47 +146,33 @@ def test_other_writers_ways(tmp_path):
     np.testing.assert_allclose(alpha[:30], opacity(scene(30, 4)), atol=0.51 / 255)
 
 
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        (lambda told: told.update(extensionsRequired=["EXT_meshopt_compression"]), "EXT_meshopt_compression"),
-        (lambda told: told["accessors"][0].update(count=1 << 40), "rows of 12 bytes"),
-        (lambda told: told["accessors"][0].update(sparse={}), "sparse"),
-        (lambda told: told["bufferViews"][0].update(byteOffset=-4), "from -4 on"),
-        (lambda told: told["bufferViews"][0].update(byteStride=0), "rows of 0 bytes"),
-        (lambda told: primitive(told)["extensions"].clear(), "no primitive of its scene"),
-        (lambda told: primitive(told)["attributes"].pop(f"{NAME}:SCALE"), f"no attribute {NAME}:SCALE"),
-        (lambda told: primitive(told)["attributes"].pop(f"{NAME}:SH_DEGREE_1_COEF_1"), "3 coeff"),
-        (lambda told: told["nodes"][0].update(children=[0]), "node 0 is in its scene twice"),
-        (lambda told: told["nodes"][0].update(scale=[1, 2, 1]), "node 0 scales its axes unequally, by 1, 2, 1"),
-        (lambda told: told["nodes"][0].update(scale=[1, 1, -1]), "mirrors"),
-        (lambda told: told["nodes"][0].update(scale=[0, 0, 0]), "by 0"),
-        (lambda told: told["nodes"][0].update(matrix=[1, 0, 0, 0, 1, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), "axes"),
-        (lambda told: extension(told).update(colorSpace="lin_rec709_display"), "lin_rec709_display (linear light)"),
-        (lambda told: extension(told).update(projection="fisheye"), "projection of its Gaussians is fisheye"),
-        (lambda told: extension(told).update(extensions={"EXT_x": {}}), "use the extension EXT_x"),
-        (lambda told: told["accessors"][2].update(componentType=5121), "not normalised"),
-        (lambda told: extension(told).update(kernel="cube"), "kernel of its Gaussians is cube"),
-        (lambda told: told["accessors"][4].update(bufferView=0, byteOffset=0), "not finite"),
-        (lambda told: told.update(extensionsRequired=["KHR_materials_unlit", NAME, "KHR_x"]), "extension KHR_x"),
-    ],
-)
+@pytest.mark.parametrize(("change", "says"), [
+    (lambda told: told.update(extensionsRequired=["EXT_meshopt_compression"]), "EXT_meshopt_compression"),
+    (lambda told: told["accessors"][0].update(count=1 << 40), "rows of 12 bytes"),
+    (lambda told: told["accessors"][0].update(sparse={}), "sparse"),
+    (lambda told: told["bufferViews"][0].update(byteOffset=-4), "from -4 on"),
+    (lambda told: told["bufferViews"][0].update(byteStride=0), "rows of 0 bytes"),
+    (lambda told: primitive(told)["extensions"].clear(), "no primitive of its scene"),
+    (lambda told: primitive(told)["attributes"].pop(f"{NAME}:SCALE"), f"no attribute {NAME}:SCALE"),
+    (lambda told: primitive(told)["attributes"].pop(f"{NAME}:SH_DEGREE_1_COEF_1"), "3 coeff"),
+    (lambda told: told["nodes"][0].update(children=[0]), "node 0 is in its scene twice"),
+    (lambda told: told["nodes"][0].update(scale=[1, 2, 1]), "node 0 scales its axes unequally, by 1, 2, 1"),
+    (lambda told: told["nodes"][0].update(scale=[1, 1, -1]), "mirrors"),
+    (lambda told: told["nodes"][0].update(scale=[0, 0, 0]), "by 0"),
+    (lambda told: told["nodes"][0].update(matrix=[1, 0, 0, 0, 1, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), "axes"),
+    (lambda told: extension(told).update(colorSpace="lin_rec709_display"), "lin_rec709_display (linear light)"),
+    (lambda told: extension(told).update(projection="fisheye"), "projection of its Gaussians is fisheye"),
+    (lambda told: extension(told).update(extensions={"EXT_x": {}}), "use the extension EXT_x"),
+    (lambda told: told["accessors"][2].update(componentType=5121), "not normalised"),
+    (lambda told: extension(told).update(kernel="cube"), "kernel of its Gaussians is cube"),
+    (lambda told: told["accessors"][4].update(bufferView=0, byteOffset=0), "not finite"),
+    (lambda told: told.update(extensionsRequired=["KHR_materials_unlit", NAME, "KHR_x"]), "extension KHR_x"),
+])  # fmt: skip
 def test_what_is_none_or_not_known(tmp_path, change, says):
     save_glb(tmp_path / "a.glb", gaussians(scene(30, 4)))
     rewritten(tmp_path / "a.glb", change)
     with refused("a.glb", says):
         load_gaussians(tmp_path / "a.glb")
-
-
-def test_files_cut_short_are_refused(tmp_path):
-    save_glb(tmp_path / "a.glb", gaussians(scene(30, 1)))
-    whole = (tmp_path / "a.glb").read_bytes()
-    for length in [*range(0, len(whole), 97), len(whole) - 1]:
-        (tmp_path / "a.glb").write_bytes(whole[:length])
-        with refused("a.glb"):
-            load_gaussians(tmp_path / "a.glb")
-    with refused("none.glb", "No such file"):
-        load_gaussians(tmp_path / "none.glb")
 
 
 @pytest.mark.parametrize("size", [1, 4, 6, 16])

@@ -216,22 +216,12 @@ def test_faces_round_trip_and_damage(tmp_path):
         read_faces(tmp_path / "points.ply")
 
 
-def test_blocks_of_rows_and_another_world(tmp_path, monkeypatch):
-    """A scene of several blocks is the file of one, each block is carried along, and read back alone."""
-    from jsecon.data.gaussians import ply
-    from jsecon.splat import transform
-
-    scene, turn = random_gaussians(40), np.diag([-2.0, -2.0, 2.0, 1.0])
-    turn[:3, 3] = 1, 2, 3
-    save_ply(tmp_path / "whole.ply", scene)
-    save_ply(tmp_path / "rgb.ply", scene, rgb=np.linspace(0, 1, 120).reshape(40, 3))
-    monkeypatch.setattr(transform, "BLOCK_ROWS", 7)
-    monkeypatch.setattr(ply, "_BLOCK", 9)
-    save_ply(tmp_path / "blocks.ply", scene)
-    save_ply(tmp_path / "rgb_blocks.ply", scene, rgb=np.linspace(0, 1, 120).reshape(40, 3))
+def test_colours_of_blocks_of_rows_are_those_of_one(tmp_path, monkeypatch):
+    """Of all else: test_gaussian_files. What is read in blocks is what was written in one."""
+    scene, rgb = random_gaussians(40), np.linspace(0, 1, 120).reshape(40, 3)
+    save_ply(tmp_path / "whole.ply", scene, rgb=rgb)
+    monkeypatch.setattr("jsecon.splat.transform.BLOCK_ROWS", 7)
+    monkeypatch.setattr("jsecon.data.gaussians.ply._BLOCK", 9)
+    save_ply(tmp_path / "blocks.ply", scene, rgb=rgb)
     assert (tmp_path / "blocks.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
-    assert (tmp_path / "rgb_blocks.ply").read_bytes() == (tmp_path / "rgb.ply").read_bytes()
-    save_ply(tmp_path / "turned.ply", scene, similarity=turn)
-    turned, expected = load_ply(tmp_path / "turned.ply"), transform.transform_gaussians(scene, turn)
-    for name in FIELDS:
-        np.testing.assert_allclose(getattr(turned, name), getattr(expected, name), rtol=1e-5, atol=1e-4)
+    np.testing.assert_array_equal(load_ply(tmp_path / "blocks.ply").means, scene.means)

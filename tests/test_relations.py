@@ -176,19 +176,11 @@ def test_every_spelling_is_understood_and_quotes_protect():
 
 
 @pytest.mark.parametrize(("text", "problem"), [
-    ("", "is empty"),
-    ("  ", "is empty"),
-    ("word " * 5000, "5000 words"),
-    ("mug across from the plate", "'across'"),
-    ("the widest mug", "'widest'"),
-    ("mug near the left plate", "'left'"),
-    ("left of the plate", "no object stands before 'left of'"),
-    ("mug left of", "an object is missing"),
-    ("mug between the plate and", "an object is missing"),
-    ("mug in box on plate near bowl", "3 relations"),
-    ("red mug or bowl on the plate", '"or"'),
-    ("second mug", "needs an order"),
-    ("caf\udce9 on the plate", "not UTF-8"),
+    ("", "is empty"), ("  ", "is empty"), ("word " * 5000, "5000 words"), ("mug across from the plate", "'across'"),
+    ("the widest mug", "'widest'"), ("mug near the left plate", "'left'"),
+    ("left of the plate", "no object stands before 'left of'"), ("mug left of", "an object is missing"),
+    ("mug between the plate and", "an object is missing"), ("mug in box on plate near bowl", "3 relations"),
+    ("red mug or bowl on the plate", '"or"'), ("second mug", "needs an order"), ("caf\udce9 on the plate", "not UTF-8"),
 ])  # fmt: skip
 def test_what_is_not_understood_is_named(text, problem):
     with pytest.raises(InputError, match=problem):
@@ -213,21 +205,14 @@ def test_one_object_and_what_it_was_compared_with(scene):
 
 
 @pytest.mark.parametrize(("text", "regions"), [
-    ("the red mug right of the dark green bottle", [1]),
-    ("the orange ball on the white plate", [4]),
-    ("the white plate under the orange ball", [3]),
-    ("the dark green bottle between the red mugs", [2]),
-    ("the dark blue box behind the dark green bottle", [5]),
-    ("the leftmost red mug", [0]),
-    ("the second red mug from the left", [1]),
-    ("the red mug nearest to the dark blue box", [1]),
-    ("the red mug farthest from the dark blue box", [0]),
-    ("two red mugs", [0, 1]),
-    ("all red mugs", [0, 1]),
+    ("the red mug right of the dark green bottle", [1]), ("the orange ball on the white plate", [4]),
+    ("the white plate under the orange ball", [3]), ("the dark green bottle between the red mugs", [2]),
+    ("the dark blue box behind the dark green bottle", [5]), ("the leftmost red mug", [0]),
+    ("the second red mug from the left", [1]), ("the red mug nearest to the dark blue box", [1]),
+    ("the red mug farthest from the dark blue box", [0]), ("two red mugs", [0, 1]), ("all red mugs", [0, 1]),
     ("the red mug left of the dark green bottle and far from the dark blue box", [0]),
     ("the orange ball on the white plate in front of the dark green bottle", [4]),
-    ("the dark blue box on the white plate", []),
-    ("third red mug from the left", []),
+    ("the dark blue box on the white plate", []), ("third red mug from the left", []),
 ])  # fmt: skip
 def test_answers_of_no_one_and_several_objects(scene, text, regions):
     answer = jsecon.query_relation(scene, text)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import look_at
+from conftest import gaussians_at, look_at
 
 from jsecon.splat.project import project
 from jsecon.splat.reference import project_reference, render_reference
@@ -185,15 +185,8 @@ def test_colour_follows_the_view_and_depth_is_that_of_the_surface(scene, cameras
         colours = np.maximum(0.5 + np.einsum("kn,nkc->nc", basis, scene.sh), 0)
         expected, _ = render_reference(scene, cameras[t], colours)
         np.testing.assert_allclose(render_rgb(scene, cameras[t]).features, expected, atol=1 / 255)
-    wall = Gaussians(
-        np.stack(np.meshgrid(np.linspace(-2, 2, 30), np.linspace(-2, 2, 30), [0.0]), -1)
-        .reshape(-1, 3)
-        .astype(np.float32),
-        np.full((900, 3), np.log(0.08), np.float32),
-        np.tile(np.float32([1, 0, 0, 0]), (900, 1)),
-        np.full(900, 6, np.float32),
-        np.zeros((900, 1, 3), np.float32),
-    )
+    side = np.linspace(-2, 2, 30)
+    wall = gaussians_at(np.stack(np.meshgrid(side, side, [0.0]), -1).reshape(-1, 3), 0.08, logit=6)
     camera = Camera(look_at((0, 0, -2.0), up=(0, -1, 0)), *(np.float32(v) for v in (45, 45, 24, 20)), 48, 40)
     depth, alpha = render_depth(wall, camera)
     assert float(alpha[10:30, 12:36].min()) > 0.95
@@ -212,8 +205,5 @@ def test_nothing_to_see_and_nothing_at_all(scene, camera):
     rendering = render(nobody, camera, np.zeros((0, 3), np.float32))
     assert float(jnp.abs(rendering.features).max()) == 0
     assert float(rendering.alpha.max()) == 0
-    behind = Gaussians(
-        scene.means + np.float32([0, 0, -50]),
-        *(getattr(scene, k) for k in ("log_scales", "quaternions", "opacity_logits", "sh")),
-    )
+    behind = dataclasses.replace(scene, means=scene.means + np.float32([0, 0, -50]))
     assert float(render(behind, camera, random_features(scene.count, 3)).alpha.max()) == 0

@@ -137,13 +137,9 @@ def shades():
 
 
 @pytest.mark.parametrize(("text", "several", "things"), [
-    ("blue", True, {0, 1}),
-    ("Blue thing", True, {0, 1}),
-    ("dark blue", True, {0}),
-    ('"blue" but not "dark blue"', False, {1}),
-    ('"white" or "light blue" but not "blue"', False, {4}),
-    ("pink", True, set()),
-    ("purple thing", True, set()),
+    ("blue", True, {0, 1}), ("Blue thing", True, {0, 1}), ("dark blue", True, {0}),
+    ('"blue" but not "dark blue"', False, {1}), ('"white" or "light blue" but not "blue"', False, {4}),
+    ("pink", True, set()), ("purple thing", True, set()),
 ])  # fmt: skip
 def test_a_bare_colour_is_answered_by_its_shades(shades, text, several, things):
     field, embedder = shades

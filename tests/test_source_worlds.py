@@ -81,19 +81,13 @@ def test_the_world_of_a_capture_is_that_of_all_its_frames(tmp_path, frames):
     assert set(some.names) <= set(whole.names)
 
 
-@pytest.mark.parametrize("far", [1e4, 455123.4, 1e7])
-def test_a_spz_refuses_coordinates_that_it_cannot_hold(tmp_path, scene, far):
-    """Fixed-point numbers of 24 bits: 2^-9 units at 1e4, 2^-4 at 455123, which is larger than Gaussians of 0.02."""
+def test_a_spz_refuses_coordinates_that_it_cannot_hold(tmp_path, scene):
+    """Fixed-point numbers of 24 bits: 2^-4 units at 455123, which is larger than Gaussians of 0.02."""
     small = dataclasses.replace(scene, log_scales=np.full_like(scene.log_scales, np.log(0.02)))
     to_source = np.eye(4)
-    to_source[0, 3] = far
-    if far == 1e4:
+    to_source[0, 3] = 455123.4
+    with pytest.raises(jsecon.InputError, match=r"a\.spz.*positions"):
         jsecon.save_gaussians(tmp_path / "a.spz", small, similarity=to_source)
-        there = jsecon.load_gaussians(tmp_path / "a.spz", similarity=np.linalg.inv(to_source))
-        np.testing.assert_allclose(there.means, small.means, atol=2**-9)
-    else:
-        with pytest.raises(jsecon.InputError, match=r"a\.spz.*(positions|lies)"):
-            jsecon.save_gaussians(tmp_path / "a.spz", small, similarity=to_source)
 
 
 def test_an_ordinary_scene_is_written_in_single_precision(tmp_path, scene):

@@ -84,14 +84,6 @@ def test_a_glb_refuses_sizes_beyond_float32(tmp_path):
 # --- .spz: versions, axes, flags
 
 
-@pytest.mark.parametrize("version", [1, 2, 3, 4])
-def test_every_version_of_spz(tmp_path, version):
-    (tmp_path / "a.SPZ").write_bytes(splat_files.spz(SCENE, version))
-    place = 2**-8 if version == 1 else 2**-12
-    turn = 0.97 if version < 3 else 0.99999
-    compare(jsecon.load_gaussians(tmp_path / "a.SPZ"), SCENE, (place, *STEPS["four.spz"][1:5], turn))
-
-
 def record(kind, body):
     return struct.pack("<II", kind, len(body)) + body
 

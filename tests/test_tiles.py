@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import gaussians_at
 from hypothesis import given, settings, strategies as st
 
 from jsecon.splat.capacity import plan_capacity, round_capacity
@@ -55,13 +56,8 @@ def listed(scene, camera, tile: int):
 def needles(count: int, seed: int) -> Gaussians:
     """Aspect 1000 in every orientation, larger than the scene."""
     rng = np.random.default_rng(seed)
-    return Gaussians(
-        rng.uniform(-1, 1, (count, 3)).astype(np.float32),
-        np.log(np.tile(np.float32([2.0, 0.002, 0.002]), (count, 1))),
-        rng.normal(size=(count, 4)).astype(np.float32),
-        rng.uniform(-5, 5, count).astype(np.float32),
-        np.zeros((count, 4, 3), np.float32),
-    )
+    means, turns = rng.uniform(-1, 1, (count, 3)), rng.normal(size=(count, 4))
+    return gaussians_at(means, (2, 0.002, 0.002), turns=turns, logit=rng.uniform(-5, 5, count), sh=np.zeros((4, 3)))
 
 
 @pytest.mark.parametrize(("kind", "tile"), [("blobs", 4), ("blobs", 8), ("needles", 8)])

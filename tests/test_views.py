@@ -6,12 +6,12 @@ import json
 import numpy as np
 import pytest
 from capture_files import small_capture, transforms, write_text_model
+from conftest import gaussians_at
 from scipy.spatial.transform import Rotation
 
 import jsecon
 from jsecon.app.cli import main
 from jsecon.splat.transform import transform_gaussians_float64
-from jsecon.types import Gaussians
 from jsecon.views import plan
 from jsecon.views.frame import scene_frame, surface_points
 from jsecon.views.plan import free_places, greedy_cover, plan_views
@@ -33,14 +33,8 @@ def scene_of(parts):
     count = [len(points) for points, _, _ in parts]
     colours = np.concatenate([np.tile(colour, (n, 1)) for n, (_, colour, _) in zip(count, parts)])
     sizes = np.concatenate([np.full(n, size) for n, (_, _, size) in zip(count, parts)])
-    total = sum(count)
-    return Gaussians(
-        means=np.concatenate([points for points, _, _ in parts]).astype(np.float32),
-        log_scales=np.log(np.repeat(sizes[:, None], 3, 1)).astype(np.float32),
-        quaternions=np.tile(np.float32([1, 0, 0, 0]), (total, 1)),
-        opacity_logits=np.full(total, 4.0, np.float32),
-        sh=((colours - 0.5) / 0.28209479).astype(np.float32)[:, None],
-    )
+    means, sh = np.concatenate([points for points, _, _ in parts]), (colours - 0.5) / 0.28209479
+    return gaussians_at(means, sizes[:, None], logit=4, sh=sh[:, None])
 
 
 def ball_points(centre):

@@ -16,7 +16,7 @@ import test_classes as of_classes
 import test_distill as of_distill
 import test_retrieval as of_retrieval
 import test_shares as of_shares
-from conftest import look_at
+from conftest import gaussians_at, look_at
 from small_field import shares, unit_rows
 from test_direct import exact_cosines, exact_relevancy
 
@@ -33,7 +33,7 @@ from jsecon.query.similarity import similarities, unit_codes
 from jsecon.splat.project import project
 from jsecon.splat.sh import colours_from_sh
 from jsecon.splat.transform import transform_gaussians
-from jsecon.types import Camera, Gaussians
+from jsecon.types import Camera
 
 pytestmark = [pytest.mark.as_shipped, pytest.mark.long]
 
@@ -202,13 +202,9 @@ def test_coders():
 def cloud():
     """Gaussians in a cube, and a camera before it."""
     rng = np.random.default_rng(COUNT)
-    gaussians = Gaussians(
-        rng.uniform(-1, 1, (COUNT, 3)).astype(np.float32),
-        rng.uniform(-5, -2, (COUNT, 3)).astype(np.float32),
-        rng.normal(size=(COUNT, 4)).astype(np.float32),
-        rng.normal(size=COUNT).astype(np.float32),
-        rng.normal(size=(COUNT, 4, 3)).astype(np.float32),
-    )
+    means, sizes = rng.uniform(-1, 1, (COUNT, 3)), rng.uniform(0.01, 0.1, (COUNT, 3))
+    turns, logit, sh = (rng.normal(size=(COUNT, *rest)) for rest in ((4,), (), (4, 3)))
+    gaussians = gaussians_at(means, sizes, turns=turns, logit=logit, sh=sh)
     lens = (np.float32(number) for number in (300, 310, 160, 120))
     return gaussians, Camera(look_at((0.3, -0.5, -3.0)), *lens, 320, 240)
 

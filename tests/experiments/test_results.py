@@ -67,15 +67,10 @@ class RoomOptions:
     out: str = ""
 
 
-@pytest.mark.parametrize(
-    ("words", "seeds", "folder"),
-    [
-        ("", (1, 2), results.HOME / "results" / "rooms"),
-        ("--seeds 3 4 5", (3, 4, 5), results.HOME / "results" / "rooms"),
-        ("--seeds 3 4 --quick", (0,), results.HOME / "results" / "quick" / "rooms"),
-        ("--quick --out there", (0,), "there"),
-    ],
-)
+@pytest.mark.parametrize(("words", "seeds", "folder"), [
+    ("", (1, 2), results.HOME / "results" / "rooms"), ("--seeds 3 4 5", (3, 4, 5), results.HOME / "results" / "rooms"),
+    ("--seeds 3 4 --quick", (0,), results.HOME / "results" / "quick" / "rooms"), ("--quick --out there", (0,), "there"),
+])  # fmt: skip
 def test_options_come_from_the_command_line(words, seeds, folder, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["rooms", *words.split()])
     options = results.read_options(RoomOptions, "rooms", "Rooms.", {"seeds": (0,)})
