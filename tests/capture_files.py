@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from jsecon.errors import InputError
-from jsecon.types import Camera, Capture
+from jsecon import Camera, Capture, InputError
 
 
 @contextlib.contextmanager

@@ -8,13 +8,11 @@ import pytest
 from small_field import REGIONS, make_field
 from test_gltf import read_glb
 
+from jsecon import load_gaussians, query_region, save_field
 from jsecon.app import cli
 from jsecon.app.ask import Answer
 from jsecon.app.outputs import main_regions, write_answers
-from jsecon.data.gaussians.files import load_gaussians
-from jsecon.language.field import save_field
 from jsecon.pipeline.progress import Listener
-from jsecon.query.select import query_region
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon.errors import InputError
+from jsecon import Autoencoder, InputError
 from jsecon.files import unpack_tree
-from jsecon.language.autoencoder import Autoencoder
 from jsecon.language.codes import Rotation
 from jsecon.pipeline import cache
 from jsecon.pipeline.results import Stage, StageResult

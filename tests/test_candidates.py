@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from small_field import make_field
 
+from jsecon import InputError, region_at
 from jsecon.app.ask import ask_text
 from jsecon.app.outputs import main_regions
 from jsecon.app.pictures import Renderer
 from jsecon.app.viewer.candidates import candidates, region_along
-from jsecon.errors import InputError
-from jsecon.query.pixel import region_at
 from jsecon.vision.colours import BASIC, ColourEmbedder
 
 EMBEDDER = ColourEmbedder()

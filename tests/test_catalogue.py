@@ -9,12 +9,9 @@ import pytest
 from small_field import REGIONS, make_field, shares, true_regions
 
 import jsecon
+from jsecon import InputError, Regions, Votes, load_gaussians, save_field
 from jsecon.app import cli
-from jsecon.data.gaussians.files import load_gaussians
 from jsecon.data.gaussians.ply import read_elements
-from jsecon.errors import InputError
-from jsecon.language.field import save_field
-from jsecon.types import Regions, Votes
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.reference_words import REFERENCE_WORDS
 

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from small_field import field_of, seen_of, unit_rows
 
+from jsecon import QueryRules, Regions, Votes
 from jsecon.query import classes
-from jsecon.query.rules import QueryRules
-from jsecon.types import Regions, Votes
 from jsecon.vision.protocols import Logits
 
 SIZE, REGIONS, KEPT = 12, 6, 3

@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 from capture_files import refused, ring_poses, small_capture, write_images, write_text_model
 
-from jsecon.data.capture import load_capture
+from jsecon import Camera, InputError, load_capture
 from jsecon.data.colmap import read_images, write_colmap
 from jsecon.data.images import write_image
-from jsecon.errors import InputError
-from jsecon.types import Camera
 
 CAPTURE = small_capture()
 

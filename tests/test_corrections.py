@@ -9,7 +9,7 @@ import pytest
 from conftest import gaussians_at, look_at
 from scipy.linalg import expm
 
-from jsecon.errors import InputError
+from jsecon import Camera, Capture, InputError, render
 from jsecon.fit import refine
 from jsecon.fit.corrections import (
     Corrections,
@@ -26,8 +26,6 @@ from jsecon.fit.refine import refine_capture
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.start import starting_gaussians
 from jsecon.fit.step import TrainingViews, cameras_extent, view_loss
-from jsecon.splat.render import render
-from jsecon.types import Camera, Capture
 
 KEY, VIEWS = jax.random.key(0), 6
 FROZEN = LearningRates(means=0.0, means_last=0.0, log_scales=0.0, quaternions=0.0, opacity_logits=0.0, colors=0.0)

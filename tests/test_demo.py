@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from jsecon import load_field, load_ply
 from jsecon.app import pictures
-from jsecon.data.gaussians.ply import load_ply
 from jsecon.demo import demo, film as film_of
-from jsecon.language.field import load_field
 from jsecon.pipeline.progress import Listener
 from jsecon.process import peak_memory_mib
 

@@ -6,8 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon.query.baselines import query_canonical, query_one_step
-from jsecon.query.similarity import unit_codes
+from jsecon import query_canonical, query_one_step, unit_codes
 
 
 def exact_cosines(codes, code):

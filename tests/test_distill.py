@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 from small_field import REGIONS, labels_of, true_regions, unit_rows
 
-from jsecon.language.distill import distill_l1, distill_votes
-from jsecon.splat.capacity import plan_capacity
-from jsecon.splat.render import render
-from jsecon.types import Votes
+from jsecon import Votes, distill_l1, distill_votes, plan_capacity, render
 
 KEY = jax.random.key(0)
 

@@ -9,9 +9,8 @@ import jax
 import pytest
 from clip_files import write_clip
 
-from jsecon import backend, process
+from jsecon import InputError, backend, process
 from jsecon.app import cli, doctor
-from jsecon.errors import InputError
 
 PROJECT = tomllib.loads((Path(__file__).resolve().parent.parent / "pyproject.toml").read_text())["project"]
 

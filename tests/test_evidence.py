@@ -10,10 +10,8 @@ from conftest import gaussians_at, look_at
 from small_field import field_of
 
 import jsecon
+from jsecon import Camera, Regions, Votes, finish_votes, save_field
 from jsecon.app import cli
-from jsecon.language.field import save_field
-from jsecon.language.membership import finish_votes
-from jsecon.types import Camera, Regions, Votes
 from jsecon.vision.colours import PALETTE, ColourEmbedder
 from jsecon.vision.reference_words import reference_of
 

@@ -4,10 +4,8 @@ the twin's weights. In every run the rows of the stability table have images and
 import numpy as np
 import pytest
 
-from jsecon.language.votes import region_votes
-from jsecon.parallel import host_mesh
+from jsecon import host_mesh, region_votes, render
 from jsecon.splat.reference import render_reference, weights_reference
-from jsecon.splat.render import render
 
 pytestmark = [pytest.mark.as_shipped, pytest.mark.long]
 

@@ -13,12 +13,10 @@ import pytest
 from capture_files import refused, small_capture, write_images, write_text_model, write_transforms
 from fuzz_readers import _field
 
+from jsecon import load_capture, save_field, save_ply
 from jsecon.data import frames
-from jsecon.data.capture import load_capture
-from jsecon.data.gaussians.ply import save_ply
 from jsecon.data.images import write_image
 from jsecon.files import exclusive_lock, write_text
-from jsecon.language.field import save_field
 from jsecon.pipeline import cache, run as pipeline
 from jsecon.pipeline.progress import Listener
 from jsecon.pipeline.results import RunContext

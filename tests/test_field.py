@@ -9,12 +9,9 @@ import pytest
 from safetensors.numpy import load_file, save_file
 from small_field import REGIONS, make_field, unit_rows
 
-from jsecon.errors import InputError
+from jsecon import InputError, check_field, load_field, save_field, train_autoencoder, with_overlap
 from jsecon.files import read_arrays, write_arrays
 from jsecon.language import field as module
-from jsecon.language.autoencoder import train_autoencoder
-from jsecon.language.field import check_field, load_field, save_field
-from jsecon.language.membership import with_overlap
 from jsecon.types import Parts
 
 

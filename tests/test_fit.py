@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 from conftest import gaussians_at, look_at
 
-from jsecon.errors import InputError
+from jsecon import Camera, Capture, InputError, render, render_rgb
 from jsecon.fit import step as one_step
 from jsecon.fit.growth import in_use
 from jsecon.fit.optimise import fit_gaussians, init_fit_state, view_order
 from jsecon.fit.quality import measure_quality
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.step import cameras_extent
-from jsecon.splat.render import render, render_rgb
-from jsecon.types import Camera, Capture
 
 KEY = jax.random.key(0)
 RATES = LearningRates(means=1e-3, means_last=1e-4, log_scales=0.02, colors=0.02, quaternions=0.01)

@@ -13,11 +13,8 @@ from capture_files import refused
 from scipy.spatial.transform import Rotation
 from splat_files import RUB, opacity, scene
 
-from jsecon.data.gaussians.files import load_gaussians, save_gaussians
-from jsecon.data.gaussians.ply import save_ply
+from jsecon import Camera, Gaussians, load_gaussians, render_rgb, save_gaussians, save_ply
 from jsecon.splat import transform
-from jsecon.splat.render import render_rgb
-from jsecon.types import Camera, Gaussians
 
 SCENE = scene(600, 4)
 PLAIN = scene(600, 1)

@@ -10,11 +10,10 @@ from scipy.spatial.transform import Rotation
 from splat_files import C0, opacity, scene
 from test_gaussian_files import gaussians, image
 
+from jsecon import Gaussians, load_gaussians
 from jsecon.data.gaussians import gltf
-from jsecon.data.gaussians.files import load_gaussians
 from jsecon.data.gaussians.gltf import save_glb
 from jsecon.splat.transform import transform_gaussians
-from jsecon.types import Gaussians
 
 COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 NAME = "KHR_gaussian_splatting"

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 
 from experiments.datasets.lerf_ovs import LERF_PAIRS
+from jsecon import InputError, Selection, selection_mask
 from jsecon.data.labels import LabelledFrame
-from jsecon.errors import InputError
 from jsecon.evaluate.lerf import ALPHA_THRESHOLD, VALA_THRESHOLD, evaluate_at_thresholds
 from jsecon.fit.resize import resize_camera
-from jsecon.query.render import selection_mask
-from jsecon.types import Selection
 
 
 def members(scene):

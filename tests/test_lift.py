@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from small_field import REGIONS, make_field, true_regions
 
-from jsecon.errors import InputError
-from jsecon.language.votes import region_votes
+from jsecon import InputError, region_votes
 from jsecon.query.outline import INSIDE, OUTSIDE, PRIOR_PX, UNKNOWN, box_mask, lift
 
 

@@ -5,9 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jsecon import plan_capacity, render
 from jsecon.query.render import render_selection, selection_mask
-from jsecon.splat.capacity import plan_capacity
-from jsecon.splat.render import render
 
 
 def cut_out(scene, chosen):

@@ -9,17 +9,13 @@ import numpy as np
 import pytest
 from small_field import colour_field
 
+from jsecon import InputError, load_capture, load_field, load_ply, query_region, save_field
 from jsecon.app.ask import Answer, ask_pixel, ask_region, ask_text
 from jsecon.app.cli import main
 from jsecon.app.outputs import file_stem, write_answer
-from jsecon.data.capture import load_capture
 from jsecon.data.colmap import write_colmap
-from jsecon.data.gaussians.ply import load_ply
-from jsecon.errors import InputError
 from jsecon.files import path_within
-from jsecon.language.field import load_field, save_field
 from jsecon.query.composite import parse_query
-from jsecon.query.select import query_region
 from jsecon.vision.colours import ColourEmbedder
 
 HOSTILE = ("/../../evil", "..", "C:\\evil", "a/b", "a\0b", "x" * 4000, "nul", "frame 1", "Frame_1", "frame_1")

@@ -16,12 +16,9 @@ from sam_files import write_sam
 from test_pipeline import Recorder
 
 from experiments.datasets.feature_files import write_features
+from jsecon import InputError, load_capture, load_field, load_ply, save_field, save_ply
 from jsecon.app import cli
-from jsecon.data.capture import load_capture
-from jsecon.data.gaussians.ply import load_ply, save_ply
-from jsecon.errors import InputError
 from jsecon.fit.start import starting_gaussians
-from jsecon.language.field import load_field, save_field
 from jsecon.networks.hub import catalogue
 from jsecon.networks.sam import SamSegmenter, SamSettings, find_sam
 from jsecon.networks.sam2 import Sam2Tracker

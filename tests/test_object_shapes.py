@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jsecon.query.object_shapes import object_shapes
-from jsecon.types import Camera
+from jsecon import Camera, object_shapes
 from jsecon.views.frame import scene_up
 
 SIZE = np.array([0.5, 0.3, 0.2])

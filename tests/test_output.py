@@ -10,11 +10,10 @@ import sys
 import pytest
 from small_field import colour_field
 
+from jsecon import InputError, save_field
 from jsecon.__main__ import UNREAD, Output
 from jsecon.app.ask import ask_text
 from jsecon.app.cli import main
-from jsecon.errors import InputError
-from jsecon.language.field import save_field
 from jsecon.vision.colours import ColourEmbedder
 
 

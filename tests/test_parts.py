@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 from small_field import KnownTexts, field_of, lone_votes, unit_rows
 
+from jsecon import QueryRules, load_field, query_anchored, save_field
 from jsecon.app.ask import ask_each, ask_text
 from jsecon.language import field as field_file
-from jsecon.language.field import load_field, save_field
 from jsecon.query.parts import MIN_REGION_RATIO, PART_THRESHOLD, best_cluster, part_scores, parts_fallback
-from jsecon.query.rules import QueryRules
-from jsecon.query.select import query_anchored
 from jsecon.types import Parts, Regions
 from jsecon.vision.protocols import Logits
 

@@ -10,13 +10,10 @@ import pytest
 from clip_files import COLOURS
 from sam3_files import write_sam3
 
+from jsecon import InputError, lift, load_field, load_ply
 from jsecon.app import cli
 from jsecon.app.phrases import lift_phrase, load_frames
-from jsecon.data.gaussians.ply import load_ply
-from jsecon.errors import InputError
-from jsecon.language.field import load_field
 from jsecon.networks.sam3 import PhraseMasks
-from jsecon.query.outline import lift
 
 
 @pytest.fixture(scope="module")

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 from small_field import make_field, rows_of_a_kind, shares
 
+from jsecon import QueryRules, Regions, query_anchored, query_region, query_several
 from jsecon.query.match import is_piece
-from jsecon.query.rules import QueryRules
-from jsecon.query.select import query_anchored, query_region, query_several
-from jsecon.types import Regions
 
 
 def test_a_piece_is_near_the_text_and_shares_gaussians_with_what_was_chosen():

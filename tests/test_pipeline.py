@@ -18,12 +18,10 @@ from capture_files import transforms
 from mask_overlaps import iou_matrix
 
 import jsecon
+from jsecon import InputError, load_field, save_ply
 from jsecon.app import cli
-from jsecon.data.gaussians.ply import save_ply
-from jsecon.errors import InputError
 from jsecon.files import write_arrays
 from jsecon.language import autoencoder, field as field_file
-from jsecon.language.field import load_field
 from jsecon.pipeline import cache, networks, results, run as pipeline
 from jsecon.pipeline.progress import Listener
 from jsecon.pipeline.results import RunContext

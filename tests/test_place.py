@@ -9,11 +9,10 @@ from small_field import make_field
 from table_field import table_field
 
 import jsecon
+from jsecon import InputError, Selection
 from jsecon.app.ask import Answer, ask_text, edit_answers
 from jsecon.app.locate import locate_answer
 from jsecon.app.server.scenes import Scene, SceneQuery
-from jsecon.errors import InputError
-from jsecon.types import Selection
 
 SIZE = np.array([0.5, 0.3, 0.1])
 

@@ -5,10 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon.parallel import host_mesh
-from jsecon.splat.plan import plan_view, render_plan
+from jsecon import host_mesh, plan_view, render, render_depth, render_plan
 from jsecon.splat.reference import project_reference, weights_reference
-from jsecon.splat.render import render, render_depth
 from jsecon.splat.walk import cumulative
 
 

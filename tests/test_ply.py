@@ -9,9 +9,8 @@ from capture_files import refused
 from splat_files import PLY_NAMES, ply_columns, write_ply
 
 from experiments.datasets.mesh_files import read_faces, write_mesh
+from jsecon import Gaussians, InputError
 from jsecon.data.gaussians.ply import load_ply, load_point_cloud, save_ply
-from jsecon.errors import InputError
-from jsecon.types import Gaussians
 
 FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
 

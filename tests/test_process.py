@@ -10,8 +10,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from jsecon import process
-from jsecon.errors import InputError
+from jsecon import InputError, process
 from jsecon.process import clear_programs, settings
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
-from jsecon.data.gaussians.ply import save_ply
-from jsecon.errors import InputError
+from jsecon import InputError, save_ply
 from jsecon.pipeline.processes import launch
 from jsecon.process import WORKER
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from jax.sharding import NamedSharding, PartitionSpec
 
-from jsecon.parallel import host_mesh
+from jsecon import host_mesh, plan_view
 from jsecon.programs import stored_jit
-from jsecon.splat.plan import plan_view
 
 stored_jit = stored_jit.__wrapped__  # as in a user's process, see compiling.py
 

@@ -11,14 +11,10 @@ from hypothesis import given, settings, strategies as st
 from table_field import THINGS, table_field
 
 import jsecon
+from jsecon import InputError, ObjectScene, ObjectShapes, Regions, save_field
 from jsecon.app import cli
-from jsecon.app.object_scene import ObjectScene
-from jsecon.errors import InputError
-from jsecon.language.field import save_field
 from jsecon.query.expressions import RELATIONS, is_expression, parse_expression
-from jsecon.query.object_shapes import ObjectShapes
 from jsecon.query.relations import PAIRS, Viewpoint, between_scores, gap, order_values, pair_scores
-from jsecon.types import Regions
 
 CORNERS = np.stack(np.meshgrid(*[np.linspace(-1, 1, 3)] * 3), -1).reshape(-1, 3)
 PLACES = st.tuples(*[st.floats(-2, 2, width=32)] * 3)

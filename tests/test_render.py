@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 from conftest import gaussians_at, look_at
 
-from jsecon.splat.project import project
+from jsecon import Camera, Gaussians, project, render, render_depth, render_rgb
 from jsecon.splat.reference import project_reference, render_reference
-from jsecon.splat.render import render, render_depth, render_rgb
-from jsecon.types import Camera, Gaussians
 
 
 def to64(tree):

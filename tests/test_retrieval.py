@@ -10,16 +10,13 @@ import pytest
 from jax.test_util import check_grads
 from small_field import KnownTexts, field_of, lone_votes, make_field, unit_rows
 
+from jsecon import Regions, load_field, query_anchored, query_classes, query_several, save_field
 from jsecon.app import cli
 from jsecon.app.ask import ask_text
-from jsecon.language.field import load_field, save_field
 from jsecon.pipeline import networks
-from jsecon.query.classes import query_classes
 from jsecon.query.match import evidence, reference_similarities, region_similarities
 from jsecon.query.rules import QUANTILE, REFERENCE_CUT, RETRIEVAL_THRESHOLD, QueryRules
-from jsecon.query.select import query_anchored, query_several
 from jsecon.query.similarity import similarities
-from jsecon.types import Regions
 
 SIZE = 12
 

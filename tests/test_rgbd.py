@@ -10,14 +10,12 @@ import pytest
 from capture_files import refused, small_capture
 from scipy.spatial.transform import Rotation
 
-from jsecon.data.capture import load_capture
+from jsecon import Capture, InputError, load_capture
 from jsecon.data.images import read_depth
 from jsecon.data.lens import Lens, resample_depth
-from jsecon.errors import InputError
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import RunContext
 from jsecon.pipeline.stages import capture_stages
-from jsecon.types import Capture
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
 

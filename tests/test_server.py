@@ -17,12 +17,11 @@ from starlette.exceptions import HTTPException
 from starlette.testclient import TestClient
 from table_field import table_field
 
+from jsecon import InputError, save_field
 from jsecon.app.server.api import application
 from jsecon.app.server.guard import Limits, Workers
 from jsecon.app.server.scenes import Scene, SceneQuery, open_scenes
 from jsecon.app.server.serve import prepare
-from jsecon.errors import InputError
-from jsecon.language.field import save_field
 from jsecon.process import cores
 from jsecon.vision.colours import ColourEmbedder
 

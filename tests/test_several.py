@@ -8,16 +8,12 @@ import pytest
 from small_field import KnownTexts, make_field, rows_of_a_kind, shares, unit_rows
 from table_field import table_field
 
+from jsecon import InputError, QueryRules, Regions, match_regions, query_relation
 from jsecon.app.ask import ask_text, with_phrases
 from jsecon.app.outputs import write_answer
-from jsecon.app.relations import query_relation
 from jsecon.app.viewer.candidates import candidates
-from jsecon.errors import InputError
 from jsecon.query.composite import parse_query
-from jsecon.query.match import match_regions
-from jsecon.query.rules import QueryRules
 from jsecon.query.select import ALL_OF_KIND, query_anchored, query_several
-from jsecon.types import Regions
 
 
 @pytest.fixture(scope="module")

@@ -13,17 +13,15 @@ from siglip_files import BIAS, LENGTH, SCALE, embedded, write_json, write_siglip
 from small_field import KnownTexts, make_field, unit_rows
 
 from experiments.export.vocabulary import write_vocabulary
+from jsecon import InputError, query_anchored, query_several, save_field
 from jsecon.app import cli
 from jsecon.app.ask import ask_text
-from jsecon.errors import InputError
-from jsecon.language.field import save_field
 from jsecon.networks.clip import ClipEmbedder, find_clip, read_preprocessing
 from jsecon.networks.tokenizer import TextRules, TextTokenizer
 from jsecon.pipeline import networks
 from jsecon.pipeline.models import inspect_models
 from jsecon.query.match import best_presence, presence
 from jsecon.query.rules import PRESENCE_THRESHOLD, RETRIEVAL_THRESHOLD, QueryRules
-from jsecon.query.select import query_anchored, query_several
 from jsecon.vision.protocols import Embedder, Logits
 
 LAYOUTS = ("immich", "transformers.js")

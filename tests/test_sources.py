@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from small_field import make_field
 
+from jsecon import InputError, load_field, save_field
 from jsecon.app.cli import main
-from jsecon.errors import InputError
-from jsecon.language.field import load_field, save_field
 from jsecon.pipeline.networks import field_embedder
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.sources import locate_sources, provenance

@@ -7,11 +7,10 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from experiments.datasets.depth_points import labels_of_points
-from jsecon.errors import InputError
+from jsecon import Camera, Capture, InputError
 from jsecon.fit.depth import points_from_depth
 from jsecon.fit.start import gaussians_from_points, neighbour_distances, starting_gaussians
 from jsecon.splat.sh import C0
-from jsecon.types import Camera, Capture
 
 
 def brute_distances(points, neighbours=3):

@@ -10,7 +10,7 @@ import pytest
 from conftest import look_at
 
 from experiments.datasets.plain_room import PALETTE, PLAIN_SHAPES, make_room
-from jsecon.data.capture import load_capture
+from jsecon import Camera, InputError, load_capture
 from jsecon.data.labels import load_lerf_labels
 from jsecon.data.masks import load_labels
 from jsecon.demo import raycast, render_views, room_cameras, room_capture, write_room
@@ -39,8 +39,6 @@ from jsecon.demo.shapes import (
     ray_interval,
     rotation,
 )
-from jsecon.errors import InputError
-from jsecon.types import Camera
 
 SEEDS = 0, pytest.param(1, marks=pytest.mark.long)
 

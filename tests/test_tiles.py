@@ -10,8 +10,8 @@ import pytest
 from conftest import gaussians_at
 from hypothesis import given, settings, strategies as st
 
+from jsecon import Gaussians, project
 from jsecon.splat.capacity import plan_capacity, round_capacity
-from jsecon.splat.project import project
 from jsecon.splat.reference import project_reference
 from jsecon.splat.strips import BLOCK, FULL_IMAGE, Strip, join_strips, split_into_strips, tile_rows
 from jsecon.splat.tiles import (
@@ -25,7 +25,6 @@ from jsecon.splat.tiles import (
     tile_grid,
     tile_lists,
 )
-from jsecon.types import Gaussians
 
 
 def reaches(scene, camera, tile: int) -> np.ndarray:

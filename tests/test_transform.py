@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jsecon.splat.render import render_rgb
+from jsecon import Gaussians, render_rgb
 from jsecon.splat.transform import transform_gaussians
-from jsecon.types import Gaussians
 
 TURN = Rotation.from_euler("ZXY", [20, -70, 130], degrees=True).as_matrix()
 

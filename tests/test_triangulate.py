@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from conftest import look_at
 
-from jsecon.errors import InputError
+from jsecon import Camera, Capture, InputError
 from jsecon.fit.start import starting_gaussians
 from jsecon.fit.triangulate import triangulate_tracks, triangulated_points, view_pairs
-from jsecon.types import Camera, Capture
 
 WIDTH, HEIGHT, FOCAL = 240, 180, 200.0
 

@@ -19,17 +19,13 @@ pytest.importorskip("viser", reason="the extra viewer is not installed")
 from browser import CHROMIUM, opened, until
 from small_field import colour_field
 
+from jsecon import Camera, InputError, load_ply, save_field, with_overlap
 from jsecon.app.ask import Answer
 from jsecon.app.cli import main
 from jsecon.app.viewer import view_state
 from jsecon.app.viewer.view_state import ViewState
 from jsecon.app.viewer.window import Viewer, open_viewer
-from jsecon.data.gaussians.ply import load_ply
-from jsecon.errors import InputError
-from jsecon.language.field import save_field
-from jsecon.language.membership import with_overlap
 from jsecon.query.pixel import region_shares_seen
-from jsecon.types import Camera
 from jsecon.vision.colours import BASIC, ColourEmbedder
 
 START = "orange; pink"

@@ -5,10 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jsecon import plan_capacity, plan_view
 from jsecon.association.atoms import atom_votes
 from jsecon.language.votes import region_votes, votes_memory
-from jsecon.splat.capacity import plan_capacity
-from jsecon.splat.plan import plan_view
 from jsecon.splat.reference import weights_reference
 
 REGIONS = 11

@@ -15,11 +15,7 @@ from experiments.protocols.opengaussian import most_similar_text, select_leaf, s
 from experiments.protocols.points import evaluate_points, point_class_means
 from experiments.rivals.leaves import silhouette_overlaps
 from experiments.tables.ours import of_all_views
-from jsecon.errors import InputError
-from jsecon.query.render import selection_mask
-from jsecon.query.select import query_anchored
-from jsecon.splat.plan import plan_view
-from jsecon.types import Regions
+from jsecon import InputError, Regions, plan_view, query_anchored, selection_mask
 
 
 @settings(deadline=None, max_examples=40)

@@ -17,11 +17,9 @@ from experiments.rivals.gaussian_grouping import query_gaussian_grouping, train_
 from experiments.rivals.langsplat import train_langsplat
 from experiments.rivals.opengaussian import Schedule, train_instances, train_opengaussian
 from experiments.simulated_vision.embeddings import made_text_space
+from jsecon import InputError, plan_view, project
 from jsecon.data.labels import LabelledFrame
-from jsecon.errors import InputError
 from jsecon.evaluate.lerf import ALPHA_THRESHOLD, evaluate_at_thresholds
-from jsecon.splat.plan import plan_view
-from jsecon.splat.project import project
 from jsecon.vision.protocols import CANONICAL
 
 QUERIES = ("floor", "red ball", "blue ball", "green ball")
