@@ -300,14 +300,11 @@ def main(options: Options) -> dict:
 
 def rule_scores(metrics: dict) -> dict[tuple[str, str], float]:
     """Mean IoU of each rule and variant over the cases that rules are chosen on."""
-
-    def mean(k, variant, row):
-        return np.mean(metrics["cases"][f"{k}, {variant}"]["points"][row])
-
-    pairs = [(row, variant) for variant in VARIANTS for row in ROWS]
-    return {
-        (row, variant): float(np.mean([mean(k, variant, row) for k in metrics["chosen_on"]])) for row, variant in pairs
-    }
+    scores = {}
+    for variant in VARIANTS:
+        points = [metrics["cases"][f"{k}, {variant}"]["points"] for k in metrics["chosen_on"]]
+        scores |= {(row, variant): float(np.mean([np.mean(own[row]) for own in points])) for row in ROWS}
+    return scores
 
 
 def _mean(values: Any) -> str:

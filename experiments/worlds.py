@@ -42,8 +42,6 @@ QUICK_READ = (
 """of a quick run: each rule and each way of choosing Gaussians once"""
 READ_TRAINED = (*READ, fair.PUBLISHED, "one mask", "cosine, threshold")
 """of methods that train; with any of their own constants ("16 roots", "one mask", 0.98)"""
-LEFT_OUT = "ours, outspoken views", WITH_PARTS
-"""of `experiments.fair`: an older one of ours, and one that was not measured here yet"""
 FIGURES = ("miou", "miou_vala")
 
 
@@ -111,7 +109,7 @@ def is_read(row: str, trained: bool, quick: bool = False) -> bool:
     """Whether a row of `experiments.fair` is one of these tables."""
     method, way = row.split(": ")
     if not trained:
-        return way in (QUICK_READ if quick else READ) and method not in (*LEFT_OUT, *TRAINED)
+        return way in (QUICK_READ if quick else READ) and method not in (WITH_PARTS, *TRAINED)
     return method in TRAINED and fair.reading_of(row) in READ_TRAINED
 
 

@@ -63,7 +63,6 @@ def by_consensus(
     frames: np.ndarray,
     *,
     seed: int,
-    abstain_if_unlabelled: bool = True,
     centre: float = 0.0,
     **how: Any,
 ) -> Association:
@@ -73,7 +72,6 @@ def by_consensus(
       levels: Masks and embeddings of each level.
       frames: (T, H, W, 3) uint8.
       seed: Seed of the clustering.
-      abstain_if_unlabelled: As for `mask_signatures`.
       centre: As for `SceneViews`.
       **how: Options of `consensus_masklets`.
 
@@ -82,12 +80,7 @@ def by_consensus(
     """
     given = jax.tree.map(jnp.asarray, (levels[0].gaussians, levels[0].cameras))
     scene = SceneViews(*given, lambda t: proposals(levels, t), centre=centre)
-    return associated(
-        levels,
-        clean_masklets(
-            consensus_masklets(frames, scene, abstain_if_unlabelled=abstain_if_unlabelled, seed=seed, **how)
-        ),
-    )
+    return associated(levels, clean_masklets(consensus_masklets(frames, scene, seed=seed, **how)))
 
 
 def proposals(levels: Sequence[Evidence], t: int) -> np.ndarray:

@@ -35,17 +35,16 @@ AGREEMENT = 0.4
 def association(
     setting: Setting, by: str, *, labels: np.ndarray | None = None, centre: float = 0.0, agreement: float = AGREEMENT
 ) -> Association:
-    """The regions of a setting: by "tracks", "consensus" ("outspoken": in which a view speaks on what lies in none of
-    its masks), or any other name with its `labels`. `centre` and `agreement` are
-    those of a consensus."""
+    """The regions of a setting: by "tracks", "consensus", or any other name with its `labels`. `centre` and `agreement`
+    are those of a consensus."""
     if by == "tracks":
         return setting.tracked
     if labels is not None:
         return setting.shared.get(by, lambda: associated(setting.levels, labels))
-    how = {"abstain_if_unlabelled": by != "outspoken", "centre": centre, "agreement": agreement}
 
     def make():
-        return by_consensus(setting.levels, setting.frames, seed=setting.seed, **how)
+        given = {"seed": setting.seed, "centre": centre, "agreement": agreement}
+        return by_consensus(setting.levels, setting.frames, **given)
 
     return setting.shared.get((by, centre, agreement), make)
 

@@ -35,7 +35,7 @@ NO_REFUSAL = -1.0
 """below every similarity"""
 WAYS = {"votes": "", "all": ", all"}
 """of asking jsecon's regions: the one that answers best with its pieces, all that answer"""
-OURS = {"ours, tracks": "tracks", "ours, outspoken views": "outspoken", "ours, consensus": "consensus"}
+OURS = {"ours, tracks": "tracks", "ours, consensus": "consensus"}
 WITH_PARTS = "ours, with parts"
 """those of consensus; where no region answers a text, the parts that do"""
 CENTRES: dict[str, dict[str, float]] = {
