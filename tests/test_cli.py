@@ -314,7 +314,6 @@ def test_an_output_folder_that_cannot_be_written(capture, room_run, tmp_path, ca
     field, out = room_run[1] / "field.safetensors", tmp_path / "file" / "out"
     for line in (("run", capture), ("demo",), ("query", field, "red"), ("eval", field, "--labels", capture)):
         _refused(capsys, *line, "--out", out, says=["out"])
-    _refused(capsys, "run", capture, "--out", capture, says=["own folder"])
 
 
 def test_a_text_that_is_not_understood_does_not_stop_the_others(room_run, tmp_path, capsys):

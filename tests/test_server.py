@@ -223,7 +223,7 @@ def test_paths_lead_nowhere(client):
     for path in ("/../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "/selection.ply/../../x", "//etc/passwd", "/query/"):
         assert client.get(path).status_code in (404, 405, 422), path
     assert client.get("/query").status_code == 405
-    for frame in ("../../etc/passwd", "#99", ""):
+    for frame in ("../../etc/passwd", ""):
         assert client.get("/mask.png", params={"text": "red", "frame": frame}).status_code == 422
 
 

@@ -202,10 +202,8 @@ def test_the_command_says_where_it_listens(viewer, tmp_path):
 
 def test_bad_arguments_end_in_one_message(viewer, tmp_path, capsys):
     save_field(tmp_path / "field.safetensors", viewer.field)
-    asked = ["view", str(tmp_path / "field.safetensors"), "--port", str(viewer.server.get_port())]
-    for more, wanted in ((["--link", "what"], "link: 'what'"), ([], "--port: ")):
-        assert main([*asked, *more]) == 2
-        assert wanted in capsys.readouterr().err
+    assert main(["view", str(tmp_path / "field.safetensors"), "--link", "what"]) == 2
+    assert "link: 'what'" in capsys.readouterr().err
 
 
 CANVAS = "[...document.querySelectorAll('canvas')].sort((a, b) => b.width - a.width)[0]"

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon import plan_capacity, plan_view
+from jsecon import plan_view
 from jsecon.association.atoms import atom_votes
 from jsecon.language.votes import region_votes, votes_memory
 from jsecon.splat.reference import weights_reference
@@ -96,16 +96,6 @@ def test_strongest_first_and_what_is_cut_is_counted(cast, scene, cameras, labels
     np.testing.assert_allclose(few.cut, cast.weights[:, 2:].sum(-1), rtol=1e-4, atol=1e-4)
     assert bool((cast.weights[:, :-1] >= cast.weights[:, 1:]).all())
     np.testing.assert_array_equal(cast.regions >= 0, cast.weights > 0)
-
-
-def test_traced_is_eager(cast, scene, cameras, labels):
-    capacity = plan_capacity(scene, cameras)
-    cast_by = jax.jit(
-        lambda g, seen: region_votes(g, cameras, seen, REGIONS, top=REGIONS, by_view=True, capacity=capacity)
-    )
-    traced = cast_by(scene, labels)
-    np.testing.assert_allclose(traced.dense(), cast.dense(), rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(traced.by_view, cast.by_view, rtol=1e-4, atol=1e-4)
 
 
 def test_what_they_take_is_told_beforehand(monkeypatch):
