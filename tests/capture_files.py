@@ -10,6 +10,12 @@ import numpy as np
 import pytest
 
 from jsecon import Camera, Capture, InputError
+from jsecon.app import cli
+
+
+def run_cli(*arguments) -> int:
+    """The exit code of `jsecon` with these words."""
+    return cli.main([str(argument) for argument in arguments])
 
 
 @contextlib.contextmanager

@@ -5,11 +5,11 @@ import json
 
 import numpy as np
 import pytest
+from capture_files import run_cli
 from small_field import REGIONS, make_field
 from test_gltf import read_glb
 
 from jsecon import load_gaussians, query_region, save_field
-from jsecon.app import cli
 from jsecon.app.ask import Answer
 from jsecon.app.outputs import main_regions, write_answers
 from jsecon.pipeline.progress import Listener
@@ -26,17 +26,13 @@ def saved(scene, cameras, tmp_path_factory):
     return field, file
 
 
-def run(*arguments) -> int:
-    return cli.main([str(argument) for argument in arguments])
-
-
 def test_a_field_is_exported_in_every_format(saved, tmp_path, capsys):
     field, file = saved
     means = np.add(field.gaussians.means, [2, 0, 0])
     for ending in ("ply", "spz"):
-        assert run("export", file, "--out", tmp_path / f"scene.{ending}") == 0
+        assert run_cli("export", file, "--out", tmp_path / f"scene.{ending}") == 0
         np.testing.assert_allclose(load_gaussians(tmp_path / f"scene.{ending}").means, means, atol=2**-16)
-    assert run("export", file, "--out", tmp_path / "scene.glb") == 0
+    assert run_cli("export", file, "--out", tmp_path / "scene.glb") == 0
     assert f"{len(means)} Gaussians" in capsys.readouterr().out
     _, found = read_glb(tmp_path / "scene.glb")
     np.testing.assert_allclose(found["POSITION"], means * [-1, -1, 1], atol=1e-6)
@@ -52,7 +48,7 @@ def test_a_selection_is_written_in_every_format(saved, tmp_path, ending):
     field, file = saved
     size = field.cameras.width, field.cameras.height
     asked = "query", file, "--box", "#0", 0, 0, *size, "--out", tmp_path, "--format", ending, "--views", 1
-    assert run(*asked) == 0
+    assert run_cli(*asked) == 0
     told = json.loads(next(tmp_path.glob("*.json")).read_text())
     assert told["count"] > 0
     chosen = tmp_path / told[ending]
@@ -66,7 +62,7 @@ def test_a_selection_is_written_in_every_format(saved, tmp_path, ending):
 
 @pytest.mark.parametrize("verb", ["export", "fit"])
 def test_an_ending_that_cannot_be_written_is_refused_before_anything_is_read(tmp_path, capsys, verb):
-    assert run(verb, tmp_path / "nowhere", "--out", tmp_path / "scene.sog") == 2
+    assert run_cli(verb, tmp_path / "nowhere", "--out", tmp_path / "scene.sog") == 2
     told = capsys.readouterr().err
     assert "scene.sog" in told
     assert "npx @playcanvas/splat-transform" in told

@@ -6,11 +6,11 @@ import json
 
 import numpy as np
 import pytest
+from capture_files import run_cli
 from small_field import REGIONS, make_field, shares, true_regions
 
 import jsecon
 from jsecon import InputError, Regions, Votes, load_gaussians, save_field
-from jsecon.app import cli
 from jsecon.data.gaussians.ply import read_elements
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.reference_words import REFERENCE_WORDS
@@ -56,10 +56,6 @@ def pair(first, second, share):
 def file(field, tmp_path):
     save_field(tmp_path / "field.safetensors", field)
     return tmp_path / "field.safetensors"
-
-
-def run(*arguments) -> int:
-    return cli.main([str(argument) for argument in arguments])
 
 
 def test_each_region_is_an_object_with_its_gaussians_and_its_colour(field):
@@ -160,7 +156,7 @@ def test_a_field_without_regions_has_an_empty_catalogue(field):
 
 def test_the_command_line_writes_a_table_records_and_a_page(field, file, tmp_path, capsys):
     (tmp_path / "names.txt").write_text("# things\nred mug\ngreen mug\n\nblue wall\n")
-    assert run("objects", file, "--vocabulary", tmp_path / "names.txt", "--out", tmp_path / "out") == 0
+    assert run_cli("objects", file, "--vocabulary", tmp_path / "names.txt", "--out", tmp_path / "out") == 0
     printed = capsys.readouterr().out
     listed = json.loads((tmp_path / "out" / "objects.json").read_text())["objects"]
     catalogue = jsecon.objects(field, ["red mug", "green mug", "blue wall"])
@@ -174,13 +170,13 @@ def test_the_command_line_writes_a_table_records_and_a_page(field, file, tmp_pat
     assert page.count('class="card"') == len(catalogue)
     assert all(f"{row['names'][0]['name']}" in printed and row["frames"][0] in page for row in listed)
     (tmp_path / "names.txt").write_text("#\n")
-    assert run("objects", file, "--vocabulary", tmp_path / "names.txt") == 2
+    assert run_cli("objects", file, "--vocabulary", tmp_path / "names.txt") == 2
     assert "names.txt" in capsys.readouterr().err
 
 
 def test_exported_objects_and_labels_are_those_of_the_catalogue(field, file, tmp_path):
     scene, ids, folder = tmp_path / "scene.ply", tmp_path / "ids.npy", tmp_path / "objects"
-    assert run("export", file, "--out", scene, "--with-labels", "--labels", ids, "--objects", folder) == 0
+    assert run_cli("export", file, "--out", scene, "--with-labels", "--labels", ids, "--objects", folder) == 0
     catalogue = jsecon.objects(field)
     labels = np.load(ids)
     assert labels.dtype == np.int32
@@ -198,10 +194,10 @@ def test_exported_objects_and_labels_are_those_of_the_catalogue(field, file, tmp
 
 def test_only_and_without_part_the_scene_bit_for_bit(field, file, tmp_path, capsys):
     paths = {name: tmp_path / f"{name}.ply" for name in ("scene", "only", "without")}
-    assert run("export", file, "--out", paths["scene"]) == 0
+    assert run_cli("export", file, "--out", paths["scene"]) == 0
     for name in ("only", "without"):
         ids = tmp_path / f"{name}.npy"
-        assert run("export", file, f"--{name}", "red thing", "--out", paths[name], "--labels", ids) == 0
+        assert run_cli("export", file, f"--{name}", "red thing", "--out", paths[name], "--labels", ids) == 0
         assert len(np.load(ids)) == load_gaussians(paths[name]).count
     rows = {name: [row.tobytes() for row in read_elements(path)["vertex"]] for name, path in paths.items()}
     assert sorted(rows["only"] + rows["without"]) == sorted(rows["scene"])
@@ -214,5 +210,5 @@ def test_only_and_without_part_the_scene_bit_for_bit(field, file, tmp_path, caps
         ("--only", "red", "--objects", tmp_path / "objects"),
         ("--labels", tmp_path / "ids.txt"),
     ):
-        assert run("export", file, *wrong) == 2
+        assert run_cli("export", file, *wrong) == 2
         assert "jsecon:" in capsys.readouterr().err

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from capture_files import ROOM_FIT
+from capture_files import ROOM_FIT, run_cli
 
 from jsecon.app import cli, verbs
 from jsecon.app.ask import METHODS
@@ -21,11 +21,6 @@ from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Console
 from jsecon.process import peak_memory_mib
 from jsecon.splat.transform import transform_gaussians
-
-
-def _run(*arguments):
-    return cli.main([str(argument) for argument in arguments])
-
 
 FITTED = [word for name, value in ROOM_FIT.items() for word in (f"--{name.replace('_', '-')}", value)]
 """options of `room_run`'s fit"""
@@ -42,7 +37,7 @@ def capture(room, tmp_path):
 
 def _object(capsys, *arguments):
     """What a verb prints with --json: one object and nothing else; and its words, on standard error."""
-    assert _run(*arguments, "--json") == 0
+    assert run_cli(*arguments, "--json") == 0
     out, err = capsys.readouterr()
     assert out.count("\n") == 1
     return json.loads(out), err
@@ -80,7 +75,7 @@ def test_fit_writes_a_scene_in_the_captures_world_and_says_how_good_it_is(room, 
     run, out = room_run
     shutil.copytree(out / "cache", tmp_path / "scene" / "cache")  # a run into the folder, gone on with
     line = "fit", room, "--out", tmp_path / "scene.ply", *FITTED
-    assert _run(*line) == 0
+    assert run_cli(*line) == 0
     words = capsys.readouterr().out
     assert "gaussians        cached" in words
     assert f"held-out PSNR {run.psnr.mean():.2f} dB, SSIM 0." in words
@@ -96,7 +91,7 @@ def test_fit_writes_a_scene_in_the_captures_world_and_says_how_good_it_is(room, 
 def test_query_writes_a_ply_a_json_and_masks_for_each_text(room_run, tmp_path, capsys, by):
     run, out = room_run
     names = list(json.loads((run.options.capture / "scene.json").read_text())["objects"].values())[:2]
-    assert _run("query", out / "field.safetensors", *names, "--out", tmp_path, "--by", by, "--views", 2) == 0
+    assert run_cli("query", out / "field.safetensors", *names, "--out", tmp_path, "--by", by, "--views", 2) == 0
     told = capsys.readouterr().out
     for name in names:
         slug = name.replace(" ", "-")
@@ -134,7 +129,7 @@ def test_query_at_a_pixel_selects_the_object_under_it(room_run, largest, tmp_pat
     names, masks, region = largest
     inside = cv2.distanceTransform(masks[0].astype(np.uint8), cv2.DIST_L2, 5)
     y, x = np.unravel_index(inside.argmax(), inside.shape)
-    assert _run("query", room_run[1] / "field.safetensors", "--at", names[0], x, y, "--out", tmp_path) == 0
+    assert run_cli("query", room_run[1] / "field.safetensors", "--at", names[0], x, y, "--out", tmp_path) == 0
     answer = json.loads(next(tmp_path.glob("*.json")).read_text())
     assert answer["count"] > 0
     assert "text encoder" in answer["skipped"]
@@ -151,7 +146,7 @@ def test_query_by_what_is_outlined(room_run, largest, tmp_path):
     rows, columns = np.nonzero(masks[0])
     box = names[0][-3:], columns.min(), rows.min(), columns.max(), rows.max()
     field = room_run[1] / "field.safetensors"
-    assert _run("query", field, "--mask", *files, "--box", *box, "--out", tmp_path) == 0
+    assert run_cli("query", field, "--mask", *files, "--box", *box, "--out", tmp_path) == 0
     answers = [json.loads(file.read_text()) for file in sorted(tmp_path.glob("*.json"))]
     assert len(answers) == 2
     for answer in answers:
@@ -159,7 +154,7 @@ def test_query_by_what_is_outlined(room_run, largest, tmp_path):
         assert answer["region"] == region
         assert answer["count"] > 0
     cv2.imwrite(str(tmp_path / "small.png"), np.zeros((50, 160), np.uint8))
-    assert _run("query", field, "--mask", names[0], tmp_path / "small.png", "--out", tmp_path) == 2
+    assert run_cli("query", field, "--mask", names[0], tmp_path / "small.png", "--out", tmp_path) == 2
 
 
 def test_eval_prints_the_table_and_writes_every_pair(room_run, room, tmp_path, capsys):
@@ -190,7 +185,7 @@ def test_other_verbs_too_tell_what_they_wrote_as_one_object(room_run, tmp_path, 
     assert (told["written"]["page"], told["answers"]) == (str(tmp_path / "page.html"), ["red"])
     told, _ = _object(capsys, "completion", "bash")
     assert told["script"].count("jsecon") > 10
-    assert _run("query", field, "red", "zzz", "--out", tmp_path / "answers", "--json") == 2
+    assert run_cli("query", field, "red", "zzz", "--out", tmp_path / "answers", "--json") == 2
     told = json.loads(capsys.readouterr().out)
     assert len(told["answers"]) == 1
     assert told["error"]["problem"]
@@ -199,20 +194,20 @@ def test_other_verbs_too_tell_what_they_wrote_as_one_object(room_run, tmp_path, 
 @pytest.mark.parametrize("verb", cli.VERB_NAMES)
 def test_help_of_a_verb_fits_a_screen_its_examples_parse_and_every_option_has_words(verb, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
-    assert _run(verb, "--help") == 0
+    assert run_cli(verb, "--help") == 0
     short = capsys.readouterr().out
     assert short.count("\n") <= 52
     examples = re.findall(rf"^  (jsecon {verb}\b.*)$", short, re.MULTILINE)
     assert examples
     for line in examples:
         cli.parse(shlex.split(line.partition(" > ")[0])[1:])
-    assert _run(verb, "--help-all") == 0
+    assert run_cli(verb, "--help-all") == 0
     whole = capsys.readouterr().out
     flags = [set(re.findall(r"^\W+(--[a-z][a-z-]*)", told, re.MULTILINE)) for told in (short, whole)]
     assert flags[0] <= flags[1]
     assert {"--json", "--debug"} <= flags[1]
     monkeypatch.setenv("COLUMNS", "200")
-    assert _run(verb, "--help-all") == 0
+    assert run_cli(verb, "--help-all") == 0
     rows = [line.strip("│| ") for line in capsys.readouterr().out.splitlines()]
     options = [n for n, row in enumerate(rows) if re.match("-h|--[a-z][a-z-]*( |,|$)|FIELD |CAPTURE ", row)]
     assert len(options) >= 3
@@ -222,17 +217,17 @@ def test_help_of_a_verb_fits_a_screen_its_examples_parse_and_every_option_has_wo
 
 
 def test_help_has_examples_and_leaves_advanced_options_to_the_long_one_which_groups_them(capsys):
-    assert _run("--help") == 0
+    assert run_cli("--help") == 0
     told = capsys.readouterr().out
     assert "jsecon run my_capture --out my_field" in told
     for verb in cli.VERB_NAMES:
         assert re.search(rf"^\W+{verb} +[A-Z]", told, re.MULTILINE)
-    assert _run("run", "--help") == 0
+    assert run_cli("run", "--help") == 0
     told = capsys.readouterr().out
     assert "--masks" in told
     assert "--agreement" not in told
     assert "jsecon run --help-all" in told
-    assert _run("run", "--help-all") == 0
+    assert run_cli("run", "--help-all") == 0
     told = capsys.readouterr().out
     order = ["--out", "scene options", "--downscale", "masks options", "--granularity", "models options", "--segmenter"]
     places = [told.index(word) for word in [*order, "field options", "--latent"]]
@@ -274,7 +269,7 @@ def test_options_of_a_query_are_read(line, options):
     ("query f x --out", "--out'. Expected 1"), ("models look x", "'check'"),
 ])  # fmt: skip
 def test_a_wrong_line_is_one_sentence_and_exit_code_2(capsys, line, says):
-    assert _run(*line.split()) == 2
+    assert run_cli(*line.split()) == 2
     told = capsys.readouterr().err
     assert told.startswith("jsecon: jsecon")
     assert told.count("\n") == 1
@@ -287,7 +282,7 @@ def test_a_wrong_line_is_one_sentence_and_exit_code_2(capsys, line, says):
 
 def _refused(capsys, *arguments, says=()):
     """Exit code 2, one message on standard error, no traceback, every one of `says` in it."""
-    assert _run(*arguments) == 2
+    assert run_cli(*arguments) == 2
     told = capsys.readouterr().err
     message = [line for line in told.splitlines() if line.startswith("jsecon: ")]
     assert len(message) == 1
@@ -319,7 +314,7 @@ def test_an_output_folder_that_cannot_be_written(capture, room_run, tmp_path, ca
 def test_a_text_that_is_not_understood_does_not_stop_the_others(room_run, tmp_path, capsys):
     field, out = room_run[1] / "field.safetensors", tmp_path / "answers"
     texts = ["red ball", "the meaning of life", "zzz"]
-    assert _run("query", field, *texts, "--out", out) == 2
+    assert run_cli("query", field, *texts, "--out", out) == 2
     told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("jsecon: ")]
     assert ["meaning of life" in line for line in told] == [True, False]
     assert "zzz" in told[1]

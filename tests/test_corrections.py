@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from conftest import gaussians_at, look_at
 from scipy.linalg import expm
+from test_fit import same
 
 from jsecon import Camera, Capture, InputError, render
 from jsecon.fit import refine
@@ -89,10 +90,6 @@ def errors(seed=4):
     rng = np.random.default_rng(seed)
     twists = np.concatenate([0.009 * rng.normal(size=(VIEWS, 3)), 0.02 * rng.normal(size=(VIEWS, 3))], axis=1)
     return {"twists": twists, "gains": rng.uniform(0.8, 1.0, VIEWS)}
-
-
-def same(a, b):
-    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
 def test_exponential_is_scipys_over_all_angles(x64):

@@ -12,8 +12,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from capture_files import run_cli
 
-from jsecon.app import cli
 from jsecon.data import capture as captures
 from jsecon.data.gaussians.ply import load_ply, save_ply
 from jsecon.data.sfm import list_photographs
@@ -21,10 +21,6 @@ from jsecon.pipeline.cache import files_digest
 
 HOME = Path(__file__).resolve().parent.parent
 PLACE = "Büro für Köln 日本 #1 %20 'é'"
-
-
-def _run(*arguments):
-    return cli.main([str(argument) for argument in arguments])
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +39,7 @@ def ran(room, room_run, tmp_path_factory):
     (capture / "sparse" / "0" / "images.bin").write_bytes(model)
     save_ply(base / "Szene ö.ply", room_run[0].field.gaussians)
     given = "--gaussians", base / "Szene ö.ply", "--masks", capture / "masks", "--holdout", 4
-    assert _run("run", capture, "--out", base / "Ausgabe ß 出力", *given) == 0
+    assert run_cli("run", capture, "--out", base / "Ausgabe ß 出力", *given) == 0
     return base, base / "Ausgabe ß 出力" / "field.safetensors", sorted(names.values())
 
 
@@ -64,17 +60,17 @@ def test_what_is_asked_is_answered_there(ran, capsys):
     thing = next(iter(json.loads((base / "Aufnahme 撮影" / "scene.json").read_text())["objects"].values()))
     answers = base / "Antworten ü 答え"
     at = "--at", names[1], 80, 60
-    assert _run("query", file, thing, *at, "--out", answers, "--views", 1, "--json") == 0
+    assert run_cli("query", file, thing, *at, "--out", answers, "--views", 1, "--json") == 0
     told = json.loads(capsys.readouterr().out)
     for answer in told["answers"]:
         assert load_ply(answers / answer["ply"]).count == answer["count"] > 0
         for mask in answer["masks"].values():
             assert cv2.imdecode(np.fromfile(answers / mask, np.uint8), cv2.IMREAD_UNCHANGED) is not None
-    assert _run("view", file, thing, "--export", base / "Seite ñ 頁.html") == 0
+    assert run_cli("view", file, thing, "--export", base / "Seite ñ 頁.html") == 0
     page = (base / "Seite ñ 頁.html").read_text(encoding="utf-8")
     assert thing in page
     assert "Ausgabe ß 出力" in page
-    assert _run("export", file, "--out", base / "Export 輸出.glb") == 0
+    assert run_cli("export", file, "--out", base / "Export 輸出.glb") == 0
     assert (base / "Export 輸出.glb").read_bytes()[:4] == b"glTF"
 
 
