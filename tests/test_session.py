@@ -6,6 +6,7 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
+from capture_files import refused
 from onnx_files import node, write_graph
 
 from jsecon.errors import InputError
@@ -56,10 +57,8 @@ def test_a_scalar_stays_one(tmp_path):
     ({"x": np.zeros((1, 3), np.float32)}, ["embedding"], ["tensor 'embedding'", "y float32[batch, 2]"]),
 ])  # fmt: skip
 def test_a_tensor_that_does_not_fit_is_named(affine, feeds, outputs, named):
-    with pytest.raises(InputError) as caught:
+    with refused("affine.onnx", *named):
         Graph(affine).run(feeds, outputs)
-    for words in ("affine.onnx", *named):
-        assert words in str(caught.value)
 
 
 def test_requirements_name_the_tensor_and_what_was_wanted(affine):
