@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from scipy import sparse
 
 from jsecon.association.algorithm1 import clean_masklets, masklets
 from jsecon.association.run_lengths import encode_masks, encode_rows, memoized_masks
@@ -247,14 +246,6 @@ def test_masks_come_back(seed, count, share):
         np.testing.assert_array_equal(getattr(again, name), getattr(runs, name))
     both = runs.concatenate(encode_masks(~masks))
     np.testing.assert_array_equal(both.masks(5, 7), np.concatenate([masks, ~masks]))
-
-
-def test_a_mask_that_ends_where_the_next_begins_is_not_run_together():
-    rows = sparse.csr_matrix(np.array([[0, 0, 0, 1, 1, 0], [0, 0, 0, 0, 0, 1], [1, 1, 0, 0, 0, 0]], bool))
-    runs = encode_rows(rows)
-    np.testing.assert_array_equal(runs.counts, [1, 1, 1])
-    np.testing.assert_array_equal(runs.starts, [3, 5, 0])
-    np.testing.assert_array_equal(runs.stops, [5, 6, 2])
 
 
 def test_a_frame_is_asked_once():
