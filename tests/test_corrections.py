@@ -213,7 +213,7 @@ def test_a_refining_fit_goes_on_from_a_checkpoint_to_the_same_result(capture, tr
 def test_a_rough_capture_is_corrected_and_its_held_out_frames_have_no_part_in_it(capture, truth, decide):
     told = rough(capture, **errors())
     start = truth if decide else dataclasses.replace(truth, opacity_logits=np.zeros(40, np.float32))
-    given = {"key": KEY, "visits": 10, "probes": 2, "decide": decide}
+    given = {"key": KEY, "visits": 15, "probes": 2, "decide": decide}
     better = refine_capture(told, start, **given)
     assert ("are corrected" if decide else "poses refined") in " ".join(better.notes)
     assert decide or "held-out" in better.notes[-1]
