@@ -231,6 +231,18 @@ def test_an_open_question_is_asked_and_a_near_miss_is_named(scene):
     assert "the text says 3 and 2 match" in three.reason
 
 
+def test_orange_means_the_orange_thing_where_there_is_a_dark_orange_one_too():
+    """With regions whose colours are only near to the words', as those of frames are."""
+    field, embedder = table_field((*THINGS, ("dark orange bowl", (0.8, -0.6, 0.05), (0.05, 0.05, 0.05))))
+    seen = np.array(field.regions.embeddings)
+    seen[4], seen[6] = seen[4] + 0.5 * embedder.embed_text(["yellow"])[0], seen[6] + 0.3 * seen[4]
+    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+    field = dataclasses.replace(field, regions=Regions(seen, field.regions.pixels))
+    scene = ObjectScene(field, embedder, up=(0, 0, 1))
+    for text, region in (("all orange balls", 4), ("all dark orange bowls", 6)):
+        assert [found.regions for found in jsecon.query_relation(scene, text).objects] == [(region,)]
+
+
 def test_the_ends_of_a_beam_whose_middle_is_hidden_are_one_object():
     ends = [("purple beam", (x, 0.3, 0.03), (0.15, 0.03, 0.03)) for x in (-0.16, 0.16)]
     scene = ObjectScene(*table_field((*THINGS, *ends, ("purple ball", (0.9, -0.7, 0.05), (0.05, 0.05, 0.05)))))

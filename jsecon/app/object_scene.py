@@ -29,6 +29,8 @@ from jsecon.views.frame import field_up
 
 ONE_WAY = 0.5
 """length of the mean of the cameras' horizontal directions from which they look one way"""
+SAME_NAME = 1e-4
+"""cosine by which a name must be nearer to an object than the text, to fit it better"""
 
 
 class ObjectScene:
@@ -71,7 +73,7 @@ class ObjectScene:
                 self._object(regions)
         if self.field.regions.count:
             match_regions(self.field, self.field.regions.embeddings[:1], self.rules)  # compiles it
-        _ = self.catalogue
+        _ = self.catalogue, self._names
 
     @functools.cached_property
     def catalogue(self) -> Catalogue:
@@ -97,10 +99,29 @@ class ObjectScene:
             embedded = jax.device_put(self.embedder.embed_text(texts))
             match = match_regions(self.field, embedded, self.rules)
             regions = np.flatnonzero(np.asarray(match.chosen)) if int(match.region) >= 0 else np.zeros(0, int)
-            made = [(group, self._object(group)) for group in join_pieces(regions, self._joined)]
+            groups = self._best_named(texts, join_pieces(regions, self._joined))
+            made = [(group, self._object(group)) for group in groups]
             objects = [FoundObject(phrase, group, *parts) for group, parts in made if parts is not None]
             self._phrases[phrase] = objects, float(match.quantile)
         return self._phrases[phrase]
+
+    def _best_named(self, texts: Sequence[str], groups: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
+        """Keeps the objects that no other name of the vocabulary fits better than the text, if there are any.
+
+        "Orange" means the orange thing where there is a dark orange one too.
+        """
+        if len(texts) > 1 or len(groups) < 2 or self._names is None:
+            return groups
+        embeddings = np.asarray(self.field.regions.embeddings)
+        similarity = embeddings @ np.asarray(self.embedder.embed_text(list(texts)))[0]
+        fits = similarity >= (embeddings @ self._names.T).max(1) - SAME_NAME
+        return [group for group in groups if fits[list(group)].any()] or groups
+
+    @functools.cached_property
+    def _names(self) -> np.ndarray | None:
+        """(V, E) embeddings of the embedder's vocabulary, if it has one."""
+        names = getattr(self.embedder, "vocabulary", ())
+        return np.asarray(self.embedder.embed_text(list(names))) if names else None
 
     @functools.cached_property
     def _joined(self) -> np.ndarray:
