@@ -141,6 +141,12 @@ class Labeller:
             remedy = "Fetch the file again."
             raise InputError(self.file, f"not a readable labeller ({describe_error(error)})", remedy=remedy) from error
         (source,), (target,) = interpreter.get_input_details(), interpreter.get_output_details()
+        pictures = source["dtype"] == np.uint8 and len(source["shape"]) == 4 and source["shape"][3] == 3
+        scores = target["dtype"] == np.uint8 and tuple(target["shape"]) == (1, len(self.names))
+        if not (pictures and scores):
+            found = f"takes {tuple(source['shape'])} and gives {tuple(target['shape'])}"
+            expected = f"one uint8 picture and a uint8 score for each of its {len(self.names)} names"
+            raise InputError(self.file, found, expected, "Give a quantised labeller with its names.")
         return interpreter, source, target
 
 
@@ -160,6 +166,9 @@ class TextVectors:
             remedy = "Give an .npz with `names` (N,) and `vectors` (N, E)."
             problem = f"not a readable table of vectors ({describe_error(error)})"
             raise InputError(self.file, problem, remedy=remedy) from error
+        if vectors.ndim != 2 or len(names) != len(vectors) or not np.isfinite(vectors).all():
+            found, expected = f"{len(names)} names and vectors {vectors.shape}", "a finite vector for each name"
+            raise InputError(self.file, found, expected, "Give an .npz with `names` (N,) and `vectors` (N, E).")
         units = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
         self.names, self.vectors = tuple(names), units.astype(np.float32)
         self._rows = {name: row for row, name in enumerate(names)}

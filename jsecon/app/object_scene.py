@@ -83,7 +83,8 @@ class ObjectScene:
     def objects_of(self, phrase: str) -> tuple[list[FoundObject], float]:
         """Finds the objects that a phrase names: regions that match it, those of one object joined.
 
-        These overlap, or are one object in the catalogue: the ends of a beam whose middle is hidden.
+        These overlap, or are one object in the catalogue: the ends of a beam whose middle is hidden. Where a text is
+        the best name of some of the objects, the others do not count.
 
         Args:
           phrase: Free text for the embedder.
