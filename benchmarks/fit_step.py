@@ -23,13 +23,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
-from jsecon.data.capture import load_capture
 from jsecon.fit.growth import pad_with_free_rows
 from jsecon.fit.photometric import l1, photometric_loss
 from jsecon.fit.schedule import LearningRates
 from jsecon.fit.start import starting_gaussians
 from jsecon.fit.step import StepConfig, StepRunner, TrainState, put_on_devices
 from jsecon.parallel import MESH_OPTIONS, host_mesh, map_rows
+from jsecon.read.captures.capture import load_capture
 from jsecon.splat.capacity import default_capacity, round_capacity
 from jsecon.splat.render import render, render_rgb
 from jsecon.splat.sh import colours_from_sh

@@ -123,7 +123,7 @@ def main() -> None:
     if arguments.measure:
         return measure(Path(arguments.measure[0]), arguments.measure[1])
     with tempfile.TemporaryDirectory(prefix="jsecon-objects-") as folder:
-        from jsecon.language.field import save_field
+        from jsecon.field.field import save_field
 
         file = Path(folder) / "field.safetensors"
         save_field(file, made_field(arguments.objects, arguments.gaussians))

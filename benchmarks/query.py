@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from metrics import Metric, interleaved, show
 
-from jsecon.query.baselines import query_one_step
+from jsecon.field.similarity import unit_codes
+from jsecon.paper.baselines import query_one_step
 from jsecon.query.select import query_anchored
-from jsecon.query.similarity import unit_codes
 from jsecon.types import Camera, Gaussians, LanguageField, Regions, Votes
 
 REGIONS, TOP, TEXTS, SAMPLE = 40, 8, 100, 20_000

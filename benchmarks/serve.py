@@ -29,7 +29,7 @@ prepare_process(keep_programs=False)
 import jax
 import numpy as np
 
-from jsecon.language.field import load_field, save_field
+from jsecon.field.field import load_field, save_field
 from jsecon.types import LanguageField
 
 TOKEN = "measured"

@@ -84,11 +84,11 @@ def main() -> None:
     prepare_process()
     import jax.numpy as jnp
 
-    from jsecon.association.algorithm1 import masklets
     from jsecon.association.consensus import consensus_masklets
     from jsecon.association.run_lengths import memoized_masks
-    from jsecon.association.tracker import GeometricTracker
     from jsecon.fit.start import gaussians_from_points
+    from jsecon.paper.algorithm1 import masklets
+    from jsecon.paper.tracker import GeometricTracker
     from jsecon.types import Camera
     from jsecon.vision.classical import ClassicalSegmenter
 

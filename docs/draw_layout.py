@@ -16,8 +16,8 @@ OUT = HOME / "docs" / "_static"
 CAPTURE, QUESTION, PLAIN = "#c2410c", "#1d4ed8", "#94a3b8"
 STYLE = {"font.family": "DejaVu Sans", "svg.fonttype": "none", "svg.hashsalt": "jsecon"}
 ROUTES = {
-    CAPTURE: ("a capture", ("pipeline", "data", "fit", "splat", "vision", "association", "language")),
-    QUESTION: ("a question", ("app", "query", "language", "splat")),
+    CAPTURE: ("a capture", ("pipeline", "read", "fit", "splat", "vision", "association", "field")),
+    QUESTION: ("a question", ("app", "query", "field", "splat")),
 }
 """colour -> a route and the packages that it passes"""
 

@@ -21,12 +21,12 @@ from experiments import results
 from experiments.datasets.depth_points import confirmed_depths
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import accuracy_at, iou, mean_iou
+from jsecon.field.membership import with_shown
+from jsecon.field.votes import region_votes
 from jsecon.fit.depth import points_from_depth
 from jsecon.fit.quality import measure_quality
 from jsecon.fit.start import gaussians_from_points
-from jsecon.language.distill import distill_votes
-from jsecon.language.membership import with_shown
-from jsecon.language.votes import region_votes
+from jsecon.paper.distill import distill_votes
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.render import selection_mask
 from jsecon.query.select import query_region

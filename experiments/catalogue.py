@@ -23,7 +23,6 @@ from jaxtyping import Float, Int
 import jsecon
 from experiments import results
 from jsecon.app.catalogue import Catalogue
-from jsecon.data.masks import load_labels
 from jsecon.demo import write_room
 from jsecon.demo.room import Room, RoomObject, crowded_room
 from jsecon.demo.shapes import contains
@@ -31,6 +30,7 @@ from jsecon.errors import InputError
 from jsecon.pipeline import run as pipeline
 from jsecon.pipeline.options import Options as RunOptions
 from jsecon.pipeline.progress import Listener
+from jsecon.read.masks.masks import load_labels
 from jsecon.types import LanguageField
 
 FOUND = 0.5

@@ -22,8 +22,8 @@ from experiments.tables.association import overlaps
 from experiments.tables.fill import measure
 from experiments.tables.ours import paper
 from experiments.tables.setting import Setting, prepare
-from jsecon.language.autoencoder import Autoencoder, train_autoencoder
 from jsecon.numerics import cosine, cosine_matrix
+from jsecon.paper.autoencoder import Autoencoder, train_autoencoder
 
 LATENT = 3
 """Size of the autoencoder's code."""

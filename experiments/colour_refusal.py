@@ -16,8 +16,8 @@ import numpy as np
 import jsecon
 from experiments import results
 from jsecon.app.ask import ask_text
-from jsecon.data.labels import load_lerf_labels
 from jsecon.numerics import cosine_matrix
+from jsecon.read.masks.labels import load_lerf_labels
 from jsecon.vision.colours import BASIC, ColourEmbedder
 
 COLOURS = "red orange yellow green blue purple pink brown turquoise teal cyan magenta violet olive navy maroon"

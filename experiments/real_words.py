@@ -35,7 +35,7 @@ from experiments.words import rules
 from experiments.words.absent import absent_names
 from experiments.words.conse import Conse, Crop, Labeller, TextVectors, class_weights, conse
 from experiments.words.scenes import DEFAULT, GIVEN, RIVALS, WordScene, load_scene, rival_weights, scores_of
-from jsecon.language.membership import finish_votes
+from jsecon.field.membership import finish_votes
 from jsecon.query.classes import query_classes
 from jsecon.query.match import evidence, match_regions
 from jsecon.query.rules import KIND_THRESHOLD, QUANTILE, RETRIEVAL_THRESHOLD

@@ -42,13 +42,13 @@ from jsecon.demo.room import (
 )
 from jsecon.demo.shapes import SHAPES, Body, box, contains, ellipsoid, place
 from jsecon.errors import InputError
+from jsecon.field.field import load_field, save_field
+from jsecon.field.membership import finish_votes
+from jsecon.field.regions import region_embeddings
+from jsecon.field.votes import region_votes
 from jsecon.fit.depth import points_from_depth
 from jsecon.fit.start import gaussians_from_points
-from jsecon.language.distill import distill_votes
-from jsecon.language.field import load_field, save_field
-from jsecon.language.membership import finish_votes
-from jsecon.language.regions import region_embeddings
-from jsecon.language.votes import region_votes
+from jsecon.paper.distill import distill_votes
 from jsecon.types import Camera, Capture, LanguageField
 from jsecon.vision.colours import ColourEmbedder
 

@@ -30,8 +30,8 @@ from experiments.tables import twins
 from experiments.tables.association import associated
 from experiments.tables.ours import field_of, parts_of
 from experiments.tables.setting import Setting
+from jsecon.field.votes import region_votes
 from jsecon.fit.start import gaussians_from_points
-from jsecon.language.votes import region_votes
 from jsecon.process import clear_programs
 from jsecon.query.match import match_regions
 from jsecon.query.outliers import remove_outliers

@@ -11,11 +11,7 @@ from .app.relations import (
     measure as measure,
     query_relation as query_relation,
 )
-from .association.algorithm1 import masklets as masklets
 from .backend import check_backend as check_backend
-from .data.capture import load_capture as load_capture
-from .data.gaussians.files import load_gaussians as load_gaussians, save_gaussians as save_gaussians
-from .data.gaussians.ply import load_ply as load_ply, save_ply as save_ply
 from .errors import InputError as InputError
 from .evaluate.metrics import (
     accuracy_at as accuracy_at,
@@ -23,24 +19,26 @@ from .evaluate.metrics import (
     localization_accuracy as localization_accuracy,
     mean_iou as mean_iou,
 )
-from .language.autoencoder import Autoencoder as Autoencoder, train_autoencoder as train_autoencoder
-from .language.distill import distill_l1 as distill_l1, distill_votes as distill_votes
-from .language.field import check_field as check_field, load_field as load_field, save_field as save_field
-from .language.membership import (
+from .field.field import check_field as check_field, load_field as load_field, save_field as save_field
+from .field.membership import (
     finish_votes as finish_votes,
     finish_votes_in_blocks as finish_votes_in_blocks,
     membership_probability as membership_probability,
     with_overlap as with_overlap,
     with_shown as with_shown,
 )
-from .language.regions import region_embeddings as region_embeddings
-from .language.streaming import (
+from .field.regions import region_embeddings as region_embeddings
+from .field.similarity import unit_codes as unit_codes
+from .field.streaming import (
     codes_in_blocks as codes_in_blocks,
     region_votes_in_blocks as region_votes_in_blocks,
 )
-from .language.votes import region_votes as region_votes, scan_region_votes as scan_region_votes
+from .field.votes import region_votes as region_votes, scan_region_votes as scan_region_votes
+from .paper.algorithm1 import masklets as masklets
+from .paper.autoencoder import Autoencoder as Autoencoder, train_autoencoder as train_autoencoder
+from .paper.baselines import query_canonical as query_canonical, query_one_step as query_one_step
+from .paper.distill import distill_l1 as distill_l1, distill_votes as distill_votes
 from .parallel import host_mesh as host_mesh
-from .query.baselines import query_canonical as query_canonical, query_one_step as query_one_step
 from .query.blocks import query_in_blocks as query_in_blocks
 from .query.classes import query_classes as query_classes
 from .query.match import RegionMatch as RegionMatch, match_regions as match_regions
@@ -56,7 +54,9 @@ from .query.select import (
     query_several as query_several,
     select_gaussians as select_gaussians,
 )
-from .query.similarity import unit_codes as unit_codes
+from .read.captures.capture import load_capture as load_capture
+from .read.splats.files import load_gaussians as load_gaussians, save_gaussians as save_gaussians
+from .read.splats.ply import load_ply as load_ply, save_ply as save_ply
 from .splat.capacity import plan_capacity as plan_capacity
 from .splat.plan import plan_view as plan_view, render_plan as render_plan
 from .splat.project import project as project

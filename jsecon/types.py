@@ -291,7 +291,7 @@ class LanguageField(_Shown):
     region_codes: Array
     """(R, d) unit codes of the regions."""
     autoencoder: Any
-    """Coder of jsecon.language.codes, or None where the codes are the embeddings themselves."""
+    """Coder of jsecon.paper.codes, or None where the codes are the embeddings themselves."""
     cameras: Camera
     """batch of T: the capture's views, for masks and for `--at`."""
     canonical: Array

@@ -23,26 +23,26 @@ from test_rgbd import FORMATS as RGBD
 
 from experiments.datasets.feature_files import write_features
 from jsecon.app import ask
-from jsecon.data import images, video
-from jsecon.data.capture import load_capture
-from jsecon.data.colmap import write_colmap
-from jsecon.data.gaussians.files import read_gaussians
-from jsecon.data.gaussians.gltf import save_glb
-from jsecon.data.gaussians.ply import load_ply, load_point_cloud, save_ply
-from jsecon.data.labels import load_lerf_labels
-from jsecon.data.langsplat import embedding_size, load_features
-from jsecon.data.masks import load_labels
-from jsecon.data.proposals import load_proposals
 from jsecon.errors import InputError
-from jsecon.language.autoencoder import Autoencoder
-from jsecon.language.codes import Rotation
-from jsecon.language.field import check_field, load_field, save_field
+from jsecon.field.field import check_field, load_field, save_field
 from jsecon.networks.clip import MAX_BIAS, MAX_SCALE, ClipEmbedder
 from jsecon.networks.sam import SamSegmenter, SamSettings, find_sam
 from jsecon.networks.sam2 import Sam2Tracker
 from jsecon.networks.sam3 import PhraseMasks, Sam3
 from jsecon.networks.tokenizer import CLIP_LENGTH, TextTokenizer
+from jsecon.paper.autoencoder import Autoencoder
+from jsecon.paper.codes import Rotation
 from jsecon.pipeline import cache
+from jsecon.read.captures import images, video
+from jsecon.read.captures.capture import load_capture
+from jsecon.read.captures.colmap import write_colmap
+from jsecon.read.masks.labels import load_lerf_labels
+from jsecon.read.masks.langsplat import embedding_size, load_features
+from jsecon.read.masks.masks import load_labels
+from jsecon.read.masks.proposals import load_proposals
+from jsecon.read.splats.files import read_gaussians
+from jsecon.read.splats.gltf import save_glb
+from jsecon.read.splats.ply import load_ply, load_point_cloud, save_ply
 from jsecon.types import Camera, Gaussians, LanguageField, Parts, Regions, Votes
 from jsecon.vision.stores import EmbeddingStore, StoredSegmenter
 

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsecon.language.codes import region_codes
-from jsecon.language.distill import distill_votes
-from jsecon.language.membership import LABELLED_PART, SEEN_PART
-from jsecon.language.votes import region_votes
+from jsecon.field.membership import LABELLED_PART, SEEN_PART
+from jsecon.field.votes import region_votes
+from jsecon.paper.codes import region_codes
+from jsecon.paper.distill import distill_votes
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.render import render
 from jsecon.types import Camera, Gaussians, LanguageField, Regions, Votes

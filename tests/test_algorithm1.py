@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from jsecon.association.algorithm1 import clean_masklets, masklets
 from jsecon.association.run_lengths import encode_masks, encode_rows, memoized_masks
+from jsecon.paper.algorithm1 import clean_masklets, masklets
 from jsecon.pipeline import cache
 
 

@@ -7,7 +7,7 @@ import pytest
 from conftest import look_at
 from scipy.linalg import expm
 
-from jsecon.fit.alignment import align_cameras
+from jsecon.poses.alignment import align_cameras
 from jsecon.types import Camera, Capture
 
 VIEWS, WIDTH, HEIGHT, FOCAL = 10, 120, 90, 110.0

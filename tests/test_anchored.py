@@ -11,8 +11,8 @@ import pytest
 from small_field import REGIONS, field_of, make_field, shares, true_regions, unit_rows
 
 from jsecon.errors import InputError
-from jsecon.language.membership import finish_votes, vote_shares, with_shown
-from jsecon.language.votes import region_votes
+from jsecon.field.membership import finish_votes, vote_shares, with_shown
+from jsecon.field.votes import region_votes
 from jsecon.query.classes import query_classes
 from jsecon.query.pixel import pixel_weights, region_at, region_shares_seen
 from jsecon.query.rules import QueryRules

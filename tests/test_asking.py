@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from jsecon.app import ask, cli
-from jsecon.language import columns, field as field_file
-from jsecon.language.field import load_field, save_field, subset_field
+from jsecon.field import columns, field as field_file
+from jsecon.field.field import load_field, save_field, subset_field
 from jsecon.types import Parts
 from jsecon.vision.colours import ColourEmbedder
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from small_field import unit_rows
 
-from jsecon.language.autoencoder import train_autoencoder
 from jsecon.numerics import cosine
+from jsecon.paper.autoencoder import train_autoencoder
 
 KEY = jax.random.key(0)
 

@@ -8,9 +8,9 @@ from jax.extend.core import jaxprs_in_params
 
 import jsecon
 import jsecon.backend as backend
-from jsecon.language.codes import Rotation
+from jsecon.field.similarity import similarities, unit_codes
 from jsecon.numerics import FULL_PRECISION, cosine_matrix
-from jsecon.query.similarity import similarities, unit_codes
+from jsecon.paper.codes import Rotation
 
 pytestmark = pytest.mark.as_shipped
 

@@ -12,12 +12,12 @@ from small_field import make_field
 from test_votes import REGIONS, expected, labels  # noqa: F401
 
 from jsecon.errors import InputError
-from jsecon.language import columns, view_votes, votes as votes_module
-from jsecon.language.distill import distill_votes
-from jsecon.language.field import load_field, save_field
-from jsecon.language.membership import finish_votes, finish_votes_in_blocks, with_overlap
-from jsecon.language.streaming import codes_in_blocks, region_votes_in_blocks, strongest
-from jsecon.language.votes import region_votes
+from jsecon.field import columns, view_votes, votes as votes_module
+from jsecon.field.field import load_field, save_field
+from jsecon.field.membership import finish_votes, finish_votes_in_blocks, with_overlap
+from jsecon.field.streaming import codes_in_blocks, region_votes_in_blocks, strongest
+from jsecon.field.votes import region_votes
+from jsecon.paper.distill import distill_votes
 from jsecon.query.blocks import query_in_blocks
 from jsecon.query.select import query_anchored
 from jsecon.splat.render import render_rgb
@@ -213,7 +213,7 @@ def test_strongest_is_top_k_with_equal_ones_by_region():
 @pytest.fixture
 def fields(scene, cameras, tmp_path, monkeypatch):
     """A field in memory, and the same with all its columns mapped."""
-    from jsecon.language import field as home
+    from jsecon.field import field as home
 
     field = make_field(scene, cameras)[0]
     field = dataclasses.replace(field, votes=with_overlap(field.votes))

@@ -11,7 +11,7 @@ import pytest
 
 from jsecon import Autoencoder, InputError
 from jsecon.files import unpack_tree
-from jsecon.language.codes import Rotation
+from jsecon.paper.codes import Rotation
 from jsecon.pipeline import cache
 from jsecon.pipeline.results import Stage, StageResult
 
@@ -196,7 +196,13 @@ def test_a_key_follows_the_source_that_a_stage_can_import_and_no_other(tmp_path,
 
     behind = ("app/viewer/window.py", "query/match.py", "evaluate/lerf.py", "demo/room.py")
     assert not any(changed(file) for file in behind)
-    ahead = ("association/consensus.py", "networks/sam2.py", "data/colmap.py", "types.py", "pipeline/stages.py")
+    ahead = (
+        "association/consensus.py",
+        "networks/sam2.py",
+        "read/captures/colmap.py",
+        "types.py",
+        "pipeline/stages.py",
+    )
     assert all(changed(file) for file in ahead)
 
 

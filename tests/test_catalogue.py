@@ -11,7 +11,7 @@ from small_field import REGIONS, make_field, shares, true_regions
 
 import jsecon
 from jsecon import InputError, Regions, Votes, load_gaussians, save_field
-from jsecon.data.gaussians.ply import read_elements
+from jsecon.read.splats.ply import read_elements
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.reference_words import REFERENCE_WORDS
 

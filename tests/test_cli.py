@@ -15,11 +15,11 @@ from capture_files import ROOM_FIT, run_cli
 
 from jsecon.app import cli, verbs
 from jsecon.app.ask import METHODS
-from jsecon.data.gaussians.ply import load_ply
 from jsecon.pipeline import progress
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Console
 from jsecon.process import peak_memory_mib
+from jsecon.read.splats.ply import load_ply
 from jsecon.splat.transform import transform_gaussians
 
 FITTED = [word for name, value in ROOM_FIT.items() for word in (f"--{name.replace('_', '-')}", value)]

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from small_field import unit_rows
 
-from jsecon.language.autoencoder import Autoencoder
-from jsecon.language.codes import (
+from jsecon.paper.autoencoder import Autoencoder
+from jsecon.paper.codes import (
     CODE_THRESHOLD,
     LATENTS,
     Rotation,

@@ -8,8 +8,8 @@ import pytest
 from capture_files import refused, ring_poses, small_capture, write_images, write_text_model
 
 from jsecon import Camera, InputError, load_capture
-from jsecon.data.colmap import read_images, write_colmap
-from jsecon.data.images import write_image
+from jsecon.read.captures.colmap import read_images, write_colmap
+from jsecon.read.captures.images import write_image
 
 CAPTURE = small_capture()
 

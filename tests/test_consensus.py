@@ -14,7 +14,7 @@ from jsecon.association.consensus import (
     split_cells,
 )
 from jsecon.association.views import SceneViews, claim_atoms
-from jsecon.language.votes import region_votes
+from jsecon.field.votes import region_votes
 
 
 @pytest.fixture(scope="module")

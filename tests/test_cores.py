@@ -14,7 +14,7 @@ import pytest
 from small_field import make_field
 
 from jsecon.app.ask import ask_text
-from jsecon.language.field import save_field
+from jsecon.field.field import save_field
 from jsecon.vision.colours import ColourEmbedder
 
 TESTS = Path(__file__).resolve().parent

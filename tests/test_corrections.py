@@ -11,7 +11,6 @@ from scipy.linalg import expm
 from test_fit import same
 
 from jsecon import Camera, Capture, InputError, render
-from jsecon.fit import refine
 from jsecon.fit.corrections import (
     Corrections,
     RefineOptions,
@@ -23,10 +22,11 @@ from jsecon.fit.corrections import (
 )
 from jsecon.fit.optimise import fit_gaussians, init_fit_state
 from jsecon.fit.quality import measure_quality
-from jsecon.fit.refine import refine_capture
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.start import starting_gaussians
 from jsecon.fit.step import TrainingViews, cameras_extent, view_loss
+from jsecon.poses import refine
+from jsecon.poses.refine import refine_capture
 
 KEY, VIEWS = jax.random.key(0), 6
 FROZEN = LearningRates(means=0.0, means_last=0.0, log_scales=0.0, quaternions=0.0, opacity_logits=0.0, colors=0.0)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from jsecon.app import cli
-from jsecon.data.capture import capture_extent, load_capture
-from jsecon.data.frames import CaptureExtent, FrameOptions
-from jsecon.data.video import video_size
+from jsecon.read.captures.capture import capture_extent, load_capture
+from jsecon.read.captures.frames import CaptureExtent, FrameOptions
+from jsecon.read.captures.video import video_size
 
 STAGES = ["load", "gaussians", "masklets", "regions", "codes", "votes", "distil", "held_out"]
 

@@ -7,7 +7,7 @@ import numpy as np
 from small_field import make_field
 
 from jsecon.app import cli
-from jsecon.language.field import save_field
+from jsecon.field.field import save_field
 from jsecon.query import edits
 from jsecon.vision.colours import ColourEmbedder
 

@@ -14,13 +14,13 @@ from capture_files import refused, small_capture, write_images, write_text_model
 from fuzz_readers import _field
 
 from jsecon import load_capture, save_field, save_ply
-from jsecon.data import frames
-from jsecon.data.images import write_image
 from jsecon.files import exclusive_lock, write_text
 from jsecon.pipeline import cache, run as pipeline
 from jsecon.pipeline.progress import Listener
 from jsecon.pipeline.results import RunContext
 from jsecon.pipeline.stages import capture_stages
+from jsecon.read.captures import frames
+from jsecon.read.captures.images import write_image
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
 

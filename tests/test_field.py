@@ -10,8 +10,8 @@ from safetensors.numpy import load_file, save_file
 from small_field import REGIONS, make_field, unit_rows
 
 from jsecon import InputError, check_field, load_field, save_field, train_autoencoder, with_overlap
+from jsecon.field import field as module
 from jsecon.files import read_arrays, write_arrays
-from jsecon.language import field as module
 from jsecon.types import Parts
 
 

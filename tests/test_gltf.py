@@ -11,8 +11,8 @@ from splat_files import C0, opacity, scene
 from test_gaussian_files import gaussians, image
 
 from jsecon import Gaussians, load_gaussians
-from jsecon.data.gaussians import gltf
-from jsecon.data.gaussians.gltf import save_glb
+from jsecon.read.splats import gltf
+from jsecon.read.splats.gltf import save_glb
 from jsecon.splat.transform import transform_gaussians
 
 COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}

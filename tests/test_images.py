@@ -11,9 +11,16 @@ import PIL.ImageOps
 import pytest
 from capture_files import png, png_chunk, refused
 
-from jsecon.data.images import apply_orientation, image_header, read_depth, read_image, read_label_image, write_image
-from jsecon.data.lens import Lens, distort, undistorted_pinhole, undistortion_maps
 from jsecon.errors import InputError
+from jsecon.read.captures.images import (
+    apply_orientation,
+    image_header,
+    read_depth,
+    read_image,
+    read_label_image,
+    write_image,
+)
+from jsecon.read.captures.lens import Lens, distort, undistorted_pinhole, undistortion_maps
 
 RNG = np.random.default_rng(3)
 FRAME = RNG.integers(0, 256, (13, 17, 3), np.uint8)
@@ -141,7 +148,7 @@ def test_too_large_images_are_shrunk_or_say_the_limit(tmp_path, monkeypatch):
     (tmp_path / "big.png").write_bytes(b"\x89PNG\r\n\x1a\n" + header + rest)
     with refused("big.png", "16000x9000", "134 million", "Shrink"):
         read_image(tmp_path / "big.png")
-    monkeypatch.setattr("jsecon.data.images.MAX_PIXELS", 101 * 61)
+    monkeypatch.setattr("jsecon.read.captures.images.MAX_PIXELS", 101 * 61)
     PIL.Image.fromarray(corners(201, 121)).save(tmp_path / "big.jpg", quality=95)
     assert image_header(tmp_path / "big.jpg").upright == (101, 61)
     image, _ = read_image(tmp_path / "big.jpg")

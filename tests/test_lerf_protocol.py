@@ -9,9 +9,9 @@ import pytest
 
 from experiments.datasets.lerf_ovs import LERF_PAIRS
 from jsecon import InputError, Selection, selection_mask
-from jsecon.data.labels import LabelledFrame
 from jsecon.evaluate.lerf import ALPHA_THRESHOLD, VALA_THRESHOLD, evaluate_at_thresholds
 from jsecon.fit.resize import resize_camera
+from jsecon.read.masks.labels import LabelledFrame
 
 
 def members(scene):

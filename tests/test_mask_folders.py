@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from capture_files import refused
 
-from jsecon.data.langsplat import load_features
-from jsecon.data.masks import load_labels
-from jsecon.data.proposals import load_proposals
 from jsecon.errors import InputError
+from jsecon.read.masks.langsplat import load_features
+from jsecon.read.masks.masks import load_labels
+from jsecon.read.masks.proposals import load_proposals
 from jsecon.types import ImageFile
 
 SIZE = (12, 16)

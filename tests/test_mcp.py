@@ -14,7 +14,7 @@ from table_field import table_field
 
 from jsecon.app.mcp_server import make_server
 from jsecon.app.server.scenes import Scene
-from jsecon.language.field import save_field
+from jsecon.field.field import save_field
 
 TOOLS = {"find", "relation", "objects", "locate", "measure", "count", "render"}
 

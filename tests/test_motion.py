@@ -18,16 +18,16 @@ from photo_files import FOCAL, HEIGHT, WIDTH, apart, write_photos
 from PIL import Image
 
 from jsecon.app import cli
-from jsecon.data import sfm
-from jsecon.data.capture import load_capture
-from jsecon.data.colmap import read_images
-from jsecon.data.images import read_image
-from jsecon.data.sfm import find_poses, list_photographs
 from jsecon.pipeline import run as pipeline
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Listener
 from jsecon.pipeline.results import KEY_FILE, RunContext
 from jsecon.pipeline.stages import capture_stages
+from jsecon.read.captures import sfm
+from jsecon.read.captures.capture import load_capture
+from jsecon.read.captures.colmap import read_images
+from jsecon.read.captures.images import read_image
+from jsecon.read.captures.sfm import find_poses, list_photographs
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
 

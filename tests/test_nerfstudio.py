@@ -8,7 +8,7 @@ import pytest
 from capture_files import refused, small_capture, transforms, write_images, write_transforms
 from splat_files import write_ply
 
-from jsecon.data.capture import load_capture
+from jsecon.read.captures.capture import load_capture
 
 CAPTURE = small_capture()
 

@@ -9,7 +9,7 @@ from small_field import KnownTexts, field_of, lone_votes, unit_rows
 
 from jsecon import QueryRules, load_field, query_anchored, save_field
 from jsecon.app.ask import ask_each, ask_text
-from jsecon.language import field as field_file
+from jsecon.field import field as field_file
 from jsecon.query.parts import MIN_REGION_RATIO, PART_THRESHOLD, best_cluster, part_scores, parts_fallback
 from jsecon.types import Parts, Regions
 from jsecon.vision.protocols import Logits

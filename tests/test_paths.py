@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from capture_files import run_cli
 
-from jsecon.data import capture as captures
-from jsecon.data.gaussians.ply import load_ply, save_ply
-from jsecon.data.sfm import list_photographs
 from jsecon.pipeline.cache import files_digest
+from jsecon.read.captures import capture as captures
+from jsecon.read.captures.sfm import list_photographs
+from jsecon.read.splats.ply import load_ply, save_ply
 
 HOME = Path(__file__).resolve().parent.parent
 PLACE = "Büro für Köln 日本 #1 %20 'é'"
@@ -44,7 +44,7 @@ def ran(room, room_run, tmp_path_factory):
 
 
 def test_a_run_in_odd_folders_makes_the_field_of_plain_ones(ran, room_run):
-    from jsecon.language.field import load_field
+    from jsecon.field.field import load_field
 
     base, file, names = ran
     field, plain = load_field(file), room_run[0].field

@@ -20,8 +20,9 @@ from mask_overlaps import iou_matrix
 import jsecon
 from jsecon import InputError, load_field, save_ply
 from jsecon.app import cli
+from jsecon.field import field as field_file
 from jsecon.files import write_arrays
-from jsecon.language import autoencoder, field as field_file
+from jsecon.paper import autoencoder
 from jsecon.pipeline import cache, networks, results, run as pipeline
 from jsecon.pipeline.progress import Listener
 from jsecon.pipeline.results import RunContext

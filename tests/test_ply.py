@@ -10,7 +10,7 @@ from splat_files import PLY_NAMES, ply_columns, write_ply
 
 from experiments.datasets.mesh_files import read_faces, write_mesh
 from jsecon import Gaussians, InputError
-from jsecon.data.gaussians.ply import load_ply, load_point_cloud, save_ply
+from jsecon.read.splats.ply import load_ply, load_point_cloud, save_ply
 
 FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
 
@@ -220,7 +220,7 @@ def test_colours_of_blocks_of_rows_are_those_of_one(tmp_path, monkeypatch):
     scene, rgb = random_gaussians(40), np.linspace(0, 1, 120).reshape(40, 3)
     save_ply(tmp_path / "whole.ply", scene, rgb=rgb)
     monkeypatch.setattr("jsecon.splat.transform.BLOCK_ROWS", 7)
-    monkeypatch.setattr("jsecon.data.gaussians.ply._BLOCK", 9)
+    monkeypatch.setattr("jsecon.read.splats.ply._BLOCK", 9)
     save_ply(tmp_path / "blocks.ply", scene, rgb=rgb)
     assert (tmp_path / "blocks.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
     np.testing.assert_array_equal(load_ply(tmp_path / "blocks.ply").means, scene.means)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from jsecon.data.proposals import decode_rle, load_proposals
 from jsecon.errors import InputError
+from jsecon.read.masks.proposals import decode_rle, load_proposals
 
 SIZE = (20, 30)
 

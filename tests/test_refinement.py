@@ -16,11 +16,11 @@ from test_corrections import (
 )
 
 from jsecon.app import cli
-from jsecon.fit import refine
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import RunContext
 from jsecon.pipeline.run import compute_stages
 from jsecon.pipeline.stages import capture_stages
+from jsecon.poses import refine
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
 

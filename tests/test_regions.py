@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy import sparse
 
-from jsecon.language.regions import embeddings_of_masks, region_embeddings, scene_parts
+from jsecon.field.regions import embeddings_of_masks, region_embeddings, scene_parts
 
 
 def embed(frame, masks):

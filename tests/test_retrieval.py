@@ -13,10 +13,10 @@ from small_field import KnownTexts, field_of, lone_votes, make_field, unit_rows
 from jsecon import Regions, load_field, query_anchored, query_classes, query_several, save_field
 from jsecon.app import cli
 from jsecon.app.ask import ask_text
+from jsecon.field.similarity import similarities
 from jsecon.pipeline import networks
 from jsecon.query.match import evidence, reference_similarities, region_similarities
 from jsecon.query.rules import QUANTILE, REFERENCE_CUT, RETRIEVAL_THRESHOLD, QueryRules
-from jsecon.query.similarity import similarities
 
 SIZE = 12
 

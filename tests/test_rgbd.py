@@ -11,11 +11,11 @@ from capture_files import refused, small_capture
 from scipy.spatial.transform import Rotation
 
 from jsecon import Capture, InputError, load_capture
-from jsecon.data.images import read_depth
-from jsecon.data.lens import Lens, resample_depth
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import RunContext
 from jsecon.pipeline.stages import capture_stages
+from jsecon.read.captures.images import read_depth
+from jsecon.read.captures.lens import Lens, resample_depth
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
 

@@ -12,10 +12,10 @@ from splat_files import scene
 from test_gaussian_files import gaussians
 
 from jsecon import load_gaussians, render_rgb, save_gaussians
-from jsecon.data.nerfstudio import trained_to_source
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import Checkpoint, Results, RunContext, StageInput
 from jsecon.pipeline.stages import run_stages
+from jsecon.read.captures.nerfstudio import trained_to_source
 from jsecon.splat.transform import transform_gaussians, transform_gaussians_float64
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks

@@ -15,7 +15,7 @@ from jax.test_util import check_grads
 from scipy.stats import beta
 from small_field import seen_of
 
-from jsecon.language.membership import (
+from jsecon.field.membership import (
     CORRELATION,
     finish_votes,
     membership_probability,

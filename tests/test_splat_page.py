@@ -12,7 +12,7 @@ from small_field import make_field
 from jsecon.app.ask import Answer
 from jsecon.app.outputs import main_regions
 from jsecon.app.viewer.static_page import NO_REGION, page
-from jsecon.language.membership import vote_shares
+from jsecon.field.membership import vote_shares
 from jsecon.splat.sh import C0
 from jsecon.types import Selection
 

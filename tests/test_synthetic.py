@@ -11,8 +11,6 @@ from conftest import look_at
 
 from experiments.datasets.plain_room import PALETTE, PLAIN_SHAPES, make_room
 from jsecon import Camera, InputError, load_capture
-from jsecon.data.labels import load_lerf_labels
-from jsecon.data.masks import load_labels
 from jsecon.demo import raycast, render_views, room_cameras, room_capture, write_room
 from jsecon.demo.raycast import lamp_visibility, texture_pattern, trace_rays
 from jsecon.demo.room import (
@@ -39,6 +37,8 @@ from jsecon.demo.shapes import (
     ray_interval,
     rotation,
 )
+from jsecon.read.masks.labels import load_lerf_labels
+from jsecon.read.masks.masks import load_labels
 
 SEEDS = 0, pytest.param(1, marks=pytest.mark.long)
 

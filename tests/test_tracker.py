@@ -4,9 +4,9 @@ from balls import HEIGHT, VIEWS, WIDTH, ious, ring_of_balls
 from conftest import look_at
 from mask_overlaps import iou_matrix
 
-from jsecon.association.algorithm1 import clean_masklets, masklets
 from jsecon.association.atoms import image_atoms
-from jsecon.association.tracker import GeometricTracker
+from jsecon.paper.algorithm1 import clean_masklets, masklets
+from jsecon.paper.tracker import GeometricTracker
 from jsecon.types import Camera
 from jsecon.vision.protocols import Tracker
 

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from capture_files import refused
 
-from jsecon.data.video import is_video, write_frames
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import RunContext
 from jsecon.pipeline.stages import capture_stages
+from jsecon.read.captures.video import is_video, write_frames
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
 

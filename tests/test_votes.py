@@ -7,7 +7,7 @@ import pytest
 
 from jsecon import plan_view
 from jsecon.association.atoms import atom_votes
-from jsecon.language.votes import region_votes, votes_memory
+from jsecon.field.votes import region_votes, votes_memory
 from jsecon.splat.reference import weights_reference
 
 REGIONS = 11
@@ -109,7 +109,7 @@ def test_what_they_take_is_told_beforehand(monkeypatch):
 
 
 def test_regions_in_blocks_are_the_same_votes(monkeypatch, cast, scene, cameras, labels):
-    from jsecon.language import votes as module
+    from jsecon.field import votes as module
 
     monkeypatch.setattr(module, "DENSE_BYTES", 4 * 4 * scene.count)  # four regions a pass
     blocks = region_votes(scene, cameras, labels, REGIONS, top=REGIONS)

@@ -20,16 +20,16 @@ from conftest import gaussians_at, look_at
 from small_field import shares, unit_rows
 from test_direct import exact_cosines, exact_relevancy
 
+from jsecon.field.membership import share_of, with_overlap, with_shown
+from jsecon.field.similarity import similarities, unit_codes
 from jsecon.fit.photometric import l1, psnr
-from jsecon.language.codes import Rotation, Spread
-from jsecon.language.distill import distill_votes
-from jsecon.language.membership import share_of, with_overlap, with_shown
-from jsecon.query.baselines import query_canonical, query_one_step
+from jsecon.paper.baselines import query_canonical, query_one_step
+from jsecon.paper.codes import Rotation, Spread
+from jsecon.paper.distill import distill_votes
 from jsecon.query.classes import query_classes
 from jsecon.query.match import region_similarities
 from jsecon.query.rules import QueryRules
 from jsecon.query.select import query_anchored, query_several
-from jsecon.query.similarity import similarities, unit_codes
 from jsecon.splat.project import project
 from jsecon.splat.sh import colours_from_sh
 from jsecon.splat.transform import transform_gaussians

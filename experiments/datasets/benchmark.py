@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from jsecon.data.labels import LabelledFrame
 from jsecon.errors import InputError
+from jsecon.read.masks.labels import LabelledFrame
 from jsecon.types import Array, Capture
 
 TWIN_FILE = "twin.json"

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from jsecon.data.masks import LEVELS
 from jsecon.errors import InputError
 from jsecon.files import atomic_write, write_text
+from jsecon.read.masks.masks import LEVELS
 from jsecon.vision.protocols import CANONICAL
 
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from experiments.datasets.benchmark import Benchmark, hold_out, require_count, twin_of
-from jsecon.data.capture import load_capture
-from jsecon.data.labels import load_lerf_labels
 from jsecon.errors import InputError
+from jsecon.read.captures.capture import load_capture
+from jsecon.read.masks.labels import load_lerf_labels
 
 LERF_PAIRS = {"figurines": 56, "ramen": 71, "teatime": 59, "waldo_kitchen": 22}
 """(frame, query) pairs of each LERF-OVS scene in the label files: a run with others does not measure the same thing"""

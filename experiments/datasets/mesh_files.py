@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from jsecon.data.gaussians.ply import ORDERS, read_ply_file
 from jsecon.errors import InputError
 from jsecon.files import atomic_write
+from jsecon.read.splats.ply import ORDERS, read_ply_file
 
 
 def _error(path: Path, problem: str, expected: str) -> InputError:

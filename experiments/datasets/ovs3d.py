@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from experiments.datasets.benchmark import Benchmark, hold_out, require_count, twin_of
-from jsecon.data.capture import load_capture
-from jsecon.data.images import IMAGE_SUFFIXES, read_image, write_image
-from jsecon.data.labels import LabelledFrame
 from jsecon.errors import InputError
 from jsecon.files import write_text
+from jsecon.read.captures.capture import load_capture
+from jsecon.read.captures.images import IMAGE_SUFFIXES, read_image, write_image
+from jsecon.read.masks.labels import LabelledFrame
 
 OVS3D_PAIRS = {"bed": 30, "bench": 35, "lawn": 30, "room": 30, "sofa": 30}
 """(frame, query) pairs: five labelled frames of six or seven classes"""

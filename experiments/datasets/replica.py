@@ -18,10 +18,10 @@ from jaxtyping import Float, Int, UInt8
 
 from experiments.datasets.benchmark import Benchmark, require_count, twin_of
 from experiments.datasets.mesh_files import read_faces
-from jsecon.data.frames import FrameOptions, PosedImage, PosedImages, build_capture
-from jsecon.data.gaussians.ply import load_point_cloud
-from jsecon.data.lens import Lens
 from jsecon.errors import InputError
+from jsecon.read.captures.frames import FrameOptions, PosedImage, PosedImages, build_capture
+from jsecon.read.captures.lens import Lens
+from jsecon.read.splats.ply import load_point_cloud
 from jsecon.types import Capture
 
 REPLICA_SCENES = ("room0", "room1", "room2", "office0", "office1", "office2", "office3", "office4")

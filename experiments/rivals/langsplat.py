@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from experiments.rivals.evidence import Evidence, with_room
-from jsecon.language.autoencoder import Autoencoder, train_autoencoder
-from jsecon.language.distill import distill_l1
+from jsecon.paper.autoencoder import Autoencoder, train_autoencoder
+from jsecon.paper.distill import distill_l1
 from jsecon.types import Array
 
 STEPS = 30_000

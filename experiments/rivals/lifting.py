@@ -22,7 +22,7 @@ from scipy.spatial import KDTree
 
 from experiments.rivals.evidence import Evidence, local_masks
 from jsecon.association.atoms import atom_votes
-from jsecon.query.baselines import relevancies
+from jsecon.paper.baselines import relevancies
 from jsecon.splat.fusion import materialize
 from jsecon.splat.plan import ViewPlan, plan_view
 from jsecon.splat.walk import blend_weights, make_batches, make_table, walk

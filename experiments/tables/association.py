@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.rivals.evidence import Evidence, unit
-from jsecon.association.algorithm1 import clean_masklets
 from jsecon.association.consensus import consensus_masklets
 from jsecon.association.views import SceneViews
+from jsecon.paper.algorithm1 import clean_masklets
 
 ROWS = 64
 """The number of regions is padded to a multiple of this, so that scenes share compiled programs."""

@@ -12,13 +12,13 @@ from experiments.tables.association import Association, associated, by_consensus
 from experiments.tables.setting import Setting
 from jsecon.association.consensus import pieces_on_masks
 from jsecon.association.views import SceneViews
-from jsecon.language.autoencoder import train_autoencoder
-from jsecon.language.codes import encode, region_codes
-from jsecon.language.distill import distill_l1, distill_votes
-from jsecon.language.membership import finish_votes, membership_probability
-from jsecon.language.regions import scene_parts
-from jsecon.language.votes import region_votes
-from jsecon.query.baselines import query_canonical, query_one_step
+from jsecon.field.membership import finish_votes, membership_probability
+from jsecon.field.regions import scene_parts
+from jsecon.field.votes import region_votes
+from jsecon.paper.autoencoder import train_autoencoder
+from jsecon.paper.baselines import query_canonical, query_one_step
+from jsecon.paper.codes import encode, region_codes
+from jsecon.paper.distill import distill_l1, distill_votes
 from jsecon.query.classes import query_classes
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.parts import parts_fallback

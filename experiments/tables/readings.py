@@ -18,7 +18,7 @@ from experiments.tables.answers import Answers
 from experiments.tables.setting import Setting
 from jsecon.errors import require
 from jsecon.numerics import cosine_matrix, normalize
-from jsecon.query.baselines import relevancies
+from jsecon.paper.baselines import relevancies
 from jsecon.query.silhouette import SILHOUETTE_WEIGHTS, fit_silhouette
 from jsecon.types import Selection
 

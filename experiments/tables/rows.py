@@ -25,7 +25,7 @@ from experiments.tables.methods import (
 from experiments.tables.ours import ask_field, field_of, paper_field
 from experiments.tables.readings import CHOOSERS, RULES, SHARP, SHARPENED, as_share, chosen_by, read, scores
 from experiments.tables.setting import Setting
-from jsecon.language.membership import SHARE_THRESHOLD
+from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.query.edits import nearest_neighbours
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.rules import RETRIEVALS

@@ -14,12 +14,12 @@ from experiments.datasets.feature_files import load_text_features
 from experiments.rivals.evidence import Evidence
 from experiments.tables import twins
 from experiments.tables.association import Association, Shared, associated
-from jsecon.data.gaussians.ply import load_ply, save_ply
-from jsecon.data.langsplat import load_features
-from jsecon.data.masks import load_labels
 from jsecon.fit.optimise import fit_gaussians
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.start import gaussians_from_points, starting_gaussians
+from jsecon.read.masks.langsplat import load_features
+from jsecon.read.masks.masks import load_labels
+from jsecon.read.splats.ply import load_ply, save_ply
 from jsecon.types import Camera, Gaussians
 
 

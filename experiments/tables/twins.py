@@ -33,10 +33,10 @@ from experiments.simulated_vision.embeddings import (
 )
 from experiments.simulated_vision.masks import LEVELS as NOISE, Faults, SimulatedMasks, simulated_masks
 from experiments.simulated_vision.worlds import Seen, World, seen_in, world_of
-from jsecon.data.images import write_image
-from jsecon.data.masks import LEVELS
 from jsecon.demo.raycast import trace_rays
 from jsecon.files import write_text
+from jsecon.read.captures.images import write_image
+from jsecon.read.masks.masks import LEVELS
 from jsecon.vision.protocols import CANONICAL
 from jsecon.vision.reference_words import REFERENCE_WORDS
 

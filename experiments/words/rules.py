@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jsecon.language.membership import SHARE_THRESHOLD, share_of
-from jsecon.query.baselines import TEMPERATURE
+from jsecon.field.membership import SHARE_THRESHOLD, share_of
+from jsecon.paper.baselines import TEMPERATURE
 from jsecon.types import Votes
 
 SCORES = ("cosine", "relevancy", "contrast", "apart")

@@ -30,13 +30,13 @@ from experiments.replica_apartment_0 import Options as Scan, load_replica, point
 from experiments.rivals import lifting
 from experiments.rivals.evidence import Evidence, unit
 from experiments.words.conse import WORDS, Conse
-from jsecon.data.capture import load_capture
 from jsecon.errors import InputError
+from jsecon.field.votes import region_votes
 from jsecon.fit.start import starting_gaussians
-from jsecon.language.votes import region_votes
 from jsecon.pipeline.options import Options as RunOptions
 from jsecon.pipeline.results import RunContext
 from jsecon.pipeline.stages import associate_masks, frame_proposals
+from jsecon.read.captures.capture import load_capture
 from jsecon.types import Camera, Capture, Gaussians, Regions, Votes
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks

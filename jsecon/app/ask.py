@@ -18,13 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Int
 
-from jsecon.data.images import read_pixels
-from jsecon.data.masks import resize_nearest
 from jsecon.errors import InputError, require
-from jsecon.language.columns import is_mapped
-from jsecon.language.field import subset_field
-from jsecon.language.membership import SHARE_THRESHOLD
-from jsecon.language.regions import ALIKE_THRESHOLD
+from jsecon.field.columns import is_mapped
+from jsecon.field.field import subset_field
+from jsecon.field.membership import SHARE_THRESHOLD
+from jsecon.field.regions import ALIKE_THRESHOLD
 from jsecon.query import edits
 from jsecon.query.blocks import SparseSelection, select_in_blocks
 from jsecon.query.composite import parse_query
@@ -35,6 +33,8 @@ from jsecon.query.pixel import region_at
 from jsecon.query.rules import PIECE_THRESHOLD, QUANTILE, QueryRules
 from jsecon.query.select import select_gaussians
 from jsecon.query.silhouette import SILHOUETTE_WEIGHTS, fit_silhouette
+from jsecon.read.captures.images import read_pixels
+from jsecon.read.masks.masks import resize_nearest
 from jsecon.types import LanguageField, Selection
 
 T = TypeVar("T")

@@ -14,8 +14,8 @@ from scipy.special import softmax
 
 from jsecon.app.locate import gaussian_rows
 from jsecon.errors import InputError
-from jsecon.language.columns import vote_blocks
-from jsecon.language.membership import SHARE_THRESHOLD, membership_probability, vote_shares
+from jsecon.field.columns import vote_blocks
+from jsecon.field.membership import SHARE_THRESHOLD, membership_probability, vote_shares
 from jsecon.query.groups import containment, objects_of_gaussians, same_object
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.outliers import MIN_SAMPLES

@@ -11,17 +11,17 @@ import jax.numpy as jnp
 from jsecon.app import verbs
 from jsecon.app.ask import ask_text, with_phrases
 from jsecon.app.models import open_embedder
-from jsecon.data.labels import LabelledFrame, load_lerf_labels
 from jsecon.errors import InputError
 from jsecon.evaluate.lerf import Row, evaluate_at_thresholds
+from jsecon.field.field import load_field
 from jsecon.files import write_text
-from jsecon.language.codes import encode
-from jsecon.language.field import load_field
+from jsecon.paper.baselines import query_canonical, query_one_step
+from jsecon.paper.codes import encode
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console, Listener
-from jsecon.query.baselines import query_canonical, query_one_step
 from jsecon.query.composite import parse_query
 from jsecon.query.render import ALPHA_THRESHOLD
+from jsecon.read.masks.labels import LabelledFrame, load_lerf_labels
 from jsecon.types import LanguageField, Selection
 
 Evaluation: TypeAlias = dict[str, tuple[list[Row], dict[str, Any]]]

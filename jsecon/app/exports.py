@@ -15,13 +15,13 @@ from jsecon.app.catalogue import Catalogue, objects
 from jsecon.app.locate import decimals, rounded
 from jsecon.app.models import open_embedder
 from jsecon.app.outputs import save_scene, slug
-from jsecon.data.gaussians.files import require_writable_format
 from jsecon.errors import InputError
+from jsecon.field.field import check_field, load_field
 from jsecon.files import atomic_write, write_text
-from jsecon.language.field import check_field, load_field
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console, Listener
 from jsecon.query.render import selection_mask
+from jsecon.read.splats.files import require_writable_format
 from jsecon.types import LanguageField
 
 THUMBNAIL_PX = 150

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from jsecon.app.ask import Answer
 from jsecon.errors import InputError
-from jsecon.language.membership import probability_inside
+from jsecon.field.membership import probability_inside
 from jsecon.query.object_shapes import gaussian_spreads, object_shapes
 from jsecon.splat.transform import transform_gaussians_float64
 from jsecon.types import Gaussians, LanguageField

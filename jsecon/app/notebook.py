@@ -14,10 +14,10 @@ from jaxtyping import UInt8
 from jsecon.app import pictures, report
 from jsecon.app.ask import ask_text
 from jsecon.app.outputs import answer_masks
-from jsecon.data.frames import evenly_spaced
 from jsecon.errors import InputError
 from jsecon.fit.resize import resize_frame, scale_cameras
 from jsecon.pipeline import networks
+from jsecon.read.captures.frames import evenly_spaced
 from jsecon.types import Capture, LanguageField, Selection
 
 LONG_SIDE = 240

@@ -13,10 +13,9 @@ import numpy as np
 from jsecon.app.ask import frame_index, narrow_texts, with_phrases
 from jsecon.app.catalogue import Catalogue, objects as list_objects, region_objects
 from jsecon.app.locate import gaussian_rows
-from jsecon.data.capture import may_have_depth
 from jsecon.errors import InputError
-from jsecon.language.columns import votes_of_rows
-from jsecon.language.membership import SHARE_THRESHOLD, share_of_regions
+from jsecon.field.columns import votes_of_rows
+from jsecon.field.membership import SHARE_THRESHOLD, share_of_regions
 from jsecon.pipeline.sources import locate_sources
 from jsecon.query.match import join_pieces, match_regions
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
@@ -24,6 +23,7 @@ from jsecon.query.outliers import split_outliers
 from jsecon.query.referring import FoundObject
 from jsecon.query.relations import Viewpoint, viewpoint
 from jsecon.query.rules import QueryRules
+from jsecon.read.captures.capture import may_have_depth
 from jsecon.types import Camera, LanguageField
 from jsecon.views.frame import field_up
 

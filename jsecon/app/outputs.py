@@ -19,15 +19,15 @@ from jaxtyping import Bool, Int
 from jsecon.app import pictures, report
 from jsecon.app.ask import Answer
 from jsecon.app.locate import decimals, rounded, selected_centers
-from jsecon.data.gaussians.files import save_gaussians
-from jsecon.data.gaussians.ply import save_ply
-from jsecon.data.images import write_image
+from jsecon.field.columns import vote_blocks
+from jsecon.field.field import subset_field
+from jsecon.field.membership import SHARE_THRESHOLD, probability_inside, vote_shares
 from jsecon.files import write_text
-from jsecon.language.columns import vote_blocks
-from jsecon.language.field import subset_field
-from jsecon.language.membership import SHARE_THRESHOLD, probability_inside, vote_shares
 from jsecon.pipeline.progress import Listener
 from jsecon.query.render import selection_mask
+from jsecon.read.captures.images import write_image
+from jsecon.read.splats.files import save_gaussians
+from jsecon.read.splats.ply import save_ply
 from jsecon.types import LanguageField
 
 MAX_SLUG_BYTES = 80

@@ -13,15 +13,15 @@ from jaxtyping import UInt8
 
 from jsecon.app import verbs
 from jsecon.app.ask import Answer, collect, drop_outliers
-from jsecon.data.capture import load_capture
-from jsecon.data.frames import evenly_spaced
 from jsecon.errors import InputError
-from jsecon.language.membership import SHARE_THRESHOLD
+from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.networks.sam3 import IMAGE_SIDE, PhraseMasks, Sam3
 from jsecon.pipeline.progress import Console
 from jsecon.pipeline.sources import locate_sources
 from jsecon.query.outline import lift
 from jsecon.query.select import query_region
+from jsecon.read.captures.capture import load_capture
+from jsecon.read.captures.frames import evenly_spaced
 from jsecon.types import LanguageField
 
 

@@ -11,15 +11,15 @@ from jsecon.app import ask, verbs
 from jsecon.app.ask import Answer
 from jsecon.app.models import open_embedder, with_models
 from jsecon.app.outputs import write_answers
-from jsecon.data.gaussians.files import require_writable_format
 from jsecon.errors import InputError
-from jsecon.language.field import check_field, load_field
-from jsecon.language.membership import SHARE_THRESHOLD
+from jsecon.field.field import check_field, load_field
+from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.pipeline.options import Options, is_bare_scene, require_writable
 from jsecon.pipeline.progress import Console
 from jsecon.process import MEMORY, memory_budget
 from jsecon.query.expressions import is_expression
 from jsecon.query.outline import box_mask, lift
+from jsecon.read.splats.files import require_writable_format
 from jsecon.types import LanguageField
 
 

@@ -11,14 +11,14 @@ import numpy as np
 
 from jsecon.app import pictures, report, verbs
 from jsecon.app.models import with_models
-from jsecon.data.frames import evenly_spaced
-from jsecon.data.gaussians.files import require_writable_format, save_gaussians
 from jsecon.files import write_text
 from jsecon.pipeline import processes, run as pipeline
 from jsecon.pipeline.progress import Console, Listener
 from jsecon.pipeline.results import WARNING, vision_frames
 from jsecon.pipeline.run import Run
 from jsecon.process import peak_memory_mib, worker_info
+from jsecon.read.captures.frames import evenly_spaced
+from jsecon.read.splats.files import require_writable_format, save_gaussians
 from jsecon.types import Quality
 
 FILES = ("field.safetensors", "report.html", "metrics.json")

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32, UInt8
 from scipy import sparse
 
-from jsecon.language.view_votes import Sparse, view_votes
+from jsecon.field.view_votes import Sparse, view_votes
 from jsecon.types import Camera, Gaussians
 from jsecon.vision.region_graph import relabel_sequential
 from jsecon.vision.surfaces import fill_nearest

@@ -16,7 +16,6 @@ import numpy as np
 from jsecon.app import ask, evaluation, pictures, report, running, verbs
 from jsecon.app.evaluation import Evaluation
 from jsecon.app.outputs import answer_masks, write_answer
-from jsecon.data.labels import LabelledFrame, load_lerf_labels
 from jsecon.demo import write_room
 from jsecon.demo.film import write_film
 from jsecon.demo.room import crowded_room
@@ -27,6 +26,7 @@ from jsecon.pipeline.options import Options, require_writable
 from jsecon.pipeline.progress import Console, Listener
 from jsecon.pipeline.run import Run
 from jsecon.process import peak_memory_mib
+from jsecon.read.masks.labels import LabelledFrame, load_lerf_labels
 
 HOLDOUT = 5
 """Every `HOLDOUT`-th frame is held out."""

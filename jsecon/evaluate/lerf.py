@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsecon.data.labels import LabelledFrame
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import accuracy_at, in_any_box, iou, mean_iou
 from jsecon.fit.resize import resize_camera
 from jsecon.query.render import ALPHA_THRESHOLD, VALA_THRESHOLD, render_selection
+from jsecon.read.masks.labels import LabelledFrame
 from jsecon.types import Camera, Gaussians, Progress, Selection
 
 LOCALISATION_WINDOW = 0.04

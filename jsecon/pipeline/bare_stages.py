@@ -5,14 +5,14 @@ from pathlib import Path
 
 import numpy as np
 
-from jsecon.data.colmap import find_models, read_cameras, read_images
-from jsecon.data.coordinates import make_rigid, transform_poses
-from jsecon.data.frames import FrameOptions, frame_names
-from jsecon.data.nerfstudio import read_poses
 from jsecon.errors import InputError
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import RunContext, Stage, StageInput, StageResult
 from jsecon.pipeline.scene_files import check_overlap, read_scene
+from jsecon.read.captures.colmap import find_models, read_cameras, read_images
+from jsecon.read.captures.coordinates import make_rigid, transform_poses
+from jsecon.read.captures.frames import FrameOptions, frame_names
+from jsecon.read.captures.nerfstudio import read_poses
 from jsecon.splat.transform import transform_gaussians_float64
 from jsecon.types import Camera, Gaussians, Quality
 from jsecon.views.capture import capture_from_cameras, render_capture

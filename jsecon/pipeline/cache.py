@@ -34,7 +34,7 @@ from jsecon.files import (
 )
 
 PACKAGE = Path(jsecon.__file__).parent
-PACKAGES = ("association", "data", "fit", "language", "networks", "pipeline", "splat", "views", "vision")
+PACKAGES = ("association", "field", "fit", "networks", "paper", "pipeline", "poses", "read", "splat", "views", "vision")
 """subpackages that stages compute with"""
 MAPPED = 1 << 30
 """bytes; larger arrays are memory-mapped"""

@@ -94,7 +94,7 @@ def open_networks(options: Options, store: Path) -> Networks:
 
         model = find_clip(options.embedder, options.precision)
     if options.features is not None:
-        from jsecon.data.langsplat import embedding_size
+        from jsecon.read.masks.langsplat import embedding_size
 
         external = ExternalSpace(embedding_size(options.features))
         if model is None:

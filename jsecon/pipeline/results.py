@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jsecon.data.frames import evenly_spaced
 from jsecon.errors import InputError
-from jsecon.language.codes import Coder
+from jsecon.paper.codes import Coder
 from jsecon.pipeline import cache
 from jsecon.pipeline.options import Options
+from jsecon.read.captures.frames import evenly_spaced
 from jsecon.types import Array, Capture, Gaussians, Parts, Progress, Quality, Regions, Votes
 from jsecon.vision.protocols import Networks
 

@@ -30,17 +30,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from jsecon.data.capture import capture_extent
-from jsecon.data.frames import CaptureExtent, FrameOptions, evenly_spaced, frame_names, holdout_mask
-from jsecon.data.images import image_header
-from jsecon.data.langsplat import load_features
-from jsecon.data.masks import load_labels
-from jsecon.data.proposals import load_proposals
-from jsecon.data.sfm import check_photographs, list_photographs, require_pycolmap
-from jsecon.data.video import DEFAULT_VIDEO_FRAMES, is_video, video_size
 from jsecon.errors import InputError
+from jsecon.field.field import load_field, save_field
 from jsecon.files import exclusive_lock
-from jsecon.language.field import load_field, save_field
 from jsecon.pipeline import cache, networks, processes, stages
 from jsecon.pipeline.options import Options, is_bare_scene, require_writable
 from jsecon.pipeline.processes import Coordinator
@@ -59,6 +51,14 @@ from jsecon.pipeline.results import (
 from jsecon.pipeline.scene_files import read_scene
 from jsecon.pipeline.sources import provenance
 from jsecon.process import compilation_counts
+from jsecon.read.captures.capture import capture_extent
+from jsecon.read.captures.frames import CaptureExtent, FrameOptions, evenly_spaced, frame_names, holdout_mask
+from jsecon.read.captures.images import image_header
+from jsecon.read.captures.sfm import check_photographs, list_photographs, require_pycolmap
+from jsecon.read.captures.video import DEFAULT_VIDEO_FRAMES, is_video, video_size
+from jsecon.read.masks.langsplat import load_features
+from jsecon.read.masks.masks import load_labels
+from jsecon.read.masks.proposals import load_proposals
 from jsecon.types import Capture, Gaussians, ImageFile, LanguageField, Quality
 from jsecon.vision.classical import require_contrib
 from jsecon.vision.stores import StoredSegmenter

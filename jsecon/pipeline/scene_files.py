@@ -15,14 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jsecon.data.coordinates import transform_poses
-from jsecon.data.frames import evenly_spaced
-from jsecon.data.gaussians.files import read_gaussians
-from jsecon.data.gaussians.ply import MAX_READ_ROUNDING
 from jsecon.errors import InputError
 from jsecon.fit.quality import QUICK_LONG_SIDE
 from jsecon.fit.resize import resize_frame, shrink_cameras
 from jsecon.pipeline.results import WARNING
+from jsecon.read.captures.coordinates import transform_poses
+from jsecon.read.captures.frames import evenly_spaced
+from jsecon.read.splats.files import read_gaussians
+from jsecon.read.splats.ply import MAX_READ_ROUNDING
 from jsecon.splat.project import project
 from jsecon.splat.render import render_rgb
 from jsecon.splat.transform import transform_gaussians_float64

@@ -17,32 +17,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsecon.association.algorithm1 import clean_masklets, masklets as algorithm1
 from jsecon.association.consensus import consensus_masklets, pieces_on_masks
 from jsecon.association.run_lengths import memoized_masks
-from jsecon.association.tracker import GeometricTracker
 from jsecon.association.views import SceneViews
-from jsecon.data.capture import load_capture, may_have_depth, unposed_photographs
-from jsecon.data.langsplat import load_features
-from jsecon.data.masks import load_labels
-from jsecon.data.nerfstudio import trained_to_source
-from jsecon.data.proposals import load_proposals
-from jsecon.data.sfm import find_poses, list_photographs
-from jsecon.data.video import DEFAULT_VIDEO_FRAMES, is_video, write_frames
 from jsecon.errors import InputError
+from jsecon.field.columns import is_mapped
+from jsecon.field.membership import finish_votes_in_blocks
+from jsecon.field.regions import Embed, embeddings_of_masks, region_embeddings, scene_parts
+from jsecon.field.streaming import codes_in_blocks, region_votes_in_blocks
+from jsecon.field.votes import region_votes, votes_memory
 from jsecon.files import write_text
 from jsecon.fit.depth import points_from_depth
 from jsecon.fit.quality import QUICK_LONG_SIDE, is_weak, measure_quality
 from jsecon.fit.start import starting_gaussians
-from jsecon.language.autoencoder import Autoencoder
-from jsecon.language.codes import region_codes
-from jsecon.language.columns import is_mapped
-from jsecon.language.distill import distill_votes
-from jsecon.language.membership import finish_votes_in_blocks
-from jsecon.language.regions import Embed, embeddings_of_masks, region_embeddings, scene_parts
-from jsecon.language.streaming import codes_in_blocks, region_votes_in_blocks
-from jsecon.language.votes import region_votes, votes_memory
 from jsecon.networks.hub import model_name
+from jsecon.paper.algorithm1 import clean_masklets, masklets as algorithm1
+from jsecon.paper.autoencoder import Autoencoder
+from jsecon.paper.codes import region_codes
+from jsecon.paper.distill import distill_votes
+from jsecon.paper.tracker import GeometricTracker
 from jsecon.pipeline.bare_stages import bare_stages, require_options_apply
 from jsecon.pipeline.options import Options, is_bare_scene
 from jsecon.pipeline.results import (
@@ -58,6 +51,13 @@ from jsecon.pipeline.results import (
 )
 from jsecon.pipeline.scene_files import check_overlap, place_in_capture, read_scene
 from jsecon.process import memory_budget
+from jsecon.read.captures.capture import load_capture, may_have_depth, unposed_photographs
+from jsecon.read.captures.nerfstudio import trained_to_source
+from jsecon.read.captures.sfm import find_poses, list_photographs
+from jsecon.read.captures.video import DEFAULT_VIDEO_FRAMES, is_video, write_frames
+from jsecon.read.masks.langsplat import load_features
+from jsecon.read.masks.masks import load_labels
+from jsecon.read.masks.proposals import load_proposals
 from jsecon.splat.render import render_depth
 from jsecon.types import Camera, Capture, Gaussians, LanguageField, Progress, Regions
 from jsecon.vision.classical import GRANULARITIES, ClassicalSegmenter
@@ -243,7 +243,7 @@ def _load(stage: StageInput) -> StageResult:
 def _refine(capture: Capture, options: Options, refine: str, progress: Progress) -> Capture:
     """Corrects poses and exposures by short fits, and leaves out the frames that these do not explain."""
     from jsecon.fit.corrections import RefineOptions  # late, like all that imports optax: a plan needs none of it
-    from jsecon.fit.refine import refine_capture
+    from jsecon.poses.refine import refine_capture
 
     what, max_fit_steps = None, None
     if refine == "auto" and capture.depths is not None:

@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jsecon.errors import require_one_of
-from jsecon.language.columns import row_slices, votes_of_rows
+from jsecon.field.columns import row_slices, votes_of_rows
+from jsecon.field.similarity import Number
 from jsecon.query.match import RULES, RegionMatch, match_regions
 from jsecon.query.rules import QueryRules
 from jsecon.query.select import THRESHOLDS, select_by_code, select_by_share
-from jsecon.query.similarity import Number
 from jsecon.types import Array, LanguageField
 
 

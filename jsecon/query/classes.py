@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Float, Int
 
 from jsecon.errors import require
-from jsecon.language.membership import SHARE_THRESHOLD, ratio, share_of, vote_columns
+from jsecon.field.membership import SHARE_THRESHOLD, ratio, share_of, vote_columns
 from jsecon.query.match import (
     RULES,
     evidence,
@@ -46,7 +46,7 @@ def query_classes(
         sum_r p_nr s_rq / sum_r p_nr
 
     with s the similarities of regions and texts (`match_regions`) and p_nr the share of region r in Gaussian n
-    (`jsecon.language.membership`). A region is of the class of its best text. It is of no class, as the wall behind is,
+    (`jsecon.field.membership`). A region is of the class of its best text. It is of no class, as the wall behind is,
     if the rules refuse that text for this region; such regions are left out of the sums.
 
     Standardised, the classes of regions are right for 0.98, 0.94 and 0.84 of the pixels of simulated CLIP at medium

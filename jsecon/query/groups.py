@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
-from jsecon.language.membership import SHARE_THRESHOLD, ratio, vote_columns
+from jsecon.field.membership import SHARE_THRESHOLD, ratio, vote_columns
 from jsecon.programs import stored_jit
 from jsecon.query.match import RULES, match_embedding
 from jsecon.query.rules import MIN_PIECE_OVERLAP, QueryRules

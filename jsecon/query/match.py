@@ -17,7 +17,8 @@ from jax import export
 from jaxtyping import Bool, Float, Int, Shaped
 
 from jsecon.errors import require
-from jsecon.language.regions import ALIKE_THRESHOLD, mean_residuals
+from jsecon.field.regions import ALIKE_THRESHOLD, mean_residuals
+from jsecon.field.similarity import Number, similarities
 from jsecon.numerics import cosine_matrix, normalize
 from jsecon.programs import stored_jit
 from jsecon.query.confidence import answer_confidence
@@ -29,7 +30,6 @@ from jsecon.query.rules import (
     REFERENCE_CUT,
     QueryRules,
 )
-from jsecon.query.similarity import Number, similarities
 from jsecon.types import Array, LanguageField, Regions
 from jsecon.vision.protocols import Logits
 

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from jsecon.errors import InputError, require
-from jsecon.language.membership import SHARE_THRESHOLD, share_of, vote_shares
-from jsecon.language.votes import region_votes
+from jsecon.field.membership import SHARE_THRESHOLD, share_of, vote_shares
+from jsecon.field.votes import region_votes
 from jsecon.types import LanguageField, Selection
 
 OUTSIDE, INSIDE, UNKNOWN = 0, 1, 2

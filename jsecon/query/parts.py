@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jsecon.errors import require
-from jsecon.language.membership import SHARE_THRESHOLD
+from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.numerics import normalize
 from jsecon.query.match import (
     RULES,

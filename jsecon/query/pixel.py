@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jsecon.errors import InputError
-from jsecon.language.columns import row_slices, votes_of_rows
-from jsecon.language.membership import vote_shares
+from jsecon.field.columns import row_slices, votes_of_rows
+from jsecon.field.membership import vote_shares
 from jsecon.numerics import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from jsecon.splat.project import project
 from jsecon.types import Array, Camera, Gaussians, LanguageField

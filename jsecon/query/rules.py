@@ -5,8 +5,8 @@ import dataclasses
 import jax
 
 from jsecon.errors import require_one_of
-from jsecon.language.regions import ALIKE_THRESHOLD
-from jsecon.query.similarity import Number
+from jsecon.field.regions import ALIKE_THRESHOLD
+from jsecon.field.similarity import Number
 from jsecon.types import static
 from jsecon.vision.protocols import Logits
 

@@ -5,12 +5,12 @@ import jax.numpy as jnp
 from jaxtyping import Float, Int
 
 from jsecon.errors import require_one_of, require_shape
-from jsecon.language.codes import CODE_THRESHOLD
-from jsecon.language.membership import SHARE_THRESHOLD, share_of
+from jsecon.field.membership import SHARE_THRESHOLD, share_of
+from jsecon.field.similarity import Number, UnitCodes, similarities
+from jsecon.paper.codes import CODE_THRESHOLD
 from jsecon.programs import stored_jit
 from jsecon.query.match import ONE_REGION, RULES, RegionMatch, match_region, match_regions
 from jsecon.query.rules import QueryRules
-from jsecon.query.similarity import Number, UnitCodes, similarities
 from jsecon.types import Array, LanguageField, Selection, Votes
 
 THRESHOLDS = {"votes": SHARE_THRESHOLD, "code": CODE_THRESHOLD}

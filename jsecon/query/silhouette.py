@@ -1,6 +1,6 @@
 """The Gaussians whose silhouette fits an object best. Host code around compiled parts.
 
-A Gaussian's share (`jsecon.language.membership`) says how much of it belongs to the object; many Gaussians make a
+A Gaussian's share (`jsecon.field.membership`) says how much of it belongs to the object; many Gaussians make a
 silhouette. A splat that is half the object's fills a hole of it, and spills over at its rim. Here each one is taken or
 left by what the outline gains, in expectation, over the views.
 """
@@ -16,8 +16,8 @@ from jax import lax
 from jaxtyping import Bool, Float
 
 from jsecon.errors import require_shape
+from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.fit.resize import scale_cameras
-from jsecon.language.membership import SHARE_THRESHOLD
 from jsecon.process import cores
 from jsecon.query.render import ALPHA_THRESHOLD, HIDDEN_LOGIT, VALA_THRESHOLD
 from jsecon.splat.plan import plan_view, render_plan

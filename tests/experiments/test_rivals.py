@@ -18,8 +18,8 @@ from experiments.rivals.langsplat import train_langsplat
 from experiments.rivals.opengaussian import Schedule, train_instances, train_opengaussian
 from experiments.simulated_vision.embeddings import made_text_space
 from jsecon import InputError, plan_view, project
-from jsecon.data.labels import LabelledFrame
 from jsecon.evaluate.lerf import ALPHA_THRESHOLD, evaluate_at_thresholds
+from jsecon.read.masks.labels import LabelledFrame
 from jsecon.vision.protocols import CANONICAL
 
 QUERIES = ("floor", "red ball", "blue ball", "green ball")
@@ -184,7 +184,7 @@ def test_lifting(world, train):
 
 def test_backprojection_is_the_sum_over_all_pixels(world):
     """Against the votes' own total: every labelled pixel's weight is in it, once."""
-    from jsecon.language.votes import region_votes
+    from jsecon.field.votes import region_votes
 
     evidence = world[0]
     lifted = lifting.train_backprojection(evidence)

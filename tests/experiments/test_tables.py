@@ -14,10 +14,10 @@ from experiments.datasets.replica import REPLICA_SCENES
 from experiments.tables import fill, layout, published
 from experiments.tables.methods import METHODS, RECOMMENDED
 from experiments.tables.setting import levels_of, prepare
-from jsecon.data.gaussians.ply import load_ply, save_ply
-from jsecon.data.langsplat import load_features
-from jsecon.data.masks import LEVELS
 from jsecon.fit.start import gaussians_from_points
+from jsecon.read.masks.langsplat import load_features
+from jsecon.read.masks.masks import LEVELS
+from jsecon.read.splats.ply import load_ply, save_ply
 
 TRACKED = "ours, tracks"
 CHEAP = ("VALA", TRACKED)

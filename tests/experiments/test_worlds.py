@@ -23,9 +23,9 @@ from experiments.simulated_vision.masks import LEVELS
 from experiments.simulated_vision.worlds import World, seen_in, world_of
 from experiments.tables import twins
 from experiments.tables.rows import TRAINED
-from jsecon.data.labels import LabelledFrame
 from jsecon.demo.room import TABLE_WOOD, srgb_to_linear
 from jsecon.errors import InputError
+from jsecon.read.masks.labels import LabelledFrame
 
 TABLE = 7
 """the label after four objects, wall, floor and ceiling"""

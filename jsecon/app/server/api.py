@@ -29,9 +29,9 @@ from jsecon.app.relations import measure, query_relation
 from jsecon.app.server.guard import LIMITS, Guard, Limits, Workers
 from jsecon.app.server.scenes import Scene, SceneQuery
 from jsecon.app.verbs import By
-from jsecon.data.gaussians.ply import save_ply
 from jsecon.errors import InputError
 from jsecon.process import cores
+from jsecon.read.splats.ply import save_ply
 
 Text = Annotated[str, StringConstraints(strict=True, min_length=1, max_length=500, pattern=r"\S")]
 

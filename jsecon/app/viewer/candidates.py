@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jsecon.app.ask import narrow_texts, with_phrases
-from jsecon.language.regions import mean_residuals
+from jsecon.field.regions import mean_residuals
+from jsecon.field.similarity import similarities
 from jsecon.query.composite import parse_query
 from jsecon.query.match import ROUNDING, RULES, evidence, reference_words, region_similarities
 from jsecon.query.pixel import MIN_SHARE, region_shares_seen
 from jsecon.query.render import HIDDEN_LOGIT
-from jsecon.query.similarity import similarities
 from jsecon.types import Camera, LanguageField
 
 RAY_VIEW_SIDE = 1025

@@ -13,7 +13,7 @@ from jsecon.app.report import data_uri
 from jsecon.app.viewer.candidates import Candidate
 from jsecon.app.viewer.view_state import COLOURINGS, MAX_SHELLS, ViewState, answer_colours, from_link
 from jsecon.errors import InputError
-from jsecon.language.membership import probability_inside
+from jsecon.field.membership import probability_inside
 from jsecon.query.rules import PRESENCE_THRESHOLD, QUANTILE, RETRIEVAL_THRESHOLD
 from jsecon.types import LanguageField
 

@@ -21,8 +21,8 @@ from jsecon.app.models import open_embedder
 from jsecon.app.outputs import main_regions
 from jsecon.app.querying import ask_texts
 from jsecon.errors import InputError
+from jsecon.field.field import load_field
 from jsecon.files import write_text
-from jsecon.language.field import load_field
 from jsecon.numerics import sigmoid
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console

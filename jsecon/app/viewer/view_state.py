@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from jsecon.errors import InputError, describe_error
-from jsecon.language.membership import SHARE_THRESHOLD
+from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.query.rules import PIECE_THRESHOLD
 
 Colouring: TypeAlias = Literal["photo", "code", "region", "score"]

@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jsecon.data.masks import AllFrames, MaskFitter, compact_ids, find_masks, read_level
 from jsecon.errors import InputError
 from jsecon.files import map_npy, reading
 from jsecon.numerics import is_finite_and_bounded
+from jsecon.read.masks.masks import AllFrames, MaskFitter, compact_ids, find_masks, read_level
 
 
 class FrameMasks(NamedTuple):
@@ -39,7 +39,7 @@ def load_features(
 ) -> FrameMasks:
     """Reads one level of the masks of frames, with their embeddings.
 
-    Files are named as in `jsecon.data.masks`. Masks that vanish at the size asked for are skipped.
+    Files are named as in `jsecon.read.masks.masks`. Masks that vanish at the size asked for are skipped.
 
     Args:
       folder: The language_features folder.

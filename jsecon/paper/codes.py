@@ -2,7 +2,7 @@
 
 A coder has `.encode`: `Rotation` (principal directions; exact where the regions' span fits), `Spread`
 (a code per region, placed on the sphere so that distinct regions stay apart), LangSplat's `Autoencoder`
-(jsecon.language.autoencoder), or None (the embeddings themselves). `region_codes` chooses.
+(jsecon.paper.autoencoder), or None (the embeddings themselves). `region_codes` chooses.
 """
 
 import dataclasses
@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jsecon.errors import require
-from jsecon.language.autoencoder import Autoencoder, require_finite, train_autoencoder
 from jsecon.numerics import FULL_PRECISION, cosine_matrix, normalize
+from jsecon.paper.autoencoder import Autoencoder, require_finite, train_autoencoder
 from jsecon.types import Array, Key
 
 MAX_COSINE_LOSS = 1e-4

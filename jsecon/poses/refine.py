@@ -27,7 +27,6 @@ import numpy as np
 from jaxtyping import Bool, Float, PRNGKeyArray
 
 from jsecon.errors import require
-from jsecon.fit.alignment import align_cameras
 from jsecon.fit.corrections import (
     Corrections,
     RefineOptions,
@@ -42,6 +41,7 @@ from jsecon.fit.resize import resize_frame, scale_cameras
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.start import starting_gaussians
 from jsecon.fit.step import cameras_extent
+from jsecon.poses.alignment import align_cameras
 from jsecon.splat.render import render_rgb
 from jsecon.types import Array, Camera, Capture, Gaussians, Progress
 

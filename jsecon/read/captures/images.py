@@ -3,8 +3,8 @@
 Pillow decodes them and raises on truncated files. OpenCV decodes TIFF, of which Pillow warns and libtiff writes to the
 standard error, and encodes: after `import pycolmap`, Pillow ends the process when it saves a PNG.
 
-Images are returned upright, as their EXIF orientation asks. If poses belong to the stored pixels (`jsecon.data.frames`
-decides that), images are read with `upright=False`.
+Images are returned upright, as their EXIF orientation asks. If poses belong to the stored pixels
+(`jsecon.read.captures.frames` decides that), images are read with `upright=False`.
 """
 
 import io

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
-from jsecon.data.images import MAX_PIXELS
 from jsecon.errors import InputError, require
 from jsecon.files import path_within, read_json, write_text
+from jsecon.read.captures.images import MAX_PIXELS
 from jsecon.types import record, static
 
 _REMEDY = "Label the frame again (LangSplat's format, as its LERF-OVS labels have it)."

@@ -3,13 +3,13 @@
 from collections.abc import Callable, Collection
 from pathlib import Path
 
-from jsecon.data.colmap import find_models, read_colmap
-from jsecon.data.frames import CaptureExtent, FrameOptions, PosedImages, build_capture, planned_extent
-from jsecon.data.nerfstudio import read_nerfstudio
-from jsecon.data.rgbd import find_rgbd
-from jsecon.data.sfm import list_photographs
 from jsecon.errors import InputError
 from jsecon.files import is_output_folder
+from jsecon.read.captures.colmap import find_models, read_colmap
+from jsecon.read.captures.frames import CaptureExtent, FrameOptions, PosedImages, build_capture, planned_extent
+from jsecon.read.captures.nerfstudio import read_nerfstudio
+from jsecon.read.captures.rgbd import find_rgbd
+from jsecon.read.captures.sfm import list_photographs
 from jsecon.types import Capture, Progress
 
 

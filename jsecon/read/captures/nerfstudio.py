@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jsecon.data.coordinates import make_rigid
-from jsecon.data.frames import PosedImage, PosedImages
-from jsecon.data.gaussians.ply import load_point_cloud
-from jsecon.data.images import find_image, image_header
-from jsecon.data.lens import Lens
 from jsecon.errors import InputError
 from jsecon.files import read_json
 from jsecon.numerics import is_finite_and_bounded
+from jsecon.read.captures.coordinates import make_rigid
+from jsecon.read.captures.frames import PosedImage, PosedImages
+from jsecon.read.captures.images import find_image, image_header
+from jsecon.read.captures.lens import Lens
+from jsecon.read.splats.ply import load_point_cloud
 
 MILLIMETRE = 0.001
 """nerfstudio's default depth unit, metres"""

@@ -24,8 +24,8 @@ from jax.scipy.special import betainc
 from jaxtyping import Bool, Float, Int
 
 from jsecon.errors import require
-from jsecon.language.columns import row_slices, votes_of_rows
-from jsecon.language.regions import ALIKE_THRESHOLD, mean_residuals
+from jsecon.field.columns import row_slices, votes_of_rows
+from jsecon.field.regions import ALIKE_THRESHOLD, mean_residuals
 from jsecon.numerics import FULL_PRECISION, cosine_matrix
 from jsecon.programs import stored_jit
 from jsecon.types import Array, Regions, Votes

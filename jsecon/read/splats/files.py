@@ -29,8 +29,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from jsecon.data.gaussians.gltf import read_glb, save_glb
-from jsecon.data.gaussians.ply import (
+from jsecon.errors import InputError, describe_error
+from jsecon.files import atomic_write, parse_json, reading
+from jsecon.read.splats.gltf import read_glb, save_glb
+from jsecon.read.splats.ply import (
     drawable_gaussians,
     in_float32,
     read_elements,
@@ -39,8 +41,6 @@ from jsecon.data.gaussians.ply import (
     save_ply,
     usable_blocks,
 )
-from jsecon.errors import InputError, describe_error
-from jsecon.files import atomic_write, parse_json, reading
 from jsecon.splat.project import check_gaussians
 from jsecon.splat.sh import C0
 from jsecon.splat.transform import transform_axes

@@ -18,9 +18,9 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Int, Int16
 
-from jsecon.data.images import IMAGE_SUFFIXES, TRANSPOSED, apply_orientation, read_label_image
 from jsecon.errors import InputError
 from jsecon.files import is_output_folder, map_npy, reading
+from jsecon.read.captures.images import IMAGE_SUFFIXES, TRANSPOSED, apply_orientation, read_label_image
 from jsecon.types import ImageFile, Progress
 
 LEVELS = ("default", "s", "m", "l")

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jsecon.errors import require, require_shape
-from jsecon.query.similarity import Codes, Number, UnitCodes, similarities
+from jsecon.field.similarity import Codes, Number, UnitCodes, similarities
 from jsecon.types import Array, Selection
 
 TEMPERATURE = 10.0

@@ -21,9 +21,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from jsecon.data.gaussians.ply import drawable_gaussians, needs_float64, usable_blocks
 from jsecon.errors import InputError
 from jsecon.files import atomic_write, parse_json, reading
+from jsecon.read.splats.ply import drawable_gaussians, needs_float64, usable_blocks
 from jsecon.splat.project import check_gaussians
 from jsecon.splat.sh import C0, COEFFICIENT_COUNTS
 from jsecon.splat.transform import transform_blocks, transform_gaussians_float64

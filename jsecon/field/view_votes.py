@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Float, Float32, Int, Shaped
 from scipy import sparse
 
-from jsecon.language.votes import at_centre, distinct_labels
+from jsecon.field.votes import at_centre, distinct_labels
 from jsecon.numerics import FULL_PRECISION, NEAR
 from jsecon.splat.capacity import round_capacity
 from jsecon.splat.fusion import materialize

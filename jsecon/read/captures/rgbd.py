@@ -16,13 +16,13 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from jsecon.data.coordinates import make_rigid
-from jsecon.data.frames import MIN_FOCAL, PosedImage, PosedImages
-from jsecon.data.images import MAX_PIXELS, image_header
-from jsecon.data.lens import Lens
 from jsecon.errors import InputError
 from jsecon.files import parse_json, read_text, reading
 from jsecon.numerics import is_finite_and_bounded
+from jsecon.read.captures.coordinates import make_rigid
+from jsecon.read.captures.frames import MIN_FOCAL, PosedImage, PosedImages
+from jsecon.read.captures.images import MAX_PIXELS, image_header
+from jsecon.read.captures.lens import Lens
 
 _TUM_INTRINSICS = {
     "1": (517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),

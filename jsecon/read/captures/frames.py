@@ -18,11 +18,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from jsecon.data.coordinates import camera_jumps, make_rigid, normalizing_transform, transform_poses
-from jsecon.data.images import TRANSPOSED, ImageHeader, apply_orientation, image_header, read_depth, read_image
-from jsecon.data.lens import Lens, distort, resample_depth, undistorted_pinhole, undistortion_maps
 from jsecon.errors import InputError
 from jsecon.numerics import is_finite_and_bounded
+from jsecon.read.captures.coordinates import camera_jumps, make_rigid, normalizing_transform, transform_poses
+from jsecon.read.captures.images import TRANSPOSED, ImageHeader, apply_orientation, image_header, read_depth, read_image
+from jsecon.read.captures.lens import Lens, distort, resample_depth, undistorted_pinhole, undistortion_maps
 from jsecon.types import Camera, Capture, ImageFile, Progress
 
 MIN_FOCAL = 1e-3

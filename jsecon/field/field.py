@@ -17,8 +17,8 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from jsecon.data.images import MAX_PIXELS
 from jsecon.errors import InputError, describe_error, require
+from jsecon.field.columns import votes_of_rows
 from jsecon.files import (
     READ_ERRORS,
     ForeignFileError,
@@ -29,9 +29,9 @@ from jsecon.files import (
     unpack_tree,
     write_arrays,
 )
-from jsecon.language.autoencoder import Autoencoder
-from jsecon.language.codes import Rotation, Spread
-from jsecon.language.columns import votes_of_rows
+from jsecon.paper.autoencoder import Autoencoder
+from jsecon.paper.codes import Rotation, Spread
+from jsecon.read.captures.images import MAX_PIXELS
 from jsecon.splat.project import unusable_rows
 from jsecon.splat.sh import COEFFICIENT_COUNTS
 from jsecon.types import Camera, Gaussians, LanguageField, Parts, Regions, Votes

@@ -19,13 +19,13 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
-from jsecon.data.coordinates import transform_poses
-from jsecon.data.frames import PosedImage, PosedImages
-from jsecon.data.images import find_image, write_image
-from jsecon.data.lens import PROJECTIONS, Lens
 from jsecon.errors import InputError
 from jsecon.files import atomic_write, path_within, read_text
 from jsecon.numerics import is_finite_and_bounded
+from jsecon.read.captures.coordinates import transform_poses
+from jsecon.read.captures.frames import PosedImage, PosedImages
+from jsecon.read.captures.images import find_image, write_image
+from jsecon.read.captures.lens import PROJECTIONS, Lens
 from jsecon.types import Capture
 
 _MODELS = {

@@ -19,11 +19,11 @@ from jaxtyping import Float
 from scipy import sparse
 
 from jsecon.errors import InputError, require, require_shape
+from jsecon.field.columns import ROWS, vote_blocks
+from jsecon.field.view_votes import view_votes
 from jsecon.files import atomic_write, map_npy, write_npy
-from jsecon.language.columns import ROWS, vote_blocks
-from jsecon.language.distill import MIN_LABELLED, distill_votes
-from jsecon.language.view_votes import view_votes
 from jsecon.numerics import NEAR, require_labels
+from jsecon.paper.distill import MIN_LABELLED, distill_votes
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.visible import geometry_of_rows, visible_rows
 from jsecon.types import Array, Camera, Gaussians, Progress, Votes

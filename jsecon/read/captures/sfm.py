@@ -6,7 +6,7 @@ ALL_PAIRS photographs, every pair is matched. Above, each photograph is matched 
 with those that look most alike, by a vocabulary of visual words made of the photographs themselves.
 
 COLMAP writes to the standard streams, ends its process when an internal check fails, and cannot be stopped within a
-step. Therefore `python -m jsecon.data.sfm WORK` runs the steps in a process of its own. Features and matches stay in
+step. Therefore `python -m jsecon.read.captures.sfm WORK` runs the steps in a process of its own. Features and matches stay in
 WORK/database.db: a stopped run resumes there.
 """
 
@@ -32,10 +32,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from jsecon.data.frames import frame_names
-from jsecon.data.images import IMAGE_SUFFIXES, image_header, read_image, write_image
 from jsecon.errors import InputError
 from jsecon.files import list_files, write_text
+from jsecon.read.captures.frames import frame_names
+from jsecon.read.captures.images import IMAGE_SUFFIXES, image_header, read_image, write_image
 from jsecon.types import Progress
 
 MIN_PHOTOS = 3
@@ -256,7 +256,7 @@ def _run_steps(work: Path, progress: Progress | None) -> None:
     log = work / "log.txt"
     with log.open("w") as stream:
         child = subprocess.Popen(
-            [sys.executable, "-m", "jsecon.data.sfm", str(work)],
+            [sys.executable, "-m", "jsecon.read.captures.sfm", str(work)],
             stdout=subprocess.PIPE,
             stderr=stream,
             env=environ,

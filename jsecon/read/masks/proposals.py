@@ -19,10 +19,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
-from jsecon.data.images import MAX_PIXELS, read_label_image
-from jsecon.data.masks import AllFrames, FrameNames, MaskFiles, MaskFitter, find_masks, read_level
 from jsecon.errors import InputError
 from jsecon.files import READ_ERRORS, map_npy, read_json, reading
+from jsecon.read.captures.images import MAX_PIXELS, read_label_image
+from jsecon.read.masks.masks import AllFrames, FrameNames, MaskFiles, MaskFitter, find_masks, read_level
 from jsecon.types import ImageFile
 
 SUFFIXES = (".json", "_s.npy", ".png", ".npy")
@@ -136,8 +136,8 @@ def load_proposals(
 ) -> Proposals:
     """Finds the masks of single frames.
 
-    Files are named, and their subfolders read, as in `jsecon.data.masks`. Masks are in the order of their scores (SAM's
-    stability times predicted IoU), else as in the file; other sizes of the same aspect are resized (nearest). A frame
+    Files are named, and their subfolders read, as in `jsecon.read.masks.masks`. Masks are in the order of their scores
+    (SAM's stability times predicted IoU), else as in the file; other sizes of the same aspect are resized (nearest). A frame
     without a file has no masks.
 
     Args:

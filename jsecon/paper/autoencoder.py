@@ -1,4 +1,4 @@
-"""Region embeddings to small codes by LangSplat's autoencoder; jsecon.language.codes says when it is needed."""
+"""Region embeddings to small codes by LangSplat's autoencoder; jsecon.paper.codes says when it is needed."""
 
 import dataclasses
 import functools

@@ -1,0 +1,1 @@
+"""Language fields: regions, votes and their file."""

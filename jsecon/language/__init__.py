@@ -1,1 +1,0 @@
-"""The language field: masklets, regions, votes, codes, their distillation, and the file that holds it all."""

@@ -1,0 +1,1 @@
+"""Camera poses: structure from motion, corrections, alignment."""

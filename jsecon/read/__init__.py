@@ -1,0 +1,1 @@
+"""Readers and writers of captures, masks and files of Gaussians."""
