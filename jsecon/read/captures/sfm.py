@@ -6,8 +6,8 @@ ALL_PAIRS photographs, every pair is matched. Above, each photograph is matched 
 with those that look most alike, by a vocabulary of visual words made of the photographs themselves.
 
 COLMAP writes to the standard streams, ends its process when an internal check fails, and cannot be stopped within a
-step. Therefore `python -m jsecon.read.captures.sfm WORK` runs the steps in a process of its own. Features and matches stay in
-WORK/database.db: a stopped run resumes there.
+step. Therefore `python -m jsecon.read.captures.sfm WORK` runs the steps in a process of its own. Features and
+matches stay in WORK/database.db: a stopped run resumes there.
 """
 
 from __future__ import annotations

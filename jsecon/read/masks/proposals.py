@@ -137,8 +137,8 @@ def load_proposals(
     """Finds the masks of single frames.
 
     Files are named, and their subfolders read, as in `jsecon.read.masks.masks`. Masks are in the order of their scores
-    (SAM's stability times predicted IoU), else as in the file; other sizes of the same aspect are resized (nearest). A frame
-    without a file has no masks.
+    (SAM's stability times predicted IoU), else as in the file; other sizes of the same aspect are resized (nearest). A
+    frame without a file has no masks.
 
     Args:
       folder: The files of masks, or a COCO file.
