@@ -60,7 +60,20 @@ def jsecon_imports(path: Path) -> set[str]:
 
 
 GROUND = ("types", "numerics", "errors", "files", "parallel", "process", "programs", "backend")
-LOW = "splat", "vision", "read", "fit", "poses", "networks", "field", "association", "paper", "query", "evaluate", "views"
+LOW = (
+    "splat",
+    "vision",
+    "read",
+    "fit",
+    "poses",
+    "networks",
+    "field",
+    "association",
+    "paper",
+    "query",
+    "evaluate",
+    "views",
+)
 LAYERS = *LOW, "pipeline", "app", "demo"
 """packages, lowest first: each imports the modules of the root, itself, and packages before it"""
 

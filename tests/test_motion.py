@@ -27,7 +27,8 @@ from jsecon.read.captures import sfm
 from jsecon.read.captures.capture import load_capture
 from jsecon.read.captures.colmap import read_images
 from jsecon.read.captures.images import read_image
-from jsecon.read.captures.sfm import find_poses, list_photographs
+from jsecon.read.captures.photographs import list_photographs
+from jsecon.read.captures.sfm import find_poses
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
 

@@ -8,8 +8,8 @@ from jsecon.files import is_output_folder
 from jsecon.read.captures.colmap import find_models, read_colmap
 from jsecon.read.captures.frames import CaptureExtent, FrameOptions, PosedImages, build_capture, planned_extent
 from jsecon.read.captures.nerfstudio import read_nerfstudio
+from jsecon.read.captures.photographs import list_photographs
 from jsecon.read.captures.rgbd import find_rgbd
-from jsecon.read.captures.sfm import list_photographs
 from jsecon.types import Capture, Progress
 
 

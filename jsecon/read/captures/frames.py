@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from jsecon.errors import InputError
 from jsecon.numerics import is_finite_and_bounded
+from jsecon.process import cores
 from jsecon.read.captures.coordinates import camera_jumps, make_rigid, normalizing_transform, transform_poses
 from jsecon.read.captures.images import TRANSPOSED, ImageHeader, apply_orientation, image_header, read_depth, read_image
 from jsecon.read.captures.lens import Lens, distort, resample_depth, undistorted_pinhole, undistortion_maps
@@ -442,7 +443,7 @@ def build_capture(
         return is_transparent
 
     transparent = 0
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         try:
             for done, is_transparent in enumerate(pool.map(read, range(len(images))), start=1):
                 transparent += is_transparent

@@ -18,7 +18,6 @@ import dataclasses
 import importlib.util
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -33,9 +32,10 @@ import numpy as np
 from PIL import Image
 
 from jsecon.errors import InputError
-from jsecon.files import list_files, write_text
+from jsecon.files import write_text
+from jsecon.process import cores
 from jsecon.read.captures.frames import frame_names
-from jsecon.read.captures.images import IMAGE_SUFFIXES, image_header, read_image, write_image
+from jsecon.read.captures.images import image_header, read_image, write_image
 from jsecon.types import Progress
 
 MIN_PHOTOS = 3
@@ -60,8 +60,6 @@ photograph relative to the median. In a right model of 125 photographs the media
 wrongly placed ones had 0.08 and 0.12."""
 _FOCAL, _FOCAL_35MM, _MODEL, _EXIF_FOLDER = 0x920A, 0xA405, 0x0110, 0x8769
 """EXIF tags; the last is the folder that holds the first two"""
-_OTHER_IMAGES = re.compile(r"mask|depth|segmentation|proposal|label|confidence|normal|thumb")
-"""in the name of a folder whose images are not photographs"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,39 +93,6 @@ class SfmResult:
             hint = "" if self.models == 1 else f" There are {self.models} separate models: photograph the gaps."
             notes.append(f"{len(self.skipped)} photographs match the others too little and are skipped: {names}.{hint}")
         return tuple(notes)
-
-
-def list_photographs(path: Path) -> list[Path]:
-    """Lists the photographs of a folder, or of its images/, in name order.
-
-    If none lies directly in the folder, those of its subfolders are listed (cam0/, cam1/), except in folders of masks
-    or depth, masks named like the photograph beside them (a.jpg.png), and output of jsecon.
-
-    Args:
-      path: A folder; any other path has no photographs.
-
-    Returns:
-      Paths of the photographs.
-    """
-    folder = path / "images" if (path / "images").is_dir() else path
-    if not folder.is_dir():
-        return []
-    direct = sorted(file for file in folder.iterdir() if _is_image(file) and file.is_file())
-    if direct:
-        return direct
-    images = [file for file in list_files(folder) if _is_image(file)]
-    masked = {image.with_suffix("") for image in images}.intersection(images)
-    return [
-        file
-        for file in images
-        if file.with_suffix("") not in masked
-        and not any(_OTHER_IMAGES.search(part.lower()) for part in file.relative_to(folder).parts[:-1])
-    ]
-
-
-def _is_image(file: Path) -> bool:
-    """Whether a file is named like a visible image."""
-    return file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".")
 
 
 def require_pycolmap(where: object) -> None:
@@ -191,7 +156,7 @@ def find_poses(
     """
     require_pycolmap(where)
     original = check_photographs(photos, where)
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # reads all pixels: a damaged photograph is an error now
+    with ThreadPoolExecutor(cores()) as pool:  # reads all pixels: a damaged photograph is an error now
         sizes = [image.shape[1::-1] for image, _ in pool.map(read_image, photos)]
     links: list[str] = []
     for number, photo in enumerate(photos):
