@@ -14,7 +14,6 @@ from capture_files import png, small_capture, transforms, write_images, write_te
 from clip_files import write_clip, write_tokenizer
 from PIL import Image
 from sam2_files import write_sam2
-from sam3_files import KINDS as SAM3_KINDS, write_sam3
 from sam_files import write_sam
 from siglip_files import write_siglip
 from splat_files import compressed_ply, ply_columns, scene, sog, splat, spz, write_ply
@@ -28,7 +27,6 @@ from jsecon.field.field import check_field, load_field, save_field
 from jsecon.networks.clip import MAX_BIAS, MAX_SCALE, ClipEmbedder
 from jsecon.networks.sam import SamSegmenter, SamSettings, find_sam
 from jsecon.networks.sam2 import Sam2Tracker
-from jsecon.networks.sam3 import PhraseMasks, Sam3
 from jsecon.networks.tokenizer import CLIP_LENGTH, TextTokenizer
 from jsecon.paper.autoencoder import Autoencoder
 from jsecon.paper.codes import Rotation
@@ -600,24 +598,6 @@ def sam2(folder: Path) -> Iterator[Case]:
     yield Case(_inputs_of(folder), read, _array((2, 16, 16), np.int16, -1, 0))
 
 
-def sam3(folder: Path) -> Iterator[Case]:
-    """SAM 3 folders, put to the test, then asked for what a phrase names in a frame."""
-    frame = np.full((24, 32, 3), (230, 26, 26), np.uint8)
-
-    def read(name: str) -> PhraseMasks:
-        model = Sam3(folder / name)
-        model.check()
-        return model(frame, "red mug")
-
-    def whole(found: PhraseMasks) -> None:
-        _array((len(found.scores), 24, 32), bool)(found.masks)
-        _finite(found.scores)
-
-    for name in SAM3_KINDS:
-        write_sam3(folder / name, name, side=56)
-        yield Case(_inputs_of(folder / name), lambda name=name: read(name), whole)
-
-
 def videos(folder: Path) -> Iterator[Case]:
     """Videos of three containers."""
     rng = np.random.default_rng(0)
@@ -643,6 +623,6 @@ READERS: dict[str, Callable[[Path], Iterator[Case]]] = {
     own.__name__: own
     for own in (
         *(ply, splats, points, colmap, colmap_text, nerfstudio, rgbd, image, masks, langsplat, proposals, labels),
-        *(field, kept, tokenizer, clip, siglip, sam, sam2, sam3, videos),
+        *(field, kept, tokenizer, clip, siglip, sam, sam2, videos),
     )
 }

@@ -142,8 +142,8 @@ def test_sam_2_takes_a_frame_stretched_to_a_square_and_one_prompt_a_run(folders,
     assert [masks.shape for masks, _ in found] == [(1, 3, 64, 64)] * 3
 
 
-def test_sam_3_scales_colours_as_its_configuration_says(frame, tmp_path):
-    folder = write_sam(tmp_path / "sam3", "sam2", side=64)
+def test_sam_scales_colours_as_its_configuration_says(frame, tmp_path):
+    folder = write_sam(tmp_path / "sam2", "sam2", side=64)
     plain, name = SamGraphs(find_sam(folder)).encode(frame), SamSegmenter(find_sam(folder)).name
     config = folder / "preprocessor_config.json"
     content = json.loads(config.read_text())

@@ -43,7 +43,7 @@ def test_it_runs_by_name_and_converts_within_a_kind(affine):
 
 
 def test_a_scalar_stays_one(tmp_path):
-    """SAM 3's decoder takes a frame's height so; ONNX Runtime takes no row of one number for it."""
+    """SAM 2's memory encoder takes `binarize` so; ONNX Runtime takes no row of one number for it."""
     path = write_graph(tmp_path / "a.onnx", [node("Neg", ["h"], ["y"])], {"h": ("int64", [])}, {"y": ("int64", [])})
     found = Graph(path).run({"h": np.asarray(7, np.int32)})["y"]
     assert (found.shape, int(found)) == ((), -7)

@@ -52,12 +52,11 @@ class Answer:
 
     Attributes:
       query: The text, or the name of the pixel, region or outline.
-      by: One of METHODS, "outline", "phrase" or "relation".
+      by: One of METHODS, "outline" or "relation".
       selection: The Gaussians as the query selects them.
       mask: (N,) bool, the selection without outliers.
       skipped: Part of the work -> why it was not needed.
       presence: Probability that the text is true of the best region; None for embedders without `Logits`.
-      frames: Of a phrase, name of a frame -> score of each of its masks, best first.
       rows: (M,) int64 ids of the Gaussians that selection and mask have rows for; None if these are all.
       key: What tells the query from any other in the names of its files; None for a text, which does so itself.
       clusters: Number of clusters that DBSCAN kept and dropped, (0, 0) if it was not needed.
@@ -72,7 +71,6 @@ class Answer:
     mask: np.ndarray
     skipped: dict[str, str]
     presence: float | None = None
-    frames: Mapping[str, list[float]] | None = None
     rows: np.ndarray | None = None
     key: str | None = None
     clusters: tuple[int, int] = (0, 0)

@@ -172,8 +172,7 @@ def _record(field: LanguageField, answer: Answer) -> dict[str, Any]:
         "place": place,
         "skipped": answer.skipped,
     }
-    record |= {} if answer.relation is None else {"relation": dict(answer.relation)}
-    return record if answer.frames is None else record | {"frames": dict(answer.frames)}
+    return record if answer.relation is None else record | {"relation": dict(answer.relation)}
 
 
 def write_answers(

@@ -37,14 +37,8 @@ def _query(verb: verbs.Query, console: Console) -> verbs.VerbResult:
             _require_blocks(verb)
             check_field(verb.field)
         field = load_field(verb.field, mapped=large)
-        texts = verb.texts if verb.phrases is None else []
-        embedder = open_embedder(field, verb, console) if texts else None
-    answers, errors = [], []
-    if verb.phrases is not None:
-        from jsecon.app.phrases import ask_phrases  # SAM 3 runs on ONNX Runtime, which other queries may not need
-
-        answers, errors = ask_phrases(field, verb, console)
-    expression = next(filter(is_expression, texts), None)
+        embedder = open_embedder(field, verb, console) if verb.texts else None
+    expression = next(filter(is_expression, verb.texts), None)
     if expression is not None and large:
         problem = f"{expression!r} has a relation, an order or a number, which needs the whole field in memory"
         raise InputError(verb.field, problem, remedy="Raise JSECON_MEMORY (GiB), or put the text in quotes.")
@@ -53,11 +47,11 @@ def _query(verb: verbs.Query, console: Console) -> verbs.VerbResult:
     options |= {"pixels": verb.at, "frame": verb.from_frame, "up": verb.up}
     outlines = [lambda pairs=pairs: _ask_masks(field, pairs, **outline) for pairs in verb.mask]
     outlines += [lambda box=box: _ask_box(field, *box, **outline) for box in verb.box]
-    more, refused = ask_texts(field, embedder, texts, console, **options)
+    answers, errors = ask_texts(field, embedder, verb.texts, console, **options)
     with console.progress("answers"):
         outlined, failed = ask.collect(outlines)
-        answers += more + outlined
-        errors += refused + failed
+        answers += outlined
+        errors += failed
         answers = ask.edit_answers(field, answers, grow=verb.grow, shrink=verb.shrink, invert=verb.invert)
     files = {"views": verb.views, "ending": verb.format}
     result = write_answers(field, answers, verb.out, console, **files) if answers else {"answers": []}
@@ -146,32 +140,13 @@ def _check_query(verb: verbs.Query) -> None:
     if (verb.mask or verb.box) and verb.by != "votes":
         problem = "--mask and --box select by the outline alone"
         raise InputError("--by", problem, remedy="Leave --by out, or ask by a text.")
-    if verb.phrases is None:
-        for name, used in (("--images", verb.images is not None), ("--looks", verb.looks != verbs.Query.looks)):
-            if used:
-                raise InputError(name, "it needs --phrases", remedy="Give --phrases DIR, a SAM 3 model folder.")
-        return
-    if not verb.texts:
-        remedy = 'For example: jsecon query field.safetensors "red mug" --phrases sam3 --out answers'
-        raise InputError("--phrases", "there is no text, which is the phrase", remedy=remedy)
-    unused = {
-        "--by": verb.by != "votes",
-        "--all": verb.all,
-        "--quantile": verb.quantile != verbs.Query.quantile,
-        "--template": bool(verb.template),
-        "--embedder": verb.embedder is not None,
-    }
-    if any(unused.values()):
-        flags = " ".join(flag for flag, used in unused.items() if used)
-        problem = f"{flags} cannot be combined with it, since SAM 3 reads the texts and finds all objects of a kind"
-        raise InputError("--phrases", problem, remedy=f"Leave out {flags}.")
 
 
 def _require_blocks(verb: verbs.Query) -> None:
     """Raises InputError if queries of a field that is larger than memory need the whole field there."""
     needs_all = {
         f"--by {verb.by}": verb.by not in ("votes", "code"),
-        "--mask, --box or --phrases": verb.mask or verb.box or verb.phrases,
+        "--mask or --box": verb.mask or verb.box,
         "--grow, --shrink or --invert": verb.grow or verb.shrink or verb.invert,
     }
     for option, used in needs_all.items():

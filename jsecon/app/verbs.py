@@ -228,10 +228,6 @@ class Query(FieldVerb):
       grow: Adds this many shells of neighbouring Gaussians to each answer.
       shrink: Removes this many shells from each answer, after growing. The same number of both closes gaps.
       invert: Selects the Gaussians that an answer does not select, after both.
-      phrases: Folder of a SAM 3 model (.onnx), which masks the objects that each text names in some frames of the
-        capture. A text then selects what lies in the masks in most of the frames that see it.
-      images: With --phrases, the capture whose frames are used. By default it is where the run had it.
-      looks: With --phrases, number of frames, evenly spaced. More frames take longer.
       views: Number of masks to write for each query.
       format: Format of the selected Gaussians. The glb is glTF with Khronos' KHR_gaussian_splatting, y up, and holds
         their codes and regions too.
@@ -260,9 +256,6 @@ class Query(FieldVerb):
     grow: Advanced[int] = 0
     shrink: Advanced[int] = 0
     invert: Advanced[bool] = False
-    phrases: Advanced[Path | None] = None
-    images: Advanced[Path | None] = None
-    looks: Advanced[int] = 8
     views: Advanced[int] = 3
     format: Option[Literal["ply", "spz", "glb"]] = "ply"
 

@@ -1,4 +1,4 @@
-"""Segmenter by SAM, SlimSAM, EdgeTAM, SAM 2.1 or SAM 3 on ONNX Runtime: the automatic mask generator.
+"""Segmenter by SAM, SlimSAM, EdgeTAM or SAM 2.1 on ONNX Runtime: the automatic mask generator.
 
 Points prompt the frame and crops of it: one in the middle of each region that differs by colour, then some in what the
 masks of these do not explain (guided prompts), or the 1,024 points of SAM's grid. Each point gives three masks:
@@ -11,7 +11,7 @@ A model folder has onnx/vision_encoder.onnx and onnx/prompt_encoder_mask_decoder
 and preprocessor_config.json, which states how colours are scaled. The decoder takes input_points (1, B, P, 2) and
 input_labels (1, B, P) and gives iou_scores and pred_masks. There are two kinds, which differ in its other inputs:
     SAM      image_embeddings of a frame that is scaled by its longer side and padded; a batch of prompts in one run
-    SAM 2    image_embeddings.0, .1 and .2 of a frame that is stretched to a square, as EdgeTAM, SAM 2.1 and SAM 3 have;
+    SAM 2    image_embeddings.0, .1 and .2 of a frame that is stretched to a square, as EdgeTAM and SAM 2.1 have;
              input_boxes (1, 0, 4), so one prompt a run
 """
 

@@ -7,7 +7,6 @@ from jsecon.errors import InputError
 from jsecon.networks.clip import LOGITS_REMEDY, ClipEmbedder
 from jsecon.networks.sam import SamGraphs, find_sam
 from jsecon.networks.sam2 import open_sam2
-from jsecon.networks.sam3 import Sam3
 from jsecon.networks.session import Graph, describe
 
 
@@ -16,7 +15,7 @@ class Use:
     """A kind of model that a folder may hold."""
 
     model: str
-    """CLIP, SAM, SAM 2 or SAM 3."""
+    """CLIP, SAM or SAM 2."""
     usable: bool
     """Whether the folder holds one."""
     summary: str
@@ -70,7 +69,7 @@ def inspect_models(folder: str | Path) -> ModelReport:
         raise InputError(folder, "no such folder", "a folder of models", "Check the path.")
     graphs = {path.relative_to(folder).as_posix(): _signature(path) for path in sorted(folder.rglob("*.onnx"))}
     uses = []
-    for model, examine in (("CLIP", _clip), ("SAM", _sam), ("SAM 2", _sam2), ("SAM 3", _sam3)):
+    for model, examine in (("CLIP", _clip), ("SAM", _sam), ("SAM 2", _sam2)):
         try:
             uses.append(Use(model, True, examine(folder)))
         except InputError as error:
@@ -113,10 +112,3 @@ def _sam(folder: Path) -> str:
 def _sam2(folder: Path) -> str:
     side = open_sam2(folder).sizes["S"]
     return f"objects followed through the frames, images of {side} px: jsecon run --tracker {folder}"
-
-
-def _sam3(folder: Path) -> str:
-    sam3 = Sam3(folder)
-    summary = sam3.summary
-    sam3.check()
-    return f"{summary}: jsecon query FIELD TEXT --phrases {folder}"
