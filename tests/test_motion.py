@@ -23,12 +23,12 @@ from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Listener
 from jsecon.pipeline.results import KEY_FILE, RunContext
 from jsecon.pipeline.stages import capture_stages
-from jsecon.read.captures import sfm
+from jsecon.poses import sfm
+from jsecon.poses.sfm import find_poses
 from jsecon.read.captures.capture import load_capture
 from jsecon.read.captures.colmap import read_images
 from jsecon.read.captures.images import read_image
 from jsecon.read.captures.photographs import list_photographs
-from jsecon.read.captures.sfm import find_poses
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
 

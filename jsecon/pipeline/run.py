@@ -50,12 +50,12 @@ from jsecon.pipeline.results import (
 )
 from jsecon.pipeline.scene_files import read_scene
 from jsecon.pipeline.sources import provenance
+from jsecon.poses.sfm import check_photographs, require_pycolmap
 from jsecon.process import compilation_counts
 from jsecon.read.captures.capture import capture_extent
 from jsecon.read.captures.frames import CaptureExtent, FrameOptions, evenly_spaced, frame_names, holdout_mask
 from jsecon.read.captures.images import image_header
 from jsecon.read.captures.photographs import list_photographs
-from jsecon.read.captures.sfm import check_photographs, require_pycolmap
 from jsecon.read.captures.video import DEFAULT_VIDEO_FRAMES, is_video, video_size
 from jsecon.read.masks.langsplat import load_features
 from jsecon.read.masks.masks import load_labels

@@ -50,11 +50,11 @@ from jsecon.pipeline.results import (
     vision_frames,
 )
 from jsecon.pipeline.scene_files import check_overlap, place_in_capture, read_scene
+from jsecon.poses.sfm import find_poses
 from jsecon.process import memory_budget
 from jsecon.read.captures.capture import load_capture, may_have_depth, unposed_photographs
 from jsecon.read.captures.nerfstudio import trained_to_source
 from jsecon.read.captures.photographs import list_photographs
-from jsecon.read.captures.sfm import find_poses
 from jsecon.read.captures.video import DEFAULT_VIDEO_FRAMES, is_video, write_frames
 from jsecon.read.masks.langsplat import load_features
 from jsecon.read.masks.masks import load_labels

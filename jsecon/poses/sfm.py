@@ -6,7 +6,7 @@ ALL_PAIRS photographs, every pair is matched. Above, each photograph is matched 
 with those that look most alike, by a vocabulary of visual words made of the photographs themselves.
 
 COLMAP writes to the standard streams, ends its process when an internal check fails, and cannot be stopped within a
-step. Therefore `python -m jsecon.read.captures.sfm WORK` runs the steps in a process of its own. Features and
+step. Therefore `python -m jsecon.poses.sfm WORK` runs the steps in a process of its own. Features and
 matches stay in WORK/database.db: a stopped run resumes there.
 """
 
@@ -221,7 +221,7 @@ def _run_steps(work: Path, progress: Progress | None) -> None:
     log = work / "log.txt"
     with log.open("w") as stream:
         child = subprocess.Popen(
-            [sys.executable, "-m", "jsecon.read.captures.sfm", str(work)],
+            [sys.executable, "-m", "jsecon.poses.sfm", str(work)],
             stdout=subprocess.PIPE,
             stderr=stream,
             env=environ,
