@@ -152,7 +152,7 @@ def votes_step(folder: Path, views: int, width: int, height: int) -> dict[str, f
         told[name] = float(np.median(np.diff(own))) if len(own) > 1 else np.nan
     told["seen"] = float(np.mean([np.count_nonzero(votes.views[a : a + (1 << 20)]) / len(votes.views[a : a + (1 << 20)])
                                   for a in range(0, len(votes.views), 1 << 20)]))  # fmt: skip
-    votes = timed(told, "votes finished, s", lambda: jsecon.finish_votes_in_blocks(votes, regions))
+    votes = timed(told, "votes finished, s", lambda: jsecon.normalise_votes_in_blocks(votes, regions))
     table = regions.embeddings[:, :CODE]
     codes = timed(told, "codes, s", lambda: jsecon.codes_in_blocks(votes, table, folder / "codes.npy"))
     field = field_of(gaussians, votes, codes, cameras, regions)
@@ -178,14 +178,14 @@ def export_step(folder: Path, *_: int) -> dict[str, float]:
     timed(told, "field checked, s", lambda: jsecon.check_field(folder / "field.safetensors"))
     field = jsecon.load_field(folder / "field.safetensors", mapped=True)
     turn = np.array([[0, 0, 1, 5], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1.0]])
-    turned = dataclasses.replace(field, to_source=turn)
+    turned = dataclasses.replace(field, source_from_scene=turn)
     timed(told, "exported, s", lambda: save_scene(turned, folder / "scene.ply"))
     return told
 
 
 def finished(gaussians, cameras, labels, regions, **how):
     """Votes in blocks with all that queries read."""
-    return jsecon.finish_votes_in_blocks(
+    return jsecon.normalise_votes_in_blocks(
         jsecon.region_votes_in_blocks(gaussians, cameras, labels, REGIONS, **how), regions
     )
 
@@ -203,10 +203,10 @@ def part_step(folder: Path, views: int, width: int, height: int) -> dict[str, fl
     memory = timed(
         told,
         "in memory, s",
-        lambda: jsecon.finish_votes(jsecon.region_votes(part, cameras, images, REGIONS, by_view=True), regions),
+        lambda: jsecon.normalise_votes(jsecon.region_votes(part, cameras, images, REGIONS, by_view=True), regions),
     )
     told["part"], told["seen"] = part.count, float((np.asarray(memory.views) > 0).mean())
-    for name in ("weights", "shown", "labelled", "total", "peak"):
+    for name in ("weights", "weight_where_region_visible", "labelled", "total", "max_pixel_weight"):
         own, other = (np.asarray(getattr(votes, name), np.float64) for votes in (blocks, memory))
         told[f"{name}: largest difference"] = float(np.abs(own - other).max())
         told[f"{name}: relative"] = float(np.linalg.norm(own - other) / np.linalg.norm(other))
@@ -292,8 +292,12 @@ def growth(base: Path, largest: int) -> None:
 def random_votes(folder: Path, count: int) -> Votes:
     """Mapped columns of votes that nothing cast."""
     folder.mkdir(parents=True)
-    kinds = {"regions": ((8,), np.int32), "weights": ((8,), np.float32), "shown": ((8,), np.float32)}
-    kinds |= {name: ((), np.float32) for name in ("labelled", "total", "peak")} | {"views": ((), np.int32)}
+    kinds = {
+        "regions": ((8,), np.int32),
+        "weights": ((8,), np.float32),
+        "weight_where_region_visible": ((8,), np.float32),
+    }
+    kinds |= {name: ((), np.float32) for name in ("labelled", "total", "max_pixel_weight")} | {"views": ((), np.int32)}
     for name, (rest, dtype) in kinds.items():
         rng = np.random.default_rng(len(name))
         sizes = ((min(1 << 20, count - first), *rest) for first in range(0, count, 1 << 20))

@@ -65,7 +65,18 @@ def made_field(objects: int, gaussians: int, seed: int = 0) -> Any:
     overlap[twins, twin_of[twins]] = overlap[twin_of[twins], twins] = 0.6
     shown = np.repeat(np.maximum(total, 10.0)[:, None], 3, axis=1).astype(np.float32)
     views, nothing = np.full(gaussians, 24, np.int32), np.zeros((), np.int32)
-    votes = Votes(regions, weights, total, total * 1.1, flat, views, nothing, count, shown=shown, overlap=overlap)
+    votes = Votes(
+        regions,
+        weights,
+        total,
+        total * 1.1,
+        flat,
+        views,
+        nothing,
+        count,
+        weight_where_region_visible=shown,
+        overlap=overlap,
+    )
     names = [VOCABULARY[k % len(VOCABULARY)] for k in [*range(objects), *twins]]
     embeddings = np.asarray(embedder.embed_text(names), np.float32) + draw.normal(0, 0.01, (count, embedder.dim))
     embeddings = (embeddings / np.linalg.norm(embeddings, axis=1, keepdims=True)).astype(np.float32)
@@ -80,11 +91,11 @@ def made_field(objects: int, gaussians: int, seed: int = 0) -> Any:
         region_codes=embeddings,
         autoencoder=None,
         cameras=Camera(poses, lens, lens, lens, lens * 0.75, 600, 450),
-        canonical=np.asarray(embedder.canonical, np.float32),
-        to_source=np.eye(4),
+        canonical_phrases=np.asarray(embedder.canonical_phrases, np.float32),
+        source_from_scene=np.eye(4),
         names=tuple(f"frame_{t:05d}" for t in range(len(eyes))),
         embedder=embedder.name,
-        reference=np.asarray(embedder.reference, np.float16),
+        unrelated_words=np.asarray(embedder.unrelated_words, np.float16),
     )
 
 

@@ -85,7 +85,7 @@ def main() -> None:
     import jax.numpy as jnp
 
     from jsecon.association.consensus import consensus_masklets
-    from jsecon.association.run_lengths import memoized_masks
+    from jsecon.association.run_lengths import cache_masks_as_rle
     from jsecon.fit.start import gaussians_from_points
     from jsecon.paper.algorithm1 import masklets
     from jsecon.paper.tracker import GeometricTracker
@@ -107,7 +107,7 @@ def main() -> None:
     def true_masks(t: int) -> np.ndarray:
         return draw(poses[t], focal, size, centres)[0] == np.arange(count + 1)[:, None, None]
 
-    proposals = memoized_masks(true_masks)  # as a run keeps what its segmenter finds
+    proposals = cache_masks_as_rle(true_masks)  # as a run keeps what its segmenter finds
     tracker = GeometricTracker(gaussians, cameras, proposals)
     start = time.perf_counter()
     tracker.views.all(frames)

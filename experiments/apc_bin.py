@@ -21,7 +21,7 @@ from experiments import results
 from experiments.datasets.depth_points import confirmed_depths
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import accuracy_at, iou, mean_iou
-from jsecon.field.membership import with_shown
+from jsecon.field.membership import add_visible_weight
 from jsecon.field.votes import region_votes
 from jsecon.fit.depth import points_from_depth
 from jsecon.fit.quality import measure_quality
@@ -135,7 +135,9 @@ def build_field(gaussians: Gaussians, capture: Capture, labels: np.ndarray) -> L
     codes = jnp.eye(count)
     pixels = np.stack([(labels[used] == r).sum((1, 2)) for r in range(count)]).astype(np.int32)
     regions = Regions(codes, jnp.asarray(pixels))
-    votes = with_shown(region_votes(gaussians, cameras, jnp.asarray(labels[used]), count, by_view=True), regions)
+    votes = add_visible_weight(
+        region_votes(gaussians, cameras, jnp.asarray(labels[used]), count, by_view=True), regions
+    )
     return LanguageField(
         gaussians=gaussians,
         codes=distill_votes(votes, codes, "mode"),
@@ -144,8 +146,8 @@ def build_field(gaussians: Gaussians, capture: Capture, labels: np.ndarray) -> L
         region_codes=codes,
         autoencoder=None,
         cameras=cameras,
-        canonical=jnp.zeros((1, count)),
-        to_source=jnp.eye(4),
+        canonical_phrases=jnp.zeros((1, count)),
+        source_from_scene=jnp.eye(4),
         names=tuple(capture.names[t] for t in used),
         embedder="labels",
     )

@@ -96,10 +96,10 @@ def answered(options: Options, scene: str, seed: int, level: str, vision: int) -
     root = options.data.place(scene, seed, "medium")
     bench = options.data.load(root, scene)
     found = pooled(bench, root, level, vision)
-    words = twins.words_of(bench, root, level, vision).reference
+    words = twins.words_of(bench, root, level, vision).unrelated_words
     # Rooms share one program: regions without an embedding change nothing.
     room = -len(found.embeddings) % PADDED
-    embeddings, pixels = (np.pad(own, ((0, room), (0, 0))) for own in (found.embeddings, found.pixels))
+    embeddings, pixels = (np.pad(own, ((0, room), (0, 0))) for own in (found.embeddings, found.pixel_counts))
     rows = []
     for texts, objects in ((found.texts, np.arange(len(found.texts))), (found.absent, np.full(len(found.absent), -1))):
         given = (jnp.asarray(own, jnp.float32) for own in (embeddings, texts, pixels, words))

@@ -35,7 +35,7 @@ from experiments.words import rules
 from experiments.words.absent import absent_names
 from experiments.words.conse import Conse, Crop, Labeller, TextVectors, class_weights, conse
 from experiments.words.scenes import DEFAULT, GIVEN, RIVALS, WordScene, load_scene, rival_weights, scores_of
-from jsecon.field.membership import finish_votes
+from jsecon.field.membership import normalise_votes
 from jsecon.query.classes import query_classes
 from jsecon.query.match import evidence, match_regions
 from jsecon.query.rules import KIND_THRESHOLD, QUANTILE, RETRIEVAL_THRESHOLD
@@ -84,8 +84,8 @@ class Case:
 
     def scores(self, kind: str) -> np.ndarray:
         """(Q, R) of all texts with all regions, by one of `rules.SCORES`."""
-        embeddings, pixels = self.regions.embeddings, self.regions.pixels
-        canonical, words = np.asarray(self.field.canonical), np.asarray(self.field.reference)
+        embeddings, pixels = self.regions.embeddings, self.regions.pixel_counts
+        canonical, words = np.asarray(self.field.canonical_phrases), np.asarray(self.field.unrelated_words)
         return rules.scores(embeddings, self.texts, canonical, words, pixels, kind)
 
 
@@ -102,16 +102,16 @@ def case_of(scene: WordScene, embedder: Conse, variant: str) -> Case:
     field = LanguageField(
         gaussians=scene.gaussians,
         codes=np.zeros((scene.gaussians.count, 1), np.float32),
-        votes=finish_votes(scene.votes, regions),
+        votes=normalise_votes(scene.votes, regions),
         regions=regions,
         region_codes=np.zeros((regions.count, 1), np.float32),
         autoencoder=None,
         cameras=scene.cameras,
-        canonical=embedder.canonical,
-        to_source=np.eye(4),
+        canonical_phrases=embedder.canonical_phrases,
+        source_from_scene=np.eye(4),
         names=tuple(map(str, range(len(scene.frames)))),
         embedder=embedder.name,
-        reference=reference_of(embedder),
+        unrelated_words=reference_of(embedder),
     )
     return Case(scene, crops, regions, embedder.embed_text(list(scene.texts)), field)
 
@@ -124,7 +124,7 @@ def _by_regions(kind: str, way: str) -> Chooser:
     """A rule of `experiments.words.rules`: scores of regions, and which of them a text takes. It refuses nothing."""
 
     def choose(case: Case) -> np.ndarray:
-        table, weight = case.scores(kind), np.asarray(evidence(jnp.asarray(case.regions.pixels)))
+        table, weight = case.scores(kind), np.asarray(evidence(jnp.asarray(case.regions.pixel_counts)))
         chosen = {
             "best region": lambda: rules.best_of(table),
             "best region by evidence": lambda: rules.best_of(np.where(table > 0, table * weight, table)),
@@ -172,8 +172,8 @@ def alone(name: str, masks: str, embedder: Callable[[], Conse], method: str) -> 
     scene = load_scene(name, masks)
     case, truth, asked = case_of(scene, embedder(), VARIANTS[0]), scene.truth, scene.asked
     features = unit(np.asarray(rival_weights(scene, method) @ case.crops, np.float64))
-    cosine = rules.point_scores(features, case.texts, case.field.canonical, "cosine")
-    relevancy = rules.point_scores(features, case.texts, case.field.canonical, "relevancy")
+    cosine = rules.point_scores(features, case.texts, case.field.canonical_phrases, "cosine")
+    relevancy = rules.point_scores(features, case.texts, case.field.canonical_phrases, "relevancy")
     smooth = smoothed(scene.gaussians.means, relevancy)
     chosen = (smooth > READOUT, relevancy >= 0.5, cosine >= RETRIEVAL_THRESHOLD)
     found = {reading: rules.ious(own, truth, asked) for reading, own in zip(FIXED, chosen)}
@@ -224,7 +224,7 @@ def lifting(name: str, masks: str) -> list[float]:
     """The IoUs of the regions whose true names are the texts': the part of the error that no text plays a role in."""
     scene = load_scene(name, masks)
     # The votes as queries read them, where no two regions are alike.
-    votes = finish_votes(scene.votes, Regions(np.eye(len(scene.pixels), dtype=np.float32), scene.pixels))
+    votes = normalise_votes(scene.votes, Regions(np.eye(len(scene.pixels), dtype=np.float32), scene.pixels))
     chosen = rules.selected(votes, scene.region_names == scene.asked[:, None])
     return rules.ious(chosen, scene.truth, scene.asked).tolist()
 

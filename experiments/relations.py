@@ -43,7 +43,7 @@ from jsecon.demo.room import (
 from jsecon.demo.shapes import SHAPES, Body, box, contains, ellipsoid, place
 from jsecon.errors import InputError
 from jsecon.field.field import load_field, save_field
-from jsecon.field.membership import finish_votes
+from jsecon.field.membership import normalise_votes
 from jsecon.field.regions import region_embeddings
 from jsecon.field.votes import region_votes
 from jsecon.fit.depth import points_from_depth
@@ -346,7 +346,7 @@ def true_field(room: Room) -> LanguageField:
     labels = np.asarray(instances, np.int16)
     regions = region_embeddings(frames, labels, embedder.embed_regions, num_regions=len(room.objects))
     votes = region_votes(scene, cameras, labels, len(room.objects), by_view=True)
-    votes = finish_votes(votes, regions)
+    votes = normalise_votes(votes, regions)
     codes = distill_votes(votes, jnp.asarray(regions.embeddings))
     return LanguageField(
         gaussians=scene,
@@ -356,11 +356,11 @@ def true_field(room: Room) -> LanguageField:
         region_codes=jnp.asarray(regions.embeddings),
         autoencoder=None,
         cameras=cameras,
-        canonical=np.asarray(embedder.canonical, np.float32),
-        to_source=np.eye(4),
+        canonical_phrases=np.asarray(embedder.canonical_phrases, np.float32),
+        source_from_scene=np.eye(4),
         names=names,
         embedder=embedder.name,
-        reference=np.asarray(embedder.reference, np.float16),
+        unrelated_words=np.asarray(embedder.unrelated_words, np.float16),
     )
 
 

@@ -88,8 +88,8 @@ def on_points(data: twins.Data, scene: str, seed: int, level: str) -> tuple[Sett
     tracks = np.asarray(seen.labels, np.int32)
     evidence = Evidence(gaussians, cameras, masks, np.concatenate(rows), np.array(owners), tracks)
     texts, levels = embedder.embed_text(list(bench.queries)), (evidence,)
-    known = (bench, evidence, frames, levels, associated(levels, tracks), texts, embedder.canonical)
-    setting = Setting(*known, {}, tuple(names), seed, root / scene, level, embedder.reference)
+    known = (bench, evidence, frames, levels, associated(levels, tracks), texts, embedder.canonical_phrases)
+    setting = Setting(*known, {}, tuple(names), seed, root / scene, level, embedder.unrelated_words)
     votes = region_votes(gaussians, cameras, jnp.asarray(truth, jnp.int32), int(truth.max()) + 1)
     inside, outside = np.asarray(votes.weights[:, 0]), np.asarray(votes.total - votes.labelled)
     return setting, np.where(inside > outside, np.asarray(votes.regions[:, 0]), -1)
@@ -107,7 +107,9 @@ def anchored(change: Callable[[LanguageField], LanguageField] = lambda field: fi
 
 def without_evidence(field: LanguageField) -> LanguageField:
     """A field whose regions have full evidence in each view that shows them."""
-    return dataclasses.replace(field, regions=dataclasses.replace(field.regions, pixels=FULL_PX * field.regions.pixels))
+    return dataclasses.replace(
+        field, regions=dataclasses.replace(field.regions, pixel_counts=FULL_PX * field.regions.pixel_counts)
+    )
 
 
 def every_region(setting: Setting, field: LanguageField, k: int) -> Any:

@@ -81,7 +81,7 @@ class Pooled(NamedTuple):
     """(Q,) the objects that the benchmark's queries name."""
     absent: np.ndarray
     """(A, E) texts of nothing in the scene."""
-    canonical: np.ndarray
+    canonical_phrases: np.ndarray
     """(4, E)."""
 
 
@@ -100,17 +100,17 @@ def pooled(bench: Benchmark, root: Path, level: str, seed: int) -> Pooled:
     asked = np.array([names.index(query) for query in bench.queries])
     absent = twins.words_of(bench, root, level, seed).absent
     texts = embedder.embed_text(names)
-    return Pooled(embeddings, pixels, labels.origin, masks, texts, asked, absent, embedder.canonical)
+    return Pooled(embeddings, pixels, labels.origin, masks, texts, asked, absent, embedder.canonical_phrases)
 
 
 def figures_of(found: Pooled) -> dict[str, float]:
     """The figures of REAL, of one twin."""
-    here = (found.pixels.sum(1) > 0) & (found.objects >= 0)
+    here = (found.pixel_counts.sum(1) > 0) & (found.objects >= 0)
     own = found.objects[here]
     rows = found.embeddings[here]
     different = ~np.eye(len(found.texts), dtype=bool)
     to_text = found.masks[:, here] @ found.texts.T
-    shown = found.pixels[here].T > 0
+    shown = found.pixel_counts[here].T > 0
     to_own = np.take_along_axis(to_text, np.broadcast_to(own[None, :, None], (*shown.shape, 1)), axis=2)[..., 0]
     views = np.einsum("tre,sre->rts", found.masks[:, here], found.masks[:, here])
     pairs = shown.T[:, :, None] & shown.T[:, None, :] & ~np.eye(len(shown), dtype=bool)
@@ -127,7 +127,7 @@ def figures_of(found: Pooled) -> dict[str, float]:
     every = np.concatenate([found.texts, found.absent])
     words = found.absent[: len(found.absent) // 2]
     for rule, kind in RULES.items():
-        scores = rules.scores(found.embeddings, every, found.canonical, words, found.pixels, kind)
+        scores = rules.scores(found.embeddings, every, found.canonical_phrases, words, found.pixel_counts, kind)
         texts, absent = scores[: len(found.texts)], scores[len(found.texts) + len(words) :]
         told[f"own text is the best, by {rule}"] = (texts[:, here].argmax(0) == own).mean()
         answer = texts[found.asked].argmax(1)

@@ -21,11 +21,11 @@ from .evaluate.metrics import (
 )
 from .field.field import check_field as check_field, load_field as load_field, save_field as save_field
 from .field.membership import (
-    finish_votes as finish_votes,
-    finish_votes_in_blocks as finish_votes_in_blocks,
+    add_visible_weight as add_visible_weight,
     membership_probability as membership_probability,
+    normalise_votes as normalise_votes,
+    normalise_votes_in_blocks as normalise_votes_in_blocks,
     with_overlap as with_overlap,
-    with_shown as with_shown,
 )
 from .field.regions import region_embeddings as region_embeddings
 from .field.similarity import unit_codes as unit_codes

@@ -167,7 +167,7 @@ class Capture(_Shown):
     """(T,) bool: frames that are only measured, never fitted to."""
     depths: Array | None
     """(T, H, W) float32 z-depth in world units, 0 = unknown; or None."""
-    to_source: Array
+    source_from_scene: Array
     """(4, 4) float64 similarity from this world to the files' world (identity if it was not normalised)."""
     names: tuple[str, ...] = static()
     """T file names without folder or ending, in frame order."""
@@ -177,7 +177,7 @@ class Capture(_Shown):
     """(T, H, W) bool: what a fit shall not look at, as what moved; or None."""
     files: tuple[ImageFile, ...] = static(default=())
     """T images, or () if the frames have no files. Masks, proposals and depth follow their folders."""
-    to_poses: Array | None = None
+    poses_from_scene: Array | None = None
     """(4, 4) similarity from this world to that of the poses in the files, before any transform that they name
     (applied_transform) is undone; None: it is the same."""
 
@@ -220,7 +220,7 @@ class Votes:
     """(N,) sum of alpha T over labelled pixels, all regions."""
     total: Array
     """(N,) sum of alpha T over all pixels, labelled or not."""
-    peak: Array
+    max_pixel_weight: Array
     """(N,) largest alpha T at any pixel of any view, in [0, 1)."""
     views: Array
     """(N,) int32 views in which the Gaussian has any weight; 0 = never seen: unknown."""
@@ -230,13 +230,13 @@ class Votes:
     """R."""
     by_view: Array | None = None
     """(T, N) sum of alpha T over the pixels of each view, or None where it was not kept."""
-    shown: Array | None = None
+    weight_where_region_visible: Array | None = None
     """(N, K) sum of alpha T over the views that show that region, or one alike to it; None: not known."""
     overlap: Array | None = None
     """(R, R) in [0, 1]: soft IoU of the Gaussians of two regions; None: not known."""
 
     @property
-    def cut(self) -> Array:
+    def weight_beyond_top_k(self) -> Array:
         """(N,) labelled weight that lies outside the K strongest regions."""
         return jnp.maximum(self.labelled - self.weights.sum(-1), 0.0)
 
@@ -258,7 +258,7 @@ class Regions:
 
     embeddings: Array
     """(R, E) unit length; pixel-weighted mean of the views' embeddings (paper: phi_bar); zero where never embedded."""
-    pixels: Array
+    pixel_counts: Array
     """(R, T) int32 pixels of the region in each view; 0 where it is not seen."""
 
     @property
@@ -294,9 +294,9 @@ class LanguageField(_Shown):
     """Coder of jsecon.paper.codes, or None where the codes are the embeddings themselves."""
     cameras: Camera
     """batch of T: the capture's views, for masks and for `--at`."""
-    canonical: Array
+    canonical_phrases: Array
     """(C, E) embeddings of the canonical phrases (LERF: object, things, stuff, texture) in the embedder's space."""
-    to_source: Array
+    source_from_scene: Array
     """(4, 4) from the field's world to the capture files' world; undone on export."""
     names: tuple[str, ...] = static()
     """T frame names."""
@@ -306,7 +306,7 @@ class LanguageField(_Shown):
     """JSON: version, options, inputs' digests."""
     parts: Parts | None = None
     """what single masks say of small parts of the scene, where the run was asked for it."""
-    reference: Array | None = None
+    unrelated_words: Array | None = None
     """(W, E) embeddings of words unrelated to the scene, W may be 0: what a text's similarity is
     measured against (jsecon.query.match). None: a field of an earlier version."""
 

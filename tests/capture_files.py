@@ -65,7 +65,7 @@ def small_capture(count: int = 5, width: int = 24, height: int = 16, points: int
         point_colors=rng.integers(0, 256, (points, 3), np.uint8),
         held_out=np.zeros(count, bool),
         depths=None,
-        to_source=np.eye(4),
+        source_from_scene=np.eye(4),
         names=tuple(f"frame_{index:03d}" for index in range(count)),
     )
 

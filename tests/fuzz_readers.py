@@ -144,7 +144,7 @@ def _whole_capture(found) -> None:
     assert found.points.shape == found.point_colors.shape == (len(found.points), 3)
     assert len(found.names) == len(found.held_out) == count
     assert all(isinstance(name, str) for name in found.names)
-    _finite(found.cameras.world_to_camera, found.points, found.to_source)
+    _finite(found.cameras.world_to_camera, found.points, found.source_from_scene)
     for own in (found.cameras.fx, found.cameras.fy, found.cameras.cx, found.cameras.cy):
         assert own.shape == (count,)
         _finite(own)
@@ -408,7 +408,7 @@ def _field(coder: Any = None) -> LanguageField:
 
     votes = Votes(
         rng.integers(-1, r, (n, k)).astype(np.int32), positive(n, k), positive(n), positive(n) + 1, positive(n),
-        np.full(n, t, np.int32), np.int32(0), r, shown=positive(n, k), overlap=positive(r, r),
+        np.full(n, t, np.int32), np.int32(0), r, weight_where_region_visible=positive(n, k), overlap=positive(r, r),
     )  # fmt: skip
     return LanguageField(
         gaussians=_gaussians(n, 4),
@@ -418,8 +418,8 @@ def _field(coder: Any = None) -> LanguageField:
         region_codes=unit(r, d),
         autoencoder=coder,
         cameras=Camera(np.tile(np.eye(4, dtype=np.float32), (t, 1, 1)), *np.full((4, t), 20, np.float32), 24, 16),
-        canonical=unit(4, e),
-        to_source=np.eye(4),
+        canonical_phrases=unit(4, e),
+        source_from_scene=np.eye(4),
         names=("a", "b"),
         embedder="colours",
         provenance='{"jsecon": "1", "options": {"embedder": null}}',
@@ -464,8 +464,8 @@ def field(folder: Path) -> Iterator[Case]:
         assert type(found.cameras.width) is type(found.cameras.height) is int
         assert min(found.cameras.width, found.cameras.height) > 0
         if found.autoencoder is not None:
-            codes = found.autoencoder.encode(np.asarray(found.canonical))
-            assert codes.shape == (len(found.canonical), found.codes.shape[1])
+            codes = found.autoencoder.encode(np.asarray(found.canonical_phrases))
+            assert codes.shape == (len(found.canonical_phrases), found.codes.shape[1])
             _finite(codes)
 
     rotation = Rotation(np.eye(8, 4, dtype=np.float32))

@@ -82,12 +82,12 @@ def _make_field(scene, cameras, dim, latent):
         region_codes=table,
         autoencoder=coder,
         cameras=cameras,
-        canonical=unit_rows(rng, 4, dim),
-        to_source=np.eye(4),
+        canonical_phrases=unit_rows(rng, 4, dim),
+        source_from_scene=np.eye(4),
         names=tuple(f"frame_{t}" for t in range(len(labels))),
         embedder="random",
         provenance='{"made by": "a test"}',
-        reference=np.zeros((0, dim), np.float32),
+        unrelated_words=np.zeros((0, dim), np.float32),
     )
     return field, labels
 
@@ -99,7 +99,7 @@ class KnownTexts:
 
     def __init__(self, rows, **more):
         self.rows, self.dim = rows, len(next(iter(rows.values())))
-        self.canonical = np.zeros((0, self.dim), np.float32)
+        self.canonical_phrases = np.zeros((0, self.dim), np.float32)
         vars(self).update(more)
 
     def embed_text(self, texts):
@@ -109,10 +109,10 @@ class KnownTexts:
 def seen_of(votes):
     """(N, K) float64 what each vote is a share of."""
     total = np.repeat(np.asarray(votes.total, np.float64)[:, None], votes.regions.shape[1], 1)
-    if votes.shown is None:
+    if votes.weight_where_region_visible is None:
         return total
     least = np.maximum(LABELLED_PART * np.asarray(votes.labelled, np.float64)[:, None], SEEN_PART * total)
-    return np.maximum(np.asarray(votes.shown, np.float64), least)
+    return np.maximum(np.asarray(votes.weight_where_region_visible, np.float64), least)
 
 
 def shares(field, regions):

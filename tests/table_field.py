@@ -21,7 +21,7 @@ THINGS = (
 """name, middle and half size, m"""
 
 
-def table_field(things=THINGS, *, to_source=None, directions=((0.0, -2.0, 0.8),)):
+def table_field(things=THINGS, *, source_from_scene=None, directions=((0.0, -2.0, 0.8),)):
     """(field, embedder). The cameras stand at `directions` and look at the origin."""
     draw = np.random.default_rng(3)
     embedder = ColourEmbedder()
@@ -34,7 +34,18 @@ def table_field(things=THINGS, *, to_source=None, directions=((0.0, -2.0, 0.8),)
     views = np.full(count, len(directions), np.int32)
     overlap = np.eye(len(things), dtype=np.float32)
     weights = np.ones((count, 1), np.float32)
-    votes = Votes(member, weights, ones, ones, ones, views, np.int32(0), len(things), shown=weights, overlap=overlap)
+    votes = Votes(
+        member,
+        weights,
+        ones,
+        ones,
+        ones,
+        views,
+        np.int32(0),
+        len(things),
+        weight_where_region_visible=weights,
+        overlap=overlap,
+    )
     embeddings = np.asarray(embedder.embed_text([name for name, _, _ in things]), np.float32)
     pixels = np.full((len(things), len(directions)), 900, np.int32)
     poses = np.stack([look_at(np.array(eye), np.zeros(3)) for eye in directions])
@@ -47,10 +58,10 @@ def table_field(things=THINGS, *, to_source=None, directions=((0.0, -2.0, 0.8),)
         region_codes=embeddings,
         autoencoder=None,
         cameras=Camera(poses, flat, flat, flat, flat * 0.8, 100, 80),
-        canonical=np.asarray(embedder.canonical, np.float32),
-        to_source=np.eye(4) if to_source is None else to_source,
+        canonical_phrases=np.asarray(embedder.canonical_phrases, np.float32),
+        source_from_scene=np.eye(4) if source_from_scene is None else source_from_scene,
         names=tuple(f"frame_{t}" for t in range(len(directions))),
         embedder=embedder.name,
-        reference=np.asarray(embedder.reference, np.float16),
+        unrelated_words=np.asarray(embedder.unrelated_words, np.float16),
     )
     return field, embedder

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from jsecon.association.run_lengths import encode_masks, encode_rows, memoized_masks
+from jsecon.association.run_lengths import cache_masks_as_rle, encode_masks, encode_rows
 from jsecon.paper.algorithm1 import clean_masklets, masklets
 from jsecon.pipeline import cache
 
@@ -250,7 +250,7 @@ def test_masks_come_back(seed, count, share):
 
 def test_a_frame_is_asked_once():
     calls, masks = [], np.random.default_rng(0).random((2, 3, 4, 6)) < 0.5
-    masks_of = memoized_masks(lambda t: calls.append(t) or masks[t])
+    masks_of = cache_masks_as_rle(lambda t: calls.append(t) or masks[t])
     for t in (1, 0, 1, 1):
         np.testing.assert_array_equal(masks_of(t), masks[t])
     assert calls == [1, 0]

@@ -33,8 +33,8 @@ def in_a_corner() -> Capture:
     cameras = Camera(poses.astype(np.float32), *lens, width=WIDTH, height=HEIGHT)
     nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
     held_out, depths = np.arange(VIEWS) == VIEWS - 1, np.float32(depths)
-    names, to_source = tuple(f"f{t}" for t in range(VIEWS)), np.eye(4, dtype=np.float32)
-    return Capture(np.uint8(frames), cameras, *nothing, held_out, depths, to_source, names)
+    names, source_from_scene = tuple(f"f{t}" for t in range(VIEWS)), np.eye(4, dtype=np.float32)
+    return Capture(np.uint8(frames), cameras, *nothing, held_out, depths, source_from_scene, names)
 
 
 def moved(capture: Capture, centimetres: float, degrees: float) -> Capture:

@@ -11,7 +11,7 @@ import pytest
 from small_field import REGIONS, field_of, make_field, shares, true_regions, unit_rows
 
 from jsecon.errors import InputError
-from jsecon.field.membership import finish_votes, vote_shares, with_shown
+from jsecon.field.membership import add_visible_weight, normalise_votes, vote_shares
 from jsecon.field.votes import region_votes
 from jsecon.query.classes import query_classes
 from jsecon.query.pixel import pixel_weights, region_at, region_shares_seen
@@ -44,9 +44,9 @@ def test_a_region_has_the_same_members_however_it_is_asked_for(made, shown):
     field, labels = made
     cast = region_votes(field.gaussians, field.cameras, jnp.asarray(labels), REGIONS, top=3, by_view=True)
     texts = np.eye(REGIONS, 12, dtype=np.float32)
-    regions = Regions(texts, field.regions.pixels)
-    votes = finish_votes(cast, regions)
-    votes = votes if shown else dataclasses.replace(votes, shown=None)
+    regions = Regions(texts, field.regions.pixel_counts)
+    votes = normalise_votes(cast, regions)
+    votes = votes if shown else dataclasses.replace(votes, weight_where_region_visible=None)
     field = dataclasses.replace(field, regions=regions, votes=votes)
     under = {}
     for view, y, x in np.random.default_rng(0).permutation(np.argwhere(labels >= 0)):
@@ -120,7 +120,7 @@ def test_a_region_asked_for_by_its_number_is_the_same(field):
 def test_nothing_passes_a_retrieval_threshold_that_no_region_reaches(field):
     text = unit_rows(np.random.default_rng(9), 1, 12)[0]
     words = unit_rows(np.random.default_rng(10), 30, 12)
-    worded = dataclasses.replace(field, reference=words)
+    worded = dataclasses.replace(field, unrelated_words=words)
     directions = {"cosine": text, "apart": text - words.mean(0)}
     for by, (retrieval, direction) in itertools.product(("votes", "code"), directions.items()):
         ask = functools.partial(query_anchored, worded, text, by=by)
@@ -147,7 +147,7 @@ def test_jit_and_vmap_over_texts_equal_the_loop(field):
 
 def test_regions_that_are_alike_count_as_one(field):
     embeddings = np.array(field.regions.embeddings)
-    pixels = np.array(field.regions.pixels)
+    pixels = np.array(field.regions.pixel_counts)
     embeddings[4], pixels[4] = embeddings[1], pixels[1]  # of two that are as well known the first is the anchor
     twin = dataclasses.replace(field, regions=Regions(embeddings, pixels))
     alone = query_anchored(twin, embeddings[1], rules=QueryRules(alike_threshold=None))
@@ -165,7 +165,7 @@ def test_regions_that_are_alike_count_as_one(field):
 @pytest.mark.parametrize("threshold", [-2.0, 0.0, 0.5])
 def test_what_was_never_seen_is_never_selected(field, by, threshold):
     unseen = np.arange(64) % 2 == 0
-    names = "labelled", "total", "views", "peak"
+    names = "labelled", "total", "views", "max_pixel_weight"
     gone = {name: np.where(unseen, 0, np.asarray(getattr(field.votes, name))) for name in names}
     gone["regions"] = np.where(unseen[:, None], -1, field.votes.regions)
     gone["weights"] = np.where(unseen[:, None], 0, field.votes.weights)
@@ -189,7 +189,7 @@ def test_a_view_that_lost_the_region_says_nothing_against_it():
     views = (by_view > 0).sum(0)
     votes = Votes(regions, weights, weights.sum(1), total, total, views, 0, 2, by_view)
     plain = field_of(votes, Regions(np.eye(2, 8, dtype=np.float32), shows))
-    known = dataclasses.replace(plain, votes=with_shown(votes, plain.regions))
+    known = dataclasses.replace(plain, votes=add_visible_weight(votes, plain.regions))
     text = jnp.eye(2, 8)[0]
     assert np.asarray(query_anchored(plain, text).mask).tolist() == [False, False, False]  # 4 of 10
     found = query_anchored(known, text)
@@ -233,7 +233,7 @@ def test_broken_texts_and_regions_select_nothing(field, by):
     embeddings = np.array(field.regions.embeddings)
     text = embeddings[1].copy()
     embeddings[0], embeddings[1] = np.nan, 0  # neither can be retrieved
-    lost = dataclasses.replace(field, regions=Regions(embeddings, field.regions.pixels))
+    lost = dataclasses.replace(field, regions=Regions(embeddings, field.regions.pixel_counts))
     got = query_anchored(lost, text, rules=QueryRules(retrieval_threshold=-1.0), by=by)
     assert int(got.region) in (2, 3, 4)
     for value in (0.0, np.nan):

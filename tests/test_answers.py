@@ -20,7 +20,7 @@ def saved(scene, cameras, tmp_path_factory):
     """A small field whose source lies 2 units to the side of its world, and its file."""
     moved = np.eye(4)
     moved[0, 3] = 2
-    field = dataclasses.replace(make_field(scene, cameras)[0], to_source=moved)
+    field = dataclasses.replace(make_field(scene, cameras)[0], source_from_scene=moved)
     file = tmp_path_factory.mktemp("field") / "field.safetensors"
     save_field(file, field)
     return field, file

@@ -51,7 +51,7 @@ def test_parts_and_what_no_text_names(room_run, tmp_path, forced):
     """The parts of a field of `--parts` divide an answer alike; an answer of nothing is one in blocks too."""
     _, out = room_run
     rng, field = np.random.default_rng(0), load_field(out / "field.safetensors")
-    rows = rng.normal(size=(20, field.canonical.shape[1])).astype(np.float32)
+    rows = rng.normal(size=(20, field.canonical_phrases.shape[1])).astype(np.float32)
     rows /= np.linalg.norm(rows, axis=1, keepdims=True)
     parts = Parts(rng.integers(-1, 20, field.gaussians.count).astype(np.int32), rows, np.ones(20, np.float32))
     field = dataclasses.replace(field, parts=parts)

@@ -14,7 +14,7 @@ from test_votes import REGIONS, expected, labels  # noqa: F401
 from jsecon.errors import InputError
 from jsecon.field import columns, view_votes, votes as votes_module
 from jsecon.field.field import load_field, save_field
-from jsecon.field.membership import finish_votes, finish_votes_in_blocks, with_overlap
+from jsecon.field.membership import normalise_votes, normalise_votes_in_blocks, with_overlap
 from jsecon.field.streaming import codes_in_blocks, region_votes_in_blocks, strongest
 from jsecon.field.votes import region_votes
 from jsecon.paper.distill import distill_votes
@@ -64,9 +64,9 @@ def assert_alike(blocks, memory, *, pixels=0):
         assert np.linalg.norm(own - other) <= 1e-6 * np.linalg.norm(other) + 0.01 * np.sqrt(pixels)
         np.testing.assert_allclose(own, other, rtol=3e-6, atol=1e-6 + 0.01 * (pixels > 0))
     # A single pixel's weight hangs on the last bit of a splat's place, which each program rounds its own way.
-    apart = ~np.isclose(blocks.peak, memory.peak, rtol=2e-4, atol=1e-5)
+    apart = ~np.isclose(blocks.max_pixel_weight, memory.max_pixel_weight, rtol=2e-4, atol=1e-5)
     assert apart.sum() <= pixels
-    np.testing.assert_allclose(blocks.peak, memory.peak, atol=0.011)
+    np.testing.assert_allclose(blocks.max_pixel_weight, memory.max_pixel_weight, atol=0.011)
 
 
 @pytest.mark.parametrize("rows", [16, *(pytest.param(rows, marks=pytest.mark.long) for rows in (5, 64, 1 << 18))])
@@ -78,7 +78,7 @@ def test_equal_to_votes_in_memory(scene, cameras, labels, tmp_path, rows):
     assert cast.weights.flags.writeable is False
     assert with_overlap(cast).overlap.shape == (REGIONS, REGIONS)
     assert sorted(file.name for file in (tmp_path / "v").iterdir()) == sorted(
-        f"{name}.npy" for name in ("regions", "weights", "labelled", "total", "peak", "views")
+        f"{name}.npy" for name in ("regions", "weights", "labelled", "total", "max_pixel_weight", "views")
     )
 
 
@@ -108,7 +108,7 @@ def test_equal_at_many_gaussians(tmp_path, monkeypatch, opaque):
     assert_alike(cast, memory, pixels=3)
     assert (np.asarray(cast.regions) != np.asarray(memory.regions)).sum() <= 4
     assert (np.asarray(cast.views) != np.asarray(memory.views)).sum() <= 4
-    np.testing.assert_allclose(cast.cut, memory.cut, rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(cast.weight_beyond_top_k, memory.weight_beyond_top_k, rtol=1e-4, atol=1e-3)
 
 
 def test_equal_depths_keep_the_order_of_indices(scene, cameras, labels, tmp_path):
@@ -129,16 +129,18 @@ def test_finished_votes_are_those_in_memory(scene, cameras, labels, tmp_path, mo
     pixels[:5, 1] = 0  # as if the noise of that view showed but half of them
     regions = Regions(embeddings, pixels)
     whole = region_votes(scene, cameras, labels, REGIONS, top=4, by_view=True)
-    memory = finish_votes(whole, regions)
+    memory = normalise_votes(whole, regions)
     monkeypatch.setattr(columns, "ROWS", 24)
     how = {"top": 4, "rows": 16, "by_view": True}
     cast = region_votes_in_blocks(scene, cameras, labels, REGIONS, **how, folder=tmp_path / "w")
     assert isinstance(cast.by_view, np.memmap)
     np.testing.assert_array_equal(cast.regions, memory.regions)
     np.testing.assert_allclose(cast.by_view, whole.by_view, rtol=1e-5, atol=1e-5)
-    blocks, one = finish_votes_in_blocks(cast, regions), finish_votes_in_blocks(whole, regions)
+    blocks, one = normalise_votes_in_blocks(cast, regions), normalise_votes_in_blocks(whole, regions)
     for finished in (blocks, one):
-        np.testing.assert_allclose(finished.shown, memory.shown, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(
+            finished.weight_where_region_visible, memory.weight_where_region_visible, rtol=1e-5, atol=1e-6
+        )
         np.testing.assert_allclose(finished.overlap, memory.overlap, rtol=1e-5, atol=1e-6)
 
 

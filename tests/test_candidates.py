@@ -29,7 +29,7 @@ def test_the_answer_is_the_first_candidate(field):
         assert len(found) == 5
         assert found[0].score == pytest.approx(float(selection.score), abs=1e-6)
         assert int(selection.region) in (-1, found[0].region)
-        assert found[0].frame == int(np.asarray(field.regions.pixels)[found[0].region].argmax())
+        assert found[0].frame == int(np.asarray(field.regions.pixel_counts)[found[0].region].argmax())
 
 
 def test_candidates_of_a_composite_text_are_those_of_its_wanted_parts(field):

@@ -30,15 +30,15 @@ def field(scene, cameras):
         weights=np.tile(np.array([8.0, 2.0, 0.0], np.float32), (count, 1)),
         labelled=np.full(count, 10, np.float32),
         total=np.full(count, 10, np.float32),
-        peak=np.full(count, 0.5, np.float32),
+        max_pixel_weight=np.full(count, 0.5, np.float32),
         views=np.full(count, 4, np.int32),
         overflow=np.zeros((), np.int32),
         num_regions=REGIONS,
     )
     field = dataclasses.replace(field, votes=votes)
-    regions = Regions(EMBEDDER.embed_text([f"plain {colour} thing" for colour in COLOURS]), field.regions.pixels)
-    reference = EMBEDDER.reference.astype(np.float16)
-    field = dataclasses.replace(field, regions=regions, embedder=EMBEDDER.name, reference=reference)
+    regions = Regions(EMBEDDER.embed_text([f"plain {colour} thing" for colour in COLOURS]), field.regions.pixel_counts)
+    reference = EMBEDDER.unrelated_words.astype(np.float16)
+    field = dataclasses.replace(field, regions=regions, embedder=EMBEDDER.name, unrelated_words=reference)
     return with_overlap(field, np.eye(REGIONS, dtype=np.float32))
 
 
@@ -71,7 +71,7 @@ def test_each_region_is_an_object_with_its_gaussians_and_its_colour(field):
     assert ((catalogue.confidence > 0.5) & (catalogue.confidence <= 1)).all()
     assert (np.diff(catalogue.probability, axis=1) <= 0).all()
     region = int(np.flatnonzero(catalogue.regions == 0)[0])
-    seen = np.asarray(field.regions.pixels)[region]
+    seen = np.asarray(field.regions.pixel_counts)[region]
     assert catalogue.views[0] == (seen > 0).sum()
     assert catalogue.frames[0, 0] == seen.argmax()
 
@@ -135,10 +135,10 @@ def test_names_come_from_the_vocabulary_that_is_given(field):
 
 
 def test_a_field_of_words_or_without_a_model_needs_none(field):
-    words = np.tile(np.array(EMBEDDER.reference[:1], np.float16), (len(REFERENCE_WORDS), 1))
-    named = jsecon.objects(dataclasses.replace(field, embedder="clip-x", reference=words))
+    words = np.tile(np.array(EMBEDDER.unrelated_words[:1], np.float16), (len(REFERENCE_WORDS), 1))
+    named = jsecon.objects(dataclasses.replace(field, embedder="clip-x", unrelated_words=words))
     assert set(named.names[:, 0]) <= set(REFERENCE_WORDS)
-    bare = jsecon.objects(dataclasses.replace(field, embedder=f"given-{EMBEDDER.dim}", reference=words[:0]))
+    bare = jsecon.objects(dataclasses.replace(field, embedder=f"given-{EMBEDDER.dim}", unrelated_words=words[:0]))
     assert (bare.names == "").all()
     assert len(bare) == len(named)
 

@@ -27,11 +27,13 @@ def made_field(count, *, regions=REGIONS, seed=0):
     labelled = weights.sum(1)
     views, peak = np.full(count, 3, np.int32), np.full(count, 0.5, np.float32)
     shown = np.where(ids >= 0, weights * rng.uniform(1, 3, weights.shape), 0).astype(np.float32)
-    votes = Votes(ids, weights, labelled, labelled + 1, peak, views, np.int32(0), regions, shown=shown)
+    votes = Votes(
+        ids, weights, labelled, labelled + 1, peak, views, np.int32(0), regions, weight_where_region_visible=shown
+    )
     table = unit_rows(rng, regions, 4)
     known = Regions(unit_rows(rng, regions, SIZE), rng.integers(1, 900, (regions, 2)).astype(np.int32))
     codes, canonical = np.zeros((count, 4), np.float32), unit_rows(rng, 4, SIZE)
-    return field_of(votes, known, codes=codes, region_codes=table, canonical=canonical)
+    return field_of(votes, known, codes=codes, region_codes=table, canonical_phrases=canonical)
 
 
 def exact(field, similarity, least):
@@ -56,8 +58,8 @@ def test_equals_the_formula(retrieval, count):
     known = field.regions
     similarity = known.embeddings @ texts.T
     if retrieval == "apart":
-        field = dataclasses.replace(field, reference=unit_rows(np.random.default_rng(6), 20, SIZE))
-        directions = texts - field.reference.astype(np.float64).mean(0)
+        field = dataclasses.replace(field, unrelated_words=unit_rows(np.random.default_rng(6), 20, SIZE))
+        directions = texts - field.unrelated_words.astype(np.float64).mean(0)
         similarity = known.embeddings @ (directions / np.linalg.norm(directions, axis=1, keepdims=True)).T
     least = float(np.sort(similarity.max(1))[2]) - 1e-4  # two regions are none of the classes
     options = {"rules": QueryRules(retrieval=retrieval, retrieval_threshold=least)}
@@ -113,12 +115,16 @@ def test_regions_and_texts_without_a_direction_are_nobodys():
     field, texts = made_field(60), unit_rows(np.random.default_rng(1), 3, SIZE)
     lost = np.array(field.regions.embeddings)
     lost[2] = 0
-    known = Regions(lost, field.regions.pixels)
+    known = Regions(lost, field.regions.pixel_counts)
     ask = {"rules": QueryRules(retrieval="cosine", retrieval_threshold=-1.0)}
     labels, found = query_classes(dataclasses.replace(field, regions=known), texts, **ask)
-    ids, weights, shown = (np.array(a) for a in (field.votes.regions, field.votes.weights, field.votes.shown))
+    ids, weights, shown = (
+        np.array(a) for a in (field.votes.regions, field.votes.weights, field.votes.weight_where_region_visible)
+    )
     ids[ids == 2] = -1
-    without = dataclasses.replace(field.votes, regions=ids, weights=np.where(ids >= 0, weights, 0), shown=shown)
+    without = dataclasses.replace(
+        field.votes, regions=ids, weights=np.where(ids >= 0, weights, 0), weight_where_region_visible=shown
+    )
     expected, same = query_classes(dataclasses.replace(field, votes=without), texts, **ask)
     np.testing.assert_array_equal(labels, expected)
     np.testing.assert_allclose(found, same, atol=1e-6)
@@ -128,7 +134,7 @@ def test_regions_and_texts_without_a_direction_are_nobodys():
     assert not np.asarray(labels).any()  # the worst of texts is nearer than none
     labels, _ = query_classes(field, opposite[1:])
     assert (np.asarray(labels) == -1).all()
-    empty = dataclasses.replace(made_field(5), regions=Regions(lost[:0], field.regions.pixels[:0]))
+    empty = dataclasses.replace(made_field(5), regions=Regions(lost[:0], field.regions.pixel_counts[:0]))
     labels, found = query_classes(empty, texts)
     assert (np.asarray(labels) == -1).all()
     assert found.shape == (5, 3)
@@ -136,10 +142,14 @@ def test_regions_and_texts_without_a_direction_are_nobodys():
 
 def test_a_region_that_is_none_of_the_classes_speaks_where_no_other_does():
     field = made_field(3, regions=3)
-    known = Regions(np.eye(3, SIZE, dtype=np.float32), field.regions.pixels)
+    known = Regions(np.eye(3, SIZE, dtype=np.float32), field.regions.pixel_counts)
     ids = np.int32([[2, 0, -1], [2, -1, -1], [1, 2, -1]])
     weights = np.float32([[8, 4, 0], [8, 0, 0], [8, 1, 0]])
-    seen = {"shown": np.float32([[8, 8, 0]] * 3), "labelled": weights.sum(1), "total": weights.sum(1)}
+    seen = {
+        "weight_where_region_visible": np.float32([[8, 8, 0]] * 3),
+        "labelled": weights.sum(1),
+        "total": weights.sum(1),
+    }
     votes = dataclasses.replace(field.votes, regions=ids, weights=weights, **seen)
     field = dataclasses.replace(field, regions=known, votes=votes)
     texts = np.float32(np.stack([known.embeddings[0], known.embeddings[1] + 0.05 * known.embeddings[2]]))
@@ -148,7 +158,7 @@ def test_a_region_that_is_none_of_the_classes_speaks_where_no_other_does():
     np.testing.assert_array_equal(labels, [0, 1, 1])  # the second was seen in the region of no class alone
     np.testing.assert_array_equal(query_classes(field, texts, rules=rules)[0], [0, -1, 1])
     np.testing.assert_allclose(found[0], [1, 0], atol=1e-6)
-    without = dataclasses.replace(field, votes=dataclasses.replace(votes, shown=None))
+    without = dataclasses.replace(field, votes=dataclasses.replace(votes, weight_where_region_visible=None))
     np.testing.assert_array_equal(query_classes(without, texts, rules=rules, every=True)[0], [0, 1, 1])
 
 

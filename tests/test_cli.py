@@ -83,7 +83,7 @@ def test_fit_writes_a_scene_in_the_captures_world_and_says_how_good_it_is(room, 
     assert told["held_out_psnr"] == pytest.approx(run.psnr.mean(), abs=1e-3)
     scene = load_ply(told["written"]["scene"])
     assert scene.count == told["gaussians"]
-    expected = transform_gaussians(run.field.gaussians, run.capture.to_source)
+    expected = transform_gaussians(run.field.gaussians, run.capture.source_from_scene)
     np.testing.assert_allclose(scene.means, expected.means, atol=1e-5)
 
 

@@ -51,7 +51,7 @@ def test_images_and_texts_meet_in_every_layout(folders, frame, masks, layout):
     true = np.asarray(list(COLOURS.values()))
     np.testing.assert_allclose(rows[:4], true / np.linalg.norm(true, axis=1, keepdims=True), atol=0.01)
     assert ((rows[:4] @ texts.T).argmax(1) == np.arange(4)).all()
-    assert embedder.canonical.shape == (len(CANONICAL), 3)
+    assert embedder.canonical_phrases.shape == (len(CANONICAL), 3)
     embedder.close()
     np.testing.assert_array_equal(embedder.embed_regions(frame, masks), rows)
 
@@ -88,7 +88,7 @@ def test_templates_are_averaged_as_unit_vectors(folders):
     first, second = bare.embed_text(texts), bare.embed_text([f"{text} on green" for text in texts])
     mean = (first + second) / np.linalg.norm(first + second, axis=1, keepdims=True)
     np.testing.assert_allclose(both.embed_text(texts), mean, atol=1e-6)
-    np.testing.assert_array_equal(both.canonical, bare.canonical)
+    np.testing.assert_array_equal(both.canonical_phrases, bare.canonical_phrases)
     with pytest.raises(ValueError, match="a phrase that holds"):
         ClipEmbedder(folders["immich"], templates=("a photo",))
 

@@ -35,7 +35,7 @@ def test_binary_round_trip(folder):
     assert_same(loaded, CAPTURE)
     assert loaded.notes == ()
     assert not loaded.held_out.any()
-    np.testing.assert_array_equal(loaded.to_source, np.eye(4))
+    np.testing.assert_array_equal(loaded.source_from_scene, np.eye(4))
 
 
 def test_quaternions_in_every_quadrant(tmp_path):

@@ -40,8 +40,8 @@ def test_is_an_embedder_of_unit_vectors(embedder):
     regions = embedder.embed_regions(frame, np.stack([mask, ~mask, np.zeros_like(mask)]))
     texts = embedder.embed_text(["red", "dark green bottle"])
     assert regions.shape == (3, embedder.dim)
-    assert regions.dtype == texts.dtype == embedder.canonical.dtype == np.float32
-    for rows in (regions[:2], texts, embedder.canonical):
+    assert regions.dtype == texts.dtype == embedder.canonical_phrases.dtype == np.float32
+    for rows in (regions[:2], texts, embedder.canonical_phrases):
         np.testing.assert_allclose(np.linalg.norm(rows, axis=1), 1, atol=1e-5)
     assert not regions[2].any()  # an empty mask has no embedding
     assert embedder.embed_regions(frame, np.zeros((0, 120, 120), bool)).shape == (0, embedder.dim)
@@ -137,7 +137,7 @@ def test_only_a_bare_basic_term_has_narrower_texts(embedder, text, narrower):
 def test_canonical_phrases_lose_to_the_right_colour_and_win_over_wrong_ones(embedder):
     names = [name for name in BASIC if name != "grey"]
     regions = np.stack([of_ball(embedder, PALETTE[name]) for name in names])
-    neutral = (embedder.canonical @ regions.T).max(0)
+    neutral = (embedder.canonical_phrases @ regions.T).max(0)
     assert (np.diagonal(embedder.embed_text(names) @ regions.T) > neutral + 0.05).all()
     others = [names.index("green"), names.index("yellow")]
     assert (embedder.embed_text(["magenta"]) @ regions[others].T < neutral[others]).all()

@@ -13,7 +13,7 @@ from jsecon.association.consensus import (
     scene_pieces,
     split_cells,
 )
-from jsecon.association.views import SceneViews, claim_atoms
+from jsecon.association.scene import SceneSuperpixels, assign_superpixels
 from jsecon.field.votes import region_votes
 
 
@@ -23,7 +23,7 @@ def world():
 
 
 def scene_of(world, proposals, atoms=60):
-    return SceneViews(world[0], world[1], proposals, atoms_per_frame=atoms)
+    return SceneSuperpixels(world[0], world[1], proposals, superpixels_per_frame=atoms)
 
 
 @pytest.fixture(scope="module")
@@ -124,10 +124,10 @@ def test_claims_without_a_class_or_a_proposal(world, scene):
     view = scene.all(world[2])[0]
     atoms = view.votes.shape[1]
     total = view.votes.T @ np.ones((len(view.seen), 1), np.float32)
-    unknown = claim_atoms(view, np.zeros((atoms, 2), np.float32), np.zeros((atoms, 1), np.float32))
+    unknown = assign_superpixels(view, np.zeros((atoms, 2), np.float32), np.zeros((atoms, 1), np.float32))
     assert (unknown == -1).all()
-    covered = total[:, 0] > 0.2 * np.bincount(view.atoms.ravel())
-    assert (claim_atoms(view, total, total)[covered] == 0).all()
+    covered = total[:, 0] > 0.2 * np.bincount(view.labels.ravel())
+    assert (assign_superpixels(view, total, total)[covered] == 0).all()
 
 
 def joined_pair_by_pair(together, both, least):

@@ -19,7 +19,7 @@ from jsecon.vision.colours import ColourEmbedder
 
 TESTS = Path(__file__).resolve().parent
 PARTS = "votes", "image", "fit", "query"
-VOTES = "regions", "weights", "labelled", "total", "peak", "views", "by_view"
+VOTES = "regions", "weights", "labelled", "total", "max_pixel_weight", "views", "by_view"
 VIEWS, HEIGHT, WIDTH = 5, 235, 50
 """fewer views than some numbers of devices; a strip for each of up to 8, and rows of pixels that few numbers divide"""
 

@@ -10,7 +10,7 @@ from conftest import gaussians_at, look_at
 from small_field import field_of
 
 import jsecon
-from jsecon import Camera, Regions, Votes, finish_votes, save_field
+from jsecon import Camera, Regions, Votes, normalise_votes, save_field
 from jsecon.app import cli
 from jsecon.vision.colours import PALETTE, ColourEmbedder
 from jsecon.vision.reference_words import reference_of
@@ -54,7 +54,7 @@ def test_what_a_wall_hides_is_not_part_of_what_stands_before_it(two_rooms, masks
     assert hidden.max() > 0  # the wall lets a trace through
     pixels = np.stack([(labels == r).sum((1, 2)) for r in range(3)])
     regions = Regions(np.eye(3, dtype=np.float32), pixels)
-    field = field_of(finish_votes(votes, regions), regions)
+    field = field_of(normalise_votes(votes, regions), regions)
     chosen = np.asarray(jsecon.query_region(field, FRIDGE).mask)
     assert chosen[thing == FRIDGE].mean() > 0.9
     assert not chosen[thing == SOFA].any()
@@ -140,7 +140,7 @@ def asked_of(embeddings, pixels, text):
     own = np.arange(count, dtype=np.int32)[:, None]
     ones = np.ones(count, np.float32)
     votes = Votes(own, ones[:, None], ones, ones, ones, ones.astype(np.int32), np.int32(0), count)
-    own = {"canonical": COLOURS.canonical, "reference": reference_of(COLOURS)}
+    own = {"canonical_phrases": COLOURS.canonical_phrases, "unrelated_words": reference_of(COLOURS)}
     field = field_of(votes, Regions(embeddings, np.repeat(pixels[:, None], 10, 1)), **own)
     rules = jsecon.QueryRules(quantile=0.0)  # all colours but one are there, so most other words match as well
     found = jsecon.query_anchored(field, jnp.asarray(COLOURS.embed_text([text])[0]), rules=rules)

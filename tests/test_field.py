@@ -36,7 +36,7 @@ def assert_same(a, b):
 
 def test_what_goes_in_comes_out_in_equal_bytes_and_without_a_pickle(field, path, tmp_path):
     assert_same(load_field(path), field)
-    assert field.to_source.dtype == np.float64
+    assert field.source_from_scene.dtype == np.float64
     save_field(tmp_path / "again.field", field)
     assert (tmp_path / "again.field").read_bytes() == path.read_bytes()
     others = load_file(path)

@@ -169,7 +169,7 @@ def test_one_centroid_in_the_world_of_a_map_projection(field, tmp_path):
 
     moved = np.eye(4)
     moved[:3, 3] = [500_000.125, 5_400_000.25, 120.5]
-    own = dataclasses.replace(field, to_source=moved)
+    own = dataclasses.replace(field, source_from_scene=moved)
     found = answer(own, "red")
     means = np.asarray(field.gaussians.means, np.float64)[found.mask] + moved[:3, 3]
     told = write_answer(own, found, tmp_path, {})
@@ -177,7 +177,7 @@ def test_one_centroid_in_the_world_of_a_map_projection(field, tmp_path):
     np.testing.assert_allclose(told["place"]["bounding_box"]["max"], means.max(0), atol=1e-5)
     assert locate_answer(own, found).as_dict()["centroid"] == pytest.approx(told["place"]["centroid"], abs=1e-5)
     small = np.diag([1e-6, 1e-6, 1e-6, 1.0])
-    told = write_answer(dataclasses.replace(field, to_source=small), found, tmp_path, {})
+    told = write_answer(dataclasses.replace(field, source_from_scene=small), found, tmp_path, {})
     np.testing.assert_allclose(told["place"]["centroid"], 1e-6 * (means - moved[:3, 3]).mean(0), rtol=1e-4, atol=1e-11)
 
 
@@ -185,11 +185,11 @@ def test_one_centroid_in_the_world_of_a_map_projection(field, tmp_path):
 def test_the_centroid_is_printed_with_the_digits_that_it_needs(field, word, tmp_path, capsys, scale, shift):
     moved = np.diag([scale, scale, scale, 1.0])
     moved[:3, 3] = shift
-    save_field(tmp_path / "field.safetensors", dataclasses.replace(field, to_source=moved))
+    save_field(tmp_path / "field.safetensors", dataclasses.replace(field, source_from_scene=moved))
     assert run("query", tmp_path / "field.safetensors", word, "--out", tmp_path / "out", "--views", 0) == 0
     line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith(repr(word)))
     printed = np.array(line.rpartition("(")[2].rstrip(").").split(","), float)
     told = json.loads(next((tmp_path / "out").glob("*.json")).read_text())["place"]
     size = np.linalg.norm(np.subtract(told["bounding_box"]["max"], told["bounding_box"]["min"]))
     assert np.abs(printed - told["centroid"]).max() <= 0.01 * size
-    assert load_field(tmp_path / "field.safetensors").to_source[0, 3] == shift
+    assert load_field(tmp_path / "field.safetensors").source_from_scene[0, 3] == shift

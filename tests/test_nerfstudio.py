@@ -29,7 +29,7 @@ def test_round_trip(tmp_path):
     assert (loaded.cameras.width, loaded.cameras.height) == (24, 16)
     assert loaded.points.shape == (0, 3)
     assert loaded.notes == ()
-    np.testing.assert_array_equal(loaded.to_source, np.eye(4))
+    np.testing.assert_array_equal(loaded.source_from_scene, np.eye(4))
     assert json.loads((tmp_path / "transforms.json").read_text()) == transforms(CAPTURE)  # it is only read
 
 
@@ -89,7 +89,7 @@ def test_applied_transform_and_scale_are_undone(tmp_path):
     loaded = load_changed(tmp_path, lambda content: content.update(applied_transform=applied, applied_scale=2.0))
     source = np.array([0.3, -0.4, 0.5, 1.0])
     world = np.append(2.0 * (np.array(applied) @ source), 1.0)
-    np.testing.assert_allclose(loaded.to_source @ world, source, atol=1e-12)
+    np.testing.assert_allclose(loaded.source_from_scene @ world, source, atol=1e-12)
 
 
 def test_depth_maps(tmp_path):

@@ -163,11 +163,11 @@ def test_query_finds_the_model_by_itself_or_says_what_it_needs(seen, models, tmp
     assert cli.main([*query, "--quantile", "0"]) == 0
     answer, found = json.loads((tmp_path / "a" / "red.json").read_text()), load_field(field)
     text = networks.field_embedder(found, templates=("a {} thing",)).embed_text(["red"])[0]
-    words = networks.field_embedder(found, templates=("a {} thing",)).reference
+    words = networks.field_embedder(found, templates=("a {} thing",)).unrelated_words
     similar = (
         np.asarray(found.regions.embeddings) @ (text - words.mean(axis=0)) / np.linalg.norm(text - words.mean(axis=0))
     )
-    standing = np.asarray(evidence(found.regions.pixels))
+    standing = np.asarray(evidence(found.regions.pixel_counts))
     assert answer["region"] == int(np.where(similar > 0, similar * standing, similar).argmax())
     assert answer["score"] == pytest.approx(float(similar[answer["region"]]), abs=2e-3)
     other = write_clip(tmp_path / "other", "immich")
@@ -216,7 +216,9 @@ def test_regions_take_their_embeddings_from_langsplat_s_files(room, splat, model
 
 def test_texts_need_the_model_of_embeddings_from_files(seen, models, tmp_path, capsys):
     known = load_field(seen[1] / "field.safetensors")
-    given = dataclasses.replace(known, embedder="given-3", canonical=np.zeros((0, 3), np.float32), provenance="{}")
+    given = dataclasses.replace(
+        known, embedder="given-3", canonical_phrases=np.zeros((0, 3), np.float32), provenance="{}"
+    )
     save_field(tmp_path / "field.safetensors", given)
     ask = ["query", str(tmp_path / "field.safetensors"), "red", "--views", "0", "--out", str(tmp_path / "answers")]
     assert cli.main(ask) == 2
@@ -283,7 +285,7 @@ def test_models_by_name_are_fetched_once_and_found_again_for_a_moved_field(
     assert len(hub.requests) == asked
     assert "SAM: 3 frames, about" in planned
     assert "by edgetam, asked at 10x10 points" in planned
-    assert (np.asarray(load_field(field).regions.pixels).sum(0) > 0).sum() == 5
+    assert (np.asarray(load_field(field).regions.pixel_counts).sum(0) > 0).sum() == 5
     use_hub(hub, tmp_path / "empty", monkeypatch)
     capsys.readouterr()
     assert cli.main(query) == 2

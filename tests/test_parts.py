@@ -83,7 +83,9 @@ def unheld():
     part[-20:] = 5
     weight = np.array([30, 30, 30, 30, 20, 10], np.float32)
     embeddings = unit_rows_near(directions[[0, 1, 2, 3, 4, 4]], rng)
-    field = dataclasses.replace(field_of_rows_of(means, thing, directions[:4]), canonical=across(directions)[:1])
+    field = dataclasses.replace(
+        field_of_rows_of(means, thing, directions[:4]), canonical_phrases=across(directions)[:1]
+    )
     return dataclasses.replace(field, parts=Parts(part, embeddings, weight)), directions, thing
 
 

@@ -37,7 +37,7 @@ def broken(scene, cameras):
     field, _ = make_field(scene, cameras)
     overlap = np.eye(5, dtype=np.float32)
     overlap[0, 1] = overlap[1, 0] = 0.4
-    return with_other(field, overlap, regions=Regions(rows_of_a_kind(), field.regions.pixels))
+    return with_other(field, overlap, regions=Regions(rows_of_a_kind(), field.regions.pixel_counts))
 
 
 def with_other(field, overlap, **changes):

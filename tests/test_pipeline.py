@@ -63,8 +63,8 @@ def test_a_run_ends_in_a_field_that_can_be_read_and_asked(room_run):
     assert field.codes.shape == (field.gaussians.count, field.region_codes.shape[1])
     assert field.votes.overlap.shape == (field.regions.count, field.regions.count)
     assert len(run.psnr) == run.capture.held_out.sum() == 2
-    assert (np.asarray(field.regions.pixels)[:, run.capture.held_out] == 0).all()
-    assert (np.asarray(field.regions.pixels)[:, ~run.capture.held_out].sum(1) > 0).all()
+    assert (np.asarray(field.regions.pixel_counts)[:, run.capture.held_out] == 0).all()
+    assert (np.asarray(field.regions.pixel_counts)[:, ~run.capture.held_out].sum(1) > 0).all()
     assert set(run.seconds) == {*STAGES, "field"}
     assert run.labels.shape == (6, 120, 160)
 
@@ -116,7 +116,7 @@ def test_votes_of_a_scene_larger_than_memory_are_cast_in_blocks_to_the_same_fiel
     assert sorted(path.suffix for path in (tmp_path / "out" / "cache").iterdir()) == [".TAG"] + 9 * [".safetensors"]
     blocks, memory = (load_field(folder / "field.safetensors").votes for folder in (tmp_path / "out", out))
     np.testing.assert_allclose(blocks.weights, memory.weights, rtol=1e-4, atol=0.02)
-    for name in ("weights", "total", "shown", "overlap"):
+    for name in ("weights", "total", "weight_where_region_visible", "overlap"):
         own, other = (np.asarray(getattr(votes, name), np.float64) for votes in (blocks, memory))
         assert np.linalg.norm(own - other) <= 1e-4 * np.linalg.norm(other)
     assert (np.asarray(blocks.regions) != np.asarray(memory.regions)).mean() < 1e-3
@@ -153,8 +153,8 @@ def test_the_same_scene_far_away_in_another_world_and_unit_gives_the_same_answer
     given, scale = on_given_gaussians[0], 1e-3
     shift, turn = np.array([1e7, 5411876.6, 312.25]), np.eye(4)
     turn[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
-    to_source = np.diag([scale, scale, scale, 1.0])
-    to_source[:3, 3] = scale * shift
+    source_from_scene = np.diag([scale, scale, scale, 1.0])
+    source_from_scene[:3, 3] = scale * shift
     told = transforms(given.capture, applied_transform=turn[:3].tolist())
     for frame in told["frames"]:
         pose = np.array(frame["transform_matrix"])
@@ -164,7 +164,7 @@ def test_the_same_scene_far_away_in_another_world_and_unit_gives_the_same_answer
     (tmp_path / "capture" / "images").symlink_to(room / "images")
     (tmp_path / "capture" / "transforms.json").write_text(json.dumps(told))
     scene, out = tmp_path / "scene.ply", tmp_path / "out"
-    jsecon.save_gaussians(scene, given.field.gaussians, similarity=to_source)
+    jsecon.save_gaussians(scene, given.field.gaussians, similarity=source_from_scene)
     options = dataclasses.replace(given.options, capture=tmp_path / "capture", gaussians=scene)
     there = pipeline.run(options, out)
     assert not [note for note in there.notes if "WARNING" in note]
@@ -173,7 +173,7 @@ def test_the_same_scene_far_away_in_another_world_and_unit_gives_the_same_answer
     place = jsecon.locate(given.field, text)
     assert cli.main(["query", str(out / "field.safetensors"), text, "--out", str(out), "--views", "1"]) == 0
     answer = json.loads(next(out.glob("*.json")).read_text())
-    chosen = jsecon.load_gaussians(out / answer["ply"], similarity=np.linalg.inv(to_source))
+    chosen = jsecon.load_gaussians(out / answer["ply"], similarity=np.linalg.inv(source_from_scene))
     assert chosen.count == answer["count"] == len(place.points)
     np.testing.assert_allclose(chosen.means, place.points, atol=1e-4)
     found = jsecon.locate(jsecon.load_field(out / "field.safetensors"), text)

@@ -55,9 +55,9 @@ def test_the_oriented_box_is_that_of_the_brick(answer):
 def test_it_is_in_the_world_of_the_capture(answer):
     field, asked, *_ = answer
     here = locate_answer(field, asked)
-    to_source = np.diag([2.0, 2.0, 2.0, 1.0])
-    to_source[:3, 3] = [5, 0, 0]
-    there = locate_answer(dataclasses.replace(field, to_source=to_source), asked)
+    source_from_scene = np.diag([2.0, 2.0, 2.0, 1.0])
+    source_from_scene[:3, 3] = [5, 0, 0]
+    there = locate_answer(dataclasses.replace(field, source_from_scene=source_from_scene), asked)
     np.testing.assert_allclose(there.centroid, 2 * here.centroid + [5, 0, 0], rtol=1e-4)
     np.testing.assert_allclose(there.extent, 2 * here.extent, rtol=1e-3)
 

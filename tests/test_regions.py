@@ -43,7 +43,7 @@ def test_equals_the_definition(seed, weighting):
     assert regions.embeddings.shape == (7, 4)
     assert regions.embeddings.dtype == np.float32
     np.testing.assert_allclose(regions.embeddings, slow(frames, labels, 7, weighting), atol=1e-6)
-    np.testing.assert_array_equal(regions.pixels, [[(image == r).sum() for image in labels] for r in range(7)])
+    np.testing.assert_array_equal(regions.pixel_counts, [[(image == r).sum() for image in labels] for r in range(7)])
 
 
 @settings(deadline=None, max_examples=20)
@@ -63,7 +63,7 @@ def test_given_embeddings_equal_the_definition(seed, weighting):
     wanted /= np.maximum(np.linalg.norm(wanted, axis=1, keepdims=True), 1e-12)
     found = embeddings_of_masks(labels, masks, rows, weighting=weighting, num_regions=4)
     np.testing.assert_allclose(found.embeddings, wanted, atol=1e-6)
-    np.testing.assert_array_equal(found.pixels[3], 0)
+    np.testing.assert_array_equal(found.pixel_counts[3], 0)
     with pytest.raises(ValueError, match="masks"):
         embeddings_of_masks(labels, masks[:2], rows)
 
@@ -98,7 +98,7 @@ def test_what_is_never_seen_is_zero_and_counts_nowhere():
     labels[labels == 2] = -1
     regions = region_embeddings(frames, labels, embed)
     assert not regions.embeddings[2].any()
-    assert not regions.pixels[2].any()
+    assert not regions.pixel_counts[2].any()
     nothing = region_embeddings(frames, np.full_like(labels, -1), embed, num_regions=3)
     assert nothing.embeddings.shape == (3, 4)
     assert not nothing.embeddings.any()

@@ -237,7 +237,7 @@ def test_orange_means_the_orange_thing_where_there_is_a_dark_orange_one_too():
     seen = np.array(field.regions.embeddings)
     seen[4], seen[6] = seen[4] + 0.5 * embedder.embed_text(["yellow"])[0], seen[6] + 0.3 * seen[4]
     seen /= np.linalg.norm(seen, axis=1, keepdims=True)
-    field = dataclasses.replace(field, regions=Regions(seen, field.regions.pixels))
+    field = dataclasses.replace(field, regions=Regions(seen, field.regions.pixel_counts))
     scene = ObjectScene(field, embedder, up=(0, 0, 1))
     for text, region in (("all orange balls", 4), ("all dark orange bowls", 6)):
         assert [found.regions for found in jsecon.query_relation(scene, text).objects] == [(region,)]
@@ -274,9 +274,9 @@ def test_the_ground_tells_what_is_up_where_cameras_look_one_way_and_down():
 
 
 def test_measures_are_in_the_captures_world():
-    to_source = np.diag([2.0, 2.0, 2.0, 1.0])
-    to_source[:3, 3] = [500_000, 5_000_000, 7]
-    field, embedder = table_field(to_source=to_source)
+    source_from_scene = np.diag([2.0, 2.0, 2.0, 1.0])
+    source_from_scene[:3, 3] = [500_000, 5_000_000, 7]
+    field, embedder = table_field(source_from_scene=source_from_scene)
     told = jsecon.measure(field, "the leftmost red mug", "the dark green bottle", embedder)
     assert told.centers == pytest.approx(2 * np.hypot(0.5, 0.1), rel=0.05)
     assert told.surfaces == pytest.approx(2 * 0.41, rel=0.08)

@@ -116,7 +116,7 @@ const wait = ms => new Promise(done => setTimeout(done, ms));
   found.covers = [side(".pair input").width, side(".pair .after").width];
   const box = document.getElementById("search"), cards = [...document.querySelectorAll(".card")];
   box.value = "MUG blue"; box.dispatchEvent(new Event("input", { bubbles: true }));
-  found.shown = cards.map(card => getComputedStyle(card).display !== "none");
+  found.weight_where_region_visible = cards.map(card => getComputedStyle(card).display !== "none");
   cards[1].querySelector("summary").click(); await wait(50);
   found.opened = side(".card[open] .grid").height > 0;
   found.overflow = document.documentElement.scrollWidth - document.documentElement.clientWidth;

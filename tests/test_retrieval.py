@@ -85,11 +85,11 @@ def test_gradient_equals_central_differences(rows, x64):
 def test_a_query_finds_its_region_by_the_one_or_the_other(worded):
     field, texts = worded
     embeddings, differ = field.regions.embeddings, 0
-    like_one = unit(np.asarray(field.reference) + 2 * embeddings[0]).astype(np.float32)
-    field = dataclasses.replace(field, reference=like_one)
+    like_one = unit(np.asarray(field.unrelated_words) + 2 * embeddings[0]).astype(np.float32)
+    field = dataclasses.replace(field, unrelated_words=like_one)
     for text in texts[:10]:
-        weight = np.asarray(evidence(field.regions.pixels))
-        scores = {"cosine": embeddings @ text, "apart": exact(embeddings, text, field.reference)}
+        weight = np.asarray(evidence(field.regions.pixel_counts))
+        scores = {"cosine": embeddings @ text, "apart": exact(embeddings, text, field.unrelated_words)}
         ranked = {"cosine": scores["cosine"], "apart": np.where(scores["apart"] > 0, weight, 1) * scores["apart"]}
         for retrieval, score in scores.items():
             got = query_anchored(field, text, rules=QueryRules(retrieval=retrieval, quantile=0.0))
@@ -98,7 +98,7 @@ def test_a_query_finds_its_region_by_the_one_or_the_other(worded):
             assert float(got.score) == pytest.approx(score[best], abs=1e-5)
         differ += ranked["cosine"].argmax() != ranked["apart"].argmax()
     assert differ
-    bare, text = dataclasses.replace(field, reference=None), texts[0]
+    bare, text = dataclasses.replace(field, unrelated_words=None), texts[0]
     against = -embeddings.sum(0)
     low = query_anchored(bare, against, rules=QueryRules(retrieval_threshold=-1.0)).region
     high = query_anchored(bare, against).region
@@ -134,7 +134,7 @@ def test_a_thing_that_fills_a_third_of_all_views_is_found_before_slivers_of_its_
     plain, _ = region_similarities(embeddings, text, words, "apart")
     assert int(jnp.argmax(plain)) > 2  # by the similarity alone a sliver wins
     field = field_of(lone_votes(np.arange(6), 6), Regions(embeddings, pixels))
-    field = dataclasses.replace(field, reference=words)
+    field = dataclasses.replace(field, unrelated_words=words)
     one = query_anchored(field, jnp.asarray(text))
     assert int(one.region) == 0
     assert np.asarray(one.mask)[0]
@@ -160,7 +160,7 @@ def worded(scene, cameras):
     """A field of five regions with 61 unrelated words, and texts."""
     rng = np.random.default_rng(3)
     field, _ = make_field(scene, cameras)
-    return dataclasses.replace(field, reference=unit_rows(rng, 61, SIZE)), unit_rows(rng, 200, SIZE)
+    return dataclasses.replace(field, unrelated_words=unit_rows(rng, 61, SIZE)), unit_rows(rng, 200, SIZE)
 
 
 def test_a_text_is_refused_by_its_quantile_among_unrelated_words(worded):
@@ -171,7 +171,7 @@ def test_a_text_is_refused_by_its_quantile_among_unrelated_words(worded):
 
     together = jax.jit(jax.vmap(ask))(texts[:15])
     for k, text in enumerate(texts[:15]):
-        expected = exact_quantile(field.regions.embeddings, text, field.reference)
+        expected = exact_quantile(field.regions.embeddings, text, field.unrelated_words)
         found = ask(text)
         assert float(found.quantile) == pytest.approx(expected, abs=1e-6)
         assert (int(found.region) >= 0) == (expected >= QUANTILE)
@@ -197,11 +197,13 @@ def test_of_unrelated_texts_about_one_minus_the_quantile_is_answered(worded):
 
 def test_unrelated_words_that_tell_nothing_refuse_nothing_and_no_words_fall_back(worded):
     field, texts = worded
-    tied = dataclasses.replace(field, reference=np.repeat(field.reference[:1], 9, 0))
-    itself = query_anchored(tied, field.reference[0])  # of equal words none is less similar, and the text is no text
+    tied = dataclasses.replace(field, unrelated_words=np.repeat(field.unrelated_words[:1], 9, 0))
+    itself = query_anchored(
+        tied, field.unrelated_words[0]
+    )  # of equal words none is less similar, and the text is no text
     assert float(itself.quantile) == 1 or np.isnan(float(itself.quantile))
-    empty = dataclasses.replace(field, reference=field.reference[:0])
-    old = dataclasses.replace(field, reference=None)
+    empty = dataclasses.replace(field, unrelated_words=field.unrelated_words[:0])
+    old = dataclasses.replace(field, unrelated_words=None)
     for text in texts[:8]:
         cosine = query_anchored(
             field, text, rules=QueryRules(retrieval="cosine", retrieval_threshold=RETRIEVAL_THRESHOLD)
@@ -214,16 +216,16 @@ def test_unrelated_words_that_tell_nothing_refuse_nothing_and_no_words_fall_back
     nan = query_anchored(field, np.full(SIZE, np.nan, np.float32))
     assert int(nan.region) == -1
     assert np.isnan(float(nan.quantile))
-    known = field.reference[7]
+    known = field.unrelated_words[7]
     assert float(query_anchored(field, known).quantile) == pytest.approx(
-        exact_quantile(field.regions.embeddings, known, field.reference), abs=1e-6
+        exact_quantile(field.regions.embeddings, known, field.unrelated_words), abs=1e-6
     )
     one = dataclasses.replace(
-        field_of(lone_votes(np.zeros(4), 1), Regions(field.reference[:1] * 0.5, np.full((1, 1), 900))),
-        canonical=np.zeros((0, SIZE), np.float32),
-        reference=field.reference,
+        field_of(lone_votes(np.zeros(4), 1), Regions(field.unrelated_words[:1] * 0.5, np.full((1, 1), 900))),
+        canonical_phrases=np.zeros((0, SIZE), np.float32),
+        unrelated_words=field.unrelated_words,
     )
-    assert float(query_anchored(one, field.reference[0]).quantile) == 1  # nothing is nearer to it than itself
+    assert float(query_anchored(one, field.unrelated_words[0]).quantile) == 1  # nothing is nearer to it than itself
     none = dataclasses.replace(one, regions=Regions(np.zeros((0, SIZE), np.float32), np.zeros((0, 1), np.int32)))
     assert int(query_anchored(none, texts[0]).region) == -1
 
@@ -232,9 +234,9 @@ def test_a_list_of_classes_is_compared_in_deviations_of_each_text(worded):
     field = worded[0]
     hub = unit(unit(np.asarray(field.regions.embeddings)).sum(0)).astype(np.float32)  # a little like every region
     names = np.stack([hub, *np.asarray(field.regions.embeddings)[:2]])
-    words = np.asarray(field.reference, np.float64).mean(0)
+    words = np.asarray(field.unrelated_words, np.float64).mean(0)
     similar = unit(np.asarray(field.regions.embeddings, np.float64)) @ unit(names - words).T
-    weight = np.asarray(evidence(field.regions.pixels), np.float64)[:, None]
+    weight = np.asarray(evidence(field.regions.pixel_counts), np.float64)[:, None]
     weight = weight / weight.sum()
     mean = (weight * similar).sum(0)
     table = (similar - mean) / np.sqrt((weight * (similar - mean) ** 2).sum(0))
@@ -252,9 +254,9 @@ def test_a_list_of_classes_is_compared_in_deviations_of_each_text(worded):
 
 def test_the_command_line_says_the_quantile_and_what_an_old_field_lacks(worded, tmp_path, monkeypatch, capsys):
     field, texts = worded
-    shares = [exact_quantile(field.regions.embeddings, text, field.reference) for text in texts]
+    shares = [exact_quantile(field.regions.embeddings, text, field.unrelated_words) for text in texts]
     rows = {"seen": texts[int(np.argmax(shares))], "unseen": texts[int(np.argmin(shares))]}
-    words = KnownTexts(rows, canonical=field.canonical)
+    words = KnownTexts(rows, canonical_phrases=field.canonical_phrases)
     monkeypatch.setattr(networks, "field_embedder", lambda *a, **k: words)
 
     def asked(name, *options):
@@ -263,8 +265,11 @@ def test_the_command_line_says_the_quantile_and_what_an_old_field_lacks(worded, 
         told = [json.loads((tmp_path / f"{text}.json").read_text()) for text in ("seen", "unseen")]
         return told, capsys.readouterr().out
 
-    save_field(tmp_path / "new.safetensors", dataclasses.replace(field, reference=field.reference.astype(np.float16)))
-    assert np.asarray(load_field(tmp_path / "new.safetensors").reference).dtype == np.float16
+    save_field(
+        tmp_path / "new.safetensors",
+        dataclasses.replace(field, unrelated_words=field.unrelated_words.astype(np.float16)),
+    )
+    assert np.asarray(load_field(tmp_path / "new.safetensors").unrelated_words).dtype == np.float16
     (seen, unseen), out = asked("new.safetensors")
     assert seen["quantile"] == pytest.approx(max(shares), abs=0.02)  # of words in float16
     assert unseen["quantile"] == pytest.approx(min(shares), abs=0.02)
@@ -278,13 +283,13 @@ def test_the_command_line_says_the_quantile_and_what_an_old_field_lacks(worded, 
     assert cli.main(beyond) == 2
     assert "--quantile" in capsys.readouterr().err
 
-    save_field(tmp_path / "old.safetensors", dataclasses.replace(field, reference=None))
+    save_field(tmp_path / "old.safetensors", dataclasses.replace(field, unrelated_words=None))
     (seen, unseen), out = asked("old.safetensors")
     assert seen["quantile"] is unseen["quantile"] is None
     assert seen["confidence"] is unseen["confidence"] is None
     assert out.count("earlier version") == 1
-    cosine = query_anchored(dataclasses.replace(field, reference=None), rows["seen"])
+    cosine = query_anchored(dataclasses.replace(field, unrelated_words=None), rows["seen"])
     assert seen["score"] == pytest.approx(float(cosine.score), abs=1e-5)
-    more = {"templates": ("a photo of a {}.",), "reference": -np.asarray(field.reference)}
-    templated = KnownTexts(rows, canonical=field.canonical, **more)
+    more = {"templates": ("a photo of a {}.",), "unrelated_words": -np.asarray(field.unrelated_words)}
+    templated = KnownTexts(rows, canonical_phrases=field.canonical_phrases, **more)
     assert ask_text(field, templated, "seen").quantile != ask_text(field, words, "seen").quantile

@@ -53,7 +53,7 @@ def photographed(scene, capture=None):
 def test_a_scene_that_nerfstudio_trained_is_carried_back(tmp_path, near, name):
     """Into the world of transforms.json, which is not the source's where an applied_transform made it."""
     applied = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0.1], [0, 0, 0, 1.0]])
-    capture = dataclasses.replace(photographed(near), to_source=np.linalg.inv(applied))
+    capture = dataclasses.replace(photographed(near), source_from_scene=np.linalg.inv(applied))
     save_gaussians(tmp_path / name, transform_gaussians(near, TRAINED @ np.linalg.inv(applied)))
     plain, before = read(capture, tmp_path / name)
     assert plain.notes[0].startswith("WARNING")
@@ -70,10 +70,10 @@ def test_the_world_is_found_that_the_frames_show(tmp_path, near, world):
     """The one before an applied_transform, which jsecon writes; that of the poses; and those that trainings make of it.
     The capture's points are not about the origin, so that the trainings' worlds are their own."""
     applied = np.array([[1, 0, 0, 2], [0, 0, 1, 0], [0, -1, 0, 0.1], [0, 0, 0, 1.0]])
-    to_source = np.linalg.inv(applied) if world in ("files", "poses") else np.eye(4)
-    capture = dataclasses.replace(photographed(near), to_source=to_source)
+    source_from_scene = np.linalg.inv(applied) if world in ("files", "poses") else np.eye(4)
+    capture = dataclasses.replace(photographed(near), source_from_scene=source_from_scene)
     others = {
-        "files": to_source,
+        "files": source_from_scene,
         "poses": np.eye(4),
         "gsplat": gsplat_world(capture),
         "nerfstudio": nerfstudio_world(capture),
@@ -133,25 +133,29 @@ def test_a_wrong_world_is_told(tmp_path, near):
 )
 def test_gaussians_are_read_as_they_were_written_in_a_map_projections_world(tmp_path, near, scale, ending):
     """Where float32 would round them to half a unit."""
-    to_source = np.diag([scale, scale, scale, 1.0])
-    to_source[:3, 3] = 455123.4, 5411876.6, 1e7
-    capture = dataclasses.replace(photographed(near), to_source=to_source, to_poses=to_source)
-    save_gaussians(tmp_path / f"scene.{ending}", near, similarity=to_source)
+    source_from_scene = np.diag([scale, scale, scale, 1.0])
+    source_from_scene[:3, 3] = 455123.4, 5411876.6, 1e7
+    capture = dataclasses.replace(
+        photographed(near), source_from_scene=source_from_scene, poses_from_scene=source_from_scene
+    )
+    save_gaussians(tmp_path / f"scene.{ending}", near, similarity=source_from_scene)
     found, _ = read(capture, tmp_path / f"scene.{ending}")
     np.testing.assert_allclose(found.value.means, near.means, atol=1e-5)
     assert len(found.notes) == 1
     if scale <= 1:  # the larger ones float32 does hold
         with refused(f"scene.{ending}", "float32"):
             load_gaussians(tmp_path / f"scene.{ending}")
-    there = load_gaussians(tmp_path / f"scene.{ending}", similarity=np.linalg.inv(to_source))
+    there = load_gaussians(tmp_path / f"scene.{ending}", similarity=np.linalg.inv(source_from_scene))
     np.testing.assert_allclose(there.means, near.means, atol=1e-5)
 
 
 def test_a_file_whose_float32_has_rounded_the_places_is_told(tmp_path, near):
-    to_source = np.eye(4)
-    to_source[:3, 3] = 455123.4, 5411876.6, 1e7
-    capture = dataclasses.replace(photographed(near), to_source=to_source, to_poses=to_source)
-    far = transform_gaussians_float64(near, to_source)
+    source_from_scene = np.eye(4)
+    source_from_scene[:3, 3] = 455123.4, 5411876.6, 1e7
+    capture = dataclasses.replace(
+        photographed(near), source_from_scene=source_from_scene, poses_from_scene=source_from_scene
+    )
+    far = transform_gaussians_float64(near, source_from_scene)
     save_gaussians(tmp_path / "scene.ply", dataclasses.replace(far, means=far.means.astype(np.float32)))
     found, _ = read(capture, tmp_path / "scene.ply")
     assert any("scene.ply holds positions in float32" in note for note in found.notes)

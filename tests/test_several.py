@@ -19,7 +19,7 @@ from jsecon.query.select import ALL_OF_KIND, query_anchored, query_several
 @pytest.fixture(scope="module")
 def field(scene, cameras):
     field, _ = make_field(scene, cameras)
-    return dataclasses.replace(field, regions=Regions(rows_of_a_kind(), field.regions.pixels))
+    return dataclasses.replace(field, regions=Regions(rows_of_a_kind(), field.regions.pixel_counts))
 
 
 def test_all_of_a_kind_are_found_and_no_others(field):
@@ -102,7 +102,7 @@ def test_questions_come_apart():
 def words(field):
     """An embedder of two words."""
     chair, stool = field.regions.embeddings[:2]
-    return KnownTexts({"chair": chair, "stool": stool}, canonical=unit_rows(np.random.default_rng(8), 4, 12))
+    return KnownTexts({"chair": chair, "stool": stool}, canonical_phrases=unit_rows(np.random.default_rng(8), 4, 12))
 
 
 def test_a_question_put_to_a_field(field, words, tmp_path):
@@ -117,9 +117,11 @@ def test_a_question_put_to_a_field(field, words, tmp_path):
 
 
 def test_a_field_without_phrases_takes_those_of_who_reads_the_text(field, words):
-    bare = dataclasses.replace(field, canonical=np.zeros((0, 12), np.float32))
-    np.testing.assert_array_equal(with_phrases(bare, words).canonical, np.asarray(words.canonical, np.float32))
-    np.testing.assert_array_equal(with_phrases(field, words).canonical, field.canonical)
+    bare = dataclasses.replace(field, canonical_phrases=np.zeros((0, 12), np.float32))
+    np.testing.assert_array_equal(
+        with_phrases(bare, words).canonical_phrases, np.asarray(words.canonical_phrases, np.float32)
+    )
+    np.testing.assert_array_equal(with_phrases(field, words).canonical_phrases, field.canonical_phrases)
 
 
 SHADES = ("dark blue vase", "light blue kettle", "red mug", "dark green bottle", "white plate")

@@ -17,14 +17,14 @@ from small_field import seen_of
 
 from jsecon.field.membership import (
     CORRELATION,
-    finish_votes,
+    add_visible_weight,
+    inside_fraction,
+    inside_fraction_of_regions,
     membership_probability,
+    normalise_votes,
     probability_inside,
-    share_of,
-    share_of_regions,
     vote_shares,
     with_overlap,
-    with_shown,
 )
 from jsecon.types import Regions, Votes
 
@@ -52,11 +52,11 @@ def cast(count, *, regions=REGIONS, seed=0):
 
 def known_votes(count, *, shown=True, **options):
     votes, regions = cast(count, **options)
-    return with_shown(votes, regions) if shown else dataclasses.replace(votes, by_view=None)
+    return add_visible_weight(votes, regions) if shown else dataclasses.replace(votes, by_view=None)
 
 
 def exact_shown(votes, regions):
-    shows = np.asarray(regions.pixels) > 0
+    shows = np.asarray(regions.pixel_counts) > 0
     shows[3] = shows[4] = shows[3] | shows[4]
     of_region = np.stack([np.asarray(votes.by_view, np.float64)[row].sum(0) for row in shows], 1)
     place = np.asarray(votes.regions)
@@ -91,34 +91,36 @@ def exact_overlap(votes):
 @pytest.mark.parametrize("count", [1, 400])
 def test_shown_is_the_sum_over_the_views_that_show_the_region(count):
     votes, regions = cast(count)
-    found = with_shown(votes, regions)
+    found = add_visible_weight(votes, regions)
     assert found.by_view is None
-    np.testing.assert_allclose(found.shown, exact_shown(votes, regions), rtol=1e-5, atol=1e-6)
-    assert (np.asarray(found.shown) <= np.asarray(votes.total)[:, None] * (1 + 1e-5)).all()
+    np.testing.assert_allclose(found.weight_where_region_visible, exact_shown(votes, regions), rtol=1e-5, atol=1e-6)
+    assert (np.asarray(found.weight_where_region_visible) <= np.asarray(votes.total)[:, None] * (1 + 1e-5)).all()
 
 
 def test_shown_under_jit_is_eager_and_without_gaussians_or_regions_empty():
     votes, regions = cast(300)
-    traced = jax.jit(with_shown)(jax.tree.map(jnp.asarray, votes), jax.tree.map(jnp.asarray, regions))
-    np.testing.assert_allclose(traced.shown, with_shown(votes, regions).shown, rtol=1e-6)
-    assert with_shown(cast(0)[0], regions).shown.shape == (0, KEPT)
+    traced = jax.jit(add_visible_weight)(jax.tree.map(jnp.asarray, votes), jax.tree.map(jnp.asarray, regions))
+    np.testing.assert_allclose(
+        traced.weight_where_region_visible, add_visible_weight(votes, regions).weight_where_region_visible, rtol=1e-6
+    )
+    assert add_visible_weight(cast(0)[0], regions).weight_where_region_visible.shape == (0, KEPT)
     none = dataclasses.replace(votes, regions=np.full((300, 1), -1), weights=np.zeros((300, 1)), num_regions=0)
-    found = with_shown(none, Regions(np.zeros((0, 8)), np.zeros((0, VIEWS), int)))
-    assert not np.asarray(found.shown).any()
+    found = add_visible_weight(none, Regions(np.zeros((0, 8)), np.zeros((0, VIEWS), int)))
+    assert not np.asarray(found.weight_where_region_visible).any()
 
 
 def test_votes_without_views_or_of_other_views_are_refused():
     votes, regions = cast(10)
     with pytest.raises(ValueError, match=r"by_view=True"):
-        with_shown(with_shown(votes, regions), regions)
+        add_visible_weight(add_visible_weight(votes, regions), regions)
     with pytest.raises(ValueError, match="same regions in the same views"):
-        with_shown(votes, dataclasses.replace(regions, pixels=regions.pixels[:, 1:]))
+        add_visible_weight(votes, dataclasses.replace(regions, pixel_counts=regions.pixel_counts[:, 1:]))
 
 
 def test_finished_votes_know_both():
     votes, regions = cast(100)
-    found, shown = finish_votes(votes, regions), with_shown(votes, regions)
-    np.testing.assert_array_equal(found.shown, shown.shown)
+    found, shown = normalise_votes(votes, regions), add_visible_weight(votes, regions)
+    np.testing.assert_array_equal(found.weight_where_region_visible, shown.weight_where_region_visible)
     np.testing.assert_array_equal(found.overlap, with_overlap(shown).overlap)
 
 
@@ -126,12 +128,12 @@ def test_finished_votes_know_both():
 def test_share_is_the_definition_under_jit_and_vmap(count, shown):
     votes = jax.tree.map(jnp.asarray, known_votes(count, shown=shown))
     chosen = np.random.default_rng(1).random((3, REGIONS)) < 0.5
-    together = jax.jit(jax.vmap(share_of, in_axes=(None, 0)))(votes, chosen)
+    together = jax.jit(jax.vmap(inside_fraction, in_axes=(None, 0)))(votes, chosen)
     for n, one in enumerate(chosen):
-        alone = share_of(votes, one)
-        np.testing.assert_array_equal(alone.share, together.share[n])
-        np.testing.assert_array_equal(alone.known, np.asarray(alone.share) > 0)  # of random votes none is for nothing
-        np.testing.assert_allclose(alone.share, exact_share(votes, one), atol=1e-6)
+        alone = inside_fraction(votes, one)
+        np.testing.assert_array_equal(alone.fraction, together.fraction[n])
+        np.testing.assert_array_equal(alone.known, np.asarray(alone.fraction) > 0)
+        np.testing.assert_allclose(alone.fraction, exact_share(votes, one), atol=1e-6)
 
 
 @pytest.mark.parametrize("shown", [False, True])
@@ -142,8 +144,8 @@ def test_the_share_of_a_few_regions_without_a_program_has_the_same_bits(shown):
     votes = dataclasses.replace(votes, weights=weights, views=np.arange(700, dtype=np.int32) % 9)
     for regions in ([], [0], [2, 1], range(REGIONS)):
         chosen = np.isin(np.arange(REGIONS), list(regions))
-        expected = share_of(jax.tree.map(jnp.asarray, votes), chosen).share
-        np.testing.assert_array_equal(share_of_regions(votes, list(regions)), expected)
+        expected = inside_fraction(jax.tree.map(jnp.asarray, votes), chosen).fraction
+        np.testing.assert_array_equal(inside_fraction_of_regions(votes, list(regions)), expected)
 
 
 @pytest.mark.parametrize("count", [1, 33, 257])
@@ -153,7 +155,7 @@ def test_any_number_of_regions(count):
     some = cast(500)[0]
     votes = dataclasses.replace(some, regions=ids, weights=weights, by_view=None, num_regions=count)
     for chosen in (rng.random(count) < 0.3, np.zeros(count, bool), np.ones(count, bool)):
-        np.testing.assert_allclose(share_of(votes, chosen).share, exact_share(votes, chosen), rtol=1e-6)
+        np.testing.assert_allclose(inside_fraction(votes, chosen).fraction, exact_share(votes, chosen), rtol=1e-6)
 
 
 def test_numbers_that_are_not_finite_are_not_known_where_they_are_asked_for():
@@ -162,16 +164,16 @@ def test_numbers_that_are_not_finite_are_not_known_where_they_are_asked_for():
         np.float32([[1e30, np.nan], [np.inf, 2], [3, 4], [1e-30, 0], [1, 0]]),
         *np.float32([[1] * 5, [1e30, 4, 1, 1e-30, np.nan], [1] * 5]), np.ones(5, np.int32), np.int32(0), 2,
     )  # fmt: skip
-    first, second = (share_of(votes, np.arange(2) == r) for r in range(2))
-    np.testing.assert_array_equal(first.share, np.float32([1, 0.5, 0, 0, 0]))  # what is not chosen does not spread
+    first, second = (inside_fraction(votes, np.arange(2) == r) for r in range(2))
+    np.testing.assert_array_equal(first.fraction, np.float32([1, 0.5, 0, 0, 0]))  # what is not chosen does not spread
     np.testing.assert_array_equal(first.known, [True, True, False, False, False])
-    np.testing.assert_array_equal(second.share, np.float32([0, 0, 0, 1, 0]))
+    np.testing.assert_array_equal(second.fraction, np.float32([0, 0, 0, 1, 0]))
     np.testing.assert_array_equal(second.known, [False, False, False, True, False])
     np.testing.assert_array_equal(vote_shares(votes)[:2], np.float32([[1, np.nan], [np.nan, 0.5]]))
     unseen = dataclasses.replace(votes, views=np.zeros(5, np.int32))
-    assert not np.asarray(share_of(unseen, np.ones(2, bool)).known).any()
+    assert not np.asarray(inside_fraction(unseen, np.ones(2, bool)).known).any()
     none = dataclasses.replace(votes, regions=np.zeros((5, 0), np.int32), weights=np.zeros((5, 0), np.float32))
-    assert not np.asarray(share_of(none, np.ones(2, bool)).share).any()
+    assert not np.asarray(inside_fraction(none, np.ones(2, bool)).fraction).any()
 
 
 COUNT, MANY = 3, 40
@@ -192,7 +194,9 @@ def votes_and_regions(draw):
     weights, total = np.where(ids >= 0, draw(_rows(_numbers)), 0), draw(_rows(_numbers)).max(1)
     views = draw(arrays(np.int32, COUNT, elements=st.integers(0, 3)))
     shown = draw(_rows(_numbers))
-    votes = Votes(ids, weights, weights.sum(1), total, total, views, np.int32(0), MANY, shown=shown)
+    votes = Votes(
+        ids, weights, weights.sum(1), total, total, views, np.int32(0), MANY, weight_where_region_visible=shown
+    )
     more = draw(arrays(bool, MANY))
     return votes, more & draw(arrays(bool, MANY)), more
 
@@ -201,31 +205,40 @@ def votes_and_regions(draw):
 @given(votes_and_regions())
 def test_laws_of_the_share(drawn):
     votes, fewer, more = drawn
-    share, known = (np.asarray(a) for a in share_of(votes, fewer))
+    share, known = (np.asarray(a) for a in inside_fraction(votes, fewer))
     assert ((share >= 0) & (share <= 1)).all()
     voted = (votes.regions >= 0) & fewer[votes.regions] & (seen_of(votes) > 0)
     np.testing.assert_array_equal(known, (votes.views > 0) & voted.any(1))
     assert not share[~known].any()
     # Where one region is shown the others are: then more of them never have less of a Gaussian.
-    together = dataclasses.replace(votes, shown=None)
-    assert (np.asarray(share_of(together, fewer).share) <= np.asarray(share_of(together, more).share)).all()
+    together = dataclasses.replace(votes, weight_where_region_visible=None)
+    assert (
+        np.asarray(inside_fraction(together, fewer).fraction) <= np.asarray(inside_fraction(together, more).fraction)
+    ).all()
     # Two sets have together at most what each has alone, where a region has no weight in views that do not show it.
-    shown = dataclasses.replace(votes, shown=np.maximum(votes.shown, votes.weights))
-    both, one, other = (np.asarray(share_of(shown, chosen).share) for chosen in (more, fewer, more & ~fewer))
+    shown = dataclasses.replace(
+        votes, weight_where_region_visible=np.maximum(votes.weight_where_region_visible, votes.weights)
+    )
+    both, one, other = (np.asarray(inside_fraction(shown, chosen).fraction) for chosen in (more, fewer, more & ~fewer))
     assert (both <= (one + other) * (1 + 1e-5)).all()
     # One region alone has the share of its vote.
-    alone = np.asarray(jax.vmap(share_of, (None, 0))(votes, np.eye(MANY, dtype=bool)).share)
+    alone = np.asarray(jax.vmap(inside_fraction, (None, 0))(votes, np.eye(MANY, dtype=bool)).fraction)
     own = np.where((votes.regions >= 0) & (votes.views > 0)[:, None], vote_shares(votes), 0)
     np.testing.assert_array_equal(alone[votes.regions, np.arange(COUNT)[:, None]] * (votes.regions >= 0), own)
     # Neither the unit of the weights, nor the order of the votes, nor the regions' numbers mean anything.
-    scaled = {name: getattr(votes, name) * np.float32(2**-20) for name in ("weights", "labelled", "total", "shown")}
+    scaled = {
+        name: getattr(votes, name) * np.float32(2**-20)
+        for name in ("weights", "labelled", "total", "weight_where_region_visible")
+    }
     np.testing.assert_allclose(
-        share_of(dataclasses.replace(votes, **scaled), fewer).share, share, rtol=1e-6, atol=1e-30
+        inside_fraction(dataclasses.replace(votes, **scaled), fewer).fraction, share, rtol=1e-6, atol=1e-30
     )
-    turned = {name: getattr(votes, name)[:, ::-1] for name in ("regions", "weights", "shown")}
-    np.testing.assert_allclose(share_of(dataclasses.replace(votes, **turned), fewer).share, share, rtol=1e-6)
+    turned = {name: getattr(votes, name)[:, ::-1] for name in ("regions", "weights", "weight_where_region_visible")}
+    np.testing.assert_allclose(inside_fraction(dataclasses.replace(votes, **turned), fewer).fraction, share, rtol=1e-6)
     renamed = np.where(votes.regions >= 0, MANY - 1 - votes.regions, -1)
-    np.testing.assert_array_equal(share_of(dataclasses.replace(votes, regions=renamed), fewer[::-1]).share, share)
+    np.testing.assert_array_equal(
+        inside_fraction(dataclasses.replace(votes, regions=renamed), fewer[::-1]).fraction, share
+    )
 
 
 def test_gradient_equals_central_differences(x64):
@@ -234,9 +247,11 @@ def test_gradient_equals_central_differences(x64):
 
     @jax.jit
     def share(weights, shown):
-        return share_of(dataclasses.replace(votes, weights=weights, shown=shown), chosen).share
+        return inside_fraction(
+            dataclasses.replace(votes, weights=weights, weight_where_region_visible=shown), chosen
+        ).fraction
 
-    given = jnp.asarray(votes.weights), jnp.asarray(votes.shown)
+    given = jnp.asarray(votes.weights), jnp.asarray(votes.weight_where_region_visible)
     check_grads(share, given, order=1, modes=["rev"], rtol=1e-4, atol=0, eps=1e-7)
 
 
@@ -255,13 +270,15 @@ def test_overlap_without_gaussians_or_regions_and_with_numbers_that_are_not_fini
     none = {"regions": np.full((5, 1), -1), "weights": np.zeros((5, 1), np.float32), "num_regions": 0}
     assert with_overlap(dataclasses.replace(known_votes(5, shown=False), **none)).overlap.shape == (0, 0)
     votes = known_votes(300)
-    weights, shown = np.array(votes.weights), np.array(votes.shown)
+    weights, shown = np.array(votes.weights), np.array(votes.weight_where_region_visible)
     weights[:50, 0], shown[50:60, 1] = np.nan, np.inf
-    broken = dataclasses.replace(votes, weights=weights, shown=shown)
+    broken = dataclasses.replace(votes, weights=weights, weight_where_region_visible=shown)
     without = np.where(np.isfinite(weights) & np.isfinite(shown), votes.regions, -1)
     expected = with_overlap(dataclasses.replace(votes, regions=without)).overlap
     np.testing.assert_allclose(with_overlap(broken).overlap, expected, rtol=1e-6)
-    huge = {name: getattr(votes, name) * 1e30 for name in ("weights", "labelled", "total", "shown")}
+    huge = {
+        name: getattr(votes, name) * 1e30 for name in ("weights", "labelled", "total", "weight_where_region_visible")
+    }
     huge = dataclasses.replace(votes, **huge)
     np.testing.assert_allclose(with_overlap(huge).overlap, with_overlap(votes).overlap, rtol=1e-5)
 

@@ -46,7 +46,7 @@ def written(kind, capture, folder, scale, shift):
 def test_a_capture_comes_out_the_same_in_any_place_and_unit(tmp_path, kind, scale, shift):
     plain = jsecon.load_capture(written(kind, small_capture(), tmp_path / "plain", 1, 0 * SHIFT))
     there = jsecon.load_capture(written(kind, small_capture(), tmp_path / "there", scale, shift))
-    np.testing.assert_array_equal(plain.to_source, np.eye(4))
+    np.testing.assert_array_equal(plain.source_from_scene, np.eye(4))
     offset = there.cameras.centres[0] - plain.cameras.centres[0]
     assert np.abs(offset).max() < 11
     np.testing.assert_allclose(there.cameras.centres, plain.cameras.centres + offset, atol=2e-5)
@@ -54,7 +54,7 @@ def test_a_capture_comes_out_the_same_in_any_place_and_unit(tmp_path, kind, scal
         np.testing.assert_allclose(there.points, plain.points + offset, atol=2e-5)
     if kind == "depth":
         np.testing.assert_allclose(np.asarray(there.depths), np.asarray(plain.depths), rtol=1e-6)
-    back = there.cameras.centres.astype(np.float64) @ there.to_source[:3, :3].T + there.to_source[:3, 3]
+    back = there.cameras.centres.astype(np.float64) @ there.source_from_scene[:3, :3].T + there.source_from_scene[:3, 3]
     np.testing.assert_allclose(back, scale * plain.cameras.centres.astype(np.float64) + shift, atol=3e-6 * scale)
 
 
@@ -66,9 +66,9 @@ def test_a_capture_from_one_place_keeps_its_unit(tmp_path, shift):
     poses[:, :3, 3] = 1e-9 * np.arange(15).reshape(5, 3)
     capture = dataclasses.replace(capture, cameras=dataclasses.replace(capture.cameras, world_to_camera=poses))
     found = jsecon.load_capture(written("poses", capture, tmp_path, 1, shift))
-    np.testing.assert_allclose(found.to_source[:3, :3], np.eye(3))
+    np.testing.assert_allclose(found.source_from_scene[:3, :3], np.eye(3))
     assert np.abs(found.cameras.centres).max() < 1
-    np.testing.assert_allclose(found.to_source[:3, 3] + found.cameras.centres[0], shift, atol=1e-3)
+    np.testing.assert_allclose(found.source_from_scene[:3, 3] + found.cameras.centres[0], shift, atol=1e-3)
 
 
 @pytest.mark.parametrize("frames", [None, 3])
@@ -77,17 +77,17 @@ def test_the_world_of_a_capture_is_that_of_all_its_frames(tmp_path, frames):
     folder = written("colmap", small_capture(), tmp_path, 1e-3, SHIFT)
     whole = jsecon.load_capture(folder)
     some = jsecon.load_capture(folder, frames=frames, only=whole.names[:3])
-    np.testing.assert_array_equal(some.to_source, whole.to_source)
+    np.testing.assert_array_equal(some.source_from_scene, whole.source_from_scene)
     assert set(some.names) <= set(whole.names)
 
 
 def test_a_spz_refuses_coordinates_that_it_cannot_hold(tmp_path, scene):
     """Fixed-point numbers of 24 bits: 2^-4 units at 455123, which is larger than Gaussians of 0.02."""
     small = dataclasses.replace(scene, log_scales=np.full_like(scene.log_scales, np.log(0.02)))
-    to_source = np.eye(4)
-    to_source[0, 3] = 455123.4
+    source_from_scene = np.eye(4)
+    source_from_scene[0, 3] = 455123.4
     with pytest.raises(jsecon.InputError, match=r"a\.spz.*positions"):
-        jsecon.save_gaussians(tmp_path / "a.spz", small, similarity=to_source)
+        jsecon.save_gaussians(tmp_path / "a.spz", small, similarity=source_from_scene)
 
 
 def test_an_ordinary_scene_is_written_in_single_precision(tmp_path, scene):

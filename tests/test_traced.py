@@ -35,9 +35,9 @@ def calls(field, labels):
         "render_depth": lambda: jsecon.render_depth(scene, camera),
         "region_votes": by_view,
         "scan_region_votes": lambda: jsecon.scan_region_votes(scene, cameras, labels, REGIONS),
-        "with_shown": lambda: jsecon.with_shown(by_view(), field.regions),
+        "add_visible_weight": lambda: jsecon.add_visible_weight(by_view(), field.regions),
         "with_overlap": lambda: jsecon.with_overlap(field.votes),
-        "finish_votes": lambda: jsecon.finish_votes(by_view(), field.regions),
+        "normalise_votes": lambda: jsecon.normalise_votes(by_view(), field.regions),
         "membership_probability": lambda: jsecon.membership_probability(jnp.full(scene.count, 0.5), field.votes),
         "distill_votes": lambda: jsecon.distill_votes(field.votes, field.region_codes),
         "distill_l1": lambda: jsecon.distill_l1(scene, cameras, labels, field.region_codes, **descent),
@@ -66,7 +66,7 @@ def calls(field, labels):
 HOST = {
     *("show", "to_html", "to_png", "locate", "masklets", "check_backend", "load_capture", "load_gaussians"),
     *("save_gaussians", "load_ply", "save_ply", "codes_in_blocks", "region_votes_in_blocks", "check_field"),
-    "finish_votes_in_blocks",
+    "normalise_votes_in_blocks",
     *("load_field", "save_field", "region_embeddings", "host_mesh", "query_in_blocks", "lift", "remove_outliers"),
     *("region_at", "plan_capacity", "objects", "object_shapes", "measure", "query_relation"),
 }

@@ -4,7 +4,7 @@ from balls import HEIGHT, VIEWS, WIDTH, ious, ring_of_balls
 from conftest import look_at
 from mask_overlaps import iou_matrix
 
-from jsecon.association.atoms import image_atoms
+from jsecon.association.superpixels import superpixels
 from jsecon.paper.algorithm1 import clean_masklets, masklets
 from jsecon.paper.tracker import GeometricTracker
 from jsecon.types import Camera
@@ -19,7 +19,7 @@ def world():
 @pytest.fixture(scope="module")
 def tracker(world):
     gaussians, cameras, _, _, proposals = world
-    return GeometricTracker(gaussians, cameras, proposals, atoms_per_frame=60)
+    return GeometricTracker(gaussians, cameras, proposals, superpixels_per_frame=60)
 
 
 def prompts_at(truth, t):
@@ -73,7 +73,7 @@ def test_where_a_frame_proposes_nothing_or_a_merger_the_gaussians_find_the_ball(
     worse = list(proposals)
     worse[13] = np.zeros((0, HEIGHT, WIDTH), bool)
     worse[14] = (truth[14] >= 0)[None]  # everything is one region
-    tracker = GeometricTracker(gaussians, cameras, lambda t: worse[t], atoms_per_frame=300)
+    tracker = GeometricTracker(gaussians, cameras, lambda t: worse[t], superpixels_per_frame=300)
     scores = ious(tracker(frames, 12, prompts_at(truth, 12)), truth, 3)
     assert np.nanmin(scores[[13, 14]]) > 0.5
     assert np.nanmean(np.delete(scores, [13, 14], axis=0)) > 0.9  # and the track goes on behind them
@@ -84,7 +84,7 @@ def test_a_frame_that_looks_away_stays_empty(world):
     poses = np.array(cameras.world_to_camera)
     poses[4] = look_at((0.0, -1.0, -2.2), (0.0, -1.0, -9.0))
     away = Camera(poses, cameras.fx, cameras.fy, cameras.cx, cameras.cy, width=WIDTH, height=HEIGHT)
-    tracker = GeometricTracker(gaussians, away, proposals, atoms_per_frame=60)
+    tracker = GeometricTracker(gaussians, away, proposals, superpixels_per_frame=60)
     labels = tracker(frames, 12, prompts_at(truth, 12))
     assert (labels[4] == -1).all()
     assert np.nanmin(np.delete(ious(labels, truth, 3), 4, axis=0)) > 0.85
@@ -121,8 +121,8 @@ def test_bad_arguments_are_refused(world, tracker):
     gaussians, cameras, frames, truth, proposals = world
     with pytest.raises(ValueError, match="prompts"):
         tracker(frames, 0, prompts_at(truth, 0)[:, 1:])
-    with pytest.raises(ValueError, match="atoms_per_frame"):
-        GeometricTracker(gaussians, cameras, proposals, atoms_per_frame=0)
+    with pytest.raises(ValueError, match="superpixels_per_frame"):
+        GeometricTracker(gaussians, cameras, proposals, superpixels_per_frame=0)
 
 
 @pytest.mark.parametrize("count", [1, 20, 200])
@@ -132,11 +132,11 @@ def test_atoms_cover_the_frame_and_respect_the_masks(count):
     masks = np.zeros((2, 60, 80), bool)
     masks[0, 10:40, 10:50] = True
     masks[1, 20:50, 30:70] = True
-    atoms = image_atoms(frame, masks, count=count)
+    atoms = superpixels(frame, masks, count=count)
     areas = np.bincount(atoms.ravel())
     assert (areas >= 12).all()
     for mask in masks:  # an atom lies in or out of a mask, but for the slivers that it took in
         inside = np.bincount(atoms[mask], minlength=len(areas)) / areas
         assert np.mean((inside < 0.05) | (inside > 0.95)) > 0.5
         assert inside.max() > 0.95
-    assert image_atoms(frame, masks[:0], count=count).shape == (60, 80)
+    assert superpixels(frame, masks[:0], count=count).shape == (60, 80)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jsecon import plan_view
-from jsecon.association.atoms import atom_votes
+from jsecon.association.superpixels import superpixel_votes
 from jsecon.field.votes import region_votes, votes_memory
 from jsecon.splat.reference import weights_reference
 
@@ -51,7 +51,7 @@ def test_equals_the_oracles_weights(cast, expected):
     assert np.linalg.norm(cast.dense() - votes) <= 1e-4 * np.linalg.norm(votes)
     np.testing.assert_allclose(cast.by_view, total, rtol=2e-4, atol=0.02)
     np.testing.assert_allclose(cast.total, total.sum(0), rtol=2e-4, atol=0.02)
-    np.testing.assert_allclose(cast.peak, peak, atol=1e-4)
+    np.testing.assert_allclose(cast.max_pixel_weight, peak, atol=1e-4)
     np.testing.assert_array_equal(cast.views, views)
 
 
@@ -77,12 +77,12 @@ def test_at_the_centre_they_are_the_weights_of_that_pixel(scene, cameras, labels
 def test_votes_on_atoms_are_those_of_the_view(scene, cameras, labels, expected, t):
     """Also where a tile shows more atoms than one walk counts (the noise of view 1)."""
     camera, atoms = cameras[t], labels[t] + 1
-    got = atom_votes(scene, camera, atoms, negligible=0.0).toarray()
+    got = superpixel_votes(scene, camera, atoms, negligible=0.0).toarray()
     same = region_votes(scene, cameras[t : t + 1], atoms[None], REGIONS + 1, top=REGIONS + 1)
     np.testing.assert_allclose(got, same.dense(), rtol=1e-5, atol=1e-6)
-    few = atom_votes(scene, camera, atoms, negligible=0.3).toarray()
+    few = superpixel_votes(scene, camera, atoms, negligible=0.3).toarray()
     np.testing.assert_array_equal(few, np.where(got > 0.3 * got.sum(1, keepdims=True), got, 0.0))
-    middle = atom_votes(scene, camera, atoms, negligible=0.0, centre=1.0).toarray()
+    middle = superpixel_votes(scene, camera, atoms, negligible=0.0, centre=1.0).toarray()
     at_centre = region_votes(scene, cameras[t : t + 1], atoms[None], REGIONS + 1, top=REGIONS + 1, centre=1.0)
     np.testing.assert_allclose(middle, at_centre.dense(), rtol=1e-5, atol=1e-6)
     assert (middle > 0).sum(1).max() == 1
@@ -93,7 +93,7 @@ def test_strongest_first_and_what_is_cut_is_counted(cast, scene, cameras, labels
     assert few.regions.shape == (scene.count, 2)
     assert few.by_view is None
     np.testing.assert_allclose(few.weights, cast.weights[:, :2], rtol=1e-6)
-    np.testing.assert_allclose(few.cut, cast.weights[:, 2:].sum(-1), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(few.weight_beyond_top_k, cast.weights[:, 2:].sum(-1), rtol=1e-4, atol=1e-4)
     assert bool((cast.weights[:, :-1] >= cast.weights[:, 1:]).all())
     np.testing.assert_array_equal(cast.regions >= 0, cast.weights > 0)
 

@@ -20,7 +20,7 @@ from conftest import gaussians_at, look_at
 from small_field import shares, unit_rows
 from test_direct import exact_cosines, exact_relevancy
 
-from jsecon.field.membership import share_of, with_overlap, with_shown
+from jsecon.field.membership import add_visible_weight, inside_fraction, with_overlap
 from jsecon.field.similarity import similarities, unit_codes
 from jsecon.fit.photometric import l1, psnr
 from jsecon.paper.baselines import query_canonical, query_one_step
@@ -149,17 +149,19 @@ def test_similarities_of_many_regions():
 def test_shares(shown):
     votes = jax.tree.map(jnp.asarray, of_shares.known_votes(COUNT, shown=shown))
     chosen = np.random.default_rng(1).random((3, of_shares.REGIONS)) < 0.5
-    found = compiled(lambda one, votes: share_of(votes, one), chosen, votes)
+    found = compiled(lambda one, votes: inside_fraction(votes, one), chosen, votes)
     rows = np.unique(np.linspace(0, COUNT - 1, 2_000).astype(int))
     few = jax.tree.map(lambda a: a if a.ndim == 0 else np.asarray(a)[rows], votes)
     for n, one in enumerate(chosen):
-        np.testing.assert_allclose(found.share[n][rows], of_shares.exact_share(few, one), atol=1e-6)
+        np.testing.assert_allclose(found.fraction[n][rows], of_shares.exact_share(few, one), atol=1e-6)
 
 
 def test_shown_and_overlap():
     votes, regions = of_shares.cast(COUNT)
-    found = with_shown(votes, regions)
-    np.testing.assert_allclose(found.shown, of_shares.exact_shown(votes, regions), rtol=1e-5, atol=1e-6)
+    found = add_visible_weight(votes, regions)
+    np.testing.assert_allclose(
+        found.weight_where_region_visible, of_shares.exact_shown(votes, regions), rtol=1e-5, atol=1e-6
+    )
     np.testing.assert_allclose(with_overlap(found).overlap, of_shares.exact_overlap(found), rtol=2e-5, atol=1e-6)
 
 

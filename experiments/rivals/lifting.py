@@ -21,7 +21,7 @@ from scipy import sparse
 from scipy.spatial import KDTree
 
 from experiments.rivals.evidence import Evidence, local_masks
-from jsecon.association.atoms import atom_votes
+from jsecon.association.superpixels import superpixel_votes
 from jsecon.paper.baselines import relevancies
 from jsecon.splat.fusion import materialize
 from jsecon.splat.plan import ViewPlan, plan_view
@@ -72,7 +72,7 @@ def train_backprojection(evidence: Evidence) -> Lifted:
     gaussians, cameras = jax.tree.map(jnp.asarray, (evidence.gaussians, evidence.cameras))
     blocks = []
     for t, image in enumerate(local):
-        cast = atom_votes(gaussians, cameras[t], image, negligible=0.0).tocoo()
+        cast = superpixel_votes(gaussians, cameras[t], image, negligible=0.0).tocoo()
         blocks.append((cast.data, cast.row, names[t][cast.col]))
     return _lifted(_sparse(blocks, evidence), evidence)
 

@@ -110,7 +110,7 @@ class SimulatedEmbedder:
         (1 - LEANING shared) text_k + LEANING shared sum_j m_kj text_j
 
     with m_kj the object's mixture (`leanings`) of the other classes and of names that nothing has, `others` (O, E).
-    `reference` (W, E) are the unrelated words of the space; by default there are none.
+    `unrelated_words` (W, E) are the unrelated words of the space; by default there are none.
     """
 
     def __init__(
@@ -169,8 +169,8 @@ class SimulatedEmbedder:
             self._turning = _unit(np.einsum("khe,ht->kte", turning, waves))
         # Canonical phrases are words like any other of the space.
         words = PAIRWISE_COSINE**0.5 * mean + (1 - PAIRWISE_COSINE) ** 0.5 * _unit(draw.standard_normal((4, self.dim)))
-        self.canonical = _unit(words).astype(np.float32)
-        self.reference = np.zeros((0, self.dim), np.float32) if reference is None else reference
+        self.canonical_phrases = _unit(words).astype(np.float32)
+        self.unrelated_words = np.zeros((0, self.dim), np.float32) if reference is None else reference
 
     def embed_regions(
         self, frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m h w"]

@@ -11,7 +11,7 @@ import numpy as np
 
 from experiments.rivals.evidence import Evidence, unit
 from jsecon.association.consensus import consensus_masklets
-from jsecon.association.views import SceneViews
+from jsecon.association.scene import SceneSuperpixels
 from jsecon.paper.algorithm1 import clean_masklets
 
 ROWS = 64
@@ -72,14 +72,14 @@ def by_consensus(
       levels: Masks and embeddings of each level.
       frames: (T, H, W, 3) uint8.
       seed: Seed of the clustering.
-      centre: As for `SceneViews`.
+      centre: As for `SceneSuperpixels`.
       **how: Options of `consensus_masklets`.
 
     Returns:
       The regions.
     """
     given = jax.tree.map(jnp.asarray, (levels[0].gaussians, levels[0].cameras))
-    scene = SceneViews(*given, lambda t: proposals(levels, t), centre=centre)
+    scene = SceneSuperpixels(*given, lambda t: proposals(levels, t), centre=centre)
     return associated(levels, clean_masklets(consensus_masklets(frames, scene, seed=seed, **how)))
 
 

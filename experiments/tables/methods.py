@@ -32,7 +32,7 @@ def by_features(setting: Setting, features: Float[Array, "n e"], *, relevancy: b
     means = setting.evidence.gaussians.means
 
     def read(k):
-        return lifting.query_relevancy(features, means, texts[k], jnp.asarray(setting.canonical))
+        return lifting.query_relevancy(features, means, texts[k], jnp.asarray(setting.canonical_phrases))
 
     return Answers(read if relevancy else by_text, lambda: np.asarray(labels), features=features)
 
@@ -51,7 +51,7 @@ def langsplat_of(setting: Setting, evidence: Evidence, steps: Steps) -> LangSpla
 def gaussian_grouping(setting: Setting, steps: Steps) -> Answers:
     """Tracked ids; a text is found in the first view or not at all."""
     model = gaussian_grouping_of(setting, steps)
-    canonical = jnp.asarray(setting.canonical)
+    canonical = jnp.asarray(setting.canonical_phrases)
 
     def ask(k):
         return query_gaussian_grouping(model, setting.evidence, jnp.asarray(setting.texts[k]), canonical)

@@ -11,8 +11,8 @@ from experiments.tables.answers import Answers, Method, Steps, by_selection
 from experiments.tables.association import Association, associated, by_consensus, proposals
 from experiments.tables.setting import Setting
 from jsecon.association.consensus import pieces_on_masks
-from jsecon.association.views import SceneViews
-from jsecon.field.membership import finish_votes, membership_probability
+from jsecon.association.scene import SceneSuperpixels
+from jsecon.field.membership import membership_probability, normalise_votes
 from jsecon.field.regions import scene_parts
 from jsecon.field.votes import region_votes
 from jsecon.paper.autoencoder import train_autoencoder
@@ -67,11 +67,11 @@ def field_of(
     regions = association(setting, by, labels=labels, centre=centre, agreement=agreement)
     embeddings = jnp.asarray(regions.uniform_embeddings if uniform else regions.embeddings)
     found, key = jnp.asarray(regions.labels), jax.random.key(setting.seed)
-    known = Regions(np.asarray(embeddings), regions.pixels)
+    known = Regions(np.asarray(embeddings), regions.pixel_counts)
 
     def cast() -> Votes:
         given = evidence.gaussians, evidence.cameras, found, len(embeddings)
-        return finish_votes(region_votes(*given, by_view=True, centre=centre), known)
+        return normalise_votes(region_votes(*given, by_view=True, centre=centre), known)
 
     votes = shared.get(("votes", by, uniform, centre, agreement), cast)
     if latent == "auto":
@@ -97,10 +97,10 @@ def field_of(
         table,
         coder,
         evidence.cameras,
-        setting.canonical,
+        setting.canonical_phrases,
         np.eye(4),
         setting.names,
-        reference=setting.reference,
+        unrelated_words=setting.unrelated_words,
     )
 
 
@@ -109,7 +109,7 @@ def parts_of(setting: Setting) -> Parts:
     evidence, levels = setting.evidence, setting.levels
 
     def make() -> Parts:
-        views = SceneViews(evidence.gaussians, evidence.cameras, lambda t: proposals(levels, t))
+        views = SceneSuperpixels(evidence.gaussians, evidence.cameras, lambda t: proposals(levels, t))
         frame, rows = (np.concatenate([np.asarray(getattr(e, k)) for e in levels]) for k in ("frame", "embeddings"))
         given = pieces_on_masks(setting.frames, views, seed=setting.seed)
         return scene_parts(*given, rows[np.argsort(frame, kind="stable")])
@@ -119,7 +119,7 @@ def parts_of(setting: Setting) -> Parts:
 
 def of_all_views(field: LanguageField) -> LanguageField:
     """A field whose votes count every view that sees a Gaussian, not only those that show the region."""
-    return dataclasses.replace(field, votes=dataclasses.replace(field.votes, shown=None))
+    return dataclasses.replace(field, votes=dataclasses.replace(field.votes, weight_where_region_visible=None))
 
 
 def ask_field(
@@ -140,7 +140,7 @@ def ask_field(
     votes, parts answer where no region does (`parts_fallback`)."""
     means = np.asarray(setting.evidence.gaussians.means)
     field = of_all_views(field) if way == "all_views" else field
-    phrases = jnp.asarray(field.canonical)
+    phrases = jnp.asarray(field.canonical_phrases)
     rules = QueryRules(retrieval=retrieval, retrieval_threshold=retrieval_threshold)
     rules = rules if pieces else dataclasses.replace(rules, piece_threshold=None)
 

@@ -45,11 +45,15 @@ def scores(
     if rule == "cosine":
         found = np.asarray(cosine_matrix(texts, features))
     elif rule == "apart":
-        require(setting.reference is not None, "apart", "a setting without unrelated words", "a twin", "Use contrast.")
-        words = normalize(jnp.asarray(setting.reference))
+        require(
+            setting.unrelated_words is not None, "apart", "a setting without unrelated words", "a twin", "Use contrast."
+        )
+        words = normalize(jnp.asarray(setting.unrelated_words))
         found = np.asarray(cosine_matrix(normalize(texts) - words.mean(0), features))
     elif rule == "relevancy":
-        found = np.stack([np.asarray(relevancies(features, t, jnp.asarray(setting.canonical))[0]) for t in texts])
+        found = np.stack(
+            [np.asarray(relevancies(features, t, jnp.asarray(setting.canonical_phrases))[0]) for t in texts]
+        )
     else:
         evidence = setting.evidence if evidence is None else evidence
         masks = np.asarray(evidence.masks)
@@ -57,7 +61,7 @@ def scores(
         units = np.asarray(normalize(jnp.asarray(evidence.embeddings)))
         mean = (pixels[:, None] * units).sum(0) / pixels.sum()
         apart = normalize(normalize(features) - jnp.asarray(mean, jnp.float32))
-        cone = normalize(jnp.asarray(setting.canonical).mean(0))
+        cone = normalize(jnp.asarray(setting.canonical_phrases).mean(0))
         across = normalize(texts) - (normalize(texts) @ cone)[:, None] * cone
         found = np.asarray(cosine_matrix(across, apart))
     return np.where(known, found, np.nan)

@@ -170,7 +170,7 @@ def _grouping_row(nearly: float, rule: str, chooser: str) -> Method:
 
     def row(setting: Setting, steps: Steps) -> Answers:
         model = setting.shared.get("Gaussian Grouping-m", lambda: gaussian_grouping_of(setting, steps))
-        evidence, canonical = setting.evidence, jnp.asarray(setting.canonical)
+        evidence, canonical = setting.evidence, jnp.asarray(setting.canonical_phrases)
         first = np.asarray(evidence.embeddings)[np.asarray(evidence.frame) == 0]
         table = scores(setting, first, rule) if rule and len(first) else None
 

@@ -37,7 +37,7 @@ class Setting:
     """regions by the tracker's ids."""
     texts: np.ndarray
     """(Q, E) of bench.queries."""
-    canonical: np.ndarray
+    canonical_phrases: np.ndarray
     """(4, E)."""
     cameras: dict[str, Camera]
     """of all frames, by name."""
@@ -48,7 +48,7 @@ class Setting:
     """of the scene's files: masks, language_features, text_features.json."""
     level: str = ""
     """of a twin's simulated vision."""
-    reference: np.ndarray | None = None
+    unrelated_words: np.ndarray | None = None
     """(W, E) of the unrelated words; None of a real dataset, whose files have none."""
     shared: Shared = dataclasses.field(default_factory=Shared, compare=False)
     """what methods have in common."""
@@ -86,7 +86,7 @@ def prepare(data: twins.Data, scene: str, seed: int, level: str, *, fit_steps: i
         seed,
         folder,
         level,
-        None if data.root else twins.words_of(bench, root, level, seed).reference,
+        None if data.root else twins.words_of(bench, root, level, seed).unrelated_words,
     )
 
 

@@ -91,7 +91,7 @@ def sight(bench: Benchmark, root: Path, level: str, seed: int) -> Sight:
     azimuths = np.arctan2(cameras.centres[:, 1], cameras.centres[:, 0])
     hard = {"world": world, "objects": seen.objects, "azimuths": azimuths, "others": texts.absent}
     embedder = SimulatedEmbedder(
-        frames, seen.content, told["objects"], texts.space, faults, seed=seed, reference=texts.reference, **hard
+        frames, seen.content, told["objects"], texts.space, faults, seed=seed, reference=texts.unrelated_words, **hard
     )
     return Sight(names, frames, truth, levels, embedder)
 
@@ -111,7 +111,7 @@ def look(bench: Benchmark, root: Path, level: str, seed: int) -> None:
             found.append(first[id(level)])
         write_features(folder / "language_features", name, np.stack(found), np.concatenate(rows))
         write_image(folder / "masks" / f"{name}.png", (masks.labels[t] + 1).astype(np.uint16))
-    vectors = np.concatenate([embedder.embed_text(list(bench.queries)), embedder.canonical])
+    vectors = np.concatenate([embedder.embed_text(list(bench.queries)), embedder.canonical_phrases])
     write_text_features(folder / "text_features.json", [*bench.queries, *CANONICAL], vectors)
 
 
@@ -122,7 +122,7 @@ class Words(NamedTuple):
     """its own names and the benchmark's queries."""
     absent: np.ndarray
     """(ABSENT, E) vectors of names that nothing in the twin has."""
-    reference: np.ndarray
+    unrelated_words: np.ndarray
     """(W, E) vectors of the unrelated words, one for each of `REFERENCE_WORDS`."""
 
 

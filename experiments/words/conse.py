@@ -253,9 +253,9 @@ class Conse:
         self.labeller, self.texts = labeller or Labeller(), texts or TextVectors()
         self.crop, self.top = crop, top
         self.class_vectors = self.texts.embed(list(self.labeller.names))
-        self.canonical = self.embed_text(list(CANONICAL))
+        self.canonical_phrases = self.embed_text(list(CANONICAL))
         # Without a model for the vectors the table lacks some of the words: those that it has are enough.
-        self.reference = self.embed_text([word for word in REFERENCE_WORDS if word in self.texts])
+        self.unrelated_words = self.embed_text([word for word in REFERENCE_WORDS if word in self.texts])
         self.dim = self.class_vectors.shape[1]
         digest = hashlib.sha256(self.class_vectors.tobytes() + self.labeller.file.read_bytes()).hexdigest()[:12]
         self.name = f"conse-{digest}-{crop.margin:g}-{crop.shape}-{crop.surroundings}-{top}"

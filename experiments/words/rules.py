@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jsecon.field.membership import SHARE_THRESHOLD, share_of
+from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction
 from jsecon.paper.baselines import TEMPERATURE
 from jsecon.types import Votes
 
@@ -94,7 +94,7 @@ def selected(votes: Votes, chosen: Bool[np.ndarray, "q r"]) -> Bool[np.ndarray, 
     return np.stack(rows)
 
 
-_share = jax.jit(lambda votes, chosen: tuple(share_of(votes, chosen)))
+_share = jax.jit(lambda votes, chosen: tuple(inside_fraction(votes, chosen)))
 
 
 def point_scores(

@@ -386,12 +386,13 @@ def with_phrases(field: LanguageField, embedder: Any) -> LanguageField:
       The field with canonical phrases, and with unrelated words in the embedder's templates if it has any.
     """
     has_templates = getattr(embedder, "templates", ("{}",)) != ("{}",)
-    if len(field.canonical) and (field.reference is None or not has_templates):
+    if len(field.canonical_phrases) and (field.unrelated_words is None or not has_templates):
         return field
-    reference = None if field.reference is None else getattr(embedder, "reference", None)
-    canonical = field.canonical if len(field.canonical) else np.asarray(embedder.canonical, np.float32)
-    reference = field.reference if reference is None else np.asarray(reference, np.float16)
-    return dataclasses.replace(field, canonical=canonical, reference=reference)
+    reference = None if field.unrelated_words is None else getattr(embedder, "unrelated_words", None)
+    canonical = field.canonical_phrases
+    canonical = canonical if len(canonical) else np.asarray(embedder.canonical_phrases, np.float32)
+    reference = field.unrelated_words if reference is None else np.asarray(reference, np.float16)
+    return dataclasses.replace(field, canonical_phrases=canonical, unrelated_words=reference)
 
 
 def frame_index(field: LanguageField, frame: int | str) -> int:

@@ -163,7 +163,7 @@ def objects(
     size, main = _sizes(field)
     groups = _groups(field, main, upright)
     members = np.arange(groups.max(initial=-1) + 1)[:, None] == groups  # (G, R)
-    pixels = np.asarray(field.regions.pixels, np.float64)
+    pixels = np.asarray(field.regions.pixel_counts, np.float64)
     weighted = pixels.sum(1)[:, None] * np.asarray(field.regions.embeddings, np.float64)
     order, probability = _name(members @ weighted, names)
     text = np.asarray((*names.texts, ""), object)
@@ -179,8 +179,8 @@ def objects(
     shown = members[rows] @ pixels
     best = np.argsort(-shown, axis=1, kind="stable")[:, :FRAMES]
     best = np.where(np.take_along_axis(shown, best, axis=1) > 0, best, -1)
-    to_source = np.asarray(field.to_source, np.float64)
-    upright = to_source[:3, :3] @ upright
+    source_from_scene = np.asarray(field.source_from_scene, np.float64)
+    upright = source_from_scene[:3, :3] @ upright
     upright /= np.linalg.norm(upright)
     return Catalogue(
         names=text[order[rows]],
@@ -214,9 +214,11 @@ def region_objects(field: LanguageField, up: np.ndarray) -> Int[np.ndarray, " r"
 
 def _vocabulary(field: LanguageField, vocabulary: Sequence[str] | None, embedder: Any) -> _Names:
     """Returns the names to choose from, with their embeddings."""
-    words_known = field.reference is not None and len(field.reference) == len(REFERENCE_WORDS)
+    words_known = field.unrelated_words is not None and len(field.unrelated_words) == len(REFERENCE_WORDS)
     if vocabulary is None and embedder is None and words_known and not field.embedder.startswith("colours"):
-        return _Names(REFERENCE_WORDS, np.asarray(field.reference, np.float32), SOFTMAX_SCALE)  # without the model
+        return _Names(
+            REFERENCE_WORDS, np.asarray(field.unrelated_words, np.float32), SOFTMAX_SCALE
+        )  # without the model
     if embedder is None:
         from jsecon.pipeline.networks import external_dim, field_embedder
 
@@ -364,7 +366,7 @@ def _shapes(
     own = np.concatenate([labels[labels >= 0], part_labels[part_labels >= 0]])
     plain = dataclasses.replace(field.gaussians, sh=field.gaussians.sh[:, :1])  # the place does not need colours
     taken = gaussian_rows(plain, chosen)
-    placed = transform_gaussians_float64(taken, field.to_source)
-    to_source = np.asarray(field.to_source, np.float64)
-    means = np.asarray(taken.means, np.float64) @ to_source[:3, :3].T + to_source[:3, 3]
+    placed = transform_gaussians_float64(taken, field.source_from_scene)
+    source_from_scene = np.asarray(field.source_from_scene, np.float64)
+    means = np.asarray(taken.means, np.float64) @ source_from_scene[:3, :3].T + source_from_scene[:3, 3]
     return object_shapes(means, own, up, spreads=gaussian_spreads(placed))

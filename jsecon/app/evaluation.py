@@ -87,7 +87,7 @@ def _select_by_code(field: LanguageField, embedder: Any, text: str, kind: str) -
     code = encode(field.autoencoder, jax.device_put(embedder.embed_text(texts[:1])[0]))
     if kind == "one_step":
         return query_one_step(field.codes, code, ONE_STEP_THRESHOLD)
-    canonical = encode(field.autoencoder, jnp.asarray(with_phrases(field, embedder).canonical))
+    canonical = encode(field.autoencoder, jnp.asarray(with_phrases(field, embedder).canonical_phrases))
     return query_canonical(field.codes, code, canonical, CANONICAL_THRESHOLD)
 
 

@@ -79,7 +79,7 @@ def locate_answer(field: LanguageField, answer: Answer) -> Place:
         raise InputError(f"query {answer.query!r}", problem, remedy="Ask with other words, or by a pixel.")
     mask = np.asarray(answer.mask)
     plain = dataclasses.replace(field.gaussians, sh=field.gaussians.sh[:, :1])  # the place does not need colours
-    selected = transform_gaussians_float64(gaussian_rows(plain, mask), field.to_source)
+    selected = transform_gaussians_float64(gaussian_rows(plain, mask), field.source_from_scene)
     points = selected_centers(field, mask)
     shape = object_shapes(points, np.zeros(len(points), int), spreads=gaussian_spreads(selected))[0]
     return Place(
@@ -119,8 +119,11 @@ def selected_centers(field: LanguageField, mask: Bool[np.ndarray, " n"]) -> Floa
     Returns:
       (M, 3) float64 centres.
     """
-    to_source = np.asarray(field.to_source, np.float64)
-    return np.asarray(field.gaussians.means)[mask].astype(np.float64) @ to_source[:3, :3].T + to_source[:3, 3]
+    source_from_scene = np.asarray(field.source_from_scene, np.float64)
+    return (
+        np.asarray(field.gaussians.means)[mask].astype(np.float64) @ source_from_scene[:3, :3].T
+        + source_from_scene[:3, 3]
+    )
 
 
 def decimals(size: float, part: float) -> int:

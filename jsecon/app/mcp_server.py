@@ -110,7 +110,7 @@ def _words(text: str) -> str:
 
 def _top_of(scene: Scene, place: Place) -> np.ndarray:
     """Returns the middle of the upper side of a place's points, (3,) in the capture's world."""
-    up = np.asarray(scene.field.to_source, np.float64)[:3, :3] @ scene.object_scene.up
+    up = np.asarray(scene.field.source_from_scene, np.float64)[:3, :3] @ scene.object_scene.up
     up /= np.linalg.norm(up)
     return place.center + (np.quantile(place.points @ up, 0.98) - place.center @ up) * up
 

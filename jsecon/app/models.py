@@ -92,7 +92,7 @@ def open_embedder(field: Any, verb: verbs.FieldVerb, console: Console) -> Any:
     """
     from jsecon.pipeline import networks
 
-    if field.reference is None:
+    if field.unrelated_words is None:
         console.note(OLD_FIELD)
     folder = with_models(verb, console, yes=verb.yes).embedder
     if folder is None and (verb.yes or sys.stdin.isatty()):

@@ -15,7 +15,7 @@ from jsecon.app.catalogue import Catalogue, objects as list_objects, region_obje
 from jsecon.app.locate import gaussian_rows
 from jsecon.errors import InputError
 from jsecon.field.columns import votes_of_rows
-from jsecon.field.membership import SHARE_THRESHOLD, share_of_regions
+from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction_of_regions
 from jsecon.pipeline.sources import locate_sources
 from jsecon.query.match import join_pieces, match_regions
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
@@ -50,12 +50,12 @@ class ObjectScene:
         self.up = field_up(field, up)
         field = with_phrases(field, embedder)
         regions = jax.tree.map(jnp.asarray, field.regions)  # on the device once, not for each phrase
-        reference = None if field.reference is None else jnp.asarray(field.reference)
+        reference = None if field.unrelated_words is None else jnp.asarray(field.unrelated_words)
         cameras = jax.tree.map(np.asarray, field.cameras)  # on which jax would compile each step of a viewpoint
-        self.field = dataclasses.replace(field, regions=regions, reference=reference, cameras=cameras)
+        self.field = dataclasses.replace(field, regions=regions, unrelated_words=reference, cameras=cameras)
         self.embedder = embedder
-        self.to_source = np.asarray(field.to_source, np.float64)
-        self.scale = float(np.cbrt(abs(np.linalg.det(self.to_source[:3, :3]))))
+        self.source_from_scene = np.asarray(field.source_from_scene, np.float64)
+        self.scale = float(np.cbrt(abs(np.linalg.det(self.source_from_scene[:3, :3]))))
         self.rules = QueryRules(all_of_kind=True, logits=getattr(embedder, "logits", None))
         self._given_up = up
         self._votes = jax.tree.map(np.asarray, field.votes)
@@ -144,7 +144,7 @@ class ObjectScene:
     def _measure_object(self, regions: tuple[int, ...]) -> tuple[np.ndarray, ObjectShapes] | None:
         """Returns Gaussians and shape of the object of some regions; None if it has no Gaussian."""
         voters = np.unique(np.concatenate([self._voters[region] for region in regions]))
-        share = share_of_regions(votes_of_rows(self._votes, voters), regions)
+        share = inside_fraction_of_regions(votes_of_rows(self._votes, voters), regions)
         rows, share = voters[share >= SHARE_THRESHOLD], share[share >= SHARE_THRESHOLD]
         taken = gaussian_rows(dataclasses.replace(self.field.gaussians, sh=None), rows)
         weight = share * self._votes.total[rows]
@@ -178,7 +178,7 @@ class ObjectScene:
             if np.linalg.norm(mean) >= ONE_WAY:
                 middle = np.asarray(self.field.cameras.centres, np.float64).mean(0)
                 return Viewpoint(middle, mean / np.linalg.norm(mean), self.up), "as seen from the mean of the cameras"
-            pixels = np.asarray(self.field.regions.pixels, np.int64)
+            pixels = np.asarray(self.field.regions.pixel_counts, np.int64)
             frame = int(np.lexsort((pixels.sum(0), (pixels > 0).sum(0)))[-1])
         if camera is None:
             index = frame_index(self.field, frame if frame is not None else 0)

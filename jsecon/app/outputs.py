@@ -69,7 +69,7 @@ def best_frames(field: LanguageField, answer: Answer, count: int) -> list[int]:
     """
     region = int(answer.selection.region)
     if region >= 0:
-        visible = np.asarray(field.regions.pixels)[region]
+        visible = np.asarray(field.regions.pixel_counts)[region]
     else:
         means = np.asarray(field.gaussians.means)[answer.mask]
         pose = np.asarray(field.cameras.world_to_camera)
@@ -268,10 +268,10 @@ def save_scene(
         field = subset_field(field, rows)
         object_ids = None if object_ids is None else object_ids[rows]
     if file.suffix.lower() == ".ply":
-        save_ply(file, field.gaussians, similarity=field.to_source, object_ids=object_ids)
+        save_ply(file, field.gaussians, similarity=field.source_from_scene, object_ids=object_ids)
         return
     columns = {"codes": field.codes, "regions": main_regions(field)} if file.suffix.lower() == ".glb" else {}
-    save_gaussians(file, field.gaussians, similarity=field.to_source, **columns)
+    save_gaussians(file, field.gaussians, similarity=field.source_from_scene, **columns)
 
 
 def file_stem(answer: Answer) -> str:

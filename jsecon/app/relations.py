@@ -41,7 +41,7 @@ class RelationAnswer:
       question: What would settle it; empty if nothing has to be.
       reason: Why there is no object, or not the number that the text says; else empty.
       mask: (N,) the Gaussians of the objects.
-      to_source: (4, 4) from the field's world to the capture's.
+      source_from_scene: (4, 4) from the field's world to the capture's.
     """
 
     text: str
@@ -54,7 +54,7 @@ class RelationAnswer:
     question: str
     reason: str
     mask: np.ndarray
-    to_source: np.ndarray
+    source_from_scene: np.ndarray
 
     @property
     def count(self) -> int:
@@ -79,8 +79,10 @@ class RelationAnswer:
           Plain values by name: those of this class and its description, without the mask, in the capture's world.
         """
         record = {name: getattr(self, name) for name in ("text", "reading", "viewpoint", "ambiguous", "question")}
-        groups = {name: [_plain(o, self.to_source) for o in getattr(self, name)] for name in ("objects", "used")}
-        alternatives = [_plain(found, self.to_source) for found in self.alternatives]
+        groups = {
+            name: [_plain(o, self.source_from_scene) for o in getattr(self, name)] for name in ("objects", "used")
+        }
+        alternatives = [_plain(found, self.source_from_scene) for found in self.alternatives]
         record |= {"description": self.describe(), "reason": self.reason, "count": self.count}
         return record | groups | {"alternatives": alternatives}
 
@@ -174,7 +176,7 @@ def query_relation(
         question=question,
         reason=best.reason,
         mask=mask,
-        to_source=scene.to_source,
+        source_from_scene=scene.source_from_scene,
     )
 
 
@@ -186,7 +188,9 @@ def _tell_apart(scene: ObjectScene, objects: Sequence[FoundObject], view: Viewpo
     times = Counter(name_of)
     marks = [k for k, name in enumerate(name_of) if times[name] == 1 and k not in own and not listed.surroundings[k]]
     if marks:
-        centers = np.stack([scene.to_source[:3, :3] @ o.shape.center[0] + scene.to_source[:3, 3] for o in objects])
+        centers = np.stack(
+            [scene.source_from_scene[:3, :3] @ o.shape.center[0] + scene.source_from_scene[:3, 3] for o in objects]
+        )
         away = np.linalg.norm(centers[:, None] - np.asarray(listed.shapes.center)[marks], axis=2)
         nearest = [name_of[marks[k]] for k in away.argmin(1)]
         if len(set(nearest)) == len(nearest):
@@ -194,15 +198,15 @@ def _tell_apart(scene: ObjectScene, objects: Sequence[FoundObject], view: Viewpo
             return f"{', '.join(words[:-1])} or {words[-1]}"
     bearing = order_values(stack_shapes(objects), view)["leftmost"]
     places = ["the left one", *["a middle one"] * (len(objects) - 2), "the right one"]
-    centers = [_plain(objects[k], scene.to_source)["center"] for k in np.argsort(bearing)]
+    centers = [_plain(objects[k], scene.source_from_scene)["center"] for k in np.argsort(bearing)]
     words = [f"{place} at ({', '.join(f'{x:.2f}' for x in center)})" for place, center in zip(places, centers)]
     return f"{', '.join(words[:-1])} or {words[-1]}"
 
 
-def _plain(found: FoundObject, to_source: np.ndarray) -> dict[str, Any]:
+def _plain(found: FoundObject, source_from_scene: np.ndarray) -> dict[str, Any]:
     """Returns an object as plain values, in the capture's world."""
-    center = to_source[:3, :3] @ found.shape.center[0] + to_source[:3, 3]
-    scale = float(np.cbrt(abs(np.linalg.det(to_source[:3, :3]))))
+    center = source_from_scene[:3, :3] @ found.shape.center[0] + source_from_scene[:3, 3]
+    scale = float(np.cbrt(abs(np.linalg.det(source_from_scene[:3, :3]))))
     size = 2 * scale * np.asarray(found.shape.half_size[0])
     length = float(np.linalg.norm(size))
     return {

@@ -58,7 +58,7 @@ def _fit(verb: verbs.Fit, console: Console) -> verbs.VerbResult:
     if verb.dry_run:
         return pipeline.dry_run(verb.options, folder, scene_only=True, listener=console)
     gaussians, capture, held_out = pipeline.fit(verb.options, folder, listener=console)
-    save_gaussians(verb.out, gaussians, similarity=capture.to_source)
+    save_gaussians(verb.out, gaussians, similarity=capture.source_from_scene)
     _print_quality(held_out, console)
     console.say(f"{gaussians.count} Gaussians  {verb.out}")
     return {"written": {"scene": verb.out}, "gaussians": gaussians.count} | _quality_metrics(held_out)
@@ -189,7 +189,7 @@ def _masklet_part(run: Run, train: np.ndarray) -> str:
     largest = small[np.argsort(-sizes.sum(0)[small], kind="stable")][:MASKLETS]
     rows = []
     for region in largest[sizes.sum(0)[largest] > 0].tolist():
-        count = int((np.asarray(run.field.regions.pixels)[region] > 0).sum())
+        count = int((np.asarray(run.field.regions.pixel_counts)[region] > 0).sum())
         tiles = pictures.masklet_strip(frames, labels, region)
         caption = f"in {count} of {len(run.labels)} frames"
         rows.append(report.figure(tiles, caption, strong=f"region {region}", wide=True))

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float, Int, Int16, UInt8
 from scipy import sparse
 
-from jsecon.association.atoms import Sparse, one_hot, sum_entries
-from jsecon.association.views import FrameView, SceneViews, claim_atoms
+from jsecon.association.scene import FrameSuperpixels, SceneSuperpixels, assign_superpixels
+from jsecon.association.superpixels import Sparse, one_hot, sum_entries
 from jsecon.errors import require
 from jsecon.types import Progress
 from jsecon.vision.region_graph import relabel_sequential
@@ -220,7 +220,7 @@ def average_linkage(
 
 def consensus_masklets(
     frames: UInt8[np.ndarray, "t h w 3"],
-    scene: SceneViews,
+    scene: SceneSuperpixels,
     *,
     agreement: float = 0.4,
     abstain_if_unlabelled: bool = True,
@@ -229,7 +229,8 @@ def consensus_masklets(
 ) -> Int16[np.ndarray, "t h w"]:
     """Makes masklets by consensus, independent of the order of the frames.
 
-    The Gaussians are grouped by `group_by_consensus`, and the groups claim the atoms of each frame (`claim_atoms`).
+    The Gaussians are grouped by `group_by_consensus`, and the groups claim the atoms of each frame
+    (`assign_superpixels`).
 
     Args:
       frames: (T, H, W, 3) uint8.
@@ -254,13 +255,13 @@ def consensus_masklets(
     for image, view in zip(labels, views):
         if count:
             mass = (view.votes.T @ one_hot(owner[view.seen], count)).toarray()
-            image[:] = claim_atoms(view, mass, mass.sum(1, keepdims=True))[view.atoms]
+            image[:] = assign_superpixels(view, mass, mass.sum(1, keepdims=True))[view.labels]
     return labels
 
 
 def pieces_on_masks(
     frames: UInt8[np.ndarray, "t h w 3"],
-    scene: SceneViews,
+    scene: SceneSuperpixels,
     *,
     seed: int = 0,
     progress: Progress | None = None,
@@ -288,7 +289,7 @@ def pieces_on_masks(
 
 
 def mask_signatures(
-    views: list[FrameView], count: int, *, abstain_if_unlabelled: bool = True
+    views: list[FrameSuperpixels], count: int, *, abstain_if_unlabelled: bool = True
 ) -> tuple[Sparse, Sparse, Float[np.ndarray, " n"]]:
     """Computes the input of `group_by_consensus`.
 

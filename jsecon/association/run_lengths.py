@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool
 from scipy import sparse
 
-from jsecon.association.atoms import Sparse
+from jsecon.association.superpixels import Sparse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,7 +93,9 @@ def encode_masks(masks: Bool[np.ndarray, "r h w"]) -> RunLengthMasks:
     return encode_rows(sparse.csr_matrix(masks.reshape(len(masks), masks.shape[1] * masks.shape[2])))
 
 
-def memoized_masks(propose: Callable[[int], Bool[np.ndarray, "m h w"]]) -> Callable[[int], Bool[np.ndarray, "m h w"]]:
+def cache_masks_as_rle(
+    propose: Callable[[int], Bool[np.ndarray, "m h w"]],
+) -> Callable[[int], Bool[np.ndarray, "m h w"]]:
     """Memoizes a function from the index of a frame to its masks, in run-length encoding.
 
     Args:

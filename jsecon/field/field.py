@@ -37,7 +37,7 @@ from jsecon.splat.sh import COEFFICIENT_COUNTS
 from jsecon.types import Camera, Gaussians, LanguageField, Parts, Regions, Votes
 
 FORMAT = "jsecon-field"
-VERSION = 2
+VERSION = 3
 _RECORDS = {
     cls.__name__: cls
     for cls in (LanguageField, Gaussians, Votes, Regions, Parts, Camera, Autoencoder, Rotation, Spread)
@@ -49,14 +49,14 @@ _ROWS = 1 << 20
 _REMEDY = "Make the field again with `jsecon run`."
 _LETTERS = {
     "n": ("gaussians.means", 0),
-    "r": ("regions.pixels", 0),
+    "r": ("regions.pixel_counts", 0),
     "d": ("region_codes", -1),
     "e": ("regions.embeddings", -1),
     "t": ("cameras.world_to_camera", 0),
     "k": ("votes.regions", -1),
-    "c": ("canonical", 0),
+    "c": ("canonical_phrases", 0),
     "p": ("parts.weight", 0),
-    "w": ("reference", 0),
+    "w": ("unrelated_words", 0),
     "b": ("gaussians.sh", 1),
 }
 """Array and axis of each of a field's sizes."""
@@ -64,21 +64,21 @@ _SHAPES = {
     ("n", 3): "gaussians.means gaussians.log_scales",
     ("n", 4): "gaussians.quaternions",
     ("n", "b", 3): "gaussians.sh",
-    ("n",): "gaussians.opacity_logits votes.labelled votes.total votes.peak votes.views parts.part",
+    ("n",): "gaussians.opacity_logits votes.labelled votes.total votes.max_pixel_weight votes.views parts.part",
     ("n", "d"): "codes",
-    ("n", "k"): "votes.regions votes.weights votes.shown",
+    ("n", "k"): "votes.regions votes.weights votes.weight_where_region_visible",
     ("r", "e"): "regions.embeddings",
     ("r", "d"): "region_codes",
     ("r", "r"): "votes.overlap",
     ("t", 4, 4): "cameras.world_to_camera",
     ("t",): "cameras.fx cameras.fy cameras.cx cameras.cy",
     (): "votes.overflow",
-    ("c", "e"): "canonical",
+    ("c", "e"): "canonical_phrases",
     ("p", "e"): "parts.embeddings",
-    ("w", "e"): "reference",
-    (4, 4): "to_source",
+    ("w", "e"): "unrelated_words",
+    (4, 4): "source_from_scene",
 }
-_OPTIONAL = ("votes.shown", "votes.overlap", "parts.part", "parts.embeddings", "reference")
+_OPTIONAL = ("votes.weight_where_region_visible", "votes.overlap", "parts.part", "parts.embeddings", "unrelated_words")
 
 
 def save_field(path: str | os.PathLike, field: LanguageField) -> None:
@@ -248,13 +248,13 @@ def _oddity(field: LanguageField, checked: bool = True) -> str | None:
     if not 0 < field.cameras.width * field.cameras.height <= MAX_PIXELS:
         return f"views of {field.cameras.width}x{field.cameras.height} px"
     if field.autoencoder is not None:
-        size = field.canonical.shape[1], field.codes.shape[1]
+        size = field.canonical_phrases.shape[1], field.codes.shape[1]
         try:
             if isinstance(field.autoencoder, Autoencoder):
                 field.autoencoder.require_layers()
                 coded = field.autoencoder.dim, field.autoencoder.latent
             else:
-                coded = size[0], *jax.eval_shape(field.autoencoder.encode, field.canonical).shape[1:]
+                coded = size[0], *jax.eval_shape(field.autoencoder.encode, field.canonical_phrases).shape[1:]
         except Exception as error:  # jax's own kinds have no common base but this
             return f"a coder that does not encode ({error})"
         if coded != size:

@@ -3,11 +3,11 @@
     p_nr = w_nr / max(W_nr, LABELLED_PART L_n, SEEN_PART W_n)
 
 with w_nr the weight of region r on Gaussian n (`region_votes`), W_nr the weight with which n was seen in the views that
-show r (`with_shown`), L_n that on pixels of any region, and W_n that on all pixels. A view in which the tracker lost a
-region, or in which nothing was proposed, does not count against it. The two other terms ask for evidence: a Gaussian
-behind the fridge, in the next room, has a trace of weight in the views that show the fridge and most of its weight in
-views of its own room. Where the votes do not know which views show a region, all count: p_nr = w_nr / W_n. `share_of`
-is the share of several regions together.
+show r (`add_visible_weight`), L_n that on pixels of any region, and W_n that on all pixels. A view in which the tracker
+lost a region, or in which nothing was proposed, does not count against it. The two other terms ask for evidence: a
+Gaussian behind the fridge, in the next room, has a trace of weight in the views that show the fridge and most of its
+weight in views of its own room. Where the votes do not know which views show a region, all count: p_nr = w_nr / W_n.
+`inside_fraction` is the share of several regions together.
 """
 
 import dataclasses
@@ -41,26 +41,26 @@ SEEN_PART = 0.05
 CORRELATION = 0.05
 """Correlation of two views' errors: a tracker's loss or a proposal's cut lasts, so views beyond about 20 add little."""
 _BLOCK = 1 << 15
-"""Gaussians at a time in `with_shown`, where arrays are dense in the regions."""
+"""Gaussians at a time in `add_visible_weight`, where arrays are dense in the regions."""
 _WORD = 32
 _MOST_WORDS = 8
 """Words of the table from which a lookup is cheaper than selections."""
 
 
-class Share(NamedTuple):
+class InsideFraction(NamedTuple):
     """How much of each Gaussian lies in some regions."""
 
-    share: Float[Array, " n"]
+    fraction: Float[Array, " n"]
     """In [0, 1]; 0 where it is not known."""
     known: Bool[Array, " n"]
     """The Gaussian was seen, and has finite votes for these regions."""
 
 
-def finish_votes(votes: Votes, regions: Regions) -> Votes:
-    """Adds what queries read to votes that were cast `by_view`: `with_overlap(with_shown(votes, regions))`. Pure.
+def normalise_votes(votes: Votes, regions: Regions) -> Votes:
+    """Adds what queries read to votes that were cast `by_view`. Pure.
 
     Args:
-      votes: Votes of N Gaussians, cast `by_view`. Memory-mapped ones need `finish_votes_in_blocks`.
+      votes: Votes of N Gaussians, cast `by_view`. Memory-mapped ones need `normalise_votes_in_blocks`.
       regions: Regions made from the labels that voted.
 
     Returns:
@@ -69,11 +69,11 @@ def finish_votes(votes: Votes, regions: Regions) -> Votes:
     Raises:
       ValueError: The votes have no `by_view`, or other views than `regions`.
     """
-    return with_overlap(with_shown(votes, regions))
+    return with_overlap(add_visible_weight(votes, regions))
 
 
-def finish_votes_in_blocks(votes: Votes, regions: Regions) -> Votes:
-    """Finishes memory-mapped votes as `finish_votes` does, block by block. Host code.
+def normalise_votes_in_blocks(votes: Votes, regions: Regions) -> Votes:
+    """Finishes memory-mapped votes as `normalise_votes` does, block by block. Host code.
 
     Args:
       votes: Votes of N Gaussians, cast `by_view`; votes in memory are one block.
@@ -91,17 +91,19 @@ def finish_votes_in_blocks(votes: Votes, regions: Regions) -> Votes:
     by_view = votes.by_view
     if by_view is None:
         raise ValueError(
-            "finish_votes_in_blocks: got votes without by_view, expected by_view (T, N). Cast them with it."
+            "normalise_votes_in_blocks: got votes without by_view, expected by_view (T, N). Cast them with it."
         )
     for rows in row_slices(votes, len(votes.views)):
         block = dataclasses.replace(votes_of_rows(votes, rows), by_view=np.asarray(by_view[:, rows]))
         block = _add_shown(block, shows)
         sums += _overlap_sums(jnp.asarray(block.regions), vote_shares(block), regions.count)
-        shown.append(np.asarray(block.shown))
-    return dataclasses.replace(votes, by_view=None, shown=np.concatenate(shown), overlap=_soft_iou(sums))
+        shown.append(np.asarray(block.weight_where_region_visible))
+    return dataclasses.replace(
+        votes, by_view=None, weight_where_region_visible=np.concatenate(shown), overlap=_soft_iou(sums)
+    )
 
 
-def with_shown(votes: Votes, regions: Regions) -> Votes:
+def add_visible_weight(votes: Votes, regions: Regions) -> Votes:
     """Replaces `by_view` by `shown`: the weight with which the views that show a vote's region see the Gaussian. Pure.
 
     The share that follows is the object posterior of B3-Seg: weight inside over inside and outside, over the views that
@@ -119,11 +121,11 @@ def with_shown(votes: Votes, regions: Regions) -> Votes:
     """
     views = None if votes.by_view is None else votes.by_view.shape[0]
     remedy = "Cast them with region_votes(..., by_view=True)."
-    require(views is not None, "with_shown", "votes without the weight of each view", "by_view (T, N)", remedy)
-    sizes = f"{votes.num_regions} regions and {views} views voted, of {regions.pixels.shape}"
+    require(views is not None, "add_visible_weight", "votes without the weight of each view", "by_view (T, N)", remedy)
+    sizes = f"{votes.num_regions} regions and {views} views voted, of {regions.pixel_counts.shape}"
     expected = "the pixels (R, T) of the same regions in the same views"
-    same = views == regions.pixels.shape[1] and votes.num_regions == regions.count
-    require(same, "with_shown", sizes, expected, "Give the regions that were made from the labels that voted.")
+    same = views == regions.pixel_counts.shape[1] and votes.num_regions == regions.count
+    require(same, "add_visible_weight", sizes, expected, "Give the regions that were made from the labels that voted.")
     return _add_shown(votes, _views_that_show(regions))
 
 
@@ -133,7 +135,7 @@ def _views_that_show(regions: Regions) -> Bool[Array, "r t"]:
     apart, known = mean_residuals(jnp.asarray(regions.embeddings))
     alike = cosine_matrix(apart, apart) >= ALIKE_THRESHOLD
     alike = (alike & known[:, None] & known[None]) | jnp.eye(regions.count, dtype=bool)
-    return (alike.astype(jnp.float32) @ (jnp.asarray(regions.pixels) > 0).astype(jnp.float32)) > 0
+    return (alike.astype(jnp.float32) @ (jnp.asarray(regions.pixel_counts) > 0).astype(jnp.float32)) > 0
 
 
 @jax.jit
@@ -154,7 +156,7 @@ def _add_shown(votes: Votes, shows: Bool[Array, "r t"]) -> Votes:
     shown = jnp.zeros(regions.shape, by_view.dtype)
     if count and shows.shape[0]:
         shown = lax.fori_loop(0, -(-count // block), one_block, shown)
-    return dataclasses.replace(votes, by_view=None, shown=shown)
+    return dataclasses.replace(votes, by_view=None, weight_where_region_visible=shown)
 
 
 def with_overlap(votes: Votes) -> Votes:
@@ -209,7 +211,8 @@ def vote_shares(votes: Votes) -> Float[Array, "n k"]:
     Returns:
       (N, K) in [0, 1]: 0 without a vote, NaN if its numbers are not finite.
     """
-    seen = votes.total[:, None] if votes.shown is None else jnp.maximum(votes.shown, _least_seen(votes)[:, None])
+    visible = votes.weight_where_region_visible
+    seen = votes.total[:, None] if visible is None else jnp.maximum(visible, _least_seen(votes)[:, None])
     return ratio(jnp.where(votes.regions >= 0, votes.weights, 0.0), jnp.where(votes.regions >= 0, seen, 0.0))
 
 
@@ -224,9 +227,9 @@ def vote_columns(votes: Votes) -> Iterator[tuple[Int[Array, " n"], Float[Array, 
     Yields:
       The region r (N,), -1 without a vote; its weight w_nr (N,); and the weight that this is a share of (N,).
     """
-    least = _least_seen(votes)
+    least, visible = _least_seen(votes), votes.weight_where_region_visible
     for k in range(votes.regions.shape[1]):
-        seen = votes.total if votes.shown is None else jnp.maximum(votes.shown[:, k], least)
+        seen = votes.total if visible is None else jnp.maximum(visible[:, k], least)
         yield votes.regions[:, k], votes.weights[:, k], seen
 
 
@@ -250,7 +253,7 @@ def ratio(weight: Array, seen: Array) -> Array:
 
 
 @jax.jit
-def share_of(votes: Votes, chosen: Bool[Array, " r"]) -> Share:
+def inside_fraction(votes: Votes, chosen: Bool[Array, " r"]) -> InsideFraction:
     """Computes the share of several regions together in each Gaussian. Pure; differentiable in the votes' weights.
 
         p_n = min(sum_r w_nr / max(max_r W_nr, LABELLED_PART L_n, SEEN_PART W_n), 1)
@@ -274,11 +277,11 @@ def share_of(votes: Votes, chosen: Bool[Array, " r"]) -> Share:
         seen = jnp.maximum(seen, jnp.where(here, region_seen, 0.0))
     known = (votes.views > 0) & (seen > 0) & jnp.isfinite(seen) & jnp.isfinite(weight)
     # Written out, not by `ratio`: XLA then keeps the two sums instead of gathering them anew for each use.
-    return Share(jnp.where(known, jnp.clip(weight / jnp.where(known, seen, 1.0), 0.0, 1.0), 0.0), known)
+    return InsideFraction(jnp.where(known, jnp.clip(weight / jnp.where(known, seen, 1.0), 0.0, 1.0), 0.0), known)
 
 
-def share_of_regions(votes: Votes, regions: Sequence[int]) -> Float[np.ndarray, " n"]:
-    """Computes `share_of` a few regions with NumPy, for a few Gaussians. Host code, which compiles no program.
+def inside_fraction_of_regions(votes: Votes, regions: Sequence[int]) -> Float[np.ndarray, " n"]:
+    """Computes `inside_fraction` a few regions with NumPy, for a few Gaussians. Host code, which compiles no program.
 
     Args:
       votes: Votes of N Gaussians.
@@ -290,9 +293,10 @@ def share_of_regions(votes: Votes, regions: Sequence[int]) -> Float[np.ndarray, 
     inside = np.isin(votes.regions, regions)
     weights, total = np.asarray(votes.weights), np.asarray(votes.total)
     least = np.maximum(np.float32(LABELLED_PART) * np.asarray(votes.labelled), np.float32(SEEN_PART) * total)
-    seen = total[:, None] if votes.shown is None else np.maximum(votes.shown, least[:, None])
+    visible = votes.weight_where_region_visible
+    seen = total[:, None] if visible is None else np.maximum(visible, least[:, None])
     seen = np.where(inside, seen, 0).max(1)
-    weight = functools.reduce(np.add, np.where(inside, weights, 0).T)  # in the order of `share_of`
+    weight = functools.reduce(np.add, np.where(inside, weights, 0).T)  # in the order of `inside_fraction`
     known = (np.asarray(votes.views) > 0) & (seen > 0) & np.isfinite(seen) & np.isfinite(weight)
     return np.where(known, np.clip(weight / np.where(known, seen, 1), 0, 1), 0)
 
@@ -331,7 +335,7 @@ def membership_probability(
     certain than 0.9 of twenty views'.
 
     Args:
-      share: (N,) in [0, 1], similarity of a query by votes (`share_of`).
+      share: (N,) in [0, 1], similarity of a query by votes (`inside_fraction`).
       votes: Votes of the N Gaussians.
       correlation: Correlation of the errors of two views, in [0, 1].
 

@@ -125,7 +125,7 @@ def _pool_embeddings(
             total[seen] += weight[:, None] * rows
     if total is None:  # without a label the embedder alone knows E
         total = np.zeros((count, np.asarray(embed(0, np.zeros((1, *labels.shape[1:]), bool))).shape[1]))
-    return Regions(embeddings=_unit_rows(total), pixels=pixels)
+    return Regions(embeddings=_unit_rows(total), pixel_counts=pixels)
 
 
 def _unit_rows(rows: np.ndarray) -> np.ndarray:

@@ -63,7 +63,7 @@ def region_votes_in_blocks(
       num_regions: R. Labels must be smaller.
       folder: New or empty folder for the columns of the votes; they stay as long as its files do.
       top: Number of strongest regions, of the sums over all views, that each Gaussian keeps.
-      by_view: Whether to keep each view's total too, as `finish_votes_in_blocks` needs it.
+      by_view: Whether to keep each view's total too, as `normalise_votes_in_blocks` needs it.
       centre: In [0, 1]. A weight away from the pixel that holds the Gaussian's centre counts 1 - `centre`.
       near: Near plane, world units.
       rows: Maximum number of Gaussians that are added up at once.
@@ -95,7 +95,7 @@ def region_votes_in_blocks(
             if progress is not None:
                 progress(t + 1, views)
         kinds = {"regions": ("<i4", (top_kept := min(top, max(num_regions, 1)),)), "weights": ("<f4", (top_kept,))}
-        kinds |= {name: ("<f4", ()) for name in ("labelled", "total", "peak")} | {"views": ("<i4", ())}
+        kinds |= {name: ("<f4", ()) for name in ("labelled", "total", "max_pixel_weight")} | {"views": ("<i4", ())}
         blocks = (slice(first, min(first + rows, count)) for first in range(0, count, rows))
         sums = (_sum_block(scratch, views, block, num_regions, top_kept, by_view) for block in blocks)
         columns = _write_columns(Path(folder), sums, kinds | ({"by_view": ("<f4", (views,))} if by_view else {}), count)
@@ -190,14 +190,14 @@ def _sum_block(scratch: Path, views: int, rows: slice, regions: int, top: int, b
     votes.sum_duplicates()
     sums: dict[str, Any] = dict(zip(("regions", "weights"), strongest(votes, top)))
     sums |= {"labelled": np.asarray(votes.sum(1)).reshape(-1), "total": np.zeros(count)}
-    sums |= {"views": np.zeros(count, np.int32), "peak": np.zeros(count, np.float32)}
+    sums |= {"views": np.zeros(count, np.int32), "max_pixel_weight": np.zeros(count, np.float32)}
     sums |= {"by_view": np.zeros((count, views), np.float32)} if by_view else {}
     for t in range(views):
         seen = _rows_of(scratch / f"{t}-seen.npy", rows)
         row = (seen["gaussian"] - rows.start).astype(np.int64)
         sums["total"][row] += seen["weight"]
         sums["views"][row] += 1
-        sums["peak"][row] = np.maximum(sums["peak"][row], seen["peak"])
+        sums["max_pixel_weight"][row] = np.maximum(sums["max_pixel_weight"][row], seen["peak"])
         if by_view:
             sums["by_view"][row, t] = seen["weight"]
     return sums

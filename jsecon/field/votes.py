@@ -57,8 +57,8 @@ def region_votes(
       cameras: Batch of T cameras.
       labels: (T, H, W) integers below `num_regions`; -1 where a pixel belongs to no region.
       num_regions: R.
-      top: Number of strongest regions that each Gaussian keeps; `Votes.cut` counts the rest.
-      by_view: Whether to keep each view's total too (`Votes.by_view`, 4 T N bytes), as `with_shown` needs it.
+      top: Number of strongest regions that each Gaussian keeps; `Votes.weight_beyond_top_k` counts the rest.
+      by_view: Whether to keep each view's total too (`Votes.by_view`, 4 T N bytes), as `add_visible_weight` needs it.
       centre: In [0, 1]. A weight away from the pixel that holds the Gaussian's centre counts 1 - `centre`: at 1 a
         Gaussian is what its centre is, at 0 what its whole footprint is.
       capacity: Number of (block, Gaussian) pairs of a view, see `render`. By default votes of views that overflow are

@@ -231,12 +231,12 @@ class ClipEmbedder:
         return self._visual_output.fixed(1) or self._run_visual(self._black_image()).shape[1]
 
     @functools.cached_property
-    def canonical(self) -> Float32[np.ndarray, "c e"]:
+    def canonical_phrases(self) -> Float32[np.ndarray, "c e"]:
         """(C, E) unit embeddings of CANONICAL, without templates."""
         return self._embed_phrases(list(CANONICAL))
 
     @functools.cached_property
-    def reference(self) -> Float32[np.ndarray, "w e"]:
+    def unrelated_words(self) -> Float32[np.ndarray, "w e"]:
         """(W, E) unit embeddings of the reference words, in the templates like other texts.
 
         They are embedded once for each model and its templates, and kept in the user's cache folder.

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Int, Int16
 from scipy import sparse
 
-from jsecon.association.atoms import Sparse, one_hot
 from jsecon.association.run_lengths import RunLengthMasks, encode_masks, encode_rows
+from jsecon.association.superpixels import Sparse, one_hot
 from jsecon.errors import require, require_shape
 from jsecon.types import Progress
 from jsecon.vision.protocols import Segmenter, Tracker

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int16, UInt8
 from scipy import sparse
 
-from jsecon.association.atoms import Sparse, atom_coverage, one_hot, sum_entries
-from jsecon.association.views import FrameView, SceneViews, claim_atoms
+from jsecon.association.scene import FrameSuperpixels, SceneSuperpixels, assign_superpixels
+from jsecon.association.superpixels import Sparse, one_hot, sum_entries, superpixel_coverage
 from jsecon.errors import require_shape
 from jsecon.types import Camera, Gaussians
 
@@ -21,14 +21,14 @@ class GeometricTracker:
     Prompts are tracked against rivals: the other proposals of their frame, and the rest of it. From that frame the
     track proceeds to the frame with the largest overlap with a visited one. Every frame adds evidence e_ib, the weight
     of Gaussian i on the masks of class b; ownership is e_ib^2 / sum_b e_ib^2. In the next frame the classes claim atoms
-    (`claim_atoms`). Occlusion is that of the compositing of the full scene. A Gaussian counts as known in proportion to
-    its clarity in the visited frames, fully from half of its clarity in the present frame.
+    (`assign_superpixels`). Occlusion is that of the compositing of the full scene. A Gaussian counts as known in
+    proportion to its clarity in the visited frames, fully from half of its clarity in the present frame.
 
     Args:
       gaussians: Scene of N Gaussians.
       cameras: Batch of T cameras, one per frame.
-      proposals: Masks (M, H, W) bool of each frame, see `SceneViews`.
-      atoms_per_frame: Approximate number of superpixels per frame before the cut along proposals.
+      proposals: Masks (M, H, W) bool of each frame, see `SceneSuperpixels`.
+      superpixels_per_frame: Approximate number of superpixels per frame before the cut along proposals.
     """
 
     def __init__(
@@ -37,9 +37,9 @@ class GeometricTracker:
         cameras: Camera,
         proposals: Callable[[int], np.ndarray] | Sequence[np.ndarray],
         *,
-        atoms_per_frame: int = 256,
+        superpixels_per_frame: int = 256,
     ):
-        self.views = SceneViews(gaussians, cameras, proposals, atoms_per_frame=atoms_per_frame)
+        self.views = SceneSuperpixels(gaussians, cameras, proposals, superpixels_per_frame=superpixels_per_frame)
 
     def __call__(
         self, frames: UInt8[np.ndarray, "t h w 3"], index: int, prompts: Bool[np.ndarray, "b _ _"]
@@ -69,7 +69,7 @@ class GeometricTracker:
         evidence = np.zeros((self.views.count, len(classes)), np.float32)
         best = np.zeros(len(evidence), np.float32)
         start = views[index]
-        weight = start.votes @ atom_coverage(start.atoms, classes, start.votes.shape[1]).T
+        weight = start.votes @ superpixel_coverage(start.labels, classes, start.votes.shape[1]).T
         # A Gaussian seen from the side, across an outline, is weak evidence.
         evidence[start.seen] = start.clarity[:, None] * weight
         best[start.seen] = start.clarity
@@ -89,7 +89,7 @@ class GeometricTracker:
             evidence[view.seen] = here
             best[view.seen] = np.maximum(best[view.seen], view.clarity)
         for t, owner in owners.items():
-            labels[t] = np.where(owner < len(prompts), owner, -1).astype(np.int16)[views[t].atoms]
+            labels[t] = np.where(owner < len(prompts), owner, -1).astype(np.int16)[views[t].labels]
         return labels
 
     def _with_rivals(self, labels: Int16[np.ndarray, "h w"], index: int, count: int) -> Bool[np.ndarray, "c h w"]:
@@ -123,7 +123,7 @@ class GeometricTracker:
         for _ in range(4 if count else 0):  # a merger may affect other regions; rarely more than two rounds
             entries = []
             for t, view in enumerate(self.views.all(frames)):
-                shares = _label_shares(view.atoms, labels[t], view.votes.shape[1], count)
+                shares = _label_shares(view.labels, labels[t], view.votes.shape[1], count)
                 cast = (view.votes @ shares).tocoo()
                 entries.append((cast.data, view.seen[cast.row], cast.col))
             votes = sum_entries(entries, (self.views.count, count))
@@ -151,7 +151,7 @@ class GeometricTracker:
         return order
 
     def _match(
-        self, view: FrameView, evidence: Float[np.ndarray, "n c"], best: Float[np.ndarray, " n"]
+        self, view: FrameSuperpixels, evidence: Float[np.ndarray, "n c"], best: Float[np.ndarray, " n"]
     ) -> Int[np.ndarray, " a"]:
         """Classifies each atom; returns (A,) ids or -1. `best` (n,) is the clarity in the best frame so far."""
         # A Gaussian on an outline overlaps its neighbours and is counted with them, in view after view. So it counts
@@ -165,7 +165,7 @@ class GeometricTracker:
         owned = np.square(evidence[rows])
         owned *= known[rows] / np.maximum(owned.sum(1, keepdims=True), 1e-12)
         votes = view.votes[rows]
-        owner = claim_atoms(view, votes.T @ owned[:, classes], votes.T @ known[rows])
+        owner = assign_superpixels(view, votes.T @ owned[:, classes], votes.T @ known[rows])
         return np.where(owner >= 0, classes[owner], -1)
 
 
@@ -176,7 +176,9 @@ def _label_shares(atoms: np.ndarray, labels: np.ndarray, rows: int, columns: int
     return sparse.csr_matrix((weights.astype(np.float32), (atoms[inside], labels[inside])), shape=(rows, columns))
 
 
-def _evidence(view: FrameView, owner: Int[np.ndarray, " a"], count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _evidence(
+    view: FrameSuperpixels, owner: Int[np.ndarray, " a"], count: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns rows, classes and weights (times clarity) of the nonzero evidence of a view.
 
     `owner` (A,) is the class of each atom of the view, -1 if unassigned.

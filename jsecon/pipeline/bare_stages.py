@@ -89,10 +89,10 @@ def _planned_views(context: RunContext) -> Stage:
 def _render_views(stage: StageInput) -> StageResult:
     options = stage.context.options
     source, _ = read_scene(options.capture)
-    to_source = _world_of_scene(source)
+    source_from_scene = _world_of_scene(source)
     capture = render_capture(
-        _into_world(source, to_source),
-        to_source,
+        _into_world(source, source_from_scene),
+        source_from_scene,
         views=options.views,
         width=options.long_side,
         height=options.long_side * 3 // 4,
@@ -106,29 +106,29 @@ def _render_poses(stage: StageInput) -> StageResult:
     options = stage.context.options
     assert options.cameras is not None
     source, _ = read_scene(options.capture)
-    to_source = _world_of_scene(source)
+    source_from_scene = _world_of_scene(source)
     cameras, names = _load_poses(options.cameras, options.long_side)
-    poses = transform_poses(np.asarray(cameras.world_to_camera), np.linalg.inv(to_source)).astype(np.float32)
+    poses = transform_poses(np.asarray(cameras.world_to_camera), np.linalg.inv(source_from_scene)).astype(np.float32)
     cameras = dataclasses.replace(cameras, world_to_camera=poses)
-    scene = _into_world(source, to_source)
+    scene = _into_world(source, source_from_scene)
     check_overlap(scene, cameras, str(options.cameras))
-    return StageResult(capture_from_cameras(scene, cameras, names, to_source))
+    return StageResult(capture_from_cameras(scene, cameras, names, source_from_scene))
 
 
 def _world_of_scene(gaussians: Gaussians) -> np.ndarray:
     """Returns the (4, 4) similarity to the world of a scene's file from one in which the scene has ordinary numbers."""
     frame = scene_frame(surface_points(gaussians))
-    to_source = np.eye(4)
+    source_from_scene = np.eye(4)
     if not ORDINARY[0] <= frame.diagonal <= ORDINARY[1]:
-        to_source[:3, :3] *= frame.diagonal / DIAGONAL
+        source_from_scene[:3, :3] *= frame.diagonal / DIAGONAL
     if np.linalg.norm(frame.centre) > FAR * frame.diagonal:
-        to_source[:3, 3] = frame.centre
-    return to_source
+        source_from_scene[:3, 3] = frame.centre
+    return source_from_scene
 
 
-def _into_world(gaussians: Gaussians, to_source: np.ndarray) -> Gaussians:
+def _into_world(gaussians: Gaussians, source_from_scene: np.ndarray) -> Gaussians:
     """Moves Gaussians from the world of their file into that of the capture, in float32."""
-    moved = transform_gaussians_float64(gaussians, np.linalg.inv(to_source))
+    moved = transform_gaussians_float64(gaussians, np.linalg.inv(source_from_scene))
     return dataclasses.replace(moved, means=np.asarray(moved.means, np.float32))
 
 
@@ -163,7 +163,7 @@ def _load_poses(path: Path, long_side: int) -> tuple[Camera, tuple[str, ...]]:
 
 def _read_scene(stage: StageInput) -> StageResult:
     source, notes = read_scene(stage.context.options.capture)
-    return StageResult(_into_world(source, np.asarray(stage.results.load.to_source, np.float64)), notes=notes)
+    return StageResult(_into_world(source, np.asarray(stage.results.load.source_from_scene, np.float64)), notes=notes)
 
 
 def _quality_of_no_frame(stage: StageInput) -> StageResult:

@@ -36,7 +36,7 @@ class ExternalSpace:
 
     def __init__(self, dim: int):
         self.dim, self.name = dim, f"{_EXTERNAL}{dim}"
-        self.canonical = self.reference = np.zeros((0, dim), np.float32)
+        self.canonical_phrases = self.unrelated_words = np.zeros((0, dim), np.float32)
 
     def _refuse(self, *args: object, **kwargs: object) -> NoReturn:
         raise _missing_model(self.dim)

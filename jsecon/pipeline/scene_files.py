@@ -125,20 +125,31 @@ def place_in_capture(
     Returns:
       The Gaussians in the capture's world, and notes on the world that was taken.
     """
-    to_source = np.asarray(capture.to_source, np.float64)
-    to_poses = np.eye(4) if capture.to_poses is None else np.asarray(capture.to_poses, np.float64)
-    transformed = not np.allclose(to_poses, to_source, rtol=1e-9, atol=1e-9 * np.abs(to_source).max())
+    source_from_scene = np.asarray(capture.source_from_scene, np.float64)
+    poses_from_scene = (
+        np.eye(4) if capture.poses_from_scene is None else np.asarray(capture.poses_from_scene, np.float64)
+    )
+    transformed = not np.allclose(
+        poses_from_scene, source_from_scene, rtol=1e-9, atol=1e-9 * np.abs(source_from_scene).max()
+    )
     worlds: list[tuple[str, np.ndarray]] = []
     if trained is not None:
         worlds.append(("dataparser_transforms.json", trained))
         if transformed:
-            worlds.append(("dataparser_transforms.json, of the poses", to_source @ np.linalg.inv(to_poses) @ trained))
+            worlds.append(
+                (
+                    "dataparser_transforms.json, of the poses",
+                    source_from_scene @ np.linalg.inv(poses_from_scene) @ trained,
+                )
+            )
     worlds.append(("the capture's files" if transformed else "the capture's poses", np.eye(4)))
     if transformed:
-        worlds.append(("the poses, without the applied_transform undone", to_source @ np.linalg.inv(to_poses)))
+        worlds.append(
+            ("the poses, without the applied_transform undone", source_from_scene @ np.linalg.inv(poses_from_scene))
+        )
 
     def place(name: str, world: np.ndarray) -> _Placement:
-        moved = transform_gaussians_float64(gaussians, np.linalg.inv(to_source) @ world)
+        moved = transform_gaussians_float64(gaussians, np.linalg.inv(source_from_scene) @ world)
         scene = jax.tree.map(jnp.asarray, moved)
         return _Placement(name, scene, _photo_similarity(scene, capture))
 
@@ -149,10 +160,14 @@ def place_in_capture(
         progress(n + 1, len(worlds))
     assert best is not None
     if not best.similarity.explained:
-        cameras = np.linalg.inv(transform_poses(np.asarray(capture.cameras.world_to_camera, np.float64), to_poses))
-        points = np.asarray(capture.points, np.float64) @ to_poses[:3, :3].T + to_poses[:3, 3]
+        cameras = np.linalg.inv(
+            transform_poses(np.asarray(capture.cameras.world_to_camera, np.float64), poses_from_scene)
+        )
+        points = np.asarray(capture.points, np.float64) @ poses_from_scene[:3, :3].T + poses_from_scene[:3, 3]
         for name, world in _training_worlds(cameras, points):
-            other = place(f"the training, normalised as by {name}", to_source @ np.linalg.inv(world @ to_poses))
+            other = place(
+                f"the training, normalised as by {name}", source_from_scene @ np.linalg.inv(world @ poses_from_scene)
+            )
             if other.similarity.explained and other.leads(best):
                 best = other
     figures = f"correlation with the frames {best.similarity.correlation:.2f}, {best.similarity.psnr:.1f} dB"

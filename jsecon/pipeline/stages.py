@@ -18,11 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsecon.association.consensus import consensus_masklets, pieces_on_masks
-from jsecon.association.run_lengths import memoized_masks
-from jsecon.association.views import SceneViews
+from jsecon.association.run_lengths import cache_masks_as_rle
+from jsecon.association.scene import SceneSuperpixels
 from jsecon.errors import InputError
 from jsecon.field.columns import is_mapped
-from jsecon.field.membership import finish_votes_in_blocks
+from jsecon.field.membership import normalise_votes_in_blocks
 from jsecon.field.regions import Embed, embeddings_of_masks, region_embeddings, scene_parts
 from jsecon.field.streaming import codes_in_blocks, region_votes_in_blocks
 from jsecon.field.votes import region_votes, votes_memory
@@ -480,7 +480,7 @@ def frame_proposals(
 
         return segment, ()
     classical = _classical_segmenter(options, capture, gaussians)
-    return memoized_masks(lambda t: classical(frames[t], t)), ()
+    return cache_masks_as_rle(lambda t: classical(frames[t], t)), ()
 
 
 def _classical_segmenter(options: Options, capture: Capture, gaussians: Gaussians) -> Segmenter:
@@ -535,7 +535,7 @@ def associate_masks(
     options, vision = context.options, _Vision(capture, context.options)
     frames, cameras = vision.frames, vision.cameras
     if options.associated_by == "consensus":
-        scene = SceneViews(gaussians, cameras, proposals, centre=options.centre)
+        scene = SceneSuperpixels(gaussians, cameras, proposals, centre=options.centre)
         labels = consensus_masklets(frames, scene, agreement=options.agreement, seed=options.seed, progress=progress)
         return clean_masklets(labels)
     tracker = context.networks.tracker or GeometricTracker(gaussians, cameras, proposals)
@@ -628,7 +628,7 @@ def _find_parts(stage: StageInput) -> StageResult:
     vision = _Vision(stage.results.load, options)
     frames = vision.frames
     masks, embed = _masks_with_embeddings(context, stage.results)
-    views = SceneViews(stage.results.gaussians, vision.cameras, masks, centre=options.centre)
+    views = SceneSuperpixels(stage.results.gaussians, vision.cameras, masks, centre=options.centre)
     piece, weights = pieces_on_masks(frames, views, seed=options.seed, progress=stage.progress)
     rows = np.concatenate([embed(t, masks(t)) for t in range(len(frames))])
     context.networks.close()
@@ -740,21 +740,21 @@ def field_of(results: Results, embedder: Embedder, provenance: str, options: Opt
     """
     capture, embedded = results.load, results.regions
     pixels = np.zeros((embedded.count, len(capture.names)), np.int32)
-    pixels[:, vision_frames(capture, options)] = embedded.pixels
+    pixels[:, vision_frames(capture, options)] = embedded.pixel_counts
     table, coder = results.codes
     return LanguageField(
         gaussians=results.gaussians,
         codes=results.distil,
-        votes=finish_votes_in_blocks(results.votes, embedded),
+        votes=normalise_votes_in_blocks(results.votes, embedded),
         regions=Regions(embedded.embeddings, pixels),
         region_codes=table,
         autoencoder=coder,
         cameras=capture.cameras,
-        canonical=np.asarray(embedder.canonical, np.float32),
-        to_source=np.asarray(capture.to_source),
+        canonical_phrases=np.asarray(embedder.canonical_phrases, np.float32),
+        source_from_scene=np.asarray(capture.source_from_scene),
         names=capture.names,
         embedder=embedder.name,
         provenance=provenance,
         parts=results.parts,
-        reference=reference_of(embedder).astype(np.float16),
+        unrelated_words=reference_of(embedder).astype(np.float16),
     )

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Float, Int
 
 from jsecon.errors import require
-from jsecon.field.membership import SHARE_THRESHOLD, ratio, share_of, vote_columns
+from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction, ratio, vote_columns
 from jsecon.query.match import (
     RULES,
     evidence,
@@ -74,7 +74,7 @@ def query_classes(
     if field.regions.count == 0:
         count, dtype = field.codes.shape[0], jnp.asarray(field.regions.embeddings).dtype
         return Classes(jnp.full(count, -1, jnp.int32), jnp.zeros((count, texts.shape[0]), dtype))
-    arrays = field.regions.embeddings, texts, field.regions.pixels, field.votes
+    arrays = field.regions.embeddings, texts, field.regions.pixel_counts, field.votes
     return _classes(*jax.tree.map(jnp.asarray, arrays), reference_words(field), rules, standardise, every)
 
 
@@ -123,7 +123,7 @@ def _classes(embeddings, texts, pixels, votes, reference, rules: QueryRules, sta
     possible = finite[:, None] & valid
     if not every:
         of_class = accepted & (best == jnp.arange(len(texts))[:, None])
-        share = jax.vmap(lambda chosen: share_of(votes, chosen).share, out_axes=1)(of_class)
+        share = jax.vmap(lambda chosen: inside_fraction(votes, chosen).fraction, out_axes=1)(of_class)
         possible &= share >= SHARE_THRESHOLD
     label = jnp.argmax(jnp.where(possible, mean, -jnp.inf), axis=1)
     return Classes(jnp.where(jnp.any(possible, axis=1), label, -1).astype(jnp.int32), mean)

@@ -74,8 +74,8 @@ def containment(overlap: Float[Array, "r r"], size: Float[Array, " r"]) -> Float
 def objects_of_gaussians(votes: Votes, objects: Int[Array, " r"]) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
     """Assigns each Gaussian to the object with the largest share in it.
 
-    The share is that of all regions of the object together (`share_of`), so a query for exactly these regions selects
-    the same Gaussians, and those that belong to another object even more.
+    The share is that of all regions of the object together (`inside_fraction`), so a query for exactly these regions
+    selects the same Gaussians, and those that belong to another object even more.
 
     Args:
       votes: Votes of N Gaussians on R regions.

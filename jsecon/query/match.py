@@ -2,8 +2,8 @@
 
 In a space such as CLIP's all texts lie in one narrow cone and all images in another, so the cosine of a text and an
 image is mostly that of the cones. What a text has in common with all texts is therefore subtracted before it is
-compared: the mean of unrelated words (`LanguageField.reference`). Those words also say how similar a text must be to
-the scene: it is refused unless it beats most of them (`QueryRules.quantile`).
+compared: the mean of unrelated words (`LanguageField.unrelated_words`). Those words also say how similar a text must be
+to the scene: it is refused unless it beats most of them (`QueryRules.quantile`).
 """
 
 import functools
@@ -119,7 +119,7 @@ def match_regions(
     require(fit, "match_regions", shapes, f"(Q >= 1, {size}) and (U, {size})", remedy)
     if field.regions.count == 0:
         return NO_REGIONS
-    arrays = field.regions.embeddings, field.regions.pixels, field.votes.overlap, queries, excluded
+    arrays = field.regions.embeddings, field.regions.pixel_counts, field.votes.overlap, queries, excluded
     return _match(*jax.tree.map(jnp.asarray, arrays), reference_words(field), rules)
 
 
@@ -226,7 +226,8 @@ def reference_words(field: LanguageField) -> Array | None:
     Returns:
       (W, E) embeddings, or None if it has none.
     """
-    return jnp.asarray(field.reference) if field.reference is not None and len(field.reference) else None
+    words = field.unrelated_words
+    return jnp.asarray(words) if words is not None and len(words) else None
 
 
 def _text_direction(

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from jsecon.errors import InputError, require
-from jsecon.field.membership import SHARE_THRESHOLD, share_of, vote_shares
+from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction, vote_shares
 from jsecon.field.votes import region_votes
 from jsecon.types import LanguageField, Selection
 
@@ -68,7 +68,7 @@ def lift(
     outside, inside, unknown = weight[:, OUTSIDE], weight[:, INSIDE], weight[:, UNKNOWN]
     within = _regions_within(field, inside + unknown, outside)
     chosen = within >= 0.5
-    known = np.asarray(share_of(field.votes, jnp.asarray(chosen)).share) if chosen.any() else 0.0
+    known = np.asarray(inside_fraction(field.votes, jnp.asarray(chosen)).fraction) if chosen.any() else 0.0
     share = (inside + PRIOR_PX * known) / (inside + outside + PRIOR_PX)
     if not chosen.any():
         share = np.where(inside + outside > 0, inside / np.maximum(inside + outside, 1e-9), 0.0)

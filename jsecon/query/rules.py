@@ -13,9 +13,9 @@ from jsecon.vision.protocols import Logits
 RETRIEVALS = ("apart", "cosine")
 """Ways to compare a text with regions: what sets it apart from unrelated words, or the plain cosine (the paper)."""
 QUANTILE = 0.82
-"""Smallest share of unrelated words (`LanguageField.reference`) that must match the scene less than the text does. It
-is the least that refuses 0.8 of the absent texts with simulated CLIP at medium noise. Refused of these, and kept of the
-others: there 0.81 and 0.95, with errors that views share 0.78 and 0.49; on real words (ConSE, 15 classes of
+"""Smallest share of unrelated words (`LanguageField.unrelated_words`) that must match the scene less than the text
+does. It is the least that refuses 0.8 of the absent texts with simulated CLIP at medium noise. Refused of these, and
+kept of the others: there 0.81 and 0.95, with errors that views share 0.78 and 0.49; on real words (ConSE, 15 classes of
 replica_apartment_0) 0.95 and 0.93, with jsecon's own masks 0.94 and 0.73."""
 RETRIEVAL_THRESHOLD = 0.2
 """Smallest cosine of the best region, for fields without unrelated words. The paper has such a threshold and does not

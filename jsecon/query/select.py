@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Float, Int
 
 from jsecon.errors import require_one_of, require_shape
-from jsecon.field.membership import SHARE_THRESHOLD, share_of
+from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction
 from jsecon.field.similarity import Number, UnitCodes, similarities
 from jsecon.paper.codes import CODE_THRESHOLD
 from jsecon.programs import stored_jit
@@ -120,8 +120,8 @@ def select_gaussians(
     Args:
       field: The field of N Gaussians.
       match: Its regions, from `match_regions`.
-      by: "votes": the share of all chosen regions in a Gaussian (`share_of`), an estimate of the probability that a
-        pixel of it belongs to them. "code": cosine of its code with that of the best region (the paper).
+      by: "votes": the share of all chosen regions in a Gaussian (`inside_fraction`), an estimate of the probability
+        that a pixel of it belongs to them. "code": cosine of its code with that of the best region (the paper).
       similarity_threshold: Smallest similarity of a selected Gaussian; None takes 0.5 for votes and 0.9 for codes.
       codes: `unit_codes(field.codes)`, made once for many queries by "code".
 
@@ -154,7 +154,7 @@ def select_by_share(votes: Votes, match: RegionMatch, threshold: Number) -> Sele
     Returns:
       The selection of the N Gaussians.
     """
-    share, known = share_of(votes, match.chosen)
+    share, known = inside_fraction(votes, match.chosen)
     mask = known & (share >= threshold) & (match.region >= 0)
     return Selection(mask, share, match.region, match.score, match.quantile, match.confidence)
 

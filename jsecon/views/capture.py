@@ -15,7 +15,7 @@ BACKGROUNDS = (0.0, 1.0, 0.5)
 
 def render_capture(
     gaussians: Gaussians,
-    to_source: np.ndarray,
+    source_from_scene: np.ndarray,
     *,
     views: int = 24,
     width: int = 400,
@@ -27,7 +27,7 @@ def render_capture(
 
     Args:
       gaussians: Scene of N Gaussians, in the capture's world.
-      to_source: (4, 4) similarity from that world to the file's.
+      source_from_scene: (4, 4) similarity from that world to the file's.
       views: T, number of views.
       width: Width of the frames, px.
       height: Height of the frames, px.
@@ -42,11 +42,16 @@ def render_capture(
     """
     planned = plan_views(gaussians, views=views, width=width, height=height, up=up, progress=progress)
     names = tuple(f"view_{index:03d}" for index in range(len(planned.cameras)))
-    return capture_from_cameras(gaussians, planned.cameras, names, to_source, notes=(f"{planned.describe()}.",))
+    return capture_from_cameras(gaussians, planned.cameras, names, source_from_scene, notes=(f"{planned.describe()}.",))
 
 
 def capture_from_cameras(
-    gaussians: Gaussians, cameras: Camera, names: tuple[str, ...], to_source: np.ndarray, *, notes: tuple[str, ...] = ()
+    gaussians: Gaussians,
+    cameras: Camera,
+    names: tuple[str, ...],
+    source_from_scene: np.ndarray,
+    *,
+    notes: tuple[str, ...] = (),
 ) -> Capture:
     """Renders a bare scene as the frames of a capture.
 
@@ -54,7 +59,7 @@ def capture_from_cameras(
       gaussians: Scene of N Gaussians, in the capture's world.
       cameras: Batch of T cameras, in the capture's world.
       names: T names of the frames.
-      to_source: (4, 4) similarity from that world to the file's.
+      source_from_scene: (4, 4) similarity from that world to the file's.
       notes: What the user should know, a sentence each.
 
     Returns:
@@ -73,7 +78,7 @@ def capture_from_cameras(
         point_colors=np.zeros((0, 3), np.uint8),
         held_out=np.zeros(len(frames), bool),
         depths=None,
-        to_source=to_source,
+        source_from_scene=source_from_scene,
         names=names,
         notes=notes,
     )

@@ -178,7 +178,7 @@ def field_up(field: LanguageField, up: Sequence[Any] | np.ndarray | None = None)
       InputError: `up` has no direction.
     """
     if up is not None:
-        own = np.asarray(field.to_source, np.float64)[:3, :3].T @ _direction(up)
+        own = np.asarray(field.source_from_scene, np.float64)[:3, :3].T @ _direction(up)
         return own / np.linalg.norm(own)
     axis = scene_up(field.cameras)
     right = np.asarray(field.cameras.world_to_camera, np.float64)[:, 0, :3]

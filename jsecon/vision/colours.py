@@ -107,10 +107,10 @@ class ColourEmbedder:
     An embedding is the kernel mean over the palette's P prototypes, times sqrt(1 - EXTENT_WEIGHT), followed by two
     coordinates of length sqrt(EXTENT_WEIGHT) that turn from `thing` to `surroundings` with the share of the frame.
 
-    `canonical` has the place of object / things / stuff / texture in LERF's relevancy: the mean of the palette (any
-    colour), mid grey, and a pale and a dark neutral (walls, shadow).
+    `canonical_phrases` has the place of object / things / stuff / texture in LERF's relevancy: the mean of the palette
+    (any colour), mid grey, and a pale and a dark neutral (walls, shadow).
 
-    `reference` has objects of two colours, for each pair of basic terms and their shades. Most rooms contain most
+    `unrelated_words` has objects of two colours, for each pair of basic terms and their shades. Most rooms contain most
     colours but few such pairs: a region with one of the two measures the similarity of half a text.
     """
 
@@ -132,10 +132,10 @@ class ColourEmbedder:
         self._family = functools.cache(self._make_family)
         neutral = lab_of(np.asarray([(128, 128, 128), (190, 182, 170), (64, 62, 60)]))
         colours = [self._mean(self._points), *(self._mean(point[None]) for point in neutral)]
-        self.canonical = np.stack([_joined(c, angle) for c, angle in zip(colours, (0.25, 0.25, 0.5, 0.25))])
+        self.canonical_phrases = np.stack([_joined(c, angle) for c, angle in zip(colours, (0.25, 0.25, 0.5, 0.25))])
 
     @functools.cached_property
-    def reference(self) -> Float32[np.ndarray, "w e"]:
+    def unrelated_words(self) -> Float32[np.ndarray, "w e"]:
         """Embeddings of unrelated texts. A field holds its own."""
         basic = [name for name in self.names if name.split()[-1] in BASIC]
         return self.embed_text([f"{one} and {other}" for one, other in itertools.combinations(basic, 2)])

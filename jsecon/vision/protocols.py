@@ -81,17 +81,17 @@ class NamedTracker(Tracker, Network, Protocol):
 class Embedder(Protocol):
     """A joint space of images and texts; every vector has unit length, so that a cosine is a similarity.
 
-    An embedder may also have `reference`, (W, E) float32 unit: embeddings of texts unrelated to any scene. Without it
-    `REFERENCE_WORDS` are embedded (`reference_words.reference_of`). Texts in a tuple `vocabulary` are the names that a
-    catalogue gives to objects by default, and `softmax_scale` scales their cosines before a softmax. A function
-    `narrower(text) -> list[str]` lists texts that answer in place of one that no region matches.
+    An embedder may also have `unrelated_words`, (W, E) float32 unit: embeddings of texts unrelated to any scene.
+    Without it `REFERENCE_WORDS` are embedded (`reference_words.reference_of`). Texts in a tuple `vocabulary` are the
+    names that a catalogue gives to objects by default, and `softmax_scale` scales their cosines before a softmax. A
+    function `narrower(text) -> list[str]` lists texts that answer in place of one that no region matches.
     """
 
     name: str
     """Identifies the space, which a field and its texts must share."""
     dim: int
     """E"""
-    canonical: np.ndarray
+    canonical_phrases: np.ndarray
     """(C, E) float32 unit embeddings that a query must exceed, such as those of `CANONICAL`."""
 
     def embed_regions(self, frame: np.ndarray, masks: np.ndarray) -> np.ndarray:

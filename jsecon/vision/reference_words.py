@@ -56,12 +56,12 @@ def reference_of(embedder: Embedder) -> Float32[np.ndarray, "w e"]:
     """Embeds texts that have nothing to do with a scene.
 
     Args:
-      embedder: Space of images and texts. Where it has `reference`, that is taken.
+      embedder: Space of images and texts. Where it has `unrelated_words`, that is taken.
 
     Returns:
       (W, E) unit rows; W is 0 where the embedder has no words for REFERENCE_WORDS.
     """
-    rows = getattr(embedder, "reference", None)
+    rows = getattr(embedder, "unrelated_words", None)
     if rows is None:
         try:
             rows = embedder.embed_text(list(REFERENCE_WORDS))

@@ -148,7 +148,7 @@ def test_a_crop_is_the_box_with_its_margin_within_the_frame(crop, shape, outside
 def test_it_is_an_embedder_of_regions_and_texts(embedder):
     assert isinstance(embedder, Embedder)
     assert embedder.dim == 4
-    np.testing.assert_allclose(embedder.canonical, 0.5, atol=1e-6)
+    np.testing.assert_allclose(embedder.canonical_phrases, 0.5, atol=1e-6)
     frame, masks = np.zeros((20, 30, 3), np.uint8), np.zeros((3, 20, 30), bool)
     masks[0, 2:6, 2:6] = masks[1, 10:18, 10:18] = True
     frame[masks[0]] = 250, 10, 120  # red and blue are the two most probable: green is left out

@@ -194,7 +194,7 @@ def application(
                 "views": int((pixels > 0).sum()),
                 "frame": scene.field.names[pixels.argmax()],
             }
-            for region, pixels in enumerate(np.asarray(scene.field.regions.pixels))
+            for region, pixels in enumerate(np.asarray(scene.field.regions.pixel_counts))
         ]
         return _AsciiResponse({"field": scene.name, "regions": rows})
 
@@ -209,7 +209,7 @@ def application(
             with tempfile.TemporaryDirectory() as folder:
                 file = Path(folder) / "selection.ply"
                 selected = gaussian_rows(scene.field.gaussians, answer.mask)
-                save_ply(file, selected, similarity=scene.field.to_source)
+                save_ply(file, selected, similarity=scene.field.source_from_scene)
                 return file.read_bytes()
 
         return Response(await computed(work, "text"), media_type="application/octet-stream")

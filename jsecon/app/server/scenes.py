@@ -131,7 +131,7 @@ class Scene:
             "name": self.name,
             "gaussians": self.field.gaussians.count,
             "regions": self.field.regions.count,
-            "unrelated_words": None if self.field.reference is None else len(self.field.reference),
+            "unrelated_words": None if self.field.unrelated_words is None else len(self.field.unrelated_words),
             "frames": list(self.field.names),
             "size": [self.field.cameras.width, self.field.cameras.height],
         }

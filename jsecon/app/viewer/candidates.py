@@ -55,7 +55,7 @@ def candidates(field: LanguageField, embedder: Any, query: str | int, count: int
     if field.regions.count == 0:
         return []
     table = jnp.asarray(field.regions.embeddings)
-    weight = np.asarray(_evidence(jnp.asarray(field.regions.pixels)))
+    weight = np.asarray(_evidence(jnp.asarray(field.regions.pixel_counts)))
     if isinstance(query, str):
         field = with_phrases(field, embedder)
         reference = reference_words(field)
@@ -71,7 +71,7 @@ def candidates(field: LanguageField, embedder: Any, query: str | int, count: int
         known[query : query + 1] = False
     weighted = np.where(known, np.where(score > 0, score * weight, score), -np.inf)
     order = [r for r in np.argsort(-weighted, kind="stable")[:count] if known[r]]
-    frames = np.asarray(field.regions.pixels).argmax(1)
+    frames = np.asarray(field.regions.pixel_counts).argmax(1)
     return [Candidate(int(r), float(score[r]), int(frames[r])) for r in order]
 
 

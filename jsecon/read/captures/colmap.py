@@ -396,8 +396,10 @@ def write_colmap(capture: Capture, path: str | Path, *, image_format: str = "png
         for n, row in enumerate(distinct, start=1)
     ]
     image_bytes = [struct.pack("<Q", len(names))]
-    to_poses = np.eye(4) if capture.to_poses is None else np.asarray(capture.to_poses, np.float64)
-    poses = transform_poses(np.asarray(cameras.world_to_camera, np.float64), to_poses)
+    poses_from_scene = (
+        np.eye(4) if capture.poses_from_scene is None else np.asarray(capture.poses_from_scene, np.float64)
+    )
+    poses = transform_poses(np.asarray(cameras.world_to_camera, np.float64), poses_from_scene)
     for n, (name, pose, camera) in enumerate(zip(names, poses, camera_of.ravel()), start=1):
         quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True, scalar_first=True)
         numbers = itertools.chain(quaternion, pose[:3, 3])
@@ -405,7 +407,7 @@ def write_colmap(capture: Capture, path: str | Path, *, image_format: str = "png
         image_bytes.append(head + os.fsencode(name) + b"\0" + struct.pack("<Q", 0))
     points = np.zeros(len(capture.points), "<u8, 3<f8, 3u1, <f8, <u8")
     points["f0"] = np.arange(1, len(points) + 1)
-    points["f1"] = np.asarray(capture.points, np.float64) @ to_poses[:3, :3] + to_poses[:3, 3]
+    points["f1"] = np.asarray(capture.points, np.float64) @ poses_from_scene[:3, :3] + poses_from_scene[:3, 3]
     points["f2"], points["f3"] = capture.point_colors, -1.0
     contents = {
         "cameras": b"".join(camera_bytes),

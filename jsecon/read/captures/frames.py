@@ -66,7 +66,7 @@ class PosedImages:
     points: Float[np.ndarray, "p 3"] = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
     """Sparse points, world, float64."""
     colours: UInt8[np.ndarray, "p 3"] = dataclasses.field(default_factory=lambda: np.zeros((0, 3), np.uint8))
-    to_source: Float[np.ndarray, "4 4"] = dataclasses.field(default_factory=lambda: np.eye(4))
+    source_from_scene: Float[np.ndarray, "4 4"] = dataclasses.field(default_factory=lambda: np.eye(4))
     """From the world of the poses to that of the files that they were made from."""
     notes: tuple[str, ...] = ()
 
@@ -383,7 +383,7 @@ def build_capture(
     Distorted images are resampled (bilinear) to the widest pinhole lens without empty pixels, then shrunk (area
     average). Images of other sizes than the commonest are resized to it, focal lengths with them. Large coordinates and
     units far from metres are changed in float64 (`normalizing_transform`), by the same for any choice of frames;
-    `Capture.to_source` leads back.
+    `Capture.source_from_scene` leads back.
 
     Args:
       posed: The posed images.
@@ -467,9 +467,9 @@ def build_capture(
         point_colors=np.asarray(posed.colours, np.uint8),
         held_out=held_out,
         depths=depth_maps,
-        to_source=np.asarray(posed.to_source, np.float64) @ from_world,
+        source_from_scene=np.asarray(posed.source_from_scene, np.float64) @ from_world,
         names=names,
         notes=tuple(notes),
         files=_files(images, lenses, orientations),
-        to_poses=from_world,
+        poses_from_scene=from_world,
     )

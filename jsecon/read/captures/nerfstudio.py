@@ -2,7 +2,7 @@
 
 Format: nerfstudio docs/quickstart/data_conventions.md, instant-ngp scripts/colmap2nerf.py. transform_matrix is
 camera-to-world in OpenGL camera axes (x right, y up, looking along -z): columns 1 and 2 are negated for OpenCV axes.
-The world is the file's own; Capture.to_source undoes what made it of the source's (applied_transform, _scale).
+The world is the file's own; Capture.source_from_scene undoes what made it of the source's (applied_transform, _scale).
 """
 
 import math
@@ -117,14 +117,14 @@ def read_nerfstudio(file: Path) -> PosedImages:
         raise scene.error(problem, remedy="Copy the images to where file_path says, relative to this file.")
     if any("mask_path" in entry for entry in entries):
         notes.append("The masks named by mask_path (pixels to ignore) were not used.")
-    to_source, points = _to_source(scene, scale), ()
+    source_from_scene, points = _to_source(scene, scale), ()
     if scene.content.get("ply_file_path"):
         cloud = file.parent / scene.get(scene.content, "ply_file_path", "the file", str)
         if not os.path.isfile(cloud):  # False also for a name that no file can have
             problem = "no such file, which is the ply_file_path of transforms.json"
             raise InputError(cloud, problem, remedy="Check the path.")
         points = load_point_cloud(cloud)
-    return PosedImages(images, file, *points, to_source=to_source, notes=tuple(notes))
+    return PosedImages(images, file, *points, source_from_scene=source_from_scene, notes=tuple(notes))
 
 
 def read_poses(file: Path) -> list[tuple[str, Lens, np.ndarray]]:

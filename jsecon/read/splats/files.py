@@ -101,8 +101,8 @@ def load_gaussians(path: str | Path, *, similarity: Float[Array, "4 4"] | None =
     Args:
       path: The file; its suffix, in small or capital letters, names the format.
       similarity: (4, 4) float64. Carries the Gaussians into another world before they become float32. The inverse of
-        `Capture.to_source` carries them from the world of a capture's files into that of its cameras, and keeps the
-        digits of a map projection's coordinates.
+        `Capture.source_from_scene` carries them from the world of a capture's files into that of its cameras, and keeps
+        the digits of a map projection's coordinates.
 
     Returns:
       Its Gaussians, float32; N may be 0.

@@ -426,7 +426,9 @@ def in_float32(path: Path, gaussians: Gaussians, similarity: Float[Array, "4 4"]
     rounding = float32_rounding(gaussians)
     if len(rounding) and np.median(rounding) > MAX_READ_ROUNDING:
         place = ", ".join(f"{number:.10g}" for number in np.median(gaussians.means, axis=0))
-        remedy = "Give load_gaussians a similarity that brings them near 0, as numpy.linalg.inv(capture.to_source)."
+        remedy = (
+            "Give load_gaussians a similarity that brings them near 0, as numpy.linalg.inv(capture.source_from_scene)."
+        )
         problem = f"the Gaussians lie about ({place}), where float32 does not tell them apart"
         raise _error(path, problem, remedy=remedy)
     return jax.tree.map(jnp.asarray, gaussians)

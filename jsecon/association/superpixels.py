@@ -14,7 +14,7 @@ MIN_ATOM_PX = 12
 """Least size in px; smaller pieces are slivers along an edge."""
 
 
-def image_atoms(
+def superpixels(
     frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m h w"], *, count: int
 ) -> Int32[np.ndarray, "h w"]:
     """Segments a frame into superpixels (SLICO, Achanta et al. 2012) that are cut along the outlines of masks.
@@ -40,7 +40,7 @@ def image_atoms(
     return relabel_sequential(pieces).astype(np.int32)
 
 
-def atom_coverage(
+def superpixel_coverage(
     atoms: Int32[np.ndarray, "h w"], masks: Bool[np.ndarray, "m h w"], count: int
 ) -> Float32[np.ndarray, "m a"]:
     """Computes how far atoms lie in masks.
@@ -86,7 +86,7 @@ def one_hot(labels: Int[np.ndarray, " a"], count: int) -> Sparse:
     return sparse.csr_matrix((np.ones(len(rows), np.float32), (rows, labels[rows])), shape=(len(labels), count))
 
 
-def atom_votes(
+def superpixel_votes(
     gaussians: Gaussians,
     camera: Camera,
     atoms: Int32[np.ndarray, "h w"],

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from scipy import sparse
 
-from jsecon.association.atoms import MIN_ATOM_PX, Sparse, atom_coverage, atom_votes, image_atoms
+from jsecon.association.superpixels import MIN_ATOM_PX, Sparse, superpixel_coverage, superpixel_votes, superpixels
 from jsecon.errors import require
 from jsecon.parallel import LANES, map_over_processes
 from jsecon.process import cores
@@ -25,14 +25,14 @@ MIN_ATOM_SHARE = 0.6
 MIN_MERGED_SHARE = 0.5
 MIN_KNOWN_SHARE = 0.5
 MIN_COVERAGE = 0.2
-"""Thresholds of `claim_atoms`."""
+"""Thresholds of `assign_superpixels`."""
 
 
 @dataclasses.dataclass(frozen=True)
-class FrameView:
+class FrameSuperpixels:
     """Votes of the Gaussians in one frame."""
 
-    atoms: np.ndarray
+    labels: np.ndarray
     """(H, W) int32 atom of each pixel, 0 .. A-1."""
     seen: np.ndarray
     """(n,) indices of the Gaussians that the frame shows."""
@@ -54,7 +54,7 @@ class FrameView:
         return self.votes @ sparse.csr_matrix(self.proposals.T)
 
 
-class SceneViews:
+class SceneSuperpixels:
     """Votes of one scene in all frames, computed once.
 
     Args:
@@ -62,7 +62,7 @@ class SceneViews:
       cameras: Batch of T cameras, one per frame.
       proposals: Masks (M, H, W) bool of each frame, which may overlap: a sequence, or a function of the index of a
         frame, which is called in several threads.
-      atoms_per_frame: Approximate number of superpixels per frame before the cut along proposals.
+      superpixels_per_frame: Approximate number of superpixels per frame before the cut along proposals.
       centre: Weight of a Gaussian's centre against its footprint, see `region_votes`; above 0 if answers are judged at
         the centres of Gaussians.
     """
@@ -73,23 +73,29 @@ class SceneViews:
         cameras: Camera,
         proposals: Callable[[int], np.ndarray] | Sequence[np.ndarray],
         *,
-        atoms_per_frame: int = 256,
+        superpixels_per_frame: int = 256,
         centre: float = 0.0,
     ):
-        require(atoms_per_frame > 0, "atoms_per_frame", atoms_per_frame, "at least 1", "Use 200 for small frames.")
+        require(
+            superpixels_per_frame > 0,
+            "superpixels_per_frame",
+            superpixels_per_frame,
+            "at least 1",
+            "Use 200 for small frames.",
+        )
         self.gaussians, self.cameras, self.count = gaussians, cameras, gaussians.count
-        self.atoms_per_frame, self.centre = atoms_per_frame, centre
+        self.superpixels_per_frame, self.centre = superpixels_per_frame, centre
         self.propose = proposals if callable(proposals) else proposals.__getitem__
-        self._views: list[FrameView] = []
+        self._views: list[FrameSuperpixels] = []
         self.shared = np.zeros((0, 0), np.float32)
         """(T, T) overlap of two frames: the cosine of their visible cross-sections of all Gaussians. Set by `all`."""
 
     def _view(self, frame: UInt8[np.ndarray, "h w 3"], t: int) -> tuple:
         """Atoms, visible Gaussians, arrays and shape of the votes, and proposals of a frame."""
         masks = np.asarray(self.propose(t), bool)
-        atoms = image_atoms(frame, masks, count=self.atoms_per_frame)
-        within = atom_coverage(atoms, masks, int(atoms.max()) + 1)
-        votes = atom_votes(self.gaussians, self.cameras[t], atoms, centre=self.centre)
+        atoms = superpixels(frame, masks, count=self.superpixels_per_frame)
+        within = superpixel_coverage(atoms, masks, int(atoms.max()) + 1)
+        votes = superpixel_votes(self.gaussians, self.cameras[t], atoms, centre=self.centre)
         seen = np.flatnonzero(np.diff(votes.indptr))
         votes = votes[seen]
         return atoms, seen, [votes.data, votes.indices, votes.indptr], votes.shape, within
@@ -102,7 +108,7 @@ class SceneViews:
         finally:
             pool.shutdown(cancel_futures=True)
 
-    def all(self, frames: UInt8[np.ndarray, "t h w 3"], progress: Progress | None = None) -> list[FrameView]:
+    def all(self, frames: UInt8[np.ndarray, "t h w 3"], progress: Progress | None = None) -> list[FrameSuperpixels]:
         """Computes the votes of all frames; several processes (`jax.distributed`) divide the frames.
 
         Args:
@@ -110,7 +116,7 @@ class SceneViews:
           progress: Called with the number of frames done and of all.
 
         Returns:
-          One `FrameView` per frame.
+          One `FrameSuperpixels` per frame.
 
         Raises:
           ValueError: The frames have another number or size than the cameras.
@@ -120,7 +126,7 @@ class SceneViews:
         require(frames.shape[:3] == expected, "frames", frames.shape, f"{(*expected, 3)}", remedy)
         if not self._views:
             views = [
-                FrameView(
+                FrameSuperpixels(
                     atoms, seen, sparse.csr_matrix((*votes,), shape=shape), within, np.ones(len(seen), np.float32)
                 )
                 for atoms, seen, votes, shape, within in map_over_processes(
@@ -143,8 +149,8 @@ class SceneViews:
         return self._views
 
 
-def claim_atoms(
-    view: FrameView, mass: Float[np.ndarray, "a c"], known_mass: Float[np.ndarray, "a 1"]
+def assign_superpixels(
+    view: FrameSuperpixels, mass: Float[np.ndarray, "a c"], known_mass: Float[np.ndarray, "a 1"]
 ) -> Int[np.ndarray, " a"]:
     """Assigns the atoms of a view to classes of Gaussians.
 
@@ -169,7 +175,7 @@ def claim_atoms(
     """
     total = view.votes.T @ np.ones((len(view.seen), 1), np.float32)
     share_of_atom = mass / np.maximum(known_mass, 1e-6)
-    area = np.bincount(view.atoms.reshape(-1), minlength=len(total))
+    area = np.bincount(view.labels.reshape(-1), minlength=len(total))
     reliable_atom = (known_mass >= MIN_KNOWN_SHARE * total)[:, 0] & (total[:, 0] >= MIN_COVERAGE * area)
     inside, known_inside = view.proposals @ mass, view.proposals @ known_mass  # (M, C), (M, 1)
     share = inside / np.maximum(known_inside, 1e-6)
