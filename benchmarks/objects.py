@@ -103,7 +103,7 @@ def measure(file: Path, order: str) -> None:
     """Opens the field and asks in this process; prints seconds and CPU seconds of each step as JSON."""
     prepare_process()
     import jsecon
-    from jsecon.pipeline.networks import field_embedder
+    from jsecon.pipeline.model_loading import field_embedder
 
     rows: dict[str, tuple[float, float]] = {}
 

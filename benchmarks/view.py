@@ -30,7 +30,7 @@ from serve import SHADES, WORDS, copied, free_port
 from jsecon.app.viewer.view_state import ViewState
 from jsecon.app.viewer.window import Viewer, open_viewer
 from jsecon.field.field import load_field, save_field
-from jsecon.pipeline.networks import field_embedder
+from jsecon.pipeline.model_loading import field_embedder
 
 HOOK = """(undrawn => {
   const now = () => performance.timeOrigin + performance.now();

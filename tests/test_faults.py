@@ -22,7 +22,7 @@ from jsecon.pipeline.stages import capture_stages
 from jsecon.read.captures import frames
 from jsecon.read.captures.images import write_image
 from jsecon.vision.colours import ColourEmbedder
-from jsecon.vision.protocols import Networks
+from jsecon.vision.protocols import Models
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -96,7 +96,7 @@ class Meddler(Listener):
 
 
 def test_a_file_that_changes_while_it_is_read_is_told_and_nothing_of_it_is_kept(capture, tmp_path):
-    work = RunContext(pipeline.Options(capture), Networks(ColourEmbedder()), tmp_path / "out")
+    work = RunContext(pipeline.Options(capture), Models(ColourEmbedder()), tmp_path / "out")
     (tmp_path / "out").mkdir()
 
     def loaded_by(listener):

@@ -30,7 +30,7 @@ from jsecon.read.captures.colmap import read_images
 from jsecon.read.captures.images import read_image
 from jsecon.read.captures.photographs import list_photographs
 from jsecon.vision.colours import ColourEmbedder
-from jsecon.vision.protocols import Networks
+from jsecon.vision.protocols import Models
 
 COUNT = 8
 
@@ -236,7 +236,7 @@ def test_an_output_folder_among_the_photographs_is_no_input(photos, tmp_path):
     folder = shutil.copytree(photos[0], tmp_path / "walk")
 
     def stage(out):
-        work = RunContext(Options(folder), Networks(ColourEmbedder()), out)
+        work = RunContext(Options(folder), Models(ColourEmbedder()), out)
         return capture_stages(work)[0], work
 
     (one, work), (other, other_work) = stage(folder / "f"), stage(folder / "g")
@@ -331,7 +331,7 @@ def test_a_run_finds_the_poses_first_and_keeps_them(photos, at_once, tmp_path):
 
 def test_only_captures_without_poses_have_the_stage(photos, room, found, tmp_path):
     def names(capture):
-        work = RunContext(Options(capture), Networks(ColourEmbedder()), tmp_path)
+        work = RunContext(Options(capture), Models(ColourEmbedder()), tmp_path)
         return [stage.name for stage in capture_stages(work)]
 
     assert names(photos[0]) == ["poses", "load"]

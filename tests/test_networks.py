@@ -22,8 +22,8 @@ from jsecon.fit.start import starting_gaussians
 from jsecon.networks.hub import catalogue
 from jsecon.networks.sam import SamSegmenter, SamSettings, find_sam
 from jsecon.networks.sam2 import Sam2Tracker
-from jsecon.pipeline import networks, run as pipeline
-from jsecon.pipeline.networks import ExternalSpace
+from jsecon.pipeline import model_loading, run as pipeline
+from jsecon.pipeline.model_loading import ExternalSpace
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import Checkpoint, Results, RunContext, StageInput
 from jsecon.pipeline.stages import run_stages
@@ -74,7 +74,7 @@ def test_a_run_with_sam_and_clip_finds_things_by_their_names(seen):
     assert field.embedder.startswith("clip-")
     assert field.regions.embeddings.shape[1] == 3
     assert field.regions.count >= 4
-    texts = networks.field_embedder(field).embed_text([f"a {name} thing" for name in COLOURS])
+    texts = model_loading.field_embedder(field).embed_text([f"a {name} thing" for name in COLOURS])
     frames = np.asarray(run.capture.frames)[~run.capture.held_out]
     for text, (name, colour) in zip(texts, COLOURS.items()):
         best = int((np.asarray(field.regions.embeddings) @ text).argmax())
@@ -138,7 +138,7 @@ def test_a_run_that_is_stopped_while_sam_2_tracks_goes_on_at_its_frame(room, spl
 
     def tracked(folder):
         called.clear()
-        work, results = RunContext(options, networks.open_networks(options, folder), folder), Results()
+        work, results = RunContext(options, model_loading.open_models(options, folder), folder), Results()
         for stage in run_stages(work)[:3]:
             checkpoint = Checkpoint(folder / f"{stage.name}.safetensors")
             given = StageInput(work, results, lambda done, total: None, checkpoint)
@@ -162,8 +162,8 @@ def test_query_finds_the_model_by_itself_or_says_what_it_needs(seen, models, tmp
     query = ["query", str(field), "red", "--out", str(tmp_path / "a"), "--template", "a {} thing", "--views", "0"]
     assert cli.main([*query, "--quantile", "0"]) == 0
     answer, found = json.loads((tmp_path / "a" / "red.json").read_text()), load_field(field)
-    text = networks.field_embedder(found, templates=("a {} thing",)).embed_text(["red"])[0]
-    words = networks.field_embedder(found, templates=("a {} thing",)).unrelated_words
+    text = model_loading.field_embedder(found, templates=("a {} thing",)).embed_text(["red"])[0]
+    words = model_loading.field_embedder(found, templates=("a {} thing",)).unrelated_words
     similar = (
         np.asarray(found.regions.embeddings) @ (text - words.mean(axis=0)) / np.linalg.norm(text - words.mean(axis=0))
     )
@@ -177,8 +177,8 @@ def test_query_finds_the_model_by_itself_or_says_what_it_needs(seen, models, tmp
     assert "a phrase that holds {}" in capsys.readouterr().err
     lost = dataclasses.replace(load_field(field), provenance=json.dumps({"options": {"embedder": "/nowhere"}}))
     with pytest.raises(InputError, match=r"--embedder DIR"):
-        networks.field_embedder(lost)
-    assert networks.field_embedder(lost, models[1]).name == lost.embedder
+        model_loading.field_embedder(lost)
+    assert model_loading.field_embedder(lost, models[1]).name == lost.embedder
 
 
 def test_regions_take_their_embeddings_from_langsplat_s_files(room, splat, models, tmp_path):
@@ -190,8 +190,8 @@ def test_regions_take_their_embeddings_from_langsplat_s_files(room, splat, model
         write_features(folder, name, labels, vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
         rows += [] if capture.held_out[t] else list(np.load(folder / f"{name}_f.npy"))
     options = Options(room, gaussians=splat, holdout=4, masks=folder, features=folder, parts=True)
-    work = RunContext(options, networks.open_networks(options, tmp_path), tmp_path)
-    assert work.networks.embedder.name == "given-3"
+    work = RunContext(options, model_loading.open_models(options, tmp_path), tmp_path)
+    assert work.models.embedder.name == "given-3"
     planned, results = {s.name: s for s in run_stages(work)}, Results(load=capture, gaussians=load_ply(splat))
     stage = planned["regions"]
     given = StageInput(work, results, lambda done, total: None, Checkpoint(tmp_path / "none.safetensors"))
@@ -210,7 +210,7 @@ def test_regions_take_their_embeddings_from_langsplat_s_files(room, splat, model
         write_features(folder, name, np.full((120, 160), -1), np.zeros((0, 3)))
     with pytest.raises(InputError, match="no mask of level l"):
         stage.compute(given)
-    with_clip = networks.open_networks(dataclasses.replace(options, embedder=models[1]), tmp_path).embedder
+    with_clip = model_loading.open_models(dataclasses.replace(options, embedder=models[1]), tmp_path).embedder
     assert with_clip.name.startswith("clip-")
 
 
@@ -228,12 +228,12 @@ def test_texts_need_the_model_of_embeddings_from_files(seen, models, tmp_path, c
     assert cli.main([*ask, "--embedder", str(models[1]), "--quantile", "0"]) == 0
     assert 0 < json.loads((tmp_path / "answers" / "red.json").read_text())["score"] < 1
     with pytest.raises(InputError, match="5, as those from files have"):
-        networks.open_embedder("given-5", folder=models[1])
+        model_loading.open_embedder("given-5", folder=models[1])
 
 
 def test_templates_are_for_clip():
     with pytest.raises(InputError, match="--template"):
-        networks.open_embedder(templates=("a photo of a {}.",))
+        model_loading.open_embedder(templates=("a photo of a {}.",))
 
 
 def test_two_sources_of_masks_are_refused(room, models, tmp_path):

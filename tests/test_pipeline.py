@@ -23,13 +23,13 @@ from jsecon.app import cli
 from jsecon.field import field as field_file
 from jsecon.files import write_arrays
 from jsecon.paper import autoencoder
-from jsecon.pipeline import cache, networks, results, run as pipeline
+from jsecon.pipeline import cache, model_loading, results, run as pipeline
 from jsecon.pipeline.progress import Listener
 from jsecon.pipeline.results import RunContext
 from jsecon.pipeline.stages import fit_stages
 from jsecon.process import peak_memory_mib
 from jsecon.vision.colours import ColourEmbedder
-from jsecon.vision.protocols import Networks
+from jsecon.vision.protocols import Models
 
 STAGES = ("load", "gaussians", "masklets", "regions", "codes", "votes", "distil", "held_out")
 
@@ -136,7 +136,7 @@ def test_the_plan_says_what_is_left_out_and_why(room_run, on_given_gaussians, tm
     given, listener = on_given_gaussians
     assert {"segmenter", "association"} <= set(run.skipped)
     flat = dataclasses.replace(run.options, sh_degree=0, gaussians_at_most=1)
-    work, bare = (RunContext(options, Networks(ColourEmbedder()), tmp_path) for options in (run.options, flat))
+    work, bare = (RunContext(options, Models(ColourEmbedder()), tmp_path) for options in (run.options, flat))
     skipped = [{part for stage in fit_stages(context) for part in stage.skipped} for context in (bare, work)]
     left = skipped[0] - skipped[1]
     assert left == {"view-dependent colour"}
@@ -277,7 +277,7 @@ def test_peak_memory_is_in_mebibytes():
 
 def test_embedders_of_other_versions_are_refused():
     with pytest.raises(InputError, match="Run the capture again"):
-        networks.open_embedder("colours-of-the-future")
+        model_loading.open_embedder("colours-of-the-future")
 
 
 class Killed(Exception):

@@ -14,7 +14,7 @@ from jsecon import Regions, load_field, query_anchored, query_classes, query_sev
 from jsecon.app import cli
 from jsecon.app.ask import ask_text
 from jsecon.field.similarity import similarities
-from jsecon.pipeline import networks
+from jsecon.pipeline import model_loading
 from jsecon.query.match import evidence, reference_similarities, region_similarities
 from jsecon.query.rules import QUANTILE, REFERENCE_CUT, RETRIEVAL_THRESHOLD, QueryRules
 
@@ -257,7 +257,7 @@ def test_the_command_line_says_the_quantile_and_what_an_old_field_lacks(worded, 
     shares = [exact_quantile(field.regions.embeddings, text, field.unrelated_words) for text in texts]
     rows = {"seen": texts[int(np.argmax(shares))], "unseen": texts[int(np.argmin(shares))]}
     words = KnownTexts(rows, canonical_phrases=field.canonical_phrases)
-    monkeypatch.setattr(networks, "field_embedder", lambda *a, **k: words)
+    monkeypatch.setattr(model_loading, "field_embedder", lambda *a, **k: words)
 
     def asked(name, *options):
         line = ["query", str(tmp_path / name), "seen", "unseen", "--views", "0", "--out", str(tmp_path), *options]

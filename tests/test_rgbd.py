@@ -17,7 +17,7 @@ from jsecon.pipeline.stages import capture_stages
 from jsecon.read.captures.images import read_depth
 from jsecon.read.captures.lens import Lens, resample_depth
 from jsecon.vision.colours import ColourEmbedder
-from jsecon.vision.protocols import Networks
+from jsecon.vision.protocols import Models
 
 _RANDOM = small_capture(count=12)
 _ONE = {name: np.full(12, getattr(_RANDOM.cameras, name)[0]) for name in ("fx", "fy", "cx", "cy")}
@@ -142,7 +142,7 @@ def test_the_capture_comes_back(tmp_path, name):
     assert any("1 of 1" in note and "no pose" in note for note in found.notes)
     if name == "scannet":
         assert found.names == tuple(map(str, kept))
-    work = RunContext(Options(tmp_path / name), Networks(ColourEmbedder()), tmp_path / "out")
+    work = RunContext(Options(tmp_path / name), Models(ColourEmbedder()), tmp_path / "out")
     assert [stage.name for stage in capture_stages(work)] == ["load"]  # a run looks for no poses
 
 

@@ -18,7 +18,7 @@ from jsecon.pipeline.stages import run_stages
 from jsecon.read.captures.nerfstudio import trained_to_source
 from jsecon.splat.transform import transform_gaussians, transform_gaussians_float64
 from jsecon.vision.colours import ColourEmbedder
-from jsecon.vision.protocols import Networks
+from jsecon.vision.protocols import Models
 
 TURN = np.array([[0, 0, 1, 0.3], [1, 0, 0, -0.2], [0, 1, 0, 0.5], [0, 0, 0, 1.0]])
 TRAINED = np.diag([0.4, 0.4, 0.4, 1]) @ TURN
@@ -27,7 +27,7 @@ TRAINED = np.diag([0.4, 0.4, 0.4, 1]) @ TURN
 
 def read(capture, file):
     """The outcome of the stage that reads `file`, and the stage."""
-    work = RunContext(Options(capture=file.parent, gaussians=file), Networks(ColourEmbedder()), file.parent / "out")
+    work = RunContext(Options(capture=file.parent, gaussians=file), Models(ColourEmbedder()), file.parent / "out")
     stage = next(stage for stage in run_stages(work) if stage.name == "gaussians")
     stage_input = StageInput(work, Results(load=capture), lambda done, total: None, Checkpoint(work.out))
     return stage.compute(stage_input), stage

@@ -18,7 +18,7 @@ from jsecon.app import cli
 from jsecon.app.ask import ask_text
 from jsecon.networks.clip import ClipEmbedder, find_clip, read_preprocessing
 from jsecon.networks.tokenizer import TextRules, TextTokenizer
-from jsecon.pipeline import networks
+from jsecon.pipeline import model_loading
 from jsecon.pipeline.models import inspect_models
 from jsecon.query.match import best_presence, presence
 from jsecon.query.rules import PRESENCE_THRESHOLD, RETRIEVAL_THRESHOLD, QueryRules
@@ -253,7 +253,7 @@ def test_the_answer_says_how_likely_the_text_is_there(field, tmp_path, monkeypat
     save_field(tmp_path / "field.safetensors", dataclasses.replace(field, embedder="told"))
     told = {}
     for name, known in (("with", embedder), ("without", KnownTexts(texts))):
-        monkeypatch.setattr(networks, "field_embedder", lambda *a, known=known, **k: known)
+        monkeypatch.setattr(model_loading, "field_embedder", lambda *a, known=known, **k: known)
         out = tmp_path / name
         line = ["query", str(tmp_path / "field.safetensors"), "mug", "ghost", "--views", "0", "--out", str(out)]
         assert cli.main(line) == 0

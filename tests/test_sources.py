@@ -9,7 +9,7 @@ from small_field import make_field
 
 from jsecon import InputError, load_field, save_field
 from jsecon.app.cli import main
-from jsecon.pipeline.networks import field_embedder
+from jsecon.pipeline.model_loading import field_embedder
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.sources import locate_sources, provenance
 from jsecon.vision.colours import ColourEmbedder

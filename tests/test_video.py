@@ -10,7 +10,7 @@ from jsecon.pipeline.results import RunContext
 from jsecon.pipeline.stages import capture_stages
 from jsecon.read.captures.video import is_video, write_frames
 from jsecon.vision.colours import ColourEmbedder
-from jsecon.vision.protocols import Networks
+from jsecon.vision.protocols import Models
 
 SHARP = (2, 7, 12, 16, 20, 29)
 """of 30 frames, one in each stretch of five"""
@@ -55,7 +55,7 @@ def test_a_run_on_a_video_takes_as_many_frames_as_it_is_told(video, tmp_path):
     assert not is_video(tmp_path)
     keys = []
     for frames in (None, 20, 30):
-        work = RunContext(Options(video, frames=frames), Networks(ColourEmbedder()), tmp_path)
+        work = RunContext(Options(video, frames=frames), Models(ColourEmbedder()), tmp_path)
         poses, load = capture_stages(work)
         assert f"the {frames or 150} sharpest frames of walk.avi" in poses.how
         assert load.after == ("poses",)

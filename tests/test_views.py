@@ -14,7 +14,7 @@ from jsecon.app.cli import main
 from jsecon.splat.transform import transform_gaussians_float64
 from jsecon.views import plan
 from jsecon.views.frame import scene_frame, surface_points
-from jsecon.views.plan import free_places, greedy_cover, plan_views
+from jsecon.views.plan import free_places, greedy_cover, place_cameras
 
 BALLS = {"red": (0.8, 0.1, 0.1), "blue": (0.1, 0.2, 0.8), "green": (0.1, 0.6, 0.15)}
 CENTRES = np.array([(-1.2, -0.8, 0.4), (1.0, 0.2, 0.4), (-0.2, 1.1, 0.4)])
@@ -76,7 +76,7 @@ def few_candidates():
 @pytest.fixture(scope="module")
 def around(object_alone):
     """Planned views of the object."""
-    return plan_views(object_alone, views=6, width=160, height=120)
+    return place_cameras(object_alone, views=6, width=160, height=120)
 
 
 def moved(gaussians, seed, scale=None):
@@ -226,7 +226,7 @@ def test_greedy_cover_gains_at_each_step_the_most_that_any_view_would():
 
 
 def test_a_room_is_seen_from_inside_and_an_object_from_around(room, object_alone, around):
-    inside = plan_views(room, views=8, width=160, height=120)
+    inside = place_cameras(room, views=8, width=160, height=120)
     assert inside.kind == "room"
     centres = np.asarray(inside.cameras.centres)
     assert (np.abs(centres[:, 0]) < 3).all()
@@ -245,7 +245,7 @@ def test_no_view_looks_through_fog():
     scene = scene_of([*balls(), (fog, (0.5, 0.5, 0.5), 0.3)])
 
     def most_fog():
-        cameras = plan_views(scene, views=16, width=80, height=60, up=np.array([0, 0, 1.0])).cameras
+        cameras = place_cameras(scene, views=16, width=80, height=60, up=np.array([0, 0, 1.0])).cameras
         cameras, labels = cameras[np.arange(48) % 16], np.full((48, 60, 80), -1, np.int32)
         weights = np.asarray(jsecon.region_votes(scene, cameras, labels, 1, top=1, by_view=True).by_view)
         poses = np.asarray(cameras.world_to_camera)
@@ -266,7 +266,7 @@ def test_no_view_looks_through_fog():
 ], ids=["transparent", "one place", "fog"])  # fmt: skip
 def test_a_scene_that_cannot_be_judged_is_refused(object_alone, change, clause):
     with pytest.raises(jsecon.InputError, match=clause):
-        plan_views(dataclasses.replace(object_alone, **change(object_alone)))
+        place_cameras(dataclasses.replace(object_alone, **change(object_alone)))
 
 
 def test_a_splat_without_photographs_answers_a_text(room, tmp_path, capsys):

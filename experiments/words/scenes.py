@@ -39,7 +39,7 @@ from jsecon.pipeline.stages import associate_masks, frame_proposals
 from jsecon.read.captures.capture import load_capture
 from jsecon.types import Camera, Capture, Gaussians, Regions, Votes
 from jsecon.vision.colours import ColourEmbedder
-from jsecon.vision.protocols import Networks
+from jsecon.vision.protocols import Models
 
 GIVEN, DEFAULT = "given", "default"
 """masks of the data, and of jsecon's vision without weights"""
@@ -139,7 +139,7 @@ class WordScene:
 
 def _default_masks(capture: Capture, gaussians: Gaussians) -> np.ndarray:
     """labels (T, H, W) of the views that vote, by the vision without weights as `jsecon run` has it."""
-    work, scene = RunContext(RunOptions(capture=Path()), Networks(ColourEmbedder()), Path()), _on_device(gaussians)
+    work, scene = RunContext(RunOptions(capture=Path()), Models(ColourEmbedder()), Path()), _on_device(gaussians)
     propose = functools.cache(frame_proposals(work, capture, scene)[0])
     return associate_masks(work, capture, scene, propose, lambda done, total: None)
 

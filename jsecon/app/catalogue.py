@@ -220,7 +220,7 @@ def _vocabulary(field: LanguageField, vocabulary: Sequence[str] | None, embedder
             REFERENCE_WORDS, np.asarray(field.unrelated_words, np.float32), SOFTMAX_SCALE
         )  # without the model
     if embedder is None:
-        from jsecon.pipeline.networks import external_dim, field_embedder
+        from jsecon.pipeline.model_loading import external_dim, field_embedder
 
         if vocabulary is None and external_dim(field.embedder) is not None:
             return _Names((), np.zeros((0, field.regions.embeddings.shape[1]), np.float32), SOFTMAX_SCALE)

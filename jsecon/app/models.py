@@ -90,16 +90,16 @@ def open_embedder(field: Any, verb: verbs.FieldVerb, console: Console) -> Any:
     Raises:
       InputError: The model is not on this machine, or is another one.
     """
-    from jsecon.pipeline import networks
+    from jsecon.pipeline import model_loading
 
     if field.unrelated_words is None:
         console.note(OLD_FIELD)
     folder = with_models(verb, console, yes=verb.yes).embedder
     if folder is None and (verb.yes or sys.stdin.isatty()):
-        missing = networks.find_model(field)
+        missing = model_loading.find_model(field)
         if isinstance(missing, HubModel):
             folder = _folders_of_models({"embedder": missing}, console, yes=verb.yes)["embedder"]
-    return networks.field_embedder(field, folder, templates=verb.template or ("{}",))
+    return model_loading.field_embedder(field, folder, templates=verb.template or ("{}",))
 
 
 AUTO = "auto"

@@ -16,7 +16,7 @@ from jsecon.app.ask import ask_text
 from jsecon.app.outputs import answer_masks
 from jsecon.errors import InputError
 from jsecon.fit.resize import resize_frame, scale_cameras
-from jsecon.pipeline import networks
+from jsecon.pipeline import model_loading
 from jsecon.read.captures.frames import evenly_spaced
 from jsecon.types import Capture, LanguageField, Selection
 
@@ -74,7 +74,7 @@ def show(field: LanguageField, text: str, *, embedder: Any = None, views: int = 
     except ImportError as error:
         remedy = "Run: pip install 'jsecon[figures]'"
         raise InputError("jsecon.show", "the package matplotlib is missing", remedy=remedy) from error
-    answer = ask_text(field, embedder or networks.field_embedder(field), text, **options)
+    answer = ask_text(field, embedder or model_loading.field_embedder(field), text, **options)
     masks = answer_masks(field, answer, views) or {0: np.zeros((field.cameras.height, field.cameras.width), bool)}
     renderer = pictures.Renderer(field.gaussians, field.cameras)
     size = (3.2 * len(masks), 4.8)

@@ -212,7 +212,7 @@ def open_scene(field: LanguageField | ObjectScene, embedder: Any, up: Sequence[A
     if field.regions.count == 0:
         raise InputError("field", "it has no regions, so no objects", remedy="Make it again with other --masks.")
     if embedder is None:
-        from jsecon.pipeline.networks import field_embedder
+        from jsecon.pipeline.model_loading import field_embedder
 
         embedder = field_embedder(field)
     return ObjectScene(field, embedder, up=up)

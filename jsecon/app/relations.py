@@ -271,7 +271,7 @@ def locate(
         if isinstance(field, ObjectScene):
             field, embedder = field.field, field.embedder
         if embedder is None:
-            from jsecon.pipeline.networks import field_embedder
+            from jsecon.pipeline.model_loading import field_embedder
 
             embedder = field_embedder(field)
         answer = ask_text(field, embedder, text, **options)

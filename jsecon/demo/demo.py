@@ -21,7 +21,7 @@ from jsecon.demo.film import write_film
 from jsecon.demo.room import crowded_room
 from jsecon.evaluate.lerf import Row
 from jsecon.files import atomic_write, write_text
-from jsecon.pipeline import networks, run as pipeline
+from jsecon.pipeline import model_loading, run as pipeline
 from jsecon.pipeline.options import Options, require_writable
 from jsecon.pipeline.progress import Console, Listener
 from jsecon.pipeline.run import Run
@@ -61,7 +61,7 @@ def run_demo(
     true_run = pipeline.run(true_options, out / "true_masks", listener=listener, cache_folder=out / "cache")
 
     labels = load_lerf_labels(capture / "label")
-    embedder = networks.field_embedder(run.field)
+    embedder = model_loading.field_embedder(run.field)
     listener.say("measured on the held-out views")
     results = evaluation.evaluate(run.field, embedder, labels, listener)
     true_results = evaluation.evaluate(true_run.field, embedder, labels, listener, ("anchored", "one_step"))

@@ -150,7 +150,7 @@ def _dense_votes(
     That is the first region of a block; and {"votes" (N, block), "total", "peak", "views" (N,), "overflow", "by_view"
     (T, N) or None}.
     """
-    # One program serves every near plane, which `plan_views` chooses by the scene's size.
+    # One program serves every near plane, which `place_cameras` chooses by the scene's size.
     scene, near_plane = _without_colour(gaussians), np.asarray(near, gaussians.means.dtype)
     size = _default_capacity(gaussians, cameras) if capacity is None else capacity
     blocks = _region_blocks(gaussians.count, num_regions)

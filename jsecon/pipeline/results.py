@@ -21,7 +21,7 @@ from jsecon.pipeline import cache
 from jsecon.pipeline.options import Options
 from jsecon.read.captures.frames import evenly_spaced
 from jsecon.types import Array, Capture, Gaussians, Parts, Progress, Quality, Regions, Votes
-from jsecon.vision.protocols import Networks
+from jsecon.vision.protocols import Models
 
 CHECKPOINT_SECONDS = 20.0
 """s between two checkpoints of a stage; a stop loses at most this and one chunk of steps, or one tracked frame"""
@@ -77,7 +77,7 @@ class RunContext:
 
     options: Options
     """Options of the run."""
-    networks: Networks
+    models: Models
     """Models of the run."""
     out: Path
     """Output folder. It does not count as input if it lies inside of an input folder."""

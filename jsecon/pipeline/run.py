@@ -33,7 +33,7 @@ import numpy as np
 from jsecon.errors import InputError
 from jsecon.field.field import load_field, save_field
 from jsecon.files import exclusive_lock
-from jsecon.pipeline import cache, networks, processes, stages
+from jsecon.pipeline import cache, model_loading, processes, stages
 from jsecon.pipeline.options import Options, is_bare_scene, require_writable
 from jsecon.pipeline.processes import Coordinator
 from jsecon.pipeline.progress import Listener, Step
@@ -257,7 +257,7 @@ def compute_stages(
         listener.say(f"{context.options.capture} -> {context.out}")
         for step in plan.steps:
             listener.step(step)
-        context.networks.require_ready(plan.running)
+        context.models.require_ready(plan.running)
         computed = Computed(Results(), plan.keys, plan.steps)
         for stage in stage_list:
             _compute_stage(context, stage, plan, computed, listener, coordinator)
@@ -269,7 +269,7 @@ def compute_stages(
 def _note_vision_time(context: RunContext, capture: Capture, running: list[str], listener: Listener) -> None:
     """Measures the models on two frames, and says how long all will take; the masks of these two frames are stored."""
     frames = np.asarray(capture.frames)[vision_frames(capture, context.options)]
-    segmenter, crops, notes = context.networks.segmenter, CROPS_PER_FRAME, []
+    segmenter, crops, notes = context.models.segmenter, CROPS_PER_FRAME, []
     with listener.progress("vision"):
         if "masklets" in running and isinstance(segmenter, StoredSegmenter):
             missing = [t for t in range(len(frames)) if not segmenter.has(frames[t])]
@@ -280,11 +280,11 @@ def _note_vision_time(context: RunContext, capture: Capture, running: list[str],
                     crops = len(segmenter(frames[t], t))
                     seconds = time.monotonic() - started
                 notes.append(f"SAM: {len(missing) - 2} frames, about {_duration(seconds * (len(missing) - 2))}")
-        seconds_per_crop = getattr(context.networks.embedder, "seconds_per_crop", None)
+        seconds_per_crop = getattr(context.models.embedder, "seconds_per_crop", None)
         if "regions" in running and seconds_per_crop is not None and len(frames) >= FEW_FRAMES:
             count = crops * len(frames)
             notes.append(f"CLIP: some {count:,} regions, about {_duration(seconds_per_crop() * count)}")
-        context.networks.close()
+        context.models.close()
     for note in notes:
         listener.note(f"{note}. Fewer frames: --vision-frames.")
 
@@ -362,7 +362,7 @@ def run(
     folder = cache_folder or out / "cache"
     context = _open_context(options, out, folder)
     computed = compute_stages(context, stages.run_stages(context), folder, listener=listener, coordinator=coordinator)
-    results, embedder = computed.results, context.networks.embedder
+    results, embedder = computed.results, context.models.embedder
     started = time.monotonic()
     with listener.progress("field"):
         field = stages.field_of(results, embedder, provenance(options, computed.keys, embedder.name, out), options)
@@ -375,7 +375,7 @@ def run(
 
 def _open_context(options: Options, out: Path, cache_folder: Path | None = None) -> RunContext:
     """Opens the models of a run."""
-    return RunContext(options, networks.open_networks(options, cache_folder or out / "cache"), out)
+    return RunContext(options, model_loading.open_models(options, cache_folder or out / "cache"), out)
 
 
 def current_field(options: Options, out: Path) -> Path | None:
@@ -433,7 +433,7 @@ def dry_run(options: Options, out: Path, *, scene_only: bool = False, listener: 
         context = _open_context(options, out)
         stage_list = stages.fit_stages(context) if scene_only else stages.run_stages(context)
         plan = _plan(context, stage_list, out / "cache")
-        context.networks.require_ready(plan.running)
+        context.models.require_ready(plan.running)
         _check_inputs(context, plan)
     listener.say(f"{options.capture} -> {out}, a dry run")
     for step in plan.steps:

@@ -362,7 +362,7 @@ def _measure(stage: StageInput) -> StageResult:
 
 def _plan_masklets(context: RunContext) -> Stage:
     """Plans the labels of the training frames: from mask files, or proposals associated over the frames."""
-    options, networks, folder = context.options, context.networks, context.options.masks
+    options, models, folder = context.options, context.models, context.options.masks
     if folder is not None:
         reason = f"masks are given ({folder.name})"
         skipped = {"segmenter": reason, "association": reason}
@@ -377,7 +377,7 @@ def _plan_masklets(context: RunContext) -> Stage:
         )
     if options.proposals is not None:
         how, key_options = f"proposals read from {options.proposals.name}", context.key_options("level")
-    elif networks.segmenter is not None:
+    elif models.segmenter is not None:
         assert options.segmenter is not None
         crops = f" and {options.crop_layers} layers of crops" if options.crop_layers else ""
         grid = f"at {options.points_per_side}x{options.points_per_side} points"
@@ -385,7 +385,7 @@ def _plan_masklets(context: RunContext) -> Stage:
         how = (
             f"proposals of level {options.level} by {model_name(options.segmenter, 'segmenter')}, asked {asked}{crops}"
         )
-        key_options = {"model": networks.segmenter.name}
+        key_options = {"model": models.segmenter.name}
     else:
         how = f"{options.granularity} proposals by colour and texture"
         key_options = context.key_options("granularity")
@@ -396,7 +396,7 @@ def _plan_masklets(context: RunContext) -> Stage:
         by = "through the Gaussians" if options.tracker is None else f"by {model_name(options.tracker, 'tracker')}"
         how += f", followed {by}"
         key_options |= context.key_options("iou_threshold")
-    tracker = None if networks.tracker is None else networks.tracker.name
+    tracker = None if models.tracker is None else models.tracker.name
     key_options = {**key_options, "association": options.associated_by, "tracker": tracker}
     key_options |= context.key_options("vision_frames")
     if options.vision_frames is not None:
@@ -446,7 +446,7 @@ def _find_masklets(stage: StageInput) -> StageResult:
     context, capture, scene = stage.context, stage.results.load, stage.results.gaussians
     proposals, notes = frame_proposals(context, capture, scene)
     labels = associate_masks(context, capture, scene, proposals, stage.progress, stage.checkpoint)
-    context.networks.close()
+    context.models.close()
     _require_regions(labels, str(context.options.capture))
     return StageResult(labels, notes=notes)
 
@@ -470,7 +470,7 @@ def frame_proposals(
     options, vision = context.options, _Vision(capture, context.options)
     if options.proposals is not None:
         return load_proposals(options.proposals, vision.names, vision.size, **vision.mask_layout)
-    segmenter, frames = context.networks.segmenter, vision.frames
+    segmenter, frames = context.models.segmenter, vision.frames
     if segmenter is not None:  # it stores its masks on disk
         lock = threading.Lock()  # a network takes all cores for one frame
 
@@ -538,7 +538,7 @@ def associate_masks(
         scene = SceneSuperpixels(gaussians, cameras, proposals, centre=options.centre)
         labels = consensus_masklets(frames, scene, agreement=options.agreement, seed=options.seed, progress=progress)
         return clean_masklets(labels)
-    tracker = context.networks.tracker or GeometricTracker(gaussians, cameras, proposals)
+    tracker = context.models.tracker or GeometricTracker(gaussians, cameras, proposals)
     labels = algorithm1(
         frames,
         lambda frame, index: proposals(index),
@@ -564,7 +564,7 @@ def _require_regions(labels: np.ndarray, where: str) -> None:
 
 def _plan_regions(context: RunContext) -> Stage:
     """Plans an embedding of each region: by the embedder, or from files."""
-    options, embedder = context.options, context.networks.embedder
+    options, embedder = context.options, context.models.embedder
     after, key_options = ("load", "masklets"), context.key_options("weighting")
     if options.features is None:
         how = f"embedded by {embedder.name!r}, views weighted by {options.weighting}"
@@ -585,9 +585,9 @@ def _plan_regions(context: RunContext) -> Stage:
 
 def _embed_regions(stage: StageInput) -> StageResult:
     context, weighting = stage.context, stage.context.options.weighting
-    frames, embed = _Vision(stage.results.load, context.options).frames, context.networks.embedder.embed_regions
+    frames, embed = _Vision(stage.results.load, context.options).frames, context.models.embedder.embed_regions
     embedded = region_embeddings(frames, stage.results.masklets, embed, weighting=weighting, progress=stage.progress)
-    context.networks.close()
+    context.models.close()
     return StageResult(embedded)
 
 
@@ -618,7 +618,7 @@ def _plan_parts(context: RunContext) -> Stage:
         "of the scene, by what single masks say of them",
         _find_parts,
         after=("load", "gaussians", "masklets"),
-        key_options=key_options | {"embedder": context.networks.embedder.name},
+        key_options=key_options | {"embedder": context.models.embedder.name},
         files=context.options.features,
     )
 
@@ -631,7 +631,7 @@ def _find_parts(stage: StageInput) -> StageResult:
     views = SceneSuperpixels(stage.results.gaussians, vision.cameras, masks, centre=options.centre)
     piece, weights = pieces_on_masks(frames, views, seed=options.seed, progress=stage.progress)
     rows = np.concatenate([embed(t, masks(t)) for t in range(len(frames))])
-    context.networks.close()
+    context.models.close()
     return StageResult(scene_parts(piece, weights, rows))
 
 
@@ -641,7 +641,7 @@ def _masks_with_embeddings(context: RunContext, results: Results) -> tuple[Calla
     frames = vision.frames
 
     def by_model(t, masks):
-        return context.networks.embedder.embed_regions(frames[t], masks)
+        return context.models.embedder.embed_regions(frames[t], masks)
 
     if options.features is not None:
         features = load_features(options.features, vision.names, vision.size, **vision.mask_layout)

@@ -7,7 +7,7 @@ import numpy as np
 from jsecon.splat.render import render_rgb
 from jsecon.splat.sh import colours_from_sh
 from jsecon.types import Camera, Capture, Gaussians, Progress
-from jsecon.views.plan import plan_views
+from jsecon.views.plan import place_cameras
 
 BACKGROUNDS = (0.0, 1.0, 0.5)
 """grey values that may lie behind a scene, the usual one first"""
@@ -40,7 +40,7 @@ def render_capture(
     Raises:
       InputError: The scene cannot be judged.
     """
-    planned = plan_views(gaussians, views=views, width=width, height=height, up=up, progress=progress)
+    planned = place_cameras(gaussians, views=views, width=width, height=height, up=up, progress=progress)
     names = tuple(f"view_{index:03d}" for index in range(len(planned.cameras)))
     return capture_from_cameras(gaussians, planned.cameras, names, source_from_scene, notes=(f"{planned.describe()}.",))
 

@@ -85,7 +85,7 @@ class PlannedViews:
         )
 
 
-def plan_views(
+def place_cameras(
     gaussians: Gaussians,
     *,
     views: int = 24,

@@ -129,8 +129,8 @@ class Logits(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Networks:
-    """Models of a run. Networks are opened when first needed and closed when their stage is done."""
+class Models:
+    """Models of a run. A network is opened when first needed and closed when its stage is done."""
 
     embedder: Embedder
     segmenter: NamedSegmenter | None = None

@@ -16,7 +16,7 @@ from jsecon.app.object_scene import ObjectScene
 from jsecon.app.outputs import best_frames
 from jsecon.errors import InputError
 from jsecon.field.field import load_field
-from jsecon.pipeline.networks import field_embedder
+from jsecon.pipeline.model_loading import field_embedder
 from jsecon.query.render import selection_mask
 from jsecon.types import LanguageField
 

@@ -35,7 +35,7 @@ from jsecon.app.viewer.static_page import export_page
 from jsecon.app.viewer.view_state import History, ViewQuery, ViewState
 from jsecon.errors import InputError
 from jsecon.field.field import load_field
-from jsecon.pipeline.networks import ExternalSpace, external_dim
+from jsecon.pipeline.model_loading import ExternalSpace, external_dim
 from jsecon.pipeline.progress import Console
 from jsecon.query.edits import mutual_neighbours
 from jsecon.query.expressions import is_expression

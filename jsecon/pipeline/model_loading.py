@@ -1,6 +1,6 @@
 """Opens what looks at the frames: OpenCV and colours without weights, or SAM, SAM 2 and CLIP from model folders.
 
-Networks are opened when first needed and closed when their stage is done, to free their memory.
+A network is opened when first needed and closed when its stage is done, to free their memory.
 """
 
 import contextlib
@@ -15,7 +15,7 @@ from jsecon.networks.hub import HubModel, parse_model
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.sources import locate_sources
 from jsecon.types import LanguageField
-from jsecon.vision.protocols import Embedder, Networks
+from jsecon.vision.protocols import Embedder, Models
 from jsecon.vision.stores import StoredSegmenter
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def _missing_model(dim: int) -> InputError:
     return InputError("field", problem, "the CLIP model that made them", remedy)
 
 
-def open_networks(options: Options, store: Path) -> Networks:
+def open_models(options: Options, store: Path) -> Models:
     """Opens SAM, SAM 2 and CLIP if the options name their folders.
 
     Args:
@@ -98,9 +98,9 @@ def open_networks(options: Options, store: Path) -> Networks:
 
         external = ExternalSpace(embedding_size(options.features))
         if model is None:
-            return Networks(external, segmenter, tracker)
+            return Models(external, segmenter, tracker)
         name = external.name
-    return Networks(open_embedder(name, folder=model, store=store / "embeddings"), segmenter, tracker)
+    return Models(open_embedder(name, folder=model, store=store / "embeddings"), segmenter, tracker)
 
 
 def open_embedder(
