@@ -3,7 +3,7 @@
     python benchmarks/processes.py [CAPTURE] [--repeats 3] [--long-side 400] [--steps 300]
 
 Fits the capture's Gaussians once, which several processes don't share; then runs all the rest by one process on one
-core and by `jsecon run --processes 2` on two, one after the other, a first time to compile and then `--repeats` times.
+core and by `mpirun -n 2` on two, one after the other, a first time to compile and then `--repeats` times.
 Prints of each stage that is shared the median seconds and the ratio, and whether the fields are the same to the bit.
 """
 
@@ -37,7 +37,8 @@ def main() -> None:
         fit = [*jsecon, "fit", *common, "--out", str(place / "scene.ply"), "--steps", str(given.steps)]
         subprocess.run(fit, check=True, stdout=subprocess.DEVNULL)
         run = [*jsecon, "run", *common, "--gaussians", str(place / "scene.ply")]
-        how = {ONE: (["taskset", "-c", "0"], []), TWO: ([], ["--processes", "2"])}
+        mpirun = ["mpirun", "--allow-run-as-root", "-n", "2"]
+        how = {ONE: (["taskset", "-c", "0"], []), TWO: (mpirun, ["--distributed"])}
         seconds = {name: {stage: [] for stage in STAGES} for name in how}
         for repeat in range(given.repeats + 1):
             for name, (before, behind) in how.items():

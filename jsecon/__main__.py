@@ -8,7 +8,7 @@ import sys
 import traceback
 from typing import Any
 
-from jsecon.process import prepare_process, prepare_worker, stop_by_signals, worker_info
+from jsecon.process import prepare_process, stop_by_signals
 
 STOPPED = 130
 """exit code of a program that the user stopped"""
@@ -31,22 +31,11 @@ class Output:
         return getattr(self._stream, name)
 
     def isatty(self) -> bool:
-        """Whether it is a terminal.
-
-        Returns:
-          The stream's own answer.
-        """
+        """Whether it is a terminal."""
         return self._stream.isatty()
 
     def write(self, text: str) -> int:
-        """Writes a text, or drops it after a failure.
-
-        Args:
-          text: The text.
-
-        Returns:
-          The number of its characters.
-        """
+        """Writes a text, or drops it after a failure."""
         try:
             return self._stream.write(text)
         except OSError as error:
@@ -68,14 +57,7 @@ class Output:
 
 
 def main() -> int:
-    """Runs the command line.
-
-    Returns:
-      The exit code: STOPPED after an interrupt, UNREAD if the reader of standard output went away.
-    """
-    several = worker_info() is not None
-    if several:
-        prepare_worker()
+    """Runs the command line."""
     prepare_process()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -92,8 +74,6 @@ def main() -> int:
         print("\njsecon: interrupted.", file=sys.stderr)
         code = STOPPED
     except Exception:
-        if not several:
-            raise
         traceback.print_exc()
     finally:
         for output in outputs:
@@ -103,8 +83,9 @@ def main() -> int:
             if failure.errno not in (errno.EPIPE, errno.EINVAL):  # Windows has the second for the first
                 code = 2
                 print(f"jsecon: cannot write to standard output: {failure.strerror}.", file=sys.stderr)
-        if several or code == STOPPED:  # jax would wait for the other processes; and end by SIGSEGV, as Python takes
-            sys.stdout.flush()  # itself apart, where a stop fell into a compilation
+        jax = sys.modules.get("jax")
+        if code == STOPPED or (code and jax is not None and jax.distributed.is_initialized()):
+            # jax would wait for the other processes, or end by SIGSEGV if the stop fell into a compilation
             os._exit(code)
         gc.freeze()  # else the interpreter collects three times at its end, for half a second
     return code

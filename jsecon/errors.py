@@ -35,14 +35,7 @@ class InputError(ValueError):
 
 
 def describe_error(error: BaseException) -> str:
-    """Describes an exception without its Python name.
-
-    Args:
-      error: Any exception of a reader or writer.
-
-    Returns:
-      One line without a full stop.
-    """
+    """Describes an exception without its Python name."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror.partition(" (")[0]
     if isinstance(error, KeyError) and error.args:
@@ -57,34 +50,13 @@ def describe_error(error: BaseException) -> str:
 
 
 def require(condition: bool, name: str, got: object, expected: str, remedy: str) -> None:
-    """Checks what is known at trace time: shapes, dtypes, options.
-
-    Args:
-      condition: What must hold.
-      name: Name of the argument or function.
-      got: The value.
-      expected: What it should be.
-      remedy: What to do about it, a sentence.
-
-    Raises:
-      ValueError: The condition is false.
-    """
+    """Checks what is known at trace time: shapes, dtypes, options."""
     if not condition:
         raise ValueError(f"{name}: got {got}, expected {expected}. {remedy}")
 
 
 def require_shape(name: str, array: Any, expected: tuple[Any, ...], remedy: str) -> None:
-    """Checks the shape of an array.
-
-    Args:
-      name: Name of the argument.
-      array: The array.
-      expected: Its shape: numbers, letters for any size, ... first for any leading axes.
-      remedy: What to do about it, a sentence.
-
-    Raises:
-      ValueError: The array has another shape.
-    """
+    """Checks the shape of an array."""
     got = tuple(array.shape)
     shape = (*got[: len(got) - len(expected) + 1], *expected[1:]) if expected[0] is ... else expected
     fits = len(got) == len(shape) and all(isinstance(size, str) or size == actual for actual, size in zip(got, shape))
@@ -93,16 +65,6 @@ def require_shape(name: str, array: Any, expected: tuple[Any, ...], remedy: str)
 
 
 def require_one_of(name: str, got: object, choices: Iterable[str], remedy: str) -> None:
-    """Checks that an option is one of its choices.
-
-    Args:
-      name: Name of the option.
-      got: Its value.
-      choices: The choices.
-      remedy: What to do about it, a sentence.
-
-    Raises:
-      ValueError: It is not.
-    """
+    """Checks that an option is one of its choices."""
     choices = tuple(choices)
     require(got in choices, name, repr(got), " or ".join(map(repr, choices)), remedy)

@@ -59,17 +59,7 @@ class ForeignFileError(ValueError):
 
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
-    """Opens a temporary path beside a file, which gets the file's name at the end, or is removed if the body raised.
-
-    Args:
-      path: The file. Missing folders are made. The temporary name keeps its suffix, by which writers choose the format.
-
-    Yields:
-      The temporary path, an empty file.
-
-    Raises:
-      InputError: The folder cannot be written, or the disk is full.
-    """
+    """Opens a temporary path beside a file, which gets the file's name at the end, or is removed if the body raised."""
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:8]}.partial{path.suffix}")
     try:
@@ -92,17 +82,7 @@ def _unwritten(path: Path, error: OSError) -> InputError:
 
 @contextlib.contextmanager
 def exclusive_lock(folder: Path) -> Iterator[None]:
-    """Locks a folder for this process, for the body of a `with`.
-
-    Args:
-      folder: The folder, which must exist. On a file system without locks the body runs unlocked.
-
-    Yields:
-      None.
-
-    Raises:
-      InputError: Another run has locked it, or it cannot be written.
-    """
+    """Locks a folder for this process, for the body of a `with`."""
     lock = FileLock(folder / ".lock", timeout=0)
     try:
         lock.acquire()
@@ -121,18 +101,7 @@ def exclusive_lock(folder: Path) -> Iterator[None]:
 
 
 def path_within(folder: Path, name: str) -> Path:
-    """Joins a folder and a name that comes from a file.
-
-    Args:
-      folder: The folder.
-      name: Relative path beneath it.
-
-    Returns:
-      The path, which need not exist.
-
-    Raises:
-      InputError: The name leads out of the folder.
-    """
+    """Joins a folder and a name that comes from a file."""
     first = Path(os.path.normpath(name)).parts[:1]
     if "\0" in name or os.path.splitdrive(name)[0] or os.path.isabs(name) or first == ("..",):
         problem = f"the name {name[:MAX_NAME]!r} leads out of the folder"
@@ -141,27 +110,12 @@ def path_within(folder: Path, name: str) -> Path:
 
 
 def is_output_folder(folder: Path) -> bool:
-    """Whether a folder is the output folder of a run or a query, which is never input.
-
-    Args:
-      folder: The folder.
-
-    Returns:
-      True if it has the cache of a run or the page of a query.
-    """
+    """Whether a folder is the output folder of a run or a query, which is never input."""
     return (folder / "cache" / "CACHEDIR.TAG").is_file() or (folder / "answers.html").is_file()
 
 
 def list_files(root: Path, *, exclude: Path | None = None) -> Iterator[Path]:
-    """Lists the files beneath a folder, through links too. Hidden files and output folders of jsecon are skipped.
-
-    Args:
-      root: The folder.
-      exclude: A folder to skip.
-
-    Yields:
-      The files in the order of their paths.
-    """
+    """Lists the files beneath a folder, through links too. Hidden files and output folders of jsecon are skipped."""
     excluded = None if exclude is None else exclude.resolve()
     files, visited = [], set()
     for place, folders, names in os.walk(root, followlinks=True):
@@ -175,28 +129,13 @@ def list_files(root: Path, *, exclude: Path | None = None) -> Iterator[Path]:
 
 
 def write_text(path: str | os.PathLike, text: str) -> None:
-    r"""Writes a text (UTF-8) atomically.
-
-    Args:
-      path: The file.
-      text: The text; bytes of file names that are no UTF-8 become \\udcxx.
-
-    Raises:
-      InputError: The file cannot be written.
-    """
+    r"""Writes a text (UTF-8) atomically."""
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def read_text(path: Path) -> str:
-    """Reads a text file as UTF-8, or as UTF-16 if it begins with that byte order mark.
-
-    Args:
-      path: The file.
-
-    Returns:
-      The text. Bytes that are no UTF-8 are surrogates, as in file names: a path made of them finds its file.
-    """
+    """Reads a text file as UTF-8, or as UTF-16 if it begins with that byte order mark."""
     data = path.read_bytes()
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16", "replace")
@@ -204,17 +143,7 @@ def read_text(path: Path) -> str:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parses JSON.
-
-    Args:
-      text: The text, or its bytes in UTF-8.
-
-    Returns:
-      Its value; whole numbers of 300 digits and more are floats.
-
-    Raises:
-      ValueError: It is not JSON.
-    """
+    """Parses JSON."""
     try:
         return json.loads(text, parse_int=lambda digits: int(digits) if len(digits) < 300 else float(digits))
     except RecursionError as error:
@@ -222,19 +151,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def read_json(path: Path, expected: str, remedy: str) -> Any:
-    """Reads a JSON file.
-
-    Args:
-      path: The file.
-      expected: What it should hold, for the message.
-      remedy: What to do about it, a sentence.
-
-    Returns:
-      Its value, as of `parse_json`.
-
-    Raises:
-      InputError: It cannot be read.
-    """
+    """Reads a JSON file."""
     try:
         return parse_json(path.read_bytes())
     except OSError as error:
@@ -247,20 +164,7 @@ def read_json(path: Path, expected: str, remedy: str) -> Any:
 def reading(
     path: object, expected: str = "", remedy: str = "", *, problem: str = "it cannot be read"
 ) -> Iterator[None]:
-    """Turns what the reading of a damaged file raises (READ_ERRORS) into an InputError.
-
-    Args:
-      path: The file, or a place in it.
-      expected: What should be there.
-      remedy: What to do about it, a sentence.
-      problem: What is wrong; the error follows in brackets.
-
-    Yields:
-      None.
-
-    Raises:
-      InputError: The body raises an error.
-    """
+    """Turns what the reading of a damaged file raises (READ_ERRORS) into an InputError."""
     try:
         yield
     except InputError:
@@ -273,15 +177,6 @@ def map_npy(path: Path) -> np.ndarray:
     """Memory-maps the array of a .npy file.
 
     The header is parsed here: NumPy's parser warns of damaged ones, and raises errors of Python's tokenizer.
-
-    Args:
-      path: A .npy file.
-
-    Returns:
-      The array, read-only.
-
-    Raises:
-      OSError, ValueError, ...: One of READ_ERRORS. The file is missing, is damaged, or holds other values than numbers.
     """
     with open(path, "rb") as file:
         magic = file.read(8)
@@ -301,14 +196,7 @@ def map_npy(path: Path) -> np.ndarray:
 
 
 def write_npy(path: str | os.PathLike, shape: tuple[int, ...], dtype: Any, blocks: Iterable[np.ndarray]) -> None:
-    """Writes a .npy block by block. On a full disk a write raises; a memory map would end the process.
-
-    Args:
-      path: The file.
-      shape: Shape of the whole array.
-      dtype: Its type.
-      blocks: Consecutive blocks of rows.
-    """
+    """Writes a .npy block by block. On a full disk a write raises; a memory map would end the process."""
     with open(path, "wb") as file:
         header = {"descr": np.lib.format.dtype_to_descr(np.dtype(dtype)), "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(file, header)
@@ -321,14 +209,6 @@ def write_arrays(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], desc
 
     Its metadata have two texts: "jsecon", JSON with the description and with each array's CRC-32, and "crc32", the
     CRC-32 of that JSON.
-
-    Args:
-      path: The file.
-      arrays: Arrays of numbers by name.
-      description: A JSON value to keep beside them.
-
-    Raises:
-      OSError: The file cannot be written.
     """
     # safetensors.numpy.save_file makes files of mode 600, and hides a full disk behind another error.
     # The widest first, as there, so that every array is aligned to its type.
@@ -351,19 +231,7 @@ def write_arrays(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], desc
 def read_arrays(
     path: str | os.PathLike, *, memory_map_above: int = sys.maxsize, verify: bool = True
 ) -> tuple[Any, dict[str, np.ndarray]]:
-    """Reads what `write_arrays` wrote.
-
-    Args:
-      path: The file.
-      memory_map_above: Arrays of more bytes are memory-mapped.
-      verify: Also compare the checksums of mapped arrays, which reads them. Those of the others are always compared.
-
-    Returns:
-      The description, and the arrays by name.
-
-    Raises:
-      OSError, ValueError, ...: One of READ_ERRORS. The file is missing, is damaged, or was not written by jsecon.
-    """
+    """Reads what `write_arrays` wrote."""
     with safe_open(path, framework="numpy"):  # checks sizes and places: no gap, no overlap, no bytes behind the end
         pass
     arrays = {}
@@ -415,18 +283,6 @@ def pack_tree(
 
     A node is one of: {"value": JSON value}, a list of them for a tuple; {"list": [...]}, {"tuple": [...]}, {"dict":
     {...}}, {"record": name, "fields": {...}}, {"array": path, "shape", "dtype"}.
-
-    Args:
-      node: The tree.
-      path: Path of its root.
-      arrays: Receives the arrays by their paths.
-      name_of: Returns the name of a type of record, None for any other type; by default of any of jsecon's records.
-
-    Returns:
-      The description.
-
-    Raises:
-      ValueError: The tree holds another kind of object.
     """
 
     def inner(parts: Any) -> dict:
@@ -452,19 +308,7 @@ def pack_tree(
 
 
 def unpack_tree(node: Any, arrays: Mapping[str, np.ndarray], kind_of: Callable[[str], type] = _record_of_name) -> Any:
-    """Builds the tree that `pack_tree` described.
-
-    Args:
-      node: The description.
-      arrays: NumPy arrays by their paths.
-      kind_of: Returns the type of record of a name.
-
-    Returns:
-      The tree. A tuple of plain values stays a tuple.
-
-    Raises:
-      OSError, ValueError, ...: One of READ_ERRORS. `pack_tree` did not write the description.
-    """
+    """Builds the tree that `pack_tree` described."""
     if "value" in node:
         return tuple(node["value"]) if isinstance(node["value"], list) else node["value"]
     if "array" in node:

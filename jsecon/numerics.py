@@ -34,14 +34,7 @@ MAX_MAGNITUDE = 1e18
 
 @np.errstate(invalid="ignore")  # a signalling NaN
 def is_finite_and_bounded(*numbers: Any) -> bool:
-    """Whether all numbers are finite and at most MAX_MAGNITUDE in size.
-
-    Args:
-      *numbers: Numbers and arrays of any shape.
-
-    Returns:
-      True also for empty arrays.
-    """
+    """Whether all numbers are finite and at most MAX_MAGNITUDE in size."""
     return all(bool((np.abs(np.asarray(values, np.float64)) <= MAX_MAGNITUDE).all()) for values in numbers)
 
 
@@ -51,12 +44,6 @@ def safe_scale(size: Array) -> Array:
     Multiplied, not divided: XLA turns a division by a row's largest number into a product with its reciprocal, and that
     of 1e38 is flushed to zero. A constant to the gradient, which stays exact: lengths are homogeneous, directions
     invariant.
-
-    Args:
-      size: Sizes of the numbers, any shape, not negative.
-
-    Returns:
-      The factors, of the shape of `size`; 1 for most sizes.
     """
     limit = jnp.finfo(size.dtype).maxexp
     far, shift = limit * 5 // 16, limit * 21 // 32
@@ -66,15 +53,7 @@ def safe_scale(size: Array) -> Array:
 
 @functools.partial(jax.jit, static_argnames="keepdims", inline=True)
 def safe_norm(x: Array, keepdims: bool = False) -> Array:
-    """Computes Euclidean lengths, right over the whole float range (1e-30 and 1e30 alike).
-
-    Args:
-      x: (..., d) vectors.
-      keepdims: Keep the last axis, with one entry.
-
-    Returns:
-      The lengths; the gradient at a zero vector is zero.
-    """
+    """Computes Euclidean lengths, right over the whole float range (1e-30 and 1e30 alike)."""
     x = jnp.asarray(x)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=-1, keepdims=True, initial=0.0))
     usable = (largest > 0) & jnp.isfinite(largest)
@@ -87,15 +66,7 @@ def safe_norm(x: Array, keepdims: bool = False) -> Array:
 
 @functools.partial(jax.jit, static_argnames="axis", inline=True)
 def normalize(x: Array, axis: int = -1) -> Array:
-    """Scales vectors to unit length.
-
-    Args:
-      x: Vectors.
-      axis: Their axis.
-
-    Returns:
-      x / |x|: zero, with a zero gradient, where x is zero; NaN where x is not finite.
-    """
+    """Scales vectors to unit length."""
     x = jnp.asarray(x)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True, initial=0.0))
     usable = (largest > 0) & jnp.isfinite(largest)
@@ -111,12 +82,6 @@ def sigmoid(x: Array) -> Array:
 
     The derivative is s(x) s(-x), because 1 - s(x) cancels: jax.nn.sigmoid's is off by 5e-4 at x = 10, and 0 from 17 on,
     in float32.
-
-    Args:
-      x: Any shape.
-
-    Returns:
-      Of that shape, in 0..1.
     """
     return jax.nn.sigmoid(x)
 
@@ -126,42 +91,22 @@ sigmoid.defjvps(lambda tangent, value, x: tangent * value * jax.nn.sigmoid(-x))
 
 @functools.partial(jax.jit, inline=True)
 def cosine(x: Array, y: Array) -> Array:
-    """Computes cosines by multiply-and-sum, which jax issue 39103 leaves right.
-
-    Args:
-      x: (..., d) vectors.
-      y: (..., d) vectors; leading axes broadcast.
-
-    Returns:
-      (...) cosines; 0 where either vector is zero.
-    """
+    """Computes cosines by multiply-and-sum, which jax issue 39103 leaves right."""
     return jnp.sum(normalize(x) * normalize(y), axis=-1)
 
 
 @functools.partial(jax.jit, inline=True)
 def cosine_matrix(x: Array, y: Array) -> Array:
-    """Computes all cosines of two sets as one matrix product, the form that jax issue 39103 leaves right.
+    """Computes the (N, M) cosines of (N, d) and (M, d) vectors as one matrix product.
 
-    Args:
-      x: (N, d) vectors.
-      y: (M, d) vectors.
-
-    Returns:
-      (N, M) cosines; 0 where either vector is zero.
+    It is the form that jax issue 39103 leaves right.
     """
     return jnp.matmul(normalize(x), normalize(y).T, precision=FULL_PRECISION)
 
 
 @functools.partial(jax.jit, inline=True)
 def all_finite(*arrays: Array) -> Array:
-    """Whether every number in every array is finite.
-
-    Args:
-      *arrays: Arrays of any shape.
-
-    Returns:
-      () bool; true without arrays.
-    """
+    """Whether every number in every array is finite."""
     result = jnp.asarray(True)
     for array in arrays:
         result &= jnp.all(jnp.isfinite(array))
@@ -169,15 +114,7 @@ def all_finite(*arrays: Array) -> Array:
 
 
 def is_traced(tree: Any = ()) -> bool:
-    """Whether a tree is being traced by jax (jit, grad, vmap).
-
-    Args:
-      tree: Tree of arrays. Inside a jit all that is computed is traced, also arrays that its function closes over: the
-        answer is then True for any tree.
-
-    Returns:
-      True if a leaf is a tracer.
-    """
+    """Whether a tree is being traced by jax (jit, grad, vmap)."""
     return any(isinstance(leaf, Tracer) for leaf in [*jax.tree.leaves(tree), jnp.zeros(())])
 
 
@@ -185,13 +122,6 @@ def require_labels(labels: Any, num_regions: int) -> None:
     """Checks that an array of labels holds integers, all below `num_regions`.
 
     Inside a trace the numbers are not known: there a label of `num_regions` or more belongs to no region, like -1.
-
-    Args:
-      labels: Array of any shape.
-      num_regions: R.
-
-    Raises:
-      ValueError: They do not.
     """
     remedy = "Convert them, for example by labels.astype(np.int32)."
     integers = "integers, -1 for a pixel of no region"

@@ -55,18 +55,7 @@ def host_mesh(most: int | None = None) -> Mesh | None:
 
 
 def map_over_devices(local: Callable, dealt: Any, common: Any, mesh: Mesh, *, total: bool = False) -> Any:
-    """Runs a function on every device of a mesh.
-
-    Args:
-      local: Called as `local(index of the device, its part of dealt, common)`.
-      dealt: Tree of arrays; each device gets an equal part along their leading axes.
-      common: Tree of arrays that each device gets whole.
-      mesh: The devices.
-      total: Whether to add up the results, instead of joining them along their leading axes.
-
-    Returns:
-      The results of all devices.
-    """
+    """Runs a function on every device of a mesh."""
 
     def run(dealt, common):
         out = local(jax.lax.axis_index(AXIS), dealt, common)
@@ -81,17 +70,7 @@ def map_over_devices(local: Callable, dealt: Any, common: Any, mesh: Mesh, *, to
 
 
 def map_rows(local: Callable, rows: Any, common: Any, mesh: Mesh | None) -> Any:
-    """Runs a function that treats rows independently, each device with an equal part of them.
-
-    Args:
-      local: Called as `local(rows, common)`. The last part is padded with zeros, which it must accept.
-      rows: Tree of arrays with rows along their leading axes.
-      common: Tree of arrays that each device gets whole.
-      mesh: The devices, or None.
-
-    Returns:
-      The results, row by row.
-    """
+    """Runs a function that treats rows independently, each device with an equal part of them."""
     if mesh is None:
         return local(rows, common)
     count = jax.tree.leaves(rows)[0].shape[0]
@@ -104,15 +83,7 @@ def map_rows(local: Callable, rows: Any, common: Any, mesh: Mesh | None) -> Any:
 
 
 def concurrent_lanes(views: int, state_bytes: int) -> int:
-    """Computes how many lanes of `accumulate_over_views` this process works on at a time.
-
-    Args:
-      views: Number of views.
-      state_bytes: Size of the state of a lane.
-
-    Returns:
-      At most the number of devices, the same in every turn, and above two no more than fit into _LANES_BYTES.
-    """
+    """Computes how many lanes of `accumulate_over_views` this process works on at a time."""
     world = jax.process_count()
     lanes = -(-_lane_count(views) // world)
     devices = min(sum(device.process_index == p for device in jax.devices()) for p in range(world))
@@ -141,20 +112,6 @@ def accumulate_over_views(
     (up to LANES) changes no bit of the sum. A device works on one lane at a time (`concurrent_lanes`); all run one
     program, which jax compiles once. Over several processes (`jax.distributed.initialize`) that make the same call,
     process p of P takes lanes p, p + P, ...; all end with the same result.
-
-    Args:
-      step: Pure function `state, out = step(state, common, view, *static)`, traced under shard_map.
-      start: Neutral state of `merge`.
-      merge: Joins the states of two lanes. It may donate the first.
-      common: Tree of arrays that each step gets whole.
-      views: Tree of arrays with the views along their leading axes.
-      prepare: If present, the step gets `prepare(common, view, *static)` in place of the view, from a separate program
-        that states of other sizes share.
-      static: Hashable arguments.
-      progress: Called as `progress(done, total)` as views finish.
-
-    Returns:
-      The state, and the `out` of each view, stacked (NumPy).
     """
     rank, world = jax.process_index(), jax.process_count()
     common, start, views = jax.tree.map(np.asarray, (common, start, views))
@@ -277,14 +234,6 @@ def map_over_processes(
 
     Over several processes that make the same call (`jax.distributed.initialize`), process p of P computes
     p, p + P, ...; all end with all results. One process computes them all.
-
-    Args:
-      count: Number of indices.
-      rows: Yields the results of a sequence of indices, one after the other: trees of NumPy arrays and plain values.
-      progress: Called as `progress(done, total)`.
-
-    Returns:
-      The results of 0 .. count - 1.
     """
     rank, world = jax.process_index(), jax.process_count()
     results = []
@@ -298,27 +247,8 @@ def map_over_processes(
     return [parts[t % world][t // world] for t in range(count)]
 
 
-def cache_worker_programs() -> None:
-    """Lets this process, one of several, store its compiled programs on disk, if there is a folder for them.
-
-    jax leaves that to the first process (jax/_src/compiler.py, `_cache_write`). But a program is stored for its device,
-    and every process has its own device: the others would compile all programs in every run.
-    """
-    from jax._src import distributed
-
-    jax.local_devices()  # from here on jax identifies the process by the number of its devices
-    distributed.global_state.process_id = 0
-
-
 def allgather_tree(tree: Any) -> list[Any]:
-    """Exchanges trees between the processes, without pickle: all call it, minutes apart if need be.
-
-    Args:
-      tree: Tree of arrays, plain values, dicts, lists, tuples and jsecon's records of this process.
-
-    Returns:
-      The tree of each process, in their order, with NumPy arrays.
-    """
+    """Exchanges trees between the processes, without pickle: all call it, minutes apart if need be."""
     arrays: dict[str, np.ndarray] = {}
     description = json.dumps(pack_tree(tree, "root", arrays)).encode()
     stream = io.BytesIO()

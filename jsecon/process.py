@@ -12,7 +12,6 @@ A program that runs long and sees many scenes calls `clear_programs()` from time
 
 import _thread
 import contextlib
-import ctypes
 import gc
 import hashlib
 import os
@@ -20,6 +19,7 @@ import re
 import signal
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -27,45 +27,37 @@ from typing import Any
 
 from jsecon.errors import InputError
 
-# mallopt's parameters (malloc.h), and values: a request is served from memory that was freed before, not from the
-# kernel, whose pages cost more to touch anew than a kernel of XLA takes to fill them.
-_MALLOPT = {-3: (1 << 31) - 1, -1: (1 << 31) - 1, -2: 1 << 26}
-_COLLECTIONS = 20_000, 20, 20
-"""thresholds of Python's garbage collector: a tenth of the CPU time of a question less than with 700, 10, 10"""
-_OPENCV = {"OPENCV_LOG_LEVEL": "OFF", "OPENCV_FFMPEG_LOGLEVEL": "-8", "OPENCV_IO_MAX_IMAGE_PIXELS": str(1 << 27)}
-"""no messages of OpenCV, as an InputError reports damaged files; and the largest image that it allocates"""
-WORKER = "JSECON_WORKER"
-"""environment variable of a process that is one of several (pipeline/processes.py)"""
 MEMORY = "JSECON_MEMORY"
 """environment variable: GiB for a scene's columns, in place of half of the free memory"""
-AGAIN_SECONDS = 0.05
-"""s after which a stop that Python dropped is raised again: the destructor has ended"""
-_CACHE_WARNING = r"Error (?:reading|writing) persistent compilation cache entry for '([\w.-]+)'"
-"""jax's warning of a program that it cannot read from disk or write there"""
+_OPENCV = {"OPENCV_LOG_LEVEL": "OFF", "OPENCV_FFMPEG_LOGLEVEL": "-8", "OPENCV_IO_MAX_IMAGE_PIXELS": str(1 << 27)}
+"""no messages of OpenCV, as an InputError reports damaged files; and the largest image that it allocates"""
+_PROGRAM_DAYS = 60
+"""days after which a compiled program that no process has read is deleted: each upgrade makes new ones"""
 _counts: dict[str, int] = {}
 
 
 def prepare_process(*, keep_programs: bool = True) -> None:
-    """Sets XLA's flags (see `settings`), silences OpenCV and keeps freed memory for the next request (glibc only).
-
-    Python also looks for cycles less often: imports and traces make many objects, of which few are ever freed.
+    """Sets XLA's flags and the folder of compiled programs (see `settings`), and silences OpenCV.
 
     Call it before jax makes its first array and OpenCV is imported. Variables that the user has set stay.
-
-    Args:
-      keep_programs: Whether to store compiled programs on disk.
     """
-    gc.set_threshold(*_COLLECTIONS)
     chosen = settings(os.environ, cores(), _cpu_features())
     if not keep_programs:
         chosen.pop("JAX_COMPILATION_CACHE_DIR", None)
     os.environ.update({name: value for name, value in _OPENCV.items() if name not in os.environ} | chosen)
     if (folder := chosen.get("JAX_COMPILATION_CACHE_DIR")) is not None:
+        _remove_old_programs(Path(folder).parent)
         _remove_damaged_programs(Path(folder))
-    if sys.platform == "linux" and not any(name.startswith("MALLOC_") for name in os.environ):
-        mallopt = getattr(ctypes.CDLL(None), "mallopt", lambda parameter, value: None)
-        for parameter, value in _MALLOPT.items():
-            mallopt(parameter, value)
+
+
+def _remove_old_programs(home: Path) -> None:
+    """Deletes compiled programs, of any kind of machine, that were last read or written _PROGRAM_DAYS ago."""
+    oldest = time.time() - 86400 * _PROGRAM_DAYS
+    for file in home.glob("xla-*/*"):
+        with contextlib.suppress(OSError):  # another process may have deleted it
+            status = file.stat()
+            if max(status.st_atime, status.st_mtime) < oldest:
+                file.unlink()
 
 
 def _remove_damaged_programs(folder: Path) -> None:
@@ -75,41 +67,18 @@ def _remove_damaged_programs(folder: Path) -> None:
     of that forever, and never write the program again. `jsecon doctor` reports a disk without room for programs.
     """
     show = warnings.showwarning
+    warning = r"Error (?:reading|writing) persistent compilation cache entry for '([\w.-]+)'"
 
-    def shown(message: Warning | str, *args: Any, **kwargs: Any) -> None:
-        match = re.match(_CACHE_WARNING, str(message))
+    def show_or_remove(message: Warning | str, *args: Any, **kwargs: Any) -> None:
+        match = re.match(warning, str(message))
         if match is None:
             return show(message, *args, **kwargs)
         for file in folder.glob(f"{match[1]}-*-cache"):
             with contextlib.suppress(OSError):
                 file.unlink()
 
-    warnings.showwarning = shown
-    warnings.filterwarnings("always", _CACHE_WARNING)  # each time, also for programs of the same name
-
-
-def worker_info() -> tuple[int, int, str] | None:
-    """Reads from WORKER which of the processes of a run this is.
-
-    Returns:
-      (index, number of processes, HOST:PORT of the first); None if this is no such process.
-    """
-    words = os.environ.get(WORKER, "").split()
-    return (int(words[0]), int(words[1]), words[2]) if words else None
-
-
-def prepare_worker() -> None:
-    """Limits a worker to the cores that WORKER names last ("0,2"), and drops what C++ code prints.
-
-    That is pages if another process of the run dies. What Python prints stays. Call it before `prepare_process`.
-    """
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {int(core) for core in os.environ[WORKER].split()[3].split(",")})
-    for number, name in ((1, "stdout"), (2, "stderr")):
-        getattr(sys, name).flush()
-        kept = os.dup(number)
-        os.dup2(os.open(os.devnull, os.O_WRONLY), number)
-        setattr(sys, name, os.fdopen(kept, "w", buffering=1))
+    warnings.showwarning = show_or_remove
+    warnings.filterwarnings("always", warning)  # each time, also for programs of the same name
 
 
 def stop_by_signals() -> None:
@@ -120,14 +89,14 @@ def stop_by_signals() -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     show = sys.unraisablehook
 
-    def shown(dropped: Any) -> None:
+    def show_or_repeat(dropped: Any) -> None:
         if dropped.exc_type is not KeyboardInterrupt:
             return show(dropped)
-        again = threading.Timer(AGAIN_SECONDS, _stop_main)
+        again = threading.Timer(0.05, _stop_main)  # s; the destructor has ended by then
         again.daemon = True
         again.start()
 
-    sys.unraisablehook = shown
+    sys.unraisablehook = show_or_repeat
 
 
 def _stop_main() -> None:
@@ -139,26 +108,19 @@ def _stop_main() -> None:
 
 
 def cores() -> int:
-    """Counts the CPU cores that this process may use.
-
-    Returns:
-      The number, at least 1.
-    """
+    """Counts the CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def available_memory() -> tuple[int | None, int | None]:
-    """Reads the free memory and the limit of this process's cgroup.
-
-    Returns:
-      Bytes that are free within the limit, and the limit; None for what the system does not state.
-    """
+    """Reads the free memory within this process's cgroup, and the cgroup's limit, in bytes; None if not stated."""
     try:
-        import psutil
-
-        free = psutil.virtual_memory().available
-    except (ImportError, OSError):
+        found = re.search(r"MemAvailable: *(\d+) kB", Path("/proc/meminfo").read_text())
+    except OSError:
         return None, None
+    if found is None:
+        return None, None
+    free = int(found[1]) << 10
     limit = read_cgroup("memory.max", "memory/memory.limit_in_bytes")
     if not limit or not limit[0].isdecimal() or int(limit[0]) >= 1 << 60:  # more is no limit
         return free, None
@@ -167,31 +129,19 @@ def available_memory() -> tuple[int | None, int | None]:
 
 
 def peak_memory_mib() -> float:
-    """Reads the largest resident memory of this process so far.
-
-    Returns:
-      MiB; 0 if the system does not state it.
-    """
-    with contextlib.suppress(ImportError):
+    """Reads the largest resident memory of this process so far, in MiB; 0 on Windows."""
+    try:
         import resource
-
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
-    with contextlib.suppress(ImportError):  # Windows
-        import psutil
-
-        now = psutil.Process().memory_info()
-        return getattr(now, "peak_wset", now.rss) / 2**20
-    return 0.0
+    except ImportError:
+        return 0.0
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def memory_budget() -> float:
-    """Computes how much memory a scene's columns may take; larger ones are read in blocks.
+    """Computes how many bytes a scene's columns may take; larger ones are read in blocks.
 
-    Returns:
-      Bytes: the value of MEMORY, or half of the free memory, as reading takes twice the size of the columns.
-
-    Raises:
-      InputError: MEMORY is not a number.
+    It is the value of MEMORY, or half of the free memory, as reading takes twice the size of the columns. Raises
+    InputError if MEMORY is not a number.
     """
     text = os.environ.get(MEMORY)
     if text is None:
@@ -203,14 +153,11 @@ def memory_budget() -> float:
 
 
 def read_cgroup(new: str, old: str) -> list[str]:
-    """Reads a file of this process's cgroup, split into words.
+    """Reads a file of this process's cgroup, split into words; empty if there is none.
 
     Args:
       new: Name of the file in version 2.
       old: Its path in version 1, controller first.
-
-    Returns:
-      The words; empty if there is no such file.
     """
     try:
         groups = dict(line.split(":", 2)[1:] for line in Path("/proc/self/cgroup").read_text().splitlines())
@@ -224,11 +171,7 @@ def read_cgroup(new: str, old: str) -> list[str]:
 
 
 def compilation_counts() -> dict[str, int]:
-    """Counts the programs that jax has compiled since the first call.
-
-    Returns:
-      "all", and of these those that it read "from_disk".
-    """
+    """Counts the programs that jax has compiled since the first call ("all"), and of these those "from_disk"."""
     import jax
 
     if not _counts:
@@ -244,45 +187,26 @@ def compilation_counts() -> dict[str, int]:
     return dict(_counts)
 
 
-def clear_programs(*, above: int = 25_000) -> bool:
-    """Frees jax's compiled programs if the process has many memory maps.
+def clear_programs(*, above: int = 25_000) -> None:
+    """Frees jax's compiled programs if the process has more than `above` memory maps, which Linux counts.
 
     Linux allows a process 65,530 of them and XLA takes several a program: one that sees scene after scene, each with
     sizes of its own, ends in "Unable to allocate section memory". Programs are compiled again, or read from disk, when
-    they are next called. Without Linux the maps cannot be counted, and the programs stay.
-
-    Args:
-      above: Number of memory maps.
-
-    Returns:
-      Whether the programs were freed.
+    they are next called.
     """
-    try:
-        maps = Path("/proc/self/maps").read_bytes().count(b"\n")
-    except OSError:
-        return False
-    if maps <= above:
-        return False
-    import jax
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > above:
+        import jax
 
-    jax.clear_caches()
-    gc.collect()
-    return True
+        jax.clear_caches()
+        gc.collect()
 
 
 def settings(environ: Mapping[str, str], cores: int, cpu_features: frozenset[str]) -> dict[str, str]:
     """Chooses environment variables for one host device per core, full-width vectors and stored programs.
 
     512-bit vectors are used only if the CPU has them. The folder of compiled programs is named by a digest of the CPU's
-    features, so that different machines can share a home folder.
-
-    Args:
-      environ: Environment variables. Flags that XLA_FLAGS has stay.
-      cores: Number of cores.
-      cpu_features: Names of the CPU's features.
-
-    Returns:
-      The variables to set, by name.
+    features, so that different machines can share a home folder. Flags that XLA_FLAGS has stay.
     """
     flags = environ.get("XLA_FLAGS", "").split()
     present = {flag.split("=")[0] for flag in flags}
@@ -300,14 +224,7 @@ def settings(environ: Mapping[str, str], cores: int, cpu_features: frozenset[str
 
 
 def cache_home(environ: Mapping[str, str]) -> Path | None:
-    """Finds the user's cache folder, and makes it if it is missing.
-
-    Args:
-      environ: Environment variables.
-
-    Returns:
-      The folder, or None if it cannot be written: a program must run without one.
-    """
+    """Finds the user's cache folder, and makes it if it is missing; None if it cannot be written."""
     home = Path(environ["HOME"]) / ".cache" if "HOME" in environ else None
     base = environ.get("XDG_CACHE_HOME") or home or environ.get("LOCALAPPDATA")  # the last on Windows
     if base is None:

@@ -31,27 +31,13 @@ Progress: TypeAlias = Callable[[int, int], None]
 
 
 def static(**kwargs) -> Any:
-    """Declares a field that jax holds to be part of the type: jit compiles anew for each value.
-
-    Args:
-      **kwargs: As for dataclasses.field.
-
-    Returns:
-      The field of a `record`.
-    """
+    """Declares a field that jax holds to be part of the type: jit compiles anew for each value."""
     return dataclasses.field(metadata={"static": True}, **kwargs)
 
 
 @dataclass_transform(frozen_default=True)
 def record(cls):
-    """Makes a class a frozen dataclass that is a pytree.
-
-    Args:
-      cls: The class. jax.export stores it if its static fields are plain values.
-
-    Returns:
-      The dataclass.
-    """
+    """Makes a class a frozen dataclass that is a pytree."""
     cls = jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(cls))
     export.register_pytree_node_serialization(
         cls,
@@ -241,11 +227,7 @@ class Votes:
         return jnp.maximum(self.labelled - self.weights.sum(-1), 0.0)
 
     def dense(self) -> Array:
-        """Spreads the votes over all regions.
-
-        Returns:
-          (N, R) votes, zeros outside the K strongest.
-        """
+        """Spreads the votes over all regions."""
         n, k = self.regions.shape
         rows = jnp.broadcast_to(jnp.arange(n)[:, None], (n, k))
         columns = jnp.where(self.regions >= 0, self.regions, self.num_regions)

@@ -1,6 +1,7 @@
-"""A run by several processes: the same field as by one; and what is said where one dies or does not fit."""
+"""A run by several processes of Open MPI: the same field as by one, and one message if one of them fails."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,24 +12,11 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
-from jsecon import InputError, save_ply
-from jsecon.pipeline.processes import launch
-from jsecon.process import WORKER
+from jsecon import save_ply
 
-COMMAND = [sys.executable, "-m", "jsecon"]
-
-
-def members(out: Path) -> dict[int, int]:
-    """index -> process id of the children of a run into `out`."""
-    found = {}
-    for place in Path("/proc").glob("[0-9]*"):
-        try:
-            environ, line = (place / "environ").read_bytes(), (place / "cmdline").read_bytes()
-        except OSError:
-            continue
-        if (told := environ.partition(f"{WORKER}=".encode())[2]) and os.fsencode(out) in line:
-            found[int(told.split(b" ")[0])] = int(place.name)
-    return found
+JSECON = [sys.executable, "-m", "jsecon", "run"]
+MPIRUN = ["mpirun", "--allow-run-as-root", "--oversubscribe", "--bind-to", "none"]
+needs_mpirun = pytest.mark.skipif(shutil.which("mpirun") is None, reason="Open MPI is not installed")
 
 
 @pytest.fixture(scope="module")
@@ -36,54 +24,89 @@ def small_run(room, room_run, tmp_path_factory) -> list[str]:
     """The arguments of a small run without a fit, on true masks."""
     scene = tmp_path_factory.mktemp("processes") / "scene.ply"
     save_ply(scene, room_run[0].field.gaussians)
-    return ["run", str(room), "--gaussians", str(scene), "--masks", str(room / "masks"), "--long-side", "96"]
+    return [str(room), "--gaussians", str(scene), "--masks", str(room / "masks"), "--long-side", "96"]
 
 
+def start(arguments, out, launcher=("-n", "2")):
+    """Starts a run of two processes."""
+    line = [*MPIRUN, *launcher, *JSECON, *arguments, "--out", str(out), "--distributed"]
+    return subprocess.Popen(line, stdout=-1, stderr=-1, text=True)
+
+
+@needs_mpirun
 @pytest.mark.long
 def test_two_processes_end_in_the_field_of_one(small_run, tmp_path):
-    alone, both = tmp_path / "alone", tmp_path / "both"
-    one = subprocess.Popen([*COMMAND, *small_run, "--out", str(alone)], stdout=-1, stderr=-1)
-    two = [*COMMAND, *small_run, "--out", str(both), "--processes", "2"]
-    done = subprocess.run(two, capture_output=True, text=True, timeout=200)
-    assert done.returncode == 0, done.stderr
-    assert "field" in done.stdout
-    assert "Gloo" not in done.stdout + done.stderr
-    _, error = one.communicate(timeout=200)
-    assert one.returncode == 0, error
-    a, b = (load_file(folder / "field.safetensors") for folder in (alone, both))
+    one = subprocess.Popen([*JSECON, *small_run, "--out", str(tmp_path / "one")], stdout=-1, stderr=-1, text=True)
+    two = start(small_run, tmp_path / "two")
+    for running in (one, two):
+        out, error = running.communicate(timeout=300)
+        assert running.returncode == 0, error
+        assert out.count("field   ") == 1
+    a, b = (load_file(tmp_path / name / "field.safetensors") for name in ("one", "two"))
     assert a.keys() == b.keys()
     for name in a:
         np.testing.assert_array_equal(a[name], b[name], err_msg=name)
 
 
+def rank_of(out: Path, index: int) -> int | None:
+    """Process id of one of the processes of a run into `out`, if it has started."""
+    for place in Path("/proc").glob("[0-9]*"):
+        try:
+            environ, line = (place / "environ").read_bytes(), (place / "cmdline").read_bytes()
+        except OSError:
+            continue
+        if f"OMPI_COMM_WORLD_RANK={index}\0".encode() in environ and os.fsencode(out) in line:
+            return int(place.name)
+    return None
+
+
+@needs_mpirun
 @pytest.mark.long
-def test_a_dead_process_ends_the_other(small_run, tmp_path):
-    line = [*COMMAND, *small_run, "--out", str(tmp_path / "out"), "--processes", "2"]
-    killed = subprocess.Popen(line, stdout=-1, stderr=-1, text=True)
-    until = time.monotonic() + 60
-    while len(found := members(tmp_path / "out")) < 2 or not (tmp_path / "out" / ".lock").exists():
-        assert killed.poll() is None
+@pytest.mark.parametrize("index", [0, 1])
+def test_a_process_that_is_killed_ends_the_run(small_run, tmp_path, index):
+    running = start(small_run, tmp_path / "out")
+    until = time.monotonic() + 120
+    while not (tmp_path / "out" / ".lock").exists():
+        assert running.poll() is None
         assert time.monotonic() < until
         time.sleep(0.05)
-    os.kill(found[1], signal.SIGKILL)
-    _, error = killed.communicate(timeout=60)
-    assert (killed.returncode, error.count("jsecon:")) == (2, 1)
-    assert "process 1 of 2, signal SIGKILL" in error
+    os.kill(rank_of(tmp_path / "out", index), signal.SIGKILL)
+    _, error = running.communicate(timeout=120)
+    assert running.returncode != 0
+    assert f"rank {index}" in error  # mpirun says which
+    assert "Traceback" not in error
+    assert rank_of(tmp_path / "out", 1 - index) is None
 
 
-def test_what_is_wrong_with_the_input_is_said_once(tmp_path):
+@needs_mpirun
+@pytest.mark.long
+def test_wrong_input_and_other_options_are_reported_once(small_run, tmp_path):
     (tmp_path / "empty").mkdir()
-    line = [*COMMAND, "run", str(tmp_path / "empty"), "--out", str(tmp_path / "out"), "--processes", "2"]
-    ended = subprocess.run(line, capture_output=True, text=True, timeout=120)
-    assert (ended.returncode, ended.stderr.count("jsecon:")) == (2, 1)
-    assert "empty" in ended.stderr
+    _, error = start([str(tmp_path / "empty")], tmp_path / "out").communicate(timeout=120)
+    assert error.count("empty") >= 1
+    other = [
+        "-n",
+        "1",
+        *JSECON,
+        *small_run,
+        "--out",
+        str(tmp_path / "out"),
+        "--distributed",
+        "--top",
+        "4",
+        ":",
+        "-n",
+        "1",
+    ]
+    running = start(small_run, tmp_path / "out", other)
+    _, error = running.communicate(timeout=120)
+    assert running.returncode != 0
+    assert error.count("Give all processes the same options and version.") == 1
 
 
-@pytest.mark.parametrize(("count", "coordinator", "index", "where"), [
-    (0, None, None, "processes"), (2, "127.0.0.1:7733", None, "processes"), (2, None, 1, "processes"),
-    (2, "127.0.0.1:7733", 2, "processes"), (2, "nowhere", 0, "--coordinator"), (2, "host:port", 0, "--coordinator"),
-])  # fmt: skip
-def test_numbers_that_do_not_fit_are_refused(count, coordinator, index, where):
-    with pytest.raises(InputError) as caught:
-        launch([], count, coordinator, index)
-    assert caught.value.where == where
+def test_without_a_launcher_the_remedy_names_one(room, tmp_path):
+    environ = {name: value for name, value in os.environ.items() if not name.startswith(("OMPI_", "SLURM_"))}
+    line = [*JSECON, str(room), "--out", str(tmp_path / "out"), "--distributed"]
+    done = subprocess.run(line, capture_output=True, text=True, env=environ, timeout=120)
+    assert (done.returncode, done.stderr.count("jsecon:")) == (2, 1)
+    assert "mpirun -n 2 jsecon run" in done.stderr

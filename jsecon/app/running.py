@@ -1,9 +1,9 @@
 """`jsecon run` and `jsecon fit`, and what a run writes at its end: metrics.json, and report.html with pictures."""
 
+import contextlib
 import dataclasses
 import html
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from jsecon.pipeline import processes, run as pipeline
 from jsecon.pipeline.progress import Console, Listener
 from jsecon.pipeline.results import WARNING, vision_frames
 from jsecon.pipeline.run import Run
-from jsecon.process import peak_memory_mib, worker_info
+from jsecon.process import peak_memory_mib
 from jsecon.read.captures.frames import evenly_spaced
 from jsecon.read.splats.files import require_writable_format, save_gaussians
 from jsecon.types import Quality
@@ -32,22 +32,19 @@ LARGE = 0.15
 
 
 def _run(verb: verbs.Run, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon run`; the result has the metrics, of a dry run the plan, of a worker nothing else."""
+    """Does the work of `jsecon run`; the result has the metrics, or the plan of a dry run."""
     options = with_models(verb.options, console, yes=verb.yes)
     if verb.dry_run:
         return pipeline.dry_run(options, verb.out, listener=console)
-    place = worker_info()
-    if place is None and (verb.processes, verb.coordinator, verb.process) != (1, None, None):
-        raise SystemExit(processes.launch(sys.argv[1:], verb.processes, verb.coordinator, verb.process))
-    with processes.exit_if_disconnected():
-        if place is not None:
-            processes.join(options, *place)
-            if place[0] > 0:
-                pipeline.run_worker(options, verb.out)
-                return {}
-        coordinator = processes.Coordinator(several=place is not None)
-        run = pipeline.run(options, verb.out, listener=console, coordinator=coordinator)
-        coordinator.shutdown()
+    with processes.connection(options) if verb.distributed else contextlib.nullcontext(0) as index:
+        if index == 0:
+            coordinator = processes.Coordinator(several=verb.distributed)
+            run = pipeline.run(options, verb.out, listener=console, coordinator=coordinator)
+            coordinator.shutdown()
+        else:
+            pipeline.run_worker(options, verb.out)
+    if index > 0:
+        raise SystemExit(0)
     return {"written": [verb.out / name for name in FILES]} | _write_run(run, verb.out, console)
 
 

@@ -92,12 +92,8 @@ class Run(Verb, InputOptions):
       out: Output folder.
       dry_run: Only lists the stages that would run, and checks their inputs. It writes no file.
       yes: Fetches models that are not on this machine without asking.
-      processes: Number of processes that share the masklets, the embeddings, the votes and the held-out frames. The
-        field stays the same. Without --coordinator they run on this machine and share its cores.
-      coordinator: HOST:PORT where process 0 listens, an address of its own machine, for a run on several machines.
-        Every machine runs the same command with the same capture and models at the same paths, and the name of
-        process 0's machine must stand for an address that the others reach.
-      process: Index of this process on several machines, 0 to N - 1. Process 0 writes the output folder.
+      distributed: Shares the masks, the embeddings, the votes and the held-out frames with the other processes that
+        mpirun or srun starts. The field stays the same.
     """
 
     examples = (
@@ -110,9 +106,7 @@ class Run(Verb, InputOptions):
     out: Option[Path]
     dry_run: Option[bool] = False
     yes: Option[bool] = False
-    processes: Advanced[int] = 1
-    coordinator: Advanced[str | None] = None
-    process: Advanced[int | None] = None
+    distributed: Advanced[bool] = False
     scene: SceneOptions = dataclasses.field(default_factory=SceneOptions)
     bare: BareOptions = dataclasses.field(default_factory=BareOptions)
     masks: MaskOptions = dataclasses.field(default_factory=MaskOptions)

@@ -31,15 +31,7 @@ OF_BARE_SCENES = ("views", "up", "cameras")
 
 
 def require_options_apply(options: Options, *, bare: bool) -> None:
-    """Checks that no option is set that the input has no use for.
-
-    Args:
-      options: Options of the run.
-      bare: Whether the input is a scene without photographs.
-
-    Raises:
-      InputError: One is.
-    """
+    """Checks that no option is set that the input has no use for."""
     defaults = {field.name: field.default for field in dataclasses.fields(options)}
     for name in OF_PHOTOGRAPHS if bare else OF_BARE_SCENES:
         if getattr(options, name) != defaults[name]:
@@ -54,15 +46,7 @@ def require_options_apply(options: Options, *, bare: bool) -> None:
 
 
 def bare_stages(context: RunContext) -> dict[str, Stage]:
-    """Plans what a bare scene has in place of the stages of photographs.
-
-    Args:
-      context: The run.
-
-    Returns:
-      "load": virtual views, or given cameras, rendered as frames. "gaussians": those of the file, in the world of these
-      frames. "held_out": the quality of no frame, as the frames are renders.
-    """
+    """Plans what a bare scene has in place of the stages of photographs."""
     path = context.options.capture
     skipped = {"photometric fit": f"the scene's Gaussians are given ({path.name})"}
     scene = Stage("gaussians", f"read from {path.name}", _read_scene, after=("load",), files=path, skipped=skipped)

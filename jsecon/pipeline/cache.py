@@ -63,16 +63,7 @@ _WRITTEN = (".spz", ".glb", ".splat", ".sog", ".html")
 
 
 def files_digest(paths: Iterable[Path], *, exclude: Path | None = None) -> str:
-    """Hashes names, sizes and times of files, and of all files beneath folders (`list_files`).
-
-    Args:
-      paths: Files and folders.
-      exclude: Output folder of the run. If it lies inside of one of the folders, it is skipped, and so is the scene
-        of the same name beside it, which `jsecon fit` writes.
-
-    Returns:
-      16 hex digits.
-    """
+    """Hashes names, sizes and times of files, and of all files beneath folders (`list_files`)."""
     entries = []
     for root in paths:
         output = None if exclude is None or exclude.resolve() == root.resolve() else exclude
@@ -93,9 +84,6 @@ def source_digest() -> str:
 
     The packages behind all stages (query, evaluate, app, demo) are left out: a change of the viewer does not recompute
     a fit.
-
-    Returns:
-      32 hex digits.
     """
     digest = hashlib.blake2b(digest_size=16)
     files = [*PACKAGE.glob("*.py"), *(file for name in PACKAGES for file in (PACKAGE / name).rglob("*.py"))]
@@ -106,14 +94,7 @@ def source_digest() -> str:
 
 
 def prepare(folder: Path) -> None:
-    """Makes the folder of a cache, marks it for backup programs, and removes half-written files of killed runs.
-
-    Args:
-      folder: The folder.
-
-    Raises:
-      InputError: The folder cannot be written.
-    """
+    """Makes the folder of a cache, marks it for backup programs, and removes half-written files of killed runs."""
     tag = folder / "CACHEDIR.TAG"
     if not tag.exists():
         write_text(tag, "Signature: 8a477f597d28d172789f06886806bc55\n# Made by jsecon; see bford.info/cachedir\n")
@@ -124,19 +105,7 @@ def prepare(folder: Path) -> None:
 
 
 def fetch(path: Path, compute: Callable[[], Any], *, note: Callable[[str], None] | None = None) -> CachedResult:
-    """Reads the result of a stage, or computes and stores it.
-
-    Args:
-      path: File of the result.
-      compute: Computes the result if the file is missing or damaged.
-      note: Receives a sentence about a damaged file.
-
-    Returns:
-      The result, its arrays in NumPy, and how long it took.
-
-    Raises:
-      InputError: The file cannot be written.
-    """
+    """Reads the result of a stage, or computes and stores it."""
     if path.exists():
         try:
             value, seconds = load(path)
@@ -153,20 +122,7 @@ def fetch(path: Path, compute: Callable[[], Any], *, note: Callable[[str], None]
 
 
 def save(path: Path, value: Any, seconds: float = 0.0) -> Any:
-    """Writes a tree to a file, atomically.
-
-    Args:
-      path: The file.
-      value: Tree of plain values, arrays and jsecon's records.
-      seconds: Time that it took, to be kept with it.
-
-    Returns:
-      The tree as `load` gives it, so that later stages see the same arrays after a stop. A memory-mapped one is read
-      back, so that its files may be deleted.
-
-    Raises:
-      InputError: The file cannot be written.
-    """
+    """Writes a tree to a file, atomically."""
     arrays: dict[str, np.ndarray] = {}
     tree = pack_tree(value, "root", arrays)
     with atomic_write(path) as temporary:
@@ -178,17 +134,7 @@ def save(path: Path, value: Any, seconds: float = 0.0) -> Any:
 
 
 def load(path: Path) -> tuple[Any, float]:
-    """Reads what `save` wrote.
-
-    Args:
-      path: The file.
-
-    Returns:
-      The tree, whose arrays of more than MAPPED bytes are memory-mapped, and its seconds.
-
-    Raises:
-      CorruptCacheError: The file cannot be read.
-    """
+    """Reads what `save` wrote."""
     try:
         description, arrays = read_arrays(path, memory_map_above=MAPPED)
         return unpack_tree(description["tree"], arrays), float(description["seconds"])

@@ -208,27 +208,12 @@ SPLATS = (".ply", ".spz", ".sog", ".splat", ".glb")
 
 
 def is_bare_scene(capture: Path) -> bool:
-    """Whether the input of a run is a file of Gaussians instead of a capture.
-
-    Args:
-      capture: Path of the input.
-
-    Returns:
-      True by the suffix, also if the file is missing.
-    """
+    """Whether the input of a run is a file of Gaussians instead of a capture."""
     return capture.suffix.lower() in SPLATS and not capture.is_dir()
 
 
 def require_writable(folder: Path, *, create: bool = True) -> None:
-    """Creates a folder, and checks that files can be created in it.
-
-    Args:
-      folder: The output folder.
-      create: False checks the nearest folder above that exists, and creates none.
-
-    Raises:
-      InputError: The folder cannot be created or written.
-    """
+    """Creates a folder, and checks that files can be created in it."""
     try:
         if create:
             folder.mkdir(parents=True, exist_ok=True)

@@ -41,83 +41,42 @@ class Listener:
     """Receives the messages of a run. Each becomes a line for `say`, which this base class ignores."""
 
     def say(self, text: str) -> None:
-        """Receives a line of results.
-
-        Args:
-          text: The line.
-        """
+        """Receives a line of results."""
 
     def step(self, step: Step) -> None:
-        """Receives a step: first all that are planned, later also parts that only the data could settle.
-
-        Args:
-          step: The step.
-        """
+        """Receives a step: first all that are planned, later also parts that only the data could settle."""
         self.say(f"  {step.name:<16} {step.status:<9} {step.why}".rstrip())
 
     def done(self, name: str, seconds: float, fresh: bool) -> None:
-        """Receives the end of a stage.
-
-        Args:
-          name: Name of the stage.
-          seconds: Wall time of its computation.
-          fresh: True if it was computed in this run, False if its result was read from the cache.
-        """
+        """Receives the end of a stage."""
         if fresh:
             self.say(f"  {name:<16} {'done':<9} {seconds:.1f} s")
 
     def note(self, text: str) -> None:
-        """Receives a note.
-
-        Args:
-          text: A sentence about the input or the run.
-        """
+        """Receives a note."""
         self.say(f"  note: {text}")
 
     @contextlib.contextmanager
     def progress(self, name: str) -> Iterator[Callable[[int, int], None]]:
-        """Reports the progress of a step, for the body of a `with`.
-
-        Args:
-          name: Name of the step.
-
-        Yields:
-          A callback (done, total).
-        """
+        """Reports the progress of a step, for the body of a `with`."""
         yield lambda done, total: None
 
 
 class Console(Listener):
-    """The listener of the command line.
-
-    Args:
-      out: Text stream for results; by default standard output.
-      err: Text stream for progress; by default standard error.
-    """
+    """The listener of the command line."""
 
     def __init__(self, out: Any = None, err: Any = None):
         self._out = out or sys.stdout
         self._err = err or sys.stderr
 
     def say(self, text: str) -> None:
-        """Prints a line, above the bar if one is drawn.
-
-        Args:
-          text: The line.
-        """
+        """Prints a line, above the bar if one is drawn."""
         with _Bar.external_write_mode(file=self._out):
             print(text, file=self._out, flush=True)
 
     @contextlib.contextmanager
     def progress(self, name: str) -> Iterator[Callable[[int, int], None]]:
-        """Draws a bar with the time left on a terminal, and prints a line now and then elsewhere.
-
-        Args:
-          name: Name of the step.
-
-        Yields:
-          A callback (done, total).
-        """
+        """Draws a bar with the time left on a terminal, and prints a line now and then elsewhere."""
         terminal = self._err.isatty()
         shown = (_Bar if terminal else _Lines)(name, self._err)
         ended = threading.Event()

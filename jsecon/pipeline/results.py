@@ -83,23 +83,12 @@ class RunContext:
     """Output folder. It does not count as input if it lies inside of an input folder."""
 
     def key_options(self, *names: str) -> dict[str, Any]:
-        """Picks options for the key of a stage.
-
-        Args:
-          *names: Names of the options.
-
-        Returns:
-          Their values by name.
-        """
+        """Picks options for the key of a stage."""
         return {name: getattr(self.options, name) for name in names}
 
 
 class Checkpoint:
-    """State of a stage in progress on disk, so that it resumes there after a stop.
-
-    Args:
-      path: File of the state.
-    """
+    """State of a stage in progress on disk, so that it resumes there after a stop."""
 
     def __init__(self, path: Path):
         self._path = path
@@ -111,21 +100,13 @@ class Checkpoint:
         return self._path.with_suffix("")
 
     def read(self) -> Any | None:
-        """Reads the last state.
-
-        Returns:
-          The state; None if there is none, or if its file cannot be read: the stage then starts again.
-        """
+        """Reads the last state."""
         with contextlib.suppress(cache.CorruptCacheError):
             return cache.load(self._path)[0] if self._path.exists() else None
         return None
 
     def keep(self, state: Callable[[], Any]) -> None:
-        """Writes the state, at most every CHECKPOINT_SECONDS.
-
-        Args:
-          state: Returns the state; not called otherwise.
-        """
+        """Writes the state, at most every CHECKPOINT_SECONDS."""
         if time.monotonic() - self._last >= CHECKPOINT_SECONDS:
             cache.save(self._path, state())
             self._last = time.monotonic()
@@ -170,15 +151,7 @@ class Stage:
     folder."""
 
     def key(self, keys: Mapping[str, str], files: str | None) -> str:
-        """Hashes all that the result depends on.
-
-        Args:
-          keys: Keys of the stages before this one.
-          files: Digest of the input files, from `files_digest`.
-
-        Returns:
-          16 hex digits that cover source, options, input files and the results that the stage reads.
-        """
+        """Hashes all that the result depends on."""
         parts = {
             "source": cache.source_digest(),
             "after": [keys[other] for other in self.after],
@@ -189,14 +162,7 @@ class Stage:
         return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
     def files_digest(self, context: RunContext) -> str | None:
-        """Hashes names, sizes and times of the input files.
-
-        Args:
-          context: The run, whose output folder is skipped.
-
-        Returns:
-          16 hex digits; None if the stage reads no files.
-        """
+        """Hashes names, sizes and times of the input files."""
         if self.files is None:
             return None
         paths = [self.files] if isinstance(self.files, Path) else self.files()
@@ -204,17 +170,7 @@ class Stage:
 
 
 def training_frames(held_out: Array) -> np.ndarray:
-    """Lists the frames that may be fitted to.
-
-    Args:
-      held_out: (T,) bool.
-
-    Returns:
-      Ascending indices.
-
-    Raises:
-      InputError: There are fewer than two.
-    """
+    """Lists the frames that may be fitted to."""
     train = np.flatnonzero(~np.asarray(held_out))
     if len(train) < 2:
         problem = f"{len(train)} of {len(held_out)} frames to work with"
@@ -223,17 +179,6 @@ def training_frames(held_out: Array) -> np.ndarray:
 
 
 def vision_frames(capture: Capture, options: Options) -> np.ndarray:
-    """Lists the training frames in which masks are found and embedded.
-
-    Args:
-      capture: The capture.
-      options: Options of the run; `vision_frames` is the maximum.
-
-    Returns:
-      Ascending indices, evenly spaced among the training frames.
-
-    Raises:
-      InputError: There are fewer than two training frames.
-    """
+    """Lists the training frames in which masks are found and embedded."""
     train = training_frames(capture.held_out)
     return train[evenly_spaced(len(train), options.vision_frames)]

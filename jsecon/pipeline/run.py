@@ -231,21 +231,7 @@ def compute_stages(
     listener: Listener | None = None,
     coordinator: Coordinator | None = None,
 ) -> Computed:
-    """Plans stages, reports the plan, then computes each or reads it from the cache.
-
-    Args:
-      context: The run.
-      stage_list: Stages in order.
-      folder: Folder of the cache.
-      listener: Receives plan, progress and notes.
-      coordinator: Calls the other processes of the run, if there are any.
-
-    Returns:
-      Results, keys, steps, times and notes of the stages.
-
-    Raises:
-      InputError: An option or input is invalid, or memory is full.
-    """
+    """Plans stages, reports the plan, then computes each or reads it from the cache."""
     listener, coordinator = listener or Listener(), coordinator or Coordinator(several=False)
     with listener.progress("plan"):
         plan = _plan(context, stage_list, folder)
@@ -344,19 +330,6 @@ def run(
     """Builds the field of a capture and writes OUT/field.safetensors.
 
     A run that was stopped resumes where it stopped, to the same result.
-
-    Args:
-      options: Options of the run.
-      out: Output folder.
-      listener: Receives plan, progress and notes.
-      cache_folder: Folder of the cache; by default OUT/cache.
-      coordinator: Calls the other processes of the run (`run_worker`), if there are any.
-
-    Returns:
-      The field, and what the run did.
-
-    Raises:
-      InputError: An option or input is invalid. Finished stages are kept.
     """
     listener, before = listener or Listener(), compilation_counts()
     folder = cache_folder or out / "cache"
@@ -379,18 +352,7 @@ def _open_context(options: Options, out: Path, cache_folder: Path | None = None)
 
 
 def current_field(options: Options, out: Path) -> Path | None:
-    """Looks for the field that a run would write, without running.
-
-    Args:
-      options: Options of the run.
-      out: Its output folder.
-
-    Returns:
-      The field's file, or None if it is missing, or other options, inputs or sources made it.
-
-    Raises:
-      InputError: The run would refuse its options or inputs.
-    """
+    """Looks for the field that a run would write, without running."""
     path = out / FIELD_FILE
     if not path.is_file():
         return None
@@ -404,31 +366,13 @@ def current_field(options: Options, out: Path) -> Path | None:
 
 
 def run_worker(options: Options, out: Path) -> None:
-    """Does the part of a run of every process but the first (`processes`).
-
-    Args:
-      options: Options of the run.
-      out: Its output folder, where this process writes no file.
-    """
+    """Does the part of a run of every process but the first (`processes`)."""
     context = _open_context(options, out)
     processes.run_worker(context, stages.run_stages(context))
 
 
 def dry_run(options: Options, out: Path, *, scene_only: bool = False, listener: Listener) -> dict[str, Any]:
-    """Lists the stages that `run` would compute, and writes no file.
-
-    Args:
-      options: Options of the run.
-      out: Its output folder.
-      scene_only: List the stages of `fit` instead.
-      listener: Receives the list.
-
-    Returns:
-      {"stages": list of `Step`}.
-
-    Raises:
-      InputError: A run would refuse its options or inputs.
-    """
+    """Lists the stages that `run` would compute, and writes no file."""
     with listener.progress("plan"):
         context = _open_context(options, out)
         stage_list = stages.fit_stages(context) if scene_only else stages.run_stages(context)
@@ -503,19 +447,7 @@ def _check_masks(options: Options, running: list[str], extent: CaptureExtent, tr
 
 
 def fit(options: Options, out: Path, *, listener: Listener | None = None) -> tuple[Gaussians, Capture, Quality]:
-    """Computes the stages of `run` that make and measure the scene, into the same cache, so that a `run` continues.
-
-    Args:
-      options: Options of the run.
-      out: Output folder of the run.
-      listener: Receives plan, progress and notes.
-
-    Returns:
-      The Gaussians, their capture, and the quality of the held-out frames.
-
-    Raises:
-      InputError: An option or input is invalid.
-    """
+    """Computes the stages of `run` that make and measure the scene, into the same cache, so that a `run` continues."""
     context = _open_context(options, out)
     results = compute_stages(context, stages.fit_stages(context), out / "cache", listener=listener).results
     return results.gaussians, results.load, results.held_out

@@ -57,17 +57,7 @@ _COLMAP_TO_NERFSTUDIO = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [
 
 
 def read_scene(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
-    """Reads a file of Gaussians.
-
-    Args:
-      path: The file.
-
-    Returns:
-      The Gaussians (NumPy), and the notes of the reader.
-
-    Raises:
-      InputError: The file cannot be read, or holds no Gaussians.
-    """
+    """Reads a file of Gaussians."""
     scene, notes = read_gaussians(path)
     if not scene.count:
         raise InputError(path, "the file holds no Gaussians", "at least one", "Export the scene again.")
@@ -114,16 +104,6 @@ def place_in_capture(
 
     A few frames are rendered in each world that the file may be in: the one that `trained` leads back from, that of the
     capture's files, that of its poses, and those of known training programs. The one most like the frames is taken.
-
-    Args:
-      gaussians: Gaussians of the file (NumPy, float64 means).
-      capture: The capture.
-      path: The file, for notes.
-      trained: (4, 4) from the file's world to that of the capture's files, by dataparser_transforms.json; or None.
-      progress: Callback.
-
-    Returns:
-      The Gaussians in the capture's world, and notes on the world that was taken.
     """
     source_from_scene = np.asarray(capture.source_from_scene, np.float64)
     poses_from_scene = (
@@ -289,16 +269,7 @@ def _least_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def check_overlap(gaussians: Gaussians, cameras: Camera, where: str) -> None:
-    """Checks that at least two cameras see some of the Gaussians.
-
-    Args:
-      gaussians: N Gaussians.
-      cameras: Batch of cameras.
-      where: File or folder, for the message.
-
-    Raises:
-      InputError: Fewer than MIN_OVERLAP of them are in the view of two cameras.
-    """
+    """Checks that at least two cameras see some of the Gaussians."""
     each = jax.lax.map(lambda camera: project(gaussians, camera).visible, jax.tree.map(jnp.asarray, cameras))
     visible = np.asarray(each)
     share = float(np.mean(visible.sum(0) >= 2)) if gaussians.count else 0.0

@@ -33,17 +33,7 @@ class Sources(NamedTuple):
 
 
 def provenance(options: Options, keys: dict[str, str], embedder: str, out: Path) -> str:
-    """Writes where the field of a run comes from.
-
-    Args:
-      options: Options of the run.
-      keys: Key of each stage.
-      embedder: Name of the embedder.
-      out: Output folder.
-
-    Returns:
-      JSON for `LanguageField.provenance`, with hints for `locate_sources`.
-    """
+    """Writes where the field of a run comes from."""
     values = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
     folders = {name: getattr(options, name) for name in ("segmenter", "tracker", "embedder")}
     addresses = {name: cached_address(folder) for name, folder in folders.items() if folder is not None}
@@ -66,18 +56,7 @@ def _relative_folders(options: Options, out: Path) -> dict[str, str]:
 
 
 def locate_sources(field: LanguageField, beside: Path | None = None) -> Sources:
-    """Locates the model and the capture of a field by the hints of its run.
-
-    Args:
-      field: The field.
-      beside: Folder of its file; `load_field` has recorded it in a field that it read.
-
-    Returns:
-      Their places on this machine; None for what is not there.
-
-    Raises:
-      InputError: The provenance is not what a run writes.
-    """
+    """Locates the model and the capture of a field by the hints of its run."""
     beside = getattr(field.provenance, "folder", None) if beside is None else beside
     try:
         provenance = parse_json(field.provenance or "{}")

@@ -81,17 +81,7 @@ MIN_CLOUD_SPACING = 0.02
 
 
 def run_stages(context: RunContext) -> list[Stage]:
-    """Plans the stages of a run. Mask files come before the long fit, so that their errors are found early.
-
-    Args:
-      context: The run.
-
-    Returns:
-      The stages in order.
-
-    Raises:
-      InputError: An option is set that the input has no use for.
-    """
+    """Plans the stages of a run. Mask files come before the long fit, so that their errors are found early."""
     first = [_plan_gaussians(context), _plan_masklets(context)]
     if context.options.masks is not None:
         first.reverse()
@@ -101,17 +91,7 @@ def run_stages(context: RunContext) -> list[Stage]:
 
 
 def fit_stages(context: RunContext) -> list[Stage]:
-    """Plans the stages that make and measure the scene.
-
-    Args:
-      context: The run.
-
-    Returns:
-      The stages in order.
-
-    Raises:
-      InputError: As in `run_stages`.
-    """
+    """Plans the stages that make and measure the scene."""
     return [*capture_stages(context), _plan_gaussians(context), _plan_held_out(context)]
 
 
@@ -119,17 +99,7 @@ def fit_stages(context: RunContext) -> list[Stage]:
 
 
 def capture_stages(context: RunContext) -> list[Stage]:
-    """Plans the capture, and before it the poses if there are photographs or a video without poses.
-
-    Args:
-      context: The run.
-
-    Returns:
-      The stage "load", perhaps after "poses".
-
-    Raises:
-      InputError: An option is set that the input has no use for.
-    """
+    """Plans the capture, and before it the poses if there are photographs or a video without poses."""
     bare = is_bare_scene(context.options.capture)
     require_options_apply(context.options, bare=bare)
     if bare:
@@ -454,19 +424,7 @@ def _find_masklets(stage: StageInput) -> StageResult:
 def frame_proposals(
     context: RunContext, capture: Capture, gaussians: Gaussians
 ) -> tuple[Callable[[int], np.ndarray], tuple[str, ...]]:
-    """Opens the proposals of the frames: from files, by a segmenter, or by colour and texture.
-
-    Args:
-      context: The run.
-      capture: The capture.
-      gaussians: The scene, whose depth shapes coarse proposals without a model.
-
-    Returns:
-      A function of t that gives the masks (M, H, W) of the t-th training frame, and notes.
-
-    Raises:
-      InputError: The files of proposals belong to no frame.
-    """
+    """Opens the proposals of the frames: from files, by a segmenter, or by colour and texture."""
     options, vision = context.options, _Vision(capture, context.options)
     if options.proposals is not None:
         return load_proposals(options.proposals, vision.names, vision.size, **vision.mask_layout)
@@ -519,19 +477,7 @@ def associate_masks(
     progress: Progress,
     checkpoint: Checkpoint | None = None,
 ) -> np.ndarray:
-    """Associates the proposals of the training frames as the options ask: by consensus or by a tracker.
-
-    Args:
-      context: The run.
-      capture: The capture.
-      gaussians: The scene.
-      proposals: From `frame_proposals`.
-      progress: Callback.
-      checkpoint: A tracker resumes behind its last frame.
-
-    Returns:
-      (T, H, W) int16 labels of the training frames, -1 for no region.
-    """
+    """Associates the proposals of the training frames as the options ask: by consensus or by a tracker."""
     options, vision = context.options, _Vision(capture, context.options)
     frames, cameras = vision.frames, vision.cameras
     if options.associated_by == "consensus":
@@ -727,17 +673,7 @@ def _distil(stage: StageInput) -> StageResult:
 
 
 def field_of(results: Results, embedder: Embedder, provenance: str, options: Options) -> LanguageField:
-    """Joins the results of a run to a field.
-
-    Args:
-      results: Results of all stages.
-      embedder: The embedder of the run.
-      provenance: JSON for `LanguageField.provenance`.
-      options: Options of the run.
-
-    Returns:
-      The field. It has all views; in frames that vision left out no region has any pixels.
-    """
+    """Joins the results of a run to a field."""
     capture, embedded = results.load, results.regions
     pixels = np.zeros((embedded.count, len(capture.names)), np.int32)
     pixels[:, vision_frames(capture, options)] = embedded.pixel_counts
