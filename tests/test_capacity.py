@@ -12,7 +12,7 @@ from jsecon.parallel import host_mesh
 from jsecon.process import compilation_counts
 from jsecon.query.render import selection_mask
 from jsecon.splat.capacity import default_capacity, enough_capacity, plan_capacity
-from jsecon.splat.plan import plan_views, render_plan
+from jsecon.splat.plan import prepare_views, render_plan
 from jsecon.splat.reference import render_reference
 from jsecon.splat.render import render, render_depth
 from jsecon.types import Gaussians
@@ -85,14 +85,14 @@ def test_depth_that_lacks_something_is_no_number(covering, camera):
 
 def test_plans_and_votes_hold_what_exceeds_it(covering, cameras):
     pair = jax.tree.map(lambda a: a[:2], cameras)
-    plans = plan_views(covering, pair)
+    plans = prepare_views(covering, pair)
     assert np.asarray(plans.overflow).tolist() == [0, 0]
     features, weight = features_of(COVERING), 0.0
     for t in range(2):
         one = render_plan(jax.tree.map(lambda a, t=t: a[t], plans), features)
         np.testing.assert_allclose(one.features, render_reference(covering, pair[t], features)[0], atol=2e-4)
         weight += np.asarray(one.alpha).sum()
-    assert plan_views(covering, pair, max_bytes=1000) is None
+    assert prepare_views(covering, pair, max_bytes=1000) is None
 
     labels = np.zeros((2, 40, 48), np.int32)
     votes = region_votes(covering, pair, labels, 1)

@@ -7,7 +7,7 @@ import pytest
 
 from jsecon import host_mesh, plan_view, render, render_depth, render_plan
 from jsecon.splat.reference import project_reference, weights_reference
-from jsecon.splat.walk import cumulative
+from jsecon.splat.scan import cumulative
 
 
 def features_of(count: int, channels: int) -> jax.Array:

@@ -20,7 +20,7 @@ from jsecon.query.silhouette import (
     footprints,
 )
 from jsecon.splat.plan import plan_view, render_plan
-from jsecon.splat.walk import to_tiles
+from jsecon.splat.scan import to_tiles
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from jsecon.splat.plan import ViewPlan, plan_views
+from jsecon.splat.plan import ViewPlan, prepare_views
 from jsecon.types import Array, Camera, Gaussians
 
 _SLOTS = 8
@@ -73,7 +73,7 @@ def view_plans(evidence: Evidence) -> ViewPlan:
     """The plans of all views of the Gaussians `with_room`, stacked on a leading axis: the geometry is frozen, so each
     is made once."""
     gaussians, cameras = with_room(evidence.gaussians), jax.tree.map(jnp.asarray, evidence.cameras)
-    plans = plan_views(gaussians, cameras, max_bytes=sys.maxsize)
+    plans = prepare_views(gaussians, cameras, max_bytes=sys.maxsize)
     assert plans is not None
     return plans
 

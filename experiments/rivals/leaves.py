@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Float, Int
 
 from jsecon.splat.plan import ViewPlan
-from jsecon.splat.walk import make_batches, make_table, to_tiles, walk
+from jsecon.splat.scan import make_batches, make_table, scan_tiles, to_tiles
 from jsecon.types import Array
 
 LLOYD = 5
@@ -100,7 +100,7 @@ def silhouette_overlaps(
             row = jnp.where(group >= 0, group, groups)  # out of range: dropped
             return transmittance, logs.at[row, tiles[:, None]].add(jnp.log1p(-chunk.alpha), mode="drop")
 
-        return walk(table, plan.lists, batches, tiles, body, logs)[0], None
+        return scan_tiles(table, plan.lists, batches, tiles, body, logs)[0], None
 
     start = jnp.zeros((groups, *masks.shape), plan.splats.dtype)
     logs, _ = lax.scan(one_batch, start, batches.tiles)

@@ -23,9 +23,9 @@ from scipy.spatial import KDTree
 from experiments.rivals.evidence import Evidence, local_masks
 from jsecon.association.superpixels import superpixel_votes
 from jsecon.paper.baselines import relevancies
-from jsecon.splat.fusion import materialize
+from jsecon.splat.fusion import compute_once
 from jsecon.splat.plan import ViewPlan, plan_view
-from jsecon.splat.walk import blend_weights, make_batches, make_table, walk
+from jsecon.splat.scan import blend_weights, make_batches, make_table, scan_tiles
 from jsecon.types import Array, Selection
 
 MASS, LEAST_WEIGHT, QUANTILE, SURE = 0.75, 0.13, 0.85, 0.15
@@ -107,7 +107,7 @@ def centre_weights(plan: ViewPlan) -> tuple[Float[Array, " n"], Int[Array, " n"]
         corner_x, corner_y = (corner[:, None] for corner in batches.corners(tiles, splats.dtype))
 
         def body(transmittance, found, chunk):
-            weight, transmittance = materialize(chunk.always, blend_weights, transmittance, chunk.alpha)
+            weight, transmittance = compute_once(chunk.always, blend_weights, transmittance, chunk.alpha)
             x, y = (
                 jnp.floor(chunk.attributes[..., k]).astype(jnp.int32) - corner.astype(jnp.int32)
                 for k, corner in enumerate((corner_x, corner_y))
@@ -117,7 +117,7 @@ def centre_weights(plan: ViewPlan) -> tuple[Float[Array, " n"], Int[Array, " n"]
             own = jnp.take_along_axis(weight, pixel[..., None], axis=-1)[..., 0]
             return transmittance, found.at[chunk.ids].add(jnp.where(here, own, 0.0))
 
-        return walk(table, lists, batches, tiles, body, found)[0], None
+        return scan_tiles(table, lists, batches, tiles, body, found)[0], None
 
     found, _ = lax.scan(one_batch, jnp.zeros_like(splats[:, 0]), batches.tiles)
     return jnp.where(inside, found, 0.0), jnp.where(inside, row * plan.width + column, -1)

@@ -18,9 +18,9 @@ from scipy import sparse
 from jsecon.field.votes import at_centre, distinct_labels
 from jsecon.numerics import FULL_PRECISION, NEAR
 from jsecon.splat.capacity import round_capacity
-from jsecon.splat.fusion import materialize
+from jsecon.splat.fusion import compute_once
 from jsecon.splat.plan import ViewPlan, plan_view
-from jsecon.splat.walk import blend_weights, make_batches, make_table, to_tiles, walk
+from jsecon.splat.scan import blend_weights, make_batches, make_table, scan_tiles, to_tiles
 from jsecon.types import Array, Camera, Gaussians
 
 Sparse: TypeAlias = Any
@@ -130,7 +130,7 @@ def _sums_by_pair(
         corners = batches.corners(ids_of_tiles, splats.dtype)
 
         def body(transmittance, sums, chunk):
-            weight, transmittance = materialize(chunk.always, blend_weights, transmittance, chunk.alpha)
+            weight, transmittance = compute_once(chunk.always, blend_weights, transmittance, chunk.alpha)
             if centre:
                 weight = weight * (1 - centre + centre * at_centre(chunk.attributes, corners, lists.tile))
             rows = jnp.einsum("bcp,bps->bcs", weight, is_slot, precision=FULL_PRECISION)
@@ -138,7 +138,7 @@ def _sums_by_pair(
             put = functools.partial(jax.tree.map, lambda all_pairs, a: all_pairs.at[chunk.places].set(a, mode="drop"))
             return transmittance, put(sums, (rows, largest))
 
-        return walk(table, lists, batches, ids_of_tiles, body, sums)[0], None
+        return scan_tiles(table, lists, batches, ids_of_tiles, body, sums)[0], None
 
     count = lists.gaussians.shape[0]
     empty = jnp.zeros((count, _SLOTS), splats.dtype), jnp.zeros(count, splats.dtype) if with_peak else None

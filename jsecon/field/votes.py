@@ -19,9 +19,9 @@ from jsecon.errors import require, require_shape
 from jsecon.numerics import FULL_PRECISION, NEAR, is_traced, require_labels
 from jsecon.parallel import accumulate_over_views, concurrent_lanes
 from jsecon.splat.capacity import default_capacity, enough_capacity
-from jsecon.splat.fusion import materialize
+from jsecon.splat.fusion import compute_once
 from jsecon.splat.plan import ViewPlan, plan_view
-from jsecon.splat.walk import blend_weights, make_batches, make_table, to_tiles, walk
+from jsecon.splat.scan import blend_weights, make_batches, make_table, scan_tiles, to_tiles
 from jsecon.types import Array, Camera, Gaussians, Progress, Votes
 
 # A tile of 8x8 pixels seldom shows more regions than this; where one does, the view is walked again for the rest.
@@ -303,7 +303,7 @@ def _add_view(
 
             def body(transmittance, inner, chunk):
                 votes, total, peak = inner
-                weight, transmittance = materialize(chunk.always, blend_weights, transmittance, chunk.alpha)
+                weight, transmittance = compute_once(chunk.always, blend_weights, transmittance, chunk.alpha)
                 weight = weight * covered[:, None]
                 if centre:
                     weight = weight * (1 - centre + centre * at_centre(chunk.attributes, corners, lists.tile))
@@ -314,7 +314,7 @@ def _add_view(
                 peak = peak.at[chunk.ids].max(weight.max(-1))
                 return transmittance, (votes, total, peak)
 
-            inner, _ = walk(table, lists, batches, ids_of_tiles, body, (votes, total, peak))
+            inner, _ = scan_tiles(table, lists, batches, ids_of_tiles, body, (votes, total, peak))
             return done + _SLOTS, *inner
 
         carry = lax.while_loop(lambda c: (c[0] == 0) | (c[0] < needed), one_pass, (jnp.int32(0), *carry))

@@ -262,7 +262,7 @@ def _run_chunk(
     while True:
         after, losses, overflow = state, [], []
         for n, view in enumerate(order):
-            after, loss, missing = runner.take(after, size, int(view), first + n, float(done[n]), config)
+            after, loss, missing = runner.run_step(after, size, int(view), first + n, float(done[n]), config)
             losses.append(loss)
             overflow.append(missing)
             if n >= MAX_PENDING_STEPS:

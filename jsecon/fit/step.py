@@ -353,7 +353,7 @@ class StepRunner:
             self._programs[program] = self._compiler.submit(lambda: jitted.lower(*tree, capacity, self._mesh).compile())
         return self._programs[program]
 
-    def take(
+    def run_step(
         self, state: TrainState, size: float, view: int, index: int, done: float, config: StepConfig
     ) -> tuple[TrainState, Array, Array]:
         """Takes one step, see `step`.

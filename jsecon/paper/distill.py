@@ -14,7 +14,7 @@ from jaxtyping import Float, Int, Shaped
 from jsecon.errors import require, require_one_of, require_shape
 from jsecon.numerics import is_traced, normalize, require_labels, safe_norm
 from jsecon.splat.capacity import plan_capacity
-from jsecon.splat.plan import plan_view, plan_views, render_plan
+from jsecon.splat.plan import plan_view, prepare_views, render_plan
 from jsecon.types import Array, Camera, Gaussians, Key, Progress, Votes
 
 ADAM_EPS = 1e-15
@@ -179,7 +179,7 @@ def distill_l1(
     # Regions in multiples of 256, the last without a code: scenes share their compiled programs.
     table = jnp.pad(jnp.asarray(region_codes), ((0, -len(region_codes) % 256), (0, 0)))
     stretch = steps if progress is None else max(1, -(-steps // 100))
-    state, plans = start, plan_views(gaussians, cameras, capacity=capacity)
+    state, plans = start, prepare_views(gaussians, cameras, capacity=capacity)
     if plans is None and capacity is None and not is_traced((gaussians, cameras)):
         capacity = plan_capacity(gaussians, cameras, margin=1.0)
     for begin in range(0, steps, stretch):

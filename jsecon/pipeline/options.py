@@ -181,8 +181,8 @@ class FieldOptions:
       latent: Maximum length of a code. The paper uses 3; auto takes as few numbers as keep the regions apart.
       reduce: How a Gaussian's code follows from its votes.
       top: Number of regions whose votes a Gaussian keeps.
-      centre: Weight of the pixel at a Gaussian's centre against all pixels that it covers, 0 to 1. Use 1 if the answer
-        is evaluated on points.
+      centre_pixel_weight: Weight of the pixel at a Gaussian's centre against all pixels that it covers, 0 to 1. Use 1
+        if the answer is evaluated on points.
     """
 
     weighting: Advanced[Literal["pixels", "uniform"]] = "pixels"
@@ -190,7 +190,7 @@ class FieldOptions:
     latent: Advanced[int | Literal["auto"]] = 16
     reduce: Advanced[Literal["mode", "median", "mean"]] = "mode"
     top: Advanced[int] = 8
-    centre: Advanced[float] = 0.0
+    centre_pixel_weight: Advanced[float] = 0.0
 
 
 @dataclasses.dataclass(frozen=True)

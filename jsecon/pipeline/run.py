@@ -79,7 +79,7 @@ LEAST: dict[str, float] = {
     "crop_layers": 0,
     "latent": 1,
     "top": 1,
-    "centre": 0,
+    "centre_pixel_weight": 0,
 }
 """smallest value of an option"""
 CROPS_PER_FRAME = 40
@@ -191,8 +191,13 @@ def _require_inputs(options: Options) -> None:
     if not 0 < options.agreement <= 1:
         remedy = "Leave it out, or use 0.3 to 0.6."
         raise InputError("--agreement", str(options.agreement), "a share above 0 and at most 1", remedy)
-    if options.centre > 1:
-        raise InputError("--centre", str(options.centre), "0 to 1", "Use 1 for the pixel of the centre alone.")
+    if options.centre_pixel_weight > 1:
+        raise InputError(
+            "--centre-pixel-weight",
+            str(options.centre_pixel_weight),
+            "0 to 1",
+            "Use 1 for the pixel of the centre alone.",
+        )
 
 
 def _require_own_folder(options: Options, out: Path) -> None:

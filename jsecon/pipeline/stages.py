@@ -361,7 +361,7 @@ def _plan_masklets(context: RunContext) -> Stage:
         key_options = context.key_options("granularity")
     if options.associated_by == "consensus":
         how += ", what the views agree on"
-        key_options |= context.key_options("agreement", "seed", "centre")
+        key_options |= context.key_options("agreement", "seed", "centre_pixel_weight")
     else:
         by = "through the Gaussians" if options.tracker is None else f"by {model_name(options.tracker, 'tracker')}"
         how += f", followed {by}"
@@ -481,7 +481,7 @@ def associate_masks(
     options, vision = context.options, _Vision(capture, context.options)
     frames, cameras = vision.frames, vision.cameras
     if options.associated_by == "consensus":
-        scene = SceneSuperpixels(gaussians, cameras, proposals, centre=options.centre)
+        scene = SceneSuperpixels(gaussians, cameras, proposals, centre=options.centre_pixel_weight)
         labels = consensus_masklets(frames, scene, agreement=options.agreement, seed=options.seed, progress=progress)
         return clean_masklets(labels)
     tracker = context.models.tracker or GeometricTracker(gaussians, cameras, proposals)
@@ -558,7 +558,7 @@ def _read_regions(stage: StageInput) -> StageResult:
 
 def _plan_parts(context: RunContext) -> Stage:
     """Plans small parts of the scene, each with the embeddings of all single-frame masks that contain it."""
-    key_options = context.key_options("seed", "level", "granularity", "centre")
+    key_options = context.key_options("seed", "level", "granularity", "centre_pixel_weight")
     return Stage(
         "parts",
         "of the scene, by what single masks say of them",
@@ -574,7 +574,7 @@ def _find_parts(stage: StageInput) -> StageResult:
     vision = _Vision(stage.results.load, options)
     frames = vision.frames
     masks, embed = _masks_with_embeddings(context, stage.results)
-    views = SceneSuperpixels(stage.results.gaussians, vision.cameras, masks, centre=options.centre)
+    views = SceneSuperpixels(stage.results.gaussians, vision.cameras, masks, centre=options.centre_pixel_weight)
     piece, weights = pieces_on_masks(frames, views, seed=options.seed, progress=stage.progress)
     rows = np.concatenate([embed(t, masks(t)) for t in range(len(frames))])
     context.models.close()
@@ -633,7 +633,7 @@ def _plan_votes(context: RunContext) -> Stage:
         f"the {context.options.top} strongest regions of each Gaussian",
         _accumulate_votes,
         after=("load", "gaussians", "masklets"),
-        key_options=context.key_options("top", "centre"),
+        key_options=context.key_options("top", "centre_pixel_weight"),
         distributed=True,
     )
 
@@ -644,7 +644,7 @@ def _accumulate_votes(stage: StageInput) -> StageResult:
     labels, folder = stage.results.masklets, stage.checkpoint.folder
     cameras = capture.cameras[vision_frames(capture, options)]
     count = int(labels.max()) + 1
-    settings = {"top": options.top, "centre": options.centre, "by_view": True, "progress": stage.progress}
+    settings = {"top": options.top, "centre": options.centre_pixel_weight, "by_view": True, "progress": stage.progress}
     needed, budget = votes_memory(scene.count, len(labels), count), memory_budget()
     notes = ()
     if needed > budget and jax.process_count() == 1:  # several processes accumulate them together, in memory

@@ -21,7 +21,7 @@ from jsecon.fit.resize import scale_cameras
 from jsecon.process import cores
 from jsecon.query.render import ALPHA_THRESHOLD, HIDDEN_LOGIT, VALA_THRESHOLD
 from jsecon.splat.plan import plan_view, render_plan
-from jsecon.splat.walk import pixel_alphas, to_tiles
+from jsecon.splat.scan import pixel_alphas, to_tiles
 from jsecon.types import Array, Camera, Gaussians
 
 SILHOUETTE_WEIGHTS = {"silhouette": (2.0, 1.0), "strict_silhouette": (1.0, 0.0), "lenient_silhouette": (0.0, 1.0)}

@@ -32,7 +32,7 @@ from jsecon.types import Array
 def _rasterize(
     splats: Array, features: Array, lists: TileLists, width: int, height: int, mesh: Mesh | None = None
 ) -> tuple[Array, Array]:
-    """Composites finite features; arguments and results as for `rasterize_contained`."""
+    """Composites finite features; arguments and results as for `rasterize_nan_contained`."""
     return _forward(splats, features, lists, width, height, mesh)[:2]
 
 
@@ -68,17 +68,17 @@ def _forward(splats, features, lists, width: int, height: int, mesh: Mesh | None
     def split(out, sets):
         return (_unmerge(out[0], sets), *out[1:]), (True, False, False)
 
-    return _merging_channels(one, split)(splats, features, lists)
+    return _fold_vmap_into_channels(one, split)(splats, features, lists)
 
 
 def _features_backward(splats: Array, cotangent: Array, lists: TileLists, mesh: Mesh | None) -> Array:
     def one(splats, cotangent, lists):
         return composite_features_vjp(splats, lists, cotangent, mesh)
 
-    return _merging_channels(one, lambda out, sets: (_unmerge(out, sets), True))(splats, cotangent, lists)
+    return _fold_vmap_into_channels(one, lambda out, sets: (_unmerge(out, sets), True))(splats, cotangent, lists)
 
 
-def _merging_channels(one: Callable, split: Callable) -> Callable:
+def _fold_vmap_into_channels(one: Callable, split: Callable) -> Callable:
     """Wraps `one(splats, channels, lists)` with a rule for vmap.
 
     If only channels (S, ..., D) are batched, they become S D channels of one call, whose result `split(result, S)`
@@ -109,7 +109,7 @@ def _unmerge(array: Array, sets: int) -> Array:
     return jnp.moveaxis(array.reshape(*array.shape[:-1], sets, -1), -2, 0)
 
 
-def rasterize_contained(
+def rasterize_nan_contained(
     splats: Float[Array, "n 6"],
     features: Float[Array, "n d"],
     lists: TileLists,
@@ -135,11 +135,11 @@ def rasterize_contained(
     image, transmittance = _rasterize(splats, jnp.where(finite, features, 0.0), lists, width, height, mesh)
     bad = lax.stop_gradient(1.0 - finite.all(1, keepdims=True).astype(splats.dtype))
 
-    def walk(bad) -> Array:
+    def mark(bad) -> Array:
         image, _ = cast(tuple[Array, Array], _rasterize(lax.stop_gradient(splats), bad, lists, width, height, mesh))
         return image[..., 0] > 0
 
-    touched = lax.cond(_any(bad), walk, lambda bad: jnp.zeros((height, width), bool), bad)
+    touched = lax.cond(_any(bad), mark, lambda bad: jnp.zeros((height, width), bool), bad)
     return jnp.where(touched[..., None], jnp.nan, image), transmittance
 
 

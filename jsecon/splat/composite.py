@@ -1,6 +1,6 @@
 """Front-to-back alpha compositing of tile lists, and its transpose, the gradient with respect to the features.
 
-The tiles of a batch are walked together (walk.py), one batch after another. Each device walks one strip.
+The tiles of a batch are walked together (scan.py), one batch after another. Each device walks one strip.
 """
 
 import jax.numpy as jnp
@@ -9,10 +9,10 @@ from jax.sharding import Mesh
 from jaxtyping import Float, Int
 
 from jsecon.numerics import FULL_PRECISION, MIN_TRANSMITTANCE
-from jsecon.splat.fusion import materialize
+from jsecon.splat.fusion import compute_once
+from jsecon.splat.scan import CHUNK, Batches, blend_weights, make_batches, make_table, scan_tiles, to_tiles
 from jsecon.splat.strips import join_strips, map_strips, split_into_strips
 from jsecon.splat.tiles import TileLists
-from jsecon.splat.walk import CHUNK, Batches, blend_weights, make_batches, make_table, to_tiles, walk
 from jsecon.types import Array
 
 MAX_RECOMPUTED = 6
@@ -54,14 +54,14 @@ def composite(
                 chunk = chunk._replace(columns=jnp.concatenate([columns, chunk.columns], axis=-1))
             if channels <= MAX_RECOMPUTED:
                 return _add_recomputed(transmittance, total, chunk)
-            weight, transmittance = materialize(chunk.always, blend_weights, transmittance, chunk.alpha)
+            weight, transmittance = compute_once(chunk.always, blend_weights, transmittance, chunk.alpha)
             for k in range(CHUNK):
                 total = total + weight[:, None, k] * chunk.columns[:, k, :, None]
             return transmittance, total
 
         def one_batch(tiles):
             total = jnp.zeros((tiles.shape[0], channels, batches.tile**2), table.dtype)
-            return walk(table, lists, batches, tiles, body, total)
+            return scan_tiles(table, lists, batches, tiles, body, total)
 
         totals, seen = lax.map(one_batch, batches.tiles)
         image = _to_image(totals, batches, width)[None]
@@ -121,11 +121,11 @@ def composite_features_vjp(
             values = jnp.moveaxis(cotangents[tiles], -1, 1)  # pixels innermost on both sides: the faster product
 
             def body(transmittance, gradient, chunk):
-                weight, transmittance = materialize(chunk.always, blend_weights, transmittance, chunk.alpha)
+                weight, transmittance = compute_once(chunk.always, blend_weights, transmittance, chunk.alpha)
                 rows = jnp.einsum("bcp,bdp->bcd", weight, values, precision=FULL_PRECISION)
                 return transmittance, gradient.at[chunk.ids].add(rows)
 
-            return walk(table, lists, batches, tiles, body, gradient)[0], None
+            return scan_tiles(table, lists, batches, tiles, body, gradient)[0], None
 
         return lax.scan(one_batch, jnp.zeros((splats.shape[0], channels), splats.dtype), batches.tiles)[0]
 

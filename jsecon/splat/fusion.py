@@ -14,7 +14,7 @@ from jax import lax
 from jsecon.types import Array
 
 
-def materialize(always: Array, compute: Callable, *operands: Any) -> Any:
+def compute_once(always: Array, compute: Callable, *operands: Any) -> Any:
     """Computes `compute(*operands)` once and stores it.
 
     Args:
@@ -34,7 +34,7 @@ def materialize(always: Array, compute: Callable, *operands: Any) -> Any:
 
 
 def opaque_true(number: Array) -> Array:
-    """Makes a condition for `materialize`.
+    """Makes a condition for `compute_once`.
 
     Args:
       number: () float of any value, NaN included.

@@ -11,10 +11,8 @@ from jax.sharding import Mesh
 from jaxtyping import Float
 
 from jsecon.numerics import FULL_PRECISION, MAX_ALPHA
-from jsecon.splat.fusion import materialize
-from jsecon.splat.strips import map_strips, split_into_strips
-from jsecon.splat.tiles import TileLists
-from jsecon.splat.walk import (
+from jsecon.splat.fusion import compute_once
+from jsecon.splat.scan import (
     ATTRIBUTES,
     MAX_BATCH_BACKWARD,
     blend_weights,
@@ -22,9 +20,11 @@ from jsecon.splat.walk import (
     make_batches,
     make_table,
     pixel_centres,
+    scan_tiles,
     to_tiles,
-    walk,
 )
+from jsecon.splat.strips import map_strips, split_into_strips
+from jsecon.splat.tiles import TileLists
 from jsecon.types import Array
 
 _UNROLLED = 8
@@ -78,9 +78,9 @@ def composite_vjp(
 
             def body(transmittance, state, chunk):
                 before, gradient = state
-                weight, transmittance = materialize(chunk.always, blend_weights, transmittance, chunk.alpha)
+                weight, transmittance = compute_once(chunk.always, blend_weights, transmittance, chunk.alpha)
                 along = _along(chunk.columns, local) - along_transmittance[:, None]
-                slope, before = materialize(chunk.always, _slopes, weight, chunk.alpha, along, before, final)
+                slope, before = compute_once(chunk.always, _slopes, weight, chunk.alpha, along, before, final)
                 moments = jnp.einsum("bcp,mp->bcm", slope, monomials, precision=FULL_PRECISION)
                 by_attribute = _attribute_gradient(moments, chunk.attributes, corners, lists.tile / 2)
                 by_feature = jnp.einsum("bcp,bdp->bcd", weight, local, precision=FULL_PRECISION)
@@ -88,7 +88,7 @@ def composite_vjp(
                 return transmittance, (before, gradient.at[chunk.ids].add(rows))
 
             state = (jnp.zeros_like(final), gradient)
-            return walk(table, lists, batches, tiles, body, state)[0][1], None
+            return scan_tiles(table, lists, batches, tiles, body, state)[0][1], None
 
         start = jnp.zeros((splats.shape[0], ATTRIBUTES + channels), splats.dtype)
         return lax.scan(one_batch, start, batches.tiles)[0]

@@ -1,7 +1,7 @@
 """Plans of views: what repeated renderings of frozen geometry share, so that they skip projection and sorting.
 
-`_make_plan` and `_composite_plan` are pure. `plan_view`, `plan_views` and `render_plan` are their drivers: outside of a
-trace they call compiled programs, and plan again if the capacity overflows.
+`_make_plan` and `_composite_plan` are pure. `plan_view`, `prepare_views` and `render_plan` are their drivers: outside of
+a trace they call compiled programs, and plan again if the capacity overflows.
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ from jsecon.errors import require, require_shape
 from jsecon.numerics import NEAR, all_finite, is_traced
 from jsecon.parallel import MESH_OPTIONS, map_rows
 from jsecon.programs import stored_jit
-from jsecon.splat.autodiff import rasterize_contained
+from jsecon.splat.autodiff import rasterize_nan_contained
 from jsecon.splat.capacity import default_capacity, enough_capacity, round_capacity
 from jsecon.splat.project import Projection, check_gaussians, project
 from jsecon.splat.strips import map_strips
@@ -135,7 +135,7 @@ def plan_view(
     return plan
 
 
-def plan_views(
+def prepare_views(
     gaussians: Gaussians, cameras: Camera, *, capacity: int | None = None, max_bytes: int = MAX_PLAN_BYTES
 ) -> ViewPlan | None:
     """Plans all views of a batch.
@@ -183,7 +183,7 @@ def _composite_plan(plan: ViewPlan, features: Array, background: Array | None, d
     if depth or features.dtype != jnp.bfloat16:
         features = features.astype(plan.splats.dtype)
     columns = jnp.concatenate([features, plan.depths[:, None]], axis=1) if depth else features
-    image, transmittance = rasterize_contained(plan.splats, columns, plan.lists, plan.width, plan.height, plan.mesh)
+    image, transmittance = rasterize_nan_contained(plan.splats, columns, plan.lists, plan.width, plan.height, plan.mesh)
     image, transmittance = (jnp.where(plan.camera_is_finite, a, jnp.nan) for a in (image, transmittance))
     alpha, expected_depth = 1 - transmittance, None
     if depth:

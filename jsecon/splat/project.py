@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from jsecon.errors import require, require_shape
 from jsecon.numerics import BLUR_PX2, FRUSTUM_MARGIN, MIN_ALPHA, NEAR, all_finite, normalize, sigmoid
-from jsecon.splat.fusion import materialize, opaque_true
+from jsecon.splat.fusion import compute_once, opaque_true
 from jsecon.splat.sh import COEFFICIENT_COUNTS
 from jsecon.types import Array, Camera, Gaussians, Leaf, record
 
@@ -222,10 +222,10 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float | Array = NEAR)
 
     # Each stage is stored, not recomputed by every reader: the gradient becomes four times faster.
     always = opaque_true(gaussians.means[0, 0]) if gaussians.means.shape[0] else jnp.asarray(True)
-    unit = materialize(always, lambda q: [normalize(q)[:, i] for i in range(4)], gaussians.quaternions)
+    unit = compute_once(always, lambda q: [normalize(q)[:, i] for i in range(4)], gaussians.quaternions)
     rays = (x_ratio, y_ratio, camera.fx / z_safe, camera.fy / z_safe)
-    row_1, row_2 = materialize(always, _covariance_root, w2c, unit, gaussians.log_scales, rays)
-    cov_xx, cov_yy, l11, l21, l22 = materialize(always, _whitening, row_1, row_2)
+    row_1, row_2 = compute_once(always, _covariance_root, w2c, unit, gaussians.log_scales, rays)
+    cov_xx, cov_yy, l11, l21, l22 = compute_once(always, _whitening, row_1, row_2)
 
     opacities = sigmoid(gaussians.opacity_logits)
     reach = jnp.sqrt(2 * jnp.log(jnp.maximum(opacities / MIN_ALPHA, 1.0)))

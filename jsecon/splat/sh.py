@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from jsecon.errors import require
 from jsecon.numerics import normalize
-from jsecon.splat.fusion import materialize, opaque_true
+from jsecon.splat.fusion import compute_once, opaque_true
 from jsecon.types import Array, Camera, Gaussians
 
 C0 = 0.28209479177387814
@@ -61,7 +61,7 @@ def _colours(directions: Array, sh: Array) -> Array:
 
     For stacked columns XLA's CPU backend tests in the innermost loop which basis function a number belongs to.
     """
-    basis = materialize(opaque_true(sh[0, 0, 0]), lambda d: _basis(d[:, 0], d[:, 1], d[:, 2], sh.shape[1]), directions)
+    basis = compute_once(opaque_true(sh[0, 0, 0]), lambda d: _basis(d[:, 0], d[:, 1], d[:, 2], sh.shape[1]), directions)
 
     def colour(c):
         return sum((b * sh[:, k, c] for k, b in enumerate(basis[1:], start=1)), basis[0] * sh[:, 0, c])
@@ -73,7 +73,7 @@ def _colours_backward(residuals: tuple[Array, Array], bar: Array) -> tuple[Array
     directions, sh = residuals
     coefficients = sh.shape[1]
     always, columns = opaque_true(sh[0, 0, 0]), [directions[:, i] for i in range(3)]
-    by_basis = materialize(always, lambda sh, bar: [(sh[:, k] * bar).sum(1) for k in range(coefficients)], sh, bar)
+    by_basis = compute_once(always, lambda sh, bar: [(sh[:, k] * bar).sum(1) for k in range(coefficients)], sh, bar)
 
     def evaluate(x, y, z):
         return _basis(x, y, z, coefficients)
@@ -81,8 +81,8 @@ def _colours_backward(residuals: tuple[Array, Array], bar: Array) -> tuple[Array
     def along(x, y, z, by):
         return jnp.stack(jax.vjp(evaluate, x, y, z)[1](by), axis=-1)
 
-    basis = materialize(always, lambda d: sh_basis(d, coefficients), directions)
-    return materialize(always, along, *columns, by_basis), basis[:, :, None] * bar[:, None]
+    basis = compute_once(always, lambda d: sh_basis(d, coefficients), directions)
+    return compute_once(always, along, *columns, by_basis), basis[:, :, None] * bar[:, None]
 
 
 _colours.defvjp(lambda directions, sh: (_colours(directions, sh), (directions, sh)), _colours_backward)

@@ -21,7 +21,7 @@ from jax import lax
 from jaxtyping import Float, Int, UInt
 
 from jsecon.errors import require
-from jsecon.splat.fusion import materialize
+from jsecon.splat.fusion import compute_once
 from jsecon.splat.project import Projection
 from jsecon.splat.strips import BLOCK, FULL_IMAGE, Strip, tile_rows
 from jsecon.types import Array, Leaf, record, static
@@ -325,7 +325,7 @@ def tile_bits(
 
     def step(first: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         so_far, members, before = carry
-        reached = materialize(first < total, reach, part(owner, first), part(blocks, first))
+        reached = compute_once(first < total, reach, part(owner, first), part(blocks, first))
         bits = _transpose_words(reached, tiles)
         ends = so_far + lax.cumsum(lax.population_count(bits).astype(jnp.int32))
 
@@ -406,10 +406,10 @@ def compact_tile_lists(
         begin_bits = lax.dynamic_slice(begins, (first // WORD,), (_CHUNK_SLOTS // WORD,))
         begun = begun + lax.cumsum(lax.population_count(begin_bits).astype(jnp.int32))
         always = first < last
-        segment = materialize(
+        segment = compute_once(
             always, segment_of, begin_bits, begun - lax.population_count(begin_bits).astype(jnp.int32)
         )
-        pairs = materialize(always, pair_of, first, *materialize(always, lambda s: [c[s] for c in columns], segment))
+        pairs = compute_once(always, pair_of, first, *compute_once(always, lambda s: [c[s] for c in columns], segment))
         return begun[-1], lax.dynamic_update_slice(out, owner[pairs], (first,))
 
     out = _loop_in_chunks(last, _CHUNK_SLOTS, fill, (jnp.int32(0), jnp.zeros(slots, jnp.int32)))[1]

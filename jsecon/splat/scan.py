@@ -6,8 +6,8 @@ innermost and fill the vectors; numbers of a Gaussian are shared by a row of pix
 XLA's CPU backend decides the speed; measured on garden (benchmarks/results.md):
 - A scan over single Gaussians starts four kernels for each and reads slices unvectorised. A chunk at a time, with the
   recurrence inside of one kernel, takes a third of that.
-- Fusion recomputes cheap arithmetic for every reader, such as the exponentials of a chunk as polynomials. `materialize`
-  prevents it.
+- Fusion recomputes cheap arithmetic for every reader, such as the exponentials of a chunk as polynomials:
+  `compute_once` prevents it.
 """
 
 import functools
@@ -20,7 +20,7 @@ from jax import lax
 from jaxtyping import Float
 
 from jsecon.numerics import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
-from jsecon.splat.fusion import materialize
+from jsecon.splat.fusion import compute_once
 from jsecon.splat.strips import FULL_IMAGE, Strip
 from jsecon.splat.tiles import TileLists, tile_grid
 from jsecon.types import Array
@@ -135,7 +135,7 @@ class Chunk(NamedTuple):
     alpha: Array
     """(B, CHUNK, pixels), 0 below the cut."""
     always: Array
-    """() bool, true: for `materialize`."""
+    """() bool, true: for `compute_once`."""
 
 
 def make_table(splats: Float[Array, "n 6"], *columns: Array) -> Float[Array, "n k"]:
@@ -259,7 +259,7 @@ def blend_weights(transmittance: Array, alpha: Array) -> tuple[Array, Array]:
     return jnp.where(before - weight > MIN_TRANSMITTANCE, weight, 0.0), after
 
 
-def walk(
+def scan_tiles(
     table: Array, lists: TileLists, batches: Batches, tiles: Array, body: Callable, state: Any
 ) -> tuple[Any, Array]:
     """Walks down the lists of one batch, until the longest ends or every pixel is opaque.
@@ -291,7 +291,7 @@ def walk(
         exponent = jnp.where(index < length, rows[..., ATTRIBUTES], -jnp.inf)
         coefficients = _coefficients(rows, corner_x, corner_y, exponent)
         always = first < longest
-        alpha = materialize(always, functools.partial(_alphas, tile=batches.tile), coefficients)
+        alpha = compute_once(always, functools.partial(_alphas, tile=batches.tile), coefficients)
         places = jnp.where(index < length, start + index, lists.gaussians.shape[0])
         chunk = Chunk(ids, places, rows[..., ATTRIBUTES + 1 :], rows[..., :ATTRIBUTES], alpha, always)
         seen = jnp.where(transmittance.max(1) > MIN_TRANSMITTANCE, first + CHUNK, seen)
