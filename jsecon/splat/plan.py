@@ -1,7 +1,7 @@
 """Plans of views: what repeated renderings of frozen geometry share, so that they skip projection and sorting.
 
-`_make_plan` and `_composite_plan` are pure. `plan_view`, `prepare_views` and `render_plan` are their drivers: outside of
-a trace they call compiled programs, and plan again if the capacity overflows.
+`_make_plan` and `_composite_plan` are pure. `plan_view`, `prepare_views` and `render_plan` drive them: outside of a
+trace they call compiled programs, and plan again if the capacity overflows.
 """
 
 import dataclasses
