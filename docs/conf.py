@@ -91,7 +91,7 @@ def _shorten_types(app: Sphinx, what: str, name: str, obj: Any, options: Any, si
 
 
 class CommandHelp(SphinxDirective):
-    """The directive `jsecon-help`: a section for each verb, with what --help-all prints."""
+    """The directive `jsecon-help`: a section for each verb, with what --help prints."""
 
     def run(self) -> list[nodes.Node]:
         """Returns the sections."""
@@ -100,7 +100,7 @@ class CommandHelp(SphinxDirective):
         for verb in cli.VERB_NAMES:
             printed = io.StringIO()
             with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
-                cli.parse([verb, "--help-all"])
+                cli.parse([verb, "--help"])
             section = nodes.section("", nodes.title(text=f"jsecon {verb}"), ids=[f"jsecon-{verb}"])
             lines = [textwrap.fill(line, 92) if len(line) > 92 else line for line in printed.getvalue().splitlines()]
             section += nodes.literal_block("", "\n".join(lines), language="text")

@@ -317,9 +317,7 @@ def test_models_are_listed_fetched_checked_and_removed_by_name(hub, tmp_path, mo
     assert rows == {"clip": [], "siglip2": ["fp32"], "mobileclip": []}
     assert cli.main(["models", "list"]) == 0
     assert "s/frame" in (listed := capsys.readouterr().out)
-    assert cli.main(["run", "--help-all"]) == 0
-    helped = capsys.readouterr().out
-    assert all(row.purpose in listed and row.purpose in helped for row in catalogue())
+    assert all(row.purpose in listed for row in catalogue())
     assert cli.main(["models", "check", "siglip2"]) == 0
     assert "CLIP: usable" in capsys.readouterr().out
     assert cli.main(["models", "remove", "siglip2"]) == 0

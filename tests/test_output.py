@@ -48,7 +48,7 @@ def test_answers_are_written_where_nobody_reads_the_lines(saved, tmp_path, monke
 @pytest.mark.skipif(os.name != "posix", reason="pipes of POSIX")
 def test_the_program_ends_quietly_with_the_code_of_a_broken_pipe():
     with closed_pipe() as stream:
-        command = [sys.executable, "-m", "jsecon", "completion", "bash"]
+        command = [sys.executable, "-m", "jsecon", "run", "--help"]
         done = subprocess.run(command, stdout=stream, stderr=subprocess.PIPE, text=True, timeout=120)
     assert (done.returncode, done.stderr) == (UNREAD, "")
 

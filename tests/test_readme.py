@@ -108,12 +108,8 @@ def _check_jsecon(words, *, whole):
     if not whole and words[0] in cli.VERB_NAMES:
         printed = io.StringIO()
         with contextlib.suppress(SystemExit), contextlib.redirect_stdout(printed):
-            cli.parse([words[0], "--help-all"])
-        assert {word for word in words if word.startswith("--")} <= {
-            *printed.getvalue().split(),
-            "--help",
-            "--help-all",
-        }
+            cli.parse([words[0], "--help"])
+        assert {word for word in words if word.startswith("--")} <= {*printed.getvalue().split(), "--help"}
 
 
 def test_every_example_of_the_program_parses():

@@ -13,22 +13,16 @@ import io
 import json
 import os
 import re
-import shutil
 import sys
-import textwrap
 import traceback
-import warnings
-from collections.abc import Callable, Iterator, Sequence
-from typing import Annotated, Any, Union, get_type_hints
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Any, Union
 
-import docstring_parser
 import tyro
 
 import jsecon
-from jsecon.app.models import help_table
-from jsecon.app.verbs import VERBS, Completion, Output, Run, Verb, VerbResult
+from jsecon.app.verbs import VERBS, OutputOptions, Verb, VerbResult
 from jsecon.errors import InputError, describe_error
-from jsecon.pipeline.options import ADVANCED
 from jsecon.pipeline.progress import Console
 
 ABOUT = """Finds things in 3D Gaussian scenes by text, at the level of points, on a plain CPU.
@@ -58,8 +52,6 @@ examples
 jsecon VERB --help has the options of a verb. Repeat the command of a stopped run to resume it. jsecon --version prints
 the version."""
 
-MAX_WIDTH = 100
-"""columns that a description takes at most"""
 MARKERS = (tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff, tyro.conf.PositionalMetavarFromFieldName)
 
 
@@ -73,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
       The exit code.
     """
     argv = sys.argv[1:] if argv is None else list(argv)
-    output = Output("--json" in argv, "--debug" in argv)  # also for a line that cannot be read
+    output = OutputOptions("--json" in argv, "--debug" in argv)  # also for a line that cannot be read
     try:
         if argv == ["--version"]:
             print(f"jsecon {jsecon.__version__}")
@@ -82,9 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         output = verb.output
         if output.debug:
             os.environ.setdefault("JAX_TRACEBACK_FILTERING", "off")  # before jax is imported
-        act, _ = _VERBS[argv[0]]
-        console = Console(sys.stderr if output.json else None)
-        result = act(verb, console)
+        result = _run_verb(verb, Console(sys.stderr if output.json else None))
     except SystemExit as stop:  # --help
         return int(stop.code or 0)
     except (KeyboardInterrupt, Exception) as error:
@@ -107,96 +97,28 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def parse(argv: Sequence[str]) -> Verb:
-    """Reads a command line.
-
-    Args:
-      argv: Arguments behind the program's name, the verb first.
-
-    Returns:
-      The verb with its options.
-
-    Raises:
-      InputError: The command line is wrong.
-      SystemExit: It asks for help, which is printed.
-    """
-    if argv and argv[0] in _VERBS:
-        kind, prog = _VERBS[argv[0]][1], f"jsecon {argv[0]}"
-        if "--help-all" in argv:
-            return _read(kind, prog, ["--help"], description=_description(kind, whole=True))
-        if {"-h", "--help"} & set(argv):
-            shown = _common_options(kind)
-            return _read(shown, prog, ["--help"], description=_description(kind, whole=False))
-        return _read(kind, prog, argv[1:])
+    """Reads a command line: the arguments behind the program's name, the verb first."""
+    if argv and argv[0] in _VERBS:  # one verb alone is read ten times faster than all
+        kind = _VERBS[argv[0]]
+        examples = "\n".join(["examples", *(f"  {line}" for line in kind.examples)])
+        return _read(kind, f"jsecon {argv[0]}", argv[1:], description=f"{_summary(kind)}\n\n{examples}")
     if argv and not argv[0].startswith("-"):
         similar = "".join(f"Did you mean {name}? " for name in difflib.get_close_matches(argv[0], _VERBS, 1))
         raise InputError("jsecon", f"{argv[0]} is not a verb", remedy=f"{similar}jsecon --help lists the verbs.")
     return _read(_all_verbs(), "jsecon", argv, description=ABOUT)
 
 
-def _description(kind: Any, *, whole: bool) -> str:
-    """Describes a verb: what it does, in one sentence or as a `whole`, examples, and how to see all options."""
-    width = min(shutil.get_terminal_size().columns, MAX_WIDTH)
-    parsed = docstring_parser.parse(inspect.getdoc(kind) or "", docstring_parser.DocstringStyle.GOOGLE)
-    paragraphs = [parsed.short_description or "", *((parsed.long_description or "").split("\n\n") if whole else [])]
-    filled = [textwrap.fill(" ".join(paragraph.split()), width) for paragraph in paragraphs if paragraph]
-    examples = "\n".join(["examples", *(f"  {line}" for line in kind.examples)])
-    verb = kind.examples[0].split()[1]
-    more = [help_table()] if whole and kind is Run else []
-    if not whole:
-        more = [f"jsecon {verb} --help-all describes every option."]
-    return "\n\n".join([*filled, examples, *more])
-
-
-def _common_options(kind: Any) -> Any:
-    """Makes a dataclass of the options of a verb that are not `Advanced`, with the first sentence of each.
-
-    tyro prints its help, which fits a screen. The options of the verb's groups come after its own.
-    """
-    fields: list[tuple[str, Any, dataclasses.Field]] = []
-    sentences: list[str] = []
-    for owner in (kind, *_groups(kind)):
-        hints = get_type_hints(owner, include_extras=True)
-        for field in dataclasses.fields(owner):
-            if dataclasses.is_dataclass(hints[field.name]) or ADVANCED in getattr(
-                hints[field.name], "__metadata__", ()
-            ):
-                continue
-            default = {"default": field.default, "default_factory": field.default_factory}
-            fields.append((field.name, hints[field.name], dataclasses.field(**default, kw_only=True)))
-            sentences.append(f"  {field.name}: {_first_sentence(_help_text(owner, field.name))}")
-    made = dataclasses.make_dataclass(kind.__name__, fields, frozen=True)
-    made.__doc__ = "\n".join(["Options.", "", "Attributes:", *sentences])
-    return made
-
-
-def _groups(kind: Any) -> list[Any]:
-    """The classes of a verb's groups of options, but for those of the output, which every verb has."""
-    hints = get_type_hints(kind, include_extras=True)
-    groups = [hints[field.name] for field in dataclasses.fields(kind) if field.name != "output"]
-    return [group for group in groups if dataclasses.is_dataclass(group)]
-
-
-def _help_text(owner: Any, name: str) -> str:
-    """The help text of an option, from the docstring of its class or of a base of it."""
-    for cls in owner.__mro__:
-        for parameter in docstring_parser.parse(cls.__doc__ or "", docstring_parser.DocstringStyle.GOOGLE).params:
-            if parameter.arg_name == name:
-                return " ".join((parameter.description or "").split())
-    raise LookupError(f"{owner.__name__}.{name} has no help text")
-
-
-def _first_sentence(text: str) -> str:
-    """The text up to the first full stop that ends a sentence; a stop before a small letter or a digit ends none."""
-    end = re.search(r"[.:](?= [A-Z`])", text)
-    return text if end is None else text[: end.start()] + "."
+def _summary(kind: type[Verb]) -> str:
+    """Returns what a verb does: its docstring without the section of the options."""
+    return (inspect.getdoc(kind) or "").partition("\n\nAttributes:")[0]
 
 
 def _all_verbs() -> Any:
     """Returns the union of the verbs, of which tyro makes subcommands, with the first line of each description."""
     kinds = []
-    for name, (_, kind) in _VERBS.items():
-        summary = (inspect.getdoc(kind) or "").partition("\n")[0]
-        kinds.append(Annotated[kind, tyro.conf.subcommand(name=name, description=summary, prefix_name=False)])
+    for name, kind in _VERBS.items():
+        first_line = _summary(kind).partition("\n")[0]
+        kinds.append(Annotated[kind, tyro.conf.subcommand(name=name, description=first_line, prefix_name=False)])
     return Union[tuple(kinds)]  # noqa: UP007
 
 
@@ -209,7 +131,7 @@ def _read(kind: Any, prog: str, argv: Sequence[str], description: str | None = N
     except SystemExit as stop:
         if not stop.code:
             raise
-        remedy = f"{prog} --help-all lists the options." if " " in prog else f"{prog} --help lists the verbs."
+        remedy = f"{prog} --help lists the options." if " " in prog else f"{prog} --help lists the verbs."
         raise InputError(prog, _sentence(printed.getvalue(), prog), remedy=remedy) from None
 
 
@@ -238,7 +160,7 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__ or error.__context__
 
 
-def _finish(output: Output, result: VerbResult, code: int = 0) -> int:
+def _finish(output: OutputOptions, result: VerbResult, code: int = 0) -> int:
     """Prints errors, and with --json the result, with the last error as "error"; returns 2 if there are any."""
     errors = result.get("errors", ())
     for error in errors:
@@ -262,44 +184,21 @@ def _to_json(value: Any) -> Any:
     return vars(value) if dataclasses.is_dataclass(value) else str(value)
 
 
-def _completion(verb: Completion, console: Console) -> VerbResult:
-    """Prints the script that completes verbs, options, choices and paths in a shell.
-
-    shtab makes it from tyro's parser. The scripts of tyro 1.0 itself do not complete positional arguments, such as the
-    path of a capture, and start Python at each key press.
-    """
-    import shtab
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # tyro names no other way to a parser
-        parser: Any = tyro.extras.get_parser(_all_verbs(), prog="jsecon", config=MARKERS)
-    script = shtab.complete(parser, verb.shell)
-    console.say(script)
-    return {"shell": verb.shell, "script": script}
-
-
-def _act(module: str) -> Callable[[Any, Console], VerbResult]:
-    """Returns the function that does the work of a verb; its module is imported when it is called."""
-
-    def act(verb: Verb, console: Console) -> VerbResult:
-        name = type(verb).__name__.lower()
-        with console.progress("start"):
-            try:
-                work = importlib.import_module(f"jsecon.{module}").VERBS[type(verb)]
-            except ModuleNotFoundError as error:
-                if not verb.extra:
-                    raise
-                problem = f"the package {str(error.name).partition('.')[0]} is missing"
-                remedy = f'Run: pip install "jsecon[{verb.extra}]"'
-                raise InputError(f"jsecon {name}", problem, remedy=remedy) from error
-        return work(verb, console)
-
-    return act
+def _run_verb(verb: Verb, console: Console) -> VerbResult:
+    """Imports the module that does the work of a verb, and runs it."""
+    name = type(verb).__name__.lower()
+    module, function = VERBS[type(verb)].split(":")
+    with console.progress("start"):
+        try:
+            work = getattr(importlib.import_module(f"jsecon.{module}"), function)
+        except ModuleNotFoundError as error:
+            if not verb.extra:
+                raise
+            problem = f"the package {str(error.name).partition('.')[0]} is missing"
+            raise InputError(f"jsecon {name}", problem, remedy=f'Run: pip install "jsecon[{verb.extra}]"') from error
+    return work(verb, console)
 
 
-_VERBS: dict[str, tuple[Callable[[Any, Console], VerbResult], type[Verb]]] = {
-    **{kind.__name__.lower(): (_act(module), kind) for kind, module in VERBS.items()},
-    "completion": (_completion, Completion),
-}
+_VERBS: dict[str, type[Verb]] = {kind.__name__.lower(): kind for kind in VERBS}
 VERB_NAMES = tuple(_VERBS)
-"""in the order of the help"""
+"""Names of the verbs, in the order of the help."""

@@ -23,7 +23,7 @@ MIN_CACHE_DISK = 32 << 20
 # fmt: off
 PACKAGES = (
     "numpy", "filelock", "psutil", "scipy", "sklearn", "cv2", "PIL", "jaxtyping", "optax", "flax", "onnxruntime",
-    "tokenizers", "safetensors", "ftfy", "tqdm", "tyro", "shtab", "docstring_parser", "lazy_loader", "huggingface_hub",
+    "tokenizers", "safetensors", "ftfy", "tqdm", "tyro", "lazy_loader", "huggingface_hub",
 )
 # fmt: on
 """modules of the packages that jsecon requires; jax has another check"""

@@ -12,7 +12,6 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from jsecon.networks.hub import Precision, Role
 from jsecon.pipeline.options import (
-    Advanced,
     BareOptions,
     FieldOptions,
     InputOptions,
@@ -26,8 +25,6 @@ from jsecon.pipeline.options import (
 T = TypeVar("T")
 Repeated: TypeAlias = Option[UseAppendAction[list[T]]]
 """option that can be repeated"""
-RepeatedAdvanced: TypeAlias = Advanced[UseAppendAction[list[T]]]
-"""option that can be repeated and that few need"""
 By = Literal["votes", "silhouette", "code"]
 
 VerbResult: TypeAlias = dict[str, Any]
@@ -36,7 +33,7 @@ what it could not do besides, under "then" what to do after that is printed."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Output:
+class OutputOptions:
     """Options of every verb.
 
     Attributes:
@@ -55,7 +52,7 @@ class Verb:
 
     examples: ClassVar[tuple[str, ...]]
     extra: ClassVar[str] = ""
-    output: Output = Output()
+    output: OutputOptions = OutputOptions()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -77,7 +74,7 @@ class Demo(Verb):
 
     seed: Option[int] = 0
     out: Option[Path] = Path("jsecon-demo")
-    steps: Advanced[int] = 550
+    steps: Option[int] = 550
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -106,7 +103,7 @@ class Run(Verb, InputOptions):
     out: Option[Path]
     dry_run: Option[bool] = False
     yes: Option[bool] = False
-    distributed: Advanced[bool] = False
+    distributed: Option[bool] = False
     scene: SceneOptions = dataclasses.field(default_factory=SceneOptions)
     bare: BareOptions = dataclasses.field(default_factory=BareOptions)
     masks: MaskOptions = dataclasses.field(default_factory=MaskOptions)
@@ -163,7 +160,7 @@ class ServerVerb(Verb):
     host: Option[str] = "127.0.0.1"
     port: Option[int] = 8765
     token: Option[str] = ""
-    allow_host: RepeatedAdvanced[str] = dataclasses.field(default_factory=list)
+    allow_host: Repeated[str] = dataclasses.field(default_factory=list)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -181,8 +178,8 @@ class FieldVerb(Verb):
 
     field: Positional[Path]
     embedder: Option[Path | None] = None
-    yes: Advanced[bool] = False
-    template: RepeatedAdvanced[str] = dataclasses.field(default_factory=list)
+    yes: Option[bool] = False
+    template: Repeated[str] = dataclasses.field(default_factory=list)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -244,13 +241,13 @@ class Query(FieldVerb):
     up: Option[tuple[float, float, float] | None] = None
     by: Option[By] = "votes"
     threshold: Option[float | None] = None
-    quantile: Advanced[float] = 0.82
+    quantile: Option[float] = 0.82
     all: Option[bool] = False
-    keep_outliers: Advanced[bool] = False
-    grow: Advanced[int] = 0
-    shrink: Advanced[int] = 0
-    invert: Advanced[bool] = False
-    views: Advanced[int] = 3
+    keep_outliers: Option[bool] = False
+    grow: Option[int] = 0
+    shrink: Option[int] = 0
+    invert: Option[bool] = False
+    views: Option[int] = 3
     format: Option[Literal["ply", "spz", "glb"]] = "ply"
 
 
@@ -328,7 +325,7 @@ class View(ServerVerb, FieldVerb):
 
     texts: Positional[list[str]]
     export: Option[Path | None] = None
-    link: Advanced[str] = ""
+    link: Option[str] = ""
     port: Option[int] = 8766
 
 
@@ -412,7 +409,7 @@ class Models(Verb):
 
     action: Positional[Literal["list", "get", "check", "remove"]]
     names: Positional[list[str]] = dataclasses.field(default_factory=list)
-    role: Advanced[Role | None] = None
+    role: Option[Role | None] = None
     precision: Option[Precision | None] = None
     yes: Option[bool] = False
 
@@ -434,35 +431,19 @@ class Doctor(Verb):
     models: Option[Path | None] = None
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Completion(Verb):
-    """Prints a script that completes jsecon's words in a shell.
-
-    For bash: jsecon completion bash > ~/.local/share/bash-completion/completions/jsecon. For zsh, write it as _jsecon
-    to a folder of $fpath. For fish, write it to ~/.config/fish/completions/jsecon.fish. Then open a new shell.
-
-    Attributes:
-      shell: The shell.
-    """
-
-    examples = ("jsecon completion bash > ~/.local/share/bash-completion/completions/jsecon",)
-
-    shell: Positional[Literal["bash", "zsh", "fish"]]
-
-
 VERBS: dict[type[Verb], str] = {
-    Demo: "demo.demo",
-    Run: "app.running",
-    Fit: "app.running",
-    Query: "app.querying",
-    Objects: "app.exports",
-    Export: "app.exports",
-    View: "app.viewer.window",
-    Eval: "app.evaluation",
-    Serve: "app.server.serve",
-    Mcp: "app.mcp_server",
-    Models: "app.models",
-    Doctor: "app.doctor",
+    Demo: "demo.demo:_demo",
+    Run: "app.running:_run",
+    Fit: "app.running:_fit",
+    Query: "app.querying:_query",
+    Objects: "app.exports:_objects",
+    Export: "app.exports:_export",
+    View: "app.viewer.window:_view",
+    Eval: "app.evaluation:_eval",
+    Serve: "app.server.serve:_serve",
+    Mcp: "app.mcp_server:_mcp",
+    Models: "app.models:_models",
+    Doctor: "app.doctor:_doctor",
 }
-"""A verb's options -> the module whose table VERBS has the function that does its work: of (verb, `Console`), to a
-`VerbResult`. It raises InputError for bad input."""
+"""A verb's options -> the module and the function that do its work: of (verb, `Console`), to a `VerbResult`. The
+function raises InputError for bad input."""

@@ -24,10 +24,6 @@ def _default_hint(default: str) -> str:
 
 Option: TypeAlias = Annotated[T, tyro.conf.arg(prefix_name=False, help_behavior_hint=_default_hint)]
 """an option of the command line; its flag does not name the group"""
-ADVANCED = "advanced"
-"""mark of an option that --help leaves out and --help-all describes"""
-Advanced: TypeAlias = Annotated[Option[T], ADVANCED]
-"""an option that few need"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,17 +71,17 @@ class SceneOptions:
       seed: Seed of all random numbers.
     """
 
-    downscale: Advanced[float | None] = None
+    downscale: Option[float | None] = None
     long_side: Option[int] = 400
     frames: Option[int | None] = None
-    holdout: Advanced[int] = 8
-    refine: Advanced[Literal["none", "poses", "exposure", "both", "auto"]] = "auto"
-    drop_frames: Advanced[Literal["none", "auto"]] = "none"
-    steps: Advanced[int] = 2000
+    holdout: Option[int] = 8
+    refine: Option[Literal["none", "poses", "exposure", "both", "auto"]] = "auto"
+    drop_frames: Option[Literal["none", "auto"]] = "none"
+    steps: Option[int] = 2000
     minutes: Option[float | None] = None
-    gaussians_at_most: Advanced[int | None] = None
-    sh_degree: Advanced[Literal[0, 1, 2, 3]] = 2
-    seed: Advanced[int] = 0
+    gaussians_at_most: Option[int | None] = None
+    sh_degree: Option[Literal[0, 1, 2, 3]] = 2
+    seed: Option[int] = 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,9 +95,9 @@ class BareOptions:
         images are not needed.
     """
 
-    views: Advanced[int] = 24
+    views: Option[int] = 24
     up: Option[tuple[float, float, float] | None] = None
-    cameras: Advanced[Path | None] = None
+    cameras: Option[Path | None] = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,11 +119,11 @@ class MaskOptions:
     """
 
     masks: Option[Path | None] = None
-    proposals: Advanced[Path | None] = None
+    proposals: Option[Path | None] = None
     granularity: Option[Literal["fine", "medium", "coarse"]] = "medium"
-    association: Advanced[Literal["consensus", "tracking"]] = "consensus"
-    agreement: Advanced[float] = 0.4
-    iou_threshold: Advanced[float] = 0.5
+    association: Option[Literal["consensus", "tracking"]] = "consensus"
+    agreement: Option[float] = 0.4
+    iou_threshold: Option[float] = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,15 +155,15 @@ class ModelOptions:
 
     models: Option[Literal["auto"] | None] = None
     segmenter: Option[Path | None] = None
-    level: Advanced[Literal["default", "s", "m", "l"]] = "l"
-    prompts: Advanced[Literal["guided", "grid"]] = "guided"
-    points_per_side: Advanced[int] = 32
-    crop_layers: Advanced[int] = 0
-    tracker: Advanced[Path | None] = None
+    level: Option[Literal["default", "s", "m", "l"]] = "l"
+    prompts: Option[Literal["guided", "grid"]] = "guided"
+    points_per_side: Option[int] = 32
+    crop_layers: Option[int] = 0
+    tracker: Option[Path | None] = None
     embedder: Option[Path | None] = None
-    vision_frames: Advanced[int | None] = None
-    precision: Advanced[Precision | None] = None
-    features: Advanced[Path | None] = None
+    vision_frames: Option[int | None] = None
+    precision: Option[Precision | None] = None
+    features: Option[Path | None] = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -185,12 +181,12 @@ class FieldOptions:
         if the answer is evaluated on points.
     """
 
-    weighting: Advanced[Literal["pixels", "uniform"]] = "pixels"
-    parts: Advanced[bool] = False
-    latent: Advanced[int | Literal["auto"]] = 16
-    reduce: Advanced[Literal["mode", "median", "mean"]] = "mode"
-    top: Advanced[int] = 8
-    centre_pixel_weight: Advanced[float] = 0.0
+    weighting: Option[Literal["pixels", "uniform"]] = "pixels"
+    parts: Option[bool] = False
+    latent: Option[int | Literal["auto"]] = 16
+    reduce: Option[Literal["mode", "median", "mean"]] = "mode"
+    top: Option[int] = 8
+    centre_pixel_weight: Option[float] = 0.0
 
 
 @dataclasses.dataclass(frozen=True)
