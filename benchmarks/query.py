@@ -20,7 +20,8 @@ from metrics import Metric, interleaved, show
 
 from jsecon.field.similarity import unit_codes
 from jsecon.paper.baselines import query_one_step
-from jsecon.query.select import query_anchored
+from jsecon.query.answer import match_regions, query_anchored
+from jsecon.query.select import select_by_code
 from jsecon.types import Camera, Gaussians, LanguageField, Regions, Votes
 
 REGIONS, TOP, TEXTS, SAMPLE = 40, 8, 100, 20_000
@@ -62,7 +63,9 @@ def measure(count: int, repeats: int) -> list[Metric]:
         texts = jnp.asarray(np.asarray(field.regions.embeddings)[rng.integers(0, REGIONS, TEXTS)])
         ask = {
             "by votes": jax.jit(lambda field, units, text: query_anchored(field, text)),
-            "by code": jax.jit(lambda field, units, text: query_anchored(field, text, by="code", codes=units)),
+            "by code": jax.jit(
+                lambda field, units, text: select_by_code(field, match_regions(field, text[None]), codes=units)
+            ),
         }
         if size == 512:
             ask["one-step"] = jax.jit(lambda field, units, text: query_one_step(units, text, 0.8))

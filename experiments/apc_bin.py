@@ -27,9 +27,11 @@ from jsecon.fit.depth import points_from_depth
 from jsecon.fit.quality import measure_quality
 from jsecon.fit.start import gaussians_from_points
 from jsecon.paper.distill import distill_votes
+from jsecon.query.answer import match_region, select_gaussians
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.render import selection_mask
-from jsecon.query.select import query_region
+from jsecon.query.rules import QueryRules
+from jsecon.query.select import select_by_code
 from jsecon.types import Camera, Capture, Gaussians, LanguageField, Regions
 
 OBJECTS = {48: "chenille stems", 114: "bunny book", 132: "kleenex tissue box", 144: "joke book"}
@@ -165,9 +167,11 @@ def evaluate(
     for way in ways:
         by = way.split()[0]
         for index, name in enumerate(OBJECTS.values()):
-            chosen = query_region(
-                field, index, by=by, similarity_threshold=options.threshold if by == "votes" else None
-            ).mask
+            match = match_region(field, index)
+            if by == "code":
+                chosen = select_by_code(field, match).mask
+            else:
+                chosen = select_gaussians(field, match, QueryRules(min_share=options.threshold)).mask
             if way.endswith("DBSCAN"):
                 chosen = jnp.asarray(remove_outliers(np.asarray(field.gaussians.means), np.asarray(chosen), keep="all"))
             for t in np.flatnonzero(capture.held_out):

@@ -36,10 +36,10 @@ from experiments.words.absent import absent_names
 from experiments.words.conse import Conse, Crop, Labeller, TextVectors, class_weights, conse
 from experiments.words.scenes import DEFAULT, GIVEN, RIVALS, WordScene, load_scene, rival_weights, scores_of
 from jsecon.field.membership import normalise_votes
+from jsecon.query.answer import match_regions, query_anchored, query_several
 from jsecon.query.classes import query_classes
-from jsecon.query.match import evidence, match_regions
-from jsecon.query.rules import KIND_THRESHOLD, QUANTILE, RETRIEVAL_THRESHOLD
-from jsecon.query.select import query_anchored, query_several
+from jsecon.query.rules import MIN_COSINE, MIN_RANK, SAME_CLASS_SCORE
+from jsecon.query.scores import view_count_weight
 from jsecon.types import LanguageField, Regions, Selection
 from jsecon.vision.reference_words import reference_of
 
@@ -124,11 +124,11 @@ def _by_regions(kind: str, way: str) -> Chooser:
     """A rule of `experiments.words.rules`: scores of regions, and which of them a text takes. It refuses nothing."""
 
     def choose(case: Case) -> np.ndarray:
-        table, weight = case.scores(kind), np.asarray(evidence(jnp.asarray(case.regions.pixel_counts)))
+        table, weight = case.scores(kind), np.asarray(view_count_weight(jnp.asarray(case.regions.pixel_counts)))
         chosen = {
             "best region": lambda: rules.best_of(table),
             "best region by evidence": lambda: rules.best_of(np.where(table > 0, table * weight, table)),
-            "all near": lambda: rules.near_best(table, KIND_THRESHOLD),
+            "all near": lambda: rules.near_best(table, SAME_CLASS_SCORE),
             CLASS_LIST: lambda: rules.best_text(table),
             f"{CLASS_LIST}, standardised": lambda: rules.best_text(rules.standardised(table)),
             f"{CLASS_LIST}, standardised by evidence": lambda: rules.best_text(rules.standardised(table, weight)),
@@ -159,7 +159,7 @@ RULES: dict[str, Chooser] = {f"{kind}, {way}": _by_regions(kind, way) for kind i
 ROWS = PRODUCT | RULES
 
 
-FIXED = (f"relevancy, smoothed, {READOUT}", "relevancy 0.5", f"cosine {RETRIEVAL_THRESHOLD}")
+FIXED = (f"relevancy, smoothed, {READOUT}", "relevancy 0.5", f"cosine {MIN_COSINE}")
 """of `alone`: thresholds of others and of the paper"""
 
 
@@ -175,7 +175,7 @@ def alone(name: str, masks: str, embedder: Callable[[], Conse], method: str) -> 
     cosine = rules.point_scores(features, case.texts, case.field.canonical_phrases, "cosine")
     relevancy = rules.point_scores(features, case.texts, case.field.canonical_phrases, "relevancy")
     smooth = smoothed(scene.gaussians.means, relevancy)
-    chosen = (smooth > READOUT, relevancy >= 0.5, cosine >= RETRIEVAL_THRESHOLD)
+    chosen = (smooth > READOUT, relevancy >= 0.5, cosine >= MIN_COSINE)
     found = {reading: rules.ious(own, truth, asked) for reading, own in zip(FIXED, chosen)}
     found[CLASS_LIST] = rules.ious(rules.best_text(cosine), truth, asked)
     found[STANDARDISED[0]] = rules.ious(rules.best_text(rules.standardised(cosine)), truth, asked)
@@ -239,7 +239,7 @@ def refusal(case: Case, embedder: Conse) -> dict[str, Any]:
     quantiles, answers = [], []
     for names, wanted in ((scene.texts, scene.asked), (absent, np.full(len(absent), -1))):
         told = [match_regions(case.field, jnp.asarray(text)[None]) for text in embedder.embed_text(list(names))]
-        quantiles.append(np.array([float(answer.quantile) for answer in told]))
+        quantiles.append(np.array([float(answer.rank) for answer in told]))
         answers.append([int(answer.region) for answer in told])
         found.setdefault("confidence", []).append(
             [
@@ -344,7 +344,7 @@ def tables(metrics: dict) -> list[str]:
         own = figures["refusal"]
         rows.append((k, own["asked"][1], *(own[key] for key in ("auc", "kept", "refused", "calibration error"))))
     text.append(
-        f"Present and absent names by `query_anchored`, which answers above the quantile {QUANTILE}; the calibration "
+        f"Present and absent names by `query_anchored`, which answers above the quantile {MIN_RANK}; the calibration "
         "error of its confidence, both kinds weighing the same in all."
     )
     header = ("scene, masks, embedder", "absent", "AUC", "kept", "refused", "calibration error")

@@ -33,11 +33,10 @@ from experiments.tables.setting import Setting
 from jsecon.field.votes import region_votes
 from jsecon.fit.start import gaussians_from_points
 from jsecon.process import clear_programs
-from jsecon.query.match import match_regions
+from jsecon.query.answer import match_regions, query_anchored, query_several
+from jsecon.query.grouping import parts_fallback
 from jsecon.query.outliers import remove_outliers
-from jsecon.query.parts import parts_fallback
-from jsecon.query.rules import QUANTILE, RETRIEVAL_THRESHOLD, QueryRules
-from jsecon.query.select import query_anchored, query_several
+from jsecon.query.rules import MIN_COSINE, MIN_RANK, QueryRules
 from jsecon.types import LanguageField
 
 AS_IT_IS = "as it is"
@@ -49,7 +48,7 @@ LEAST = 5
 """points of an object that is judged"""
 QUANTILES = (0.8, 0.9, 0.95, 0.98)
 """of the reference words' similarities with their best regions, above which a text is answered"""
-CONSTANTS = {"cosine": RETRIEVAL_THRESHOLD}
+CONSTANTS = {"cosine": MIN_COSINE}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,7 +100,7 @@ Row = Callable[[Setting, LanguageField, int], Any]
 
 def anchored(change: Callable[[LanguageField], LanguageField] = lambda field: field, **query: Any) -> Row:
     """A field that is changed, asked by other rules `query`."""
-    rules = QueryRules(**{"retrieval_threshold": NO_REFUSAL, **query})
+    rules = QueryRules(**{"min_score": NO_REFUSAL, **query})
     return lambda setting, field, k: query_anchored(change(field), jnp.asarray(setting.texts[k]), rules=rules)
 
 
@@ -114,30 +113,30 @@ def without_evidence(field: LanguageField) -> LanguageField:
 
 def every_region(setting: Setting, field: LanguageField, k: int) -> Any:
     """All regions that answer."""
-    rules = QueryRules(all_of_kind=True, retrieval_threshold=NO_REFUSAL)
+    rules = QueryRules(all_of_class=True, min_score=NO_REFUSAL)
     return query_several(field, jnp.asarray(setting.texts[k])[None], rules=rules)
 
 
 def instead(setting: Setting, field: LanguageField, k: int) -> Any:
     """The parts that answer where no region does."""
-    text, rules = jnp.asarray(setting.texts[k]), QueryRules(retrieval_threshold=NO_REFUSAL)
+    text, rules = jnp.asarray(setting.texts[k]), QueryRules(min_score=NO_REFUSAL)
     found = query_anchored(field, text, rules=rules)
     other = parts_fallback(dataclasses.replace(field, parts=parts_of(setting)), text, found.score, rules)
-    return found if other is None else other.selection
+    return found if other is None else other
 
 
 ROWS: dict[str, Row] = {
     AS_IT_IS: anchored(),
     "the region by the plain cosine": anchored(retrieval="cosine"),
     "a few pixels are evidence enough": anchored(without_evidence),
-    "no pieces": anchored(piece_threshold=None),
-    "pieces at 0.25 of the way": anchored(piece_threshold=0.25),
-    "pieces at 0.75 of the way": anchored(piece_threshold=0.75),
-    "none alike": anchored(alike_threshold=None),
+    "no pieces": anchored(fragment_score=None),
+    "pieces at 0.25 of the way": anchored(fragment_score=0.25),
+    "pieces at 0.75 of the way": anchored(fragment_score=0.75),
+    "none alike": anchored(duplicate_cosine=None),
     "all regions that answer": every_region,
     "parts where no region answers": instead,
-    "refusing by the constant": anchored(retrieval_threshold=None),
-    "by the plain cosine, refusing by its constant": anchored(retrieval="cosine", retrieval_threshold=None),
+    "refusing by the constant": anchored(min_score=None),
+    "by the plain cosine, refusing by its constant": anchored(retrieval="cosine", min_score=None),
 }
 OF_PARTS = ("parts where no region answers",)
 """rows that are asked of consensus alone"""
@@ -172,13 +171,13 @@ def default_refusal(setting: Setting, field: LanguageField, by: str) -> dict[str
     def share(texts):
         return float(np.mean([bool(match_regions(field, jnp.asarray(text)[None]).chosen.any()) for text in texts]))
 
-    name = f"jsecon query, {by}, quantile {QUANTILE:g}"
+    name = f"jsecon query, {by}, quantile {MIN_RANK:g}"
     return {f"{name}: kept": share(setting.texts), f"{name}: refused": 1 - share(absent)}
 
 
 def best_scores(field: LanguageField, texts: np.ndarray, retrieval: str) -> np.ndarray:
     """(Q,) the similarity of each text's best region."""
-    rules = QueryRules(retrieval=retrieval, retrieval_threshold=NO_REFUSAL)
+    rules = QueryRules(retrieval=retrieval, min_score=NO_REFUSAL)
     return np.array([float(match_regions(field, jnp.asarray(text)[None], rules).score) for text in texts])
 
 

@@ -39,21 +39,22 @@ from .paper.autoencoder import Autoencoder as Autoencoder, train_autoencoder as 
 from .paper.baselines import query_canonical as query_canonical, query_one_step as query_one_step
 from .paper.distill import distill_l1 as distill_l1, distill_votes as distill_votes
 from .parallel import host_mesh as host_mesh
+from .query.answer import (
+    RegionMatch as RegionMatch,
+    match_regions as match_regions,
+    query_anchored as query_anchored,
+    query_region as query_region,
+    query_several as query_several,
+    select_gaussians as select_gaussians,
+)
 from .query.blocks import query_in_blocks as query_in_blocks
 from .query.classes import query_classes as query_classes
-from .query.match import RegionMatch as RegionMatch, match_regions as match_regions
 from .query.object_shapes import ObjectShapes as ObjectShapes, object_shapes as object_shapes
 from .query.outliers import remove_outliers as remove_outliers
 from .query.outline import lift as lift
 from .query.pixel import region_at as region_at
 from .query.render import selection_mask as selection_mask
 from .query.rules import QueryRules as QueryRules
-from .query.select import (
-    query_anchored as query_anchored,
-    query_region as query_region,
-    query_several as query_several,
-    select_gaussians as select_gaussians,
-)
 from .read.captures.capture import load_capture as load_capture
 from .read.splats.files import load_gaussians as load_gaussians, save_gaussians as save_gaussians
 from .read.splats.ply import load_ply as load_ply, save_ply as save_ply

@@ -290,7 +290,7 @@ class LanguageField(_Shown):
     """what single masks say of small parts of the scene, where the run was asked for it."""
     unrelated_words: Array | None = None
     """(W, E) embeddings of words unrelated to the scene, W may be 0: what a text's similarity is
-    measured against (jsecon.query.match). None: a field of an earlier version."""
+    measured against (jsecon.query.scores). None: a field of an earlier version."""
 
 
 @record
@@ -305,9 +305,11 @@ class Selection(_Shown):
     """() int32 region that anchored the query; -1 if no region was retrieved, or for a query without anchor."""
     score: Array
     """() float: similarity of the text to that region; for queries without anchor the best similarity."""
-    quantile: Array | None = None
+    rank: Array | None = None
     """() float: share of unrelated words that are less similar to the scene than the text is; NaN or None where that is
     not known."""
     confidence: Array | None = None
-    """() float: probability that the region shows what the text names (jsecon.query.confidence); NaN or None where that
-    is not known."""
+    """() float: probability that the region shows what the text names (jsecon.query.scores); NaN or None where that is
+    not known."""
+    presence: Array | None = None
+    """() float: probability that the text is true of the region; None unless the embedder was trained to tell that."""

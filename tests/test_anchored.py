@@ -13,12 +13,39 @@ from small_field import REGIONS, field_of, make_field, shares, true_regions, uni
 from jsecon.errors import InputError
 from jsecon.field.membership import add_visible_weight, normalise_votes, vote_shares
 from jsecon.field.votes import region_votes
+from jsecon.paper.codes import CODE_THRESHOLD
+from jsecon.query.answer import (
+    RULES,
+    match_region,
+    match_regions,
+    query_anchored,
+    query_region,
+    query_several,
+    select_gaussians,
+)
 from jsecon.query.classes import query_classes
 from jsecon.query.pixel import pixel_weights, region_at, region_shares_seen
 from jsecon.query.rules import QueryRules
-from jsecon.query.select import query_anchored, query_region, query_several
+from jsecon.query.select import select_by_code
 from jsecon.splat.render import render
 from jsecon.types import Regions, Votes
+
+
+def select(field, match, by, rules=RULES, threshold=None):
+    """The Gaussians of matched regions, "votes" or "code"."""
+    if by == "code":
+        return select_by_code(field, match, CODE_THRESHOLD if threshold is None else threshold)
+    return select_gaussians(
+        field, match, rules if threshold is None else dataclasses.replace(rules, min_share=threshold)
+    )
+
+
+def ask(field, text, by, rules=RULES, threshold=None):
+    return select(field, match_regions(field, jnp.asarray(text)[None], rules), by, rules, threshold)
+
+
+def ask_region(field, region, by, threshold=None):
+    return select(field, match_region(field, region), by, threshold=threshold)
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +113,7 @@ def test_a_text_like_a_region_finds_it_and_its_gaussians(field, region):
     share = shares(field, [region])
     np.testing.assert_allclose(got.similarity, share, atol=1e-6)
     np.testing.assert_array_equal(got.mask, share >= 0.5)
-    by_code = query_anchored(field, text, by="code")
+    by_code = ask(field, text, "code")
     cosine = exact_cosine(field.codes, field.region_codes[region])
     np.testing.assert_allclose(by_code.similarity, cosine, atol=1e-6)
     np.testing.assert_array_equal(by_code.mask, cosine >= 0.9)
@@ -96,7 +123,7 @@ def test_what_is_selected_is_mostly_right(field, scene):
     """The labels were rendered from these regions, in a scene whose 64 translucent Gaussians hide one another."""
     true = true_regions(scene)
     for by in ("votes", "code"):
-        masks = np.stack([query_region(field, region, by=by).mask for region in range(REGIONS)])
+        masks = np.stack([ask_region(field, region, by).mask for region in range(REGIONS)])
         right = sum((masks[region] & (true == region)).sum() for region in range(REGIONS))
         assert right / masks.sum() > 0.75
         assert right / 64 > 0.4
@@ -104,31 +131,31 @@ def test_what_is_selected_is_mostly_right(field, scene):
 
 def test_a_region_asked_for_by_its_number_is_the_same(field):
     for by in ("votes", "code"):
-        asked = query_region(field, 2, by=by)
-        found = query_anchored(field, field.regions.embeddings[2], by=by)
+        asked = ask_region(field, 2, by)
+        found = ask(field, field.regions.embeddings[2], by)
         np.testing.assert_array_equal(asked.mask, found.mask)
         np.testing.assert_array_equal(asked.similarity, found.similarity)
         assert int(asked.region) == 2
         assert float(asked.score) == 1
         for absent in (-1, REGIONS, 10_000, jnp.asarray(-1)):
-            nothing = query_region(field, absent, by=by)
+            nothing = ask_region(field, absent, by)
             assert not nothing.mask.any()
             assert int(nothing.region) == -1
             assert float(nothing.score) == 0
 
 
-def test_nothing_passes_a_retrieval_threshold_that_no_region_reaches(field):
+def test_nothing_passes_a_min_score_that_no_region_reaches(field):
     text = unit_rows(np.random.default_rng(9), 1, 12)[0]
     words = unit_rows(np.random.default_rng(10), 30, 12)
     worded = dataclasses.replace(field, unrelated_words=words)
     directions = {"cosine": text, "apart": text - words.mean(0)}
     for by, (retrieval, direction) in itertools.product(("votes", "code"), directions.items()):
-        ask = functools.partial(query_anchored, worded, text, by=by)
+        best_of = functools.partial(ask, worded, text, by)
         rules = functools.partial(QueryRules, retrieval=retrieval)
-        best = float(ask(rules=rules(retrieval_threshold=-1.0)).score)
+        best = float(best_of(rules(min_score=-1.0)).score)
         assert np.abs(exact_cosine(field.regions.embeddings, direction) - best).min() < 1e-6
-        assert int(ask(rules=rules(retrieval_threshold=best - 1e-4)).region) >= 0
-        nothing = ask(rules=rules(retrieval_threshold=best + 1e-4), similarity_threshold=-1.0)
+        assert int(best_of(rules(min_score=best - 1e-4)).region) >= 0
+        nothing = best_of(rules(min_score=best + 1e-4), -1.0)
         assert int(nothing.region) == -1
         assert not nothing.mask.any()
         assert float(nothing.score) == pytest.approx(best, abs=1e-6)  # how close it was is still told
@@ -137,9 +164,9 @@ def test_nothing_passes_a_retrieval_threshold_that_no_region_reaches(field):
 def test_jit_and_vmap_over_texts_equal_the_loop(field):
     texts = unit_rows(np.random.default_rng(4), 7, 12)
     for by in ("votes", "code"):
-        together = jax.jit(jax.vmap(lambda text, by=by: query_anchored(field, text, by=by)))(texts)
+        together = jax.jit(jax.vmap(lambda text, by=by: ask(field, text, by)))(texts)
         for index, text in enumerate(texts):
-            alone = query_anchored(field, text, by=by)
+            alone = ask(field, text, by)
             np.testing.assert_array_equal(together.mask[index], alone.mask)
             np.testing.assert_allclose(together.similarity[index], alone.similarity, atol=1e-7)
             assert int(together.region[index]) == int(alone.region)
@@ -150,14 +177,14 @@ def test_regions_that_are_alike_count_as_one(field):
     pixels = np.array(field.regions.pixel_counts)
     embeddings[4], pixels[4] = embeddings[1], pixels[1]  # of two that are as well known the first is the anchor
     twin = dataclasses.replace(field, regions=Regions(embeddings, pixels))
-    alone = query_anchored(twin, embeddings[1], rules=QueryRules(alike_threshold=None))
+    alone = query_anchored(twin, embeddings[1], rules=QueryRules(duplicate_cosine=None))
     both = query_anchored(twin, embeddings[1])
     np.testing.assert_allclose(alone.similarity, shares(field, [1]), atol=1e-6)
     np.testing.assert_allclose(both.similarity, shares(field, [1, 4]), atol=1e-6)
     np.testing.assert_allclose(query_region(twin, 4).similarity, shares(field, [4]), atol=1e-6)
-    pointed = query_region(twin, 4, rules=QueryRules(alike_threshold=0.9, piece_threshold=None))
+    pointed = query_region(twin, 4, rules=QueryRules(duplicate_cosine=0.9, fragment_score=None))
     np.testing.assert_allclose(pointed.similarity, both.similarity, atol=1e-6)
-    unlike = query_anchored(twin, embeddings[1], rules=QueryRules(alike_threshold=1.5))
+    unlike = query_anchored(twin, embeddings[1], rules=QueryRules(duplicate_cosine=1.5))
     np.testing.assert_allclose(unlike.similarity, alone.similarity, atol=1e-6)  # the anchor itself always counts
 
 
@@ -174,7 +201,7 @@ def test_what_was_never_seen_is_never_selected(field, by, threshold):
     without = [{"votes": votes}, *([{"codes": codes}] if by == "code" else [])]
     for columns in without:
         hidden = dataclasses.replace(field, **columns)
-        got = query_region(hidden, 1, by=by, similarity_threshold=threshold)
+        got = ask_region(hidden, 1, by, threshold)
         assert not np.asarray(got.mask)[unseen].any()
 
 
@@ -206,7 +233,7 @@ def test_numbers_that_are_not_finite_never_select(field):
     codes[0], codes[1], codes[2], codes[3] = nan, inf, 1e30 * codes[2], 1e-30 * codes[3]
     broken = dataclasses.replace(field, codes=codes)
     for region in range(REGIONS):
-        got, sound = query_region(broken, region, by="code"), query_region(field, region, by="code")
+        got, sound = ask_region(broken, region, "code"), ask_region(field, region, "code")
         assert not got.mask[:2].any()
         np.testing.assert_array_equal(got.mask[2:], sound.mask[2:])
     weights, total = np.array(field.votes.weights), np.array(field.votes.total)
@@ -226,7 +253,7 @@ def test_numbers_that_are_not_finite_never_select(field):
 @pytest.mark.parametrize("by", ["votes", "code"])
 def test_broken_texts_and_regions_select_nothing(field, by):
     for text in (np.zeros(12), np.full(12, np.nan), np.r_[np.inf, np.zeros(11)]):
-        got = query_anchored(field, text.astype(np.float32), rules=QueryRules(retrieval_threshold=-1.0), by=by)
+        got = ask(field, text.astype(np.float32), by, QueryRules(min_score=-1.0))
         assert int(got.region) == -1
         assert not got.mask.any()
         assert float(got.score) == 0
@@ -234,14 +261,14 @@ def test_broken_texts_and_regions_select_nothing(field, by):
     text = embeddings[1].copy()
     embeddings[0], embeddings[1] = np.nan, 0  # neither can be retrieved
     lost = dataclasses.replace(field, regions=Regions(embeddings, field.regions.pixel_counts))
-    got = query_anchored(lost, text, rules=QueryRules(retrieval_threshold=-1.0), by=by)
+    got = ask(lost, text, by, QueryRules(min_score=-1.0))
     assert int(got.region) in (2, 3, 4)
     for value in (0.0, np.nan):
         table = np.array(field.region_codes)
         table[1] = value
         lost = dataclasses.replace(field, region_codes=table)
-        assert not query_region(lost, 1, by="code", similarity_threshold=-1.0).mask.any()
-    assert not query_region(field, 1, by=by, similarity_threshold=np.nan).mask.any()
+        assert not ask_region(lost, 1, "code", -1.0).mask.any()
+    assert not ask_region(field, 1, by, np.nan).mask.any()
 
 
 def test_a_field_without_regions_answers_nothing(field):
@@ -262,9 +289,9 @@ def test_a_field_without_regions_answers_nothing(field):
 def test_wrong_arguments_are_told(field):
     with pytest.raises(ValueError, match=r"expected \(12,\).*random"):
         query_anchored(field, np.ones(11, np.float32))
-    for query, asked in ((query_anchored, np.ones(12, np.float32)), (query_region, 1)):
-        with pytest.raises(ValueError, match="'votes' or 'code'"):
-            query(field, asked, by="x")
+    for region in (1.5, np.float32(1), True, "1"):
+        with pytest.raises(ValueError, match="an integer"):
+            query_region(field, region)
 
 
 def dense_weights(gaussians, camera, x, y):

@@ -9,7 +9,7 @@ from capture_files import run_cli
 from small_field import REGIONS, make_field
 from test_gltf import read_glb
 
-from jsecon import load_gaussians, query_region, save_field
+from jsecon import QueryRules, load_gaussians, query_region, save_field
 from jsecon.app.ask import Answer
 from jsecon.app.outputs import main_regions, write_answers
 from jsecon.pipeline.progress import Listener
@@ -80,7 +80,7 @@ def test_an_answer_without_a_region_says_so_and_one_without_gaussians_differs(sc
     field, _ = make_field(scene, cameras)
     nothing = np.zeros(field.gaussians.count, bool)
     none = Answer("unicorn", "votes", query_region(field, -1), nothing, {})
-    empty = Answer("faint", "votes", query_region(field, 1, similarity_threshold=2.0), nothing, {})
+    empty = Answer("faint", "votes", query_region(field, 1, rules=QueryRules(min_share=2.0)), nothing, {})
     told = Told()
     write_answers(field, [none, empty], tmp_path, told, views=1)
     first, second, pictures = told.lines

@@ -18,8 +18,8 @@ from jsecon.field.membership import normalise_votes, normalise_votes_in_blocks, 
 from jsecon.field.streaming import codes_in_blocks, region_votes_in_blocks, strongest
 from jsecon.field.votes import region_votes
 from jsecon.paper.distill import distill_votes
+from jsecon.query.answer import query_anchored
 from jsecon.query.blocks import query_in_blocks
-from jsecon.query.select import query_anchored
 from jsecon.splat.render import render_rgb
 from jsecon.splat.visible import geometry_of_rows, render_in_blocks, visible_rows
 from jsecon.types import Camera, Gaussians, Regions

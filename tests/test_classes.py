@@ -62,7 +62,7 @@ def test_equals_the_formula(retrieval, count):
         directions = texts - field.unrelated_words.astype(np.float64).mean(0)
         similarity = known.embeddings @ (directions / np.linalg.norm(directions, axis=1, keepdims=True)).T
     least = float(np.sort(similarity.max(1))[2]) - 1e-4  # two regions are none of the classes
-    options = {"rules": QueryRules(retrieval=retrieval, retrieval_threshold=least)}
+    options = {"rules": QueryRules(retrieval=retrieval, min_score=least)}
     labels, found = query_classes(field, texts, every=True, **options)
     expected, part = exact(field, similarity, least)
     np.testing.assert_allclose(found, expected, atol=2e-6)
@@ -116,7 +116,7 @@ def test_regions_and_texts_without_a_direction_are_nobodys():
     lost = np.array(field.regions.embeddings)
     lost[2] = 0
     known = Regions(lost, field.regions.pixel_counts)
-    ask = {"rules": QueryRules(retrieval="cosine", retrieval_threshold=-1.0)}
+    ask = {"rules": QueryRules(retrieval="cosine", min_score=-1.0)}
     labels, found = query_classes(dataclasses.replace(field, regions=known), texts, **ask)
     ids, weights, shown = (
         np.array(a) for a in (field.votes.regions, field.votes.weights, field.votes.weight_where_region_visible)
@@ -181,8 +181,8 @@ def test_a_probability_refuses_classes_as_it_refuses_texts():
     np.testing.assert_array_equal((np.asarray(labels) >= 0)[sure], (part >= 0.5).any(1)[sure])
     assert 0.1 < (np.asarray(labels) < 0).mean() < 0.9
     assert (np.asarray(query_classes(field, texts, rules=QueryRules(logits=Logits(40.0, -1000.0)))[0]) == -1).all()
-    every, _ = query_classes(field, texts, rules=QueryRules(logits=logits, retrieval_threshold=0.0))
-    np.testing.assert_array_equal(every, query_classes(field, texts, rules=QueryRules(retrieval_threshold=-2.0))[0])
+    every, _ = query_classes(field, texts, rules=QueryRules(logits=logits, min_score=0.0))
+    np.testing.assert_array_equal(every, query_classes(field, texts, rules=QueryRules(min_score=-2.0))[0])
 
 
 def test_refuses_what_it_cannot_ask():

@@ -142,7 +142,7 @@ def asked_of(embeddings, pixels, text):
     votes = Votes(own, ones[:, None], ones, ones, ones, ones.astype(np.int32), np.int32(0), count)
     own = {"canonical_phrases": COLOURS.canonical_phrases, "unrelated_words": reference_of(COLOURS)}
     field = field_of(votes, Regions(embeddings, np.repeat(pixels[:, None], 10, 1)), **own)
-    rules = jsecon.QueryRules(quantile=0.0)  # all colours but one are there, so most other words match as well
+    rules = jsecon.QueryRules(min_rank=0.0)  # all colours but one are there, so most other words match as well
     found = jsecon.query_anchored(field, jnp.asarray(COLOURS.embed_text([text])[0]), rules=rules)
     return int(found.region), float(found.score)
 

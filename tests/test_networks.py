@@ -27,7 +27,7 @@ from jsecon.pipeline.model_loading import ExternalSpace
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import Checkpoint, Results, RunContext, StageInput
 from jsecon.pipeline.stages import run_stages
-from jsecon.query.match import evidence
+from jsecon.query.scores import view_count_weight
 from jsecon.vision.protocols import NamedSegmenter
 from jsecon.vision.stores import StoredSegmenter
 
@@ -160,14 +160,14 @@ def test_query_finds_the_model_by_itself_or_says_what_it_needs(seen, models, tmp
     _, folder, _ = seen
     field = folder / "field.safetensors"
     query = ["query", str(field), "red", "--out", str(tmp_path / "a"), "--template", "a {} thing", "--views", "0"]
-    assert cli.main([*query, "--quantile", "0"]) == 0
+    assert cli.main([*query, "--min-rank", "0"]) == 0
     answer, found = json.loads((tmp_path / "a" / "red.json").read_text()), load_field(field)
     text = model_loading.field_embedder(found, templates=("a {} thing",)).embed_text(["red"])[0]
     words = model_loading.field_embedder(found, templates=("a {} thing",)).unrelated_words
     similar = (
         np.asarray(found.regions.embeddings) @ (text - words.mean(axis=0)) / np.linalg.norm(text - words.mean(axis=0))
     )
-    standing = np.asarray(evidence(found.regions.pixel_counts))
+    standing = np.asarray(view_count_weight(found.regions.pixel_counts))
     assert answer["region"] == int(np.where(similar > 0, similar * standing, similar).argmax())
     assert answer["score"] == pytest.approx(float(similar[answer["region"]]), abs=2e-3)
     other = write_clip(tmp_path / "other", "immich")
@@ -225,7 +225,7 @@ def test_texts_need_the_model_of_embeddings_from_files(seen, models, tmp_path, c
     assert "came from files, 3 numbers each" in capsys.readouterr().err
     with pytest.raises(InputError, match="--embedder DIR"):
         ExternalSpace(3).embed_text(["red"])
-    assert cli.main([*ask, "--embedder", str(models[1]), "--quantile", "0"]) == 0
+    assert cli.main([*ask, "--embedder", str(models[1]), "--min-rank", "0"]) == 0
     assert 0 < json.loads((tmp_path / "answers" / "red.json").read_text())["score"] < 1
     with pytest.raises(InputError, match="5, as those from files have"):
         model_loading.open_embedder("given-5", folder=models[1])
@@ -280,7 +280,7 @@ def test_models_by_name_are_fetched_once_and_found_again_for_a_moved_field(
     field.parent.mkdir()
     shutil.copy(out / "field.safetensors", field)
     assert str(tmp_path).encode() + b"/cache" not in field.read_bytes()
-    query = ["query", str(field), "a red thing", "--out", str(tmp_path / "answers"), "--quantile", "0"]
+    query = ["query", str(field), "a red thing", "--out", str(tmp_path / "answers"), "--min-rank", "0"]
     assert cli.main(query) == 0
     assert len(hub.requests) == asked
     assert "SAM: 3 frames, about" in planned

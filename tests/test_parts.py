@@ -1,6 +1,7 @@
 """Parts of a scene and what of them answers a text, against NumPy."""
 
 import dataclasses
+import functools
 
 import jax
 import numpy as np
@@ -10,7 +11,7 @@ from small_field import KnownTexts, field_of, lone_votes, unit_rows
 from jsecon import QueryRules, load_field, query_anchored, save_field
 from jsecon.app.ask import ask_each, ask_text
 from jsecon.field import field as field_file
-from jsecon.query.parts import MIN_REGION_RATIO, PART_THRESHOLD, best_cluster, part_scores, parts_fallback
+from jsecon.query.grouping import MIN_REGION_RATIO, PART_SCORE, _best_cluster, part_scores, parts_fallback
 from jsecon.types import Parts, Regions
 from jsecon.vision.protocols import Logits
 
@@ -36,38 +37,40 @@ def test_part_scores_are_the_stated_ones_compiled_and_over_many_texts():
     parts = made_parts()
     rng = np.random.default_rng(1)
     texts, words = unit_rows(rng, 3, 16), unit_rows(rng, 4, 16)
-    many = jax.vmap(part_scores, (None, 0, None))(parts, texts, words)
+    many = jax.vmap(functools.partial(part_scores, retrieval="apart"), (None, 0, None))(parts, texts, words)
     for text, row in zip(texts, many):
         expected = scores_in_numpy(parts, text.astype(np.float64), words)
         np.testing.assert_allclose(row, expected, atol=1e-4)
-        np.testing.assert_allclose(part_scores(parts, text, words), row, atol=1e-5)
+        np.testing.assert_allclose(part_scores(parts, text, words, retrieval="apart"), row, atol=1e-5)
     assert float(np.max(many)) == pytest.approx(1)
-    plain = part_scores(parts, texts[0], None)
+    plain = part_scores(parts, texts[0], None, retrieval="apart")
     np.testing.assert_allclose(plain, scores_in_numpy(parts, texts[0], np.zeros((1, 16))), atol=1e-4)
 
 
 def test_parts_that_are_all_equally_near_answer_nothing():
     parts = Parts(np.zeros(4, np.int32), np.ones((1, 3), np.float32) / 3**0.5, np.ones(1, np.float32))
-    np.testing.assert_array_equal(part_scores(parts, np.array([1, 0, 0], np.float32), None), np.zeros(4))
+    np.testing.assert_array_equal(
+        part_scores(parts, np.array([1, 0, 0], np.float32), None, retrieval="apart"), np.zeros(4)
+    )
 
 
 def test_a_scene_whose_parts_lie_in_no_mask():
     bare = Parts(np.zeros(5, np.int32), np.zeros((1, 2), np.float32), np.zeros(1, np.float32))
-    np.testing.assert_array_equal(part_scores(bare, np.ones(2, np.float32), None), np.zeros(5))
+    np.testing.assert_array_equal(part_scores(bare, np.ones(2, np.float32), None, retrieval="apart"), np.zeros(5))
 
 
 def test_the_best_cluster_stays_and_specks_do_not_rule():
     rng = np.random.default_rng(0)
     means = np.concatenate([c + 0.1 * rng.normal(size=(n, 3)) for c, n in ((0, 300), (5, 200), (9, 15))])
     scores = np.repeat([0.6, 0.55, 0.5], [300, 200, 15])
-    kept = best_cluster(np.ones(515, bool), scores, means)
+    kept = _best_cluster(np.ones(515, bool), scores, means)
     assert kept[:300].mean() > 0.95
     assert not kept[300:].any()
-    assert not best_cluster(np.zeros(515, bool), scores, means).any()
+    assert not _best_cluster(np.zeros(515, bool), scores, means).any()
     few = np.arange(515) < 5
-    np.testing.assert_array_equal(best_cluster(few, scores, means), few)
+    np.testing.assert_array_equal(_best_cluster(few, scores, means), few)
     means[0] = np.nan
-    assert not best_cluster(np.ones(515, bool), scores, means)[0]
+    assert not _best_cluster(np.ones(515, bool), scores, means)[0]
 
 
 @pytest.fixture(scope="module")
@@ -119,39 +122,41 @@ def pooled_in_numpy(field, mask, text):
 def test_the_parts_answer_what_no_region_holds(unheld):
     field, directions, thing = unheld
     text, score = directions[4], query_anchored(field, directions[4]).score
-    found = parts_fallback(field, text, score)
-    selection = found.selection
+    found = parts_fallback(field, text, score, QueryRules())
+    selection = found
     np.testing.assert_array_equal(selection.mask, thing == 4)
     assert int(selection.region) == -1
-    assert found.presence_prob is None
+    assert found.presence is None
     expected = pooled_in_numpy(field, thing == 4, text.astype(np.float64))
     assert float(selection.score) == pytest.approx(expected, abs=1e-5)
-    near = np.asarray(part_scores(field.parts, text, None))
-    on_scale = np.interp(near, [0, PART_THRESHOLD, 1], [0, 0.5, 1])
+    near = np.asarray(part_scores(field.parts, text, None, retrieval="apart"))
+    on_scale = np.interp(near, [0, PART_SCORE, 1], [0, 0.5, 1])
     np.testing.assert_allclose(selection.similarity, on_scale, atol=1e-6)
     assert on_scale[thing != 4].max() < 0.5
-    assert parts_fallback(field, text, MIN_REGION_RATIO * expected + 1e-4) is None  # a region that good holds it
-    assert parts_fallback(field, text, MIN_REGION_RATIO * expected - 1e-4) is not None
+    assert (
+        parts_fallback(field, text, MIN_REGION_RATIO * expected + 1e-4, QueryRules()) is None
+    )  # a region that good holds it
+    assert parts_fallback(field, text, MIN_REGION_RATIO * expected - 1e-4, QueryRules()) is not None
 
 
 def test_they_are_silent_where_a_region_answers_or_nothing_does(unheld):
     field, directions, _ = unheld
     for text in directions[:4]:
-        assert parts_fallback(field, text, query_anchored(field, text).score) is None
-    assert parts_fallback(field, across(directions)[1], 0.0) is None
+        assert parts_fallback(field, text, query_anchored(field, text).score, QueryRules()) is None
+    assert parts_fallback(field, across(directions)[1], 0.0, QueryRules()) is None
     never = dataclasses.replace(field, parts=dataclasses.replace(field.parts, part=np.full(200, -1, np.int32)))
-    assert parts_fallback(never, directions[4], 0.0) is None
+    assert parts_fallback(never, directions[4], 0.0, QueryRules()) is None
     with pytest.raises(ValueError, match="--parts"):
-        parts_fallback(dataclasses.replace(field, parts=None), directions[4], 0.0)
+        parts_fallback(dataclasses.replace(field, parts=None), directions[4], 0.0, QueryRules())
 
 
 def test_a_higher_threshold_takes_fewer_and_a_probability_decides_where_there_is_one(unheld):
     field, directions, thing = unheld
     text = directions[4]
-    strict = parts_fallback(field, text, 0.0, similarity_threshold=0.999)
-    assert 0 < np.asarray(strict.selection.mask).sum() < (thing == 4).sum()  # the nearer of its two parts
+    strict = parts_fallback(field, text, 0.0, QueryRules(min_share=0.999))
+    assert 0 < np.asarray(strict.mask).sum() < (thing == 4).sum()  # the nearer of its two parts
     likely, unlikely = Logits(20.0, -10.0), Logits(20.0, -40.0)
-    assert parts_fallback(field, text, 0.0, QueryRules(logits=likely)).presence_prob > 0.9
+    assert parts_fallback(field, text, 0.0, QueryRules(logits=likely)).presence > 0.9
     assert parts_fallback(field, text, 0.0, QueryRules(logits=unlikely)) is None
 
 

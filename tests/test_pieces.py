@@ -9,26 +9,26 @@ import pytest
 from small_field import make_field, rows_of_a_kind, shares
 
 from jsecon import QueryRules, Regions, query_anchored, query_region, query_several
-from jsecon.query.match import is_piece
+from jsecon.query.grouping import MIN_FRAGMENT_OVERLAP, regions_with
+
+EMBEDDINGS = np.eye(9, dtype=np.float32)
 
 
-def test_a_piece_is_near_the_text_and_shares_gaussians_with_what_was_chosen():
+def test_a_fragment_is_near_the_text_and_shares_gaussians_with_the_best_region():
     rng = np.random.default_rng(0)
+    rules = QueryRules(duplicate_cosine=None)
     for _ in range(20):
         similarity, known = rng.normal(size=9).astype(np.float32), rng.random(9) < 0.8
-        overlap = rng.random((9, 9)).astype(np.float32)
-        chosen = np.arange(9) == np.where(known, similarity, -9).argmax()
-        chosen[rng.integers(9)] = True
+        overlap = np.where(rng.random((9, 9)) < 0.5, 0.0, rng.random((9, 9))).astype(np.float32)
+        first = np.where(known, similarity, -9).argmax()
         best, middle = similarity[known].max(), np.median(similarity[known])
         near = known & (similarity >= middle + 0.5 * (best - middle)) & (best > middle)
-        wanted = near & (overlap[chosen].max(0) >= 0.7)
-        got = is_piece(similarity, known, chosen, overlap, threshold=0.5, min_overlap=0.7)
-        np.testing.assert_array_equal(got, wanted)
-    nothing = np.zeros(9, bool)
-    assert not np.asarray(is_piece(similarity, nothing, chosen, overlap)).any()
-    assert not np.asarray(
-        is_piece(np.zeros(9, np.float32), ~nothing, chosen, overlap)
-    ).any()  # no best above the middle
+        expected = near & (overlap[first] >= MIN_FRAGMENT_OVERLAP)
+        expected[first] = True
+        np.testing.assert_array_equal(regions_with(first, similarity, known, EMBEDDINGS, overlap, rules), expected)
+    alone = np.arange(9) == first
+    for values, usable in ((similarity, np.zeros(9, bool)), (np.zeros(9, np.float32), np.ones(9, bool))):
+        np.testing.assert_array_equal(regions_with(first, values, usable, EMBEDDINGS, overlap, rules), alone)
 
 
 @pytest.fixture(scope="module")
@@ -51,14 +51,12 @@ def test_a_text_finds_a_thing_with_its_pieces_but_no_other_of_its_kind(broken, r
     np.testing.assert_allclose(found.similarity, shares(broken, [0, 1]), atol=1e-6)
     np.testing.assert_array_equal(found.mask, shares(broken, [0, 1]) >= 0.5)
     assert int(found.region) == 0
-    alone = query_anchored(broken, text, rules=QueryRules(retrieval=retrieval, piece_threshold=None))
+    alone = query_anchored(broken, text, rules=QueryRules(retrieval=retrieval, fragment_score=None))
     np.testing.assert_allclose(alone.similarity, shares(broken, [0]), atol=1e-6)
     for other in (with_other(broken, np.eye(5, dtype=np.float32)), with_other(broken, None)):  # apart; not known
         got = query_anchored(other, text, rules=QueryRules(retrieval=retrieval))
         np.testing.assert_array_equal(got.similarity, alone.similarity)
-    by_code = [query_anchored(field, text, by="code").mask for field in (broken, other)]
-    np.testing.assert_array_equal(*by_code)
-    none = query_anchored(broken, text, rules=QueryRules(retrieval=retrieval, retrieval_threshold=2.0))
+    none = query_anchored(broken, text, rules=QueryRules(retrieval=retrieval, min_score=2.0))
     assert int(none.region) == -1
     assert not np.asarray(none.mask).any()
 
@@ -67,14 +65,14 @@ def test_several_regions_take_their_pieces_with_them(broken):
     text = broken.regions.embeddings[:1]
     apart = with_other(broken, np.eye(5, dtype=np.float32))
     for field, options, regions in (
-        (broken, {"all_of_kind": False}, [0, 1]),
-        (broken, {"all_of_kind": False, "piece_threshold": 1.0}, [0]),
-        (apart, {"all_of_kind": False}, [0]),
-        (apart, {"kind_threshold": 0.8}, [0, 1]),
-        (broken, {"kind_threshold": 0.99}, [0, 1]),
-        (apart, {"kind_threshold": 0.99}, [0]),
+        (broken, {"all_of_class": False}, [0, 1]),
+        (broken, {"all_of_class": False, "fragment_score": 1.0}, [0]),
+        (apart, {"all_of_class": False}, [0]),
+        (apart, {"same_class_score": 0.8}, [0, 1]),
+        (broken, {"same_class_score": 0.99}, [0, 1]),
+        (apart, {"same_class_score": 0.99}, [0]),
     ):
-        found = query_several(field, text, rules=QueryRules(**{"all_of_kind": True} | options))
+        found = query_several(field, text, rules=QueryRules(**{"all_of_class": True} | options))
         np.testing.assert_allclose(found.similarity, shares(field, regions), atol=1e-6, err_msg=str(options))
 
 
@@ -96,7 +94,7 @@ def test_a_region_takes_its_pieces_with_it_where_that_is_asked_for(broken):
         (broken, 0.5, [0, 1]),
         (unknown, 0.5, [0]),
     ):
-        found = query_region(field, 0, rules=QueryRules(piece_threshold=nearness, alike_threshold=None))
+        found = query_region(field, 0, rules=QueryRules(fragment_score=nearness, duplicate_cosine=None))
         np.testing.assert_allclose(found.similarity, shares(broken, regions), atol=1e-6)
         assert int(found.region) == 0
-    assert int(query_region(broken, 99, rules=QueryRules(piece_threshold=0.5, alike_threshold=None)).region) == -1
+    assert int(query_region(broken, 99, rules=QueryRules(fragment_score=0.5, duplicate_cosine=None)).region) == -1

@@ -15,8 +15,8 @@ from jsecon.app import cli
 from jsecon.app.ask import ask_text
 from jsecon.field.similarity import similarities
 from jsecon.pipeline import model_loading
-from jsecon.query.match import evidence, reference_similarities, region_similarities
-from jsecon.query.rules import QUANTILE, REFERENCE_CUT, RETRIEVAL_THRESHOLD, QueryRules
+from jsecon.query.rules import MIN_COSINE, MIN_RANK, QueryRules
+from jsecon.query.scores import NEAREST_WORDS, region_similarities, view_count_weight, word_similarities
 
 SIZE = 12
 
@@ -46,7 +46,7 @@ def test_equals_the_formula(rows):
     plain = similarities(jnp.asarray(embeddings), jnp.asarray(text))[0]
     np.testing.assert_array_equal(region_similarities(*rows, "cosine")[0], plain)
     np.testing.assert_array_equal(region_similarities(embeddings, text, None, "apart")[0], plain)
-    np.testing.assert_allclose(reference_similarities(embeddings, words, "cosine"), words @ embeddings.T, atol=1e-6)
+    np.testing.assert_allclose(word_similarities(embeddings, words, "cosine"), words @ embeddings.T, atol=1e-6)
 
 
 def test_rows_without_a_direction_are_unknown(rows):
@@ -88,11 +88,11 @@ def test_a_query_finds_its_region_by_the_one_or_the_other(worded):
     like_one = unit(np.asarray(field.unrelated_words) + 2 * embeddings[0]).astype(np.float32)
     field = dataclasses.replace(field, unrelated_words=like_one)
     for text in texts[:10]:
-        weight = np.asarray(evidence(field.regions.pixel_counts))
+        weight = np.asarray(view_count_weight(field.regions.pixel_counts))
         scores = {"cosine": embeddings @ text, "apart": exact(embeddings, text, field.unrelated_words)}
         ranked = {"cosine": scores["cosine"], "apart": np.where(scores["apart"] > 0, weight, 1) * scores["apart"]}
         for retrieval, score in scores.items():
-            got = query_anchored(field, text, rules=QueryRules(retrieval=retrieval, quantile=0.0))
+            got = query_anchored(field, text, rules=QueryRules(retrieval=retrieval, min_rank=0.0))
             best = ranked[retrieval].argmax()
             assert int(got.region) == best
             assert float(got.score) == pytest.approx(score[best], abs=1e-5)
@@ -100,10 +100,10 @@ def test_a_query_finds_its_region_by_the_one_or_the_other(worded):
     assert differ
     bare, text = dataclasses.replace(field, unrelated_words=None), texts[0]
     against = -embeddings.sum(0)
-    low = query_anchored(bare, against, rules=QueryRules(retrieval_threshold=-1.0)).region
+    low = query_anchored(bare, against, rules=QueryRules(min_score=-1.0)).region
     high = query_anchored(bare, against).region
-    assert int(low) >= 0 > int(high)  # without words and threshold it is RETRIEVAL_THRESHOLD
-    assert (embeddings @ unit(against)).max() < RETRIEVAL_THRESHOLD
+    assert int(low) >= 0 > int(high)  # without words and threshold it is MIN_COSINE
+    assert (embeddings @ unit(against)).max() < MIN_COSINE
     with pytest.raises(ValueError, match="apart"):
         QueryRules(retrieval="nearest")
 
@@ -112,9 +112,11 @@ def test_evidence_is_of_views_and_counts_against_the_best_known_region():
     pixels = np.array([[400, 900, 0], [100, 100, 0], [0, 0, 0], [5000, 5000, 5000]])
     looks = np.array([2.0, 0.5, 0.0, 3.0])
     expected = looks / (looks + 2) / (3 / 5)
-    np.testing.assert_allclose(evidence(jnp.asarray(pixels)), expected, rtol=1e-6)
-    np.testing.assert_array_equal(evidence(jnp.zeros((3, 4), jnp.int32)), 1)
-    np.testing.assert_array_equal(evidence(jnp.asarray([[7], [7]])), 1)  # one view: nothing to tell them apart by
+    np.testing.assert_allclose(view_count_weight(jnp.asarray(pixels)), expected, rtol=1e-6)
+    np.testing.assert_array_equal(view_count_weight(jnp.zeros((3, 4), jnp.int32)), 1)
+    np.testing.assert_array_equal(
+        view_count_weight(jnp.asarray([[7], [7]])), 1
+    )  # one view: nothing to tell them apart by
 
 
 def test_a_thing_that_fills_a_third_of_all_views_is_found_before_slivers_of_its_colour():
@@ -139,7 +141,7 @@ def test_a_thing_that_fills_a_third_of_all_views_is_found_before_slivers_of_its_
     assert int(one.region) == 0
     assert np.asarray(one.mask)[0]
     everything = np.asarray(
-        query_several(field, jnp.asarray(text[None]), rules=QueryRules(all_of_kind=True, retrieval_threshold=0.2)).mask
+        query_several(field, jnp.asarray(text[None]), rules=QueryRules(all_of_class=True, min_score=0.2)).mask
     )
     assert everything[0]
     assert everything[3:].any()
@@ -150,7 +152,7 @@ def exact_quantile(embeddings, text, words):
     """The share of words, without the tenth that is nearest to the text, that are less similar to their best region."""
     rows, words, text = (unit(np.asarray(a, np.float64)) for a in (embeddings, words, text))
     mean = words.mean(0)
-    order = np.argsort(-(unit(words - mean) @ unit(text - mean)), kind="stable")[int(REFERENCE_CUT * len(words)) :]
+    order = np.argsort(-(unit(words - mean) @ unit(text - mean)), kind="stable")[int(NEAREST_WORDS * len(words)) :]
     scores = (unit(words - mean) @ rows.T).max(1)[order]
     return np.mean(scores < (rows @ unit(text - mean)).max())
 
@@ -163,7 +165,7 @@ def worded(scene, cameras):
     return dataclasses.replace(field, unrelated_words=unit_rows(rng, 61, SIZE)), unit_rows(rng, 200, SIZE)
 
 
-def test_a_text_is_refused_by_its_quantile_among_unrelated_words(worded):
+def test_a_text_is_refused_by_its_rank_among_words_unrelated_words(worded):
     field, texts = worded
 
     def ask(text):
@@ -173,24 +175,24 @@ def test_a_text_is_refused_by_its_quantile_among_unrelated_words(worded):
     for k, text in enumerate(texts[:15]):
         expected = exact_quantile(field.regions.embeddings, text, field.unrelated_words)
         found = ask(text)
-        assert float(found.quantile) == pytest.approx(expected, abs=1e-6)
-        assert (int(found.region) >= 0) == (expected >= QUANTILE)
-        assert bool(found.mask.any()) <= (expected >= QUANTILE)
-        assert float(together.quantile[k]) == pytest.approx(expected, abs=1e-6)
+        assert float(found.rank) == pytest.approx(expected, abs=1e-6)
+        assert (int(found.region) >= 0) == (expected >= MIN_RANK)
+        assert bool(found.mask.any()) <= (expected >= MIN_RANK)
+        assert float(together.rank[k]) == pytest.approx(expected, abs=1e-6)
         np.testing.assert_array_equal(together.mask[k], found.mask)
         loose, strict = (
-            query_anchored(field, text, rules=QueryRules(quantile=q)) for q in (expected - 1e-3, expected + 1e-3)
+            query_anchored(field, text, rules=QueryRules(min_rank=q)) for q in (expected - 1e-3, expected + 1e-3)
         )
         assert int(loose.region) >= 0 > int(strict.region)
-        assert float(query_several(field, text[None]).quantile) == pytest.approx(expected, abs=1e-6)
-    assert int(query_anchored(field, texts[0], rules=QueryRules(quantile=0.0)).region) >= 0
-    by_threshold = query_anchored(field, texts[0], rules=QueryRules(retrieval_threshold=-1.0, quantile=1.0))
+        assert float(query_several(field, text[None]).rank) == pytest.approx(expected, abs=1e-6)
+    assert int(query_anchored(field, texts[0], rules=QueryRules(min_rank=0.0)).region) >= 0
+    by_threshold = query_anchored(field, texts[0], rules=QueryRules(min_score=-1.0, min_rank=1.0))
     assert int(by_threshold.region) >= 0  # a threshold that is given decides
 
 
 def test_of_unrelated_texts_about_one_minus_the_quantile_is_answered(worded):
     field, texts = worded
-    shares = np.asarray(jax.vmap(lambda text: query_anchored(field, text).quantile)(texts))
+    shares = np.asarray(jax.vmap(lambda text: query_anchored(field, text).rank)(texts))
     for q in (0.5, 0.8, 0.9):
         assert np.mean(shares >= q) == pytest.approx(1 - q, abs=0.1)
 
@@ -198,26 +200,22 @@ def test_of_unrelated_texts_about_one_minus_the_quantile_is_answered(worded):
 def test_unrelated_words_that_tell_nothing_refuse_nothing_and_no_words_fall_back(worded):
     field, texts = worded
     tied = dataclasses.replace(field, unrelated_words=np.repeat(field.unrelated_words[:1], 9, 0))
-    itself = query_anchored(
-        tied, field.unrelated_words[0]
-    )  # of equal words none is less similar, and the text is no text
-    assert float(itself.quantile) == 1 or np.isnan(float(itself.quantile))
+    itself = query_anchored(tied, field.unrelated_words[0])  # no word is less similar
+    assert float(itself.rank) == 1 or np.isnan(float(itself.rank))
     empty = dataclasses.replace(field, unrelated_words=field.unrelated_words[:0])
     old = dataclasses.replace(field, unrelated_words=None)
     for text in texts[:8]:
-        cosine = query_anchored(
-            field, text, rules=QueryRules(retrieval="cosine", retrieval_threshold=RETRIEVAL_THRESHOLD)
-        )
+        cosine = query_anchored(field, text, rules=QueryRules(retrieval="cosine", min_score=MIN_COSINE))
         for bare in (empty, old):
             found = query_anchored(bare, text)
-            assert np.isnan(float(found.quantile))
+            assert np.isnan(float(found.rank))
             assert float(found.score) == float(cosine.score)
             np.testing.assert_array_equal(found.mask, cosine.mask)
     nan = query_anchored(field, np.full(SIZE, np.nan, np.float32))
     assert int(nan.region) == -1
-    assert np.isnan(float(nan.quantile))
+    assert np.isnan(float(nan.rank))
     known = field.unrelated_words[7]
-    assert float(query_anchored(field, known).quantile) == pytest.approx(
+    assert float(query_anchored(field, known).rank) == pytest.approx(
         exact_quantile(field.regions.embeddings, known, field.unrelated_words), abs=1e-6
     )
     one = dataclasses.replace(
@@ -225,7 +223,7 @@ def test_unrelated_words_that_tell_nothing_refuse_nothing_and_no_words_fall_back
         canonical_phrases=np.zeros((0, SIZE), np.float32),
         unrelated_words=field.unrelated_words,
     )
-    assert float(query_anchored(one, field.unrelated_words[0]).quantile) == 1  # nothing is nearer to it than itself
+    assert float(query_anchored(one, field.unrelated_words[0]).rank) == 1  # nothing is nearer to it than itself
     none = dataclasses.replace(one, regions=Regions(np.zeros((0, SIZE), np.float32), np.zeros((0, 1), np.int32)))
     assert int(query_anchored(none, texts[0]).region) == -1
 
@@ -236,11 +234,11 @@ def test_a_list_of_classes_is_compared_in_deviations_of_each_text(worded):
     names = np.stack([hub, *np.asarray(field.regions.embeddings)[:2]])
     words = np.asarray(field.unrelated_words, np.float64).mean(0)
     similar = unit(np.asarray(field.regions.embeddings, np.float64)) @ unit(names - words).T
-    weight = np.asarray(evidence(field.regions.pixel_counts), np.float64)[:, None]
+    weight = np.asarray(view_count_weight(field.regions.pixel_counts), np.float64)[:, None]
     weight = weight / weight.sum()
     mean = (weight * similar).sum(0)
     table = (similar - mean) / np.sqrt((weight * (similar - mean) ** 2).sum(0))
-    label, likeness = query_classes(field, names, rules=QueryRules(quantile=0.0))
+    label, likeness = query_classes(field, names, rules=QueryRules(min_rank=0.0))
     shares = np.zeros((len(label), len(table)))
     votes = field.votes
     rows = np.repeat(np.arange(len(label)), votes.regions.shape[1])
@@ -271,25 +269,25 @@ def test_the_command_line_says_the_quantile_and_what_an_old_field_lacks(worded, 
     )
     assert np.asarray(load_field(tmp_path / "new.safetensors").unrelated_words).dtype == np.float16
     (seen, unseen), out = asked("new.safetensors")
-    assert seen["quantile"] == pytest.approx(max(shares), abs=0.02)  # of words in float16
-    assert unseen["quantile"] == pytest.approx(min(shares), abs=0.02)
+    assert seen["rank"] == pytest.approx(max(shares), abs=0.02)  # of words in float16
+    assert unseen["rank"] == pytest.approx(min(shares), abs=0.02)
     assert seen["region"] is not None
     assert unseen["region"] is None
     assert f"more similar than {int(100 * seen['quantile'])} % of unrelated words" in out
     assert f"confidence {int(100 * seen['confidence'])} %" in out
     assert "earlier version" not in out
-    assert asked("new.safetensors", "--quantile", "0")[0][1]["region"] is not None
-    beyond = ["query", str(tmp_path / "new.safetensors"), "seen", "--out", str(tmp_path), "--quantile", "1.5"]
+    assert asked("new.safetensors", "--min-rank", "0")[0][1]["region"] is not None
+    beyond = ["query", str(tmp_path / "new.safetensors"), "seen", "--out", str(tmp_path), "--min-rank", "1.5"]
     assert cli.main(beyond) == 2
-    assert "--quantile" in capsys.readouterr().err
+    assert "--min-rank" in capsys.readouterr().err
 
     save_field(tmp_path / "old.safetensors", dataclasses.replace(field, unrelated_words=None))
     (seen, unseen), out = asked("old.safetensors")
-    assert seen["quantile"] is unseen["quantile"] is None
+    assert seen["rank"] is unseen["rank"] is None
     assert seen["confidence"] is unseen["confidence"] is None
     assert out.count("earlier version") == 1
     cosine = query_anchored(dataclasses.replace(field, unrelated_words=None), rows["seen"])
     assert seen["score"] == pytest.approx(float(cosine.score), abs=1e-5)
-    more = {"templates": ("a photo of a {}.",), "unrelated_words": -np.asarray(field.unrelated_words)}
-    templated = KnownTexts(rows, canonical_phrases=field.canonical_phrases, **more)
-    assert ask_text(field, templated, "seen").quantile != ask_text(field, words, "seen").quantile
+    more = {"templates": ("a photo of a {}.",), "reference": -np.asarray(field.unrelated_words)}
+    templated = KnownTexts(rows, canonical=field.canonical_phrases, **more)
+    assert ask_text(field, templated, "seen").rank != ask_text(field, words, "seen").rank

@@ -12,8 +12,8 @@ from jsecon import InputError, QueryRules, Regions, match_regions, query_relatio
 from jsecon.app.ask import ask_text, with_phrases
 from jsecon.app.outputs import write_answer
 from jsecon.app.viewer.candidates import candidates
+from jsecon.query.answer import ALL_OF_CLASS, query_anchored, query_several
 from jsecon.query.composite import parse_query
-from jsecon.query.select import ALL_OF_KIND, query_anchored, query_several
 
 
 @pytest.fixture(scope="module")
@@ -24,10 +24,10 @@ def field(scene, cameras):
 
 def test_all_of_a_kind_are_found_and_no_others(field):
     rows = field.regions.embeddings
-    chosen = match_regions(field, rows[:1], ALL_OF_KIND).chosen
+    chosen = match_regions(field, rows[:1], ALL_OF_CLASS).chosen
     assert np.asarray(chosen).tolist() == [True, True, False, False, False]  # from 0.75 of the way from 0 to 1 on
     for retrieval in ("apart", "cosine"):
-        got = query_several(field, rows[:1], rules=QueryRules(all_of_kind=True, retrieval=retrieval))
+        got = query_several(field, rows[:1], rules=QueryRules(all_of_class=True, retrieval=retrieval))
         np.testing.assert_array_equal(got.mask, shares(field, [0, 1]) >= 0.5)
 
 
@@ -46,7 +46,7 @@ def test_the_rule_is_the_stated_one(field):
         made = dataclasses.replace(field, regions=regions, votes=dataclasses.replace(field.votes, overlap=None))
         for kind in (0.3, 0.8):
             expected = ((similarity >= middle + kind * (best - middle)) | alike) & known & (best >= 0.2)
-            got = match_regions(made, text[None], QueryRules(all_of_kind=True, kind_threshold=kind))
+            got = match_regions(made, text[None], QueryRules(all_of_class=True, same_class_score=kind))
             np.testing.assert_array_equal(got.chosen, expected)
 
 
@@ -151,7 +151,7 @@ def test_one_shade_answers_where_one_thing_is_asked_for(shades):
     best = int(answer.selection.region)
     assert best in (0, 1)
     assert set(np.flatnonzero(answer.selection.mask) // 120) == {best}
-    assert answer.quantile >= ask_text(field, embedder, "blue", quantile=0.0).quantile
+    assert answer.rank >= ask_text(field, embedder, "blue", min_rank=0.0).rank
     assert {candidate.region for candidate in candidates(field, embedder, "blue")[:2]} == {0, 1}
 
 

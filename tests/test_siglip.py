@@ -20,8 +20,8 @@ from jsecon.networks.clip import ClipEmbedder, find_clip, read_preprocessing
 from jsecon.networks.tokenizer import TextRules, TextTokenizer
 from jsecon.pipeline import model_loading
 from jsecon.pipeline.models import inspect_models
-from jsecon.query.match import best_presence, presence
-from jsecon.query.rules import PRESENCE_THRESHOLD, RETRIEVAL_THRESHOLD, QueryRules
+from jsecon.query.rules import MIN_COSINE, MIN_PRESENCE, QueryRules
+from jsecon.query.scores import presence_prob
 from jsecon.vision.protocols import Embedder, Logits
 
 LAYOUTS = ("immich", "transformers.js")
@@ -197,13 +197,13 @@ def test_a_text_is_refused_by_its_probability_and_not_by_its_cosine(field):
     text = embeddings[2] / np.linalg.norm(embeddings[2])
     plain = query_anchored(field, text)
     cosine = float(embeddings[2] @ text / np.linalg.norm(embeddings[2]))
-    for least in (0.001, PRESENCE_THRESHOLD, 0.7):
+    for least in (0.001, MIN_PRESENCE, 0.7):
         edge = np.log(least / (1 - least)) - 50 * cosine  # the bias with which the probability is `least`
         for shift, there in ((0.1, True), (-0.1, False)):
-            given = None if least == PRESENCE_THRESHOLD else least
+            given = None if least == MIN_PRESENCE else least
             logits = Logits(50.0, edge + shift)
-            found = query_anchored(field, text, rules=QueryRules(logits=logits, retrieval_threshold=given))
-            several = query_several(field, text[None], rules=QueryRules(logits=logits, retrieval_threshold=given))
+            found = query_anchored(field, text, rules=QueryRules(logits=logits, min_score=given))
+            several = query_several(field, text[None], rules=QueryRules(logits=logits, min_score=given))
             for selection in (found, several):
                 np.testing.assert_array_equal(selection.mask, plain.mask if there else False)
                 assert int(selection.region) == (int(plain.region) if there else -1)
@@ -211,7 +211,7 @@ def test_a_text_is_refused_by_its_probability_and_not_by_its_cosine(field):
     texts = unit_rows(np.random.default_rng(0), 500, 12)
     best = (texts @ (embeddings / np.linalg.norm(embeddings, axis=1, keepdims=True)).T).max(1)
     weak = texts[int(np.argmin(best))]
-    assert min(best) < RETRIEVAL_THRESHOLD
+    assert min(best) < MIN_COSINE
     assert int(query_anchored(field, weak).region) == -1
     assert int(query_anchored(field, weak, rules=QueryRules(logits=Logits(50.0, 60.0))).region) >= 0
 
@@ -225,14 +225,14 @@ def test_presence_is_the_sigmoid_of_the_cosine_also_under_jit_and_vmap(field):
     expected = 1 / (1 + np.exp(-(7.0 * cosines - 2.0)))
     expected[:, 3] = 0
     given = embeddings.astype(np.float32), texts.astype(np.float32)
-    found = jax.jit(jax.vmap(lambda text: presence(given[0], text, Logits(7.0, -2.0))))(given[1])
+    found = jax.jit(jax.vmap(lambda text: presence_prob(given[0], text, Logits(7.0, -2.0))))(given[1])
     np.testing.assert_allclose(found, expected, atol=1e-6)
     many = jax.vmap(lambda text: query_anchored(field, text, rules=QueryRules(logits=Logits(50.0, -10.0))).region)(
         given[1]
     )
     each = [query_anchored(field, text, rules=QueryRules(logits=Logits(50.0, -10.0))).region for text in given[1]]
     np.testing.assert_array_equal(many, each)
-    assert best_presence(field.regions, given[1], np.asarray(-1), None) is None
+    assert query_anchored(field, given[1][0]).presence is None
 
 
 def test_the_answer_says_how_likely_the_text_is_there(field, tmp_path, monkeypatch):
@@ -246,7 +246,7 @@ def test_the_answer_says_how_likely_the_text_is_there(field, tmp_path, monkeypat
     np.testing.assert_allclose(both.presence, 1 / (1 + np.exp(-2.0)), rtol=1e-4)
     ghost = ask_text(field, embedder, "ghost")
     assert int(ghost.selection.region) == -1
-    assert 0 <= ghost.presence < PRESENCE_THRESHOLD
+    assert 0 <= ghost.presence < MIN_PRESENCE
     silent = ask_text(field, KnownTexts(texts), "mug")
     assert silent.presence is None
 

@@ -26,10 +26,11 @@ from jsecon.fit.photometric import l1, psnr
 from jsecon.paper.baselines import query_canonical, query_one_step
 from jsecon.paper.codes import Rotation, Spread
 from jsecon.paper.distill import distill_votes
+from jsecon.query.answer import match_regions, query_anchored, query_several
 from jsecon.query.classes import query_classes
-from jsecon.query.match import region_similarities
 from jsecon.query.rules import QueryRules
-from jsecon.query.select import query_anchored, query_several
+from jsecon.query.scores import region_similarities
+from jsecon.query.select import select_by_code
 from jsecon.splat.project import project
 from jsecon.splat.sh import colours_from_sh
 from jsecon.splat.transform import transform_gaussians
@@ -98,9 +99,13 @@ def field():
 def test_anchored(field):
     asked = np.array([0, 3])
     texts = field.regions.embeddings[asked]
-    ask = {"rules": QueryRules(retrieval="cosine", alike_threshold=None, piece_threshold=None)}
+    ask = {"rules": QueryRules(retrieval="cosine", duplicate_cosine=None, fragment_score=None)}
     by_votes = compiled(lambda text, field: query_anchored(field, text, **ask).similarity, texts, field)
-    by_code = compiled(lambda text, field: query_anchored(field, text, by="code", **ask).similarity, texts, field)
+    by_code = compiled(
+        lambda text, field: select_by_code(field, match_regions(field, text[None], ask["rules"])).similarity,
+        texts,
+        field,
+    )
     for n, region in enumerate(asked):
         np.testing.assert_allclose(by_votes[n], shares(field, [region]).clip(max=1), atol=1e-6)
         np.testing.assert_allclose(by_code[n], exact_cosines(field.codes, field.region_codes[region]), atol=1e-6)
@@ -116,7 +121,7 @@ def test_several(field):
 
 def test_classes_of_all(field):
     sets = unit_rows(np.random.default_rng(2), 10, of_classes.SIZE).reshape(2, 5, -1)
-    rules = QueryRules(retrieval="cosine", retrieval_threshold=-1.0)
+    rules = QueryRules(retrieval="cosine", min_score=-1.0)
     ask = {"rules": rules, "standardise": False, "every": True}
     labels, found = compiled(lambda texts, field: query_classes(field, texts, **ask), sets, field)
     rows = np.unique(np.linspace(0, COUNT - 1, 2_000).astype(int))

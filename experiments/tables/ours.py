@@ -17,13 +17,14 @@ from jsecon.field.regions import scene_parts
 from jsecon.field.votes import region_votes
 from jsecon.paper.autoencoder import train_autoencoder
 from jsecon.paper.baselines import query_canonical, query_one_step
-from jsecon.paper.codes import encode, region_codes
+from jsecon.paper.codes import CODE_THRESHOLD, encode, region_codes
 from jsecon.paper.distill import distill_l1, distill_votes
+from jsecon.query.answer import match_regions, query_anchored, query_several
 from jsecon.query.classes import query_classes
+from jsecon.query.grouping import parts_fallback
 from jsecon.query.outliers import remove_outliers
-from jsecon.query.parts import parts_fallback
-from jsecon.query.rules import PIECE_THRESHOLD, QueryRules
-from jsecon.query.select import query_anchored, query_several
+from jsecon.query.rules import FRAGMENT_SCORE, QueryRules
+from jsecon.query.select import select_by_code
 from jsecon.types import LanguageField, Parts, Regions, Selection, Votes
 
 BY_COSINE = {"retrieval": "cosine"}
@@ -132,7 +133,7 @@ def ask_field(
     threshold: float | None = None,
     pieces: bool = False,
     instead: bool = False,
-    retrieval_threshold: float | None = None,
+    min_score: float | None = None,
 ) -> Answers:
     """Queries of a field: `way` is votes, all_views (votes, but every view that sees a Gaussian counts), code,
     probability (of the votes; all anchored, by `retrieval`), one_step or canonical; or all (of all regions that
@@ -141,13 +142,13 @@ def ask_field(
     means = np.asarray(setting.evidence.gaussians.means)
     field = of_all_views(field) if way == "all_views" else field
     phrases = jnp.asarray(field.canonical_phrases)
-    rules = QueryRules(retrieval=retrieval, retrieval_threshold=retrieval_threshold)
-    rules = rules if pieces else dataclasses.replace(rules, piece_threshold=None)
+    rules = QueryRules(retrieval=retrieval, min_score=min_score)
+    rules = rules if pieces else dataclasses.replace(rules, fragment_score=None)
 
     def ask(k: int) -> Selection:
         text = jnp.asarray(setting.texts[k])
         if way == "all":
-            every = dataclasses.replace(rules, all_of_kind=True, piece_threshold=PIECE_THRESHOLD)
+            every = dataclasses.replace(rules, all_of_class=True, fragment_score=FRAGMENT_SCORE)
             found = query_several(field, text[None], rules=every)
             return dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, found.mask, keep="all")))
         if way == "one_step":
@@ -158,16 +159,20 @@ def ask_field(
             code, canonical = encode(field.autoencoder, text), encode(field.autoencoder, phrases)
             found = query_canonical(field.codes, code, canonical, 0.5 if threshold is None else threshold)
         elif way == "probability":
-            found = query_anchored(field, text, rules=dataclasses.replace(rules, retrieval_threshold=None))
+            found = query_anchored(field, text, rules=dataclasses.replace(rules, min_score=None))
             probability = membership_probability(found.similarity, field.votes)
             inside = (found.region >= 0) & (probability >= (0.5 if threshold is None else threshold))
             found = dataclasses.replace(found, mask=inside)
         else:
-            by = "votes" if way == "all_views" else way
-            found = query_anchored(field, text, rules=rules, by=by, similarity_threshold=threshold)
+            cut = {} if threshold is None else {"min_share": threshold}
+            if way == "code":
+                match = match_regions(field, text[None], rules)
+                found = select_by_code(field, match, CODE_THRESHOLD if threshold is None else threshold)
+            else:
+                found = query_anchored(field, text, rules=dataclasses.replace(rules, **cut))
             whole = dataclasses.replace(field, parts=parts_of(setting)) if instead else field
             if instead and (other := parts_fallback(whole, text, found.score, rules)) is not None:
-                found = other.selection
+                found = other
         mask = np.asarray(found.mask)
         return dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, mask))) if clean else found
 

@@ -105,7 +105,7 @@ def own(
 
     def row(setting: Setting, steps: Steps) -> Answers:
         field = field_of(setting, by=association, **regions)
-        options = {"retrieval": retrieval, "retrieval_threshold": NO_REFUSAL, "pieces": True, "instead": instead}
+        options = {"retrieval": retrieval, "min_score": NO_REFUSAL, "pieces": True, "instead": instead}
         answers = ask_field(setting, field, way, clean=chooser == "threshold" and not even, **options)
         answers = _evened(setting, answers, clean=chooser == "threshold") if even else answers
         return _chosen(setting, answers, chooser, None)
@@ -186,7 +186,7 @@ def _grouping_row(nearly: float, rule: str, chooser: str) -> Method:
 def _paper_row(retrieval: str, threshold: float, chooser: str) -> Method:
     def row(setting: Setting, steps: Steps) -> Answers:
         field = paper_field(setting, steps)
-        options = {"retrieval": retrieval, "threshold": threshold, "retrieval_threshold": NO_REFUSAL}
+        options = {"retrieval": retrieval, "threshold": threshold, "min_score": NO_REFUSAL}
         answers = ask_field(setting, field, "code", clean=chooser == "threshold", **options)
         return by_selection(setting, _chosen(setting, answers, chooser, threshold).select)
 

@@ -24,14 +24,14 @@ from jsecon.field.field import subset_field
 from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.field.regions import ALIKE_THRESHOLD
 from jsecon.query import edits
+from jsecon.query.answer import ONE_REGION, RegionMatch, match_region, match_regions, select_gaussians
 from jsecon.query.blocks import SparseSelection, select_in_blocks
 from jsecon.query.composite import parse_query
-from jsecon.query.match import ONE_REGION, RegionMatch, best_presence, join_pieces, match_region, match_regions
+from jsecon.query.grouping import join_fragments, parts_fallback
 from jsecon.query.outliers import split_outliers
-from jsecon.query.parts import PartsAnswer, parts_fallback
 from jsecon.query.pixel import region_at
-from jsecon.query.rules import PIECE_THRESHOLD, QUANTILE, QueryRules
-from jsecon.query.select import select_gaussians
+from jsecon.query.rules import FRAGMENT_SCORE, MIN_RANK, QueryRules
+from jsecon.query.select import select_by_code
 from jsecon.query.silhouette import SILHOUETTE_WEIGHTS, fit_silhouette
 from jsecon.read.captures.images import read_pixels
 from jsecon.read.masks.masks import resize_nearest
@@ -78,17 +78,17 @@ class Answer:
     objects: int = 1
 
     @property
-    def quantile(self) -> float | None:
+    def rank(self) -> float | None:
         """Share of unrelated words that are less similar to the scene than the text; None if it is unknown."""
-        share = self.selection.quantile
-        return None if share is None or np.isnan(share) else round(float(share), 4)
+        rank = self.selection.rank
+        return None if rank is None or np.isnan(rank) else round(float(rank), 4)
 
     @property
-    def quantile_words(self) -> str:
-        """The quantile in words, in whole percent and rounded down; "" if it is unknown."""
-        if self.quantile is None:
+    def rank_words(self) -> str:
+        """The rank in words, in whole percent and rounded down; "" if it is unknown."""
+        if self.rank is None:
             return ""
-        return f"more similar than {int(100 * self.quantile + 1e-6)} % of unrelated words"
+        return f"more similar than {int(100 * self.rank + 1e-6)} % of unrelated words"
 
     @property
     def confidence(self) -> float | None:
@@ -111,8 +111,7 @@ class _Match(NamedTuple):
     key: str | None = None
     keep: str = "supported"
     """clusters to keep of the selection (`split_outliers`)"""
-    presence: float | None = None
-    parts: PartsAnswer | None = None
+    parts: Selection | None = None
     """answer in place of the regions"""
 
 
@@ -125,8 +124,8 @@ def ask_text(
     threshold: float | None = None,
     outliers: bool = True,
     several: bool = False,
-    piece_threshold: float = PIECE_THRESHOLD,
-    quantile: float = QUANTILE,
+    fragment_score: float = FRAGMENT_SCORE,
+    min_rank: float = MIN_RANK,
 ) -> Answer:
     """Selects the Gaussians that a text names.
 
@@ -138,8 +137,8 @@ def ask_text(
       threshold: Threshold of the method; None is its default.
       outliers: Whether to drop outliers.
       several: Whether to select all regions that match instead of the best one.
-      piece_threshold: How near to the text other pieces of the object must be; 1 adds no piece.
-      quantile: Share of unrelated words that must be less similar to the scene than the text, else it has no match.
+      fragment_score: How near to the text other fragments of the object must be; 1 adds no fragment.
+      min_rank: Share of unrelated words that must be less similar to the scene than the text, else it has no match.
 
     Returns:
       The answer. If a field has parts, they answer a plain text that no region matches.
@@ -147,7 +146,7 @@ def ask_text(
     Raises:
       InputError: The embedder has no words for the text, or several regions are selected by codes.
     """
-    rules = QueryRules(quantile=quantile, piece_threshold=piece_threshold, all_of_kind=several)
+    rules = QueryRules(min_rank=min_rank, fragment_score=fragment_score, all_of_class=several)
     match = _match_text(field, embedder, text, rules, by=by, threshold=threshold)
     return _select(field, match, by, threshold, outliers)
 
@@ -180,7 +179,7 @@ def ask_region(
     *,
     several: bool = False,
     threshold: float | None = None,
-    piece_threshold: float | None = None,
+    fragment_score: float | None = None,
 ) -> Answer:
     """Selects the Gaussians of a region by votes.
 
@@ -189,13 +188,13 @@ def ask_region(
       region: Its id. A region that the field does not have selects no Gaussians.
       several: Whether to select all regions that are alike.
       threshold: Threshold on the share of votes; None is its default.
-      piece_threshold: How near to the region other pieces of the object must be; None adds no piece.
+      fragment_score: How near to the region other fragments of the object must be; None adds no fragment.
 
     Returns:
       The answer.
     """
-    alike = ALIKE_THRESHOLD if several else None
-    rules = dataclasses.replace(ONE_REGION, alike_threshold=alike, piece_threshold=piece_threshold)
+    duplicate = ALIKE_THRESHOLD if several else None
+    rules = dataclasses.replace(ONE_REGION, duplicate_cosine=duplicate, fragment_score=fragment_score)
     regions = match_region(field, region, rules)
     name = f"region {region}"
     skipped = {"text encoder": "the region is the query"}
@@ -212,8 +211,8 @@ def _match_text(
     included, excluded = parse_query(text)
     # Of an embedder trained to tell whether a text is true of an image; the cosines of all others only rank.
     rules = dataclasses.replace(rules, logits=getattr(embedder, "logits", None))
-    several = rules.all_of_kind or len(included + excluded) > 1
-    included = narrow_texts(field, embedder, included, rules, every=rules.all_of_kind or bool(excluded))
+    several = rules.all_of_class or len(included + excluded) > 1
+    included = narrow_texts(field, embedder, included, rules, every=rules.all_of_class or bool(excluded))
     excluded = narrow_texts(field, embedder, excluded, rules, every=True)
     if several and by == "code":
         problem = "codes cannot select several regions"
@@ -221,14 +220,18 @@ def _match_text(
     embedded = embedder.embed_text(included + excluded)  # NumPy's slices need no compilation
     texts, without = jax.device_put((embedded[: len(included)], embedded[len(included) :]))
     regions = match_regions(field, texts, rules, excluded=without)
-    presence = best_presence(field.regions, texts, regions.region, rules.logits)
     if several:
-        return _Match(text, regions, {}, keep="all", presence=presence)
+        return _Match(text, regions, {}, keep="all")
     if field.parts is not None and by != "code":
-        parts = parts_fallback(field, texts[0], regions.score, rules, similarity_threshold=threshold)
+        parts = parts_fallback(field, texts[0], regions.score, _with_share(rules, threshold))
         if parts is not None:
-            return _Match(text, regions, PARTS_ANSWER, presence=parts.presence_prob, parts=parts)
-    return _Match(text, regions, {}, presence=presence)
+            return _Match(text, regions, PARTS_ANSWER, parts=parts)
+    return _Match(text, regions, {})
+
+
+def _with_share(rules: QueryRules, threshold: float | None) -> QueryRules:
+    """Returns rules with a threshold on the share; None is the default."""
+    return rules if threshold is None else dataclasses.replace(rules, min_share=threshold)
 
 
 def narrow_texts(
@@ -265,7 +268,7 @@ def narrow_texts(
         best: list[str] = []
         if narrower and np.isinf(score(text, rules)):
             # Of n attempts one succeeds by chance as often as one attempt that is n times as strict.
-            strict = dataclasses.replace(rules, quantile=1 - (1 - rules.quantile) / len(narrower))
+            strict = dataclasses.replace(rules, min_rank=1 - (1 - rules.min_rank) / len(narrower))
             scores = {option: score(option, strict) for option in narrower}
             best = [option for option in sorted(narrower, key=scores.__getitem__) if scores[option] > -np.inf]
         replaced.extend(best[0 if every else -1 :] or [text])
@@ -288,10 +291,11 @@ def _select(field: LanguageField, match: _Match, by: str, threshold: float | Non
     """Selects the Gaussians of matching regions."""
     require(by in METHODS, "by", by, f"one of {METHODS}", "votes is the default.")
     if match.parts is not None:
-        selection = match.parts.selection
+        selection = match.parts
+    elif by == "code":
+        selection = select_by_code(field, match.regions, *(() if threshold is None else (threshold,)))
     else:
-        by_region = "code" if by == "code" else "votes"
-        selection = select_gaussians(field, match.regions, by_region, similarity_threshold=threshold)
+        selection = select_gaussians(field, match.regions, _with_share(QueryRules(), threshold))
     return _finish(field, match, selection, by, threshold, outliers)
 
 
@@ -305,12 +309,13 @@ def _finish(
         mask = fit_silhouette(*scene, threshold=least, weights=SILHOUETTE_WEIGHTS["silhouette"])
         mask &= (jnp.asarray(field.votes.views) > 0) & jnp.any(selection.mask)
         selection = dataclasses.replace(selection, mask=mask)
-    answer = Answer(match.name, by, selection, np.asarray(selection.mask), match.skipped, match.presence, key=match.key)
+    presence = None if selection.presence is None else float(selection.presence)
+    answer = Answer(match.name, by, selection, np.asarray(selection.mask), match.skipped, presence, key=match.key)
     answer = drop_outliers(field, answer, outliers, keep=match.keep)
     overlap = field.votes.overlap
     if match.parts is not None or overlap is None:
         return answer
-    groups = join_pieces(np.flatnonzero(match.regions.chosen), np.asarray(overlap))
+    groups = join_fragments(np.flatnonzero(match.regions.chosen), np.asarray(overlap))
     return dataclasses.replace(answer, objects=max(1, min(len(groups), answer.clusters[0])))
 
 
@@ -460,7 +465,7 @@ def ask_each(
     threshold: float | None = None,
     outliers: bool = True,
     several: bool = False,
-    quantile: float = QUANTILE,
+    min_rank: float = MIN_RANK,
 ) -> tuple[list[Answer], list[InputError]]:
     """Answers texts and pixels. An error of one does not stop the others.
 
@@ -473,12 +478,12 @@ def ask_each(
       threshold: Threshold of the method; None is its default.
       outliers: Whether to drop outliers.
       several: As for `ask_text`.
-      quantile: As for `ask_text`.
+      min_rank: As for `ask_text`.
 
     Returns:
       The answers, and the errors of the other queries. Answers of a mapped field hold the rows of what they select.
     """
-    rules = QueryRules(quantile=quantile, all_of_kind=several)
+    rules = QueryRules(min_rank=min_rank, all_of_class=several)
     match_text = functools.partial(_match_text, field, embedder, rules=rules, by=by, threshold=threshold)
     queries: list[Callable[[], _Match]] = [
         *(functools.partial(match_text, text) for text in texts),
@@ -514,12 +519,12 @@ def collect(queries: Sequence[Callable[[], T]]) -> tuple[list[T], list[InputErro
 
 def _select_rows(field: LanguageField, match: _Match, sparse: SparseSelection, by: str, outliers: bool) -> Answer:
     """Makes the answer of a mapped field from the rows that a match selects."""
-    quantile = match.regions.quantile
+    rank, presence = match.regions.rank, match.regions.presence
     if match.parts is not None:
-        selection = jax.tree.map(np.asarray, match.parts.selection)
+        selection = jax.tree.map(np.asarray, match.parts)
         rows = np.flatnonzero(selection.mask)
         sparse = SparseSelection(rows, selection.similarity[rows], -1, float(selection.score))
-        quantile = selection.quantile
+        rank, presence = selection.rank, selection.presence
     count = len(sparse.gaussians)
     size = min(max(1 << max(count - 1, 0).bit_length(), MIN_BLOCK_ROWS), field.gaussians.count)
     rows = np.zeros(size, np.int64)
@@ -527,6 +532,7 @@ def _select_rows(field: LanguageField, match: _Match, sparse: SparseSelection, b
     rows[:count] = sparse.gaussians
     similarity[:count] = sparse.similarity
     best = np.asarray(sparse.region, np.int32), np.asarray(sparse.score, np.float32)
-    selection = Selection(np.arange(size) < count, similarity, *best, np.asarray(quantile), match.regions.confidence)
+    told = np.asarray(rank), match.regions.confidence, presence
+    selection = Selection(np.arange(size) < count, similarity, *best, *told)
     answer = _finish(subset_field(field, rows), match, selection, by, None, outliers)
     return dataclasses.replace(answer, rows=rows)

@@ -16,7 +16,7 @@ from jsecon.app.locate import gaussian_rows
 from jsecon.errors import InputError
 from jsecon.field.columns import vote_blocks
 from jsecon.field.membership import SHARE_THRESHOLD, membership_probability, vote_shares
-from jsecon.query.groups import containment, objects_of_gaussians, same_object
+from jsecon.query.grouping import containment, objects_of_gaussians, same_object
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.outliers import MIN_SAMPLES
 from jsecon.splat.transform import transform_gaussians_float64
@@ -265,7 +265,9 @@ def _sizes(field: LanguageField) -> tuple[Float[np.ndarray, " r"], Int[np.ndarra
 
 def _groups(field: LanguageField, main: np.ndarray, up: np.ndarray) -> Int[np.ndarray, " r"]:
     """Returns the group of each region: those that show one object have the same one."""
-    joined, alike = map(np.array, same_object(field))
+    joined, alike = map(
+        np.array, same_object(*jax.tree.map(jnp.asarray, (field.regions.embeddings, field.votes.overlap)))
+    )
     if not len(joined):
         return np.zeros(0, int)
     pairs = np.argwhere(np.triu(alike & ~joined, 1))

@@ -17,7 +17,8 @@ from jsecon.errors import InputError
 from jsecon.field.columns import votes_of_rows
 from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction_of_regions
 from jsecon.pipeline.sources import locate_sources
-from jsecon.query.match import join_pieces, match_regions
+from jsecon.query.answer import match_regions
+from jsecon.query.grouping import join_fragments
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.outliers import split_outliers
 from jsecon.query.referring import FoundObject
@@ -56,7 +57,7 @@ class ObjectScene:
         self.embedder = embedder
         self.source_from_scene = np.asarray(field.source_from_scene, np.float64)
         self.scale = float(np.cbrt(abs(np.linalg.det(self.source_from_scene[:3, :3]))))
-        self.rules = QueryRules(all_of_kind=True, logits=getattr(embedder, "logits", None))
+        self.rules = QueryRules(all_of_class=True, logits=getattr(embedder, "logits", None))
         self._given_up = up
         self._votes = jax.tree.map(np.asarray, field.votes)
         self._object = functools.cache(self._measure_object)
@@ -68,7 +69,7 @@ class ObjectScene:
         Raises:
           InputError: The embedder has no names for objects.
         """
-        for group in join_pieces(range(self.field.regions.count), self._joined):
+        for group in join_fragments(range(self.field.regions.count), self._joined):
             for regions in {(region,) for region in group} | {group}:
                 self._object(regions)
         if self.field.regions.count:
@@ -100,10 +101,10 @@ class ObjectScene:
             embedded = jax.device_put(self.embedder.embed_text(texts))
             match = match_regions(self.field, embedded, self.rules)
             regions = np.flatnonzero(np.asarray(match.chosen)) if int(match.region) >= 0 else np.zeros(0, int)
-            groups = self._best_named(texts, join_pieces(regions, self._joined))
+            groups = self._best_named(texts, join_fragments(regions, self._joined))
             made = [(group, self._object(group)) for group in groups]
             objects = [FoundObject(phrase, group, *parts) for group, parts in made if parts is not None]
-            self._phrases[phrase] = objects, float(match.quantile)
+            self._phrases[phrase] = objects, float(match.rank)
         return self._phrases[phrase]
 
     def _best_named(self, texts: Sequence[str], groups: list[tuple[int, ...]]) -> list[tuple[int, ...]]:

@@ -159,7 +159,7 @@ def _record(field: LanguageField, answer: Answer) -> dict[str, Any]:
         "count": len(means),
         "objects": answer.objects if len(means) else 0,
         "score": round(float(answer.selection.score), 6),
-        "quantile": answer.quantile,
+        "rank": answer.rank,
         "confidence": answer.confidence,
         "region": region if region >= 0 else None,
         "probability": probability or None,
@@ -222,7 +222,7 @@ def _line(answer: Answer, record: Mapping[str, Any]) -> str:
     parts = [f"{record['count']} of {record['gaussians']} Gaussians"]
     parts += [f"{record['objects']} objects"] if record["objects"] > 1 else []
     parts.append(f"score {record['score']:.3f}")
-    parts += [answer.quantile_words] if answer.quantile_words else []
+    parts += [answer.rank_words] if answer.rank_words else []
     if record["confidence"] is not None and record["region"] is not None:
         parts.append(f"confidence {int(100 * record['confidence'])} %")
     if record["region"] is not None:

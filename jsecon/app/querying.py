@@ -43,7 +43,7 @@ def _query(verb: verbs.Query, console: Console) -> verbs.VerbResult:
         problem = f"{expression!r} has a relation, an order or a number, which needs the whole field in memory"
         raise InputError(verb.field, problem, remedy="Raise JSECON_MEMORY (GiB), or put the text in quotes.")
     outline: dict[str, Any] = {"threshold": verb.threshold, "outliers": not verb.keep_outliers}
-    options = outline | {"by": verb.by, "several": verb.all, "quantile": verb.quantile}
+    options = outline | {"by": verb.by, "several": verb.all, "min_rank": verb.min_rank}
     options |= {"pixels": verb.at, "frame": verb.from_frame, "up": verb.up}
     outlines = [lambda pairs=pairs: _ask_masks(field, pairs, **outline) for pairs in verb.mask]
     outlines += [lambda box=box: _ask_box(field, *box, **outline) for box in verb.box]
@@ -131,9 +131,9 @@ def _check_query(verb: verbs.Query) -> None:
     if verb.up is not None and not any(map(is_expression, verb.texts)) and not is_bare_scene(verb.field):
         problem = "no text has a relation, and the field has its views"
         raise InputError("--up", problem, remedy="Leave it out, or make the field again: jsecon run --up.")
-    if not 0 <= verb.quantile <= 1:
-        remedy = f"{verbs.Query.quantile:g} is the default; 0 refuses no text."
-        raise InputError("--quantile", f"{verb.quantile:g}", "a share of words, 0 to 1", remedy)
+    if not 0 <= verb.min_rank <= 1:
+        remedy = f"{verbs.Query.min_rank:g} is the default; 0 refuses no text."
+        raise InputError("--min-rank", f"{verb.min_rank:g}", "a share of words, 0 to 1", remedy)
     for name, shells in (("--grow", verb.grow), ("--shrink", verb.shrink)):
         if shells < 0:
             raise InputError(name, f"{shells}", "a number of shells, 0 or more", "1 is a small step.")

@@ -210,8 +210,8 @@ class Query(FieldVerb):
         votes is then kept or dropped by what the outline of all gains in the views.
       threshold: Smallest similarity of a selected Gaussian. By default it is 0.5 for votes and silhouette, and 0.9 for
         code.
-      quantile: Share of unrelated words that must be less similar to the scene than a text, else the text has no match.
-        About 1 - quantile of the texts of absent objects are answered. With 0 every text is answered.
+      min_rank: Share of unrelated words that must be less similar to the scene than a text, else the text has no match.
+        About 1 - min_rank of the texts of absent objects are answered. With 0 every text is answered.
       all: Selects every region of the kind that a text names, such as all chairs, instead of the best one: those whose
         similarity lies at least 0.75 of the way from the median region to the best one (by votes or silhouette).
       keep_outliers: Keeps the Gaussians that stand apart from the rest of an answer. By default DBSCAN drops them, and
@@ -241,7 +241,7 @@ class Query(FieldVerb):
     up: Option[tuple[float, float, float] | None] = None
     by: Option[By] = "votes"
     threshold: Option[float | None] = None
-    quantile: Option[float] = 0.82
+    min_rank: Option[float] = 0.82
     all: Option[bool] = False
     keep_outliers: Option[bool] = False
     grow: Option[int] = 0

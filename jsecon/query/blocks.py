@@ -11,9 +11,10 @@ from jaxtyping import Float, Int
 from jsecon.errors import require_one_of
 from jsecon.field.columns import row_slices, votes_of_rows
 from jsecon.field.similarity import Number
-from jsecon.query.match import RULES, RegionMatch, match_regions
+from jsecon.paper.codes import CODE_THRESHOLD
+from jsecon.query.answer import RULES, RegionMatch, match_regions, select_from_votes
 from jsecon.query.rules import QueryRules
-from jsecon.query.select import THRESHOLDS, select_by_code, select_by_share
+from jsecon.query.select import select_rows_by_code
 from jsecon.types import Array, LanguageField
 
 
@@ -46,7 +47,7 @@ def query_in_blocks(
       field: Field of R regions, such as `load_field(path, mapped=True)`.
       text_embeddings: (Q, E), one row per text.
       rules: How texts match regions.
-      by: "votes" or "code", see `select_gaussians`.
+      by: "votes" or "code", or "code".
       similarity_threshold: Smallest similarity; None takes 0.5 for votes and 0.9 for codes.
 
     Returns:
@@ -71,7 +72,7 @@ def select_in_blocks(
     Args:
       field: Field of R regions, such as `load_field(path, mapped=True)`.
       matches: Results of `match_regions`.
-      by: "votes" or "code", see `select_gaussians`.
+      by: "votes" or "code", or "code".
       similarity_threshold: Smallest similarity; None takes 0.5 for votes and 0.9 for codes.
 
     Returns:
@@ -80,8 +81,9 @@ def select_in_blocks(
     Raises:
       ValueError: `by` is unknown.
     """
-    require_one_of("select_in_blocks", by, THRESHOLDS, "'votes' is the default.")
-    threshold = THRESHOLDS[by] if similarity_threshold is None else similarity_threshold
+    require_one_of("select_in_blocks", by, ("votes", "code"), "'votes' is the default.")
+    default = RULES.min_share if by == "votes" else CODE_THRESHOLD
+    threshold = default if similarity_threshold is None else similarity_threshold
     table = jnp.asarray(field.region_codes)
     columns = [[(np.zeros(0, np.int64), np.zeros(0, np.float32))] for _ in matches]
     for rows in row_slices(field.votes, len(field.votes.views)) if field.regions.count and matches else ():
@@ -89,9 +91,9 @@ def select_in_blocks(
         codes = jnp.asarray(field.codes[rows]) if by == "code" else None
         for column, match in zip(columns, matches):
             if codes is None:
-                selection = select_by_share(votes, match, threshold)
+                selection = select_from_votes(votes, match, threshold)
             else:
-                selection = select_by_code(codes, table, votes.views, match, threshold)
+                selection = select_rows_by_code(codes, table, votes.views, match, threshold)
             places = np.flatnonzero(np.asarray(selection.mask))
             column.append((places + rows.start, np.asarray(selection.similarity)[places]))
     answers = []

@@ -12,15 +12,15 @@ from jaxtyping import Float, Int
 
 from jsecon.errors import require
 from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction, ratio, vote_columns
-from jsecon.query.match import (
-    RULES,
-    evidence,
-    presence,
-    reference_similarities,
-    reference_words,
-    region_similarities,
-)
+from jsecon.query.answer import RULES
 from jsecon.query.rules import QueryRules
+from jsecon.query.scores import (
+    presence_prob,
+    region_similarities,
+    unrelated_words,
+    view_count_weight,
+    word_similarities,
+)
 from jsecon.types import Array, LanguageField
 
 
@@ -55,9 +55,9 @@ def query_classes(
     Args:
       field: Field of N Gaussians and R regions.
       texts: Embeddings of Q class names.
-      rules: How texts match regions. `quantile` and the thresholds refuse a region's best text.
+      rules: How texts match regions. `min_rank` and `min_score` refuse a region's best text.
       standardise: Whether similarities are taken in standard deviations from each text's mean over the regions,
-        weighted by `evidence`: some texts are more similar to all regions than others are to their own.
+        weighted by `view_count_weight`: some texts are more similar to all regions than others are to their own.
       every: Whether every Gaussian with votes gets a class, as the protocols of ScanNet and Replica ask. Otherwise the
         regions of the class must have a share of at least 0.5 in it, as for a query by votes.
 
@@ -75,13 +75,13 @@ def query_classes(
         count, dtype = field.codes.shape[0], jnp.asarray(field.regions.embeddings).dtype
         return Classes(jnp.full(count, -1, jnp.int32), jnp.zeros((count, texts.shape[0]), dtype))
     arrays = field.regions.embeddings, texts, field.regions.pixel_counts, field.votes
-    return _classes(*jax.tree.map(jnp.asarray, arrays), reference_words(field), rules, standardise, every)
+    return _classes(*jax.tree.map(jnp.asarray, arrays), unrelated_words(field), rules, standardise, every)
 
 
 @functools.partial(jax.jit, static_argnames=("standardise", "every"))
-def _classes(embeddings, texts, pixels, votes, reference, rules: QueryRules, standardise: bool, every: bool) -> Classes:
+def _classes(embeddings, texts, pixels, votes, words, rules: QueryRules, standardise: bool, every: bool) -> Classes:
     def compare(text):
-        return region_similarities(embeddings, text, reference, rules.retrieval)
+        return region_similarities(embeddings, text, words, rules.retrieval)
 
     similarity, known = jax.vmap(compare)(texts)  # (Q, R) both
     valid = jnp.any(known, axis=1)  # a text without a direction is no region's class
@@ -92,15 +92,15 @@ def _classes(embeddings, texts, pixels, votes, reference, rules: QueryRules, sta
     def of_best(table):
         return jnp.take_along_axis(table, best[:, None], axis=1)[:, 0]
 
-    if rules.retrieval_threshold is None and reference is not None:
-        scores = reference_similarities(embeddings, reference, rules.retrieval)
+    rank = presence = None
+    if words is not None:
+        scores = word_similarities(embeddings, words, rules.retrieval)
+        count = jnp.sum(jnp.isfinite(scores), axis=0)
         below = jnp.sum(scores < of_best(plain), axis=0, dtype=plain.dtype)
-        accepted = below >= rules.quantile * jnp.sum(jnp.isfinite(scores), axis=0)
-    else:
-        judged = plain
-        if (logits := rules.logits) is not None:
-            judged = jax.vmap(lambda text: presence(embeddings, text, logits), out_axes=1)(texts)
-        accepted = of_best(judged) >= rules.fixed_threshold
+        rank = jnp.where(count > 0, below / jnp.maximum(count, 1), 1.0)
+    if (logits := rules.logits) is not None:
+        presence = of_best(jax.vmap(lambda text: presence_prob(embeddings, text, logits), out_axes=1)(texts))
+    accepted = rules.accept(rank, of_best(plain), presence)
     accepted &= known & jnp.any(valid)
     count = votes.regions.shape[0]
 
@@ -130,8 +130,8 @@ def _classes(embeddings, texts, pixels, votes, reference, rules: QueryRules, sta
 
 
 def _standardised(table: Array, known: Array, pixels: Array) -> Array:
-    """Converts similarities (R, Q) to deviations from each text's mean over the known regions, weighted by evidence."""
-    weight = jnp.where(known, evidence(pixels).astype(table.dtype), 0.0)[:, None]
+    """Converts similarities (R, Q) to deviations from the mean of a text over the known regions, weighted by views."""
+    weight = jnp.where(known, view_count_weight(pixels).astype(table.dtype), 0.0)[:, None]
     weight = weight / jnp.maximum(jnp.sum(weight), jnp.finfo(table.dtype).tiny)
     apart = jnp.where(known[:, None], table - jnp.sum(weight * table, axis=0), 0.0)
     deviation = jnp.sqrt(jnp.sum(weight * apart**2, axis=0))

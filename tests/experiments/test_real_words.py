@@ -13,7 +13,7 @@ from experiments.words.conse import Conse, Crop, Labeller, TextVectors, class_we
 from experiments.words.minilm import MiniLM
 from jsecon.errors import InputError
 from jsecon.paper.baselines import relevancies
-from jsecon.query.match import region_similarities
+from jsecon.query.scores import region_similarities
 from jsecon.vision.protocols import CANONICAL, Embedder
 
 SIDE = 8

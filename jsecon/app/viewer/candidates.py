@@ -11,10 +11,11 @@ from jaxtyping import Bool, Float
 from jsecon.app.ask import narrow_texts, with_phrases
 from jsecon.field.regions import mean_residuals
 from jsecon.field.similarity import similarities
+from jsecon.query.answer import ROUNDING, RULES
 from jsecon.query.composite import parse_query
-from jsecon.query.match import ROUNDING, RULES, evidence, reference_words, region_similarities
 from jsecon.query.pixel import MIN_SHARE, region_shares_seen
 from jsecon.query.render import HIDDEN_LOGIT
+from jsecon.query.scores import region_similarities, unrelated_words, view_count_weight
 from jsecon.types import Camera, LanguageField
 
 RAY_VIEW_SIDE = 1025
@@ -37,7 +38,7 @@ class Candidate:
 
 
 def candidates(field: LanguageField, embedder: Any, query: str | int, count: int = 6) -> list[Candidate]:
-    """Finds the regions that are most similar to a text or a region, as queries weigh them (`evidence`).
+    """Finds the regions that are most similar to a text or a region, as queries weigh them (`view_count_weight`).
 
     Args:
       field: The field.
@@ -55,14 +56,14 @@ def candidates(field: LanguageField, embedder: Any, query: str | int, count: int
     if field.regions.count == 0:
         return []
     table = jnp.asarray(field.regions.embeddings)
-    weight = np.asarray(_evidence(jnp.asarray(field.regions.pixel_counts)))
+    weight = np.asarray(_view_count_weight(jnp.asarray(field.regions.pixel_counts)))
     if isinstance(query, str):
         field = with_phrases(field, embedder)
-        reference = reference_words(field)
-        weight = np.ones_like(weight) if reference is None else weight  # the plain cosine ranks without evidence
+        words = unrelated_words(field)
+        weight = np.ones_like(weight) if words is None else weight  # the plain cosine ranks without weights
         included, excluded = (narrow_texts(field, embedder, texts, RULES, every=True) for texts in parse_query(query))
         texts = jnp.asarray(embedder.embed_text(included + excluded))
-        matches = [_similarities(table, text, reference, RULES.retrieval) for text in texts]
+        matches = [_similarities(table, text, words, RULES.retrieval) for text in texts]
         scores = np.stack([score for score, _ in matches])
         score = scores[: len(included)].max(0)
         known = matches[0][1] & (score > scores[len(included) :].max(0, initial=-np.inf) + ROUNDING)
@@ -76,7 +77,7 @@ def candidates(field: LanguageField, embedder: Any, query: str | int, count: int
 
 
 _similarities = jax.jit(region_similarities, static_argnames="retrieval")
-_evidence = jax.jit(evidence)
+_view_count_weight = jax.jit(view_count_weight)
 
 
 @jax.jit

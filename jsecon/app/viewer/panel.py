@@ -14,7 +14,7 @@ from jsecon.app.viewer.candidates import Candidate
 from jsecon.app.viewer.view_state import COLOURINGS, MAX_SHELLS, ViewState, answer_colours, from_link
 from jsecon.errors import InputError
 from jsecon.field.membership import probability_inside
-from jsecon.query.rules import PRESENCE_THRESHOLD, QUANTILE, RETRIEVAL_THRESHOLD
+from jsecon.query.rules import MIN_COSINE, MIN_PRESENCE, MIN_RANK
 from jsecon.types import LanguageField
 
 THUMBNAIL = 88
@@ -253,11 +253,11 @@ def messages(field: LanguageField, state: ViewState, answers: Sequence[Answer | 
 
 def _refusal(answer: Answer) -> str:
     """Returns the measure by which a query has no match, and its threshold."""
-    if answer.quantile_words:
-        return f"{answer.quantile_words}, and {100 * QUANTILE:.0f} % are required"
+    if answer.rank_words:
+        return f"{answer.rank_words}, and {100 * MIN_RANK:.0f} % are required"
     if answer.presence is not None:
-        return f"the probability that it is there is {answer.presence:.2g}, and {PRESENCE_THRESHOLD} is required"
-    return f"the best score is {float(answer.selection.score):.2f}, and {RETRIEVAL_THRESHOLD} is required"
+        return f"the probability that it is there is {answer.presence:.2g}, and {MIN_PRESENCE} is required"
+    return f"the best score is {float(answer.selection.score):.2f}, and {MIN_COSINE} is required"
 
 
 def candidate_grid(

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from jsecon.errors import InputError, describe_error
 from jsecon.field.membership import SHARE_THRESHOLD
-from jsecon.query.rules import PIECE_THRESHOLD
+from jsecon.query.rules import FRAGMENT_SCORE
 
 Colouring: TypeAlias = Literal["photo", "code", "region", "score"]
 COLOURINGS: tuple[Colouring, ...] = get_args(Colouring)
@@ -50,7 +50,7 @@ class ViewQuery:
 
     query: str | int
     threshold: float = SHARE_THRESHOLD
-    part_vs_whole: float = 1 - PIECE_THRESHOLD
+    part_vs_whole: float = 1 - FRAGMENT_SCORE
     all_matches: bool = False
     shells: int = 0
 

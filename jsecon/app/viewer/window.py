@@ -268,7 +268,7 @@ class Viewer:
 
     def _answer(self, query: ViewQuery) -> Answer | InputError:
         """Answers a query that is not among the last ones."""
-        options: dict[str, Any] = {"several": query.all_matches, "piece_threshold": 1 - query.part_vs_whole}
+        options: dict[str, Any] = {"several": query.all_matches, "fragment_score": 1 - query.part_vs_whole}
         try:
             if isinstance(query.query, str) and is_expression(query.query):
                 answer = relation_answer(query_relation(self.objects, query.query))

@@ -1,0 +1,304 @@
+"""From the embedding of a text to Gaussians: the whole path of a question, on one page.
+
+    match_regions      embedding of the text -> the region that matches best, unless the rules refuse the text, with the
+                       regions that belong to it. Each region is scored (query/scores), and one rule says which belong
+                       together (query/grouping)
+    select_gaussians   regions -> the Gaussians of which these regions hold at least half (field/membership)
+    trim               Gaussians -> without those that lie apart from the rest (query/outliers)
+
+`answer_texts` does all three; thresholds are `QueryRules`. A region, as under a pixel, can stand in place of a text.
+The gap between a text's and an image's embedding is crossed once, among R regions, where only the order matters (the
+paper's GT-anchored query). Gaussians are then compared with regions, so almost any threshold does.
+
+All but `trim` and the two functions that call it can be traced: jit them, or vmap them over texts.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import export
+from jaxtyping import Bool, Float, Int
+
+from jsecon.errors import require, require_shape
+from jsecon.field.membership import inside_fraction
+from jsecon.field.similarity import Number, similarities
+from jsecon.programs import stored_jit
+from jsecon.query.grouping import join_fragments, parts_fallback, regions_with
+from jsecon.query.outliers import OutlierResult, split_outliers
+from jsecon.query.rules import QueryRules
+from jsecon.query.scores import score_text, unrelated_words, word_similarities
+from jsecon.types import Array, LanguageField, Selection, Votes
+
+RULES = QueryRules()
+"""The defaults."""
+ALL_OF_CLASS = QueryRules(all_of_class=True)
+"""All regions of a class answer."""
+ONE_REGION = QueryRules(duplicate_cosine=None, fragment_score=None)
+"""A region alone: who points at one of two red chairs means that one."""
+ROUNDING = 1e-5
+"""Similarities that differ by no more count as equal: a text that is both included and excluded matches nothing."""
+
+
+class RegionMatch(NamedTuple):
+    """The regions of a field, R of them, that match a question."""
+
+    chosen: Bool[Array, " r"]
+    """Regions that match."""
+    region: Int[Array, ""]
+    """The best of them; -1 if there is none."""
+    score: Float[Array, ""]
+    """Similarity of the best region, whether it is chosen or not; 0 without regions."""
+    rank: Float[Array, ""] | np.ndarray = np.asarray(np.nan, np.float32)
+    """Share of unrelated words that match the scene less than the text does; NaN without such words."""
+    confidence: Float[Array, ""] | np.ndarray = np.asarray(np.nan, np.float32)
+    """Probability that the best region shows what the text names (`answer_confidence`); NaN without such words."""
+    presence: Float[Array, ""] | None = None
+    """Probability that the text is true of the best region; None without `QueryRules.logits`."""
+
+
+export.register_namedtuple_serialization(RegionMatch, serialized_name="jsecon.RegionMatch")  # for `stored_jit`
+NO_REGIONS = RegionMatch(np.zeros(0, bool), np.asarray(-1, np.int32), np.asarray(0.0, np.float32))
+"""The match of a field without regions."""
+
+
+class Trimmed(NamedTuple):
+    """The answer to a question."""
+
+    match: RegionMatch
+    """The regions."""
+    selection: Selection
+    """Their Gaussians, or those of the parts that answer in place of regions (`parts_fallback`)."""
+    outliers: OutlierResult
+    """The mask of the selection without outliers, and what became of its clusters."""
+    objects: int
+    """Number of separate objects: groups of regions that overlap, at most as many as there are clusters. 1 of parts."""
+    by_parts: bool = False
+    """Whether parts answer."""
+
+
+def answer_texts(
+    field: LanguageField,
+    queries: Float[Array, "q e"],
+    rules: QueryRules = RULES,
+    *,
+    excluded: Float[Array, "u e"] | None = None,
+    outliers: bool = True,
+) -> Trimmed:
+    """Answers a question of one text or several: the path of this page. Host code.
+
+    Args:
+      field: The field.
+      queries: Embeddings of the texts, by the field's embedder.
+      rules: How texts match regions, and regions Gaussians.
+      excluded: Embeddings of texts whose regions are left out.
+      outliers: Whether Gaussians that lie apart are dropped.
+    """
+    match = match_regions(field, queries, rules, excluded=excluded)
+    several = rules.all_of_class or len(queries) > 1 or (excluded is not None and len(excluded) > 0)
+    if field.parts is not None and not several:
+        selection = parts_fallback(field, queries[0], match.score, rules)
+        if selection is not None:
+            return Trimmed(match, selection, trim(field, selection, "supported" if outliers else None), 1, True)
+    return _answer(field, match, rules, ("all" if several else "supported") if outliers else None)
+
+
+def answer_region(
+    field: LanguageField, region: int, rules: QueryRules = ONE_REGION, *, outliers: bool = True
+) -> Trimmed:
+    """Answers a region in place of a text, as `answer_texts` does. Host code."""
+    keep = ("all" if rules.duplicate_cosine is not None else "supported") if outliers else None
+    return _answer(field, match_region(field, region, rules), rules, keep)
+
+
+def _answer(field: LanguageField, match: RegionMatch, rules: QueryRules, keep: str | None) -> Trimmed:
+    selection = select_gaussians(field, match, rules)
+    outliers = trim(field, selection, keep)
+    overlap = field.votes.overlap
+    groups = [] if overlap is None else join_fragments(np.flatnonzero(match.chosen), np.asarray(overlap))
+    return Trimmed(match, selection, outliers, max(1, min(len(groups), outliers.clusters_kept)))
+
+
+def match_regions(
+    field: LanguageField,
+    queries: Float[Array, "q e"],
+    rules: QueryRules = RULES,
+    *,
+    excluded: Float[Array, "u e"] | None = None,
+) -> RegionMatch:
+    """Finds the regions that match any of the texts and none of the excluded ones. Pure.
+
+    A text matches the region with the largest similarity times `view_count_weight`, unless the rules refuse it, and the
+    regions that belong to that one (`regions_with`). A region that matches a text and an excluded text belongs to the
+    one that it is more similar to, so "mug but not handle" keeps a mug whose handle has no region.
+
+    Args:
+      field: Field of R regions with embeddings of E numbers.
+      queries: (Q, E) embeddings of the texts, Q >= 1.
+      rules: How texts match.
+      excluded: (U, E) embeddings of texts whose regions are left out; None is an empty list.
+
+    Returns:
+      The match.
+
+    Raises:
+      ValueError: An embedding has another size.
+    """
+    size = field.regions.embeddings.shape[1]
+    excluded = jnp.zeros((0, size)) if excluded is None else excluded
+    fit = all(texts.ndim == 2 and texts.shape[1] == size for texts in (queries, excluded)) and len(queries) >= 1
+    remedy = f"Embed the text with the field's embedder{f', {field.embedder}' if field.embedder else ''}."
+    shapes = f"queries {queries.shape}, excluded {excluded.shape}"
+    require(fit, "match_regions", shapes, f"(Q >= 1, {size}) and (U, {size})", remedy)
+    if field.regions.count == 0:
+        return NO_REGIONS
+    arrays = field.regions.embeddings, field.regions.pixel_counts, field.votes.overlap, queries, excluded
+    return _match(*jax.tree.map(jnp.asarray, arrays), unrelated_words(field), rules)
+
+
+@stored_jit
+def _match(embeddings, pixels, overlap, queries, excluded, words, rules: QueryRules) -> RegionMatch:
+    word_scores = None if words is None else word_similarities(embeddings, words, rules.retrieval)
+
+    def match_each(texts):
+        def match_text(text):
+            scores = score_text(embeddings, text, pixels, words, word_scores, rules)
+            chosen = regions_with(scores.best, scores.similarity, scores.known, embeddings, overlap, rules)
+            return scores, chosen & scores.known & scores.accepted
+
+        scores, chosen = jax.vmap(match_text)(texts)
+        return scores, chosen.any(0), jnp.max(jnp.where(chosen, scores.similarity, -jnp.inf), axis=0)
+
+    scores, chosen, similarity = match_each(queries)
+    if len(excluded):
+        _, rejected, against = match_each(excluded)
+        chosen &= ~(rejected & (against >= similarity - ROUNDING))
+    # The best region of a text is before those that join it, whose similarity may be larger: similarities span 2.
+    is_best = jnp.any((jnp.arange(len(embeddings)) == scores.best[:, None]) & scores.accepted[:, None], axis=0)
+    best = jnp.argmax(jnp.where(chosen, similarity + 4.0 * is_best, -jnp.inf))
+    matches = jnp.any(chosen)
+
+    def of_best(rows):
+        return jnp.take_along_axis(rows, scores.best[:, None], axis=1)[:, 0]
+
+    known = of_best(scores.known)
+    nearest = jnp.where(jnp.any(known), jnp.max(jnp.where(known, of_best(scores.similarity), -jnp.inf)), 0.0)
+    presence = None if scores.presence is None else jnp.max(scores.presence, axis=0)
+    return RegionMatch(
+        chosen,
+        jnp.where(matches, best, -1).astype(jnp.int32),
+        jnp.where(matches, similarity[best], nearest),
+        jnp.nanmax(jnp.where(known, scores.rank, jnp.nan)),
+        jnp.nanmax(jnp.where(known, scores.confidence, jnp.nan)),
+        None if presence is None else jnp.where(matches, presence[best], jnp.max(presence)),
+    )
+
+
+def match_region(field: LanguageField, region: int | Int[Array, ""], rules: QueryRules = ONE_REGION) -> RegionMatch:
+    """Matches a region in place of a text, with score 1. Pure.
+
+    Args:
+      field: Field of R regions.
+      region: Its id. For one that the field does not have, such as -1, region is -1 and score 0.
+      rules: Which regions join it; by default only that region.
+
+    Raises:
+      ValueError: The id is not an integer.
+    """
+    integral = jnp.issubdtype(jnp.asarray(region).dtype, jnp.integer)
+    require(integral, "match_region", region, "the id of a region, an integer", "region_at finds the one of a pixel.")
+    if field.regions.count == 0:
+        return NO_REGIONS
+    return _match_one(jnp.asarray(field.regions.embeddings), field.votes.overlap, jnp.asarray(region), rules)
+
+
+@jax.jit
+def _match_one(embeddings, overlap, region, rules: QueryRules) -> RegionMatch:
+    valid, row = (region >= 0) & (region < len(embeddings)), jnp.maximum(region, 0)
+    similarity, known = similarities(embeddings, embeddings[row])
+    chosen = regions_with(row, similarity, known, embeddings, overlap, rules)
+    return RegionMatch(chosen & valid, jnp.where(valid, region, -1).astype(jnp.int32), valid.astype(embeddings.dtype))
+
+
+def select_gaussians(field: LanguageField, match: RegionMatch, rules: QueryRules = RULES) -> Selection:
+    """Selects the Gaussians in which the matched regions have a share of at least `rules.min_share`. Pure.
+
+    The share (`inside_fraction`) estimates the probability that a pixel of the Gaussian belongs to the regions.
+    Gaussians that no view sees, or with votes that are not finite, stay out.
+    """
+    if field.regions.count == 0:
+        none = jnp.zeros(field.gaussians.count, bool)
+        return Selection(none, none.astype(jnp.float32), *map(jnp.asarray, match[1:5]))
+    return select_from_votes(jax.tree.map(jnp.asarray, field.votes), match, rules.min_share)
+
+
+@stored_jit
+def select_from_votes(votes: Votes, match: RegionMatch, min_share: Number) -> Selection:
+    """Selects any Gaussians as `select_gaussians` does: each row of the votes stands for itself. Pure."""
+    share, known = inside_fraction(votes, match.chosen)
+    mask = known & (share >= min_share) & (match.region >= 0)
+    return Selection(mask, share, *match[1:])
+
+
+def trim(field: LanguageField, selection: Selection, keep: str | None = "supported") -> OutlierResult:
+    """Drops the selected Gaussians that lie apart from the rest (`remove_outliers`). Host code.
+
+    Args:
+      field: The field.
+      selection: Selection of its Gaussians.
+      keep: Clusters that stay; None keeps all Gaussians.
+    """
+    if keep is None:
+        return OutlierResult(np.asarray(selection.mask), "outliers are kept", 0, 0)
+    weight = np.clip(np.asarray(selection.similarity), 0.0, 1.0) * np.asarray(field.votes.total)
+    return split_outliers(field.gaussians.means, selection.mask, keep=keep, weight=weight)
+
+
+def query_anchored(field: LanguageField, text_embedding: Float[Array, " e"], *, rules: QueryRules = RULES) -> Selection:
+    """Selects the Gaussians of the region that matches a text best, with the regions that belong to it. Pure.
+
+    Args:
+      field: The field; close over it to jit or vmap over texts.
+      text_embedding: (E,) by the field's embedder.
+      rules: How the text matches regions, and regions Gaussians.
+
+    Returns:
+      The selection. `region` is -1 and the mask is empty if the text matches no region.
+
+    Raises:
+      ValueError: The embedding has another size.
+    """
+    size = field.regions.embeddings.shape[1]
+    remedy = f"Embed the text with the field's embedder{f', {field.embedder}' if field.embedder else ''}."
+    require_shape("text_embedding", text_embedding, (size,), remedy)
+    return query_several(field, jnp.asarray(text_embedding)[None], rules=rules)
+
+
+def query_region(field: LanguageField, region: int | Int[Array, ""], *, rules: QueryRules = ONE_REGION) -> Selection:
+    """Selects the Gaussians of a region, such as `region_at` returns, as `match_region` matches it. Pure."""
+    return select_gaussians(field, match_region(field, region, rules), rules)
+
+
+def query_several(
+    field: LanguageField,
+    queries: Float[Array, "q e"],
+    excluded: Float[Array, "u e"] | None = None,
+    *,
+    rules: QueryRules = ALL_OF_CLASS,
+) -> Selection:
+    """Selects the Gaussians of all regions that match any of several texts and no excluded text. Pure.
+
+    Args:
+      field: The field.
+      queries: (Q, E) embeddings of the texts, Q >= 1.
+      excluded: (U, E) embeddings of texts whose regions are left out (`match_regions`); None is an empty list.
+      rules: How texts match regions, by default all regions of a class.
+
+    Returns:
+      The selection.
+
+    Raises:
+      ValueError: An embedding has another size.
+    """
+    return select_gaussians(field, match_regions(field, queries, rules, excluded=excluded), rules)
