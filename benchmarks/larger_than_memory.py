@@ -1,4 +1,4 @@
-"""Votes, codes, queries and export of a scene whose columns stay on disk: seconds, peak memory, growth.
+"""Votes, queries and export of a scene whose columns stay on disk: seconds, peak memory, growth.
 
     python benchmarks/larger_than_memory.py --gaussians 20000000 --views 20        (11 GB in FOLDER while it runs)
     python benchmarks/larger_than_memory.py --growth votes        (or: queries)
@@ -35,7 +35,7 @@ from jsecon.types import Camera, Gaussians, LanguageField, Regions, Votes
 SIDE, ACROSS, SQUARES, PART = 100.0, 64, 10, 2_000_000
 """m of the ground; tiles along each side, in whose order Gaussians lie; regions along each side"""
 SHAPES = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "opacity_logits": (), "sh": (1, 3)}
-REGIONS, EMBEDDING, CODE, TEXTS = SQUARES**2, 64, 16, 100
+REGIONS, EMBEDDING, TEXTS = SQUARES**2, 64, 100
 
 
 def landscape(count: int, first: int, rows: int) -> Gaussians:
@@ -109,11 +109,10 @@ def main_regions(labels: Labels) -> Regions:
     return Regions(embeddings, np.stack(pixels, 1).astype(np.int32))
 
 
-def field_of(gaussians: Gaussians, votes: Votes, codes: np.ndarray, cameras: Camera, regions: Regions) -> LanguageField:
+def field_of(gaussians: Gaussians, votes: Votes, cameras: Camera, regions: Regions) -> LanguageField:
     names = tuple(f"{t:05d}" for t in range(len(cameras.world_to_camera)))
     canonical = np.random.default_rng(1).normal(size=(4, EMBEDDING)).astype(np.float32)
-    table = regions.embeddings[:, :CODE]
-    return LanguageField(gaussians, codes, votes, regions, table, None, cameras, canonical, np.eye(4), names)
+    return LanguageField(gaussians, votes, regions, cameras, canonical, np.eye(4), names)
 
 
 def texts_near(regions: Regions) -> np.ndarray:
@@ -130,7 +129,7 @@ def timed(told: dict[str, float], name: str, call):
 
 
 def votes_step(folder: Path, views: int, width: int, height: int) -> dict[str, float]:
-    """Votes, overlap, codes; and all in one field file."""
+    """Votes, overlap; and all in one field file."""
     cameras, told = ring(views, width, height), {}
     labels, gaussians = Labels(cameras), mapped(folder / "scene")
     regions = timed(told, "labels' pixels, s", lambda: main_regions(labels))
@@ -153,9 +152,7 @@ def votes_step(folder: Path, views: int, width: int, height: int) -> dict[str, f
     told["seen"] = float(np.mean([np.count_nonzero(votes.views[a : a + (1 << 20)]) / len(votes.views[a : a + (1 << 20)])
                                   for a in range(0, len(votes.views), 1 << 20)]))  # fmt: skip
     votes = timed(told, "votes finished, s", lambda: jsecon.normalise_votes_in_blocks(votes, regions))
-    table = regions.embeddings[:, :CODE]
-    codes = timed(told, "codes, s", lambda: jsecon.codes_in_blocks(votes, table, folder / "codes.npy"))
-    field = field_of(gaussians, votes, codes, cameras, regions)
+    field = field_of(gaussians, votes, cameras, regions)
     timed(told, "field written, s", lambda: jsecon.save_field(folder / "field.safetensors", field))
     return told
 
@@ -212,8 +209,7 @@ def part_step(folder: Path, views: int, width: int, height: int) -> dict[str, fl
         told[f"{name}: relative"] = float(np.linalg.norm(own - other) / np.linalg.norm(other))
     for name in ("regions", "views"):
         told[f"{name}: differ"] = int((np.asarray(getattr(blocks, name)) != np.asarray(getattr(memory, name))).sum())
-    codes = np.zeros((part.count, CODE), np.float32)
-    mapped_field = field_of(part, blocks, codes, cameras, regions)
+    mapped_field = field_of(part, blocks, cameras, regions)
     held = {own.name: getattr(mapped_field.votes, own.name) for own in dataclasses.fields(Votes)}
     held = {name: np.array(a) if isinstance(a, np.memmap) else a for name, a in held.items()}
     held_field = dataclasses.replace(mapped_field, votes=Votes(**held))

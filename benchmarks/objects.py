@@ -85,11 +85,8 @@ def made_field(objects: int, gaussians: int, seed: int = 0) -> Any:
     lens = np.full(len(eyes), 300, np.float32)
     return LanguageField(
         gaussians=scene,
-        codes=embeddings[owner],
         votes=votes,
         regions=Regions(embeddings, np.full((count, len(eyes)), 900, np.int32)),
-        region_codes=embeddings,
-        autoencoder=None,
         cameras=Camera(poses, lens, lens, lens, lens * 0.75, 600, 450),
         canonical_phrases=np.asarray(embedder.canonical_phrases, np.float32),
         source_from_scene=np.eye(4),

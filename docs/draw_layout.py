@@ -107,7 +107,7 @@ def draw_layout() -> None:
 def draw_how() -> None:
     """Draws what flows through a run and through a query."""
     figure, axes = _figure(9, 2.7)
-    run = ["frames,\nposes", "masks", "regions and\nembeddings", "votes and\ncodes", "field"]
+    run = ["frames,\nposes", "masks", "regions and\nembeddings", "votes", "field"]
     query = [
         "text, pixel\nor outline",
         "best region",

@@ -32,7 +32,7 @@ from jsecon.query.outliers import remove_outliers
 from jsecon.query.render import selection_mask
 from jsecon.query.rules import QueryRules
 from jsecon.query.select import select_by_code
-from jsecon.types import Camera, Capture, Gaussians, LanguageField, Regions
+from jsecon.types import Camera, Capture, Codes, Gaussians, LanguageField, Regions
 
 OBJECTS = {48: "chenille stems", 114: "bunny book", 132: "kleenex tissue box", 144: "joke book"}
 """Objects by their numbers in segm/; 0 is background."""
@@ -130,28 +130,25 @@ def build_gaussians(capture: Capture, options: Options) -> Gaussians:
 
 
 def build_field(gaussians: Gaussians, capture: Capture, labels: np.ndarray) -> LanguageField:
-    """Field of the votes of the training masks. The regions have one-hot codes."""
+    """Field of the votes of the training masks. The regions have one-hot embeddings."""
     used = np.flatnonzero(~capture.held_out)
     cameras = jax.tree.map(jnp.asarray, capture.cameras[used])
     count = len(OBJECTS) + 1
-    codes = jnp.eye(count)
     pixels = np.stack([(labels[used] == r).sum((1, 2)) for r in range(count)]).astype(np.int32)
-    regions = Regions(codes, jnp.asarray(pixels))
+    regions = Regions(jnp.eye(count), jnp.asarray(pixels))
     votes = add_visible_weight(
         region_votes(gaussians, cameras, jnp.asarray(labels[used]), count, by_view=True), regions
     )
     return LanguageField(
         gaussians=gaussians,
-        codes=distill_votes(votes, codes, "mode"),
         votes=votes,
         regions=regions,
-        region_codes=codes,
-        autoencoder=None,
         cameras=cameras,
         canonical_phrases=jnp.zeros((1, count)),
         source_from_scene=jnp.eye(4),
         names=tuple(capture.names[t] for t in used),
         embedder="labels",
+        codes=Codes(distill_votes(votes, regions.embeddings), regions.embeddings, None),
     )
 
 

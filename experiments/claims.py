@@ -23,7 +23,8 @@ from experiments.tables.fill import measure
 from experiments.tables.ours import paper
 from experiments.tables.setting import Setting, prepare
 from jsecon.numerics import cosine, cosine_matrix
-from jsecon.paper.autoencoder import Autoencoder, train_autoencoder
+from jsecon.paper.autoencoder import decode, encode, train_autoencoder
+from jsecon.types import Autoencoder
 
 LATENT = 3
 """Size of the autoencoder's code."""
@@ -75,7 +76,7 @@ def spread(regions: list[tuple[np.ndarray, np.ndarray]], seed: int) -> tuple[flo
 
 def compressed(coder: Autoencoder, averages: np.ndarray, texts: np.ndarray) -> tuple[float, float]:
     """Cosine of the decoded averages, and share of texts that match the same region as before."""
-    back = coder.decode(coder.encode(jnp.asarray(averages)))
+    back = decode(coder, encode(coder, jnp.asarray(averages)))
     before, after = (np.asarray(cosine_matrix(jnp.asarray(texts), rows)).argmax(1) for rows in (averages, back))
     return float(cosine(back, jnp.asarray(averages)).mean()), float((before == after).mean())
 

@@ -101,11 +101,8 @@ def case_of(scene: WordScene, embedder: Conse, variant: str) -> Case:
     regions = scene.regions(crops)
     field = LanguageField(
         gaussians=scene.gaussians,
-        codes=np.zeros((scene.gaussians.count, 1), np.float32),
         votes=normalise_votes(scene.votes, regions),
         regions=regions,
-        region_codes=np.zeros((regions.count, 1), np.float32),
-        autoencoder=None,
         cameras=scene.cameras,
         canonical_phrases=embedder.canonical_phrases,
         source_from_scene=np.eye(4),

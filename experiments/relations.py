@@ -48,7 +48,6 @@ from jsecon.field.regions import region_embeddings
 from jsecon.field.votes import region_votes
 from jsecon.fit.depth import points_from_depth
 from jsecon.fit.start import gaussians_from_points
-from jsecon.paper.distill import distill_votes
 from jsecon.types import Camera, Capture, LanguageField
 from jsecon.vision.colours import ColourEmbedder
 
@@ -347,14 +346,10 @@ def true_field(room: Room) -> LanguageField:
     regions = region_embeddings(frames, labels, embedder.embed_regions, num_regions=len(room.objects))
     votes = region_votes(scene, cameras, labels, len(room.objects), by_view=True)
     votes = normalise_votes(votes, regions)
-    codes = distill_votes(votes, jnp.asarray(regions.embeddings))
     return LanguageField(
         gaussians=scene,
-        codes=codes,
         votes=votes,
         regions=regions,
-        region_codes=jnp.asarray(regions.embeddings),
-        autoencoder=None,
         cameras=cameras,
         canonical_phrases=np.asarray(embedder.canonical_phrases, np.float32),
         source_from_scene=np.eye(4),

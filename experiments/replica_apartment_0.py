@@ -24,12 +24,12 @@ from experiments import results
 from experiments.apc_bin import read_png
 from experiments.datasets.depth_points import labels_of_points
 from experiments.protocols.points import point_accuracy, point_class_means
+from experiments.tables.codes import region_codes
 from jsecon.errors import InputError
 from jsecon.field.votes import region_votes
 from jsecon.fit.depth import DepthPoints, points_from_depth
 from jsecon.fit.start import gaussians_from_points
 from jsecon.numerics import cosine_matrix
-from jsecon.paper.codes import region_codes
 from jsecon.paper.distill import distill_votes
 from jsecon.types import Camera, Capture, Gaussians
 

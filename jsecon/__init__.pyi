@@ -28,14 +28,10 @@ from .field.membership import (
     with_overlap as with_overlap,
 )
 from .field.regions import region_embeddings as region_embeddings
-from .field.similarity import unit_codes as unit_codes
-from .field.streaming import (
-    codes_in_blocks as codes_in_blocks,
-    region_votes_in_blocks as region_votes_in_blocks,
-)
+from .field.streaming import region_votes_in_blocks as region_votes_in_blocks
 from .field.votes import region_votes as region_votes, scan_region_votes as scan_region_votes
 from .paper.algorithm1 import masklets as masklets
-from .paper.autoencoder import Autoencoder as Autoencoder, train_autoencoder as train_autoencoder
+from .paper.autoencoder import decode as decode, encode as encode, train_autoencoder as train_autoencoder
 from .paper.baselines import query_canonical as query_canonical, query_one_step as query_one_step
 from .paper.distill import distill_l1 as distill_l1, distill_votes as distill_votes
 from .parallel import host_mesh as host_mesh
@@ -63,8 +59,10 @@ from .splat.plan import plan_view as plan_view, render_plan as render_plan
 from .splat.project import project as project
 from .splat.render import render as render, render_depth as render_depth, render_rgb as render_rgb
 from .types import (
+    Autoencoder as Autoencoder,
     Camera as Camera,
     Capture as Capture,
+    Codes as Codes,
     Gaussians as Gaussians,
     LanguageField as LanguageField,
     Regions as Regions,

@@ -262,18 +262,35 @@ class Parts:
 
 
 @record
-class LanguageField(_Shown):
-    """Everything a query needs, in one file: the scene, its codes and votes, its regions, and where they came from."""
+class Autoencoder:
+    """Parameters of one scene's autoencoder (`train_autoencoder`), layer by layer."""
 
-    gaussians: Gaussians
-    codes: Array
+    encoder: Leaf
+    """Tuple of dicts: weight (in, out), bias (out,), and but for the last layer scale, shift, mean and variance (out,)
+    of the batch normalisation behind it."""
+    decoder: Leaf
+    """Tuple of dicts: weight (in, out), bias (out,)."""
+
+
+@record
+class Codes:
+    """The paper's compressed features of d numbers, which `jsecon run --paper` adds to a field."""
+
+    gaussians: Array
     """(N, d) unit codes; zero = unknown (never seen or never labelled)."""
-    votes: Votes
-    regions: Regions
-    region_codes: Array
+    regions: Array
     """(R, d) unit codes of the regions."""
     autoencoder: Any
-    """Coder of jsecon.paper.codes, or None where the codes are the embeddings themselves."""
+    """What encodes a text in the same way, an `Autoencoder`."""
+
+
+@record
+class LanguageField(_Shown):
+    """Everything a query needs, in one file: the scene, its votes, its regions, and where they came from."""
+
+    gaussians: Gaussians
+    votes: Votes
+    regions: Regions
     cameras: Camera
     """batch of T: the capture's views, for masks and for `--at`."""
     canonical_phrases: Array
@@ -291,6 +308,8 @@ class LanguageField(_Shown):
     unrelated_words: Array | None = None
     """(W, E) embeddings of words unrelated to the scene, W may be 0: what a text's similarity is
     measured against (jsecon.query.scores). None: a field of an earlier version."""
+    codes: Codes | None = None
+    """codes of Gaussians and regions, which only queries by code read; None if the run was not asked for them."""
 
 
 @record

@@ -28,8 +28,7 @@ from jsecon.networks.clip import MAX_BIAS, MAX_SCALE, ClipEmbedder
 from jsecon.networks.sam import SamSegmenter, SamSettings, find_sam
 from jsecon.networks.sam2 import Sam2Tracker
 from jsecon.networks.tokenizer import CLIP_LENGTH, TextTokenizer
-from jsecon.paper.autoencoder import Autoencoder
-from jsecon.paper.codes import Rotation
+from jsecon.paper.autoencoder import encode
 from jsecon.pipeline import cache
 from jsecon.read.captures import images, video
 from jsecon.read.captures.capture import load_capture
@@ -41,7 +40,7 @@ from jsecon.read.masks.proposals import load_proposals
 from jsecon.read.splats.files import read_gaussians
 from jsecon.read.splats.gltf import save_glb
 from jsecon.read.splats.ply import load_ply, load_point_cloud, save_ply
-from jsecon.types import Camera, Gaussians, LanguageField, Parts, Regions, Votes
+from jsecon.types import Autoencoder, Camera, Codes, Gaussians, LanguageField, Parts, Regions, Votes
 from jsecon.vision.stores import EmbeddingStore, StoredSegmenter
 
 
@@ -396,7 +395,7 @@ def labels(folder: Path) -> Iterator[Case]:
     yield Case(sorted(folder.iterdir()), lambda: load_lerf_labels(folder), whole)
 
 
-def _field(coder: Any = None) -> LanguageField:
+def _field(coder: Autoencoder | None = None) -> LanguageField:
     rng = np.random.default_rng(0)
     n, r, e, d, t, k, p = 12, 3, 8, 4, 2, 2, 2
 
@@ -412,11 +411,8 @@ def _field(coder: Any = None) -> LanguageField:
     )  # fmt: skip
     return LanguageField(
         gaussians=_gaussians(n, 4),
-        codes=unit(n, d),
         votes=votes,
         regions=Regions(unit(r, e), rng.integers(0, 9, (r, t)).astype(np.int32)),
-        region_codes=unit(r, d),
-        autoencoder=coder,
         cameras=Camera(np.tile(np.eye(4, dtype=np.float32), (t, 1, 1)), *np.full((4, t), 20, np.float32), 24, 16),
         canonical_phrases=unit(4, e),
         source_from_scene=np.eye(4),
@@ -424,22 +420,21 @@ def _field(coder: Any = None) -> LanguageField:
         embedder="colours",
         provenance='{"jsecon": "1", "options": {"embedder": null}}',
         parts=Parts((np.arange(n) % (p + 1) - 1).astype(np.int32), unit(p, e), positive(p)),
+        codes=None if coder is None else Codes(unit(n, d), unit(r, d), coder),
     )
 
 
 def _coder() -> Autoencoder:
     """Layers of the true layout: 8 -> 4 -> 4, and back."""
 
-    def dense(a, b):
-        return {"kernel": np.full((a, b), 0.1, np.float32), "bias": np.zeros(b, np.float32)}
+    def layer(a, b):
+        return {"weight": np.full((a, b), 0.1, np.float32), "bias": np.zeros(b, np.float32)}
 
-    norm = {"scale": np.ones(4, np.float32), "bias": np.zeros(4, np.float32)}
-    stats = {"mean": np.zeros(4, np.float32), "var": np.ones(4, np.float32)}
-    encoder = {
-        "params": {"Dense_0": dense(8, 4), "BatchNorm_0": norm, "Dense_1": dense(4, 4)},
-        "batch_stats": {"BatchNorm_0": stats},
+    norm = {
+        name: np.full(4, value, np.float32)
+        for name, value in {"scale": 1, "shift": 0, "mean": 0, "variance": 1}.items()
     }
-    return Autoencoder(encoder, {"params": {"Dense_0": dense(4, 4), "Dense_1": dense(4, 8)}})
+    return Autoencoder((layer(8, 4) | norm, layer(4, 4)), (layer(4, 4), layer(4, 8)))
 
 
 def field(folder: Path) -> Iterator[Case]:
@@ -463,17 +458,15 @@ def field(folder: Path) -> Iterator[Case]:
         assert isinstance(json.loads(found.provenance), dict)
         assert type(found.cameras.width) is type(found.cameras.height) is int
         assert min(found.cameras.width, found.cameras.height) > 0
-        if found.autoencoder is not None:
-            codes = found.autoencoder.encode(np.asarray(found.canonical_phrases))
-            assert codes.shape == (len(found.canonical_phrases), found.codes.shape[1])
+        if found.codes is not None:
+            codes = encode(found.codes.autoencoder, np.asarray(found.canonical_phrases))
+            assert codes.shape == (len(found.canonical_phrases), found.codes.regions.shape[1])
             _finite(codes)
 
-    rotation = Rotation(np.eye(8, 4, dtype=np.float32))
     for name, value in {
         "plain": _field(),
-        "rotation": _field(rotation),
         "coder": _field(_coder()),
-        "bare": dataclasses.replace(_field(rotation), parts=None),
+        "bare": dataclasses.replace(_field(), parts=None),
     }.items():
         save_field(folder / f"{name}.safetensors", value)
         yield Case(

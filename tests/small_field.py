@@ -8,11 +8,10 @@ import numpy as np
 
 from jsecon.field.membership import LABELLED_PART, SEEN_PART
 from jsecon.field.votes import region_votes
-from jsecon.paper.codes import region_codes
 from jsecon.paper.distill import distill_votes
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.render import render
-from jsecon.types import Camera, Gaussians, LanguageField, Regions, Votes
+from jsecon.types import Camera, Codes, Gaussians, LanguageField, Regions, Votes
 from jsecon.vision.colours import ColourEmbedder
 
 REGIONS = 5
@@ -42,11 +41,11 @@ def labels_of(scene, cameras, members):
 _made = {}
 
 
-def make_field(scene, cameras, *, dim=12, latent=8):
+def make_field(scene, cameras, *, dim=12):
     """(field, (T, H, W) labels), made once per process for each scene and size."""
-    key = id(scene), id(cameras), dim, latent
+    key = id(scene), id(cameras), dim
     if key not in _made:
-        _made[key] = scene, cameras, *_make_field(scene, cameras, dim, latent)  # the scene keeps its id
+        _made[key] = scene, cameras, *_make_field(scene, cameras, dim)  # the scene keeps its id
     return _made[key][2], _made[key][3].copy()
 
 
@@ -62,7 +61,7 @@ def rows_of_a_kind() -> np.ndarray:
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
 
 
-def _make_field(scene, cameras, dim, latent):
+def _make_field(scene, cameras, dim):
     rng = np.random.default_rng(5)
     scene, cameras = jax.tree.map(jnp.asarray, (scene, cameras))
     labels = labels_of(scene, cameras, true_regions(scene))
@@ -72,15 +71,13 @@ def _make_field(scene, cameras, dim, latent):
         embeddings += ColourEmbedder().embed_text(["red", "green", "blue", "orange", "pink"])
         embeddings /= np.linalg.norm(embeddings, axis=1, keepdims=True)
     embeddings.flags.writeable = False  # several tests share it
-    table, coder, _ = region_codes(jnp.asarray(embeddings), latent=latent, key=jax.random.key(0))
+    left, sizes, _ = np.linalg.svd(embeddings, full_matrices=False)
+    table = left * sizes  # unit rows with the cosines of the embeddings
     pixels = np.stack([(labels == r).sum((1, 2)) for r in range(REGIONS)]).astype(np.int32)
     field = LanguageField(
         gaussians=scene,
-        codes=distill_votes(votes, table),
         votes=votes,
         regions=Regions(embeddings, pixels),
-        region_codes=table,
-        autoencoder=coder,
         cameras=cameras,
         canonical_phrases=unit_rows(rng, 4, dim),
         source_from_scene=np.eye(4),
@@ -88,6 +85,7 @@ def _make_field(scene, cameras, dim, latent):
         embedder="random",
         provenance='{"made by": "a test"}',
         unrelated_words=np.zeros((0, dim), np.float32),
+        codes=Codes(distill_votes(votes, table), table, None),
     )
     return field, labels
 
@@ -132,13 +130,11 @@ def lone_votes(regions, count: int) -> Votes:
 
 
 def field_of(votes: Votes, regions: Regions, **own) -> LanguageField:
-    """A field of votes and regions, and of its `own` parts; else its Gaussians and codes mean nothing."""
+    """A field of votes and regions, and of its `own` parts; else its Gaussians mean nothing."""
     count = votes.regions.shape[0]
     zeros = np.zeros((count, 3), np.float32)
     gaussians = Gaussians(zeros, zeros, np.ones((count, 4), np.float32), zeros[:, 0], zeros[:, None])
     one = np.ones(1, np.float32)
     camera = Camera(np.eye(4)[None], one, one, one, one, 4, 4)
-    codes = np.ones((count, 2), np.float32)
-    table, canonical = np.ones((regions.count, 2), np.float32), np.zeros((0, 8))
-    made = LanguageField(gaussians, codes, votes, regions, table, None, camera, canonical, np.eye(4), ("a",))
+    made = LanguageField(gaussians, votes, regions, camera, np.zeros((0, 8)), np.eye(4), ("a",))
     return dataclasses.replace(made, **own)

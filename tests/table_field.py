@@ -52,11 +52,8 @@ def table_field(things=THINGS, *, source_from_scene=None, directions=((0.0, -2.0
     flat = np.full(len(directions), 50.0, np.float32)
     field = LanguageField(
         gaussians=gaussians,
-        codes=embeddings[member[:, 0]],
         votes=votes,
         regions=Regions(embeddings, pixels),
-        region_codes=embeddings,
-        autoencoder=None,
         cameras=Camera(poses, flat, flat, flat, flat * 0.8, 100, 80),
         canonical_phrases=np.asarray(embedder.canonical_phrases, np.float32),
         source_from_scene=np.eye(4) if source_from_scene is None else source_from_scene,

@@ -13,7 +13,6 @@ from small_field import REGIONS, field_of, make_field, shares, true_regions, uni
 from jsecon.errors import InputError
 from jsecon.field.membership import add_visible_weight, normalise_votes, vote_shares
 from jsecon.field.votes import region_votes
-from jsecon.paper.codes import CODE_THRESHOLD
 from jsecon.query.answer import (
     RULES,
     match_region,
@@ -26,7 +25,7 @@ from jsecon.query.answer import (
 from jsecon.query.classes import query_classes
 from jsecon.query.pixel import pixel_weights, region_at, region_shares_seen
 from jsecon.query.rules import QueryRules
-from jsecon.query.select import select_by_code
+from jsecon.query.select import CODE_THRESHOLD, select_by_code
 from jsecon.splat.render import render
 from jsecon.types import Regions, Votes
 
@@ -114,7 +113,7 @@ def test_a_text_like_a_region_finds_it_and_its_gaussians(field, region):
     np.testing.assert_allclose(got.similarity, share, atol=1e-6)
     np.testing.assert_array_equal(got.mask, share >= 0.5)
     by_code = ask(field, text, "code")
-    cosine = exact_cosine(field.codes, field.region_codes[region])
+    cosine = exact_cosine(field.codes.gaussians, field.codes.regions[region])
     np.testing.assert_allclose(by_code.similarity, cosine, atol=1e-6)
     np.testing.assert_array_equal(by_code.mask, cosine >= 0.9)
 
@@ -197,7 +196,7 @@ def test_what_was_never_seen_is_never_selected(field, by, threshold):
     gone["regions"] = np.where(unseen[:, None], -1, field.votes.regions)
     gone["weights"] = np.where(unseen[:, None], 0, field.votes.weights)
     votes = dataclasses.replace(field.votes, **gone)
-    codes = np.where(unseen[:, None], 0, field.codes)
+    codes = dataclasses.replace(field.codes, gaussians=np.where(unseen[:, None], 0, field.codes.gaussians))
     without = [{"votes": votes}, *([{"codes": codes}] if by == "code" else [])]
     for columns in without:
         hidden = dataclasses.replace(field, **columns)
@@ -229,9 +228,9 @@ def test_a_view_that_lost_the_region_says_nothing_against_it():
 
 def test_numbers_that_are_not_finite_never_select(field):
     nan, inf = np.nan, np.inf
-    codes = np.array(field.codes)
+    codes = np.array(field.codes.gaussians)
     codes[0], codes[1], codes[2], codes[3] = nan, inf, 1e30 * codes[2], 1e-30 * codes[3]
-    broken = dataclasses.replace(field, codes=codes)
+    broken = dataclasses.replace(field, codes=dataclasses.replace(field.codes, gaussians=codes))
     for region in range(REGIONS):
         got, sound = ask_region(broken, region, "code"), ask_region(field, region, "code")
         assert not got.mask[:2].any()
@@ -264,9 +263,9 @@ def test_broken_texts_and_regions_select_nothing(field, by):
     got = ask(lost, text, by, QueryRules(min_score=-1.0))
     assert int(got.region) in (2, 3, 4)
     for value in (0.0, np.nan):
-        table = np.array(field.region_codes)
+        table = np.array(field.codes.regions)
         table[1] = value
-        lost = dataclasses.replace(field, region_codes=table)
+        lost = dataclasses.replace(field, codes=dataclasses.replace(field.codes, regions=table))
         assert not ask_region(lost, 1, "code", -1.0).mask.any()
     assert not ask_region(field, 1, by, np.nan).mask.any()
 
@@ -277,7 +276,7 @@ def test_a_field_without_regions_answers_nothing(field):
         field,
         votes=Votes(*columns, np.ones(64, np.int32), np.int32(0), 0),
         regions=Regions(np.zeros((0, 12), np.float32), np.zeros((0, 4), np.int32)),
-        region_codes=np.zeros((0, 8), np.float32),
+        codes=None,
     )
     for got in (query_anchored(empty, np.ones(12, np.float32)), query_region(empty, 0)):
         assert got.mask.shape == (64,)

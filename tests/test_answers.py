@@ -11,7 +11,8 @@ from test_gltf import read_glb
 
 from jsecon import QueryRules, load_gaussians, query_region, save_field
 from jsecon.app.ask import Answer
-from jsecon.app.outputs import main_regions, write_answers
+from jsecon.app.outputs import write_answers
+from jsecon.app.pictures import main_regions
 from jsecon.pipeline.progress import Listener
 
 
@@ -37,7 +38,7 @@ def test_a_field_is_exported_in_every_format(saved, tmp_path, capsys):
     _, found = read_glb(tmp_path / "scene.glb")
     np.testing.assert_allclose(found["POSITION"], means * [-1, -1, 1], atol=1e-6)
     codes = np.concatenate([found[name] for name in found if name.startswith("_CODE")], axis=1)
-    np.testing.assert_array_equal(codes, field.codes)
+    np.testing.assert_array_equal(codes, field.codes.gaussians)
     regions = main_regions(field)
     np.testing.assert_array_equal(found["_REGION"][:, 0], regions)
     assert set(range(REGIONS)) <= set(found["_REGION"][:, 0].astype(int))

@@ -72,7 +72,7 @@ def test_parts_and_what_no_text_names(room_run, tmp_path, forced):
     assert few.votes.overlap.shape == field.votes.overlap.shape
 
 
-@pytest.mark.parametrize("more", [("--by", "silhouette"), ("--box", "#1", 2, 2, 9, 9)])
+@pytest.mark.parametrize("more", [("--box", "#1", 2, 2, 9, 9)])
 def test_what_needs_all_columns_at_once_is_refused(room_run, tmp_path, forced, capsys, more):
     _, out = room_run
     assert _query(out / "field.safetensors", tmp_path / "answers", "red", *more) == 2

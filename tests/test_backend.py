@@ -8,9 +8,8 @@ from jax.extend.core import jaxprs_in_params
 
 import jsecon
 import jsecon.backend as backend
-from jsecon.field.similarity import similarities, unit_codes
 from jsecon.numerics import FULL_PRECISION, cosine_matrix
-from jsecon.paper.codes import Rotation
+from jsecon.paper.autoencoder import encode, train_autoencoder
 
 pytestmark = pytest.mark.as_shipped
 
@@ -44,15 +43,15 @@ def products(jaxpr):
 
 def test_no_product_of_matrices_is_left_to_the_device(scene, cameras):
     """A GPU keeps 10 bits of a factor that nobody asks it to keep whole."""
-    rows, coder = jnp.ones((9, 40)), Rotation(jnp.ones((40, 5)))
+    rows = jnp.ones((9, 40))
+    coder = train_autoencoder(rows, latent=5, key=jax.random.key(0), epochs=1)
 
     def image(g, c, f):
         return (jsecon.render(g, c[0], f, capacity=4096).features ** 2).sum()
 
     programs = {
         "cosines": lambda *_: cosine_matrix(rows, rows),
-        "similarities": lambda *_: similarities(unit_codes(rows), rows[0])[0],
-        "code": lambda *_: coder.encode(rows),
+        "code": lambda *_: encode(coder, rows),
         "gradients": lambda g, c, _: jax.grad(image, argnums=(0, 2))(g, c, jnp.ones((64, 40))),
         "votes": lambda g, c, x: jsecon.region_votes(g, c, x, 3, capacity=4096).weights,
     }

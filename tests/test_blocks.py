@@ -15,9 +15,8 @@ from jsecon.errors import InputError
 from jsecon.field import columns, view_votes, votes as votes_module
 from jsecon.field.field import load_field, save_field
 from jsecon.field.membership import normalise_votes, normalise_votes_in_blocks, with_overlap
-from jsecon.field.streaming import codes_in_blocks, region_votes_in_blocks, strongest
+from jsecon.field.streaming import region_votes_in_blocks, strongest
 from jsecon.field.votes import region_votes
-from jsecon.paper.distill import distill_votes
 from jsecon.query.answer import query_anchored
 from jsecon.query.blocks import query_in_blocks
 from jsecon.splat.render import render_rgb
@@ -223,15 +222,6 @@ def fields(scene, cameras, tmp_path, monkeypatch):
     monkeypatch.setattr(home, "MAPPED", 0)
     monkeypatch.setattr(columns, "ROWS", 10)
     return field, load_field(tmp_path / "a.safetensors", mapped=True)
-
-
-def test_overlap_and_codes_of_mapped_votes(fields, tmp_path):
-    field, mapped = fields
-    assert isinstance(mapped.votes.regions, np.memmap)
-    for reduce in ("mode", "mean"):
-        codes = codes_in_blocks(mapped.votes, field.region_codes, tmp_path / f"{reduce}.npy", reduce)
-        assert isinstance(codes, np.memmap)
-        np.testing.assert_array_equal(codes, distill_votes(field.votes, field.region_codes, reduce))
 
 
 @pytest.mark.parametrize("by", ["votes", "code"])

@@ -9,8 +9,7 @@ from small_field import make_field
 
 from jsecon import InputError, region_at
 from jsecon.app.ask import ask_text
-from jsecon.app.outputs import main_regions
-from jsecon.app.pictures import Renderer
+from jsecon.app.pictures import Renderer, main_regions
 from jsecon.app.viewer.candidates import candidates, region_along
 from jsecon.vision.colours import BASIC, ColourEmbedder
 

@@ -30,10 +30,8 @@ def made_field(count, *, regions=REGIONS, seed=0):
     votes = Votes(
         ids, weights, labelled, labelled + 1, peak, views, np.int32(0), regions, weight_where_region_visible=shown
     )
-    table = unit_rows(rng, regions, 4)
     known = Regions(unit_rows(rng, regions, SIZE), rng.integers(1, 900, (regions, 2)).astype(np.int32))
-    codes, canonical = np.zeros((count, 4), np.float32), unit_rows(rng, 4, SIZE)
-    return field_of(votes, known, codes=codes, region_codes=table, canonical_phrases=canonical)
+    return field_of(votes, known, canonical_phrases=unit_rows(rng, 4, SIZE))
 
 
 def exact(field, similarity, least):

@@ -167,7 +167,7 @@ def test_eval_prints_the_table_and_writes_every_pair(room_run, room, tmp_path, c
     line = "eval", out / "field.safetensors", "--labels", tmp_path / "one", "--out", tmp_path
     told, words = _object(capsys, *line)
     found = json.loads((tmp_path / "evaluation.json").read_text())
-    assert set(found) == {"anchored", "silhouette", "all", "anchored_code", "one_step", "canonical"}
+    assert set(found) == {"anchored", "all"}
     for kind, summary in found.items():
         assert kind in words
         assert len(summary["rows"]) == summary["pairs"] > 0
@@ -220,10 +220,10 @@ def test_help_lists_the_verbs_and_tyro_prints_a_completion_script(capsys):
 def test_what_is_not_given_has_the_default_of_the_dataclass():
     run = cli.parse(["run", "room", "--out", "out"])
     assert run.options == Options(Path("room"))
-    changed = ["--latent", "auto", "--sh-degree", "2", "--masks", "m", "--downscale", "2", "--weighting", "uniform"]
+    changed = ["--paper", "--sh-degree", "2", "--masks", "m", "--downscale", "2", "--weighting", "uniform"]
     options = cli.parse(["run", "room", "--out=out", *changed]).options
-    found = options.latent, options.sh_degree, options.masks, options.downscale, options.weighting
-    assert found == ("auto", 2, Path("m"), 2, "uniform")
+    found = options.paper, options.sh_degree, options.masks, options.downscale, options.weighting
+    assert found == (True, 2, Path("m"), 2, "uniform")
     assert cli.parse(["fit", "room", "--out", "a.ply", "--steps", "7"]).options == Options(Path("room"), steps=7)
 
 
@@ -248,8 +248,7 @@ def test_options_of_a_query_are_read(line, options):
     ("", "{demo, run,"), ("query f x --out o --thresold 3", "Perhaps you meant: --threshold FLOAT"),
     ("query f x --out o --threshold a", "--threshold does not take 'a'"),
     ("run c --out o --steps 1.5", "--steps does not take '1.5'"),
-    ("run c --out o --latent few", "--latent does not take 'few'"),
-    ("query f x --out o --by magic", "'silhouette'"), ("query f --out o --at 0 1", "--at'. Expected 3"),
+    ("query f x --out o --by magic", "'votes'"), ("query f --out o --at 0 1", "--at'. Expected 3"),
     ("query f x --out", "--out'. Expected 1"), ("models look x", "'check'"),
 ])  # fmt: skip
 def test_a_wrong_line_is_one_sentence_and_exit_code_2(capsys, line, says):

@@ -44,7 +44,7 @@ def finished(tmp_path_factory):
 def test_metrics_have_every_figure_that_is_promised(finished):
     metrics, out, seconds = finished
     assert json.loads((out / "metrics.json").read_text()) == metrics
-    for kind in ("anchored", "silhouette", "all", "anchored_code", "one_step", "canonical", "true_masks"):
+    for kind in ("anchored", "all", "true_masks"):
         assert set(metrics[kind]) >= {"miou", "macc", "loc_acc"}
         assert all(0 <= metrics[kind][name] <= 1 for name in ("miou", "macc", "loc_acc"))
     assert metrics["true_masks"]["miou"] > 0.25  # a tiny room and a short fit: far from the figures and from chance
@@ -107,11 +107,11 @@ def test_a_second_call_finds_it_all_done(finished, monkeypatch):
     assert again["anchored"] == metrics["anchored"]
 
 
-def test_codes_are_shown_in_colours_that_tell_regions_apart(finished):
+def test_regions_are_shown_in_colours_that_tell_them_apart(finished):
     _, out, _ = finished
     field = load_field(out / "field.safetensors")
-    colours = pictures.code_colours(field)
-    known = np.abs(np.asarray(field.codes)).max(1) > 0
+    colours = pictures.region_colours(field)
+    known = pictures.main_regions(field) >= 0
     assert colours.shape == (field.gaussians.count, 3)
     assert ((colours >= 0) & (colours <= 1)).all()
     np.testing.assert_array_equal(colours[~known], np.full((int((~known).sum()), 3), pictures.UNKNOWN))

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon import query_canonical, query_one_step, unit_codes
+from jsecon import query_canonical, query_one_step
 
 
 def exact_cosines(codes, code):
@@ -50,24 +50,6 @@ def test_nan_threshold_and_no_gaussians_select_nothing_and_sizes_that_disagree_a
         query_canonical(jnp.eye(3), jnp.ones(3), jnp.zeros((0, 3)), 0.5)
     with pytest.raises(ValueError, match="text"):
         query_canonical(jnp.eye(3), jnp.ones(2), jnp.ones((1, 3)), 0.5)
-
-
-@pytest.mark.parametrize("size", [3, 512])
-def test_unit_codes_answer_as_codes_do_under_jit_and_vmap(size):
-    rng = np.random.default_rng(size)
-    codes, texts = (rng.normal(size=(n, size)).astype(np.float32) for n in (300, 2))
-    codes[:3] = [[0] * size, [np.nan] * size, [1e30] * size]
-    units = unit_codes(codes)
-    many = jax.jit(jax.vmap(lambda text: query_one_step(units, text, 0.1)))(texts)
-    for index, text in enumerate(texts):
-        alone, plain = query_one_step(units, text, 0.1), query_one_step(codes, text, 0.1)
-        expected = exact_cosines(codes[2:], text)
-        for got in (alone, plain, jax.tree.map(lambda a, index=index: a[index], many)):
-            np.testing.assert_allclose(got.similarity[2:], expected, atol=1e-6)
-            assert not np.asarray(got.mask)[:2].any()
-    assert float(query_one_step(units, texts[0], -1.0).mask[:2].sum()) == 0
-    relevancy = query_canonical(units, texts[0], texts, 0.5).similarity
-    np.testing.assert_allclose(relevancy, query_canonical(codes, texts[0], texts, 0.5).similarity, atol=1e-6)
 
 
 def exact_relevancy(features, text, canonical):

@@ -9,7 +9,7 @@ import pytest
 from safetensors.numpy import load_file, save_file
 from small_field import REGIONS, make_field, unit_rows
 
-from jsecon import InputError, check_field, load_field, save_field, train_autoencoder, with_overlap
+from jsecon import InputError, check_field, encode, load_field, save_field, train_autoencoder, with_overlap
 from jsecon.field import field as module
 from jsecon.files import read_arrays, write_arrays
 from jsecon.types import Parts
@@ -44,18 +44,23 @@ def test_what_goes_in_comes_out_in_equal_bytes_and_without_a_pickle(field, path,
     assert all(array.dtype.kind in "biuf" for array in others.values())
 
 
-def test_with_an_autoencoder_and_without_any_coder(field, tmp_path):
-    coder = train_autoencoder(unit_rows(np.random.default_rng(0), 1, 12), latent=8, key=jax.random.key(0), epochs=1)
-    for changed in (dataclasses.replace(field, autoencoder=coder), dataclasses.replace(field, autoencoder=None)):
+def test_with_an_autoencoder_and_without_codes(field, tmp_path):
+    coder = train_autoencoder(unit_rows(np.random.default_rng(0), 1, 12), latent=5, key=jax.random.key(0), epochs=1)
+    coded = dataclasses.replace(field, codes=dataclasses.replace(field.codes, autoencoder=coder))
+    for changed in (coded, dataclasses.replace(field, codes=None)):
         save_field(tmp_path / "a.field", changed)
-        back = load_field(tmp_path / "a.field")
-        assert_same(back, changed)
+        assert_same(load_field(tmp_path / "a.field"), changed)
+    save_field(tmp_path / "a.field", coded)
     texts = unit_rows(np.random.default_rng(1), 3, 12)
-    save_field(tmp_path / "a.field", dataclasses.replace(field, autoencoder=coder))
-    np.testing.assert_array_equal(load_field(tmp_path / "a.field").autoencoder.encode(texts), coder.encode(texts))
-    bare = dataclasses.replace(coder, encoder=coder.encoder | {"batch_stats": {}})
-    with pytest.raises(ValueError, match=r"a coder that does not encode.*batch_stats"):
-        save_field(tmp_path / "b.field", dataclasses.replace(field, autoencoder=bare))
+    read = load_field(tmp_path / "a.field").codes.autoencoder
+    np.testing.assert_array_equal(encode(read, texts), encode(coder, texts))
+    for encoder in (coder.encoder[1:], coder.encoder[:-1], (coder.encoder[-1], *coder.encoder[1:])):
+        broken = dataclasses.replace(coder, encoder=encoder)
+        with pytest.raises(ValueError, match="layers do not lead"):
+            save_field(
+                tmp_path / "b.field",
+                dataclasses.replace(field, codes=dataclasses.replace(coded.codes, autoencoder=broken)),
+            )
 
 
 def test_with_the_parts_of_the_scene(field, tmp_path):
@@ -77,9 +82,7 @@ def test_empty_scene_and_no_regions(field, tmp_path):
     gaussians, votes, codes = jax.tree.map(none, (field.gaussians, field.votes, field.codes))
     regions = jax.tree.map(none, field.regions)
     votes = dataclasses.replace(votes, num_regions=0, overlap=np.zeros((0, 0), np.float32))
-    changed = dataclasses.replace(
-        field, gaussians=gaussians, votes=votes, codes=codes, regions=regions, region_codes=none(field.region_codes)
-    )
+    changed = dataclasses.replace(field, gaussians=gaussians, votes=votes, codes=codes, regions=regions)
     save_field(tmp_path / "a.field", changed)
     assert_same(load_field(tmp_path / "a.field"), changed)
 
@@ -130,8 +133,9 @@ def exchanged(header, record, name, other):
 
 @pytest.mark.parametrize(("change", "match"), [
     (lambda h, a: h.update(version=99), "version 99"), (lambda h, a: h.pop("field"), "damaged"),
-    (lambda h, a: a.pop("codes"), "damaged"), (lambda h, a: a.update(codes=a["codes"][:-1]), "damaged"),
-    (lambda h, a: h["field"]["fields"].pop("codes"), "damaged"),
+    (lambda h, a: a.pop("codes.gaussians"), "damaged"),
+    (lambda h, a: a.update({"codes.regions": a["codes.regions"][:-1]}), "damaged"),
+    (lambda h, a: h["field"]["fields"].pop("votes"), "damaged"),
     (lambda h, a: h["field"].update(record="Popen"), "damaged"),
     (lambda h, a: h.update(field={"value": 3}), "no field at its root"),
     (lambda h, a: h["field"]["fields"].update(gaussians={"value": None}), "damaged"),
@@ -195,13 +199,13 @@ def test_numbers_that_are_not_finite_are_found_a_piece_at_a_time(path, monkeypat
 
 def test_fields_that_do_not_fit_together_are_not_written(field, tmp_path):
     for changed in (
-        dataclasses.replace(field, codes=field.codes[:-1]),
-        dataclasses.replace(field, region_codes=field.region_codes[:, :2]),
+        dataclasses.replace(field, codes=dataclasses.replace(field.codes, gaussians=field.codes.gaussians[:-1])),
+        dataclasses.replace(field, codes=dataclasses.replace(field.codes, regions=field.codes.regions[:, :2])),
         dataclasses.replace(field, names=("one",)),
         dataclasses.replace(field, votes=dataclasses.replace(field.votes, overlap=np.eye(REGIONS - 1))),
-        dataclasses.replace(field, autoencoder={"w": jnp.ones(3, jnp.bfloat16)}),
+        dataclasses.replace(field, codes=dataclasses.replace(field.codes, autoencoder=jnp.ones(3, jnp.bfloat16))),
     ):
-        with pytest.raises(ValueError, match=r"save_field|autoencoder\.w: got .*bfloat16"):
+        with pytest.raises(ValueError, match=r"save_field|autoencoder: got .*bfloat16"):
             save_field(tmp_path / "a.field", changed)
     assert not list(tmp_path.iterdir())  # neither the file nor a temporary one
 

@@ -31,7 +31,7 @@ from jsecon.process import peak_memory_mib
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Models
 
-STAGES = ("load", "gaussians", "masklets", "regions", "codes", "votes", "distil", "held_out")
+STAGES = ("load", "gaussians", "masklets", "regions", "votes", "held_out")
 
 
 class Recorder(Listener):
@@ -60,7 +60,7 @@ def test_a_run_ends_in_a_field_that_can_be_read_and_asked(room_run):
     field = load_field(out / "field.safetensors")
     assert field.gaussians.count == run.field.gaussians.count > 100
     assert field.names == run.capture.names
-    assert field.codes.shape == (field.gaussians.count, field.region_codes.shape[1])
+    assert field.codes is None
     assert field.votes.overlap.shape == (field.regions.count, field.regions.count)
     assert len(run.psnr) == run.capture.held_out.sum() == 2
     assert (np.asarray(field.regions.pixel_counts)[:, run.capture.held_out] == 0).all()
@@ -81,8 +81,7 @@ def test_a_second_run_reads_every_stage_and_writes_the_same_bytes(room_run, tmp_
 
 
 @pytest.mark.parametrize(("changes", "rerun"), [
-    ({"reduce": "mean"}, {"distil"}), pytest.param({"latent": 3}, {"codes", "distil"}, marks=pytest.mark.long),
-    ({"top": 4}, {"votes", "distil"}),
+    ({"paper": True}, {"codes"}), ({"top": 4}, {"votes"}),
 ])  # fmt: skip
 def test_a_changed_option_reruns_only_what_depends_on_it(room_run, tmp_path, monkeypatch, changes, rerun):
     monkeypatch.setattr(autoencoder, "MIN_STEPS", 1)  # it is enough that one is trained, by LangSplat's 100 epochs
@@ -111,7 +110,7 @@ def test_votes_of_a_scene_larger_than_memory_are_cast_in_blocks_to_the_same_fiel
         file.unlink()
     monkeypatch.setenv("JSECON_MEMORY", "1e-6")
     monkeypatch.setattr(cache, "MAPPED", 1000)  # what is kept of them is mapped, as were it larger
-    _, listener = _again(run, tmp_path / "out", reduce="mean")  # so that codes are made of them too
+    _, listener = _again(run, tmp_path / "out", paper=True)  # codes are made of them too
     assert any("votes are cast in blocks: " in note for note in listener.notes)
     assert sorted(path.suffix for path in (tmp_path / "out" / "cache").iterdir()) == [".TAG"] + 9 * [".safetensors"]
     blocks, memory = (load_field(folder / "field.safetensors").votes for folder in (tmp_path / "out", out))
@@ -144,7 +143,6 @@ def test_the_plan_says_what_is_left_out_and_why(room_run, on_given_gaussians, tm
     assert listener.planned["photometric fit"].status == "skipped"
     assert listener.planned["gaussians"].status == "run"
     np.testing.assert_array_equal(given.field.gaussians.means, run.field.gaussians.means)
-    np.testing.assert_array_equal(given.field.codes, run.field.codes)
 
 
 def test_the_same_scene_far_away_in_another_world_and_unit_gives_the_same_answers(room, on_given_gaussians, tmp_path):
@@ -196,7 +194,7 @@ def test_what_is_held_out_never_reaches_the_field(room_run, room, tmp_path):
     noisy = dataclasses.replace(short, capture=tmp_path / "noise", masks=tmp_path / "noise" / "masks")
     one, other = (pipeline.run(options, tmp_path / f"out{n}") for n, options in enumerate((short, noisy)))
     assert not np.array_equal(other.capture.frames, one.capture.frames)
-    for name in ("gaussians", "codes", "votes", "regions", "region_codes"):
+    for name in ("gaussians", "votes", "regions"):
         want, have = (jax.tree.leaves(getattr(r.field, name)) for r in (one, other))
         for a, b in zip(have, want, strict=True):
             np.testing.assert_array_equal(a, b, err_msg=name)
@@ -245,7 +243,7 @@ def test_default_vision_finds_regions_by_itself(room, room_run, tmp_path):
 @pytest.mark.parametrize(("changes", "where"), [
     ({"capture": Path("nowhere")}, "nowhere"), ({"gaussians": Path("nowhere.ply")}, "nowhere.ply"),
     ({"masks": Path("nowhere")}, "nowhere"), ({"steps": 0}, "--steps"), ({"frames": 1}, "--frames"),
-    ({"downscale": 0.5}, "--downscale"), ({"latent": 0}, "--latent"),
+    ({"downscale": 0.5}, "--downscale"),
 ])  # fmt: skip
 def test_what_cannot_be_is_refused_before_any_work(room_run, tmp_path, changes, where):
     run, _ = room_run
@@ -361,7 +359,7 @@ def test_a_run_killed_in_each_stage_and_started_again_ends_in_the_same_bytes(roo
         command = [sys.executable, "-c", DRIVER, str(room), str(out), victim, str(nth)]
         assert subprocess.run(command, env=environ, capture_output=True).returncode == -signal.SIGKILL, victim
 
-    order = ("load", "masklets", "gaussians checkpoint", "gaussians", "regions", "codes", "votes", "distil", "held_out")
+    order = ("load", "masklets", "gaussians checkpoint", "gaussians", "regions", "votes", "held_out")
     assert {victim.split()[0] for victim in order} == set(STAGES)
     for victim in (*order, "field"):
         if victim in ("gaussians checkpoint", "votes"):

@@ -10,7 +10,7 @@ from browser import CHROMIUM, WEBGL, dumped
 from small_field import make_field
 
 from jsecon.app.ask import Answer
-from jsecon.app.outputs import main_regions
+from jsecon.app.pictures import main_regions
 from jsecon.app.viewer.static_page import NO_REGION, page
 from jsecon.field.membership import vote_shares
 from jsecon.splat.sh import C0

@@ -23,7 +23,10 @@ def calls(field, labels):
     def by_view():
         return jsecon.region_votes(scene, cameras, labels, REGIONS, by_view=True)
 
-    mask = np.arange(scene.count) < 9
+    def autoencoder():
+        return jsecon.train_autoencoder(field.regions.embeddings, latent=2, key=jax.random.key(0), epochs=1)
+
+    codes, mask = field.codes.gaussians, np.arange(scene.count) < 9
     boxes = [np.array([[0.0, 0.0, 2.0, 2.0]])]
     descent = {"steps": 1, "key": jax.random.key(0)}
     return {
@@ -39,8 +42,8 @@ def calls(field, labels):
         "with_overlap": lambda: jsecon.with_overlap(field.votes),
         "normalise_votes": lambda: jsecon.normalise_votes(by_view(), field.regions),
         "membership_probability": lambda: jsecon.membership_probability(jnp.full(scene.count, 0.5), field.votes),
-        "distill_votes": lambda: jsecon.distill_votes(field.votes, field.region_codes),
-        "distill_l1": lambda: jsecon.distill_l1(scene, cameras, labels, field.region_codes, **descent),
+        "distill_votes": lambda: jsecon.distill_votes(field.votes, field.codes.regions),
+        "distill_l1": lambda: jsecon.distill_l1(scene, cameras, labels, field.codes.regions, **descent),
         "match_regions": lambda: jsecon.match_regions(field, field.regions.embeddings[:2]),
         "select_gaussians": lambda: jsecon.select_gaussians(
             field, jsecon.match_regions(field, field.regions.embeddings)
@@ -49,23 +52,22 @@ def calls(field, labels):
         "query_region": lambda: jsecon.query_region(field, 1),
         "query_several": lambda: jsecon.query_several(field, field.regions.embeddings[:2]),
         "query_classes": lambda: jsecon.query_classes(field, field.regions.embeddings[:2]),
-        "query_one_step": lambda: jsecon.query_one_step(field.codes, field.region_codes[0], 0.5),
-        "query_canonical": lambda: jsecon.query_canonical(field.codes, field.codes[0], field.codes[1:3], 0.5),
-        "unit_codes": lambda: jsecon.unit_codes(field.codes),
+        "query_one_step": lambda: jsecon.query_one_step(codes, codes[0], 0.5),
+        "query_canonical": lambda: jsecon.query_canonical(codes, codes[0], codes[1:3], 0.5),
+        "encode": lambda: jsecon.encode(autoencoder(), field.regions.embeddings),
+        "decode": lambda: jsecon.decode(autoencoder(), codes[:, :2]),
         "selection_mask": lambda: jsecon.selection_mask(scene, camera, mask),
         "iou": lambda: jsecon.iou(mask, ~mask),
         "mean_iou": lambda: jnp.asarray(jsecon.mean_iou([0.5, None])),
         "accuracy_at": lambda: jnp.asarray(jsecon.accuracy_at([0.5, None])),
         "localization_accuracy": lambda: jnp.asarray(jsecon.localization_accuracy([(1.0, 1.0)], boxes)),
-        "train_autoencoder": lambda: jsecon.train_autoencoder(
-            field.regions.embeddings, latent=2, key=jax.random.key(0), epochs=1
-        ),
+        "train_autoencoder": autoencoder,
     }
 
 
 HOST = {
     *("show", "to_html", "to_png", "locate", "masklets", "check_backend", "load_capture", "load_gaussians"),
-    *("save_gaussians", "load_ply", "save_ply", "codes_in_blocks", "region_votes_in_blocks", "check_field"),
+    *("save_gaussians", "load_ply", "save_ply", "region_votes_in_blocks", "check_field"),
     "normalise_votes_in_blocks",
     *("load_field", "save_field", "region_embeddings", "host_mesh", "query_in_blocks", "lift", "remove_outliers"),
     *("region_at", "plan_capacity", "objects", "object_shapes", "measure", "query_relation"),
@@ -90,7 +92,7 @@ def test_labels_that_are_no_regions_are_refused(made, tmp_path):
             *given, labels, count, folder=tmp_path / str(count)
         ),
         "distill_l1": lambda labels, count: jsecon.distill_l1(
-            *given, labels, field.region_codes[:count], steps=1, key=jax.random.key(0)
+            *given, labels, field.codes.regions[:count], steps=1, key=jax.random.key(0)
         ),
         "region_embeddings": lambda labels, count: jsecon.region_embeddings(
             np.zeros((*labels.shape, 3), np.uint8), labels, lambda _, masks: np.ones((len(masks), 2)), num_regions=count

@@ -59,9 +59,9 @@ def test_another_candidate_takes_the_place_of_its_thing():
 
 
 def test_controls_apply_to_all_that_is_lit_up_and_stay_within_their_ends():
-    state = MUG.with_texts("a; b").with_controls(threshold=0.7, part_vs_whole=2, all_matches=True, colouring="code")
+    state = MUG.with_texts("a; b").with_controls(threshold=0.7, part_vs_whole=2, all_matches=True, colouring="region")
     assert state.view_queries == (ViewQuery("a", 0.7, 1.0, True), ViewQuery("b", 0.7, 1.0, True))
-    assert state.colouring == "code"
+    assert state.colouring == "region"
     assert state.with_controls(threshold=-1).threshold == 0
     grown = MUG.with_controls(shells=-2)
     assert from_link(grown.link).view_queries == (ViewQuery("red mug", shells=-2),)

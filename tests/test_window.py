@@ -21,10 +21,10 @@ from small_field import shares, unit_rows
 from test_direct import exact_cosines, exact_relevancy
 
 from jsecon.field.membership import add_visible_weight, inside_fraction, with_overlap
-from jsecon.field.similarity import similarities, unit_codes
+from jsecon.field.similarity import similarities
 from jsecon.fit.photometric import l1, psnr
+from jsecon.paper.autoencoder import encode
 from jsecon.paper.baselines import query_canonical, query_one_step
-from jsecon.paper.codes import Rotation, Spread
 from jsecon.paper.distill import distill_votes
 from jsecon.query.answer import match_regions, query_anchored, query_several
 from jsecon.query.classes import query_classes
@@ -34,7 +34,7 @@ from jsecon.query.select import select_by_code
 from jsecon.splat.project import project
 from jsecon.splat.sh import colours_from_sh
 from jsecon.splat.transform import transform_gaussians
-from jsecon.types import Camera
+from jsecon.types import Camera, Codes
 
 pytestmark = [pytest.mark.as_shipped, pytest.mark.long]
 
@@ -77,23 +77,12 @@ def test_canonical():
     np.testing.assert_allclose(query_canonical(features, texts[1], phrases, 0.5).similarity, expected[1], atol=3e-6)
 
 
-def test_unit_codes():
-    codes, texts = normal(COUNT, 40), normal(2, 40)
-    codes[:3] = [[0] * 40, [np.nan] * 40, [1e30] * 40]
-    units = unit_codes(codes)
-    found = compiled(lambda text, units: query_one_step(units, text, 0.1), texts, units)
-    for text, similarity, mask in zip(texts, found.similarity, found.mask):
-        np.testing.assert_allclose(similarity[2:], exact_cosines(codes[2:], text), atol=1e-6)
-        assert not mask[:2].any()
-    relevancy = query_canonical(units, texts[0], texts, 0.5).similarity
-    np.testing.assert_allclose(relevancy[2:], exact_relevancy(codes[2:], texts[0], texts), atol=3e-6)
-
-
 @pytest.fixture
 def field():
     """Random votes and codes for six regions."""
     made = of_classes.made_field(COUNT)
-    return dataclasses.replace(made, codes=unit_rows(np.random.default_rng(1), COUNT, 4))
+    rng = np.random.default_rng(1)
+    return dataclasses.replace(made, codes=Codes(unit_rows(rng, COUNT, 4), unit_rows(rng, made.regions.count, 4), None))
 
 
 def test_anchored(field):
@@ -108,7 +97,9 @@ def test_anchored(field):
     )
     for n, region in enumerate(asked):
         np.testing.assert_allclose(by_votes[n], shares(field, [region]).clip(max=1), atol=1e-6)
-        np.testing.assert_allclose(by_code[n], exact_cosines(field.codes, field.region_codes[region]), atol=1e-6)
+        np.testing.assert_allclose(
+            by_code[n], exact_cosines(field.codes.gaussians, field.codes.regions[region]), atol=1e-6
+        )
 
 
 def test_several(field):
@@ -181,28 +172,18 @@ def test_reductions_of_votes(reduce):
         np.testing.assert_allclose(found[n], of_distill.exact(small, table, reduce)[rows], atol=3e-5)
 
 
-def test_coders():
-    units, many = unit_rows(np.random.default_rng(0), 5, 12), unit_rows(np.random.default_rng(1), COUNT, 12)
-    basis = np.linalg.qr(normal(12, 4))[0]
-    expected = many.astype(np.float64) @ basis
-    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
-    np.testing.assert_allclose(compiled(Rotation(jnp.asarray(basis)).encode, many), expected, atol=2e-6)
-    table = unit_rows(np.random.default_rng(2), 5, 3)
-    weights = np.exp(40 * (many.astype(np.float64) @ units.T - 1))
-    expected = weights @ table
-    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
-    found = compiled(Spread(jnp.asarray(units), jnp.asarray(table)).encode, many)
-    np.testing.assert_allclose(found, expected, atol=3e-5)
+def test_encode():
+    many = unit_rows(np.random.default_rng(1), COUNT, 12)
     rng = np.random.default_rng(3)
 
     def drawn(leaf):
         return rng.uniform(0.1, 0.2, leaf.shape).astype(np.float32) * rng.choice([-1, 1], leaf.shape)
 
     coder = jax.tree.map(drawn, of_autoencoder.shapes_of(12, 3))
-    variances = jax.tree.map(np.abs, coder.encoder["batch_stats"])
-    coder = dataclasses.replace(coder, encoder=coder.encoder | {"batch_stats": variances})
+    encoder = tuple(layer | {n: abs(layer[n]) for n in ("variance",) if n in layer} for layer in coder.encoder)
+    coder = dataclasses.replace(coder, encoder=encoder)
     expected = of_autoencoder.encoded(coder, many)
-    np.testing.assert_allclose(compiled(lambda row, coder: coder.encode(row), many, coder), expected, atol=1e-3)
+    np.testing.assert_allclose(compiled(lambda row, coder: encode(coder, row), many, coder), expected, atol=1e-3)
 
 
 @pytest.fixture

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from experiments.rivals.evidence import Evidence, with_room
-from jsecon.paper.autoencoder import Autoencoder, train_autoencoder
+from jsecon.paper.autoencoder import decode, encode, train_autoencoder
 from jsecon.paper.distill import distill_l1
-from jsecon.types import Array
+from jsecon.types import Array, Autoencoder
 
 STEPS = 30_000
 LATENT = 3
@@ -36,7 +36,7 @@ class LangSplat:
 
     def features(self) -> Float[Array, "n e"]:
         """(N, E) decoded codes; zero where the code is unknown."""
-        decoded = self.autoencoder.decode(self.codes)
+        decoded = decode(self.autoencoder, self.codes)
         return jnp.where(jnp.any(self.codes != 0, axis=-1, keepdims=True), decoded, 0.0)
 
 
@@ -48,7 +48,7 @@ def train_langsplat(evidence: Evidence, *, key: Array, steps: int = STEPS, **tra
     """
     coder_key, code_key = jax.random.split(key)
     autoencoder = train_autoencoder(jnp.asarray(evidence.embeddings), latent=LATENT, key=coder_key, **training)
-    table = autoencoder.encode(jnp.asarray(evidence.embeddings))
+    table = encode(autoencoder, jnp.asarray(evidence.embeddings))
     given = with_room(evidence.gaussians), evidence.cameras, jnp.asarray(evidence.masks), table
     codes, history = distill_l1(*given, steps=steps, key=code_key, init="random", learning_rate=RATE)
     return LangSplat(codes[: evidence.gaussians.count], autoencoder, history)

@@ -9,6 +9,7 @@ import numpy as np
 from experiments.rivals.evidence import with_room
 from experiments.tables.answers import Answers, Method, Steps, by_selection
 from experiments.tables.association import Association, associated, by_consensus, proposals
+from experiments.tables.codes import encode, region_codes
 from experiments.tables.setting import Setting
 from jsecon.association.consensus import pieces_on_masks
 from jsecon.association.scene import SceneSuperpixels
@@ -17,15 +18,14 @@ from jsecon.field.regions import scene_parts
 from jsecon.field.votes import region_votes
 from jsecon.paper.autoencoder import train_autoencoder
 from jsecon.paper.baselines import query_canonical, query_one_step
-from jsecon.paper.codes import CODE_THRESHOLD, encode, region_codes
 from jsecon.paper.distill import distill_l1, distill_votes
 from jsecon.query.answer import match_regions, query_anchored, query_several
 from jsecon.query.classes import query_classes
 from jsecon.query.grouping import parts_fallback
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.rules import FRAGMENT_SCORE, QueryRules
-from jsecon.query.select import select_by_code
-from jsecon.types import LanguageField, Parts, Regions, Selection, Votes
+from jsecon.query.select import CODE_THRESHOLD, codes_of, select_by_code
+from jsecon.types import Codes, LanguageField, Parts, Regions, Selection, Votes
 
 BY_COSINE = {"retrieval": "cosine"}
 """the region of the largest cosine, as the paper finds it"""
@@ -82,7 +82,7 @@ def field_of(
     else:
         epochs = None if steps is None else steps.epochs
         coder = train_autoencoder(embeddings, latent=latent, key=key, epochs=epochs)
-        table = coder.encode(embeddings)
+        table = encode(coder, embeddings)
     if steps is None:
         codes = distill_votes(votes, table)
     else:
@@ -92,16 +92,14 @@ def field_of(
         codes = codes[: evidence.gaussians.count]
     return LanguageField(
         evidence.gaussians,
-        codes,
         votes,
         known,
-        table,
-        coder,
         evidence.cameras,
         setting.canonical_phrases,
         np.eye(4),
         setting.names,
         unrelated_words=setting.unrelated_words,
+        codes=Codes(codes, table, coder),
     )
 
 
@@ -141,7 +139,7 @@ def ask_field(
     votes, parts answer where no region does (`parts_fallback`)."""
     means = np.asarray(setting.evidence.gaussians.means)
     field = of_all_views(field) if way == "all_views" else field
-    phrases = jnp.asarray(field.canonical_phrases)
+    phrases, codes = jnp.asarray(field.canonical_phrases), codes_of(field)
     rules = QueryRules(retrieval=retrieval, min_score=min_score)
     rules = rules if pieces else dataclasses.replace(rules, fragment_score=None)
 
@@ -152,12 +150,11 @@ def ask_field(
             found = query_several(field, text[None], rules=every)
             return dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, found.mask, keep="all")))
         if way == "one_step":
-            found = query_one_step(
-                field.codes, encode(field.autoencoder, text), 0.9 if threshold is None else threshold
-            )
+            code = encode(codes.autoencoder, text)
+            found = query_one_step(codes.gaussians, code, 0.9 if threshold is None else threshold)
         elif way == "canonical":
-            code, canonical = encode(field.autoencoder, text), encode(field.autoencoder, phrases)
-            found = query_canonical(field.codes, code, canonical, 0.5 if threshold is None else threshold)
+            code, canonical = encode(codes.autoencoder, text), encode(codes.autoencoder, phrases)
+            found = query_canonical(codes.gaussians, code, canonical, 0.5 if threshold is None else threshold)
         elif way == "probability":
             found = query_anchored(field, text, rules=dataclasses.replace(rules, min_score=None))
             probability = membership_probability(found.similarity, field.votes)
@@ -177,7 +174,7 @@ def ask_field(
         return dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, mask))) if clean else found
 
     if way not in ("votes", "all"):
-        return by_selection(setting, ask, field.codes)
+        return by_selection(setting, ask, codes.gaussians)
     texts = jnp.asarray(setting.texts)
 
     def classes():
@@ -185,7 +182,7 @@ def ask_field(
             query_classes(field, texts, rules=QueryRules(retrieval=retrieval), standardise=False, every=True)[0]
         )
 
-    return Answers(ask, classes, features=field.codes)
+    return Answers(ask, classes, features=codes.gaussians)
 
 
 def asked(way: str, *, retrieval: str = "apart", clean: bool = True, pieces: bool = False, **options) -> Method:

@@ -16,10 +16,10 @@ from experiments.rivals import lifting
 from experiments.rivals.evidence import Evidence
 from experiments.tables.answers import Answers
 from experiments.tables.setting import Setting
+from experiments.tables.silhouette import SILHOUETTE_WEIGHTS, fit_silhouette
 from jsecon.errors import require
 from jsecon.numerics import cosine_matrix, normalize
 from jsecon.paper.baselines import relevancies
-from jsecon.query.silhouette import SILHOUETTE_WEIGHTS, fit_silhouette
 from jsecon.types import Selection
 
 RULES = ("cosine", "relevancy", "contrast", "apart")

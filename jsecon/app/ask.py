@@ -21,7 +21,6 @@ from jaxtyping import Bool, Int
 from jsecon.errors import InputError, require
 from jsecon.field.columns import is_mapped
 from jsecon.field.field import subset_field
-from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.field.regions import ALIKE_THRESHOLD
 from jsecon.query import edits
 from jsecon.query.answer import ONE_REGION, RegionMatch, match_region, match_regions, select_gaussians
@@ -32,14 +31,13 @@ from jsecon.query.outliers import split_outliers
 from jsecon.query.pixel import region_at
 from jsecon.query.rules import FRAGMENT_SCORE, MIN_RANK, QueryRules
 from jsecon.query.select import select_by_code
-from jsecon.query.silhouette import SILHOUETTE_WEIGHTS, fit_silhouette
 from jsecon.read.captures.images import read_pixels
 from jsecon.read.masks.masks import resize_nearest
 from jsecon.types import LanguageField, Selection
 
 T = TypeVar("T")
-METHODS = ("votes", "silhouette", "code")
-"""how a region selects Gaussians: by their votes, by these and the outline in the views, or by their codes"""
+METHODS = ("votes", "code")
+"""how a region selects Gaussians: by their votes, or by their codes"""
 PARTS_ANSWER = {"regions": "no region holds the object, so the parts that match the text were selected"}
 """why a text is answered by parts"""
 MIN_BLOCK_ROWS = 1 << 12
@@ -207,6 +205,7 @@ def _match_text(
 ) -> _Match:
     """Finds the regions that match a text, or the parts that answer in place of them."""
     require(by in METHODS, "by", by, f"one of {METHODS}", "votes is the default.")
+    _require_codes(field, by)
     field = with_phrases(field, embedder)
     included, excluded = parse_query(text)
     # Of an embedder trained to tell whether a text is true of an image; the cosines of all others only rank.
@@ -216,7 +215,7 @@ def _match_text(
     excluded = narrow_texts(field, embedder, excluded, rules, every=True)
     if several and by == "code":
         problem = "codes cannot select several regions"
-        raise InputError(f"query {text!r}", problem, remedy="Ask by votes or silhouette, or for one thing.")
+        raise InputError(f"query {text!r}", problem, remedy="Ask by votes, or for one thing.")
     embedded = embedder.embed_text(included + excluded)  # NumPy's slices need no compilation
     texts, without = jax.device_put((embedded[: len(included)], embedded[len(included) :]))
     regions = match_regions(field, texts, rules, excluded=without)
@@ -290,25 +289,24 @@ def _match_pixel(field: LanguageField, frame: int | str, x: int, y: int) -> _Mat
 def _select(field: LanguageField, match: _Match, by: str, threshold: float | None, outliers: bool) -> Answer:
     """Selects the Gaussians of matching regions."""
     require(by in METHODS, "by", by, f"one of {METHODS}", "votes is the default.")
+    _require_codes(field, by)
     if match.parts is not None:
         selection = match.parts
     elif by == "code":
         selection = select_by_code(field, match.regions, *(() if threshold is None else (threshold,)))
     else:
         selection = select_gaussians(field, match.regions, _with_share(QueryRules(), threshold))
-    return _finish(field, match, selection, by, threshold, outliers)
+    return _finish(field, match, selection, by, outliers)
 
 
-def _finish(
-    field: LanguageField, match: _Match, selection: Selection, by: str, threshold: float | None, outliers: bool
-) -> Answer:
-    """Trims a selection by silhouette and outliers."""
-    if by == "silhouette":
-        scene = field.gaussians, field.cameras, selection.similarity
-        least = SHARE_THRESHOLD if threshold is None else threshold
-        mask = fit_silhouette(*scene, threshold=least, weights=SILHOUETTE_WEIGHTS["silhouette"])
-        mask &= (jnp.asarray(field.votes.views) > 0) & jnp.any(selection.mask)
-        selection = dataclasses.replace(selection, mask=mask)
+def _require_codes(field: LanguageField, by: str) -> None:
+    """Raises InputError if a query by codes meets a field that has none."""
+    if by == "code" and field.codes is None:
+        raise InputError("", "This field has no codes", remedy="Run jsecon run --paper, or ask by votes.")
+
+
+def _finish(field: LanguageField, match: _Match, selection: Selection, by: str, outliers: bool) -> Answer:
+    """Trims a selection by outliers."""
     presence = None if selection.presence is None else float(selection.presence)
     answer = Answer(match.name, by, selection, np.asarray(selection.mask), match.skipped, presence, key=match.key)
     answer = drop_outliers(field, answer, outliers, keep=match.keep)
@@ -492,6 +490,7 @@ def ask_each(
     matches, errors = collect(queries)
     if not is_mapped(field.votes):
         return [_select(field, match, by, threshold, outliers) for match in matches], errors
+    _require_codes(field, by)
     regions = [match.regions for match in matches]
     selections = select_in_blocks(field, regions, by, similarity_threshold=threshold)
     pairs = zip(matches, selections)
@@ -534,5 +533,5 @@ def _select_rows(field: LanguageField, match: _Match, sparse: SparseSelection, b
     best = np.asarray(sparse.region, np.int32), np.asarray(sparse.score, np.float32)
     told = np.asarray(rank), match.regions.confidence, presence
     selection = Selection(np.arange(size) < count, similarity, *best, *told)
-    answer = _finish(subset_field(field, rows), match, selection, by, None, outliers)
+    answer = _finish(subset_field(field, rows), match, selection, by, outliers)
     return dataclasses.replace(answer, rows=rows)

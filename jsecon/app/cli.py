@@ -40,7 +40,7 @@ examples
   jsecon objects my_field/field.safetensors --out catalogue
                                                         what is in it: names, boxes, sizes, a page of pictures
   jsecon export my_field/field.safetensors --out scene.glb
-                                                        the whole scene for other programs, codes included
+                                                        the whole scene for other programs, regions included
   jsecon view my_field/field.safetensors "red mug"      in a browser; --export page.html writes a page
   jsecon eval my_field/field.safetensors --labels my_capture/label --out evaluation
   jsecon run my_capture --out my_field --models auto

@@ -22,7 +22,7 @@ MIN_CACHE_DISK = 32 << 20
 """bytes of the compiled programs of `jsecon demo`, rounded up"""
 # fmt: off
 PACKAGES = (
-    "numpy", "filelock", "psutil", "scipy", "sklearn", "cv2", "PIL", "jaxtyping", "optax", "flax", "onnxruntime",
+    "numpy", "filelock", "scipy", "sklearn", "cv2", "PIL", "jaxtyping", "optax", "onnxruntime",
     "tokenizers", "safetensors", "ftfy", "tqdm", "tyro", "lazy_loader", "huggingface_hub",
 )
 # fmt: on

@@ -15,12 +15,13 @@ from jsecon.errors import InputError
 from jsecon.evaluate.lerf import Row, evaluate_at_thresholds
 from jsecon.field.field import load_field
 from jsecon.files import write_text
+from jsecon.paper.autoencoder import encode
 from jsecon.paper.baselines import query_canonical, query_one_step
-from jsecon.paper.codes import encode
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console, Listener
 from jsecon.query.composite import parse_query
 from jsecon.query.render import ALPHA_THRESHOLD
+from jsecon.query.select import codes_of
 from jsecon.read.masks.labels import LabelledFrame, load_lerf_labels
 from jsecon.types import LanguageField, Selection
 
@@ -29,7 +30,6 @@ Evaluation: TypeAlias = dict[str, tuple[list[Row], dict[str, Any]]]
 
 KINDS: dict[str, dict[str, Any]] = {
     "anchored": {"by": "votes"},
-    "silhouette": {"by": "silhouette"},
     "all": {"several": True},
     "anchored_code": {"by": "code"},
 }
@@ -47,7 +47,7 @@ def evaluate(
     embedder: Any,
     labels: Sequence[LabelledFrame],
     listener: Listener,
-    kinds: Sequence[str] = (*KINDS, *BASELINES),
+    kinds: Sequence[str] | None = None,
 ) -> Evaluation:
     """Measures kinds of queries.
 
@@ -56,14 +56,15 @@ def evaluate(
       embedder: Its embedder. A text that it has no words for counts as 0.
       labels: Masks of named objects in frames of the field.
       listener: Receives the progress.
-      kinds: Names in `KINDS` and `BASELINES`.
+      kinds: Names in `KINDS` and `BASELINES`; None takes all that the field has data for.
 
     Returns:
       Pairs and summary of each kind.
     """
     cameras = {name: field.cameras[t] for t, name in enumerate(field.names)}
     results = {}
-    for kind in kinds:
+    by_votes = [kind for kind in KINDS if KINDS[kind].get("by") != "code"]
+    for kind in kinds or (by_votes if field.codes is None else (*KINDS, *BASELINES)):
 
         def select(text: str, kind: str = kind) -> Selection | None:
             try:
@@ -84,11 +85,12 @@ def evaluate(
 def _select_by_code(field: LanguageField, embedder: Any, text: str, kind: str) -> Selection:
     """Selects the Gaussians whose codes are similar to that of a text: by a kind of BASELINES, without regions."""
     texts = parse_query(text).included
-    code = encode(field.autoencoder, jax.device_put(embedder.embed_text(texts[:1])[0]))
+    codes = codes_of(field)
+    code = encode(codes.autoencoder, jax.device_put(embedder.embed_text(texts[:1])[0]))
     if kind == "one_step":
-        return query_one_step(field.codes, code, ONE_STEP_THRESHOLD)
-    canonical = encode(field.autoencoder, jnp.asarray(with_phrases(field, embedder).canonical_phrases))
-    return query_canonical(field.codes, code, canonical, CANONICAL_THRESHOLD)
+        return query_one_step(codes.gaussians, code, ONE_STEP_THRESHOLD)
+    canonical = encode(codes.autoencoder, jnp.asarray(with_phrases(field, embedder).canonical_phrases))
+    return query_canonical(codes.gaussians, code, canonical, CANONICAL_THRESHOLD)
 
 
 def _eval(verb: verbs.Eval, console: Console) -> verbs.VerbResult:

@@ -98,10 +98,10 @@ def _picture(value: LanguageField | Selection | Capture) -> tuple[UInt8[np.ndarr
 
 
 def _field_picture(field: LanguageField) -> tuple[np.ndarray, str]:
-    """Renders the first view in the scene's colours and in those of the codes."""
+    """Renders the first view in the scene's colours and in those of the regions."""
     cameras = jax.tree.map(np.asarray, field.cameras)
     renderer = pictures.Renderer(field.gaussians, scale_cameras(cameras, _scale(cameras.width, cameras.height)))
-    image = np.concatenate([renderer.photo(0), renderer.colours(0, pictures.code_colours(field))], axis=1)
+    image = np.concatenate([renderer.photo(0), renderer.colours(0, pictures.region_colours(field))], axis=1)
     words = f"LanguageField of {field.gaussians.count:,} Gaussians, {field.regions.count} regions and "
     return image, f"{words}{len(field.names)} frames, texts by {field.embedder or 'no embedder'}"
 

@@ -19,9 +19,8 @@ from jaxtyping import Bool, Int
 from jsecon.app import pictures, report
 from jsecon.app.ask import Answer
 from jsecon.app.locate import decimals, rounded, selected_centers
-from jsecon.field.columns import vote_blocks
 from jsecon.field.field import subset_field
-from jsecon.field.membership import SHARE_THRESHOLD, probability_inside, vote_shares
+from jsecon.field.membership import probability_inside
 from jsecon.files import write_text
 from jsecon.pipeline.progress import Listener
 from jsecon.query.render import selection_mask
@@ -36,24 +35,6 @@ DEVICES = frozenset(("con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("co
 """names that Windows reserves for devices, whatever their ending"""
 POINTED = re.compile(r"(at|box|region) .*\d", re.DOTALL)
 """names of queries without a text: a pixel, a box, a region"""
-
-
-def main_regions(field: LanguageField) -> Int[np.ndarray, " n"]:
-    """Finds the main region of each Gaussian. The votes are read in blocks.
-
-    Args:
-      field: A field of N Gaussians.
-
-    Returns:
-      (N,) int id of the region that has at least half of the Gaussian's weight, or -1.
-    """
-    blocks = [np.zeros(0, np.int32)]
-    for votes in vote_blocks(field.votes):
-        shares = np.nan_to_num(np.asarray(vote_shares(votes)))
-        best = shares.argmax(1)
-        rows = np.arange(len(best))
-        blocks.append(np.where(shares[rows, best] >= SHARE_THRESHOLD, np.asarray(votes.regions)[rows, best], -1))
-    return np.concatenate(blocks)
 
 
 def best_frames(field: LanguageField, answer: Answer, count: int) -> list[int]:
@@ -260,7 +241,7 @@ def save_scene(
 
     Args:
       field: The field.
-      file: The .ply, .spz or .glb to write. A .glb also holds codes and regions.
+      file: The .ply, .spz or .glb to write. A .glb also holds regions, and codes if the field has them.
       rows: The Gaussians to write, in this order; None writes all.
       object_ids: (N,) ids of all Gaussians for the property `object_id` of a .ply.
     """
@@ -270,7 +251,10 @@ def save_scene(
     if file.suffix.lower() == ".ply":
         save_ply(file, field.gaussians, similarity=field.source_from_scene, object_ids=object_ids)
         return
-    columns = {"codes": field.codes, "regions": main_regions(field)} if file.suffix.lower() == ".glb" else {}
+    columns = {}
+    if file.suffix.lower() == ".glb":
+        codes = None if field.codes is None else field.codes.gaussians
+        columns = {"codes": codes, "regions": pictures.main_regions(field)}
     save_gaussians(file, field.gaussians, similarity=field.source_from_scene, **columns)
 
 

@@ -1,4 +1,4 @@
-"""Pictures of a run: regions in colours that stay the same in every view, codes as colours, selections."""
+"""Pictures of a run: regions in colours that stay the same in every view, selections."""
 
 import colorsys
 import functools
@@ -9,6 +9,8 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from jsecon.field.columns import vote_blocks
+from jsecon.field.membership import SHARE_THRESHOLD, vote_shares
 from jsecon.splat.render import render, render_rgb
 from jsecon.splat.visible import render_in_blocks
 from jsecon.types import Array, Camera, Gaussians, LanguageField
@@ -18,7 +20,7 @@ SELECTED = (255, 64, 160)
 TRUTH = (255, 255, 255)
 """RGB of the ground truth's outline, over a black line"""
 UNKNOWN = 0.25
-"""grey of Gaussians without a code, 0 to 1"""
+"""grey of Gaussians without a region, 0 to 1"""
 GOLDEN_ANGLE = 0.61803398875
 """difference of neighbouring hues, in turns"""
 MARGIN = 0.3
@@ -170,31 +172,20 @@ def _outlined(image: np.ndarray, mask: np.ndarray, colour: tuple[int, ...], thic
     return image
 
 
-def code_colours(field: LanguageField) -> Float[np.ndarray, "n 3"]:
-    """Returns the codes of the Gaussians as colours.
+def main_regions(field: LanguageField) -> Int[np.ndarray, " n"]:
+    """Finds the region that has at least half of each Gaussian's weight, or -1. The votes are read in blocks."""
+    blocks = [np.zeros(0, np.int32)]
+    for votes in vote_blocks(field.votes):
+        shares = np.nan_to_num(np.asarray(vote_shares(votes)))
+        best = shares.argmax(1)
+        rows = np.arange(len(best))
+        blocks.append(np.where(shares[rows, best] >= SHARE_THRESHOLD, np.asarray(votes.regions)[rows, best], -1))
+    return np.concatenate(blocks)
 
-    Args:
-      field: The field.
 
-    Returns:
-      (N, 3) RGB in [0, 1]: the first three principal components of the codes, stretched over the regions. A Gaussian
-      without a code is grey.
-    """
-    table = np.asarray(field.region_codes, np.float64)
-    codes = np.asarray(field.codes, np.float64)
-    known = np.abs(codes).max(axis=1, initial=0.0) > 0
-    used = table[np.abs(table).max(axis=1, initial=0.0) > 0]
-    if len(used) == 0:
-        return np.full((len(codes), 3), UNKNOWN)
-    mean = used.mean(0)
-    axes = np.linalg.svd(used - mean, full_matrices=False)[2][:3]
-    axes = axes * np.sign(axes[np.arange(len(axes)), np.abs(axes).argmax(1)])[:, None]
-    points = (used - mean) @ axes.T
-    low, high = points.min(0), points.max(0)
-    rgb = np.full((len(codes), 3), 0.5)
-    rgb[:, : len(axes)] = np.clip(((codes - mean) @ axes.T - low) / np.where(high > low, high - low, 1.0), 0.0, 1.0)
-    rgb[~known] = UNKNOWN
-    return rgb
+def region_colours(field: LanguageField) -> Float[np.ndarray, "n 3"]:
+    """Returns the colour of each Gaussian's main region in [0, 1]; grey without a region."""
+    return np.concatenate([palette(field.regions.count) / 255, np.full((1, 3), UNKNOWN)])[main_regions(field)]
 
 
 def side_by_side(panels: Mapping[str, UInt8[np.ndarray, "h w 3"]]) -> UInt8[np.ndarray, "h2 w2 3"]:

@@ -145,7 +145,6 @@ def _check_query(verb: verbs.Query) -> None:
 def _require_blocks(verb: verbs.Query) -> None:
     """Raises InputError if queries of a field that is larger than memory need the whole field there."""
     needs_all = {
-        f"--by {verb.by}": verb.by not in ("votes", "code"),
         "--mask or --box": verb.mask or verb.box,
         "--grow, --shrink or --invert": verb.grow or verb.shrink or verb.invert,
     }
@@ -153,9 +152,7 @@ def _require_blocks(verb: verbs.Query) -> None:
         if used:
             size, budget = verb.field.stat().st_size / 2**30, memory_budget() / 2**30
             problem = f"the field has {size:.3g} GiB, memory has room for {budget:.3g}, and {option} needs all of it"
-            remedy = (
-                f"Ask by a text or --at, by votes or code, or set {MEMORY}={1.1 * size:.2g} (GiB) to read it whole."
-            )
+            remedy = f"Ask by a text or --at, or set {MEMORY}={1.1 * size:.2g} (GiB) to read it whole."
             raise InputError(verb.field, problem, remedy=remedy)
 
 

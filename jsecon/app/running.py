@@ -24,7 +24,7 @@ from jsecon.types import Quality
 FILES = ("field.safetensors", "report.html", "metrics.json")
 """files of a run"""
 FRAMES = 6
-"""number of frames that are shown with masklets and codes"""
+"""number of frames that are shown with masklets and regions"""
 MASKLETS = 10
 """number of masklets that are shown through as many frames"""
 LARGE = 0.15
@@ -75,7 +75,7 @@ def _write_run(run: Run, out: Path, listener: Listener) -> dict[str, Any]:
     for note in warnings:
         listener.say(f"{WARNING}{note}")
     listener.say(
-        f"{metrics['gaussians']} Gaussians, {metrics['regions']} regions, codes of {metrics['code_size']} numbers, "
+        f"{metrics['gaussians']} Gaussians, {metrics['regions']} regions, "
         f"{sum(run.seconds.values()):.0f} s, peak memory {metrics['peak_memory_mib']:.0f} MiB, "
         f"{run.programs['all']} programs compiled ({run.programs['from_disk']} of them read from disk)"
     )
@@ -107,7 +107,6 @@ def _run_metrics(run: Run) -> dict[str, Any]:
     return {
         "gaussians": run.field.gaussians.count,
         "regions": run.field.regions.count,
-        "code_size": int(run.field.region_codes.shape[1]),
         "frames": len(run.capture.names),
         "size": [run.capture.cameras.width, run.capture.cameras.height],
         **_quality_metrics(run.held_out),
@@ -125,7 +124,6 @@ def _tiles(metrics: dict[str, Any]) -> dict[str, str]:
     return {
         "Gaussians": f"{metrics['gaussians']:,}",
         "regions": str(metrics["regions"]),
-        "numbers in a code": str(metrics["code_size"]),
         "held-out PSNR": "no held-out frames" if psnr is None else f"{psnr:.2f} dB",
         "total": f"{sum(metrics['seconds'].values()):.0f} s",
         "peak memory": f"{metrics['peak_memory_mib']:,.0f} MiB",
@@ -139,16 +137,16 @@ def run_parts(run: Run) -> list[str]:
       run: The run.
 
     Returns:
-      Sections (`jsecon.app.report`): frames, masklets, codes, held-out frames, seconds, stages and settings.
+      Sections (`jsecon.app.report`): frames, masklets, regions, held-out frames, seconds, stages and settings.
     """
     return [*_scene_parts(run), *_work_parts(run)]
 
 
 def _scene_parts(run: Run) -> list[str]:
-    """Returns the parts that show frames, masklets, codes and the rendered scene."""
+    """Returns the parts that show frames, masklets, regions and the rendered scene."""
     train = vision_frames(run.capture, run.options)
     renderer = pictures.Renderer(run.field.gaussians, run.field.cameras)
-    colours = pictures.code_colours(run.field)
+    colours = pictures.region_colours(run.field)
     cells = []
     for row in evenly_spaced(len(train), FRAMES):
         t = int(train[row])
@@ -156,14 +154,13 @@ def _scene_parts(run: Run) -> list[str]:
         cells += [
             report.figure(frame, run.capture.names[t]),
             report.figure(pictures.label_overlay(frame, run.labels[row]), "masklets", sharp=True),
-            report.figure(renderer.colours(t, colours), "codes"),
+            report.figure(renderer.colours(t, colours), "regions"),
             report.figure(renderer.photo(t), "rendered"),
         ]
     words = (
-        "A region has one colour in all views. The colours of the codes are their first three principal components, "
-        "rendered by the Gaussians; a grey Gaussian has no code."
+        "A region has one colour in all views, and so has each Gaussian by its strongest region; a grey one has none."
     )
-    parts = [report.section("Frames, masklets, codes", words, report.grid(cells, 4)), _masklet_part(run, train)]
+    parts = [report.section("Frames, masklets, regions", words, report.grid(cells, 4)), _masklet_part(run, train)]
     if len(run.psnr):
         held_out = np.flatnonzero(run.capture.held_out)
         psnr = dict(zip(held_out.tolist(), run.psnr.tolist()))

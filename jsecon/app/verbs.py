@@ -25,7 +25,7 @@ from jsecon.pipeline.options import (
 T = TypeVar("T")
 Repeated: TypeAlias = Option[UseAppendAction[list[T]]]
 """option that can be repeated"""
-By = Literal["votes", "silhouette", "code"]
+By = Literal["votes", "code"]
 
 VerbResult: TypeAlias = dict[str, Any]
 """Files and figures of a verb, which --json prints: plain values, paths and records; under "errors" the InputErrors of
@@ -190,7 +190,7 @@ class Query(FieldVerb):
     the capture's world; SuperSplat opens it), a .json with count, score, region, centroid and bounding box, masks
     of the frames that show it best, and answers.html with the pictures. A field of more than half of the free memory,
     or than JSECON_MEMORY (GiB) of the environment, stays on disk and is read in blocks, with the same answers: texts
-    and --at, by votes or code.
+    and --at.
 
     Attributes:
       field: Path of field.safetensors, written by jsecon run, or a file of Gaussians without photographs.
@@ -206,14 +206,12 @@ class Query(FieldVerb):
       mask: Selects the object that a mask outlines in a frame, or masks in several frames. Black is outside.
       box: Selects the regions that are seen by more than half in a box of a frame.
       out: Output folder.
-      by: How a matching region selects Gaussians: by its votes, or by its code. With silhouette, each Gaussian of the
-        votes is then kept or dropped by what the outline of all gains in the views.
-      threshold: Smallest similarity of a selected Gaussian. By default it is 0.5 for votes and silhouette, and 0.9 for
-        code.
+      by: How a matching region selects Gaussians: by its votes, or by its code in a field of jsecon run --paper.
+      threshold: Smallest similarity of a selected Gaussian. By default it is 0.5 for votes and 0.9 for code.
       min_rank: Share of unrelated words that must be less similar to the scene than a text, else the text has no match.
         About 1 - min_rank of the texts of absent objects are answered. With 0 every text is answered.
       all: Selects every region of the kind that a text names, such as all chairs, instead of the best one: those whose
-        similarity lies at least 0.75 of the way from the median region to the best one (by votes or silhouette).
+        similarity lies at least 0.75 of the way from the median region to the best one (by votes).
       keep_outliers: Keeps the Gaussians that stand apart from the rest of an answer. By default DBSCAN drops them, and
         clusters with less than a tenth of the largest one's weight in the views. The .json counts them.
       grow: Adds this many shells of neighbouring Gaussians to each answer.
@@ -221,7 +219,7 @@ class Query(FieldVerb):
       invert: Selects the Gaussians that an answer does not select, after both.
       views: Number of masks to write for each query.
       format: Format of the selected Gaussians. The glb is glTF with Khronos' KHR_gaussian_splatting, y up, and holds
-        their codes and regions too.
+        their regions too.
     """
 
     examples = (
@@ -279,7 +277,7 @@ class Export(FieldVerb):
     """Writes the scene of a field, or objects of it, for other programs.
 
     The scene is in the capture's world. A .glb is glTF with Khronos' KHR_gaussian_splatting, y up, and holds each
-    Gaussian's code (_CODE_0, _CODE_1 ...) and region (_REGION) too.
+    Gaussian's region (_REGION) too, and its code (_CODE_0, _CODE_1 ...) if the field has codes.
 
     Attributes:
       out: The .ply (INRIA's layout), .spz or .glb to write.

@@ -64,9 +64,7 @@ def run_demo(
     embedder = model_loading.field_embedder(run.field)
     listener.say("measured on the held-out views")
     results = evaluation.evaluate(run.field, embedder, labels, listener)
-    true_results = evaluation.evaluate(true_run.field, embedder, labels, listener, ("anchored", "one_step"))
-    results["true_masks"] = true_results["anchored"]
-    results["true_masks_one_step"] = true_results["one_step"]
+    results["true_masks"] = evaluation.evaluate(true_run.field, embedder, labels, listener, ("anchored",))["anchored"]
     metrics = _metrics(results, run, true_run)
     with listener.progress("report"):
         texts = sorted({name for frame in labels for name in frame.objects})
@@ -136,7 +134,7 @@ def _metrics(results: Evaluation, run: Run, true_run: Run) -> dict[str, Any]:
 
 
 def _write_panels(file: Path, run: Run, frame: int, masks: Mapping[str, np.ndarray]) -> None:
-    """Writes a held-out frame, the masklets and codes of the nearest training frame, and the masks of the answers."""
+    """Writes a held-out frame, the masklets and regions of the nearest training frame, and the masks of the answers."""
     train = np.flatnonzero(~np.asarray(run.capture.held_out))
     nearest = int(np.abs(train - frame).argmin())
     frames, t = np.asarray(run.capture.frames), int(train[nearest])
@@ -144,7 +142,7 @@ def _write_panels(file: Path, run: Run, frame: int, masks: Mapping[str, np.ndarr
     panels = {
         "frame": frames[frame],
         "masklets": pictures.label_overlay(frames[t], run.labels[nearest]),
-        "codes of the Gaussians": renderer.colours(t, pictures.code_colours(run.field)),
+        "regions of the Gaussians": renderer.colours(t, pictures.region_colours(run.field)),
         "answers to texts": pictures.answers_overlay(frames[frame], masks),
     }
     with atomic_write(file) as temporary:
@@ -169,20 +167,14 @@ def _page(
             "mAcc@0.25": f"{anchored['macc']:.3f}",
             "localisation accuracy": f"{anchored['loc_acc']:.3f}",
             "mIoU, true masks given": f"{metrics['true_masks']['miou']:.3f}",
-            "mIoU, one-step query": f"{metrics['one_step']['miou']:.3f}",
             "held-out PSNR": f"{metrics['held_out_psnr']:.2f} dB",
             "of work": f"{metrics['total_seconds']:.0f} s",
         }
     )
     names = {
         "anchored": "text → region → its votes",
-        "anchored_code": "text → region → its code",
-        "silhouette": "text → region → its votes, then by the outline",
         "all": "text → all matching regions → their votes",
-        "one_step": "text → codes, directly",
-        "canonical": "text → codes, against the canonical phrases",
         "true_masks": "text → region → its votes, true masks given",
-        "true_masks_one_step": "text → codes, directly, true masks given",
     }
     rows = []
     for kind, (_, figures) in results.items():

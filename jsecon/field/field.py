@@ -29,19 +29,14 @@ from jsecon.files import (
     unpack_tree,
     write_arrays,
 )
-from jsecon.paper.autoencoder import Autoencoder
-from jsecon.paper.codes import Rotation, Spread
 from jsecon.read.captures.images import MAX_PIXELS
 from jsecon.splat.project import unusable_rows
 from jsecon.splat.sh import COEFFICIENT_COUNTS
-from jsecon.types import Camera, Gaussians, LanguageField, Parts, Regions, Votes
+from jsecon.types import Autoencoder, Camera, Codes, Gaussians, LanguageField, Parts, Regions, Votes
 
 FORMAT = "jsecon-field"
 VERSION = 3
-_RECORDS = {
-    cls.__name__: cls
-    for cls in (LanguageField, Gaussians, Votes, Regions, Parts, Camera, Autoencoder, Rotation, Spread)
-}
+_RECORDS = {cls.__name__: cls for cls in (LanguageField, Gaussians, Votes, Regions, Parts, Camera, Codes, Autoencoder)}
 MAPPED = 1 << 20
 """bytes of a column from which a mapped field leaves it on disk"""
 _ROWS = 1 << 20
@@ -50,7 +45,7 @@ _REMEDY = "Make the field again with `jsecon run`."
 _LETTERS = {
     "n": ("gaussians.means", 0),
     "r": ("regions.pixel_counts", 0),
-    "d": ("region_codes", -1),
+    "d": ("codes.regions", -1),
     "e": ("regions.embeddings", -1),
     "t": ("cameras.world_to_camera", 0),
     "k": ("votes.regions", -1),
@@ -65,10 +60,10 @@ _SHAPES = {
     ("n", 4): "gaussians.quaternions",
     ("n", "b", 3): "gaussians.sh",
     ("n",): "gaussians.opacity_logits votes.labelled votes.total votes.max_pixel_weight votes.views parts.part",
-    ("n", "d"): "codes",
+    ("n", "d"): "codes.gaussians",
     ("n", "k"): "votes.regions votes.weights votes.weight_where_region_visible",
     ("r", "e"): "regions.embeddings",
-    ("r", "d"): "region_codes",
+    ("r", "d"): "codes.regions",
     ("r", "r"): "votes.overlap",
     ("t", 4, 4): "cameras.world_to_camera",
     ("t",): "cameras.fx cameras.fy cameras.cx cameras.cy",
@@ -78,7 +73,10 @@ _SHAPES = {
     ("w", "e"): "unrelated_words",
     (4, 4): "source_from_scene",
 }
-_OPTIONAL = ("votes.weight_where_region_visible", "votes.overlap", "parts.part", "parts.embeddings", "unrelated_words")
+_OPTIONAL = (
+    "votes.weight_where_region_visible", "votes.overlap", "parts.part", "parts.embeddings", "unrelated_words",
+    "codes.gaussians", "codes.regions",
+)  # fmt: skip
 
 
 def save_field(path: str | os.PathLike, field: LanguageField) -> None:
@@ -131,9 +129,10 @@ def subset_field(field: LanguageField, rows: Int[np.ndarray, " m"]) -> LanguageF
         return np.asarray(a)[rows]
 
     parts = None if field.parts is None else dataclasses.replace(field.parts, part=take(field.parts.part))
+    codes = None if field.codes is None else dataclasses.replace(field.codes, gaussians=take(field.codes.gaussians))
     gaussians = jax.tree.map(take, field.gaussians)
     votes = dataclasses.replace(votes_of_rows(field.votes, rows), overlap=field.votes.overlap)
-    return dataclasses.replace(field, gaussians=gaussians, votes=votes, codes=take(field.codes), parts=parts)
+    return dataclasses.replace(field, gaussians=gaussians, votes=votes, codes=codes, parts=parts)
 
 
 class Provenance(str):
@@ -247,16 +246,25 @@ def _oddity(field: LanguageField, checked: bool = True) -> str | None:
         return "names, embedder or provenance that are no texts, or no JSON object"
     if not 0 < field.cameras.width * field.cameras.height <= MAX_PIXELS:
         return f"views of {field.cameras.width}x{field.cameras.height} px"
-    if field.autoencoder is not None:
-        size = field.canonical_phrases.shape[1], field.codes.shape[1]
-        try:
-            if isinstance(field.autoencoder, Autoencoder):
-                field.autoencoder.require_layers()
-                coded = field.autoencoder.dim, field.autoencoder.latent
-            else:
-                coded = size[0], *jax.eval_shape(field.autoencoder.encode, field.canonical_phrases).shape[1:]
-        except Exception as error:  # jax's own kinds have no common base but this
-            return f"a coder that does not encode ({error})"
-        if coded != size:
-            return f"a coder from and to {coded} numbers beside embeddings and codes of {size}"
+    codes, dim = field.codes, field.regions.embeddings.shape[1]
+    coder = None if codes is None else codes.autoencoder
+    if isinstance(coder, Autoencoder) and not _layers_fit(coder, dim, codes.regions.shape[1]):
+        return "an autoencoder whose layers do not lead from embeddings to codes and back"
     return None
+
+
+def _layers_fit(autoencoder: Autoencoder, dim: int, latent: int) -> bool:
+    """Whether the layers lead from `dim` numbers to `latent` ones and back."""
+    normalised = {"scale", "shift", "mean", "variance"}
+    ways = (autoencoder.encoder, normalised, dim, latent), (autoencoder.decoder, set(), latent, dim)
+    for layers, more, inputs, outputs in ways:
+        for n, layer in enumerate(layers):
+            width = len(layer["bias"])
+            if set(layer) != {"weight", "bias"} | (more if n < len(layers) - 1 else set()):
+                return False
+            if any(a.shape != ((inputs, width) if name == "weight" else (width,)) for name, a in layer.items()):
+                return False
+            inputs = width
+        if inputs != outputs:
+            return False
+    return True

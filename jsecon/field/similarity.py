@@ -1,14 +1,13 @@
 """Cosines of rows with one vector, as every query needs them: of Gaussians' codes or of regions' embeddings. Pure."""
 
-import dataclasses
 import functools
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from jsecon.numerics import FULL_PRECISION, normalize, safe_scale
-from jsecon.types import Array, Leaf
+from jsecon.numerics import normalize, safe_scale
+from jsecon.types import Array
 
 NARROW = 32
 """Codes of at most so many numbers are compared column by column."""
@@ -16,49 +15,12 @@ Number = float | int | Array
 """A threshold: a Python number, or () under a trace."""
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class UnitCodes:
-    """Codes of unit length, as `unit_codes` makes them; queries take them in place of codes."""
-
-    rows: Leaf
-    """(N, d) of unit length; zero if unknown."""
-    known: Leaf
-    """(N,) bool: the code was finite and not zero."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Shape of the codes."""
-        return self.rows.shape
-
-
-Codes = Float[Array, "n d"] | UnitCodes
-"""(N, d) of any length, or scaled to unit length by `unit_codes`."""
-
-
-@jax.jit
-def unit_codes(codes: Float[Array, "n d"]) -> UnitCodes:
-    """Scales codes to unit length, once for many queries. Pure.
-
-    The lengths of 1 million codes of 512 numbers cost more than the query itself.
-
-    Args:
-      codes: (N, d) of any length.
-
-    Returns:
-      The unit codes; zero codes and codes that are not finite are unknown.
-    """
-    units = normalize(codes)
-    known = jnp.all(jnp.isfinite(units), axis=-1) & jnp.any(units != 0, axis=-1)
-    return UnitCodes(jnp.where(known[:, None], units, 0.0), known)
-
-
 @functools.partial(jax.jit, inline=True)
-def similarities(codes: Codes, code: Float[Array, " d"]) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
+def similarities(codes: Float[Array, "n d"], code: Float[Array, " d"]) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
     """Computes cosines of rows with one code. Pure.
 
     Args:
-      codes: (N, d) rows of any length, or their `unit_codes`.
+      codes: (N, d) rows of any length.
       code: (d,) of any length.
 
     Returns:
@@ -66,22 +28,10 @@ def similarities(codes: Codes, code: Float[Array, " d"]) -> tuple[Float[Array, "
     """
     unit = normalize(code)
     usable = jnp.all(jnp.isfinite(unit)) & jnp.any(unit != 0)
-    if isinstance(codes, UnitCodes):
-        known = codes.known & usable
-        return jnp.where(known, _product(codes.rows, unit), 0.0), known
     narrow = codes.shape[1] <= NARROW
     largest, dots, squares = (_by_column if narrow else _by_row)(codes, unit)
     known = (largest > 0) & jnp.isfinite(largest) & usable
     return jnp.where(known, dots / jnp.sqrt(jnp.where(known, squares, 1.0)), 0.0), known
-
-
-def _product(rows: Array, unit: Array) -> Array:
-    """Rows @ unit. Under vmap over codes it is one (N, d) x (d, Q) product: no query walks the rows on its own."""
-    if rows.shape[1] <= NARROW:
-        columns = (rows[:, k] * unit[k] for k in range(rows.shape[1]))
-        return sum(columns, start=jnp.zeros(rows.shape[0], rows.dtype))
-    # One column of a product of matrices: matrix times vector can be silently wrong (jax issue 39103).
-    return jnp.matmul(rows, unit[:, None], precision=FULL_PRECISION)[:, 0]
 
 
 def _by_column(codes: Array, unit: Array) -> tuple[Array, Array, Array]:

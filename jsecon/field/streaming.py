@@ -1,8 +1,8 @@
-"""Votes and codes of a scene that need not fit into memory. Host code.
+"""Votes of a scene that need not fit into memory. Host code.
 
 Each view is cast on the Gaussians that it can see, whose geometry alone is read. What it casts goes to disk, and is
-added up for one block of Gaussians after the other, so that no array of N rows is ever held. The codes and the shares
-that follow are functions of rows, applied block by block.
+added up for one block of Gaussians after the other, so that no array of N rows is ever held. The shares that
+follow are functions of rows, applied block by block.
 """
 
 import contextlib
@@ -15,18 +15,16 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float
 from scipy import sparse
 
 from jsecon.errors import InputError, require, require_shape
-from jsecon.field.columns import ROWS, vote_blocks
+from jsecon.field.columns import ROWS
 from jsecon.field.view_votes import view_votes
-from jsecon.files import atomic_write, map_npy, write_npy
+from jsecon.files import map_npy
 from jsecon.numerics import NEAR, require_labels
-from jsecon.paper.distill import MIN_LABELLED, distill_votes
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.visible import geometry_of_rows, visible_rows
-from jsecon.types import Array, Camera, Gaussians, Progress, Votes
+from jsecon.types import Camera, Gaussians, Progress, Votes
 
 _PAIR = np.dtype([("gaussian", "<u4"), ("region", "<i4"), ("weight", "<f4")])
 """The weight that a view's region casts on a Gaussian."""
@@ -100,36 +98,6 @@ def region_votes_in_blocks(
         sums = (_sum_block(scratch, views, block, num_regions, top_kept, by_view) for block in blocks)
         columns = _write_columns(Path(folder), sums, kinds | ({"by_view": ("<f4", (views,))} if by_view else {}), count)
     return Votes(**columns, overflow=np.asarray(overflow, np.int32), num_regions=num_regions)
-
-
-def codes_in_blocks(
-    votes: Votes,
-    region_codes: Float[Array, "r d"],
-    path: str | os.PathLike,
-    reduce: str = "mode",
-    *,
-    min_labelled: float = MIN_LABELLED,
-) -> Float[np.ndarray, "n d"]:
-    """Distills memory-mapped votes as `distill_votes` does, block by block. Host code.
-
-    Args:
-      votes: Votes of N Gaussians.
-      region_codes: (R, d) codes of the regions.
-      path: File of the codes, .npy.
-      reduce: "mode", "mean" or "median", see `distill_votes`.
-      min_labelled: Smallest share of a Gaussian's weight on labelled pixels.
-
-    Returns:
-      (N, d) unit codes as a memory map of the file, zero if unknown.
-
-    Raises:
-      ValueError: Shapes disagree, or the reduction is unknown.
-    """
-    shape = (votes.regions.shape[0], region_codes.shape[1])
-    blocks = (distill_votes(block, region_codes, reduce, min_labelled=min_labelled) for block in vote_blocks(votes))
-    with atomic_write(path) as temporary:
-        write_npy(temporary, shape, np.float32, map(np.asarray, blocks))
-    return map_npy(Path(path))
 
 
 @contextlib.contextmanager

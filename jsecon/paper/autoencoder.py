@@ -1,7 +1,11 @@
-"""Region embeddings to small codes by LangSplat's autoencoder; jsecon.paper.codes says when it is needed."""
+"""The autoencoder of one scene: region embeddings to codes of d numbers, and back.
 
-import dataclasses
+The paper takes LangSplat's (minghanqin/LangSplat, autoencoder/): codes l = E(phi_bar) on the unit sphere, trained to
+bring the embeddings back, min |D(E(phi_bar)) - phi_bar|^2 + w (1 - cos(D(E(phi_bar)), phi_bar)). Pure.
+"""
+
 import functools
+import itertools
 from typing import Any, NamedTuple
 
 import jax
@@ -10,84 +14,54 @@ import numpy as np
 from jaxtyping import Float
 
 from jsecon.errors import require, require_shape
-from jsecon.numerics import FULL_PRECISION, cosine, is_traced, normalize
-from jsecon.types import Array, Key, Progress
+from jsecon.numerics import FULL_PRECISION, cosine, normalize
+from jsecon.types import Array, Autoencoder, Key, Progress
 
 ENCODER_WIDTHS = (256, 128, 64, 32)
 DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
 """LangSplat's hidden layers for E = 512; one narrower than the latent is widened to it."""
 MIN_STEPS = 1_000
-"""LangSplat's 100 epochs run over tens of thousands of crops; a few masklets need more epochs to see as many steps."""
+"""LangSplat's 100 epochs run over tens of thousands of crops; a few regions need more epochs to see as many steps."""
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Autoencoder:
-    """Parameters of one scene's autoencoder. The layers' sizes follow from the arrays."""
+def encode(autoencoder: Autoencoder, embeddings: Float[Array, "*batch e"]) -> Float[Array, "*batch d"]:
+    """Encodes embeddings, of regions or of a text: l = E(phi).
 
-    encoder: Any
-    """{"params", "batch_stats"}: nested dicts of arrays, flax's layout."""
-    decoder: Any
-    """{"params"}: nested dicts of arrays."""
+    Args:
+      autoencoder: Of the field, `field.codes.autoencoder`.
+      embeddings: (..., E) of any length.
 
-    @property
-    def latent(self) -> int:
-        """Size of a code."""
-        return _widths(self.encoder["params"])[-1]
+    Returns:
+      (..., d) unit codes; zero (unknown) for a zero embedding.
 
-    @property
-    def dim(self) -> int:
-        """E, size of an embedding."""
-        return self.encoder["params"]["Dense_0"]["kernel"].shape[0]
+    Raises:
+      ValueError: Embeddings of another size.
+    """
+    size = autoencoder.encoder[0]["weight"].shape[0]
+    require_shape("embeddings", embeddings, (..., size), "Embed with what the autoencoder was trained on.")
+    units = normalize(jnp.asarray(embeddings))
+    codes = _encode(autoencoder.encoder, units.reshape(-1, size))
+    return codes.reshape(*units.shape[:-1], codes.shape[-1])
 
-    def require_layers(self) -> None:
-        """Raises ValueError unless the shapes of all arrays are those of LangSplat's layers. Does not import flax."""
-        parts = ("encoder", self.encoder, self.dim), ("decoder", self.decoder, self.latent)
-        for name, variables, inputs in parts:
-            widths = _widths(variables["params"])
-            sizes = zip((inputs, *widths), widths)
-            shapes = {f"Dense_{n}": {"kernel": size, "bias": size[1:]} for n, size in enumerate(sizes)}
-            norms = {f"BatchNorm_{n}": (width,) for n, width in enumerate(widths[:-1]) if name == "encoder"}
-            shapes |= {norm: {"scale": size, "bias": size} for norm, size in norms.items()}
-            expected = {"params": shapes}
-            if norms:
-                expected["batch_stats"] = {norm: {"mean": size, "var": size} for norm, size in norms.items()}
-            shapes = jax.tree.map(np.shape, variables)
-            require(shapes == expected, name, f"{shapes}", f"{expected}", "Train it again.")
 
-    def encode(self, embeddings: Float[Array, "*batch e"]) -> Float[Array, "*batch d"]:
-        """Encodes embeddings.
+def decode(autoencoder: Autoencoder, codes: Float[Array, "*batch d"]) -> Float[Array, "*batch e"]:
+    """Decodes codes: phi = D(l).
 
-        Args:
-          embeddings: (..., E) of any length.
+    Args:
+      autoencoder: Of the field, `field.codes.autoencoder`.
+      codes: (..., d) of any length.
 
-        Returns:
-          (..., d) unit codes; zero (unknown) for a zero embedding.
+    Returns:
+      (..., E) unit embeddings.
 
-        Raises:
-          ValueError: Embeddings of another size.
-        """
-        require_shape("embeddings", embeddings, (..., self.dim), "Embed with what the autoencoder was trained on.")
-        units = normalize(jnp.asarray(embeddings))
-        codes = _encode(self.encoder, units.reshape(-1, self.dim))
-        return codes.reshape(*units.shape[:-1], self.latent)
-
-    def decode(self, codes: Float[Array, "*batch d"]) -> Float[Array, "*batch e"]:
-        """Decodes codes.
-
-        Args:
-          codes: (..., d) of any length.
-
-        Returns:
-          (..., E) unit embeddings.
-
-        Raises:
-          ValueError: Codes of another size.
-        """
-        require_shape("codes", codes, (..., self.latent), "Decode codes of this autoencoder.")
-        codes = jnp.asarray(codes)
-        rows = _decode(self.decoder, codes.reshape(-1, self.latent))
-        return rows.reshape(*codes.shape[:-1], self.dim)
+    Raises:
+      ValueError: Codes of another size.
+    """
+    size = autoencoder.decoder[0]["weight"].shape[0]
+    require_shape("codes", codes, (..., size), "Decode codes of this autoencoder.")
+    codes = jnp.asarray(codes)
+    rows = _decode(autoencoder.decoder, codes.reshape(-1, size))
+    return rows.reshape(*codes.shape[:-1], rows.shape[-1])
 
 
 def train_autoencoder(
@@ -101,7 +75,7 @@ def train_autoencoder(
     cosine_weight: float = 0.001,
     progress: Progress | None = None,
 ) -> Autoencoder:
-    """Trains LangSplat's autoencoder (minghanqin/LangSplat, autoencoder/) on the regions' embeddings.
+    """Trains LangSplat's autoencoder on the regions' embeddings.
 
     Args:
       embeddings: (R, E), R >= 1, of any length; zero rows (never embedded) are left out.
@@ -124,7 +98,8 @@ def train_autoencoder(
     positive, options = batch >= 1 and (epochs is None or epochs >= 1), f"batch={batch}, epochs={epochs}"
     require(positive, "train_autoencoder", options, "both at least 1", "Leave epochs out to have it chosen.")
     rows = np.asarray(embeddings)
-    require_finite("train_autoencoder", rows)
+    remedy, finite = "Find the regions whose crops gave NaN and leave them out.", bool(np.isfinite(rows).all())
+    require(finite, "train_autoencoder", "embeddings that are not finite", "finite numbers", remedy)
     count = f"{len(rows)} rows, all zero"
     rows = rows[np.any(rows != 0, axis=1)]
     require(len(rows) >= 1, "train_autoencoder", count, "at least one embedding", "Embed the regions first.")
@@ -132,8 +107,8 @@ def train_autoencoder(
     count, dim = units.shape
     batches = -(-count // batch)
     total = epochs if epochs is not None else max(100, -(-MIN_STEPS // batches))
-    inward = (*(max(w, latent) for w in ENCODER_WIDTHS), latent)
-    outward = (*(max(w, latent) for w in DECODER_WIDTHS), dim)
+    inward = (dim, *(max(w, latent) for w in ENCODER_WIDTHS), latent)
+    outward = (latent, *(max(w, latent) for w in DECODER_WIDTHS), dim)
     plan = _Plan(inward, outward, batches, learning_rate, cosine_weight)
     init_key, shuffle_key = jax.random.split(key)
     carry = _start(units, init_key, plan)
@@ -144,24 +119,9 @@ def train_autoencoder(
         if progress is not None:
             jax.block_until_ready(carry)
             progress(stop, total)
-    _, vector, stats = carry[1]
-    vector = vector if is_traced(vector) else np.asarray(vector)  # NumPy's slices need no compilation
-    params = jax.device_put(_unflatten(vector, _shapes(units, plan)[0]))
-    return Autoencoder({"params": params["encoder"], "batch_stats": stats}, {"params": params["decoder"]})
-
-
-def require_finite(where: str, embeddings: np.ndarray) -> None:
-    """Checks that embeddings are finite.
-
-    Args:
-      where: Name of the function that the message names.
-      embeddings: Array of any shape.
-
-    Raises:
-      ValueError: A number is NaN or infinite.
-    """
-    remedy, finite = "Find the regions whose crops gave NaN and leave them out.", bool(np.isfinite(embeddings).all())
-    require(finite, where, "embeddings that are not finite", "finite numbers", remedy)
+    _, vector, moments = carry[1]
+    encoder, decoder = _unflatten(vector, plan)
+    return Autoencoder((*(a | b for a, b in zip(encoder, moments)), encoder[-1]), tuple(decoder))
 
 
 class _Plan(NamedTuple):
@@ -173,47 +133,50 @@ class _Plan(NamedTuple):
     learning_rate: float
     cosine_weight: float
 
+    def shapes(self) -> tuple[list[dict], list[dict]]:
+        """Shapes of the trained parameters of encoder and decoder, layer by layer."""
+        encoder, decoder = (
+            [{"weight": (inputs, outputs), "bias": (outputs,)} for inputs, outputs in itertools.pairwise(widths)]
+            for widths in (self.encoder_widths, self.decoder_widths)
+        )
+        normalised = [layer | {"scale": layer["bias"], "shift": layer["bias"]} for layer in encoder[:-1]]
+        return [*normalised, encoder[-1]], decoder
+
 
 @functools.partial(jax.jit, static_argnames="plan")
 def _start(units: Array, key: Key, plan: _Plan) -> Any:
-    """((parameters as one vector, batch statistics, Adam's moments), best so far: (loss, vector, batch statistics))."""
-    shapes, stats = _shapes(units, plan)
+    """((parameters as one vector, running moments, Adam's state), best so far: (loss, vector, running moments))."""
     middle, spread = [], []
-    for path, leaf in jax.tree_util.tree_leaves_with_path(shapes):
-        part, name, kind = (step.key for step in path)
-        norm = name.startswith("BatchNorm")
-        middle.append(np.full(leaf.size, float(norm and kind == "scale")))
-        # PyTorch's default, which LangSplat starts from: weights and biases uniform in +-1/sqrt(inputs).
-        spread.append(np.full(leaf.size, 0.0 if norm else shapes[part][name]["kernel"].shape[0] ** -0.5))
+    for layer in (*plan.shapes()[0], *plan.shapes()[1]):
+        for name, shape in layer.items():
+            size = int(np.prod(shape))
+            middle.append(np.full(size, float(name == "scale")))
+            # PyTorch's default, which LangSplat starts from: weights and biases uniform in +-1/sqrt(inputs).
+            spread.append(np.full(size, layer["weight"][0] ** -0.5 if name in ("weight", "bias") else 0.0))
     middle, spread = (jnp.asarray(np.concatenate(values), units.dtype) for values in (middle, spread))
-    # One draw for all layers compiles several times faster than flax's initialisers, a draw a layer.
+    # One draw for all layers compiles several times faster than a draw a layer.
     vector = middle + spread * jax.random.uniform(key, middle.shape, units.dtype, -1.0, 1.0)
-    stats = {
-        name: {"mean": jnp.zeros_like(norm["mean"]), "var": jnp.ones_like(norm["var"])} for name, norm in stats.items()
-    }
-    moments = _optimizer(plan).init(vector)
-    return (vector, stats, moments), (jnp.asarray(jnp.inf, units.dtype), vector, stats)
+    hidden = plan.encoder_widths[1:-1]
+    moments = [{"mean": jnp.zeros(n, units.dtype), "variance": jnp.ones(n, units.dtype)} for n in hidden]
+    return (vector, moments, _optimizer(plan).init(vector)), (jnp.asarray(jnp.inf, units.dtype), vector, moments)
 
 
-def _shapes(units: Array, plan: _Plan) -> tuple[Any, Any]:
-    """Shapes of the parameters {"encoder", "decoder"} and of the batch statistics."""
-    key, codes = jax.random.key(0), jnp.zeros((1, plan.encoder_widths[-1]), units.dtype)
-    encoder, decoder = _layers()
-    first = jax.eval_shape(lambda: encoder(plan.encoder_widths).init(key, units[:1], train=False))
-    second = jax.eval_shape(lambda: decoder(plan.decoder_widths).init(key, codes))
-    return {"encoder": first["params"], "decoder": second["params"]}, first["batch_stats"]
-
-
-def _unflatten(vector: Any, shapes: Any) -> Any:
-    """The tree of parameters that `vector` holds end to end; of NumPy's arrays where it is one."""
-    leaves, tree = jax.tree.flatten(shapes)
-    ends = np.cumsum([leaf.size for leaf in leaves])
-    parts = [vector[end - leaf.size : end].reshape(leaf.shape) for end, leaf in zip(ends, leaves, strict=True)]
-    return jax.tree.unflatten(tree, parts)
+def _unflatten(vector: Array, plan: _Plan) -> tuple[list[dict], list[dict]]:
+    """Parameters of encoder and decoder, which `vector` holds end to end."""
+    start, parts = 0, ([], [])
+    for layers, shapes in zip(parts, plan.shapes()):
+        for shape_of in shapes:
+            layer = {}
+            for name, shape in shape_of.items():
+                stop = start + int(np.prod(shape))
+                layer[name] = vector[start:stop].reshape(shape)
+                start = stop
+            layers.append(layer)
+    return parts
 
 
 def _optimizer(plan: _Plan) -> Any:
-    import optax
+    import optax  # late: a field is read without it
 
     return optax.adam(plan.learning_rate)
 
@@ -225,25 +188,23 @@ def _epochs(
 ) -> Any:
     count = units.shape[0]
     size = -(-count // plan.batches)
-    encoder, decoder = (layers(widths) for layers, widths in zip(_layers(), (plan.encoder_widths, plan.decoder_widths)))
     optimizer = _optimizer(plan)
-    shapes, _ = _shapes(units, plan)
 
-    def difference(params, codes, x, weight):
-        out: Any = decoder.apply({"params": params["decoder"]}, codes)
+    def difference(decoder, codes, x, weight):
+        out = _decode(decoder, codes)
         return jnp.mean((out - x) ** 2) + weight * (1 - jnp.mean(cosine(out, x)))
 
-    def loss(vector, stats, x):
-        params = _unflatten(vector, shapes)
-        variables = {"params": params["encoder"], "batch_stats": stats}
-        codes, changed = encoder.apply(variables, x, train=True, mutable=["batch_stats"])
-        return difference(params, codes, x, plan.cosine_weight), changed["batch_stats"]
+    def loss(vector, moments, x):
+        encoder, decoder = _unflatten(vector, plan)
+        codes, of_batch = _forward(encoder, None, x)
+        moments = jax.tree.map(lambda old, new: 0.9 * old + 0.1 * new, moments, of_batch)
+        return difference(decoder, codes, x, plan.cosine_weight), moments
 
     def step(state, x) -> tuple[Any, None]:
-        vector, stats, moments = state
-        gradient, stats = jax.grad(loss, has_aux=True)(vector, stats, x)
-        updates, moments = optimizer.update(gradient, moments)
-        return (vector + updates, stats, moments), None
+        vector, moments, adam = state
+        gradient, moments = jax.grad(loss, has_aux=True)(vector, moments, x)
+        updates, adam = optimizer.update(gradient, adam)
+        return (vector + updates, moments, adam), None
 
     def epoch(index, carry):
         state, best = carry
@@ -252,58 +213,42 @@ def _epochs(
         state, _ = jax.lax.scan(lambda s, rows: step(s, units[rows]), state, order)
 
         def judge(best):
-            vector, stats, _ = state
-            params = _unflatten(vector, shapes)
-            codes = encoder.apply({"params": params["encoder"], "batch_stats": stats}, units, train=False)
+            vector, moments, _ = state
+            encoder, decoder = _unflatten(vector, plan)
+            codes, _ = _forward(encoder, moments, units)
             # LangSplat trains with the cosine term at 0.001 and chooses its checkpoint with it at full weight.
-            value = difference(params, codes, units, 1.0)
-            return jax.tree.map(lambda new, old: jnp.where(value < best[0], new, old), (value, vector, stats), best)
+            value = difference(decoder, codes, units, 1.0)
+            return jax.tree.map(lambda new, old: jnp.where(value < best[0], new, old), (value, vector, moments), best)
 
         return state, jax.lax.cond(index >= judged_from, judge, lambda best: best, best)
 
     return jax.lax.fori_loop(start, stop, epoch, carry)
 
 
-def _widths(params: Any) -> tuple[int, ...]:
-    layers = sum(name.startswith("Dense_") for name in params)
-    return tuple(params[f"Dense_{i}"]["kernel"].shape[-1] for i in range(layers))
-
-
 @jax.jit
-def _encode(variables: Any, rows: Array) -> Array:
-    codes: Any = _layers()[0](_widths(variables["params"])).apply(variables, rows, train=False)
+def _encode(layers: Any, rows: Array) -> Array:
+    codes, _ = _forward(layers, layers, rows)
     return jnp.where(jnp.any(rows != 0, axis=-1, keepdims=True), codes, 0.0)
 
 
+def _forward(layers: Any, moments: Any, x: Array) -> tuple[Array, list[dict[str, Array]]]:
+    """E(x): unit codes of rows, and the moments of each normalisation; these are the batch's own if none are given."""
+    used = []
+    for n, layer in enumerate(layers[:-1]):
+        x = _affine(layer, x)
+        mean, variance = (moments[n]["mean"], moments[n]["variance"]) if moments else (x.mean(0), x.var(0))
+        used.append({"mean": mean, "variance": variance})
+        x = jax.nn.relu((x - mean) * jax.lax.rsqrt(variance + 1e-5) * layer["scale"] + layer["shift"])
+    return normalize(_affine(layers[-1], x)), used
+
+
 @jax.jit
-def _decode(variables: Any, rows: Array) -> Any:
-    return _layers()[1](_widths(variables["params"])).apply(variables, rows)
+def _decode(layers: Any, x: Array) -> Array:
+    """D(x): unit embeddings of codes."""
+    for layer in layers[:-1]:
+        x = jax.nn.relu(_affine(layer, x))
+    return normalize(_affine(layers[-1], x))
 
 
-@functools.cache
-def _layers() -> tuple[Any, Any]:
-    """Encoder and decoder, by their widths. flax is imported here, late: a field is read without it."""
-    from flax import linen as nn
-
-    class Encoder(nn.Module):
-        widths: tuple[int, ...]
-
-        @nn.compact
-        def __call__(self, x, train: bool):
-            x = nn.Dense(self.widths[0], param_dtype=x.dtype, precision=FULL_PRECISION)(x)
-            for width in self.widths[1:]:
-                norm = nn.BatchNorm(use_running_average=not train, momentum=0.9, epsilon=1e-5, param_dtype=x.dtype)
-                x = nn.relu(norm(x))
-                x = nn.Dense(width, param_dtype=x.dtype, precision=FULL_PRECISION)(x)
-            return normalize(x)
-
-    class Decoder(nn.Module):
-        widths: tuple[int, ...]
-
-        @nn.compact
-        def __call__(self, x):
-            for index, width in enumerate(self.widths):
-                x = nn.Dense(width, param_dtype=x.dtype, precision=FULL_PRECISION)(nn.relu(x) if index else x)
-            return normalize(x)
-
-    return Encoder, Decoder
+def _affine(layer: dict[str, Array], x: Array) -> Array:
+    return jnp.matmul(x, layer["weight"], precision=FULL_PRECISION) + layer["bias"]

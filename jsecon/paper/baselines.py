@@ -9,19 +9,19 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jsecon.errors import require, require_shape
-from jsecon.field.similarity import Codes, Number, UnitCodes, similarities
+from jsecon.field.similarity import Number, similarities
 from jsecon.types import Array, Selection
 
 TEMPERATURE = 10.0
 """LERF's and LangSplat's factor on the cosines; not CLIP's own 100"""
 
 
-def query_one_step(codes: Codes, text_code: Float[Array, " d_text"], threshold: Number) -> Selection:
+def query_one_step(codes: Float[Array, "n d"], text_code: Float[Array, " d_text"], threshold: Number) -> Selection:
     """Selects the Gaussians whose code has a cosine of at least `threshold` with the text's code. Pure.
 
     Args:
-      codes: (N, d) of any length, or `unit_codes(codes)`, made once for many queries. A zero code (unknown) or one that
-        is not finite has similarity 0 and is never selected.
+      codes: (N, d) of any length. A zero code (unknown) or one that is not finite has similarity 0 and is never
+        selected.
       text_code: (d,) of any length.
       threshold: Smallest cosine.
 
@@ -31,18 +31,21 @@ def query_one_step(codes: Codes, text_code: Float[Array, " d_text"], threshold: 
     Raises:
       ValueError: Shapes disagree.
     """
-    require_shape("query_one_step", text_code, (codes.shape[1],), "Encode the text with the field's coder.")
+    require_shape("query_one_step", text_code, (codes.shape[1],), "Encode the text with the field's autoencoder.")
     return _one_step(codes, text_code, threshold)
 
 
 @jax.jit
-def _one_step(codes: Array | UnitCodes, text_code: Array, threshold: Number) -> Selection:
+def _one_step(codes: Array, text_code: Array, threshold: Number) -> Selection:
     similarity, known = similarities(codes, text_code)
     return _selection(similarity, known, threshold)
 
 
 def query_canonical(
-    features: Codes, text: Float[Array, " d_text"], canonical: Float[Array, "c d_canonical"], threshold: Number
+    features: Float[Array, "n d"],
+    text: Float[Array, " d_text"],
+    canonical: Float[Array, "c d_canonical"],
+    threshold: Number,
 ) -> Selection:
     """Selects the Gaussians whose relevancy to the text is at least `threshold`. Pure.
 
@@ -50,8 +53,7 @@ def query_canonical(
     LERF), in (0, 1); above 0.5 the text is closer than every phrase.
 
     Args:
-      features: (N, d) embeddings or codes, or their `unit_codes`; zero or non-finite ones have relevancy 0 and are
-        never selected.
+      features: (N, d) embeddings or codes; zero or non-finite ones have relevancy 0 and are never selected.
       text: (d,) in the same space.
       canonical: (C, d) phrases in the same space, C >= 1.
       threshold: Smallest relevancy.
@@ -70,11 +72,13 @@ def query_canonical(
 
 
 @jax.jit
-def _canonical(features: Codes, text: Array, canonical: Array, threshold: Number) -> Selection:
+def _canonical(features: Array, text: Array, canonical: Array, threshold: Number) -> Selection:
     return _selection(*relevancies(features, text, canonical), threshold)
 
 
-def relevancies(features: Codes, text: Float[Array, " d"], canonical: Float[Array, "c d"]) -> tuple[Array, Array]:
+def relevancies(
+    features: Float[Array, "n d"], text: Float[Array, " d"], canonical: Float[Array, "c d"]
+) -> tuple[Array, Array]:
     """Computes LERF's relevancy, see `query_canonical`. Pure.
 
     Args:

@@ -174,8 +174,7 @@ class FieldOptions:
       weighting: How the views of a region are weighted in its embedding: by their pixels, or all alike.
       parts: Embeds each frame's own masks too, so that query finds things that no region holds, and query --all leaves
         out what most views took for one with its neighbour. Takes twice as many embeddings.
-      latent: Maximum length of a code. The paper uses 3; auto takes as few numbers as keep the regions apart.
-      reduce: How a Gaussian's code follows from its votes.
+      paper: Also computes the paper's codes, three numbers per Gaussian, which query --by code compares.
       top: Number of regions whose votes a Gaussian keeps.
       centre_pixel_weight: Weight of the pixel at a Gaussian's centre against all pixels that it covers, 0 to 1. Use 1
         if the answer is evaluated on points.
@@ -183,8 +182,7 @@ class FieldOptions:
 
     weighting: Option[Literal["pixels", "uniform"]] = "pixels"
     parts: Option[bool] = False
-    latent: Option[int | Literal["auto"]] = 16
-    reduce: Option[Literal["mode", "median", "mean"]] = "mode"
+    paper: Option[bool] = False
     top: Option[int] = 8
     centre_pixel_weight: Option[float] = 0.0
 

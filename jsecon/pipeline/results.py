@@ -16,11 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jsecon.errors import InputError
-from jsecon.paper.codes import Coder
 from jsecon.pipeline import cache
 from jsecon.pipeline.options import Options
 from jsecon.read.captures.frames import evenly_spaced
-from jsecon.types import Array, Capture, Gaussians, Parts, Progress, Quality, Regions, Votes
+from jsecon.types import Array, Capture, Codes, Gaussians, Parts, Progress, Quality, Regions, Votes
 from jsecon.vision.protocols import Models
 
 CHECKPOINT_SECONDS = 20.0
@@ -44,12 +43,10 @@ class Results:
     """R regions of the training frames"""
     parts: Parts | None = None
     """parts of the scene, if the options ask for them"""
-    codes: tuple[Array, Coder]
-    """(R, d) codes of the regions, and their coder"""
     votes: Votes
     """weight of each region on each Gaussian"""
-    distil: Array
-    """(N, d) codes of the Gaussians"""
+    codes: Codes | None = None
+    """codes of the paper, if the options ask for them"""
     held_out: Quality
     """PSNR and SSIM of the held-out frames"""
     poses: Any

@@ -1,8 +1,9 @@
 """A run: from a capture to a language field, stage by stage, each stored as it is finished.
 
-    poses (if they are missing) -> load -> gaussians -> masklets -> regions -> codes -> votes -> distil -> field
+    poses (if they are missing) -> load -> gaussians -> masklets -> regions -> votes -> field
 
-and with --parts, after regions, the parts of the scene. Last, the held-out frames are measured.
+and with --parts, after regions, the parts of the scene; with --paper, after votes, the codes. Last, the held-out frames
+are measured.
 
 The keys of all stages are known before any runs, so the plan is printed first: which stages run, which are cached, what
 is skipped and why. These files are passed on the way, by default; behind each lies more of its own package:
@@ -12,9 +13,7 @@ is skipped and why. These files are passed on the way, by default; behind each l
     gaussians   fit/start, fit/optimise
     masklets    vision/classical, association/views, association/consensus, association/algorithm1
     regions     vision/colours, language/regions
-    codes       language/codes
     votes       language/votes, splat/render
-    distil      language/distill
     field       language/field
 """
 
@@ -77,7 +76,6 @@ LEAST: dict[str, float] = {
     "points_per_side": 1,
     "vision_frames": 2,
     "crop_layers": 0,
-    "latent": 1,
     "top": 1,
     "centre_pixel_weight": 0,
 }

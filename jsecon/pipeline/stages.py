@@ -1,6 +1,6 @@
 """The stages of a run. A function `_plan_...` plans a stage, the function below it computes the result.
 
-    poses, load, gaussians, masklets, regions, parts, codes, votes, distil, held_out
+    poses, load, gaussians, masklets, regions, parts, votes, codes, held_out
 
 Only `load`, `field_of` and the measurement of quality read held-out frames.
 """
@@ -21,10 +21,10 @@ from jsecon.association.consensus import consensus_masklets, pieces_on_masks
 from jsecon.association.run_lengths import cache_masks_as_rle
 from jsecon.association.scene import SceneSuperpixels
 from jsecon.errors import InputError
-from jsecon.field.columns import is_mapped
+from jsecon.field.columns import is_mapped, vote_blocks
 from jsecon.field.membership import normalise_votes_in_blocks
 from jsecon.field.regions import Embed, embeddings_of_masks, region_embeddings, scene_parts
-from jsecon.field.streaming import codes_in_blocks, region_votes_in_blocks
+from jsecon.field.streaming import region_votes_in_blocks
 from jsecon.field.votes import region_votes, votes_memory
 from jsecon.files import write_text
 from jsecon.fit.depth import points_from_depth
@@ -32,8 +32,7 @@ from jsecon.fit.quality import QUICK_LONG_SIDE, is_weak, measure_quality
 from jsecon.fit.start import starting_gaussians
 from jsecon.networks.hub import model_name
 from jsecon.paper.algorithm1 import clean_masklets, masklets as algorithm1
-from jsecon.paper.autoencoder import Autoencoder
-from jsecon.paper.codes import region_codes
+from jsecon.paper.autoencoder import encode, train_autoencoder
 from jsecon.paper.distill import distill_votes
 from jsecon.paper.tracker import GeometricTracker
 from jsecon.pipeline.bare_stages import bare_stages, require_options_apply
@@ -60,7 +59,7 @@ from jsecon.read.masks.langsplat import load_features
 from jsecon.read.masks.masks import load_labels
 from jsecon.read.masks.proposals import load_proposals
 from jsecon.splat.render import render_depth
-from jsecon.types import Camera, Capture, Gaussians, LanguageField, Progress, Regions
+from jsecon.types import Camera, Capture, Codes, Gaussians, LanguageField, Progress, Regions
 from jsecon.vision.classical import GRANULARITIES, ClassicalSegmenter
 from jsecon.vision.protocols import Embedder, Segmenter
 from jsecon.vision.reference_words import reference_of
@@ -78,6 +77,8 @@ MAX_CLOUD_POINTS = 100_000
 """points from depth whose normals are estimated"""
 MIN_CLOUD_SPACING = 0.02
 """least distance between them, as a share of the median depth: closer points show a sensor's noise, not the surface"""
+LATENT = 3
+"""numbers of a code in the paper"""
 
 
 def run_stages(context: RunContext) -> list[Stage]:
@@ -86,7 +87,8 @@ def run_stages(context: RunContext) -> list[Stage]:
     if context.options.masks is not None:
         first.reverse()
     parts = [_plan_parts(context)] if context.options.parts else []
-    last = [plan(context) for plan in (_plan_codes, _plan_votes, _plan_distil, _plan_held_out)]
+    codes = [_plan_codes(context)] if context.options.paper else []
+    last = [_plan_votes(context), *codes, _plan_held_out(context)]
     return [*capture_stages(context), *first, _plan_regions(context), *parts, *last]
 
 
@@ -605,25 +607,7 @@ def _masks_with_embeddings(context: RunContext, results: Results) -> tuple[Calla
     return frame_proposals(context, results.load, results.gaussians)[0], by_model
 
 
-# The codes
-
-
-def _plan_codes(context: RunContext) -> Stage:
-    """Plans the codes of the regions: their embeddings, compressed if they are longer than a code."""
-    latent = context.options.latent
-    auto = "as few numbers per region as keep them apart"
-    how = auto if latent == "auto" else f"at most {latent} numbers per region"
-    return Stage("codes", how, _encode, after=("regions",), key_options=context.key_options("latent", "seed"))
-
-
-def _encode(stage: StageInput) -> StageResult:
-    options, embeddings = stage.context.options, stage.results.regions.embeddings
-    key = jax.random.key(options.seed)
-    table, coder, reason = region_codes(embeddings, latent=options.latent, key=key, progress=stage.progress)
-    reason = reason.partition(": ")[2] or reason
-    if isinstance(coder, Autoencoder):
-        return StageResult((table, coder), notes=(f"autoencoder: {reason}",))
-    return StageResult((table, coder), {"autoencoder": reason})
+# The votes
 
 
 def _plan_votes(context: RunContext) -> Stage:
@@ -655,21 +639,32 @@ def _accumulate_votes(stage: StageInput) -> StageResult:
     else:
         accumulated = region_votes(scene, cameras, labels, count, **settings)
     unseen = int((np.asarray(accumulated.views) == 0).sum())
-    skipped = {"unseen Gaussians": f"{unseen} of {scene.count} that no frame sees get no code"} if unseen else {}
+    skipped = {"unseen Gaussians": f"{unseen} of {scene.count}, which no frame sees"} if unseen else {}
     return StageResult(accumulated, skipped, notes)
 
 
-def _plan_distil(context: RunContext) -> Stage:
-    """Plans the codes of the Gaussians, from their votes."""
-    how = f"a Gaussian's code is its votes' {context.options.reduce}"
-    return Stage("distil", how, _distil, after=("votes", "codes"), key_options=context.key_options("reduce"))
+# The codes of the paper
 
 
-def _distil(stage: StageInput) -> StageResult:
-    (table, _), cast, reduce = stage.results.codes, stage.results.votes, stage.context.options.reduce
-    if is_mapped(cast):
-        return StageResult(codes_in_blocks(cast, table, stage.checkpoint.folder / "codes.npy", reduce))
-    return StageResult(distill_votes(cast, table, reduce=reduce))
+def _plan_codes(context: RunContext) -> Stage:
+    """Plans the paper's codes of regions and Gaussians (--paper)."""
+    how = f"{LATENT} numbers per region by an autoencoder, distilled into the Gaussians by their votes"
+    return Stage("codes", how, _compute_codes, after=("regions", "votes"), key_options=context.key_options("seed"))
+
+
+def _compute_codes(stage: StageInput) -> StageResult:
+    options, embeddings, cast = stage.context.options, stage.results.regions.embeddings, stage.results.votes
+    if not np.any(np.asarray(embeddings)):
+        raise InputError("--paper", "no region has an embedding to train the autoencoder on", remedy="Leave it out.")
+    key = jax.random.key(options.seed)
+    autoencoder = train_autoencoder(embeddings, latent=LATENT, key=key, progress=stage.progress)
+    table = encode(autoencoder, embeddings)
+    blocks = vote_blocks(cast) if is_mapped(cast) else [cast]
+    codes = np.concatenate([np.asarray(distill_votes(block, table)) for block in blocks])
+    return StageResult(Codes(codes, table, autoencoder))
+
+
+# The field
 
 
 def field_of(results: Results, embedder: Embedder, provenance: str, options: Options) -> LanguageField:
@@ -677,14 +672,10 @@ def field_of(results: Results, embedder: Embedder, provenance: str, options: Opt
     capture, embedded = results.load, results.regions
     pixels = np.zeros((embedded.count, len(capture.names)), np.int32)
     pixels[:, vision_frames(capture, options)] = embedded.pixel_counts
-    table, coder = results.codes
     return LanguageField(
         gaussians=results.gaussians,
-        codes=results.distil,
         votes=normalise_votes_in_blocks(results.votes, embedded),
         regions=Regions(embedded.embeddings, pixels),
-        region_codes=table,
-        autoencoder=coder,
         cameras=capture.cameras,
         canonical_phrases=np.asarray(embedder.canonical_phrases, np.float32),
         source_from_scene=np.asarray(capture.source_from_scene),
@@ -693,4 +684,5 @@ def field_of(results: Results, embedder: Embedder, provenance: str, options: Opt
         provenance=provenance,
         parts=results.parts,
         unrelated_words=reference_of(embedder).astype(np.float16),
+        codes=results.codes,
     )

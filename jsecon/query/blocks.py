@@ -11,10 +11,9 @@ from jaxtyping import Float, Int
 from jsecon.errors import require_one_of
 from jsecon.field.columns import row_slices, votes_of_rows
 from jsecon.field.similarity import Number
-from jsecon.paper.codes import CODE_THRESHOLD
 from jsecon.query.answer import RULES, RegionMatch, match_regions, select_from_votes
 from jsecon.query.rules import QueryRules
-from jsecon.query.select import select_rows_by_code
+from jsecon.query.select import CODE_THRESHOLD, codes_of, select_rows_by_code
 from jsecon.types import Array, LanguageField
 
 
@@ -84,16 +83,16 @@ def select_in_blocks(
     require_one_of("select_in_blocks", by, ("votes", "code"), "'votes' is the default.")
     default = RULES.min_share if by == "votes" else CODE_THRESHOLD
     threshold = default if similarity_threshold is None else similarity_threshold
-    table = jnp.asarray(field.region_codes)
+    stored = codes_of(field) if by == "code" else None
     columns = [[(np.zeros(0, np.int64), np.zeros(0, np.float32))] for _ in matches]
     for rows in row_slices(field.votes, len(field.votes.views)) if field.regions.count and matches else ():
         votes = jax.tree.map(jnp.asarray, votes_of_rows(field.votes, rows))
-        codes = jnp.asarray(field.codes[rows]) if by == "code" else None
         for column, match in zip(columns, matches):
-            if codes is None:
+            if stored is None:
                 selection = select_from_votes(votes, match, threshold)
             else:
-                selection = select_rows_by_code(codes, table, votes.views, match, threshold)
+                codes = jnp.asarray(stored.gaussians[rows]), jnp.asarray(stored.regions)
+                selection = select_rows_by_code(*codes, votes.views, match, threshold)
             places = np.flatnonzero(np.asarray(selection.mask))
             column.append((places + rows.start, np.asarray(selection.similarity)[places]))
     answers = []

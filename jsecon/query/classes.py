@@ -72,7 +72,7 @@ def query_classes(
     remedy = "Embed the names of the classes with the field's embedder."
     require(fit, "query_classes", f"texts {texts.shape}", f"(Q >= 1, {size})", remedy)
     if field.regions.count == 0:
-        count, dtype = field.codes.shape[0], jnp.asarray(field.regions.embeddings).dtype
+        count, dtype = field.gaussians.count, jnp.asarray(field.regions.embeddings).dtype
         return Classes(jnp.full(count, -1, jnp.int32), jnp.zeros((count, texts.shape[0]), dtype))
     arrays = field.regions.embeddings, texts, field.regions.pixel_counts, field.votes
     return _classes(*jax.tree.map(jnp.asarray, arrays), unrelated_words(field), rules, standardise, every)

@@ -4,33 +4,41 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Int
 
-from jsecon.field.similarity import Number, UnitCodes, similarities
-from jsecon.paper.codes import CODE_THRESHOLD
+from jsecon.errors import require
+from jsecon.field.similarity import Number, similarities
 from jsecon.query.answer import RegionMatch
-from jsecon.types import Array, LanguageField, Selection
+from jsecon.types import Array, Codes, LanguageField, Selection
+
+CODE_THRESHOLD = 0.9
+"""Smallest cosine with the region's code: codes of one region lie within a few degrees (0.9 is 26)."""
 
 
-def select_by_code(
-    field: LanguageField, match: RegionMatch, threshold: Number = CODE_THRESHOLD, *, codes: UnitCodes | None = None
-) -> Selection:
+def codes_of(field: LanguageField) -> Codes:
+    """Returns the codes of a field. Raises ValueError if it has none."""
+    remedy = "Make the field with jsecon run --paper, or select by votes."
+    require(field.codes is not None, "field.codes", None, "codes", remedy)
+    return field.codes
+
+
+def select_by_code(field: LanguageField, match: RegionMatch, threshold: Number = CODE_THRESHOLD) -> Selection:
     """Selects the Gaussians whose code has at least a cosine with that of the best region. Pure.
 
     Args:
       field: The field of N Gaussians.
       match: Its regions, of which only the best counts.
       threshold: Smallest cosine.
-      codes: `unit_codes(field.codes)`, made once for many queries.
     """
+    codes = codes_of(field)
     if field.regions.count == 0:
         none = jnp.zeros(field.gaussians.count, bool)
         return Selection(none, none.astype(jnp.float32), *map(jnp.asarray, match[1:5]))
-    table, views = jnp.asarray(field.region_codes), jnp.asarray(field.votes.views)
-    return select_rows_by_code(field.codes if codes is None else codes, table, views, match, threshold)
+    columns = codes.gaussians, codes.regions, field.votes.views
+    return select_rows_by_code(*map(jnp.asarray, columns), match, threshold)
 
 
 @jax.jit
 def select_rows_by_code(
-    codes: Float[Array, "n d"] | UnitCodes,
+    codes: Float[Array, "n d"],
     region_codes: Float[Array, "r d"],
     views: Int[Array, " n"],
     match: RegionMatch,

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from jsecon.app.outputs import main_regions
+from jsecon.app.pictures import main_regions
 from jsecon.numerics import sigmoid
 from jsecon.splat.project import is_usable
 from jsecon.splat.sh import C0

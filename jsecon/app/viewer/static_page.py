@@ -18,7 +18,7 @@ from jaxtyping import Float
 from jsecon.app import verbs
 from jsecon.app.ask import Answer
 from jsecon.app.models import open_embedder
-from jsecon.app.outputs import main_regions
+from jsecon.app.pictures import main_regions
 from jsecon.app.querying import ask_texts
 from jsecon.errors import InputError
 from jsecon.field.field import load_field

@@ -16,9 +16,9 @@ from jsecon.errors import InputError, describe_error
 from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.query.rules import FRAGMENT_SCORE
 
-Colouring: TypeAlias = Literal["photo", "code", "region", "score"]
+Colouring: TypeAlias = Literal["photo", "region", "score"]
 COLOURINGS: tuple[Colouring, ...] = get_args(Colouring)
-"""what the colours of the Gaussians show: the photographs, codes, regions, or how far each belongs to the answers"""
+"""what the colours of the Gaussians show: the photographs, regions, or how far each belongs to the answers"""
 DIM = 0.4
 """brightness of Gaussians outside of all answers, as a share of what it was"""
 GREY = 0.6

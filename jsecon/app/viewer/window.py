@@ -25,7 +25,7 @@ from jsecon.app.ask import Answer, ask_region, ask_text, edit_answers
 from jsecon.app.models import open_embedder
 from jsecon.app.object_scene import ObjectScene
 from jsecon.app.outputs import answer_masks, file_stem, write_answer
-from jsecon.app.pictures import UNKNOWN, Renderer, code_colours, palette
+from jsecon.app.pictures import UNKNOWN, Renderer, palette
 from jsecon.app.relations import query_relation, relation_answer
 from jsecon.app.viewer import view_state
 from jsecon.app.viewer.candidates import Candidate, candidates, region_along
@@ -303,8 +303,6 @@ class Viewer:
 
     def _compute_base_colours(self, colouring: str) -> np.ndarray:
         """Returns the RGB (N, 3) of the Gaussians without an answer."""
-        if colouring == "code":
-            return (255 * code_colours(self.field)).astype(np.uint8)
         if colouring == "region":
             table = np.concatenate([palette(self.field.regions.count), np.full((1, 3), 255 * UNKNOWN, np.uint8)])
             return table[self.scene.regions]

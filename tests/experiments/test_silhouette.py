@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from balls import ring_of_balls
 
-from jsecon.query.render import ALPHA_THRESHOLD, VALA_THRESHOLD, render_selection
-from jsecon.query.silhouette import (
+from experiments.tables.silhouette import (
     SILHOUETTE_WEIGHTS,
     SWEEPS,
     WEIGHTS,
@@ -19,6 +18,7 @@ from jsecon.query.silhouette import (
     fit_silhouette,
     footprints,
 )
+from jsecon.query.render import ALPHA_THRESHOLD, VALA_THRESHOLD, render_selection
 from jsecon.splat.plan import plan_view, render_plan
 from jsecon.splat.scan import to_tiles
 

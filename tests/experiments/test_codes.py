@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from small_field import unit_rows
 
-from jsecon.paper.autoencoder import Autoencoder
-from jsecon.paper.codes import (
+from experiments.tables.codes import (
     CODE_THRESHOLD,
     LATENTS,
     Rotation,
@@ -16,6 +15,7 @@ from jsecon.paper.codes import (
     region_codes,
     spread_codes,
 )
+from jsecon.paper.autoencoder import Autoencoder
 
 KEY = jax.random.key(0)
 

@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float
 
 from jsecon.errors import require
 from jsecon.numerics import FULL_PRECISION, cosine_matrix, normalize
-from jsecon.paper.autoencoder import Autoencoder, require_finite, train_autoencoder
-from jsecon.types import Array, Key
+from jsecon.paper.autoencoder import encode as encode_by_network, train_autoencoder
+from jsecon.types import Array, Autoencoder, Key
 
 MAX_COSINE_LOSS = 1e-4
 """Largest change of a cosine between two regions for which a rotation counts as lossless."""
@@ -106,7 +106,9 @@ def encode(coder: Coder, embeddings: Float[Array, "*batch e"]) -> Float[Array, "
     Returns:
       (..., d) unit codes.
     """
-    return normalize(jnp.asarray(embeddings)) if coder is None else coder.encode(embeddings)
+    if coder is None:
+        return normalize(jnp.asarray(embeddings))
+    return encode_by_network(coder, embeddings) if isinstance(coder, Autoencoder) else coder.encode(embeddings)
 
 
 class RegionCodes(NamedTuple):
@@ -142,7 +144,8 @@ def region_codes(embeddings: Float[Array, "r e"], *, latent: int | str, key: Key
     """
     known = latent == "auto" or (isinstance(latent, int) and latent >= 1)
     require(known, "region_codes", f"latent={latent!r}", "at least 1, or 'auto'", "3 is LangSplat's.")
-    require_finite("region_codes", np.asarray(embeddings))
+    finite = bool(np.isfinite(np.asarray(embeddings)).all())
+    require(finite, "region_codes", "embeddings that are not finite", "finite numbers", "Leave these regions out.")
     units = normalize(jnp.asarray(embeddings))
     if latent == "auto":
         return _smallest_codes(units)
@@ -159,7 +162,7 @@ def region_codes(embeddings: Float[Array, "r e"], *, latent: int | str, key: Key
         return RegionCodes(codes, rotation, f"left out: {count} regions fit in {latent} dimensions without loss")
     coder = train_autoencoder(units, latent=latent, key=key, **training)
     why = f"run: a rotation into {latent} dimensions would move cosines by up to {loss:.2f}"
-    return RegionCodes(coder.encode(units), coder, why)
+    return RegionCodes(encode(coder, units), coder, why)
 
 
 def _smallest_codes(units: Array) -> RegionCodes:
