@@ -60,7 +60,7 @@ def field_of_room(folder: Path, seed: int, options: Options) -> LanguageField:
         write_room(capture, crowded_room(seed), holdout=HOLDOUT, **(QUICK_ROOM if options.quick else {}))
     if not (folder / pipeline.FIELD_FILE).is_file():
         steps = 60 if options.quick else 550
-        run = RunOptions(capture, holdout=HOLDOUT, steps=steps, downscale=1.0, seed=seed)
+        run = RunOptions(capture, holdout=HOLDOUT, steps=steps, seed=seed)
         pipeline.run(run, folder, listener=Listener())
     return jsecon.load_field(folder / pipeline.FIELD_FILE)
 

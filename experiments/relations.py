@@ -374,7 +374,7 @@ def default_field(room: Room, folder: Path) -> LanguageField:
     from jsecon.pipeline.progress import Console
 
     write_room(folder / "capture", room)
-    options = Options(folder / "capture", holdout=5, steps=550, downscale=1.0, seed=room.seed)
+    options = Options(folder / "capture", holdout=5, steps=550, seed=room.seed)
     return pipeline.run(options, folder, listener=Console()).field
 
 

@@ -29,7 +29,7 @@ def refused(*parts):
     assert info.value.remedy
 
 
-ROOM_FIT = {"holdout": 4, "steps": 110, "gaussians_at_most": 4000}
+ROOM_FIT = {"holdout": 4, "steps": 110}
 """options of the fixture `room_run`: two chunks of steps and a part of a third, one growth"""
 
 

@@ -23,6 +23,7 @@ import tyro
 import jsecon
 from jsecon.app.verbs import VERBS, OutputOptions, Verb, VerbResult
 from jsecon.errors import InputError, describe_error
+from jsecon.pipeline.options import check_ranges
 from jsecon.pipeline.progress import Console
 
 ABOUT = """Finds things in 3D Gaussian scenes by text, at the level of points, on a plain CPU.
@@ -101,7 +102,9 @@ def parse(argv: Sequence[str]) -> Verb:
     if argv and argv[0] in _VERBS:  # one verb alone is read ten times faster than all
         kind = _VERBS[argv[0]]
         examples = "\n".join(["examples", *(f"  {line}" for line in kind.examples)])
-        return _read(kind, f"jsecon {argv[0]}", argv[1:], description=f"{_summary(kind)}\n\n{examples}")
+        verb = _read(kind, f"jsecon {argv[0]}", argv[1:], description=f"{_summary(kind)}\n\n{examples}")
+        check_ranges(verb)
+        return verb
     if argv and not argv[0].startswith("-"):
         similar = "".join(f"Did you mean {name}? " for name in difflib.get_close_matches(argv[0], _VERBS, 1))
         raise InputError("jsecon", f"{argv[0]} is not a verb", remedy=f"{similar}jsecon --help lists the verbs.")

@@ -13,13 +13,17 @@ from tyro.conf import Positional, UseAppendAction, arg
 from jsecon.networks.hub import Precision, Role
 from jsecon.pipeline.options import (
     BareOptions,
+    Count,
+    Direction,
     FieldOptions,
     InputOptions,
     MaskOptions,
     ModelOptions,
     Option,
     Options,
+    Range,
     SceneOptions,
+    Seed,
 )
 
 T = TypeVar("T")
@@ -72,9 +76,9 @@ class Demo(Verb):
 
     examples = ("jsecon demo", "jsecon demo --seed 3 --out room_3")
 
-    seed: Option[int] = 0
+    seed: Seed[Option[int]] = 0
     out: Option[Path] = Path("jsecon-demo")
-    steps: Option[int] = 550
+    steps: Count[Option[int]] = 550
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -158,7 +162,7 @@ class ServerVerb(Verb):
     """
 
     host: Option[str] = "127.0.0.1"
-    port: Option[int] = 8765
+    port: Annotated[Option[int], Range(0, 65535)] = 8765
     token: Option[str] = ""
     allow_host: Repeated[str] = dataclasses.field(default_factory=list)
 
@@ -229,23 +233,25 @@ class Query(FieldVerb):
     )
 
     texts: Positional[list[str]]
-    at: Annotated[Repeated[tuple[str, int, int]], arg(metavar="FRAME X Y")] = dataclasses.field(default_factory=list)
-    mask: Annotated[Repeated[list[str]], arg(metavar="FRAME PNG ...")] = dataclasses.field(default_factory=list)
-    box: Annotated[Repeated[tuple[str, int, int, int, int]], arg(metavar="FRAME X0 Y0 X1 Y1")] = dataclasses.field(
+    at: Annotated[Repeated[tuple[str, int, int]], arg(metavar="FRAME X Y"), Range(0, 100_000)] = dataclasses.field(
         default_factory=list
+    )
+    mask: Annotated[Repeated[list[str]], arg(metavar="FRAME PNG ...")] = dataclasses.field(default_factory=list)
+    box: Annotated[Repeated[tuple[str, int, int, int, int]], arg(metavar="FRAME X0 Y0 X1 Y1"), Range(0, 100_000)] = (
+        dataclasses.field(default_factory=list)
     )
     out: Option[Path]
     from_frame: Annotated[Option[str | None], arg(name="from", metavar="FRAME")] = None
-    up: Option[tuple[float, float, float] | None] = None
+    up: Direction[Option[tuple[float, float, float] | None]] = None
     by: Option[By] = "votes"
-    threshold: Option[float | None] = None
-    min_rank: Option[float] = 0.82
+    threshold: Annotated[Option[float | None], Range(-1, 1)] = None
+    min_rank: Annotated[Option[float], Range(0, 1)] = 0.82
     all: Option[bool] = False
     keep_outliers: Option[bool] = False
-    grow: Option[int] = 0
-    shrink: Option[int] = 0
+    grow: Annotated[Option[int], Range(0, 100)] = 0
+    shrink: Annotated[Option[int], Range(0, 100)] = 0
     invert: Option[bool] = False
-    views: Option[int] = 3
+    views: Annotated[Option[int], Range(0, 1000)] = 3
     format: Option[Literal["ply", "spz", "glb"]] = "ply"
 
 
@@ -324,7 +330,7 @@ class View(ServerVerb, FieldVerb):
     texts: Positional[list[str]]
     export: Option[Path | None] = None
     link: Option[str] = ""
-    port: Option[int] = 8766
+    port: Annotated[Option[int], Range(0, 65535)] = 8766
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -55,7 +55,7 @@ def run_demo(
     """
     require_writable(out)
     capture = _write_capture(out / "capture", seed, {"holdout": HOLDOUT} | (room or {}), listener)
-    options = Options(capture, holdout=HOLDOUT, steps=steps, downscale=1.0, seed=seed)
+    options = Options(capture, holdout=HOLDOUT, steps=steps, seed=seed)
     run = pipeline.run(options, out, listener=listener)
     true_options = dataclasses.replace(options, masks=capture / "masks")
     true_run = pipeline.run(true_options, out / "true_masks", listener=listener, cache_folder=out / "cache")

@@ -24,7 +24,7 @@ DIAGONAL = 6.0
 """diagonal that any other scene is brought to"""
 FAR = 100.0
 """diagonals from the origin beyond which a scene is moved to it: float32 has few digits out there"""
-OF_PHOTOGRAPHS = ("downscale", "frames", "holdout", "refine", "drop_frames")
+OF_PHOTOGRAPHS = ("frames", "holdout", "refine", "drop_frames")
 """options that only photographs have a use for"""
 OF_BARE_SCENES = ("views", "up", "cameras")
 """options that only a scene without photographs has a use for"""

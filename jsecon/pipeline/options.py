@@ -6,8 +6,9 @@ values it accepts. Each class is a group of the help.
 
 import dataclasses
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias, TypeVar
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar, get_type_hints
 
 import tyro
 
@@ -24,6 +25,58 @@ def _default_hint(default: str) -> str:
 
 Option: TypeAlias = Annotated[T, tyro.conf.arg(prefix_name=False, help_behavior_hint=_default_hint)]
 """an option of the command line; its flag does not name the group"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Range:
+    """Mark of an option with numbers: each of them must lie in it. NaN lies in no range."""
+
+    low: int | float
+    high: int | float
+    above: bool = False
+    """`low` itself is too small"""
+    direction: bool = False
+    """the numbers are a direction, so that at least one of them must not be 0"""
+
+    def __contains__(self, numbers: Any) -> bool:
+        """Whether all numbers of a tree of tuples and lists lie in the range."""
+        leaves = [x for x in _leaves(numbers) if isinstance(x, int | float) and not isinstance(x, bool)]
+        if self.direction and leaves and not any(leaves):
+            return False
+        return all(self.low <= x <= self.high and not (self.above and x == self.low) for x in leaves)
+
+    def __str__(self) -> str:
+        """The range in words."""
+        if self.direction:
+            return "a direction, three numbers that are not all 0"
+        return f"{'above' if self.above else 'at least'} {self.low:g} and at most {self.high:g}"
+
+
+def _leaves(tree: Any) -> Iterator[Any]:
+    if isinstance(tree, tuple | list):
+        for part in tree:
+            yield from _leaves(part)
+    else:
+        yield tree
+
+
+Count: TypeAlias = Annotated[T, Range(1, 1_000_000)]
+Seed: TypeAlias = Annotated[T, Range(0, 2**31 - 1)]
+"""what jax and NumPy both take"""
+Direction: TypeAlias = Annotated[T, Range(-1e6, 1e6, direction=True)]
+
+
+def check_ranges(options: Any) -> None:
+    """Raises InputError if a number of a dataclass of options, or of a group in it, is out of its `Range`."""
+    hints = get_type_hints(type(options), include_extras=True)
+    for field in dataclasses.fields(options):
+        value = getattr(options, field.name)
+        if dataclasses.is_dataclass(value):
+            check_ranges(value)
+        for mark in getattr(hints[field.name], "__metadata__", ()):
+            if isinstance(mark, Range) and value not in mark:
+                words = " ".join(map(str, _leaves(value)))
+                raise InputError(f"--{field.name.replace('_', '-')}", words, str(mark), "Change the option.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,9 +104,7 @@ class SceneOptions:
     """Options of the frames and of the photometric fit.
 
     Attributes:
-      downscale: Makes the frames this many times smaller, at least 1. By default their longer side becomes at most
-        --long-side.
-      long_side: Longest side of the frames in pixels, at least 16, unless --downscale is given.
+      long_side: Longest side of the frames in pixels, at least 16. Smaller frames keep their size.
       frames: Maximum number of frames, evenly spaced, at least 2. By default all frames are used, of a video 150.
       holdout: Every how many frames one is held out for measuring; 0 holds out no frame.
       refine: What to correct by short fits before anything else: camera poses, exposures or both. Held-out frames are
@@ -64,24 +115,17 @@ class SceneOptions:
       steps: Number of optimisation steps of the photometric fit.
       minutes: Time limit of the photometric fit in minutes, at least 0.05. It replaces --steps, and the schedule makes
         the best of it on this machine.
-      gaussians_at_most: Maximum number of Gaussians of the fit. A denser initial point cloud is kept as it is. By
-        default there is one for every other pixel of a frame, for every pixel in fits of at least 3 minutes or 3000
-        steps, and at most 100,000.
-      sh_degree: Degree of the spherical harmonics of the fitted colours.
       seed: Seed of all random numbers.
     """
 
-    downscale: Option[float | None] = None
-    long_side: Option[int] = 400
-    frames: Option[int | None] = None
-    holdout: Option[int] = 8
+    long_side: Annotated[Option[int], Range(16, 16384)] = 400
+    frames: Annotated[Option[int | None], Range(2, 1_000_000)] = None
+    holdout: Annotated[Option[int], Range(0, 1_000_000)] = 8
     refine: Option[Literal["none", "poses", "exposure", "both", "auto"]] = "auto"
     drop_frames: Option[Literal["none", "auto"]] = "none"
-    steps: Option[int] = 2000
-    minutes: Option[float | None] = None
-    gaussians_at_most: Option[int | None] = None
-    sh_degree: Option[Literal[0, 1, 2, 3]] = 2
-    seed: Option[int] = 0
+    steps: Count[Option[int]] = 2000
+    minutes: Annotated[Option[float | None], Range(0.05, 10_000)] = None
+    seed: Seed[Option[int]] = 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,8 +139,8 @@ class BareOptions:
         images are not needed.
     """
 
-    views: Option[int] = 24
-    up: Option[tuple[float, float, float] | None] = None
+    views: Annotated[Option[int], Range(2, 1000)] = 24
+    up: Direction[Option[tuple[float, float, float] | None]] = None
     cameras: Option[Path | None] = None
 
 
@@ -115,15 +159,13 @@ class MaskOptions:
       association: How the proposals of the frames are brought together: what most views agree on (consensus), or
         Algorithm 1 of the paper with a tracker through the Gaussians (tracking).
       agreement: For consensus, share of the views that must put two things into one proposal. A lower share joins more.
-      iou_threshold: For tracking, IoU with a masklet above which a proposal is not a new object.
     """
 
     masks: Option[Path | None] = None
     proposals: Option[Path | None] = None
     granularity: Option[Literal["fine", "medium", "coarse"]] = "medium"
     association: Option[Literal["consensus", "tracking"]] = "consensus"
-    agreement: Option[float] = 0.4
-    iou_threshold: Option[float] = 0.5
+    agreement: Annotated[Option[float], Range(0, 1, above=True)] = 0.4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,11 +199,11 @@ class ModelOptions:
     segmenter: Option[Path | None] = None
     level: Option[Literal["default", "s", "m", "l"]] = "l"
     prompts: Option[Literal["guided", "grid"]] = "guided"
-    points_per_side: Option[int] = 32
-    crop_layers: Option[int] = 0
+    points_per_side: Annotated[Option[int], Range(1, 1000)] = 32
+    crop_layers: Annotated[Option[int], Range(0, 4)] = 0
     tracker: Option[Path | None] = None
     embedder: Option[Path | None] = None
-    vision_frames: Option[int | None] = None
+    vision_frames: Annotated[Option[int | None], Range(2, 1_000_000)] = None
     precision: Option[Precision | None] = None
     features: Option[Path | None] = None
 
@@ -171,20 +213,16 @@ class FieldOptions:
     """Options of the language field.
 
     Attributes:
-      weighting: How the views of a region are weighted in its embedding: by their pixels, or all alike.
       parts: Embeds each frame's own masks too, so that query finds things that no region holds, and query --all leaves
         out what most views took for one with its neighbour. Takes twice as many embeddings.
       paper: Also computes the paper's codes, three numbers per Gaussian, which query --by code compares.
-      top: Number of regions whose votes a Gaussian keeps.
       centre_pixel_weight: Weight of the pixel at a Gaussian's centre against all pixels that it covers, 0 to 1. Use 1
         if the answer is evaluated on points.
     """
 
-    weighting: Option[Literal["pixels", "uniform"]] = "pixels"
     parts: Option[bool] = False
     paper: Option[bool] = False
-    top: Option[int] = 8
-    centre_pixel_weight: Option[float] = 0.0
+    centre_pixel_weight: Annotated[Option[float], Range(0, 1)] = 0.0
 
 
 @dataclasses.dataclass(frozen=True)

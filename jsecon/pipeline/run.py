@@ -33,7 +33,7 @@ from jsecon.errors import InputError
 from jsecon.field.field import load_field, save_field
 from jsecon.files import exclusive_lock
 from jsecon.pipeline import cache, model_loading, processes, stages
-from jsecon.pipeline.options import Options, is_bare_scene, require_writable
+from jsecon.pipeline.options import Options, check_ranges, is_bare_scene, require_writable
 from jsecon.pipeline.processes import Coordinator
 from jsecon.pipeline.progress import Listener, Step
 from jsecon.pipeline.results import (
@@ -64,27 +64,11 @@ from jsecon.vision.classical import require_contrib
 from jsecon.vision.stores import StoredSegmenter
 
 FIELD_FILE = "field.safetensors"
-LEAST: dict[str, float] = {
-    "downscale": 1,
-    "long_side": 16,
-    "frames": 2,
-    "views": 2,
-    "holdout": 0,
-    "steps": 1,
-    "minutes": 0.05,
-    "gaussians_at_most": 1,
-    "points_per_side": 1,
-    "vision_frames": 2,
-    "crop_layers": 0,
-    "top": 1,
-    "centre_pixel_weight": 0,
-}
-"""smallest value of an option"""
 CROPS_PER_FRAME = 40
 """regions of a frame, where no segmenter tells"""
 FEW_FRAMES = 4
 """the time of fewer frames is not estimated"""
-OUT_OF_MEMORY = "Take smaller frames (--long-side), fewer (--frames), or fewer Gaussians (--gaussians-at-most)."
+OUT_OF_MEMORY = "Take smaller frames (--long-side), or fewer (--frames)."
 """what to do if memory is full"""
 
 
@@ -175,27 +159,16 @@ def _plan(context: RunContext, stage_list: list[Stage], folder: Path) -> _Plan:
 
 def _require_inputs(options: Options) -> None:
     """Raises InputError for a missing file, a number that is out of its range, or several sources of masks."""
+    check_ranges(options)
     for name, value in vars(options).items():
         flag = f"--{name.replace('_', '-')}"
         if isinstance(value, Path) and not value.exists():
             remedy = "Check the path." if name == "capture" else f"Check the path, or leave out {flag}."
             raise InputError(value, "no such file or folder", remedy=remedy)
-        if name in LEAST and isinstance(value, int | float) and not value >= LEAST[name]:
-            raise InputError(flag, str(value), f"at least {LEAST[name]}", "Change the option.")
     sources = [f"--{name}" for name in ("masks", "proposals", "segmenter") if getattr(options, name) is not None]
     if len(sources) > 1:
         expected = "one: tracked masks, masks of single frames, or a model that finds them"
         raise InputError(" ".join(sources), "more than one source of masks", expected, "Leave out the others.")
-    if not 0 < options.agreement <= 1:
-        remedy = "Leave it out, or use 0.3 to 0.6."
-        raise InputError("--agreement", str(options.agreement), "a share above 0 and at most 1", remedy)
-    if options.centre_pixel_weight > 1:
-        raise InputError(
-            "--centre-pixel-weight",
-            str(options.centre_pixel_weight),
-            "0 to 1",
-            "Use 1 for the pixel of the centre alone.",
-        )
 
 
 def _require_own_folder(options: Options, out: Path) -> None:
@@ -416,7 +389,7 @@ def _check_inputs(context: RunContext, plan: _Plan) -> None:
 def _extent(context: RunContext, plan: _Plan) -> CaptureExtent:
     """Returns number, size and names of the frames that a run would load. A video's frames have no names yet."""
     options = context.options
-    frame_options = FrameOptions(options.downscale, options.long_side, options.frames)
+    frame_options = FrameOptions(long_side=options.long_side, frames=options.frames)
     if "load" not in plan.running:
         with contextlib.suppress(cache.CorruptCacheError):  # a run would compute it again
             capture = cache.load(plan.paths["load"])[0].value

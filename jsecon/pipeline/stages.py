@@ -69,6 +69,8 @@ SECONDS_PER_STEP = 0.024
 """s of a step of the fit, on two cores of an AMD EPYC; estimates how many steps --minutes allows"""
 SECONDS_PER_MEGAPIXEL = 0.2
 """s more of a step per million pixels of a frame"""
+SH_DEGREE = 2
+"""degree of the spherical harmonics of fitted colours"""
 LONG_STEPS = 3000
 """Number of steps from which a fit counts as long."""
 LONG_MINUTES = 3.0
@@ -163,10 +165,10 @@ def _find_poses(stage: StageInput) -> StageResult:
 def _plan_load(context: RunContext) -> Stage:
     """Plans the capture at the size that the options ask for, corrected if they ask for that."""
     options = context.options
-    key_options = context.key_options("downscale", "long_side", "frames", "holdout")
+    key_options = context.key_options("long_side", "frames", "holdout")
     count = "all frames" if options.frames is None else f"at most {options.frames} frames"
     held_out = f"1 in {options.holdout} held out" if options.holdout else "none held out"
-    how = f"{count}, {_size_words(options)}, {held_out}"
+    how = f"{count}, long side at most {options.long_side} px, {held_out}"
     refine = _refinement(options)
     if refine != "none" or options.drop_frames != "none":
         key_options |= context.key_options("drop_frames", "seed") | {"refine": refine}
@@ -181,13 +183,6 @@ def _plan_load(context: RunContext) -> Stage:
     return Stage("load", how, _load, key_options=key_options, files=options.capture)
 
 
-def _size_words(options: Options) -> str:
-    """How the options scale the frames, in words."""
-    if options.downscale is None:
-        return f"long side at most {options.long_side} px"
-    return "full size" if options.downscale == 1 else f"{options.downscale:g} times smaller"
-
-
 def _refinement(options: Options) -> str:
     """What a run corrects of poses and exposures: "auto" only if depth and the data can still decide it."""
     if options.refine != "auto":
@@ -198,11 +193,11 @@ def _refinement(options: Options) -> str:
 
 
 def _load(stage: StageInput) -> StageResult:
-    options, sizes = stage.context.options, stage.context.key_options("downscale", "long_side", "frames", "holdout")
+    options, sizes = stage.context.options, stage.context.key_options("long_side", "frames", "holdout")
     capture = load_capture(options.capture, **sizes, progress=stage.progress)
     train = training_frames(capture.held_out)
     count, height, width = capture.frames.shape[:3]
-    frames = f"{count} frames of {width}x{height} ({_size_words(options)}), {count - len(train)} of them held out"
+    frames = f"{count} frames of {width}x{height}, {count - len(train)} of them held out"
     points = f"{len(capture.points)} sparse points{'' if capture.depths is None else ', depth'}"
     notes = (f"{frames}, {points}", *capture.notes)
     refine = _refinement(options)
@@ -258,14 +253,10 @@ def _plan_gaussians(context: RunContext) -> Stage:
         return Stage(
             "gaussians", how, _read_gaussians, after=("load",), key_options=key_options, files=path, skipped=skipped
         )
-    skipped = {"view-dependent colour": "SH degree 0"} if options.sh_degree == 0 else {}
     length = f"{options.steps} steps" if options.minutes is None else f"{options.minutes:g} minutes"
-    most = options.gaussians_at_most
-    limit = "" if most is None else f", at most {most} Gaussians"
-    how = f"fitted to the frames in {length}, SH degree {options.sh_degree}{limit}"
-    names = ("steps", "minutes", "sh_degree", "gaussians_at_most", "seed")
+    key_options = context.key_options("steps", "minutes", "seed")
     return Stage(
-        "gaussians", how, _fit_gaussians, after=("load",), key_options=context.key_options(*names), skipped=skipped
+        "gaussians", f"fitted to the frames in {length}", _fit_gaussians, after=("load",), key_options=key_options
     )
 
 
@@ -287,12 +278,12 @@ def _fit_gaussians(stage: StageInput) -> StageResult:
     options, capture, state = stage.context.options, stage.results.load, stage.checkpoint.read()
     start, notes = None, ()
     if state is None:
-        start, origin = starting_gaussians(capture, sh_degree=options.sh_degree, progress=stage.progress)
+        start, origin = starting_gaussians(capture, sh_degree=SH_DEGREE, progress=stage.progress)
         check_overlap(start, capture.cameras[training_frames(capture.held_out)], str(options.capture))
         notes = (f"start of the fit: {origin}",)
     pixels, minutes = capture.cameras.width * capture.cameras.height, options.minutes
     is_long = options.steps >= LONG_STEPS if minutes is None else minutes >= LONG_MINUTES
-    most = options.gaussians_at_most or min(pixels if is_long else pixels // 2, MAX_GAUSSIANS)
+    most = min(pixels if is_long else pixels // 2, MAX_GAUSSIANS)
     fitted, losses = fit_gaussians(
         capture,
         key=jax.random.key(options.seed),
@@ -367,7 +358,6 @@ def _plan_masklets(context: RunContext) -> Stage:
     else:
         by = "through the Gaussians" if options.tracker is None else f"by {model_name(options.tracker, 'tracker')}"
         how += f", followed {by}"
-        key_options |= context.key_options("iou_threshold")
     tracker = None if models.tracker is None else models.tracker.name
     key_options = {**key_options, "association": options.associated_by, "tracker": tracker}
     key_options |= context.key_options("vision_frames")
@@ -491,7 +481,6 @@ def associate_masks(
         frames,
         lambda frame, index: proposals(index),
         tracker,
-        iou_threshold=options.iou_threshold,
         state=None if checkpoint is None else checkpoint.read(),
         on_checkpoint=None if checkpoint is None else checkpoint.keep,
         progress=progress,
@@ -513,28 +502,27 @@ def _require_regions(labels: np.ndarray, where: str) -> None:
 def _plan_regions(context: RunContext) -> Stage:
     """Plans an embedding of each region: by the embedder, or from files."""
     options, embedder = context.options, context.models.embedder
-    after, key_options = ("load", "masklets"), context.key_options("weighting")
+    after = "load", "masklets"
     if options.features is None:
-        how = f"embedded by {embedder.name!r}, views weighted by {options.weighting}"
-        key_options |= {"embedder": embedder.name}
+        how, key_options = f"embedded by {embedder.name!r}, views weighted by pixels", {"embedder": embedder.name}
         return Stage("regions", how, _embed_regions, after=after, key_options=key_options, distributed=True)
     name = options.features.name
-    how = f"embeddings read from {name}, level {options.level}, views weighted by {options.weighting}"
+    how = f"embeddings read from {name}, level {options.level}, views weighted by pixels"
     return Stage(
         "regions",
         how,
         _read_regions,
         after=after,
-        key_options=key_options | context.key_options("level"),
+        key_options=context.key_options("level"),
         files=options.features,
         skipped={"embedder": f"embeddings are given ({name})"},
     )
 
 
 def _embed_regions(stage: StageInput) -> StageResult:
-    context, weighting = stage.context, stage.context.options.weighting
+    context = stage.context
     frames, embed = _Vision(stage.results.load, context.options).frames, context.models.embedder.embed_regions
-    embedded = region_embeddings(frames, stage.results.masklets, embed, weighting=weighting, progress=stage.progress)
+    embedded = region_embeddings(frames, stage.results.masklets, embed, progress=stage.progress)
     context.models.close()
     return StageResult(embedded)
 
@@ -548,9 +536,7 @@ def _read_regions(stage: StageInput) -> StageResult:
         problem = f"no mask of level {options.level} in any frame"
         remedy = "Take another --level, or write the files again."
         raise InputError(options.features, problem, "masks with their embeddings", remedy)
-    embedded = embeddings_of_masks(
-        labels, features.labels, features.embeddings, weighting=options.weighting, progress=stage.progress
-    )
+    embedded = embeddings_of_masks(labels, features.labels, features.embeddings, progress=stage.progress)
     missing = int((~embedded.embeddings.any(1)).sum())
     notes = (f"{len(features.embeddings)} embeddings in the files",)
     if missing:
@@ -614,10 +600,10 @@ def _plan_votes(context: RunContext) -> Stage:
     """Plans the weight of each region on each Gaussian over the training frames, with each frame's total."""
     return Stage(
         "votes",
-        f"the {context.options.top} strongest regions of each Gaussian",
+        "the strongest regions of each Gaussian",
         _accumulate_votes,
         after=("load", "gaussians", "masklets"),
-        key_options=context.key_options("top", "centre_pixel_weight"),
+        key_options=context.key_options("centre_pixel_weight"),
         distributed=True,
     )
 
@@ -628,7 +614,7 @@ def _accumulate_votes(stage: StageInput) -> StageResult:
     labels, folder = stage.results.masklets, stage.checkpoint.folder
     cameras = capture.cameras[vision_frames(capture, options)]
     count = int(labels.max()) + 1
-    settings = {"top": options.top, "centre": options.centre_pixel_weight, "by_view": True, "progress": stage.progress}
+    settings = {"centre": options.centre_pixel_weight, "by_view": True, "progress": stage.progress}
     needed, budget = votes_memory(scene.count, len(labels), count), memory_budget()
     notes = ()
     if needed > budget and jax.process_count() == 1:  # several processes accumulate them together, in memory
