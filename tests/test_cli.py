@@ -220,10 +220,10 @@ def test_help_lists_the_verbs_and_tyro_prints_a_completion_script(capsys):
 def test_what_is_not_given_has_the_default_of_the_dataclass():
     run = cli.parse(["run", "room", "--out", "out"])
     assert run.options == Options(Path("room"))
-    changed = ["--paper", "--sh-degree", "2", "--masks", "m", "--downscale", "2", "--weighting", "uniform"]
+    changed = ["--paper", "--masks", "m", "--long-side", "200", "--agreement", "1"]
     options = cli.parse(["run", "room", "--out=out", *changed]).options
-    found = options.paper, options.sh_degree, options.masks, options.downscale, options.weighting
-    assert found == (True, 2, Path("m"), 2, "uniform")
+    found = options.paper, options.masks, options.long_side, options.agreement
+    assert found == (True, Path("m"), 200, 1.0)
     assert cli.parse(["fit", "room", "--out", "a.ply", "--steps", "7"]).options == Options(Path("room"), steps=7)
 
 
