@@ -126,7 +126,7 @@ def test_a_heic_is_turned_once_and_damage_and_absence_are_told(tmp_path, monkeyp
     photo.save(tmp_path / "cut.heic", quality=95)
     data = (tmp_path / "cut.heic").read_bytes()
     (tmp_path / "cut.heic").write_bytes(data[: len(data) // 2])
-    with refused("cut.heic", "decoded"):
+    with refused("cut.heic", "cannot be read"):
         read_image(tmp_path / "cut.heic")
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
     with refused("a.heic", "pip install 'jsecon[formats]'"):
@@ -208,7 +208,7 @@ def test_damaged_png_missing_file_and_no_image(tmp_path):
     with refused("none.png", "No such file"):
         read_image(tmp_path / "none.png")
     (tmp_path / "text.png").write_text("no image at all, but long enough to look at")
-    with refused("text.png", "unknown kind"):
+    with refused("text.png", "known kind"):
         image_header(tmp_path / "text.png")
 
 
@@ -234,7 +234,7 @@ def test_label_colours_and_refusals(tmp_path):
     with refused("four.png", "half transparent"):
         read_label_image(tmp_path / "four.png")
     cv2.imwrite(str(tmp_path / "deep.png"), FRAME.astype(np.uint16) * 257)
-    with refused("deep.png", "16 bits", "3 channels"):
+    with refused("deep.png", "16 bits"):
         read_label_image(tmp_path / "deep.png")
     write_image(tmp_path / "a.jpg", FRAME)
     with refused("a.jpg", "not a PNG"):
@@ -259,7 +259,7 @@ def test_label_arrays(tmp_path, dtype):
     for shape in (ids, ids[None], ids[..., None]):
         np.save(tmp_path / "a.npy", shape)
         np.testing.assert_array_equal(read_label_image(tmp_path / "a.npy")[0], ids)
-    for wrong, words in ((np.zeros((3, 9, 11)), "stack"), (ids + 0.5, "not ids"), (ids[0], "shape")):
+    for wrong, words in ((np.zeros((3, 9, 11)), "shape"), (ids + 0.5, "not ids"), (ids[0], "shape")):
         np.save(tmp_path / "a.npy", wrong)
         with refused("a.npy", words):
             read_label_image(tmp_path / "a.npy")

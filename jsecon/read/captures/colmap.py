@@ -1,4 +1,4 @@
-"""COLMAP captures, a model and its images, on the host: read (binary or text) and written (binary).
+"""COLMAP models and their images, on the host, binary or text.
 
 Format: https://colmap.github.io/format.html and src/colmap/scene/reconstruction_io*.cc. rigs.bin and frames.bin (COLMAP
 3.12 and later) are not needed, since images.bin has each image's own pose. Poses are world-to-camera in OpenCV axes,
@@ -8,8 +8,6 @@ package, and ends the process on a damaged file.
 
 from __future__ import annotations
 
-import itertools
-import os
 import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -20,71 +18,79 @@ from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from jsecon.errors import InputError
-from jsecon.files import atomic_write, path_within, read_text
+from jsecon.files import path_within, read_text
 from jsecon.numerics import is_finite_and_bounded
-from jsecon.read.captures.coordinates import transform_poses
 from jsecon.read.captures.frames import PosedImage, PosedImages
-from jsecon.read.captures.images import find_image, write_image
-from jsecon.read.captures.lens import PROJECTIONS, Lens
-from jsecon.types import Capture
+from jsecon.read.captures.images import find_image
+from jsecon.read.captures.lens import Lens
 
-_MODELS = {
-    "SIMPLE_PINHOLE": (0, 3),
-    "PINHOLE": (1, 4),
-    "SIMPLE_RADIAL": (2, 4),
-    "RADIAL": (3, 5),
-    "OPENCV": (4, 8),
-    "OPENCV_FISHEYE": (5, 8),
-    "FULL_OPENCV": (6, 12),
-    "FOV": (7, 5),
-    "SIMPLE_RADIAL_FISHEYE": (8, 4),
-    "RADIAL_FISHEYE": (9, 5),
-    "THIN_PRISM_FISHEYE": (10, 12),
-    "RAD_TAN_THIN_PRISM_FISHEYE": (11, 16),
-    "SIMPLE_DIVISION": (12, 4),
-    "DIVISION": (13, 5),
-    "SIMPLE_FISHEYE": (14, 3),
-    "FISHEYE": (15, 4),
-    "EUCM": (16, 6),
-    "EQUIRECTANGULAR": (17, 2),
+MODEL_MARK = "cameras.[bt][ix][nt]"
+"""cameras.bin or cameras.txt, which every model has"""
+_PARAMETERS = {
+    "SIMPLE_PINHOLE": 3,
+    "PINHOLE": 4,
+    "SIMPLE_RADIAL": 4,
+    "RADIAL": 5,
+    "OPENCV": 8,
+    "OPENCV_FISHEYE": 8,
+    "FULL_OPENCV": 12,
+    "FOV": 5,
+    "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL_FISHEYE": 5,
+    "THIN_PRISM_FISHEYE": 12,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 16,
+    "SIMPLE_DIVISION": 4,
+    "DIVISION": 5,
+    "SIMPLE_FISHEYE": 3,
+    "FISHEYE": 4,
+    "EUCM": 6,
+    "EQUIRECTANGULAR": 2,
 }
-"""camera model -> its number in binary files, and its number of parameters"""
-_MODEL_OF_NUMBER = {number: (name, count) for name, (number, count) in _MODELS.items()}
-_ONE_FOCAL = {name for name in _MODELS if name.startswith("SIMPLE_")} | {"RADIAL", "RADIAL_FISHEYE"}
+"""camera models in the order of their numbers in binary files, from 0 on -> number of parameters"""
+_PYCOLMAP = ("FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE", "DIVISION", "EUCM")
+"""models that OpenCV does not have"""
 _REMEDY = "Copy the model again, or export it anew with colmap model_converter."
 _UNDISTORT = "Run colmap image_undistorter and load its output."
-_POINT_HEAD = struct.calcsize("<Q3d3BdQ")
-"""bytes of a point before its track"""
 
 
-def find_models(path: str | Path) -> list[Path]:
-    """Finds the COLMAP models of a capture.
+def _find_models(path: Path) -> list[Path]:
+    """Folders of the COLMAP models of a capture, the one with the most images first.
 
-    They lie in sparse/0, sparse/1, ... or in sparse itself. If there is none and no transforms.json, colmap/sparse,
-    colmap_text and the capture's own folder are searched, as nerfstudio and instant-ngp lay them out.
-
-    Args:
-      path: Folder of the capture.
-
-    Returns:
-      Folders of the models, the one with the most images first.
+    They lie in sparse/0, sparse/1, ... or in sparse itself; else where nerfstudio (colmap/sparse) and instant-ngp
+    (colmap_text) put them, or in the folder itself.
     """
-    path = Path(path)
-    models = _models_in(path / "sparse")
-    if not models and not (path / "transforms.json").exists():
-        places = (path / "colmap" / "sparse", path / "colmap_text", path)
-        models = next(filter(None, map(_models_in, places)), [])
-    return models
+    for places in (("sparse/*", "sparse"), ("colmap/sparse/*", "colmap/sparse"), ("colmap_text",), ("",)):
+        models = [file.parent for place in places for file in path.glob(f"{place}/{MODEL_MARK}".lstrip("/"))]
+        if models:
+            unique = sorted(dict.fromkeys(models), key=lambda model: (not model.name.isdecimal(), len(model.name), model))
+            return sorted(unique, key=_count_images, reverse=True) if len(unique) > 1 else unique
+    raise InputError(path, "it holds no COLMAP model", "cameras.bin or cameras.txt", "Check the path.")
 
 
-def _models_in(folder: Path) -> list[Path]:
-    """The models in a folder or, if it is called sparse, in its subfolders, the one with the most images first."""
-    if not folder.is_dir():
-        return []
-    inner = [child for child in folder.iterdir() if child.is_dir()] if folder.name == "sparse" else []
-    inner.sort(key=lambda child: (not child.name.isdecimal(), len(child.name), child.name))
-    models = [place for place in (*inner, folder) if _model_file(place, "cameras") is not None]
-    return sorted(models, key=_count_images, reverse=True) if len(models) > 1 else models
+def read_colmap(path: Path) -> PosedImages:
+    """Reads the posed images and sparse points of the largest COLMAP model of a capture's folder.
+
+    The images lie in images/, in the folder itself or in input/.
+    """
+    models = _find_models(path)
+    model, notes = models[0], []
+    if len(models) > 1:
+        others = ", ".join(f"{place.relative_to(path)} with {_count_images(place)}" for place in models[1:])
+        notes.append(
+            f"There are {len(models)} models. {model.relative_to(path)} has the most images, {_count_images(model)}, and "
+            f"is used; left out: {others}. Join them (colmap model_merger), or take photographs between them, to use all."
+        )
+    lenses, images = _read_cameras(model), _read_images(model)
+    files = _find_images(path, [name for name, _, _ in images])
+    posed = []
+    for name, camera, pose in images:
+        if camera not in lenses:
+            raise InputError(model, f"image {name} has camera {camera}, which the cameras file lacks", remedy=_REMEDY)
+        posed.append(PosedImage(name, files.get(name), lenses[camera], pose))
+    if _model_file(model, "points3D") is None:
+        notes.append("The model has no points3D file: there are no sparse points.")
+        return PosedImages(posed, model, notes=tuple(notes))
+    return PosedImages(posed, model, *_read_points(model), notes=tuple(notes))
 
 
 def _model_file(model: Path, kind: str) -> Path | None:
@@ -98,44 +104,6 @@ def _require_file(model: Path, kind: str) -> Path:
     if file is None:
         raise InputError(model, f"it has no {kind}.bin or {kind}.txt", remedy=_REMEDY)
     return file
-
-
-def read_colmap(path: Path, models: Sequence[Path]) -> PosedImages:
-    """Reads a COLMAP capture.
-
-    Args:
-      path: Folder of the capture; its images lie in images/, in it or in input/.
-      models: Its models; the first is read.
-
-    Returns:
-      Its posed images and sparse points.
-
-    Raises:
-      InputError: The model is damaged, names images that are missing, or has EQUIRECTANGULAR cameras.
-    """
-    model = models[0]
-    lenses, images = read_cameras(model), read_images(model)
-    files = _find_images(path, [name for name, _, _ in images])
-    if missing := [name for name, _, _ in images if name not in files]:
-        problem = f"{len(missing)} of {len(images)} images of the model are missing (the first: {missing[0]})"
-        remedy = "Copy them there, or take them out of the model (colmap image_deleter)."
-        raise InputError(path / "images", problem, remedy=remedy)
-    shots = []
-    for name, camera, pose in images:
-        if camera not in lenses:
-            raise InputError(model, f"image {name} has camera {camera}, which the cameras file lacks", remedy=_REMEDY)
-        shots.append(PosedImage(name, files[name], lenses[camera], pose))
-    notes = []
-    if len(models) > 1:
-        others = ", ".join(f"{place.relative_to(path)} with {_count_images(place)}" for place in models[1:])
-        notes.append(
-            f"There are {len(models)} models. {model.relative_to(path)} has the most images, {len(images)}, and is used"
-            f"; left out: {others}. Join them (colmap model_merger), or take photographs between them, to use all."
-        )
-    if _model_file(model, "points3D") is None:
-        notes.append("The model has no points3D file: there are no sparse points.")
-        return PosedImages(shots, model, notes=tuple(notes))
-    return PosedImages(shots, model, *_read_points(model), notes=tuple(notes))
 
 
 def _find_images(path: Path, names: Sequence[str]) -> dict[str, Path]:
@@ -217,38 +185,29 @@ def _parse_lines(
 
 def _lens(file: Path, model: str, width: int, height: int, parameters: tuple[float, ...]) -> Lens:
     """The lens of a camera of a model file."""
-    if model not in _MODELS:
-        known = ", ".join(name for name in _MODELS if name != "EQUIRECTANGULAR")
+    if model not in _PARAMETERS:
+        known = ", ".join(name for name in _PARAMETERS if name != "EQUIRECTANGULAR")
         raise InputError(file, f"the camera model {model} is unknown", f"one of {known}", _UNDISTORT)
     if model == "EQUIRECTANGULAR":
         remedy = "Cut perspective views out of the panoramas (colmap panorama_sfm.py does) and load those."
         raise InputError(file, f"the camera model {model} sees all around, which is not supported", remedy=remedy)
-    if len(parameters) != _MODELS[model][1]:
-        raise InputError(file, f"a {model} camera has {len(parameters)} parameters", str(_MODELS[model][1]), _REMEDY)
-    focals = 1 if model in _ONE_FOCAL else 2
+    if len(parameters) != _PARAMETERS[model]:
+        raise InputError(file, f"a {model} camera has {len(parameters)} parameters", str(_PARAMETERS[model]), _REMEDY)
+    focals = 1 if model.startswith("SIMPLE_") or model in ("RADIAL", "RADIAL_FISHEYE") else 2
     fx, fy = parameters[0], parameters[focals - 1]
     cx, cy, *distortion = parameters[focals:]
     is_valid = fx > 0 and fy > 0 and 0 < width < 1 << 31 and 0 < height < 1 << 31
     if not (is_finite_and_bounded(parameters) and is_valid):
         problem = f"a camera of {width}x{height} px has the parameters {parameters}"
         raise InputError(file, problem, "positive size and focal length", "Estimate the cameras again.")
-    projection = model if model in PROJECTIONS else None
+    model = model.removeprefix("SIMPLE_")
+    projection = model if model in _PYCOLMAP else None
     is_fisheye = "FISHEYE" in model and projection is None
     return Lens(width, height, fx, fy, cx, cy, tuple(distortion), is_fisheye, projection)
 
 
-def read_cameras(model: Path) -> dict[int, Lens]:
-    """Reads the lenses of a model.
-
-    Args:
-      model: Folder of the model.
-
-    Returns:
-      Lenses by camera number.
-
-    Raises:
-      InputError: The file is missing or damaged, or a lens sees all around.
-    """
+def _read_cameras(model: Path) -> dict[int, Lens]:
+    """The lenses of a model by camera number."""
     file = _require_file(model, "cameras")
 
     def parse(line: str) -> tuple[int, Lens]:
@@ -257,14 +216,13 @@ def read_cameras(model: Path) -> dict[int, Lens]:
 
     if file.suffix == ".txt":
         return dict(_parse_lines(file, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS", parse))
-    data, lenses = _BinaryReader(file), {}
+    data, lenses, names = _BinaryReader(file), {}, list(_PARAMETERS)
     for _ in data.records(48):
         camera, number, width, height = data.take("iiQQ")
-        if number not in _MODEL_OF_NUMBER:
-            expected = f"one of 0 to {max(_MODEL_OF_NUMBER)} (COLMAP 4.2)"
+        if not 0 <= number < len(names):
+            expected = f"one of 0 to {len(names) - 1} (COLMAP 4.2)"
             raise InputError(file, f"the unknown camera model number {number}", expected, _UNDISTORT)
-        name, count = _MODEL_OF_NUMBER[number]
-        lenses[camera] = _lens(file, name, width, height, data.take(f"{count}d"))
+        lenses[camera] = _lens(file, names[number], width, height, data.take(f"{_PARAMETERS[names[number]]}d"))
     return lenses
 
 
@@ -281,18 +239,8 @@ def _pose(file: Path, name: str, numbers: tuple[float, ...]) -> np.ndarray:
     return pose
 
 
-def read_images(model: Path) -> list[tuple[str, int, np.ndarray]]:
-    """Reads the images of a model.
-
-    Args:
-      model: Folder of the model.
-
-    Returns:
-      (name, camera number, (4, 4) float64 world_to_camera) of each image, in the order of the file.
-
-    Raises:
-      InputError: The file is missing or damaged.
-    """
+def _read_images(model: Path) -> list[tuple[str, int, np.ndarray]]:
+    """(name, camera number, (4, 4) float64 world-to-camera) of each image of a model, in the order of the file."""
     file = _require_file(model, "images")
 
     def parse(line: str) -> tuple[str, int, np.ndarray]:
@@ -324,13 +272,13 @@ def _count_images(model: Path) -> int:
     if file is None:
         return 0
     if file.suffix == ".txt":
-        return len(read_images(model))
+        return len(_read_images(model))
     with file.open("rb") as stream:
         return int.from_bytes(stream.read(8), "little")
 
 
 def _read_points(model: Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
-    """Reads the sparse points of a model, float64, and their colours."""
+    """The sparse points of a model, float64, and their colours."""
     file = _require_file(model, "points3D")
     if file.suffix == ".txt":
         rows = _parse_lines(file, "POINT3D_ID X Y Z R G B ERROR TRACK", _parse_point)
@@ -354,66 +302,16 @@ def _parse_point(line: str) -> tuple[float, float, float, int, int, int]:
 
 def _read_binary_points(file: Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
     """Positions and colours of points3D.bin."""
-    data = _BinaryReader(file)
-    raw, count = data.data, len(data.records(_POINT_HEAD))
+    data, head = _BinaryReader(file), struct.calcsize("<Q3d3BdQ")
+    raw, count = data.data, len(data.records(head))
     # Tracks make the records differ in length: a short loop finds where each begins, NumPy reads them all.
     starts, offset, track = np.empty(count, np.int64), data.offset, struct.Struct("<Q")
     for index in range(count):
-        if offset + _POINT_HEAD > len(raw):
+        if offset + head > len(raw):
             raise data.truncated()
         starts[index] = offset
-        offset += _POINT_HEAD + 8 * track.unpack_from(raw, offset + _POINT_HEAD - 8)[0]
+        offset += head + 8 * track.unpack_from(raw, offset + head - 8)[0]
     if offset > len(raw):
         raise data.truncated()
     heads = np.frombuffer(raw, np.uint8)[starts[:, None] + np.arange(8, 35)]
     return np.ascontiguousarray(heads[:, :24]).view("<f8"), np.ascontiguousarray(heads[:, 24:])
-
-
-def write_colmap(capture: Capture, path: str | Path, *, image_format: str = "png") -> None:
-    """Writes a capture for COLMAP, in the world of the poses that it was loaded from.
-
-    Points keep their colours; observations and tracks are empty and errors -1 (not computed), since a Capture has none.
-    The format has no place for depths and held-out frames: hold frames out again on loading.
-
-    Args:
-      capture: The capture.
-      path: Folder for sparse/0/{cameras,images,points3D}.bin (PINHOLE) and images/.
-      image_format: Suffix of the images.
-
-    Raises:
-      InputError: The folder cannot be written.
-    """
-    path, cameras = Path(path), capture.cameras
-    intrinsics = np.stack([cameras.fx, cameras.fy, cameras.cx, cameras.cy], axis=-1).astype(np.float64)
-    distinct, camera_of = np.unique(intrinsics, axis=0, return_inverse=True)
-    names = [f"{name}.{image_format.lstrip('.')}" for name in capture.names]
-    files = [path_within(path / "images", name) for name in names]
-    for file, frame in zip(files, np.asarray(capture.frames)):
-        write_image(file, frame)
-    camera_bytes = [struct.pack("<Q", len(distinct))]
-    camera_bytes += [
-        struct.pack("<iiQQ4d", n, _MODELS["PINHOLE"][0], cameras.width, cameras.height, *row)
-        for n, row in enumerate(distinct, start=1)
-    ]
-    image_bytes = [struct.pack("<Q", len(names))]
-    poses_from_scene = (
-        np.eye(4) if capture.poses_from_scene is None else np.asarray(capture.poses_from_scene, np.float64)
-    )
-    poses = transform_poses(np.asarray(cameras.world_to_camera, np.float64), poses_from_scene)
-    for n, (name, pose, camera) in enumerate(zip(names, poses, camera_of.ravel()), start=1):
-        quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True, scalar_first=True)
-        numbers = itertools.chain(quaternion, pose[:3, 3])
-        head = struct.pack("<i7di", n, *numbers, camera + 1)
-        image_bytes.append(head + os.fsencode(name) + b"\0" + struct.pack("<Q", 0))
-    points = np.zeros(len(capture.points), "<u8, 3<f8, 3u1, <f8, <u8")
-    points["f0"] = np.arange(1, len(points) + 1)
-    points["f1"] = np.asarray(capture.points, np.float64) @ poses_from_scene[:3, :3] + poses_from_scene[:3, 3]
-    points["f2"], points["f3"] = capture.point_colors, -1.0
-    contents = {
-        "cameras": b"".join(camera_bytes),
-        "images": b"".join(image_bytes),
-        "points3D": struct.pack("<Q", len(points)) + points.tobytes(),
-    }
-    for kind, content in contents.items():
-        with atomic_write(path / "sparse" / "0" / f"{kind}.bin") as temporary:
-            temporary.write_bytes(content)

@@ -1,15 +1,15 @@
 """Image files on the host: RGB frames, label images of integers, depth maps.
 
-Pillow decodes them and raises on truncated files. OpenCV decodes TIFF, of which Pillow warns and libtiff writes to the
-standard error, and encodes: after `import pycolmap`, Pillow ends the process when it saves a PNG.
+Pillow decodes them and raises on truncated files; its classes are called directly, since `Image.open` warns of large
+photographs. OpenCV encodes: after `import pycolmap`, Pillow ends the process when it saves a PNG.
 
 Images are returned upright, as their EXIF orientation asks. If poses belong to the stored pixels
 (`jsecon.read.captures.frames` decides that), images are read with `upright=False`.
 """
 
-import io
+import contextlib
 import os
-import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +21,7 @@ from PIL.BmpImagePlugin import BmpImageFile
 from PIL.ImageFile import ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
+from PIL.TiffImagePlugin import TiffImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
 from jsecon.errors import InputError, describe_error
@@ -33,92 +34,61 @@ MAX_PIXELS = 1 << 27
 """pixels of an image: 134 million"""
 TRANSPOSED = (5, 6, 7, 8)
 """EXIF orientations that swap width and height"""
-ID_REMEDY = "Write one id per pixel as an 8 or 16 bit grey PNG without transparency, or as integers in a .npy."
-_PNG = b"\x89PNG\r\n\x1a\n"
-_JPEG = b"\xff\xd8"
-_TIFF = (b"II*\0", b"MM\0*")
-_HEIC = (b"ftypheic", b"ftypheix", b"ftypmif1", b"ftyphevc")
-_EXIF, _HIDDEN_EXIF = b"Exif\0\0", b"unread"
-"""Start of an EXIF block, and what replaces it in a JPEG: Pillow warns of damaged EXIF when it opens one."""
+_DECODERS: dict[bytes, type[ImageFile]] = {
+    b"\x89PNG": PngImageFile,
+    b"\xff\xd8": JpegImageFile,
+    b"RIFF": WebPImageFile,
+    b"BM": BmpImageFile,
+    b"II*\0": TiffImageFile,
+    b"MM\0*": TiffImageFile,
+}
+"""first bytes of a file -> Pillow's decoder"""
 _ORIENTATION = 0x0112
 """EXIF tag: 1 is upright; 6, the commonest of a phone held upright, asks for a turn clockwise by 90 degrees"""
-_MODES = {"1": "L", "L": "L"} | dict.fromkeys(("RGBA", "PA", "LA", "La", "RGBa"), "RGBA")
-"""Pillow's mode of a file -> mode of the returned pixels; other modes become RGB"""
-_DEEP_MODES = ("I;16", "I;16B", "I", "F")
-"""Pillow's modes of more than 8 bits, which are kept"""
-_PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
-"""PNG colour type -> channels"""
+_MODES = {"1": "L"} | dict.fromkeys(("RGBA", "PA", "LA", "La", "RGBa"), "RGBA")
+"""Pillow's mode of a file -> mode of the returned pixels; grey and deep modes stay, others become RGB"""
+_KEPT_MODES = ("L", "I;16", "I;16B", "I", "F")
 
 
-def _unreadable(path: Path, problem: str) -> InputError:
-    """The error of a file that is not a complete image."""
+@contextlib.contextmanager
+def _open(path: Path) -> Iterator[ImageFile]:
+    """Opens an image; only its header is read. Errors of the decoder in the body of the `with` become InputErrors."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(12)
+            file.seek(0)
+            if not head:
+                raise ValueError("the file is empty")
+            decoder = next((kind for magic, kind in _DECODERS.items() if head.startswith(magic)), None)
+            if decoder is None and head[4:8] == b"ftyp":
+                decoder = _heic_decoder(path)
+            if decoder is None:
+                raise ValueError("it is not an image of a known kind")
+            with decoder(file) as image:
+                if isinstance(image, JpegImageFile) and image.width * image.height > MAX_PIXELS:
+                    image.draft(None, (image.width // 2, image.height // 2))
+                if image.width * image.height > MAX_PIXELS:
+                    problem = f"the image has {image.width}x{image.height} pixels"
+                    remedy = "Shrink it, for instance to half its width and height."
+                    raise InputError(path, problem, f"at most {MAX_PIXELS // 10**6} million", remedy)
+                yield image
+    except InputError:
+        raise
+    except OSError as error:
+        if error.errno is not None:
+            raise InputError(path, describe_error(error), remedy="Check the path.") from error
+        raise _damaged(path, error) from error
+    except Exception as error:  # Pillow's errors have no other common base
+        raise _damaged(path, error) from error
+
+
+def _damaged(path: Path, error: Exception) -> InputError:
+    problem = f"the image cannot be read ({describe_error(error)})"
     return InputError(path, problem, remedy="Copy or export the file again.")
 
 
-def _read_bytes(path: Path) -> bytes:
-    """Reads a file that must not be empty."""
-    try:
-        data = path.read_bytes()
-    except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
-        raise _unreadable(path, describe_error(error)) from error
-    if not data:
-        raise _unreadable(path, "the file is empty")
-    return data
-
-
-def _open(path: Path, data: bytes, *, check: bool = False) -> tuple[Image.Image, int]:
-    """Opens an image, with its EXIF orientation; `check` also compares the checksums of a PNG.
-
-    The orientation of a HEIC is 1: its decoder applies the file's own rotation.
-    """
-    exif = b""
-    try:
-        if data.startswith(_PNG):
-            if check:
-                PngImageFile(io.BytesIO(data)).verify()
-            image = PngImageFile(io.BytesIO(data))
-            exif = image.info.get("exif", b"").removeprefix(_EXIF)
-        elif data.startswith(_JPEG):
-            image = JpegImageFile(io.BytesIO(data.replace(_EXIF, _HIDDEN_EXIF)))
-            blocks = [body for _, body in image.applist if body.startswith(_HIDDEN_EXIF)]
-            exif = blocks[0].removeprefix(_HIDDEN_EXIF) if blocks else b""
-        elif data[4:12] in _HEIC:
-            image = _heic_class(path)(io.BytesIO(data))
-        elif data.startswith(b"RIFF"):
-            image = WebPImageFile(io.BytesIO(data))
-            exif = image.info.get("exif", b"").removeprefix(_EXIF)
-        elif data.startswith(b"BM"):
-            image = BmpImageFile(io.BytesIO(data))
-        else:
-            image = _decode_tiff(data)
-            exif = data[: 1 << 16]
-    except InputError:
-        raise
-    except Exception as error:  # Pillow's errors have no other common base
-        raise _unreadable(path, f"the image is damaged or of an unknown kind ({describe_error(error)})") from error
-    shrink = _decoder_shrink(image)
-    width, height = (-(-side // shrink) for side in image.size)
-    if width * height > MAX_PIXELS:
-        problem = f"the image has {width}x{height} pixels ({width * height / 1e6:.0f} million)"
-        remedy = "Shrink it, for instance to half its width and height."
-        raise InputError(path, problem, f"at most {MAX_PIXELS // 10**6} million", remedy)
-    return image, _orientation(exif)
-
-
-def _decode_tiff(data: bytes) -> Image.Image:
-    """Decodes a TIFF, upright."""
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if data[:4] not in _TIFF or pixels is None:
-        raise ValueError("it is not a TIFF that can be read")
-    if pixels.ndim == 2:
-        return Image.fromarray(pixels)
-    if pixels.dtype == np.uint16:
-        pixels = cv2.convertScaleAbs(pixels, alpha=255 / 65535)
-    return Image.fromarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGBA))
-
-
-def _heic_class(path: Path) -> type[ImageFile]:
-    """Pillow's reader of HEIC photographs, from the extra formats."""
+def _heic_decoder(path: Path) -> type[ImageFile]:
+    """Pillow's decoder of HEIC photographs, from the extra formats."""
     try:
         from pillow_heif import HeifImageFile
     except ImportError as error:
@@ -127,36 +97,20 @@ def _heic_class(path: Path) -> type[ImageFile]:
     return HeifImageFile
 
 
-def _decoder_shrink(image: Image.Image) -> int:
-    """The least factor, of those that a JPEG decoder can shrink by, that brings a JPEG to MAX_PIXELS; else 1."""
-    factors = (1, 2, 4, 8) if isinstance(image, JpegImageFile) else ()
-    return next((n for n in factors if -(-image.width // n) * -(-image.height // n) <= MAX_PIXELS), 1)
-
-
-def _orientation(exif: bytes) -> int:
-    """The orientation, 1 to 8, of an EXIF block, which is a TIFF; 1 if it has none."""
-    order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
-    if order is None or len(exif) < 8:
-        return 1
-    (start,) = struct.unpack_from(f"{order}I", exif, 4)
-    count = struct.unpack_from(f"{order}H", exif, start)[0] if start + 2 <= len(exif) else 0
-    for entry in range(start + 2, min(start + 2 + 12 * count, len(exif) - 11), 12):
-        tag, kind, values, value = struct.unpack_from(f"{order}HHIH", exif, entry)
-        if (tag, kind, values) == (_ORIENTATION, 3, 1):  # one 16-bit integer
-            return value if 1 <= value <= 8 else 1
-    return 1
+def _orientation(image: ImageFile) -> int:
+    """EXIF's orientation of the pixels that Pillow returns, 1 to 8; 1 for HEIC, whose decoder turns them itself."""
+    if isinstance(image, TiffImageFile):
+        value = image.tag_v2.get(_ORIENTATION, 1)
+    else:
+        tags = Image.Exif()
+        with contextlib.suppress(Exception):  # damaged EXIF turns nothing
+            tags.load(image.info.get("exif", b""))
+        value = tags.get(_ORIENTATION, 1) if isinstance(image, tuple(_DECODERS.values())) else 1
+    return value if value in range(1, 9) else 1
 
 
 def apply_orientation(image: np.ndarray, orientation: int) -> np.ndarray:
-    """Turns stored pixels upright.
-
-    Args:
-      image: (H, W, ...) stored pixels.
-      orientation: Their EXIF orientation, 1 to 8.
-
-    Returns:
-      The upright image, contiguous.
-    """
+    """Turns stored pixels (H, W, ...) upright, by their EXIF orientation."""
     if orientation in TRANSPOSED:
         image = image.swapaxes(0, 1)
     if orientation in (2, 3, 6, 7):
@@ -166,37 +120,33 @@ def apply_orientation(image: np.ndarray, orientation: int) -> np.ndarray:
     return np.ascontiguousarray(image)
 
 
-def _decode(path: Path, image: Image.Image, *, native: bool = False) -> np.ndarray:
-    """Decodes to grey, RGB or RGBA, upright for TIFF and HEIC; 16 bits of colour become 8.
+def _decode(path: Path, *, upright: bool = True, native: bool = False) -> tuple[np.ndarray, ImageFile]:
+    """Decodes an image to grey, RGB or RGBA; 16 bits of colour become 8.
 
-    `native` keeps the indices of a palette, and colours that are declared transparent.
+    `native` keeps the indices of a palette, and colours that are declared transparent. Also returns the closed image.
     """
-    try:
-        shrink = _decoder_shrink(image)
-        if isinstance(image, JpegImageFile) and shrink > 1:
-            image.draft(None, (image.width // shrink, image.height // shrink))
+    with _open(path) as image:
+        if isinstance(image, PngImageFile):
+            with PngImageFile(path) as copy:
+                copy.verify()  # compares the checksums, and leaves an image that cannot be decoded
+        orientation = _orientation(image)
         image.load()
-        mode = image.mode if native or image.mode in _DEEP_MODES else _MODES.get(image.mode, "RGB")
+        is_kept = native or image.mode in _KEPT_MODES
+        mode = image.mode if is_kept else _MODES.get(image.mode, "RGB")
         if mode in ("L", "RGB") and "transparency" in image.info and not native:
             mode = "RGBA"
         pixels = np.asarray(image if mode == image.mode else image.convert(mode))
-        return pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
-    except Exception as error:  # Pillow's errors have no other common base
-        raise _unreadable(path, f"the image cannot be decoded ({describe_error(error)})") from error
+        pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
+        if isinstance(image, TiffImageFile):  # Pillow has turned it
+            return pixels if upright else apply_orientation(pixels, {6: 8, 8: 6}.get(orientation, orientation)), image
+        return apply_orientation(pixels, orientation) if upright else pixels, image
 
 
 def find_image(folder: Path, name: str) -> Path | None:
-    """Finds the image file that a capture names.
+    """Finds the image file that a capture names, relative to `folder`.
 
     Tried are the name itself, with backslashes as separators (of a Windows program), with its suffix in upper or lower
     case, and, if it has no suffix of an image, with one added.
-
-    Args:
-      folder: Folder that the name is relative to.
-      name: The name in the capture.
-
-    Returns:
-      The file, or None.
     """
     for base in dict.fromkeys((name, name.replace("\\", "/"))):
         stem, suffix = os.path.splitext(base)
@@ -222,77 +172,30 @@ class ImageHeader(NamedTuple):
         return (height, width) if self.orientation in TRANSPOSED else (width, height)
 
     def closest_to_centre(self, cx: object, cy: object) -> tuple[int, int]:
-        """Chooses the size, stored or upright, that a principal point fits better.
-
-        Args:
-          cx: Its x, px; anything but a number means that it is not known.
-          cy: Its y, px.
-
-        Returns:
-          (width, height), px: the one whose middle is nearer to the point; the upright size if that is not known.
-        """
+        """Chooses the size, stored or upright, whose middle is nearer to a principal point, px; upright if unknown."""
         if not isinstance(cx, int | float) or not isinstance(cy, int | float):
             return self.upright
         return min(self.upright, self.stored, key=lambda size: abs(2 * cx - size[0]) + abs(2 * cy - size[1]))
 
 
 def image_header(path: str | Path) -> ImageHeader:
-    """Reads size and orientation of an image file; decodes no pixels unless it is a TIFF.
-
-    Args:
-      path: An image file.
-
-    Returns:
-      Its header.
-
-    Raises:
-      InputError: The file is missing, empty, too large, or not an image.
-    """
-    data = _read_bytes(Path(path))
-    image, orientation = _open(Path(path), data)
-    width, height = image.size
-    if data[:4] in _TIFF and orientation in TRANSPOSED:
-        width, height = height, width
-    shrink = _decoder_shrink(image)
-    return ImageHeader((-(-width // shrink), -(-height // shrink)), orientation)
+    """Reads size and orientation of an image file, from its header alone."""
+    with _open(Path(path)) as image:
+        orientation, (width, height) = _orientation(image), image.size
+        is_swapped = isinstance(image, TiffImageFile) and orientation in TRANSPOSED
+        return ImageHeader((height, width) if is_swapped else (width, height), orientation)
 
 
 def read_pixels(path: Path, *, upright: bool = True) -> np.ndarray:
-    """Reads an image file without a conversion of its values.
-
-    Args:
-      path: An image file.
-      upright: Apply the EXIF orientation; False returns the stored pixels.
-
-    Returns:
-      Grey (H, W), RGB or RGBA (H, W, C).
-
-    Raises:
-      InputError: The file is missing, damaged, too large, or not an image.
-    """
-    data = _read_bytes(path)
-    image, orientation = _open(path, data, check=True)
-    pixels = _decode(path, image)
-    if orientation == 1 or (data[:4] in _TIFF) == upright:
-        return pixels
-    return apply_orientation(pixels, orientation if upright else {6: 8, 8: 6}.get(orientation, orientation))
+    """Reads an image file without a conversion of its values: grey (H, W), RGB or RGBA (H, W, C)."""
+    return _decode(path, upright=upright)[0]
 
 
 def read_image(path: str | Path, *, upright: bool = True) -> tuple[UInt8[np.ndarray, "h w 3"], bool]:
-    """Reads an image file as RGB of 8 bits.
+    """Reads an image file as RGB of 8 bits, and whether it had transparent pixels.
 
     Transparent pixels are blended with black, as in a render without background. A JPEG of more than MAX_PIXELS is
-    decoded at a half, a quarter or an eighth of its size.
-
-    Args:
-      path: An image file.
-      upright: Apply the EXIF orientation, as viewers do; False returns the stored pixels.
-
-    Returns:
-      The image, and whether it had transparent pixels.
-
-    Raises:
-      InputError: The file is missing, damaged, too large, or not an image.
+    decoded at half its size. `upright=False` returns the stored pixels.
     """
     path = Path(path)
     image = read_pixels(path, upright=upright)
@@ -310,15 +213,7 @@ def read_image(path: str | Path, *, upright: bool = True) -> tuple[UInt8[np.ndar
 
 
 def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"] | UInt[np.ndarray, "h w"]) -> None:
-    """Writes an image atomically.
-
-    Args:
-      path: The file; its suffix chooses the format.
-      image: (H, W, 3) uint8 RGB, or (H, W) grey values of 8 or 16 bits.
-
-    Raises:
-      InputError: The suffix is not that of an image format, or the folder cannot be written.
-    """
+    """Writes RGB, or grey values of 8 or 16 bits, atomically; the suffix chooses the format."""
     path, image = Path(path), np.asarray(image)
     try:
         encoded, data = cv2.imencode(path.suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image)
@@ -331,80 +226,59 @@ def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"] | UInt[np.nd
 
 
 def read_label_image(path: str | Path) -> tuple[Int[np.ndarray, "h w"], bool]:
-    """Reads a label image as integers.
+    """Reads the ids of a label image (.png or .npy), and whether they are colours.
 
     A grey PNG of 1 to 16 bits has its values as ids; a palette PNG the indices into it, never its colours; an RGB PNG
     of 8 bits R*65536 + G*256 + B. Fully transparent pixels are 0; if all colours are black, the opaque pixels are the
     mask. A .npy has whole numbers or booleans (H, W), negative where there is no label.
-
-    Args:
-      path: A .png or .npy file.
-
-    Returns:
-      (H, W) ids, and whether they are colours.
-
-    Raises:
-      InputError: The file is of another kind, or damaged.
     """
     path = Path(path)
     if path.suffix.lower() == ".npy":
         return _read_id_array(path), False
-    data = _read_bytes(path)
     expected = "ids as grey values (8 or 16 bits), palette indices or 8 bit colours"
-    if not data.startswith(_PNG):
-        raise InputError(path, "the mask is not a PNG", expected, ID_REMEDY)
-    opened, orientation = _open(path, data, check=True)
-    bits, colour_type = data[24], data[25]
-    image = apply_orientation(_decode(path, opened, native=True), orientation)
-    if colour_type in (0, 3):
+    remedy = "Write one id per pixel as an 8 or 16 bit grey PNG without transparency, or as integers in a .npy."
+    image, decoder = _decode(path, native=True)
+    if not isinstance(decoder, PngImageFile):
+        raise InputError(path, "the mask is not a PNG", expected, remedy)
+    bits = path.read_bytes()[24]
+    if image.ndim == 2:
         ids = image.astype(np.int32)
-        return ids // (255 // (2**bits - 1)) if opened.mode == "L" else ids, False  # Pillow stretches 2 and 4 bits
-    if bits > 8 or image.ndim != 3:
-        problem = f"the mask has {bits} bits in each of {_PNG_CHANNELS[colour_type]} channels"
-        raise InputError(path, problem, expected, ID_REMEDY)
-    is_grey = colour_type == 4
+        is_stretched = decoder.mode == "L"  # Pillow stretches 2 and 4 bits
+        return ids // (255 // (2**bits - 1)) if is_stretched else ids, False
+    if bits > 8:
+        raise InputError(path, f"the mask has {bits} bits in each of its channels", expected, remedy)
+    is_grey = image.shape[2] == 2
     colours = image.astype(np.int32)
     ids = colours[..., 0] if is_grey else colours[..., :3] @ np.array([65536, 256, 1], np.int32)
     if image.shape[2] in (2, 4):
         alpha = image[..., -1]
         opaque = alpha == 255
         if not (opaque | (alpha == 0)).all():
-            raise InputError(path, "the mask has half transparent pixels (4 channels)", expected, ID_REMEDY)
+            raise InputError(path, "the mask has half transparent pixels", expected, remedy)
         ids = np.where(opaque, ids, 0) if ids.any() else opaque.astype(np.int32)
     return ids, not is_grey
 
 
 def _read_id_array(path: Path) -> Int[np.ndarray, "h w"]:
     """Reads the ids of a .npy."""
-    expected, remedy = "whole numbers of shape (H, W)", "Write the mask again."
+    expected, remedy = "whole numbers of shape (H, W)", "Write one array of ids for each frame."
     with reading(path, expected, remedy, problem="the array cannot be read"):
         image = map_npy(path)
     image = np.asarray(image.squeeze() if image.ndim == 3 and 1 in (image.shape[0], image.shape[2]) else image)
-    if image.ndim == 3:
-        remedy = "Give such stacks with --proposals, or write one image of ids for each frame."
-        raise InputError(path, f"the array is a stack of shape {image.shape}", expected, remedy)
     if image.ndim != 2 or not image.size:
         raise InputError(path, f"the array has shape {image.shape}", expected, remedy)
     with np.errstate(invalid="ignore"):
-        whole = image.dtype.kind in "biu" or bool((image == np.floor(image)).all())
-        whole = whole and bool((image < 1 << 62).all() and (image > -(1 << 62)).all())
-    if not whole:
+        is_whole = image.dtype.kind in "biu" or bool((image == np.floor(image)).all())
+        is_bounded = bool((image < 1 << 62).all() and (image > -(1 << 62)).all())
+    if not (is_whole and is_bounded):
         raise InputError(path, "the array has numbers that are not ids", expected, remedy)
     return image.astype(np.int64)
 
 
 def read_depth(path: str | Path, unit: float) -> Float[np.ndarray, "h w"]:
-    """Reads a depth map.
+    """Reads a depth map, float32 z-depth in world units, 0 = unknown, of a 16 bit PNG or a .npy of shape (H, W).
 
-    Args:
-      path: A PNG of one channel of 16 bits, or a .npy of shape (H, W).
-      unit: World units of one count (nerfstudio: 0.001, from millimetres).
-
-    Returns:
-      (H, W) float32 z-depth in world units, 0 = unknown.
-
-    Raises:
-      InputError: The file is damaged or of another kind.
+    `unit` is that of one count in world units (nerfstudio: 0.001, from millimetres).
     """
     path = Path(path)
     expected = "one channel of 16 bits (PNG), or a .npy of shape (H, W)"
@@ -413,11 +287,11 @@ def read_depth(path: str | Path, unit: float) -> Float[np.ndarray, "h w"]:
         with reading(path, expected, remedy, problem="the depth map cannot be read"):
             depth = map_npy(path)
         depth = depth[..., 0] if depth.ndim == 3 and depth.shape[2] == 1 else depth
-        valid = depth.ndim == 2 and depth.size > 0
+        is_depth = depth.ndim == 2 and depth.size > 0
     else:
         depth = read_pixels(path)
-        valid = depth.ndim == 2 and depth.dtype == np.uint16
-    if not valid:
+        is_depth = depth.ndim == 2 and depth.dtype == np.uint16
+    if not is_depth:
         raise InputError(path, f"the depth map has shape {depth.shape} of {depth.dtype}", expected, remedy)
     with np.errstate(over="ignore", invalid="ignore"):  # infinite: unknown
         depth = depth.astype(np.float32) * np.float32(unit)

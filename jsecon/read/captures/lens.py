@@ -1,7 +1,6 @@
 """Lenses of captures, on the host, and the pinhole lens that replaces a distorted one.
 
-OpenCV projects two models, Brown's and Kannala and Brandt's. COLMAP's others are projected here, by the formulas of its
-src/colmap/sensor/models.h: pycolmap, which has them too, is an optional package.
+OpenCV projects two models, Brown's and Kannala and Brandt's; pycolmap (extra sfm) projects COLMAP's others.
 
 Pixels are counted as everywhere here (and in COLMAP): the centre of the first pixel is at (0.5, 0.5). OpenCV puts it at
 (0, 0), hence the half pixels below.
@@ -10,7 +9,7 @@ Pixels are counted as everywhere here (and in COLMAP): the centre of the first p
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,11 +17,9 @@ from jaxtyping import Float
 
 from jsecon.errors import InputError
 
-MIN_ZOOM, MAX_ZOOM = 0.5, 8.0
+_MIN_ZOOM, _MAX_ZOOM = 0.5, 8.0
 """zooms searched for a pinhole lens without empty pixels: below the one the centre would lose over half its resolution,
 above the other the coefficients are nonsense"""
-RAY_STEPS, BORDER_STEPS = 64, 48
-"""samples along a ray from the principal point, and along each edge of the image, in that search"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +44,7 @@ class Lens:
     fisheye: bool = False
     """equidistant model (Kannala and Brandt) instead of the polynomial one (Brown)."""
     model: str | None = None
-    """one of PROJECTIONS; None: OpenCV's, see `fisheye`."""
+    """one of COLMAP's models with two focal lengths that OpenCV does not have; None: OpenCV's, see `fisheye`."""
 
     @property
     def distorted(self) -> bool:
@@ -55,95 +52,22 @@ class Lens:
         return self.fisheye or self.model is not None or any(k != 0 for k in self.distortion)
 
     def resized(self, width: int, height: int) -> Lens:
-        """Scales the lens to another size of the same image.
-
-        Args:
-          width: New width, px.
-          height: New height, px.
-
-        Returns:
-          The lens; its distortion stays.
-        """
+        """Scales the lens to another size of the same image, px; its distortion stays."""
         x, y = width / self.width, height / self.height
         return dataclasses.replace(
             self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y
         )
 
 
-def _radius(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Distance from the axis, above 0 so that it can be divided by."""
-    return np.maximum(np.hypot(x, y), 1e-12)
-
-
-def _equidistant(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(x/z, y/z) -> the direction's angle to the axis, along x and y."""
-    radius = _radius(x, y)
-    scale = np.arctan(radius) / radius
-    return x * scale, y * scale
-
-
-def _polynomial(squared: np.ndarray, coefficients: Sequence[float]) -> np.ndarray:
-    """1 + k1 r^2 + k2 r^4 + ..."""
-    result = np.zeros_like(squared)
-    for coefficient in reversed(coefficients):
-        result = squared * (coefficient + result)
-    return 1 + result
-
-
-def _field_of_view(x: np.ndarray, y: np.ndarray, omega: float) -> tuple[np.ndarray, np.ndarray]:
-    """COLMAP's FOV (Devernay and Faugeras, "Straight lines have to be straight", 2001); omega 0 is a pinhole."""
-    if abs(omega) < 1e-6:
-        return x, y
-    radius = _radius(x, y)
-    scale = np.arctan(2 * radius * np.tan(omega / 2)) / (radius * omega)
-    return x * scale, y * scale
-
-
-def _thin_prism(x: np.ndarray, y: np.ndarray, *parameters: float) -> tuple[np.ndarray, np.ndarray]:
-    """COLMAP's THIN_PRISM_FISHEYE: k1 k2 p1 p2 k3 k4 sx1 sy1 act on the angles."""
-    k1, k2, p1, p2, k3, k4, sx1, sy1 = parameters
-    u, v = _equidistant(x, y)
-    squared = u * u + v * v
-    radial = _polynomial(squared, (k1, k2, k3, k4))
-    across = u * radial + 2 * p1 * u * v + p2 * (squared + 2 * u * u) + sx1 * squared
-    down = v * radial + 2 * p2 * u * v + p1 * (squared + 2 * v * v) + sy1 * squared
-    return across, down
-
-
-def _radial_tangential(x: np.ndarray, y: np.ndarray, *parameters: float) -> tuple[np.ndarray, np.ndarray]:
-    """COLMAP's RAD_TAN_THIN_PRISM_FISHEYE (Project Aria's Fisheye624): k0..k5, then p0 p1 s0..s3 on the result."""
-    p0, p1, s0, s1, s2, s3 = parameters[6:]
-    u, v = _equidistant(x, y)
-    radial = _polynomial(u * u + v * v, parameters[:6])
-    u, v = u * radial, v * radial
-    squared = u * u + v * v
-    along = 2 * (u * p0 + v * p1)
-    across = u + along * u + squared * p0 + s0 * squared + s1 * squared**2
-    down = v + along * v + squared * p1 + s2 * squared + s3 * squared**2
-    return across, down
-
-
-def _division(x: np.ndarray, y: np.ndarray, k: float) -> tuple[np.ndarray, np.ndarray]:
-    """COLMAP's DIVISION (Fitzgibbon, CVPR 2001): undistorted = distorted / (1 + k r^2). NaN beyond its range."""
-    scale = 2 / (1 + np.sqrt(1 - 4 * k * (x * x + y * y)))
-    return x * scale, y * scale
-
-
-def _unified(x: np.ndarray, y: np.ndarray, alpha: float, beta: float) -> tuple[np.ndarray, np.ndarray]:
-    """COLMAP's EUCM (Khomutenko et al., "An enhanced unified camera model", RA-L 2016)."""
-    scale = 1 / (alpha * np.sqrt(beta * (x * x + y * y) + 1) + 1 - alpha)
-    return x * scale, y * scale
-
-
-PROJECTIONS: dict[str, Callable[..., tuple[np.ndarray, np.ndarray]]] = {
-    "FOV": _field_of_view,
-    "THIN_PRISM_FISHEYE": _thin_prism,
-    "RAD_TAN_THIN_PRISM_FISHEYE": _radial_tangential,
-    "SIMPLE_DIVISION": _division,
-    "DIVISION": _division,
-    "EUCM": _unified,
-}
-"""COLMAP's other models: (x/z, y/z) and coefficients -> (u - cx) / fx, (v - cy) / fy"""
+def _colmap_camera(lens: Lens) -> Any:
+    """pycolmap's camera of a lens."""
+    try:
+        import pycolmap
+    except ImportError as error:
+        remedy = "Run: pip install 'jsecon[sfm]' (or undistort the images: colmap image_undistorter)."
+        raise InputError(lens.model, "this camera model needs pycolmap, which is not installed", remedy=remedy) from error
+    parameters = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
+    return pycolmap.Camera(model=lens.model, width=lens.width, height=lens.height, params=parameters)
 
 
 def _opencv(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
@@ -154,24 +78,15 @@ def _opencv(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
 
 
 def distort(lens: Lens, directions: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """Projects directions into the distorted image.
-
-    Args:
-      lens: The lens.
-      directions: (N, 2) x/z and y/z in the camera's frame.
-
-    Returns:
-      (N, 2) u v, px.
-    """
-    if lens.model is not None:
-        across, down = PROJECTIONS[lens.model](*np.asarray(directions, np.float64).T, *lens.distortion)
-        return np.stack([lens.fx * across + lens.cx, lens.fy * down + lens.cy], axis=-1)
-    matrix, coefficients = _opencv(lens)
+    """Projects directions, x/z and y/z in the camera's frame, into the distorted image, px."""
     points = np.ascontiguousarray(directions, np.float64)
+    spatial = np.concatenate([points, np.ones((len(points), 1))], axis=1)
+    if lens.model is not None:
+        return _colmap_camera(lens).img_from_cam(spatial)  # NaN beyond the range of the model
+    matrix, coefficients = _opencv(lens)
     if lens.fisheye:
         pixels = cv2.fisheye.distortPoints(points[None], matrix, coefficients)
     else:
-        spatial = np.concatenate([points, np.ones((len(points), 1))], axis=1)
         pixels, _ = cv2.projectPoints(spatial, np.zeros(3), np.zeros(3), matrix, coefficients)
     return pixels.reshape(-1, 2) + 0.5
 
@@ -183,11 +98,11 @@ def _covered(lens: Lens, zoom: float) -> bool:
     Looks along rays from the principal point to the border: the distorted radius must grow all the way (a polynomial
     folds back beyond its range, which would show the same pixels twice) and end inside the image.
     """
-    across, down = np.linspace(0, lens.width, BORDER_STEPS), np.linspace(0, lens.height, BORDER_STEPS)
+    across, down = np.linspace(0, lens.width, 48), np.linspace(0, lens.height, 48)
     edges = [(across, 0 * across), (across, 0 * across + lens.height), (0 * down, down), (0 * down + lens.width, down)]
     border = np.concatenate([np.stack(edge, -1) for edge in edges])
     ends = (border - [lens.cx, lens.cy]) / [lens.fx * zoom, lens.fy * zoom]
-    rays = ends[:, None] * np.linspace(0, 1, RAY_STEPS + 1)[:, None]
+    rays = ends[:, None] * np.linspace(0, 1, 65)[:, None]
     pixels = distort(lens, rays.reshape(-1, 2)).reshape(rays.shape)
     if not np.isfinite(pixels).all():
         return False
@@ -200,22 +115,12 @@ def _covered(lens: Lens, zoom: float) -> bool:
 def undistorted_pinhole(lens: Lens, where: object) -> Lens:
     """Finds the widest pinhole lens, of the same size and principal point, whose image has no empty border.
 
-    An empty border could not be told from black things.
-
-    Args:
-      lens: The distorted lens.
-      where: Name of its file for errors.
-
-    Returns:
-      The pinhole lens; `lens` itself if it is not distorted.
-
-    Raises:
-      InputError: There is no such lens: the principal point lies outside the image, or coefficients are absurd.
+    An empty border could not be told from black things. `where` names the file of the lens for errors.
     """
     if not lens.distorted:
         return dataclasses.replace(lens, distortion=())
     # Covered at a zoom means covered at every larger one: its rays are the same, but shorter. So bisection is exact.
-    low, high = MIN_ZOOM, MAX_ZOOM
+    low, high = _MIN_ZOOM, _MAX_ZOOM
     if not _covered(lens, high):
         remedy = "Calibrate again, or undistort the images first (colmap image_undistorter)."
         raise InputError(where, f"the distortion {lens.distortion} leaves no undistorted image", remedy=remedy)
@@ -228,15 +133,7 @@ def undistorted_pinhole(lens: Lens, where: object) -> Lens:
 
 
 def undistortion_maps(lens: Lens, pinhole: Lens) -> tuple[np.ndarray, np.ndarray]:
-    """Computes where each pixel of the undistorted image lies in the distorted one.
-
-    Args:
-      lens: The distorted lens.
-      pinhole: Its pinhole lens.
-
-    Returns:
-      Two tables (H, W) float32 for cv2.remap.
-    """
+    """Computes where each pixel of the undistorted image lies in the distorted one: two tables for cv2.remap."""
     if lens.model is not None:
         columns = (np.arange(pinhole.width) + 0.5 - pinhole.cx) / pinhole.fx
         rows = (np.arange(pinhole.height) + 0.5 - pinhole.cy) / pinhole.fy
@@ -250,16 +147,7 @@ def undistortion_maps(lens: Lens, pinhole: Lens) -> tuple[np.ndarray, np.ndarray
 
 
 def resample_depth(depth: Float[np.ndarray, "h w"], lens: Lens, other: Lens) -> Float[np.ndarray, "p q"]:
-    """Resamples a depth map for another lens at the same place.
-
-    Args:
-      depth: (H, W) z-depth.
-      lens: Its pinhole lens.
-      other: The other pinhole lens.
-
-    Returns:
-      (P, Q) depth of the nearest pixel, 0 outside.
-    """
+    """Resamples a z-depth map for another pinhole lens at the same place: the nearest pixel, 0 outside."""
     columns = np.floor((np.arange(other.width) + 0.5 - other.cx) / other.fx * lens.fx + lens.cx).astype(int)
     rows = np.floor((np.arange(other.height) + 0.5 - other.cy) / other.fy * lens.fy + lens.cy).astype(int)
     height, width = depth.shape

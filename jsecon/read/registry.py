@@ -1,0 +1,52 @@
+"""Registries of readers: the table of formats that a file or folder may have.
+
+A row has the name of a format, the marks that tell it, and the function that reads it. Other packages add rows by an
+entry point whose object is a `Reader`; the groups are jsecon.captures, jsecon.masks and jsecon.splats.
+"""
+
+import importlib.metadata
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jsecon.errors import InputError, describe_error
+
+
+class Reader(NamedTuple):
+    """A format, the marks that tell it, and the function that reads it."""
+
+    name: str
+    marks: tuple[str, ...]
+    """Ends of a file's name, which begin with "." or "_" (".spz", "_s.npy"): one must fit. Or names in a folder, which
+    may be patterns ("rgb.txt", "sparse/*/cameras.bin"): all must be there."""
+    read: Callable[..., Any]
+    """Reads the file or folder. Raises InputError, or a built-in error of a damaged file (jsecon.files.READ_ERRORS)."""
+
+    def fits(self, path: Path) -> bool:
+        """Whether a file or folder has the marks."""
+        if path.is_dir():
+            return not self.marks[0].startswith((".", "_")) and all(any(path.glob(mark)) for mark in self.marks)
+        name = path.name.lower()
+        return any(name.endswith(mark) for mark in self.marks if mark.startswith((".", "_")))
+
+
+def readers(group: str, own: Sequence[Reader]) -> tuple[Reader, ...]:
+    """Lists the readers of installed packages, by their entry points in `group`, and then jsecon's `own`."""
+    added = []
+    for entry in importlib.metadata.entry_points(group=group):
+        try:
+            reader = entry.load()
+        except Exception as error:  # whatever a foreign package raises when it is imported
+            problem = f"the reader {entry.value} of another package cannot be loaded ({describe_error(error)})"
+            raise InputError(f"{group}:{entry.name}", problem, remedy="Update or uninstall that package.") from error
+        if not isinstance(reader, Reader):
+            problem = f"{entry.value} is a {type(reader).__name__}"
+            remedy = "Update or uninstall the package that registers it."
+            raise InputError(f"{group}:{entry.name}", problem, "a jsecon.read.registry.Reader", remedy)
+        added.append(reader)
+    return (*added, *own)
+
+
+def find_reader(group: str, own: Sequence[Reader], path: Path) -> Reader | None:
+    """Finds the first reader of `readers` whose marks a file or folder has."""
+    return next((reader for reader in readers(group, own) if reader.fits(path)), None)
