@@ -22,6 +22,7 @@ from test_rgbd import FORMATS as RGBD
 
 from experiments.datasets.feature_files import write_features
 from jsecon.app import ask
+from jsecon.demo.writers import write_colmap
 from jsecon.errors import InputError
 from jsecon.field.field import check_field, load_field, save_field
 from jsecon.networks.clip import MAX_BIAS, MAX_SCALE, ClipEmbedder
@@ -32,7 +33,6 @@ from jsecon.paper.autoencoder import encode
 from jsecon.pipeline import cache
 from jsecon.read.captures import images, video
 from jsecon.read.captures.capture import load_capture
-from jsecon.read.captures.colmap import write_colmap
 from jsecon.read.masks.labels import load_lerf_labels
 from jsecon.read.masks.langsplat import embedding_size, load_features
 from jsecon.read.masks.masks import load_labels

@@ -19,7 +19,7 @@ from jsecon.pipeline import cache, run as pipeline
 from jsecon.pipeline.progress import Listener
 from jsecon.pipeline.results import RunContext
 from jsecon.pipeline.stages import capture_stages
-from jsecon.read.captures import frames
+from jsecon.read.captures import build
 from jsecon.read.captures.images import write_image
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Models
@@ -71,7 +71,7 @@ def test_an_opencv_without_its_contrib_modules_is_told_before_anything_runs(capt
 
 def test_frames_that_lie_on_a_full_disk_are_told(capture, no_room, monkeypatch):
     """They are mapped: a page without a place on the disk would end the process."""
-    monkeypatch.setattr(frames, "MAX_IN_MEMORY", 500)
+    monkeypatch.setattr(build, "_MAX_IN_MEMORY", 500)
     with refused("for 0.0 GiB of frames", "TMPDIR"):
         load_capture(capture)
 

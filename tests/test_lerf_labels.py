@@ -10,8 +10,9 @@ import pytest
 from capture_files import refused
 from hypothesis import given, settings, strategies as st
 
+from jsecon.demo.writers import write_lerf_labels
 from jsecon.errors import InputError
-from jsecon.read.masks.labels import LabelledFrame, load_lerf_labels, write_lerf_labels
+from jsecon.read.masks.labels import LabelledFrame, load_lerf_labels
 
 SQUARE = [[2.9, 3.0], [8.0, 3.0], [8.0, 6.7], [2.0, 6.0]]
 

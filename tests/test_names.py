@@ -13,9 +13,9 @@ from jsecon import InputError, load_capture, load_field, load_ply, query_region,
 from jsecon.app.ask import Answer, ask_pixel, ask_region, ask_text
 from jsecon.app.cli import main
 from jsecon.app.outputs import file_stem, write_answer
+from jsecon.demo.writers import write_colmap
 from jsecon.files import path_within
 from jsecon.query.composite import parse_query
-from jsecon.read.captures.colmap import write_colmap
 from jsecon.vision.colours import ColourEmbedder
 
 HOSTILE = ("/../../evil", "..", "C:\\evil", "a/b", "a\0b", "x" * 4000, "nul", "frame 1", "Frame_1", "frame_1")

@@ -110,7 +110,7 @@ def test_depth_maps(tmp_path):
     with refused("d.png", "16x24"):
         load_capture(tmp_path)
     (tmp_path / "d.png").unlink()
-    with refused("d.png", "no such depth map"):
+    with refused("d.png", "no such file"):
         load_capture(tmp_path)
 
 
@@ -182,7 +182,7 @@ SCALED = np.diag([2.0, 2.0, 2.0, 1.0]).tolist()
     (_drop("frames"), "no key 'frames'"),
     (_drop("frames", 2, "transform_matrix"), "no key 'transform_matrix' in frame 2 (images/frame_002.png)"),
     (_drop("frames", 1, "file_path"), "no key 'file_path' in frame 1"), (_put("x", "frames"), "type str"),
-    (_put([], "frames"), "0 frames"), (_put(7, "frames", 0), "not an object"), (_put("wide", "w"), "w = 'wide'"),
+    (_put([], "frames"), "no frame"), (_put(7, "frames", 0), "not an object"), (_put("wide", "w"), "w = 'wide'"),
     (_put(None, "cx"), "cx = None"), (_put(0, "w"), "0x16"),
     (_put([[1, 2], [3, 4]], "frames", 0, "transform_matrix"), "shape (2, 2)"),
     (_put([["a"] * 4] * 4, "frames", 0, "transform_matrix"), "more than numbers"),

@@ -15,7 +15,7 @@ from jsecon import load_gaussians, render_rgb, save_gaussians
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import Checkpoint, Results, RunContext, StageInput
 from jsecon.pipeline.stages import run_stages
-from jsecon.read.captures.nerfstudio import trained_to_source
+from jsecon.read.captures.nerfstudio import source_from_trained
 from jsecon.splat.transform import transform_gaussians, transform_gaussians_float64
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Models
@@ -178,7 +178,7 @@ def test_what_a_trained_world_must_be(tmp_path):
     ):
         file.write_text(json.dumps(told))
         with refused(file.name, says):
-            trained_to_source(file)
+            source_from_trained(file)
     file.write_text("{")
     with refused(file.name, "not JSON"):
-        trained_to_source(file)
+        source_from_trained(file)

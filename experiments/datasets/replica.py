@@ -19,7 +19,8 @@ from jaxtyping import Float, Int, UInt8
 from experiments.datasets.benchmark import Benchmark, require_count, twin_of
 from experiments.datasets.mesh_files import read_faces
 from jsecon.errors import InputError
-from jsecon.read.captures.frames import FrameOptions, PosedImage, PosedImages, build_capture
+from jsecon.read.captures.build import build_capture
+from jsecon.read.captures.frames import FrameOptions, PosedImage, PosedImages
 from jsecon.read.captures.lens import Lens
 from jsecon.read.splats.ply import load_point_cloud
 from jsecon.types import Capture

@@ -24,10 +24,10 @@ from experiments.datasets.ovs3d import write_segmentations
 from experiments.datasets.plain_room import make_room
 from jsecon.demo.capture import label_frame, look_at, render_capture, room_cameras
 from jsecon.demo.room import TABLE_WOOD, Part, Room, srgb_to_linear
+from jsecon.demo.writers import write_colmap, write_lerf_labels
 from jsecon.files import write_text
-from jsecon.read.captures.colmap import write_colmap
 from jsecon.read.captures.images import write_image
-from jsecon.read.masks.labels import LabelledFrame, write_lerf_labels
+from jsecon.read.masks.labels import LabelledFrame
 from jsecon.types import Camera, Capture
 
 

@@ -24,7 +24,7 @@ from jsecon.query.outliers import split_outliers
 from jsecon.query.referring import FoundObject
 from jsecon.query.relations import Viewpoint, viewpoint
 from jsecon.query.rules import QueryRules
-from jsecon.read.captures.capture import may_have_depth
+from jsecon.read.captures.capture import has_depth
 from jsecon.types import Camera, LanguageField
 from jsecon.views.frame import field_up
 
@@ -191,7 +191,7 @@ class ObjectScene:
     def unit(self) -> str:
         """Unit of the capture's world."""
         capture = locate_sources(self.field).capture
-        return "metres" if capture is not None and may_have_depth(Path(capture)) else "capture units"
+        return "metres" if capture is not None and has_depth(Path(capture)) else "capture units"
 
 
 def open_scene(field: LanguageField | ObjectScene, embedder: Any, up: Sequence[Any] | None = None) -> ObjectScene:

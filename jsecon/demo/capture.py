@@ -12,12 +12,12 @@ from jaxtyping import Bool, Int16
 
 from jsecon.demo.raycast import render_views
 from jsecon.demo.room import Room
+from jsecon.demo.writers import write_colmap, write_lerf_labels
 from jsecon.errors import require
 from jsecon.files import write_text
-from jsecon.read.captures.colmap import write_colmap
 from jsecon.read.captures.frames import FrameOptions, holdout_mask
 from jsecon.read.captures.images import write_image
-from jsecon.read.masks.labels import LabelledFrame, write_lerf_labels
+from jsecon.read.masks.labels import LabelledFrame
 from jsecon.types import Camera, Capture, Progress
 
 MIN_LABEL_PIXELS = 40

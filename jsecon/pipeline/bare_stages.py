@@ -9,10 +9,9 @@ from jsecon.errors import InputError
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import RunContext, Stage, StageInput, StageResult
 from jsecon.pipeline.scene_files import check_overlap, read_scene
-from jsecon.read.captures.colmap import find_models, read_cameras, read_images
+from jsecon.read.captures.capture import read_posed_images
 from jsecon.read.captures.coordinates import make_rigid, transform_poses
 from jsecon.read.captures.frames import FrameOptions, frame_names
-from jsecon.read.captures.nerfstudio import read_poses
 from jsecon.splat.transform import transform_gaussians_float64
 from jsecon.types import Camera, Gaussians, Quality
 from jsecon.views.capture import capture_from_cameras, render_capture
@@ -119,30 +118,23 @@ def _into_world(gaussians: Gaussians, source_from_scene: np.ndarray) -> Gaussian
 def _load_poses(path: Path, long_side: int) -> tuple[Camera, tuple[str, ...]]:
     """Returns T cameras to render from, poses in float64 in the world of their file, and their names.
 
-    `path` is the folder of a COLMAP model (.bin or .txt) or of a capture that has one, or a transforms.json. All
+    `path` is a capture, whose images need not be there, such as the folder of a COLMAP model or a transforms.json. All
     cameras get the size of the first lens, shrunk to `long_side`, each with its field of view and without distortion.
     """
-    model = next(iter(find_models(path)), None) if path.is_dir() else None
-    file = path / "transforms.json" if path.is_dir() else path
-    if model is not None:
-        lenses = read_cameras(model)
-        posed = [(name, lenses[number], pose) for name, number, pose in read_images(model)]
-    elif file.is_file() and file.suffix.lower() == ".json":
-        posed = read_poses(file)
-    else:
-        expected = "a folder with cameras.bin and images.bin (or .txt), or a transforms.json"
-        raise InputError(path, "it has no poses", expected, "Check the path.")
-    if not posed:
-        raise InputError(path, "it has no frame", "at least one pose", "Estimate the poses again.")
-    width, height = FrameOptions(long_side=long_side).size((posed[0][1].width, posed[0][1].height))
-    sized = [lens.resized(width, height) for _, lens, _ in posed]
+    images = read_posed_images(path).images
+    lenses = [image.lens for image in images if image.lens is not None]
+    if not images or len(lenses) < len(images):
+        problem = "one of its frames has no size" if images else "it has no frame"
+        raise InputError(path, problem, "at least one pose, each with w and h", "Estimate the poses again.")
+    width, height = FrameOptions(long_side=long_side).size((lenses[0].width, lenses[0].height))
+    sized = [lens.resized(width, height) for lens in lenses]
 
     def column(name):
         return np.array([getattr(lens, name) for lens in sized], np.float32)
 
-    poses = np.stack([make_rigid(pose, path, name) for name, _, pose in posed])
+    poses = np.stack([make_rigid(image.world_to_camera, path, image.name) for image in images])
     cameras = Camera(poses, column("fx"), column("fy"), column("cx"), column("cy"), width, height)
-    return cameras, frame_names([name for name, _, _ in posed], path)
+    return cameras, frame_names([image.name for image in images], path)
 
 
 def _read_scene(stage: StageInput) -> StageResult:

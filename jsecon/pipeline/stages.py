@@ -51,8 +51,8 @@ from jsecon.pipeline.results import (
 from jsecon.pipeline.scene_files import check_overlap, place_in_capture, read_scene
 from jsecon.poses.sfm import find_poses
 from jsecon.process import memory_budget
-from jsecon.read.captures.capture import load_capture, may_have_depth, unposed_photographs
-from jsecon.read.captures.nerfstudio import trained_to_source
+from jsecon.read.captures.capture import has_depth, load_capture, unposed_photographs
+from jsecon.read.captures.nerfstudio import source_from_trained
 from jsecon.read.captures.photographs import list_photographs
 from jsecon.read.captures.video import DEFAULT_VIDEO_FRAMES, is_video, write_frames
 from jsecon.read.masks.langsplat import load_features
@@ -189,7 +189,7 @@ def _refinement(options: Options) -> str:
         return options.refine
     if options.gaussians is not None:  # they belong to the poses as they are
         return "none"
-    return "auto" if may_have_depth(options.capture) else "none"
+    return "auto" if has_depth(options.capture) else "none"
 
 
 def _load(stage: StageInput) -> StageResult:
@@ -265,7 +265,7 @@ def _read_gaussians(stage: StageInput) -> StageResult:
     assert path is not None
     scene, read_notes = read_scene(path)
     transform = path.parent / "dataparser_transforms.json"
-    trained = trained_to_source(transform) if transform.is_file() else None
+    trained = source_from_trained(transform) if transform.is_file() else None
     placed, notes = place_in_capture(scene, capture, path, trained, stage.progress)
     check_overlap(placed, capture.cameras[training_frames(capture.held_out)], str(path))
     return StageResult(placed, notes=(*notes, *read_notes))

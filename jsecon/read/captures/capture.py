@@ -1,16 +1,40 @@
-"""Captures of any known format, on the host, and whether their views can be used together."""
+"""Captures of any known format, on the host.
 
-from collections.abc import Callable, Collection
+`READERS` is the table of formats. A reader takes a folder, or a file of poses, and returns PosedImages: images, lenses
+and poses in OpenCV axes. Other packages add readers by entry points in the group jsecon.captures.
+"""
+
+from collections.abc import Collection
 from pathlib import Path
 
 from jsecon.errors import InputError
-from jsecon.files import is_output_folder
-from jsecon.read.captures.colmap import find_models, read_colmap
-from jsecon.read.captures.frames import CaptureExtent, FrameOptions, PosedImages, build_capture, planned_extent
+from jsecon.files import is_output_folder, reading
+from jsecon.read.captures import rgbd
+from jsecon.read.captures.build import build_capture, planned_extent
+from jsecon.read.captures.colmap import MODEL_MARK, read_colmap
+from jsecon.read.captures.frames import CaptureExtent, FrameOptions, PosedImages
 from jsecon.read.captures.nerfstudio import read_nerfstudio
 from jsecon.read.captures.photographs import list_photographs
-from jsecon.read.captures.rgbd import find_rgbd
+from jsecon.read.registry import Reader, find_reader
 from jsecon.types import Capture, Progress
+
+_COLMAP = "COLMAP"
+READERS = (
+    *(Reader(_COLMAP, (f"{place}/{MODEL_MARK}",), read_colmap) for place in ("sparse/*", "sparse")),
+    Reader("nerfstudio", ("transforms.json",), read_nerfstudio),
+    Reader("nerfstudio", (".json",), read_nerfstudio),
+    *(
+        Reader(_COLMAP, (f"{place}{MODEL_MARK}",), read_colmap)
+        for place in ("colmap/sparse/*/", "colmap/sparse/", "colmap_text/", "")
+    ),
+    Reader("ScanNet", ("color", "pose", "intrinsic/intrinsic_color.txt"), rgbd.read_scannet),
+    Reader("TUM", ("rgb.txt", "groundtruth.txt"), rgbd.read_tum),
+    Reader("ARKitScenes", ("lowres_wide", "lowres_wide.traj"), rgbd.read_arkitscenes),
+    Reader("Polycam", ("keyframes",), rgbd.read_polycam),
+    Reader("Record3D", ("rgb", "metadata.json"), rgbd.read_record3d),
+    Reader("Record3D", ("rgbd", "metadata"), rgbd.read_record3d),
+)
+"""The formats, the preferred first: a folder of both COLMAP and nerfstudio is read as COLMAP, which has the points."""
 
 
 def load_capture(
@@ -45,75 +69,41 @@ def load_capture(
       InputError: The path holds no capture, or a damaged one.
     """
     options = FrameOptions(downscale, long_side, frames, holdout)
-    return build_capture(_read(Path(path)), options, only=only, progress=progress)
+    return build_capture(read_posed_images(Path(path)), options, only=only, progress=progress)
 
 
 def capture_extent(path: str | Path, options: FrameOptions) -> CaptureExtent:
-    """Computes what frames `load_capture` would load, from image headers only.
-
-    Args:
-      path: As in `load_capture`.
-      options: Options of the frames.
-
-    Returns:
-      Number, size and names of the frames.
-
-    Raises:
-      InputError: As in `load_capture`, but for damaged pixels.
-    """
-    return planned_extent(_read(Path(path)), options)
+    """Computes what frames `load_capture` would load, from image headers only."""
+    return planned_extent(read_posed_images(Path(path)), options)
 
 
-def _find_reader(path: Path) -> Callable[[], PosedImages] | None:
-    """The reader of a capture's format, or None."""
-    if path.is_dir() and (models := find_models(path)):
-        return lambda: read_colmap(path, models)
-    if (file := _transforms_file(path)) is not None:
-        return lambda: read_nerfstudio(file)
-    if (reader := find_rgbd(path)) is not None:
-        return lambda: reader(path)
-    return None
-
-
-def _transforms_file(path: Path) -> Path | None:
-    """The file of transforms at a path, or None."""
-    file = path / "transforms.json" if path.is_dir() else path
-    return file if file.is_file() and file.suffix.lower() == ".json" else None
-
-
-def _read(path: Path) -> PosedImages:
-    """Reads a capture without its pixels."""
+def read_posed_images(path: Path) -> PosedImages:
+    """Reads a capture without its pixels; its images need not be there."""
     reader = _find_reader(path)
     if reader is None:
         raise _no_capture(path)
-    return reader()
+    with reading(path, remedy="Export the capture again."):
+        return reader.read(path)
 
 
-def may_have_depth(path: Path) -> bool:
-    """Whether a capture can have depth maps, by its format and its transforms.json; reads no frame.
+def _find_reader(path: Path) -> Reader | None:
+    """The reader of a capture's format, or None."""
+    return find_reader("jsecon.captures", READERS, path)
 
-    Args:
-      path: As in `load_capture`; anything else has no depth.
 
-    Returns:
-      False for COLMAP, and for transforms without `depth_file_path`.
-    """
-    if path.is_dir() and find_models(path):
+def has_depth(path: Path) -> bool:
+    """Whether a capture names depth maps; False also for any path that cannot be read."""
+    reader = _find_reader(path)
+    if reader is None or reader.name == _COLMAP:
         return False
-    if (file := _transforms_file(path)) is not None:
-        return b"depth_file_path" in file.read_bytes()
-    return find_rgbd(path) is not None
+    try:
+        return any(image.depth is not None for image in read_posed_images(path).images)
+    except InputError:
+        return False
 
 
 def unposed_photographs(path: Path) -> list[Path]:
-    """Lists the photographs of a folder without poses; those of subfolders only if none of these is a capture.
-
-    Args:
-      path: A folder, or another path, which has no photographs.
-
-    Returns:
-      Paths of the photographs; empty if the folder has poses.
-    """
+    """Lists the photographs of a folder without poses; those of subfolders only if none of these is a capture."""
     if not path.is_dir() or _find_reader(path) is not None:
         return []
     photos = list_photographs(path)

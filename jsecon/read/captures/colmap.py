@@ -62,8 +62,8 @@ def _find_models(path: Path) -> list[Path]:
     for places in (("sparse/*", "sparse"), ("colmap/sparse/*", "colmap/sparse"), ("colmap_text",), ("",)):
         models = [file.parent for place in places for file in path.glob(f"{place}/{MODEL_MARK}".lstrip("/"))]
         if models:
-            unique = sorted(dict.fromkeys(models), key=lambda model: (not model.name.isdecimal(), len(model.name), model))
-            return sorted(unique, key=_count_images, reverse=True) if len(unique) > 1 else unique
+            models = sorted(set(models), key=lambda model: (not model.name.isdecimal(), len(model.name), model))
+            return sorted(models, key=_count_images, reverse=True) if len(models) > 1 else models
     raise InputError(path, "it holds no COLMAP model", "cameras.bin or cameras.txt", "Check the path.")
 
 
@@ -75,10 +75,10 @@ def read_colmap(path: Path) -> PosedImages:
     models = _find_models(path)
     model, notes = models[0], []
     if len(models) > 1:
-        others = ", ".join(f"{place.relative_to(path)} with {_count_images(place)}" for place in models[1:])
+        largest, *others = (f"{place.relative_to(path)} with {_count_images(place)} images" for place in models)
         notes.append(
-            f"There are {len(models)} models. {model.relative_to(path)} has the most images, {_count_images(model)}, and "
-            f"is used; left out: {others}. Join them (colmap model_merger), or take photographs between them, to use all."
+            f"There are {len(models)} models. The largest, {largest}, is used; left out: {', '.join(others)}. "
+            "Join them (colmap model_merger), or take photographs between them, to use all."
         )
     lenses, images = _read_cameras(model), _read_images(model)
     files = _find_images(path, [name for name, _, _ in images])

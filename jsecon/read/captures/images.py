@@ -43,6 +43,7 @@ _DECODERS: dict[bytes, type[ImageFile]] = {
     b"MM\0*": TiffImageFile,
 }
 """first bytes of a file -> Pillow's decoder"""
+_HEIC = (b"ftypheic", b"ftypheix", b"ftypmif1", b"ftyphevc")
 _ORIENTATION = 0x0112
 """EXIF tag: 1 is upright; 6, the commonest of a phone held upright, asks for a turn clockwise by 90 degrees"""
 _MODES = {"1": "L"} | dict.fromkeys(("RGBA", "PA", "LA", "La", "RGBa"), "RGBA")
@@ -60,7 +61,7 @@ def _open(path: Path) -> Iterator[ImageFile]:
             if not head:
                 raise ValueError("the file is empty")
             decoder = next((kind for magic, kind in _DECODERS.items() if head.startswith(magic)), None)
-            if decoder is None and head[4:8] == b"ftyp":
+            if decoder is None and head[4:12] in _HEIC:
                 decoder = _heic_decoder(path)
             if decoder is None:
                 raise ValueError("it is not an image of a known kind")

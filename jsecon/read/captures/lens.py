@@ -60,12 +60,14 @@ class Lens:
 
 
 def _colmap_camera(lens: Lens) -> Any:
-    """pycolmap's camera of a lens."""
+    """Pycolmap's camera of a lens."""
     try:
         import pycolmap
     except ImportError as error:
         remedy = "Run: pip install 'jsecon[sfm]' (or undistort the images: colmap image_undistorter)."
-        raise InputError(lens.model, "this camera model needs pycolmap, which is not installed", remedy=remedy) from error
+        raise InputError(
+            lens.model, "this camera model needs pycolmap, which is not installed", remedy=remedy
+        ) from error
     parameters = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
     return pycolmap.Camera(model=lens.model, width=lens.width, height=lens.height, params=parameters)
 

@@ -1,13 +1,13 @@
 """Captures of depth cameras and phones, on the host: ScanNet, TUM, ARKitScenes, Polycam and Record3D.
 
 Formats: ScanNet SensReader/python; TUM's RGB-D benchmark (file_formats); ARKitScenes DATA.md; nerfstudio process_data
-polycam_utils.py and record3d_utils.py. Each keeps its world; phones look along -z with y up.
+polycam_utils.py and record3d_utils.py. Each keeps its world; phones look along -z with y up. Frames without a pose are
+left out, and counted in a note.
 """
 
 import dataclasses
 import functools
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from jsecon.errors import InputError
 from jsecon.files import parse_json, read_text, reading
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.read.captures.coordinates import make_rigid
-from jsecon.read.captures.frames import MIN_FOCAL, PosedImage, PosedImages
+from jsecon.read.captures.frames import PosedImage, PosedImages
 from jsecon.read.captures.images import MAX_PIXELS, image_header
 from jsecon.read.captures.lens import Lens
 
@@ -30,35 +30,12 @@ _TUM_INTRINSICS = {
     "3": (535.4, 539.2, 320.1, 247.6),
 }
 """fx fy cx cy k1 k2 p1 p2 k3 of the benchmark's cameras freiburg1 to 3, the centre of the first pixel at (0, 0)"""
-_TUM_DEPTH_UNIT = 1 / 5000
 _MAX_GAP = 0.02
 """seconds between an image and its pose or depth"""
 _PHONE_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 _EXPORT = "Export the capture again."
 _parsing = functools.partial(reading, remedy=_EXPORT)
 """makes errors in parsing a file InputErrors"""
-
-
-def find_rgbd(path: Path) -> Callable[[Path], PosedImages] | None:
-    """Finds the reader of a folder by the files in it.
-
-    Args:
-      path: Folder of a capture.
-
-    Returns:
-      A function that reads the folder, or None. It skips frames without a pose, which its notes count, and raises
-      InputError on damaged files.
-    """
-    for marks, reader in _FOLDERS.items():
-        if all((path / mark).exists() for mark in marks):
-            return functools.partial(_read, reader)
-    return None
-
-
-def _read(reader: Callable[[Path], PosedImages], path: Path) -> PosedImages:
-    """Reads a folder, and makes the errors of its reader InputErrors."""
-    with _parsing(path), np.errstate(invalid="ignore", over="ignore"):
-        return reader(path)
 
 
 def _lines(file: Path) -> list[str]:
@@ -102,7 +79,7 @@ def _lens(width: Any, height: Any, *intrinsics: Any) -> Lens:
     """
     fx, fy, cx, cy = map(float, intrinsics)
     has_size = 1 <= width <= MAX_PIXELS and 1 <= height <= MAX_PIXELS
-    if not (has_size and is_finite_and_bounded(intrinsics) and min(fx, fy) >= MIN_FOCAL):
+    if not (has_size and is_finite_and_bounded(intrinsics) and min(fx, fy) >= 1e-3):
         raise ValueError(f"a frame of {width}x{height} with focal lengths {fx:g}, {fy:g}")
     if not (0 < cx < width and 0 < cy < height):
         raise ValueError(f"a frame of {width}x{height} with its centre at {cx:g}, {cy:g}")
@@ -123,8 +100,8 @@ def _posed_images(path: Path, images: list[PosedImage], count: int, *notes: str)
     return PosedImages(images, path, notes=(*lost_note, *notes))
 
 
-def _read_scannet(path: Path) -> PosedImages:
-    """ScanNet's exported folders."""
+def read_scannet(path: Path) -> PosedImages:
+    """Reads ScanNet's exported folders."""
     images, lenses = _list_images(path / "color"), {}
     for kind in ("color", "depth"):
         file = path / "intrinsic" / f"intrinsic_{kind}.txt"
@@ -157,8 +134,8 @@ def _nearest_times(times: np.ndarray, queries: np.ndarray) -> np.ndarray:
     return np.where(gap <= _MAX_GAP, index, -1)
 
 
-def _read_tum(path: Path) -> PosedImages:
-    """TUM's RGB-D benchmark."""
+def read_tum(path: Path) -> PosedImages:
+    """Reads a sequence of TUM's RGB-D benchmark."""
     (times, images), poses = _read_tum_list(path / "rgb.txt"), _numbers(path / "groundtruth.txt", 8)
     file = path / "intrinsics.txt"
     camera = re.search(r"(?:freiburg|fr)([123])", path.resolve().name)
@@ -181,12 +158,12 @@ def _read_tum(path: Path) -> PosedImages:
             with _parsing(path / "groundtruth.txt"):
                 pose = _matrix(Rotation.from_quat(poses[row, 4:]), poses[row, 1:4])
             frame = _posed_image(image, lens, pose, depths[depth] if depth >= 0 else None)
-            posed.append(dataclasses.replace(frame, depth_unit=_TUM_DEPTH_UNIT))
+            posed.append(dataclasses.replace(frame, depth_unit=1 / 5000))
     return _posed_images(path, posed, len(images))
 
 
-def _read_arkitscenes(path: Path) -> PosedImages:
-    """ARKitScenes' low resolution frames."""
+def read_arkitscenes(path: Path) -> PosedImages:
+    """Reads ARKitScenes' low resolution frames."""
     images, rows = _list_images(path / "lowres_wide"), _numbers(path / "lowres_wide.traj", 7)
     lens_files = sorted((path / "lowres_wide_intrinsics").glob("*.pincam"))
     with _parsing(path / "lowres_wide"):
@@ -206,8 +183,8 @@ def _read_arkitscenes(path: Path) -> PosedImages:
     return _posed_images(path, posed, len(images))
 
 
-def _read_polycam(path: Path) -> PosedImages:
-    """Polycam's raw data."""
+def read_polycam(path: Path) -> PosedImages:
+    """Reads Polycam's raw data."""
     frames = path / "keyframes"
     is_corrected = all((frames / f"corrected_{kind}").is_dir() for kind in ("images", "cameras"))
     prefix = "corrected_" if is_corrected else ""
@@ -242,8 +219,8 @@ def _polycam_size(camera: Any, uncorrected: Path, image: Path) -> tuple[Any, Any
     return (width, height) if abs(width * size[1] - height * size[0]) <= max(width, height) else size
 
 
-def _read_record3d(path: Path) -> PosedImages:
-    """Record3D's exported or unpacked folders."""
+def read_record3d(path: Path) -> PosedImages:
+    """Reads Record3D's exported or unpacked folders."""
     is_unpacked = (path / "rgbd").is_dir()  # a .r3d is an archive
     images, posed = _list_images(path / ("rgbd" if is_unpacked else "rgb")), []
     file = path / ("metadata" if is_unpacked else "metadata.json")
@@ -260,14 +237,3 @@ def _read_record3d(path: Path) -> PosedImages:
                 size = (metadata["w"], metadata["h"]) if has_size else image_header(image).upright
                 posed.append(_posed_image(image, _lens(*size, *intrinsics[n]), pose))
     return _posed_images(path, posed, len(images), "Record3D's depth was not read: its compression is not supported.")
-
-
-_FOLDERS: dict[tuple[str, ...], Callable[[Path], PosedImages]] = {
-    ("color", "pose", "intrinsic/intrinsic_color.txt"): _read_scannet,
-    ("rgb.txt", "groundtruth.txt"): _read_tum,
-    ("lowres_wide", "lowres_wide.traj"): _read_arkitscenes,
-    ("keyframes",): _read_polycam,
-    ("rgb", "metadata.json"): _read_record3d,
-    ("rgbd", "metadata"): _read_record3d,
-}
-"""files and folders of a capture -> its reader"""

@@ -15,34 +15,18 @@ from jsecon.errors import InputError
 from jsecon.files import atomic_write
 from jsecon.types import Progress
 
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".3gp")
+_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".3gp")
 DEFAULT_VIDEO_FRAMES = 150
 """frames taken by default: two or three rounds about a table top"""
-SHARPNESS_SIDE = 640
-"""px of the longer side at which sharpness is measured: motion still blurs it, and noise counts less"""
 
 
 def is_video(path: Path) -> bool:
-    """Whether a path is a file with the suffix of a video.
-
-    Args:
-      path: The path.
-
-    Returns:
-      False also if it does not exist.
-    """
-    return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
+    """Whether a path is a file with the suffix of a video."""
+    return path.suffix.lower() in _SUFFIXES and path.is_file()
 
 
 def video_size(path: Path) -> tuple[int, int]:
-    """Reads the size of a video's frames from its header.
-
-    Args:
-      path: The video.
-
-    Returns:
-      (width, height), px; zeros if OpenCV cannot read it.
-    """
+    """Reads (width, height) of a video's frames from its header, px; zeros if OpenCV cannot read it."""
     reader = cv2.VideoCapture(os.fspath(path))
     try:
         return int(reader.get(cv2.CAP_PROP_FRAME_WIDTH)), int(reader.get(cv2.CAP_PROP_FRAME_HEIGHT))
@@ -56,24 +40,12 @@ def write_frames(
     """Writes the sharpest frame of each stretch of a video as a JPEG, named by its number in the video.
 
     Sharpness is the variance of the Laplacian of the grey values (Pech-Pacheco et al., "Diatom autofocusing in
-    brightfield microscopy", ICPR 2000). The video is decoded twice, a frame at a time.
-
-    Args:
-      video: The video.
-      folder: Folder for the frames.
-      frames: Most frames to write; None: DEFAULT_VIDEO_FRAMES.
-      progress: Called with (frames decoded, frames to decode).
-
-    Returns:
-      Paths of the frames.
-
-    Raises:
-      InputError: OpenCV cannot read the video.
+    brightfield microscopy", ICPR 2000). The video is decoded twice, a frame at a time. `frames` is the most to write.
     """
     sharpness = []
     for image, total in _decode(video):
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        shrink = min(1.0, SHARPNESS_SIDE / max(grey.shape))
+        shrink = min(1.0, 640 / max(grey.shape))  # at that size motion still blurs, and noise counts less
         small = cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
         sharpness.append(cv2.Laplacian(small, cv2.CV_32F).var())
         if progress is not None:

@@ -6,17 +6,14 @@ belong to the mask), the objects of a category OR-ed, their boxes side by side.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool
 
-from jsecon.errors import InputError, require
-from jsecon.files import path_within, read_json, write_text
+from jsecon.errors import InputError
+from jsecon.files import read_json
 from jsecon.read.captures.images import MAX_PIXELS
 from jsecon.types import record, static
 
@@ -105,75 +102,3 @@ def _numbers(file: Path, values: list, shape: tuple[int, int], what: str) -> np.
     if not np.isfinite(array).all() or np.abs(array).max(initial=0) > 1e6 or not len(array):
         raise _error(file, f"the {what} is empty or out of all range", "pixels")
     return array
-
-
-def write_lerf_labels(folder: str | Path, frames: Iterable[LabelledFrame], *, image_ending: str = ".png") -> None:
-    """Writes `<name>.json` of each frame; `load_lerf_labels` gives the same masks and boxes back.
-
-    A polygon has one piece and no holes, so a mask is written as several objects of its category: one for each
-    connected piece, and pieces with holes are cut along pixel rows. Each has the category's box that fits it best.
-
-    Args:
-      folder: The folder.
-      frames: The labelled frames.
-      image_ending: Suffix of the frames' images.
-
-    Raises:
-      ValueError: A category has no pixels or boxes.
-      InputError: The folder cannot be written.
-    """
-    for frame in frames:
-        objects = []
-        for group, (category, (mask, boxes)) in enumerate(frame.objects.items(), start=1):
-            fits = mask.shape == (frame.height, frame.width) and bool(mask.any()) and len(boxes) > 0
-            got = f"mask {mask.shape} with {int(mask.sum())} pixels, {len(boxes)} boxes"
-            expected = f"({frame.height}, {frame.width}), with pixels and a box"
-            require(fits, f"{frame.name}: {category}", got, expected, "Leave out what the frame does not show.")
-            for polygon, box in _with_boxes(_mask_polygons(mask), np.asarray(boxes, np.float64)):
-                shape = {"segmentation": polygon.astype(float).tolist(), "area": float(mask.sum()), "layer": 1.0}
-                rest = {"bbox": box.tolist(), "iscrowd": 0, "note": ""}
-                objects.append({"category": category, "group": group} | shape | rest)
-        info = {"name": frame.name + image_ending, "width": frame.width, "height": frame.height, "depth": 3, "note": ""}
-        write_text(path_within(Path(folder), f"{frame.name}.json"), json.dumps({"info": info, "objects": objects}))
-
-
-def _mask_polygons(mask: Bool[np.ndarray, "h w"]) -> list[np.ndarray]:
-    """Outlines a mask by polygons without holes, whose polygon masks OR-ed are the mask exactly."""
-    polygons = []
-    image = np.ascontiguousarray(mask, np.uint8)
-    _, labels = cv2.connectedComponents(image, connectivity=8)
-    contours, tree = cv2.findContours(image, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
-    for contour, (_, _, hole, parent) in zip(contours, tree[0] if tree is not None else ()):
-        if parent >= 0:
-            continue
-        outline = contour[:, 0]
-        if hole < 0:
-            polygons.append(outline)
-            continue
-        # Cut along the middle row of a hole: it opens into a notch of either part. The hole nearest to the piece's
-        # middle, so that many holes are halved at each cut.
-        cuts = []
-        while hole >= 0:
-            rows = contours[hole][:, 0, 1]
-            cuts.append(int(rows.min() + rows.max() + 1) // 2)
-            hole = tree[0][hole][0]
-        cut = min(cuts, key=lambda row: abs(2 * row - outline[:, 1].min() - outline[:, 1].max()))
-        x, y, width, height = cv2.boundingRect(outline)
-        piece = labels[y : y + height, x : x + width] == labels[outline[0, 1], outline[0, 0]]
-        upper, lower = piece[: cut - y], piece[cut - y :]
-        polygons += [polygon + np.array([x, y]) for polygon in _mask_polygons(upper)]
-        polygons += [polygon + np.array([x, cut]) for polygon in _mask_polygons(lower)]
-    return polygons
-
-
-def _with_boxes(polygons: list[np.ndarray], boxes: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Each polygon with the box that shares most with it; boxes left over go with the first polygon again."""
-    pairs, unused = [], set(range(len(boxes)))
-    for polygon in polygons:
-        low, high = polygon.min(0), polygon.max(0) + 1
-        shared = (np.minimum(boxes[:, 2:], high) - np.maximum(boxes[:, :2], low)).clip(0).prod(1)
-        area = (boxes[:, 2:] - boxes[:, :2]).clip(0).prod(1)
-        best = int(np.lexsort((area, -shared))[0])
-        pairs.append((polygon, boxes[best]))
-        unused.discard(best)
-    return pairs + [(polygons[0], boxes[index]) for index in sorted(unused)]
