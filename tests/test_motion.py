@@ -25,8 +25,7 @@ from jsecon.pipeline.results import KEY_FILE, RunContext
 from jsecon.pipeline.stages import capture_stages
 from jsecon.poses import sfm
 from jsecon.poses.sfm import find_poses
-from jsecon.read.captures.capture import load_capture
-from jsecon.read.captures.colmap import read_images
+from jsecon.read.captures.capture import load_capture, read_posed_images
 from jsecon.read.captures.images import read_image
 from jsecon.read.captures.photographs import list_photographs
 from jsecon.vision.colours import ColourEmbedder
@@ -85,7 +84,7 @@ def test_an_incremental_model_replaces_a_global_one_that_fails(photos, found, tm
     sfm.main(work)
     result = json.loads((work / "result.json").read_text())
     assert (len(result["registered"]), result["models"]) == (COUNT, 1)
-    poses = {name: pose for name, _, pose in read_images(work / "capture" / "sparse" / "0")}
+    poses = {image.name: image.world_to_camera for image in read_posed_images(work / "capture").images}
     poses_are_true(np.stack([poses[name] for name in sorted(poses)]), photos[1])
 
 
