@@ -33,7 +33,7 @@ def made_field(objects: int, gaussians: int, seed: int = 0) -> Any:
     """A field of objects on a grid, z up, seen from one side."""
     import numpy as np
 
-    from jsecon.demo.capture import look_at
+    from experiments.rooms.capture import look_at
     from jsecon.types import Camera, Gaussians, LanguageField, Regions, Votes
     from jsecon.vision.colours import VOCABULARY, ColourEmbedder
 

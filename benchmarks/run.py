@@ -50,7 +50,7 @@ def rgbd_room(folder: Path, *, seed: int = 0, views: int = 100, width: int = 400
     import numpy as np
 
     from experiments.datasets.plain_room import make_room
-    from jsecon.demo import render_views, room_cameras
+    from experiments.rooms import render_views, room_cameras
 
     if (folder / "transforms.json").exists():
         return folder

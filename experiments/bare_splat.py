@@ -3,8 +3,9 @@
     python -m experiments.bare_splat [--seeds 1 2 3 4 5] [--demos FOLDER]
     python -m experiments.bare_splat --field FIELD       (a field of `jsecon run` on a capture)
 
-Each made-up room comes from `jsecon demo --seed S`, kept in DEMOS/demoS. Its fitted Gaussians are written to a .ply,
-turned, scaled by 0.01 to 100 and shifted at random, and `jsecon run scene.ply` makes a field without photographs.
+Each made-up room and its fields come from experiments/demo_rooms.py, kept in DEMOS/SEED. Its fitted Gaussians are
+written to a .ply, turned, scaled by 0.01 to 100 and shifted at random, and `jsecon run scene.ply` makes a field
+without photographs.
 
 - label mIoU: for each true object (the demo's field of exact masks), the best IoU of its Gaussians with those of one
   region; a Gaussian belongs to its strongest region if that has half of its weight. The ratio is bare / photographs.
@@ -26,6 +27,7 @@ from scipy.spatial.transform import Rotation
 
 import jsecon
 from experiments import results
+from experiments.demo_rooms import fields_of_room
 
 SMALLEST = 50
 """Gaussians of a region that is matched"""
@@ -36,7 +38,7 @@ class Options:
     """What is compared."""
 
     seeds: tuple[int, ...] = (1, 2, 3, 4, 5)
-    demos: str = "jsecon-demos"
+    demos: str = str(results.HOME.parent / "demos")
     field: str = ""
     views: int = 24
     out: str = ""
@@ -102,10 +104,8 @@ def main(options: Options) -> dict[str, dict]:
         scenes.append((Path(options.field).parent.name, 0, Path(options.field), None))
     else:
         for seed in options.seeds:
-            demo = Path(options.demos) / f"demo{seed}"
-            if not (demo / "metrics.json").exists():
-                command = [sys.executable, "-m", "jsecon", "demo", "--seed", str(seed), "--out", str(demo)]
-                subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+            demo = Path(options.demos) / str(seed)
+            fields_of_room(demo, seed, quick=False)
             scenes.append((f"room {seed}", seed, demo / "field.safetensors", demo / "true_masks" / "field.safetensors"))
     for name, seed, path, true_path in scenes:
         field = jsecon.load_field(path)

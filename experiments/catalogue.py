@@ -22,10 +22,10 @@ from jaxtyping import Float, Int
 
 import jsecon
 from experiments import results
+from experiments.rooms import write_room
+from experiments.rooms.room import Room, RoomObject, crowded_room
+from experiments.rooms.shapes import contains
 from jsecon.app.catalogue import Catalogue
-from jsecon.demo import write_room
-from jsecon.demo.room import Room, RoomObject, crowded_room
-from jsecon.demo.shapes import contains
 from jsecon.errors import InputError
 from jsecon.pipeline import run as pipeline
 from jsecon.pipeline.options import Options as RunOptions

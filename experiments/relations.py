@@ -24,11 +24,9 @@ from scipy.spatial import KDTree
 
 from experiments import results
 from experiments.cells import append_cell, read_cells
-from jsecon.app.object_scene import ObjectScene
-from jsecon.app.relations import query_relation
-from jsecon.demo.capture import room_cameras, write_room
-from jsecon.demo.raycast import render_views
-from jsecon.demo.room import (
+from experiments.rooms.capture import room_cameras, write_room
+from experiments.rooms.raycast import render_views
+from experiments.rooms.room import (
     ARCH_COLOUR,
     BEAM_COLOUR,
     ON_PLATE_COLOUR,
@@ -40,7 +38,9 @@ from jsecon.demo.room import (
     place_object,
     scatter_circles,
 )
-from jsecon.demo.shapes import SHAPES, Body, box, contains, ellipsoid, place
+from experiments.rooms.shapes import SHAPES, Body, box, contains, ellipsoid, place
+from jsecon.app.object_scene import ObjectScene
+from jsecon.app.relations import query_relation
 from jsecon.errors import InputError
 from jsecon.field.field import load_field, save_field
 from jsecon.field.membership import normalise_votes

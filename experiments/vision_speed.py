@@ -21,10 +21,10 @@ from scipy.spatial.distance import cosine, pdist
 
 from experiments import results
 from experiments.datasets.plain_room import make_room
+from experiments.rooms.capture import room_cameras
+from experiments.rooms.raycast import render_views
+from experiments.rooms.room import crowded_room
 from experiments.simulated_vision.exact_sam import ExactSam, found_shares, level_labels, masks_of
-from jsecon.demo.capture import room_cameras
-from jsecon.demo.raycast import render_views
-from jsecon.demo.room import crowded_room
 from jsecon.networks.clip import ClipEmbedder, find_clip
 from jsecon.networks.hub import SUFFIXES, Precision, Role
 from jsecon.networks.sam import Level, Prompts, SamGraphs, SamSettings, find_sam

@@ -82,7 +82,7 @@ gc.set_threshold(20_000, 20, 20)
 LONGEST = (
     "pipeline", "corrections", "fit", "views", "render", "blocks", "cores", "cli", "readme", "networks", "capacity",
     "relations", "retrieval", "votes", "tiles", "anchored", "silhouette", "distill", "motion", "photometric",
-    "evidence", "synthetic", "several", "rivals", "classes", "codes", "autoencoder", "asking", "tracker", "consensus",
+    "evidence", "several", "rivals", "classes", "codes", "autoencoder", "asking", "tracker", "consensus",
     "scene_stages", "traced", "parts", "gaussian_files", "processes", "paths", "names", "window", "viewer", "direct",
     "shares", "field",
 )
@@ -214,7 +214,7 @@ def made_once(tmp_path_factory):
 @pytest.fixture(scope="session", autouse=True)
 def _bake_once():
     """Lights the surfaces of a made-up room once a process: most of the time of a small rendering."""
-    from jsecon.demo import raycast
+    from experiments.rooms import raycast
 
     bake, kept = raycast.bake_room, {}
 
@@ -234,7 +234,7 @@ def _bake_once():
 def room(made_once) -> Path:
     """A small demo room on disk: 8 views of 160x120, 2 held out."""
     from experiments.datasets.plain_room import make_room
-    from jsecon.demo import write_room
+    from experiments.rooms import write_room
 
     with made_once("room") as folder:
         if not (folder / "written").exists():

@@ -21,8 +21,8 @@ from test_proposal_files import records
 from test_rgbd import FORMATS as RGBD
 
 from experiments.datasets.feature_files import write_features
+from experiments.rooms.writers import write_colmap
 from jsecon.app import ask
-from jsecon.demo.writers import write_colmap
 from jsecon.errors import InputError
 from jsecon.field.field import check_field, load_field, save_field
 from jsecon.networks.clip import MAX_BIAS, MAX_SCALE, ClipEmbedder

@@ -6,7 +6,7 @@ World: z up; the cameras look along y, x is to the right.
 import numpy as np
 from conftest import gaussians_at
 
-from jsecon.demo.capture import look_at
+from experiments.rooms.capture import look_at
 from jsecon.types import Camera, LanguageField, Regions, Votes
 from jsecon.vision.colours import ColourEmbedder
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from capture_files import refused, small_capture, transforms, write_transforms
 
-from jsecon.demo.writers import write_colmap
+from experiments.rooms.writers import write_colmap
 from jsecon.read.captures.capture import load_capture
 from jsecon.read.captures.coordinates import camera_jumps
 from jsecon.read.captures.frames import evenly_spaced

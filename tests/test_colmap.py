@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from capture_files import refused, ring_poses, small_capture, write_images, write_text_model
 
+from experiments.rooms.writers import write_colmap
 from jsecon import Camera, InputError, load_capture
-from jsecon.demo.writers import write_colmap
 from jsecon.read.captures.capture import read_posed_images
 from jsecon.read.captures.images import write_image
 

@@ -29,8 +29,8 @@ def work(out: str, field: str, word: str, parts: tuple[str, ...]) -> None:
     import jax
 
     import jsecon
+    from experiments.rooms.capture import look_at
     from jsecon.app.cli import main
-    from jsecon.demo.capture import look_at
     from jsecon.fit.optimise import fit_gaussians
     from jsecon.fit.schedule import Schedule
 

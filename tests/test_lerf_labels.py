@@ -10,7 +10,7 @@ import pytest
 from capture_files import refused
 from hypothesis import given, settings, strategies as st
 
-from jsecon.demo.writers import write_lerf_labels
+from experiments.rooms.writers import write_lerf_labels
 from jsecon.errors import InputError
 from jsecon.read.masks.labels import LabelledFrame, load_lerf_labels
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from small_field import colour_field
 
+from experiments.rooms.writers import write_colmap
 from jsecon import InputError, load_capture, load_field, load_ply, query_region, save_field
 from jsecon.app.ask import Answer, ask_pixel, ask_region, ask_text
 from jsecon.app.cli import main
 from jsecon.app.outputs import file_stem, write_answer
-from jsecon.demo.writers import write_colmap
 from jsecon.files import path_within
 from jsecon.query.composite import parse_query
 from jsecon.vision.colours import ColourEmbedder

@@ -56,8 +56,6 @@ def page():
                 "Search",
             ),
             report.figure(_image(), "in 3 of 4 frames", strong="region 7", wide=True),
-            report.film(b"RIFF", "a film"),
-            report.shades(["text", "votes", "code"], [("red <mug>", [0.5, None]), ("mean", [1.0, 0.0])]),
             report.folded("the others & more", report.table(["c"], [["d"]])),
             report.table(["a", "b"], [[1, "<script>"]]),
         ],
@@ -162,19 +160,6 @@ def test_labels_are_drawn_in_their_colours_and_unlabelled_pixels_stay_grey():
     inside, outside = image[8:16, 8:16].reshape(-1, 3).astype(float), image[:, 24:].reshape(-1, 3)
     assert (outside.max(1) == outside.min(1)).all()
     assert np.corrcoef(inside.mean(0), pictures.palette(4)[3])[0, 1] > 0.99
-
-
-def test_answers_keep_their_colours_and_those_that_leave_no_room_stay_dark():
-    masks = {name: np.zeros((60, 150), bool) for name in ("red mug", "blue cup", "nothing", "on the mug")}
-    masks["red mug"][20:40, 5:50] = masks["blue cup"][25:50, 100:140] = masks["on the mug"][10:20, 20:29] = True
-    frame = np.full((60, 150, 3), (200, 100, 0), np.uint8)
-    image = pictures.answers_overlay(frame, masks)
-    np.testing.assert_array_equal(image[[30, 47], [27, 120]], [(200, 100, 0)] * 2)
-    np.testing.assert_array_equal(image[57, 1], [35] * 3)
-    without = pictures.answers_overlay(frame, {name: masks[name] for name in ("red mug", "blue cup")})
-    np.testing.assert_array_equal(image, without)
-    assert (image[:, :60] > 210).any()  # names
-    assert (image[:, 90:] > 210).any()
 
 
 def test_a_region_is_cut_out_of_each_frame_and_missing_where_it_is_not_seen():

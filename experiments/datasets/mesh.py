@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from jsecon.demo.room import TABLE_HEIGHT, Room
+from experiments.rooms.room import TABLE_HEIGHT, Room
 from jsecon.types import Capture
 
 CEILING = "ceiling"

@@ -6,8 +6,8 @@ from collections import Counter
 
 import numpy as np
 
-from jsecon.demo.room import Room, build_room, footprint_radius, place_object, scatter_circles
-from jsecon.demo.shapes import SHAPES, box, ellipsoid, frustum, place, rotation
+from experiments.rooms.room import Room, build_room, footprint_radius, place_object, scatter_circles
+from experiments.rooms.shapes import SHAPES, box, ellipsoid, frustum, place, rotation
 from jsecon.errors import require
 
 PALETTE = {

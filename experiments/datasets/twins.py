@@ -22,9 +22,9 @@ from experiments.datasets.mesh import SURROUNDINGS, mesh_of, surfaces_of
 from experiments.datasets.mesh_files import write_mesh
 from experiments.datasets.ovs3d import write_segmentations
 from experiments.datasets.plain_room import make_room
-from jsecon.demo.capture import label_frame, look_at, render_capture, room_cameras
-from jsecon.demo.room import TABLE_WOOD, Part, Room, srgb_to_linear
-from jsecon.demo.writers import write_colmap, write_lerf_labels
+from experiments.rooms.capture import label_frame, look_at, render_capture, room_cameras
+from experiments.rooms.room import TABLE_WOOD, Part, Room, srgb_to_linear
+from experiments.rooms.writers import write_colmap, write_lerf_labels
 from jsecon.files import write_text
 from jsecon.read.captures.images import write_image
 from jsecon.read.masks.labels import LabelledFrame

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Int, Int32
 
-from jsecon.demo.raycast import trace_rays
-from jsecon.demo.room import Room
+from experiments.rooms.raycast import trace_rays
+from experiments.rooms.room import Room
 from jsecon.networks.sam import EncodedFrame, SamSegmenter, SamSettings
 from jsecon.types import Camera
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jsecon.demo.room import Room
+from experiments.rooms.room import Room
 from jsecon.errors import require
 
 

@@ -24,6 +24,7 @@ from experiments.datasets.mesh import SURROUNDINGS, surfaces_of
 from experiments.datasets.ovs3d import load_ovs3d
 from experiments.datasets.plain_room import make_room
 from experiments.datasets.replica import load_replica
+from experiments.rooms.raycast import trace_rays
 from experiments.simulated_vision.embeddings import (
     SimulatedEmbedder,
     TextSpace,
@@ -33,7 +34,6 @@ from experiments.simulated_vision.embeddings import (
 )
 from experiments.simulated_vision.masks import LEVELS as NOISE, Faults, SimulatedMasks, simulated_masks
 from experiments.simulated_vision.worlds import Seen, World, seen_in, world_of
-from jsecon.demo.raycast import trace_rays
 from jsecon.files import write_text
 from jsecon.read.captures.images import write_image
 from jsecon.read.masks.masks import LEVELS

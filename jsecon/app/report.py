@@ -79,25 +79,6 @@ def table(header: Sequence[str], rows: Iterable[Sequence[object]], *, numbers_fr
     return _scrolled(f"<table><thead><tr>{cells('th', header)}</tr></thead><tbody>{body}</tbody></table>")
 
 
-def shades(header: Sequence[str], rows: Iterable[tuple[str, Sequence[float | None]]]) -> str:
-    """Makes a table of shares, deeper in colour the higher they are.
-
-    Args:
-      header: Names of the columns, that of the rows' names first.
-      rows: Name and values (0 to 1) of each row; None is a gap.
-
-    Returns:
-      Its HTML.
-    """
-
-    def cell(value: float | None) -> str:
-        return "<td></td>" if value is None else f'<td class="n" style="--v:{100 * value:.0f}%">{value:.2f}</td>'
-
-    head = "".join(f"<th{' class=n' if k else ''}>{_escaped(name)}</th>" for k, name in enumerate(header))
-    body = "".join(f"<tr><td>{_escaped(name)}</td>{''.join(map(cell, values))}</tr>" for name, values in rows)
-    return _scrolled(f'<table class="shades"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>')
-
-
 def bars(seconds: Mapping[str, float]) -> str:
     """Makes a bar for each stage.
 
@@ -133,21 +114,6 @@ def figure(image: np.ndarray, caption: str, *, strong: str = "", sharp: bool = F
     picture = _image(image, f"{strong} {caption}", sharp, " tabindex=0")
     element = f"<figure>{picture}{_caption(caption, strong)}</figure>"
     return f'<div class="wide">{element}</div>' if wide else element
-
-
-def film(webp: bytes, caption: str) -> str:
-    """Makes a figure of a film.
-
-    Args:
-      webp: Content of an animated WebP.
-      caption: The caption.
-
-    Returns:
-      Its HTML.
-    """
-    data = base64.b64encode(webp).decode()
-    image = f'<img alt="{_escaped(caption)}" src="data:image/webp;base64,{data}" tabindex=0>'
-    return f'<figure class="film">{image}{_caption(caption, "")}</figure>'
 
 
 def pair(before: np.ndarray, after: np.ndarray, caption: str, *, strong: str = "") -> str:

@@ -63,7 +63,7 @@ def _fit(verb: verbs.Fit, console: Console) -> verbs.VerbResult:
 
 def _write_run(run: Run, out: Path, listener: Listener) -> dict[str, Any]:
     """Writes OUT/metrics.json and OUT/report.html of a run, prints its figures, and returns the metrics."""
-    metrics = _run_metrics(run)
+    metrics = run_metrics(run)
     write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
     warnings = [note.removeprefix(WARNING) for note in run.notes if note.startswith(WARNING)]
     with listener.progress("report"):
@@ -102,7 +102,7 @@ def _print_quality(held_out: Quality, listener: Listener) -> None:
         listener.say(f"held-out PSNR {psnr:.2f} dB, SSIM {ssim:.3f} over {count} frames")
 
 
-def _run_metrics(run: Run) -> dict[str, Any]:
+def run_metrics(run: Run) -> dict[str, Any]:
     """Returns the figures of a run for metrics.json."""
     return {
         "gaussians": run.field.gaussians.count,

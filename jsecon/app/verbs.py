@@ -13,7 +13,6 @@ from tyro.conf import Positional, UseAppendAction, arg
 from jsecon.networks.hub import Precision, Role
 from jsecon.pipeline.options import (
     BareOptions,
-    Count,
     Direction,
     FieldOptions,
     InputOptions,
@@ -23,7 +22,6 @@ from jsecon.pipeline.options import (
     Options,
     Range,
     SceneOptions,
-    Seed,
 )
 
 T = TypeVar("T")
@@ -61,24 +59,19 @@ class Verb:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Demo(Verb):
-    """Makes a room, builds its field, queries it and writes a report.
+    """Copies the capture of a made-up room, builds its field, queries it and writes a report.
 
-    The room is procedural, with named, coloured objects. It is written to disk as an ordinary COLMAP capture, and
-    `jsecon run`, `query` and `eval` then use only frames, poses and sparse points of it. The demo writes report.html,
-    metrics.json, field.safetensors, a short film and a .ply for each query, in one to two minutes on two cores. For
-    other captures, use `jsecon run` and `jsecon query`.
+    The room has named, coloured objects. It is an ordinary COLMAP capture, of which `jsecon run`, `query` and `eval`
+    use only frames, poses and sparse points. The demo writes report.html, metrics.json, field.safetensors and a .ply
+    for each query, in one to two minutes on two cores. For other captures, use `jsecon run` and `jsecon query`.
 
     Attributes:
-      seed: Seed of the room.
       out: Output folder.
-      steps: Number of optimisation steps of the photometric fit.
     """
 
-    examples = ("jsecon demo", "jsecon demo --seed 3 --out room_3")
+    examples = ("jsecon demo", "jsecon demo --out room")
 
-    seed: Seed[Option[int]] = 0
     out: Option[Path] = Path("jsecon-demo")
-    steps: Count[Option[int]] = 550
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from twin_files import replica_twin
 from experiments.datasets.mesh import SURROUNDINGS
 from experiments.datasets.plain_room import make_room
 from experiments.datasets.replica import REPLICA_SCENES, load_replica, vertex_classes
-from jsecon.demo import room_cameras
+from experiments.rooms import room_cameras
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ from hypothesis import given, settings, strategies as st
 from experiments import worlds
 from experiments.datasets.plain_room import make_room
 from experiments.datasets.twins import by_kind, camouflaged
+from experiments.rooms.room import TABLE_WOOD, srgb_to_linear
 from experiments.simulated_vision.embeddings import (
     CONFUSED,
     LEANING,
@@ -23,7 +24,6 @@ from experiments.simulated_vision.masks import LEVELS
 from experiments.simulated_vision.worlds import World, seen_in, world_of
 from experiments.tables import twins
 from experiments.tables.rows import TRAINED
-from jsecon.demo.room import TABLE_WOOD, srgb_to_linear
 from jsecon.errors import InputError
 from jsecon.read.masks.labels import LabelledFrame
 

@@ -24,7 +24,7 @@ def replica_twin(root, scene="room0"):
 def rooms_instances(seed, cameras):
     """(T, H, W) the objects that ray casting finds, asked for again from the room itself."""
     from experiments.datasets.plain_room import make_room
-    from jsecon.demo.raycast import trace_rays
+    from experiments.rooms.raycast import trace_rays
 
     room = make_room(seed, num_objects=SMALL["num_objects"])
     owners = np.array([part.owner for part in room.parts] + [-1])

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from experiments.rooms.capture import look_at
 from jsecon.app.ask import Answer
 from jsecon.app.pictures import Renderer
-from jsecon.demo.capture import look_at
 from jsecon.files import atomic_write
 from jsecon.fit.resize import scale_cameras
 from jsecon.splat.sh import C0

@@ -10,10 +10,9 @@ import pytest
 from conftest import look_at
 
 from experiments.datasets.plain_room import PALETTE, PLAIN_SHAPES, make_room
-from jsecon import Camera, InputError, load_capture
-from jsecon.demo import raycast, render_views, room_cameras, room_capture, write_room
-from jsecon.demo.raycast import lamp_visibility, texture_pattern, trace_rays
-from jsecon.demo.room import (
+from experiments.rooms import raycast, render_views, room_cameras, room_capture, write_room
+from experiments.rooms.raycast import lamp_visibility, texture_pattern, trace_rays
+from experiments.rooms.room import (
     ARCH_COLOUR,
     BEAM_COLOUR,
     CLUTTER_COLOURS,
@@ -24,7 +23,7 @@ from jsecon.demo.room import (
     Part,
     crowded_room,
 )
-from jsecon.demo.shapes import (
+from experiments.rooms.shapes import (
     blocks_segment,
     box,
     contains,
@@ -37,6 +36,7 @@ from jsecon.demo.shapes import (
     ray_interval,
     rotation,
 )
+from jsecon import Camera, InputError, load_capture
 from jsecon.read.masks.labels import load_lerf_labels
 from jsecon.read.masks.masks import load_labels
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jsecon.demo.shapes import SHAPES, Body, Solid, box, place, rotation
+from experiments.rooms.shapes import SHAPES, Body, Solid, box, place, rotation
 
 TABLE_HALF = (0.68, 0.56)
 """Half the width and depth of the table top, m."""

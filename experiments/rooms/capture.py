@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Int16
 
-from jsecon.demo.raycast import render_views
-from jsecon.demo.room import Room
-from jsecon.demo.writers import write_colmap, write_lerf_labels
+from experiments.rooms.raycast import render_views
+from experiments.rooms.room import Room
+from experiments.rooms.writers import write_colmap, write_lerf_labels
 from jsecon.errors import require
 from jsecon.files import write_text
 from jsecon.read.captures.frames import FrameOptions, holdout_mask

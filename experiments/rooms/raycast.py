@@ -13,8 +13,8 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float, Float32, Int16, UInt8
 
-from jsecon.demo.room import TABLE_HALF, TABLE_HEIGHT, TABLE_WOOD, Part, Room, Texture, srgb_to_linear
-from jsecon.demo.shapes import blocks_segment, first_hit, normals
+from experiments.rooms.room import TABLE_HALF, TABLE_HEIGHT, TABLE_WOOD, Part, Room, Texture, srgb_to_linear
+from experiments.rooms.shapes import blocks_segment, first_hit, normals
 from jsecon.types import Camera, Progress
 
 SKY_RADIANCE, LAMP_RADIANCE = 0.84, 0.48
