@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from safetensors.numpy import load_file
 
-STAGES = ("masklets", "regions", "votes", "held_out")
+STAGES = ("objects", "regions", "votes", "held_out")
 ONE, TWO = "one process", "two processes"
 
 

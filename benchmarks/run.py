@@ -19,7 +19,7 @@ from jsecon.process import peak_memory_mib, prepare_process
 
 KEPT = "load", "gaussians"
 """stages of the cold run that the warm one finds in the cache"""
-ASKED = "masklets", "regions", "codes", "votes", "held_out"
+ASKED = "objects", "regions", "votes", "held_out"
 """whose warm seconds are added up"""
 
 

@@ -32,12 +32,12 @@ def voting_views(run: Path, width: int) -> tuple[Gaussians, Camera, np.ndarray, 
     """Gaussians, the voting views' cameras and labels (T, H, W) at `width` pixels, and the number of regions."""
     field = jsecon.load_field(run / "field.safetensors")
     stored = {}
-    for stage in ("masklets", "load"):
+    for stage in ("objects", "load"):
         files = sorted((run / "cache").glob(f"{stage}-*.safetensors"), key=lambda file: file.stat().st_mtime)
         if not files:
             raise InputError(run, f"it has no cache of the stage {stage}", "the folder of a whole run", "jsecon run")
         stored[stage] = read_arrays(files[-1])[1]
-    labels, voting = stored["masklets"]["root.value"], ~stored["load"]["root.value.held_out"]
+    labels, voting = stored["objects"]["root.value"], ~stored["load"]["root.value.held_out"]
     scale = width / field.cameras.width
     height = round(field.cameras.height * scale)
     lens = {name: getattr(field.cameras, name) * np.float32(scale) for name in ("fx", "fy", "cx", "cy")}

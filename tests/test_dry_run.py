@@ -13,7 +13,7 @@ from jsecon.read.captures.capture import capture_extent, load_capture
 from jsecon.read.captures.frames import CaptureExtent, FrameOptions
 from jsecon.read.captures.video import video_size
 
-STAGES = ["load", "gaussians", "masklets", "regions", "votes", "held_out"]
+STAGES = ["load", "gaussians", "objects", "regions", "votes", "held_out"]
 
 
 def _dry(capsys, *arguments):

@@ -15,7 +15,7 @@ from fuzz_readers import _field
 
 from jsecon import load_capture, save_field, save_ply
 from jsecon.files import exclusive_lock, write_text
-from jsecon.pipeline import cache, run as pipeline
+from jsecon.pipeline import cache, run as pipeline, scene
 from jsecon.pipeline.progress import Listener
 from jsecon.pipeline.results import RunContext
 from jsecon.pipeline.stages import capture_stages
@@ -57,7 +57,7 @@ def capture(tmp_path):
 
 
 def test_want_of_memory_names_the_stage_and_what_helps(capture, tmp_path, monkeypatch):
-    monkeypatch.setattr(pipeline.stages, "load_capture", lambda *_, **__: np.ones(1 << 50))
+    monkeypatch.setattr(scene, "load_capture", lambda *_, **__: np.ones(1 << 50))
     with refused("stage load", "Unable to allocate", "--long-side"):
         pipeline.run(pipeline.Options(capture), tmp_path / "out")
 

@@ -296,7 +296,7 @@ def at_once(found, monkeypatch):
         asked.append(where)
         return found[0], Path(shutil.copytree(found[1], work / "capture", symlinks=True))
 
-    monkeypatch.setattr("jsecon.pipeline.stages.find_poses", copied)
+    monkeypatch.setattr("jsecon.pipeline.scene.find_poses", copied)
     return asked
 
 

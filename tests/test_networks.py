@@ -69,7 +69,7 @@ def seen(room, splat, models, tmp_path_factory):
 
 def test_a_run_with_sam_and_clip_finds_things_by_their_names(seen):
     run, folder, listener = seen
-    assert "proposals of level m by sam, asked at points in regions by colour" in listener.planned["masklets"].why
+    assert "proposals of level m by sam" in listener.planned["objects"].why
     field = load_field(folder / "field.safetensors")
     assert field.embedder.startswith("clip-")
     assert field.regions.embeddings.shape[1] == 3
@@ -97,7 +97,7 @@ def test_the_same_models_elsewhere_are_cached_and_others_are_not(seen, models, t
     pipeline.run(options, tmp_path / "out", listener=listener)
     fresh = {name for name, value in listener.fresh.items() if value}
     assert "regions" in fresh
-    assert not fresh & {"load", "gaussians", "masklets", "votes"}
+    assert not fresh & {"load", "gaussians", "objects", "votes"}
 
 
 def test_a_damaged_model_is_said_before_any_work(seen, models, tmp_path):
@@ -118,8 +118,8 @@ def test_sam_2_follows_what_sam_proposes(seen, tmp_path):
     listener = Recorder()
     options = dataclasses.replace(run.options, tracker=write_sam2(tmp_path / "sam2"))
     followed = pipeline.run(options, tmp_path / "out", listener=listener)
-    assert listener.planned["masklets"].why.endswith("followed by sam2")
-    assert listener.fresh["masklets"]
+    assert listener.planned["objects"].why.endswith("followed by sam2")
+    assert listener.fresh["objects"]
     assert not listener.fresh["gaussians"]
     assert not np.array_equal(followed.labels, run.labels)
 
@@ -143,7 +143,7 @@ def test_a_run_that_is_stopped_while_sam_2_tracks_goes_on_at_its_frame(room, spl
             checkpoint = Checkpoint(folder / f"{stage.name}.safetensors")
             given = StageInput(work, results, lambda done, total: None, checkpoint)
             setattr(results, stage.name, stage.compute(given).value)
-        return results.masklets
+        return results.objects
 
     monkeypatch.setattr(Sam2Tracker, "__call__", counted)
     whole, everywhere = tracked(tmp_path / "whole"), called.copy()
@@ -197,7 +197,7 @@ def test_regions_take_their_embeddings_from_langsplat_s_files(room, splat, model
     given = StageInput(work, results, lambda done, total: None, Checkpoint(tmp_path / "none.safetensors"))
     assert "read from language_features, level l" in stage.how
     assert "embedder" in stage.skipped
-    results.masklets = planned["masklets"].compute(given).value
+    results.objects = planned["objects"].compute(given).value
     found = stage.compute(given)
     np.testing.assert_allclose(found.value.embeddings, rows, atol=1e-6)
     assert found.notes == (f"{len(rows)} embeddings in the files",)

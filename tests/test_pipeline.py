@@ -27,7 +27,7 @@ from jsecon.pipeline import cache, model_loading, results, run as pipeline
 from jsecon.pipeline.progress import Listener
 from jsecon.process import peak_memory_mib
 
-STAGES = ("load", "gaussians", "masklets", "regions", "votes", "held_out")
+STAGES = ("load", "gaussians", "objects", "regions", "votes", "held_out")
 
 
 class Recorder(Listener):
@@ -220,7 +220,7 @@ def test_default_vision_finds_regions_by_itself(room, room_run, tmp_path):
     listener = Recorder()
     found = pipeline.run(dataclasses.replace(run.options, masks=None), tmp_path, listener=listener)
     assert not listener.fresh["gaussians"]
-    assert listener.fresh["masklets"]
+    assert listener.fresh["objects"]
     assert "segmenter" not in found.skipped
     overlap = iou_matrix(
         *(labels.ravel() == np.arange(labels.max() + 1)[:, None] for labels in (run.labels, found.labels))
@@ -350,7 +350,7 @@ def test_a_run_killed_in_each_stage_and_started_again_ends_in_the_same_bytes(roo
         command = [sys.executable, "-c", DRIVER, str(room), str(out), victim, str(nth)]
         assert subprocess.run(command, env=environ, capture_output=True).returncode == -signal.SIGKILL, victim
 
-    order = ("load", "masklets", "gaussians checkpoint", "gaussians", "regions", "votes", "held_out")
+    order = ("load", "objects", "gaussians checkpoint", "gaussians", "regions", "votes", "held_out")
     assert {victim.split()[0] for victim in order} == set(STAGES)
     for victim in (*order, "field"):
         if victim in ("gaussians checkpoint", "votes"):

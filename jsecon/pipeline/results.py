@@ -37,7 +37,7 @@ class Results:
     """the capture, corrected if the options ask for that"""
     gaussians: Gaussians
     """N Gaussians, read or fitted"""
-    masklets: np.ndarray
+    objects: np.ndarray
     """(T, H, W) int16 labels of the training frames, -1 for no region"""
     regions: Regions
     """R regions of the training frames"""

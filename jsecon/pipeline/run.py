@@ -1,20 +1,7 @@
 """A run: from a capture to a language field, stage by stage, each stored as it is finished.
 
-    poses (if they are missing) -> load -> gaussians -> masklets -> regions -> votes -> field
-
-and with --parts, after regions, the parts of the scene; with --paper, after votes, the codes. Last, the held-out frames
-are measured.
-
 The keys of all stages are known before any runs, so the plan is printed first: which stages run, which are cached, what
-is skipped and why. These files are passed on the way, by default; behind each lies more of its own package:
-
-    all stages  pipeline/run, pipeline/stages, pipeline/results
-    load        data/capture, data/colmap
-    gaussians   fit/start, fit/optimise
-    masklets    vision/classical, association/views, association/consensus, association/algorithm1
-    regions     vision/colours, language/regions
-    votes       language/votes, splat/render
-    field       language/field
+is skipped and why. `stages` is the table of the stages.
 """
 
 import contextlib
@@ -32,7 +19,7 @@ import numpy as np
 from jsecon.errors import InputError
 from jsecon.field.field import load_field, save_field
 from jsecon.files import exclusive_lock
-from jsecon.pipeline import cache, model_loading, processes, stages
+from jsecon.pipeline import cache, lifting, model_loading, processes, stages
 from jsecon.pipeline.options import Options, check_ranges, is_bare_scene, require_writable
 from jsecon.pipeline.processes import Coordinator
 from jsecon.pipeline.progress import Listener, Step
@@ -94,7 +81,7 @@ class Computed:
     @property
     def labels(self) -> np.ndarray:
         """(T, H, W) int16 masklets of the training frames that vision uses."""
-        return self.results.masklets
+        return self.results.objects
 
     @property
     def held_out(self) -> Quality:
@@ -160,6 +147,7 @@ def _plan(context: RunContext, stage_list: list[Stage], folder: Path) -> _Plan:
 def _require_inputs(options: Options) -> None:
     """Raises InputError for a missing file, a number that is out of its range, or several sources of masks."""
     check_ranges(options)
+    _require_options_apply(options)
     for name, value in vars(options).items():
         flag = f"--{name.replace('_', '-')}"
         if isinstance(value, Path) and not value.exists():
@@ -169,6 +157,23 @@ def _require_inputs(options: Options) -> None:
     if len(sources) > 1:
         expected = "one: tracked masks, masks of single frames, or a model that finds them"
         raise InputError(" ".join(sources), "more than one source of masks", expected, "Leave out the others.")
+
+
+def _require_options_apply(options: Options) -> None:
+    """Raises InputError if an option is set that the input has no use for."""
+    bare, defaults = (
+        is_bare_scene(options.capture),
+        {field.name: field.default for field in dataclasses.fields(options)},
+    )
+    for name in ("frames", "holdout", "refine", "drop_frames") if bare else ("views", "up", "cameras"):
+        if getattr(options, name) != defaults[name]:
+            kind = "a scene without photographs" if bare else "a capture, which has its own views"
+            remedy = "--views sets the number of views." if bare else "--frames sets the most."
+            flag = f"--{name.replace('_', '-')}"
+            raise InputError(flag, f"{options.capture.name} is {kind}", remedy=f"Leave it out; {remedy}")
+    if bare and options.gaussians is not None:
+        problem = f"{options.capture.name} is a scene of Gaussians itself"
+        raise InputError("--gaussians", problem, "", "Leave out --gaussians, or give the folder of the photographs.")
 
 
 def _require_own_folder(options: Options, out: Path) -> None:
@@ -233,7 +238,7 @@ def _note_vision_time(context: RunContext, capture: Capture, running: list[str],
     frames = np.asarray(capture.frames)[vision_frames(capture, context.options)]
     segmenter, crops, notes = context.models.segmenter, CROPS_PER_FRAME, []
     with listener.progress("vision"):
-        if "masklets" in running and isinstance(segmenter, StoredSegmenter):
+        if "objects" in running and isinstance(segmenter, StoredSegmenter):
             missing = [t for t in range(len(frames)) if not segmenter.has(frames[t])]
             if len(missing) >= FEW_FRAMES:
                 seconds = 0.0
@@ -314,7 +319,7 @@ def run(
     results, embedder = computed.results, context.models.embedder
     started = time.monotonic()
     with listener.progress("field"):
-        field = stages.field_of(results, embedder, provenance(options, computed.keys, embedder.name, out), options)
+        field = lifting.join_field(results, embedder, provenance(options, computed.keys, embedder.name, out), options)
         save_field(out / FIELD_FILE, field)
     computed.seconds["field"] = time.monotonic() - started
     listener.done("field", computed.seconds["field"], True)
@@ -414,9 +419,9 @@ def _check_masks(options: Options, running: list[str], extent: CaptureExtent, tr
     """Checks that files of masks, proposals and features belong to the frames."""
     size = extent.size[1], extent.size[0]
     layout = {"level": options.level, "frames": dict(itertools.zip_longest(extent.names, extent.files))}
-    if options.masks is not None and "masklets" in running:
+    if options.masks is not None and "objects" in running:
         load_labels(options.masks, train_names, size, **layout, limit=1)
-    if options.proposals is not None and "masklets" in running:
+    if options.proposals is not None and "objects" in running:
         load_proposals(options.proposals, train_names, size, **layout).read(0)
     if options.features is not None and "regions" in running:
         load_features(options.features, train_names[:1], size, **layout)

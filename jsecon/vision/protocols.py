@@ -147,7 +147,7 @@ class Models:
         Raises:
           InputError: A network cannot serve them.
         """
-        for stage, used in (("masklets", self.segmenter), ("masklets", self.tracker), ("regions", self.embedder)):
+        for stage, used in (("objects", self.segmenter), ("objects", self.tracker), ("regions", self.embedder)):
             check = getattr(used, "check", None)
             if stage in stages and check is not None:
                 check()

@@ -1,0 +1,78 @@
+"""Lifts the labels of the frames to the Gaussians: votes, the paper's codes on request, and the field of it all."""
+
+import shutil
+
+import jax
+import numpy as np
+
+from jsecon.errors import InputError
+from jsecon.field.columns import is_mapped, vote_blocks
+from jsecon.field.membership import normalise_votes_in_blocks
+from jsecon.field.streaming import region_votes_in_blocks
+from jsecon.field.votes import region_votes, votes_memory
+from jsecon.paper.autoencoder import encode, train_autoencoder
+from jsecon.paper.distill import distill_votes
+from jsecon.pipeline.options import Options
+from jsecon.pipeline.results import Results, StageInput, StageResult, vision_frames
+from jsecon.process import memory_budget
+from jsecon.types import Codes, LanguageField, Regions
+from jsecon.vision.protocols import Embedder
+from jsecon.vision.reference_words import reference_of
+
+CODE_LENGTH = 3
+"""numbers of a code in the paper"""
+
+
+def accumulate_votes(stage: StageInput) -> StageResult:
+    """Accumulates votes; in blocks on disk if they do not fit into memory, to the same up to float32's rounding."""
+    options, capture, scene = stage.context.options, stage.results.load, stage.results.gaussians
+    labels, folder = stage.results.objects, stage.checkpoint.folder
+    cameras = capture.cameras[vision_frames(capture, options)]
+    count = int(labels.max()) + 1
+    settings = {"centre": options.centre_pixel_weight, "by_view": True, "progress": stage.progress}
+    needed, budget = votes_memory(scene.count, len(labels), count), memory_budget()
+    notes = ()
+    if needed > budget and jax.process_count() == 1:  # several processes accumulate them together, in memory
+        shutil.rmtree(folder, ignore_errors=True)  # of a run that was stopped
+        accumulated = region_votes_in_blocks(scene, cameras, labels, count, folder=folder, **settings)
+        sizes = f"{needed / 2**30:.2g} GiB otherwise, where memory has room for {budget / 2**30:.2g}"
+        notes = (f"votes are cast in blocks: {sizes}",)
+    else:
+        accumulated = region_votes(scene, cameras, labels, count, **settings)
+    unseen = int((np.asarray(accumulated.views) == 0).sum())
+    skipped = {"unseen Gaussians": f"{unseen} of {scene.count}, which no frame sees"} if unseen else {}
+    return StageResult(accumulated, skipped, notes)
+
+
+def compute_codes(stage: StageInput) -> StageResult:
+    """Trains the paper's autoencoder, and distils the codes of the regions into the Gaussians by their votes."""
+    options, embeddings, cast = stage.context.options, stage.results.regions.embeddings, stage.results.votes
+    if not np.any(np.asarray(embeddings)):
+        raise InputError("--paper", "no region has an embedding to train the autoencoder on", remedy="Leave it out.")
+    key = jax.random.key(options.seed)
+    autoencoder = train_autoencoder(embeddings, latent=CODE_LENGTH, key=key, progress=stage.progress)
+    table = encode(autoencoder, embeddings)
+    blocks = vote_blocks(cast) if is_mapped(cast) else [cast]
+    codes = np.concatenate([np.asarray(distill_votes(block, table)) for block in blocks])
+    return StageResult(Codes(codes, table, autoencoder))
+
+
+def join_field(results: Results, embedder: Embedder, provenance: str, options: Options) -> LanguageField:
+    """Joins the results of a run to a field."""
+    capture, embedded = results.load, results.regions
+    pixels = np.zeros((embedded.count, len(capture.names)), np.int32)
+    pixels[:, vision_frames(capture, options)] = embedded.pixel_counts
+    return LanguageField(
+        gaussians=results.gaussians,
+        votes=normalise_votes_in_blocks(results.votes, embedded),
+        regions=Regions(embedded.embeddings, pixels),
+        cameras=capture.cameras,
+        canonical_phrases=np.asarray(embedder.canonical_phrases, np.float32),
+        source_from_scene=np.asarray(capture.source_from_scene),
+        names=capture.names,
+        embedder=embedder.name,
+        provenance=provenance,
+        parts=results.parts,
+        unrelated_words=reference_of(embedder).astype(np.float16),
+        codes=results.codes,
+    )

@@ -1,0 +1,222 @@
+"""What the stages of objects compute: labels of the training frames, embeddings of the regions, parts of the scene."""
+
+import functools
+import itertools
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsecon.association.consensus import consensus_masklets, pieces_on_masks
+from jsecon.association.run_lengths import cache_masks_as_rle
+from jsecon.association.scene import SceneSuperpixels
+from jsecon.errors import InputError
+from jsecon.field.regions import Embed, embeddings_of_masks, region_embeddings, scene_parts
+from jsecon.fit.depth import points_from_depth
+from jsecon.paper.algorithm1 import clean_masklets, masklets as algorithm1
+from jsecon.paper.tracker import GeometricTracker
+from jsecon.pipeline.options import Options
+from jsecon.pipeline.results import Checkpoint, Results, RunContext, StageInput, StageResult, vision_frames
+from jsecon.read.masks.langsplat import load_features
+from jsecon.read.masks.masks import load_labels
+from jsecon.read.masks.proposals import load_proposals
+from jsecon.splat.render import render_depth
+from jsecon.types import Camera, Capture, Gaussians, Progress
+from jsecon.vision.classical import GRANULARITIES, ClassicalSegmenter
+from jsecon.vision.protocols import Segmenter
+from jsecon.vision.surfaces import smooth_depth, surfaces_from_depth
+
+MAX_CLOUD_POINTS = 100_000
+"""points from depth whose normals are estimated"""
+MIN_CLOUD_SPACING = 0.02
+"""least distance between them, as a share of the median depth: closer points show a sensor's noise, not the surface"""
+
+
+class TrainingView:
+    """The training frames in which masks are found and embedded."""
+
+    def __init__(self, capture: Capture, options: Options):
+        self.capture, self.train = capture, vision_frames(capture, options)
+        self.names = [capture.names[t] for t in self.train]
+        self.size = capture.cameras.height, capture.cameras.width
+        frames = dict(itertools.zip_longest(capture.names, capture.files))
+        self.mask_layout: dict[str, Any] = {"level": options.level, "frames": frames}
+        """How files of masks belong to the frames, for their readers."""
+
+    @functools.cached_property
+    def frames(self) -> np.ndarray:
+        """(T, H, W, 3) their pixels: a view of the capture's if these are all of its frames, else one copy."""
+        frames = np.asarray(self.capture.frames)
+        return frames if len(self.train) == len(frames) else frames[self.train]
+
+    @functools.cached_property
+    def cameras(self) -> Camera:
+        """Their T cameras, on jax's device."""
+        return jax.tree.map(jnp.asarray, self.capture.cameras[self.train])
+
+
+def read_masks(stage: StageInput) -> StageResult:
+    """Reads the labels of the training frames from mask files."""
+    folder, view = stage.context.options.masks, TrainingView(stage.results.load, stage.context.options)
+    assert folder is not None
+    loaded = load_labels(folder, view.names, view.size, **view.mask_layout, progress=stage.progress)
+    _require_regions(loaded.labels, str(folder))
+    return StageResult(loaded.labels, notes=(f"{len(loaded.ids)} regions in the masks", *loaded.notes))
+
+
+def find_objects(stage: StageInput) -> StageResult:
+    """Finds proposals in the training frames, and associates them over the frames to labels of objects."""
+    context, scene = stage.context, stage.results.gaussians
+    view = TrainingView(stage.results.load, context.options)
+    proposals, notes = frame_proposals(context, view, scene)
+    labels = associate_masks(context, view, scene, proposals, stage.progress, stage.checkpoint)
+    context.models.close()
+    _require_regions(labels, str(context.options.capture))
+    return StageResult(labels, notes=notes)
+
+
+def frame_proposals(
+    context: RunContext, view: TrainingView, gaussians: Gaussians
+) -> tuple[Callable[[int], np.ndarray], tuple[str, ...]]:
+    """Opens the proposals, masks (M, H, W) of the t-th training frame: from files, a segmenter, or by colour."""
+    options, frames, segmenter = context.options, view.frames, context.models.segmenter
+    if options.proposals is not None:
+        return load_proposals(options.proposals, view.names, view.size, **view.mask_layout)
+    if segmenter is not None:  # it stores its masks on disk
+        lock = threading.Lock()  # a network takes all cores for one frame
+
+        def segment(t: int) -> np.ndarray:
+            with lock:
+                return segmenter(frames[t], t)
+
+        return segment, ()
+    classical = _classical_segmenter(options, view, gaussians)
+    return cache_masks_as_rle(lambda t: classical(frames[t], t)), ()
+
+
+def _classical_segmenter(options: Options, view: TrainingView, gaussians: Gaussians) -> Segmenter:
+    """Opens the segmenter without weights for the training frames.
+
+    Surfaces come from the capture's depth. Without depth, the coarse granularity takes the depth that the Gaussians
+    render; the finer ones do not, as rendered depth costs them more outline than it tells.
+    """
+    capture, cameras, setting = view.capture, view.cameras, GRANULARITIES[options.granularity]
+    depths = None if capture.depths is None else np.asarray(capture.depths)[view.train]
+    if depths is not None and depths[:, ::4, ::4].any():
+        known = depths[:, ::4, ::4]
+        spacing = MIN_CLOUD_SPACING * float(np.median(known[known > 0]))
+        cloud = points_from_depth(capture, voxel=spacing, stride=4)
+        if len(cloud.points) > MAX_CLOUD_POINTS:
+            cloud = points_from_depth(capture, max_points=MAX_CLOUD_POINTS, stride=4)
+        surfaces = surfaces_from_depth(depths, cameras, cloud.points)
+        return ClassicalSegmenter(**setting, surfaces=surfaces)
+    if options.granularity != "coarse":
+        return ClassicalSegmenter(**setting)
+
+    def rendered(t: int) -> np.ndarray:
+        depth, alpha = (np.asarray(image) for image in render_depth(gaussians, cameras[t]))
+        return smooth_depth(np.where(alpha > 0.5, depth, 0.0).astype(np.float32))
+
+    return ClassicalSegmenter(**setting, depths=rendered)
+
+
+def associate_masks(
+    context: RunContext,
+    view: TrainingView,
+    gaussians: Gaussians,
+    proposals: Callable[[int], np.ndarray],
+    progress: Progress,
+    checkpoint: Checkpoint | None = None,
+) -> np.ndarray:
+    """Associates proposals by consensus or by a tracker: (T, H, W) int16 labels, -1 for no region."""
+    options, frames, cameras = context.options, view.frames, view.cameras
+    if options.associated_by == "consensus":
+        scene = SceneSuperpixels(gaussians, cameras, proposals, centre=options.centre_pixel_weight)
+        labels = consensus_masklets(frames, scene, agreement=options.agreement, seed=options.seed, progress=progress)
+        return clean_masklets(labels)
+    tracker = context.models.tracker or GeometricTracker(gaussians, cameras, proposals)
+    labels = algorithm1(
+        frames,
+        lambda frame, index: proposals(index),
+        tracker,
+        state=None if checkpoint is None else checkpoint.read(),
+        on_checkpoint=None if checkpoint is None else checkpoint.keep,
+        progress=progress,
+    )
+    if isinstance(tracker, GeometricTracker):
+        labels = tracker.consistent(frames, labels)
+    return clean_masklets(labels)
+
+
+def _require_regions(labels: np.ndarray, where: str) -> None:
+    if labels.max(initial=-1) < 0:
+        remedy = "Give masks (--masks DIR), or frames with more contrast."
+        raise InputError(where, "no region in any frame", "at least one", remedy)
+
+
+def embed_objects(stage: StageInput) -> StageResult:
+    """Embeds each region by the embedder of the run."""
+    context = stage.context
+    frames, embed = TrainingView(stage.results.load, context.options).frames, context.models.embedder.embed_regions
+    embedded = region_embeddings(frames, stage.results.objects, embed, progress=stage.progress)
+    context.models.close()
+    return StageResult(embedded)
+
+
+def read_embeddings(stage: StageInput) -> StageResult:
+    """Reads the embeddings of masks from files, and pools them to those of the regions."""
+    options, labels = stage.context.options, stage.results.objects
+    view = TrainingView(stage.results.load, options)
+    assert options.features is not None
+    features = load_features(options.features, view.names, view.size, **view.mask_layout)
+    if not len(features.embeddings):
+        problem = f"no mask of level {options.level} in any frame"
+        remedy = "Take another --level, or write the files again."
+        raise InputError(options.features, problem, "masks with their embeddings", remedy)
+    embedded = embeddings_of_masks(labels, features.labels, features.embeddings, progress=stage.progress)
+    missing = int((~embedded.embeddings.any(1)).sum())
+    notes = (f"{len(features.embeddings)} embeddings in the files",)
+    if missing:
+        notes = (*notes, f"{missing} regions lie on no mask with one")
+    return StageResult(embedded, notes=notes)
+
+
+def find_parts(stage: StageInput) -> StageResult:
+    """Finds small parts of the scene, each with the embeddings of all single-frame masks that contain it."""
+    context, options = stage.context, stage.context.options
+    view = TrainingView(stage.results.load, options)
+    frames = view.frames
+    masks, embed = _masks_with_embeddings(context, view, stage.results)
+    views = SceneSuperpixels(stage.results.gaussians, view.cameras, masks, centre=options.centre_pixel_weight)
+    piece, weights = pieces_on_masks(frames, views, seed=options.seed, progress=stage.progress)
+    rows = np.concatenate([embed(t, masks(t)) for t in range(len(frames))])
+    context.models.close()
+    return StageResult(scene_parts(piece, weights, rows))
+
+
+def _masks_with_embeddings(
+    context: RunContext, view: TrainingView, results: Results
+) -> tuple[Callable[[int], np.ndarray], Embed]:
+    """Masks (M, H, W) of the t-th training frame and their embeddings: of --features, of --masks, or proposals."""
+    options, frames = context.options, view.frames
+
+    def by_model(t, masks):
+        return context.models.embedder.embed_regions(frames[t], masks)
+
+    if options.features is not None:
+        features = load_features(options.features, view.names, view.size, **view.mask_layout)
+
+        def rows(t):
+            return np.flatnonzero(np.asarray(features.frame) == t)
+
+        def masks(t):
+            return features.labels[t][None] == rows(t)[:, None, None]
+
+        return masks, lambda t, masks: features.embeddings[rows(t)]
+    if options.masks is not None:
+        labels = results.objects
+        return lambda t: labels[t][None] == np.unique(labels[t][labels[t] >= 0])[:, None, None], by_model
+    return frame_proposals(context, view, results.gaussians)[0], by_model

@@ -1,0 +1,252 @@
+"""What the stages of a scene compute: poses, frames, Gaussians and their quality, with photographs or without.
+
+A scene that comes without photographs is rendered from virtual views, or from given poses. Only `load_frames` and
+`measure_held_out` read held-out frames.
+"""
+
+import dataclasses
+import shutil
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jsecon.errors import InputError
+from jsecon.files import write_text
+from jsecon.fit.quality import QUICK_LONG_SIDE, is_weak, measure_quality
+from jsecon.fit.start import starting_gaussians
+from jsecon.pipeline.options import Options
+from jsecon.pipeline.results import KEY_FILE, StageInput, StageResult, training_frames
+from jsecon.pipeline.scene_files import check_overlap, place_in_capture, read_scene
+from jsecon.poses.sfm import find_poses
+from jsecon.read.captures.capture import has_depth, load_capture, read_posed_images
+from jsecon.read.captures.coordinates import make_rigid, transform_poses
+from jsecon.read.captures.frames import FrameOptions, frame_names
+from jsecon.read.captures.nerfstudio import source_from_trained
+from jsecon.read.captures.photographs import list_photographs
+from jsecon.read.captures.video import is_video, write_frames
+from jsecon.splat.transform import transform_gaussians_float64
+from jsecon.types import Camera, Capture, Gaussians, Progress, Quality
+from jsecon.views.capture import capture_from_cameras, render_capture
+from jsecon.views.frame import scene_frame, surface_points
+
+SECONDS_PER_STEP = 0.024
+"""s of a step of the fit, on two cores of an AMD EPYC; estimates how many steps --minutes allows"""
+SECONDS_PER_MEGAPIXEL = 0.2
+"""s more of a step per million pixels of a frame"""
+
+
+def estimate_poses(stage: StageInput) -> StageResult:
+    """Finds the poses of photographs or of a video's frames, and writes them as a COLMAP capture to OUT/poses."""
+    context, folder = stage.context, stage.checkpoint.folder
+    capture, out = context.options.capture, context.out / "poses"
+    video = is_video(capture)
+    if video:
+        frames = context.options.frames
+        photos = write_frames(capture, folder / "frames", frames=frames, progress=stage.progress)
+    else:
+        photos = list_photographs(capture)
+    report, posed = find_poses(photos, folder, where=capture, progress=stage.progress)
+    if video:
+        shutil.rmtree(posed / "images")
+        (folder / "frames").rename(posed / "images")
+    shutil.rmtree(out, ignore_errors=True)
+    shutil.move(posed, out)
+    write_text(out / KEY_FILE, folder.name)
+    return StageResult(report, notes=(*report.notes, f"The poses are in {out}: COLMAP opens them."))
+
+
+def refinement(options: Options, capture: Path) -> str:
+    """What a run corrects of poses and exposures: "auto" only if depth and the data can still decide it."""
+    if options.refine != "auto":
+        return options.refine
+    if options.gaussians is not None:  # they belong to the poses as they are
+        return "none"
+    return "auto" if has_depth(capture) else "none"
+
+
+def load_frames(stage: StageInput) -> StageResult:
+    """Loads the capture, in OUT/poses if its poses were estimated, and corrects it as the options ask."""
+    options, sizes = stage.context.options, stage.context.key_options("long_side", "frames", "holdout")
+    folder = stage.context.out / "poses" if hasattr(stage.results, "poses") else options.capture
+    capture = load_capture(folder, **sizes, progress=stage.progress)
+    train = training_frames(capture.held_out)
+    count, height, width = capture.frames.shape[:3]
+    frames = f"{count} frames of {width}x{height}, {count - len(train)} of them held out"
+    points = f"{len(capture.points)} sparse points{'' if capture.depths is None else ', depth'}"
+    notes = (f"{frames}, {points}", *capture.notes)
+    refine = refinement(options, folder)
+    if refine == "none" and options.drop_frames == "none":
+        return StageResult(capture, notes=notes)
+    better = _refine(capture, options, refine, stage.progress)
+    training_frames(better.held_out)
+    return StageResult(better, notes=(*notes, *better.notes[len(capture.notes) :]))
+
+
+def _refine(capture: Capture, options: Options, refine: str, progress: Progress) -> Capture:
+    """Corrects poses and exposures by short fits, and leaves out the frames that these do not explain."""
+    from jsecon.fit.corrections import RefineOptions  # late, like all that imports optax: a plan needs none of it
+    from jsecon.poses.refine import refine_capture
+
+    what, max_fit_steps = None, None
+    if refine == "auto" and capture.depths is not None:
+        what, max_fit_steps = RefineOptions(), _fit_steps(options, capture) / 2
+    elif refine not in ("auto", "none"):
+        what = RefineOptions(refine in ("poses", "both"), refine in ("exposure", "both"))
+    return refine_capture(
+        capture,
+        key=jax.random.key(options.seed),
+        refine=what,
+        drop_weak=options.drop_frames == "auto",
+        decide=refine == "auto",
+        max_fit_steps=max_fit_steps,
+        progress=progress,
+    )
+
+
+def _fit_steps(options: Options, capture: Capture) -> float:
+    """Steps of the photometric fit; those that `minutes` allow are estimated."""
+    if options.minutes is None:
+        return float(options.steps)
+    megapixels = capture.cameras.width * capture.cameras.height / 1e6
+    return 60 * options.minutes / (SECONDS_PER_STEP + SECONDS_PER_MEGAPIXEL * megapixels)
+
+
+def read_gaussians_of_capture(stage: StageInput) -> StageResult:
+    """Reads the Gaussians of a file into the world of the capture."""
+    path, capture = stage.context.options.gaussians, stage.results.load
+    assert path is not None
+    scene, read_notes = read_scene(path)
+    transform = path.parent / "dataparser_transforms.json"
+    trained = source_from_trained(transform) if transform.is_file() else None
+    placed, notes = place_in_capture(scene, capture, path, trained, stage.progress)
+    check_overlap(placed, capture.cameras[training_frames(capture.held_out)], str(path))
+    return StageResult(placed, notes=(*notes, *read_notes))
+
+
+def fit_scene(stage: StageInput) -> StageResult:
+    """Fits Gaussians to the training frames. A long fit may have one for each pixel of a frame, a short one half."""
+    from jsecon.fit.optimise import fit_gaussians
+    from jsecon.fit.schedule import MAX_GAUSSIANS, Schedule
+
+    options, capture, state = stage.context.options, stage.results.load, stage.checkpoint.read()
+    start, notes = None, ()
+    if state is None:
+        start, origin = starting_gaussians(capture, sh_degree=2, progress=stage.progress)
+        check_overlap(start, capture.cameras[training_frames(capture.held_out)], str(options.capture))
+        notes = (f"start of the fit: {origin}",)
+    pixels, minutes = capture.cameras.width * capture.cameras.height, options.minutes
+    is_long = options.steps >= 3000 if minutes is None else minutes >= 3
+    most = min(pixels if is_long else pixels // 2, MAX_GAUSSIANS)
+    fitted, losses = fit_gaussians(
+        capture,
+        key=jax.random.key(options.seed),
+        steps=options.steps if minutes is None else None,
+        seconds=None if minutes is None else 60 * minutes,
+        start=start,
+        state=state,
+        schedule=Schedule(max_gaussians=most),
+        on_checkpoint=lambda current: stage.checkpoint.keep(lambda: current),
+        progress=stage.progress,
+    )
+    return StageResult(fitted, notes=(*notes, f"{fitted.count} Gaussians after {len(losses)} steps"))
+
+
+def measure_held_out(stage: StageInput) -> StageResult:
+    """Measures the held-out frames, and names training frames that the scene does not explain."""
+    capture, scene = stage.results.load, stage.results.gaussians
+    train = np.flatnonzero(~np.asarray(capture.held_out))
+    fitted = measure_quality(scene, capture, frames=train, long_side=QUICK_LONG_SIDE, progress=stage.progress)
+    weak = np.flatnonzero(is_weak(np.asarray(fitted.psnr)))
+    notes = ()
+    if len(weak):
+        names = ", ".join(f"{capture.names[fitted.frames[n]]} ({fitted.psnr[n]:.1f} dB)" for n in weak[:5])
+        more = f" and {len(weak) - 5} more" if len(weak) > 5 else ""
+        note = f"far below the median frame ({np.median(fitted.psnr):.1f} dB): {names}{more}; a wrong pose, or "
+        notes = (note + "something moved (--drop-frames auto leaves them out)",)
+    return StageResult(measure_quality(scene, capture, progress=stage.progress), notes=notes)
+
+
+def render_planned_views(stage: StageInput) -> StageResult:
+    """Plans virtual views of a scene without photographs, and renders them."""
+    options = stage.context.options
+    source, _ = read_scene(options.capture)
+    source_from_scene = _world_of_scene(source)
+    capture = render_capture(
+        _into_world(source, source_from_scene),
+        source_from_scene,
+        views=options.views,
+        width=options.long_side,
+        height=options.long_side * 3 // 4,
+        up=None if options.up is None else np.array(options.up, np.float64),
+        progress=stage.progress,
+    )
+    return StageResult(capture, notes=capture.notes)
+
+
+def render_given_poses(stage: StageInput) -> StageResult:
+    """Renders a scene without photographs from the poses of a file."""
+    options = stage.context.options
+    assert options.cameras is not None
+    source, _ = read_scene(options.capture)
+    source_from_scene = _world_of_scene(source)
+    cameras, names = _load_poses(options.cameras, options.long_side)
+    poses = transform_poses(np.asarray(cameras.world_to_camera), np.linalg.inv(source_from_scene)).astype(np.float32)
+    cameras = dataclasses.replace(cameras, world_to_camera=poses)
+    scene = _into_world(source, source_from_scene)
+    check_overlap(scene, cameras, str(options.cameras))
+    return StageResult(capture_from_cameras(scene, cameras, names, source_from_scene))
+
+
+def _world_of_scene(gaussians: Gaussians) -> np.ndarray:
+    """Returns the (4, 4) similarity to the world of a scene's file from one in which the scene has ordinary numbers.
+
+    A scene from the size of a table to that of a flat, in metres, keeps its units. One that is further from the origin
+    than 100 times its size is moved there: float32 has few digits out there.
+    """
+    frame = scene_frame(surface_points(gaussians))
+    source_from_scene = np.eye(4)
+    if not 3 <= frame.diagonal <= 30:
+        source_from_scene[:3, :3] *= frame.diagonal / 6
+    if np.linalg.norm(frame.centre) > 100 * frame.diagonal:
+        source_from_scene[:3, 3] = frame.centre
+    return source_from_scene
+
+
+def _into_world(gaussians: Gaussians, source_from_scene: np.ndarray) -> Gaussians:
+    """Moves Gaussians from the world of their file into that of the capture, in float32."""
+    moved = transform_gaussians_float64(gaussians, np.linalg.inv(source_from_scene))
+    return dataclasses.replace(moved, means=np.asarray(moved.means, np.float32))
+
+
+def _load_poses(path: Path, long_side: int) -> tuple[Camera, tuple[str, ...]]:
+    """Returns T cameras to render from, poses in float64 in the world of their file, and their names.
+
+    `path` is a capture, whose images need not be there, such as the folder of a COLMAP model or a transforms.json. All
+    cameras get the size of the first lens, shrunk to `long_side`, each with its field of view and without distortion.
+    """
+    images = read_posed_images(path).images
+    lenses = [image.lens for image in images if image.lens is not None]
+    if not images or len(lenses) < len(images):
+        problem = "one of its frames has no size" if images else "it has no frame"
+        raise InputError(path, problem, "at least one pose, each with w and h", "Estimate the poses again.")
+    width, height = FrameOptions(long_side=long_side).size((lenses[0].width, lenses[0].height))
+    sized = [lens.resized(width, height) for lens in lenses]
+
+    def column(name):
+        return np.array([getattr(lens, name) for lens in sized], np.float32)
+
+    poses = np.stack([make_rigid(image.world_to_camera, path, image.name) for image in images])
+    cameras = Camera(poses, column("fx"), column("fy"), column("cx"), column("cy"), width, height)
+    return cameras, frame_names([image.name for image in images], path)
+
+
+def read_bare_scene(stage: StageInput) -> StageResult:
+    """Reads a scene without photographs into the world of its rendered views."""
+    source, notes = read_scene(stage.context.options.capture)
+    return StageResult(_into_world(source, np.asarray(stage.results.load.source_from_scene, np.float64)), notes=notes)
+
+
+def measure_nothing(stage: StageInput) -> StageResult:
+    """Returns the quality of no frame: renders are no photographs."""
+    return StageResult(Quality(np.zeros(0, int), np.zeros(0), np.zeros(0)))
