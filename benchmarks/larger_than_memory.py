@@ -28,7 +28,6 @@ import jax
 import numpy as np
 
 import jsecon
-from jsecon.app.outputs import save_scene
 from jsecon.files import map_npy, write_npy
 from jsecon.types import Camera, Gaussians, LanguageField, Regions, Votes
 
@@ -176,7 +175,7 @@ def export_step(folder: Path, *_: int) -> dict[str, float]:
     field = jsecon.load_field(folder / "field.safetensors", mapped=True)
     turn = np.array([[0, 0, 1, 5], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1.0]])
     turned = dataclasses.replace(field, source_from_scene=turn)
-    timed(told, "exported, s", lambda: save_scene(turned, folder / "scene.ply"))
+    timed(told, "exported, s", lambda: jsecon.Scene(turned).export(folder / "scene.ply"))
     return told
 
 

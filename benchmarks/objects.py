@@ -111,14 +111,14 @@ def measure(file: Path, order: str) -> None:
         return value
 
     field = timed("import and load the field", lambda: jsecon.load_field(file))
-    scene = timed("open it for questions", lambda: jsecon.ObjectScene(field, field_embedder(field)))
+    scene = timed("open it for questions", lambda: jsecon.Scene(field, field_embedder(field)))
     if order == "prepared":
         timed("prepare it", scene.prepare)
     if order == "catalogue":
         timed("catalogue", lambda: jsecon.objects(field))
     else:
         for number, text in enumerate(QUESTIONS):
-            timed(f"relation query {number + 1}", lambda text=text: jsecon.query_relation(scene, text))
+            timed(f"relation query {number + 1}", lambda text=text: scene.relate(text))
     print(json.dumps(rows))
 
 

@@ -106,7 +106,7 @@ def located(field: LanguageField, room: Room) -> tuple[float, float, float]:
         low, high = points.min(0), points.max(0)
         middle, top = (low + high) / 2, np.array([*(low + high)[:2] / 2, high[2]])
         try:
-            place = jsecon.locate(field, item.name)
+            place = jsecon.locate(field, item.name).place
         except InputError as error:
             print(f"  not located: {item.name}: {error}")
             inside.append(False)

@@ -15,7 +15,7 @@ import numpy as np
 
 import jsecon
 from experiments import results
-from jsecon.app.ask import ask_text
+from jsecon import Scene
 from jsecon.numerics import cosine_matrix
 from jsecon.read.masks.labels import load_lerf_labels
 from jsecon.vision.colours import BASIC, ColourEmbedder
@@ -40,7 +40,8 @@ def room_counts(demo: Path, embedder: ColourEmbedder) -> tuple[int, ...]:
     shades = {b: [text for text in texts if f"dark {b}" in text or f"light {b}" in text] for b in bare}
     shades = {basic: names for basic, names in shades.items() if names}
     asked = {*texts, *absent, *shades}
-    region = {text: int(ask_text(field, embedder, text).selection.region) for text in asked}
+    scene = Scene(field, embedder)
+    region = {text: int(scene.ask(text).selection.region) for text in asked}
     kept = sum(region[text] >= 0 for text in texts)
     refused = sum(region[text] < 0 for text in absent)
     right = sum(region[basic] in [region[name] for name in names] for basic, names in shades.items())

@@ -39,8 +39,7 @@ from experiments.rooms.room import (
     scatter_circles,
 )
 from experiments.rooms.shapes import SHAPES, Body, box, contains, ellipsoid, place
-from jsecon.app.object_scene import ObjectScene
-from jsecon.app.relations import query_relation
+from jsecon import Scene
 from jsecon.errors import InputError
 from jsecon.field.field import load_field, save_field
 from jsecon.field.membership import normalise_votes
@@ -392,14 +391,14 @@ def ask_room(seed: int, vision: str, rooms: Path) -> list[tuple[str, int, int, b
         folder.mkdir(parents=True, exist_ok=True)
         save_field(folder / "field.safetensors", field)
     field = load_field(folder / "field.safetensors")
-    scene = ObjectScene(field, ColourEmbedder())
+    scene = Scene(field, ColourEmbedder())
     everything = KDTree(np.concatenate(truth.points))
     owner = np.repeat(np.arange(len(truth.points)), [len(cloud) for cloud in truth.points])
     means = np.asarray(field.gaussians.means, np.float64)
     rows = []
     for question in questions(truth, jax.tree.map(np.asarray, field.cameras), seed):
         try:
-            answer = query_relation(scene, question.text, frame=question.frame)
+            answer = scene.relate(question.text, frame=question.frame)
         except InputError as error:
             rows.append((question.relation, len(question.right), -1, False, f"{question.text}: {error}"))
             continue

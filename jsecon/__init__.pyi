@@ -1,16 +1,17 @@
 """Public names of `jsecon`, and the module of each."""
 
 from .app.catalogue import Catalogue as Catalogue, objects as objects
-from .app.locate import Place as Place
 from .app.notebook import show as show, to_html as to_html, to_png as to_png
-from .app.object_scene import ObjectScene as ObjectScene
-from .app.relations import (
-    Measure as Measure,
-    RelationAnswer as RelationAnswer,
-    locate as locate,
-    measure as measure,
-    query_relation as query_relation,
+from .app.records import (
+    Answer as Answer,
+    At as At,
+    Box as Box,
+    Mask as Mask,
+    Object as Object,
+    Query as Query,
+    Region as Region,
 )
+from .app.scene import Scene as Scene, locate as locate, open_scene as open_scene
 from .backend import check_backend as check_backend
 from .errors import InputError as InputError
 from .evaluate.metrics import (

@@ -9,8 +9,7 @@ from capture_files import run_cli
 from small_field import REGIONS, make_field
 from test_gltf import read_glb
 
-from jsecon import QueryRules, load_gaussians, query_region, save_field
-from jsecon.app.ask import Answer
+from jsecon import Answer, Query, QueryRules, Scene, load_gaussians, query_region, save_field
 from jsecon.app.outputs import write_answers
 from jsecon.app.pictures import main_regions
 from jsecon.pipeline.progress import Listener
@@ -80,10 +79,11 @@ class Told(Listener):
 def test_an_answer_without_a_region_says_so_and_one_without_gaussians_differs(scene, cameras, tmp_path):
     field, _ = make_field(scene, cameras)
     nothing = np.zeros(field.gaussians.count, bool)
-    none = Answer("unicorn", "votes", query_region(field, -1), nothing, {})
-    empty = Answer("faint", "votes", query_region(field, 1, rules=QueryRules(min_share=2.0)), nothing, {})
+    none = Answer(Query("unicorn"), "votes", nothing, query_region(field, -1), field, count=0)
+    faint = query_region(field, 1, rules=QueryRules(min_share=2.0))
+    empty = Answer(Query("faint"), "votes", nothing, faint, field, count=0)
     told = Told()
-    write_answers(field, [none, empty], tmp_path, told, views=1)
+    write_answers(Scene(field), [none, empty], tmp_path, told, views=1)
     first, second, pictures = told.lines
     assert first.startswith("'unicorn': 0 of 64 Gaussians")
     assert first.endswith("no region matches it, no Gaussian is selected")

@@ -6,7 +6,8 @@ import json
 import numpy as np
 import pytest
 
-from jsecon.app import ask, cli
+from jsecon import Scene
+from jsecon.app import cli
 from jsecon.field import columns, field as field_file
 from jsecon.field.field import load_field, save_field, subset_field
 from jsecon.types import Parts
@@ -57,28 +58,27 @@ def test_parts_and_what_no_text_names(room_run, tmp_path, forced):
     field = dataclasses.replace(field, parts=parts)
     save_field(tmp_path / "field.safetensors", field)
     mapped = load_field(tmp_path / "field.safetensors", mapped=True)
-    how = {"texts": ("red", "magenta"), "several": True}
     assert isinstance(mapped.parts.part, np.memmap)
-    for threshold in (None, 2.0):
-        how["threshold"] = threshold
-        answers, _ = ask.ask_each(field, ColourEmbedder(), **how)
-        blocks, _ = ask.ask_each(mapped, ColourEmbedder(), **how)
-        for memory, own in zip(answers, blocks, strict=True):
-            np.testing.assert_array_equal(own.rows[own.mask], np.flatnonzero(memory.mask))
-            np.testing.assert_array_equal(own.selection.similarity[own.mask], memory.selection.similarity[memory.mask])
-            assert own.dropped == memory.dropped
+    for threshold in (None, 1.0):
+        options = {"all_of_class": True, "threshold": threshold}
+        answers, blocks = (Scene(f, ColourEmbedder()).ask_all(("red", "magenta"), **options) for f in (field, mapped))
+        for memory, block in zip(answers, blocks, strict=True):
+            np.testing.assert_array_equal(block.mask, memory.mask)
+            rows = memory.rows
+            np.testing.assert_array_equal(block.selection.similarity[rows], memory.selection.similarity[rows])
+            assert block.as_dict() == memory.as_dict()
     few = subset_field(mapped, np.array([3, 5]))
     np.testing.assert_array_equal(few.gaussians.means, np.asarray(field.gaussians.means)[[3, 5]])
     assert few.votes.overlap.shape == field.votes.overlap.shape
 
 
-@pytest.mark.parametrize("more", [("--box", "#1", 2, 2, 9, 9)])
+@pytest.mark.parametrize("more", [("--box", "#1", 2, 2, 9, 9), ("the leftmost red",)])
 def test_what_needs_all_columns_at_once_is_refused(room_run, tmp_path, forced, capsys, more):
     _, out = room_run
-    assert _query(out / "field.safetensors", tmp_path / "answers", "red", *more) == 2
-    told = capsys.readouterr().err
-    assert more[0] in told
-    assert "JSECON_MEMORY=" in told
+    assert _query(out / "field.safetensors", tmp_path / "answers", *more) == 2
+    message = capsys.readouterr().err
+    assert ("an outline" if len(more) > 1 else "a relation") in message
+    assert "JSECON_MEMORY=" in message
     assert not list((tmp_path / "answers").glob("*"))
 
 

@@ -14,7 +14,7 @@ import pytest
 from capture_files import ROOM_FIT, run_cli
 
 from jsecon.app import cli, verbs
-from jsecon.app.ask import METHODS
+from jsecon.app.records import METHODS
 from jsecon.pipeline import progress
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Console

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from small_field import make_field
 
-from jsecon.app.ask import ask_text
+from jsecon import Scene
 from jsecon.field.field import save_field
 from jsecon.vision.colours import ColourEmbedder
 
@@ -81,7 +81,7 @@ def asked(scene, cameras, tmp_path_factory) -> tuple[str, str]:
     file = tmp_path_factory.mktemp("asked") / "field.safetensors"
     save_field(file, field)
     words = ("red", "green", "blue", "orange", "pink")
-    return str(file), next(word for word in words if ask_text(field, embedder, word).mask.any())
+    return str(file), next(word for word in words if Scene(field, embedder).ask(word).mask.any())
 
 
 @pytest.fixture(scope="module")

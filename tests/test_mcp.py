@@ -13,7 +13,7 @@ from mcp import Client, StdioServerParameters
 from table_field import table_field
 
 from jsecon.app.mcp_server import make_server
-from jsecon.app.server.scenes import Scene
+from jsecon.app.scene import Scene
 from jsecon.field.field import save_field
 
 TOOLS = {"find", "relation", "objects", "locate", "measure", "count", "render"}
@@ -21,7 +21,7 @@ TOOLS = {"find", "relation", "objects", "locate", "measure", "count", "render"}
 
 @pytest.fixture(scope="module")
 def server():
-    return make_server({"table": Scene("table", *table_field())})
+    return make_server({"table": Scene(*table_field(), name="table")})
 
 
 def call(server, name, **arguments):

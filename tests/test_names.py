@@ -10,8 +10,19 @@ import pytest
 from small_field import colour_field
 
 from experiments.rooms.writers import write_colmap
-from jsecon import InputError, load_capture, load_field, load_ply, query_region, save_field
-from jsecon.app.ask import Answer, ask_pixel, ask_region, ask_text
+from jsecon import (
+    Answer,
+    At,
+    InputError,
+    Query,
+    Region,
+    Scene,
+    load_capture,
+    load_field,
+    load_ply,
+    query_region,
+    save_field,
+)
 from jsecon.app.cli import main
 from jsecon.app.outputs import file_stem, write_answer
 from jsecon.files import path_within
@@ -30,15 +41,16 @@ def field(scene, cameras):
 def word(field):
     """A colour that selects a part of the scene."""
     embedder = ColourEmbedder()
-    return next(w for w in ("red", "green", "blue", "orange", "pink") if ask_text(field, embedder, w).mask.any())
+    return next(w for w in ("red", "green", "blue", "orange", "pink") if Scene(field, embedder).ask(w).mask.any())
 
 
 def run(*arguments) -> int:
     return main([str(argument) for argument in arguments])
 
 
-def answer(field, question, key=None):
-    return Answer(question, "votes", query_region(field, 1), np.asarray(query_region(field, 1).mask), {}, key=key)
+def answer(field, question):
+    selection = query_region(field, 1)
+    return Answer(Query(question), "votes", np.asarray(selection.mask), selection, field)
 
 
 TEXTS = [
@@ -62,11 +74,12 @@ def test_texts_have_names_of_their_own_also_without_case(field):
 
 def test_a_text_and_a_pixel_of_one_name_do_not_share_files(field):
     at = "at frame_1 24 20"
-    pixel, region = ask_pixel(field, 1, 24, 20), ask_region(field, 1)
-    assert pixel.query == at
+    scene = Scene(field)
+    pixel, region = scene.ask(At(1, 24, 20)), scene.ask(Region(1))
+    assert str(pixel.query) == at
     assert file_stem(pixel) != file_stem(answer(field, at))
     assert file_stem(region) != file_stem(answer(field, "region 1"))
-    assert file_stem(pixel) == file_stem(ask_pixel(field, "frame_1", 24, 20)) != file_stem(ask_pixel(field, 1, 24, 21))
+    assert file_stem(pixel) == file_stem(scene.ask(At("frame_1", 24, 20))) != file_stem(scene.ask(At(1, 24, 21)))
 
 
 def test_frames_of_hostile_names_are_written_beneath_the_folder(field, tmp_path):
@@ -74,7 +87,7 @@ def test_frames_of_hostile_names_are_written_beneath_the_folder(field, tmp_path)
         own = dataclasses.replace(field, names=names)
         masks = {t: np.ones((4, 4), bool) for t in range(4)}
         out = tmp_path / "deep" / "out"
-        told = write_answer(own, answer(field, "red"), out, masks)
+        told = write_answer(answer(own, "red"), Scene(own), out, masks)
         assert set(told["masks"]) == set(names)
         files = {file.name.casefold() for file in out.iterdir()}
         assert {file.casefold() for file in told["masks"].values()} < files
@@ -82,7 +95,8 @@ def test_frames_of_hostile_names_are_written_beneath_the_folder(field, tmp_path)
         assert list(tmp_path.rglob("*.png")) == list(out.glob("*.png"))
         for file in out.iterdir():
             file.unlink()
-    told = write_answer(dataclasses.replace(field, names=("a", "b-1", "c", "d")), answer(field, "red"), tmp_path, masks)
+    own = dataclasses.replace(field, names=("a", "b-1", "c", "d"))
+    told = write_answer(answer(own, "red"), Scene(own), tmp_path, masks)
     assert told["masks"]["a"] == "red-a.png"
 
 
@@ -150,7 +164,7 @@ def test_a_lone_quoted_text_is_embedded_without_its_quotes(field, word):
         heard: list[str] = []
         embedder = Heard()
         heard.clear()
-        plain, quoted = (ask_text(field, embedder, text, by=by) for text in (word, f'"{word}"'))
+        plain, quoted = (Scene(field, embedder).ask(text, by=by) for text in (word, f'"{word}"'))
         np.testing.assert_array_equal(plain.mask, quoted.mask)
         assert set(heard) == {word}
 
@@ -171,19 +185,18 @@ def test_a_question_by_codes_of_a_field_without_them_says_how_to_get_them(field,
 
 def test_one_centroid_in_the_world_of_a_map_projection(field, tmp_path):
     """Of the .json, of `locate` and of the server: the mean of the centres, to less than a millimetre at 5e6 m."""
-    from jsecon.app.locate import locate_answer
-
     moved = np.eye(4)
     moved[:3, 3] = [500_000.125, 5_400_000.25, 120.5]
     own = dataclasses.replace(field, source_from_scene=moved)
     found = answer(own, "red")
     means = np.asarray(field.gaussians.means, np.float64)[found.mask] + moved[:3, 3]
-    told = write_answer(own, found, tmp_path, {})
+    told = write_answer(found, Scene(own), tmp_path, {})
     np.testing.assert_allclose(told["place"]["centroid"], means.mean(0), atol=1e-5)
     np.testing.assert_allclose(told["place"]["bounding_box"]["max"], means.max(0), atol=1e-5)
-    assert locate_answer(own, found).as_dict()["centroid"] == pytest.approx(told["place"]["centroid"], abs=1e-5)
+    np.testing.assert_allclose(found.place.center, means.mean(0), atol=3)
     small = np.diag([1e-6, 1e-6, 1e-6, 1.0])
-    told = write_answer(dataclasses.replace(field, source_from_scene=small), found, tmp_path, {})
+    own = dataclasses.replace(field, source_from_scene=small)
+    told = write_answer(answer(own, "red"), Scene(own), tmp_path, {})
     np.testing.assert_allclose(told["place"]["centroid"], 1e-6 * (means - moved[:3, 3]).mean(0), rtol=1e-4, atol=1e-11)
 
 

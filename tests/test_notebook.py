@@ -63,7 +63,8 @@ def test_a_selection_shows_how_far_the_selected_are_from_the_others():
 def test_show_draws_each_frame_and_what_is_selected_in_it(field, monkeypatch):
     pytest.importorskip("matplotlib").use("Agg")
     known = KnownTexts({"the first": np.asarray(field.regions.embeddings)[0]})
-    axes = jsecon.show(field, "the first", embedder=known, views=2)
+    scene = jsecon.Scene(field, known)
+    axes = jsecon.show(scene, "the first", views=2)
     assert axes.shape == (2, 2)
     above, below = (axis.images[0].get_array() for axis in axes[:, 0])
     assert above.shape == below.shape == (40, 48, 3)
@@ -72,4 +73,4 @@ def test_show_draws_each_frame_and_what_is_selected_in_it(field, monkeypatch):
     assert re.match(r"the first: \d+ Gaussians, score [01]\.\d\d", axes[0, 0].figure.get_suptitle())
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
     with pytest.raises(jsecon.InputError, match=r"pip install 'jsecon\[figures\]'"):
-        jsecon.show(field, "the first", embedder=known)
+        jsecon.show(scene, "the first")

@@ -12,8 +12,8 @@ from small_field import colour_field
 
 from jsecon import InputError, save_field
 from jsecon.__main__ import UNREAD, Output
-from jsecon.app.ask import ask_text
 from jsecon.app.cli import main
+from jsecon.app.scene import Scene
 from jsecon.vision.colours import ColourEmbedder
 
 
@@ -66,4 +66,4 @@ def test_a_text_that_is_not_utf8_is_refused_in_one_sentence(saved, tmp_path, cap
     assert line.isascii()
     for by in ("votes", "code"):
         with pytest.raises(InputError, match="not UTF-8"):
-            ask_text(field, ColourEmbedder(), text, by=by)
+            Scene(field, ColourEmbedder()).ask(text, by=by)

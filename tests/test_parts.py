@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from small_field import KnownTexts, field_of, lone_votes, unit_rows
 
-from jsecon import QueryRules, load_field, query_anchored, save_field
-from jsecon.app.ask import ask_each, ask_text
+from jsecon import QueryRules, Scene, load_field, query_anchored, save_field
 from jsecon.field import field as field_file
 from jsecon.query.grouping import MIN_REGION_RATIO, PART_SCORE, _best_cluster, part_scores, parts_fallback
 from jsecon.types import Parts, Regions
@@ -163,20 +162,19 @@ def test_a_higher_threshold_takes_fewer_and_a_probability_decides_where_there_is
 def test_a_text_that_no_region_answers_is_answered_by_parts_in_memory_and_in_blocks(unheld, tmp_path, monkeypatch):
     field, directions, thing = unheld
     embedder = KnownTexts({"fifth": directions[4], "first": directions[0]})
-    answer = ask_text(field, embedder, "fifth")
+    answer = Scene(field, embedder).ask("fifth")
     np.testing.assert_array_equal(answer.mask, thing == 4)
     assert "parts" in answer.skipped["regions"]
-    plain = ask_text(field, embedder, "first")
+    plain = Scene(field, embedder).ask("first")
     np.testing.assert_array_equal(plain.mask, thing == 0)
     assert "regions" not in plain.skipped
-    alone = ask_text(dataclasses.replace(field, parts=None), embedder, "fifth")  # the region that it went to, whole
+    alone = Scene(dataclasses.replace(field, parts=None), embedder).ask("fifth")  # the region that it went to, whole
     np.testing.assert_array_equal(alone.mask, thing >= 3)
     save_field(tmp_path / "field.safetensors", field)
     monkeypatch.setattr(field_file, "MAPPED", 0)
     mapped = load_field(tmp_path / "field.safetensors", mapped=True)
-    (found, first), refused = ask_each(mapped, embedder, texts=["fifth", "first"])
-    assert not refused
-    np.testing.assert_array_equal(np.sort(found.rows[found.mask]), np.flatnonzero(thing == 4))
+    found, first = Scene(mapped, embedder).ask_all(["fifth", "first"])
+    np.testing.assert_array_equal(found.mask, thing == 4)
     assert found.skipped == answer.skipped
     assert float(found.selection.score) == float(answer.selection.score)
-    np.testing.assert_array_equal(np.sort(first.rows[first.mask]), np.flatnonzero(thing == 0))
+    np.testing.assert_array_equal(first.mask, thing == 0)

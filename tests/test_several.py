@@ -8,8 +8,7 @@ import pytest
 from small_field import KnownTexts, make_field, rows_of_a_kind, shares, unit_rows
 from table_field import table_field
 
-from jsecon import InputError, QueryRules, Regions, match_regions, query_relation
-from jsecon.app.ask import ask_text, with_phrases
+from jsecon import InputError, QueryRules, Regions, Scene, match_regions
 from jsecon.app.outputs import write_answer
 from jsecon.app.viewer.candidates import candidates
 from jsecon.query.answer import ALL_OF_CLASS, query_anchored, query_several
@@ -106,22 +105,22 @@ def words(field):
 
 
 def test_a_question_put_to_a_field(field, words, tmp_path):
-    every = ask_text(field, words, "chair", several=True, outliers=False)
+    every = Scene(field, words).ask("chair", all_of_class=True, outliers=False)
     np.testing.assert_array_equal(every.mask, shares(field, [0, 1]) >= 0.5)
-    but = ask_text(field, words, "chair but not stool", outliers=False)
+    but = Scene(field, words).ask("chair but not stool", outliers=False)
     np.testing.assert_array_equal(but.mask, shares(field, [0]) >= 0.5)
-    told = write_answer(field, but, tmp_path, {})
+    told = write_answer(but, Scene(field, words), tmp_path, {})
     assert 0.5 < told["probability"]["percentile_10"] <= told["probability"]["mean"] <= 1
     with pytest.raises(InputError, match="by votes"):
-        ask_text(field, words, "chair but not stool", by="code")
+        Scene(field, words).ask("chair but not stool", by="code")
 
 
 def test_a_field_without_phrases_takes_those_of_who_reads_the_text(field, words):
     bare = dataclasses.replace(field, canonical_phrases=np.zeros((0, 12), np.float32))
     np.testing.assert_array_equal(
-        with_phrases(bare, words).canonical_phrases, np.asarray(words.canonical_phrases, np.float32)
+        Scene(bare, words).text_field.canonical_phrases, np.asarray(words.canonical_phrases, np.float32)
     )
-    np.testing.assert_array_equal(with_phrases(field, words).canonical_phrases, field.canonical_phrases)
+    np.testing.assert_array_equal(Scene(field, words).text_field.canonical_phrases, field.canonical_phrases)
 
 
 SHADES = ("dark blue vase", "light blue kettle", "red mug", "dark green bottle", "white plate")
@@ -141,21 +140,21 @@ def shades():
 ])  # fmt: skip
 def test_a_bare_colour_is_answered_by_its_shades(shades, text, several, things):
     field, embedder = shades
-    answer = ask_text(field, embedder, text, several=several)
+    answer = Scene(field, embedder).ask(text, all_of_class=several)
     assert set(np.flatnonzero(answer.selection.mask) // 120) == things
 
 
 def test_one_shade_answers_where_one_thing_is_asked_for(shades):
     field, embedder = shades
-    answer = ask_text(field, embedder, "blue")
+    answer = Scene(field, embedder).ask("blue")
     best = int(answer.selection.region)
     assert best in (0, 1)
     assert set(np.flatnonzero(answer.selection.mask) // 120) == {best}
-    assert answer.rank >= ask_text(field, embedder, "blue", min_rank=0.0).rank
+    assert answer.rank >= Scene(field, embedder).ask("blue", min_rank=0.0).rank
     assert {candidate.region for candidate in candidates(field, embedder, "blue")[:2]} == {0, 1}
 
 
 def test_relations_count_the_shades_of_a_bare_colour(shades):
     field, embedder = shades
-    assert query_relation(field, "how many blue things", embedder).count == 2
-    assert [o.regions for o in query_relation(field, "the blue thing left of the red mug", embedder).objects] == [(0,)]
+    assert Scene(field, embedder).ask("how many blue things").count == 2
+    assert [o.regions for o in Scene(field, embedder).ask("the blue thing left of the red mug").objects] == [(0,)]

@@ -13,9 +13,8 @@ from siglip_files import BIAS, LENGTH, SCALE, embedded, write_json, write_siglip
 from small_field import KnownTexts, make_field, unit_rows
 
 from experiments.export.vocabulary import write_vocabulary
-from jsecon import InputError, query_anchored, query_several, save_field
+from jsecon import InputError, Scene, query_anchored, query_several, save_field
 from jsecon.app import cli
-from jsecon.app.ask import ask_text
 from jsecon.networks.clip import ClipEmbedder, find_clip, read_preprocessing
 from jsecon.networks.tokenizer import TextRules, TextTokenizer
 from jsecon.pipeline import model_loading
@@ -239,15 +238,15 @@ def test_the_answer_says_how_likely_the_text_is_there(field, tmp_path, monkeypat
     units = np.asarray(field.regions.embeddings) / np.linalg.norm(field.regions.embeddings, axis=1, keepdims=True)
     texts = {"mug": units[0], "cup": units[1], "ghost": -units.sum(0)}
     embedder = KnownTexts(texts, logits=Logits(20.0, -18.0))
-    mug = ask_text(field, embedder, "mug")
+    mug = Scene(field, embedder).ask("mug")
     assert int(mug.selection.region) == 0
     np.testing.assert_allclose(mug.presence, 1 / (1 + np.exp(-2.0)), rtol=1e-4)
-    both = ask_text(field, embedder, "mug or cup")
+    both = Scene(field, embedder).ask("mug or cup")
     np.testing.assert_allclose(both.presence, 1 / (1 + np.exp(-2.0)), rtol=1e-4)
-    ghost = ask_text(field, embedder, "ghost")
+    ghost = Scene(field, embedder).ask("ghost")
     assert int(ghost.selection.region) == -1
     assert 0 <= ghost.presence < MIN_PRESENCE
-    silent = ask_text(field, KnownTexts(texts), "mug")
+    silent = Scene(field, KnownTexts(texts)).ask("mug")
     assert silent.presence is None
 
     save_field(tmp_path / "field.safetensors", dataclasses.replace(field, embedder="told"))

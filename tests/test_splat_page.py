@@ -9,8 +9,8 @@ import pytest
 from browser import CHROMIUM, WEBGL, dumped
 from small_field import make_field
 
-from jsecon.app.ask import Answer
 from jsecon.app.pictures import main_regions
+from jsecon.app.records import Answer, Query
 from jsecon.app.viewer.static_page import NO_REGION, page
 from jsecon.field.membership import vote_shares
 from jsecon.splat.sh import C0
@@ -23,8 +23,10 @@ def made(scene, cameras):
     mask, none = main_regions(field) == 1, np.zeros(64, bool)
     share = mask.astype(np.float32)
     answers = [
-        Answer("the second </script>", "votes", Selection(mask, share, np.int32(1), np.float32(0.75)), mask, {}),
-        Answer("nothing", "votes", Selection(none, 0 * share, np.int32(-1), np.float32(0.01)), none, {}),
+        Answer(
+            Query("the second </script>"), "votes", mask, Selection(mask, share, np.int32(1), np.float32(0.75)), field
+        ),
+        Answer(Query("nothing"), "votes", none, Selection(none, 0 * share, np.int32(-1), np.float32(0.01)), field),
     ]
     return field, answers, page(field, answers, title="A <room>"), labels
 

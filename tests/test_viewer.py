@@ -20,8 +20,8 @@ from browser import CHROMIUM, opened, until
 from small_field import colour_field
 
 from jsecon import Camera, InputError, load_ply, save_field, with_overlap
-from jsecon.app.ask import Answer
 from jsecon.app.cli import main
+from jsecon.app.records import Answer
 from jsecon.app.viewer import view_state
 from jsecon.app.viewer.view_state import ViewState
 from jsecon.app.viewer.window import Viewer, open_viewer

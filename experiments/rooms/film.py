@@ -8,8 +8,8 @@ import numpy as np
 from PIL import Image
 
 from experiments.rooms.capture import look_at
-from jsecon.app.ask import Answer
 from jsecon.app.pictures import Renderer
+from jsecon.app.records import Answer
 from jsecon.files import atomic_write
 from jsecon.fit.resize import scale_cameras
 from jsecon.splat.sh import C0
@@ -59,7 +59,7 @@ def write_film(field: LanguageField, answers: Sequence[Answer], file: Path) -> i
             rgb[answer.mask] += lit * (bright - rgb[answer.mask])
         image, latest = renderer.colours(t, rgb), int(np.floor(lit_answers))
         if 0 <= latest < len(answers):
-            image = _captioned(image, answers[latest].query)
+            image = _captioned(image, str(answers[latest].query))
         frames.append(Image.fromarray(image))
     first, *rest = frames
     options = {"duration": 1000 // FRAMES_PER_SECOND, "loop": 0, "quality": WEBP_QUALITY, "method": 2}

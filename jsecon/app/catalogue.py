@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 from scipy.special import softmax
 
-from jsecon.app.locate import gaussian_rows
+from jsecon.app.records import gaussian_rows
 from jsecon.errors import InputError
 from jsecon.field.columns import vote_blocks
 from jsecon.field.membership import SHARE_THRESHOLD, membership_probability, vote_shares
@@ -253,7 +253,7 @@ def _name(embeddings: np.ndarray, names: _Names) -> tuple[Int[np.ndarray, "k m"]
 def _sizes(field: LanguageField) -> tuple[Float[np.ndarray, " r"], Int[np.ndarray, " n"]]:
     """Returns the sum of each region's shares, and the region that has at least half of each Gaussian, or -1."""
     size = np.zeros(field.regions.count)
-    main = []
+    main = [np.zeros(0, np.int32)]
     for votes in vote_blocks(field.votes):
         shares, regions = np.nan_to_num(np.asarray(vote_shares(votes))), np.asarray(votes.regions)
         size += np.bincount(regions[regions >= 0], shares[regions >= 0], len(size))[: len(size)]

@@ -9,11 +9,10 @@ import jax
 import jax.numpy as jnp
 
 from jsecon.app import verbs
-from jsecon.app.ask import ask_text, with_phrases
 from jsecon.app.models import open_embedder
+from jsecon.app.scene import Scene, open_scene
 from jsecon.errors import InputError
 from jsecon.evaluate.lerf import Row, evaluate_at_thresholds
-from jsecon.field.field import load_field
 from jsecon.files import write_text
 from jsecon.paper.autoencoder import encode
 from jsecon.paper.baselines import query_canonical, query_one_step
@@ -23,17 +22,17 @@ from jsecon.query.composite import parse_query
 from jsecon.query.render import ALPHA_THRESHOLD
 from jsecon.query.select import codes_of
 from jsecon.read.masks.labels import LabelledFrame, load_lerf_labels
-from jsecon.types import LanguageField, Selection
+from jsecon.types import Selection
 
 Evaluation: TypeAlias = dict[str, tuple[list[Row], dict[str, Any]]]
 """kind of query -> its pairs, and their summary"""
 
 KINDS: dict[str, dict[str, Any]] = {
     "anchored": {"by": "votes"},
-    "all": {"several": True},
+    "all": {"all_of_class": True},
     "anchored_code": {"by": "code"},
 }
-"""kind of query -> options of `ask_text`"""
+"""kind of query -> options of `Scene.ask`"""
 BASELINES = ("one_step", "canonical")
 """kinds of queries that compare the code of each Gaussian with a text"""
 ONE_STEP_THRESHOLD = 0.8
@@ -43,17 +42,12 @@ CANONICAL_THRESHOLD = 0.5
 
 
 def evaluate(
-    field: LanguageField,
-    embedder: Any,
-    labels: Sequence[LabelledFrame],
-    listener: Listener,
-    kinds: Sequence[str] | None = None,
+    scene: Scene, labels: Sequence[LabelledFrame], listener: Listener, kinds: Sequence[str] | None = None
 ) -> Evaluation:
     """Measures kinds of queries.
 
     Args:
-      field: The field.
-      embedder: Its embedder. A text that it has no words for counts as 0.
+      scene: The scene. A text that its embedder has no words for counts as 0.
       labels: Masks of named objects in frames of the field.
       listener: Receives the progress.
       kinds: Names in `KINDS` and `BASELINES`; None takes all that the field has data for.
@@ -61,6 +55,7 @@ def evaluate(
     Returns:
       Pairs and summary of each kind.
     """
+    field = scene.field
     cameras = {name: field.cameras[t] for t, name in enumerate(field.names)}
     results = {}
     by_votes = [kind for kind in KINDS if KINDS[kind].get("by") != "code"]
@@ -69,8 +64,8 @@ def evaluate(
         def select(text: str, kind: str = kind) -> Selection | None:
             try:
                 if kind in BASELINES:
-                    return _select_by_code(field, embedder, text, kind)
-                answer = ask_text(field, embedder, text, **KINDS[kind])
+                    return _select_by_code(scene, text, kind)
+                answer = scene.ask(text, **KINDS[kind])
             except InputError:  # no words for it
                 return None
             return dataclasses.replace(answer.selection, mask=answer.mask)
@@ -82,14 +77,15 @@ def evaluate(
     return results
 
 
-def _select_by_code(field: LanguageField, embedder: Any, text: str, kind: str) -> Selection:
+def _select_by_code(scene: Scene, text: str, kind: str) -> Selection:
     """Selects the Gaussians whose codes are similar to that of a text: by a kind of BASELINES, without regions."""
+    field = scene.text_field
     texts = parse_query(text).included
     codes = codes_of(field)
-    code = encode(codes.autoencoder, jax.device_put(embedder.embed_text(texts[:1])[0]))
+    code = encode(codes.autoencoder, jax.device_put(scene.embedder.embed_text(texts[:1])[0]))
     if kind == "one_step":
         return query_one_step(codes.gaussians, code, ONE_STEP_THRESHOLD)
-    canonical = encode(codes.autoencoder, jnp.asarray(with_phrases(field, embedder).canonical_phrases))
+    canonical = encode(codes.autoencoder, jnp.asarray(field.canonical_phrases))
     return query_canonical(codes.gaussians, code, canonical, CANONICAL_THRESHOLD)
 
 
@@ -98,9 +94,9 @@ def _eval(verb: verbs.Eval, console: Console) -> verbs.VerbResult:
     out = verb.out or verb.field.parent
     require_writable(out)
     with console.progress("field"):
-        field = load_field(verb.field)
-        embedder = open_embedder(field, verb, console)
-    results = evaluate(field, embedder, load_lerf_labels(verb.labels), console)
+        scene = open_scene(verb.field, embedder=lambda field: open_embedder(field, verb, console))
+        _ = scene.embedder  # else its absence would count as 0 for every text
+    results = evaluate(scene, load_lerf_labels(verb.labels), console)
     print_table(results, console)
     pairs = {kind: summary | {"rows": [_plain(row) for row in rows]} for kind, (rows, summary) in results.items()}
     write_text(out / "evaluation.json", json.dumps(pairs, indent=2) + "\n")
@@ -129,7 +125,3 @@ def print_table(results: Evaluation, listener: Listener) -> None:
     for kind, (_, summary) in results.items():
         shares = f"{summary['miou']:>6.3f} {summary['macc']:>10.3f} {summary['loc_acc']:>10.3f}"
         listener.say(f"  {kind:<14} {shares} {summary['missing']:>8}")
-
-
-VERBS = {verbs.Eval: _eval}
-"""what does the work of each verb"""

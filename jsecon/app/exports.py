@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +11,12 @@ import jax
 import numpy as np
 
 from jsecon.app import pictures, report, verbs
-from jsecon.app.ask import ask_text
-from jsecon.app.catalogue import Catalogue, objects
-from jsecon.app.locate import decimals, rounded
+from jsecon.app.catalogue import Catalogue
 from jsecon.app.models import open_embedder
-from jsecon.app.outputs import save_scene, slug
+from jsecon.app.outputs import slug
+from jsecon.app.records import decimals, rounded
+from jsecon.app.scene import Scene, export_rows, open_scene
 from jsecon.errors import InputError
-from jsecon.field.field import check_field, load_field
 from jsecon.files import atomic_write, write_text
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console, Listener
@@ -68,14 +68,14 @@ def _objects(verb: verbs.Objects, console: Console) -> verbs.VerbResult:
         require_writable(verb.out)
     with console.progress("field"):
         names = None if verb.vocabulary is None else _read_vocabulary(verb.vocabulary)
-        field = load_field(verb.field)
         by_model = names is not None or verb.template or verb.embedder is not None  # else its words may be in the field
-        listed = objects(field, names, open_embedder(field, verb, console) if by_model else None)
+        scene = open_scene(verb.field, embedder=_embedder_of(verb, console) if by_model else None)
+        listed = scene.objects(names)
     _print_catalogue(listed, console)
     result: verbs.VerbResult = {"objects": object_records(listed)}
     if verb.out is None:
         return result
-    files = _write_catalogue(field, listed, verb.out, console)
+    files = _write_catalogue(scene, listed, verb.out, console)
     console.say(f"pictures  {files['catalogue']}")
     return result | {"written": files}
 
@@ -95,39 +95,47 @@ def _read_vocabulary(file: Path) -> list[str]:
 def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon export`; the result has the number of exported Gaussians and the bytes of the scene."""
     _check_export(verb)
+    text = verb.only if verb.only is not None else verb.without
     with console.progress("field"):
         if verb.out is not None:
             require_writable_format(verb.out)
-        text = verb.only if verb.only is not None else verb.without
-        listed_ids = verb.with_labels or verb.labels is not None or verb.objects is not None
-        check_field(verb.field)
-        field = load_field(verb.field, mapped=text is None and not listed_ids)
-    rows = None
-    if text is not None:
-        mask = ask_text(field, open_embedder(field, verb, console), text).mask
-        if not mask.any():
-            option = "--only" if verb.only is not None else "--without"
-            raise InputError(option, f"{text!r} selects no Gaussian", remedy="Ask with other words.")
-        rows = np.flatnonzero(mask if verb.only is not None else ~mask)
-    result: verbs.VerbResult = {"written": {}, "gaussians": field.gaussians.count if rows is None else len(rows)}
+        scene = open_scene(verb.field, embedder=_embedder_of(verb, console))
+    answer = None if text is None else scene.ask(text)
+    if answer is not None and not len(answer.rows):
+        option = "--only" if verb.only is not None else "--without"
+        raise InputError(option, f"{text!r} selects no Gaussian", answer.reason, "Ask with other words.")
+    without = verb.without is not None
+    count = scene.field.gaussians.count
+    if answer is not None:
+        console.say(str(answer))
+        count = count - len(answer.rows) if without else len(answer.rows)
+    result: verbs.VerbResult = {"written": {}, "gaussians": count}
     with console.progress("files"):
-        listed = objects(field) if listed_ids else None
+        listed_ids = verb.with_labels or verb.labels is not None or verb.objects is not None
+        listed = scene.objects() if listed_ids else None
         if verb.out is not None:
-            save_scene(field, verb.out, rows=rows, object_ids=listed.labels if listed and verb.with_labels else None)
+            ids = listed.labels if listed is not None and verb.with_labels else None
+            scene.export(verb.out, answer, without=without, object_ids=ids)
             result["bytes"] = verb.out.stat().st_size
             result["written"]["scene"] = verb.out
-            console.say(f"{result['gaussians']} Gaussians, {result['bytes'] / 2**20:.1f} MiB  {verb.out}")
+            console.say(f"{count} Gaussians, {result['bytes'] / 2**20:.1f} MiB  {verb.out}")
         if listed is not None and verb.labels is not None:
-            ids = np.asarray(listed.labels if rows is None else listed.labels[rows], np.int32)
+            ids = np.asarray(listed.labels, np.int32)
+            ids = ids if answer is None else ids[answer.mask != without]
             with atomic_write(verb.labels) as temporary, temporary.open("wb") as stream:
                 np.save(stream, ids)
             result["written"]["labels"] = verb.labels
             console.say(f"{len(ids)} ids of objects, {int((ids < 0).sum())} of them -1  {verb.labels}")
         if listed is not None and verb.objects is not None:
-            files = _save_objects(field, listed, verb.objects)
+            files = _save_objects(scene, listed, verb.objects)
             result["written"]["objects"] = files
             console.say(f"{len(files)} objects  {verb.objects}")
     return result
+
+
+def _embedder_of(verb: verbs.FieldVerb, console: Console) -> Callable[[LanguageField], Any]:
+    """Opens the embedder of a verb's field when a text needs it."""
+    return lambda field: open_embedder(field, verb, console)
 
 
 def _check_export(verb: verbs.Export) -> None:
@@ -159,7 +167,7 @@ def _print_catalogue(catalogue: Catalogue, listener: Listener) -> None:
         listener.say("  there are no objects: the field has no regions with Gaussians")
 
 
-def _write_catalogue(field: LanguageField, catalogue: Catalogue, out: Path, listener: Listener) -> dict[str, Path]:
+def _write_catalogue(scene: Scene, catalogue: Catalogue, out: Path, listener: Listener) -> dict[str, Path]:
     """Writes OUT/objects.json, OUT/objects.csv and OUT/catalogue.html; returns the files."""
     files = {"objects": out / "objects.json", "catalogue": out / "catalogue.html", "table": out / "objects.csv"}
     content = {"frame": "the capture's world", "up": catalogue.up.round(6).tolist()}
@@ -172,22 +180,23 @@ def _write_catalogue(field: LanguageField, catalogue: Catalogue, out: Path, list
     for row in zip(*columns.values()):
         writer.writerow([" ".join(value) if isinstance(value, list) else value for value in row])
     write_text(files["table"], table.getvalue())
-    write_text(files["catalogue"], _page(field, catalogue, listener))
+    write_text(files["catalogue"], _page(scene, catalogue, listener))
     return files
 
 
-def _save_objects(field: LanguageField, catalogue: Catalogue, folder: Path) -> list[Path]:
+def _save_objects(scene: Scene, catalogue: Catalogue, folder: Path) -> list[Path]:
     """Writes a .ply of each object, named by its id and name; of a whole with the Gaussians of its parts."""
     files = []
     for n in range(len(catalogue)):
         name = slug(_title(catalogue, n)).encode()[:MAX_NAME_BYTES].decode("utf-8", "ignore")
         files.append(folder / f"{n:03d}-{name}.ply")
-        save_scene(field, files[-1], rows=np.flatnonzero(catalogue.mask(n)))
+        export_rows(scene.field, files[-1], np.flatnonzero(catalogue.mask(n)))
     return files
 
 
-def _page(field: LanguageField, catalogue: Catalogue, listener: Listener) -> str:
+def _page(scene: Scene, catalogue: Catalogue, listener: Listener) -> str:
     """Returns the page: a card for each object, which opens to its views."""
+    field = scene.field
     renderer = pictures.Renderer(field.gaussians, field.cameras)
     cameras = jax.tree.map(np.asarray, field.cameras)
     gaussians = jax.device_put(field.gaussians)
@@ -260,7 +269,3 @@ def _center(catalogue: Catalogue, n: int) -> str:
     """Returns the centre of an object, to a hundredth of its size."""
     digits = decimals(2 * float(np.linalg.norm(catalogue.shapes.half_size[n])), 0.01)
     return ", ".join(f"{x:.{digits}f}" for x in catalogue.shapes.center[n])
-
-
-VERBS = {verbs.Objects: _objects, verbs.Export: _export}
-"""what does the work of each verb"""

@@ -17,12 +17,12 @@ from mcp.server.mcpserver.exceptions import ToolError
 from mcp.types import ToolAnnotations
 from pydantic import Field
 
-from jsecon.app import pictures, verbs
+from jsecon.app import verbs
 from jsecon.app.exports import object_records
-from jsecon.app.locate import Place
 from jsecon.app.models import with_models
-from jsecon.app.relations import locate, measure, query_relation, relation_answer
-from jsecon.app.server.scenes import Scene, SceneQuery, open_scenes
+from jsecon.app.records import Answer
+from jsecon.app.scene import Scene
+from jsecon.app.server.scenes import open_scenes
 from jsecon.errors import InputError
 from jsecon.pipeline.progress import Console
 from jsecon.query.expressions import is_expression
@@ -55,9 +55,13 @@ class _Tools:
             raise InputError(f"field {name!r}", "there is no such field", remedy=f"There are {', '.join(self.scenes)}.")
         return self.scenes[name]
 
-    def find(self, text: Words, field: FieldName = None) -> dict[str, Any]:
-        """Finds what a text names: number of Gaussians, score, centre and box. No relations in the text."""
-        return self.scene(field).record(SceneQuery(_words(text)))
+    def find(self, text: Words, frame: Frame = None, field: FieldName = None) -> dict[str, Any]:
+        """Finds what a text names: number of Gaussians, score, centre and box, or why there is nothing.
+
+        A text may tell things apart by relations, orders or numbers, as relation does.
+        """
+        scene = self.scene(field)
+        return {"field": scene.name} | scene.ask(_words(text), frame=frame).as_dict()
 
     def relation(self, text: Words, frame: Frame = None, field: FieldName = None) -> dict[str, Any]:
         """Finds things told apart by relations, orders or numbers: "the red mug left of the bottle".
@@ -65,39 +69,35 @@ class _Tools:
         The answer has 0, 1 or several objects, alternatives, and a question where the text leaves open which is meant.
         Directions are seen from a frame, or as `viewpoint` says.
         """
-        return query_relation(self.scene(field).object_scene, text, frame=frame).as_dict()
+        return self.scene(field).relate(text, frame=frame).as_dict()
 
     def objects(self, field: FieldName = None) -> dict[str, Any]:
         """Lists the objects of a scene with names, sizes and places, the largest first."""
-        rows = object_records(self.scene(field).object_scene.catalogue)
+        rows = object_records(self.scene(field).objects())
         return {"count": len(rows), "objects": rows[:MAX_OBJECTS]}
 
     def locate(self, text: Words, frame: Frame = None, field: FieldName = None) -> dict[str, Any]:
         """Locates one thing: oriented box, and the middle of its top, where a gripper from above would close."""
         scene = self.scene(field)
-        place = locate(scene.object_scene, _words(text), frame=frame)
-        return place.as_dict() | {"top": np.round(_top_of(scene, place), 6).tolist()}
+        answer = scene.locate(_words(text), frame=frame)
+        return answer.as_dict() | {"top": np.round(_top_of(scene, answer), 6).tolist()}
 
     def measure(self, a: Words, b: Words, frame: Frame = None, field: FieldName = None) -> dict[str, Any]:
         """Measures the distance of two things: between surfaces, between centres, free gap, angle above horizontal."""
-        return measure(self.scene(field).object_scene, a, b, frame=frame).as_dict()
+        return self.scene(field).measure(a, b, frame=frame)
 
     def count(self, text: Words, frame: Frame = None, field: FieldName = None) -> dict[str, Any]:
         """Counts the things that a text names: "bottles", "red mugs on the table"."""
         text = text if is_expression(text) else f"how many {text}"
-        answer = query_relation(self.scene(field).object_scene, text, frame=frame)
+        answer = self.scene(field).relate(text, frame=frame)
         return {"count": answer.count, "reading": answer.reading, "reason": answer.reason}
 
     def render(self, text: Words, frame: Frame = None, field: FieldName = None) -> Image:
         """Renders a frame with what a text names lit up, as a PNG; by default the frame that shows it best."""
         scene = self.scene(field)
-        if is_expression(text):
-            answer = relation_answer(query_relation(scene.object_scene, text, frame=frame))
-        else:
-            answer = scene.answer(SceneQuery(_words(text)))
-        index, mask = scene.mask(answer, frame)
-        photo = pictures.Renderer(scene.field.gaussians, scene.field.cameras).photo(index)
-        image = cv2.cvtColor(pictures.selection_overlay(photo, mask), cv2.COLOR_RGB2BGR)
+        answer = scene.ask(_words(text), frame=frame)
+        index = scene.frame_index(frame) if frame is not None else [*scene.best_frames(answer, 1), 0][0]
+        image = cv2.cvtColor(scene.render(index, answer), cv2.COLOR_RGB2BGR)
         return Image(data=cv2.imencode(".png", image)[1].tobytes(), format="png")
 
 
@@ -108,11 +108,10 @@ def _words(text: str) -> str:
     return text
 
 
-def _top_of(scene: Scene, place: Place) -> np.ndarray:
-    """Returns the middle of the upper side of a place's points, (3,) in the capture's world."""
-    up = np.asarray(scene.field.source_from_scene, np.float64)[:3, :3] @ scene.object_scene.up
-    up /= np.linalg.norm(up)
-    return place.center + (np.quantile(place.points @ up, 0.98) - place.center @ up) * up
+def _top_of(scene: Scene, answer: Answer) -> np.ndarray:
+    """Returns the middle of the upper side of an answer's points, (3,) in the capture's world."""
+    up = scene.objects().up
+    return answer.place.center + (np.quantile(answer.points @ up, 0.98) - answer.place.center @ up) * up
 
 
 def make_server(scenes: dict[str, Scene]) -> MCPServer:

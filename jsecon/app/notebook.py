@@ -12,11 +12,9 @@ import numpy as np
 from jaxtyping import UInt8
 
 from jsecon.app import pictures, report
-from jsecon.app.ask import ask_text
-from jsecon.app.outputs import answer_masks
+from jsecon.app.scene import Scene
 from jsecon.errors import InputError
 from jsecon.fit.resize import resize_frame, scale_cameras
-from jsecon.pipeline import model_loading
 from jsecon.read.captures.frames import evenly_spaced
 from jsecon.types import Capture, LanguageField, Selection
 
@@ -53,15 +51,14 @@ def to_png(value: Any) -> bytes:
     return cv2.imencode(".png", cv2.cvtColor(_picture(value)[0], cv2.COLOR_RGB2BGR))[1].tobytes()
 
 
-def show(field: LanguageField, text: str, *, embedder: Any = None, views: int = 3, **options: Any) -> Any:
+def show(scene: Scene | LanguageField, text: str, *, views: int = 3, **options: Any) -> Any:
     """Draws the frames that show best what a text selects, rendered without and with the selection, by matplotlib.
 
     Args:
-      field: The field.
+      scene: The scene, or a field.
       text: The text.
-      embedder: Embedder of the field; None opens it.
       views: Number of frames.
-      **options: Options of `jsecon.app.ask.ask_text`.
+      **options: Options of `Scene.ask`.
 
     Returns:
       Axes (2, views) of the figure.
@@ -74,19 +71,19 @@ def show(field: LanguageField, text: str, *, embedder: Any = None, views: int = 
     except ImportError as error:
         remedy = "Run: pip install 'jsecon[figures]'"
         raise InputError("jsecon.show", "the package matplotlib is missing", remedy=remedy) from error
-    answer = ask_text(field, embedder or model_loading.field_embedder(field), text, **options)
-    masks = answer_masks(field, answer, views) or {0: np.zeros((field.cameras.height, field.cameras.width), bool)}
-    renderer = pictures.Renderer(field.gaussians, field.cameras)
-    size = (3.2 * len(masks), 4.8)
-    figure, axes = plt.subplots(2, len(masks), squeeze=False, figsize=size, layout="constrained")
-    for column, (t, mask) in zip(axes.T, masks.items()):
-        photo = renderer.photo(t)
-        for axis, image, title in zip(column, (photo, pictures.selection_overlay(photo, mask)), (field.names[t], "")):
+    scene = scene if isinstance(scene, Scene) else Scene(scene)
+    answer = scene.ask(text, **options)
+    frames = scene.best_frames(answer, views) or [0]
+    size = (3.2 * len(frames), 4.8)
+    figure, axes = plt.subplots(2, len(frames), squeeze=False, figsize=size, layout="constrained")
+    for column, t in zip(axes.T, frames):
+        images = (scene.render(t), scene.render(t, answer))
+        for axis, image, title in zip(column, images, (scene.field.names[t], "")):
             axis.imshow(image)
             axis.set_title(title, fontsize="small")
             axis.set_axis_off()
     score = float(answer.selection.score)
-    figure.suptitle(f"{text}: {int(answer.mask.sum()):,} Gaussians, score {score:.2f}")
+    figure.suptitle(f"{text}: {len(answer.rows):,} Gaussians, score {score:.2f}")
     return axes
 
 

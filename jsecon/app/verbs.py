@@ -211,9 +211,6 @@ class Query(FieldVerb):
         similarity lies at least 0.75 of the way from the median region to the best one (by votes).
       keep_outliers: Keeps the Gaussians that stand apart from the rest of an answer. By default DBSCAN drops them, and
         clusters with less than a tenth of the largest one's weight in the views. The .json counts them.
-      grow: Adds this many shells of neighbouring Gaussians to each answer.
-      shrink: Removes this many shells from each answer, after growing. The same number of both closes gaps.
-      invert: Selects the Gaussians that an answer does not select, after both.
       views: Number of masks to write for each query.
       format: Format of the selected Gaussians. The glb is glTF with Khronos' KHR_gaussian_splatting, y up, and holds
         their regions too.
@@ -241,9 +238,6 @@ class Query(FieldVerb):
     min_rank: Annotated[Option[float], Range(0, 1)] = 0.82
     all: Option[bool] = False
     keep_outliers: Option[bool] = False
-    grow: Annotated[Option[int], Range(0, 100)] = 0
-    shrink: Annotated[Option[int], Range(0, 100)] = 0
-    invert: Option[bool] = False
     views: Annotated[Option[int], Range(0, 1000)] = 3
     format: Option[Literal["ply", "spz", "glb"]] = "ply"
 

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from jsecon.app import ask, evaluation, pictures, report, running, verbs
-from jsecon.app.outputs import answer_masks, write_answer
+from jsecon.app import evaluation, pictures, report, running, verbs
+from jsecon.app.outputs import write_answer
+from jsecon.app.scene import Scene
 from jsecon.evaluate.lerf import Row
 from jsecon.files import write_text
-from jsecon.pipeline import model_loading, run as pipeline
+from jsecon.pipeline import run as pipeline
 from jsecon.pipeline.options import Options, require_writable
 from jsecon.pipeline.progress import Console, Listener
 from jsecon.pipeline.run import Run
@@ -38,14 +39,14 @@ def run_demo(out: Path, *, listener: Listener, room: Path = ROOM, steps: int = 5
     holdout = json.loads((capture / "scene.json").read_text())["holdout"]
     options = Options(capture, holdout=holdout, steps=steps)
     run = pipeline.run(options, out, listener=listener)
-    labels, embedder = load_lerf_labels(capture / "label"), model_loading.field_embedder(run.field)
-    results = evaluation.evaluate(run.field, embedder, labels, listener, ("anchored",))
+    scene, labels = Scene(run.field), load_lerf_labels(capture / "label")
+    results = evaluation.evaluate(scene, labels, listener, ("anchored",))
     rows, summary = results["anchored"]
     with listener.progress("report"):
         texts = sorted({name for frame in labels for name in frame.objects})
-        answers = ask.ask_each(run.field, embedder, texts=texts)[0]
-        for answer in answers:
-            write_answer(run.field, answer, out / "queries", answer_masks(run.field, answer, views=2))
+        for text in texts:
+            answer = scene.ask(text)
+            write_answer(answer, scene, out / "queries", scene.masks(answer, 2))
         metrics = running.run_metrics(run) | {"anchored": summary}
         write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
         write_text(out / "report.html", _page(run, rows, summary, labels))

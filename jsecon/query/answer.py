@@ -22,6 +22,7 @@ from jax import export
 from jaxtyping import Bool, Float, Int
 
 from jsecon.errors import require, require_shape
+from jsecon.field.columns import is_mapped, vote_blocks
 from jsecon.field.membership import inside_fraction
 from jsecon.field.similarity import Number, similarities
 from jsecon.programs import stored_jit
@@ -225,12 +226,16 @@ def select_gaussians(field: LanguageField, match: RegionMatch, rules: QueryRules
     """Selects the Gaussians in which the matched regions have a share of at least `rules.min_share`. Pure.
 
     The share (`inside_fraction`) estimates the probability that a pixel of the Gaussian belongs to the regions.
-    Gaussians that no view sees, or with votes that are not finite, stay out.
+    Gaussians that no view sees, or with votes that are not finite, stay out. Mapped votes are read in blocks.
     """
     if field.regions.count == 0:
         none = jnp.zeros(field.gaussians.count, bool)
         return Selection(none, none.astype(jnp.float32), *map(jnp.asarray, match[1:5]))
-    return select_from_votes(jax.tree.map(jnp.asarray, field.votes), match, rules.min_share)
+    if not is_mapped(field.votes):
+        return select_from_votes(jax.tree.map(jnp.asarray, field.votes), match, rules.min_share)
+    parts = [select_from_votes(votes, match, rules.min_share) for votes in vote_blocks(field.votes)]
+    mask, share = (np.concatenate(column) for column in zip(*((part.mask, part.similarity) for part in parts)))
+    return Selection(mask, share, *match[1:])
 
 
 @stored_jit

@@ -7,7 +7,7 @@ from small_field import make_field, true_regions
 
 from experiments.rooms import film
 from experiments.rooms.panels import answers_overlay
-from jsecon.app.ask import Answer
+from jsecon.app.records import Answer, Query
 from jsecon.types import Camera, Selection
 
 
@@ -41,7 +41,7 @@ def test_an_answer_is_dark_before_its_turn_and_bright_after(scene, cameras, tmp_
     for region in (1, 3):
         mask = true_regions(scene) == region
         selection = Selection(mask, mask.astype(np.float32), np.int32(region), np.float32(0.5))
-        answers.append(Answer(f"slab {region}", "votes", selection, mask, {}))
+        answers.append(Answer(Query(f"slab {region}"), "votes", mask, selection, field))
     size = film.write_film(field, answers, tmp_path / "film.webp")
     assert size == (tmp_path / "film.webp").stat().st_size < 2 * 2**20
     with Image.open(tmp_path / "film.webp") as found:

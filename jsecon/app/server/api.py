@@ -22,16 +22,14 @@ from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictFloat, Stri
 from starlette.exceptions import HTTPException as AnyHTTPException
 
 import jsecon
-from jsecon.app.ask import frame_index
 from jsecon.app.exports import object_records
-from jsecon.app.locate import gaussian_rows
-from jsecon.app.relations import measure, query_relation
+from jsecon.app.records import At, Query as SceneQuery
+from jsecon.app.scene import Scene
 from jsecon.app.server.guard import LIMITS, Guard, Limits, Workers
-from jsecon.app.server.scenes import Scene, SceneQuery
+from jsecon.app.server.scenes import describe_scene
 from jsecon.app.verbs import By
 from jsecon.errors import InputError
 from jsecon.process import cores
-from jsecon.read.splats.ply import save_ply
 
 Text = Annotated[str, StringConstraints(strict=True, min_length=1, max_length=500, pattern=r"\S")]
 
@@ -159,29 +157,32 @@ def application(
         if request.at is not None and request.all:
             raise _wrong("all", 'it needs a text, not "at".')
         scene = scene_of(request.field)
-        scene_query = SceneQuery(request.text or "", request.at, request.by, request.threshold, request.all)
-        record = scene.records.get(scene_query)
-        if record is None:
-            record = await computed(lambda: scene.record(scene_query), "text" if request.at is None else "at")
-        return _AsciiResponse(record)
+        place = "text" if request.at is None else "at"
+        question = request.text if request.text is not None else At(*request.at)
+        try:
+            query = SceneQuery(question, by=request.by, threshold=request.threshold, all_of_kind=request.all)
+        except InputError as error:
+            raise _wrong(error.where, str(error)) from error
+        answer = scene.known(query)  # is sent at once, also while all threads are taken
+        record = await computed(lambda: scene.ask(query).as_dict(), place) if answer is None else answer.as_dict()
+        return _AsciiResponse({"field": scene.name} | record)
 
     @app.post("/relation", summary="The objects that an expression such as 'the mug left of the bottle' names")
     async def relation(request: RelationQuery) -> Response:
         scene = scene_of(request.field)
-        answer = await computed(lambda: query_relation(scene.object_scene, request.text, frame=request.frame), "text")
-        return _AsciiResponse({"field": scene.name} | answer.as_dict())
+        record = await computed(lambda: scene.relate(request.text, frame=request.frame).as_dict(), "text")
+        return _AsciiResponse({"field": scene.name} | record)
 
     @app.post("/measure", summary="Distances between two objects: surfaces, centres, free gap, angle")
     async def distance(request: MeasureQuery) -> Response:
         scene = scene_of(request.field)
-        a, b, frame = request.a, request.b, request.frame
-        distances = await computed(lambda: measure(scene.object_scene, a, b, frame=frame), "a or b")
-        return _AsciiResponse({"field": scene.name} | distances.as_dict())
+        distances = await computed(lambda: scene.measure(request.a, request.b, frame=request.frame), "a or b")
+        return _AsciiResponse({"field": scene.name} | distances)
 
     @app.get("/objects", summary="The objects of a field: names, boxes, Gaussians")
     async def objects(request: Annotated[Fields, Query()]) -> Response:
         scene = scene_of(request.field)
-        rows = await computed(lambda: object_records(scene.object_scene.catalogue), "field")
+        rows = await computed(lambda: object_records(scene.objects()), "field")
         return _AsciiResponse({"field": scene.name, "objects": rows})
 
     @app.get("/regions", summary="Pixels and views of each region")
@@ -203,13 +204,11 @@ def application(
         scene = scene_of(request.field)
 
         def work() -> bytes:
-            answer = scene.answer(SceneQuery(request.text, by=request.by))
-            if not answer.mask.any():
-                raise InputError(f"query {answer.query!r}", "no Gaussian is selected", remedy="Ask with other words.")
+            answer = scene.ask(request.text, by=request.by)
+            _ = answer.place  # refuses an answer of no Gaussian
             with tempfile.TemporaryDirectory() as folder:
                 file = Path(folder) / "selection.ply"
-                selected = gaussian_rows(scene.field.gaussians, answer.mask)
-                save_ply(file, selected, similarity=scene.field.source_from_scene)
+                scene.export(file, answer)
                 return file.read_bytes()
 
         return Response(await computed(work, "text"), media_type="application/octet-stream")
@@ -218,18 +217,23 @@ def application(
     async def mask(request: Annotated[MaskQuery, Query()]) -> Response:
         scene = scene_of(request.field)
         try:
-            frame = None if request.frame is None else frame_index(scene.field, request.frame)
+            frame = None if request.frame is None else scene.frame_index(request.frame)
         except InputError as error:
             raise _wrong("frame", str(error)) from error
-        scene_query = SceneQuery(request.text, by=request.by)
-        index, pixels = await computed(lambda: scene.mask(scene.answer(scene_query), frame), "text")
+
+        def work() -> tuple[int, np.ndarray]:
+            answer = scene.ask(request.text, by=request.by)
+            index = frame if frame is not None else [*scene.best_frames(answer, 1), 0][0]
+            return index, scene.mask(answer, index)
+
+        index, pixels = await computed(work, "text")
         image = cv2.imencode(".png", pixels.astype(np.uint8) * 255)[1].tobytes()
         name = re.sub("[^ -~]", "?", scene.field.names[index])
         return Response(image, media_type="image/png", headers={"x-frame": name})
 
     @app.get("/healthz", summary="The fields and their frames")
     async def health() -> Response:
-        return _AsciiResponse({"status": "ok", "fields": [scene.description for scene in scenes.values()]})
+        return _AsciiResponse({"status": "ok", "fields": [describe_scene(scene) for scene in scenes.values()]})
 
     @app.get("/", include_in_schema=False)
     async def page() -> Response:

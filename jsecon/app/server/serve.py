@@ -24,7 +24,7 @@ from jsecon.app import verbs
 from jsecon.app.access import bracketed, listen, token_for
 from jsecon.app.models import OLD_FIELD, with_models
 from jsecon.app.server.api import application
-from jsecon.app.server.scenes import open_scenes
+from jsecon.app.server.scenes import describe_scene, open_scenes
 from jsecon.pipeline.progress import Console
 
 MAX_REQUESTS = 256
@@ -57,7 +57,7 @@ def prepare(
     options: dict[str, Any] = {"timeout_keep_alive": 5, "limit_concurrency": MAX_REQUESTS}
     config = uvicorn.Config(app, log_level="warning", ws="none", server_header=False, **options)
     address = f"http://{bracketed(host)}:{listening.getsockname()[1]}"
-    description = {"address": address, "fields": [scene.description for scene in scenes.values()]}
+    description = {"address": address, "fields": [describe_scene(scene) for scene in scenes.values()]}
     return description, lambda: uvicorn.Server(config).run(sockets=[listening])
 
 

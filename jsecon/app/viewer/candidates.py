@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jsecon.app.ask import narrow_texts, with_phrases
+from jsecon.app.object_index import choose_shades
 from jsecon.field.regions import mean_residuals
 from jsecon.field.similarity import similarities
 from jsecon.query.answer import ROUNDING, RULES
@@ -41,7 +41,7 @@ def candidates(field: LanguageField, embedder: Any, query: str | int, count: int
     """Finds the regions that are most similar to a text or a region, as queries weigh them (`view_count_weight`).
 
     Args:
-      field: The field.
+      field: The field (`Scene.text_field`).
       embedder: Its embedder.
       query: A text, of whose alternatives the most similar one counts; regions that match a text behind "but not"
         better are left out. Or the id of a region, which is compared by what sets regions apart from the scene.
@@ -53,22 +53,21 @@ def candidates(field: LanguageField, embedder: Any, query: str | int, count: int
     Raises:
       InputError: The embedder has no words for the text.
     """
-    if field.regions.count == 0:
+    if field.regions.count == 0 or (isinstance(query, int) and query >= field.regions.count):
         return []
     table = jnp.asarray(field.regions.embeddings)
     weight = np.asarray(_view_count_weight(jnp.asarray(field.regions.pixel_counts)))
     if isinstance(query, str):
-        field = with_phrases(field, embedder)
         words = unrelated_words(field)
         weight = np.ones_like(weight) if words is None else weight  # the plain cosine ranks without weights
-        included, excluded = (narrow_texts(field, embedder, texts, RULES, every=True) for texts in parse_query(query))
+        included, excluded = (choose_shades(field, embedder, texts, RULES, every=True) for texts in parse_query(query))
         texts = jnp.asarray(embedder.embed_text(included + excluded))
         matches = [_similarities(table, text, words, RULES.retrieval) for text in texts]
         scores = np.stack([score for score, _ in matches])
         score = scores[: len(included)].max(0)
         known = matches[0][1] & (score > scores[len(included) :].max(0, initial=-np.inf) + ROUNDING)
     else:
-        score, known = (np.array(a) for a in _region_similarity(table, min(query, field.regions.count - 1)))
+        score, known = (np.array(a) for a in _region_similarity(table, query))
         known[query : query + 1] = False
     weighted = np.where(known, np.where(score > 0, score * weight, score), -np.inf)
     order = [r for r in np.argsort(-weighted, kind="stable")[:count] if known[r]]

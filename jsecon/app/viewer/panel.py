@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from jsecon.app.ask import Answer
 from jsecon.app.pictures import fitted
+from jsecon.app.records import Answer
 from jsecon.app.report import data_uri
 from jsecon.app.viewer.candidates import Candidate
 from jsecon.app.viewer.view_state import COLOURINGS, MAX_SHELLS, ViewState, answer_colours, from_link
@@ -229,8 +229,8 @@ def messages(field: LanguageField, state: ViewState, answers: Sequence[Answer | 
         if isinstance(answer, InputError):
             lines.append(_box(f"{head}: {_error(answer)}"))
             continue
-        if answer.relation is not None:
-            lines.append(_box(f"{head}: {html.escape(answer.relation['description'])}"))
+        if answer.by == "relation":
+            lines.append(_box(f"{head}: {html.escape(answer.describe())}"))
             continue
         score = float(answer.selection.score)
         count = int(answer.mask.sum())

@@ -16,12 +16,11 @@ import numpy as np
 from jaxtyping import Float
 
 from jsecon.app import verbs
-from jsecon.app.ask import Answer
 from jsecon.app.models import open_embedder
 from jsecon.app.pictures import main_regions
-from jsecon.app.querying import ask_texts
+from jsecon.app.records import Answer
+from jsecon.app.scene import open_scene
 from jsecon.errors import InputError
-from jsecon.field.field import load_field
 from jsecon.files import write_text
 from jsecon.numerics import sigmoid
 from jsecon.pipeline.options import require_writable
@@ -57,13 +56,18 @@ def export_page(verb: verbs.View, file: Path, console: Console) -> verbs.VerbRes
         raise InputError("--export", f"{file} does not end in .html", remedy="For example: --export page.html")
     require_writable(file.parent)
     with console.progress("page"):
-        field = load_field(verb.field)
-        embedder = open_embedder(field, verb, console) if verb.texts else None
-        answers, errors = ask_texts(field, embedder, verb.texts, console)
-        write_text(file, page(field, answers, title=verb.field.resolve().parent.name))
-    count, size = field.gaussians.count, file.stat().st_size
+        scene = open_scene(verb.field, embedder=lambda field: open_embedder(field, verb, console))
+        if verb.texts:
+            _ = scene.embedder  # without it one error stands for all texts
+        results = scene.ask_all(verb.texts)
+        answers = [answer for answer in results if not isinstance(answer, InputError)]
+        errors = [error for error in results if isinstance(error, InputError)]
+        write_text(file, page(scene.field, answers, title=scene.name))
+    for answer in answers:
+        console.say(str(answer))
+    count, size = scene.field.gaussians.count, file.stat().st_size
     console.say(f"{count} Gaussians, texts answered: {len(answers)}, {size / 2**20:.1f} MiB  {file}")
-    texts = [answer.query for answer in answers]
+    texts = [str(answer.query) for answer in answers]
     return {"written": {"page": file}, "gaussians": count, "answers": texts, "bytes": size, "errors": errors}
 
 
@@ -92,7 +96,7 @@ def page(field: LanguageField, answers: Sequence[Answer], *, title: str) -> str:
     for answer in answers:
         mask = np.packbits(np.asarray(answer.mask)[drawn], bitorder="little").tobytes()
         score = float(answer.selection.score)
-        texts.append({"text": answer.query, "score": score, "mask": base64.b64encode(mask).decode()})
+        texts.append({"text": str(answer.query), "score": score, "mask": base64.b64encode(mask).decode()})
     scene = {
         "count": int(drawn.sum()),
         "regions": field.regions.count,

@@ -5,6 +5,7 @@ empty, so that a slider that moves faster than answers come skips what lies betw
 """
 
 import contextlib
+import dataclasses
 import functools
 import io
 import queue
@@ -21,12 +22,11 @@ import numpy as np
 
 from jsecon.app import verbs
 from jsecon.app.access import bracketed, guarded_pages, listen, token_for
-from jsecon.app.ask import Answer, ask_region, ask_text, edit_answers
 from jsecon.app.models import open_embedder
-from jsecon.app.object_scene import ObjectScene
-from jsecon.app.outputs import answer_masks, file_stem, write_answer
+from jsecon.app.outputs import file_stem, write_answer
 from jsecon.app.pictures import UNKNOWN, Renderer, palette
-from jsecon.app.relations import query_relation, relation_answer
+from jsecon.app.records import Answer, Region
+from jsecon.app.scene import Scene
 from jsecon.app.viewer import view_state
 from jsecon.app.viewer.candidates import Candidate, candidates, region_along
 from jsecon.app.viewer.panel import Panel, candidate_grid, messages
@@ -37,8 +37,7 @@ from jsecon.errors import InputError
 from jsecon.field.field import load_field
 from jsecon.pipeline.model_loading import ExternalSpace, external_dim
 from jsecon.pipeline.progress import Console
-from jsecon.query.edits import mutual_neighbours
-from jsecon.query.expressions import is_expression
+from jsecon.query.edits import grow, mutual_neighbours, shrink
 from jsecon.types import LanguageField
 
 REMEDY = 'Run: pip install "jsecon[viewer]". Or write a page with --export.'
@@ -89,9 +88,9 @@ class Viewer:
         return Renderer(self.field.gaussians, self.field.cameras)
 
     @functools.cached_property
-    def objects(self) -> ObjectScene:
-        """The field as relations read it."""
-        return ObjectScene(self.field, self.embedder)
+    def asked(self) -> Scene:
+        """The field as a scene that is asked."""
+        return Scene(self.field, self.embedder, name=self.name)
 
     @functools.cached_property
     def _neighbours(self) -> np.ndarray:
@@ -228,7 +227,7 @@ class Viewer:
         options["compression"] = zipfile.ZIP_DEFLATED
         with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(packed, "w", **options) as archive:
             for answer in answers:
-                write_answer(self.field, answer, Path(folder), answer_masks(self.field, answer, EXPORTED_MASKS))
+                write_answer(answer, self.asked, Path(folder), self.asked.masks(answer, EXPORTED_MASKS))
             for file in sorted(Path(folder).iterdir()):
                 archive.write(file, file.name)
         return packed.getvalue()
@@ -268,25 +267,22 @@ class Viewer:
 
     def _answer(self, query: ViewQuery) -> Answer | InputError:
         """Answers a query that is not among the last ones."""
-        options: dict[str, Any] = {"several": query.all_matches, "fragment_score": 1 - query.part_vs_whole}
+        question = query.query if isinstance(query.query, str) else Region(query.query)
+        options: dict[str, Any] = {"all_of_class": query.all_matches, "fragment_score": 1 - query.part_vs_whole}
         try:
-            if isinstance(query.query, str) and is_expression(query.query):
-                answer = relation_answer(query_relation(self.objects, query.query))
-            elif isinstance(query.query, str):
-                answer = ask_text(self.field, self.embedder, query.query, threshold=query.threshold, **options)
-            else:
-                answer = ask_region(self.field, query.query, threshold=query.threshold, **options)
-            if not query.shells:
+            answer = self.asked.ask(question, threshold=query.threshold, **options)
+            if not query.shells or not len(answer.rows):
                 return answer
-            shells: dict[str, Any] = {"grow": max(query.shells, 0), "shrink": max(-query.shells, 0)}
-            return edit_answers(self.field, [answer], near=self._neighbours, **shells)[0]
+            edit = grow if query.shells > 0 else shrink
+            mask = np.asarray(edit(answer.mask, self._neighbours, abs(query.shells)))
+            return dataclasses.replace(answer, mask=mask, selection=dataclasses.replace(answer.selection, mask=mask))
         except InputError as error:
             return error
 
     def _prepare_objects(self) -> None:
         """Measures the objects, so that the first relation is answered as fast as later ones."""
         with contextlib.suppress(InputError):  # an embedder without words: each text then has this error
-            self.objects.prepare()
+            self.asked.prepare()
 
     def _selection(self, query: ViewQuery) -> tuple[np.ndarray, np.ndarray]:
         """Returns mask (N,) and similarity (N,) of an answer; zeros for an error."""
@@ -339,9 +335,9 @@ class Viewer:
     def _find_candidates(self, state: ViewState, answers: Sequence[Answer | InputError]) -> list[tuple[int, Candidate]]:
         """Returns the index of a query with each of its candidates, for up to four queries."""
         count = 6 if len(answers) == 1 else 3
-        named = [isinstance(answer, Answer) and answer.relation is None for answer in answers]
+        named = [isinstance(answer, Answer) and answer.by != "relation" for answer in answers]
         queries = [(k, q) for k, q in enumerate(state.queries) if named[k]][:4]
-        return [(k, c) for k, query in queries for c in candidates(self.field, self.embedder, query, count)]
+        return [(k, c) for k, query in queries for c in candidates(self.asked.text_field, self.embedder, query, count)]
 
 
 def open_viewer(

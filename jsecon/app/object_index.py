@@ -1,0 +1,280 @@
+"""The objects of a field by name: what referring expressions such as "the red mug left of the bottle" choose from.
+
+The text is parsed (query/expressions), the regions of each named object are matched as any query does and their pieces
+joined, and conditions and orders choose among the objects (query/referring). Nothing is guessed: an answer is 0, 1 or
+several objects, with what came nearest or what would settle which is meant.
+"""
+
+import dataclasses
+import functools
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial import KDTree
+
+from jsecon.app.catalogue import Catalogue, region_objects
+from jsecon.app.records import Answer, Object, Query, gaussian_rows, rounded, world_scale
+from jsecon.field.columns import votes_of_rows
+from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction_of_regions
+from jsecon.query.answer import match_regions
+from jsecon.query.expressions import parse_expression
+from jsecon.query.grouping import join_fragments
+from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
+from jsecon.query.outliers import split_outliers
+from jsecon.query.referring import evaluate, stack_shapes
+from jsecon.query.relations import Viewpoint, order_values, viewpoint
+from jsecon.query.rules import QueryRules
+from jsecon.types import LanguageField, Selection
+from jsecon.views.frame import field_up
+
+ONE_WAY = 0.5
+"""length of the mean of the cameras' horizontal directions from which they look one way"""
+SAME_NAME = 1e-4
+"""cosine by which a name must be nearer to an object than the text, to fit it better"""
+MAX_KEPT = 1024
+"""number of phrases, and of objects, that are kept"""
+SEEN = ("left of", "right of", "in front of", "behind", "leftmost", "rightmost", "nearest", "farthest")
+"""relations and orders that depend on the viewpoint"""
+
+
+class ObjectIndex:
+    """The objects that phrases name, with their Gaussians, boxes and points. It keeps the last ones.
+
+    Args:
+      field: The field, with what texts are compared with.
+      embedder: Its embedder.
+      up: (3,) up axis in the capture's world; None finds it.
+      catalogue: Lists all objects with names, which tell objects of one name apart.
+    """
+
+    def __init__(
+        self, field: LanguageField, embedder: Any, up: Sequence[float | int] | None, catalogue: Callable[[], Catalogue]
+    ):
+        """Finds the up axis; objects are measured when they are first asked for."""
+        self.up = field_up(field, up)
+        regions = jax.tree.map(jnp.asarray, field.regions)  # on the device once, not for each phrase
+        reference = None if field.unrelated_words is None else jnp.asarray(field.unrelated_words)
+        cameras = jax.tree.map(np.asarray, field.cameras)  # on which jax would compile each step of a viewpoint
+        self._field = dataclasses.replace(field, regions=regions, unrelated_words=reference, cameras=cameras)
+        self._embedder = embedder
+        self._rules = QueryRules(all_of_class=True, logits=getattr(embedder, "logits", None))
+        self._catalogue = catalogue
+        self._votes = jax.tree.map(np.asarray, field.votes)
+        self._object = functools.lru_cache(MAX_KEPT)(self._measure_object)
+        self._objects_of = functools.lru_cache(MAX_KEPT)(self._find_objects)
+
+    def prepare(self) -> None:
+        """Measures the object of every region, so that the first questions are as fast as later ones."""
+        for group in join_fragments(range(self._field.regions.count), self._joined)[:MAX_KEPT]:
+            for regions in {(region,) for region in group} | {group}:
+                self._object(regions)
+        match_regions(self._field, self._field.regions.embeddings[:1], self._rules)  # compiles it
+        _ = self._catalogue(), self._names
+
+    def _find_objects(self, phrase: str) -> tuple[list[Object], float]:
+        """Finds the objects that a phrase names: regions that match it, those of one object joined.
+
+        These overlap, or are one object in the catalogue: the ends of a beam whose middle is hidden. Where a text is
+        the best name of some of the objects, the others do not count. The second value is the share of unrelated words
+        that are less similar to the scene than the phrase.
+        """
+        texts = choose_shades(self._field, self._embedder, [phrase], self._rules, every=True)
+        embedded = jax.device_put(self._embedder.embed_text(texts))
+        match = match_regions(self._field, embedded, self._rules)
+        regions = np.flatnonzero(np.asarray(match.chosen)) if int(match.region) >= 0 else np.zeros(0, int)
+        groups = self._best_named(texts, join_fragments(regions, self._joined))
+        made = [(group, self._object(group)) for group in groups]
+        return [Object(phrase, group, *parts) for group, parts in made if parts is not None], float(match.rank)
+
+    def _best_named(self, texts: Sequence[str], groups: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
+        """Keeps the objects that no other name of the vocabulary fits better than the text, if there are any.
+
+        "Orange" means the orange thing where there is a dark orange one too.
+        """
+        if len(texts) > 1 or len(groups) < 2 or self._names is None:
+            return groups
+        embeddings = np.asarray(self._field.regions.embeddings)
+        similarity = embeddings @ np.asarray(self._embedder.embed_text(list(texts)))[0]
+        fits = similarity >= (embeddings @ self._names.T).max(1) - SAME_NAME
+        return [group for group in groups if fits[list(group)].any()] or groups
+
+    @functools.cached_property
+    def _names(self) -> np.ndarray | None:
+        """(V, E) embeddings of the embedder's vocabulary, if it has one."""
+        names = getattr(self._embedder, "vocabulary", ())
+        return np.asarray(self._embedder.embed_text(list(names))) if names else None
+
+    @functools.cached_property
+    def _joined(self) -> np.ndarray:
+        """(R, R) overlap of the regions; 1 for those of one object."""
+        groups = region_objects(self._field, self.up)
+        same = (groups[:, None] == groups).astype(np.float32)
+        return same if self._votes.overlap is None else np.maximum(self._votes.overlap, same)
+
+    @functools.cached_property
+    def _voters(self) -> list[np.ndarray]:
+        """The Gaussians that have votes for each region, rising."""
+        regions = self._votes.regions
+        count = self._field.regions.count
+        owners = np.where((regions >= 0) & (regions < count), regions, count).ravel()
+        order = np.argsort(owners.astype(np.uint16 if count < 1 << 16 else np.int32), kind="stable")
+        ends = np.cumsum(np.bincount(owners, minlength=count + 1))[:count]
+        return np.split(order // regions.shape[1], ends)[:count]
+
+    def _measure_object(self, regions: tuple[int, ...]) -> tuple[np.ndarray, ObjectShapes] | None:
+        """Returns Gaussians and shape of the object of some regions; None if it has no Gaussian."""
+        voters = np.unique(np.concatenate([self._voters[region] for region in regions]))
+        share = inside_fraction_of_regions(votes_of_rows(self._votes, voters), regions)
+        rows, share = voters[share >= SHARE_THRESHOLD], share[share >= SHARE_THRESHOLD]
+        gaussians = gaussian_rows(dataclasses.replace(self._field.gaussians, sh=None), rows)
+        weight = share * self._votes.total[rows]
+        kept = split_outliers(gaussians.means, np.ones(len(rows), bool), keep="supported", weight=weight).mask
+        if not kept.any():
+            return None
+        gaussians = gaussian_rows(gaussians, kept)
+        spreads = gaussian_spreads(gaussians)
+        return rows[kept], object_shapes(gaussians.means, np.zeros(gaussians.count, int), self.up, spreads=spreads)
+
+    def _view(self, frame: int | None) -> tuple[Viewpoint, str]:
+        """From where directions are seen, and what that is in words.
+
+        Without a frame it is the mean camera, or the frame that shows most objects where the cameras look in all
+        directions.
+        """
+        cameras = self._field.cameras
+        if frame is None:
+            ahead = np.asarray(cameras.world_to_camera, np.float64)[:, 2, :3]
+            ahead = ahead - (ahead @ self.up)[:, None] * self.up
+            ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
+            mean = ahead.mean(0)
+            if np.linalg.norm(mean) >= ONE_WAY:
+                middle = np.asarray(cameras.centres, np.float64).mean(0)
+                return Viewpoint(middle, mean / np.linalg.norm(mean), self.up), "as seen from the mean of the cameras"
+            pixels = np.asarray(self._field.regions.pixel_counts, np.int64)
+            frame = int(np.lexsort((pixels.sum(0), (pixels > 0).sum(0)))[-1])
+        camera = jax.tree.map(np.asarray, cameras[frame])
+        return viewpoint(camera, self.up), f"as seen from {self._field.names[frame]}"
+
+    def answer(self, query: Query, frame: int | None) -> Answer:
+        """Finds the objects that a referring expression names, with directions as seen from a frame."""
+        expression = parse_expression(str(query))
+        view, words = self._view(frame)
+        readings = expression.readings()
+        outcomes = [evaluate(self._objects_of, expression.thing, reading, view) for reading in readings]
+        place = next((n for n, outcome in enumerate(outcomes) if outcome.chosen), 0)
+        best, others = outcomes[place], outcomes[place + 1 :]
+        chosen = {found.regions for found in best.chosen}
+        differing = [found for outcome in others for found in outcome.chosen if found.regions not in chosen]
+        question = ""
+        if best.undecided:
+            number = str(len(best.chosen)) if best.undecided is best.chosen else "which"
+            question = f"{number} {expression.thing.text!r}: {self._tell_apart(best.undecided, view)}?"
+        if not question and any({found.regions for found in other.chosen} not in (set(), chosen) for other in others):
+            first, second = expression.conditions
+            question = f"is it the {expression.thing.text} or the {first.anchors[-1].text} that is {second}?"
+        mask = np.zeros(self._field.gaussians.count, bool)
+        for found in best.chosen:
+            mask[found.rows] = True
+        region = best.chosen[0].regions[0] if len(best.chosen) == 1 else -1
+        score = best.chosen[0].score if best.chosen else 0.0
+        selection = Selection(
+            mask, mask.astype(np.float32), np.asarray(region, np.int32), np.asarray(score, np.float32)
+        )
+        return Answer(
+            query=query,
+            by="relation",
+            mask=mask,
+            selection=selection,
+            field=self._field,
+            count=len(best.chosen),
+            reason=best.reason,
+            objects=tuple(best.chosen),
+            reading=expression.describe(readings[place]),
+            viewpoint=words if expression.words & set(SEEN) else "",
+            used=tuple(best.used),
+            alternatives=tuple({found.regions: found for found in [*best.alternatives, *differing]}.values()),
+            question=question,
+        )
+
+    def _tell_apart(self, objects: Sequence[Object], view: Viewpoint) -> str:
+        """Says how objects of one name could be told apart: by what stands nearest to each, or from left to right."""
+        listed = self._catalogue()
+        same_regions = {int(listed.regions[region]) for found in objects for region in found.regions}
+        name_of = [str(name) for name in listed.names[:, 0]]
+        times = Counter(name_of)
+        marks = [
+            k
+            for k, name in enumerate(name_of)
+            if times[name] == 1 and k not in same_regions and not listed.surroundings[k]
+        ]
+        source_from_scene = np.asarray(self._field.source_from_scene, np.float64)
+        centers = np.stack(
+            [source_from_scene[:3, :3] @ found.shape.center[0] + source_from_scene[:3, 3] for found in objects]
+        )
+        if marks:
+            away = np.linalg.norm(centers[:, None] - np.asarray(listed.shapes.center)[marks], axis=2)
+            nearest = [name_of[marks[k]] for k in away.argmin(1)]
+            if len(set(nearest)) == len(nearest):
+                words = [f"the one near the {name}" for name in nearest]
+                return f"{', '.join(words[:-1])} or {words[-1]}"
+        bearing = order_values(stack_shapes(objects), view)["leftmost"]
+        places = ["the left one", *["a middle one"] * (len(objects) - 2), "the right one"]
+        words = [
+            f"{place} at ({', '.join(f'{x:.2f}' for x in centers[k])})" for place, k in zip(places, np.argsort(bearing))
+        ]
+        return f"{', '.join(words[:-1])} or {words[-1]}"
+
+    def distances(self, first: Object, second: Object) -> dict[str, float]:
+        """Distances of two objects in the capture's world; angle of the second above the horizontal, degrees."""
+        means = np.asarray(self._field.gaussians.means, np.float64)
+        surfaces = float(KDTree(means[first.rows]).query(means[second.rows])[0].min())
+        line = second.shape.center[0] - first.shape.center[0]
+        centers = float(np.linalg.norm(line))
+        way = line / max(centers, 1e-300)
+        reach = [
+            float(np.min(np.asarray(shape.half_size[0]) / np.maximum(np.abs(shape.axes[0].T @ way), 1e-12)))
+            for shape in (first.shape, second.shape)
+        ]
+        angle = float(np.degrees(np.arcsin(np.clip(way @ self.up, -1, 1))))
+        scale = world_scale(self._field)
+        lengths = scale * np.array([surfaces, centers, max(centers - sum(reach), 0.0)])
+        return dict(zip(("surfaces", "centers", "gap"), rounded(lengths, scale * centers))) | {"angle": round(angle, 2)}
+
+
+def choose_shades(
+    field: LanguageField, embedder: Any, texts: Sequence[str], rules: QueryRules, *, every: bool
+) -> list[str]:
+    """Replaces texts that no region matches by narrower ones that some region does.
+
+    Among colours "blue" is a family, and a room may have nothing of its typical colour but a dark and a light blue
+    thing. Each is far from the word and near to its own shade.
+
+    Args:
+      field: The field.
+      embedder: Its embedder. Its `narrower(text)`, if it has one, lists texts that name a part of what the text names.
+      texts: The texts.
+      rules: How texts match. Each of n narrower texts may lose to an n-th of the unrelated words that one may lose to.
+      every: Whether all narrower texts that match replace a text, instead of the best of them.
+    """
+    if not hasattr(embedder, "narrower"):
+        return list(texts)
+
+    def score(text: str, rules: QueryRules) -> float:
+        match = match_regions(field, jnp.asarray(embedder.embed_text([text])), rules)
+        return float(match.score) if int(match.region) >= 0 else -np.inf
+
+    replaced: list[str] = []
+    for text in texts:
+        narrower = embedder.narrower(text)
+        best: list[str] = []
+        if narrower and np.isinf(score(text, rules)):
+            # Of n attempts one succeeds by chance as often as one attempt that is n times as strict.
+            strict = dataclasses.replace(rules, min_rank=1 - (1 - rules.min_rank) / len(narrower))
+            scores = {option: score(option, strict) for option in narrower}
+            best = [option for option in sorted(narrower, key=scores.__getitem__) if scores[option] > -np.inf]
+        replaced.extend(best[0 if every else -1 :] or [text])
+    return replaced

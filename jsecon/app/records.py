@@ -1,0 +1,366 @@
+"""The records of asking: what a question is (`Query`), and what comes back (`Answer`).
+
+A question is a text, or one of four small records: `At` (a pixel), `Box`, `Mask` and `Region`. Every door of jsecon
+gives it to `Scene.ask`, and shows the `Answer`: its words (`str`), its record (`as_dict`), its place.
+"""
+
+import dataclasses
+import functools
+import hashlib
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jsecon.errors import InputError, require_one_of
+from jsecon.field.membership import probability_inside
+from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
+from jsecon.query.referring import FoundObject as Object
+from jsecon.query.rules import MIN_RANK
+from jsecon.splat.transform import transform_gaussians_float64
+from jsecon.types import Gaussians, LanguageField, Selection
+
+METHODS = ("votes", "code")
+"""how a region selects Gaussians: by their votes, or by their codes (the paper)"""
+
+
+@dataclasses.dataclass(frozen=True)
+class At:
+    """The pixel in column x and row y of a frame: selects the region that lies there."""
+
+    frame: int | str
+    """name, the end of a name, or index of the frame; "#10" is an index too"""
+    x: int
+    y: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Box:
+    """A box in a frame, its last column and row included: selects the regions that are seen by more than half in it."""
+
+    frame: int | str
+    x0: int
+    y0: int
+    x1: int
+    y1: int
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Mask:
+    """One object, outlined in one frame or several."""
+
+    frames: Mapping[int | str, np.ndarray | str | Path]
+    """frame -> (H, W) bool at the size of the field's frames, or an image file in which black is outside"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Region:
+    """A region of the field by its id."""
+
+    id: int
+
+
+Question: TypeAlias = str | At | Box | Mask | Region
+
+
+@dataclasses.dataclass(frozen=True)
+class Query:
+    """A question and how it is answered. Equal queries of one scene have equal answers.
+
+    A text with a relation, an order or a number is read by its own words: `frame` is for these texts alone, and the
+    other options are for all other questions.
+
+    Attributes:
+      question: A text, `At`, `Box`, `Mask` or `Region`. A text may be composite: `"red mug" or "bowl" but not
+        "handle"`; or tell things apart: "the red mug left of the bottle", "the second largest box". Words in quotes
+        are searched for as they stand.
+      by: How a region selects Gaussians, "votes" or "code".
+      threshold: Smallest similarity of a selected Gaussian; None takes 0.5 for votes and 0.9 for codes.
+      min_rank: Share of unrelated words that must be less similar to the scene than a text, else it has no match.
+      all_of_class: Whether to select all regions of the class, such as all chairs, instead of the best one.
+      fragment_score: How near to the question other fragments of the best region's object must be, 0 to 1; 1 adds none.
+        None takes 0.5 for texts and adds none to the region of a pixel or of an id.
+      outliers: Whether to drop the Gaussians that stand apart from the rest.
+      frame: Frame from which left, right, front and behind are seen. None takes the mean camera, or the frame that
+        shows most objects where the cameras look in all directions.
+
+    Raises:
+      InputError: A number is out of its range.
+      ValueError: `by` is unknown.
+    """
+
+    question: Question
+    by: str = "votes"
+    threshold: float | None = None
+    min_rank: float = MIN_RANK
+    all_of_class: bool = False
+    fragment_score: float | None = None
+    outliers: bool = True
+    frame: int | str | None = None
+
+    def __post_init__(self) -> None:
+        """Refuses numbers out of their ranges."""
+        require_one_of("query", self.by, METHODS, "'votes' is the default.")
+        low = -1 if self.by == "code" else 0
+        for name, value, least in (("threshold", self.threshold, low), ("min_rank", self.min_rank, 0)):
+            if value is not None and not least <= value <= 1:
+                raise InputError(
+                    name, f"{value:g}", f"a number from {least} to 1", f"Leave {name} out for the default."
+                )
+        if isinstance(self.question, Box | Mask) and self.by != "votes":
+            raise InputError(
+                "by", "a mask or a box selects by the outline alone", remedy="Leave it out, or ask a text."
+            )
+
+    def __str__(self) -> str:
+        """The text, or the name of a pixel, box, mask or region."""
+        question = self.question
+        if isinstance(question, str):
+            return question
+        if isinstance(question, Mask):
+            first = next(iter(question.frames.values()), "mask")
+            return Path(first).stem if isinstance(first, str | Path) else f"mask {next(iter(question.frames))}"
+        return " ".join(map(str, (type(question).__name__.lower(), *vars(question).values())))
+
+    @property
+    def key(self) -> str | None:
+        """What tells it from any other query in the names of its files; None for a text, which does so itself."""
+        if isinstance(self.question, Mask):
+            parts = [str(part) for pair in self.question.frames.items() for part in _names(*pair)]
+            return "\0".join(("mask", *parts))
+        return None if isinstance(self.question, str) else str(self)
+
+
+def _names(frame: int | str, mask: np.ndarray | str | Path) -> tuple[int | str, str]:
+    """A frame and the path of its mask, or the digest of an array."""
+    return frame, str(mask) if isinstance(mask, str | Path) else hashlib.sha256(np.asarray(mask).tobytes()).hexdigest()
+
+
+@dataclasses.dataclass(frozen=True)
+class Answer:
+    """What a query selects of a field of N Gaussians. `str` of it is the line that the command line prints.
+
+    Attributes:
+      query: The query, with the names of its frames.
+      by: "votes" or "code"; "outline" for a box or masks; "relation" for a text that tells things apart.
+      mask: (N,) bool, the selected Gaussians, without outliers.
+      selection: The Gaussians before outliers were dropped, with similarity, best region (-1 for none) and score.
+      field: The field.
+      count: Number of separate objects: 0 if nothing is selected, and 1 where the selection does not tell.
+      reason: Why nothing is selected, or not the number that the text says; "" if there is nothing to say.
+      clusters: Number of clusters that DBSCAN kept and dropped, (0, 0) if it was not needed.
+      skipped: Part of the work -> why it was not needed.
+      objects: With by="relation", the objects that the text names, best first.
+      reading: With by="relation", how the text was read; else "".
+      viewpoint: From where directions were seen; "" if nothing depends on it.
+      used: The objects that `objects` were compared with.
+      alternatives: Other objects of the name, best first.
+      question: What would settle which object is meant; "" if nothing has to be.
+    """
+
+    query: Query
+    by: str
+    mask: np.ndarray = dataclasses.field(repr=False)
+    selection: Selection = dataclasses.field(repr=False)
+    field: LanguageField = dataclasses.field(repr=False)
+    count: int = 1
+    reason: str = ""
+    clusters: tuple[int, int] = (0, 0)
+    skipped: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    objects: tuple[Object, ...] = ()
+    reading: str = ""
+    viewpoint: str = ""
+    used: tuple[Object, ...] = ()
+    alternatives: tuple[Object, ...] = ()
+    question: str = ""
+
+    @functools.cached_property
+    def rows(self) -> np.ndarray:
+        """(M,) ids of the selected Gaussians, rising."""
+        return np.flatnonzero(self.mask)
+
+    @functools.cached_property
+    def points(self) -> Float[np.ndarray, "m 3"]:
+        """(M, 3) float64 centres of the selected Gaussians in the capture's world."""
+        source_from_scene = np.asarray(self.field.source_from_scene, np.float64)
+        means = np.asarray(self.field.gaussians.means)[self.rows].astype(np.float64)
+        return means @ source_from_scene[:3, :3].T + source_from_scene[:3, 3]
+
+    @functools.cached_property
+    def place(self) -> ObjectShapes:
+        """Oriented box, box along the axes and points of the selection, in the capture's world and its unit.
+
+        `center` is the middle of the oriented box. It lies nearer to the middle of a thing that is seen from one side
+        than the mean of the points: views from above see more of its top.
+
+        Raises:
+          InputError: No Gaussian is selected.
+        """
+        if not len(self.rows):
+            problem = self.reason or f"no Gaussian is selected (score {float(self.selection.score):.3f})"
+            raise InputError(f"query {str(self.query)!r}", problem, remedy="Ask with other words, or by a pixel.")
+        plain = dataclasses.replace(self.field.gaussians, sh=self.field.gaussians.sh[:, :1])  # the place has no colours
+        selected = transform_gaussians_float64(gaussian_rows(plain, self.rows), self.field.source_from_scene)
+        return object_shapes(self.points, np.zeros(len(self.rows), int), spreads=gaussian_spreads(selected))[0]
+
+    @property
+    def rank(self) -> float | None:
+        """Share of unrelated words that are less similar to the scene than the text; None if it is unknown."""
+        return _known(self.selection.rank)
+
+    @property
+    def confidence(self) -> float | None:
+        """Estimated probability that the answer shows what the text names; None if it is unknown."""
+        return _known(self.selection.confidence)
+
+    @property
+    def presence(self) -> float | None:
+        """Probability that the text is true of the best region; None for embedders without `Logits`."""
+        return _known(self.selection.presence)
+
+    @property
+    def outliers(self) -> dict[str, int]:
+        """Numbers of selected Gaussians, of those that were dropped, and of clusters that were kept and dropped."""
+        selected = int(np.asarray(self.selection.mask).sum())
+        kept, dropped = self.clusters
+        counts = {"dropped": selected - len(self.rows), "selected": selected}
+        return counts | {"clusters_kept": kept, "clusters_dropped": dropped}
+
+    def as_dict(self) -> dict[str, Any]:
+        """The record of the answer as plain values for JSON, in the capture's world: the same at every door."""
+        region = int(self.selection.region)
+        probability = {} if self.presence is None else {"presence": self.presence}
+        if len(self.rows) and self.by == "votes":
+            inside = probability_inside(self.selection.similarity, self.field.votes, self.mask)
+            probability["mean"] = round(float(inside.mean()), 4)
+            probability["percentile_10"] = round(float(np.quantile(inside, 0.1)), 4)
+        record = {
+            "query": str(self.query),
+            "by": self.by,
+            "count": len(self.rows),
+            "gaussians": self.field.gaussians.count,
+            "objects": self.count,
+            "score": round(float(self.selection.score), 6),
+            "rank": self.rank,
+            "confidence": self.confidence,
+            "region": region if region >= 0 else None,
+            "probability": probability or None,
+            "outliers": self.outliers,
+            "place": self._place_record() if len(self.rows) else None,
+            "reason": self.reason,
+            "skipped": dict(self.skipped),
+        }
+        if self.by != "relation":
+            return record
+        groups = {name: [self._object_record(found) for found in getattr(self, name)]
+                  for name in ("objects", "used", "alternatives")}  # fmt: skip
+        relation = {"reading": self.reading, "viewpoint": self.viewpoint, "ambiguous": bool(self.question)}
+        return record | {"relation": relation | {"question": self.question} | groups}
+
+    def _place_record(self) -> dict[str, Any]:
+        """The place as plain values: mean and box of the centres, and the oriented box."""
+        low, high = self.points.min(0), self.points.max(0)
+        size = float(np.linalg.norm(high - low))
+        oriented = {"center": self.place.center, "extent": 2 * self.place.half_size}
+        return {
+            "centroid": rounded(self.points.mean(0), size),
+            "bounding_box": {"min": rounded(low, size), "max": rounded(high, size)},
+            **{name: rounded(values, size) for name, values in oriented.items()},
+            "axes": np.round(self.place.axes, 6).tolist(),
+        }
+
+    def _object_record(self, found: Object) -> dict[str, Any]:
+        """An object as plain values."""
+        source_from_scene = np.asarray(self.field.source_from_scene, np.float64)
+        size = 2 * world_scale(self.field) * np.asarray(found.shape.half_size[0])
+        length = float(np.linalg.norm(size))
+        return {
+            "phrase": found.phrase,
+            "regions": list(found.regions),
+            "gaussians": len(found.rows),
+            "center": rounded(source_from_scene[:3, :3] @ found.shape.center[0] + source_from_scene[:3, 3], length),
+            "size": rounded(size, length),
+            "score": round(found.score, 4),
+            "conditions": found.conditions,
+        }
+
+    def describe(self) -> str:
+        """The answer in words, without the query's name: what was read, counts, score and place."""
+        if self.by == "relation":
+            names = sorted({found.phrase for found in self.objects})
+            number = f"{self.count} object{'s' * (self.count != 1)}{f' ({names[0]})' if names else ''}"
+            seen = f", {self.viewpoint}" if self.viewpoint else ""
+            sentences = [f"read as {self.reading}{seen}: {number}", self.reason.rstrip("."), self.question]
+            return ". ".join(filter(None, [*sentences, self._counts()]))
+        return self._counts()
+
+    def _counts(self) -> str:
+        """Counts, score and place, separated by commas."""
+        region = int(self.selection.region)
+        parts = [f"{len(self.rows)} of {self.field.gaussians.count} Gaussians"]
+        parts += [f"{self.count} objects"] if self.count > 1 else []
+        if self.by != "relation":
+            parts.append(f"score {float(self.selection.score):.3f}")
+            parts += [self.rank_words] if self.rank_words else []
+            if self.confidence is not None and region >= 0:
+                parts.append(f"confidence {int(100 * self.confidence)} %")
+        if region >= 0:
+            parts.append(f"region {region}")
+        elif "regions" in self.skipped:
+            parts.append("parts in place of a region")
+        elif self.by in METHODS:
+            parts.append(self.reason or "no region matches it")
+        if not len(self.rows):
+            return ", ".join([*parts, "no Gaussian is selected"])
+        digits = decimals(float(np.linalg.norm(np.ptp(self.points, axis=0))), 0.01)
+        centroid = ", ".join(f"{coordinate:.{digits}f}" for coordinate in self.points.mean(0))
+        return ", ".join([*parts, f"around ({centroid})"])
+
+    @property
+    def rank_words(self) -> str:
+        """The rank in words, in whole percent and rounded down; "" if it is unknown."""
+        known = self.rank is not None
+        return f"more similar than {int(100 * self.rank + 1e-6)} % of unrelated words" if known else ""
+
+    @property
+    def outlier_words(self) -> str:
+        """What DBSCAN dropped, in a sentence; "" if it dropped no Gaussian."""
+        counts = self.outliers
+        if not counts["dropped"]:
+            return ""
+        many = counts["clusters_dropped"]
+        clusters = f", {many} smaller cluster{'s' if many > 1 else ''} among them" if many else ""
+        return f"{counts['dropped']} of {counts['selected']} selected Gaussians stand apart and were dropped{clusters}"
+
+    def __str__(self) -> str:
+        """The line that the command line prints."""
+        return f"{str(self.query)!r}: {self.describe()}"
+
+
+def _known(value: Any) -> float | None:
+    """A number to four digits; None for None and NaN."""
+    return None if value is None or np.isnan(value) else round(float(value), 4)
+
+
+def gaussian_rows(gaussians: Gaussians, rows: np.ndarray | Bool[np.ndarray, " n"]) -> Gaussians:
+    """Takes some of the Gaussians, by their ids or a mask, as NumPy arrays."""
+    return jax.tree.map(lambda column: np.asarray(column)[np.asarray(rows)], gaussians)
+
+
+def world_scale(field: LanguageField) -> float:
+    """Units of the capture's world per unit of the field's."""
+    return float(np.cbrt(abs(np.linalg.det(np.asarray(field.source_from_scene, np.float64)[:3, :3]))))
+
+
+def decimals(size: float, part: float) -> int:
+    """Decimals that show differences of `part` of a thing's size; 6 for a size of 0 or one that is not finite."""
+    return max(0, math.ceil(-math.log10(size * part))) if size > 0 and math.isfinite(size) else 6
+
+
+def rounded(values: np.ndarray, size: float) -> list[float]:
+    """Rounds coordinates of a thing to a millionth of its size, with six decimals or more."""
+    return np.round(np.asarray(values, np.float64), max(6, decimals(size, 1e-6))).tolist()

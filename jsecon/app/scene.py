@@ -1,0 +1,710 @@
+"""A scene that is asked: `open_scene(path)`, and `Scene.ask`, the one way from a question to its answer.
+
+Every door (command line, viewer, server, tools of language models, notebook, evaluation) opens a `Scene`, gives it a
+`Query`, and shows the `Answer`. The rules are here and below: how a text is read, shades of colours, refusal, outliers,
+frames and units.
+"""
+
+import dataclasses
+import functools
+import re
+import threading
+from collections import OrderedDict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from jsecon.app.catalogue import Catalogue, objects
+from jsecon.app.object_index import ObjectIndex, choose_shades
+from jsecon.app.records import Answer, Box, Mask, Query, Question, Region
+from jsecon.errors import InputError
+from jsecon.field.columns import is_mapped
+from jsecon.field.field import check_field, load_field, subset_field
+from jsecon.field.membership import SHARE_THRESHOLD
+from jsecon.field.regions import ALIKE_THRESHOLD
+from jsecon.pipeline.options import Options, is_bare_scene
+from jsecon.pipeline.progress import Listener
+from jsecon.process import MEMORY, memory_budget
+from jsecon.query.answer import (
+    NO_REGIONS,
+    ONE_REGION,
+    RegionMatch,
+    Trimmed,
+    answer_region,
+    answer_texts,
+    match_region,
+    match_regions,
+    trim,
+)
+from jsecon.query.composite import parse_query
+from jsecon.query.expressions import is_expression
+from jsecon.query.outline import box_mask, lift
+from jsecon.query.pixel import region_at
+from jsecon.query.render import selection_mask
+from jsecon.query.rules import QueryRules
+from jsecon.query.select import CODE_THRESHOLD, select_by_code
+from jsecon.read.captures.capture import has_depth
+from jsecon.read.captures.images import read_pixels
+from jsecon.read.masks.masks import resize_nearest
+from jsecon.read.splats.files import save_gaussians
+from jsecon.read.splats.ply import save_ply
+from jsecon.types import LanguageField
+
+FIELD_FILE = "field.safetensors"
+CACHED_BYTES = 1 << 28
+"""bytes of the answers that a scene keeps, of five bytes a Gaussian each"""
+PARTS_ANSWER = "no region holds the object, so the parts that match the text were selected"
+"""why a text is answered by parts"""
+MIN_BLOCK_ROWS = 1 << 12
+"""rows of an answer to a mapped field are padded to powers of two from here on, so that few sizes are compiled"""
+
+
+def open_scene(
+    path: str | Path,
+    *,
+    embedder: Any = None,
+    up: Sequence[float | int] | None = None,
+    out: str | Path | None = None,
+    listener: Listener | None = None,
+) -> "Scene":
+    """Opens a field, or a file of Gaussians, to be asked.
+
+    Args:
+      path: A field file, a folder with field.safetensors, or a file of Gaussians without photographs (.ply, .spz ...),
+        of which a field is made once, as `jsecon query scene.ply` does.
+      embedder: What embeds texts: an embedder, a folder or a name of a CLIP model that is on this machine, or a
+        function that returns an embedder for a field when the first text is asked. None takes the model that the field
+        was made with.
+      up: Up axis of the capture's world, three numbers. None takes that of the cameras, or the normal of the ground.
+      out: Folder for the field of a file of Gaussians; by default NAME_field beside NAME.ply.
+      listener: Receives the progress where a field is made.
+
+    Returns:
+      The scene. A field of more than the memory budget (JSECON_MEMORY, GiB) stays on disk and is read in blocks, with
+      the same answers.
+
+    Raises:
+      InputError: The file cannot be read, or the model is not on this machine.
+    """
+    file = Path(path)
+    model = _model_folder(embedder) if isinstance(embedder, str | Path) else None
+    if is_bare_scene(file):
+        folder = file.with_name(f"{file.stem}_field") if out is None else Path(out)
+        axis: Any = None if up is None else tuple(map(float, up))
+        file = _field_of_gaussians(Options(file, embedder=model, up=axis), folder, listener or Listener())
+    elif file.is_dir():
+        file = file / FIELD_FILE
+    large = file.is_file() and file.stat().st_size > memory_budget()
+    if large:
+        check_field(file)
+    field = load_field(file, mapped=large)
+    if isinstance(embedder, str | Path):
+        from jsecon.pipeline.model_loading import field_embedder
+
+        embedder = field_embedder(field, model)
+    file = file.resolve()
+    return Scene(field, embedder, up=up, name=file.parent.name if file.name == FIELD_FILE else file.stem)
+
+
+def _model_folder(model: str | Path) -> Path:
+    """The folder of a model by its name, address or path."""
+    from jsecon.networks.hub import parse_model
+
+    known = parse_model(Path(model).as_posix(), "embedder", None)
+    if isinstance(known, Path):
+        return known
+    if known.cached_folder is None:
+        raise InputError(known.address, "not on this machine", remedy=f"Fetch it with: {known.get_command}.")
+    return known.cached_folder
+
+
+def _field_of_gaussians(options: Options, folder: Path, listener: Listener) -> Path:
+    """Finds the field of a file of Gaussians in a folder, or makes it there.
+
+    Without a model of its own the options take that of the field which is there.
+    """
+    from jsecon.pipeline import run as pipeline  # late: questions to a field need none of it
+
+    with listener.progress("plan"):
+        path = pipeline.current_field(options, folder)
+        if path is None and options.embedder is None and (folder / FIELD_FILE).is_file():
+            options = dataclasses.replace(options, embedder=_model_of(folder / FIELD_FILE))
+            path = pipeline.current_field(options, folder)
+    if path is None:
+        pipeline.run(options, folder, listener=listener)
+        path = folder / FIELD_FILE
+        listener.say(f"field   {path}")
+    return path
+
+
+def _model_of(file: Path) -> Path | None:
+    """The folder of the model that a field was made with, if it is on this machine."""
+    from jsecon.networks.hub import HubModel, parse_model
+    from jsecon.pipeline.sources import locate_sources
+
+    try:
+        sources = locate_sources(load_field(file, mapped=True))
+    except InputError:  # damaged: it is made anew
+        return None
+    model = None if sources.address is None else parse_model(sources.address, "embedder", sources.precision)
+    return model.cached_folder if isinstance(model, HubModel) else sources.model
+
+
+class Scene:
+    """A field that is asked. Its methods may be called from several threads: one computes at a time.
+
+    It keeps the last answers and what it has measured of objects, within fixed bounds. Answers hold a boolean and a
+    number for each Gaussian of the field.
+
+    Args:
+      field: The field. One from `load_field(mapped=True)` is read in blocks; boxes, masks and relations need all of it
+        in memory.
+      embedder: Its embedder, or a function that makes one of the field; None opens it when a text needs it.
+      up: Up axis of the capture's world; None finds it.
+      name: Name of the scene.
+
+    Attributes:
+      field: The field.
+      name: Name of the scene.
+    """
+
+    def __init__(
+        self,
+        field: LanguageField,
+        embedder: Any = None,
+        *,
+        up: Sequence[float | int] | None = None,
+        name: str = "scene",
+    ):
+        self.field = field
+        self.name = name
+        self._embedder = embedder
+        self._up = up
+        self._lock = threading.RLock()
+        self._answers: OrderedDict[Query, Answer] = OrderedDict()
+        self._cameras = jax.tree.map(np.asarray, field.cameras)  # whose items need no compilation
+
+    @functools.cached_property
+    def embedder(self) -> Any:
+        """The embedder of texts, which is opened when it is first used.
+
+        Raises:
+          InputError: The model is not on this machine, or is another one.
+        """
+        with self._lock:
+            if self._embedder is None:
+                from jsecon.pipeline.model_loading import field_embedder
+
+                return field_embedder(self.field)
+            return self._embedder if hasattr(self._embedder, "embed_text") else self._embedder(self.field)
+
+    @functools.cached_property
+    def text_field(self) -> LanguageField:
+        """The field with canonical phrases, and with unrelated words in the embedder's templates if it has any."""
+        field, embedder = self.field, self.embedder
+        has_templates = getattr(embedder, "templates", ("{}",)) != ("{}",)
+        if len(field.canonical_phrases) and (field.unrelated_words is None or not has_templates):
+            return field
+        reference = None if field.unrelated_words is None else getattr(embedder, "unrelated_words", None)
+        canonical = (
+            field.canonical_phrases
+            if len(field.canonical_phrases)
+            else np.asarray(embedder.canonical_phrases, np.float32)
+        )
+        reference = field.unrelated_words if reference is None else np.asarray(reference, np.float16)
+        return dataclasses.replace(field, canonical_phrases=canonical, unrelated_words=reference)
+
+    @functools.cached_property
+    def _index(self) -> ObjectIndex:
+        """The objects that phrases name, with their shapes."""
+        self._require_memory("a relation, an order or a number")
+        if self.field.regions.count == 0:
+            raise InputError("field", "it has no regions, so no objects", remedy="Make it again with other --masks.")
+        return ObjectIndex(self.text_field, self.embedder, self._up, self.objects)
+
+    def _require_memory(self, what: str) -> None:
+        """Raises InputError if the field is mapped, which `what` needs in memory."""
+        if is_mapped(self.field):
+            size = sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(self.field)) / 2**30
+            budget = memory_budget() / 2**30
+            problem = f"the field has {size:.3g} GiB, memory has room for {budget:.3g}, and {what} needs all of it"
+            remedy = f"Ask a plain text or a pixel, or set {MEMORY}={1.1 * size:.2g} (GiB) to read it whole."
+            raise InputError(f"scene {self.name}", problem, remedy=remedy)
+
+    def ask(self, question: Question | Query, **options: Any) -> Answer:
+        """Answers a question.
+
+        Args:
+          question: A text, `At`, `Box`, `Mask` or `Region`; or a `Query`, which has its options.
+          **options: Options of `Query` for a question: by, threshold, min_rank, all_of_class, fragment_score, outliers,
+            frame.
+
+        Returns:
+          The answer. Its mask is empty if the scene does not have what the question names; `reason` and `str` say why.
+
+        Raises:
+          InputError: The question cannot be answered: the embedder has no words for a text, the field has no such frame
+            or pixel, no region lies at a pixel, or an option is out of its range.
+        """
+        query = question if isinstance(question, Query) else Query(question, **options)
+        answer = self.known(query)
+        if answer is not None:
+            return answer
+        with self._lock:
+            answer = self.known(query) or self._answer(query)
+            if not isinstance(query.question, Mask):  # an array may change
+                self._answers[query] = answer
+            while len(self._answers) > max(CACHED_BYTES // (5 * max(self.field.gaussians.count, 1)), 1):
+                self._answers.popitem(last=False)
+        return answer
+
+    def ask_all(self, questions: Sequence[Question | Query], **options: Any) -> list[Answer | InputError]:
+        """Answers several questions. Equal ones are answered once.
+
+        Args:
+          questions: As for `ask`.
+          **options: Options of `Query` for questions that are none.
+
+        Returns:
+          For each question in turn its answer, or the error that it ends in.
+
+        Raises:
+          InputError: An option is out of its range.
+        """
+        queries = [query if isinstance(query, Query) else Query(query, **options) for query in questions]
+        results: dict[Query, Answer | InputError] = {}
+        for query in dict.fromkeys(queries):
+            try:
+                results[query] = self.ask(query)
+            except InputError as error:
+                results[query] = error
+        return [results[query] for query in queries]
+
+    def known(self, query: Query) -> Answer | None:
+        """The answer to a query if it is among the last ones, without waiting for what is computed; else None."""
+        return self._answers.get(query)
+
+    def _answer(self, query: Query) -> Answer:
+        """Answers a query that is not among the last ones."""
+        question = query.question
+        if query.by == "code" and self.field.codes is None:
+            raise InputError("", "This field has no codes", remedy="Run jsecon run --paper, or ask by votes.")
+        if isinstance(question, str):
+            return self.relate(question, frame=query.frame) if is_expression(question) else self._answer_text(query)
+        if isinstance(question, Box | Mask):
+            return self._answer_outline(query, question)
+        if isinstance(question, Region):
+            return self._answer_region(query, question.id, "the region is the query")
+        index = self.frame_index(question.frame)
+        name = self.field.names[index]
+        region = region_at(self.field, index, question.x, question.y)
+        if region < 0:
+            problem = f"no region lies under column {question.x}, row {question.y}"
+            remedy = "Choose another pixel or frame: report.html of the run shows the regions."
+            raise InputError(f"frame {name}", problem, remedy=remedy)
+        query = dataclasses.replace(query, question=dataclasses.replace(question, frame=name))
+        return self._answer_region(query, region, "the region under the pixel is the query")
+
+    def _answer_text(self, query: Query) -> Answer:
+        """Selects the Gaussians that a text names."""
+        field, embedder = self.text_field, self.embedder
+        included, excluded = parse_query(str(query))
+        rules = self._rules(query, QueryRules())
+        included = choose_shades(field, embedder, included, rules, every=query.all_of_class or bool(excluded))
+        excluded = choose_shades(field, embedder, excluded, rules, every=True)
+        if query.by == "code" and (query.all_of_class or len(included + excluded) > 1):
+            problem = "codes cannot select several regions"
+            raise InputError(f"query {str(query)!r}", problem, remedy="Ask by votes, or for one thing.")
+        embedded = embedder.embed_text(included + excluded)  # NumPy's slices need no compilation
+        texts, without = jax.device_put((embedded[: len(included)], embedded[len(included) :]))
+        if query.by == "code":
+            return self._answer_by_code(query, match_regions(field, texts, rules), {})
+        found = answer_texts(field, texts, rules, excluded=without, outliers=query.outliers)
+        return self._finish(query, found, {"regions": PARTS_ANSWER} if found.by_parts else {})
+
+    def _answer_region(self, query: Query, region: int, why: str) -> Answer:
+        """Selects the Gaussians of a region, and of those that the query's options add to it."""
+        rules = self._rules(query, ONE_REGION)
+        skipped = {"text encoder": why}
+        if query.by == "code":
+            return self._answer_by_code(query, match_region(self.field, region, rules), skipped)
+        found = answer_region(self.field, region, rules, outliers=query.outliers)
+        last = self.field.regions.count - 1
+        reason = "" if 0 <= region <= last else f"there is no region {region}: the regions are 0 to {last}"
+        return self._finish(query, found, skipped, reason)
+
+    def _rules(self, query: Query, rules: QueryRules) -> QueryRules:
+        """Rules with the options of a query."""
+        options: dict[str, Any] = {"min_rank": query.min_rank, "all_of_class": query.all_of_class}
+        if query.threshold is not None and query.by == "votes":
+            options["min_share"] = query.threshold
+        if query.fragment_score is not None:
+            options["fragment_score"] = query.fragment_score
+        if isinstance(query.question, str):
+            # Of an embedder trained to tell whether a text is true of an image; the cosines of all others only rank.
+            options["logits"] = getattr(self.embedder, "logits", None)
+        elif query.all_of_class:
+            options |= {"duplicate_cosine": ALIKE_THRESHOLD, "all_of_class": False}
+        return dataclasses.replace(rules, **options)
+
+    def _answer_by_code(self, query: Query, match: RegionMatch, skipped: dict[str, str]) -> Answer:
+        """Selects the Gaussians whose codes are close to that of the best region (the paper)."""
+        threshold = CODE_THRESHOLD if query.threshold is None else query.threshold
+        selection = select_by_code(self.field, match, threshold)
+        outliers = trim(self.field, selection, "supported" if query.outliers else None)
+        return self._finish(query, Trimmed(match, selection, outliers, 1), skipped)
+
+    def _answer_outline(self, query: Query, question: Box | Mask) -> Answer:
+        """Selects the object that a box or masks outline in frames."""
+        self._require_memory("an outline")
+        if isinstance(question, Box):
+            frame, *ends = vars(question).values()
+            index = self.frame_index(frame)
+            masks = {index: box_mask(self.field, *ends)}
+            question = dataclasses.replace(question, frame=self.field.names[index])
+        else:
+            given = {self.frame_index(frame): mask for frame, mask in question.frames.items()}
+            if len(given) < len(question.frames):
+                raise InputError("mask", "a frame has two masks", remedy="Give one mask of an object in each frame.")
+            masks = {index: self._read_mask(mask) for index, mask in given.items()}
+            question = Mask({self.field.names[index]: mask for index, mask in given.items()})
+        threshold = SHARE_THRESHOLD if query.threshold is None else query.threshold
+        stack = np.stack([np.asarray(mask).astype(int) for mask in masks.values()])
+        selection = lift(self.field, stack, list(masks), threshold=threshold)
+        outliers = trim(self.field, selection, "supported" if query.outliers else None)
+        query = dataclasses.replace(query, question=question)
+        found = Trimmed(NO_REGIONS, selection, outliers, 1)
+        return self._finish(query, found, {"text encoder": "the outline is the query"}, by="outline")
+
+    def _read_mask(self, mask: np.ndarray | str | Path) -> Bool[np.ndarray, "h w"]:
+        """A mask at the size of the field's frames, from an image file in which black is outside."""
+        if not isinstance(mask, str | Path):
+            return np.asarray(mask)
+        image = read_pixels(Path(mask))
+        width, height = self.field.cameras.width, self.field.cameras.height
+        inside = np.asarray(image[..., :3].any(-1) if image.ndim == 3 else image > 0, np.uint8)
+        if abs(inside.shape[1] * height - inside.shape[0] * width) > max(width, height) + max(inside.shape):
+            problem = f"the mask is {inside.shape[1]}x{inside.shape[0]}"
+            expected = f"{width}x{height}, or the same shape at another size"
+            raise InputError(mask, problem, expected, "Outline the frame as the run used it.")
+        return resize_nearest(inside, width, height) > 0
+
+    def _finish(
+        self, query: Query, found: Trimmed, skipped: dict[str, str], reason: str = "", by: str | None = None
+    ) -> Answer:
+        """The answer of a query whose Gaussians were selected and trimmed."""
+        outliers = found.outliers
+        return Answer(
+            query,
+            by or query.by,
+            outliers.mask,
+            jax.tree.map(np.asarray, found.selection),
+            self.field,
+            count=found.objects if outliers.mask.any() else 0,
+            reason=reason,
+            clusters=(outliers.clusters_kept, outliers.clusters_dropped),
+            skipped=skipped | ({"DBSCAN": outliers.skipped} if outliers.skipped else {}),
+        )
+
+    def relate(self, text: str, *, frame: int | str | None = None) -> Answer:
+        """Finds the objects that a text names and tells apart, such as "the red mug left of the bottle".
+
+        `ask` does so for texts with a relation, an order or a number; this reads any text so, as "red mugs".
+
+        Args:
+          text: The text.
+          frame: Frame from which left, right, front and behind are seen (`Query.frame`).
+
+        Returns:
+          The answer, with 0, 1 or several `objects`.
+
+        Raises:
+          InputError: The text is not understood, the field has no such frame or no regions, or the embedder has no
+            words for an object.
+        """
+        with self._lock:
+            return self._index.answer(Query(text, frame=frame), None if frame is None else self.frame_index(frame))
+
+    def locate(self, text: str, *, frame: int | str | None = None, relate: bool = False) -> Answer:
+        """Finds the one thing that a text names.
+
+        In five made-up rooms it finds all 60 things that have a unique name; the centre of their `place` is off by 5 mm
+        in the median (experiments/catalogue.py).
+
+        Args:
+          text: For example "orange ball" or "the red mug left of the bottle".
+          frame: As for `relate`.
+          relate: Whether to read any text as `relate` does.
+
+        Returns:
+          The answer, of one object.
+
+        Raises:
+          InputError: The text names no object, or several.
+        """
+        answer = self.relate(text, frame=frame) if relate else self.ask(text, frame=frame)
+        if answer.count != 1:
+            problem = f"it names {answer.count} objects" + (f": {answer.reason}" if answer.reason else "")
+            remedy = answer.question or "Say which, as in 'the red mug left of the green bottle', or point at it."
+            raise InputError(f"query {text!r}", problem, "one object", remedy[:1].upper() + remedy[1:])
+        return answer
+
+    def measure(self, a: str, b: str, *, frame: int | str | None = None) -> dict[str, Any]:
+        """Measures the distance between two objects.
+
+        Args:
+          a: Text that names the first object.
+          b: Text that names the second.
+          frame: As for `relate`.
+
+        Returns:
+          Plain values: the texts "a" and "b"; "surfaces", the smallest distance between Gaussians of the two;
+          "centers", that of the middles of their boxes; "gap", the free way between their boxes on the line between the
+          middles, 0 where they meet; "angle", degrees of the second above the horizontal as seen from the first; and
+          the "unit" of the lengths (`unit`).
+
+        Raises:
+          InputError: As for `relate`; or a text names no object, or several.
+        """
+        with self._lock:
+            first, second = (self.locate(text, frame=frame, relate=True).objects[0] for text in (a, b))
+            return {"a": a, "b": b} | self._index.distances(first, second) | {"unit": self.unit}
+
+    @functools.cached_property
+    def unit(self) -> str:
+        """Unit of the capture's world: "metres", or "capture units" where its scale is not known to be metres."""
+        from jsecon.pipeline.sources import locate_sources
+
+        capture = locate_sources(self.field).capture
+        return "metres" if capture is not None and has_depth(Path(capture)) else "capture units"
+
+    @functools.cached_property
+    def _catalogue(self) -> Catalogue:
+        return objects(self.field, None, self._embedder and self.embedder, up=self._up)
+
+    def objects(self, vocabulary: Sequence[str] | None = None) -> Catalogue:
+        """Lists the objects of the scene with names, boxes and sizes.
+
+        Args:
+          vocabulary: Names to choose from; None takes those of the embedder.
+
+        Returns:
+          The catalogue (`jsecon.objects`).
+
+        Raises:
+          InputError: The vocabulary is empty, or the embedder cannot represent a name.
+        """
+        with self._lock:
+            return (
+                self._catalogue if vocabulary is None else objects(self.field, vocabulary, self.embedder, up=self._up)
+            )
+
+    def prepare(self) -> None:
+        """Compiles what questions need, and measures all objects, so that the first question is as fast as later ones.
+
+        Raises:
+          InputError: The embedder has no words.
+        """
+        with self._lock:
+            self.mask(self.ask("red"), 0)
+            self._index.prepare()
+
+    def frame_index(self, frame: int | str) -> int:
+        """Finds a frame.
+
+        Args:
+          frame: Its name, the end of a name that no other name has, or its index, an integer or "#10".
+
+        Returns:
+          Its index.
+
+        Raises:
+          InputError: The field has no such frame, or several.
+        """
+        names = self.field.names
+        if isinstance(frame, str):
+            for name in (frame, Path(frame).stem):
+                if name in names:
+                    return names.index(name)
+            matches = [t for t, name in enumerate(names) if frame and name.endswith(frame)]
+            if len(matches) == 1:
+                return matches[0]
+            if len(matches) > 1:
+                problem = f"{len(matches)} frames have names that end so, such as {names[matches[0]]}"
+                raise InputError(f"frame {frame}", problem, remedy="Give more of the name.")
+        digits = re.fullmatch(r"#([0-9]{1,9})", frame) if isinstance(frame, str) else None
+        index = int(digits[1]) if digits else frame if isinstance(frame, int) and not isinstance(frame, bool) else -1
+        if 0 <= index < len(names):
+            return index
+        known = f"a name ({names[0]} ... {names[-1]}), the end of one, or a place, #0 to #{len(names) - 1}"
+        raise InputError(
+            f"frame {frame}", "no such frame in the field", known, "report.html of the run shows the frames."
+        )
+
+    def best_frames(self, answer: Answer, count: int) -> list[int]:
+        """Chooses the frames that show an answer best.
+
+        Args:
+          answer: The answer.
+          count: Maximum number of frames.
+
+        Returns:
+          Indices, best first: by the pixels of its region, or without a region by the centres in view.
+        """
+        region = int(answer.selection.region)
+        if region >= 0:
+            visible = np.asarray(self.field.regions.pixel_counts)[region]
+        else:
+            means = np.asarray(self.field.gaussians.means)[answer.rows]
+            cameras = self._cameras
+            pose = np.asarray(cameras.world_to_camera)
+            local = np.einsum("tij,nj->tni", pose[:, :3, :3], means) + pose[:, None, :3, 3]
+            z = np.where(local[..., 2] > 0, local[..., 2], np.nan)
+            u = cameras.fx[:, None] * local[..., 0] / z + cameras.cx[:, None]
+            v = cameras.fy[:, None] * local[..., 1] / z + cameras.cy[:, None]
+            visible = ((u >= 0) & (u < cameras.width) & (v >= 0) & (v < cameras.height)).sum(1)
+        order = np.argsort(-visible, kind="stable")[:count]
+        return [int(t) for t in order if visible[t] > 0]
+
+    def mask(self, answer: Answer, frame: int | str) -> Bool[np.ndarray, "h w"]:
+        """Renders an answer alone in a frame.
+
+        Args:
+          answer: The answer.
+          frame: Name or index of the frame.
+
+        Returns:
+          (H, W) bool, where its alpha is above 0.7.
+
+        Raises:
+          InputError: There is no such frame.
+        """
+        with self._lock:
+            gaussians, mask = self._device_gaussians, answer.mask
+            if gaussians is None:
+                rows = np.zeros(_padded(len(answer.rows), self.field.gaussians.count), np.int64)
+                rows[: len(answer.rows)] = answer.rows
+                mask = np.arange(len(rows)) < len(answer.rows)
+                gaussians = jax.device_put(subset_field(self.field, rows).gaussians)
+            return np.asarray(selection_mask(gaussians, self._cameras[self.frame_index(frame)], jnp.asarray(mask)))
+
+    def masks(self, answer: Answer, count: int) -> dict[int, Bool[np.ndarray, "h w"]]:
+        """Renders an answer alone in the frames that show it best.
+
+        Args:
+          answer: The answer.
+          count: Maximum number of frames.
+
+        Returns:
+          Index of a frame -> its `mask`, best first.
+        """
+        return {t: self.mask(answer, t) for t in self.best_frames(answer, count)}
+
+    @functools.cached_property
+    def _device_gaussians(self) -> Any:
+        """The Gaussians on jax's device; None for a mapped field."""
+        return None if is_mapped(self.field.gaussians) else jax.device_put(self.field.gaussians)
+
+    def render(self, frame: int | str, answer: Answer | None = None) -> UInt8[np.ndarray, "h w 3"]:
+        """Renders a frame of the scene.
+
+        Args:
+          frame: Name or index of the frame.
+          answer: Answer that is lit up in it.
+
+        Returns:
+          (H, W, 3) RGB.
+
+        Raises:
+          InputError: There is no such frame.
+        """
+        from jsecon.app import pictures
+
+        with self._lock:
+            photo = self._renderer.photo(self.frame_index(frame))
+            return photo if answer is None else pictures.selection_overlay(photo, self.mask(answer, frame))
+
+    @functools.cached_property
+    def _renderer(self) -> Any:
+        from jsecon.app.pictures import Renderer
+
+        mapped = self._device_gaussians is None
+        gaussians = self.field.gaussians if mapped else self._device_gaussians
+        return Renderer(gaussians, self._cameras, in_blocks=mapped)
+
+    def export(
+        self,
+        file: str | Path,
+        answer: Answer | None = None,
+        *,
+        without: bool = False,
+        object_ids: np.ndarray | None = None,
+    ) -> int:
+        """Writes Gaussians in the world of the capture's files, in blocks, so that a mapped field need not fit memory.
+
+        Args:
+          file: The .ply, .spz or .glb to write. A .glb also holds regions, and codes if the field has them.
+          answer: Answer whose Gaussians are written; None writes the whole scene.
+          without: Write all Gaussians but those of the answer.
+          object_ids: (N,) int ids of all Gaussians for the property object_id of a .ply (`Catalogue.labels`).
+
+        Returns:
+          Number of Gaussians written.
+
+        Raises:
+          InputError: The file cannot be written.
+        """
+        rows = None
+        if answer is not None:
+            rows = np.flatnonzero(~answer.mask) if without else answer.rows
+        return export_rows(self.field, Path(file), rows, object_ids)
+
+
+def locate(
+    scene: Scene | LanguageField, text: str, *, frame: int | str | None = None, up: Sequence[float | int] | None = None
+) -> Answer:
+    """Finds the one thing that a text names, as `Scene.locate` does.
+
+    Args:
+      scene: The scene, or a field.
+      text: For example "orange ball" or "the red mug left of the bottle".
+      frame: Frame from which left, right, front and behind are seen.
+      up: Up axis of a field's world; None finds it.
+
+    Returns:
+      The answer, of one object: see its `place`.
+
+    Raises:
+      InputError: The text names no object, or several.
+    """
+    return (scene if isinstance(scene, Scene) else Scene(scene, up=up)).locate(text, frame=frame)
+
+
+def _padded(count: int, most: int) -> int:
+    """A power of two of at least `count` and MIN_BLOCK_ROWS rows, at most `most`."""
+    return min(max(1 << max(count - 1, 0).bit_length(), MIN_BLOCK_ROWS), most)
+
+
+def export_rows(
+    field: LanguageField, file: Path, rows: np.ndarray | None = None, object_ids: np.ndarray | None = None
+) -> int:
+    """Writes Gaussians of a field in the capture's world; `rows` None is all. Returns their number."""
+    if rows is not None:
+        field = subset_field(field, rows)
+        object_ids = None if object_ids is None else object_ids[rows]
+    if file.suffix.lower() == ".ply":
+        save_ply(file, field.gaussians, similarity=field.source_from_scene, object_ids=object_ids)
+    else:
+        from jsecon.app.pictures import main_regions
+
+        columns: dict[str, Any] = {}
+        if file.suffix.lower() == ".glb":
+            codes = None if field.codes is None else field.codes.gaussians
+            columns = {"codes": codes, "regions": main_regions(field)}
+        save_gaussians(file, field.gaussians, similarity=field.source_from_scene, **columns)
+    return field.gaussians.count
