@@ -21,12 +21,13 @@ from experiments.rooms import crowded_room, write_room
 from experiments.rooms.film import write_film
 from experiments.rooms.panels import answers_overlay, side_by_side
 from experiments.tables.codes import encode, region_codes
-from jsecon.app import ask, evaluation, pictures
+from jsecon import Scene
+from jsecon.app import evaluation, pictures
 from jsecon.evaluate.lerf import Row, evaluate_at_thresholds
 from jsecon.files import atomic_write
 from jsecon.paper.baselines import query_one_step
 from jsecon.paper.distill import distill_votes
-from jsecon.pipeline import model_loading, run as pipeline
+from jsecon.pipeline import run as pipeline
 from jsecon.pipeline.options import Options as RunOptions
 from jsecon.pipeline.progress import Listener
 from jsecon.query.render import ALPHA_THRESHOLD
@@ -73,11 +74,11 @@ def one_step(run: pipeline.Run, embedder, text: str) -> Selection:
 def measure(folder: Path, seed: int, options: Options) -> tuple[dict[str, float], pipeline.Run, list[Row]]:
     """Figures of a room, its run, and the rows of the anchored query."""
     run, masked = fields_of_room(folder, seed, options.quick)
-    labels, embedder = load_lerf_labels(folder / "capture" / "label"), model_loading.field_embedder(run.field)
+    labels, scene = load_lerf_labels(folder / "capture" / "label"), Scene(run.field)
     cameras = {name: run.field.cameras[t] for t, name in enumerate(run.field.names)}
-    rows, summary = evaluation.evaluate(run.field, embedder, labels, Listener(), ("anchored",))["anchored"]
-    _, exact = evaluation.evaluate(masked.field, embedder, labels, Listener(), ("anchored",))["anchored"]
-    select = functools.partial(one_step, run, embedder)
+    rows, summary = evaluation.evaluate(scene, labels, Listener(), ("anchored",))["anchored"]
+    _, exact = evaluation.evaluate(Scene(masked.field), labels, Listener(), ("anchored",))["anchored"]
+    select = functools.partial(one_step, run, scene.embedder)
     alpha = {"alpha_thresholds": (ALPHA_THRESHOLD,)}
     direct = evaluate_at_thresholds(run.field.gaussians, cameras, labels, select, **alpha)[ALPHA_THRESHOLD][1]
     kinds = {"mIoU": summary, "exact outlines": exact, "one-step": direct}
@@ -87,8 +88,8 @@ def measure(folder: Path, seed: int, options: Options) -> tuple[dict[str, float]
 
 def draw(run: pipeline.Run, rows: list[Row], out: Path) -> None:
     """Writes the film, and a held-out frame beside masks, regions and answers."""
-    embedder = model_loading.field_embedder(run.field)
-    answers = ask.ask_each(run.field, embedder, texts=sorted({row.query for row in rows}))[0]
+    scene = Scene(run.field)
+    answers = [scene.ask(text) for text in sorted({row.query for row in rows})]
     out.mkdir(parents=True, exist_ok=True)
     write_film(run.field, [answer for answer in answers if answer.mask.any()], out / "demo.webp")
     pictured = max({row.frame for row in rows}, key=lambda name: (sum(row.frame == name for row in rows), name))

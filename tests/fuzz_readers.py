@@ -22,7 +22,7 @@ from test_rgbd import FORMATS as RGBD
 
 from experiments.datasets.feature_files import write_features
 from experiments.rooms.writers import write_colmap
-from jsecon.app import ask
+from jsecon.app.scene import read_mask
 from jsecon.errors import InputError
 from jsecon.field.field import check_field, load_field, save_field
 from jsecon.networks.clip import MAX_BIAS, MAX_SCALE, ClipEmbedder
@@ -313,7 +313,9 @@ def masks(folder: Path) -> Iterator[Case]:
     field = dataclasses.replace(_field(), cameras=Camera(np.eye(4)[None], *np.ones((4, 1)), 36, 24))
     for kind in ("grey", "colour", "bits"):
         file = folder / kind / "a.png"
-        yield Case([file], lambda file=file: ask.read_mask(file, field), _array((24, 36), bool))
+        yield Case(
+            [file], lambda file=file: read_mask(file, field.cameras.width, field.cameras.height), _array((24, 36), bool)
+        )
 
 
 def langsplat(folder: Path) -> Iterator[Case]:

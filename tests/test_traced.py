@@ -70,7 +70,7 @@ HOST = {
     *("save_gaussians", "load_ply", "save_ply", "region_votes_in_blocks", "check_field"),
     "normalise_votes_in_blocks",
     *("load_field", "save_field", "region_embeddings", "host_mesh", "query_in_blocks", "lift", "remove_outliers"),
-    *("region_at", "plan_capacity", "objects", "object_shapes", "measure", "query_relation"),
+    *("region_at", "plan_capacity", "objects", "object_shapes", "open_scene"),
 }
 """public functions that read files or need numbers, as they say"""
 

@@ -371,7 +371,8 @@ class Scene:
             given = {self.frame_index(frame): mask for frame, mask in question.frames.items()}
             if len(given) < len(question.frames):
                 raise InputError("mask", "a frame has two masks", remedy="Give one mask of an object in each frame.")
-            masks = {index: self._read_mask(mask) for index, mask in given.items()}
+            size = self.field.cameras.width, self.field.cameras.height
+            masks = {t: read_mask(m, *size) if isinstance(m, str | Path) else m for t, m in given.items()}
             question = Mask({self.field.names[index]: mask for index, mask in given.items()})
         threshold = SHARE_THRESHOLD if query.threshold is None else query.threshold
         stack = np.stack([np.asarray(mask).astype(int) for mask in masks.values()])
@@ -380,19 +381,6 @@ class Scene:
         query = dataclasses.replace(query, question=question)
         found = Trimmed(NO_REGIONS, selection, outliers, 1)
         return self._finish(query, found, {"text encoder": "the outline is the query"}, by="outline")
-
-    def _read_mask(self, mask: np.ndarray | str | Path) -> Bool[np.ndarray, "h w"]:
-        """A mask at the size of the field's frames, from an image file in which black is outside."""
-        if not isinstance(mask, str | Path):
-            return np.asarray(mask)
-        image = read_pixels(Path(mask))
-        width, height = self.field.cameras.width, self.field.cameras.height
-        inside = np.asarray(image[..., :3].any(-1) if image.ndim == 3 else image > 0, np.uint8)
-        if abs(inside.shape[1] * height - inside.shape[0] * width) > max(width, height) + max(inside.shape):
-            problem = f"the mask is {inside.shape[1]}x{inside.shape[0]}"
-            expected = f"{width}x{height}, or the same shape at another size"
-            raise InputError(mask, problem, expected, "Outline the frame as the run used it.")
-        return resize_nearest(inside, width, height) > 0
 
     def _finish(
         self, query: Query, found: Trimmed, skipped: dict[str, str], reason: str = "", by: str | None = None
@@ -683,6 +671,17 @@ def locate(
       InputError: The text names no object, or several.
     """
     return (scene if isinstance(scene, Scene) else Scene(scene, up=up)).locate(text, frame=frame)
+
+
+def read_mask(file: str | Path, width: int, height: int) -> Bool[np.ndarray, "h w"]:
+    """Reads an image, in which black is outside, as a mask at the size of a field's frames, px."""
+    image = read_pixels(Path(file))
+    inside = np.asarray(image[..., :3].any(-1) if image.ndim == 3 else image > 0, np.uint8)
+    if abs(inside.shape[1] * height - inside.shape[0] * width) > max(width, height) + max(inside.shape):
+        problem = f"the mask is {inside.shape[1]}x{inside.shape[0]}"
+        expected = f"{width}x{height}, or the same shape at another size"
+        raise InputError(file, problem, expected, "Outline the frame as the run used it.")
+    return resize_nearest(inside, width, height) > 0
 
 
 def _padded(count: int, most: int) -> int:
