@@ -377,24 +377,24 @@ def soon(monkeypatch):
     monkeypatch.setattr(progress, "QUIET_SECONDS", 0.01)
 
 
-def test_progress_is_a_bar_on_a_terminal_and_lines_elsewhere(soon):
-    bar, log = _Terminal(True), _Terminal(False)
-    _drawn(bar, [(1, 4), (3, 4)], "votes:  75%|")
-    assert bar.text.endswith("\r")  # the bar is gone
-    _drawn(log, [(1, 4), (4, 4), (1, 3), (2, 3)], "votes: 2 of 3, about 0 s left\n")
-    assert "\r" not in log.text
-    _drawn(_Terminal(True), [], "votes: 0it [00:00")  # a step that reports no count shows its time
-    _drawn(_Terminal(False), [], "votes: 0 s so far\n")
+@pytest.mark.parametrize("tty", [True, False])
+def test_progress_is_one_line_on_a_terminal_and_several_elsewhere(soon, tty):
+    counted, unknown = _Terminal(tty), _Terminal(tty)
+    _drawn(counted, [(1, 4), (4, 4), (1, 3), (2, 3)], "votes: 2 of 3, about 0 s left")
+    _drawn(unknown, [], "votes: 0 s so far")  # a step that reports no count
+    for terminal in (counted, unknown):
+        assert terminal.text.endswith("\r\x1b[K" if tty else "\n")  # the line is gone
+        assert ("\r" in terminal.text) == tty
 
 
-def test_a_note_stands_above_the_bar(soon):
+def test_a_note_takes_the_place_of_the_line(soon):
     terminal = _Terminal(True)
     console = Console(terminal, terminal)
     with console.progress("votes") as count:
         count(1, 4)
-        _wait_for("25%|", terminal)
+        _wait_for("votes: ", terminal)
         console.note("a file is read again")
-        assert "\r  note: a file is read again\n" in terminal.text
+        assert "\r\x1b[K  note: a file is read again\n" in terminal.text
 
 
 def test_short_steps_stay_silent():

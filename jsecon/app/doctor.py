@@ -23,7 +23,7 @@ MIN_CACHE_DISK = 32 << 20
 # fmt: off
 PACKAGES = (
     "numpy", "filelock", "scipy", "sklearn", "cv2", "PIL", "jaxtyping", "optax", "onnxruntime",
-    "tokenizers", "safetensors", "ftfy", "tqdm", "tyro", "lazy_loader", "huggingface_hub",
+    "tokenizers", "safetensors", "ftfy", "tyro", "lazy_loader", "huggingface_hub",
 )
 # fmt: on
 """modules of the packages that jsecon requires; jax has another check"""

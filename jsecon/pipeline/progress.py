@@ -6,23 +6,16 @@ progress on standard error.
 
 import contextlib
 import dataclasses
-import io
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any, Literal, TypeAlias
 
-from tqdm import tqdm
-
 Status: TypeAlias = Literal["run", "cached", "skipped"]
 
 QUIET_SECONDS = 2.0
 """s; shorter steps show no progress"""
-BAR_SECONDS = 0.5
-"""s between two drawings of a bar, so that its clock runs while a step reports no count"""
-LINE_SECONDS = 15.0
-"""s between two lines of progress where standard error is not a terminal"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,88 +61,63 @@ class Console(Listener):
     def __init__(self, out: Any = None, err: Any = None):
         self._out = out or sys.stdout
         self._err = err or sys.stderr
+        self._lock = threading.RLock()  # of what is printed
+        self._drawn = False  # a line of progress on the terminal
 
     def say(self, text: str) -> None:
-        """Prints a line, above the bar if one is drawn."""
-        with _Bar.external_write_mode(file=self._out):
+        """Prints a line, in place of a line of progress that is drawn."""
+        with self._lock:
+            self._erase()
             print(text, file=self._out, flush=True)
 
     @contextlib.contextmanager
     def progress(self, name: str) -> Iterator[Callable[[int, int], None]]:
-        """Draws a bar with the time left on a terminal, and prints a line now and then elsewhere."""
-        terminal = self._err.isatty()
-        shown = (_Bar if terminal else _Lines)(name, self._err)
-        ended = threading.Event()
+        """Shows the time left: in one line that is drawn again on a terminal, in a line now and then elsewhere."""
+        clock, ended, terminal = _Clock(name), threading.Event(), self._err.isatty()
 
         def draw() -> None:
             pause = QUIET_SECONDS
             while not ended.wait(pause):
-                shown.draw()
-                pause = BAR_SECONDS if terminal else LINE_SECONDS
+                with self._lock:
+                    self._drawn = terminal
+                    line = f"\r{clock.line}\x1b[K" if terminal else f"{clock.line}\n"
+                    self._err.write(line)
+                    self._err.flush()
+                pause = 0.5 if terminal else 15.0
 
         drawing = threading.Thread(target=draw, daemon=True)
         drawing.start()
         try:
-            yield shown.count
+            yield clock.count
         finally:
             ended.set()
             drawing.join()
-            shown.end()
+            self._erase()
+
+    def _erase(self) -> None:
+        if self._drawn:
+            self._err.write("\r\x1b[K")
+            self._err.flush()
+            self._drawn = False
 
 
-class _Bar(tqdm):
-    """A tqdm bar on a terminal. `count` does not draw it, so that short steps show no bar."""
+class _Clock:
+    """The progress of a step. A new total or a smaller count starts the estimate of the time left afresh."""
 
-    monitor_interval = 0  # without the thread of tqdm that redraws bars
-
-    def __init__(self, name: str, file: Any):
-        self._drawn = False
-        super().__init__(desc=f"  {name}", file=file, leave=False, dynamic_ncols=True, delay=QUIET_SECONDS)
-        self._time = time.monotonic  # a clock that cannot be set back
-        self.start_t = self.last_print_t = time.monotonic()
+    def __init__(self, name: str):
+        self._name, self._began = name, time.monotonic()
+        self._since, self._first, self._state = self._began, 0, (0, 0)
 
     def count(self, done: int, total: int) -> None:
-        """Sets the progress. A new total or a smaller count starts the estimate of the time left afresh."""
-        with self.get_lock():
-            if total != self.total or done < self.n:
-                self.total = total
-                self.initial = done
-                self.start_t = time.monotonic()
-            self.n = done
+        if total != self._state[1] or done < self._state[0]:
+            self._since, self._first = time.monotonic(), done
+        self._state = done, total
 
-    def draw(self) -> None:
-        """Draws the bar."""
-        self.refresh()
-
-    def display(self, msg: str | None = None, pos: int | None = None) -> None:
-        """Writes the bar to the terminal."""
-        self._drawn = True
-        super().display(msg, pos)
-
-    def end(self) -> None:
-        """Removes the bar."""
-        if self._drawn:
-            self.clear()
-        self.close()
-
-
-_Bar.set_lock(threading.RLock())  # one lock of C: a signal could leave the pair of locks of tqdm half taken
-
-
-class _Lines(_Bar):
-    """A line of text at each `draw`, for logs."""
-
-    def __init__(self, name: str, file: Any):
-        self._began = time.monotonic()
-        self._log = file
-        super().__init__(name, io.StringIO())
-
-    def draw(self) -> None:
-        """Prints the time left, or the time so far if it cannot be estimated."""
-        with self.get_lock():
-            if self.total and self.initial < self.n < self.total:
-                left = (time.monotonic() - self.start_t) / (self.n - self.initial) * (self.total - self.n)
-                text = f"{self.n} of {self.total}, about {left:.0f} s left"
-            else:
-                text = f"{time.monotonic() - self._began:.0f} s so far"
-        print(f"{self.desc}: {text}", file=self._log, flush=True)
+    @property
+    def line(self) -> str:
+        """The time left, or the time so far if it cannot be estimated."""
+        now, (done, total) = time.monotonic(), self._state
+        if self._first < done < total:
+            left = (now - self._since) / (done - self._first) * (total - done)
+            return f"  {self._name}: {done} of {total}, about {left:.0f} s left"
+        return f"  {self._name}: {now - self._began:.0f} s so far"
