@@ -24,11 +24,11 @@ from experiments.datasets.plain_room import make_room
 from experiments.rooms.capture import room_cameras
 from experiments.rooms.raycast import render_views
 from experiments.rooms.room import crowded_room
-from experiments.simulated_vision.exact_sam import ExactSam, found_shares, level_labels, masks_of
-from jsecon.networks.clip import ClipEmbedder, find_clip
-from jsecon.networks.hub import SUFFIXES, Precision, Role
-from jsecon.networks.sam import Level, Prompts, SamGraphs, SamSettings, find_sam
-from jsecon.networks.sam2 import FrameEncoder, follow, open_sam2
+from experiments.simulated_vision.exact_sam import ExactGridSam, ExactSam, found_shares, level_labels, masks_of
+from jsecon.networks.clip import ClipEmbedder
+from jsecon.networks.hub import SUFFIXES, Precision, Role, find_files
+from jsecon.networks.sam import Level, SamGraphs
+from jsecon.networks.sam2 import follow, open_sam2
 from jsecon.process import cores
 
 THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9)
@@ -105,9 +105,8 @@ def _count_frame(row: dict[str, Any], frame: np.ndarray, labels: dict[str, np.nd
         truth = np.unpackbits(packed, axis=1, count=frame[..., 0].size).reshape(-1, *frame.shape[:2]).astype(bool)
     row["frames"] += 1
     row["true"] += len(truth)
-    kinds: tuple[Prompts, ...] = ("guided", "grid")
-    for prompts in kinds:
-        segmenter = ExactSam(labels, SamSettings(level=level, prompts=prompts, crop_layers=0))
+    for prompts, kind in (("guided", ExactSam), ("grid", ExactGridSam)):
+        segmenter = kind(labels, level)
         started = time.perf_counter()
         masks = segmenter(frame, 0)
         mine = row[prompts]
@@ -182,7 +181,7 @@ def _seconds(call: Callable[[], Any]) -> float:
 
 
 def _time_segmenter(model: Path, precision: Precision, frame: np.ndarray) -> dict[str, Any]:
-    graphs = SamGraphs(find_sam(model, precision))
+    graphs = SamGraphs(*find_files(model, "segmenter", precision))
     encoder = _seconds(lambda: graphs.encode(frame))
     encoded = graphs.encode(frame)
     points = np.random.default_rng(0).uniform(0, 300, (8, 2)).astype(np.float32)
@@ -191,7 +190,9 @@ def _time_segmenter(model: Path, precision: Precision, frame: np.ndarray) -> dic
     for batch in (1, 8) if graphs.batch > 1 else (1,):
         graphs.batch = batch
         decoder[batch] = _seconds(lambda: list(graphs.decode(encoded, points))) / len(points)
-    reference = SamGraphs(find_sam(model, "fp32")).encode(frame).features if precision != "fp32" else encoded.features
+    reference = encoded.features
+    if precision != "fp32":
+        reference = SamGraphs(*find_files(model, "segmenter", "fp32")).encode(frame).features
     pairs = ([own[name].astype(np.float64).ravel() for own in (encoded.features, reference)] for name in reference)
     cosines = [1 - cosine(*pair) for pair in pairs]
     prompt = min(decoder.values())
@@ -203,12 +204,12 @@ def _time_embedder(model: Path, precision: Precision, frame: np.ndarray, masks: 
     def embed(embedder: ClipEmbedder) -> tuple[np.ndarray, np.ndarray]:
         return embedder.embed_regions(frame, masks), embedder.embed_text(list(TEXTS))
 
-    embedder = ClipEmbedder(find_clip(model, precision))
+    embedder = ClipEmbedder(model, precision=precision)
     regions, texts = embed(embedder)
     crop = {n: _seconds(lambda n=n: embedder.embed_regions(frame, masks[:n])) / n for n in (1, len(masks))}
     text = _seconds(lambda: embedder.embed_text([TEXTS[0]]))
     embedder.close()
-    exact = (regions, texts) if precision == "fp32" else embed(ClipEmbedder(find_clip(model, "fp32")))
+    exact = (regions, texts) if precision == "fp32" else embed(ClipEmbedder(model, precision="fp32"))
     cosines = [float((one * other).sum(1).min()) for one, other in zip((regions, texts), exact)]
     others = [float(1 - pdist(rows, "cosine").mean()) for rows in exact]
     frame_seconds = REGIONS * min(crop.values())
@@ -221,12 +222,11 @@ def _time_tracker(model: Path, precision: Precision, frame: np.ndarray) -> dict[
     frames = np.stack([np.roll(frame, 3 * t, 1) for t in range(3)])
     prompt = np.array([[200.0, 150.0]], np.float32), np.array([1], np.int32)
     seconds = []
-    encode = FrameEncoder(graphs, keep=3)
-    encoder = _seconds(lambda: FrameEncoder(graphs)(frames[0]))
-    for each in frames:
-        encode(each)
+    calls = iter((frames[0], frames[1]))  # the first is not counted; a frame that was encoded is remembered
+    encoder = _seconds(lambda: graphs.encode(next(calls)))
+    graphs.encode(frames[2])
     started = time.process_time()
-    for _ in follow(graphs, frames, 0, [prompt], encode=encode):
+    for _ in follow(graphs, frames, 0, [prompt]):
         seconds.append((time.process_time() - started) / cores())
         started = time.process_time()
     return {"encoder": encoder, "object": min(seconds[1:]), "frame": encoder + min(seconds[1:])}

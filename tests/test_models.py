@@ -7,7 +7,7 @@ from sam_files import write_sam
 
 from jsecon.app import cli
 from jsecon.errors import InputError
-from jsecon.pipeline.models import inspect_models
+from jsecon.pipeline.model_loading import inspect_models
 
 
 @pytest.fixture(scope="module")
@@ -27,15 +27,12 @@ def folders(tmp_path_factory):
 ])  # fmt: skip
 def test_what_a_folder_is_good_for(folders, model, words):
     findings = inspect_models(folders[model])
-    told = {use.model: use for use in findings.uses}
-    assert {name for name, use in told.items() if use.usable} == {model}
+    assert list(findings.usable) == [model]
     for word in words:
-        assert word in told[model].summary
-    for name, use in told.items():
-        if name != model:
-            assert "since it lacks onnx/" in use.summary
-            assert "huggingface.co" in use.summary
-    assert findings.errors == []
+        assert word in findings.usable[model]
+    for problem in findings.unusable.values():
+        assert "since it lacks onnx/" in problem
+        assert "huggingface.co" in problem
 
 
 def test_every_graph_is_told_with_its_tensors(folders, capsys):

@@ -20,7 +20,7 @@ from jsecon import InputError, load_capture, load_field, load_ply, save_field, s
 from jsecon.app import cli
 from jsecon.fit.start import starting_gaussians
 from jsecon.networks.hub import catalogue
-from jsecon.networks.sam import SamSegmenter, SamSettings, find_sam
+from jsecon.networks.sam import SamSegmenter
 from jsecon.networks.sam2 import Sam2Tracker
 from jsecon.pipeline import model_loading, run as pipeline
 from jsecon.pipeline.model_loading import ExternalSpace
@@ -246,8 +246,7 @@ def test_two_sources_of_masks_are_refused(room, models, tmp_path):
 def test_proposals_are_kept_by_content(models, tmp_path):
     frame = np.zeros((60, 80, 3), np.uint8)
     frame[10:40, 10:50] = (200, 30, 30)
-    settings = SamSettings(prompts="grid", points_per_side=4, crop_layers=0)
-    stored, failing = (StoredSegmenter(SamSegmenter(find_sam(models[0]), settings), tmp_path) for _ in range(2))
+    stored, failing = (StoredSegmenter(SamSegmenter(models[0]), tmp_path) for _ in range(2))
     assert isinstance(stored, NamedSegmenter)
     masks = stored(frame, 0)
     assert len(masks) >= 1
@@ -258,7 +257,7 @@ def test_proposals_are_kept_by_content(models, tmp_path):
     path = next(tmp_path.glob("*.safetensors"))
     path.write_bytes(path.read_bytes()[:60])
     np.testing.assert_array_equal(stored(frame, 0), masks)
-    assert SamSegmenter(find_sam(models[0]), dataclasses.replace(settings, points_per_side=5)).name != stored.name
+    assert SamSegmenter(models[0], level="m").name != stored.name
 
 
 def test_models_by_name_are_fetched_once_and_found_again_for_a_moved_field(
@@ -267,7 +266,7 @@ def test_models_by_name_are_fetched_once_and_found_again_for_a_moved_field(
     use_hub(hub, tmp_path / "cache", monkeypatch)
     out = tmp_path / "out"
     command = ["run", str(room), "--gaussians", str(splat), "--holdout", "4", "--out", str(out), "--models", "auto"]
-    command += ["--prompts", "grid", "--points-per-side", "10", "--level", "m", "--vision-frames", "5"]
+    command += ["--level", "m", "--vision-frames", "5"]
     assert cli.main(command) == 2  # without a terminal nothing is fetched unasked
     assert "jsecon models get edgetam" in (said := capsys.readouterr().err)
     assert "jsecon models get siglip2" in said
@@ -284,7 +283,7 @@ def test_models_by_name_are_fetched_once_and_found_again_for_a_moved_field(
     assert cli.main(query) == 0
     assert len(hub.requests) == asked
     assert "SAM: 3 frames, about" in planned
-    assert "by edgetam, asked at 10x10 points" in planned
+    assert "by edgetam, what the views agree on" in planned
     assert (np.asarray(load_field(field).regions.pixel_counts).sum(0) > 0).sum() == 5
     use_hub(hub, tmp_path / "empty", monkeypatch)
     capsys.readouterr()

@@ -19,7 +19,7 @@ def test_each_patch_has_its_pixel_farthest_from_the_outline():
     patches[5:26, 10:31] = 7  # 21 px a side
     patches[30:33, 40:49] = 2
     assert innermost_pixels(patches).tolist() == [[20, 15], [41, 31]]
-    assert innermost_pixels(patches, least=2.0).tolist() == [[20, 15]]
+    assert innermost_pixels(patches, min_radius=2.0).tolist() == [[20, 15]]
     assert innermost_pixels(np.full((4, 4), -1, np.int32)).shape == (0, 2)
 
 

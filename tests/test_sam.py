@@ -1,7 +1,6 @@
 """SAM's automatic mask generator over small graphs of each dialect: the same masks as a plain twin, whatever the batch,
 and a message that names the tensor for a graph of another kind."""
 
-import dataclasses
 import json
 
 import numpy as np
@@ -12,23 +11,14 @@ from sam_files import IOUS, MEAN, STD, write_decoder, write_encoder, write_sam
 from scipy import ndimage
 
 from jsecon.errors import InputError
-from jsecon.networks.sam import (
-    TOKENS,
-    SamFiles,
-    SamGraphs,
-    SamSegmenter,
-    SamSettings,
-    box_nms,
-    box_of,
-    crops_of,
-    cut_by_crop,
-    find_sam,
-    langsplat_nms,
-    point_grid,
-)
+from jsecon.networks.hub import find_files
+from jsecon.networks.prompts import GuidedPrompts
+from jsecon.networks.sam import TOKENS, SamGraphs, SamSegmenter
+from jsecon.networks.sam_masks import box_nms, box_of, langsplat_nms
 from jsecon.vision.protocols import Segmenter
 
 KINDS = [("sam", 1), ("sam", "batch"), ("sam", 7), ("sam2", "batch")]
+DECODER = "prompt_encoder_mask_decoder.onnx"
 
 
 @pytest.fixture(scope="module")
@@ -46,33 +36,43 @@ def folders(tmp_path_factory):
     return {(kind, batch): write_sam(base / f"{kind}-{batch}", kind, batch=batch) for kind, batch in KINDS}
 
 
-@pytest.fixture(scope="module")
-def segmenter(folders):
-    return SamSegmenter(find_sam(folders["sam", "batch"]), SamSettings(prompts="grid", points_per_side=8))
+class GridPrompts:
+    """An 8 x 8 grid of points, in one round."""
+
+    def __init__(self, frame, levels):
+        line = (np.arange(8, dtype=np.float32) + 0.5) / 8
+        self.points = np.stack(np.meshgrid(line, line), -1).reshape(-1, 2) * np.float32(frame.shape[1::-1])
+
+    def next_points(self):
+        points, self.points = self.points, self.points[:0]
+        return points
+
+    def explain(self, level, point, mask):
+        pass
 
 
-def by_definition(folder, frame, token_of_level, side=8):
-    """SAM's automatic mask generator with LangSplat's levels, one point a call, without any packing: masks and scores
-    of one level."""
-    graphs = SamGraphs(find_sam(folder), batch=1)
-    height, width = frame.shape[:2]
-    found = []
-    for crop in crops_of(height, width, 1, 512 / 1500):
-        part, own = frame[crop.top : crop.bottom, crop.left : crop.right], []
-        encoded = graphs.encode(np.ascontiguousarray(part))
-        for point in point_grid(side) * np.float32([part.shape[1], part.shape[0]]):
-            ((logits, ious),) = graphs.decode(encoded, point[None])
-            for token in token_of_level:
-                full = graphs.to_frame(logits[0, token], encoded)
-                stable = (full > 1).sum() / max((full > -1).sum(), 1)
-                mask = np.zeros((height, width), bool)
-                mask[crop.top : crop.bottom, crop.left : crop.right] = full > 0
-                if ious[0, token] > 0.7 and stable >= 0.85 and not cut_by_crop(box_of(mask), crop, width, height):
-                    own.append((mask, ious[0, token], stable, crop))
-        boxes = np.asarray([box_of(m) for m, *_ in own], float).reshape(-1, 4)
-        found += [own[i] for i in box_nms(boxes, np.asarray([iou for _, iou, _, _ in own]), 0.7)]
-    boxes = np.asarray([box_of(m) for m, *_ in found], float)
-    found = [found[i] for i in box_nms(boxes, np.asarray([1 / crop.area for *_, crop in found]), 0.7)]
+class GridSam(SamSegmenter):
+    prompts = GridPrompts
+
+
+def graphs_of(folder) -> SamGraphs:
+    return SamGraphs(*find_files(folder, "segmenter"))
+
+
+def by_definition(folder, frame, token_of_level):
+    """SAM's automatic mask generator with LangSplat's levels, one point a call: masks and scores of one level."""
+    graphs = graphs_of(folder)
+    graphs.batch = 1
+    found, encoded = [], graphs.encode(frame)
+    for point in GridPrompts(frame, 1).points:
+        ((logits, ious),) = graphs.decode(encoded, point[None])
+        for token in token_of_level:
+            full = graphs.to_frame(logits[0, token], encoded)
+            stable = (full > 1).sum() / max((full > -1).sum(), 1)
+            if ious[0, token] > 0.7 and stable >= 0.85:
+                found.append((full > 0, ious[0, token], stable))
+    boxes = np.asarray([box_of(mask) for mask, *_ in found], float)
+    found = [found[i] for i in box_nms(boxes, np.asarray([iou for _, iou, _ in found]), 0.7)]
     clean = []
     for mask, *_ in found:
         for hole in (True, False):
@@ -95,9 +95,8 @@ def by_definition(folder, frame, token_of_level, side=8):
 
 
 @pytest.mark.parametrize("level", ["l", "default"])
-def test_masks_are_those_of_the_definition(folders, frame, segmenter, level):
-    of_level = dataclasses.replace(segmenter.settings, level=level)
-    masks, scores = SamSegmenter(segmenter.files, of_level).segment(frame)
+def test_masks_are_those_of_the_definition(folders, frame, level):
+    masks, scores = GridSam(folders["sam", "batch"], level=level).segment(frame)
     expected, expected_scores = by_definition(folders["sam", "batch"], frame, TOKENS[level])
     assert len(masks) >= 3
     np.testing.assert_array_equal(masks, expected)
@@ -106,33 +105,39 @@ def test_masks_are_those_of_the_definition(folders, frame, segmenter, level):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_dialect_and_batch_finds_the_same_things(folders, frame, segmenter, kind):
-    other = SamSegmenter(find_sam(folders[kind]), SamSettings(prompts="grid", points_per_side=8), batch=5)
-    assert isinstance(other, Segmenter)
-    masks = other(frame, 0)
+def test_every_dialect_and_batch_finds_the_same_things(folders, frame, kind):
+    segmenter = GridSam(folders[kind])
+    assert isinstance(segmenter, Segmenter)
+    masks = segmenter(frame, 0)
     red, green = frame[..., 0] == 200, frame[..., 1] == 160
     for true in (red & (frame[..., 1] == 30), green):
         inner = ndimage.binary_erosion(true, iterations=12)
         assert any((inner & mask).sum() == inner.sum() and (mask & ~true).sum() < 0.3 * mask.sum() for mask in masks)
     if "sam2" not in kind[0]:  # which sees the frame stretched to a square
-        np.testing.assert_array_equal(masks, segmenter(frame, 0))
+        np.testing.assert_array_equal(masks, GridSam(folders["sam", "batch"])(frame, 0))
+    segmenter.close()
+    np.testing.assert_array_equal(segmenter(frame, 1), masks)
 
 
-def test_guided_prompts_find_the_things_of_the_grid_with_a_tenth_of_the_points(folders, frame, segmenter, monkeypatch):
+def test_guided_prompts_find_the_things_of_the_grid_with_fewer_points(folders, frame):
     asked = []
-    decode = SamGraphs.decode
-    monkeypatch.setattr(SamGraphs, "decode", lambda self, *a: asked.append(len(a[1])) or decode(self, *a))
-    settings = SamSettings(crop_layers=0)
-    guided = SamSegmenter(find_sam(folders["sam", "batch"]), settings)(frame, 0)
-    prompts, asked[:] = sum(asked), []
-    grid = SamSegmenter(find_sam(folders["sam", "batch"]), dataclasses.replace(settings, prompts="grid"))(frame, 0)
-    assert prompts <= sum(asked) / 10
-    for mask in grid:
+
+    class Counted(GuidedPrompts):
+        def next_points(self):
+            asked.append(len(points := super().next_points()))
+            return points
+
+    class CountedSam(SamSegmenter):
+        prompts = Counted
+
+    guided = CountedSam(folders["sam", "batch"])(frame, 0)
+    assert 0 < sum(asked) <= 64 / 4
+    for mask in GridSam(folders["sam", "batch"])(frame, 0):
         assert max((mask & other).sum() / (mask | other).sum() for other in guided) > 0.9
 
 
 def test_sam_2_takes_a_frame_stretched_to_a_square_and_one_prompt_a_run(folders, frame):
-    graphs = SamGraphs(find_sam(folders["sam2", "batch"]))
+    graphs = graphs_of(folders["sam2", "batch"])
     assert (graphs.batch, graphs.side, graphs.stretched) == (1, 256, True)
     encoded = graphs.encode(frame)
     assert encoded.scaled == (256, 256)
@@ -142,50 +147,36 @@ def test_sam_2_takes_a_frame_stretched_to_a_square_and_one_prompt_a_run(folders,
     assert [masks.shape for masks, _ in found] == [(1, 3, 64, 64)] * 3
 
 
-def test_sam_scales_colours_as_its_configuration_says(frame, tmp_path):
+def test_colours_are_scaled_as_the_configuration_says(frame, tmp_path):
     folder = write_sam(tmp_path / "sam2", "sam2", side=64)
-    plain, name = SamGraphs(find_sam(folder)).encode(frame), SamSegmenter(find_sam(folder)).name
+    plain, name = graphs_of(folder).encode(frame), SamSegmenter(folder).name
     config = folder / "preprocessor_config.json"
     content = json.loads(config.read_text())
     config.write_text(json.dumps(content | {"image_mean": [0.5] * 3, "image_std": [0.5] * 3}))
-    assert SamSegmenter(find_sam(folder)).name != name
-    found = SamGraphs(find_sam(folder)).encode(frame).features["image_embeddings.2"][0, :3]
+    assert SamSegmenter(folder).name != name
+    found = graphs_of(folder).encode(frame).features["image_embeddings.2"][0, :3]
     mean, std = (np.reshape(numbers, (3, 1, 1)) for numbers in (MEAN, STD))
     expected = plain.features["image_embeddings.2"][0, :3] * std + mean
     np.testing.assert_allclose(found, (expected - 0.5) / 0.5, atol=1e-5)
     config.write_text(json.dumps({key: content[key] for key in content if key != "image_mean"}))
     with pytest.raises(InputError, match=r"preprocessor_config\.json.*cannot be read"):
-        find_sam(folder)
+        SamSegmenter(folder)
     config.unlink()
     with pytest.raises(InputError, match=r"lacks preprocessor_config\.json"):
-        find_sam(folder)
+        SamSegmenter(folder)
 
 
-def test_a_level_is_one_of_the_three_masks_of_a_point(frame, segmenter):
+def test_a_level_is_one_of_the_three_masks_of_a_point(folders, frame):
     for level, token in (("s", 1), ("m", 2), ("l", 3)):
-        of_level = SamSegmenter(segmenter.files, dataclasses.replace(segmenter.settings, level=level))
-        masks, scores = of_level.segment(frame)
+        masks, scores = GridSam(folders["sam", "batch"], level=level).segment(frame)
         assert len(masks) >= 1
         assert scores.max() <= IOUS[token] + 1e-6
 
 
-def test_without_crops_the_frame_is_encoded_once(folders, frame, monkeypatch):
-    calls = []
-    encode = SamGraphs.encode
-    monkeypatch.setattr(SamGraphs, "encode", lambda self, part: calls.append(part.shape) or encode(self, part))
-    SamSegmenter(find_sam(folders["sam2", "batch"]), SamSettings(crop_layers=0))(frame, 0)
-    assert calls == [(120, 160, 3)]
-
-
-def test_graphs_can_be_closed_and_opened_again(segmenter, frame):
-    masks = segmenter(frame, 0)
-    segmenter.close()
-    np.testing.assert_array_equal(segmenter(frame, 1), masks)
-
-
-def test_a_frame_without_anything_good_gives_no_masks(folders, frame):
-    strict = SamSegmenter(find_sam(folders["sam", "batch"]), SamSettings(predicted_iou=0.999))
-    assert strict(frame, 0).shape == (0, 120, 160)
+def test_a_frame_without_anything_good_gives_no_masks(folders, frame, monkeypatch):
+    decode = SamGraphs.decode
+    monkeypatch.setattr(SamGraphs, "decode", lambda *given: ((masks, 0.7 * ious) for masks, ious in decode(*given)))
+    assert SamSegmenter(folders["sam", "batch"])(frame, 0).shape == (0, 120, 160)
 
 
 # Folders and graphs of another kind
@@ -193,43 +184,42 @@ def test_a_frame_without_anything_good_gives_no_masks(folders, frame):
 
 def test_folders_without_sam_say_what_they_hold(tmp_path):
     with pytest.raises(InputError, match=r"lacks onnx/vision_encoder\.onnx, onnx/prompt_enc"):
-        find_sam(tmp_path)
+        SamSegmenter(tmp_path)
     write_clip(tmp_path / "clip", "transformers.js")
     with pytest.raises(InputError, match=r"no segmenter, since it lacks onnx/vision_encoder\.onnx") as caught:
-        find_sam(tmp_path / "clip")
+        SamSegmenter(tmp_path / "clip")
     assert "huggingface.co" in str(caught.value)
 
 
 def test_variants_beside_the_plain_graph_are_left_alone(tmp_path):
     folder = write_sam(tmp_path)
     (folder / "onnx" / "vision_encoder_quantized.onnx").write_bytes(b"not looked at")
-    (folder / "onnx" / "prompt_encoder_mask_decoder_fp16.onnx").write_bytes(b"not looked at")
-    files = find_sam(folder)
-    assert files.encoder.name == "vision_encoder.onnx"
-    assert files.decoder.name == "prompt_encoder_mask_decoder.onnx"
+    (folder / "onnx" / DECODER.replace(".", "_fp16.")).write_bytes(b"not looked at")
+    assert [path.name for path in find_files(folder, "segmenter")[:2]] == ["vision_encoder.onnx", DECODER]
 
 
 def test_tensors_that_do_not_fit_are_named(tmp_path):
     names = ("image_embeddings", "image_positional_embeddings")
     encoder = write_encoder(tmp_path / "encoder.onnx", 256, names)
     decoder = write_decoder(tmp_path / "decoder.onnx", 256, "sam", "batch")
+    config = write_sam(tmp_path / "whole") / "preprocessor_config.json"
 
     with pytest.raises(InputError, match=r"decoder\.onnx, input 'pixel_values'.*input_points"):
-        SamGraphs(SamFiles(decoder, decoder, MEAN, STD))
+        SamGraphs(decoder, decoder, config)
     with pytest.raises(InputError, match=r"encoder\.onnx, input 'input_points': no such input"):
-        SamGraphs(SamFiles(encoder, encoder, MEAN, STD))
+        SamGraphs(encoder, encoder, config)
 
     smaller = write_encoder(tmp_path / "small.onnx", 128, names)
     with pytest.raises(InputError, match=r"small\.onnx, output 'image_embeddings': .*8, 8\], expected .*16, 16\]"):
-        SamGraphs(SamFiles(smaller, decoder, MEAN, STD))
+        SamGraphs(smaller, decoder, config)
 
     single = write_decoder(tmp_path / "single.onnx", 256, "sam", "batch", masks=1)
     with pytest.raises(InputError, match=r"output 'pred_masks'.*3 or 4 masks"):
-        SamGraphs(SamFiles(encoder, single, MEAN, STD))
+        SamGraphs(encoder, single, config)
 
     other = write_encoder(tmp_path / "other.onnx", 256)
     with pytest.raises(InputError, match=r"other\.onnx, output 'image_positional_embeddings': no such output"):
-        SamGraphs(SamFiles(other, decoder, MEAN, STD))
+        SamGraphs(other, decoder, config)
 
     flat = write_graph(
         tmp_path / "flat.onnx",
@@ -238,4 +228,4 @@ def test_tensors_that_do_not_fit_are_named(tmp_path):
         {"y": ("float32", [1, 5])},
     )
     with pytest.raises(InputError, match=r"flat\.onnx, input 'pixel_values': pixel_values float32\[1, 5\], expected"):
-        SamGraphs(SamFiles(flat, decoder, MEAN, STD))
+        SamGraphs(flat, decoder, config)

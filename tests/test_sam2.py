@@ -161,7 +161,7 @@ def test_tracker_gives_each_pixel_to_the_highest_logit(folder):
     assert labels.shape == frames.shape[:3]
     assert labels.dtype == np.int16
     assert set(np.unique(labels)) <= {-1, 0, 2}
-    for t, logits in follow(tracker.graphs, frames, 2, [prompts[0], prompts[2]]):
+    for t, logits in follow(open_sam2(folder), frames, 2, [prompts[0], prompts[2]]):
         whole = np.stack([cv2.resize(fill_holes(low, HOLE_AREA), (WIDTH, HEIGHT)) for low in logits])
         wanted = np.where(whole.max(0) > 0, np.array([0, 2])[whole.argmax(0)], -1)
         np.testing.assert_array_equal(labels[t], wanted)

@@ -5,16 +5,11 @@ import pytest
 from hypothesis import example, given, settings, strategies as st
 from scipy import ndimage
 
-from jsecon.networks.sam import (
-    Crop,
+from jsecon.networks.sam_masks import (
     box_nms,
     box_of,
-    crops_of,
-    cut_by_crop,
     langsplat_nms,
-    point_grid,
     remove_small_regions,
-    shared_areas,
     stability,
 )
 
@@ -31,18 +26,6 @@ def test_a_box_holds_the_outermost_pixels():
     assert box_of(mask) == (0, 0, 0, 0)
     mask[2, 3] = mask[4, 7] = True
     assert box_of(mask) == (3, 2, 7, 4)
-
-
-@pytest.mark.parametrize(("box", "cut"), [
-    ((25, 100, 125, 200), False),  # well inside, to the frame's left
-    ((5, 100, 60, 200), False),  # at an edge that is the frame's own
-    ((120, 100, 185, 200), True),  # 15 px from the crop's right edge
-    ((120, 100, 179, 200), False),
-    ((30, 250, 100, 285), True),
-])  # fmt: skip
-def test_a_box_near_a_crops_own_edge_is_cut(box, cut):
-    assert cut_by_crop(box, Crop(0, 0, 200, 300, 1), 400, 600) is cut
-    assert not cut_by_crop(box, Crop(0, 0, 200, 300, 0), 200, 300)
 
 
 @settings(max_examples=50, deadline=None)
@@ -133,14 +116,6 @@ def test_the_kept_set_is_that_of_the_definition(seed, count):
     np.testing.assert_array_equal(langsplat_nms(masks, scores), by_definition(masks, scores))
 
 
-@settings(max_examples=30, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.integers(0, 80))
-def test_shared_areas_are_exact(seed, count):
-    masks = blobs(np.random.default_rng(seed), count)
-    flat = masks.reshape(count, 24 * 30).astype(np.int64)
-    np.testing.assert_array_equal(shared_areas(masks), flat @ flat.T)
-
-
 def test_empty_masks_are_dropped_and_no_masks_stay_none():
     masks = np.zeros((2, 4, 5), bool)
     masks[1, 1:3, 1:3] = True
@@ -148,39 +123,3 @@ def test_empty_masks_are_dropped_and_no_masks_stay_none():
     assert langsplat_nms(masks[:0], np.zeros(0)).tolist() == []
     with pytest.raises(ValueError, match="One score per mask"):
         langsplat_nms(masks, np.zeros(3))
-
-
-def test_the_grid_has_the_centres_of_its_cells_and_x_runs_fastest():
-    np.testing.assert_allclose(point_grid(2), [[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])
-    assert point_grid(32).shape == (1024, 2)
-    np.testing.assert_allclose(point_grid(32)[:2, 0], [1 / 64, 3 / 64])
-    with pytest.raises(ValueError, match="at least 1"):
-        point_grid(0)
-
-
-def test_crops_are_those_of_the_automatic_mask_generator():
-    """1500 x 1000, by hand: overlap int(512/1500 * 1000 * 2/2) = 341; lengths are half of 341 + 1500 and 341 + 1000."""
-    assert crops_of(1000, 1500, 1, 512 / 1500) == [
-        Crop(0, 0, 1500, 1000, 0),
-        Crop(0, 0, 921, 671, 1),
-        Crop(0, 330, 921, 1000, 1),
-        Crop(580, 0, 1500, 671, 1),
-        Crop(580, 330, 1500, 1000, 1),
-    ]
-    assert crops_of(1000, 1500, 0, 512 / 1500) == [Crop(0, 0, 1500, 1000, 0)]
-
-
-@settings(max_examples=50, deadline=None)
-@given(st.integers(8, 300), st.integers(8, 300), st.integers(0, 2))
-def test_the_crops_of_each_layer_cover_the_frame(height, width, layers):
-    crops = crops_of(height, width, layers, 512 / 1500)
-    assert len(crops) == sum(4**k for k in range(layers + 1))
-    for layer in range(layers + 1):
-        seen = np.zeros((height, width), bool)
-        for crop in crops:
-            if crop.layer == layer:
-                assert 0 <= crop.left < crop.right <= width
-                assert 0 <= crop.top < crop.bottom <= height
-                assert crop.area == (crop.right - crop.left) * (crop.bottom - crop.top)
-                seen[crop.top : crop.bottom, crop.left : crop.right] = True
-        assert seen.all()

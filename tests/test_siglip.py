@@ -15,10 +15,9 @@ from small_field import KnownTexts, make_field, unit_rows
 from experiments.export.vocabulary import write_vocabulary
 from jsecon import InputError, Scene, query_anchored, query_several, save_field
 from jsecon.app import cli
-from jsecon.networks.clip import ClipEmbedder, find_clip, read_preprocessing
-from jsecon.networks.tokenizer import TextRules, TextTokenizer
+from jsecon.networks.clip import ClipEmbedder, read_preprocessing
+from jsecon.networks.tokenizer import TextRules, TextTokenizer, read_text_rules
 from jsecon.pipeline import model_loading
-from jsecon.pipeline.models import inspect_models
 from jsecon.query.rules import MIN_COSINE, MIN_PRESENCE, QueryRules
 from jsecon.query.scores import presence_prob
 from jsecon.vision.protocols import Embedder, Logits
@@ -34,7 +33,7 @@ def folders(tmp_path_factory):
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_images_and_texts_meet_and_the_padding_is_read(folders, layout):
-    embedder = ClipEmbedder(folders[layout], batch=2)
+    embedder = ClipEmbedder(folders[layout])
     assert isinstance(embedder, Embedder)
     np.testing.assert_allclose(embedder.embed_text(TEXTS), embedded(TEXTS), atol=1e-6)
     assert np.abs(embedded(["blue"]) - embedded(["blue"], LENGTH - 3)).max() > 0.01  # so another padding shows
@@ -63,18 +62,18 @@ def test_siglip_2_has_another_vocabulary_padding_and_case(tmp_path):
     write_siglip(tmp_path / "model", "transformers.js")
     for name in ("tokenizer.json", "tokenizer_config.json"):
         (tmp_path / "model" / name).write_bytes((tmp_path / name).read_bytes())
-    rules = find_clip(tmp_path / "model").rules
+    rules = read_text_rules(tmp_path / "model", tmp_path / "model" / "tokenizer.json")
     assert rules == TextRules(LENGTH, "<pad>", "lower")
     tokenizer = TextTokenizer(path, rules)
-    short, long, foreign = tokenizer(["Red Mug,", "mug " * 40, "\u8336"], 8)
+    (short, long, foreign), mask = tokenizer(["Red Mug,", "mug " * 40, "\u8336"], 8)
     numbers = json.loads(path.read_text())["model"]["vocab"]
     assert short[-1] == numbers["<pad>"] == 0
     assert 1 in short  # its end
     assert long[-1] == numbers["<eos>"] == 1  # a text that is cut keeps its end
     bytes_of_tea = [numbers[f"<0x{byte:02X}>"] for byte in "\u8336".encode()]
     np.testing.assert_array_equal(foreign[: len(bytes_of_tea) + 1], [*bytes_of_tea, 1])
-    np.testing.assert_array_equal(tokenizer(["RED MUG,"], 8)[0], short)
-    np.testing.assert_array_equal(tokenizer.mask(short[None]), np.ones((1, 8)))
+    np.testing.assert_array_equal(tokenizer(["RED MUG,"], 8)[0][0], short)
+    np.testing.assert_array_equal(mask, np.ones((3, 8)))
 
 
 def test_the_name_follows_the_rules_and_not_the_scale(folders, tmp_path):
@@ -94,7 +93,7 @@ def test_a_clip_folder_is_what_it_was_with_open_clip_s_configuration_beside_it(t
     name = ClipEmbedder(folder).name
     write_json(folder / "config.json", {"embed_dim": 3, "text_cfg": {"context_length": 77, "vocab_size": 49408}})
     assert ClipEmbedder(folder).name == name
-    assert find_clip(folder).rules is None
+    assert read_text_rules(folder, folder / "textual" / "tokenizer.json") is None
     assert ClipEmbedder(folder).logits is None
 
 
@@ -140,13 +139,13 @@ def test_rules_of_open_clip_that_are_not_known_are_refused(tmp_path, text, words
     own = {"context_length": LENGTH, "hf_tokenizer_name": "x"} | text
     write_json(folder / "config.json", {"text_cfg": own})
     with pytest.raises(InputError, match=words):
-        find_clip(folder)
+        ClipEmbedder(folder)
 
 
 def test_a_length_that_is_left_out_is_transformers_own(tmp_path):
     folder = write_siglip(tmp_path / "model", "transformers.js")
     write_json(folder / "config.json", {"model_type": "siglip"})
-    assert find_clip(folder).rules == TextRules(64, "</s>", "canonicalize")
+    assert read_text_rules(folder, folder / "tokenizer.json") == TextRules(64, "</s>", "canonicalize")
 
 
 # Scale and bias
@@ -174,13 +173,11 @@ def test_numbers_that_are_no_scale_and_bias_are_refused(tmp_path, content):
     folder = write_siglip(tmp_path / "model", "immich")
     write_json(folder / "logits.json", content)
     with pytest.raises(InputError, match=r"logits\.json.*logit_bias"):
-        _ = ClipEmbedder(folder).logits
+        ClipEmbedder(folder)
 
 
 def _told(folder) -> str:
-    use = next(use for use in inspect_models(folder).uses if use.model == "CLIP")
-    assert use.usable, use.summary
-    return use.summary
+    return model_loading.inspect_models(folder).usable["CLIP"]
 
 
 # The probability in place of the cosine's threshold

@@ -53,7 +53,7 @@ def compared(
         seen = encode((pixels - mean) / std).numpy()
     said, wanted = embedder.embed_text(TEXTS), texts.detach().numpy()
     looked = embedder.embed_regions(frame, masks)
-    same = embedder._tokenizer(TEXTS, ids.shape[1]) == ids.numpy()
+    same = embedder._tokenizer(TEXTS, ids.shape[1])[0] == ids.numpy()
     embedder.close()
     rows = [*rows, _row(f"{len(masks)} regions by ClipEmbedder", looked, seen)]
     rows.append(_row("6 texts by ClipEmbedder", said, wanted))

@@ -286,7 +286,8 @@ def _tracked(model: Any, modules: dict[str, tuple], folder: Path, *, count: int 
         {name: _TorchGraph(*parts) for name, parts in modules.items()}, opened.constants, opened.sizes
     )
     attention = (DistinctMemories(model, opened.sizes["G"]), *modules["memory_attention"][1:])
-    distinct = dataclasses.replace(in_torch, graphs={**in_torch.graphs, "memory_attention": _TorchGraph(*attention)})
+    without_repeats = {**in_torch.graphs, "memory_attention": _TorchGraph(*attention)}
+    distinct = Sam2Graphs(without_repeats, opened.constants, opened.sizes)
     logits, seconds = {}, {}
     for name, graphs in (("onnxruntime", opened), ("torch", in_torch), ("distinct", distinct)):
         started = time.perf_counter()

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Int, Int32
 
 from experiments.rooms.raycast import trace_rays
 from experiments.rooms.room import Room
-from jsecon.networks.sam import EncodedFrame, SamSegmenter, SamSettings
+from jsecon.networks.sam import EncodedFrame, Level, SamSegmenter
 from jsecon.types import Camera
 
 LOGIT = 8.0
@@ -96,10 +96,33 @@ class ExactGraphs:
 class ExactSam(SamSegmenter):
     """`SamSegmenter` over `ExactGraphs` of one frame."""
 
-    def __init__(self, labels: dict[str, np.ndarray], settings: SamSettings):
-        self.settings = settings
+    def __init__(self, labels: dict[str, np.ndarray], level: Level):
+        self._level: Level = level
         self.name = "exact"
         self.__dict__["_graphs"] = self.graphs = ExactGraphs(labels)
+
+
+class GridPrompts:
+    """SAM's own prompts of an image (H, W, 3), in place of guided ones: the centres of 32 x 32 cells, in one round."""
+
+    def __init__(self, image: np.ndarray, levels: int):
+        line = np.linspace(1 / 64, 63 / 64, 32)
+        size = np.array([image.shape[1], image.shape[0]], np.float32)
+        self._points = np.stack(np.meshgrid(line, line), -1).reshape(-1, 2).astype(np.float32) * size
+
+    def next_points(self) -> np.ndarray:
+        """Returns all points (P, 2) x, y in px, then none."""
+        points, self._points = self._points, self._points[:0]
+        return points
+
+    def explain(self, level: int, point: np.ndarray, mask: np.ndarray) -> None:
+        """Does nothing: the grid does not depend on the masks."""
+
+
+class ExactGridSam(ExactSam):
+    """`ExactSam` with SAM's own prompts."""
+
+    prompts = GridPrompts
 
 
 def found_shares(truth: np.ndarray, masks: np.ndarray, thresholds: Sequence[float]) -> list[int]:

@@ -23,7 +23,7 @@ MIN_CACHE_DISK = 32 << 20
 # fmt: off
 PACKAGES = (
     "numpy", "filelock", "scipy", "sklearn", "cv2", "PIL", "jaxtyping", "optax", "onnxruntime",
-    "tokenizers", "safetensors", "ftfy", "tyro", "lazy_loader", "huggingface_hub",
+    "tokenizers", "safetensors", "tyro", "lazy_loader", "huggingface_hub",
 )
 # fmt: on
 """modules of the packages that jsecon requires; jax has another check"""
@@ -169,13 +169,13 @@ def _check_models(folder: Path | None) -> list[Check]:
     """Examines a folder of models and the folders in it."""
     if folder is None:
         return [Check("models", "missing", "no folder to examine (--models DIR); without CLIP, texts name colours")]
-    from jsecon.pipeline.models import inspect_models
+    from jsecon.pipeline.model_loading import inspect_models
 
     reports = [inspect_models(place) for place in (folder, *sorted(p for p in folder.glob("*") if p.is_dir()))]
-    usable = {use.model: use.summary for report in reversed(reports) for use in report.uses if use.usable}
+    usable = {kind: summary for report in reversed(reports) for kind, summary in report.usable.items()}
     missing = f"no usable model in {folder}; jsecon models check says what is missing"
-    models = [use.model for use in reports[0].uses]
-    return [Check(m, "ok", usable[m]) if m in usable else Check(m, "missing", missing) for m in models]
+    kinds = ("CLIP", "SAM", "SAM 2")
+    return [Check(kind, "ok", usable[kind]) if kind in usable else Check(kind, "missing", missing) for kind in kinds]
 
 
 def _check_extra(name: str) -> Check:

@@ -1,4 +1,4 @@
-"""Models by name on the command line: which ones there are, fetching them after asking, and removing them."""
+"""Models by name on the command line: which ones there are, fetching them after asking, and examining them."""
 
 import contextlib
 import dataclasses
@@ -26,22 +26,17 @@ def with_models(options: T, console: Console, *, yes: bool) -> T:
     Args:
       options: A dataclass with attributes named like roles (embedder, segmenter, tracker) that hold a name, an
         address or a folder; and perhaps `models` and `precision`.
-      console: Where to say and ask.
+      console: Where to print and ask.
       yes: Fetch without asking.
-
-    Returns:
-      The options with folders.
-
-    Raises:
-      InputError: A name is unknown, a model cannot be fetched, or the user declines.
     """
     precision = getattr(options, "precision", None)
     recommended = hub.RECOMMENDED if getattr(options, "models", None) == AUTO else {}
     models = {}
     for role in get_args(Role):
-        value = getattr(options, role, None) or recommended.get(role)
-        if value is not None:
-            models[role] = hub.parse_model(Path(value).as_posix(), role, precision)
+        choice = getattr(options, role, None)
+        choice = recommended.get(role) if choice is None else choice
+        if choice is not None:
+            models[role] = hub.parse_model(choice, role, precision)
     return dataclasses.replace(options, **_folders_of_models(models, console, yes=yes))
 
 
@@ -77,19 +72,7 @@ def _folders_of_models(
 
 
 def open_embedder(field: Any, verb: verbs.FieldVerb, console: Console) -> Any:
-    """Opens the embedder of a field for a verb, and warns of a field of an earlier version.
-
-    Args:
-      field: The `LanguageField`.
-      verb: States the model and its templates, and whether to fetch a missing model without asking.
-      console: Where to say and ask.
-
-    Returns:
-      The embedder.
-
-    Raises:
-      InputError: The model is not on this machine, or is another one.
-    """
+    """Opens the embedder of a field for a verb, which states the model, and warns of a field of an earlier version."""
     from jsecon.pipeline import model_loading
 
     if field.unrelated_words is None:
@@ -116,24 +99,19 @@ def _table_lines() -> Iterator[str]:
 
 
 def help_table() -> str:
-    """Makes a table of the named models, for the help of a run.
-
-    Returns:
-      Lines with name, role, size, seconds and what each model adds.
-    """
+    """Makes a table of the named models, for the help of a run: name, role, size, seconds and what each model adds."""
     lines = [f"{line}  {row.purpose}" for row, line in zip(hub.catalogue(), _table_lines())]
     return "\n".join(["models", *(f"  {line}" for line in (f"{TABLE_HEAD}  adds", *lines, TABLE_NOTE))])
 
 
 def _models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon models`; the result has rows, folders, freed bytes or reports, and errors by model."""
+    """Does the work of `jsecon models`; the result has rows, folders or reports, and errors by model."""
     if verb.action == "list":
         return _list_models(console)
     if not verb.names:
         problem = f"models {verb.action} needs a name"
         raise InputError("jsecon", problem, remedy="jsecon models list has the names.")
-    act = {"get": _get_models, "remove": _remove_models, "check": _check_models}[verb.action]
-    return act(verb, console)
+    return _get_models(verb, console) if verb.action == "get" else _check_models(verb, console)
 
 
 def _list_models(console: Console) -> verbs.VerbResult:
@@ -165,18 +143,10 @@ def _get_models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
     return {"models": folders, "errors": errors}
 
 
-def _remove_models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
-    """Removes models from the hub's cache, and prints how much was freed."""
-    repositories = {model.repository for name in verb.names for model in _candidates(name, verb.role, None)}
-    freed = sum(map(hub.remove, repositories))
-    console.say(f"{freed / 1e6:.0f} MB freed")
-    return {"freed": freed}
-
-
 def _check_models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
     """Lists the graphs of models on this machine, and what jsecon can use them for."""
     with console.progress("start"):
-        from jsecon.pipeline.models import inspect_models
+        from jsecon.pipeline.model_loading import inspect_models
 
     results, errors = [], []
     for name in verb.names:
@@ -185,13 +155,16 @@ def _check_models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
         for line in report.lines:
             console.say(line)
         results.append(dataclasses.asdict(report))
-        errors += report.errors
+        if not report.usable:
+            problem = f"no model that can be used: neither {', '.join(report.unusable)}"
+            remedy = "See above for what is missing and where such exports are published."
+            errors.append(InputError(report.folder, problem, "", remedy))
     return {"models": results, "errors": errors}
 
 
 def _cached_model(name: str) -> Path:
     """Returns the folder of a model that is on this machine, by its name, address or folder."""
-    if Path(name).exists():
+    if Path(name).exists() and not any(row.name == name for row in hub.catalogue()):
         return Path(name)
     for model in _candidates(name, None, None):
         for precision in get_args(Precision):
@@ -205,8 +178,8 @@ def _candidates(name: str, role: Role | None, precision: Precision | None) -> li
     if name.startswith(hub.PREFIX):
         return [hub.parse_address(name, each, precision) for each in get_args(Role) if role in (None, each)]
     if name != AUTO:
-        return [row.in_precision(precision) for row in hub.rows_of_name(name, role)]
-    rows = [hub.rows_of_name(each, of)[0] for of, each in hub.RECOMMENDED.items() if role in (None, of)]
+        return [row.in_precision(precision) for row in hub.models_of_name(name, role)]
+    rows = [hub.models_of_name(each, of)[0] for of, each in hub.RECOMMENDED.items() if role in (None, of)]
     return [row.in_precision(precision) for row in rows]
 
 

@@ -17,6 +17,7 @@ from jsecon.pipeline.options import (
     FieldOptions,
     InputOptions,
     MaskOptions,
+    ModelOption,
     ModelOptions,
     Option,
     Options,
@@ -174,7 +175,7 @@ class FieldVerb(Verb):
     """
 
     field: Positional[Path]
-    embedder: Option[Path | None] = None
+    embedder: ModelOption = None
     yes: Option[bool] = False
     template: Repeated[str] = dataclasses.field(default_factory=list)
 
@@ -348,14 +349,15 @@ class Serve(ServerVerb):
 
     Attributes:
       fields: Paths of field.safetensors files. Each field is known by the name of its folder.
-      embedder: Folder of the CLIP model that the fields were made with. By default it is where the runs had it.
+      embedder: The CLIP model that the fields were made with: a name, hub:owner/name, or a folder. By default it is the
+        one that the runs used.
     """
 
     examples = ("jsecon serve my_field/field.safetensors other_field/field.safetensors",)
     extra = "serve"
 
     fields: Positional[list[Path]]
-    embedder: Option[Path | None] = None
+    embedder: ModelOption = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -367,25 +369,26 @@ class Mcp(Verb):
 
     Attributes:
       fields: Paths of field.safetensors files. Each field is known by the name of its folder.
-      embedder: Folder of the CLIP model that the fields were made with. By default it is where the runs had it.
+      embedder: The CLIP model that the fields were made with: a name, hub:owner/name, or a folder. By default it is the
+        one that the runs used.
     """
 
     examples = ("jsecon mcp my_field/field.safetensors",)
     extra = "mcp"
 
     fields: Positional[list[Path]]
-    embedder: Option[Path | None] = None
+    embedder: ModelOption = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Models(Verb):
-    """Lists, fetches, examines and removes models.
+    """Lists, fetches and examines models.
 
     With list, prints the models that have a name, their sizes and licences, and which of them are on this machine. With
     get, fetches models from huggingface.co into its cache and compares each file with its hash; HF_HOME, HF_ENDPOINT,
     HF_TOKEN and HF_HUB_OFFLINE work as usual. With check, lists inputs and outputs of each graph, what jsecon can use
-    it for, and what is missing; the exit code is 2 if jsecon cannot use any of them. With remove, deletes models from
-    the cache.
+    it for, and what is missing; the exit code is 2 if jsecon cannot use any of them. `hf cache rm` deletes models
+    from the cache.
 
     Attributes:
       action: What to do.
@@ -398,7 +401,7 @@ class Models(Verb):
 
     examples = ("jsecon models list", "jsecon models get auto", "jsecon models check my_models")
 
-    action: Positional[Literal["list", "get", "check", "remove"]]
+    action: Positional[Literal["list", "get", "check"]]
     names: Positional[list[str]] = dataclasses.field(default_factory=list)
     role: Option[Role | None] = None
     precision: Option[Precision | None] = None

@@ -1,13 +1,12 @@
 """CLIP, MobileCLIP, SigLIP and SigLIP 2 on ONNX Runtime: a joint space of images and texts.
 
-A model folder has the layout of immich or of transformers.js (`hub.LAYOUTS`). MobileCLIP has CLIP's vocabulary. SigLIP
-and SigLIP 2 are recognised by config.json (`tokenizer.read_text_rules`).
+A model folder has the layout of immich or of transformers.js (networks/hub.py). MobileCLIP has CLIP's vocabulary.
+SigLIP and SigLIP 2 are recognised by config.json (`tokenizer.read_text_rules`).
 
 A region is embedded as LangSplat does it: masked, cropped to its box, padded to a black square. A text is embedded as
 it is; with several templates its embedding is the mean over them.
 """
 
-import dataclasses
 import functools
 import time
 from collections.abc import Sequence
@@ -21,85 +20,29 @@ from jsecon.errors import InputError, require
 from jsecon.files import read_json, reading
 from jsecon.networks.hub import Precision, find_files
 from jsecon.networks.session import Graph, Tensor, batches, content_digest, graph_files
-from jsecon.networks.tokenizer import CLIP_LENGTH, TextRules, TextTokenizer, read_text_rules
+from jsecon.networks.tokenizer import CLIP_LENGTH, TextTokenizer, read_text_rules
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.vision.protocols import CANONICAL, Logits
 from jsecon.vision.reference_words import cached_reference
 from jsecon.vision.stores import EmbeddingStore, mask_key
 
-DEFAULT_SIDE = 224
-"""px of an image if neither the configuration nor the graph fixes it"""
-MAX_SIDE = 4096
-"""px of an image"""
 LOGITS = "logits.json"
-MAX_SCALE, MAX_BIAS = 1e4, 1e3
-"""far above trained values: published SigLIP models have scales near 110 and biases near -15"""
-LOGITS_REMEDY = (
+"""file of a model folder with the scale and bias of a model trained with a sigmoid"""
+_LOGITS_REMEDY = (
     f'Write {LOGITS} into the folder, {{"scale": ..., "bias": ...}}: exp of the checkpoint\'s logit_scale, and its '
     "logit_bias."
 )
-_VISUAL_OUTPUTS = ("embedding", "image_embeds", "image_features", "image_embedding")
-_TEXTUAL_OUTPUTS = ("embedding", "text_embeds", "text_features", "text_embedding")
-_SIGLIP_OUTPUT = "pooler_output"
-"""of a SigLIP by transformers, whose pooler is the last step and includes the projection. CLIP's lies before it"""
-_VISUAL, _TEXTUAL = "CLIP's graph of images with its projection", "CLIP's graph of texts with its projection"
-
-
-@dataclasses.dataclass(frozen=True)
-class ClipFiles:
-    """Files and settings of a CLIP model."""
-
-    visual: Path
-    """Graph of images: (B, 3, S, S) to (B, E)."""
-    textual: Path
-    """Graph of texts: token ids (B, L) to (B, E)."""
-    tokenizer: Path
-    mean: tuple[float, ...]
-    """Mean of RGB in 0..1."""
-    std: tuple[float, ...]
-    """Standard deviation of RGB in 0..1."""
-    size: int | None = None
-    """S in px; None to take it from the graph, else DEFAULT_SIDE."""
-    rules: TextRules | None = None
-    """How the model takes its texts; None for CLIP."""
-    logits: Path | None = None
-    """File with the scale and bias of a model trained with a sigmoid, or None."""
-
-    @functools.cached_property
-    def name(self) -> str:
-        """Name of the space: "clip-" and hex digits of all that the embeddings depend on."""
-        files = [*graph_files(self.visual), *graph_files(self.textual), self.tokenizer]
-        settings = (self.mean, self.std, self.size)
-        extra = repr(settings if self.rules is None else (*settings, *self.rules))
-        return f"clip-{content_digest(files, extra=extra)}"
-
-
-def find_clip(folder: str | Path, precision: Precision | None = None) -> ClipFiles:
-    """Finds the files of the CLIP model in a folder.
-
-    Args:
-      folder: The folder.
-      precision: Precision of its graphs; None takes the highest that is there.
-
-    Returns:
-      The files, and how the model takes images and texts.
-
-    Raises:
-      InputError: A file is missing or cannot be read.
-    """
-    visual, textual, config, tokenizer = find_files(folder, "embedder", precision)
-    rules = read_text_rules(Path(folder), tokenizer)
-    logits = Path(folder) / LOGITS
-    return ClipFiles(
-        *(visual, textual, tokenizer),
-        *read_preprocessing(config),
-        rules,
-        logits if rules is not None and logits.is_file() else None,
-    )
+_OUTPUTS = {
+    "image": ("embedding", "image_embeds", "image_features", "image_embedding"),
+    "text": ("embedding", "text_embeds", "text_features", "text_embedding"),
+}
+"""kind of graph -> the names that its output may have; the first that is there is taken"""
+_BATCH = 16
+"""crops or texts of one run, if the graph does not fix it"""
 
 
 def read_preprocessing(path: Path) -> tuple[tuple[float, ...], tuple[float, ...], int | None]:
-    """Reads how a model takes images.
+    """Reads how a model takes images, or raises InputError.
 
     Args:
       path: A preprocess_cfg.json of open_clip or a preprocessor_config.json of transformers.
@@ -107,9 +50,6 @@ def read_preprocessing(path: Path) -> tuple[tuple[float, ...], tuple[float, ...]
     Returns:
       Mean and standard deviation of RGB in 0..1 (0 and 1 if the file says not to normalise), and the side of the square
       image in px or None.
-
-    Raises:
-      InputError: The file cannot be read.
     """
     expected = "mean and std of three channels, and a size in px"
     remedy = "Fetch the file again."
@@ -125,7 +65,7 @@ def read_preprocessing(path: Path) -> tuple[tuple[float, ...], tuple[float, ...]
         size = _square_side(content.get("crop_size", content.get("size")))
         mean, std = tuple(map(float, mean)), tuple(map(float, std))
     is_valid = len(mean) == len(std) == 3 and is_finite_and_bounded(mean, std) and min(std) >= 1e-6
-    if not is_valid or not 1 <= (size or 1) <= MAX_SIDE:
+    if not is_valid or not 1 <= (size or 1) <= 4096:
         raise InputError(path, f"mean {mean}, std {std}, size {size}", expected, remedy)
     return mean, std, size
 
@@ -142,38 +82,13 @@ def _square_side(size: object) -> int | None:
     return None if size is None else int(str(size))
 
 
-def _read_logits(path: Path) -> Logits:
-    """Reads scale and bias of a model trained with a sigmoid (SigLIP, arXiv 2303.15343), which its graphs do not hold.
-
-    The text is true of the image with probability sigmoid(scale * cosine + bias).
-    """
-    expected = f'{{"scale": s, "bias": b}}, 0 < s <= {MAX_SCALE:g}, |b| <= {MAX_BIAS:g}'
-    content = read_json(path, expected, LOGITS_REMEDY)
-    with reading(path, expected, LOGITS_REMEDY):
-        logits = Logits(float(content["scale"]), float(content["bias"]))
-    if not (is_finite_and_bounded(*logits) and 0 < logits.scale <= MAX_SCALE and abs(logits.bias) <= MAX_BIAS):
-        raise InputError(path, f"scale {logits.scale:g}, bias {logits.bias:g}", expected, LOGITS_REMEDY)
-    return logits
-
-
 def masked_crop(
     frame: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], size: int
 ) -> UInt8[np.ndarray, "size size 3"]:
-    """Crops a region: black outside of its mask, centred in a black square, resized bilinearly.
+    """Crops a region: black outside of its mask, centred in a black square, resized bilinearly to `size` px.
 
     The crop is SAM's box with LangSplat's extent, largest minus smallest coordinate: the last row and column are cut
-    off unless the region has no other.
-
-    Args:
-      frame: (H, W, 3) RGB.
-      mask: (H, W), at least one pixel.
-      size: Side of the result in px.
-
-    Returns:
-      (size, size, 3).
-
-    Raises:
-      ValueError: The mask is empty, or has another shape.
+    off unless the region has no other. ValueError is raised if the mask is empty, or has another shape.
     """
     fits = mask.shape == frame.shape[:2] and bool(mask.any())
     got = f"{mask.shape}, {int(mask.sum())} pixels"
@@ -189,46 +104,49 @@ def masked_crop(
 
 
 class ClipEmbedder:
-    """Embedder (jsecon.vision.protocols) that runs the two graphs of a CLIP model.
+    """Embedder (jsecon.vision.protocols) that runs the two graphs of a CLIP-like model.
 
-    A graph is opened when it is first needed and stays open until `close`.
+    A graph is opened when it is first needed and stays open until `close`. InputError is raised if the folder holds no
+    such model, a graph has other tensors, or a text is empty.
 
     Args:
-      model: The model folder, or its files.
+      folder: The model folder.
+      precision: Precision of its graphs; None takes the highest that is there.
       templates: Phrases with `{}` for the text, whose unit embeddings are averaged.
-      batch: Number of crops or texts of one run, if the graph does not fix it.
-      store: Folder that caches embeddings of regions by content, and of the reference words; or None.
+      store: Folder that caches embeddings of regions by content; or None.
 
     Attributes:
       name: Name of the space. It follows from the content of the files, so that models are told apart.
-
-    Raises:
-      InputError: The folder holds no CLIP model, or a template has no `{}`. Methods raise it if a graph has other
-        tensors than CLIP.
+      logits: Scale and bias of a model trained with a sigmoid if the folder has them, else None.
     """
 
     def __init__(
         self,
-        model: str | Path | ClipFiles,
+        folder: str | Path,
         *,
+        precision: Precision | None = None,
         templates: Sequence[str] = ("{}",),
-        batch: int = 16,
-        store: str | Path | None = None,
+        store: Path | None = None,
     ):
         if not templates or not all("{}" in template for template in templates):
             problem = ", ".join(map(repr, templates)) or "no template"
             remedy = 'For example "a photo of a {}.", or "{}", the text alone.'
             raise InputError("--template", problem, "a phrase that holds {}", remedy)
-        self.files = model if isinstance(model, ClipFiles) else find_clip(model)
+        visual, textual, config, tokenizer = find_files(folder, "embedder", precision)
+        mean, std, size = read_preprocessing(config)
+        rules = read_text_rules(Path(folder), tokenizer)
         self.templates = tuple(templates)
-        self.name = self.files.name
-        self._batch = batch
-        self._store = None if store is None else EmbeddingStore(Path(store), self.name)
+        files = [*graph_files(visual), *graph_files(textual), tokenizer]
+        self.name = f"clip-{content_digest(files, extra=repr((mean, std, size, *(rules or ()))))}"
+        self.logits = _read_logits(Path(folder)) if rules is not None else None
+        self._visual_path, self._textual_path, self._tokenizer_path = visual, textual, tokenizer
+        self._mean, self._std, self._size, self._rules = mean, std, size, rules
+        self._store = None if store is None else EmbeddingStore(store, self.name)
 
     @functools.cached_property
     def dim(self) -> int:
         """E, the length of an embedding."""
-        return self._visual_output.fixed(1) or self._run_visual(self._black_image()).shape[1]
+        return self._output(self._visual, "image").fixed(1) or self._run_visual(self._black_image()).shape[1]
 
     @functools.cached_property
     def canonical_phrases(self) -> Float32[np.ndarray, "c e"]:
@@ -237,34 +155,18 @@ class ClipEmbedder:
 
     @functools.cached_property
     def unrelated_words(self) -> Float32[np.ndarray, "w e"]:
-        """(W, E) unit embeddings of the reference words, in the templates like other texts.
-
-        They are embedded once for each model and its templates, and kept in the user's cache folder.
-        """
+        """(W, E) unit embeddings of the unrelated words, in the templates like other texts; they are cached."""
         return cached_reference(f"{self.name} {self.templates}", self.embed_text)
-
-    @functools.cached_property
-    def logits(self) -> Logits | None:
-        """Scale and bias of a model trained with a sigmoid if the folder has them, else None."""
-        return None if self.files.logits is None else _read_logits(self.files.logits)
 
     @property
     def size(self) -> int:
         """Side of an image in px."""
-        return self.files.size or self._visual_input.fixed(3) or DEFAULT_SIDE
+        return self._size or self._visual_input.fixed(3) or 224
 
     def embed_regions(
         self, frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m h w"]
     ) -> Float32[np.ndarray, "m e"]:
-        """Embeds the regions of a frame.
-
-        Args:
-          frame: (H, W, 3) RGB.
-          masks: (M, H, W).
-
-        Returns:
-          (M, E) unit embeddings; zero for an empty mask.
-        """
+        """Embeds the regions of a frame: unit rows, zero for an empty mask."""
         keys = [mask_key(mask) for mask in masks]
         known = {} if self._store is None else self._store.read(frame)
         rows = np.zeros((len(keys), self.dim), np.float32)
@@ -274,56 +176,45 @@ class ClipEmbedder:
                 rows[index] = known[key]
             elif masks[index].any():
                 missing.append(index)
-        for start in range(0, len(missing), self._batch):
-            chunk = missing[start : start + self._batch]
+        for start in range(0, len(missing), _BATCH):
+            chunk = missing[start : start + _BATCH]
             crops = np.stack([masked_crop(frame, masks[index], self.size) for index in chunk])
-            rows[chunk] = _normalize(self._run_visual(crops), self.files.visual)
+            rows[chunk] = _normalize(self._run_visual(crops), self._visual_path)
         if self._store is not None and missing:
             self._store.write(frame, known | {keys[index]: rows[index] for index in missing})
         return rows
 
     def embed_text(self, texts: list[str]) -> Float32[np.ndarray, "q e"]:
-        """Embeds texts.
-
-        Args:
-          texts: Q texts.
-
-        Returns:
-          (Q, E) unit embeddings, the mean over the templates.
-
-        Raises:
-          InputError: A text is empty.
-        """
+        """Embeds texts: unit rows, the mean over the templates."""
         for text in texts:
             if not text.strip():
                 raise InputError("text", repr(text), "a text", 'Say what to find, for example "red mug".')
         phrases = [template.replace("{}", text) for text in texts for template in self.templates]
         rows = self._embed_phrases(phrases).reshape(len(texts), len(self.templates), -1)
-        return _normalize(rows.mean(1), self.files.textual)
+        return _normalize(rows.mean(1), self._textual_path)
 
     def seconds_per_crop(self) -> float:
-        """Measures the time of a region in a full batch.
-
-        The crops are blank: which regions are embedded is known only after their masks were tracked.
-
-        Returns:
-          Seconds.
-        """
-        crops = np.zeros((self._batch, self.size, self.size, 3), np.uint8)
+        """Measures the time of a blank region in a full batch, past the cache of embeddings."""
+        crops = np.zeros((_BATCH, self.size, self.size, 3), np.uint8)
         self._run_visual(crops)  # opens the graph
         started = time.monotonic()
         self._run_visual(crops)
-        return (time.monotonic() - started) / self._batch
+        return (time.monotonic() - started) / _BATCH
 
-    def check(self) -> None:
-        """Runs the graphs on a black image and a word, and closes them.
-
-        Raises:
-          InputError: A graph is damaged, or not a CLIP model's.
-        """
+    def check(self) -> str:
+        """Runs the graphs on a black image and a word, closes them, and describes the model in a sentence."""
         self._run_visual(self._black_image())
         self._embed_phrases(["word"])
+        summary = f"images of {self.size}x{self.size} px and texts to {self.dim} numbers"
         self.close()
+        if self._rules is None:
+            return summary
+        length, pad, clean = self._rules
+        summary = f"{summary}; texts of {length} tokens, padded with {pad!r}, cleaned by {clean!r}"
+        if self.logits is None:
+            return f"{summary}; no scale and bias, so that a text is refused by its cosine. {_LOGITS_REMEDY}"
+        scale, bias = self.logits
+        return f"{summary}; how likely a text is there: sigmoid({scale:.4f} cosine {bias:+.4f})"
 
     def close(self) -> None:
         """Closes the graphs and frees their memory; they are opened again when needed."""
@@ -335,61 +226,77 @@ class ClipEmbedder:
 
     @functools.cached_property
     def _visual(self) -> Graph:
-        return Graph(self.files.visual)
+        return Graph(self._visual_path)
 
     @functools.cached_property
     def _textual(self) -> Graph:
-        return Graph(self.files.textual)
+        return Graph(self._textual_path)
 
     @functools.cached_property
     def _tokenizer(self) -> TextTokenizer:
-        return TextTokenizer(self.files.tokenizer, self.files.rules)
+        return TextTokenizer(self._tokenizer_path, self._rules)
 
     @property
     def _visual_input(self) -> Tensor:
         name = "pixel_values" if "pixel_values" in self._visual.inputs else "image"
-        return self._visual.require("input", name, (None, 3, None, None), _VISUAL)
+        return self._visual.require("input", name, (None, 3, None, None), "CLIP's graph of images with its projection")
 
-    def _output(self, graph: Graph, names: tuple[str, ...], what: str) -> Tensor:
-        """Returns the output (B, E) of a graph: the first of `names` that it has."""
-        known = names if self.files.rules is None else (*names, _SIGLIP_OUTPUT)
-        name = next((name for name in known if name in graph.outputs), known[0])
-        return graph.require("output", name, (None, None), what)
+    def _output(self, graph: Graph, kind: str) -> Tensor:
+        """Returns the output (B, E) of a graph of images or texts.
 
-    @property
-    def _visual_output(self) -> Tensor:
-        return self._output(self._visual, _VISUAL_OUTPUTS, _VISUAL)
+        SigLIP's pooler is the last step and includes the projection; CLIP's lies before it.
+        """
+        names = _OUTPUTS[kind] if self._rules is None else (*_OUTPUTS[kind], "pooler_output")
+        name = next((name for name in names if name in graph.outputs), names[0])
+        return graph.require("output", name, (None, None), f"CLIP's graph of {kind}s with its projection")
 
     def _run_visual(self, crops: UInt8[np.ndarray, "b s s 3"]) -> np.ndarray:
         """(B, S, S, 3) RGB to (B, E), not normalised."""
-        mean, std = np.asarray(self.files.mean, np.float32), np.asarray(self.files.std, np.float32)
+        mean, std = np.asarray(self._mean, np.float32), np.asarray(self._std, np.float32)
         images = np.ascontiguousarray(((crops.astype(np.float32) / 255.0 - mean) / std).transpose(0, 3, 1, 2))
-        tensor, output = self._visual_input, self._visual_output.name
+        tensor, output = self._visual_input, self._output(self._visual, "image").name
         parts = [
             _run_rows(self._visual, {tensor.name: part}, output, count)
-            for part, count in batches(images, tensor.fixed(0), self._batch)
+            for part, count in batches(images, tensor.fixed(0), _BATCH)
         ]
         return np.concatenate(parts)
 
     def _embed_phrases(self, phrases: list[str]) -> Float32[np.ndarray, "p e"]:
         """(P, E) unit embeddings of phrases as they are."""
-        graph = self._textual
-        output = self._output(graph, _TEXTUAL_OUTPUTS, _TEXTUAL)
+        graph, what = self._textual, "CLIP's graph of texts with its projection"
+        output = self._output(graph, "text")
         masks = [name for name in graph.inputs if "mask" in name]
         names = [name for name in graph.inputs if name not in masks]
-        tensor = graph.require("input", names[0] if len(names) == 1 else "input_ids", (None, None), _TEXTUAL)
-        length = tensor.fixed(1) or (self.files.rules and self.files.rules.length) or CLIP_LENGTH
-        ids = self._tokenizer(phrases, length)
+        tensor = graph.require("input", names[0] if len(names) == 1 else "input_ids", (None, None), what)
+        length = tensor.fixed(1) or (CLIP_LENGTH if self._rules is None else self._rules.length)
         parts = []
-        for part, count in batches(ids, tensor.fixed(0), self._batch):
-            feeds = {tensor.name: part} | {name: self._tokenizer.mask(part) for name in masks}
+        for part, count in batches(np.stack(self._tokenizer(phrases, length), 1), tensor.fixed(0), _BATCH):
+            feeds = {tensor.name: part[:, 0]} | dict.fromkeys(masks, part[:, 1])
             parts.append(_run_rows(graph, feeds, output.name, count))
         rows = np.concatenate(parts)
         if rows.shape[1] != self.dim:
-            expected = f"{self.dim}, like the images of {self.files.visual.name}"
+            expected = f"{self.dim}, like the images of {self._visual_path.name}"
             remedy = "Take both graphs from one model, with their projections."
-            raise InputError(self.files.textual, f"texts of {rows.shape[1]} numbers", expected, remedy)
-        return _normalize(rows, self.files.textual)
+            raise InputError(self._textual_path, f"texts of {rows.shape[1]} numbers", expected, remedy)
+        return _normalize(rows, self._textual_path)
+
+
+def _read_logits(folder: Path) -> Logits | None:
+    """Reads scale and bias of a model trained with a sigmoid (SigLIP, arXiv 2303.15343), which its graphs do not hold.
+
+    The text is true of the image with probability sigmoid(scale * cosine + bias).
+    """
+    path = folder / LOGITS
+    if not path.is_file():
+        return None
+    # Far above trained values: published SigLIP models have scales near 110 and biases near -15.
+    expected = '{"scale": s, "bias": b}, 0 < s <= 1e4, |b| <= 1e3'
+    content = read_json(path, expected, _LOGITS_REMEDY)
+    with reading(path, expected, _LOGITS_REMEDY):
+        logits = Logits(float(content["scale"]), float(content["bias"]))
+    if not (is_finite_and_bounded(*logits) and 0 < logits.scale <= 1e4 and abs(logits.bias) <= 1e3):
+        raise InputError(path, f"scale {logits.scale:g}, bias {logits.bias:g}", expected, _LOGITS_REMEDY)
+    return logits
 
 
 def _run_rows(graph: Graph, feeds: dict[str, np.ndarray], output: str, count: int) -> np.ndarray:

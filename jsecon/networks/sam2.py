@@ -16,11 +16,9 @@ tracked by itself. Memory is bounded whatever the length of the sequence.
 
 import dataclasses
 import functools
-import hashlib
-from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import jax.numpy as jnp
@@ -30,25 +28,24 @@ from PIL import Image
 from jsecon.errors import InputError, require
 from jsecon.files import read_json, reading
 from jsecon.networks.hub import find_files, published
-from jsecon.networks.session import Graph, content_digest, graph_files
+from jsecon.networks.session import Graph, Shape, content_digest, graph_files
 from jsecon.numerics import is_finite_and_bounded
 
 SLOTS = 7
 """memories that a frame attends to, the prompted one among them"""
 POINTERS = 16
 """object pointers that a frame attends to, the prompted one among them"""
-MASK_LOGIT = 10.0
-"""logit of a pixel of a mask prompt; its negative outside"""
 HOLE_AREA = 8
 """pixels of a low-resolution mask: holes up to this size are filled"""
-KEPT_FRAMES = 16
-"""frames whose features a tracker keeps for later calls, about 16 MiB each at 1024 px"""
+_MASK_LOGIT = 10.0
+"""logit of a pixel of a mask prompt; its negative outside"""
+_ENCODED_FRAMES = 16
+"""frames whose features are kept for later calls, about 16 MiB each at 1024 px"""
 
-Shape = tuple[int | str | None, ...]
 # Letters are sizes that must agree across the files: S image, G grid of the coarsest features, T = G^2, C channels, M
 # numbers of a memory token; None is free.
 _FINE, _COARSE = (1, None, None, None), (1, "C", "G", "G")
-SIGNATURES: Mapping[str, tuple[Mapping[str, Shape], Mapping[str, Shape]]] = {
+_SIGNATURES: Mapping[str, tuple[Mapping[str, Shape], Mapping[str, Shape]]] = {
     "vision_encoder": (
         {"pixel_values": (1, 3, "S", "S")},
         {"feats0": _FINE, "feats1": _FINE}
@@ -72,6 +69,12 @@ SIGNATURES: Mapping[str, tuple[Mapping[str, Shape], Mapping[str, Shape]]] = {
 }
 """graph -> inputs and outputs that are used, with their shapes"""
 
+Features = Mapping[str, np.ndarray]
+"""output of the vision encoder for a frame, by name, shared by all objects"""
+Points = tuple[np.ndarray, np.ndarray]
+"""(P, 2) x, y in px of the frame, and their labels (P,): 1 inside, 0 outside, 2 and 3 the corners of a box (top left,
+bottom right)"""
+
 
 class Constants(NamedTuple):
     """Content of constants.json."""
@@ -82,83 +85,6 @@ class Constants(NamedTuple):
     """(3,) standard deviation of RGB in 0..1"""
     temporal_code: np.ndarray
     """(SLOTS, M) code of a memory by its distance in frames; the last row is the prompted frame's"""
-
-
-@dataclasses.dataclass(frozen=True)
-class Sam2Graphs:
-    """The graphs of one model."""
-
-    graphs: Mapping[str, Graph]
-    """By name, as in SIGNATURES."""
-    constants: Constants
-    """Content of constants.json."""
-    sizes: Mapping[str, int]
-    """Sizes of the letters of SIGNATURES."""
-
-    def _run(self, name: str, **feeds: np.ndarray) -> dict[str, np.ndarray]:
-        """Runs a graph by name."""
-        return self.graphs[name].run(feeds)
-
-
-def _sam2_files(folder: Path) -> dict[str, Path]:
-    """Finds the five graphs and constants.json, by the names of the files without their endings."""
-    return {path.stem: path for path in find_files(folder, "tracker")}
-
-
-def open_sam2(folder: Path) -> Sam2Graphs:
-    """Opens the model in a folder.
-
-    Args:
-      folder: The folder.
-
-    Returns:
-      The graphs, with the sizes that they agree on.
-
-    Raises:
-      InputError: A file is missing or damaged, or its tensors do not fit the rest of the folder.
-    """
-    files = _sam2_files(folder)
-    constants = _read_constants(files["constants"])
-    graphs = {name: Graph(files[name]) for name in SIGNATURES}
-    encoder, decoder = graphs["vision_encoder"], graphs["mask_decoder"]
-    image = encoder.require("input", "pixel_values", (1, 3, None, None), "SAM 2's vision encoder")
-    # Sizes are those of inputs: PyTorch's exporter leaves some sizes of the encoder's outputs open.
-    features = decoder.require("input", "feats2_cond", (1, None, None, None), "SAM 2's mask decoder")
-    side, channels, grid = image.fixed(2), features.fixed(1), features.fixed(2)
-    if side is None or channels is None or grid is None:
-        raise InputError(
-            decoder.path, f"{image} and {features}", "an image and features of fixed sizes", published("tracker")
-        )
-    sizes = {"S": side, "C": channels, "G": grid, "T": grid * grid, "M": constants.temporal_code.shape[1]}
-    for name, graph in graphs.items():
-        for tensors, kind in zip(SIGNATURES[name], ("input", "output")):
-            for tensor, shape in tensors.items():
-                fixed = tuple(sizes[size] if isinstance(size, str) else size for size in shape)
-                graph.require(kind, tensor, fixed, f"SAM 2's {name.replace('_', ' ')}")
-    return Sam2Graphs(graphs, constants, sizes)
-
-
-def _read_constants(path: Path) -> Constants:
-    expected = f"image_mean, image_std and memory_temporal_positional_encoding of {SLOTS} rows"
-    remedy = published("tracker")
-    content = read_json(path, expected, remedy)
-    with reading(path, expected, remedy):
-        names = ("image_mean", "image_std", "memory_temporal_positional_encoding")
-        constants = Constants(*(np.asarray(content[name], np.float32) for name in names))
-    shapes = [array.shape for array in constants]
-    fits = shapes[:2] == [(3,), (3,)] and len(shapes[2]) == 2 and shapes[2][0] == SLOTS and shapes[2][1] > 0
-    if not fits or not is_finite_and_bounded(*constants) or constants.std.min() <= 0:
-        raise InputError(path, f"shapes {shapes}, or numbers that are not finite", expected, remedy)
-    return constants
-
-
-FrameFeatures = Mapping[str, np.ndarray]
-"""output of the vision encoder for a frame, by name, shared by all objects"""
-
-
-Points = tuple[np.ndarray, np.ndarray]
-"""(P, 2) x, y in px of the frame, and their labels (P,): 1 inside, 0 outside, 2 and 3 the corners of a box (top left,
-bottom right)"""
 
 
 class _Prediction(NamedTuple):
@@ -183,6 +109,148 @@ class Memory(NamedTuple):
     """(C,) float32"""
 
 
+class Sam2Graphs:
+    """The graphs of one model, with the sizes that they agree on, and the steps of the predictor.
+
+    Args:
+      graphs: By name, as in the module's docstring.
+      constants: Content of constants.json.
+      sizes: Sizes S of the image, G of the grid of the coarsest features, C of their channels, T = G^2 and M.
+    """
+
+    def __init__(self, graphs: Mapping[str, Any], constants: Constants, sizes: Mapping[str, int]):
+        self.graphs, self.constants, self.sizes = graphs, constants, sizes
+        self._encode = functools.lru_cache(_ENCODED_FRAMES)(self._encode_bytes)
+
+    def encode(self, frame: np.ndarray) -> Features:
+        """Encodes a frame (H, W, 3), stretched to a square; the last frames are remembered by their content."""
+        return self._encode(frame.tobytes(), frame.shape)
+
+    def _encode_bytes(self, content: bytes, shape: tuple[int, ...]) -> Features:
+        side = self.sizes["S"]
+        frame = Image.fromarray(np.frombuffer(content, np.uint8).reshape(shape))
+        small = np.asarray(frame.resize((side, side), Image.Resampling.BICUBIC))
+        image = ((small / 255.0).astype(np.float32) - self.constants.mean) / self.constants.std
+        outputs = self._run("vision_encoder", pixel_values=image.transpose(2, 0, 1)[None])
+        return {name: outputs[name] for name in _SIGNATURES["vision_encoder"][1]}
+
+    def _run(self, name: str, **feeds: np.ndarray) -> dict[str, np.ndarray]:
+        """Runs a graph by name."""
+        return self.graphs[name].run(feeds)
+
+    def prompted(self, features: Features, prompt: np.ndarray | Points, size: tuple[int, int]) -> _Prediction:
+        """Predicts the object of a mask or of points in a frame of size (H, W) from that frame alone."""
+        side = self.sizes["S"]
+        scale = np.array([side / size[1], side / size[0]], np.float32)
+        if isinstance(prompt, tuple):
+            points, labels = prompt
+            return self._decode(features, features["feats2_no_mem"], np.asarray(points, np.float32) * scale, labels)
+        rows, columns = np.flatnonzero(prompt.any(1)), np.flatnonzero(prompt.any(0))
+        require(len(rows) > 0, "follow", "an empty mask", "at least one pixel", "Leave out empty masks.")
+        box = np.array([[columns[0], rows[0]], [columns[-1] + 1, rows[-1] + 1]], np.float32) * scale
+        decoded = self._decode(features, features["feats2_no_mem"], box, np.array([2, 3]))
+        inside = _resize(prompt.astype(np.float32), side) >= 0.5
+        mask = np.where(inside, _MASK_LOGIT, -_MASK_LOGIT).astype(np.float32)
+        score = np.full((1, 1), _MASK_LOGIT, np.float32)
+        return _Prediction(_resize(mask, len(decoded.logits)), mask, decoded.pointer, score)
+
+    def tracked(
+        self, features: Features, bank: "Bank", t: int, step: int, count: int, position: np.ndarray
+    ) -> _Prediction:
+        """Predicts the object of a bank in frame t of `count`; `position` (K, M) is the spatial code of a memory."""
+        memories, pointers = bank.attended(t, step, count)
+        width = self.sizes["M"]
+        distances = np.array([distance for distance, _ in pointers], np.float32) / max(min(count, POINTERS) - 1, 1)
+        ages = self._run("pointer_tpos", normalized_diffs=distances)["pointer_pos"]
+        pointer_tokens = np.array([pointer for _, pointer in pointers], np.float32).reshape(-1, width)
+        tokens = [np.asarray(array, np.float32) for _, array in memories]
+        codes = [position + self.constants.temporal_code[row] for row, _ in memories]
+        conditioned = self._run(
+            "memory_attention",
+            current_vision_features=_as_tokens(features["feats2"]),
+            current_vision_position_embeddings=_as_tokens(features["vision_pos_embed"]),
+            memory=np.concatenate([*tokens, pointer_tokens])[:, None],
+            memory_pos=np.concatenate([*codes, np.repeat(ages, self.sizes["C"] // width, axis=0)])[:, None],
+        )["conditioned_feats"]
+        return self._decode(features, conditioned, np.zeros((1, 2), np.float32), np.array([-1]))
+
+    def _decode(self, features: Features, image: np.ndarray, points: np.ndarray, labels: np.ndarray) -> _Prediction:
+        """Runs the mask decoder with points (P, 2) in px of the square image; it chooses among its masks by itself."""
+        outputs = self._run(
+            "mask_decoder",
+            feats0=features["feats0"],
+            feats1=features["feats1"],
+            feats2_cond=image,
+            input_points=points[None, None],
+            input_labels=labels[None, None],
+        )
+        masks = outputs["low_res_mask"][0, 0], outputs["high_res_mask"][0, 0]
+        return _Prediction(*masks, outputs["object_pointer"][0, 0], outputs["object_score_logits"].reshape(1, 1))
+
+    def memorize(self, features: Features, prediction: _Prediction, *, binarize: bool) -> tuple[Memory, np.ndarray]:
+        """Encodes the memory of an object in a frame, binary if it was prompted there; and returns its spatial code."""
+        outputs = self._run(
+            "memory_encoder",
+            feats2=features["feats2"],
+            high_res_mask=prediction.high_res[None, None],
+            object_score_logits=prediction.score,
+            binarize=np.asarray(binarize, np.float32),
+        )
+        tokens = outputs["memory_tokens"][:, 0].astype(jnp.bfloat16)
+        return Memory(tokens, prediction.pointer), outputs["memory_pos"][:, 0]
+
+
+def _as_tokens(grid: np.ndarray) -> np.ndarray:
+    """(1, C, G, G) to (G^2, 1, C)."""
+    return np.ascontiguousarray(grid.reshape(grid.shape[1], -1).T[:, None])
+
+
+def _resize(image: np.ndarray, side: int) -> np.ndarray:
+    """(H, W) float32 to (side, side), bilinear with a kernel that widens as it shrinks, like PyTorch's antialias."""
+    return np.asarray(Image.fromarray(image).resize((side, side), Image.Resampling.BILINEAR))
+
+
+def _sam2_files(folder: Path) -> dict[str, Path]:
+    """Finds the five graphs and constants.json, by the names of the files without their endings."""
+    return {path.stem: path for path in find_files(folder, "tracker")}
+
+
+def open_sam2(folder: Path) -> Sam2Graphs:
+    """Opens the model in a folder, or raises InputError if its files do not make one model."""
+    files = _sam2_files(folder)
+    constants = _read_constants(files["constants"])
+    graphs = {name: Graph(files[name]) for name in _SIGNATURES}
+    encoder, decoder = graphs["vision_encoder"], graphs["mask_decoder"]
+    image = encoder.require("input", "pixel_values", (1, 3, None, None), "SAM 2's vision encoder")
+    # Sizes are those of inputs: PyTorch's exporter leaves some sizes of the encoder's outputs open.
+    features = decoder.require("input", "feats2_cond", (1, None, None, None), "SAM 2's mask decoder")
+    side, channels, grid = image.fixed(2), features.fixed(1), features.fixed(2)
+    if side is None or channels is None or grid is None:
+        expected = "an image and features of fixed sizes"
+        raise InputError(decoder.path, f"{image} and {features}", expected, published("tracker"))
+    sizes = {"S": side, "C": channels, "G": grid, "T": grid * grid, "M": constants.temporal_code.shape[1]}
+    for name, graph in graphs.items():
+        for tensors, kind in zip(_SIGNATURES[name], ("input", "output")):
+            for tensor, shape in tensors.items():
+                fixed = tuple(sizes[size] if isinstance(size, str) else size for size in shape)
+                graph.require(kind, tensor, fixed, f"SAM 2's {name.replace('_', ' ')}")
+    return Sam2Graphs(graphs, constants, sizes)
+
+
+def _read_constants(path: Path) -> Constants:
+    expected = f"image_mean, image_std and memory_temporal_positional_encoding of {SLOTS} rows"
+    remedy = published("tracker")
+    content = read_json(path, expected, remedy)
+    with reading(path, expected, remedy):
+        names = ("image_mean", "image_std", "memory_temporal_positional_encoding")
+        constants = Constants(*(np.asarray(content[name], np.float32) for name in names))
+    shapes = [array.shape for array in constants]
+    fits = shapes[:2] == [(3,), (3,)] and len(shapes[2]) == 2 and shapes[2][0] == SLOTS and shapes[2][1] > 0
+    if not fits or not is_finite_and_bounded(*constants) or constants.std.min() <= 0:
+        raise InputError(path, f"shapes {shapes}, or numbers that are not finite", expected, remedy)
+    return constants
+
+
 @dataclasses.dataclass(frozen=True)
 class Bank:
     """The memories of one object."""
@@ -199,6 +267,8 @@ class Bank:
     ) -> tuple[list[tuple[int, np.ndarray]], list[tuple[int, np.ndarray]]]:
         """Lists what frame t attends to, filled up by repeating the newest entry.
 
+        The prompted frame comes first, then the frames before t in the direction of tracking, the nearest first.
+
         Args:
           t: The frame.
           step: Direction of tracking: 1 forward, -1 backward.
@@ -206,11 +276,7 @@ class Bank:
 
         Returns:
           SLOTS pairs of a row of the temporal code and memory tokens (K, M), and POINTERS pairs of a distance in frames
-          and a pointer (C,). The prompted frame comes first, then the frames before t in the direction of tracking, the
-          nearest first.
-
-        Raises:
-          ValueError: A memory that is needed was dropped.
+          and a pointer (C,).
         """
         near = [(d, self.tracked[t - step * d]) for d in range(1, POINTERS) if t - step * d in self.tracked]
         tokens = [(SLOTS - 1, self.prompted.tokens), *((d - 1, memory.tokens) for d, memory in near if d < SLOTS)]
@@ -225,17 +291,9 @@ class Bank:
         return memories, pointers
 
     def with_tracked(self, t: int, memory: Memory, step: int) -> "Bank":
-        """Adds a frame, and drops what no later frame can reach.
+        """Adds the memory of a frame, and drops what no later frame can reach.
 
         The backward pass begins before the prompted frame and reads what the forward pass left beyond it.
-
-        Args:
-          t: The frame.
-          memory: Its memory.
-          step: Direction of tracking: 1 forward, -1 backward.
-
-        Returns:
-          The new bank.
         """
         kept = {}
         for frame, old in {**self.tracked, t: memory}.items():
@@ -247,48 +305,67 @@ class Bank:
         return dataclasses.replace(self, tracked=kept)
 
 
+def follow(
+    model: Sam2Graphs, frames: np.ndarray, start: int, prompts: Sequence[np.ndarray | Points]
+) -> Iterator[tuple[int, list[np.ndarray]]]:
+    """Follows objects from a prompted frame to the last, then back to the first.
+
+    Args:
+      model: The model.
+      frames: (T, H, W, 3) uint8, anything that is indexed by frame and has a shape, such as a memory map.
+      start: The prompted frame.
+      prompts: Mask (H, W) bool or points of each object in that frame.
+
+    Yields:
+      A frame index and the mask logits (L, L) of each object, for every frame.
+    """
+    count = len(frames)
+    require(0 <= start < count, "follow", f"frame {start}", f"a frame below {count}", "Prompt a frame of the sequence.")
+    require(len(prompts) > 0, "follow", "no prompt", "at least one", "Prompt an object.")
+    features = model.encode(frames[start])
+    first = [model.prompted(features, prompt, frames.shape[1:3]) for prompt in prompts]
+    memories = [model.memorize(features, prediction, binarize=True) for prediction in first]
+    banks = [Bank(start, memory) for memory, _ in memories]
+    position = memories[0][1]
+    yield start, [prediction.logits for prediction in first]
+    for step, order in ((1, range(start + 1, count)), (-1, range(start - 1, -1, -1))):
+        for t in order:
+            features = model.encode(frames[t])
+            logits = []
+            for number, bank in enumerate(banks):
+                prediction = model.tracked(features, bank, t, step, count, position)
+                memory, _ = model.memorize(features, prediction, binarize=False)
+                banks[number] = bank.with_tracked(t, memory, step)
+                logits.append(prediction.logits)
+            yield t, logits
+
+
 class Sam2Tracker:
-    """Tracker (jsecon.vision.protocols) that runs SAM 2.1 or EdgeTAM.
+    """Tracker (jsecon.vision.protocols) that runs SAM 2.1 or EdgeTAM, or an InputError if a file is no such model's.
 
     The graphs are opened when first needed and stay open until `close`.
 
-    Args:
-      folder: The model folder.
-
     Attributes:
-      name: Follows from the content of the files and the settings.
-
-    Raises:
-      InputError: A file is missing. Methods raise it if the files do not make one model.
+      name: Follows from the content of the files.
     """
 
     def __init__(self, folder: Path):
         files = _sam2_files(folder)
-        graphs = [part for name in SIGNATURES for part in graph_files(files[name])]
+        graphs = [part for name in _SIGNATURES for part in graph_files(files[name])]
         self.name = f"sam2-{content_digest([*graphs, files['constants']], extra=repr(HOLE_AREA))}"
         self._folder = folder
 
     @functools.cached_property
-    def graphs(self) -> Sam2Graphs:
-        """The open graphs."""
+    def _graphs(self) -> Sam2Graphs:
         return open_sam2(self._folder)
 
-    @functools.cached_property
-    def _encode(self) -> "FrameEncoder":
-        return FrameEncoder(self.graphs, keep=KEPT_FRAMES)
-
-    def check(self) -> None:
-        """Opens the graphs.
-
-        Raises:
-          InputError: The files do not make one model.
-        """
-        open_sam2(self._folder)
+    def check(self) -> str:
+        """Opens the graphs, and describes the model in a sentence."""
+        return f"objects followed through the frames, images of {open_sam2(self._folder).sizes['S']} px"
 
     def close(self) -> None:
         """Closes the graphs and frees their memory; they are opened again when needed."""
-        self.__dict__.pop("_encode", None)
-        self.__dict__.pop("graphs", None)
+        self.__dict__.pop("_graphs", None)
 
     def __call__(self, frames: np.ndarray, index: int, prompts: np.ndarray) -> np.ndarray:
         """Follows objects through all frames.
@@ -300,9 +377,6 @@ class Sam2Tracker:
 
         Returns:
           (T, H, W) int16 index of the object, or -1. A pixel of several objects goes to the highest logit.
-
-        Raises:
-          ValueError: The shapes disagree, or there is no such frame.
         """
         height, width = frames.shape[1:3]
         fits = prompts.ndim == 3 and prompts.shape[1:] == (height, width) and 0 <= index < len(frames)
@@ -312,192 +386,18 @@ class Sam2Tracker:
         objects = [b for b, mask in enumerate(prompts) if mask.any()]
         if not objects:
             return labels
-        numbers = np.array([*objects, -1], np.int16)
-        masks = [prompts[b] for b in objects]
-        for t, logits in follow(self.graphs, frames, index, masks, encode=self._encode):
-            filled = [fill_holes(each, HOLE_AREA) for each in logits]
-            labels[t] = numbers[_strongest(filled, (height, width))]
+        for t, logits in follow(self._graphs, frames, index, [prompts[b] for b in objects]):
+            best = np.zeros((height, width), np.float32)
+            for number, low_res in zip(objects, logits):
+                resized = cv2.resize(fill_holes(low_res, HOLE_AREA), (width, height))
+                above = resized > best
+                best[above], labels[t, above] = resized[above], number
         return labels
 
 
-class FrameEncoder:
-    """Encodes frames and keeps the features of the last ones by their pixels.
-
-    Args:
-      graphs: The model.
-      keep: Number of frames to keep.
-    """
-
-    def __init__(self, graphs: Sam2Graphs, *, keep: int = 1):
-        self._graphs = graphs
-        self._keep = max(keep, 1)
-        self._known: OrderedDict[bytes, FrameFeatures] = OrderedDict()
-
-    def __call__(self, frame: np.ndarray) -> FrameFeatures:
-        """Encodes a frame (H, W, 3), stretched to a square."""
-        key = hashlib.blake2b(np.ascontiguousarray(frame).data, digest_size=16).digest() + repr(frame.shape).encode()
-        if key not in self._known:
-            side, constants = self._graphs.sizes["S"], self._graphs.constants
-            small = np.asarray(Image.fromarray(frame).resize((side, side), Image.Resampling.BICUBIC))
-            image = ((small / 255.0).astype(np.float32) - constants.mean) / constants.std
-            outputs = self._graphs._run("vision_encoder", pixel_values=image.transpose(2, 0, 1)[None])
-            self._known[key] = {name: outputs[name] for name in SIGNATURES["vision_encoder"][1]}
-        self._known.move_to_end(key)
-        while len(self._known) > self._keep:
-            self._known.popitem(last=False)
-        return self._known[key]
-
-
-def follow(
-    graphs: Sam2Graphs,
-    frames: np.ndarray,
-    start: int,
-    prompts: Sequence[np.ndarray | Points],
-    encode: FrameEncoder | None = None,
-) -> Iterator[tuple[int, list[np.ndarray]]]:
-    """Follows objects from a prompted frame to the last, then back to the first.
-
-    Args:
-      graphs: The model.
-      frames: (T, H, W, 3) uint8, anything that is indexed by frame and has a shape, such as a memory map.
-      start: The prompted frame.
-      prompts: Mask (H, W) bool or points of each object in that frame.
-      encode: Encoder that keeps features of frames; by default a new one.
-
-    Yields:
-      A frame index and the mask logits (L, L) of each object, for every frame.
-
-    Raises:
-      ValueError: There is no such frame, or no prompt.
-    """
-    count = len(frames)
-    require(0 <= start < count, "follow", f"frame {start}", f"a frame below {count}", "Prompt a frame of the sequence.")
-    encode = encode or FrameEncoder(graphs)
-    features = encode(frames[start])
-    size = int(frames.shape[1]), int(frames.shape[2])
-    first = [_prompted(graphs, features, prompt, size) for prompt in prompts]
-    position, banks = None, []
-    for prediction in first:
-        memory, position = _memorize(graphs, features, prediction, binarize=True)
-        banks.append(Bank(start, memory))
-    require(position is not None, "follow", "no prompt", "at least one", "Prompt an object.")
-    yield start, [prediction.logits for prediction in first]
-    for step, order in ((1, range(start + 1, count)), (-1, range(start - 1, -1, -1))):
-        for t in order:
-            features = encode(frames[t])
-            logits = []
-            for number, bank in enumerate(banks):
-                prediction = _tracked(graphs, features, bank, t, step, count, position)
-                memory, _ = _memorize(graphs, features, prediction, binarize=False)
-                banks[number] = bank.with_tracked(t, memory, step)
-                logits.append(prediction.logits)
-            yield t, logits
-
-
-def _prompted(
-    graphs: Sam2Graphs, features: FrameFeatures, prompt: np.ndarray | Points, size: tuple[int, int]
-) -> _Prediction:
-    """Predicts the object of a prompt in a frame of size (H, W) from that frame alone."""
-    side = graphs.sizes["S"]
-    scale = np.array([side / size[1], side / size[0]], np.float32)
-    if isinstance(prompt, tuple):
-        points, labels = prompt
-        return _decode(graphs, features, features["feats2_no_mem"], np.asarray(points, np.float32) * scale, labels)
-    rows, columns = np.flatnonzero(prompt.any(1)), np.flatnonzero(prompt.any(0))
-    require(len(rows) > 0, "follow", "an empty mask", "at least one pixel", "Leave out empty masks.")
-    box = np.array([[columns[0], rows[0]], [columns[-1] + 1, rows[-1] + 1]], np.float32) * scale
-    decoded = _decode(graphs, features, features["feats2_no_mem"], box, np.array([2, 3]))
-    mask = np.where(_resize(prompt.astype(np.float32), side) >= 0.5, MASK_LOGIT, -MASK_LOGIT).astype(np.float32)
-    return _Prediction(
-        _resize(mask, len(decoded.logits)), mask, decoded.pointer, np.full((1, 1), MASK_LOGIT, np.float32)
-    )
-
-
-def _resize(image: np.ndarray, side: int) -> np.ndarray:
-    """(H, W) float32 to (side, side), bilinear with a kernel that widens as it shrinks, like PyTorch's antialias."""
-    return np.asarray(Image.fromarray(image).resize((side, side), Image.Resampling.BILINEAR))
-
-
-def _tracked(
-    graphs: Sam2Graphs, features: FrameFeatures, bank: Bank, t: int, step: int, count: int, position: np.ndarray | None
-) -> _Prediction:
-    """Predicts the object of a bank in frame t of `count`; `position` (K, M) is the spatial code of a memory."""
-    memories, pointers = bank.attended(t, step, count)
-    width = graphs.sizes["M"]
-    distances = np.array([distance for distance, _ in pointers], np.float32) / max(min(count, POINTERS) - 1, 1)
-    ages = graphs._run("pointer_tpos", normalized_diffs=distances)["pointer_pos"]
-    pointer_tokens = np.array([pointer for _, pointer in pointers], np.float32).reshape(-1, width)
-    tokens = [np.asarray(array, np.float32) for _, array in memories]
-    codes = [position + graphs.constants.temporal_code[row] for row, _ in memories]
-    conditioned = graphs._run(
-        "memory_attention",
-        current_vision_features=_as_tokens(features["feats2"]),
-        current_vision_position_embeddings=_as_tokens(features["vision_pos_embed"]),
-        memory=np.concatenate([*tokens, pointer_tokens])[:, None],
-        memory_pos=np.concatenate([*codes, np.repeat(ages, graphs.sizes["C"] // width, axis=0)])[:, None],
-    )["conditioned_feats"]
-    return _decode(graphs, features, conditioned, np.zeros((1, 2), np.float32), np.array([-1]))
-
-
-def _decode(
-    graphs: Sam2Graphs, features: FrameFeatures, image: np.ndarray, points: np.ndarray, labels: np.ndarray
-) -> _Prediction:
-    """Runs the mask decoder with points (P, 2) in px of the square image; it chooses among its masks by itself."""
-    outputs = graphs._run(
-        "mask_decoder",
-        feats0=features["feats0"],
-        feats1=features["feats1"],
-        feats2_cond=image,
-        input_points=points[None, None],
-        input_labels=labels[None, None],
-    )
-    score = outputs["object_score_logits"].reshape(1, 1)
-    return _Prediction(
-        outputs["low_res_mask"][0, 0], outputs["high_res_mask"][0, 0], outputs["object_pointer"][0, 0], score
-    )
-
-
-def _memorize(
-    graphs: Sam2Graphs, features: FrameFeatures, prediction: _Prediction, *, binarize: bool
-) -> tuple[Memory, np.ndarray]:
-    """Encodes the memory of an object in a frame, binary if it was prompted there; also returns its spatial code."""
-    outputs = graphs._run(
-        "memory_encoder",
-        feats2=features["feats2"],
-        high_res_mask=prediction.high_res[None, None],
-        object_score_logits=prediction.score,
-        binarize=np.asarray(binarize, np.float32),
-    )
-    tokens = outputs["memory_tokens"][:, 0].astype(jnp.bfloat16)
-    return Memory(tokens, prediction.pointer), outputs["memory_pos"][:, 0]
-
-
-def _as_tokens(grid: np.ndarray) -> np.ndarray:
-    """(1, C, G, G) to (G^2, 1, C)."""
-    return np.ascontiguousarray(grid.reshape(grid.shape[1], -1).T[:, None])
-
-
 def fill_holes(logits: np.ndarray, area: int) -> np.ndarray:
-    """Fills small holes of a mask.
-
-    Args:
-      logits: (L, L) mask logits.
-      area: Pixels (8-connected, logits at or below 0) up to which a hole is small.
-
-    Returns:
-      (L, L) logits, 0.1 in the holes that were filled.
-    """
+    """Fills the holes of a mask's logits (8-connected, at or below 0) of up to `area` pixels with 0.1."""
     number, labels, stats, _ = cv2.connectedComponentsWithStats((logits <= 0).astype(np.uint8), connectivity=8)
     small = stats[:, cv2.CC_STAT_AREA] <= area
     small[0] = False  # label 0 is the object itself
     return np.where(small[np.asarray(labels, np.intp)], np.float32(0.1), logits) if number > 1 else logits
-
-
-def _strongest(logits: Sequence[np.ndarray], size: tuple[int, int]) -> np.ndarray:
-    """Returns (H, W) int16: the object with the highest of the logits (L, L) at each pixel, -1 if none is above 0."""
-    best, label = np.zeros(size, np.float32), np.full(size, -1, np.int16)
-    for number, low in enumerate(logits):
-        resized = cv2.resize(low, size[::-1])
-        above = resized > best
-        best[above], label[above] = resized[above], number
-    return label

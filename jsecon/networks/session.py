@@ -30,9 +30,8 @@ _DTYPES = {
     "tensor(int8)": "int8",
     "tensor(bool)": "bool",
 }
-_KINDS = {"b": "bool", "i": "integer", "u": "integer", "f": "float"}
 _MISUSED = "This graph has another size or kind than the one that it is used as."
-MAX_INPUT_NUMBERS = 1 << 26
+_MAX_INPUT_NUMBERS = 1 << 26
 """size of an input; an image of 4096 x 4096 px has 2^25.6 numbers"""
 _MESSAGES = {
     ("model", 7): "graph",
@@ -43,12 +42,8 @@ _MESSAGES = {
     ("attribute", 6): "graph",
 }
 """messages of onnx.proto that lead to constants, by their place: the message around them and their field"""
-_DATA_TYPE = 2
-"""field of a tensor with its type"""
-_FLOAT16 = 10
-_LFS_POINTER = b"version https://git-lfs"
-Size = int | str | None
-"""size of an axis: a number if it is fixed, the name of a symbol or None if it is free"""
+Shape = Sequence[int | str | None]
+"""sizes of the axes: a number if it is fixed, the name of a symbol or None if it is free"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,7 +53,7 @@ class Tensor:
     name: str
     dtype: str
     """NumPy's name of the type, or ONNX Runtime's if NumPy has no such type."""
-    shape: tuple[Size, ...] | None
+    shape: tuple[int | str | None, ...] | None
     """Sizes of the axes; None if the file does not declare them."""
 
     def __str__(self) -> str:
@@ -68,28 +63,14 @@ class Tensor:
         return f"{self.name} {self.dtype}[{', '.join('?' if size is None else str(size) for size in self.shape)}]"
 
     def fixed(self, axis: int) -> int | None:
-        """Reads the size of an axis.
-
-        Args:
-          axis: The axis; negative ones count from the last.
-
-        Returns:
-          The size if the file fixes it, else None.
-        """
+        """Returns the size of an axis if the file fixes it, else None."""
         if self.shape is None or not -len(self.shape) <= axis < len(self.shape):
             return None
         size = self.shape[axis]
         return size if isinstance(size, int) and size > 0 else None
 
-    def fits(self, shape: Sequence[Size]) -> bool:
-        """Whether an array could be the tensor.
-
-        Args:
-          shape: Shape of the array; None and symbols fit every size.
-
-        Returns:
-          True also if the file declares no shape.
-        """
+    def fits(self, shape: Shape) -> bool:
+        """Whether an array of a shape could be the tensor; None and symbols fit every size."""
         if self.shape is None:
             return True
         return len(self.shape) == len(shape) and all(
@@ -99,9 +80,10 @@ class Tensor:
 
 
 class Graph:
-    """An ONNX graph, ready to run.
+    """An ONNX graph, ready to run. Threads never spin: an idle graph costs no time, only memory.
 
-    Threads never spin: an idle graph costs no time, only memory. Drop it when its stage is done.
+    InputError is raised if the file is missing, empty, cut short or a Git LFS pointer, lacks its external data, or uses
+    what the installed ONNX Runtime does not know.
 
     Args:
       path: The .onnx file.
@@ -110,10 +92,6 @@ class Graph:
     Attributes:
       inputs: Input tensors by name, in the order of the file.
       outputs: Output tensors by name, in the order of the file.
-
-    Raises:
-      InputError: The file is missing, empty, cut short or a Git LFS pointer, lacks its external data, declares an
-        input of more than MAX_INPUT_NUMBERS, or uses what the installed ONNX Runtime does not know.
     """
 
     def __init__(self, path: str | os.PathLike, *, optimise: bool = True):
@@ -124,9 +102,9 @@ class Graph:
         self.outputs = {tensor.name: tensor for tensor in map(_tensor, self._session.get_outputs())}
         for tensor in self.inputs.values():  # before the optimiser allocates constants of such sizes
             sizes = [size for size in tensor.shape or () if isinstance(size, int) and size > 0]
-            if math.prod(sizes) > MAX_INPUT_NUMBERS:
+            if math.prod(sizes) > _MAX_INPUT_NUMBERS:
                 problem = f"an input {tensor.name!r} of {' x '.join(map(str, sizes))} numbers"
-                raise InputError(self.path, problem, f"at most {MAX_INPUT_NUMBERS}", "Fetch or export the file again.")
+                raise InputError(self.path, problem, f"at most {_MAX_INPUT_NUMBERS}", "Fetch or export the file again.")
         if optimise:
             self._session = self._open(optimise=True)
         self._run_options = onnxruntime.RunOptions()
@@ -155,20 +133,14 @@ class Graph:
             expected = "a whole ONNX graph, with its external data files beside it"
             raise InputError(self.path, problem, expected, "Fetch or export the file again.") from error
 
-    def require(self, side: Literal["input", "output"], name: str, shape: Sequence[Size], what: str) -> Tensor:
-        """Checks the shape of a tensor of the graph.
+    def require(self, side: Literal["input", "output"], name: str, shape: Shape, what: str) -> Tensor:
+        """Returns a tensor of the graph, or raises InputError if it is missing or has another shape.
 
         Args:
           side: Whether it is an input or an output.
           name: Its name.
           shape: Its shape; None fits any size.
           what: What the graph should be, for the message.
-
-        Returns:
-          The tensor.
-
-        Raises:
-          InputError: There is no such tensor, or it has another shape.
         """
         tensors = self.inputs if side == "input" else self.outputs
         if name not in tensors or not tensors[name].fits(shape):
@@ -180,19 +152,9 @@ class Graph:
         return tensors[name]
 
     def run(self, feeds: Mapping[str, np.ndarray], outputs: Sequence[str] | None = None) -> dict[str, np.ndarray]:
-        """Runs the graph.
+        """Computes the outputs of some names, by default all, or raises InputError if a tensor does not fit.
 
         Numbers are converted to the declared type if their kind stays the same (float to float, integer to integer).
-
-        Args:
-          feeds: Arrays by the names of the inputs.
-          outputs: Names of the outputs to compute; by default all.
-
-        Returns:
-          Arrays by the names of the outputs.
-
-        Raises:
-          InputError: A tensor is missing, unknown, or of another shape or kind, or the graph fails.
         """
         names = list(self.outputs) if outputs is None else list(outputs)
         unknown = [n for n in feeds if n not in self.inputs] + [n for n in names if n not in self.outputs]
@@ -213,35 +175,25 @@ class Graph:
 
     def _converted(self, tensor: Tensor, array: np.ndarray) -> np.ndarray:
         dtype = np.dtype(tensor.dtype) if tensor.dtype in _DTYPES.values() else None
-        same_kind = dtype is not None and _KINDS.get(array.dtype.kind) == _KINDS[dtype.kind]
-        if not same_kind or not tensor.fits(array.shape):
+        kinds = [each.kind.replace("u", "i") for each in (array.dtype, dtype) if each is not None]
+        if kinds != [kinds[0]] * 2 or not tensor.fits(array.shape):
             expected = f"{array.dtype}{list(array.shape)}"
             raise InputError(f"{self.path}, input {tensor.name!r}", str(tensor), expected, _MISUSED)
         return np.asarray(array, dtype, order="C")  # np.ascontiguousarray makes a row of a scalar
 
 
 def describe(tensors: Iterable[Tensor]) -> str:
-    """Lists name, type and shape of tensors.
-
-    Args:
-      tensors: The tensors.
-
-    Returns:
-      One line.
-    """
+    """Lists name, type and shape of tensors on one line."""
     return ", ".join(map(str, tensors)) or "no tensor"
 
 
 def batches(rows: np.ndarray, fixed: int | None, free: int) -> Iterator[tuple[np.ndarray, int]]:
-    """Cuts rows into batches.
+    """Yields batches of rows, each with the number of its rows that are not padding.
 
     Args:
       rows: Array with any leading axis.
       fixed: Batch size that a graph fixes, or None; the last batch is then padded with zeros.
       free: Largest batch size if none is fixed.
-
-    Yields:
-      A batch, and the number of its rows that are not padding.
     """
     size = fixed or free
     for start in range(0, len(rows), size):
@@ -252,45 +204,23 @@ def batches(rows: np.ndarray, fixed: int | None, free: int) -> Iterator[tuple[np
         yield part, count
 
 
-def graph_files(path: str | os.PathLike) -> tuple[Path, ...]:
-    """Lists the files of a graph.
-
-    Args:
-      path: The .onnx file.
-
-    Returns:
-      The file, and the external data files that it names beneath its folder.
-
-    Raises:
-      InputError: The .onnx file cannot be read.
-    """
-    path = Path(path)
+def graph_files(path: Path) -> tuple[Path, ...]:
+    """Lists the .onnx file of a graph and the external data files that it names beneath its folder."""
     _check_bytes(path)
     content = path.read_bytes()
     beside = (file for file in sorted(path.parent.rglob("*")) if file.is_file() and file.suffix != ".onnx")
     return path, *(file for file in beside if os.fsencode(file.relative_to(path.parent).as_posix()) in content)
 
 
-def content_digest(files: Iterable[str | os.PathLike], *, extra: str = "") -> str:
-    """Hashes the contents of files; names, places and times do not count.
-
-    Args:
-      files: The files, in an order that counts.
-      extra: A text that is hashed too.
-
-    Returns:
-      32 hex digits.
-
-    Raises:
-      InputError: A file cannot be read.
-    """
+def content_digest(files: Iterable[Path], *, extra: str = "") -> str:
+    """Hashes a text and the contents of files, in their order, to 32 hex digits; names and times do not count."""
     digest = hashlib.blake2b(extra.encode(), digest_size=16)
     for file in files:
         try:
             with open(file, "rb") as stream:
                 digest.update(hashlib.file_digest(stream, lambda: hashlib.blake2b(digest_size=16)).digest())
         except OSError as error:
-            raise _unreadable(Path(file), error.strerror or "an error on reading") from error
+            raise _unreadable(file, error.strerror or "an error on reading") from error
     return digest.hexdigest()
 
 
@@ -307,23 +237,23 @@ def _has_half_precision(path: Path) -> bool:
                 if byte < 128:
                     return value, at
 
-        def found(message: str, at: int, end: int) -> bool:
+        def has_half(message: str, at: int, end: int) -> bool:
             while at < end:
                 tag, at = varint(at)
                 field, kind = tag >> 3, tag & 7
                 if kind == 0:
                     value, at = varint(at)
-                    if message == "tensor" and field == _DATA_TYPE and value == _FLOAT16:
+                    if (message, field, value) == ("tensor", 2, 10):  # its data type is FLOAT16
                         return True
                     continue
                 size, at = varint(at) if kind == 2 else ({1: 8, 5: 4}[kind], at)
                 inner = _MESSAGES.get((message, field))
-                if inner is not None and found(inner, at, at + size):
+                if inner is not None and has_half(inner, at, at + size):
                     return True
                 at += size
             return False
 
-        return found("model", 0, len(data))
+        return has_half("model", 0, len(data))
 
 
 def _check_bytes(path: Path) -> None:
@@ -335,7 +265,7 @@ def _check_bytes(path: Path) -> None:
         raise _unreadable(path, error.strerror or "an error on reading") from error
     if not head:
         raise _unreadable(path, "an empty file")
-    if head.startswith(_LFS_POINTER):
+    if head.startswith(b"version https://git-lfs"):
         raise _unreadable(path, "a Git LFS pointer in place of the file", "Fetch the content: git lfs pull.")
 
 

@@ -1,13 +1,13 @@
 """Turns texts into token ids with a model's tokenizer.json, through Hugging Face's `tokenizers`.
 
-CLIP's files differ in normaliser, padding and special tokens, so a text is cleaned and split into words here as
-open_clip does it. The files of SigLIP and SigLIP 2 are used as they are. They state neither the length of a text nor
-its padding nor how it is cleaned: `read_text_rules` takes that from the configuration files beside them.
+The file has the vocabulary, the words and the special tokens. It states neither the length of a text nor its padding
+nor how SigLIP's texts are cleaned: those follow from the configuration files beside it, which exporters write.
 """
 
 import contextlib
 import html
 import string
+import unicodedata
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,186 +20,92 @@ from jsecon.files import read_json
 
 CLIP_LENGTH = 77
 """tokens of a text of CLIP, if the graph does not fix it; and open_clip's default"""
-CLIP_ENDS = ("<|startoftext|>", "<|endoftext|>"), ("<start_of_text>", "<end_of_text>")
-"""start and end of a text in the vocabularies of Hugging Face and of open_clip"""
-CLIP_WORDS = r"(?i)'s|'t|'re|'ve|'m|'ll|'d|\p{L}+|\p{N}|[^\s\p{L}\p{N}]+"
-"""words of a cleaned text: English endings, runs of letters, single digits, runs of other characters"""
-CLEANINGS = ("canonicalize", "lower", "whitespace")
-"""open_clip's names: lower case without punctuation (SigLIP), lower case (SigLIP 2), as written. Each also repairs
-mis-decoded characters, HTML entities and white space"""
-CLASSES = {"SiglipTokenizer": "canonicalize", "GemmaTokenizer": "lower", "Siglip2Tokenizer": "lower"}
+_CLEANING_OF_CLASS = {"SiglipTokenizer": "canonicalize", "GemmaTokenizer": "lower", "Siglip2Tokenizer": "lower"}
 """transformers' tokenizer -> cleaning. SigLIP was trained without punctuation, SigLIP 2 in lower case
 (google-research/big_vision); its published files carry the class of Gemma, whose vocabulary it uses"""
-MAX_LENGTH = 4096
-"""tokens of a text"""
-SIGLIP_LENGTH = 64
-"""tokens of a text of SigLIP if config.json does not state it: the default of transformers' SiglipTextConfig"""
 _FETCH = "Fetch the file again, from the folder that the graphs come from."
 
 
 class TextRules(NamedTuple):
-    """How a model takes its texts."""
+    """How a SigLIP takes its texts."""
 
     length: int
     """tokens of a text; a longer one is cut, and keeps its end"""
     pad: str
     """token that pads a shorter one. These models read it: their attention has no causal mask"""
     clean: str
-    """one of CLEANINGS"""
+    """open_clip's name of the cleaning: canonicalize (lower case without punctuation), lower, or whitespace"""
 
 
 class TextTokenizer:
-    """Tokenizer of a model folder.
+    """Tokenizer of a model folder, or an InputError that names its file.
 
     Args:
       path: The tokenizer.json.
-      rules: How the model takes its texts; None for CLIP: lower case, start and end, padded with 0.
-
-    Raises:
-      InputError: The file cannot be read, or lacks the padding token or CLIP's start and end.
+      rules: How the model takes its texts; None for CLIP, which reads up to the first end of a text, padded with 0.
     """
 
-    def __init__(self, path: str | Path, rules: TextRules | None = None):
+    def __init__(self, path: Path, rules: TextRules | None):
         from tokenizers import Tokenizer
 
-        self._path = Path(path)
+        self._path = path
         self._rules = rules
         expected = "a tokenizer.json of Hugging Face's kind"
-        with _tokenizer_errors(self._path, f"{expected} with the token {rules.pad!r}" if rules else expected):
-            self._tokenizer = Tokenizer.from_str(self._path.read_text(encoding="utf-8"))
-            self._end = -1
-            self._pad = 0 if rules is None else self._token_id(rules.pad)
-            if rules is None:
-                self._follow_open_clip()
+        with self._errors(f"{expected} with the token {rules.pad!r}" if rules else expected):
+            self._tokenizer = Tokenizer.from_str(path.read_text(encoding="utf-8"))
+            self._tokenizer.encode_special_tokens = True  # a text cannot end itself
+            self._pad = 0 if rules is None else self._tokenizer.token_to_id(rules.pad)
+            if self._pad is None:
+                raise ValueError(f"{self._tokenizer.get_vocab_size()} tokens without it")
+            if rules is None and len(self._tokenizer.encode("a").ids) != 3:
+                raise ValueError("it does not put a start and an end around a word")
 
-    def __call__(self, texts: Sequence[str], length: int) -> Int64[np.ndarray, "q _"]:
-        """Encodes texts, cut or padded on the right.
+    def __call__(self, texts: Sequence[str], length: int) -> tuple[Int64[np.ndarray, "q l"], Int64[np.ndarray, "q l"]]:
+        """Encodes texts, cut or padded on the right to a number of tokens.
 
         The models were trained so (google-research/big_vision). A `padding_side` of "left" in tokenizer_config.json is
         that of the language model whose vocabulary it is.
 
-        Args:
-          texts: Q texts.
-          length: Number of tokens of each.
-
         Returns:
-          (Q, length) token ids.
+          Token ids, and their attention mask: for CLIP 1 up to the end of the text, else 1 everywhere.
         """
-        with _tokenizer_errors(self._path, f"{length} tokens for every text"):
+        with self._errors(f"{length} tokens for every text"):
             self._tokenizer.enable_truncation(max_length=length)
             self._tokenizer.enable_padding(length=length, pad_id=self._pad)
             rows = self._tokenizer.encode_batch([self.clean(text) for text in texts])
-            return np.array([row.ids for row in rows], np.int64).reshape(len(texts), length)
-
-    def count(self, text: str) -> int:
-        """Counts the tokens of a text.
-
-        Args:
-          text: The text.
-
-        Returns:
-          Their number, start and end included.
-        """
-        self._tokenizer.no_truncation()
-        self._tokenizer.no_padding()
-        return len(self._tokenizer.encode(self.clean(text)).ids)
+            ids = np.array([row.ids for row in rows], np.int64).reshape(len(texts), length)
+            mask = np.array([row.attention_mask for row in rows], np.int64).reshape(ids.shape)
+        return ids, mask if self._rules is None else np.ones_like(ids)
 
     def clean(self, text: str) -> str:
-        """Cleans a text as the model was trained on it.
+        """Cleans a text as the model was trained on it: straight quotes, no HTML, single spaces, its letter case."""
+        text = text.encode("utf-16", "surrogatepass").decode("utf-16", "replace")  # half of a pair has no encoding
+        text = unicodedata.normalize("NFC", html.unescape(html.unescape(text)))
+        text = " ".join(text.translate(str.maketrans("\u2018\u2019\u201c\u201d", "''\"\"")).split())
+        if self._rules is not None and self._rules.clean == "canonicalize":
+            text = " ".join(text.replace("_", " ").translate(str.maketrans("", "", string.punctuation)).split())
+        return text if self._rules is not None and self._rules.clean == "whitespace" else text.lower()
 
-        Args:
-          text: The text.
-
-        Returns:
-          The clean text.
-        """
-        repaired = _repair(text)
-        if self._rules is None or self._rules.clean == "lower":
-            return repaired.lower()
-        if self._rules.clean == "whitespace":
-            return repaired
-        bare = repaired.replace("_", " ").translate(str.maketrans("", "", string.punctuation))
-        return " ".join(bare.lower().split())
-
-    def mask(self, ids: Int64[np.ndarray, "b l"]) -> Int64[np.ndarray, "b l"]:
-        """Makes the attention mask of token ids.
-
-        Args:
-          ids: (B, L).
-
-        Returns:
-          (B, L): for CLIP 1 up to the first end, else 1 everywhere.
-        """
-        if self._rules is not None:
-            return np.ones_like(ids)
-        ends = ids == self._end
-        return (np.cumsum(ends, axis=1) - ends == 0).astype(np.int64)
-
-    def _token_id(self, token: str) -> int:
-        number = self._tokenizer.token_to_id(token)
-        if number is None:
-            raise ValueError(f"{self._tokenizer.get_vocab_size()} tokens without {token!r}")
-        return int(number)
-
-    def _follow_open_clip(self) -> None:
-        """Splits and ends texts as open_clip does, whatever the file says."""
-        from tokenizers import Regex, models, pre_tokenizers, processors
-
-        if not isinstance(self._tokenizer.model, models.BPE):
-            raise ValueError(f"type {type(self._tokenizer.model).__name__}, not CLIP's BPE")
-        self._tokenizer.model.end_of_word_suffix = "</w>"
-        for sign in pre_tokenizers.ByteLevel.alphabet():
-            self._token_id(sign)
-            self._token_id(f"{sign}</w>")
-        start, end = next(
-            (ends for ends in CLIP_ENDS if self._tokenizer.token_to_id(ends[0]) is not None), CLIP_ENDS[0]
-        )
-        ends = [(token, self._token_id(token)) for token in (start, end)]
-        self._end = ends[1][1]
-        words = pre_tokenizers.Split(Regex(CLIP_WORDS), "removed", invert=True)
-        signs = pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False)
-        self._tokenizer.normalizer = None
-        self._tokenizer.pre_tokenizer = pre_tokenizers.Sequence([words, signs])
-        self._tokenizer.post_processor = processors.TemplateProcessing(single=f"{start} $A {end}", special_tokens=ends)
-        self._tokenizer.encode_special_tokens = True  # a text cannot end itself
-
-
-def _repair(text: str) -> str:
-    """Repairs mis-decoded characters (ftfy), two rounds of HTML entities, and white space."""
-    import ftfy
-
-    return " ".join(html.unescape(html.unescape(ftfy.fix_text(text))).split())
-
-
-@contextlib.contextmanager
-def _tokenizer_errors(path: Path, expected: str) -> Iterator[None]:
-    """Turns whatever `tokenizers` raises into an InputError: its exceptions have no base of their own."""
-    try:
-        yield
-    except BaseException as error:
-        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":  # of its Rust
-            raise
-        problem = f"it is no tokenizer of this model ({describe_error(error)})"
-        remedy = "Fetch tokenizer.json again; for SigLIP also config.json and tokenizer_config.json."
-        raise InputError(path, problem, expected, remedy) from error
+    @contextlib.contextmanager
+    def _errors(self, expected: str) -> Iterator[None]:
+        """Turns whatever `tokenizers` raises into an InputError: its exceptions have no base of their own."""
+        try:
+            yield
+        except BaseException as error:
+            if not isinstance(error, Exception) and type(error).__name__ != "PanicException":  # of its Rust
+                raise
+            problem = f"it is no tokenizer of this model ({describe_error(error)})"
+            remedy = "Fetch tokenizer.json again; for SigLIP also config.json and tokenizer_config.json."
+            raise InputError(self._path, problem, expected, remedy) from error
 
 
 def read_text_rules(folder: Path, tokenizer: Path) -> TextRules | None:
-    """Reads how a model takes its texts from the configurations that its exporters write.
+    """Reads how a model takes its texts; None if it does so as CLIP does, or there is no config.json.
 
     config.json of open_clip (immich's layout) has `text_cfg` with `context_length` and, for another vocabulary than
     CLIP's, `hf_tokenizer_name` and `tokenizer_kwargs` (`clean`). That of transformers has `model_type` siglip or
     siglip2, and `text_config`. tokenizer_config.json has `pad_token`, and of transformers `tokenizer_class`.
-
-    Args:
-      folder: The model folder.
-      tokenizer: Its tokenizer.json.
-
-    Returns:
-      The rules; None if the model takes texts as CLIP does, or there is no config.json.
-
-    Raises:
-      InputError: A configuration cannot be read or does not state a rule.
+    InputError is raised if a configuration cannot be read or does not state a rule.
     """
     path = folder / "config.json"
     if not path.is_file():
@@ -215,16 +121,17 @@ def read_text_rules(folder: Path, tokenizer: Path) -> TextRules | None:
         pad = _read_padding(tokenizer)[0]
     elif str(content.get("model_type", "")).startswith("siglip"):
         pad, name = _read_padding(tokenizer)
-        if name not in CLASSES:
+        if name not in _CLEANING_OF_CLASS:
             where = tokenizer.with_name("tokenizer_config.json")
-            raise InputError(where, f"tokenizer_class {name!r}", " or ".join(CLASSES), _FETCH)
+            raise InputError(where, f"tokenizer_class {name!r}", " or ".join(_CLEANING_OF_CLASS), _FETCH)
         text = content.get("text_config")
-        length = (text if isinstance(text, dict) else {}).get("max_position_embeddings", SIGLIP_LENGTH)
-        clean = CLASSES[name]
+        # 64 is the default of transformers' SiglipTextConfig.
+        length = (text if isinstance(text, dict) else {}).get("max_position_embeddings", 64)
+        clean = _CLEANING_OF_CLASS[name]
     else:
         return None
-    if type(length) is not int or not 2 <= length <= MAX_LENGTH or clean not in CLEANINGS:
-        expected = f"2 to {MAX_LENGTH} tokens, cleaned by {', '.join(CLEANINGS)}"
+    if type(length) is not int or not 2 <= length <= 4096 or clean not in ("canonicalize", "lower", "whitespace"):
+        expected = "2 to 4096 tokens, cleaned by canonicalize, lower or whitespace"
         raise InputError(path, f"texts of {length!r} tokens, cleaned by {clean!r}", expected, _FETCH)
     return TextRules(length, pad, clean)
 

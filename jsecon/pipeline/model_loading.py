@@ -1,17 +1,19 @@
-"""Opens what looks at the frames: OpenCV and colours without weights, or SAM, SAM 2 and CLIP from model folders.
+"""Opens models: from a name, an address of the hub or a folder to what looks at the frames and reads the texts.
 
-A network is opened when first needed and closed when its stage is done, to free their memory.
+Without models these are OpenCV and colours; with them SAM, SAM 2 and CLIP. A network is opened when first needed and
+closed when its stage is done, to free its memory.
 """
 
 import contextlib
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, get_args
 
 import numpy as np
 
 from jsecon.errors import InputError
-from jsecon.networks.hub import HubModel, parse_model
+from jsecon.networks.hub import HubModel, Precision, Role, parse_model
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.sources import locate_sources
 from jsecon.types import LanguageField
@@ -19,19 +21,16 @@ from jsecon.vision.protocols import Embedder, Models
 from jsecon.vision.stores import StoredSegmenter
 
 if TYPE_CHECKING:
-    from jsecon.networks.clip import ClipFiles
+    from jsecon.networks.clip import ClipEmbedder
 
 _EXTERNAL = "given-"
 """prefix of the names of external spaces, as fields hold them"""
 
 
 class ExternalSpace:
-    """Embedder (jsecon.vision.protocols) of embeddings from files, whose model is missing.
+    """Embedder (jsecon.vision.protocols) of embeddings from files of `dim` numbers each, whose model is missing.
 
     It embeds neither texts nor regions; its regions can be queried by a pixel.
-
-    Args:
-      dim: Length of an embedding.
     """
 
     def __init__(self, dim: int):
@@ -45,14 +44,7 @@ class ExternalSpace:
 
 
 def external_dim(name: str | None) -> int | None:
-    """Reads the name of a space of embeddings from files.
-
-    Args:
-      name: Name of a field's space, or None.
-
-    Returns:
-      Length of its embeddings; None for the space of an embedder.
-    """
+    """Returns the length of the embeddings of an external space by its name; None for the space of an embedder."""
     return int(name.removeprefix(_EXTERNAL)) if name is not None and name.startswith(_EXTERNAL) else None
 
 
@@ -63,86 +55,88 @@ def _missing_model(dim: int) -> InputError:
     return InputError("field", problem, "the CLIP model that made them", remedy)
 
 
+def local_folder(choice: str | Path, role: Role, precision: Precision | None = None) -> Path:
+    """Finds the folder of a model that is on this machine, by a name, an address or a folder, or raises InputError."""
+    model = parse_model(choice, role, precision)
+    folder = model.cached_folder if isinstance(model, HubModel) else model
+    if folder is None:
+        raise InputError(str(choice), "not on this machine", "", f"Fetch it with: {model.get_command}. Or add --yes.")
+    return folder
+
+
+def with_folders(options: Options) -> Options:
+    """Replaces the models in options by their folders on this machine, or raises InputError."""
+    choices = {role: getattr(options, role) for role in get_args(Role)}
+    folders = {
+        role: local_folder(choice, role, options.precision) for role, choice in choices.items() if choice is not None
+    }
+    return dataclasses.replace(options, **folders)
+
+
 def open_models(options: Options, store: Path) -> Models:
-    """Opens SAM, SAM 2 and CLIP if the options name their folders.
-
-    Args:
-      options: Options of the run.
-      store: Folder that caches proposals and embeddings.
-
-    Returns:
-      The models; colours embed if no CLIP is named.
-
-    Raises:
-      InputError: A folder holds no such model.
-    """
+    """Opens the models of a run by their folders; `store` is the folder that caches proposals and embeddings."""
+    precision = options.precision
     segmenter = tracker = None
     if options.segmenter is not None:
-        from jsecon.networks.sam import SamSegmenter, SamSettings, find_sam
+        from jsecon.networks.sam import SamSegmenter
 
-        level, side, layers = options.level, options.points_per_side, options.crop_layers
-        settings = SamSettings(level=level, prompts=options.prompts, points_per_side=side, crop_layers=layers)
-        files = find_sam(options.segmenter, options.precision)
-        segmenter = StoredSegmenter(SamSegmenter(files, settings), store / "proposals")
+        sam = SamSegmenter(options.segmenter, level=options.level, precision=precision)
+        segmenter = StoredSegmenter(sam, store / "proposals")
     if options.tracker is not None:
         from jsecon.networks.sam2 import Sam2Tracker
 
         tracker = Sam2Tracker(options.tracker)
-    name = model = None
-    if options.embedder is not None:
-        from jsecon.networks.clip import find_clip
-
-        model = find_clip(options.embedder, options.precision)
+    name = None
     if options.features is not None:
         from jsecon.read.masks.langsplat import embedding_size
 
         external = ExternalSpace(embedding_size(options.features))
-        if model is None:
+        if options.embedder is None:
             return Models(external, segmenter, tracker)
         name = external.name
-    return Models(open_embedder(name, folder=model, store=store / "embeddings"), segmenter, tracker)
+    embedder = open_embedder(name, folder=options.embedder, precision=precision, store=store / "embeddings")
+    return Models(embedder, segmenter, tracker)
 
 
 def open_embedder(
     name: str | None = None,
     *,
-    folder: "Path | ClipFiles | None" = None,
+    folder: str | Path | None = None,
+    precision: Precision | None = None,
     templates: Sequence[str] = ("{}",),
     store: Path | None = None,
 ) -> Embedder:
-    """Opens an embedder: CLIP if its folder is named, else colours.
+    """Opens an embedder: CLIP if one is named, else colours. InputError is raised if it is of another space.
 
     Args:
       name: Name of the space, or None for any. In an external space any CLIP with embeddings of that length is taken.
-      folder: Folder of a CLIP model.
+      folder: Folder, name or address of a CLIP model.
+      precision: Precision of its graphs.
       templates: Phrases for texts of CLIP.
       store: Folder that caches embeddings.
-
-    Returns:
-      The embedder.
-
-    Raises:
-      InputError: The folder holds no CLIP model, or the embedder is of another space.
     """
-    dim = external_dim(name)
-    if dim is not None and folder is None:
-        raise _missing_model(dim)
     if folder is not None:
         from jsecon.networks.clip import ClipEmbedder
 
-        # pyright compares a cached_property with a protocol's attribute without reading it.
-        embedder: Embedder = ClipEmbedder(folder, templates=templates, store=store)  # pyright: ignore[reportAssignmentType]
-        remedy = "Give the folder of the model that the field was made with: --embedder DIR."
-    else:
-        from jsecon.vision.colours import ColourEmbedder
+        folder = local_folder(folder, "embedder", precision)
+        clip = ClipEmbedder(folder, precision=precision, templates=templates, store=store)
+        return _of_space(clip, name, "Give the model that the field was made with: --embedder DIR.")
+    if (dim := external_dim(name)) is not None:
+        raise _missing_model(dim)
+    from jsecon.vision.colours import ColourEmbedder
 
-        embedder = ColourEmbedder()
+    if name is not None and name.startswith("clip-"):
+        remedy = "Give the folder of the model that the field was made with (--embedder DIR), or run again without."
+    elif tuple(templates) != ("{}",):
+        raise InputError("--template", "a field whose texts are colours", "one made with CLIP", "Leave out --template.")
+    else:
         remedy = "Run the capture again with this version."
-        if name is not None and name.startswith("clip-"):
-            remedy = "Give the folder of the model that the field was made with (--embedder DIR), or run again without."
-        elif tuple(templates) != ("{}",):
-            there = "a field whose texts are colours"
-            raise InputError("--template", there, "one made with CLIP", "Leave out --template.")
+    return _of_space(ColourEmbedder(), name, remedy)
+
+
+def _of_space(embedder: Any, name: str | None, remedy: str) -> Embedder:
+    """Returns the embedder if it is of a space, or of any if the name is None; else raises InputError."""
+    dim = external_dim(name)
     if dim is not None and embedder.dim != dim:
         problem, expected = f"a model whose embeddings have {embedder.dim} numbers", f"{dim}, as those from files have"
         raise InputError("--embedder", problem, expected, "Give the CLIP model that made the files.")
@@ -151,52 +145,102 @@ def open_embedder(
     return embedder
 
 
-def field_embedder(field: LanguageField, folder: Path | None = None, *, templates: Sequence[str] = ("{}",)) -> Embedder:
-    """Opens the embedder that a field's regions were embedded by.
+def field_embedder(
+    field: LanguageField, folder: str | Path | None = None, *, templates: Sequence[str] = ("{}",)
+) -> Embedder:
+    """Opens the embedder that a field's regions were embedded by, or raises InputError.
 
     Args:
       field: The field.
-      folder: Folder of the model; None looks where the run had it and in the hub's cache, and takes it only if its
-        content is the same.
+      folder: Folder, name or address of the model; None looks where the run had it and in the hub's cache, and takes it
+        only if its content is the same.
       templates: Phrases for the texts, with CLIP.
-
-    Returns:
-      The embedder.
-
-    Raises:
-      InputError: The model is not on this machine, or is another one.
     """
-    model = find_model(field) if folder is None else folder
-    if isinstance(model, HubModel):
-        problem = f"its texts need the model {model.address}, which is not on this machine"
-        raise InputError("field", problem, "", f"Fetch it with: {model.get_command}. Or add --yes.")
-    return open_embedder(field.embedder, folder=model, templates=templates)
+    if folder is None:
+        model = find_model(field, templates)
+        if isinstance(model, HubModel):
+            problem = f"its texts need the model {model.address}, which is not on this machine"
+            raise InputError("field", problem, "", f"Fetch it with: {model.get_command}. Or add --yes.")
+        if model is not None:
+            return _of_space(model, field.embedder, "")
+    return open_embedder(field.embedder, folder=folder, templates=templates)
 
 
-def find_model(field: LanguageField) -> "ClipFiles | HubModel | None":
+def find_model(field: LanguageField, templates: Sequence[str] = ("{}",)) -> "ClipEmbedder | HubModel | None":
     """Looks for the CLIP model that a field was made with, in its folder and in the hub's cache.
 
-    Args:
-      field: The field.
-
-    Returns:
-      Its files if they are on this machine, else the model of the hub that is to be fetched; None for a field without
-      a model, or if its model came from a folder that is not here.
-
-    Raises:
-      InputError: The provenance of the field is not what a run writes.
+    Returns the model if it is on this machine, else the one of the hub that is to be fetched; None for a field without
+    a model, or if its model came from a folder that is not here.
     """
     sources = locate_sources(field)
     if not (sources.embedder or "").startswith("clip-"):
         return None
-    from jsecon.networks.clip import find_clip
+    from jsecon.networks.clip import ClipEmbedder
 
     model = None if sources.address is None else parse_model(sources.address, "embedder", sources.precision)
     on_hub = model if isinstance(model, HubModel) else None
     for folder in (sources.model, None if on_hub is None else on_hub.cached_folder):
         if folder is not None:
             with contextlib.suppress(InputError):  # another model is there now
-                files = find_clip(folder, sources.precision)
-                if files.name == sources.embedder:
-                    return files
+                embedder = ClipEmbedder(folder, precision=sources.precision, templates=templates)
+                if embedder.name == sources.embedder:
+                    return embedder
     return on_hub
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelReport:
+    """Content of a folder of models."""
+
+    folder: Path
+    graphs: dict[str, str]
+    """Inputs and outputs of each .onnx file by its path within the folder, or why it cannot be opened."""
+    usable: dict[str, str]
+    """Kind of model that the folder holds (CLIP, SAM, SAM 2) -> what it is and how to use it."""
+    unusable: dict[str, str]
+    """Kind of model -> what is wrong with the folder."""
+
+    @property
+    def lines(self) -> list[str]:
+        """The content as lines of text."""
+        lines = [f"{self.folder}: {len(self.graphs)} graphs"]
+        for path, signature in self.graphs.items():
+            lines += [f"  {path}", *(f"    {line}" for line in signature.splitlines())]
+        for word, uses in (("usable", self.usable), ("not usable", self.unusable)):
+            for kind, summary in uses.items():
+                lines += [f"{kind}: {word}", f"  {summary}"]
+        return lines
+
+
+def inspect_models(folder: Path) -> ModelReport:
+    """Opens every graph of a folder and its subfolders, and tries the folder as each kind of model."""
+    from jsecon.networks.clip import ClipEmbedder
+    from jsecon.networks.sam import SamSegmenter
+    from jsecon.networks.sam2 import Sam2Tracker
+
+    if not folder.is_dir():
+        raise InputError(folder, "no such folder", "a folder of models", "Check the path.")
+    graphs = {path.relative_to(folder).as_posix(): _signature(path) for path in sorted(folder.rglob("*.onnx"))}
+    kinds: list[tuple[str, Role, Callable[[Path], Any]]] = [
+        ("CLIP", "embedder", ClipEmbedder),
+        ("SAM", "segmenter", SamSegmenter),
+        ("SAM 2", "tracker", Sam2Tracker),
+    ]
+    usable, unusable = {}, {}
+    for kind, role, open_model in kinds:
+        try:
+            usable[kind] = f"{open_model(folder).check()}: jsecon run --{role} {folder}"
+        except InputError as error:
+            unusable[kind] = str(error)
+    return ModelReport(folder, graphs, usable, unusable)
+
+
+def _signature(path: Path) -> str:
+    """Writes the inputs and outputs of a graph, or why it cannot be opened."""
+    from jsecon.networks.session import Graph, describe
+
+    try:
+        graph = Graph(path, optimise=False)
+    except InputError as error:
+        return f"cannot be opened: {error.sentence}"
+    return f"in   {describe(graph.inputs.values())}\nout  {describe(graph.outputs.values())}"

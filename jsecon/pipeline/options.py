@@ -25,6 +25,8 @@ def _default_hint(default: str) -> str:
 
 Option: TypeAlias = Annotated[T, tyro.conf.arg(prefix_name=False, help_behavior_hint=_default_hint)]
 """an option of the command line; its flag does not name the group"""
+ModelOption: TypeAlias = Annotated[Option[str | Path | None], tyro.conf.arg(metavar="MODEL")]
+"""a model as the user names it: a text is a name, an address of the hub or a folder; a Path is a folder"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,14 +177,9 @@ class ModelOptions:
     Attributes:
       models: Takes the recommended models for those that are not named: EdgeTAM finds the masks, SigLIP 2 reads texts.
       segmenter: SAM model that finds the proposals, instead of colour and texture: a name (edgetam, slimsam, sam2),
-        hub:owner/name of huggingface.co, or a folder. `jsecon models list` has sizes and licences.
+        hub:owner/name of huggingface.co, or a folder. `jsecon models list` has sizes and licences. A folder that is
+        called like a model is written as a path: ./sam2.
       level: Level of SAM's proposals and of LangSplat's files: subparts (s), parts (m), wholes (l), or all (default).
-      prompts: For SAM, where the points are that it makes masks of. With guided, they lie in the regions that differ by
-        colour, and then in what the masks of these do not explain: at most 96 a frame. With grid, they are SAM's own
-        1,024, which takes more than eight times longer.
-      points_per_side: With --prompts grid, number of points along each side of the grid.
-      crop_layers: For SAM, number of layers of crops that are prompted too, 4^k crops in layer k. LangSplat uses 1,
-        which takes five times longer.
       tracker: SAM 2 model that follows the proposals (Algorithm 1 of the paper), instead of consensus: a name (sam2,
         edgetam), hub:owner/name, or a folder.
       embedder: CLIP model for regions and texts, instead of colours: a name (clip, siglip2, mobileclip),
@@ -196,13 +193,10 @@ class ModelOptions:
     """
 
     models: Option[Literal["auto"] | None] = None
-    segmenter: Option[Path | None] = None
+    segmenter: ModelOption = None
     level: Option[Literal["default", "s", "m", "l"]] = "l"
-    prompts: Option[Literal["guided", "grid"]] = "guided"
-    points_per_side: Annotated[Option[int], Range(1, 1000)] = 32
-    crop_layers: Annotated[Option[int], Range(0, 4)] = 0
-    tracker: Option[Path | None] = None
-    embedder: Option[Path | None] = None
+    tracker: ModelOption = None
+    embedder: ModelOption = None
     vision_frames: Annotated[Option[int | None], Range(2, 1_000_000)] = None
     precision: Option[Precision | None] = None
     features: Option[Path | None] = None

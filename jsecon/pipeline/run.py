@@ -315,6 +315,7 @@ def run(
     listener, before = listener or Listener(), compilation_counts()
     folder = cache_folder or out / "cache"
     context = _open_context(options, out, folder)
+    options = context.options
     computed = compute_stages(context, stages.run_stages(context), folder, listener=listener, coordinator=coordinator)
     results, embedder = computed.results, context.models.embedder
     started = time.monotonic()
@@ -329,6 +330,7 @@ def run(
 
 def _open_context(options: Options, out: Path, cache_folder: Path | None = None) -> RunContext:
     """Opens the models of a run."""
+    options = model_loading.with_folders(options)
     return RunContext(options, model_loading.open_models(options, cache_folder or out / "cache"), out)
 
 

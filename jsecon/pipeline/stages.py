@@ -134,7 +134,6 @@ def _plan_objects(context: RunContext) -> Stage:
         how = f"proposals read from {options.proposals.name}"
         key_options |= context.key_options("level")
     elif models.segmenter is not None:
-        assert options.segmenter is not None
         how = f"proposals of level {options.level} by {model_name(options.segmenter, 'segmenter')}"
         key_options["model"] = models.segmenter.name
     else:
