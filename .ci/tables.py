@@ -20,7 +20,6 @@ import compiling  # noqa: E402
 os.environ.setdefault("XLA_FLAGS", compiling.ENVIRONMENT)
 for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):  # two processes work; threads wait by spinning
     os.environ.setdefault(threads, "1")
-compiling.install()
 
 folder, names = Path(sys.argv[1]), sys.argv[2:]
 for name in names:

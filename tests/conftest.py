@@ -45,7 +45,7 @@ from jaxtyping import install_import_hook
 
 # The tests' own processes compile programs of their own: to write all takes longer than to compile twice the few that
 # another process, or a cleared cache, would read.
-jax.config.update("jax_enable_compilation_cache", False)
+jax.config.update("jax_compilation_cache_dir", None)
 
 HOME = Path(__file__).resolve().parent.parent
 _UNCHECKED = {"types", "__init__", "__main__"}
@@ -61,8 +61,6 @@ install_import_hook(
     ),
     "beartype.beartype",
 )
-
-compiling.install()
 
 # A loaded machine, or hypothesis' first table of Unicode, is no fault of a test. CI draws the same examples each time.
 _SLOW = [HealthCheck.too_slow]
@@ -80,9 +78,9 @@ gc.set_threshold(20_000, 20, 20)
 
 # fmt: off
 LONGEST = (
-    "pipeline", "corrections", "fit", "views", "render", "blocks", "cores", "cli", "readme", "networks", "capacity",
-    "relations", "retrieval", "votes", "tiles", "anchored", "silhouette", "distill", "motion", "photometric",
-    "evidence", "several", "rivals", "classes", "codes", "autoencoder", "asking", "tracker", "consensus",
+    "compiling", "pipeline", "corrections", "fit", "views", "render", "blocks", "cores", "cli", "readme", "networks",
+    "capacity", "relations", "retrieval", "votes", "tiles", "anchored", "silhouette", "distill", "motion",
+    "photometric", "evidence", "several", "rivals", "classes", "codes", "autoencoder", "asking", "tracker", "consensus",
     "scene_stages", "traced", "parts", "gaussian_files", "processes", "paths", "names", "window", "viewer", "direct",
     "shares", "field",
 )
@@ -91,22 +89,17 @@ LONGEST = (
 
 
 def pytest_collection_modifyitems(items):
-    """Sorts files: first those compiled as shipped, so that a worker changes its options once; then the longest, which
-    would keep one worker busy alone at the end."""
+    """Leaves tests marked `as_shipped` to test_compiling.py, and sorts the longest files first: they would keep one
+    worker busy alone at the end."""
+    if not compiling.is_shipped():
+        items[:] = [item for item in items if item.get_closest_marker("as_shipped") is None]
     place = {name: n for n, name in enumerate(LONGEST)}
-    items.sort(
-        key=lambda item: (
-            item.get_closest_marker("as_shipped") is None,
-            place.get(item.path.stem.removeprefix("test_"), len(place)),
-        )
-    )
+    items.sort(key=lambda item: place.get(item.path.stem.removeprefix("test_"), len(place)))
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item, nextitem):
-    """Compiles the programs of a test and of its fixtures as the file's mark says; after a file, clears the programs if
-    they hold many of the process's memory maps."""
-    compiling.choose(shipped=item.get_closest_marker("as_shipped") is not None)
+    """After a file, clears the programs if they hold many of the process's memory maps."""
     done = yield
     if nextitem is None or nextitem.path != item.path:
         clear_programs(above=40_000)

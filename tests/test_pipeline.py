@@ -328,9 +328,8 @@ def test_a_run_stopped_while_it_writes_goes_on_to_the_same_bytes(room_run, tmp_p
 DRIVER = """
 import sys
 from pathlib import Path
-import capture_files, compiling
+import capture_files
 import test_pipeline as test
-compiling.install()
 room, out, victim, nth = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3], int(sys.argv[4])
 test.results.CHECKPOINT_SECONDS = 0.0
 test.cache.write_arrays = test.writer_that_stops(test.kill, victim, nth)

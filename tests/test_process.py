@@ -5,13 +5,13 @@ import os
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 
-import jax
 import pytest
 
 from jsecon import InputError, process
-from jsecon.process import clear_programs, settings
+from jsecon.process import settings
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -81,14 +81,29 @@ def test_a_program_that_was_cut_short_on_disk_is_compiled_and_kept_anew_without_
 
 
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="counts memory maps, which Linux tells")
-def test_programs_are_forgotten_where_there_are_too_many_maps(monkeypatch):
-    cleared = []
-    monkeypatch.setattr(jax, "clear_caches", lambda: cleared.append(True))  # those of the other tests stay
-    monkeypatch.setattr(process.gc, "collect", lambda: None)
-    assert not clear_programs(above=10**9)
-    assert not cleared
-    assert clear_programs(above=0)
-    assert cleared
+def test_programs_are_forgotten_where_there_are_too_many_maps(tmp_path):
+    program = (
+        "import jax\n"
+        "from jsecon.process import clear_programs\n"
+        "double = jax.jit(lambda x: 2 * x)\n"
+        "for above in (10**9, 0):\n"
+        "    double(1)\n"
+        "    clear_programs(above=above)\n"
+        "    print(double._cache_size())"
+    )
+    assert run(program, tmp_path).stdout.split() == ["1", "0"]
+
+
+def test_programs_that_nothing_has_read_for_months_are_deleted(tmp_path):
+    """Those of any machine that shares the folder, and no other file."""
+    names = ("xla-old/a-cache", "xla-old/b-cache", "xla-old/c.trace", "models/d")
+    paths = [tmp_path / "jsecon" / name for name in names]
+    for path, days in zip(paths, (100, 10, 100, 100)):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("kept")
+        os.utime(path, (time.time() - 86400 * days,) * 2)
+    run("from jsecon.process import prepare_process\nprepare_process()", tmp_path)
+    assert [path.exists() for path in paths] == [False, True, False, True]
 
 
 def test_room_for_columns_is_half_of_what_is_free_or_what_the_user_says(monkeypatch):

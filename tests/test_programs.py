@@ -11,8 +11,6 @@ from jax.sharding import NamedSharding, PartitionSpec
 from jsecon import host_mesh, plan_view
 from jsecon.programs import stored_jit
 
-stored_jit = stored_jit.__wrapped__  # as in a user's process, see compiling.py
-
 
 @pytest.fixture
 def folder(tmp_path):
