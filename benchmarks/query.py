@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from metrics import Metric, interleaved, show
 
-from jsecon.paper.baselines import query_one_step
+from jsecon.paper.queries import query_one_step
 from jsecon.query.answer import match_regions, query_anchored
 from jsecon.query.select import select_by_code
 from jsecon.types import Camera, Codes, Gaussians, LanguageField, Regions, Votes

@@ -84,7 +84,7 @@ def main() -> None:
     prepare_process()
     import jax.numpy as jnp
 
-    from jsecon.association.consensus import consensus_masklets
+    from jsecon.association.consensus import track_masks
     from jsecon.association.run_lengths import cache_masks_as_rle
     from jsecon.fit.start import gaussians_from_points
     from jsecon.paper.algorithm1 import masklets
@@ -117,7 +117,7 @@ def main() -> None:
         labels = masklets(frames, lambda frame, t: proposals(t), tracker)
         labels = tracker.consistent(frames, labels)
     else:
-        labels = consensus_masklets(frames, tracker.views)
+        labels = track_masks(frames, tracker.views)
     rest = time.perf_counter() - start
     peak = peak_memory_mib() / 1024
     shared = np.zeros((count + 1, int(labels.max()) + 2), np.int64)

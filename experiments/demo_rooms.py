@@ -25,8 +25,8 @@ from jsecon import Scene
 from jsecon.app import evaluation, pictures
 from jsecon.evaluate.lerf import Row, evaluate_at_thresholds
 from jsecon.files import atomic_write
-from jsecon.paper.baselines import query_one_step
 from jsecon.paper.distill import distill_votes
+from jsecon.paper.queries import query_one_step
 from jsecon.pipeline import run as pipeline
 from jsecon.pipeline.options import Options as RunOptions
 from jsecon.pipeline.progress import Listener

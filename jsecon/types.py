@@ -236,7 +236,7 @@ class Votes:
 
 @record
 class Regions:
-    """What the masklets are: one row per region."""
+    """One row per region: an object that the masks of several frames show."""
 
     embeddings: Array
     """(R, E) unit length; pixel-weighted mean of the views' embeddings (paper: phi_bar); zero where never embedded."""

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from jsecon.association.consensus import clean_tracks
 from jsecon.association.run_lengths import cache_masks_as_rle, encode_masks, encode_rows
-from jsecon.paper.algorithm1 import clean_masklets, masklets
+from jsecon.paper.algorithm1 import masklets
 from jsecon.pipeline import cache
 
 
@@ -84,7 +85,7 @@ def test_running_again_on_its_own_result_changes_nothing():
     first = masklets(frames_of(truth), segmenter(truth), tracker(truth))
     again = masklets(frames_of(truth), segmenter(first), tracker(first))
     np.testing.assert_array_equal(again, first)
-    np.testing.assert_array_equal(clean_masklets(first), first)
+    np.testing.assert_array_equal(clean_tracks(first), first)
 
 
 def test_an_object_that_enters_late_is_prompted_where_it_enters():
@@ -132,13 +133,36 @@ def test_parts_that_most_frames_hold_together_are_joined():
     half = square.copy()
     half[:, 12:] = False
 
-    for split, rate, regions in ((2, 0.5, 2), (6, 0.5, 3), (2, 1.0, 3)):
+    for split, regions in ((2, 2), (6, 3)):
 
         def segment(frame, index, split=split):
             return np.stack([truth[index] == 0, *([half, square & ~half] if index < split else [square])])
 
-        labels = masklets(frames_of(truth), segment, track_still, join_rate=rate, min_support=0.0)
-        assert len(np.unique(labels[labels >= 0])) == regions, (split, rate)
+        labels = masklets(frames_of(truth), segment, track_still)
+        assert len(np.unique(labels[labels >= 0])) == regions, split
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.int16, np.int64])
+def test_labels_of_any_integer_type_are_taken(kind):
+    truth = squares()
+    plain = masklets(frames_of(truth), segmenter(truth), tracker(truth))
+    track = tracker(truth)
+    largest = np.iinfo(kind).max if kind in (np.uint8, np.uint16) else -1  # an unsigned image has no -1
+
+    def unsigned(frames, index, prompts):
+        labels = track(frames, index, prompts)
+        return np.where(labels < 0, largest, labels).astype(kind)
+
+    np.testing.assert_array_equal(masklets(frames_of(truth), segmenter(truth), unsigned), plain)
+    np.testing.assert_array_equal(clean_tracks(truth.astype(kind)), clean_tracks(truth))
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_no_frame_and_one(count):
+    truth = squares(frames=count)
+    labels = masklets(frames_of(truth), segmenter(truth), tracker(truth))
+    assert labels.shape == truth.shape
+    assert (labels == -1).all()  # one view alone shows no track
 
 
 def test_specks_and_glimpses_are_dropped_and_what_is_beyond_the_number_wanted():
@@ -166,11 +190,11 @@ def test_bad_shapes_are_refused():
 
 @settings(deadline=None, max_examples=25)
 @given(st.integers(0, 2**32 - 1))
-def test_clean_masklets(seed):
+def test_clean_tracks(seed):
     rng = np.random.default_rng(seed)
     labels = rng.choice([-1, -1, 0, 1, 2, 5], (4, 6, 6), p=[0.2, 0.2, 0.3, 0.2, 0.08, 0.02]).astype(np.int16)
-    clean = clean_masklets(labels, min_area=0.06, min_views=2)
-    np.testing.assert_array_equal(clean_masklets(clean, min_area=0.06, min_views=2), clean)
+    clean = clean_tracks(labels, min_area=0.06, min_views=2)
+    np.testing.assert_array_equal(clean_tracks(clean, min_area=0.06, min_views=2), clean)
     ids = np.unique(clean[clean >= 0])
     np.testing.assert_array_equal(ids, np.arange(len(ids)))  # numbered without gaps, in order of appearance
     assert list(np.argsort([np.flatnonzero((clean == i).any((1, 2)))[0] for i in ids], kind="stable")) == list(ids)

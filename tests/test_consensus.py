@@ -6,12 +6,12 @@ from scipy import sparse
 
 from jsecon.association.consensus import (
     average_linkage,
-    consensus_masklets,
     group_by_consensus,
     mask_signatures,
     pieces_on_masks,
     scene_pieces,
     split_cells,
+    track_masks,
 )
 from jsecon.association.scene import SceneSuperpixels, assign_superpixels
 from jsecon.field.votes import region_votes
@@ -44,7 +44,7 @@ def as_truth(labels, truth):
 def test_finds_the_three_balls_and_the_floor(world, scene):
     _, _, frames, truth, _ = world
     calls = []
-    labels = consensus_masklets(frames, scene, progress=lambda *row: calls.append(row))
+    labels = track_masks(frames, scene, progress=lambda *row: calls.append(row))
     assert labels.shape == truth.shape
     assert labels.dtype == np.int16
     assert labels.max() == 3
@@ -61,7 +61,7 @@ def test_frames_that_merge_cut_or_propose_nothing_are_outvoted(world):
     for t in (5, 12):
         worse[t] = np.concatenate([proposals[t] & left, proposals[t] & ~left])
     worse[20] = np.zeros((0, HEIGHT, WIDTH), bool)
-    labels = as_truth(consensus_masklets(frames, scene_of(world, worse, atoms=300)), truth)
+    labels = as_truth(track_masks(frames, scene_of(world, worse, atoms=300)), truth)
     scores = ious(labels - 1, truth, 3)
     assert np.nanmean(scores) > 0.85
     assert np.nanmean(scores[[2, 9, 16, 20]]) > 0.6  # and there, too, the Gaussians tell the balls apart
@@ -116,7 +116,7 @@ def test_the_weight_on_masks_is_that_of_the_splatting(world, scene):
 def test_nothing_proposed_anywhere_gives_one_thing_or_none(world):
     _, _, frames, _, _ = world
     nothing = [np.zeros((0, HEIGHT, WIDTH), bool)] * VIEWS
-    labels = consensus_masklets(frames, scene_of(world, nothing))
+    labels = track_masks(frames, scene_of(world, nothing))
     assert labels.shape == frames.shape[:3]
 
 
@@ -211,7 +211,7 @@ def test_most_views_decide_and_rows_and_frames_that_disagree_are_refused(world, 
     with pytest.raises(ValueError, match="N rows"):
         group_by_consensus(membership[1:], visible, weights, means)
     with pytest.raises(ValueError, match="frames"):
-        consensus_masklets(world[2][1:], scene)
+        track_masks(world[2][1:], scene)
 
 
 def test_what_is_never_seen_belongs_to_nothing():

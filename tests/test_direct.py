@@ -1,4 +1,4 @@
-"""query_one_step at the ends of the floats (in test_window.py where jax was silently wrong);
+"""Queries on codes: query_one_step at the ends of the floats (in test_window.py where jax was silently wrong);
 query_canonical against LERF's definition, written as the softmax it is, in float64."""
 
 import jax
@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon import query_canonical, query_one_step
+from jsecon import query_canonical, query_gt_anchored, query_one_step
 
 
 def exact_cosines(codes, code):
@@ -89,3 +89,25 @@ def test_unknown_features_are_never_selected_and_broken_phrases_select_nothing()
     for broken in (jnp.zeros((1, 3)), jnp.full((1, 3), jnp.nan)):
         assert not query_canonical(features, text, broken, 0.0).mask.any()
     assert not query_canonical(features, jnp.zeros(3), phrases, 0.0).mask.any()
+
+
+def test_the_anchored_query_takes_the_nearest_region_then_its_code():
+    rng = np.random.default_rng(0)
+    embeddings, table = rng.normal(size=(6, 9)).astype(np.float32), rng.normal(size=(6, 3)).astype(np.float32)
+    codes = table[rng.integers(0, 6, 200)] + 0.1 * rng.normal(size=(200, 3)).astype(np.float32)
+    for region in range(6):
+        text = embeddings[region] + 0.1 * rng.normal(size=9).astype(np.float32)
+        got = query_gt_anchored(codes, table, embeddings, text)
+        expected = exact_cosines(codes, table[region])
+        assert int(got.region) == region
+        assert float(got.score) == pytest.approx(exact_cosines(embeddings, text)[region], abs=1e-6)
+        np.testing.assert_allclose(got.similarity, expected, atol=1e-6)
+        np.testing.assert_array_equal(got.mask, expected >= 0.9)
+    jitted = jax.jit(jax.vmap(lambda text: query_gt_anchored(codes, table, embeddings, text).region))(embeddings)
+    np.testing.assert_array_equal(jitted, np.arange(6))
+    for nothing in (query_gt_anchored(codes, table, embeddings, np.full(9, np.nan, np.float32)),
+                    query_gt_anchored(codes, table[:0], embeddings[:0], text),
+                    query_gt_anchored(codes[:0], table, embeddings, text)):  # fmt: skip
+        assert not nothing.mask.any()
+    unknown = query_gt_anchored(codes, table, np.where(np.arange(6)[:, None] == region, 0, embeddings), text)
+    assert int(unknown.region) != region  # a region that was never embedded answers nothing

@@ -167,7 +167,7 @@ def test_a_region_is_cut_out_of_each_frame_and_missing_where_it_is_not_seen():
     labels = np.full((3, 60, 80), -1)
     labels[0, 10:20, 10:30] = labels[2, 30:50, 40:80] = 4
     frames[labels == 4] = (0, 200, 0)
-    strip = pictures.masklet_strip(frames, labels, 4, side=48)
+    strip = pictures.object_strip(frames, labels, 4, side=48)
     assert strip.shape == (48, 3 * 48 + 2 * 3, 3)
     tiles = [strip[:, k * 51 : k * 51 + 48] for k in range(3)]
     assert (tiles[1] == 40).all()

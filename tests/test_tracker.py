@@ -4,8 +4,9 @@ from balls import HEIGHT, VIEWS, WIDTH, ious, ring_of_balls
 from conftest import look_at
 from mask_overlaps import iou_matrix
 
+from jsecon.association.consensus import clean_tracks
 from jsecon.association.superpixels import superpixels
-from jsecon.paper.algorithm1 import clean_masklets, masklets
+from jsecon.paper.algorithm1 import masklets
 from jsecon.paper.tracker import GeometricTracker
 from jsecon.types import Camera
 from jsecon.vision.protocols import Tracker
@@ -108,7 +109,9 @@ def test_consistent_gives_a_rare_part_to_its_owner_and_keeps_the_rest(world, tra
     settled = tracker.consistent(frames, labels)
     np.testing.assert_array_equal(settled, truth)
     np.testing.assert_array_equal(tracker.consistent(frames, truth), truth)
-    assert clean_masklets(settled).max() == 3
+    assert clean_tracks(settled).max() == 3
+    unsigned = labels.astype(np.uint8)
+    np.testing.assert_array_equal(tracker.consistent(frames, unsigned), tracker.consistent(frames, labels * 1))
     nothing = np.full_like(truth, -1)
     np.testing.assert_array_equal(tracker.consistent(frames, nothing), nothing)
 

@@ -24,8 +24,8 @@ from jsecon.field.membership import add_visible_weight, inside_fraction, with_ov
 from jsecon.field.similarity import similarities
 from jsecon.fit.photometric import l1, psnr
 from jsecon.paper.autoencoder import encode
-from jsecon.paper.baselines import query_canonical, query_one_step
 from jsecon.paper.distill import distill_votes
+from jsecon.paper.queries import query_canonical, query_one_step
 from jsecon.query.answer import match_regions, query_anchored, query_several
 from jsecon.query.classes import query_classes
 from jsecon.query.rules import QueryRules

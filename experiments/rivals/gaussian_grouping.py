@@ -22,7 +22,7 @@ from scipy.spatial import KDTree
 from experiments.rivals.descent import descend
 from experiments.rivals.evidence import Evidence, view_plans, with_room
 from jsecon.errors import InputError
-from jsecon.paper.baselines import relevancies
+from jsecon.paper.queries import relevancies
 from jsecon.splat.plan import plan_view, render_plan
 from jsecon.splat.sh import C0
 from jsecon.types import Array, Selection

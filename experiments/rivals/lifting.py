@@ -22,7 +22,7 @@ from scipy.spatial import KDTree
 
 from experiments.rivals.evidence import Evidence, local_masks
 from jsecon.association.superpixels import superpixel_votes
-from jsecon.paper.baselines import relevancies
+from jsecon.paper.queries import relevancies
 from jsecon.splat.fusion import compute_once
 from jsecon.splat.plan import ViewPlan, plan_view
 from jsecon.splat.scan import blend_weights, make_batches, make_table, scan_tiles

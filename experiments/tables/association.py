@@ -10,9 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.rivals.evidence import Evidence, unit
-from jsecon.association.consensus import consensus_masklets
+from jsecon.association.consensus import clean_tracks, track_masks
 from jsecon.association.scene import SceneSuperpixels
-from jsecon.paper.algorithm1 import clean_masklets
 
 ROWS = 64
 """The number of regions is padded to a multiple of this, so that scenes share compiled programs."""
@@ -73,14 +72,14 @@ def by_consensus(
       frames: (T, H, W, 3) uint8.
       seed: Seed of the clustering.
       centre: As for `SceneSuperpixels`.
-      **how: Options of `consensus_masklets`.
+      **how: Options of `track_masks`.
 
     Returns:
       The regions.
     """
     given = jax.tree.map(jnp.asarray, (levels[0].gaussians, levels[0].cameras))
     scene = SceneSuperpixels(*given, lambda t: proposals(levels, t), centre=centre)
-    return associated(levels, clean_masklets(consensus_masklets(frames, scene, seed=seed, **how)))
+    return associated(levels, clean_tracks(track_masks(frames, scene, seed=seed, **how)))
 
 
 def proposals(levels: Sequence[Evidence], t: int) -> np.ndarray:

@@ -17,8 +17,8 @@ from jsecon.field.membership import membership_probability, normalise_votes
 from jsecon.field.regions import scene_parts
 from jsecon.field.votes import region_votes
 from jsecon.paper.autoencoder import train_autoencoder
-from jsecon.paper.baselines import query_canonical, query_one_step
 from jsecon.paper.distill import distill_l1, distill_votes
+from jsecon.paper.queries import query_canonical, query_one_step
 from jsecon.query.answer import match_regions, query_anchored, query_several
 from jsecon.query.classes import query_classes
 from jsecon.query.grouping import parts_fallback

@@ -19,7 +19,7 @@ from experiments.tables.setting import Setting
 from experiments.tables.silhouette import SILHOUETTE_WEIGHTS, fit_silhouette
 from jsecon.errors import require
 from jsecon.numerics import cosine_matrix, normalize
-from jsecon.paper.baselines import relevancies
+from jsecon.paper.queries import relevancies
 from jsecon.types import Selection
 
 RULES = ("cosine", "relevancy", "contrast", "apart")

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction
-from jsecon.paper.baselines import TEMPERATURE
+from jsecon.paper.queries import TEMPERATURE
 from jsecon.types import Votes
 
 SCORES = ("cosine", "relevancy", "contrast", "apart")

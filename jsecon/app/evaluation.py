@@ -15,7 +15,7 @@ from jsecon.errors import InputError
 from jsecon.evaluate.lerf import Row, evaluate_at_thresholds
 from jsecon.files import write_text
 from jsecon.paper.autoencoder import encode
-from jsecon.paper.baselines import query_canonical, query_one_step
+from jsecon.paper.queries import query_canonical, query_one_step
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console, Listener
 from jsecon.query.composite import parse_query

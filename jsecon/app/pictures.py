@@ -83,7 +83,7 @@ def selection_overlay(
     return image
 
 
-def masklet_strip(
+def object_strip(
     frames: UInt8[np.ndarray, "t h w 3"], labels: Int[np.ndarray, "t h w"], region: int, *, side: int = 96
 ) -> UInt8[np.ndarray, "{side} w2 3"]:
     """Shows one region through frames.

@@ -24,11 +24,11 @@ from jsecon.types import Quality
 FILES = ("field.safetensors", "report.html", "metrics.json")
 """files of a run"""
 FRAMES = 6
-"""number of frames that are shown with masklets and regions"""
-MASKLETS = 10
-"""number of masklets that are shown through as many frames"""
+"""number of frames that are shown with masks and regions"""
+OBJECTS = 10
+"""number of objects that are shown through as many frames"""
 LARGE = 0.15
-"""share of a frame; a masklet that fills more in some frame is not shown by itself"""
+"""share of a frame; an object that fills more in some frame is not shown by itself"""
 
 
 def _run(verb: verbs.Run, console: Console) -> verbs.VerbResult:
@@ -137,13 +137,13 @@ def run_parts(run: Run) -> list[str]:
       run: The run.
 
     Returns:
-      Sections (`jsecon.app.report`): frames, masklets, regions, held-out frames, seconds, stages and settings.
+      Sections (`jsecon.app.report`): frames, masks, regions, held-out frames, seconds, stages and settings.
     """
     return [*_scene_parts(run), *_work_parts(run)]
 
 
 def _scene_parts(run: Run) -> list[str]:
-    """Returns the parts that show frames, masklets, regions and the rendered scene."""
+    """Returns the parts that show frames, masks, regions and the rendered scene."""
     train = vision_frames(run.capture, run.options)
     renderer = pictures.Renderer(run.field.gaussians, run.field.cameras)
     colours = pictures.region_colours(run.field)
@@ -153,14 +153,14 @@ def _scene_parts(run: Run) -> list[str]:
         frame = np.asarray(run.capture.frames[t])
         cells += [
             report.figure(frame, run.capture.names[t]),
-            report.figure(pictures.label_overlay(frame, run.labels[row]), "masklets", sharp=True),
+            report.figure(pictures.label_overlay(frame, run.labels[row]), "masks", sharp=True),
             report.figure(renderer.colours(t, colours), "regions"),
             report.figure(renderer.photo(t), "rendered"),
         ]
     words = (
         "A region has one colour in all views, and so has each Gaussian by its strongest region; a grey one has none."
     )
-    parts = [report.section("Frames, masklets, regions", words, report.grid(cells, 4)), _masklet_part(run, train)]
+    parts = [report.section("Frames, masks, regions", words, report.grid(cells, 4)), _object_part(run, train)]
     if len(run.psnr):
         held_out = np.flatnonzero(run.capture.held_out)
         psnr = dict(zip(held_out.tolist(), run.psnr.tolist()))
@@ -173,22 +173,22 @@ def _scene_parts(run: Run) -> list[str]:
     return parts
 
 
-def _masklet_part(run: Run, train: np.ndarray) -> str:
-    """Returns the part of a page that shows the largest masklets of single things through the frames."""
-    views = evenly_spaced(len(train), MASKLETS)
+def _object_part(run: Run, train: np.ndarray) -> str:
+    """Returns the part of a page that shows the largest objects through the frames."""
+    views = evenly_spaced(len(train), OBJECTS)
     frames = np.asarray(run.capture.frames)[train[views]]
     labels = run.labels[views]
     sizes = np.stack([np.bincount(view[view >= 0], minlength=run.field.regions.count) for view in labels])
     small = np.flatnonzero(sizes.max(0) < LARGE * labels[0].size)
-    largest = small[np.argsort(-sizes.sum(0)[small], kind="stable")][:MASKLETS]
+    largest = small[np.argsort(-sizes.sum(0)[small], kind="stable")][:OBJECTS]
     rows = []
     for region in largest[sizes.sum(0)[largest] > 0].tolist():
         count = int((np.asarray(run.field.regions.pixel_counts)[region] > 0).sum())
-        tiles = pictures.masklet_strip(frames, labels, region)
+        tiles = pictures.object_strip(frames, labels, region)
         caption = f"in {count} of {len(run.labels)} frames"
         rows.append(report.figure(tiles, caption, strong=f"region {region}", wide=True))
     words = "Each row is one region, cut out of frames around the scene. A dark tile is a frame that does not show it."
-    return report.section("Masklets through the frames", words, *rows)
+    return report.section("Objects through the frames", words, *rows)
 
 
 def _work_parts(run: Run) -> list[str]:

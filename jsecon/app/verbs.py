@@ -79,8 +79,8 @@ class Demo(Verb):
 class Run(Verb, InputOptions):
     """Builds the language field of a capture.
 
-    Its stages estimate poses that the capture lacks, fit Gaussians or read them, find masklets or read masks, embed
-    each region, and distil codes into the Gaussians. It lists the stages first, and writes field.safetensors,
+    Its stages estimate poses that the capture lacks, fit Gaussians or read them, find objects or read their masks,
+    embed each region, and add up its votes on the Gaussians. It lists the stages first, and writes field.safetensors,
     report.html, metrics.json and cache to the output folder.
 
     Attributes:

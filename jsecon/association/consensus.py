@@ -7,7 +7,7 @@ mask clustering by view consensus (Yan et al., CVPR 2024), between pieces of the
 """
 
 import numpy as np
-from jaxtyping import Float, Int, Int16, UInt8
+from jaxtyping import Float, Int, Int16, Integer, UInt8
 from scipy import sparse
 
 from jsecon.association.scene import FrameSuperpixels, SceneSuperpixels, assign_superpixels
@@ -218,7 +218,7 @@ def average_linkage(
     return relabel_sequential(parent)
 
 
-def consensus_masklets(
+def track_masks(
     frames: UInt8[np.ndarray, "t h w 3"],
     scene: SceneSuperpixels,
     *,
@@ -227,7 +227,7 @@ def consensus_masklets(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Int16[np.ndarray, "t h w"]:
-    """Makes masklets by consensus, independent of the order of the frames.
+    """Follows objects through the frames by consensus, independent of the order of the frames.
 
     The Gaussians are grouped by `group_by_consensus`, and the groups claim the atoms of each frame
     (`assign_superpixels`).
@@ -241,7 +241,7 @@ def consensus_masklets(
       progress: Called with the number of frames done and of all.
 
     Returns:
-      (T, H, W) int16 labels, -1 for no masklet.
+      (T, H, W) int16 labels, -1 for no object.
     """
     views, means = scene.all(frames, progress), np.asarray(scene.gaussians.means, np.float32)
     owner = group_by_consensus(
@@ -257,6 +257,31 @@ def consensus_masklets(
             mass = (view.votes.T @ one_hot(owner[view.seen], count)).toarray()
             image[:] = assign_superpixels(view, mass, mass.sum(1, keepdims=True))[view.labels]
     return labels
+
+
+def clean_tracks(
+    labels: Integer[np.ndarray, "t h w"], *, min_area: float = 0.001, min_views: int = 2
+) -> Int16[np.ndarray, "t h w"]:
+    """Removes objects that few frames show, and renumbers the others in order of first appearance.
+
+    Args:
+      labels: (T, H, W) labels, -1 for no object.
+      min_area: Share of a frame below which an object is removed from it.
+      min_views: Least number of frames that show an object.
+    """
+    labels = np.asarray(labels).astype(np.int32)
+    count = int(labels.max(initial=-1)) + 1
+    if count == 0:
+        return np.full(labels.shape, -1, np.int16)
+    areas = np.stack([np.bincount(image[image >= 0].reshape(-1), minlength=count) for image in labels])  # (T, R)
+    shown = areas >= max(min_area * labels[0].size, 1)
+    kept = shown.sum(0) >= min_views
+    first = np.where(kept, shown.argmax(0), len(labels))
+    order = np.lexsort((np.arange(count), first))[: kept.sum()]
+    number = np.full(count + 1, -1, np.int16)  # the last entry is for label -1
+    number[order] = np.arange(len(order))
+    table = np.where(np.concatenate([shown, np.zeros((len(labels), 1), bool)], 1), number, -1).astype(np.int16)
+    return np.stack([row[image] for row, image in zip(table, labels)])
 
 
 def pieces_on_masks(

@@ -1,12 +1,17 @@
-"""Masklets by Algorithm 1 of the paper: one identity per object, from any segmenter and tracker. Host code."""
+"""Masklets by Algorithm 1 of the paper: one identity per object, from any segmenter and tracker. Host code.
+
+A masklet S_r is the masks of one object in all frames. The paper leaves the overlaps of masklets open; how they are
+decided here stands in `masklets`.
+"""
 
 import dataclasses
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Int, Int16
+from jaxtyping import Int16
 from scipy import sparse
 
+from jsecon.association.consensus import clean_tracks
 from jsecon.association.run_lengths import RunLengthMasks, encode_masks, encode_rows
 from jsecon.association.superpixels import Sparse, one_hot
 from jsecon.errors import require, require_shape
@@ -35,9 +40,6 @@ def masklets(
     iou_threshold: float = 0.5,
     min_area: float = 0.001,
     max_masklets: int = 1000,
-    min_views: int = 2,
-    min_support: float = 0.5,
-    join_rate: float = 0.5,
     state: MaskletState | None = None,
     on_checkpoint: Callable[[Callable[[], MaskletState]], None] | None = None,
     progress: Progress | None = None,
@@ -48,11 +50,11 @@ def masklets(
     the mask of every masklet in frame t is at most `iou_threshold`. The prompts of a frame are tracked through the
     whole sequence. Proposals of one frame that repeat each other count once, the better first.
 
-    Parts: two masklets are joined if more than `join_rate` of the frames that show both have a proposal that contains
-    both. Overlaps: the support of a masklet is its mean best IoU with the proposals of the frames that show
-    it. A pixel belongs to the smallest masklet (in mean area) with a support of at least `min_support`, else to the
-    best supported. So objects that are proposed repeatedly are cut out of their surroundings, and single fragments and
-    mergers have no influence. Finally `clean_masklets` is applied.
+    Parts: two masklets are joined if most of the frames that show both have a proposal that contains both. Overlaps:
+    the support of a masklet is its mean best IoU with the proposals of the frames that show it. A pixel belongs to the
+    smallest masklet (in mean area) with a support of at least a half, else to the best supported. So objects that are
+    proposed repeatedly are cut out of their surroundings, and single fragments and mergers have no influence. Finally
+    masklets that only one frame shows are removed (`clean_tracks`).
 
     Args:
       frames: (T, H, W, 3) uint8 RGB.
@@ -61,9 +63,6 @@ def masklets(
       iou_threshold: The paper's kappa.
       min_area: Least area of a proposal, as a share of the frame.
       max_masklets: Maximum number of tracked prompts.
-      min_views: Least number of frames that show a masklet.
-      min_support: Least support of a masklet that goes before larger ones.
-      join_rate: Share of frames above which two masklets are parts of one object; 1 joins no two.
       state: State of a stopped call with the same frames and options, to resume after its last frame.
       on_checkpoint: Called after each frame with a function that makes the state, which has the size of all masks.
       progress: Called with the number of frames done and of all.
@@ -99,19 +98,19 @@ def masklets(
             on_checkpoint(lambda done=t + 1: MaskletState(done, proposals.record(), layers.record()))
         if progress is not None:
             progress(t + 1, count)
-    if not layers.size(0):
+    if not count or not layers.size(0):
         return np.full((count, height, width), -1, np.int16)
-    whole, area, support = _joined(layers, proposals, join_rate=join_rate)
-    order = np.lexsort((np.where(support >= min_support, area, -support), support < min_support))
-    return clean_masklets(whole.flatten(order), min_area=min_area, min_views=min_views)
+    whole, area, support = _joined(layers, proposals)
+    order = np.lexsort((np.where(support >= 0.5, area, -support), support < 0.5))
+    return clean_tracks(whole.flatten(order), min_area=min_area)
 
 
-def _joined(layers: "_Layers", proposals: "_Layers", *, join_rate: float) -> tuple["_Layers", np.ndarray, np.ndarray]:
+def _joined(layers: "_Layers", proposals: "_Layers") -> tuple["_Layers", np.ndarray, np.ndarray]:
     """Joins masklets that are parts of one object; returns them, their mean areas (R,) in px and their support (R,).
 
     Two masklets are one object in a frame if a proposal there covers more than half of each. They are joined if that
-    holds in more than `join_rate` of the frames (at least two) that show both, best pairs first: view consensus (Yan et
-    al., CVPR 2024) between tracks instead of single masks.
+    holds in more than half of the frames (at least two) that show both, best pairs first: view consensus (Yan et al.,
+    CVPR 2024) between tracks instead of single masks.
     """
     tables: list[tuple[np.ndarray, ...]] = [_overlaps(layers.at(t), proposals.at(t)) for t in range(layers.count)]
     while True:
@@ -120,7 +119,7 @@ def _joined(layers: "_Layers", proposals: "_Layers", *, join_rate: float) -> tup
         np.fill_diagonal(rate, 0.0)
         groups = np.arange(len(rate))
         free = np.ones(len(rate), bool)
-        rows, columns = np.nonzero(np.triu(rate > join_rate))
+        rows, columns = np.nonzero(np.triu(rate > 0.5))
         for k in np.lexsort((-both[rows, columns], -rate[rows, columns])):
             a, b = rows[k], columns[k]
             if free[a] and free[b]:  # one join per round: the next round counts again with the union
@@ -157,33 +156,6 @@ def _overlaps(first: Sparse, second: Sparse) -> tuple[np.ndarray, np.ndarray, np
     shared = (first @ second.T).toarray()
     size, other = np.diff(first.indptr), np.diff(second.indptr)
     return size, shared, shared / np.maximum(size[:, None] + other - shared, 1.0)
-
-
-def clean_masklets(
-    labels: Int[np.ndarray, "t h w"], *, min_area: float = 0.001, min_views: int = 2
-) -> Int16[np.ndarray, "t h w"]:
-    """Removes masklets that few frames show, and renumbers the others.
-
-    Args:
-      labels: (T, H, W) labels, -1 for no masklet.
-      min_area: Share of a frame below which a masklet is removed from it.
-      min_views: Least number of frames that show a masklet.
-
-    Returns:
-      (T, H, W) int16 labels, in order of first appearance.
-    """
-    count = int(labels.max(initial=-1)) + 1
-    if count == 0:
-        return np.full(labels.shape, -1, np.int16)
-    areas = np.stack([np.bincount(image[image >= 0].reshape(-1), minlength=count) for image in labels])  # (T, R)
-    shown = areas >= max(min_area * labels[0].size, 1)
-    kept = shown.sum(0) >= min_views
-    first = np.where(kept, shown.argmax(0), len(labels))
-    order = np.lexsort((np.arange(count), first))[: kept.sum()]
-    number = np.full(count + 1, -1, np.int16)  # the last entry is for label -1
-    number[order] = np.arange(len(order))
-    table = np.where(np.concatenate([shown, np.zeros((len(labels), 1), bool)], 1), number, -1).astype(np.int16)
-    return np.stack([row[image] for row, image in zip(table, labels)])
 
 
 def _new(masks: Sparse, known: Sparse, threshold: float) -> np.ndarray:

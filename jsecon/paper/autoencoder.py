@@ -70,9 +70,6 @@ def train_autoencoder(
     latent: int,
     key: Key,
     epochs: int | None = None,
-    batch: int = 64,
-    learning_rate: float = 7e-4,
-    cosine_weight: float = 0.001,
     progress: Progress | None = None,
 ) -> Autoencoder:
     """Trains LangSplat's autoencoder on the regions' embeddings.
@@ -82,10 +79,6 @@ def train_autoencoder(
       latent: d, size of a code.
       key: The same key gives the same parameters.
       epochs: Passes over the regions; None takes LangSplat's 100, or as many as make 1,000 steps.
-      batch: Maximum number of regions of a batch. All batches have similar sizes, because batch normalisation cannot
-        learn from one or two regions.
-      learning_rate: Learning rate of Adam.
-      cosine_weight: Weight of the cosine term of the loss.
       progress: Called as progress(done, total), in epochs.
 
     Returns:
@@ -95,8 +88,8 @@ def train_autoencoder(
       ValueError: All rows are zero, numbers are not finite, or options are out of range.
     """
     require(latent >= 1, "train_autoencoder", f"latent={latent}", "at least 1", "3 is LangSplat's.")
-    positive, options = batch >= 1 and (epochs is None or epochs >= 1), f"batch={batch}, epochs={epochs}"
-    require(positive, "train_autoencoder", options, "both at least 1", "Leave epochs out to have it chosen.")
+    positive, remedy = epochs is None or epochs >= 1, "Leave epochs out to have it chosen."
+    require(positive, "train_autoencoder", f"epochs={epochs}", "at least 1", remedy)
     rows = np.asarray(embeddings)
     remedy, finite = "Find the regions whose crops gave NaN and leave them out.", bool(np.isfinite(rows).all())
     require(finite, "train_autoencoder", "embeddings that are not finite", "finite numbers", remedy)
@@ -105,11 +98,11 @@ def train_autoencoder(
     require(len(rows) >= 1, "train_autoencoder", count, "at least one embedding", "Embed the regions first.")
     units = normalize(jnp.asarray(rows))
     count, dim = units.shape
-    batches = -(-count // batch)
+    batches = -(-count // 64)  # of similar sizes: batch normalisation cannot learn from one or two regions
     total = epochs if epochs is not None else max(100, -(-MIN_STEPS // batches))
     inward = (dim, *(max(w, latent) for w in ENCODER_WIDTHS), latent)
     outward = (latent, *(max(w, latent) for w in DECODER_WIDTHS), dim)
-    plan = _Plan(inward, outward, batches, learning_rate, cosine_weight)
+    plan = _Plan(inward, outward, batches)
     init_key, shuffle_key = jax.random.split(key)
     carry = _start(units, init_key, plan)
     stretch = total if progress is None else max(1, -(-total // 50))
@@ -130,8 +123,6 @@ class _Plan(NamedTuple):
     encoder_widths: tuple[int, ...]
     decoder_widths: tuple[int, ...]
     batches: int
-    learning_rate: float
-    cosine_weight: float
 
     def shapes(self) -> tuple[list[dict], list[dict]]:
         """Shapes of the trained parameters of encoder and decoder, layer by layer."""
@@ -158,7 +149,7 @@ def _start(units: Array, key: Key, plan: _Plan) -> Any:
     vector = middle + spread * jax.random.uniform(key, middle.shape, units.dtype, -1.0, 1.0)
     hidden = plan.encoder_widths[1:-1]
     moments = [{"mean": jnp.zeros(n, units.dtype), "variance": jnp.ones(n, units.dtype)} for n in hidden]
-    return (vector, moments, _optimizer(plan).init(vector)), (jnp.asarray(jnp.inf, units.dtype), vector, moments)
+    return (vector, moments, _optimizer().init(vector)), (jnp.asarray(jnp.inf, units.dtype), vector, moments)
 
 
 def _unflatten(vector: Array, plan: _Plan) -> tuple[list[dict], list[dict]]:
@@ -175,10 +166,10 @@ def _unflatten(vector: Array, plan: _Plan) -> tuple[list[dict], list[dict]]:
     return parts
 
 
-def _optimizer(plan: _Plan) -> Any:
+def _optimizer() -> Any:
     import optax  # late: a field is read without it
 
-    return optax.adam(plan.learning_rate)
+    return optax.adam(7e-4)
 
 
 # The bounds are arguments: one compiled loop serves every stretch between two calls of `progress`.
@@ -188,7 +179,7 @@ def _epochs(
 ) -> Any:
     count = units.shape[0]
     size = -(-count // plan.batches)
-    optimizer = _optimizer(plan)
+    optimizer = _optimizer()
 
     def difference(decoder, codes, x, weight):
         out = _decode(decoder, codes)
@@ -198,7 +189,7 @@ def _epochs(
         encoder, decoder = _unflatten(vector, plan)
         codes, of_batch = _forward(encoder, None, x)
         moments = jax.tree.map(lambda old, new: 0.9 * old + 0.1 * new, moments, of_batch)
-        return difference(decoder, codes, x, plan.cosine_weight), moments
+        return difference(decoder, codes, x, 0.001), moments
 
     def step(state, x) -> tuple[Any, None]:
         vector, moments, adam = state

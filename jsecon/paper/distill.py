@@ -1,7 +1,12 @@
-"""Codes of the regions to codes of the Gaussians: closed forms on the votes, and the paper's path on the rendered L1.
+"""Distillation: the codes of the regions become codes of the Gaussians.
 
-With the geometry frozen the rendered map is linear in the Gaussians' features, so the votes (weight that each region
-casts on each Gaussian) hold what a closed form needs. `distill_l1` is the paper's path, Adam on the rendered L1.
+With the geometry fixed the rendered map is linear in the features, F_p = sum_i w_ip f_i, and the target of a pixel is
+the code l_r(p) of its region. The paper minimises L = sum_p |F_p - l_r(p)| by Adam (`rendered_l1`, `distill_l1`). The
+votes W_ir = sum of w_ip over the pixels of r hold all that a closed form needs (`distill_votes`):
+
+    mode      l_r of the largest W_ir
+    mean      sum_r W_ir l_r, the minimum of the weighted squared error
+    median    the weighted median of each number, the minimum of L for a Gaussian taken alone
 """
 
 import functools
@@ -14,44 +19,31 @@ from jaxtyping import Float, Int, Shaped
 from jsecon.errors import require, require_one_of, require_shape
 from jsecon.numerics import is_traced, normalize, require_labels, safe_norm
 from jsecon.splat.capacity import plan_capacity
-from jsecon.splat.plan import plan_view, prepare_views, render_plan
+from jsecon.splat.plan import ViewPlan, plan_view, prepare_views, render_plan
 from jsecon.types import Array, Camera, Gaussians, Key, Progress, Votes
 
 ADAM_EPS = 1e-15
 """3DGS's and LangSplat's: gradients per Gaussian are means over all pixels, far below the usual 1e-8"""
 NORMALISE_EPS = 1e-9
 """LangSplat divides a feature by |f| + 1e-9 before rasterising"""
-RANDOM_LENGTH = 0.01
-"""length of a random initial code: short enough to turn within tens of steps, long enough to escape the trap at zero"""
 _ROWS = 8192
 """Gaussians reduced at a time: (rows, K, d) is the largest array of a reduction, 134 MB at K = 8, d = 512"""
-_TIE = 1e-5
-"""relative weight below which two halves of a median count as equal: float32 sums of K weights are no surer"""
 MIN_LABELLED = 0.5
 """Smallest labelled share of a Gaussian's weight. With masks of a few objects alone, the walls around them would
 otherwise carry the objects' codes (demo, one-step mIoU 0.24)."""
 
 
-def distill_votes(
-    votes: Votes,
-    region_codes: Float[Array, "r d"],
-    reduce: str = "mode",
-    *,
-    min_labelled: float | Float[Array, ""] = MIN_LABELLED,
-) -> Float[Array, "n d"]:
+def distill_votes(votes: Votes, region_codes: Float[Array, "r d"], reduce: str = "mode") -> Float[Array, "n d"]:
     """Computes the codes of Gaussians from their strongest votes and the codes of the regions. Pure.
 
     Args:
       votes: Votes of N Gaussians.
       region_codes: (R, d) codes of the regions.
-      reduce: "mode", the code of the strongest region. "mean", the weighted mean, which minimises the weighted squared
-        error. "median", the weighted median of each number, which minimises the rendered L1 of a Gaussian taken alone;
-        if a whole interval does, the value closest to the mode.
-      min_labelled: Smallest share of a Gaussian's weight on labelled pixels; 0 keeps all.
+      reduce: "mode", "mean" or "median". Of a whole interval of medians it is the value closest to the mode.
 
     Returns:
       (N, d) unit codes. A zero code (unknown) has a Gaussian without votes, with votes that are not finite, with at
-      least half of its weight on regions without a code, or with too little labelled weight.
+      least half of its weight on regions without a code, or with less than MIN_LABELLED of it on labelled pixels.
 
     Raises:
       ValueError: Shapes disagree, or the reduction is unknown.
@@ -62,7 +54,7 @@ def distill_votes(
     if votes.num_regions == 0 or votes.regions.shape[1] == 0:
         return jnp.zeros((votes.regions.shape[0], region_codes.shape[1]), region_codes.dtype)
     codes = _distill_votes(votes.regions, votes.weights, jnp.asarray(region_codes), reduce)
-    return jnp.where((votes.labelled >= min_labelled * votes.total)[:, None], codes, 0.0)
+    return jnp.where((votes.labelled >= MIN_LABELLED * votes.total)[:, None], codes, 0.0)
 
 
 @functools.partial(jax.jit, static_argnames="reduce")
@@ -94,7 +86,7 @@ def _mode(values: Array, weight: Array) -> Array:
 def _median(values: Array, weight: Array) -> Array:
     # A value is a median if at most half of the weight lies below it and at most half above. K is small: comparing all
     # pairs vectorises, where a sort along an axis of 8 does not.
-    half = 0.5 * jnp.sum(weight) * (1 + _TIE)
+    half = 0.5 * jnp.sum(weight) * (1 + 1e-5)  # sums of K weights in float32 are no surer: so near, both halves tie
     low, high = jnp.full(values.shape[1:], jnp.inf, values.dtype), jnp.full(values.shape[1:], -jnp.inf, values.dtype)
     for value, value_weight in zip(values, weight, strict=True):
         below = jnp.sum(jnp.where(values < value, weight[:, None], 0.0), axis=0)
@@ -110,16 +102,11 @@ _REDUCTIONS = {"mean": _mean, "median": _median, "mode": _mode}
 class _State(NamedTuple):
     """Where `distill_l1` stands."""
 
-    features: Array
-    """(N, d) before normalisation."""
-    moments: Any
-    """Adam's."""
-    order: Array
-    """(steps,) int32 the view of each step."""
-    history: Array
-    """(steps,) the loss before each step taken; NaN for a step whose view did not fit the capacity."""
-    step: Array
-    """() int32 steps taken."""
+    features: Array  # (N, d) before normalisation
+    moments: Any  # Adam's
+    order: Array  # (steps,) int32 the view of each step
+    history: Array  # (steps,) losses so far
+    step: Array  # () int32 steps taken
 
 
 class Distillation(NamedTuple):
@@ -140,16 +127,12 @@ def distill_l1(
     steps: int,
     key: Key,
     init: str | Float[Array, "n d"] = "zero",
-    learning_rate: float = 0.0025,
     capacity: int | None = None,
     progress: Progress | None = None,
 ) -> Distillation:
-    """Distills as the paper does (LangSplat, train.py): Adam on the L1 between rendered and target codes.
+    """Distills as the paper does (LangSplat, train.py): Adam on the rendered L1 (`rendered_l1`), with rate 0.0025.
 
-    One view a step, all views before any repeats, in an order drawn from `key`. The loss is the mean over all H W d
-    numbers of `|F m - G m|`: F the rendering of `f / (|f| + 1e-9)` without background or renormalisation, G the code of
-    the pixel's region, m = 1 on labelled pixels, so unlabelled ones count in the denominator alone. The geometry is
-    fixed.
+    One view a step, all views before any repeats, in an order drawn from `key`. The geometry is fixed.
 
     Args:
       gaussians: Scene of N Gaussians.
@@ -161,9 +144,8 @@ def distill_l1(
       key: Random key of the order of views and of random codes.
       init: "zero" is LangSplat's, and a trap: the gradient through `f / (|f| + 1e-9)` at zero is 1e9 times too large,
         Adam's second moment remembers it for about 15,000 steps, and until then a code hardly moves from the corner of
-        the cube that its first step took it to. "random" (length 0.01) or (N, d) codes, such as those of
-        `distill_votes`, escape it.
-      learning_rate: Learning rate of Adam.
+        the cube that its first step took it to. "random" (of length 0.01, which turns within tens of steps) or (N, d)
+        codes, such as those of `distill_votes`, escape it.
       capacity: Number of (block, Gaussian) pairs of a view, see `render`.
       progress: Called as progress(done, total), in steps.
 
@@ -184,7 +166,7 @@ def distill_l1(
         capacity = plan_capacity(gaussians, cameras, margin=1.0)
     for begin in range(0, steps, stretch):
         stop = min(begin + stretch, steps)
-        state = _descend(state, gaussians, cameras, labels, table, plans, stop, learning_rate, capacity)
+        state = _descend(state, gaussians, cameras, labels, table, plans, stop, capacity)
         if progress is not None:
             jax.block_until_ready(state.step)
             progress(stop, steps)
@@ -223,38 +205,54 @@ def _start(
         require_one_of("init", init, ("zero", "random"), "Where you have votes, start from distill_votes(...).")
         features = jnp.zeros((count, size), dtype)
         if init == "random":
-            features = RANDOM_LENGTH * normalize(jax.random.normal(init_key, (count, size), dtype))
+            features = 0.01 * normalize(jax.random.normal(init_key, (count, size), dtype))
     else:
         require_shape("init", init, (count, size), "Give one row per Gaussian, of the regions' code size.")
         features = jnp.asarray(init, dtype)
     rounds = jax.random.split(order_key, -(-steps // views))
     order = jax.vmap(lambda k: jax.random.permutation(k, views))(rounds).reshape(-1)[:steps].astype(jnp.int32)
-    return _State(features, _optimizer(0.0).init(features), order, jnp.zeros(steps, dtype), jnp.zeros((), jnp.int32))
+    return _State(features, _optimizer().init(features), order, jnp.zeros(steps, dtype), jnp.zeros((), jnp.int32))
 
 
-def _optimizer(learning_rate: Any) -> Any:
+def rendered_l1(
+    features: Float[Array, "n d"], plan: ViewPlan, labels: Int[Array, "h w"], region_codes: Float[Array, "r d"]
+) -> tuple[Float[Array, ""], Int[Array, ""]]:
+    """Computes the paper's loss of one view, the mean over all H W d numbers of |F m - G m|, and the overflow. Pure.
+
+    F renders f / (|f| + 1e-9) without background or renormalisation, G has the code of each pixel's region, and m is 1
+    on labelled pixels, so unlabelled ones count in the denominator alone.
+
+    Args:
+      features: (N, d) features of the Gaussians, of any length.
+      plan: `plan_view` of the N Gaussians.
+      labels: (H, W) region ids; those below 0, of R and more, or of a zero code count as unlabelled.
+      region_codes: (R, d) unit codes, R >= 1.
+    """
+    ids = jnp.clip(labels, 0, len(region_codes) - 1)
+    known = jnp.any(region_codes != 0, axis=-1)
+    mask = ((labels >= 0) & (labels < len(region_codes)) & known[ids])[..., None]
+    # safe_norm has a zero gradient at zero, which leaves 1e9 times the rendering's there, as in LangSplat.
+    units = features / (safe_norm(features, keepdims=True) + NORMALISE_EPS)
+    rendering = render_plan(plan, units)
+    return jnp.mean(jnp.where(mask, jnp.abs(rendering.features - region_codes[ids]), 0.0)), rendering.overflow
+
+
+def _optimizer() -> Any:
     import optax  # late: a field is read without it
 
-    return optax.adam(learning_rate, eps=ADAM_EPS)
+    return optax.adam(0.0025, eps=ADAM_EPS)
 
 
 @functools.partial(jax.jit, static_argnames="capacity")
-def _descend(state, gaussians, cameras, labels, region_codes, plans, until, learning_rate, capacity) -> _State:
-    optimizer = _optimizer(learning_rate)
-    codes = normalize(region_codes)
-    known = jnp.any(codes != 0, axis=-1)
+def _descend(state, gaussians, cameras, labels, region_codes, plans, until, capacity) -> _State:
+    optimizer, codes = _optimizer(), normalize(region_codes)
 
     def loss(features, view):
         if plans is None:
             plan = plan_view(gaussians, cameras[view], capacity=capacity)
         else:
             plan = jax.tree.map(lambda a: a[view], plans)
-        ids = jnp.clip(labels[view], 0, codes.shape[0] - 1)
-        mask = ((labels[view] >= 0) & (labels[view] < codes.shape[0]) & known[ids])[..., None]
-        # safe_norm has a zero gradient at zero, which leaves 1e9 times the rendering's there, as in LangSplat.
-        units = features / (safe_norm(features, keepdims=True) + NORMALISE_EPS)
-        rendering = render_plan(plan, units)
-        return jnp.mean(jnp.where(mask, jnp.abs(rendering.features - codes[ids]), 0.0)), rendering.overflow
+        return rendered_l1(features, plan, labels[view], codes)
 
     def step(index, state):
         (value, overflow), gradient = jax.value_and_grad(loss, has_aux=True)(state.features, state.order[index])

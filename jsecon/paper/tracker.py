@@ -1,12 +1,12 @@
 """A tracker without a network: it follows masks through the Gaussians of the scene. Host code.
 
-The votes of the Gaussians on the atoms of the frames (views.py) lift a mask and render it into other frames.
+The votes of the Gaussians on the superpixels of the frames lift a mask and render it into other frames.
 """
 
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int16, UInt8
+from jaxtyping import Bool, Float, Int, Int16, Integer, UInt8
 from scipy import sparse
 
 from jsecon.association.scene import FrameSuperpixels, SceneSuperpixels, assign_superpixels
@@ -18,17 +18,15 @@ from jsecon.types import Camera, Gaussians
 class GeometricTracker:
     """Tracker (jsecon.vision.protocols) through the Gaussians of the scene.
 
-    Prompts are tracked against rivals: the other proposals of their frame, and the rest of it. From that frame the
-    track proceeds to the frame with the largest overlap with a visited one. Every frame adds evidence e_ib, the weight
-    of Gaussian i on the masks of class b; ownership is e_ib^2 / sum_b e_ib^2. In the next frame the classes claim atoms
-    (`assign_superpixels`). Occlusion is that of the compositing of the full scene. A Gaussian counts as known in
-    proportion to its clarity in the visited frames, fully from half of its clarity in the present frame.
+    Prompts are tracked against competing labels: the other proposals of their frame, and the rest of it. From that
+    frame the track proceeds to the frame with the largest overlap with a visited one. Every frame adds evidence e_ib,
+    the weight of Gaussian i on the masks of class b; ownership is e_ib^2 / sum_b e_ib^2. In the next frame the classes
+    are assigned superpixels (`assign_superpixels`). Occlusion is that of the compositing of the full scene. A Gaussian
+    counts as known in proportion to its clarity in the visited frames, fully from half of its clarity in the present
+    frame.
 
-    Args:
-      gaussians: Scene of N Gaussians.
-      cameras: Batch of T cameras, one per frame.
-      proposals: Masks (M, H, W) bool of each frame, see `SceneSuperpixels`.
-      superpixels_per_frame: Approximate number of superpixels per frame before the cut along proposals.
+    `proposals` has the masks (M, H, W) of each frame; `superpixels_per_frame` is approximate, before the cut along
+    them.
     """
 
     def __init__(
@@ -44,18 +42,10 @@ class GeometricTracker:
     def __call__(
         self, frames: UInt8[np.ndarray, "t h w 3"], index: int, prompts: Bool[np.ndarray, "b _ _"]
     ) -> Int16[np.ndarray, "t h w"]:
-        """Tracks the masks of one frame through all frames.
+        """Tracks the masks (B, H, W) of frame `index` through all frames.
 
-        Args:
-          frames: (T, H, W, 3) uint8 RGB.
-          index: Frame of the prompts.
-          prompts: (B, H, W) bool masks.
-
-        Returns:
-          (T, H, W) int16 index of a prompt, -1 elsewhere; at `index` the prompts (the earlier one if they overlap).
-
-        Raises:
-          ValueError: The prompts have another size than the frames.
+        Returns labels (T, H, W): the index of a prompt, or -1; at `index` the prompts (the earlier one if they
+        overlap).
         """
         count, height, width = frames.shape[:3]
         require_shape("prompts", prompts, ("B", height, width), "Pass masks of the size of the frame.")
@@ -65,7 +55,7 @@ class GeometricTracker:
         views = self.views.all(frames)
         if not len(prompts):
             return labels
-        classes = self._with_rivals(labels[index], index, len(prompts))
+        classes = self._with_competitors(labels[index], index, len(prompts))
         evidence = np.zeros((self.views.count, len(classes)), np.float32)
         best = np.zeros(len(evidence), np.float32)
         start = views[index]
@@ -92,33 +82,27 @@ class GeometricTracker:
             labels[t] = np.where(owner < len(prompts), owner, -1).astype(np.int16)[views[t].labels]
         return labels
 
-    def _with_rivals(self, labels: Int16[np.ndarray, "h w"], index: int, count: int) -> Bool[np.ndarray, "c h w"]:
+    def _with_competitors(self, labels: Int16[np.ndarray, "h w"], index: int, count: int) -> Bool[np.ndarray, "c h w"]:
         """(B + C, H, W) bool masks of the prompts, of the other proposals of the frame, and of its rest."""
         classes = [labels == b for b in range(count)]
         free = labels < 0
         for mask in np.asarray(self.views.propose(index), bool):
-            rival = mask & free
-            if rival.any():
-                classes.append(rival)
-                free &= ~rival
+            competitor = mask & free
+            if competitor.any():
+                classes.append(competitor)
+                free &= ~competitor
         return np.stack([*classes, free])
 
     def consistent(
-        self, frames: UInt8[np.ndarray, "t h w 3"], labels: Int[np.ndarray, "t h w"]
+        self, frames: UInt8[np.ndarray, "t h w 3"], labels: Integer[np.ndarray, "t h w"]
     ) -> Int[np.ndarray, "t h w"]:
         """Merges regions whose Gaussians belong to another region in the sum of all views.
 
         A region stays if at least half of its weight falls on Gaussians that it has the largest weight on. Otherwise (a
-        part that few frames separate, a shadow) its pixels go to the region that owns most of it.
-
-        Args:
-          frames: (T, H, W, 3) uint8 frames of the scene.
-          labels: (T, H, W) regions, -1 for no region.
-
-        Returns:
-          Labels with the same numbers; some regions may have no pixels left.
+        part that few frames separate, a shadow) its pixels go to the region that owns most of it. The labels, -1 for no
+        region, keep their numbers; some regions may have no pixels left.
         """
-        labels = np.array(labels)
+        labels = np.array(labels, np.int32)
         count = int(labels.max(initial=-1)) + 1
         for _ in range(4 if count else 0):  # a merger may affect other regions; rarely more than two rounds
             entries = []

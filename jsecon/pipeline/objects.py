@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsecon.association.consensus import consensus_masklets, pieces_on_masks
+from jsecon.association.consensus import clean_tracks, pieces_on_masks, track_masks
 from jsecon.association.run_lengths import cache_masks_as_rle
 from jsecon.association.scene import SceneSuperpixels
 from jsecon.errors import InputError
 from jsecon.field.regions import Embed, embeddings_of_masks, region_embeddings, scene_parts
 from jsecon.fit.depth import points_from_depth
-from jsecon.paper.algorithm1 import clean_masklets, masklets as algorithm1
+from jsecon.paper.algorithm1 import masklets
 from jsecon.paper.tracker import GeometricTracker
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import Checkpoint, Results, RunContext, StageInput, StageResult, vision_frames
@@ -135,10 +135,10 @@ def associate_masks(
     options, frames, cameras = context.options, view.frames, view.cameras
     if options.associated_by == "consensus":
         scene = SceneSuperpixels(gaussians, cameras, proposals, centre=options.centre_pixel_weight)
-        labels = consensus_masklets(frames, scene, agreement=options.agreement, seed=options.seed, progress=progress)
-        return clean_masklets(labels)
+        labels = track_masks(frames, scene, agreement=options.agreement, seed=options.seed, progress=progress)
+        return clean_tracks(labels)
     tracker = context.models.tracker or GeometricTracker(gaussians, cameras, proposals)
-    labels = algorithm1(
+    labels = masklets(
         frames,
         lambda frame, index: proposals(index),
         tracker,
@@ -148,7 +148,7 @@ def associate_masks(
     )
     if isinstance(tracker, GeometricTracker):
         labels = tracker.consistent(frames, labels)
-    return clean_masklets(labels)
+    return clean_tracks(labels)
 
 
 def _require_regions(labels: np.ndarray, where: str) -> None:

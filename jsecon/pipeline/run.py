@@ -80,7 +80,7 @@ class Computed:
 
     @property
     def labels(self) -> np.ndarray:
-        """(T, H, W) int16 masklets of the training frames that vision uses."""
+        """(T, H, W) int16 labels of the training frames that vision uses."""
         return self.results.objects
 
     @property

@@ -92,7 +92,7 @@ def select_in_blocks(
                 selection = select_from_votes(votes, match, threshold)
             else:
                 codes = jnp.asarray(stored.gaussians[rows]), jnp.asarray(stored.regions)
-                selection = select_rows_by_code(*codes, votes.views, match, threshold)
+                selection = select_rows_by_code(*codes, match, threshold)
             places = np.flatnonzero(np.asarray(selection.mask))
             column.append((places + rows.start, np.asarray(selection.similarity)[places]))
     answers = []

@@ -2,15 +2,13 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from jsecon.errors import require
-from jsecon.field.similarity import Number, similarities
+from jsecon.field.similarity import Number
+from jsecon.paper.queries import CODE_THRESHOLD, select_near_region
 from jsecon.query.answer import RegionMatch
 from jsecon.types import Array, Codes, LanguageField, Selection
-
-CODE_THRESHOLD = 0.9
-"""Smallest cosine with the region's code: codes of one region lie within a few degrees (0.9 is 26)."""
 
 
 def codes_of(field: LanguageField) -> Codes:
@@ -32,19 +30,13 @@ def select_by_code(field: LanguageField, match: RegionMatch, threshold: Number =
     if field.regions.count == 0:
         none = jnp.zeros(field.gaussians.count, bool)
         return Selection(none, none.astype(jnp.float32), *map(jnp.asarray, match[1:5]))
-    columns = codes.gaussians, codes.regions, field.votes.views
-    return select_rows_by_code(*map(jnp.asarray, columns), match, threshold)
+    return select_rows_by_code(jnp.asarray(codes.gaussians), jnp.asarray(codes.regions), match, threshold)
 
 
 @jax.jit
 def select_rows_by_code(
-    codes: Float[Array, "n d"],
-    region_codes: Float[Array, "r d"],
-    views: Int[Array, " n"],
-    match: RegionMatch,
-    threshold: Number,
+    codes: Float[Array, "n d"], region_codes: Float[Array, "r d"], match: RegionMatch, threshold: Number
 ) -> Selection:
     """Selects any Gaussians as `select_by_code` does; each row stands for itself. Pure."""
-    similarity, known = similarities(codes, region_codes[jnp.maximum(match.region, 0)])
-    known &= (views > 0) & (match.region >= 0)
-    return Selection(known & (similarity >= threshold), jnp.where(known, similarity, 0.0), *match[1:])
+    near = select_near_region(codes, region_codes, match.region, threshold)
+    return Selection(near.mask, near.similarity, *match[1:])

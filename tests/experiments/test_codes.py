@@ -61,7 +61,7 @@ def test_equal_and_unknown_embeddings_fit_in_one_number():
 
 def test_an_autoencoder_where_regions_do_not_fit_and_what_is_refused():
     embeddings = unit_rows(np.random.default_rng(0), 12, 40)
-    codes, coder, reason = region_codes(embeddings, latent=3, key=KEY, epochs=50, cosine_weight=0.01)
+    codes, coder, reason = region_codes(embeddings, latent=3, key=KEY, epochs=50)
     assert isinstance(coder, Autoencoder)
     assert reason.startswith("run")
     np.testing.assert_allclose(encode(coder, embeddings), codes, atol=1e-6)

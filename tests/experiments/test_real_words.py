@@ -12,7 +12,7 @@ from experiments.words.absent import absent_names
 from experiments.words.conse import Conse, Crop, Labeller, TextVectors, class_weights, conse, cut_out
 from experiments.words.minilm import MiniLM
 from jsecon.errors import InputError
-from jsecon.paper.baselines import relevancies
+from jsecon.paper.queries import relevancies
 from jsecon.query.scores import region_similarities
 from jsecon.vision.protocols import CANONICAL, Embedder
 

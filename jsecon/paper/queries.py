@@ -1,7 +1,14 @@
-"""Queries that compare Gaussians with the text itself.
+"""Queries on codes: one-step, canonical, and the paper's GT-anchored one. Pure functions.
 
-`query_one_step` uses the cosine of codes (the paper's baseline). `query_canonical` uses LERF's relevancy, the text's
-softmax share against each of a few canonical phrases.
+With l_i the code of Gaussian i, l_r that of region r, tau the embedding of a text and E the encoder:
+
+    one-step     cos(l_i, E(tau)) >= threshold
+    canonical    min_c softmax(10 [cos(f_i, tau), cos(f_i, c)])_1 >= threshold, over LERF's phrases c
+    anchored     r = argmax_r cos(phi_bar_r, tau), then cos(l_i, l_r) >= threshold
+
+One-step compares a Gaussian with the text itself, across the gap between texts and images, so no threshold suits all
+texts. The anchored query crosses the gap once, among R regions, where only the order matters; codes distilled from one
+region lie close together, so any high threshold does.
 """
 
 import jax
@@ -14,10 +21,12 @@ from jsecon.types import Array, Selection
 
 TEMPERATURE = 10.0
 """LERF's and LangSplat's factor on the cosines; not CLIP's own 100"""
+CODE_THRESHOLD = 0.9
+"""Smallest cosine with the region's code: codes of one region lie within a few degrees (0.9 is 26)."""
 
 
 def query_one_step(codes: Float[Array, "n d"], text_code: Float[Array, " d_text"], threshold: Number) -> Selection:
-    """Selects the Gaussians whose code has a cosine of at least `threshold` with the text's code. Pure.
+    """Selects the Gaussians whose code has a cosine of at least `threshold` with the text's code.
 
     Args:
       codes: (N, d) of any length. A zero code (unknown) or one that is not finite has similarity 0 and is never
@@ -37,8 +46,7 @@ def query_one_step(codes: Float[Array, "n d"], text_code: Float[Array, " d_text"
 
 @jax.jit
 def _one_step(codes: Array, text_code: Array, threshold: Number) -> Selection:
-    similarity, known = similarities(codes, text_code)
-    return _selection(similarity, known, threshold)
+    return _selection(*similarities(codes, text_code), threshold)
 
 
 def query_canonical(
@@ -47,16 +55,13 @@ def query_canonical(
     canonical: Float[Array, "c d_canonical"],
     threshold: Number,
 ) -> Selection:
-    """Selects the Gaussians whose relevancy to the text is at least `threshold`. Pure.
-
-    The relevancy is the smallest, over the phrases c, of softmax(10 [cos(f, text), cos(f, c)])[0] (Kerr et al. 2023,
-    LERF), in (0, 1); above 0.5 the text is closer than every phrase.
+    """Selects the Gaussians whose relevancy to the text is at least `threshold` (Kerr et al. 2023, LERF).
 
     Args:
       features: (N, d) embeddings or codes; zero or non-finite ones have relevancy 0 and are never selected.
       text: (d,) in the same space.
       canonical: (C, d) phrases in the same space, C >= 1.
-      threshold: Smallest relevancy.
+      threshold: Smallest relevancy, in (0, 1); above 0.5 the text is closer than every phrase.
 
     Returns:
       The selection; `score` is the best relevancy.
@@ -79,16 +84,7 @@ def _canonical(features: Array, text: Array, canonical: Array, threshold: Number
 def relevancies(
     features: Float[Array, "n d"], text: Float[Array, " d"], canonical: Float[Array, "c d"]
 ) -> tuple[Array, Array]:
-    """Computes LERF's relevancy, see `query_canonical`. Pure.
-
-    Args:
-      features: (N, d) embeddings or codes.
-      text: (d,) in the same space.
-      canonical: (C, d) phrases in the same space.
-
-    Returns:
-      Relevancy (N,) in (0, 1), and whether it is known (N,); 0 if not.
-    """
+    """Computes LERF's relevancy (N,) of a text, see `query_canonical`, and whether it is known (N,); 0 if not."""
     positive, known = similarities(features, text)
     # One phrase at a time: the sums stay multiply-and-sum, and no (N, C) array of products is made.
     negative, known_too = jax.lax.map(lambda phrase: similarities(features, phrase), canonical)
@@ -96,6 +92,45 @@ def relevancies(
     # The softmax of two is a sigmoid of their difference, and it is smallest against the closest phrase.
     share = jax.nn.sigmoid(TEMPERATURE * (positive - jnp.max(negative, axis=0)))
     return jnp.where(known, share, 0.0), known
+
+
+@jax.jit
+def query_gt_anchored(
+    codes: Float[Array, "n d"],
+    region_codes: Float[Array, "r d"],
+    region_embeddings: Float[Array, "r e"],
+    text: Float[Array, " e"],
+    threshold: Number = CODE_THRESHOLD,
+) -> Selection:
+    """Selects the Gaussians whose code is close to that of the region most similar to the text: both steps.
+
+    Args:
+      codes: (N, d) codes of the Gaussians.
+      region_codes: (R, d) codes of the regions.
+      region_embeddings: (R, E) embeddings of the regions.
+      text: (E,) embedding of the text.
+      threshold: Smallest cosine with the region's code.
+
+    Returns:
+      The selection. `region` is -1 and the mask is empty without regions, or for a broken text.
+    """
+    if len(region_codes) == 0:
+        none = jnp.zeros(len(codes), codes.dtype)
+        return Selection(none > 0, none, jnp.asarray(-1, jnp.int32), jnp.zeros((), codes.dtype))
+    similarity, known = similarities(region_embeddings, text)
+    best = jnp.argmax(jnp.where(known, similarity, -jnp.inf))
+    region = jnp.where(jnp.any(known), best, -1).astype(jnp.int32)
+    near = select_near_region(codes, region_codes, region, threshold)
+    return Selection(near.mask, near.similarity, region, jnp.where(region >= 0, similarity[best], 0.0))
+
+
+def select_near_region(
+    codes: Float[Array, "n d"], region_codes: Float[Array, "r d"], region: Array, threshold: Number
+) -> Selection:
+    """Selects the Gaussians whose code is close to that of a region: the second step. Region -1 selects none."""
+    near = _selection(*similarities(codes, region_codes[jnp.maximum(region, 0)]), threshold)
+    found = region >= 0
+    return Selection(near.mask & found, jnp.where(found, near.similarity, 0.0), region, near.score)
 
 
 def _selection(similarity: Array, known: Array, threshold: Number) -> Selection:
