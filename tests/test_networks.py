@@ -305,7 +305,7 @@ def test_models_of_masks_stay_in_full_precision_where_there_is_no_other(room, hu
     assert cli.main([*command, "--precision", "fp16"]) == 2  # of the embedder, whose repository has no such graphs
 
 
-def test_models_are_listed_fetched_checked_and_removed_by_name(hub, tmp_path, monkeypatch, capsys):
+def test_models_are_listed_fetched_and_checked_by_name(hub, tmp_path, monkeypatch, capsys):
     use_hub(hub, tmp_path / "cache", monkeypatch)
     assert cli.main(["models", "get", "edgetam", "siglip2", "--yes"]) == 2  # this hub has no tracker of the first name
     assert "has no such repository" in capsys.readouterr().err
@@ -319,10 +319,8 @@ def test_models_are_listed_fetched_checked_and_removed_by_name(hub, tmp_path, mo
     assert all(row.purpose in listed for row in catalogue())
     assert cli.main(["models", "check", "siglip2"]) == 0
     assert "CLIP: usable" in capsys.readouterr().out
-    assert cli.main(["models", "remove", "siglip2"]) == 0
-    assert cli.main(["models", "check", "siglip2"]) == 2
-    assert "jsecon models get siglip2" in capsys.readouterr().err
+    assert cli.main(["models", "check", "clip"]) == 2
+    assert "jsecon models get clip" in capsys.readouterr().err
     assert cli.main(["models", "get", "auto", "--yes"]) == 0
-    assert cli.main(["models", "check", "siglip2"]) == 0
     assert cli.main(["models", "get", "clap", "--yes"]) == 2
     assert cli.main(["models", "get"]) == 2

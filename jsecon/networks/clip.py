@@ -103,6 +103,14 @@ def masked_crop(
     return np.asarray(cv2.resize(square, (size, size)), np.uint8)
 
 
+def require_templates(templates: Sequence[str]) -> None:
+    """Raises InputError unless each template has a place for the text, and there is one."""
+    if not templates or not all("{}" in template for template in templates):
+        problem = ", ".join(map(repr, templates)) or "no template"
+        remedy = 'For example "a photo of a {}.", or "{}", the text alone.'
+        raise InputError("--template", problem, "a phrase that holds {}", remedy)
+
+
 class ClipEmbedder:
     """Embedder (jsecon.vision.protocols) that runs the two graphs of a CLIP-like model.
 
@@ -128,10 +136,7 @@ class ClipEmbedder:
         templates: Sequence[str] = ("{}",),
         store: Path | None = None,
     ):
-        if not templates or not all("{}" in template for template in templates):
-            problem = ", ".join(map(repr, templates)) or "no template"
-            remedy = 'For example "a photo of a {}.", or "{}", the text alone.'
-            raise InputError("--template", problem, "a phrase that holds {}", remedy)
+        require_templates(templates)
         visual, textual, config, tokenizer = find_files(folder, "embedder", precision)
         mean, std, size = read_preprocessing(config)
         rules = read_text_rules(Path(folder), tokenizer)

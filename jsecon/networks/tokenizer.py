@@ -50,14 +50,15 @@ class TextTokenizer:
 
         self._path = path
         self._rules = rules
-        expected = "a tokenizer.json of Hugging Face's kind"
-        with self._errors(f"{expected} with the token {rules.pad!r}" if rules else expected):
+        with self._errors("a tokenizer.json of Hugging Face's kind"):
             self._tokenizer = Tokenizer.from_str(path.read_text(encoding="utf-8"))
             self._tokenizer.encode_special_tokens = True  # a text cannot end itself
-            self._pad = 0 if rules is None else self._tokenizer.token_to_id(rules.pad)
-            if self._pad is None:
-                raise ValueError(f"{self._tokenizer.get_vocab_size()} tokens without it")
-            if rules is None and len(self._tokenizer.encode("a").ids) != 3:
+            self._pad = 0
+            if rules is not None:
+                self._pad = self._tokenizer.token_to_id(rules.pad)
+                if self._pad is None:
+                    raise ValueError(f"{self._tokenizer.get_vocab_size()} tokens without {rules.pad!r}")
+            elif len(self._tokenizer.encode("a").ids) != 3:
                 raise ValueError("it does not put a start and an end around a word")
 
     def __call__(self, texts: Sequence[str], length: int) -> tuple[Int64[np.ndarray, "q l"], Int64[np.ndarray, "q l"]]:

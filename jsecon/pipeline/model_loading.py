@@ -175,8 +175,9 @@ def find_model(field: LanguageField, templates: Sequence[str] = ("{}",)) -> "Cli
     sources = locate_sources(field)
     if not (sources.embedder or "").startswith("clip-"):
         return None
-    from jsecon.networks.clip import ClipEmbedder
+    from jsecon.networks.clip import ClipEmbedder, require_templates
 
+    require_templates(templates)
     model = None if sources.address is None else parse_model(sources.address, "embedder", sources.precision)
     on_hub = model if isinstance(model, HubModel) else None
     for folder in (sources.model, None if on_hub is None else on_hub.cached_folder):
