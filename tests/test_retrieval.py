@@ -272,7 +272,7 @@ def test_the_command_line_says_the_quantile_and_what_an_old_field_lacks(worded, 
     assert unseen["rank"] == pytest.approx(min(shares), abs=0.02)
     assert seen["region"] is not None
     assert unseen["region"] is None
-    assert f"more similar than {int(100 * seen['quantile'])} % of unrelated words" in out
+    assert f"more similar than {int(100 * seen['rank'])} % of unrelated words" in out
     assert f"confidence {int(100 * seen['confidence'])} %" in out
     assert "earlier version" not in out
     assert asked("new.safetensors", "--min-rank", "0")[0][1]["region"] is not None

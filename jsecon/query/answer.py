@@ -196,12 +196,12 @@ def _match(embeddings, pixels, overlap, queries, excluded, words, rules: QueryRu
     )
 
 
-def match_region(field: LanguageField, region: int | Int[Array, ""], rules: QueryRules = ONE_REGION) -> RegionMatch:
+def match_region(field: LanguageField, region: Number, rules: QueryRules = ONE_REGION) -> RegionMatch:
     """Matches a region in place of a text, with score 1. Pure.
 
     Args:
       field: Field of R regions.
-      region: Its id. For one that the field does not have, such as -1, region is -1 and score 0.
+      region: Its id, an integer. For one that the field does not have, such as -1, region is -1 and score 0.
       rules: Which regions join it; by default only that region.
 
     Raises:
@@ -280,7 +280,7 @@ def query_anchored(field: LanguageField, text_embedding: Float[Array, " e"], *, 
     return query_several(field, jnp.asarray(text_embedding)[None], rules=rules)
 
 
-def query_region(field: LanguageField, region: int | Int[Array, ""], *, rules: QueryRules = ONE_REGION) -> Selection:
+def query_region(field: LanguageField, region: Number, *, rules: QueryRules = ONE_REGION) -> Selection:
     """Selects the Gaussians of a region, such as `region_at` returns, as `match_region` matches it. Pure."""
     return select_gaussians(field, match_region(field, region, rules), rules)
 
