@@ -26,7 +26,7 @@ from jsecon import (
 from jsecon.app.cli import main
 from jsecon.app.outputs import file_stem, write_answer
 from jsecon.files import path_within
-from jsecon.query.composite import parse_query
+from jsecon.query.expressions import parse_query
 from jsecon.vision.colours import ColourEmbedder
 
 HOSTILE = ("/../../evil", "..", "C:\\evil", "a/b", "a\0b", "x" * 4000, "nul", "frame 1", "Frame_1", "frame_1")

@@ -13,7 +13,6 @@ from table_field import THINGS, table_field
 import jsecon
 from jsecon import InputError, ObjectShapes, Regions, Scene, save_field
 from jsecon.app import cli
-from jsecon.query.expressions import RELATIONS, is_expression, parse_expression
 from jsecon.query.relations import PAIRS, Viewpoint, between_scores, gap, order_values, pair_scores
 
 CORNERS = np.stack(np.meshgrid(*[np.linspace(-1, 1, 3)] * 3), -1).reshape(-1, 3)
@@ -133,53 +132,6 @@ def test_predicates_are_pure_jitted_and_batched():
     np.testing.assert_allclose(jax.jit(near)(both[0], both[1]), table[0, 1], rtol=1e-5)
     values = order_values(arrays, looking())
     assert values["largest"].argmin() == values["tallest"].argmin() == values["rightmost"].argmin() == 1
-
-
-@pytest.mark.parametrize(("text", "thing", "conditions", "order"), [
-    ("the red mug to the left of the bottle", "red mug", ["left of bottle"], None),
-    ("the mug on the table left of the bottle", "mug", ["on table", "left of bottle"], None),
-    ("how many bottles are in the box?", "bottles", ["in box"], None),
-    ("the second mug from the left", "mug", [], ("leftmost", 2)),
-    ("the 3rd largest box", "box", [], ("largest", 3)),
-    ("ball between the red and white plate and the bowl", "ball", ["between red and white plate and bowl"], None),
-    ("the nearest mug to the bottle", "mug", ["nearest to bottle"], None),
-    ("the nearest mug", "mug", [], ("nearest", 1)),
-    ('"tea in a glass" on the "table left of it"', "tea in a glass", ["on table left of it"], None),
-    ("two red mugs", "red mugs", [], None),
-    ("the chest of drawers under the window", "chest of drawers", ["under window"], None),
-])  # fmt: skip
-def test_the_grammar(text, thing, conditions, order):
-    if text.startswith("ball between"):
-        text = text.replace("red and white plate", '"red and white plate"')
-    expression = parse_expression(text)
-    assert is_expression(text)
-    assert expression.thing.text == thing
-    assert list(map(str, expression.conditions)) == conditions
-    assert (expression.thing.order, expression.thing.rank) == (order or (None, 1))
-    assert len(expression.readings()) == max(1, len(conditions))
-
-
-def test_every_spelling_is_understood_and_quotes_protect():
-    for name, spellings in RELATIONS.items():
-        for words in spellings.split("|"):
-            anchors = "the plate and the bowl" if name == "between" else "the plate"
-            assert parse_expression(f"the mug {words} {anchors}").conditions[0].relation == name
-            assert not is_expression(f'"the mug {words} the plate"')
-    assert not is_expression("red mug or bowl but not handle")
-    assert parse_expression("mugs").thing.every
-    assert not parse_expression("a glass").thing.every
-
-
-@pytest.mark.parametrize(("text", "problem"), [
-    ("", "is empty"), ("  ", "is empty"), ("word " * 5000, "5000 words"), ("mug across from the plate", "'across'"),
-    ("the widest mug", "'widest'"), ("mug near the left plate", "'left'"),
-    ("left of the plate", "no object stands before 'left of'"), ("mug left of", "an object is missing"),
-    ("mug between the plate and", "an object is missing"), ("mug in box on plate near bowl", "3 relations"),
-    ("red mug or bowl on the plate", '"or"'), ("second mug", "needs an order"), ("caf\udce9 on the plate", "not UTF-8"),
-])  # fmt: skip
-def test_what_is_not_understood_is_named(text, problem):
-    with pytest.raises(InputError, match=problem):
-        parse_expression(text)
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,6 @@ from jsecon import InputError, QueryRules, Regions, Scene, match_regions
 from jsecon.app.outputs import write_answer
 from jsecon.app.viewer.candidates import candidates
 from jsecon.query.answer import ALL_OF_CLASS, query_anchored, query_several
-from jsecon.query.composite import parse_query
 
 
 @pytest.fixture(scope="module")
@@ -86,15 +85,6 @@ def test_no_region_no_answer(field):
     assert not nothing.mask.any()
     with pytest.raises(ValueError, match="match_regions"):
         query_several(field, np.zeros((1, 5), np.float32))
-
-
-def test_questions_come_apart():
-    assert parse_query("red mug") == (["red mug"], [])
-    assert parse_query("mug or 'bowl' But Not handle or lid") == (["mug", "bowl"], ["handle", "lid"])
-    assert parse_query("doorknob") == (["doorknob"], [])
-    for bad in ("", "but not handle", "mug but not ''"):
-        with pytest.raises(InputError, match="part"):
-            parse_query(bad)
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from jsecon.paper.autoencoder import encode
 from jsecon.paper.queries import query_canonical, query_one_step
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console, Listener
-from jsecon.query.composite import parse_query
+from jsecon.query.expressions import parse_query
 from jsecon.query.render import ALPHA_THRESHOLD
 from jsecon.query.select import codes_of
 from jsecon.read.masks.labels import LabelledFrame, load_lerf_labels

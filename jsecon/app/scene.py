@@ -41,8 +41,7 @@ from jsecon.query.answer import (
     match_regions,
     trim,
 )
-from jsecon.query.composite import parse_query
-from jsecon.query.expressions import is_expression
+from jsecon.query.expressions import is_expression, parse_query
 from jsecon.query.outline import box_mask, lift
 from jsecon.query.pixel import region_at
 from jsecon.query.render import selection_mask

@@ -1,10 +1,20 @@
-"""Referring expressions: a small grammar for things that are told apart by where they are. No language model.
+"""What a text asks for: several texts, or a referring expression that tells things apart by where they are.
+
+`parse_query` splits texts that are joined by words: "red mug" or "bowl" but not "handle". `parse_expression` reads a
+small grammar. There is no language model.
 
     expression  [how many | count | find | show me | where is | which is] thing [relation thing [[and] relation thing]]
-    relation    left of, on top of, near ... (RELATIONS); between THING and THING, or between two THINGS
+    relation    left of, on top of, near ...; between THING and THING, or between two THINGS
     thing       [the | a | all | both | NUMBER] [ORDINAL] [ORDER] object [ORDER]
-    ORDER       before the object: largest, second tallest ...; behind it: "from the left", "on the right" (ORDERS)
+    ORDER       before the object: largest, second tallest ...; behind it: "from the left", "on the right"
     object      any other words, which an embedder reads
+
+The words are in lexicon.toml. Everyday names contain many of them: "first aid kit", "one way sign", "under cabinet
+light", "carry on bag". A word of the grammar therefore belongs to a name where it does no work:
+
+    a number or "all"     unless a plural follows, or where it binds the next word ("two way mirrors")
+    an ordinal            without an order, or where it binds the next word ("first aid kit on the left")
+    a preposition         at the beginning without "the" ("under cabinet light"), or after a verb ("carry on bag")
 
 In "the mug on the table left of the bottle", the second relation may belong to the mug or to the table:
 `Expression.readings` has both. With "and" before it, it belongs to the mug. Words in quotes are part of an object. A
@@ -13,139 +23,124 @@ word that looks like a relation or an order and is none of the grammar's is an e
 
 import dataclasses
 import re
-from collections.abc import Mapping, Sequence
+import tomllib
+from collections.abc import Container, Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 from jsecon.errors import InputError
 
-
-def _words(text: str) -> frozenset[str]:
-    """Returns the words of a text."""
-    return frozenset(text.split())
-
-
-MAX_WORDS = 60
-"""words of an expression"""
-MAX_RELATIONS = 2
-"""relations of an expression"""
-RELATIONS = {
-    "left of": "left of|to the left of|on the left of|on the left side of|at the left of",
-    "right of": "right of|to the right of|on the right of|on the right side of|at the right of",
-    "in front of": "in front of",
-    "behind": "behind|in back of|at the back of",
-    "above": "above|over",
-    "below": "below",
-    "on": "on|on top of|atop|upon|standing on|lying on|sitting on|resting on|placed on",
-    "under": "under|underneath|beneath",
-    "in": "in|inside|inside of|within|contained in",
-    "next to": "next to|beside|alongside|adjacent to",
-    "near": "near|near to|close to",
-    "far from": "far from|far away from",
-    "touching": "touching|in contact with",
-    "between": "between|in between",
-    "nearest to": "nearest to|nearest|closest to|closest",
-    "farthest from": "farthest from|furthest from|farthest away from|furthest away from",
-}
-"""relation -> its spellings"""
+_LEXICON = tomllib.loads(Path(__file__).with_name("lexicon.toml").read_text())
+_WORDS = {name: tuple(words.split()) for name, words in _LEXICON["words"].items()}
+RELATIONS, ORDERS = _LEXICON["relations"], _LEXICON["orders"]
+"""Relation or order -> its spellings."""
 ANCHORED_ORDERS = ("nearest to", "farthest from")
-"""relations that choose one thing by its distance from another"""
-ORDERS = {
-    "largest": "largest|biggest",
-    "smallest": "smallest|tiniest",
-    "tallest": "tallest",
-    "shortest": "shortest",
-    "highest": "highest|topmost|uppermost|from the top|at the top",
-    "lowest": "lowest|bottommost|lowermost|from the bottom|at the bottom",
-    "leftmost": "leftmost|from the left|on the left|to the left|on the left side",
-    "rightmost": "rightmost|from the right|on the right|to the right|on the right side",
-    "nearest": "nearest|closest|frontmost|foremost|from the front|in front|at the front|in the front",
-    "farthest": "farthest|furthest|rearmost|hindmost|from the back|at the back|in the back",
-}
-"""order -> its spellings: those of one word stand before the object, the others behind it"""
-ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth")
-NUMBERS = ("one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
-_UNKNOWN = _words(
-    """across around along against among amongst amid beyond opposite outside through throughout toward towards facing
-    past onto surrounding surrounded by left right front back top bottom middle centre center hanging leaning parallel
-    perpendicular north south east west nearby before after away last next most least"""
-)
-"""words that look like relations or orders and are none of the grammar's"""
-_NOUNS_IN_EST = _words("chest vest nest forest guest test rest crest harvest pest quest priest protest")
-"""words that end like superlatives and are none"""
-_DETERMINERS = _words("the a an any my your our this that these those some")
-_EVERY = _words("all every each both")
-_FILLERS = _words("that which is are there stands standing lies lying located placed sits sitting")
-"""words before a relation that add nothing to it"""
+"""Relations that choose one thing by its distance from another."""
+MAX_WORDS, MAX_RELATIONS = 60, 2
+"""Of an expression."""
+_ORDINALS, _NUMBERS = _WORDS["ordinals"], _WORDS["numbers"]
 _QUESTIONS = ("how many", "count of", "count", "where is", "where are", "which is", "which are", "which", "what is")
 _QUESTIONS += ("find", "show me", "show", "select")
+_QUOTES = "\"'“”"
 _QUOTED = re.compile(r"""(?<!\S)(?:"([^"]+)"|'(.+?)'|“([^”]+)”)(?=[\s,.?!]|$)""", re.DOTALL)
+"""A text in quotes; an apostrophe within a word is not a quote."""
+_JOINED = re.compile(r"\s+(?:(but\s+not)|or)(?=\s)", re.IGNORECASE)
+"""What stands between the texts of a query."""
 _REMEDY = 'For example "the red mug left of the bottle". Words of an object that look like these go in quotes.'
 
 
+class QueryTexts(NamedTuple):
+    """The texts of a query."""
+
+    included: list[str]
+    """Texts whose regions match; at least one."""
+    excluded: list[str]
+    """Texts whose regions are left out."""
+
+
+def parse_query(query: str) -> QueryTexts:
+    """Splits a query such as `"red mug" or "bowl" but not "handle"` into its texts.
+
+    Quotes are optional. They are removed, and "or" and "but not" between a pair of them belong to the text: "tea or
+    coffee" in quotes is one text. Raises InputError for a part without words, or a query that is not UTF-8.
+    """
+    _require_utf8(query)
+    query = query.strip()
+    quoted = [match.span() for match in _QUOTED.finditer(query)]
+    parts, side, start = ([], []), 0, 0
+    for word in _JOINED.finditer(query):
+        if not any(first < word.start() < last for first, last in quoted):
+            parts[side].append(query[start : word.start()])
+            side, start = max(side, int(word[1] is not None)), word.end()
+    parts[side].append(query[start:])
+    included, excluded = ([part.strip().strip(_QUOTES).strip() for part in texts] for texts in parts)
+    if not all(included + excluded) or re.match(r"but not\b", query, re.IGNORECASE):
+        remedy = 'For example: "red mug" or "bowl" but not "handle"'
+        raise InputError(f"query {query!r}", "a part without words", 'texts joined by "or" and "but not"', remedy)
+    return QueryTexts(included, excluded)
+
+
+def _require_utf8(text: str) -> None:
+    if re.search("[\ud800-\udfff]", text):
+        remedy = "Type it in a terminal, or send it from a program, that uses UTF-8."
+        raise InputError("", f"the text {text!r} is not UTF-8", remedy=remedy)
+
+
 class _Token(NamedTuple):
-    """A word, or words in quotes."""
+    """A word, or words that are one name."""
 
     text: str
     key: str
-    """the word in lower case; empty for words in quotes"""
+    """The word in lower case; empty for words in quotes, and for a name that stands as it is."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Thing:
-    """An object as it is named.
-
-    Attributes:
-      text: Words for the embedder.
-      order: One of ORDERS, or None.
-      rank: Place in the order, 1 for the first.
-      number: How many there are said to be, or None.
-      every: Whether all that match are meant, instead of one.
-    """
+class NounPhrase:
+    """An object as it is named."""
 
     text: str
+    """Words for the embedder."""
     order: str | None = None
+    """One of ORDERS, or None."""
     rank: int = 1
+    """Place in the order, 1 for the first."""
     number: int | None = None
+    """How many there are said to be, or None."""
     every: bool = False
+    """Whether all that match are meant, instead of one."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Condition:
-    """A relation to other objects.
-
-    Attributes:
-      relation: One of RELATIONS.
-      anchors: The object, or the two objects of "between"; one with `every` stands for both of these.
-      conditions: Conditions of the last anchor.
-    """
+    """A relation to other objects."""
 
     relation: str
-    anchors: tuple[Thing, ...]
+    """One of RELATIONS."""
+    anchors: tuple[NounPhrase, ...]
+    """The object, or the two objects of "between"; one with `every` stands for both of these."""
     conditions: tuple["Condition", ...] = ()
+    """Conditions of the last anchor."""
 
     def __str__(self) -> str:
         """The condition in words."""
-        own = f"{self.relation} {' and '.join(anchor.text for anchor in self.anchors)}"
-        return own + "".join(f" that is {condition}" for condition in self.conditions)
+        words = f"{self.relation} {' and '.join(anchor.text for anchor in self.anchors)}"
+        return words + "".join(f" that is {condition}" for condition in self.conditions)
 
 
 @dataclasses.dataclass(frozen=True)
 class Expression:
-    """What a text asks for.
-
-    Attributes:
-      text: The text.
-      thing: The object that is looked for.
-      conditions: Its relations, in the order of the text.
-      joined: Whether all conditions belong to the object for certain.
-      counted: Whether the text asks for the number of objects.
-    """
+    """What a text asks for."""
 
     text: str
-    thing: Thing
+    """The text."""
+    thing: NounPhrase
+    """The object that is looked for."""
     conditions: tuple[Condition, ...] = ()
+    """Its relations, in the order of the text."""
     joined: bool = False
+    """Whether all conditions belong to the object for certain."""
     counted: bool = False
+    """Whether the text asks for the number of objects."""
 
     @property
     def words(self) -> set[str]:
@@ -156,9 +151,8 @@ class Expression:
     def readings(self) -> list[tuple[Condition, ...]]:
         """Lists the ways to attach the relations to the objects.
 
-        Returns:
-          The conditions of the object: all of them first; then, if the text allows it, the second as one of the first
-          one's anchor.
+        The conditions of the object are all of them first; then, if the text allows it, the second is one of the first
+        one's anchor.
         """
         readings = [self.conditions]
         if len(self.conditions) > 1 and not self.joined:
@@ -166,24 +160,11 @@ class Expression:
             readings.append((dataclasses.replace(first, conditions=(second,)),))
         return readings
 
-    def describe(self, conditions: Sequence[Condition] | None = None) -> str:
-        """Describes how the text is read.
-
-        Args:
-          conditions: One of `readings`, by default the first.
-
-        Returns:
-          The object, its conditions and its order, in words.
-        """
-        thing = self.thing
-        order = [] if thing.order is None else [f"{_ordinal(thing.rank)}{thing.order}"]
-        conditions = self.conditions if conditions is None else conditions
-        return ", ".join([f"{thing.text!r}", *map(str, conditions), *order])
-
-
-def _ordinal(rank: int) -> str:
-    """Returns the rank as a word before an order, "" for the first."""
-    return "" if rank == 1 else f"{ORDINALS[rank - 1]} "
+    def describe(self, conditions: Sequence[Condition]) -> str:
+        """Describes one of the `readings`: the object, its conditions and its order, in words."""
+        rank = "" if self.thing.rank == 1 else f"{_ORDINALS[self.thing.rank - 1]} "
+        order = [] if self.thing.order is None else [f"{rank}{self.thing.order}"]
+        return ", ".join([f"{self.thing.text!r}", *map(str, conditions), *order])
 
 
 def _spellings(table: Mapping[str, str]) -> dict[tuple[str, ...], str]:
@@ -191,61 +172,60 @@ def _spellings(table: Mapping[str, str]) -> dict[tuple[str, ...], str]:
     return {tuple(words.split()): name for name, row in table.items() for words in row.split("|")}
 
 
-_RELATION_OF = _spellings(RELATIONS)
-_ORDER_OF = _spellings(ORDERS)
+_RELATION_OF, _ORDER_OF = _spellings(RELATIONS), _spellings(ORDERS)
+_SPELLED = {**_RELATION_OF, **_ORDER_OF}
+_FIXED_NAMES = {tuple(words.split()): "" for words in re.split(r"[|\n]", _LEXICON["names"]["fixed"])}
+_FITTED = frozenset(_LEXICON["names"]["fitted"].split())
+_QUANTIFIERS = {*_WORDS["determiners"], *_WORDS["every"], *_ORDINALS, *_NUMBERS}
+_INDEFINITE = ("a", "an", "any", "some", "of")
+_PREPOSITIONS = {words[0] for words in _RELATION_OF if len(words) == 1} - {"nearest", "closest"}
 
 
 def is_expression(text: str) -> bool:
-    """Finds out whether a text needs the grammar.
-
-    Args:
-      text: Any text.
-
-    Returns:
-      True if it has a relation, an order or a number of the grammar outside of quotes.
-    """
-    tokens = _tokens(text)
-    _, rest = _question(tokens)
-    counted = len(rest) < len(tokens) and tokens[0].key in ("how", "count")
-    numbered = len(rest) > 1 and (rest[0].key in _EVERY or _number(rest[0].key) is not None)
-    spelled = any(_longest(rest, i, {**_RELATION_OF, **_ORDER_OF}) for i in range(len(rest)))
-    return counted or numbered or spelled
+    """Whether a text needs the grammar: it has a relation, an order or a number outside of quotes and names."""
+    counted, tokens = _question(_tokens(text))
+    if counted:
+        return True
+    if not tokens:
+        return False
+    parts, relations, _, problem = _split(tokens)
+    phrase, quantified, _ = _noun_phrase(parts[0])
+    return bool(relations or problem or quantified or phrase.order)
 
 
 def parse_expression(text: str) -> Expression:
-    """Parses a text by the grammar of this module.
+    """Parses a text by the grammar of this module, such as "the second red mug from the left".
 
-    Args:
-      text: For example "the second red mug from the left" or "two bottles between the plate and the bowl".
-
-    Returns:
-      The expression. A text without relation, order or number is an object alone.
-
-    Raises:
-      InputError: The text is empty, too long or not UTF-8, has a relation without an object, or a word that looks
-        like a relation and is none.
+    A text without relation, order or number is an object alone. Raises InputError for a text that is empty, too long or
+    not UTF-8, has a relation without an object, or a word that looks like a relation and is none.
     """
-    if re.search("[\ud800-\udfff]", text):
-        raise InputError("", f"the text {text!r} is not UTF-8", remedy="Send it from a program that uses UTF-8.")
+    _require_utf8(text)
     tokens = _tokens(text)
+    where = f"expression {text!r}"
     if not tokens:
         raise InputError("expression", "the text is empty", remedy=_REMEDY)
     if len(tokens) > MAX_WORDS:
         problem = f"the text has {len(tokens)} words, and an expression at most {MAX_WORDS}"
         raise InputError("expression", problem, remedy="Ask for one object and its relations to others.")
-    for token in tokens:
-        if token.key == "or":
-            problem = '"or" cannot be combined with relations, orders and numbers'
-            raise InputError(f"expression {text!r}", problem, remedy=f"Ask for each alone. {_REMEDY}")
+    if any(token.key == "or" for token in tokens):
+        problem = '"or" cannot be combined with relations, orders and numbers'
+        raise InputError(where, problem, remedy=f"Ask for each alone. {_REMEDY}")
     counted, tokens = _question(tokens)
-    parts, relations, joined = _split(tokens, text)
-    thing = _thing(parts[0], text)
+    parts, relations, joined, problem = _split(tokens)
+    if problem:
+        raise InputError(where, problem, remedy=_REMEDY)
+
+    def read(part: Sequence[_Token], related: bool) -> NounPhrase:
+        phrase, _, problem = _noun_phrase(part, related)
+        if problem:
+            raise InputError(where, problem, remedy=_REMEDY)
+        return phrase
+
+    thing = read(parts[0], bool(relations))
     conditions = []
-    for relation, part in zip(relations, parts[1:]):
-        anchors = [part]
-        if relation == "between" and (middle := [i for i, token in enumerate(part) if token.key == "and"]):
-            anchors = [part[: middle[0]], part[middle[0] + 1 :]]
-        things = [_thing(anchor, text) for anchor in anchors]
+    for place, (relation, part) in enumerate(zip(relations, parts[1:])):
+        anchors = _two_anchors(part) if relation == "between" else [part]
+        things = [read(anchor, place + 1 < len(relations)) for anchor in anchors]
         if relation == "between" and len(things) == 1:
             things = [dataclasses.replace(things[0], every=True)]
         conditions.append(Condition(relation, tuple(things)))
@@ -255,19 +235,34 @@ def parse_expression(text: str) -> Expression:
 
 
 def _tokens(text: str) -> list[_Token]:
-    """Splits a text into words, and words in quotes."""
+    """Splits a text into words, words in quotes, and names that stand as they are."""
     tokens, start = [], 0
     for match in [*_QUOTED.finditer(text), None]:
         end = len(text) if match is None else match.start()
         words = (word.strip(",;:.?!") for word in text[start:end].split())
-        tokens += [_Token(word, word.lower()) for word in words if word]
+        tokens += _with_names([_Token(word, word.lower()) for word in words if word])
         if match is not None:
             tokens.append(_Token(next(filter(None, match.groups())).strip(), ""))
             start = match.end()
     return [token for token in tokens if token.text]
 
 
-def _longest(tokens: Sequence[_Token], start: int, table: Mapping[tuple[str, ...], str]) -> tuple[str, ...] | None:
+def _with_names(tokens: list[_Token]) -> list[_Token]:
+    """Joins the words of names that stand as they are, such as "jack in the box" and "two in one"."""
+    result, place = [], 0
+    while place < len(tokens):
+        name = _longest(tokens, place, _FIXED_NAMES)
+        length = 1 if name is None else len(name)
+        several = _number(tokens[place].key) is not None and [t.key for t in tokens[place + 1 : place + 3]]
+        if several in (["in", "one"], ["in", "1"]):
+            length = 3
+        words = tokens[place : place + length]
+        result.append(words[0] if length == 1 else _Token(" ".join(word.text for word in words), ""))
+        place += length
+    return result
+
+
+def _longest(tokens: Sequence[_Token], start: int, table: Container[tuple[str, ...]]) -> tuple[str, ...] | None:
     """Returns the longest spelling of a table that begins at a token, or None."""
     for length in range(min(5, len(tokens) - start), 0, -1):
         words = tuple(token.key for token in tokens[start : start + length])
@@ -278,53 +273,106 @@ def _longest(tokens: Sequence[_Token], start: int, table: Mapping[tuple[str, ...
 
 def _question(tokens: list[_Token]) -> tuple[bool, list[_Token]]:
     """Returns whether a text asks for a number, and its words without those of the question."""
-    keys = " ".join(token.key for token in tokens[:2])
     for words in _QUESTIONS:
         length = len(words.split())
-        if keys == words or (keys.split()[:length] == words.split() and len(tokens) > length):
-            return words.startswith(("how", "count")), tokens[length:]
+        if [token.key for token in tokens[:length]] == words.split() and len(tokens) > length:
+            rest = tokens[length:]
+            if words in ("count", "show") and rest[0].key not in _QUANTIFIERS and not _is_plural(rest):
+                continue  # a count down timer, a show case
+            return words.startswith(("how", "count")), rest
     return False, tokens
 
 
 def _number(key: str) -> int | None:
     """Returns the number that a word is, or None."""
-    if key in NUMBERS:
-        return NUMBERS.index(key) + 1
+    if key in _NUMBERS:
+        return _NUMBERS.index(key) + 1
     return int(key) if re.fullmatch("[0-9]{1,3}", key) else None
 
 
-def _split(tokens: list[_Token], text: str) -> tuple[list[list[_Token]], list[str], bool]:
-    """Splits words into those of the objects and the relations between them."""
+def _is_plural(tokens: Sequence[_Token], *, counted: bool = False) -> bool:
+    """Whether the words of an object name several things, by the last word, or that before "of".
+
+    "Scissors" are several only where they are counted, as in "two scissors".
+    """
+    keys = [token.key for token in tokens]
+    head = keys[keys.index("of", 1) - 1 if "of" in keys[1:] else -1] if keys else ""
+    ends = head.endswith("s") and not head.endswith(("ss", "us", "is", "'s"))
+    singular = head in _WORDS["singular_s"] or (head in _WORDS["pairs"] and not counted)
+    return head in _WORDS["plural"] or (ends and not singular)
+
+
+def _split(tokens: list[_Token]) -> tuple[list[list[_Token]], list[str], bool, str]:
+    """Splits words into those of the objects and the relations between them; and whether "and" joins these.
+
+    The last value is what is wrong; empty if nothing is.
+    """
     parts: list[list[_Token]] = [[]]
     relations: list[str] = []
-    joined = False
-    place = 0
+    joined, place = False, 0
     while place < len(tokens):
-        words = _longest(tokens, place, {**_RELATION_OF, **_ORDER_OF})
+        words = _longest(tokens, place, _SPELLED)
+        named = any(t.key not in _QUANTIFIERS and (t.key,) not in _ORDER_OF for t in parts[-1])
         relation = None if words is None else _RELATION_OF.get(words)
-        named = any(token.key not in _DETERMINERS | _EVERY | set(ORDINALS) for token in parts[-1])
-        if relation in ANCHORED_ORDERS and words is not None and len(words) == 1 and not named:
+        length = len(words) if words is not None and len(words) > 1 else 1
+        if relation in ANCHORED_ORDERS and length == 1 and not named:
             relation = None  # "the nearest mug": an order before the object
+        if relation is not None and length == 1:
+            in_name = _length_in_name(tokens, place, named)
+            relation, length = (None, in_name) if in_name else (relation, length)
         if relation is None:
-            step = len(words) if words is not None and len(words) > 1 else 1
-            parts[-1] += tokens[place : place + step]
-            place += step
+            parts[-1] += tokens[place : place + length]
+            place += length
             continue
-        assert words is not None
-        while parts[-1] and parts[-1][-1].key in _FILLERS:
-            parts[-1].pop()
+        parts[-1] = _without_fillers(parts[-1])
         if relations and parts[-1] and parts[-1][-1].key == "and":
             parts[-1].pop()
             joined = True
         if not named or not parts[-1]:
-            raise InputError(f"expression {text!r}", f"no object stands before {' '.join(words)!r}", remedy=_REMEDY)
+            return parts, relations, joined, f"no object stands before {' '.join(words or ())!r}"
         relations.append(relation)
         parts.append([])
-        place += len(words)
+        place += length
     if len(relations) > MAX_RELATIONS:
         problem = f"it has {len(relations)} relations ({', '.join(relations)}), and {MAX_RELATIONS} are understood"
-        raise InputError(f"expression {text!r}", problem, remedy=f"Ask for a part of it. {_REMEDY}")
-    return (*_with_late_anchor(parts, relations), joined)
+        return parts, relations, joined, problem
+    return (*_with_late_anchor(parts, relations), joined, "")
+
+
+def _length_in_name(tokens: Sequence[_Token], place: int, named: bool) -> int:
+    """Returns how many words from a preposition on belong to a name; 0 if it is a relation.
+
+    Args:
+      tokens: Words of the text.
+      place: Place of the preposition.
+      named: Whether words of the object stand before it.
+    """
+    following = [token.key for token in tokens[place + 1 :]]
+    if tokens[place].key not in _PREPOSITIONS:
+        return 0
+    if named and tokens[place - 1].key in _WORDS["phrasal"] and tokens[place].key in ("in", "on", "over"):
+        return int(not following or following[0] not in _QUANTIFIERS)
+    if named or len(following) < 2:
+        return 0
+    if following[0] not in _WORDS["determiners"]:
+        return 1
+    return 3 if following[1] in _FITTED and len(following) > 2 else 0
+
+
+def _without_fillers(tokens: Sequence[_Token], fillers: Sequence[str] = _WORDS["fillers"]) -> list[_Token]:
+    """Returns words without those at their end that add nothing."""
+    tokens = list(tokens)
+    while tokens and tokens[-1].key in fillers:
+        tokens.pop()
+    return tokens
+
+
+def _two_anchors(part: list[_Token]) -> list[list[_Token]]:
+    """Splits "the plate and the salt and pepper shaker" into two objects, or returns one."""
+    places = [i for i, token in enumerate(part) if token.key == "and"]
+    clear = [i for i in places if i + 1 < len(part) and part[i + 1].key in _QUANTIFIERS]
+    place = next(iter(clear or places), None)
+    return [part] if place is None else [part[:place], part[place + 1 :]]
 
 
 def _with_late_anchor(parts: list[list[_Token]], relations: list[str]) -> tuple[list[list[_Token]], list[str]]:
@@ -340,48 +388,82 @@ def _with_late_anchor(parts: list[list[_Token]], relations: list[str]) -> tuple[
     return [head[: orders[0]] + head[orders[0] + 1 : late[0]], anchor], [relation]
 
 
-def _thing(tokens: list[_Token], text: str) -> Thing:
-    """Reads an object with its determiner, number and order."""
-    order, number, every, rank = None, None, False, None
-    while tokens and tokens[-1].key in _FILLERS | {"and"}:
-        tokens = tokens[:-1]
-    for start in range(len(tokens)):  # an order behind the object
+def _noun_phrase(tokens: Sequence[_Token], related: bool = False) -> tuple[NounPhrase, bool, str]:
+    """Reads an object with its determiner, number and order.
+
+    Args:
+      tokens: Its words.
+      related: Whether a relation follows.
+
+    Returns:
+      The object, whether it has a number or a word such as "all", and what is wrong; empty if nothing is.
+    """
+    order, number, rank, every, definite = None, None, 1, False, False
+    tokens = _without_fillers(tokens, (*_WORDS["fillers"], "and"))
+    for start in range(1, len(tokens)):  # an order behind the object
         words = _longest(tokens, start, _ORDER_OF)
-        if words is not None and len(words) > 1 and start + len(words) == len(tokens) and start > 0:
-            order, tokens = _ORDER_OF[words], tokens[:start]
+        if words is not None and len(words) > 1 and start + len(words) == len(tokens):
+            order, tokens = _ORDER_OF[words], _without_fillers(tokens[:start])
             break
-    while tokens and tokens[-1].key in _FILLERS:
-        tokens = tokens[:-1]
     while len(tokens) > 1:
-        key = tokens[0].key
-        if key in _EVERY:
-            every = True
-            number = 2 if key == "both" else number
-        elif _number(key) is not None and number is None:
-            number = _number(key)
-        elif rank is None and (key in ORDINALS or re.fullmatch("([1-9]|10)(st|nd|rd|th)", key)):
-            rank = ORDINALS.index(key) + 1 if key in ORDINALS else int(key[:-2])
+        key, rest = tokens[0].key, tokens[1:]
+        binds = rest[0].key
+        ordered = order is not None or any((token.key,) in _ORDER_OF for token in rest[:2])
+        if key in _WORDS["every"]:
+            several = key in ("every", "each") or binds in _WORDS["determiners"] or _is_plural(rest, counted=True)
+            if binds in _WORDS["after_numbers"] or not several:
+                break  # all purpose cleaner
+            every, number = True, 2 if key == "both" else number
+        elif (count := _number(key)) is not None and number is None:
+            objects = rest[1:] if binds == "of" else rest
+            if binds in _WORDS["after_numbers"] or not _is_plural(objects, counted=True):
+                break  # one way sign, seven up can
+            number = count
+        elif key in _ORDINALS or re.fullmatch("([1-9]|10)(st|nd|rd|th)", key):
+            if not ordered or binds in _WORDS["after_ordinals"]:
+                break  # first aid kit
+            rank = _ORDINALS.index(key) + 1 if key in _ORDINALS else int(key[:-2])
         elif order is None and (key,) in _ORDER_OF:
             order = _ORDER_OF[(key,)]
-        elif key not in _DETERMINERS and not (key == "of" and (every or number or order)):
+        elif key not in _WORDS["determiners"] and not (key == "of" and (every or number or order)):
             break
-        tokens = tokens[1:]
-    where = f"expression {text!r}"
-    for token in tokens:
-        superlative = re.fullmatch("[a-z]+est", token.key) and len(token.key) > 4 and token.key not in _NOUNS_IN_EST
-        if token.key in _UNKNOWN or superlative or (token.key,) in _ORDER_OF:
-            problem = f"the word {token.text!r} is not understood as a relation or an order"
-            raise InputError(where, problem, remedy=f"Understood are {', '.join([*RELATIONS, *ORDERS])}. {_REMEDY}")
-    words = " ".join(token.text for token in tokens)
-    if not tokens or (len(tokens) == 1 and tokens[0].key in _DETERMINERS | _EVERY):
-        raise InputError(where, "an object is missing", remedy=_REMEDY)
-    if rank is not None and order is None:
-        problem = f"{ORDINALS[rank - 1]!r} needs an order, such as 'from the left' or 'largest'"
-        raise InputError(where, problem, remedy=_REMEDY)
-    if number == 1 and not every:
-        number = None if order is not None else number
+        definite |= key not in _INDEFINITE
+        tokens = rest
+    quantified = every or number is not None
     keys = [token.key for token in tokens]
-    last = keys[keys.index("of", 1) - 1 if "of" in keys[1:] else -1]
-    plural = last.endswith("s") and not last.endswith(("ss", "us", "is"))
-    chosen = order is not None and not (number or 0) > 1
-    return Thing(words, order, rank or 1, number, not chosen and (every or plural or (number or 0) > 1))
+    if not tokens or (len(tokens) == 1 and keys[0] in {*_WORDS["determiners"], *_WORDS["every"]}):
+        return NounPhrase(""), quantified, "an object is missing"
+    unknown = _unknown_word(keys, definite, related)
+    several = (number or 0) > 1
+    if number == 1 and not every and order is not None:
+        number = None
+    every = not (order is not None and not several) and (every or several or _is_plural(tokens))
+    phrase = NounPhrase(" ".join(token.text for token in tokens), order, rank, number, every)
+    understood = ", ".join([*RELATIONS, *ORDERS])
+    problem = f"the word {unknown!r} is not understood as a relation or an order. Understood are {understood}"
+    return phrase, quantified, problem if unknown else ""
+
+
+def _unknown_word(keys: Sequence[str], definite: bool, related: bool) -> str:
+    """Returns the first word of a name that looks like a relation or an order of the grammar and is none, or "".
+
+    Args:
+      keys: Words of the name.
+      definite: Whether "the" or the like stands before them.
+      related: Whether a relation follows.
+    """
+    for place, key in enumerate(keys):
+        before, after = keys[place - 1] if place else "", keys[place + 1] if place + 1 < len(keys) else None
+        phrasal = (before in _WORDS["phrasal"] and after not in _QUANTIFIERS) or _number(before) is not None
+        ends = after in {*_QUANTIFIERS, "to", "from", "against", "with", "by"} or (after is None and related)
+        article = before in _WORDS["determiners"] and before not in _INDEFINITE
+        chosen = key in ("left", "right") or (definite if place == 0 else article)
+        if (
+            key in _WORDS["superlatives"]
+            or (key,) in _ORDER_OF
+            or (key in _WORDS["prepositions"] and place > 0 and not phrasal)
+            or (key in _WORDS["participles"] and place > 0 and ends)
+            or (key in _WORDS["places"] and chosen and after not in {*_WORDS["after_places"], *_PREPOSITIONS})
+        ):
+            return key
+    return ""

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jsecon.query.expressions import ANCHORED_ORDERS, Condition, Thing
+from jsecon.query.expressions import ANCHORED_ORDERS, Condition, NounPhrase
 from jsecon.query.object_shapes import ObjectShapes
 from jsecon.query.relations import SATISFIED, Viewpoint, between_scores, gap, order_values, pair_scores, size_of
 
@@ -53,8 +53,8 @@ Find = Callable[[str], tuple[list[FoundObject], float]]
 
 
 @dataclasses.dataclass
-class Outcome:
-    """The objects of one reading of a thing with its conditions.
+class ReferringResult:
+    """The objects of one reading of a noun phrase with its conditions.
 
     Attributes:
       chosen: The objects, best first.
@@ -83,7 +83,7 @@ def stack_shapes(objects: Sequence[FoundObject]) -> ObjectShapes:
     return jax.tree.map(lambda *columns: np.concatenate(columns), *(found.shape for found in objects))
 
 
-def evaluate(find: Find, thing: Thing, conditions: Sequence[Condition], view: Viewpoint) -> Outcome:
+def evaluate(find: Find, thing: NounPhrase, conditions: Sequence[Condition], view: Viewpoint) -> ReferringResult:
     """Finds the objects of a name that meet conditions, and chooses among them by the order.
 
     Args:
@@ -98,7 +98,7 @@ def evaluate(find: Find, thing: Thing, conditions: Sequence[Condition], view: Vi
     candidates, quantile = find(thing.text)
     if not candidates:
         known = "" if np.isnan(quantile) else f" ({int(100 * quantile)} % of unrelated words are less like the scene)"
-        return Outcome([], reason=f"there is no {thing.text!r} in the scene{known}")
+        return ReferringResult([], reason=f"there is no {thing.text!r} in the scene{known}")
     shapes = stack_shapes(candidates)
     used: list[FoundObject] = []
     orders: list[tuple[str, np.ndarray]] = []
@@ -107,7 +107,7 @@ def evaluate(find: Find, thing: Thing, conditions: Sequence[Condition], view: Vi
         for anchor in condition.anchors:
             outcome = evaluate(find, anchor, condition.conditions if anchor is condition.anchors[-1] else (), view)
             if not outcome.chosen:
-                return Outcome([], used=used, reason=f"nothing to compare with: {outcome.reason}")
+                return ReferringResult([], used=used, reason=f"nothing to compare with: {outcome.reason}")
             anchors.append(outcome.chosen)
             used += [found for found in outcome.chosen if found not in used]
         scores = _condition_scores(candidates, shapes, condition, anchors, view)
@@ -120,7 +120,7 @@ def evaluate(find: Find, thing: Thing, conditions: Sequence[Condition], view: Vi
     valid = [k for k in valid if all(np.isfinite(values[k]) for _, values in orders)]
     rest = [k for k in range(len(candidates)) if k not in valid and candidates[k].score >= WITHIN_REACH]
     if not valid:
-        return Outcome([], [candidates[k] for k in rest], used, reason=_nearest_miss(candidates))
+        return ReferringResult([], [candidates[k] for k in rest], used, reason=_nearest_miss(candidates))
     valid.sort(key=lambda k: -candidates[k].score)
     if thing.order is not None:
         orders.append((thing.order, np.asarray(order_values(shapes, view)[thing.order])))
@@ -131,7 +131,7 @@ def evaluate(find: Find, thing: Thing, conditions: Sequence[Condition], view: Vi
         valid, close, others = _ordered(shapes, valid, values, thing, name)
         if not valid:
             reason = f"there are {count} {thing.text!r}, so none is number {thing.rank}"
-            return Outcome([], [candidates[k] for k in others], used, reason=reason)
+            return ReferringResult([], [candidates[k] for k in others], used, reason=reason)
     chosen = [candidates[k] for k in valid]
     alternatives = [candidates[k] for k in dict.fromkeys([*close, *others, *rest])]
     undecided = [chosen[-1], *(candidates[k] for k in close)] if close else []
@@ -139,7 +139,7 @@ def evaluate(find: Find, thing: Thing, conditions: Sequence[Condition], view: Vi
         undecided = chosen
     wrong = thing.number is not None and len(chosen) != thing.number
     reason = f"the text says {thing.number} and {len(chosen)} match" if wrong else ""
-    return Outcome(chosen, alternatives, used, undecided, reason)
+    return ReferringResult(chosen, alternatives, used, undecided, reason)
 
 
 def _apart(a: Sequence[FoundObject], b: Sequence[FoundObject]) -> Bool[np.ndarray, "k l"]:
@@ -173,7 +173,7 @@ def _condition_scores(
 
 
 def _ordered(
-    shapes: ObjectShapes, valid: Sequence[int], values: np.ndarray, thing: Thing, name: str
+    shapes: ObjectShapes, valid: Sequence[int], values: np.ndarray, thing: NounPhrase, name: str
 ) -> tuple[list[int], list[int], list[int]]:
     """Chooses by an order: the objects, the others that are as good by a hair, and all others."""
     ranked = sorted(valid, key=lambda k: values[k])

@@ -1,0 +1,141 @@
+"""What a text asks for: several texts, referring expressions, and names that contain words of the grammar."""
+
+from pathlib import Path
+
+import pytest
+
+from jsecon import InputError
+from jsecon.query.expressions import RELATIONS, is_expression, parse_expression, parse_query
+
+PHRASES = Path(__file__).with_name("noun_phrases.txt").read_text().split("\n")[:-1]
+EXPRESSIONS = [
+    # text, object, conditions, order and rank, number, whether all are meant
+    ("the red mug to the left of the bottle", "red mug", ["left of bottle"], None, None, False),
+    ("red mug on table", "red mug", ["on table"], None, None, False),
+    ("the cup on the right side of the plate", "cup", ["right of plate"], None, None, False),
+    ("the chair in front of the desk", "chair", ["in front of desk"], None, None, False),
+    ("the box behind the door", "box", ["behind door"], None, None, False),
+    ("shelf over the sink", "shelf", ["above sink"], None, None, False),
+    ("the lamp above the bed", "lamp", ["above bed"], None, None, False),
+    ("the rug below the table", "rug", ["below table"], None, None, False),
+    ("the shoes under the bed", "shoes", ["under bed"], None, None, True),
+    ("the ball that is underneath the chair", "ball", ["under chair"], None, None, False),
+    ("the book lying on the shelf", "book", ["on shelf"], None, None, False),
+    ("mug on top of the box", "mug", ["on box"], None, None, False),
+    ("the egg inside the bowl", "egg", ["in bowl"], None, None, False),
+    ("the fork contained in the drawer", "fork", ["in drawer"], None, None, False),
+    ("the fork beside the knife", "fork", ["next to knife"], None, None, False),
+    ("the plant close to the window", "plant", ["near window"], None, None, False),
+    ("the plant far away from the window", "plant", ["far from window"], None, None, False),
+    ("the book in contact with the cup", "book", ["touching cup"], None, None, False),
+    ("ball between the plate and the bowl", "ball", ["between plate and bowl"], None, None, False),
+    ("ball between two plates", "ball", ["between plates"], None, None, False),
+    ('ball between the "red and white plate" and the bowl', "ball", ["between red and white plate and bowl"], None,
+     None, False),
+    ("mug between the salt and pepper shaker and the plate", "mug", ["between salt and pepper shaker and plate"], None,
+     None, False),
+    ("the salt and pepper shaker near the plate", "salt and pepper shaker", ["near plate"], None, None, False),
+    ("the mug nearest the plate", "mug", ["nearest to plate"], None, None, False),
+    ("the chair furthest from the door", "chair", ["farthest from door"], None, None, False),
+    ("the nearest mug to the bottle", "mug", ["nearest to bottle"], None, None, False),
+    ("the farthest chair from the door", "chair", ["farthest from door"], None, None, False),
+    ("the nearest mug", "mug", [], ("nearest", 1), None, False),
+    ("the two closest mugs", "mugs", [], ("nearest", 1), 2, True),
+    ("the largest box", "box", [], ("largest", 1), None, False),
+    ("the 3rd largest box", "box", [], ("largest", 3), None, False),
+    ("second tallest bottle", "bottle", [], ("tallest", 2), None, False),
+    ("the two largest mugs", "mugs", [], ("largest", 1), 2, True),
+    ("the second mug from the left", "mug", [], ("leftmost", 2), None, False),
+    ("the first two mugs from the left", "mugs", [], ("leftmost", 1), 2, True),
+    ("the mug on the right", "mug", [], ("rightmost", 1), None, False),
+    ("the book at the top", "book", [], ("highest", 1), None, False),
+    ("the chair in the back", "chair", [], ("farthest", 1), None, False),
+    ("the highest shelf next to the door", "shelf", ["next to door"], ("highest", 1), None, False),
+    ("two red mugs", "red mugs", [], None, 2, True),
+    ("12 bottles", "bottles", [], None, 12, True),
+    ("three of the mugs", "mugs", [], None, 3, True),
+    ("two people", "people", [], None, 2, True),
+    ("both mugs on the table", "mugs", ["on table"], None, 2, True),
+    ("all mugs left of the plate", "mugs", ["left of plate"], None, None, True),
+    ("all the furniture", "furniture", [], None, None, True),
+    ("every mug on the table", "mug", ["on table"], None, None, True),
+    ("each bottle", "bottle", [], None, None, True),
+    ("two scissors", "scissors", [], None, 2, True),
+    ("all glasses on the table", "glasses", ["on table"], None, None, True),
+    ("how many glasses", "glasses", [], None, None, True),
+    ("how many bottles are in the box?", "bottles", ["in box"], None, None, True),
+    ("count the mugs", "mugs", [], None, None, True),
+    ("where is the lens near the camera", "lens", ["near camera"], None, None, False),
+    ("the mug on the table left of the bottle", "mug", ["on table", "left of bottle"], None, None, False),
+    ("the mug on the table and left of the bottle", "mug", ["on table", "left of bottle"], None, None, False),
+    ('"tea in a glass" on the "table left of it"', "tea in a glass", ["on table left of it"], None, None, False),
+    ("the chest of drawers under the window", "chest of drawers", ["under window"], None, None, False),
+    ("find the first aid kit left of the top hat", "first aid kit", ["left of top hat"], None, None, False),
+    ("the first aid kit on the left", "first aid kit", [], ("leftmost", 1), None, False),
+    ("the carry on bag under the table", "carry on bag", ["under table"], None, None, False),
+    ("the under cabinet light above the sink", "under cabinet light", ["above sink"], None, None, False),
+    ("the iron on the board", "iron", ["on board"], None, None, False),
+    ("two way radio next to the 2 liter bottle", "two way radio", ["next to 2 liter bottle"], None, None, False),
+    ("the armrest nearest to the one way sign", "armrest", ["nearest to one way sign"], None, None, False),
+]  # fmt: skip
+
+
+def test_names_of_everyday_objects_keep_their_words():
+    """An ordinal, a number, "all", a preposition, a place or "-est" in a name is part of it, and it is one thing."""
+    assert len(PHRASES) >= 500
+    for phrase in PHRASES:
+        thing = parse_expression(phrase).thing
+        got = thing.text, thing.order, thing.number, thing.every, is_expression(phrase)
+        assert got == (phrase, None, None, False, False)
+
+
+def test_names_of_everyday_objects_stand_beside_relations():
+    for phrase in PHRASES:
+        if phrase.startswith(("show ", "count ")):  # these begin a question only
+            continue
+        expression = parse_expression(f"{phrase} near mug")
+        assert (expression.thing.text, list(map(str, expression.conditions))) == (phrase, ["near mug"])
+
+
+@pytest.mark.parametrize(("text", "thing", "conditions", "order", "number", "every"), EXPRESSIONS)
+def test_the_grammar(text, thing, conditions, order, number, every):
+    expression = parse_expression(text)
+    assert is_expression(text)
+    got = expression.thing
+    assert (got.text, got.number, got.every) == (thing, number, every)
+    assert list(map(str, expression.conditions)) == conditions
+    assert (got.order, got.rank) == (order or (None, 1))
+    assert len(expression.readings()) == (1 if expression.joined else max(1, len(conditions)))
+
+
+def test_every_spelling_is_understood_and_quotes_protect():
+    for name, spellings in RELATIONS.items():
+        for words in spellings.split("|"):
+            anchors = "the plate and the bowl" if name == "between" else "the plate"
+            assert parse_expression(f"the mug {words} {anchors}").conditions[0].relation == name
+            assert not is_expression(f'"the mug {words} the plate"')
+    assert not is_expression("red mug or bowl but not handle")
+    assert parse_expression("mugs").thing.every
+
+
+@pytest.mark.parametrize(("text", "problem"), [
+    ("", "is empty"), ("  ", "is empty"), ("word " * 5000, "5000 words"), ("mug across from the plate", "'across'"),
+    ("the widest mug", "'widest'"), ("mug near the left plate", "'left'"), ("the middle mug on the plate", "'middle'"),
+    ("the opposite mug", "'opposite'"), ("mug by the plate", "'by'"), ("lamp hanging over the table", "'hanging'"),
+    ("left of the plate", "no object stands before 'left of'"), ("mug left of", "an object is missing"),
+    ("behind the mug", "no object stands before 'behind'"), ("mug on", "an object is missing"),
+    ("mug between the plate and", "an object is missing"), ("mug in box on plate near bowl", "3 relations"),
+    ("red mug or bowl on the plate", '"or"'), ("caf\udce9 on the plate", "not UTF-8"),
+])  # fmt: skip
+def test_what_is_not_understood_is_named(text, problem):
+    with pytest.raises(InputError, match=problem):
+        parse_expression(text)
+
+
+def test_questions_come_apart():
+    assert parse_query("red mug") == (["red mug"], [])
+    assert parse_query("mug or 'bowl' But Not handle or lid") == (["mug", "bowl"], ["handle", "lid"])
+    assert parse_query("doorknob") == (["doorknob"], [])
+    for bad in ("", "but not handle", "mug but not ''"):
+        with pytest.raises(InputError, match="part"):
+            parse_query(bad)
