@@ -88,7 +88,7 @@ def bare_field(field: jsecon.LanguageField, seed: int, folder: Path, views: int)
     world[:3, :3] = Rotation.random(random_state=seed).as_matrix() * 10 ** rng.uniform(-2, 2)
     world[:3, 3] = rng.normal(size=3) * 20
     folder.mkdir(parents=True, exist_ok=True)
-    jsecon.save_ply(folder / "scene.ply", field.gaussians, similarity=world)
+    jsecon.save_gaussians(folder / "scene.ply", field.gaussians, similarity=world)
     began = time.perf_counter()
     command = [sys.executable, "-m", "jsecon", "run", "scene.ply", "--out", "field", "--views", str(views)]
     with (folder / "run.log").open("w") as log:

@@ -37,9 +37,9 @@ from jsecon.read.masks.labels import load_lerf_labels
 from jsecon.read.masks.langsplat import embedding_size, load_features
 from jsecon.read.masks.masks import load_labels
 from jsecon.read.masks.proposals import load_proposals
-from jsecon.read.splats.files import read_gaussians
+from jsecon.read.splats.files import load_gaussians, read_gaussians, save_gaussians
 from jsecon.read.splats.gltf import save_glb
-from jsecon.read.splats.ply import load_ply, load_point_cloud, save_ply
+from jsecon.read.splats.ply import load_point_cloud
 from jsecon.types import Autoencoder, Camera, Codes, Gaussians, LanguageField, Parts, Regions, Votes
 from jsecon.vision.stores import EmbeddingStore, StoredSegmenter
 
@@ -94,7 +94,7 @@ def ply(folder: Path) -> Iterator[Case]:
     """Gaussians."""
     files = []
     for count, basis in ((20, 1), (9, 4), (0, 16)):
-        save_ply(folder / f"{count}.ply", _gaussians(count, basis))
+        save_gaussians(folder / f"{count}.ply", _gaussians(count, basis))
         files.append(folder / f"{count}.ply")
     face = "element face 0\nproperty list uchar int vertex_indices\n"
     for form in ("ascii", "binary_big_endian"):
@@ -102,7 +102,7 @@ def ply(folder: Path) -> Iterator[Case]:
         columns = ply_columns(6) | {"red": np.arange(6)}
         write_ply(files[-1], columns, form, {"opacity": "double", "red": "uchar"}, face)
     for file in files:
-        yield Case([file], lambda file=file: load_ply(file), _whole_gaussians)
+        yield Case([file], lambda file=file: load_gaussians(file), _whole_gaussians)
 
 
 def splats(folder: Path) -> Iterator[Case]:

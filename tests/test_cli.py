@@ -19,7 +19,7 @@ from jsecon.pipeline import progress
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Console
 from jsecon.process import peak_memory_mib
-from jsecon.read.splats.ply import load_ply
+from jsecon.read.splats.files import load_gaussians
 from jsecon.splat.transform import transform_gaussians
 
 FITTED = [word for name, value in ROOM_FIT.items() for word in (f"--{name.replace('_', '-')}", value)]
@@ -81,7 +81,7 @@ def test_fit_writes_a_scene_in_the_captures_world_and_says_how_good_it_is(room, 
     assert f"held-out PSNR {run.psnr.mean():.2f} dB, SSIM 0." in words
     told, _ = _object(capsys, *line)
     assert told["held_out_psnr"] == pytest.approx(run.psnr.mean(), abs=1e-3)
-    scene = load_ply(told["written"]["scene"])
+    scene = load_gaussians(told["written"]["scene"])
     assert scene.count == told["gaussians"]
     expected = transform_gaussians(run.field.gaussians, run.capture.source_from_scene)
     np.testing.assert_allclose(scene.means, expected.means, atol=1e-5)
@@ -103,7 +103,7 @@ def test_query_writes_a_ply_a_json_and_masks_for_each_text(room_run, tmp_path, c
         if by != "code":
             assert 0 < answer["count"] < answer["gaussians"]
         if answer["count"]:
-            chosen = load_ply(tmp_path / answer["ply"])
+            chosen = load_gaussians(tmp_path / answer["ply"])
             assert chosen.count == answer["count"]
             box, means = answer["place"]["bounding_box"], np.asarray(chosen.means)
             np.testing.assert_allclose(means.min(0), box["min"], atol=1e-5)

@@ -13,7 +13,7 @@ import pytest
 from capture_files import refused, small_capture, write_images, write_text_model, write_transforms
 from fuzz_readers import _field
 
-from jsecon import load_capture, save_field, save_ply
+from jsecon import load_capture, save_field, save_gaussians
 from jsecon.files import exclusive_lock, write_text
 from jsecon.pipeline import cache, run as pipeline, scene
 from jsecon.pipeline.progress import Listener
@@ -39,7 +39,7 @@ def no_room():
 @pytest.mark.parametrize(("name", "write"), [
     ("a.safetensors", lambda path: save_field(path, _field())),
     ("a.safetensors", lambda path: cache.save(path, np.zeros(9999))),
-    ("a.ply", lambda path: save_ply(path, _field().gaussians)),
+    ("a.ply", lambda path: save_gaussians(path, _field().gaussians)),
     ("a.png", lambda path: write_image(path, np.random.default_rng(0).integers(0, 255, (99, 99, 3), np.uint8))),
     ("a.txt", lambda path: write_text(path, "x" * 5000)),
 ])  # fmt: skip

@@ -13,7 +13,7 @@ from capture_files import refused
 from scipy.spatial.transform import Rotation
 from splat_files import RUB, opacity, scene
 
-from jsecon import Camera, Gaussians, load_gaussians, render_rgb, save_gaussians, save_ply
+from jsecon import Camera, Gaussians, load_gaussians, render_rgb, save_gaussians
 from jsecon.splat import transform
 
 SCENE = scene(600, 4)
@@ -194,7 +194,7 @@ def test_missing_files_endings_and_packages(tmp_path, monkeypatch):
     for name in ("three.spz", "a.compressed.ply", "a.splat"):  # which take no package
         (tmp_path / name).write_bytes(FILES[name][0](FILES[name][1]))
         assert load_gaussians(tmp_path / name).count == 600
-    save_ply(tmp_path / "a.ply", gaussians(SCENE))
+    save_gaussians(tmp_path / "a.ply", gaussians(SCENE))
     assert load_gaussians(tmp_path / "a.ply").count == 600
 
 

@@ -16,7 +16,7 @@ from sam_files import write_sam
 from test_pipeline import Recorder
 
 from experiments.datasets.feature_files import write_features
-from jsecon import InputError, load_capture, load_field, load_ply, save_field, save_ply
+from jsecon import InputError, load_capture, load_field, load_gaussians, save_field, save_gaussians
 from jsecon.app import cli
 from jsecon.fit.start import starting_gaussians
 from jsecon.networks.hub import catalogue
@@ -55,7 +55,7 @@ def splat(room, tmp_path_factory):
     """The room's sparse points as Gaussians: a scene that is given, so that nothing is fitted."""
     start, _ = starting_gaussians(load_capture(room, holdout=4), sh_degree=1)
     path = tmp_path_factory.mktemp("splat") / "scene.ply"
-    save_ply(path, start)
+    save_gaussians(path, start)
     return path
 
 
@@ -192,7 +192,7 @@ def test_regions_take_their_embeddings_from_langsplat_s_files(room, splat, model
     options = Options(room, gaussians=splat, holdout=4, masks=folder, features=folder, parts=True)
     work = RunContext(options, model_loading.open_models(options, tmp_path), tmp_path)
     assert work.models.embedder.name == "given-3"
-    planned, results = {s.name: s for s in run_stages(work)}, Results(load=capture, gaussians=load_ply(splat))
+    planned, results = {s.name: s for s in run_stages(work)}, Results(load=capture, gaussians=load_gaussians(splat))
     stage = planned["regions"]
     given = StageInput(work, results, lambda done, total: None, Checkpoint(tmp_path / "none.safetensors"))
     assert "read from language_features, level l" in stage.how

@@ -17,7 +17,7 @@ from capture_files import run_cli
 from jsecon.pipeline.cache import files_digest
 from jsecon.read.captures import capture as captures
 from jsecon.read.captures.photographs import list_photographs
-from jsecon.read.splats.ply import load_ply, save_ply
+from jsecon.read.splats.files import load_gaussians, save_gaussians
 
 HOME = Path(__file__).resolve().parent.parent
 PLACE = "Büro für Köln 日本 #1 %20 'é'"
@@ -37,7 +37,7 @@ def ran(room, room_run, tmp_path_factory):
     for old, new in names.items():
         model = model.replace(f"{old}.png".encode() + b"\0", f"{new}.png".encode() + b"\0")
     (capture / "sparse" / "0" / "images.bin").write_bytes(model)
-    save_ply(base / "Szene ö.ply", room_run[0].field.gaussians)
+    save_gaussians(base / "Szene ö.ply", room_run[0].field.gaussians)
     given = "--gaussians", base / "Szene ö.ply", "--masks", capture / "masks", "--holdout", 4
     assert run_cli("run", capture, "--out", base / "Ausgabe ß 出力", *given) == 0
     return base, base / "Ausgabe ß 出力" / "field.safetensors", sorted(names.values())
@@ -63,7 +63,7 @@ def test_what_is_asked_is_answered_there(ran, capsys):
     assert run_cli("query", file, thing, *at, "--out", answers, "--views", 1, "--json") == 0
     told = json.loads(capsys.readouterr().out)
     for answer in told["answers"]:
-        assert load_ply(answers / answer["ply"]).count == answer["count"] > 0
+        assert load_gaussians(answers / answer["ply"]).count == answer["count"] > 0
         for mask in answer["masks"].values():
             assert cv2.imdecode(np.fromfile(answers / mask, np.uint8), cv2.IMREAD_UNCHANGED) is not None
     assert run_cli("view", file, thing, "--export", base / "Seite ñ 頁.html") == 0

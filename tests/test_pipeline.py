@@ -18,7 +18,7 @@ from capture_files import refused, transforms
 from mask_overlaps import iou_matrix
 
 import jsecon
-from jsecon import InputError, load_field, save_ply
+from jsecon import InputError, load_field, save_gaussians
 from jsecon.app import cli
 from jsecon.field import field as field_file
 from jsecon.files import write_arrays
@@ -121,7 +121,7 @@ def test_votes_of_a_scene_larger_than_memory_are_cast_in_blocks_to_the_same_fiel
 def on_given_gaussians(room_run, tmp_path_factory):
     """The run on its own Gaussians given as a file, and what was told."""
     folder, listener = tmp_path_factory.mktemp("given"), Recorder()
-    save_ply(folder / "scene.ply", room_run[0].field.gaussians)
+    save_gaussians(folder / "scene.ply", room_run[0].field.gaussians)
     options = dataclasses.replace(room_run[0].options, gaussians=folder / "scene.ply")
     return pipeline.run(options, folder / "out", listener=listener), listener
 
@@ -247,7 +247,7 @@ def test_what_cannot_be_is_refused_before_any_work(room_run, tmp_path, changes, 
 def test_gaussians_of_another_world_are_refused(room_run, tmp_path):
     run, _ = room_run
     far = dataclasses.replace(run.field.gaussians, means=np.asarray(run.field.gaussians.means) + np.float32(1000))
-    save_ply(tmp_path / "far.ply", far)
+    save_gaussians(tmp_path / "far.ply", far)
     with pytest.raises(InputError, match="belong"):
         pipeline.run(dataclasses.replace(run.options, gaussians=tmp_path / "far.ply"), tmp_path / "out")
 

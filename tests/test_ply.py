@@ -10,7 +10,8 @@ from splat_files import PLY_NAMES, ply_columns, write_ply
 
 from experiments.datasets.mesh_files import read_faces, write_mesh
 from jsecon import Gaussians, InputError
-from jsecon.read.splats.ply import load_ply, load_point_cloud, save_ply
+from jsecon.read.splats.files import load_gaussians, save_gaussians
+from jsecon.read.splats.ply import load_point_cloud
 
 FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
 
@@ -25,8 +26,8 @@ def random_gaussians(count: int, basis: int = 4) -> Gaussians:
 @pytest.mark.parametrize("count", [0, 1, 100])
 def test_round_trip_is_exact(tmp_path, basis, count):
     gaussians = random_gaussians(count, basis)
-    save_ply(tmp_path / "a.ply", gaussians)
-    loaded = load_ply(tmp_path / "a.ply")
+    save_gaussians(tmp_path / "a.ply", gaussians)
+    loaded = load_gaussians(tmp_path / "a.ply")
     for field in FIELDS:
         np.testing.assert_array_equal(getattr(loaded, field), getattr(gaussians, field))
         assert getattr(loaded, field).dtype == jnp.float32
@@ -36,7 +37,7 @@ def test_round_trip_is_exact(tmp_path, basis, count):
 def test_layout_is_inrias(tmp_path):
     """The order of the properties, zero normals and the channel-major rest, by raw bytes."""
     gaussians = random_gaussians(3, 4)
-    save_ply(tmp_path / "a.ply", gaussians)
+    save_gaussians(tmp_path / "a.ply", gaussians)
     header, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
     names = [line.split()[2] for line in header.decode().splitlines() if line.startswith("property float")]
     assert names == PLY_NAMES[:9] + [f"f_rest_{n}" for n in range(9)] + PLY_NAMES[9:]
@@ -56,7 +57,7 @@ def test_variants(tmp_path, form):
     mixed = {"ins_feat_r": given["x"], **dict(reversed(given.items())), "obj_dc_0": given["y"], "red": np.full(6, 128)}
     types = {"red": "uchar", "opacity": "double"}
     write_ply(tmp_path / "a.ply", mixed, form, types, extra="element face 0\nproperty list uchar int vertex_indices\n")
-    loaded = load_ply(tmp_path / "a.ply")
+    loaded = load_gaussians(tmp_path / "a.ply")
     np.testing.assert_array_equal(loaded.means, np.stack([given[axis] for axis in "xyz"], -1))
     np.testing.assert_array_equal(loaded.quaternions, np.stack([given[f"rot_{n}"] for n in range(4)], -1))
     np.testing.assert_array_equal(loaded.opacity_logits, given["opacity"])
@@ -66,13 +67,13 @@ def test_variants(tmp_path, form):
 
 def test_colours_instead_of_harmonics(tmp_path):
     gaussians, rgb = random_gaussians(50, 16), np.random.default_rng(0).uniform(size=(50, 3)).astype(np.float32)
-    save_ply(tmp_path / "a.ply", gaussians, rgb=rgb)
-    loaded = load_ply(tmp_path / "a.ply")
+    save_gaussians(tmp_path / "a.ply", gaussians, rgb=rgb)
+    loaded = load_gaussians(tmp_path / "a.ply")
     assert loaded.sh.shape == (50, 1, 3)
     np.testing.assert_allclose(0.5 + 0.28209479177387814 * loaded.sh[:, 0], rgb, atol=1e-6)
     np.testing.assert_array_equal(loaded.means, gaussians.means)
     with pytest.raises(ValueError, match="Give one colour per Gaussian"):
-        save_ply(tmp_path / "a.ply", gaussians, rgb=rgb[:49])
+        save_gaussians(tmp_path / "a.ply", gaussians, rgb=rgb[:49])
 
 
 def test_compressed(tmp_path):
@@ -82,7 +83,7 @@ def test_compressed(tmp_path):
     header = f"ply\nformat binary_little_endian 1.0\nelement chunk 1\n{chunk}\nelement vertex 2\n{packed}\nend_header\n"
     (tmp_path / "a.compressed.ply").write_bytes(header.encode() + bytes(24 + 32))
     with refused("a.compressed.ply", "compressed", "jsecon.load_gaussians", "npx @playcanvas/splat-transform"):
-        load_ply(tmp_path / "a.compressed.ply")
+        load_gaussians(tmp_path / "a.compressed.ply")
 
 
 @pytest.mark.parametrize("missing", ["opacity", "rot_3", "f_dc_0", "x"])
@@ -91,19 +92,19 @@ def test_missing_properties(tmp_path, missing):
     del given[missing]
     write_ply(tmp_path / "a.ply", given)
     with refused("a.ply", f"no {missing}"):
-        load_ply(tmp_path / "a.ply")
+        load_gaussians(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
 def test_cut_short(tmp_path, form):
     write_ply(tmp_path / "a.ply", ply_columns(), form, cut=90)
     with refused("a.ply", "cut short"):
-        load_ply(tmp_path / "a.ply")
+        load_gaussians(tmp_path / "a.ply")
     whole = (tmp_path / "a.ply").read_bytes()
     for length in range(0, len(whole), 31):
         (tmp_path / "a.ply").write_bytes(whole[:length])
         with pytest.raises(InputError):
-            load_ply(tmp_path / "a.ply")
+            load_gaussians(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize(("name", "value", "field"), [
@@ -115,19 +116,19 @@ def test_numbers_that_are_none(tmp_path, name, value, field):
     given[name][4] = value
     write_ply(tmp_path / "a.ply", given)
     with refused(f"{field} of 1 of 6 Gaussians", "the first: 4"):
-        load_ply(tmp_path / "a.ply")
+        load_gaussians(tmp_path / "a.ply")
 
 
 def test_opacity_of_one_and_no_rotation(tmp_path):
     given = ply_columns()
     given["opacity"][:2] = np.inf, -np.inf
     write_ply(tmp_path / "a.ply", given)
-    np.testing.assert_array_equal(load_ply(tmp_path / "a.ply").opacity_logits[:2], [np.inf, -np.inf])
+    np.testing.assert_array_equal(load_gaussians(tmp_path / "a.ply").opacity_logits[:2], [np.inf, -np.inf])
     for axis in range(4):
         given[f"rot_{axis}"][3] = 0
     write_ply(tmp_path / "a.ply", given)
     with refused("quaternions of 1 of 6", "zero", "the first: 3"):
-        load_ply(tmp_path / "a.ply")
+        load_gaussians(tmp_path / "a.ply")
 
 
 EMPTY = "format ascii 1.0\nelement vertex 0"
@@ -146,22 +147,22 @@ EMPTY = "format ascii 1.0\nelement vertex 0"
 def test_headers_that_are_none(tmp_path, header, said):
     (tmp_path / "a.ply").write_text(f"ply\n{header}\nend_header\n\n\n")
     with refused("a.ply", said):
-        load_ply(tmp_path / "a.ply")
+        load_gaussians(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize(("content", "said"), [("", "empty"), ("no ply", "no .ply header")])
 def test_files_without_a_header(tmp_path, content, said):
     (tmp_path / "a.ply").write_text(content)
     with refused("a.ply", said):
-        load_ply(tmp_path / "a.ply")
+        load_gaussians(tmp_path / "a.ply")
 
 
 def test_missing_file_and_unwritable_folder(tmp_path):
     with refused("none.ply", "No such file"):
-        load_ply(tmp_path / "none.ply")
+        load_gaussians(tmp_path / "none.ply")
     (tmp_path / "file").write_text("in the way")
     with refused("a.ply", "a folder"):
-        save_ply(tmp_path / "file" / "a.ply", random_gaussians(2))
+        save_gaussians(tmp_path / "file" / "a.ply", random_gaussians(2))
 
 
 @pytest.mark.parametrize(
@@ -218,9 +219,9 @@ def test_faces_round_trip_and_damage(tmp_path):
 def test_colours_of_blocks_of_rows_are_those_of_one(tmp_path, monkeypatch):
     """Of all else: test_gaussian_files. What is read in blocks is what was written in one."""
     scene, rgb = random_gaussians(40), np.linspace(0, 1, 120).reshape(40, 3)
-    save_ply(tmp_path / "whole.ply", scene, rgb=rgb)
+    save_gaussians(tmp_path / "whole.ply", scene, rgb=rgb)
     monkeypatch.setattr("jsecon.splat.transform.BLOCK_ROWS", 7)
     monkeypatch.setattr("jsecon.read.splats.ply._BLOCK", 9)
-    save_ply(tmp_path / "blocks.ply", scene, rgb=rgb)
+    save_gaussians(tmp_path / "blocks.ply", scene, rgb=rgb)
     assert (tmp_path / "blocks.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
-    np.testing.assert_array_equal(load_ply(tmp_path / "blocks.ply").means, scene.means)
+    np.testing.assert_array_equal(load_gaussians(tmp_path / "blocks.ply").means, scene.means)

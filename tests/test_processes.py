@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
-from jsecon import save_ply
+from jsecon import save_gaussians
 
 JSECON = [sys.executable, "-m", "jsecon", "run"]
 MPIRUN = ["mpirun", "--allow-run-as-root", "--oversubscribe", "--bind-to", "none"]
@@ -23,7 +23,7 @@ needs_mpirun = pytest.mark.skipif(shutil.which("mpirun") is None, reason="Open M
 def small_run(room, room_run, tmp_path_factory) -> list[str]:
     """The arguments of a small run without a fit, on true masks."""
     scene = tmp_path_factory.mktemp("processes") / "scene.ply"
-    save_ply(scene, room_run[0].field.gaussians)
+    save_gaussians(scene, room_run[0].field.gaussians)
     return [str(room), "--gaussians", str(scene), "--masks", str(room / "masks"), "--long-side", "96"]
 
 

@@ -92,5 +92,5 @@ def test_a_spz_refuses_coordinates_that_it_cannot_hold(tmp_path, scene):
 
 def test_an_ordinary_scene_is_written_in_single_precision(tmp_path, scene):
     """As INRIA's readers expect it, whatever turns and moves it a little."""
-    jsecon.save_ply(tmp_path / "a.ply", scene, similarity=np.diag([2.0, 2.0, 2.0, 1.0]) + np.eye(4, k=3))
+    jsecon.save_gaussians(tmp_path / "a.ply", scene, similarity=np.diag([2.0, 2.0, 2.0, 1.0]) + np.eye(4, k=3))
     assert b"property double" not in (tmp_path / "a.ply").read_bytes()

@@ -70,7 +70,7 @@ def calls(field, labels):
 
 HOST = {
     *("show", "to_html", "to_png", "locate", "masklets", "check_backend", "load_capture", "load_gaussians"),
-    *("save_gaussians", "load_ply", "save_ply", "region_votes_in_blocks", "check_field"),
+    *("save_gaussians", "load_gaussians", "save_gaussians", "region_votes_in_blocks", "check_field"),
     "normalise_votes_in_blocks",
     *("load_field", "save_field", "region_embeddings", "host_mesh", "query_in_blocks", "lift", "remove_outliers"),
     *("region_at", "plan_capacity", "objects", "object_shapes", "open_scene"),

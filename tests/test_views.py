@@ -272,14 +272,14 @@ def test_a_scene_that_cannot_be_judged_is_refused(object_alone, change, clause):
 def test_a_splat_without_photographs_answers_a_text(room, tmp_path, capsys):
     scene = tmp_path / "scene.ply"
     there, _ = moved(room, 5)
-    jsecon.save_ply(scene, there)
+    jsecon.save_gaussians(scene, there)
     field = tmp_path / "field"
     assert main(["run", str(scene), "--out", str(field), "--views", "8", "--long-side", "160"]) == 0
     assert "of a room" in capsys.readouterr().out
     out = tmp_path / "answers"
     assert main(["query", str(field / "field.safetensors"), "red ball", "--out", str(out)]) == 0
     (answer,) = out.glob("*.ply")
-    selected = {tuple(mean) for mean in np.round(np.asarray(jsecon.load_ply(answer).means), 3)}
+    selected = {tuple(mean) for mean in np.round(np.asarray(jsecon.load_gaussians(answer).means), 3)}
     truth = {tuple(mean) for mean in np.round(np.asarray(there.means, np.float32)[-1200:-800], 3)}
     assert len(selected & truth) / len(selected | truth) > 0.8
     assert json.loads(next(out.glob("*.json")).read_text())["count"] == len(selected)
@@ -289,7 +289,7 @@ def test_a_splat_without_photographs_answers_a_text(room, tmp_path, capsys):
 def test_given_cameras_take_the_place_of_planned_views(object_alone, around, tmp_path, kind):
     """In the world of the scene's file, which is moved and 200 times larger; no image is needed."""
     there, similarity = moved(object_alone, 3, scale=200.0)
-    jsecon.save_ply(tmp_path / "scene.ply", there)
+    jsecon.save_gaussians(tmp_path / "scene.ply", there)
     planned = around.cameras[:4]
     poses = np.array(planned.world_to_camera, np.float64) @ np.linalg.inv(similarity)
     poses[:, :3] /= np.linalg.norm(poses[:, :1, :3], axis=2, keepdims=True)
@@ -314,14 +314,14 @@ def test_given_cameras_take_the_place_of_planned_views(object_alone, around, tmp
 )
 def test_options_of_photographs_are_refused_for_a_scene_alone(room, tmp_path, capsys, monkeypatch, option):
     monkeypatch.chdir(tmp_path)
-    jsecon.save_ply("scene.ply", room)
+    jsecon.save_gaussians("scene.ply", room)
     assert main(["run", "scene.ply", *option, "--out", "field"]) == 2
     assert option[0] in capsys.readouterr().err
     assert not (tmp_path / "field").exists()
 
 
 def test_poses_that_look_elsewhere_are_refused(object_alone, tmp_path, capsys):
-    jsecon.save_ply(tmp_path / "scene.ply", object_alone)
+    jsecon.save_gaussians(tmp_path / "scene.ply", object_alone)
     pose = np.eye(4)
     pose[:3, 3] = 1000
     frames = [{"file_path": f"{k}.png", "transform_matrix": pose.tolist()} for k in range(2)]

@@ -19,7 +19,7 @@ from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.start import gaussians_from_points, starting_gaussians
 from jsecon.read.masks.langsplat import load_features
 from jsecon.read.masks.masks import load_labels
-from jsecon.read.splats.ply import load_ply, save_ply
+from jsecon.read.splats.files import load_gaussians, save_gaussians
 from jsecon.types import Camera, Gaussians
 
 
@@ -111,11 +111,11 @@ def gaussians_of(bench: Benchmark, folder: Path, kept: Path, steps: int) -> Gaus
         )
     given = folder / "point_cloud.ply"
     if given.exists():
-        return load_ply(given)
+        return load_gaussians(given)
     seen = hashlib.sha1(np.ascontiguousarray(bench.capture.frames).tobytes()).hexdigest()[:12]
     file = kept / f"{bench.name}_{seen}_{steps}.ply"
     if not file.exists():
         start, _ = starting_gaussians(bench.capture, sh_degree=0)
         gaussians, _ = fit_gaussians(bench.capture, steps=steps, key=jax.random.key(0), start=start, **FIT)
-        save_ply(file, gaussians)
-    return load_ply(file)
+        save_gaussians(file, gaussians)
+    return load_gaussians(file)

@@ -270,12 +270,12 @@ class Objects(FieldVerb):
 class Export(FieldVerb):
     """Writes the scene of a field, or objects of it, for other programs.
 
-    The scene is in the capture's world. A .glb is glTF with Khronos' KHR_gaussian_splatting, y up, and holds each
-    Gaussian's region (_REGION) too, and its code (_CODE_0, _CODE_1 ...) if the field has codes.
+    The scene is in the capture's world. A .glb is glTF with Khronos' KHR_gaussian_splatting, y up. A .spz needs the
+    extra formats.
 
     Attributes:
       out: The .ply (INRIA's layout), .spz or .glb to write.
-      with_labels: Adds to the .ply the property object_id, the id of each Gaussian's object in jsecon objects, or -1.
+      with_labels: Adds object_id, the id of each Gaussian's object in jsecon objects or -1, to the .ply or .glb.
       labels: File (.npy) to write with these ids, int32, in the order of the Gaussians in the .ply.
       objects: Folder to write a .ply of each object to, named by its id and name.
       only: Exports only the Gaussians that jsecon query selects for this text.

@@ -17,7 +17,7 @@ from experiments.tables.setting import levels_of, prepare
 from jsecon.fit.start import gaussians_from_points
 from jsecon.read.masks.langsplat import load_features
 from jsecon.read.masks.masks import LEVELS
-from jsecon.read.splats.ply import load_ply, save_ply
+from jsecon.read.splats.files import load_gaussians, save_gaussians
 
 TRACKED = "ours, tracks"
 CHEAP = ("VALA", TRACKED)
@@ -41,7 +41,7 @@ def with_gaussians(plan, *levels):
             root = plan.data.place(scene, 0, level)
             capture = plan.data.load(root, scene).capture
             points = gaussians_from_points(capture.points, capture.point_colors, opacity=0.8, scale=0.4)
-            save_ply(root / scene / "point_cloud.ply", points)
+            save_gaussians(root / scene / "point_cloud.ply", points)
     return plan
 
 
@@ -88,7 +88,7 @@ def test_levels_of_noise_share_a_fit(folder):
     for level in ("perfect", "medium"):
         setting = prepare(data, "figurines", 0, level, fit_steps=20)
         (file,) = (folder / "fits" / "fitted").iterdir()
-        np.testing.assert_array_equal(setting.evidence.gaussians.means, load_ply(file).means)
+        np.testing.assert_array_equal(setting.evidence.gaussians.means, load_gaussians(file).means)
     prepare(dataclasses.replace(data, seeds=(1,)), "figurines", 1, "medium", fit_steps=20)
     assert len(list((folder / "fits" / "fitted").iterdir())) == 2  # another room
 

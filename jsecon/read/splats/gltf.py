@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from jsecon.errors import InputError
+from jsecon.errors import InputError, require_shape
 from jsecon.files import atomic_write, parse_json, reading
 from jsecon.read.splats.ply import drawable_gaussians, needs_float64, usable_blocks
 from jsecon.splat.project import check_gaussians
@@ -33,23 +33,14 @@ _EXTENSION = "KHR_gaussian_splatting"
 _AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
 """from a .ply's x right, y down, z forward to glTF's x left, y up, z forward; and back again"""
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-_TYPES = {size: name for name, size in _COMPONENTS.items()}
-_MAX_LOG_SCALE = 88.0
-"""largest log scale whose exponential float32 holds"""
 _FLOAT, _BYTE, _VERTICES, _POINTS = 5126, 5121, 34962, 0
 """glTF's numbers for component types, a target of buffers and a mode of primitives"""
 _DTYPES = {5120: "i1", _BYTE: "u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
-_MAX_BYTES = (1 << 32) - 1
-"""of a .glb"""
 _SUPPORTED = {_EXTENSION, "KHR_mesh_quantization"}
 """extensions that a file may require"""
 _APPEARANCE = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "KHR_xmp", "EXT_texture_", "EXT_lights_")
 """prefixes of the extensions that change nothing about Gaussians"""
-_UNNORMALISED = ("POSITION", f"{_EXTENSION}:SCALE")
-"""attributes that may hold whole numbers as they are"""
 _SRGB = "srgb_rec709_display"
-_MAX_SCALE_DIFFERENCE = 1e-4
-"""relative difference of the scales of a node's axes that counts as rounding"""
 _REMEDY = "Export the scene again, or as a .ply."
 
 
@@ -57,28 +48,17 @@ def save_glb(
     path: str | Path,
     gaussians: Gaussians,
     *,
-    codes: Float[Array, "n d"] | None = None,
-    regions: Int[Array, " n"] | None = None,
+    object_ids: Int[Array, " n"] | None = None,
     similarity: Float[Array, "4 4"] | None = None,
 ) -> None:
     """Writes Gaussians in float32, in glTF's axes: (x, y, z) becomes (-x, -y, z), y up.
 
-    Written in blocks: memory-mapped arrays need not fit into memory. If float32 would not hold the positions
-    (coordinates of a map projection), they are relative to the translation of the node.
-
-    Args:
-      path: The file.
-      gaussians: N Gaussians, at least one.
-      codes: (N, D), written as the attributes _CODE_0, _CODE_1 ... of four numbers each.
-      regions: (N,) region ids, -1 for no region, written as the attribute _REGION.
-      similarity: (4, 4) transform into the world of the file.
-
-    Raises:
-      ValueError: Shapes disagree.
-      InputError: There is no Gaussian, one cannot be drawn or is too large for float32, the file would have more than
-        4 GiB, or the folder cannot be written.
+    If float32 would not hold the positions (coordinates of a map projection), they are relative to the translation of
+    the node. Object ids are the attribute _OBJECT_ID, -1 for none.
     """
     check_gaussians(gaussians)
+    if object_ids is not None:
+        require_shape("object_ids", object_ids, (gaussians.count,), "Give one id per Gaussian.")
     count, into = gaussians.count, _AXES if similarity is None else _AXES @ np.asarray(similarity, np.float64)
     if not count:
         raise InputError(path, "there are no Gaussians to write", remedy="Write a .ply, which may be empty.")
@@ -86,14 +66,14 @@ def save_glb(
     if needs_float64(gaussians, into):
         origin = np.median(next(transform_blocks(gaussians, into))[1].means, axis=0)
 
-    blocks = functools.partial(_attribute_blocks, path, into, origin, codes, regions)
+    blocks = functools.partial(_attribute_blocks, path, into, origin, object_ids)
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for _, block in blocks(dataclasses.replace(gaussians, sh=gaussians.sh[:, :1])):
         low, high = np.minimum(low, block["POSITION"].min(0)), np.maximum(high, block["POSITION"].max(0))
-    views, accessors, size = [], [], 0
+    views, accessors, size, types = [], [], 0, {number: name for name, number in _COMPONENTS.items()}
     first = next(blocks(jax.tree.map(lambda a: a[:1], gaussians)))[1]
     for name, array in first.items():
-        accessor = {"bufferView": len(views), "count": count, "type": _TYPES[array.shape[1]]}
+        accessor = {"bufferView": len(views), "count": count, "type": types[array.shape[1]]}
         if name == "POSITION":
             accessor |= {"min": low.tolist(), "max": high.tolist()}
         number = {"componentType": _FLOAT} if array.dtype == "<f4" else {"componentType": _BYTE, "normalized": True}
@@ -116,9 +96,9 @@ def save_glb(
     }
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
-    if (length := 12 + 8 + len(text) + 8 + size) > _MAX_BYTES:
-        problem, remedy = f"{count} Gaussians fill {length / 2**30:.3g} GiB", "Write a .ply, or no harmonics or codes."
-        raise InputError(path, problem, "at most 4 GiB in a .glb", remedy)
+    if (length := 12 + 8 + len(text) + 8 + size) > (1 << 32) - 1:
+        problem = f"{count} Gaussians fill {length / 2**30:.3g} GiB"
+        raise InputError(path, problem, "at most 4 GiB in a .glb", "Write a .ply.")
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         file.write(struct.pack("<4sII", b"glTF", 2, length))
         file.write(struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", size, b"BIN\0"))
@@ -130,19 +110,16 @@ def save_glb(
 
 
 def _attribute_blocks(
-    path: str | Path, into: np.ndarray, origin: np.ndarray, codes: Any, regions: Any, gaussians: Gaussians
+    path: str | Path, into: np.ndarray, origin: np.ndarray, object_ids: Any, gaussians: Gaussians
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     """Yields the attributes of Gaussians in blocks, as the file has them, after the number of the first Gaussian."""
     for rows, block in usable_blocks(path, gaussians, into):
-        if block.log_scales.max() > _MAX_LOG_SCALE:
+        if block.log_scales.max() > 88:  # beyond, float32 does not hold the exponential
             problem = f"a Gaussian is exp({block.log_scales.max():.4g}) units large"
             raise InputError(path, problem, "at most exp(88) in a .glb", "Write a .ply, or scale the scene down.")
         attributes = _attributes(dataclasses.replace(block, means=block.means - origin))
-        if codes is not None:
-            table = np.asarray(codes[rows])
-            attributes |= {f"_CODE_{n // 4}": table[:, n : n + 4] for n in range(0, table.shape[1], 4)}
-        if regions is not None:
-            attributes["_REGION"] = np.asarray(regions[rows])[:, None]
+        if object_ids is not None:
+            attributes["_OBJECT_ID"] = np.asarray(object_ids[rows])[:, None]
         kinds = {name: np.uint8 if name == "COLOR_0" else "<f4" for name in attributes}
         yield rows.start, {name: np.ascontiguousarray(a, kinds[name]) for name, a in attributes.items()}
 
@@ -169,21 +146,12 @@ def _attributes(block: Gaussians) -> dict[str, np.ndarray]:
 
 
 def read_glb(path: Path) -> Gaussians:
-    """Reads the Gaussians of all primitives of a scene, in the world of the .ply that they were made from.
+    """Reads the Gaussians of all primitives of a scene, as NumPy arrays with the means in float64.
 
-    They are transformed by their nodes, then turned back from glTF's axes. Numbers may be float32, or whole numbers as
-    the extension and KHR_mesh_quantization allow; harmonics of degree 0 to 3. Codes and regions are not read.
-
-    Args:
-      path: The file.
-
-    Returns:
-      Its Gaussians as NumPy arrays, the means in float64.
-
-    Raises:
-      InputError: The file is damaged, holds numbers that cannot be drawn, or needs what is not supported: an extension
-        or another file, a kernel but ellipses, a projection but the perspective, colours but sRGB, a node that shears,
-        mirrors or scales its axes unequally.
+    They are transformed by their nodes, then turned back from glTF's axes to the world of the .ply that they were made
+    from. Numbers may be float32, or whole numbers as the extension and KHR_mesh_quantization allow; harmonics of degree
+    0 to 3. Other attributes are not read. What is not supported is an error: other extensions, kernels, projections and
+    colour spaces, numbers in another file, and nodes that shear, mirror or scale their axes unequally.
     """
     parts, count = [], 0
     problem = "its description (JSON) is damaged or incomplete"
@@ -271,31 +239,29 @@ def _require_supported(glb: _Glb, properties: Any) -> None:
     if extensions := sorted(map(str, properties.get("extensions", ()))):
         problem = f"its Gaussians use the extension {', '.join(extensions)}"
         raise glb.error(problem, remedy="Export them uncompressed, or as a .ply.")
-    if (kernel := properties.get("kernel", "ellipse")) != "ellipse":
-        raise glb.error(f"the kernel of its Gaussians is {kernel}", "ellipse", "Export the scene as a .ply.")
-    if (projection := properties.get("projection", "perspective")) != "perspective":
-        problem = f"the projection of its Gaussians is {projection}"
-        raise glb.error(problem, "perspective", "Export the scene as a .ply.")
-    if (colours := properties.get("colorSpace", _SRGB)) != _SRGB:
-        linear = " (linear light)" if colours == "lin_rec709_display" else ""
-        remedy = "Export the scene with sRGB colours: its colours must be blended as they are stored."
-        raise glb.error(f"the colour space of its Gaussians is {colours}{linear}", _SRGB, remedy)
+    for key, words, supported in (
+        ("kernel", "kernel", "ellipse"),
+        ("projection", "projection", "perspective"),
+        ("colorSpace", "colour space", _SRGB),
+    ):
+        if (value := properties.get(key, supported)) != supported:
+            remedy = "Export the scene with sRGB colours, or as a .ply."
+            raise glb.error(f"the {words} of its Gaussians is {value}", supported, remedy)
 
 
 def _require_similarity(glb: _Glb, index: int, matrix: np.ndarray) -> None:
     """Raises InputError if the transform of a node is more than a rotation, one positive scale and a shift."""
     axes = matrix[:3, :3]
     sizes = np.linalg.norm(axes, axis=0)
-    if not np.isfinite(matrix).all() or not sizes.min() > 0:
-        problem = "has numbers that are not finite" if not np.isfinite(matrix).all() else "scales an axis by 0"
-    elif sizes.max() > (1 + _MAX_SCALE_DIFFERENCE) * sizes.min():
+    rounding = 1e-4
+    if not (np.isfinite(matrix).all() and sizes.min() > 0 and np.allclose(matrix[3], [0, 0, 0, 1])):
+        problem = "has no usable transform"
+    elif sizes.max() > (1 + rounding) * sizes.min():
         problem = f"scales its axes unequally, by {', '.join(f'{size:.6g}' for size in sizes)}"
-    elif np.abs(axes.T @ axes - np.diag(sizes**2)).max() > 2 * _MAX_SCALE_DIFFERENCE * sizes.max() ** 2:
+    elif np.abs(axes.T @ axes - np.diag(sizes**2)).max() > 2 * rounding * sizes.max() ** 2:
         problem = "shears its axes"
     elif np.linalg.det(axes) < 0:
         problem = "mirrors its axes"
-    elif not np.allclose(matrix[3], [0, 0, 0, 1]):
-        problem = "has a matrix whose last row is not 0, 0, 0, 1"
     else:
         return
     remedy = "Apply that transform to the Gaussians in the program that wrote the file, and export again."
@@ -363,6 +329,6 @@ def _column(glb: _Glb, name: str, index: int) -> Float[np.ndarray, "n c"]:
         return array.astype(np.float32)
     if accessor.get("normalized") is True:
         return np.maximum(array.astype(np.float32) / np.iinfo(kind).max, -1)
-    if name not in _UNNORMALISED:
+    if name not in ("POSITION", f"{_EXTENSION}:SCALE"):
         raise glb.error(f"the whole numbers of {name} are not normalised", "normalised ones, or floats")
     return array.astype(np.float32)
