@@ -35,8 +35,7 @@ from jsecon.read.captures import images, video
 from jsecon.read.captures.capture import load_capture
 from jsecon.read.masks.labels import load_lerf_labels
 from jsecon.read.masks.langsplat import embedding_size, load_features
-from jsecon.read.masks.masks import load_labels
-from jsecon.read.masks.proposals import load_proposals
+from jsecon.read.masks.masks import load_labels, load_proposals
 from jsecon.read.splats.files import load_gaussians, read_gaussians, save_gaussians
 from jsecon.read.splats.gltf import save_glb
 from jsecon.read.splats.ply import load_point_cloud

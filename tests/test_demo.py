@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from jsecon import load_capture, load_field, load_ply
+from jsecon import load_capture, load_field, load_gaussians
 from jsecon.app import pictures
 from jsecon.demo import demo
 from jsecon.pipeline.progress import Listener
@@ -49,7 +49,7 @@ def test_field_answers_and_figures_are_on_disk(finished):
     }
     for record in records:
         if record["count"]:
-            assert load_ply(out / "queries" / record["ply"]).count == record["count"]
+            assert load_gaussians(out / "queries" / record["ply"]).count == record["count"]
     page = (out / "report.html").read_text()
     for text in (*(record["query"] for record in records), "mAcc@0.25", "Seconds of each stage", "Held-out frames"):
         assert text in page

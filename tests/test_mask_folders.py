@@ -9,8 +9,7 @@ from capture_files import refused
 
 from jsecon.errors import InputError
 from jsecon.read.masks.langsplat import load_features
-from jsecon.read.masks.masks import load_labels
-from jsecon.read.masks.proposals import load_proposals
+from jsecon.read.masks.masks import load_labels, load_proposals
 from jsecon.types import ImageFile
 
 SIZE = (12, 16)

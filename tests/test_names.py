@@ -19,7 +19,7 @@ from jsecon import (
     Scene,
     load_capture,
     load_field,
-    load_ply,
+    load_gaussians,
     query_region,
     save_field,
 )
@@ -112,7 +112,7 @@ def test_a_field_file_with_hostile_frames_writes_nothing_elsewhere(field, word, 
     answers = [json.loads(file.read_text()) for file in out.glob("*.json")]
     assert sorted(told["query"] for told in answers) == sorted((*texts, "mug", "mug"))
     for told in answers:
-        assert load_ply(out / told["ply"]).count == told["count"] > 0
+        assert load_gaussians(out / told["ply"]).count == told["count"] > 0
     outside = [file for file in tmp_path.rglob("*.*") if out not in file.parents]
     assert sorted(file.name for file in outside) == ["field.safetensors", "mug.png", "mug.png"]
 

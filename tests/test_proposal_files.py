@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from jsecon.errors import InputError
-from jsecon.read.masks.proposals import decode_rle, load_proposals
+from jsecon.read.masks.json_masks import decode_rle
+from jsecon.read.masks.masks import load_proposals
 
 SIZE = (20, 30)
 

@@ -19,7 +19,7 @@ pytest.importorskip("viser", reason="the extra viewer is not installed")
 from browser import CHROMIUM, opened, until
 from small_field import colour_field
 
-from jsecon import Camera, InputError, load_ply, save_field, with_overlap
+from jsecon import Camera, InputError, load_gaussians, save_field, with_overlap
 from jsecon.app.cli import main
 from jsecon.app.records import Answer
 from jsecon.app.viewer import view_state
@@ -167,7 +167,7 @@ def test_files_of_the_answers(viewer, tmp_path):
         archive.extractall(tmp_path)
     assert {"region-1.json", "region-1.ply"} <= set(names)
     assert sum(name.endswith(".png") for name in names) == 3
-    assert load_ply(tmp_path / "region-1.ply").count == answer.mask.sum()
+    assert load_gaussians(tmp_path / "region-1.ply").count == answer.mask.sum()
 
 
 def test_a_taken_port_and_a_missing_extra_are_told(viewer, monkeypatch):

@@ -49,9 +49,8 @@ from jsecon.query.rules import QueryRules
 from jsecon.query.select import CODE_THRESHOLD, select_by_code
 from jsecon.read.captures.capture import has_depth
 from jsecon.read.captures.images import read_pixels
-from jsecon.read.masks.masks import resize_nearest
+from jsecon.read.masks.fitting import resize_nearest
 from jsecon.read.splats.files import save_gaussians
-from jsecon.read.splats.ply import save_ply
 from jsecon.types import LanguageField
 
 FIELD_FILE = "field.safetensors"
@@ -695,14 +694,5 @@ def export_rows(
     if rows is not None:
         field = subset_field(field, rows)
         object_ids = None if object_ids is None else object_ids[rows]
-    if file.suffix.lower() == ".ply":
-        save_ply(file, field.gaussians, similarity=field.source_from_scene, object_ids=object_ids)
-    else:
-        from jsecon.app.pictures import main_regions
-
-        columns: dict[str, Any] = {}
-        if file.suffix.lower() == ".glb":
-            codes = None if field.codes is None else field.codes.gaussians
-            columns = {"codes": codes, "regions": main_regions(field)}
-        save_gaussians(file, field.gaussians, similarity=field.source_from_scene, **columns)
+    save_gaussians(file, field.gaussians, similarity=field.source_from_scene, object_ids=object_ids)
     return field.gaussians.count

@@ -11,11 +11,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Int
 
 from jsecon.errors import InputError
 from jsecon.files import map_npy, reading
 from jsecon.numerics import is_finite_and_bounded
-from jsecon.read.masks.masks import AllFrames, MaskFitter, compact_ids, find_masks, read_level
+from jsecon.read.masks.fitting import MaskFitter, compact_ids
+from jsecon.read.masks.names import AllFrames, find_masks
+from jsecon.read.registry import Reader
+
+LEVELS = ("default", "s", "m", "l")
+"""levels of LangSplat's `_s.npy`, in their order: all of SAM's masks, subparts, parts, whole objects"""
 
 
 class FrameMasks(NamedTuple):
@@ -29,6 +35,26 @@ class FrameMasks(NamedTuple):
     """(M,) int32 the frame of each mask."""
 
 
+def read_level(path: Path, level: str) -> Int[np.ndarray, "h w"]:
+    """Reads one level of LangSplat's `_s.npy`: (H, W) ids, -1 for no region."""
+    if level not in LEVELS:
+        raise InputError("level", f"there is no level {level!r}", f"one of {', '.join(LEVELS)}", "l is the coarsest.")
+    expected = f"a .npy of shape ({len(LEVELS)}, H, W)"
+    with reading(path, expected, "Write the masks again.", problem="the array is damaged or missing"):
+        image = map_npy(path)
+    if image.ndim != 3 or len(image) != len(LEVELS) or not image.size:
+        expected = f"({len(LEVELS)}, H, W): levels {', '.join(LEVELS)}"
+        remedy = "Give _s.npy files, not the _f.npy ones."
+        raise InputError(path, f"the array has shape {image.shape}", expected, remedy)
+    with np.errstate(invalid="ignore"):  # of a signalling NaN
+        image = np.asarray(image[LEVELS.index(level)], np.float64)
+    # float32, LangSplat's type of ids, holds every integer below 1 << 24
+    if not ((image >= -(1 << 24)) & (image < 1 << 24) & (image == image.round())).all():
+        problem = "the array has numbers that are no integers or too large"
+        raise InputError(path, problem, "ids, -1 for no region", "Write the masks again.")
+    return image.astype(np.int64)
+
+
 def load_features(
     folder: Path,
     names: Sequence[str],
@@ -37,36 +63,23 @@ def load_features(
     level: str = "l",
     frames: AllFrames | None = None,
 ) -> FrameMasks:
-    """Reads one level of the masks of frames, with their embeddings.
+    """Reads one level of the masks of frames as labels (H, W), with their embeddings.
 
-    Files are named as in `jsecon.read.masks.masks`. Masks that vanish at the size asked for are skipped.
-
-    Args:
-      folder: The language_features folder.
-      names: T frames.
-      size: (H, W) of the labels.
-      level: A name of LEVELS.
-      frames: All frames of the capture in order, each with its image.
-
-    Returns:
-      Labels, embeddings and the frame of each mask.
-
-    Raises:
-      InputError: A frame has no file, its two files disagree, or embeddings are not finite.
+    Masks that vanish at the size asked for are skipped. `frames` are all frames of the capture, each with its image.
     """
     every = frames or dict.fromkeys(names)
-    by_suffix = {kind.suffix: kind.path for kind in find_masks(folder, every, ("_s.npy", "_f.npy"))}
+    found = find_masks(folder, every, (Reader("LangSplat", ("_s.npy",), read_level),), lambda path: False)
 
-    def path_of(name: str, suffix: str) -> Path:
-        path = by_suffix[suffix](name) if suffix in by_suffix else None
-        return folder / f"{name}{suffix}" if path is None else path  # a missing file is an error of its reader
+    def masks_of(name: str) -> Path:
+        return found.path(name) or folder / f"{name}_s.npy"  # a missing file is an error of its reader
 
-    fit = MaskFitter(every, size, lambda name: read_level(path_of(name, "_s.npy"), level).shape)
+    fit = MaskFitter(every, size, lambda name: read_level(masks_of(name), level).shape)
     labels = np.full((len(names), *size), -1, np.int32)
     rows: list[np.ndarray] = []
     frame: list[int] = []
     for t, name in enumerate(names):
-        file, masks = path_of(name, "_f.npy"), path_of(name, "_s.npy")
+        masks = masks_of(name)
+        file = masks.with_name(masks.name[: -len("_s.npy")] + "_f.npy")
         table = _read_table(file)
         if rows and table.shape[-1] != len(rows[0]):
             problem, expected = f"it has rows of {table.shape[-1]} numbers", f"{len(rows[0])}, as in the frames before"
@@ -90,17 +103,7 @@ def load_features(
 
 
 def embedding_size(folder: Path) -> int:
-    """Reads the size of the embeddings in a folder.
-
-    Args:
-      folder: The language_features folder.
-
-    Returns:
-      E, of the first file.
-
-    Raises:
-      InputError: It has no `_f.npy`, or a damaged one.
-    """
+    """Reads the size E of the embeddings in a folder, by its first file."""
     files = sorted(folder.rglob("*_f.npy"))
     if not files:
         remedy = "Give the language_features folder that LangSplat's preprocess.py wrote."

@@ -1,0 +1,185 @@
+"""Masks in JSON, on the host: a file a frame of SAM's generator or of SA-1B, or COCO's one file for all frames.
+
+A mask is run-length encoded or polygons. Run lengths are {"size": [H, W], "counts": ...}: runs of 0 and 1 in turn, 0
+first, down the columns. `counts` is a list of them, or COCO's text of 6-bit digits, decoded here: that also checks that
+the runs fill the mask, and needs no compiled dependency. Polygons are [[x, y, x, y, ...], ...] in px of the image; a
+polygon within another is a hole in it.
+"""
+
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool
+
+from jsecon.errors import InputError
+from jsecon.files import read_json, reading
+from jsecon.read.captures.images import MAX_PIXELS
+from jsecon.read.masks.names import FrameNames
+
+_REMEDY = "Write them with SAM's scripts/amg.py --convert-to-rle, or as COCO polygons."
+_RLE = '{"size": [H, W], "counts": a text or a list}'
+_JSON = 'a list of {"segmentation": ...}, or COCO\'s {"images", "annotations"}'
+
+
+def decode_rle(rle: Any, where: str | Path) -> Bool[np.ndarray, "h w"]:
+    """Decodes a run-length encoded mask; `where` names it for errors."""
+    with reading(where, _RLE, _REMEDY, problem="the mask cannot be read"):
+        height, width = rle["size"]
+        if not isinstance(height, int) or not isinstance(width, int):
+            raise ValueError("its size is not a pair of whole numbers")
+        counts = rle["counts"]
+        runs = np.asarray(_parse_runs(counts) if isinstance(counts, str) else counts, np.int64)
+    valid = runs.ndim == 1 and ((runs >= 0) & (runs <= MAX_PIXELS)).all() and min(height, width) > 0
+    if not valid or height * width > MAX_PIXELS or runs.sum() != height * width:
+        raise InputError(where, f"the mask's runs fill {int(runs.sum())} of {height}x{width} pixels", _RLE, _REMEDY)
+    values = np.arange(len(runs)) % 2 == 1
+    return np.ascontiguousarray(np.repeat(values, runs).reshape(width, height).T)
+
+
+def _parse_runs(text: str) -> list[int]:
+    """The runs in COCO's text of 6-bit digits.
+
+    A digit has five bits of a number, the lowest first, and a sixth bit that says whether more follow; the highest bit
+    of the last digit is the sign. From the fourth run on, a number is the difference from the run two before.
+    """
+    runs: list[int] = []
+    value = shift = 0
+    for character in text:
+        digit = ord(character) - 48
+        if not 0 <= digit < 64:
+            raise ValueError(f"{character!r} is not a digit of its runs")
+        value |= (digit & 31) << shift
+        shift += 5
+        if not digit & 32:
+            if digit & 16:
+                value -= 1 << shift
+            runs.append(value + (runs[-2] if len(runs) > 2 else 0))
+            value = shift = 0
+    if shift:
+        raise ValueError("the last run breaks off")
+    return runs
+
+
+def _fill_polygons(polygons: Any, width: int, height: int, where: str | Path) -> Bool[np.ndarray, "h w"]:
+    """Draws COCO's polygons [[x, y, x, y, ...], ...], px, as a mask; a polygon within another is a hole in it."""
+    expected = "[[x, y, x, y, ...], ...] with three corners or more each"
+    nested = isinstance(polygons, list) and all(isinstance(polygon, list) for polygon in polygons)
+    try:
+        corners = [np.asarray(each, np.float64).reshape(-1, 2) for each in (polygons if nested else [polygons])]
+    except (ValueError, TypeError) as error:
+        problem = "the mask's polygons are no lists of x and y in turn"
+        raise InputError(where, problem, expected, _REMEDY) from error
+    if not corners or not all(len(each) > 2 and np.isfinite(each).all() for each in corners):
+        raise InputError(where, "the mask has a polygon without three corners", expected, _REMEDY)
+    far = np.concatenate(corners)
+    if (far < -1).any() or (far > np.array([width, height]) + 1).any():  # corners may lie on the far edges
+        problem = f"the mask's polygons reach from {far.min(0).tolist()} to {far.max(0).tolist()} px"
+        remedy = 'Give the size of the image that they were drawn on ("images" with "width" and "height").'
+        raise InputError(where, problem, f"corners within {width}x{height}", remedy)
+    distinct = {each.tobytes(): each for each in (np.round(each).astype(np.int32) for each in corners)}.values()
+    filled = [(_fill([each], width, height), each) for each in distinct]
+    groups: list[tuple[np.ndarray, list[np.ndarray]]] = []
+    for mask, each in sorted(filled, key=lambda pair: -int(pair[0].sum())):
+        outer = next((group for group in groups if not (mask & ~group[0]).any()), None)
+        if outer is None:
+            groups.append((mask, [each]))
+        else:
+            outer[1].append(each)
+    return np.any([_fill(group, width, height) for _, group in groups], axis=0)
+
+
+def _fill(polygons: list[np.ndarray], width: int, height: int) -> np.ndarray:
+    """(H, W) bool: inside an odd number of polygons, edges included."""
+    canvas = np.zeros((height, width), np.uint8)
+    cv2.fillPoly(canvas, polygons, 1)
+    return canvas.astype(bool)
+
+
+def read_json_masks(file: Path, size: tuple[int, int]) -> list[Bool[np.ndarray, "h w"]]:
+    """Reads the masks of one frame, the best first. Polygons are drawn on `size` (width, height), or on the file's."""
+    content = read_json(file, _JSON, _REMEDY)
+    with reading(file, _JSON, _REMEDY, problem="it holds no masks"):
+        records = _records(content)
+        images = [content.get("image"), *content.get("images", [])[:1]] if isinstance(content, dict) else []
+        size = next((own for own in map(_image_size, images) if own is not None), size)
+    return _decode_records(file, records, size)
+
+
+def _records(content: Any) -> list[Any]:
+    """The records of a file's masks: a list, or "annotations". Raises ValueError with the problem."""
+    if isinstance(content, dict) and "annotations" not in content:
+        raise ValueError("'annotations' is missing")
+    records = content["annotations"] if isinstance(content, dict) else content
+    if not isinstance(records, list):
+        raise ValueError("it is not a list")
+    for number, record in enumerate(records):
+        if not isinstance(record, dict) or "segmentation" not in record:
+            raise ValueError(f"'segmentation' is missing in record {number}")
+    return records
+
+
+def _decode_records(file: Path, records: list[Any], size: tuple[int, int]) -> list[np.ndarray]:
+    """The masks of records, those with the best scores (SAM's stability times predicted IoU) first."""
+    with reading(file, remedy=_REMEDY, problem="a mask's score is not a number"):
+        scores = [float(r.get("predicted_iou", 1.0)) * float(r.get("stability_score", 1.0)) for r in records]
+    masks = []
+    for number in np.argsort(-np.asarray(scores), kind="stable"):
+        segmentation, where = records[number]["segmentation"], f"{file}, mask {number}"
+        if isinstance(segmentation, dict):
+            masks.append(decode_rle(segmentation, where))
+        elif isinstance(segmentation, list):
+            masks += [_fill_polygons(segmentation, *size, where)] if segmentation else []
+        else:
+            raise InputError(where, f"the mask is {str(segmentation)[:40]!r}", "run lengths or polygons", _REMEDY)
+    return masks
+
+
+def _image_size(image: Any) -> tuple[int, int] | None:
+    """(width, height) of an image's record, or None."""
+    try:
+        width, height = int(image["width"]), int(image["height"])
+    except (TypeError, KeyError, ValueError, OverflowError):
+        return None
+    return (width, height) if 0 < width * height <= MAX_PIXELS and width > 0 else None
+
+
+class CocoFile:
+    """A COCO file of all frames."""
+
+    def __init__(self, file: Path, content: Any, frame_names: FrameNames):
+        self.file = file
+        with reading(file, _JSON, _REMEDY, problem="it is not a COCO file"):
+            images = {image["id"]: image for image in content["images"]}
+            records: dict[Any, list[Any]] = {number: [] for number in images}
+            for record in _records(content):
+                records[record["image_id"]].append(record)
+            paths = {number: PurePosixPath(str(image["file_name"])) for number, image in images.items()}
+        matches = {n: frame_names.match(Path(path.name), path.parts[:-1], "") for n, path in paths.items()}
+        self._images = {match.frame: (images[n], records[n]) for n, match in matches.items() if match is not None}
+        if not self._images:
+            first = next(iter(paths.values()), "no image")
+            problem = f"none of its {len(paths)} images is called like a frame (the first: {first})"
+            raise InputError(file, problem, remedy="Name the images like those of the capture.")
+
+    def __contains__(self, name: str) -> bool:
+        """Whether a frame is among its images."""
+        return name in self._images
+
+    def read(self, name: str, size: tuple[int, int]) -> list[Bool[np.ndarray, "h w"]]:
+        """Reads the masks of a frame as `read_json_masks` does."""
+        image, records = self._images[name]
+        return _decode_records(self.file, records, _image_size(image) or size)
+
+
+def open_coco(folder: Path, frame_names: FrameNames) -> CocoFile | None:
+    """Opens the COCO file of all frames: `folder` itself, or the only JSON in it if that lists images."""
+    files = [folder] if folder.is_file() else sorted(folder.glob("*.json")) if folder.is_dir() else []
+    if len(files) != 1 or (files[0] != folder and frame_names.match(files[0], (), ".json") is not None):
+        return None
+    if files[0].suffix.lower() != ".json":
+        return None
+    content = read_json(files[0], _JSON, _REMEDY)
+    is_coco = files[0] == folder or (isinstance(content, dict) and "images" in content)
+    return CocoFile(files[0], content, frame_names) if is_coco else None
