@@ -11,7 +11,7 @@ from small_field import REGIONS, make_field, shares, true_regions
 
 import jsecon
 from jsecon import InputError, Regions, Votes, load_gaussians, save_field
-from jsecon.read.splats.ply import read_elements
+from jsecon.read.splats.ply import read_vertices
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.reference_words import REFERENCE_WORDS
 
@@ -181,7 +181,7 @@ def test_exported_objects_and_labels_are_those_of_the_catalogue(field, file, tmp
     labels = np.load(ids)
     assert labels.dtype == np.int32
     np.testing.assert_array_equal(labels, catalogue.labels)
-    vertices = read_elements(scene)["vertex"]
+    vertices = read_vertices(scene)
     np.testing.assert_array_equal(vertices["object_id"], labels)
     whole = load_gaussians(scene)
     np.testing.assert_array_equal(whole.means, field.gaussians.means)
@@ -199,7 +199,7 @@ def test_only_and_without_part_the_scene_bit_for_bit(field, file, tmp_path, caps
         ids = tmp_path / f"{name}.npy"
         assert run_cli("export", file, f"--{name}", "red thing", "--out", paths[name], "--labels", ids) == 0
         assert len(np.load(ids)) == load_gaussians(paths[name]).count
-    rows = {name: [row.tobytes() for row in read_elements(path)["vertex"]] for name, path in paths.items()}
+    rows = {name: [row.tobytes() for row in read_vertices(path)] for name, path in paths.items()}
     assert sorted(rows["only"] + rows["without"]) == sorted(rows["scene"])
     assert 0 < len(rows["only"]) < len(rows["scene"])
     assert rows["only"] == [row for row in rows["scene"] if row in set(rows["only"])]

@@ -133,7 +133,7 @@ def read_ply_file(path: Path) -> tuple[memoryview, Header]:
     return data, _parse_header(path, data)
 
 
-def _read_vertices(path: Path) -> np.ndarray:
+def read_vertices(path: Path) -> np.ndarray:
     """(N,) structured array of the vertices' properties; of a binary file, mapped into memory."""
     data, header = read_ply_file(path)
     names = [element.name for element in header.elements]
@@ -211,7 +211,7 @@ def read_ply(path: Path) -> Gaussians:
 
     Other properties and elements are ignored.
     """
-    table = _read_vertices(path)
+    table = read_vertices(path)
     count, names = len(table), table.dtype.names or ()
     scales = _SCALE if "scale_2" in names else _SCALE[:2]
     has_rgb = all(name in names for name in _RGB) and not any(name in names for name in _DC)
@@ -391,7 +391,7 @@ def load_point_cloud(path: str | Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[
     Colours red green blue have 8 or 16 bits, or are floats (0..1, or 0..255 if any is above 1).
     """
     path = Path(path)
-    vertices = _read_vertices(path)
+    vertices = read_vertices(path)
     names = vertices.dtype.names or ()
     if missing := [name for name in _POSITION if name not in names]:
         raise _error(path, f"its vertices have no {', '.join(missing)}", "a point cloud with x y z")
