@@ -114,11 +114,11 @@ def test_a_cluster_without_support_of_the_views_is_dropped():
     means = np.concatenate([0.1 * rng.normal(size=(200, 3)), 5 + 0.1 * rng.normal(size=(150, 3))])
     whole = np.ones(350, bool)
     weight = np.repeat([1.0, 0.01], [200, 150])
-    assert jsecon.remove_outliers(means, whole, keep="supported")[200:].mean() > 0.95
-    kept = jsecon.remove_outliers(means, whole, keep="supported", weight=weight)
+    assert jsecon.remove_outliers(means, whole)[200:].mean() > 0.95
+    kept = jsecon.remove_outliers(means, whole, weight=weight)
     assert kept[:200].mean() > 0.95
     assert not kept[200:].any()
-    assert not jsecon.remove_outliers(means, whole)[200:].any()  # the largest alone
+    assert not jsecon.remove_outliers(means, whole, keep="largest")[200:].any()  # the largest alone
 
 
 def painted(wall, things):

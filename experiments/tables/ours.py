@@ -171,7 +171,11 @@ def ask_field(
             if instead and (other := parts_fallback(whole, text, found.score, rules)) is not None:
                 found = other
         mask = np.asarray(found.mask)
-        return dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, mask))) if clean else found
+        return (
+            dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, mask, keep="largest")))
+            if clean
+            else found
+        )
 
     if way not in ("votes", "all"):
         return by_selection(setting, ask, codes.gaussians)

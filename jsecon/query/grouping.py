@@ -264,7 +264,7 @@ def _best_cluster(
         return mask
     points = np.asarray(means)[chosen].astype(np.float64)
     # A smaller radius than for outliers, so that neighbouring objects part.
-    cluster = dbscan(points, default_eps(points, spacings=3.0), MIN_SAMPLES)
+    cluster = dbscan(points, default_eps(points, spacings=3.0))
     if cluster.max() < 0:
         return mask
     sizes = np.bincount(cluster[cluster >= 0])

@@ -51,27 +51,25 @@ def remove_outliers(
     means: Float[Array, "n 3"],
     mask: Bool[Array, " n"],
     *,
-    eps: float | None = None,
-    min_samples: int = MIN_SAMPLES,
-    keep: str = "largest",
     weight: Float[Array, " n"] | None = None,
+    keep: str = "supported",
+    eps: float | None = None,
 ) -> Bool[np.ndarray, " n"]:
     """Removes the selected Gaussians that lie apart, by DBSCAN on their centres. Host code: it cannot be traced.
 
     Noise is dropped, and so are the clusters that `keep` does not name. Three kinds of selections come back as they
-    are, except for centres that are not finite: fewer than `min_samples` points, a single component (no gap of eps
+    are, except for centres that are not finite: fewer than MIN_SAMPLES points, a single component (no gap of eps
     anywhere), and points in which DBSCAN finds no cluster.
 
     Args:
       means: (N, 3) centres, world units.
       mask: (N,) the selected Gaussians.
+      weight: (N,) how much the views' masks show of each Gaussian, in pixels. `jsecon query` takes similarity *
+        votes.total of the selection; None counts each as 1.
+      keep: "supported" keeps each cluster that has at least MIN_CLUSTER_SUPPORT of the weight of the heaviest: a mask
+        may show one object in several pieces. "largest" keeps the cluster with most Gaussians (the paper). "all" keeps
+        every cluster.
       eps: Radius, world units; None takes `default_eps` of the selection, which follows its scale.
-      min_samples: Number of points within eps, itself included, that make a core point.
-      keep: "largest" keeps the cluster with most Gaussians (the paper). "supported" keeps each cluster that has at
-        least MIN_CLUSTER_SUPPORT of the weight of the heaviest: a mask may show one object in several pieces. "all"
-        keeps every cluster.
-      weight: (N,) with keep="supported", how much the views' masks show of each Gaussian, such as share * votes.total,
-        in pixels; None counts each as 1.
 
     Returns:
       (N,) bool.
@@ -79,38 +77,21 @@ def remove_outliers(
     Raises:
       ValueError: An option is out of range, or `weight` has another length.
     """
-    return split_outliers(means, mask, eps=eps, min_samples=min_samples, keep=keep, weight=weight).mask
+    return split_outliers(means, mask, weight=weight, keep=keep, eps=eps).mask
 
 
 def split_outliers(
     means: Float[Array, "n 3"],
     mask: Bool[Array, " n"],
     *,
-    eps: float | None = None,
-    min_samples: int = MIN_SAMPLES,
-    keep: str = "largest",
     weight: Float[Array, " n"] | None = None,
+    keep: str = "supported",
+    eps: float | None = None,
 ) -> OutlierResult:
-    """Removes outliers as `remove_outliers` does, and counts the clusters.
-
-    Args:
-      means: (N, 3) centres, world units.
-      mask: (N,) the selected Gaussians.
-      eps: Radius, world units; None takes `default_eps` of the selection.
-      min_samples: Number of points within eps, itself included, that make a core point.
-      keep: "largest", "supported" or "all".
-      weight: (N,) weights with keep="supported"; None counts each as 1.
-
-    Returns:
-      The mask without outliers, and how many clusters were kept and dropped.
-
-    Raises:
-      ValueError: An option is out of range, or `weight` has another length.
-    """
+    """Removes outliers as `remove_outliers` does, and counts the clusters."""
     require_one_of("remove_outliers", keep, KEEP, "Use 'all' to keep several objects.")
-    positive, options = min_samples >= 1 and (eps is None or eps > 0), f"eps={eps}, min_samples={min_samples}"
     remedy = "Leave eps out to have it follow the selection's spacing."
-    require(positive, "remove_outliers", options, "eps > 0 and min_samples >= 1", remedy)
+    require(eps is None or eps > 0, "remove_outliers", f"eps={eps}", "eps > 0", remedy)
     if weight is not None:
         require_shape("weight", weight, (len(means),), "Give one weight per Gaussian.")
     mask = np.array(mask, bool)
@@ -119,15 +100,15 @@ def split_outliers(
     finite = np.isfinite(points).all(axis=1)
     mask[chosen[~finite]] = False
     chosen, points = chosen[finite], points[finite]
-    if len(chosen) < min_samples:
-        return OutlierResult(mask, f"fewer than {min_samples} Gaussians are selected", 0, 0)
+    if len(chosen) < MIN_SAMPLES:
+        return OutlierResult(mask, f"fewer than {MIN_SAMPLES} Gaussians are selected", 0, 0)
     links = _links(points) if len(points) <= _EXACT_POINTS else None
     if eps is None:  # the links tell, unless more than half of the points coincide
         eps = EPS_SPACINGS * float(np.median(links[0][:, min(3, len(points) - 1)])) if links else 0.0
         eps = eps or default_eps(points)
     if _one_component(points, eps, links):  # then nothing lies apart, and DBSCAN is not needed
         return OutlierResult(mask, "the selection is one component", 1, 0)
-    labels = dbscan(points, eps, min_samples)
+    labels = dbscan(points, eps)
     if labels.max() < 0:
         return OutlierResult(mask, "", 0, 0)
     clustered = labels >= 0
@@ -144,15 +125,10 @@ def split_outliers(
 
 
 def default_eps(points: Float[Array, "m 3"], *, spacings: float = EPS_SPACINGS) -> float:
-    """Chooses DBSCAN's radius by the median distance of points to their third neighbour.
+    """Chooses DBSCAN's radius: `spacings` times the median distance of points to their third neighbour.
 
-    Args:
-      points: (M, 3), world units; the median is taken over at most 20,000 of them.
-      spacings: Factor on that distance.
-
-    Returns:
-      Radius, world units. If more than half of the points coincide the spacing is that of the distinct ones; 1 if there
-      is only one place.
+    The median is taken over at most 20,000 points. If more than half of the points coincide the spacing is that of the
+    distinct ones; the radius is 1 if there is only one place.
     """
     points = np.asarray(points, np.float64)
     for candidates in (points, np.unique(points, axis=0)):
@@ -165,16 +141,10 @@ def default_eps(points: Float[Array, "m 3"], *, spacings: float = EPS_SPACINGS) 
     return 1.0
 
 
-def dbscan(points: Float[Array, "m 3"], eps: float, min_samples: int) -> Int[np.ndarray, " m"]:
-    """Clusters points by scikit-learn's DBSCAN. Above 5,000 points those of one voxel have one label.
+def dbscan(points: Float[Array, "m 3"], eps: float, min_samples: int = MIN_SAMPLES) -> Int[np.ndarray, " m"]:
+    """Clusters points by scikit-learn's DBSCAN: counted from 0 in the order of their first core point, -1 for noise.
 
-    Args:
-      points: (M, 3), world units.
-      eps: Radius, world units.
-      min_samples: Number of points within eps, itself included, that make a core point.
-
-    Returns:
-      (M,) cluster, counted from 0 in the order of their first core point; -1 for noise.
+    Above 5,000 points those of one voxel have one label.
     """
     from sklearn.cluster import DBSCAN
 
