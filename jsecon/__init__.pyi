@@ -32,13 +32,9 @@ from .field.regions import region_embeddings as region_embeddings
 from .field.streaming import region_votes_in_blocks as region_votes_in_blocks
 from .field.votes import region_votes as region_votes, scan_region_votes as scan_region_votes
 from .paper.algorithm1 import masklets as masklets
-from .paper.autoencoder import decode as decode, encode as encode, train_autoencoder as train_autoencoder
+from .paper.autoencoder import encode as encode, train_autoencoder as train_autoencoder
 from .paper.distill import distill_l1 as distill_l1, distill_votes as distill_votes
-from .paper.queries import (
-    query_canonical as query_canonical,
-    query_gt_anchored as query_gt_anchored,
-    query_one_step as query_one_step,
-)
+from .paper.queries import query_canonical as query_canonical, query_one_step as query_one_step
 from .parallel import host_mesh as host_mesh
 from .query.answer import (
     RegionMatch as RegionMatch,

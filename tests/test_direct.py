@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon import query_canonical, query_gt_anchored, query_one_step
+from jsecon import query_canonical, query_one_step
+from jsecon.paper.queries import query_gt_anchored
 
 
 def exact_cosines(codes, code):

@@ -54,11 +54,7 @@ def calls(field, labels):
         "query_classes": lambda: jsecon.query_classes(field, field.regions.embeddings[:2]),
         "query_one_step": lambda: jsecon.query_one_step(codes, codes[0], 0.5),
         "query_canonical": lambda: jsecon.query_canonical(codes, codes[0], codes[1:3], 0.5),
-        "query_gt_anchored": lambda: jsecon.query_gt_anchored(
-            codes, field.codes.regions, field.regions.embeddings, text
-        ),
         "encode": lambda: jsecon.encode(autoencoder(), field.regions.embeddings),
-        "decode": lambda: jsecon.decode(autoencoder(), codes[:, :2]),
         "selection_mask": lambda: jsecon.selection_mask(scene, camera, mask),
         "iou": lambda: jsecon.iou(mask, ~mask),
         "mean_iou": lambda: jnp.asarray(jsecon.mean_iou([0.5, None])),

@@ -2,7 +2,12 @@
 
 For every labelled frame and category, the Gaussians selected for the category (once per scene) are rendered alone at
 the size of the labels. The mask is alpha > 0.7, and its IoU with the labelled mask counts for the pair. mIoU and
-mAcc@0.25 (strict) are over all pairs; a pair without prediction counts as 0.
+mAcc@0.25 (strict) are over all pairs; a pair without prediction counts as 0. Localisation has three definitions:
+
+    loc_box    the paper's ("Evaluation metrics"): the centre of the mask's bounding box lies in a labelled box
+    loc_acc    the peak of the similarity, composited by sum alpha T s over the selected Gaussians alone and averaged
+               over a window of 4 % of the image height, lies in a labelled box, edges included
+    loc_mask   after the same smoothing of the mask, any of its largest pixels (LangSplat's rule for ties) lies in one
 """
 
 import dataclasses
@@ -26,30 +31,19 @@ LOCALISATION_WINDOW = 0.04
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """Result of one (frame, query) pair."""
+    """Result of one (frame, category) pair; of a missing prediction IoU 0 and no point."""
 
     frame: str
-    """Name of the labelled frame."""
     query: str
-    """Category."""
     iou: float
-    """IoU of the rendered selection with the labelled mask; 0 for a missing prediction."""
-    located: bool
-    """Localisation by the peak of similarity: whether `point` lies in a labelled box."""
-    touched: bool
-    """Localisation by the mask: whether any of its innermost pixels lies in a labelled box."""
-    centred: bool
-    """The paper's Loc. Acc.: whether the centre of the mask's bounding box lies in a labelled box."""
-    point: tuple[int, int] | None
-    """x, y px of the peak of similarity; None for a missing prediction."""
-    selected: int
-    """Number of selected Gaussians."""
-    region: int
-    """Region that anchored the query, or -1."""
+    located: bool  # loc_acc
+    touched: bool  # loc_mask
+    centred: bool  # loc_box
+    point: tuple[int, int] | None  # x, y px of the peak of similarity
+    selected: int  # number of Gaussians
+    region: int  # that anchored the query, or -1
     score: float
-    """Score of the query."""
-    mask: np.ndarray = dataclasses.field(repr=False, compare=False)
-    """(H, W) bool mask of the rendered selection, for pictures."""
+    mask: np.ndarray = dataclasses.field(repr=False, compare=False)  # (H, W) bool, for pictures
 
 
 def evaluate_at_thresholds(
@@ -64,26 +58,17 @@ def evaluate_at_thresholds(
 ) -> dict[float, tuple[list[Row], dict]]:
     """Evaluates selections at several alpha thresholds, from one rendering per pair.
 
-    Localisation has three definitions. summary["loc_box"], the paper's ("Evaluation metrics"): the centre of the
-    bounding box of the mask lies in a labelled box. summary["loc_acc"], by the peak: the maximum of the similarity of
-    the selected Gaussians, composited by sum alpha T s over them alone and averaged over a window of 4 % of the image
-    height, lies in a labelled box of the category, edges included. summary["loc_mask"], by the mask: after the same
-    smoothing of the mask, any of its largest pixels (LangSplat's rule for ties) lies in a box.
-
     Args:
       gaussians: Scene of N Gaussians.
       cameras: Camera of each frame by name, of any size with the aspect of the labels.
       labels: Labelled frames.
       select: Maps a category to a selection of Gaussians; None, no answer, counts as missing.
       alpha_thresholds: Thresholds of the mask, by default those of OpenGaussian and VALA.
-      expected_pairs: Number of pairs of the protocol (`experiments.datasets.lerf_ovs.LERF_PAIRS`), which is checked.
+      expected_pairs: Number of pairs of the protocol, which is checked.
       progress: Called with the number of pairs done and of all.
 
     Returns:
       For each threshold the rows, one per labelled (frame, query) pair, and their summary.
-
-    Raises:
-      InputError: A labelled frame has no camera or another aspect, or the number of pairs is 0 or not as expected.
     """
     for frame in labels:
         _check(frame, cameras)
@@ -121,7 +106,7 @@ def _summary(rows: Sequence[Row], alpha_threshold: float) -> dict:
 
 
 def _labelled_pairs(labels: Sequence[LabelledFrame], expected: int | None) -> list[tuple[LabelledFrame, str]]:
-    """Returns all (frame, query) pairs. Raises InputError if there are no pairs, or not as many as `expected`."""
+    """All (frame, query) pairs, which must be as many as `expected`."""
     pairs = [(frame, query) for frame in labels for query in frame.objects]
     if not pairs or (expected is not None and len(pairs) != expected):
         remedy = "Evaluate on all label files of the protocol."

@@ -76,15 +76,7 @@ def localization_accuracy(points: Iterable[Point | None], boxes: Iterable[Float[
 
 
 def in_any_box(point: Point, boxes: Float[Array, "b 4"]) -> bool:
-    """Whether a point lies inside of a box, edges included.
-
-    Args:
-      point: (x, y), px.
-      boxes: (B, 4) x1 y1 x2 y2, px; B may be 0.
-
-    Returns:
-      True if it lies in any of them.
-    """
+    """Whether a point (x, y) lies inside of any box, edges included; B may be 0."""
     x, y = point
     boxes = np.asarray(boxes)
     return bool(((boxes[:, 0] <= x) & (x <= boxes[:, 2]) & (boxes[:, 1] <= y) & (y <= boxes[:, 3])).any())

@@ -23,13 +23,9 @@ from jsecon.vision.protocols import Segmenter, Tracker
 class MaskletState:
     """State of `masklets` between two frames, to resume from."""
 
-    done: int
-    """Number of frames whose proposals were tracked."""
-    proposals: dict[str, np.ndarray]
-    """Proposals of every frame: `rows` (T,) masks per frame; `counts`, `starts`, `stops` of their runs, as in
-    `RunLengthMasks`."""
-    layers: dict[str, np.ndarray]
-    """Tracked masks of every frame, in the same layout."""
+    done: int  # number of frames whose proposals were tracked
+    proposals: dict[str, np.ndarray]  # of every frame: `rows` (T,) masks, and `counts`, `starts`, `stops` of their runs
+    layers: dict[str, np.ndarray]  # the tracked masks of every frame, in the same layout
 
 
 def masklets(
@@ -47,14 +43,14 @@ def masklets(
     """Makes the masklets of a sequence by Algorithm 1 of the paper.
 
     For each frame t in order, a proposal becomes a prompt if it fills at least `min_area` of the frame and its IoU with
-    the mask of every masklet in frame t is at most `iou_threshold`. The prompts of a frame are tracked through the
-    whole sequence. Proposals of one frame that repeat each other count once, the better first.
+    the mask of every masklet in frame t is at most `iou_threshold`; of those that repeat each other the best does. The
+    prompts of a frame are tracked through the whole sequence.
 
-    Parts: two masklets are joined if most of the frames that show both have a proposal that contains both. Overlaps:
-    the support of a masklet is its mean best IoU with the proposals of the frames that show it. A pixel belongs to the
-    smallest masklet (in mean area) with a support of at least a half, else to the best supported. So objects that are
-    proposed repeatedly are cut out of their surroundings, and single fragments and mergers have no influence. Finally
-    masklets that only one frame shows are removed (`clean_tracks`).
+    Two masklets are joined if most of the frames that show both (at least two) have a proposal that contains both. A
+    pixel under several belongs to the smallest (in mean area) with a support of at least a half, else to the best
+    supported; support is the mean best IoU with the proposals of the frames that show a masklet. So objects that are
+    proposed repeatedly are cut out of their surroundings, and single fragments and mergers have no influence. Masklets
+    that only one frame shows are removed (`clean_tracks`).
 
     Args:
       frames: (T, H, W, 3) uint8 RGB.
@@ -108,9 +104,8 @@ def masklets(
 def _joined(layers: "_Layers", proposals: "_Layers") -> tuple["_Layers", np.ndarray, np.ndarray]:
     """Joins masklets that are parts of one object; returns them, their mean areas (R,) in px and their support (R,).
 
-    Two masklets are one object in a frame if a proposal there covers more than half of each. They are joined if that
-    holds in more than half of the frames (at least two) that show both, best pairs first: view consensus (Yan et al.,
-    CVPR 2024) between tracks instead of single masks.
+    In a frame two are one object if a proposal covers more than half of each: view consensus (Yan et al., CVPR 2024)
+    between tracks instead of single masks.
     """
     tables: list[tuple[np.ndarray, ...]] = [_overlaps(layers.at(t), proposals.at(t)) for t in range(layers.count)]
     while True:

@@ -45,18 +45,7 @@ def encode(autoencoder: Autoencoder, embeddings: Float[Array, "*batch e"]) -> Fl
 
 
 def decode(autoencoder: Autoencoder, codes: Float[Array, "*batch d"]) -> Float[Array, "*batch e"]:
-    """Decodes codes: phi = D(l).
-
-    Args:
-      autoencoder: Of the field, `field.codes.autoencoder`.
-      codes: (..., d) of any length.
-
-    Returns:
-      (..., E) unit embeddings.
-
-    Raises:
-      ValueError: Codes of another size.
-    """
+    """Decodes codes (..., d) of any length to unit embeddings (..., E): phi = D(l)."""
     size = autoencoder.decoder[0]["weight"].shape[0]
     require_shape("codes", codes, (..., size), "Decode codes of this autoencoder.")
     codes = jnp.asarray(codes)

@@ -110,12 +110,12 @@ class _State(NamedTuple):
 
 
 class Distillation(NamedTuple):
-    """What `distill_l1` trains."""
+    """What `distill_l1` trains. A loss is NaN for a view that overflowed the capacity."""
 
-    codes: Float[Array, "n d"]
-    """(N, d) of unit length; zero for Gaussians that no labelled pixel sees and that started at zero or random."""
-    losses: Float[Array, " steps"]
-    """(steps,) before each step; NaN for a view that overflowed the capacity."""
+    codes: Float[
+        Array, "n d"
+    ]  # unit; zero for Gaussians that no labelled pixel sees, if they started at zero or random
+    losses: Float[Array, " steps"]  # before each step
 
 
 def distill_l1(
@@ -137,8 +137,7 @@ def distill_l1(
     Args:
       gaussians: Scene of N Gaussians.
       cameras: Batch of T cameras.
-      labels: (T, H, W) integer region ids, -1 where a pixel belongs to no region. Inside a trace ids of R and more
-        count as -1.
+      labels: (T, H, W) integer region ids, -1 for none. Inside a trace ids of R and more count as -1.
       region_codes: (R, d) codes of the regions.
       steps: Number of steps.
       key: Random key of the order of views and of random codes.
@@ -153,8 +152,7 @@ def distill_l1(
       The codes and the losses.
 
     Raises:
-      ValueError: Shapes disagree, or labels are no integers; outside a trace also for such a NaN and for labels of R
-        and more.
+      ValueError: Shapes disagree, or labels are no integers; outside a trace also for a NaN and labels of R and more.
     """
     require_labels(labels, len(region_codes))
     start = _start(gaussians, cameras, labels, region_codes, steps=steps, key=key, init=init)
@@ -217,16 +215,11 @@ def _start(
 def rendered_l1(
     features: Float[Array, "n d"], plan: ViewPlan, labels: Int[Array, "h w"], region_codes: Float[Array, "r d"]
 ) -> tuple[Float[Array, ""], Int[Array, ""]]:
-    """Computes the paper's loss of one view, the mean over all H W d numbers of |F m - G m|, and the overflow. Pure.
+    """Computes the paper's loss of one view, the mean over all H W d numbers of |F m - G m|, and the overflow.
 
-    F renders f / (|f| + 1e-9) without background or renormalisation, G has the code of each pixel's region, and m is 1
-    on labelled pixels, so unlabelled ones count in the denominator alone.
-
-    Args:
-      features: (N, d) features of the Gaussians, of any length.
-      plan: `plan_view` of the N Gaussians.
-      labels: (H, W) region ids; those below 0, of R and more, or of a zero code count as unlabelled.
-      region_codes: (R, d) unit codes, R >= 1.
+    F renders f / (|f| + 1e-9) without background or renormalisation, G has the unit code of each pixel's region, and m
+    is 1 on labelled pixels, so unlabelled ones (no region from 0 to R - 1, or a zero code) count in the denominator
+    alone.
     """
     ids = jnp.clip(labels, 0, len(region_codes) - 1)
     known = jnp.any(region_codes != 0, axis=-1)

@@ -104,15 +104,7 @@ def query_gt_anchored(
 ) -> Selection:
     """Selects the Gaussians whose code is close to that of the region most similar to the text: both steps.
 
-    Args:
-      codes: (N, d) codes of the Gaussians.
-      region_codes: (R, d) codes of the regions.
-      region_embeddings: (R, E) embeddings of the regions.
-      text: (E,) embedding of the text.
-      threshold: Smallest cosine with the region's code.
-
-    Returns:
-      The selection. `region` is -1 and the mask is empty without regions, or for a broken text.
+    `region` is -1 and the mask is empty without regions, or for a broken text.
     """
     if len(region_codes) == 0:
         none = jnp.zeros(len(codes), codes.dtype)

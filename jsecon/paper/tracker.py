@@ -137,7 +137,7 @@ class GeometricTracker:
     def _match(
         self, view: FrameSuperpixels, evidence: Float[np.ndarray, "n c"], best: Float[np.ndarray, " n"]
     ) -> Int[np.ndarray, " a"]:
-        """Classifies each atom; returns (A,) ids or -1. `best` (n,) is the clarity in the best frame so far."""
+        """Classes (A,) of the superpixels, or -1. `best` (n,) is the clarity in the best frame so far."""
         # A Gaussian on an outline overlaps its neighbours and is counted with them, in view after view. So it counts
         # only if another view has seen about as much of it as this one does, and has assigned it.
         assigned = evidence.sum(1) / np.maximum(view.totals * view.clarity, 1e-6)
@@ -153,19 +153,16 @@ class GeometricTracker:
         return np.where(owner >= 0, classes[owner], -1)
 
 
-def _label_shares(atoms: np.ndarray, labels: np.ndarray, rows: int, columns: int) -> Sparse:
-    """Returns a sparse matrix (`rows`, `columns`): the share of the pixels of each atom that carry each label."""
+def _label_shares(pieces: np.ndarray, labels: np.ndarray, rows: int, columns: int) -> Sparse:
+    """Returns a sparse matrix (`rows`, `columns`): the share of the pixels of each superpixel that carry each label."""
     inside = labels >= 0
-    weights = 1.0 / np.bincount(atoms.reshape(-1), minlength=rows)[atoms[inside]]
-    return sparse.csr_matrix((weights.astype(np.float32), (atoms[inside], labels[inside])), shape=(rows, columns))
+    weights = 1.0 / np.bincount(pieces.reshape(-1), minlength=rows)[pieces[inside]]
+    return sparse.csr_matrix((weights.astype(np.float32), (pieces[inside], labels[inside])), shape=(rows, columns))
 
 
 def _evidence(
     view: FrameSuperpixels, owner: Int[np.ndarray, " a"], count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns rows, classes and weights (times clarity) of the nonzero evidence of a view.
-
-    `owner` (A,) is the class of each atom of the view, -1 if unassigned.
-    """
+    """Rows, classes and weights (times clarity) of a view's evidence, by the classes (A,) of its superpixels."""
     cast = (view.votes @ one_hot(owner, count)).tocoo()
     return cast.row, cast.col, view.clarity[cast.row] * cast.data
