@@ -27,7 +27,7 @@ TABLES = {"lerf": (lerf.PLAN, lerf.QUICK), "ovs3d": (ovs3d.PLAN, ovs3d.QUICK), "
 RESAMPLED = 2000
 BESIDE = "macc", "loc_box"
 """of the reading that is best by the first figure; loc_box is the paper's Loc. Acc., where silhouettes are judged"""
-_QUICK_RULES = ("contrast", "apart")
+_QUICK_RULES = ("centred", "contrast")
 QUICK_READ = (
     "as published",
     *(f"{rule}, {way}" for rule in _QUICK_RULES for way in ("threshold", "lenient silhouette", "threshold, centre")),

@@ -3,9 +3,9 @@
     python -m experiments.worlds [--scenes-trained figurines] [--seeds-trained 10] [--quick] [--processes N]
 
 Twins of LERF at medium noise. The rows are those of `experiments.fair` that need no training, each read as its paper
-does (by the relevancy) and by the contrast or "apart" with a threshold or an ascent, for > 0.7 or > 10/255 (the rivals'
-of linear and of sharp shares; ours of one region, and of all that answer): the best in that world on the seeds
-`--choosing`, for each figure its own. None may refuse a text. Methods that train take minutes a setting: those of
+does (by the relevancy) and by the centred cosine or "contrast" with a threshold or an ascent, for > 0.7 or > 10/255
+(the rivals' of linear and of sharp shares; ours of one region, and of all that answer): the best in that world on the
+seeds `--choosing`, for each figure its own. None may refuse a text. Methods that train take minutes a setting: those of
 `--scenes-trained` and `--seeds-trained` have them too, in tables of their own beside all the others there; a method
 that trains is read as is best on those very seeds, so that its figure is the most that a reading could give.
 """
@@ -30,14 +30,14 @@ under which no answer would be left to be told from another"""
 FRAMES = "kinds", "camouflage"
 """faults of the labels and of the pictures (options of the twins' writer), not of the vision"""
 FAULTS = (*(field.name for field in dataclasses.fields(World)), *FRAMES)
-_RULES = ("contrast", "apart")
+_RULES = ("centred", "contrast")
 READ = ("relevancy, threshold", *(f"{rule}, threshold{way}" for rule in _RULES for way in ("", ", all")))
 READ += tuple(
     f"{rule}, {kind} silhouette{way}" for rule in _RULES for kind in ("strict", "lenient") for way in ("", SHARP)
 )
 QUICK_READ = (
-    *("relevancy, threshold", "apart, threshold", "apart, threshold, all"),
-    *("apart, strict silhouette", f"contrast, lenient silhouette{SHARP}"),
+    *("relevancy, threshold", "contrast, threshold", "contrast, threshold, all"),
+    *("contrast, strict silhouette", f"centred, lenient silhouette{SHARP}"),
 )
 """of a quick run: each rule and each way of choosing Gaussians once"""
 READ_TRAINED = (*READ, fair.PUBLISHED, "one mask", "cosine, threshold")

@@ -147,7 +147,7 @@ def test_nothing_passes_a_min_score_that_no_region_reaches(field):
     text = unit_rows(np.random.default_rng(9), 1, 12)[0]
     words = unit_rows(np.random.default_rng(10), 30, 12)
     worded = dataclasses.replace(field, unrelated_words=words)
-    directions = {"cosine": text, "apart": text - words.mean(0)}
+    directions = {"cosine": text, "contrast": text - words.mean(0)}
     for by, (retrieval, direction) in itertools.product(("votes", "code"), directions.items()):
         best_of = functools.partial(ask, worded, text, by)
         rules = functools.partial(QueryRules, retrieval=retrieval)

@@ -50,12 +50,12 @@ def exact(field, similarity, least):
     return np.array(found), np.array(parts)
 
 
-@pytest.mark.parametrize(("retrieval", "count"), [("apart", 600), ("cosine", 60)])
+@pytest.mark.parametrize(("retrieval", "count"), [("contrast", 600), ("cosine", 60)])
 def test_equals_the_formula(retrieval, count):
     field, texts = made_field(count), unit_rows(np.random.default_rng(1), 5, SIZE)
     known = field.regions
     similarity = known.embeddings @ texts.T
-    if retrieval == "apart":
+    if retrieval == "contrast":
         field = dataclasses.replace(field, unrelated_words=unit_rows(np.random.default_rng(6), 20, SIZE))
         directions = texts - field.unrelated_words.astype(np.float64).mean(0)
         similarity = known.embeddings @ (directions / np.linalg.norm(directions, axis=1, keepdims=True)).T
@@ -188,5 +188,5 @@ def test_refuses_what_it_cannot_ask():
     for wrong in (texts[:, :5], texts[:0]):
         with pytest.raises(ValueError, match="query_classes"):
             query_classes(field, wrong)
-    with pytest.raises(ValueError, match="apart"):
+    with pytest.raises(ValueError, match="contrast"):
         query_classes(field, texts, rules=QueryRules(retrieval="nearest"))

@@ -44,7 +44,7 @@ def with_other(field, overlap, **changes):
     return dataclasses.replace(field, votes=dataclasses.replace(field.votes, overlap=overlap), **changes)
 
 
-@pytest.mark.parametrize("retrieval", ["cosine", "apart"])
+@pytest.mark.parametrize("retrieval", ["cosine", "contrast"])
 def test_a_text_finds_a_thing_with_its_pieces_but_no_other_of_its_kind(broken, retrieval):
     text = broken.regions.embeddings[0]
     found = query_anchored(broken, text, rules=QueryRules(retrieval=retrieval))

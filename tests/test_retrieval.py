@@ -25,7 +25,7 @@ def unit(rows):
 
 
 def exact(embeddings, text, words):
-    """The formula by "apart", for finite rows."""
+    """The formula by "contrast", for finite rows."""
     direction = unit(text.astype(np.float64)) - unit(words.astype(np.float64)).mean(0)
     return unit(embeddings.astype(np.float64)) @ unit(direction)
 
@@ -39,25 +39,25 @@ def rows():
 
 def test_equals_the_formula(rows):
     embeddings, text, words = rows
-    got, known = region_similarities(*rows, "apart")
+    got, known = region_similarities(*rows, "contrast")
     np.testing.assert_allclose(got, exact(*rows), atol=1e-6)
     assert np.asarray(known).all()
     plain = similarities(jnp.asarray(embeddings), jnp.asarray(text))[0]
     np.testing.assert_array_equal(region_similarities(*rows, "cosine")[0], plain)
-    np.testing.assert_array_equal(region_similarities(embeddings, text, None, "apart")[0], plain)
+    np.testing.assert_array_equal(region_similarities(embeddings, text, None, "contrast")[0], plain)
     np.testing.assert_allclose(word_similarities(embeddings, words, "cosine"), words @ embeddings.T, atol=1e-6)
 
 
 def test_rows_without_a_direction_are_unknown(rows):
     embeddings, text, words = rows
     more = np.concatenate([embeddings, np.zeros((1, SIZE), np.float32), np.full((1, SIZE), np.nan, np.float32)])
-    got, known = region_similarities(more, text, words, "apart")
+    got, known = region_similarities(more, text, words, "contrast")
     np.testing.assert_array_equal(known, [True] * 7 + [False] * 2)
     np.testing.assert_allclose(got, np.append(exact(*rows), [0, 0]), atol=1e-6)
-    got, known = region_similarities(embeddings, np.full_like(text, np.nan), words, "apart")
+    got, known = region_similarities(embeddings, np.full_like(text, np.nan), words, "contrast")
     assert not np.asarray(known).any()
     np.testing.assert_array_equal(got, 0)
-    got, known = region_similarities(embeddings[:0], text, words, "apart")
+    got, known = region_similarities(embeddings[:0], text, words, "contrast")
     assert got.shape == known.shape == (0,)
 
 
@@ -66,7 +66,7 @@ def test_jit_and_vmap_over_texts_equal_the_loop_for_many_regions():
     embeddings, texts, words = unit_rows(rng, 400, SIZE), unit_rows(rng, 3, SIZE), unit_rows(rng, 4, SIZE)
 
     def ask(text):
-        return region_similarities(embeddings, text, words, "apart")
+        return region_similarities(embeddings, text, words, "contrast")
 
     together, known = jax.jit(jax.vmap(ask))(texts)
     assert np.asarray(known).all()
@@ -77,7 +77,7 @@ def test_jit_and_vmap_over_texts_equal_the_loop_for_many_regions():
 
 def test_gradient_equals_central_differences(rows, x64):
     given = tuple(jnp.asarray(a, jnp.float64) for a in rows)
-    similar = jax.jit(lambda *given: region_similarities(*given, "apart")[0])
+    similar = jax.jit(lambda *given: region_similarities(*given, "contrast")[0])
     check_grads(similar, given, order=1, modes=["rev"], rtol=1e-5, atol=0, eps=1e-6)
 
 
@@ -88,14 +88,17 @@ def test_a_query_finds_its_region_by_the_one_or_the_other(worded):
     field = dataclasses.replace(field, unrelated_words=like_one)
     for text in texts[:10]:
         weight = np.asarray(view_count_weight(field.regions.pixel_counts))
-        scores = {"cosine": embeddings @ text, "apart": exact(embeddings, text, field.unrelated_words)}
-        ranked = {"cosine": scores["cosine"], "apart": np.where(scores["apart"] > 0, weight, 1) * scores["apart"]}
+        scores = {"cosine": embeddings @ text, "contrast": exact(embeddings, text, field.unrelated_words)}
+        ranked = {
+            "cosine": scores["cosine"],
+            "contrast": np.where(scores["contrast"] > 0, weight, 1) * scores["contrast"],
+        }
         for retrieval, score in scores.items():
             got = query_anchored(field, text, rules=QueryRules(retrieval=retrieval, min_rank=0.0))
             best = ranked[retrieval].argmax()
             assert int(got.region) == best
             assert float(got.score) == pytest.approx(score[best], abs=1e-5)
-        differ += ranked["cosine"].argmax() != ranked["apart"].argmax()
+        differ += ranked["cosine"].argmax() != ranked["contrast"].argmax()
     assert differ
     bare, text = dataclasses.replace(field, unrelated_words=None), texts[0]
     against = -embeddings.sum(0)
@@ -103,7 +106,7 @@ def test_a_query_finds_its_region_by_the_one_or_the_other(worded):
     high = query_anchored(bare, against).region
     assert int(low) >= 0 > int(high)  # without words and threshold it is MIN_COSINE
     assert (embeddings @ unit(against)).max() < MIN_COSINE
-    with pytest.raises(ValueError, match="apart"):
+    with pytest.raises(ValueError, match="contrast"):
         QueryRules(retrieval="nearest")
 
 
@@ -132,7 +135,7 @@ def test_a_thing_that_fills_a_third_of_all_views_is_found_before_slivers_of_its_
         row[:count] = 700
     text = red.astype(np.float32)
     words = unit_rows(rng, 40, 64)
-    plain, _ = region_similarities(embeddings, text, words, "apart")
+    plain, _ = region_similarities(embeddings, text, words, "contrast")
     assert int(jnp.argmax(plain)) > 2  # by the similarity alone a sliver wins
     field = field_of(lone_votes(np.arange(6), 6), Regions(embeddings, pixels))
     field = dataclasses.replace(field, unrelated_words=words)

@@ -24,7 +24,7 @@ def test_all_of_a_kind_are_found_and_no_others(field):
     rows = field.regions.embeddings
     chosen = match_regions(field, rows[:1], ALL_OF_CLASS).chosen
     assert np.asarray(chosen).tolist() == [True, True, False, False, False]  # from 0.75 of the way from 0 to 1 on
-    for retrieval in ("apart", "cosine"):
+    for retrieval in ("contrast", "cosine"):
         got = query_several(field, rows[:1], rules=QueryRules(all_of_class=True, retrieval=retrieval))
         np.testing.assert_array_equal(got.mask, shares(field, [0, 1]) >= 0.5)
 

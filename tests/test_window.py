@@ -133,7 +133,7 @@ def test_similarities_of_many_regions():
     embeddings, texts, words = (unit_rows(rng, n, of_retrieval.SIZE) for n in (COUNT, 3, 4))
 
     def ask(text, embeddings, words):
-        return region_similarities(embeddings, text, words, "apart")
+        return region_similarities(embeddings, text, words, "contrast")
 
     found, known = compiled(ask, texts, embeddings, words)
     assert np.asarray(known).all()

@@ -31,7 +31,7 @@ MOST_NOISE = 4.0
 """the view noise of a tiny mask, in units of that of a mask of `reference_pixels`"""
 LEANING = 0.75
 """part of an object's text that others take the place of where `World.shared` is 1. Chosen so that the own text is then
-the best of the scene's for about a quarter of the regions by the contrast (experiments/shared_errors.py)"""
+the best of the scene's for about a quarter of the regions by the centred cosine (experiments/shared_errors.py)"""
 CONFUSED = 2
 """other classes of the scene in an object's mixture; where names that nothing has are given, as many of these too"""
 PLAIN = World()

@@ -126,7 +126,7 @@ def ask_field(
     field: LanguageField,
     way: str,
     *,
-    retrieval: str = "apart",
+    retrieval: str = "contrast",
     clean: bool = True,
     threshold: float | None = None,
     pieces: bool = False,
@@ -189,7 +189,7 @@ def ask_field(
     return Answers(ask, classes, features=codes.gaussians)
 
 
-def asked(way: str, *, retrieval: str = "apart", clean: bool = True, pieces: bool = False, **options) -> Method:
+def asked(way: str, *, retrieval: str = "contrast", clean: bool = True, pieces: bool = False, **options) -> Method:
     """The row that asks `field_of(setting, **options)` as `ask_field` describes."""
     return lambda setting, steps: ask_field(
         setting, field_of(setting, **options), way, retrieval=retrieval, clean=clean, pieces=pieces

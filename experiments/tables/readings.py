@@ -1,8 +1,8 @@
 """Every way to read every method: text rules and ways of choosing Gaussians that are no method's own idea.
 
 A feature of each Gaussian is compared with a text by the cosine, by LERF's relevancy, or by one of jsecon's rules, the
-contrast and "apart". The similarity is cut at VALA's threshold, or handed to the ascent of the expected IoU. Every row
-answers every text, as the protocols ask.
+centred cosine and "contrast". The similarity is cut at VALA's threshold, or handed to the ascent of the expected IoU.
+Every row answers every text, as the protocols ask.
 """
 
 import dataclasses
@@ -22,7 +22,7 @@ from jsecon.numerics import cosine_matrix, normalize
 from jsecon.paper.queries import relevancies
 from jsecon.types import Selection
 
-RULES = ("cosine", "relevancy", "contrast", "apart")
+RULES = ("cosine", "relevancy", "centred", "contrast")
 """of comparing a feature with a text"""
 CHOOSERS = {"threshold": None} | {name.replace("_", " "): weights for name, weights in SILHOUETTE_WEIGHTS.items()}
 """a threshold, or the ascent of the expected IoU with these weights of its two levels of alpha"""
@@ -37,16 +37,21 @@ def scores(
 ) -> Float[np.ndarray, "q n"]:
     """Similarity of each Gaussian with each text by a rule; NaN where its feature is unknown.
 
-    The last two rules are jsecon's for regions. The contrast subtracts the mean of the masks of the `evidence`
-    (default: the setting's), weighted by their pixels. "apart" subtracts the mean of the unrelated words from the text.
+    The last two rules are jsecon's for regions. The centred cosine subtracts the mean of the masks of the `evidence`
+    (default: the setting's), weighted by their pixels. "contrast" subtracts the mean of the unrelated words from the
+    text.
     """
     features, texts = jnp.asarray(features), jnp.asarray(setting.texts)
     known = np.asarray(jnp.any(features != 0, axis=1))
     if rule == "cosine":
         found = np.asarray(cosine_matrix(texts, features))
-    elif rule == "apart":
+    elif rule == "contrast":
         require(
-            setting.unrelated_words is not None, "apart", "a setting without unrelated words", "a twin", "Use contrast."
+            setting.unrelated_words is not None,
+            "contrast",
+            "a setting without unrelated words",
+            "a twin",
+            "Use the centred cosine.",
         )
         words = normalize(jnp.asarray(setting.unrelated_words))
         found = np.asarray(cosine_matrix(normalize(texts) - words.mean(0), features))

@@ -72,12 +72,12 @@ NEARLY = (0.9, 1.0)
 TRAINED = ("LangSplat-m", "Gaussian Grouping-m", "OpenGaussian", "the paper's path")
 """methods that train, each for tens of seconds a setting"""
 _ASCENTS = (
-    ("contrast", "silhouette"),
-    ("contrast", "strict silhouette"),
-    ("contrast", "lenient silhouette"),
+    ("centred", "silhouette"),
+    ("centred", "strict silhouette"),
+    ("centred", "lenient silhouette"),
     ("relevancy", "lenient silhouette"),
-    ("contrast", f"strict silhouette{SHARP}"),
-    ("contrast", f"lenient silhouette{SHARP}"),
+    ("centred", f"strict silhouette{SHARP}"),
+    ("centred", f"lenient silhouette{SHARP}"),
 )
 """readings by the expected IoU that trained features have, beside a threshold by every rule"""
 _PROBABILITY = 0.3
@@ -238,8 +238,8 @@ def rows_of(points: bool) -> dict[str, Method]:
             nearly, "", "threshold"
         )
         for chooser in ("threshold", *ascents):
-            found[f"Gaussian Grouping-m: contrast, {chooser}{', one mask' if nearly == 1 else ''}"] = _grouping_row(
-                nearly, "contrast", chooser
+            found[f"Gaussian Grouping-m: centred, {chooser}{', one mask' if nearly == 1 else ''}"] = _grouping_row(
+                nearly, "centred", chooser
             )
     found["the paper's path: as published"] = METHODS["the paper's path"]
     for threshold in CODE_THRESHOLDS:

@@ -13,7 +13,7 @@ from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction
 from jsecon.paper.queries import TEMPERATURE
 from jsecon.types import Votes
 
-SCORES = ("cosine", "relevancy", "contrast", "apart")
+SCORES = ("cosine", "relevancy", "centred", "contrast")
 """of a text and a region"""
 
 
@@ -27,18 +27,18 @@ def scores(
 ) -> Float[np.ndarray, "q r"]:
     """Scores of all texts with all regions, by one of SCORES; -inf for a region without an embedding.
 
-    "relevancy" is LERF's. "apart" is jsecon's: it subtracts the mean of the unrelated words (W, E) from the text.
-    "contrast" compares what is left of a text across the canonical phrases (C, E) with what is left of a region without
+    "relevancy" is LERF's. "contrast" is jsecon's: it subtracts the mean of the unrelated words (W, E) from the text.
+    "centred" compares what is left of a text across the canonical phrases (C, E) with what is left of a region without
     the mean of the R regions, weighted by their pixels in T views.
     """
     known = np.asarray(embeddings).any(axis=1)
-    if kind == "contrast":
+    if kind == "centred":
         weight = pixels.sum(axis=1) * known
         mean = weight @ embeddings / max(weight.sum(), 1)
         residual = embeddings - known.sum() / (known.sum() + 1) * mean
         cone = unit(unit(canonical).sum(axis=0)[None])
         table = unit(texts - texts @ cone.T * cone) @ unit(residual).T
-    elif kind == "apart":
+    elif kind == "contrast":
         table = unit(unit(texts) - unit(words).mean(axis=0)) @ embeddings.T
     else:
         table = texts @ embeddings.T

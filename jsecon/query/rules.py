@@ -11,7 +11,7 @@ from jsecon.field.similarity import Number
 from jsecon.types import static
 from jsecon.vision.protocols import Logits
 
-RETRIEVALS = ("apart", "cosine")
+RETRIEVALS = ("contrast", "cosine")
 """Ways to compare a text with regions: what sets it apart from unrelated words, or the plain cosine (the paper)."""
 MIN_RANK = 0.82
 """Smallest share of unrelated words (`LanguageField.unrelated_words`) that must match the scene less than the text
@@ -36,7 +36,7 @@ FRAGMENT_SCORE = 0.5
 class QueryRules:
     """How a question is answered. A pytree: jit compiles anew only for the two static fields."""
 
-    retrieval: str = static(default="apart")
+    retrieval: str = static(default="contrast")
     """One of RETRIEVALS. A field without unrelated words is always searched by "cosine"."""
     min_rank: Number = MIN_RANK
     """Smallest share of unrelated words that must match the scene less than the text does; 0 refuses no text."""

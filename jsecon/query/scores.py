@@ -103,7 +103,7 @@ def region_similarities(
       embeddings: Of the regions.
       text: Embedding of the text.
       words: Unrelated words, or None.
-      retrieval: "apart" subtracts the mean of the unrelated words from the text; "cosine" does not.
+      retrieval: "contrast" subtracts the mean of the unrelated words from the text; "cosine" does not.
     """
     return similarities(embeddings, _text_direction(text, words, retrieval))
 
@@ -122,7 +122,7 @@ def word_similarities(
 def _text_direction(
     text: Float[Array, "*batch e"], words: Float[Array, "w e"] | None, retrieval: str
 ) -> Float[Array, "*batch e"]:
-    """Returns unit texts (..., E), by "apart" minus the mean of the W unit unrelated words if there are any."""
+    """Returns unit texts (..., E), by "contrast" minus the mean of the W unit unrelated words if there are any."""
     unit = normalize(text)
     if retrieval == "cosine" or words is None:
         return unit

@@ -50,11 +50,11 @@ def cell(method, seed, value, lenient):
 def test_each_method_is_read_as_suits_each_figure_and_ours_also_by_one_reading():
     cells = []
     for seed in (0, 10):
-        cells += [cell("VALA: cosine", seed, 0.6, 0.2), cell("VALA: contrast", seed, 0.5, 0.4)]
+        cells += [cell("VALA: cosine", seed, 0.6, 0.2), cell("VALA: centred", seed, 0.5, 0.4)]
         cells.append(cell("VALA: as published", seed, 0.4, 0.1))
         cells += [cell("ours, consensus: x", seed, 0.8, 0.3), cell("ours, consensus: y", seed, 0.7, 0.5)]
     best = fair.chosen(cells, (0,), ("miou", "miou_vala"))
-    assert best["VALA"] == {"miou": "VALA: cosine", "miou_vala": "VALA: contrast"}
+    assert best["VALA"] == {"miou": "VALA: cosine", "miou_vala": "VALA: centred"}
     assert best["ours, consensus"] == {"miou": "ours, consensus: x", "miou_vala": "ours, consensus: y"}
     assert set(best["ours, consensus" + fair.ONE_READING].values()) == {"ours, consensus: y"}
     options = fair.Options(seeds=(10,), choosing=(0,))
@@ -87,7 +87,7 @@ def test_the_interval_is_of_pairs():
 @pytest.mark.long
 def test_a_cell_holds_the_texts_that_its_figure_is_made_of(folder):  # noqa: F811
     rows = rows_of(points=False)
-    few = ("VALA: contrast, lenient silhouette, sharp", "ours, tracks: apart, silhouette")
+    few = ("VALA: centred, lenient silhouette, sharp", "ours, tracks: contrast, silhouette")
     plan = with_gaussians(small(lerf.QUICK, folder, "readings", methods=few), "perfect")
     plan = dataclasses.replace(plan, level="perfect")
     cells = fill.fill(plan, rows, tell=lambda _: None)
@@ -120,5 +120,5 @@ def test_shared_errors_are_measured_on_a_twin(folder):  # noqa: F811
 
 def test_readings_are_named_without_the_constants_of_methods():
     named = {fair.reading_of(row) for points in (False, True) for row in rows_of(points)}
-    assert "contrast, threshold" in named
+    assert "centred, threshold" in named
     assert not any("roots" in name or "codebook" in name or "0." in name for name in named)

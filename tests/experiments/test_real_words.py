@@ -222,13 +222,13 @@ def test_scores_of_all_texts_are_those_of_the_library():
     assert all((table[:, 2] == -np.inf).all() for table in found.values())
     known = np.arange(6) != 2
     for q, text in enumerate(texts):
-        apart = np.asarray(region_similarities(regions, text, words, "apart")[0])
+        apart = np.asarray(region_similarities(regions, text, words, "contrast")[0])
         relevancy = np.asarray(relevancies(regions, text, canonical)[0])
-        np.testing.assert_allclose(found["apart"][q, known], apart[known], atol=1e-5)
+        np.testing.assert_allclose(found["contrast"][q, known], apart[known], atol=1e-5)
         np.testing.assert_allclose(found["relevancy"][q, known], relevancy[known], atol=1e-5)
         np.testing.assert_allclose(found["cosine"][q, known], (regions @ text)[known], atol=1e-5)
-    moved = rules.scores(regions, rules.unit(texts + canonical.mean(0)), canonical, words, pixels, "contrast")
-    np.testing.assert_allclose(moved[:, known], found["contrast"][:, known], atol=1e-5)  # phrases say nothing
+    moved = rules.scores(regions, rules.unit(texts + canonical.mean(0)), canonical, words, pixels, "centred")
+    np.testing.assert_allclose(moved[:, known], found["centred"][:, known], atol=1e-5)  # phrases say nothing
 
 
 def test_minilm_reads_its_files_and_gives_units(tmp_path):

@@ -182,7 +182,7 @@ def test_the_noise_table_says_at_which_levels_ours_does_not_lead(tmp_path):
 @pytest.mark.parametrize("table", [lerf, ovs3d, replica, threshold_sweep], ids=lambda m: m.__name__)
 def test_the_committed_table_is_what_the_committed_cells_give(table, tmp_path, monkeypatch):
     """Each cell of the plan is found by its key, and nothing is computed. The ablations' cells are of the
-    contrast, which their methods no longer ask by."""
+    centred cosine, which their methods no longer ask by."""
     monkeypatch.setattr(fill, "prepare", lambda *a, **k: pytest.fail(f"no cell of {a[1:]}"))
     home = Path(table.PLAN.out)
     cells = table.PLAN.cells or str(home / "cells.jsonl")
