@@ -46,7 +46,7 @@ def _object(capsys, *arguments):
 def test_run_writes_field_metrics_and_report_and_tells_its_plan(room, room_run, tmp_path, capsys):
     run, out = room_run
     shutil.copytree(out / "cache", tmp_path / "out" / "cache")  # the stages are cached: only the verb itself is tested
-    options = "--masks", room / "masks", *FITTED, "--sh-degree", 2
+    options = "--masks", room / "masks", *FITTED
     line = "run", room, "--out", tmp_path / "out", *options
     told, words = _object(capsys, *line, "--dry-run")
     assert {stage["status"] for stage in told["stages"]} == {"cached", "skipped"}

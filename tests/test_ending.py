@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from jsecon.app import cli, models, verbs
+from jsecon.app import cli, models
 from jsecon.errors import InputError, describe_error
 
 PARTS = {"where": "mug.png", "problem": "text", "expected": "a picture", "remedy": "Draw one."}
@@ -23,7 +23,7 @@ def end(monkeypatch):
                 raise outcome
             return dict(outcome)
 
-        monkeypatch.setitem(models.VERBS, verbs.Models, act)
+        monkeypatch.setattr(models, "_models", act)
         return cli.main(["models", "list", *options])
 
     return run

@@ -8,7 +8,6 @@ it is; with several templates its embedding is the mean over them.
 """
 
 import functools
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -197,14 +196,6 @@ class ClipEmbedder:
         phrases = [template.replace("{}", text) for text in texts for template in self.templates]
         rows = self._embed_phrases(phrases).reshape(len(texts), len(self.templates), -1)
         return _normalize(rows.mean(1), self._textual_path)
-
-    def seconds_per_crop(self) -> float:
-        """Measures the time of a blank region in a full batch, past the cache of embeddings."""
-        crops = np.zeros((_BATCH, self.size, self.size, 3), np.uint8)
-        self._run_visual(crops)  # opens the graph
-        started = time.monotonic()
-        self._run_visual(crops)
-        return (time.monotonic() - started) / _BATCH
 
     def check(self) -> str:
         """Runs the graphs on a black image and a word, closes them, and describes the model in a sentence."""

@@ -32,7 +32,6 @@ from jsecon.pipeline.results import (
     StageInput,
     StageResult,
     training_frames,
-    vision_frames,
 )
 from jsecon.pipeline.scene_files import read_scene
 from jsecon.pipeline.sources import provenance
@@ -47,15 +46,8 @@ from jsecon.read.masks.langsplat import load_features
 from jsecon.read.masks.masks import load_labels, load_proposals
 from jsecon.types import Capture, Gaussians, ImageFile, LanguageField, Quality
 from jsecon.vision.classical import require_contrib
-from jsecon.vision.stores import StoredSegmenter
 
 FIELD_FILE = "field.safetensors"
-CROPS_PER_FRAME = 40
-"""regions of a frame, where no segmenter tells"""
-FEW_FRAMES = 4
-"""the time of fewer frames is not estimated"""
-OUT_OF_MEMORY = "Take smaller frames (--long-side), or fewer (--frames)."
-"""what to do if memory is full"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -227,38 +219,7 @@ def compute_stages(
         computed = Computed(Results(), plan.keys, plan.steps)
         for stage in stage_list:
             _compute_stage(context, stage, plan, computed, listener, coordinator)
-            if stage.name == "load":
-                _note_vision_time(context, computed.capture, plan.running, listener)
     return computed
-
-
-def _note_vision_time(context: RunContext, capture: Capture, running: list[str], listener: Listener) -> None:
-    """Measures the models on two frames, and says how long all will take; the masks of these two frames are stored."""
-    frames = np.asarray(capture.frames)[vision_frames(capture, context.options)]
-    segmenter, crops, notes = context.models.segmenter, CROPS_PER_FRAME, []
-    with listener.progress("vision"):
-        if "objects" in running and isinstance(segmenter, StoredSegmenter):
-            missing = [t for t in range(len(frames)) if not segmenter.has(frames[t])]
-            if len(missing) >= FEW_FRAMES:
-                seconds = 0.0
-                for t in missing[:2]:  # the first also opens the graphs
-                    started = time.monotonic()
-                    crops = len(segmenter(frames[t], t))
-                    seconds = time.monotonic() - started
-                notes.append(f"SAM: {len(missing) - 2} frames, about {_duration(seconds * (len(missing) - 2))}")
-        seconds_per_crop = getattr(context.models.embedder, "seconds_per_crop", None)
-        if "regions" in running and seconds_per_crop is not None and len(frames) >= FEW_FRAMES:
-            count = crops * len(frames)
-            notes.append(f"CLIP: some {count:,} regions, about {_duration(seconds_per_crop() * count)}")
-        context.models.close()
-    for note in notes:
-        listener.note(f"{note}. Fewer frames: --vision-frames.")
-
-
-def _duration(seconds: float) -> str:
-    """Writes seconds for a reader."""
-    minutes = seconds / 60
-    return f"{seconds:.0f} s" if minutes < 1.5 else f"{minutes:.0f} min" if minutes < 90 else f"{minutes / 60:.1f} h"
 
 
 def _compute_stage(
@@ -283,7 +244,8 @@ def _compute_stage(
             cached = cache.fetch(path, functools.partial(compute, progress), note=listener.note)
         except (MemoryError, jax.errors.JaxRuntimeError) as error:
             if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
-                problem, remedy = f"no memory left ({str(error)[:200]})", f"{OUT_OF_MEMORY} Finished stages are kept."
+                problem = f"no memory left ({str(error)[:200]})"
+                remedy = "Take smaller frames (--long-side), or fewer (--frames). Finished stages are kept."
                 raise InputError(f"stage {stage.name}", problem, "more memory", remedy) from error
             raise
     result: StageResult = cached.value

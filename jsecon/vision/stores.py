@@ -114,17 +114,6 @@ class StoredSegmenter:
         _write(path, bits=bits, shape=np.asarray(masks.shape))
         return masks
 
-    def has(self, frame: UInt8[np.ndarray, "h w 3"]) -> bool:
-        """Finds out whether the masks of a frame are cached.
-
-        Args:
-          frame: (H, W, 3) uint8 RGB.
-
-        Returns:
-          True if there is a file of them.
-        """
-        return self._path(frame).is_file()
-
     def _path(self, frame: np.ndarray) -> Path:
         return self._folder / f"{_frame_digest(self.name, frame)}.safetensors"
 
