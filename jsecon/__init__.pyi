@@ -48,8 +48,7 @@ from .query.blocks import query_in_blocks as query_in_blocks
 from .query.classes import query_classes as query_classes
 from .query.object_shapes import ObjectShapes as ObjectShapes, object_shapes as object_shapes
 from .query.outliers import remove_outliers as remove_outliers
-from .query.outline import lift as lift
-from .query.pixel import region_at as region_at
+from .query.pointing import lift as lift, region_at as region_at
 from .query.render import selection_mask as selection_mask
 from .query.rules import QueryRules as QueryRules
 from .read.captures.capture import load_capture as load_capture

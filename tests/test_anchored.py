@@ -23,7 +23,7 @@ from jsecon.query.answer import (
     select_gaussians,
 )
 from jsecon.query.classes import query_classes
-from jsecon.query.pixel import pixel_weights, region_at, region_shares_seen
+from jsecon.query.pointing import pixel_weights, region_at, region_shares_seen
 from jsecon.query.rules import QueryRules
 from jsecon.query.select import CODE_THRESHOLD, select_by_code
 from jsecon.splat.render import render

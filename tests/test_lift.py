@@ -9,7 +9,7 @@ import pytest
 from small_field import REGIONS, make_field, true_regions
 
 from jsecon import InputError, region_votes
-from jsecon.query.outline import INSIDE, OUTSIDE, PRIOR_PX, UNKNOWN, box_mask, lift
+from jsecon.query.pointing import INSIDE, OUTSIDE, PRIOR_PX, UNKNOWN, box_mask, lift
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ from jsecon.app.records import Answer
 from jsecon.app.viewer import view_state
 from jsecon.app.viewer.view_state import ViewState
 from jsecon.app.viewer.window import Viewer, open_viewer
-from jsecon.query.pixel import region_shares_seen
+from jsecon.query.pointing import region_shares_seen
 from jsecon.vision.colours import BASIC, ColourEmbedder
 
 START = "orange; pink"

@@ -42,8 +42,7 @@ from jsecon.query.answer import (
     trim,
 )
 from jsecon.query.expressions import is_expression, parse_query
-from jsecon.query.outline import box_mask, lift
-from jsecon.query.pixel import region_at
+from jsecon.query.pointing import box_mask, lift, region_at
 from jsecon.query.render import selection_mask
 from jsecon.query.rules import QueryRules
 from jsecon.query.select import CODE_THRESHOLD, select_by_code

@@ -13,7 +13,7 @@ from jsecon.field.regions import mean_residuals
 from jsecon.field.similarity import similarities
 from jsecon.query.answer import ROUNDING, RULES
 from jsecon.query.expressions import parse_query
-from jsecon.query.pixel import MIN_SHARE, region_shares_seen
+from jsecon.query.pointing import MIN_SHARE, region_shares_seen
 from jsecon.query.render import HIDDEN_LOGIT
 from jsecon.query.scores import region_similarities, unrelated_words, view_count_weight
 from jsecon.types import Camera, LanguageField

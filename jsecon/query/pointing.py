@@ -1,25 +1,108 @@
-"""An outline in one frame or several, as Gaussians: a mask or a box in place of a text. Host code.
+"""What is pointed at in a frame: the region under a pixel, and the Gaussians of a box or a mask. Host code.
 
-The rendering weights of the outline decide on the Gaussians that the frames see. The field's regions, which all views
-made, decide on the others, such as the far side of a mug.
+The region under a pixel is that of the Gaussians that make it up, by their weights. Of an outline in one frame or
+several, its rendering weights decide on the Gaussians that the frames see. The field's regions, which all views made,
+decide on the others, such as the far side of a mug.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from jsecon.errors import InputError, require
+from jsecon.field.columns import row_slices, votes_of_rows
 from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction, vote_shares
 from jsecon.field.votes import region_votes
-from jsecon.types import LanguageField, Selection
+from jsecon.numerics import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+from jsecon.splat.project import project
+from jsecon.types import Array, Camera, Gaussians, LanguageField, Selection
 
+MIN_SHARE = 0.05
+"""Smallest part of a pixel that a region must make up; the pixel is background otherwise."""
 OUTSIDE, INSIDE, UNKNOWN = 0, 1, 2
 """Values of an outline's pixels; a box only knows its outside."""
 PRIOR_PX = 4.0
 """Weight of the regions against that of the outline, px."""
+
+
+def pixel_weights(
+    gaussians: Gaussians, camera: Camera, x: int, y: int
+) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """Composites one pixel: the ids of the Gaussians that make it up, front to back, and their weights alpha T.
+
+    Without tiles it is O(N), where a render would have to carry every region as a channel. The columns may be
+    memory-mapped.
+    """
+    columns: list[Any] = [np.zeros((3, 0))]
+    for rows in row_slices(gaussians, gaussians.count):
+        block = jax.tree.map(lambda a, rows=rows: jnp.asarray(a[rows]), gaussians)
+        alpha, depths = (np.asarray(a) for a in _alphas(block, camera, x + 0.5, y + 0.5))
+        hit = np.flatnonzero(alpha)
+        columns.append((hit + rows.start, alpha[hit], depths[hit]))
+    ids, alpha, depths = (np.concatenate(column) for column in zip(*columns))
+    order = np.argsort(depths, kind="stable")  # ties in depth keep index order
+    ids, alpha = ids[order].astype(np.int64), alpha[order]
+    after = np.cumprod(1.0 - alpha.astype(np.float64))
+    seen = after > MIN_TRANSMITTANCE
+    before = np.concatenate([[1.0], after])[: seen.sum()]
+    return ids[seen], alpha[seen] * before
+
+
+@jax.jit
+def _alphas(gaussians: Gaussians, camera: Camera, x: Array | float, y: Array | float) -> tuple[Array, Array]:
+    splats = project(gaussians, camera)
+    dx, dy = x - splats.means_px[:, 0], y - splats.means_px[:, 1]
+    u, v = splats.whitening[:, 0] * dx + splats.whitening[:, 1] * dy, splats.whitening[:, 2] * dy
+    alpha = splats.opacities * jnp.exp(-0.5 * (u * u + v * v))
+    counts = splats.visible & (alpha >= MIN_ALPHA)
+    return jnp.where(counts, jnp.minimum(alpha, MAX_ALPHA), 0.0), splats.depths
+
+
+def region_shares_seen(field: LanguageField, camera: Camera, x: int, y: int) -> Float[np.ndarray, " r"]:
+    """Computes how much of a pixel each region makes up: sum_n w_n p_nr, w the weights alpha T and p the vote shares.
+
+    Each is at most the pixel's alpha.
+    """
+    ids, weights = pixel_weights(field.gaussians, camera, x, y)
+    shares = np.zeros(field.regions.count)
+    if not len(ids):
+        return shares
+    votes = votes_of_rows(field.votes, np.resize(ids, 1 << (len(ids) - 1).bit_length()))  # few sizes to compile for
+    regions = votes.regions[: len(ids)]
+    share = np.nan_to_num(np.asarray(vote_shares(votes))[: len(ids)].astype(np.float64))
+    np.add.at(shares, np.where(regions >= 0, regions, 0), share * weights[:, None])
+    return shares
+
+
+def region_at(field: LanguageField, frame: int, x: int, y: int, *, min_share: float = MIN_SHARE) -> int:
+    """Finds the region that makes up most of a pixel.
+
+    Args:
+      field: The field.
+      frame: Index of the frame.
+      x: Column of the pixel.
+      y: Row of the pixel.
+      min_share: Smallest part of the pixel that it must make up.
+
+    Returns:
+      The region, or -1 for background.
+
+    Raises:
+      InputError: The field does not have the frame or the pixel.
+    """
+    frames, width, height = field.cameras.world_to_camera.shape[0], field.cameras.width, field.cameras.height
+    if not 0 <= frame < frames:
+        raise InputError("frame", str(frame), f"0 to {frames - 1}", "Frames are numbered in the order of their names.")
+    if not (0 <= x < width and 0 <= y < height):
+        remedy = f"Give x and y in the frames as the run used them, {width}x{height}."
+        known = f"column 0 to {width - 1}, row 0 to {height - 1}"
+        raise InputError("pixel", f"column {x}, row {y} is outside the frame", known, remedy)
+    shares = region_shares_seen(field, jax.tree.map(jnp.asarray, field.cameras)[frame], x, y)
+    return int(shares.argmax()) if shares.size and shares.max() >= min_share else -1
 
 
 def lift(
@@ -84,20 +167,9 @@ def lift(
 
 
 def box_mask(field: LanguageField, x0: int, y0: int, x1: int, y1: int) -> Int[np.ndarray, "h w"]:
-    """Makes the mask of a box for `lift`.
+    """Makes the mask of a box for `lift`: OUTSIDE, and UNKNOWN from column x0 and row y0 to x1 and y1.
 
-    Args:
-      field: The field, of whose frames the size is taken.
-      x0: First column.
-      y0: First row.
-      x1: Last column.
-      y1: Last row.
-
-    Returns:
-      (H, W) OUTSIDE, and UNKNOWN within the box.
-
-    Raises:
-      InputError: The box has no pixel of the frame.
+    Raises InputError if the box has no pixel of the field's frames.
     """
     mask = np.full((field.cameras.height, field.cameras.width), OUTSIDE, np.int32)
     mask[max(y0, 0) : max(y1 + 1, 0), max(x0, 0) : max(x1 + 1, 0)] = UNKNOWN
