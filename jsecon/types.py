@@ -313,7 +313,7 @@ class LanguageField(_Shown):
 
 
 @record
-class Selection(_Shown):
+class Selection:
     """The answer to one query."""
 
     mask: Array

@@ -206,7 +206,7 @@ def test_only_and_without_part_the_scene_bit_for_bit(field, file, tmp_path, caps
     for wrong in (
         (),
         ("--only", "red", "--without", "red", "--out", paths["only"]),
-        ("--with-labels", "--out", tmp_path / "scene.glb"),
+        ("--with-labels", "--out", tmp_path / "scene.spz"),
         ("--only", "red", "--objects", tmp_path / "objects"),
         ("--labels", tmp_path / "ids.txt"),
     ):

@@ -233,7 +233,6 @@ def test_what_is_not_given_has_the_default_of_the_dataclass():
     ("f --mask 0 a.png 1 b.png --mask 2 c.png --out o", {"mask": [["0", "a.png", "1", "b.png"], ["2", "c.png"]]}),
     ("f --box x 1 2 3 4 --out o", {"box": [("x", 1, 2, 3, 4)]}),
     ("--out o f a --threshold -0.5 --by votes --by code", {"texts": ["a"], "threshold": -0.5, "by": "code"}),
-    ("f a --out o --template x --template y", {"texts": ["a"], "template": ["x", "y"]}),
     ("f a --out o --json", {"texts": ["a"], "output": verbs.OutputOptions(json=True)}),
     ("f --out o --keep_outliers -- -ish", {"texts": ["-ish"], "keep_outliers": True}),
 ])  # fmt: skip

@@ -82,18 +82,6 @@ def test_more_masks_than_a_batch_holds_have_the_same_rows(folders, frame, masks,
     np.testing.assert_allclose(rows, np.tile(embedder.embed_regions(frame, masks), (5, 1)), atol=1e-6)
 
 
-def test_templates_are_averaged_as_unit_vectors(folders):
-    texts = ["red thing", "blue"]
-    bare = ClipEmbedder(folders["immich"])
-    both = ClipEmbedder(folders["immich"], templates=("{}", "{} on green"))
-    first, second = bare.embed_text(texts), bare.embed_text([f"{text} on green" for text in texts])
-    mean = (first + second) / np.linalg.norm(first + second, axis=1, keepdims=True)
-    np.testing.assert_allclose(both.embed_text(texts), mean, atol=1e-6)
-    np.testing.assert_array_equal(both.canonical_phrases, bare.canonical_phrases)
-    with pytest.raises(ValueError, match="a phrase that holds"):
-        ClipEmbedder(folders["immich"], templates=("a photo",))
-
-
 def test_embeddings_are_kept_by_content(folders, frame, masks, tmp_path, monkeypatch):
     embedder = ClipEmbedder(folders["transformers.js"], store=tmp_path)
     crops = []
@@ -215,7 +203,7 @@ def test_preprocessing_in_all_its_spellings(tmp_path, content, expected):
         assert len(mean) == len(std) == 3
 
 
-def test_unrelated_words_are_embedded_once_for_a_model_and_its_templates(tmp_path, monkeypatch):
+def test_unrelated_words_are_embedded_once_for_a_model(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     asked = []
 

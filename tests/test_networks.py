@@ -159,11 +159,11 @@ def test_a_run_that_is_stopped_while_sam_2_tracks_goes_on_at_its_frame(room, spl
 def test_query_finds_the_model_by_itself_or_says_what_it_needs(seen, models, tmp_path, capsys):
     _, folder, _ = seen
     field = folder / "field.safetensors"
-    query = ["query", str(field), "red", "--out", str(tmp_path / "a"), "--template", "a {} thing", "--views", "0"]
+    query = ["query", str(field), "red", "--out", str(tmp_path / "a"), "--views", "0"]
     assert cli.main([*query, "--min-rank", "0"]) == 0
     answer, found = json.loads((tmp_path / "a" / "red.json").read_text()), load_field(field)
-    text = model_loading.field_embedder(found, templates=("a {} thing",)).embed_text(["red"])[0]
-    words = model_loading.field_embedder(found, templates=("a {} thing",)).unrelated_words
+    embedder = model_loading.field_embedder(found)
+    text, words = embedder.embed_text(["red"])[0], embedder.unrelated_words
     similar = (
         np.asarray(found.regions.embeddings) @ (text - words.mean(axis=0)) / np.linalg.norm(text - words.mean(axis=0))
     )
@@ -173,8 +173,6 @@ def test_query_finds_the_model_by_itself_or_says_what_it_needs(seen, models, tmp
     other = write_clip(tmp_path / "other", "immich")
     assert cli.main(["query", str(field), "red", "--out", str(tmp_path / "b"), "--embedder", str(other)]) == 2
     assert "model that the field was made with" in capsys.readouterr().err
-    assert cli.main(["query", str(field), "red", "--out", str(tmp_path / "b"), "--template", "a thing"]) == 2
-    assert "a phrase that holds {}" in capsys.readouterr().err
     lost = dataclasses.replace(load_field(field), provenance=json.dumps({"options": {"embedder": "/nowhere"}}))
     with pytest.raises(InputError, match=r"--embedder DIR"):
         model_loading.field_embedder(lost)
@@ -229,11 +227,6 @@ def test_texts_need_the_model_of_embeddings_from_files(seen, models, tmp_path, c
     assert 0 < json.loads((tmp_path / "answers" / "red.json").read_text())["score"] < 1
     with pytest.raises(InputError, match="5, as those from files have"):
         model_loading.open_embedder("given-5", folder=models[1])
-
-
-def test_templates_are_for_clip():
-    with pytest.raises(InputError, match="--template"):
-        model_loading.open_embedder(templates=("a photo of a {}.",))
 
 
 def test_two_sources_of_masks_are_refused(room, models, tmp_path):

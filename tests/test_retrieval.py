@@ -10,7 +10,7 @@ import pytest
 from jax.test_util import check_grads
 from small_field import KnownTexts, field_of, lone_votes, make_field, unit_rows
 
-from jsecon import Regions, Scene, load_field, query_anchored, query_classes, query_several, save_field
+from jsecon import Regions, load_field, query_anchored, query_classes, query_several, save_field
 from jsecon.app import cli
 from jsecon.field.similarity import similarities
 from jsecon.pipeline import model_loading
@@ -290,6 +290,3 @@ def test_the_command_line_says_the_quantile_and_what_an_old_field_lacks(worded, 
     assert out.count("earlier version") == 1
     cosine = query_anchored(dataclasses.replace(field, unrelated_words=None), rows["seen"])
     assert seen["score"] == pytest.approx(float(cosine.score), abs=1e-5)
-    more = {"templates": ("a photo of a {}.",), "unrelated_words": -np.asarray(field.unrelated_words)}
-    templated = KnownTexts(rows, canonical_phrases=field.canonical_phrases, **more)
-    assert Scene(field, templated).ask("seen").rank != Scene(field, words).ask("seen").rank

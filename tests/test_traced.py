@@ -65,7 +65,7 @@ def calls(field, labels):
 
 
 HOST = {
-    *("show", "to_html", "to_png", "locate", "masklets", "check_backend", "load_capture", "load_gaussians"),
+    *("to_html", "to_png", "locate", "masklets", "check_backend", "load_capture", "load_gaussians"),
     *("save_gaussians", "load_gaussians", "save_gaussians", "region_votes_in_blocks", "check_field"),
     "normalise_votes_in_blocks",
     *("load_field", "save_field", "region_embeddings", "host_mesh", "query_in_blocks", "lift", "remove_outliers"),

@@ -34,7 +34,7 @@ EXTRAS = {
     "viewer": (("viser",), "jsecon view"),
     "mcp": (("mcp",), "jsecon mcp"),
     "docs": (("sphinx", "myst_nb", "furo"), "building the documentation"),
-    "figures": (("matplotlib",), "jsecon.show, figures of the experiments"),
+    "figures": (("matplotlib",), "figures of the experiments"),
     "words": (("ai_edge_litert",), "the experiment on real words"),
     "export": (("torch", "open_clip", "transformers", "onnx"), "CLIP, SigLIP and SAM 2.1 from checkpoints"),
 }

@@ -15,7 +15,7 @@ from jsecon.app.catalogue import Catalogue
 from jsecon.app.models import open_embedder
 from jsecon.app.outputs import slug
 from jsecon.app.records import decimals, rounded
-from jsecon.app.scene import Scene, export_rows, open_scene
+from jsecon.app.scene import Scene, open_scene
 from jsecon.errors import InputError
 from jsecon.files import atomic_write, write_text
 from jsecon.pipeline.options import require_writable
@@ -68,7 +68,7 @@ def _objects(verb: verbs.Objects, console: Console) -> verbs.VerbResult:
         require_writable(verb.out)
     with console.progress("field"):
         names = None if verb.vocabulary is None else _read_vocabulary(verb.vocabulary)
-        by_model = names is not None or verb.template or verb.embedder is not None  # else its words may be in the field
+        by_model = names is not None or verb.embedder is not None  # else its words may be in the field
         scene = open_scene(verb.field, embedder=_embedder_of(verb, console) if by_model else None)
         listed = scene.objects(names)
     _print_catalogue(listed, console)
@@ -104,30 +104,26 @@ def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
     if answer is not None and not len(answer.rows):
         option = "--only" if verb.only is not None else "--without"
         raise InputError(option, f"{text!r} selects no Gaussian", answer.reason, "Ask with other words.")
-    without = verb.without is not None
-    count = scene.field.gaussians.count
     if answer is not None:
         console.say(str(answer))
-        count = count - len(answer.rows) if without else len(answer.rows)
+    mask = None if answer is None else ~answer.mask if verb.without is not None else answer.mask
+    count = scene.field.gaussians.count if mask is None else int(mask.sum())
     result: verbs.VerbResult = {"written": {}, "gaussians": count}
     with console.progress("files"):
-        listed_ids = verb.with_labels or verb.labels is not None or verb.objects is not None
-        listed = scene.objects() if listed_ids else None
         if verb.out is not None:
-            ids = listed.labels if listed is not None and verb.with_labels else None
-            scene.export(verb.out, answer, without=without, object_ids=ids)
+            scene.export(verb.out, mask, object_ids=scene.objects().labels if verb.with_labels else None)
             result["bytes"] = verb.out.stat().st_size
             result["written"]["scene"] = verb.out
             console.say(f"{count} Gaussians, {result['bytes'] / 2**20:.1f} MiB  {verb.out}")
-        if listed is not None and verb.labels is not None:
-            ids = np.asarray(listed.labels, np.int32)
-            ids = ids if answer is None else ids[answer.mask != without]
+        if verb.labels is not None:
+            ids = scene.objects().labels.astype(np.int32)
+            ids = ids if mask is None else ids[mask]
             with atomic_write(verb.labels) as temporary, temporary.open("wb") as stream:
                 np.save(stream, ids)
             result["written"]["labels"] = verb.labels
             console.say(f"{len(ids)} ids of objects, {int((ids < 0).sum())} of them -1  {verb.labels}")
-        if listed is not None and verb.objects is not None:
-            files = _save_objects(scene, listed, verb.objects)
+        if verb.objects is not None:
+            files = _save_objects(scene, scene.objects(), verb.objects)
             result["written"]["objects"] = files
             console.say(f"{len(files)} objects  {verb.objects}")
     return result
@@ -142,8 +138,8 @@ def _check_export(verb: verbs.Export) -> None:
     """Raises InputError for options of an export that say nothing, or that cannot be combined."""
     if verb.out is None and verb.labels is None and verb.objects is None:
         raise InputError("export", "there is nothing to write", remedy="Give --out scene.ply, --labels or --objects.")
-    if verb.with_labels and (verb.out is None or verb.out.suffix.lower() != ".ply"):
-        raise InputError("--with-labels", "only a .ply holds them", remedy="Give --out scene.ply, or --labels ids.npy.")
+    if verb.with_labels and (verb.out is None or verb.out.suffix.lower() == ".spz"):
+        raise InputError("--with-labels", "only a .ply or .glb holds them", remedy="Give --out scene.ply, or --labels.")
     if verb.only is not None and verb.without is not None:
         raise InputError("--only", "it cannot be combined with --without", remedy="Export twice, with one of them.")
     if verb.objects is not None and (verb.only is not None or verb.without is not None):
@@ -190,7 +186,7 @@ def _save_objects(scene: Scene, catalogue: Catalogue, folder: Path) -> list[Path
     for n in range(len(catalogue)):
         name = slug(_title(catalogue, n)).encode()[:MAX_NAME_BYTES].decode("utf-8", "ignore")
         files.append(folder / f"{n:03d}-{name}.ply")
-        export_rows(scene.field, files[-1], np.flatnonzero(catalogue.mask(n)))
+        scene.export(files[-1], catalogue.mask(n))
     return files
 
 

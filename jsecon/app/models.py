@@ -82,7 +82,7 @@ def open_embedder(field: Any, verb: verbs.FieldVerb, console: Console) -> Any:
         missing = model_loading.find_model(field)
         if isinstance(missing, HubModel):
             folder = _folders_of_models({"embedder": missing}, console, yes=verb.yes)["embedder"]
-    return model_loading.field_embedder(field, folder, templates=verb.template or ("{}",))
+    return model_loading.field_embedder(field, folder)
 
 
 AUTO = "auto"

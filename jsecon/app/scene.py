@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Int, UInt8
 
 from jsecon.app.catalogue import Catalogue, objects
 from jsecon.app.object_index import ObjectIndex, choose_shades
@@ -202,19 +202,13 @@ class Scene:
 
     @functools.cached_property
     def text_field(self) -> LanguageField:
-        """The field with canonical phrases, and with unrelated words in the embedder's templates if it has any."""
-        field, embedder = self.field, self.embedder
-        has_templates = getattr(embedder, "templates", ("{}",)) != ("{}",)
-        if len(field.canonical_phrases) and (field.unrelated_words is None or not has_templates):
+        """The field with phrases and words that texts are compared with: embeddings from files came without them."""
+        field, words = self.field, getattr(self.embedder, "unrelated_words", None)
+        if len(field.canonical_phrases):
             return field
-        reference = None if field.unrelated_words is None else getattr(embedder, "unrelated_words", None)
-        canonical = (
-            field.canonical_phrases
-            if len(field.canonical_phrases)
-            else np.asarray(embedder.canonical_phrases, np.float32)
-        )
-        reference = field.unrelated_words if reference is None else np.asarray(reference, np.float16)
-        return dataclasses.replace(field, canonical_phrases=canonical, unrelated_words=reference)
+        words = field.unrelated_words if field.unrelated_words is None or words is None else np.float16(words)
+        canonical = np.float32(self.embedder.canonical_phrases)
+        return dataclasses.replace(field, canonical_phrases=canonical, unrelated_words=words)
 
     @functools.cached_property
     def _index(self) -> ObjectIndex:
@@ -625,29 +619,26 @@ class Scene:
     def export(
         self,
         file: str | Path,
-        answer: Answer | None = None,
+        selected: Answer | Bool[np.ndarray, " n"] | None = None,
         *,
-        without: bool = False,
-        object_ids: np.ndarray | None = None,
-    ) -> int:
+        object_ids: Int[np.ndarray, " n"] | None = None,
+    ) -> None:
         """Writes Gaussians in the world of the capture's files, in blocks, so that a mapped field need not fit memory.
 
         Args:
-          file: The .ply, .spz or .glb to write. A .glb also holds regions, and codes if the field has them.
-          answer: Answer whose Gaussians are written; None writes the whole scene.
-          without: Write all Gaussians but those of the answer.
-          object_ids: (N,) int ids of all Gaussians for the property object_id of a .ply (`Catalogue.labels`).
-
-        Returns:
-          Number of Gaussians written.
+          file: The .ply, .spz or .glb to write.
+          selected: Answer or mask whose Gaussians are written; None writes the whole scene.
+          object_ids: (N,) ids of the Gaussians' objects (`Catalogue.labels`), which a .ply and a .glb can hold.
 
         Raises:
           InputError: The file cannot be written.
         """
-        rows = None
-        if answer is not None:
-            rows = np.flatnonzero(~answer.mask) if without else answer.rows
-        return export_rows(self.field, Path(file), rows, object_ids)
+        gaussians = self.field.gaussians
+        if selected is not None:
+            rows = np.flatnonzero(selected.mask if isinstance(selected, Answer) else selected)
+            gaussians = gaussian_rows(gaussians, rows)
+            object_ids = None if object_ids is None else object_ids[rows]
+        save_gaussians(file, gaussians, similarity=self.field.source_from_scene, object_ids=object_ids)
 
 
 def locate(
@@ -684,14 +675,3 @@ def read_mask(file: str | Path, width: int, height: int) -> Bool[np.ndarray, "h 
 def _padded(count: int, most: int) -> int:
     """A power of two of at least `count` and MIN_BLOCK_ROWS rows, at most `most`."""
     return min(max(1 << max(count - 1, 0).bit_length(), MIN_BLOCK_ROWS), most)
-
-
-def export_rows(
-    field: LanguageField, file: Path, rows: np.ndarray | None = None, object_ids: np.ndarray | None = None
-) -> int:
-    """Writes Gaussians of a field in the capture's world; `rows` None is all. Returns their number."""
-    if rows is not None:
-        field = subset_field(field, rows)
-        object_ids = None if object_ids is None else object_ids[rows]
-    save_gaussians(file, field.gaussians, similarity=field.source_from_scene, object_ids=object_ids)
-    return field.gaussians.count

@@ -170,14 +170,11 @@ class FieldVerb(Verb):
       embedder: The CLIP model that the field was made with: a name, hub:owner/name, or a folder. By default it is the
         one that the run used.
       yes: Fetches a model that is not on this machine without asking.
-      template: Phrase for the texts, such as "a photo of a {}.", with CLIP. Several phrases are averaged. By default
-        the bare text is used.
     """
 
     field: Positional[Path]
     embedder: ModelOption = None
     yes: Option[bool] = False
-    template: Repeated[str] = dataclasses.field(default_factory=list)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,7 @@ A model folder has the layout of immich or of transformers.js (networks/hub.py).
 SigLIP and SigLIP 2 are recognised by config.json (`tokenizer.read_text_rules`).
 
 A region is embedded as LangSplat does it: masked, cropped to its box, padded to a black square. A text is embedded as
-it is; with several templates its embedding is the mean over them.
+it is.
 """
 
 import functools
@@ -102,14 +102,6 @@ def masked_crop(
     return np.asarray(cv2.resize(square, (size, size)), np.uint8)
 
 
-def require_templates(templates: Sequence[str]) -> None:
-    """Raises InputError unless each template has a place for the text, and there is one."""
-    if not templates or not all("{}" in template for template in templates):
-        problem = ", ".join(map(repr, templates)) or "no template"
-        remedy = 'For example "a photo of a {}.", or "{}", the text alone.'
-        raise InputError("--template", problem, "a phrase that holds {}", remedy)
-
-
 class ClipEmbedder:
     """Embedder (jsecon.vision.protocols) that runs the two graphs of a CLIP-like model.
 
@@ -119,7 +111,6 @@ class ClipEmbedder:
     Args:
       folder: The model folder.
       precision: Precision of its graphs; None takes the highest that is there.
-      templates: Phrases with `{}` for the text, whose unit embeddings are averaged.
       store: Folder that caches embeddings of regions by content; or None.
 
     Attributes:
@@ -132,14 +123,11 @@ class ClipEmbedder:
         folder: str | Path,
         *,
         precision: Precision | None = None,
-        templates: Sequence[str] = ("{}",),
         store: Path | None = None,
     ):
-        require_templates(templates)
         visual, textual, config, tokenizer = find_files(folder, "embedder", precision)
         mean, std, size = read_preprocessing(config)
         rules = read_text_rules(Path(folder), tokenizer)
-        self.templates = tuple(templates)
         files = [*graph_files(visual), *graph_files(textual), tokenizer]
         self.name = f"clip-{content_digest(files, extra=repr((mean, std, size, *(rules or ()))))}"
         self.logits = _read_logits(Path(folder)) if rules is not None else None
@@ -154,13 +142,13 @@ class ClipEmbedder:
 
     @functools.cached_property
     def canonical_phrases(self) -> Float32[np.ndarray, "c e"]:
-        """(C, E) unit embeddings of CANONICAL, without templates."""
+        """(C, E) unit embeddings of CANONICAL."""
         return self._embed_phrases(list(CANONICAL))
 
     @functools.cached_property
     def unrelated_words(self) -> Float32[np.ndarray, "w e"]:
-        """(W, E) unit embeddings of the unrelated words, in the templates like other texts; they are cached."""
-        return cached_reference(f"{self.name} {self.templates}", self.embed_text)
+        """(W, E) unit embeddings of the unrelated words; they are cached."""
+        return cached_reference(self.name, self.embed_text)
 
     @property
     def size(self) -> int:
@@ -189,13 +177,11 @@ class ClipEmbedder:
         return rows
 
     def embed_text(self, texts: list[str]) -> Float32[np.ndarray, "q e"]:
-        """Embeds texts: unit rows, the mean over the templates."""
+        """Embeds texts: unit rows."""
         for text in texts:
             if not text.strip():
                 raise InputError("text", repr(text), "a text", 'Say what to find, for example "red mug".')
-        phrases = [template.replace("{}", text) for text in texts for template in self.templates]
-        rows = self._embed_phrases(phrases).reshape(len(texts), len(self.templates), -1)
-        return _normalize(rows.mean(1), self._textual_path)
+        return _normalize(self._embed_phrases(texts), self._textual_path)
 
     def check(self) -> str:
         """Runs the graphs on a black image and a word, closes them, and describes the model in a sentence."""

@@ -6,7 +6,7 @@ closed when its stage is done, to free its memory.
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, get_args
 
@@ -103,7 +103,6 @@ def open_embedder(
     *,
     folder: str | Path | None = None,
     precision: Precision | None = None,
-    templates: Sequence[str] = ("{}",),
     store: Path | None = None,
 ) -> Embedder:
     """Opens an embedder: CLIP if one is named, else colours. InputError is raised if it is of another space.
@@ -112,14 +111,13 @@ def open_embedder(
       name: Name of the space, or None for any. In an external space any CLIP with embeddings of that length is taken.
       folder: Folder, name or address of a CLIP model.
       precision: Precision of its graphs.
-      templates: Phrases for texts of CLIP.
       store: Folder that caches embeddings.
     """
     if folder is not None:
         from jsecon.networks.clip import ClipEmbedder
 
         folder = local_folder(folder, "embedder", precision)
-        clip = ClipEmbedder(folder, precision=precision, templates=templates, store=store)
+        clip = ClipEmbedder(folder, precision=precision, store=store)
         return _of_space(clip, name, "Give the model that the field was made with: --embedder DIR.")
     if (dim := external_dim(name)) is not None:
         raise _missing_model(dim)
@@ -127,8 +125,6 @@ def open_embedder(
 
     if name is not None and name.startswith("clip-"):
         remedy = "Give the folder of the model that the field was made with (--embedder DIR), or run again without."
-    elif tuple(templates) != ("{}",):
-        raise InputError("--template", "a field whose texts are colours", "one made with CLIP", "Leave out --template.")
     else:
         remedy = "Run the capture again with this version."
     return _of_space(ColourEmbedder(), name, remedy)
@@ -145,28 +141,25 @@ def _of_space(embedder: Any, name: str | None, remedy: str) -> Embedder:
     return embedder
 
 
-def field_embedder(
-    field: LanguageField, folder: str | Path | None = None, *, templates: Sequence[str] = ("{}",)
-) -> Embedder:
+def field_embedder(field: LanguageField, folder: str | Path | None = None) -> Embedder:
     """Opens the embedder that a field's regions were embedded by, or raises InputError.
 
     Args:
       field: The field.
       folder: Folder, name or address of the model; None looks where the run had it and in the hub's cache, and takes it
         only if its content is the same.
-      templates: Phrases for the texts, with CLIP.
     """
     if folder is None:
-        model = find_model(field, templates)
+        model = find_model(field)
         if isinstance(model, HubModel):
             problem = f"its texts need the model {model.address}, which is not on this machine"
             raise InputError("field", problem, "", f"Fetch it with: {model.get_command}. Or add --yes.")
         if model is not None:
             return _of_space(model, field.embedder, "")
-    return open_embedder(field.embedder, folder=folder, templates=templates)
+    return open_embedder(field.embedder, folder=folder)
 
 
-def find_model(field: LanguageField, templates: Sequence[str] = ("{}",)) -> "ClipEmbedder | HubModel | None":
+def find_model(field: LanguageField) -> "ClipEmbedder | HubModel | None":
     """Looks for the CLIP model that a field was made with, in its folder and in the hub's cache.
 
     Returns the model if it is on this machine, else the one of the hub that is to be fetched; None for a field without
@@ -175,15 +168,14 @@ def find_model(field: LanguageField, templates: Sequence[str] = ("{}",)) -> "Cli
     sources = locate_sources(field)
     if not (sources.embedder or "").startswith("clip-"):
         return None
-    from jsecon.networks.clip import ClipEmbedder, require_templates
+    from jsecon.networks.clip import ClipEmbedder
 
-    require_templates(templates)
     model = None if sources.address is None else parse_model(sources.address, "embedder", sources.precision)
     on_hub = model if isinstance(model, HubModel) else None
     for folder in (sources.model, None if on_hub is None else on_hub.cached_folder):
         if folder is not None:
             with contextlib.suppress(InputError):  # another model is there now
-                embedder = ClipEmbedder(folder, precision=sources.precision, templates=templates)
+                embedder = ClipEmbedder(folder, precision=sources.precision)
                 if embedder.name == sources.embedder:
                     return embedder
     return on_hub
