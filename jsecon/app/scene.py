@@ -89,7 +89,7 @@ def open_scene(
       InputError: The file cannot be read, or the model is not on this machine.
     """
     file = Path(path)
-    model = _model_folder(embedder) if isinstance(embedder, str | Path) else None
+    model = embedder if isinstance(embedder, str | Path) else None
     if is_bare_scene(file):
         folder = file.with_name(f"{file.stem}_field") if out is None else Path(out)
         axis: Any = None if up is None else tuple(map(float, up))
@@ -100,24 +100,12 @@ def open_scene(
     if large:
         check_field(file)
     field = load_field(file, mapped=large)
-    if isinstance(embedder, str | Path):
+    if model is not None:
         from jsecon.pipeline.model_loading import field_embedder
 
         embedder = field_embedder(field, model)
     file = file.resolve()
     return Scene(field, embedder, up=up, name=file.parent.name if file.name == FIELD_FILE else file.stem)
-
-
-def _model_folder(model: str | Path) -> Path:
-    """The folder of a model by its name, address or path."""
-    from jsecon.networks.hub import parse_model
-
-    known = parse_model(Path(model).as_posix(), "embedder", None)
-    if isinstance(known, Path):
-        return known
-    if known.cached_folder is None:
-        raise InputError(known.address, "not on this machine", remedy=f"Fetch it with: {known.get_command}.")
-    return known.cached_folder
 
 
 def _field_of_gaussians(options: Options, folder: Path, listener: Listener) -> Path:
@@ -139,17 +127,15 @@ def _field_of_gaussians(options: Options, folder: Path, listener: Listener) -> P
     return path
 
 
-def _model_of(file: Path) -> Path | None:
-    """The folder of the model that a field was made with, if it is on this machine."""
-    from jsecon.networks.hub import HubModel, parse_model
+def _model_of(file: Path) -> str | Path | None:
+    """The folder or address of the model that a field was made with; None if it had none."""
     from jsecon.pipeline.sources import locate_sources
 
     try:
         sources = locate_sources(load_field(file, mapped=True))
     except InputError:  # damaged: it is made anew
         return None
-    model = None if sources.address is None else parse_model(sources.address, "embedder", sources.precision)
-    return model.cached_folder if isinstance(model, HubModel) else sources.model
+    return sources.model or sources.address
 
 
 class Scene:

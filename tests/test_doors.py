@@ -1,0 +1,157 @@
+"""Thirty questions through every door: command line, export, HTTP, tools, viewer's page, evaluation and Python give the
+same Gaussians, to the bit."""
+
+import asyncio
+import base64
+import json
+import re
+
+import numpy as np
+import pytest
+from capture_files import run_cli
+from table_field import THINGS, table_field
+
+from jsecon import At, Box, InputError, Mask, Region, Scene, load_gaussians, open_scene, save_field
+from jsecon.app.evaluation import evaluate
+from jsecon.pipeline.progress import Listener
+from jsecon.read.masks.labels import LabelledFrame
+
+TEXTS = (
+    *("red mug", "dark green bottle", "white plate", "orange ball", "dark blue box", "green", "blue", "purple vase"),
+    *("red mug or orange ball", '"red mug" or "white plate" but not "orange ball"', "blue but not dark blue"),
+    *(
+        "the red mug left of the dark green bottle",
+        "the red mug right of the dark green bottle",
+        "the leftmost red mug",
+    ),
+    *("the orange ball on the white plate", "the white plate under the orange ball", "the largest blue thing"),
+    *("the second red mug from the left", "two red mugs", "how many red mugs", "the red mug near the dark blue box"),
+    *("the dark green bottle between the red mugs", "the dark blue box behind the dark green bottle"),
+    *("the orange ball on the dark blue box", "'red mug left of green'", "all red mugs"),
+)
+POINTED = (At("frame_0", 36, 36), At(0, 45, 33), Box("#0", 30, 20, 70, 60), Region(4))
+
+
+@pytest.fixture(scope="module")
+def door(tmp_path_factory):
+    """The scene of the table, its file, and question -> rows of the answer in Python."""
+    things = (*THINGS, ("light grey floor", (0.0, 0.0, -0.02), (1.5, 1.5, 0.001)))
+    folder = tmp_path_factory.mktemp("table")
+    save_field(folder / "field.safetensors", table_field(things)[0])
+    scene = open_scene(folder)
+    return scene, folder / "field.safetensors", {text: scene.ask(text).rows for text in TEXTS}
+
+
+def rows_of(scene, file) -> np.ndarray:
+    """The Gaussians that a .ply holds: every centre of the table occurs once."""
+    place = {mean.tobytes(): row for row, mean in enumerate(np.asarray(scene.field.gaussians.means, np.float32))}
+    return np.sort([place[mean.tobytes()] for mean in np.asarray(load_gaussians(file).means, np.float32)]).astype(int)
+
+
+def test_there_are_thirty_and_they_are_of_all_kinds(door):
+    scene, _, rows = door
+    assert len(TEXTS) + len(POINTED) == 30
+    answers = [scene.ask(question) for question in (*TEXTS, *POINTED)]
+    assert {answer.by for answer in answers} == {"votes", "relation", "outline"}
+    assert sum(len(answer.rows) == 0 for answer in answers) >= 2
+    assert len({answer.rows.tobytes() for answer in answers}) >= 10
+    assert all(rows["two red mugs"] == rows["red mug"])
+
+
+def test_the_command_line(door, tmp_path, capsys):
+    scene, file, _ = door
+    options = ["--at", "frame_0", 36, 36, "--at", "#0", 45, 33, "--box", "#0", 30, 20, 70, 60]
+    assert run_cli("query", file, *TEXTS, *options, "--views", 0, "--out", tmp_path, "--json") == 0
+    records = json.loads(capsys.readouterr().out)["answers"]
+    questions = (*TEXTS, *POINTED[:3])
+    assert len(records) == len(questions)
+    for question, record in zip(questions, records):
+        answer = scene.ask(question)
+        assert record == json.loads(json.dumps(answer.as_dict())) | {"ply": record["ply"], "masks": {}}
+        if len(answer.rows):
+            np.testing.assert_array_equal(rows_of(scene, tmp_path / record["ply"]), answer.rows)
+        else:
+            assert record["ply"] is None
+
+
+def test_the_export_of_one_thing(door, tmp_path):
+    scene, file, rows = door
+    for text in TEXTS:
+        code = run_cli("export", file, "--only", text, "--out", tmp_path / "only.ply")
+        assert code == (0 if len(rows[text]) else 2), text
+        if code == 0:
+            np.testing.assert_array_equal(rows_of(scene, tmp_path / "only.ply"), rows[text])
+
+
+def test_http(door, tmp_path):
+    pytest.importorskip("fastapi", reason="the extra serve is not installed")
+    from starlette.testclient import TestClient
+
+    from jsecon.app.server.api import application
+
+    scene, _, rows = door
+    client = TestClient(application({"table": scene}), "http://127.0.0.1:8765")
+    for text in TEXTS:
+        record = client.post("/query", json={"text": text}).json()
+        assert {k: v for k, v in record.items() if k != "field"} == json.loads(json.dumps(scene.ask(text).as_dict()))
+        found = client.get("/selection.ply", params={"text": text})
+        if len(rows[text]):
+            (tmp_path / "selection.ply").write_bytes(found.content)
+            np.testing.assert_array_equal(rows_of(scene, tmp_path / "selection.ply"), rows[text])
+        else:
+            assert found.status_code == 422
+    pixel = client.post("/query", json={"at": ["frame_0", 36, 36]}).json()
+    assert pixel["region"] == scene.ask(POINTED[0]).as_dict()["region"]
+
+
+def test_tools_of_language_models(door):
+    pytest.importorskip("mcp", reason="the extra mcp is not installed")
+    from mcp import Client
+
+    from jsecon.app.mcp_server import make_server
+
+    scene = door[0]
+
+    async def ask():
+        async with Client(make_server({"table": scene})) as client:
+            return [(await client.call_tool("find", {"text": text})).structured_content for text in TEXTS]
+
+    for text, record in zip(TEXTS, asyncio.run(ask()), strict=True):
+        expected = json.loads(json.dumps(scene.ask(text).as_dict()))
+        assert {name: record[name] for name in expected} == expected
+
+
+def test_the_viewers_page(door, tmp_path):
+    scene, file, rows = door
+    assert run_cli("view", file, *TEXTS, "--export", tmp_path / "page.html") == 0
+    page = (tmp_path / "page.html").read_text()
+    content = json.loads(re.search(r'id="scene-data">(.*?)</script>', page)[1])
+    assert content["count"] == scene.field.gaussians.count
+    for text, shown in zip(TEXTS, content["texts"], strict=True):
+        packed = np.frombuffer(base64.b64decode(shown["mask"]), np.uint8)
+        mask = np.unpackbits(packed, count=content["count"], bitorder="little")
+        assert shown["text"] == text
+        np.testing.assert_array_equal(np.flatnonzero(mask), rows[text])
+
+
+def test_the_evaluation(door):
+    scene, _, rows = door
+    outline = np.ones((80, 100), bool), np.array([[0, 0, 100, 80]], np.float32)
+    labels = [LabelledFrame("frame_0", 100, 80, dict.fromkeys(TEXTS, outline))]
+    measured = evaluate(scene, labels, Listener(), ("anchored",))["anchored"][0]
+    assert {row.query: row.selected for row in measured} == {text: len(rows[text]) for text in TEXTS}
+
+
+def test_texts_come_back_in_order_and_a_text_twice_is_computed_once(door, monkeypatch):
+    scene = Scene(door[0].field, door[0].embedder)
+    computed = []
+    answer = scene._answer
+    monkeypatch.setattr(scene, "_answer", lambda query: computed.append(str(query)) or answer(query))
+    texts = ["the leftmost red mug", "white plate", "the leftmost red mug", "nothing known", "white plate"]
+    answers = scene.ask_all(texts)
+    assert [isinstance(found, InputError) for found in answers] == [False, False, False, True, False]
+    assert [str(found.query) for found in answers[:3]] == texts[:3]
+    assert answers[0] is answers[2]
+    assert computed == ["the leftmost red mug", "white plate", "nothing known"]
+    scene.ask(Mask({0: np.eye(80, 100, dtype=bool)}))
+    assert len(scene._answers) == 2  # the array of a mask may change
