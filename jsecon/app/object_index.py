@@ -49,10 +49,16 @@ class ObjectIndex:
       embedder: Its embedder.
       up: (3,) up axis in the capture's world; None finds it.
       catalogue: Lists all objects with names, which tell objects of one name apart.
+      shades: Replaces texts by narrower ones that the field has (`choose_shades`).
     """
 
     def __init__(
-        self, field: LanguageField, embedder: Any, up: Sequence[float | int] | None, catalogue: Callable[[], Catalogue]
+        self,
+        field: LanguageField,
+        embedder: Any,
+        up: Sequence[float | int] | None,
+        catalogue: Callable[[], Catalogue],
+        shades: Callable[..., list[str]],
     ):
         """Finds the up axis; objects are measured when they are first asked for."""
         self.up = field_up(field, up)
@@ -62,7 +68,7 @@ class ObjectIndex:
         self._field = dataclasses.replace(field, regions=regions, unrelated_words=reference, cameras=cameras)
         self._embedder = embedder
         self._rules = QueryRules(all_of_class=True, logits=getattr(embedder, "logits", None))
-        self._catalogue = catalogue
+        self._catalogue, self._shades = catalogue, shades
         self._votes = jax.tree.map(np.asarray, field.votes)
         self._object = functools.lru_cache(MAX_KEPT)(self._measure_object)
         self._objects_of = functools.lru_cache(MAX_KEPT)(self._find_objects)
@@ -82,7 +88,7 @@ class ObjectIndex:
         the best name of some of the objects, the others do not count. The second value is the share of unrelated words
         that are less similar to the scene than the phrase.
         """
-        texts = choose_shades(self._field, self._embedder, [phrase], self._rules, every=True)
+        texts = self._shades(self._field, self._embedder, [phrase], self._rules, every=True)
         embedded = jax.device_put(self._embedder.embed_text(texts))
         match = match_regions(self._field, embedded, self._rules)
         regions = np.flatnonzero(np.asarray(match.chosen)) if int(match.region) >= 0 else np.zeros(0, int)
@@ -243,38 +249,3 @@ class ObjectIndex:
         scale = world_scale(self._field)
         lengths = scale * np.array([surfaces, centers, max(centers - sum(reach), 0.0)])
         return dict(zip(("surfaces", "centers", "gap"), rounded(lengths, scale * centers))) | {"angle": round(angle, 2)}
-
-
-def choose_shades(
-    field: LanguageField, embedder: Any, texts: Sequence[str], rules: QueryRules, *, every: bool
-) -> list[str]:
-    """Replaces texts that no region matches by narrower ones that some region does.
-
-    Among colours "blue" is a family, and a room may have nothing of its typical colour but a dark and a light blue
-    thing. Each is far from the word and near to its own shade.
-
-    Args:
-      field: The field.
-      embedder: Its embedder. Its `narrower(text)`, if it has one, lists texts that name a part of what the text names.
-      texts: The texts.
-      rules: How texts match. Each of n narrower texts may lose to an n-th of the unrelated words that one may lose to.
-      every: Whether all narrower texts that match replace a text, instead of the best of them.
-    """
-    if not hasattr(embedder, "narrower"):
-        return list(texts)
-
-    def score(text: str, rules: QueryRules) -> float:
-        match = match_regions(field, jnp.asarray(embedder.embed_text([text])), rules)
-        return float(match.score) if int(match.region) >= 0 else -np.inf
-
-    replaced: list[str] = []
-    for text in texts:
-        narrower = embedder.narrower(text)
-        best: list[str] = []
-        if narrower and np.isinf(score(text, rules)):
-            # Of n attempts one succeeds by chance as often as one attempt that is n times as strict.
-            strict = dataclasses.replace(rules, min_rank=1 - (1 - rules.min_rank) / len(narrower))
-            scores = {option: score(option, strict) for option in narrower}
-            best = [option for option in sorted(narrower, key=scores.__getitem__) if scores[option] > -np.inf]
-        replaced.extend(best[0 if every else -1 :] or [text])
-    return replaced

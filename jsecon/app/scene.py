@@ -20,11 +20,11 @@ import numpy as np
 from jaxtyping import Bool, Int, UInt8
 
 from jsecon.app.catalogue import Catalogue, objects
-from jsecon.app.object_index import ObjectIndex, choose_shades
-from jsecon.app.records import Answer, Box, Mask, Query, Question, Region
+from jsecon.app.object_index import ObjectIndex
+from jsecon.app.records import Answer, Box, Mask, Query, Question, Region, gaussian_rows
 from jsecon.errors import InputError
 from jsecon.field.columns import is_mapped
-from jsecon.field.field import check_field, load_field, subset_field
+from jsecon.field.field import check_field, load_field
 from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.field.regions import ALIKE_THRESHOLD
 from jsecon.pipeline.options import Options, is_bare_scene
@@ -202,7 +202,7 @@ class Scene:
         self._require_memory("a relation, an order or a number")
         if self.field.regions.count == 0:
             raise InputError("field", "it has no regions, so no objects", remedy="Make it again with other --masks.")
-        return ObjectIndex(self.text_field, self.embedder, self._up, self.objects)
+        return ObjectIndex(self.text_field, self.embedder, self._up, self.objects, choose_shades)
 
     def _require_memory(self, what: str) -> None:
         """Raises InputError if the field is mapped, which `what` needs in memory."""
@@ -555,7 +555,7 @@ class Scene:
                 rows = np.zeros(_padded(len(answer.rows), self.field.gaussians.count), np.int64)
                 rows[: len(answer.rows)] = answer.rows
                 mask = np.arange(len(rows)) < len(answer.rows)
-                gaussians = jax.device_put(subset_field(self.field, rows).gaussians)
+                gaussians = jax.device_put(gaussian_rows(self.field.gaussians, rows))
             return np.asarray(selection_mask(gaussians, self._cameras[self.frame_index(frame)], jnp.asarray(mask)))
 
     def masks(self, answer: Answer, count: int) -> dict[int, Bool[np.ndarray, "h w"]]:
@@ -661,3 +661,38 @@ def read_mask(file: str | Path, width: int, height: int) -> Bool[np.ndarray, "h 
 def _padded(count: int, most: int) -> int:
     """A power of two of at least `count` and MIN_BLOCK_ROWS rows, at most `most`."""
     return min(max(1 << max(count - 1, 0).bit_length(), MIN_BLOCK_ROWS), most)
+
+
+def choose_shades(
+    field: LanguageField, embedder: Any, texts: Sequence[str], rules: QueryRules, *, every: bool
+) -> list[str]:
+    """Replaces texts that no region matches by narrower ones that some region does.
+
+    Among colours "blue" is a family, and a room may have nothing of its typical colour but a dark and a light blue
+    thing. Each is far from the word and near to its own shade.
+
+    Args:
+      field: The field.
+      embedder: Its embedder. Its `narrower(text)`, if it has one, lists texts that name a part of what the text names.
+      texts: The texts.
+      rules: How texts match. Each of n narrower texts may lose to an n-th of the unrelated words that one may lose to.
+      every: Whether all narrower texts that match replace a text, instead of the best of them.
+    """
+    if not hasattr(embedder, "narrower"):
+        return list(texts)
+
+    def score(text: str, rules: QueryRules) -> float:
+        match = match_regions(field, jnp.asarray(embedder.embed_text([text])), rules)
+        return float(match.score) if int(match.region) >= 0 else -np.inf
+
+    replaced: list[str] = []
+    for text in texts:
+        narrower = embedder.narrower(text)
+        best: list[str] = []
+        if narrower and np.isinf(score(text, rules)):
+            # Of n attempts one succeeds by chance as often as one attempt that is n times as strict.
+            strict = dataclasses.replace(rules, min_rank=1 - (1 - rules.min_rank) / len(narrower))
+            scores = {option: score(option, strict) for option in narrower}
+            best = [option for option in sorted(narrower, key=scores.__getitem__) if scores[option] > -np.inf]
+        replaced.extend(best[0 if every else -1 :] or [text])
+    return replaced

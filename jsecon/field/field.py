@@ -15,10 +15,8 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Int
 
 from jsecon.errors import InputError, describe_error, require
-from jsecon.field.columns import votes_of_rows
 from jsecon.files import (
     READ_ERRORS,
     ForeignFileError,
@@ -112,27 +110,6 @@ def load_field(path: str | os.PathLike, *, mapped: bool = False) -> LanguageFiel
       InputError: The file is missing, not a field, cut short, damaged, of a later version, or inconsistent.
     """
     return _read(Path(path), MAPPED if mapped else sys.maxsize, checked=not mapped)
-
-
-def subset_field(field: LanguageField, rows: Int[np.ndarray, " m"]) -> LanguageField:
-    """Takes some of the Gaussians of a field; of mapped columns only their rows are read.
-
-    Args:
-      field: Field of N Gaussians.
-      rows: (M,) rows.
-
-    Returns:
-      Field of M Gaussians with NumPy columns.
-    """
-
-    def take(a):
-        return np.asarray(a)[rows]
-
-    parts = None if field.parts is None else dataclasses.replace(field.parts, part=take(field.parts.part))
-    codes = None if field.codes is None else dataclasses.replace(field.codes, gaussians=take(field.codes.gaussians))
-    gaussians = jax.tree.map(take, field.gaussians)
-    votes = dataclasses.replace(votes_of_rows(field.votes, rows), overlap=field.votes.overlap)
-    return dataclasses.replace(field, gaussians=gaussians, votes=votes, codes=codes, parts=parts)
 
 
 class Provenance(str):

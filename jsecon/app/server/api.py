@@ -160,7 +160,7 @@ def application(
         place = "text" if request.at is None else "at"
         question = request.text if request.text is not None else At(*request.at)
         try:
-            query = SceneQuery(question, by=request.by, threshold=request.threshold, all_of_kind=request.all)
+            query = SceneQuery(question, by=request.by, threshold=request.threshold, all_of_class=request.all)
         except InputError as error:
             raise _wrong(error.where, str(error)) from error
         answer = scene.known(query)  # is sent at once, also while all threads are taken

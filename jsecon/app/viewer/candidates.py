@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jsecon.app.object_index import choose_shades
+from jsecon.app.scene import choose_shades
 from jsecon.field.regions import mean_residuals
 from jsecon.field.similarity import similarities
 from jsecon.query.answer import ROUNDING, RULES
