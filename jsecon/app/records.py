@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 from jsecon.errors import InputError, require_one_of
 from jsecon.field.membership import probability_inside
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
-from jsecon.query.referring import FoundObject as Object
+from jsecon.query.referring import Object
 from jsecon.query.rules import MIN_RANK
 from jsecon.splat.transform import transform_gaussians_float64
 from jsecon.types import Gaussians, LanguageField, Selection

@@ -13,15 +13,13 @@ from jsecon.errors import require, require_shape
 from jsecon.types import Array, Gaussians, Leaf, record
 
 BOX_TAIL = 0.02
-"""share of the Gaussians at each end of an axis that a box leaves out as strays"""
+"""Share of the Gaussians at each end of an axis that a box leaves out as strays."""
 POINTS = 256
-"""points of each object"""
-YAW_STEPS = 18
-"""directions, evenly spaced over a right angle, that an upright box tries"""
-YAW_POINTS = 400
-"""points of an object that these directions are tried on"""
+"""Points of each object."""
+_YAW_STEPS = 18
+"""Directions, evenly spaced over a right angle, that an upright box tries."""
 _EVERY_THIRD = np.array([sum(1 << 3 * bit for bit in range(10) if number >> bit & 1) for number in range(1 << 10)])
-"""numbers of ten bits with two zeros before each of their bits"""
+"""Numbers of ten bits with two zeros before each of their bits."""
 
 
 @record
@@ -120,24 +118,24 @@ def _principal_axes(points: np.ndarray) -> np.ndarray:
 
 
 def _upright_turns(up: np.ndarray) -> np.ndarray:
-    """Returns axes (2 YAW_STEPS + 1, 3) of upright boxes: horizontal ones, the ones across to these, and up."""
+    """Returns axes (2 _YAW_STEPS + 1, 3) of upright boxes: horizontal ones, the ones across to these, and up."""
     require(bool(np.linalg.norm(up) > 0), "object_shapes", f"up {up.tolist()}", "a direction", "For example 0 0 1.")
     up = up / np.linalg.norm(up)
     first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     first /= np.linalg.norm(first)
     second = np.cross(up, first)
-    yaw = 0.5 * np.pi * np.arange(YAW_STEPS)[:, None] / YAW_STEPS
+    yaw = 0.5 * np.pi * np.arange(_YAW_STEPS)[:, None] / _YAW_STEPS
     turned = [np.cos(yaw) * first + np.sin(yaw) * second, np.cos(yaw) * second - np.sin(yaw) * first]
     return np.concatenate([*turned, up[None]])
 
 
 def _upright_axes(points: np.ndarray, spreads: np.ndarray, turns: np.ndarray) -> np.ndarray:
     """Returns the axes of the upright box with the smallest footprint as columns, the longer horizontal one first."""
-    step = -(-len(points) // YAW_POINTS)
+    step = -(-len(points) // 400)  # so many points of an object tell its yaw
     low, high = _box_ends(points[::step], spreads[::step], turns[:-1].T)
-    sides = (high - low).reshape(2, YAW_STEPS)
+    sides = (high - low).reshape(2, _YAW_STEPS)
     best = int(np.argmin(sides[0] * sides[1]))
-    long, short = turns[best], turns[best + YAW_STEPS]
+    long, short = turns[best], turns[best + _YAW_STEPS]
     if sides[1, best] > sides[0, best]:
         long, short = short, -long
     return np.stack([long, short, turns[-1]], axis=1)
@@ -167,13 +165,6 @@ def _spaced_points(points: np.ndarray, count: int) -> np.ndarray:
 
 
 def gaussian_spreads(gaussians: Gaussians) -> Float[np.ndarray, "n 3 3"]:
-    """Computes the axes of Gaussians, each as long as its standard deviation.
-
-    Args:
-      gaussians: N Gaussians.
-
-    Returns:
-      (N, 3, 3) columns, world units, float64.
-    """
+    """Computes the axes of Gaussians as columns, each as long as its standard deviation."""
     rotations = Rotation.from_quat(np.asarray(gaussians.quaternions, np.float64), scalar_first=True).as_matrix()
     return rotations * np.exp(np.asarray(gaussians.log_scales, np.float64))[:, None, :]

@@ -15,32 +15,23 @@ from jsecon.query.object_shapes import ObjectShapes
 from jsecon.query.relations import SATISFIED, Viewpoint, between_scores, gap, order_values, pair_scores, size_of
 
 WITHIN_REACH = 0.2
-"""score from which an object that was not chosen is an alternative"""
-CLOSE_CALL = 0.04
-"""difference of two values of an order, in units of their size, up to which neither is clearly before the other"""
-CLOSE_ANGLE = 0.02
-"""the same of directions, radians"""
-BLOCK = 512
-"""pairs that are scored at once: their points stay in the processor's cache"""
+"""Score from which an object that was not chosen is an alternative."""
 
 
 @dataclasses.dataclass(frozen=True)
-class FoundObject:
-    """An object that a phrase names.
-
-    Attributes:
-      phrase: The words that it was found by.
-      regions: Its regions.
-      rows: (M,) its Gaussians.
-      shape: Its box and points, in the field's world.
-      conditions: Score of each condition that was put to it, by the condition in words.
-    """
+class Object:
+    """An object that a phrase names."""
 
     phrase: str
+    """The words that it was found by."""
     regions: tuple[int, ...]
+    """Its regions."""
     rows: np.ndarray
+    """(M,) its Gaussians."""
     shape: ObjectShapes
+    """Its box and points, in the field's world."""
     conditions: dict[str, float] = dataclasses.field(default_factory=dict)
+    """Score of each condition that was put to it, by the condition in words."""
 
     @property
     def score(self) -> float:
@@ -48,7 +39,7 @@ class FoundObject:
         return min(self.conditions.values(), default=1.0)
 
 
-Find = Callable[[str], tuple[list[FoundObject], float]]
+Find = Callable[[str], tuple[list[Object], float]]
 """the objects that a phrase names, and the share of unrelated words that are less similar to the scene than it"""
 
 
@@ -64,52 +55,35 @@ class ReferringResult:
       reason: Why there is no object, or not the number that the text says; else empty.
     """
 
-    chosen: list[FoundObject]
-    alternatives: list[FoundObject] = dataclasses.field(default_factory=list)
-    used: list[FoundObject] = dataclasses.field(default_factory=list)
-    undecided: list[FoundObject] = dataclasses.field(default_factory=list)
+    chosen: list[Object]
+    alternatives: list[Object] = dataclasses.field(default_factory=list)
+    used: list[Object] = dataclasses.field(default_factory=list)
+    undecided: list[Object] = dataclasses.field(default_factory=list)
     reason: str = ""
 
 
-def stack_shapes(objects: Sequence[FoundObject]) -> ObjectShapes:
-    """Joins the shapes of objects.
-
-    Args:
-      objects: K objects, K >= 1.
-
-    Returns:
-      Their shapes as one record (K, ...).
-    """
+def stack_shapes(objects: Sequence[Object]) -> ObjectShapes:
+    """Joins the shapes of at least one object to one record."""
     return jax.tree.map(lambda *columns: np.concatenate(columns), *(found.shape for found in objects))
 
 
 def evaluate(find: Find, thing: NounPhrase, conditions: Sequence[Condition], view: Viewpoint) -> ReferringResult:
-    """Finds the objects of a name that meet conditions, and chooses among them by the order.
-
-    Args:
-      find: Finds the objects that a phrase names.
-      thing: The object that is looked for.
-      conditions: Its conditions, one reading of the text.
-      view: From where directions are seen.
-
-    Returns:
-      The chosen objects, or the reason why there are none.
-    """
-    candidates, quantile = find(thing.text)
+    """Finds the objects of a name that meet conditions, one reading of a text, and chooses among them by the order."""
+    candidates, rank = find(thing.text)
     if not candidates:
-        known = "" if np.isnan(quantile) else f" ({int(100 * quantile)} % of unrelated words are less like the scene)"
+        known = "" if np.isnan(rank) else f" ({int(100 * rank)} % of unrelated words are less like the scene)"
         return ReferringResult([], reason=f"there is no {thing.text!r} in the scene{known}")
     shapes = stack_shapes(candidates)
-    used: list[FoundObject] = []
+    used: list[Object] = []
     orders: list[tuple[str, np.ndarray]] = []
     for condition in conditions:
         anchors = []
         for anchor in condition.anchors:
-            outcome = evaluate(find, anchor, condition.conditions if anchor is condition.anchors[-1] else (), view)
-            if not outcome.chosen:
-                return ReferringResult([], used=used, reason=f"nothing to compare with: {outcome.reason}")
-            anchors.append(outcome.chosen)
-            used += [found for found in outcome.chosen if found not in used]
+            result = evaluate(find, anchor, condition.conditions if anchor is condition.anchors[-1] else (), view)
+            if not result.chosen:
+                return ReferringResult([], used=used, reason=f"nothing to compare with: {result.reason}")
+            anchors.append(result.chosen)
+            used += [found for found in result.chosen if found not in used]
         scores = _condition_scores(candidates, shapes, condition, anchors, view)
         if condition.relation in ANCHORED_ORDERS:
             orders.append((condition.relation, scores))
@@ -142,16 +116,16 @@ def evaluate(find: Find, thing: NounPhrase, conditions: Sequence[Condition], vie
     return ReferringResult(chosen, alternatives, used, undecided, reason)
 
 
-def _apart(a: Sequence[FoundObject], b: Sequence[FoundObject]) -> Bool[np.ndarray, "k l"]:
+def _apart(a: Sequence[Object], b: Sequence[Object]) -> Bool[np.ndarray, "k l"]:
     """Which pairs of objects have no region in common."""
     return np.array([[not set(one.regions) & set(other.regions) for other in b] for one in a])
 
 
 def _condition_scores(
-    candidates: Sequence[FoundObject],
+    candidates: Sequence[Object],
     shapes: ObjectShapes,
     condition: Condition,
-    anchors: Sequence[Sequence[FoundObject]],
+    anchors: Sequence[Sequence[Object]],
     view: Viewpoint,
 ) -> Float[np.ndarray, " k"]:
     """Score of a condition for each candidate, with the anchor that fits best; for an anchored order the value."""
@@ -162,7 +136,7 @@ def _condition_scores(
         distinct = _apart(candidates, anchors[-1])[:, None] & _apart(anchors[0], anchors[-1])
         scores = between_scores(shapes, others, ends)
         return np.where(usable[:, :, None] & distinct, scores, 0.0).max((1, 2))
-    rows = max(BLOCK // len(others), 1)
+    rows = max(512 // len(others), 1)  # pairs at once, whose points stay in the processor's cache
     parts = [shapes[first : first + rows] for first in range(0, len(shapes), rows)]
     if condition.relation in ANCHORED_ORDERS:
         gaps = np.concatenate([gap(part[:, None], others[None]) for part in parts])
@@ -181,12 +155,13 @@ def _ordered(
     first = thing.rank - 1 if name not in ANCHORED_ORDERS else 0
     chosen = ranked[first : first + count]
     others = [k for k in ranked if k not in chosen]
-    tolerance = CLOSE_ANGLE if name in ("leftmost", "rightmost") else CLOSE_CALL * np.median(size_of(shapes)[ranked])
+    # Within 0.02 radians, or 0.04 of the objects' size, neither is clearly before the other.
+    tolerance = 0.02 if name in ("leftmost", "rightmost") else 0.04 * np.median(size_of(shapes)[ranked])
     close = [k for k in others if chosen and min(abs(values[k] - values[c]) for c in chosen) <= tolerance]
     return chosen, close, others
 
 
-def _nearest_miss(candidates: Sequence[FoundObject]) -> str:
+def _nearest_miss(candidates: Sequence[Object]) -> str:
     """Says which candidate came nearest, and which condition it does not meet."""
     best = max(candidates, key=lambda found: found.score)
     if not best.conditions:

@@ -18,31 +18,9 @@ from jsecon.query.object_shapes import ObjectShapes
 from jsecon.types import Array, Camera, record
 
 SATISFIED = 0.5
-"""score from which a relation holds"""
-APART = 0.35
-"""distance of two middles along a direction, in units at which the two just part, from which one lies in it"""
-SIDEWAYS = 2.5
-"""gap across a direction, in units of the distance along it, up to which an object lies in it: a cone of 68 degrees"""
-NEXT, NEAR, FAR = 0.6, 1.1, 2.0
-"""gaps between surfaces up to which objects are next to each other and near, and from which they are far, in units of
-the geometric mean of their sizes"""
-TOUCH = 0.12
-"""the same for touching, in units of the smaller size"""
-CONTACT = 0.15
-"""tolerance of a contact in height, in units of the height and width of the upper object together"""
-INSIDE = 0.3
-"""share of an object's points in the box of another from which it is in it: most of a ball sticks out of a bowl"""
-OVER = 0.4
-"""share of the smaller footprint that lies within the other's from which objects are above each other"""
-LEVEL = 0.3
-"""share of the smaller height that two objects have in common from which they stand on one level"""
-BETWEEN = 0.5
-"""distance from the line between two objects, in units of half its length and the object's half size together"""
-REACH = 1.4
-"""factor by which a footprint grows to take in the other object's surface around it, since it hides that below"""
-ORDERS = ("largest", "smallest", "tallest", "shortest", "highest", "lowest", "leftmost", "rightmost")
-ORDERS += ("nearest", "farthest")
-"""orders of `order_values`"""
+"""Score from which a relation holds."""
+_OVER = 0.4
+"""Share of the smaller footprint that lies within the other's from which objects are above each other."""
 
 
 @record
@@ -63,15 +41,7 @@ class Viewpoint:
 
 
 def viewpoint(camera: Camera, up: Float[Array, " 3"]) -> Viewpoint:
-    """Makes the viewpoint of a camera. One that looks straight up or down sees as forward where its upper edge points.
-
-    Args:
-      camera: One camera.
-      up: (3,) unit up axis, world.
-
-    Returns:
-      The viewpoint.
-    """
+    """Makes the viewpoint of a camera. One that looks straight up or down has its upper edge as forward."""
     xp = _module(camera.world_to_camera)
     axes = camera.world_to_camera[:3, :3]
     forward, upper = _level(axes[2], up), _level(-axes[1], up)
@@ -104,14 +74,7 @@ def _level(vector: Array, up: Array) -> Array:
 
 
 def size_of(shape: ObjectShapes) -> Float[Array, "*batch"]:
-    """Measures objects.
-
-    Args:
-      shape: Objects of any leading axes.
-
-    Returns:
-      Mean of the three sides of each box, world units.
-    """
+    """Measures objects: the mean of the three sides of each box."""
     return 2.0 * shape.half_size.mean(-1)
 
 
@@ -158,14 +121,7 @@ def gap(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
 
     It is the smallest distance of the points of one to the box of the other, of both ways the larger: a box may hold
     free space, as that of an arch does. Points of a large object may lie farther apart than a small one is wide, which
-    is taken off.
-
-    Args:
-      a: Objects.
-      b: Objects, whose leading axes broadcast with those of `a`.
-
-    Returns:
-      Distances, world units; 0 if the surfaces touch.
+    is taken off. 0 if the surfaces touch.
     """
     xp = _module(a.points)
 
@@ -208,7 +164,8 @@ def _towards(a: ObjectShapes, b: ObjectShapes, along: Array, across: Array) -> A
     (side_a, wide_a), (side_b, wide_b) = interval(a, across), interval(b, across)
     shift = middle_a - middle_b
     beside = abs(side_a - side_b) - wide_a - wide_b
-    return _rise(_over(shift, half_a + half_b) - APART) * _within(_over(beside, SIDEWAYS * shift))
+    # From 0.35 of the shift at which they just part, within a cone of 68 degrees: 2.5 times as far aside as along.
+    return _rise(_over(shift, half_a + half_b) - 0.35) * _within(_over(beside, 2.5 * shift))
 
 
 def _left_of(a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> Float[Array, "*batch"]:
@@ -231,7 +188,7 @@ def _overlap(a: ObjectShapes, b: ObjectShapes) -> Array:
     xp = _module(a.points)
     shared = xp.maximum(_inside(a.points, b)[0].mean(-1), _inside(b.points, a)[0].mean(-1))
     crossed = xp.maximum(_centred(a, b), _centred(b, a))
-    return xp.maximum(shared, OVER * (1.0 + crossed))
+    return xp.maximum(shared, _OVER * (1.0 + crossed))
 
 
 def _centred(a: ObjectShapes, b: ObjectShapes) -> Array:
@@ -249,7 +206,7 @@ def _local(a: ObjectShapes, b: ObjectShapes, share: float, otherwise: Array) -> 
     a box. The heights are taken as evenly spread around their mean: a sort would take most of the time.
     """
     xp = _module(a.points)
-    close, _ = _inside(a.points, b, REACH)
+    close, _ = _inside(a.points, b, 1.4)  # with the surface around it, since b hides that below
     heights = _dot(a.points, a.axes[..., None, :, 2])
     number = xp.maximum(close.sum(-1), 1)
     mean = xp.where(close, heights, 0.0).sum(-1) / number
@@ -259,9 +216,9 @@ def _local(a: ObjectShapes, b: ObjectShapes, share: float, otherwise: Array) -> 
 
 
 def _tolerance(shape: ObjectShapes) -> Array:
-    """Tolerance of a contact in height, world units."""
+    """Tolerance of a contact in height, world units: 0.15 of the height and width together."""
     x, y, z = (shape.half_size[..., k] for k in range(3))
-    return CONTACT * 2.0 * (z + 0.5 * (x + y))
+    return 0.15 * 2.0 * (z + 0.5 * (x + y))
 
 
 def _above(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
@@ -269,7 +226,7 @@ def _above(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
     bottom, _, _ = _heights(a)
     _, top, _ = _heights(b)
     free = _local(a, b, 0.1, bottom) - _local(b, a, 0.9, top)
-    return _rise(_overlap(a, b) - OVER) * _rise(_over(free, _tolerance(a)) + 1.0, 4.0)
+    return _rise(_overlap(a, b) - _OVER) * _rise(_over(free, _tolerance(a)) + 1.0, 4.0)
 
 
 def _in_box(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
@@ -278,7 +235,8 @@ def _in_box(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
     bottom, top, height = _heights(a)
     deep = 0.5 * (bottom + top) - _local(b, a, 0.25, _heights(b)[0])
     smaller = _over(b.half_size[..., :2].prod(-1), a.half_size[..., :2].prod(-1))
-    return _rise(share - INSIDE) * _rise(_over(deep, height)) * _rise(smaller - 0.7)
+    # 0.3 of the points are enough: most of a ball sticks out of a bowl.
+    return _rise(share - 0.3) * _rise(_over(deep, height)) * _rise(smaller - 0.7)
 
 
 def _on(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
@@ -292,41 +250,19 @@ def _on(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
 
 
 def _next_to(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
-    """Whether the objects are close to each other on one level, neither over the other."""
+    """Whether the objects are close to each other on one level, neither over the other.
+
+    They have at least 0.3 of the smaller height in common.
+    """
     xp = _module(a.points)
     (low_a, high_a, tall_a), (low_b, high_b, tall_b) = _heights(a), _heights(b)
     common = _over(xp.minimum(high_a, high_b) - xp.maximum(low_a, low_b), xp.minimum(tall_a, tall_b))
-    return _within(_relative_gap(a, b) / NEXT) * _rise(common - LEVEL) * _rise(OVER - _overlap(a, b))
+    return _within(_relative_gap(a, b) / 0.6) * _rise(common - 0.3) * _rise(_OVER - _overlap(a, b))
 
 
 def _relative_gap(a: ObjectShapes, b: ObjectShapes) -> Array:
     """The gap in units of the geometric mean of the sizes."""
     return _over(gap(a, b), _module(a.points).sqrt(size_of(a) * size_of(b)))
-
-
-def _near(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
-    """Whether the gap is at most about the objects' size. It falls as the gap grows."""
-    return _within(_relative_gap(a, b) / NEAR)
-
-
-def _far_from(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
-    """Whether the gap is several times the objects' size."""
-    return 1.0 - _within(_relative_gap(a, b) / FAR)
-
-
-def _touching(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
-    """Whether the surfaces meet."""
-    return _within(_over(gap(a, b), TOUCH * _module(a.points).minimum(size_of(a), size_of(b))))
-
-
-def _between(a: ObjectShapes, b: ObjectShapes, c: ObjectShapes) -> Float[Array, "*batch"]:
-    """Whether a lies between b and c: its middle projects between theirs and is not far off the line."""
-    line, offset = c.center - b.center, a.center - b.center
-    length = _module(line).maximum(_length(line), 1e-12)
-    along = _dot(offset, line) / length**2
-    off = _length(offset - along[..., None] * line)
-    reach = BETWEEN * 0.5 * (length + size_of(a))
-    return _rise(along - 0.1, 20.0) * _rise(0.9 - along, 20.0) * _within(_over(off, reach), 4.0)
 
 
 _PREDICATES = {
@@ -340,53 +276,39 @@ _PREDICATES = {
     "under": lambda a, b, _: _above(b, a),
     "in": lambda a, b, _: _in_box(a, b),
     "next to": lambda a, b, _: _next_to(a, b),
-    "near": lambda a, b, _: _near(a, b),
-    "far from": lambda a, b, _: _far_from(a, b),
-    "touching": lambda a, b, _: _touching(a, b),
+    # Gaps between surfaces in units of the objects' sizes: near falls as the gap grows, far rises with it.
+    "near": lambda a, b, _: _within(_relative_gap(a, b) / 1.1),
+    "far from": lambda a, b, _: 1.0 - _within(_relative_gap(a, b) / 2.0),
+    "touching": lambda a, b, _: _within(_over(gap(a, b), 0.12 * _module(a.points).minimum(size_of(a), size_of(b)))),
 }
 PAIRS = tuple(_PREDICATES)
-"""relations of `pair_scores`"""
+"""Relations of `pair_scores`."""
 
 
 def pair_scores(relation: str, a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> Float[Array, "k l"]:
-    """Scores "object of a RELATION object of b" for all pairs.
-
-    Args:
-      relation: One of PAIRS.
-      a: K objects.
-      b: L objects.
-      view: From where directions are seen.
-
-    Returns:
-      (K, L) scores in [0, 1]; from SATISFIED on the relation holds.
-    """
+    """Scores "object of a RELATION object of b" for all pairs, by one of PAIRS; from SATISFIED on it holds."""
     return _PREDICATES[relation](a[:, None], b[None], view)
 
 
 def between_scores(a: ObjectShapes, b: ObjectShapes, c: ObjectShapes) -> Float[Array, "k l m"]:
-    """Scores "object of a between object of b and object of c" for all triples.
+    """Scores "object of a between object of b and object of c" for all triples; from SATISFIED on it holds.
 
-    Args:
-      a: K objects.
-      b: L objects.
-      c: M objects.
-
-    Returns:
-      (K, L, M) scores in [0, 1]; from SATISFIED on the relation holds.
+    The middle of a projects between those of b and c, and lies off their line by at most half of half their distance
+    and half its size together.
     """
-    return _between(a[:, None, None], b[None, :, None], c[None, None])
+    a, b, c = a[:, None, None], b[None, :, None], c[None, None]
+    line, offset = c.center - b.center, a.center - b.center
+    length = _module(line).maximum(_length(line), 1e-12)
+    along = _dot(offset, line) / length**2
+    off = _length(offset - along[..., None] * line)
+    reach = 0.5 * 0.5 * (length + size_of(a))
+    return _rise(along - 0.1, 20.0) * _rise(0.9 - along, 20.0) * _within(_over(off, reach), 4.0)
 
 
 def order_values(shapes: ObjectShapes, view: Viewpoint) -> dict[str, Float[Array, " k"]]:
-    """Computes the values by which objects are ordered; the first has the smallest.
+    """Computes the values by which objects are ordered, for each order of the grammar; the first has the smallest.
 
-    Args:
-      shapes: K objects.
-      view: From where directions and distances are seen.
-
-    Returns:
-      (K,) values for each of ORDERS. "largest" compares the volumes of boxes, "leftmost" the directions from the
-      viewpoint, "nearest" the distances.
+    "largest" compares the volumes of boxes, "leftmost" the directions from the viewpoint, "nearest" the distances.
     """
     volume = (2.0 * shapes.half_size).prod(1) ** (1 / 3)
     height = 2.0 * shapes.half_size[:, 2]
