@@ -23,8 +23,7 @@ from experiments import lerf, results
 from experiments.cells import append_cell, read_cells
 from experiments.shared_errors import pooled
 from experiments.tables import twins
-from jsecon.query.answer import RULES
-from jsecon.query.rules import MIN_RANK
+from jsecon.query.rules import MIN_RANK, RULES
 from jsecon.query.scores import OFFSET, SLOPE, score_text, word_similarities
 
 BINS = 10

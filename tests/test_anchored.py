@@ -14,7 +14,6 @@ from jsecon.errors import InputError
 from jsecon.field.membership import add_visible_weight, normalise_votes, vote_shares
 from jsecon.field.votes import region_votes
 from jsecon.query.answer import (
-    RULES,
     match_region,
     match_regions,
     query_anchored,
@@ -24,7 +23,7 @@ from jsecon.query.answer import (
 )
 from jsecon.query.classes import query_classes
 from jsecon.query.pointing import pixel_weights, region_at, region_shares_seen
-from jsecon.query.rules import QueryRules
+from jsecon.query.rules import RULES, QueryRules
 from jsecon.query.select import CODE_THRESHOLD, select_by_code
 from jsecon.splat.render import render
 from jsecon.types import Regions, Votes
@@ -283,7 +282,7 @@ def test_a_field_without_regions_answers_nothing(field):
 
 
 def test_wrong_arguments_are_told(field):
-    with pytest.raises(ValueError, match=r"expected \(12,\).*random"):
+    with pytest.raises(ValueError, match="12.*random"):
         query_anchored(field, np.ones(11, np.float32))
     for region in (1.5, np.float32(1), True, "1"):
         with pytest.raises(ValueError, match="an integer"):

@@ -11,7 +11,8 @@ from table_field import table_field
 from jsecon import InputError, QueryRules, Regions, Scene, match_regions
 from jsecon.app.outputs import write_answer
 from jsecon.app.viewer.candidates import candidates
-from jsecon.query.answer import ALL_OF_CLASS, query_anchored, query_several
+from jsecon.query.answer import query_anchored, query_several
+from jsecon.query.rules import ALL_OF_CLASS
 
 
 @pytest.fixture(scope="module")

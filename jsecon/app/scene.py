@@ -32,7 +32,6 @@ from jsecon.pipeline.progress import Listener
 from jsecon.process import MEMORY, memory_budget
 from jsecon.query.answer import (
     NO_REGIONS,
-    ONE_REGION,
     RegionMatch,
     Trimmed,
     answer_region,
@@ -44,7 +43,7 @@ from jsecon.query.answer import (
 from jsecon.query.expressions import is_expression, parse_query
 from jsecon.query.pointing import box_mask, lift, region_at
 from jsecon.query.render import selection_mask
-from jsecon.query.rules import QueryRules
+from jsecon.query.rules import ONE_REGION, QueryRules
 from jsecon.query.select import CODE_THRESHOLD, select_by_code
 from jsecon.read.captures.capture import has_depth
 from jsecon.read.captures.images import read_pixels

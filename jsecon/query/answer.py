@@ -21,23 +21,17 @@ import numpy as np
 from jax import export
 from jaxtyping import Bool, Float, Int
 
-from jsecon.errors import require, require_shape
+from jsecon.errors import require
 from jsecon.field.columns import is_mapped, vote_blocks
 from jsecon.field.membership import inside_fraction
 from jsecon.field.similarity import Number, similarities
 from jsecon.programs import stored_jit
 from jsecon.query.grouping import join_fragments, parts_fallback, regions_with
 from jsecon.query.outliers import OutlierResult, split_outliers
-from jsecon.query.rules import QueryRules
+from jsecon.query.rules import ALL_OF_CLASS, ONE_REGION, RULES, QueryRules
 from jsecon.query.scores import score_text, unrelated_words, word_similarities
 from jsecon.types import Array, LanguageField, Selection, Votes
 
-RULES = QueryRules()
-"""The defaults."""
-ALL_OF_CLASS = QueryRules(all_of_class=True)
-"""All regions of a class answer."""
-ONE_REGION = QueryRules(duplicate_cosine=None, fragment_score=None)
-"""A region alone: who points at one of two red chairs means that one."""
 ROUNDING = 1e-5
 """Similarities that differ by no more count as equal: a text that is both included and excluded matches nothing."""
 
@@ -274,9 +268,6 @@ def query_anchored(field: LanguageField, text_embedding: Float[Array, " e"], *, 
     Raises:
       ValueError: The embedding has another size.
     """
-    size = field.regions.embeddings.shape[1]
-    remedy = f"Embed the text with the field's embedder{f', {field.embedder}' if field.embedder else ''}."
-    require_shape("text_embedding", text_embedding, (size,), remedy)
     return query_several(field, jnp.asarray(text_embedding)[None], rules=rules)
 
 

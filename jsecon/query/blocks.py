@@ -11,8 +11,8 @@ from jaxtyping import Float, Int
 from jsecon.errors import require_one_of
 from jsecon.field.columns import row_slices, votes_of_rows
 from jsecon.field.similarity import Number
-from jsecon.query.answer import RULES, RegionMatch, match_regions, select_from_votes
-from jsecon.query.rules import QueryRules
+from jsecon.query.answer import RegionMatch, match_regions, select_from_votes
+from jsecon.query.rules import RULES, QueryRules
 from jsecon.query.select import CODE_THRESHOLD, codes_of, select_rows_by_code
 from jsecon.types import Array, LanguageField
 

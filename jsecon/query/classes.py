@@ -12,8 +12,7 @@ from jaxtyping import Float, Int
 
 from jsecon.errors import require
 from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction, ratio, vote_columns
-from jsecon.query.answer import RULES
-from jsecon.query.rules import QueryRules
+from jsecon.query.rules import RULES, QueryRules
 from jsecon.query.scores import (
     presence_prob,
     region_similarities,

@@ -71,3 +71,11 @@ class QueryRules:
             return rank >= self.min_rank
         value, default = (similarity, MIN_COSINE) if presence is None else (presence, MIN_PRESENCE)
         return value >= (default if self.min_score is None else self.min_score)
+
+
+RULES = QueryRules()
+"""The defaults."""
+ALL_OF_CLASS = QueryRules(all_of_class=True)
+"""All regions of a class answer."""
+ONE_REGION = QueryRules(duplicate_cosine=None, fragment_score=None)
+"""A region alone: who points at one of two red chairs means that one."""

@@ -11,10 +11,11 @@ from jaxtyping import Bool, Float
 from jsecon.app.scene import choose_shades
 from jsecon.field.regions import mean_residuals
 from jsecon.field.similarity import similarities
-from jsecon.query.answer import ROUNDING, RULES
+from jsecon.query.answer import ROUNDING
 from jsecon.query.expressions import parse_query
 from jsecon.query.pointing import MIN_SHARE, region_shares_seen
 from jsecon.query.render import HIDDEN_LOGIT
+from jsecon.query.rules import RULES
 from jsecon.query.scores import region_similarities, unrelated_words, view_count_weight
 from jsecon.types import Camera, LanguageField
 
