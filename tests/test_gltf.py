@@ -11,7 +11,6 @@ from splat_files import C0, opacity, scene
 from test_gaussian_files import gaussians, image
 
 from jsecon import Gaussians, load_gaussians
-from jsecon.read.splats import gltf
 from jsecon.read.splats.gltf import save_glb
 from jsecon.splat.transform import transform_gaussians
 
@@ -87,7 +86,8 @@ def test_what_it_holds_shows_the_same_image(tmp_path):
 def test_read_back_as_written(tmp_path, basis):
     """To float32: sizes and opacities by way of their exponential and sigmoid."""
     given = scene(101, basis)
-    save_glb(tmp_path / "a.glb", gaussians(given), codes=np.ones((101, 5), np.float32), regions=np.zeros(101, int))
+    save_glb(tmp_path / "a.glb", gaussians(given), object_ids=np.arange(101) - 1)
+    np.testing.assert_array_equal(read_glb(tmp_path / "a.glb")[1]["_OBJECT_ID"][:, 0], np.arange(101) - 1)
     found = load_gaussians(tmp_path / "a.glb")
     sign = np.sign((np.asarray(found.quaternions) * given["quaternions"]).sum(1, keepdims=True))  # q and -q turn alike
     for name, array in (given | {"quaternions": sign * given["quaternions"]}).items():
@@ -157,9 +157,9 @@ def test_other_writers_ways(tmp_path):
     (lambda told: told["nodes"][0].update(children=[0]), "node 0 is in its scene twice"),
     (lambda told: told["nodes"][0].update(scale=[1, 2, 1]), "node 0 scales its axes unequally, by 1, 2, 1"),
     (lambda told: told["nodes"][0].update(scale=[1, 1, -1]), "mirrors"),
-    (lambda told: told["nodes"][0].update(scale=[0, 0, 0]), "by 0"),
+    (lambda told: told["nodes"][0].update(scale=[0, 0, 0]), "no usable transform"),
     (lambda told: told["nodes"][0].update(matrix=[1, 0, 0, 0, 1, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), "axes"),
-    (lambda told: extension(told).update(colorSpace="lin_rec709_display"), "lin_rec709_display (linear light)"),
+    (lambda told: extension(told).update(colorSpace="lin_rec709_display"), "lin_rec709_display"),
     (lambda told: extension(told).update(projection="fisheye"), "projection of its Gaussians is fisheye"),
     (lambda told: extension(told).update(extensions={"EXT_x": {}}), "use the extension EXT_x"),
     (lambda told: told["accessors"][2].update(componentType=5121), "not normalised"),
@@ -174,24 +174,9 @@ def test_what_is_none_or_not_known(tmp_path, change, says):
         load_gaussians(tmp_path / "a.glb")
 
 
-@pytest.mark.parametrize("size", [1, 4, 6, 16])
-def test_codes_and_regions_are_the_applications(tmp_path, size):
-    rng = np.random.default_rng(size)
-    codes, regions = rng.normal(size=(30, size)).astype(np.float32), rng.integers(-1, 300, 30)
-    save_glb(tmp_path / "a.glb", gaussians(scene(30, 1)), codes=codes, regions=regions)
-    _, found = read_glb(tmp_path / "a.glb")
-    parts = [found[f"_CODE_{n}"] for n in range((size + 3) // 4)]
-    np.testing.assert_array_equal(np.concatenate(parts, axis=1), codes)
-    np.testing.assert_array_equal(found["_REGION"][:, 0], regions)
-    assert len(found) == 6 + len(parts) + 1
-
-
-def test_nothing_to_write_and_nowhere_to_write_it(tmp_path, monkeypatch):
+def test_nothing_to_write_and_nowhere_to_write_it(tmp_path):
     with refused("a.glb", "no Gaussians to write"):
         save_glb(tmp_path / "a.glb", gaussians(scene(0, 1)))
     (tmp_path / "file").write_text("in the way")
-    with monkeypatch.context() as patched, refused("a.glb", "at most 4 GiB"):
-        patched.setattr(gltf, "_MAX_BYTES", 1000)
-        save_glb(tmp_path / "a.glb", gaussians(scene(3, 1)))
     with refused("a.glb", "a folder"):
         save_glb(tmp_path / "file" / "a.glb", gaussians(scene(3, 1)))

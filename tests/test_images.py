@@ -178,17 +178,6 @@ def test_odd_kinds_of_images_are_read_right(tmp_path):
             read_image(tmp_path / f"cut{ending}")
 
 
-@pytest.mark.parametrize("ending", [".png", ".jpg"])
-def test_every_cut_is_told(tmp_path, ending):
-    file = tmp_path / ("cut" + ending)
-    write_image(file, FRAME)
-    whole = file.read_bytes()
-    for length in range(0, len(whole) - 4, 7):
-        file.write_bytes(whole[:length])
-        with refused(file, "empty" if length == 0 else "image"):
-            read_image(file)
-
-
 def test_cut_jpeg_with_a_thumbnail(tmp_path):
     """The thumbnail in the header ends like a whole JPEG does."""
     stored = cv2.imencode(".jpg", FRAME)[1].tobytes()

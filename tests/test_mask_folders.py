@@ -137,23 +137,6 @@ def test_objects_are_in_some_of_the_frames_and_the_lower_id_lies_on_top(tmp_path
         load_labels(tmp_path, tuple("bcef"), SIZE)
 
 
-def test_numbered_masks_are_taken_in_order_where_they_are_as_many_as_the_frames(tmp_path):
-    frames, order = tuple("bce"), tuple("abcde")  # a and d are held out
-    mask = np.eye(12, 16, dtype=int)
-    for n in range(5):
-        write(tmp_path / f"{n:05}.png", (n + 1) * mask)
-    labels, ids, notes = load_labels(tmp_path, frames, SIZE, frames=dict.fromkeys(order))
-    assert ids == (2, 3, 5)
-    for t in range(3):
-        np.testing.assert_array_equal(labels[t] == t, mask)
-    assert notes == ("The masks are numbered, and taken in the order of the frames: 00001.png is b.",)
-    with refused("none of which"):
-        load_labels(tmp_path, frames, SIZE)
-    (tmp_path / "00003.png").unlink()
-    with refused("a PNG for each number from 0 to 4"):
-        load_labels(tmp_path, frames, SIZE, frames=dict.fromkeys(order))
-
-
 def test_ids_above_float32_stay_apart_when_resized(tmp_path):
     first = np.zeros((24, 32))
     first[:, :16] = 255
@@ -195,12 +178,6 @@ def test_what_a_mask_may_be_called(tmp_path, frame, file):
     assert not notes or "cameras" in notes[0]
 
 
-def test_a_name_that_two_frames_share_up_to_the_dot_is_neithers(tmp_path):
-    np.save(tmp_path / "frame_s.npy", np.zeros((4, *SIZE), np.float32))
-    with refused(tmp_path, "none of which"):
-        load_labels(tmp_path, ("frame.0001", "frame.0002"), SIZE)
-
-
 def test_masks_of_no_frame_are_told(tmp_path):
     for name in "abc":
         write(tmp_path / f"{name}.png", ids_image())
@@ -237,7 +214,7 @@ def test_arrays_of_ids(tmp_path):
     assert ids == (0, 1, 2, 3, 4)
     assert "negative" in notes[0]
     np.save(tmp_path / "a.npy", np.zeros((3, *SIZE), bool))
-    with refused("a.npy", "stack", "--proposals"):
+    with refused("a.npy", "shape (3, 12, 16)"):
         load_labels(tmp_path, ("a", "b"), SIZE)
 
 
@@ -336,17 +313,6 @@ def test_wrong_masks_in_json_are_told_in_words(tmp_path, segmentation, words):
     assert "a.json, mask 0" in str(caught.value)
     assert words in str(caught.value)
     assert "Error" not in str(caught.value)
-
-
-def test_stacks_of_masks_are_proposals(tmp_path):
-    masks = RNG.random((5, *SIZE)) < 0.3
-    np.save(tmp_path / "a.npy", masks)
-    read, _ = load_proposals(tmp_path, ("a",), SIZE)
-    np.testing.assert_array_equal(read(0), masks)
-    np.save(tmp_path / "a.npy", masks * 3)
-    read, _ = load_proposals(tmp_path, ("a",), SIZE)
-    with refused("a.npy", "0 and 1"):
-        read(0)
 
 
 def test_embeddings_lie_in_the_cameras_folders(tmp_path):

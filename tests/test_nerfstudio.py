@@ -209,15 +209,6 @@ def test_no_focal_length(tmp_path):
         load_changed(tmp_path, lambda content: (change(content), content.update(camera_angle_x=4.0)))
 
 
-def test_not_json(tmp_path):
-    (tmp_path / "transforms.json").write_text(json.dumps(transforms(CAPTURE))[:-9])
-    with refused("transforms.json", "not JSON"):
-        load_capture(tmp_path)
-    (tmp_path / "transforms.json").write_text("[1]")
-    with refused("transforms.json", "JSON without keys"):
-        load_capture(tmp_path)
-
-
 def test_rounded_rotations_are_made_exact(tmp_path):
     def change(content):
         for entry in content["frames"]:

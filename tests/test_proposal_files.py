@@ -9,7 +9,7 @@ from hypothesis import given, settings, strategies as st
 
 from jsecon.errors import InputError
 from jsecon.read.masks.json_masks import decode_rle
-from jsecon.read.masks.masks import load_proposals
+from jsecon.read.masks.masks import load_labels, load_proposals
 
 SIZE = (20, 30)
 
@@ -47,15 +47,28 @@ def test_png_and_langsplat_files_hold_one_layer(tmp_path, masks):
     ids = np.zeros(SIZE, np.uint8)
     ids[masks[0]], ids[masks[2]] = 7, 200
     cv2.imwrite(str(tmp_path / "a.png"), ids)
+    read, notes = load_proposals(tmp_path, ("a",), SIZE)
+    np.testing.assert_array_equal(read(0), masks[[0, 2]])
+    assert notes == ()
     levels = np.full((4, *SIZE), -1, np.float32)
     levels[3][masks[2]], levels[1][masks[1]] = 4, 0
-    np.save(tmp_path / "b_s.npy", levels)
-    read, notes = load_proposals(tmp_path, ("a", "b.extra"), SIZE)
-    np.testing.assert_array_equal(read(0), masks[[0, 2]])
-    np.testing.assert_array_equal(read(1), masks[[2]])
-    assert notes == ()
-    read, _ = load_proposals(tmp_path, ("a", "b"), SIZE, level="s")
-    np.testing.assert_array_equal(read(1), masks[[1]])
+    (tmp_path / "langsplat").mkdir()
+    np.save(tmp_path / "langsplat" / "a_s.npy", levels)
+    for level, n in (("l", 2), ("s", 1)):
+        read, _ = load_proposals(tmp_path / "langsplat", ("a",), SIZE, level=level)
+        np.testing.assert_array_equal(read(0), masks[[n]])
+
+
+def test_masks_of_single_frames_are_regions_of_their_own(tmp_path, masks):
+    """SAM's masks given as tracked ones: the best lies on top, and no region is in two frames."""
+    for name, scores in (("a", [0.8, 0.95, 0.9]), ("b", [0.95, 0.8, 0.9])):
+        (tmp_path / f"{name}.json").write_text(json.dumps(records(masks, scores)))
+    labels, ids, notes = load_labels(tmp_path, ("a", "b"), SIZE)
+    assert len(ids) == 6
+    np.testing.assert_array_equal(labels[0][masks[1]], 0)
+    np.testing.assert_array_equal(labels[0] == 2, masks[0] & ~masks[1])
+    np.testing.assert_array_equal(labels[1] == 3, masks[0])
+    assert any("regions of their own" in note for note in notes)
 
 
 def test_masks_of_larger_frames_are_resized_and_others_refused(tmp_path, masks):

