@@ -29,7 +29,7 @@ PACKAGES = (
 """modules of the packages that jsecon requires; jax has another check"""
 EXTRAS = {
     "sfm": (("pycolmap",), "poses of photographs and videos"),
-    "formats": (("gsply", "pillow_heif"), ".sog, .spz of version 4, HEIC photographs"),
+    "formats": (("gsply", "pillow_heif"), ".spz, .sog and compressed .ply, HEIC photographs"),
     "serve": (("fastapi", "uvicorn"), "jsecon serve"),
     "viewer": (("viser",), "jsecon view"),
     "mcp": (("mcp",), "jsecon mcp"),
