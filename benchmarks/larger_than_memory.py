@@ -18,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from jsecon.process import peak_memory_mib, prepare_process
@@ -29,7 +30,7 @@ import numpy as np
 
 import jsecon
 from jsecon.files import map_npy, write_npy
-from jsecon.types import Camera, Gaussians, LanguageField, Regions, Votes
+from jsecon.types import Camera, Gaussians, LanguageField, Regions, Selection, Votes
 
 SIDE, ACROSS, SQUARES, PART = 100.0, 64, 10, 2_000_000
 """m of the ground; tiles along each side, in whose order Gaussians lie; regions along each side"""
@@ -119,6 +120,11 @@ def texts_near(regions: Regions) -> np.ndarray:
     return (regions.embeddings + near).astype(np.float32)[:TEXTS]
 
 
+def answers(field: LanguageField, texts: np.ndarray) -> Iterator[Selection]:
+    """What each text selects, one after the other."""
+    return (jsecon.query_anchored(field, text) for text in texts)
+
+
 def timed(told: dict[str, float], name: str, call):
     """Seconds on the clock, and of CPU, which other work on the machine disturbs less."""
     start, worked = time.perf_counter(), time.process_time()
@@ -137,7 +143,7 @@ def votes_step(folder: Path, views: int, width: int, height: int) -> dict[str, f
     votes = timed(
         told,
         "votes, s",
-        lambda: jsecon.region_votes_in_blocks(
+        lambda: jsecon.region_votes(
             gaussians,
             cameras,
             labels,
@@ -150,7 +156,7 @@ def votes_step(folder: Path, views: int, width: int, height: int) -> dict[str, f
         told[name] = float(np.median(np.diff(own))) if len(own) > 1 else np.nan
     told["seen"] = float(np.mean([np.count_nonzero(votes.views[a : a + (1 << 20)]) / len(votes.views[a : a + (1 << 20)])
                                   for a in range(0, len(votes.views), 1 << 20)]))  # fmt: skip
-    votes = timed(told, "votes finished, s", lambda: jsecon.normalise_votes_in_blocks(votes, regions))
+    votes = timed(told, "votes finished, s", lambda: jsecon.normalise_votes(votes, regions))
     field = field_of(gaussians, votes, cameras, regions)
     timed(told, "field written, s", lambda: jsecon.save_field(folder / "field.safetensors", field))
     return told
@@ -161,10 +167,10 @@ def query_step(folder: Path, *_: int) -> dict[str, float]:
     told: dict[str, float] = {}
     field = timed(told, "field opened, s", lambda: jsecon.load_field(folder / "field.safetensors", mapped=True))
     texts = texts_near(field.regions)
-    timed(told, "first query, compilation included, s", lambda: jsecon.query_in_blocks(field, texts[:1]))
-    timed(told, "one query, s", lambda: jsecon.query_in_blocks(field, texts[:1]))
-    found = timed(told, "100 queries, s", lambda: jsecon.query_in_blocks(field, texts))
-    told["selected by a query, mean"] = float(np.mean([len(own.gaussians) for own in found]))
+    timed(told, "first query, compilation included, s", lambda: list(answers(field, texts[:1])))
+    timed(told, "one query, s", lambda: list(answers(field, texts[:1])))
+    found = timed(told, "100 queries, s", lambda: [int(own.mask.sum()) for own in answers(field, texts)])
+    told["selected by a query, mean"] = float(np.mean(found))
     return told
 
 
@@ -181,9 +187,7 @@ def export_step(folder: Path, *_: int) -> dict[str, float]:
 
 def finished(gaussians, cameras, labels, regions, **how):
     """Votes in blocks with all that queries read."""
-    return jsecon.normalise_votes_in_blocks(
-        jsecon.region_votes_in_blocks(gaussians, cameras, labels, REGIONS, **how), regions
-    )
+    return jsecon.normalise_votes(jsecon.region_votes(gaussians, cameras, labels, REGIONS, **how), regions)
 
 
 def part_step(folder: Path, views: int, width: int, height: int) -> dict[str, float]:
@@ -213,10 +217,9 @@ def part_step(folder: Path, views: int, width: int, height: int) -> dict[str, fl
     held = {name: np.array(a) if isinstance(a, np.memmap) else a for name, a in held.items()}
     held_field = dataclasses.replace(mapped_field, votes=Votes(**held))
     texts, apart = texts_near(regions), 0
-    for text, own in zip(texts, jsecon.query_in_blocks(mapped_field, texts)):
+    for text, own in zip(texts, answers(mapped_field, texts)):
         selection = jsecon.query_anchored(held_field, text)
-        same = np.array_equal(own.gaussians, np.flatnonzero(selection.mask))
-        same &= np.array_equal(own.similarity, np.asarray(selection.similarity)[own.gaussians])
+        same = np.array_equal(own.mask, selection.mask) and np.array_equal(own.similarity, selection.similarity)
         apart += not same
     told["queries of 100 that differ in a bit"] = apart
     return told
@@ -259,7 +262,7 @@ def cast(base: Path, count: int, views: int, width: int, height: int) -> dict[st
         cameras, out = ring(given, width, height), base / "votes"
 
         def call(c=cameras, o=out):
-            return jsecon.region_votes_in_blocks(mapped(folder), c, Labels(c), REGIONS, folder=o)
+            return jsecon.region_votes(mapped(folder), c, Labels(c), REGIONS, folder=o)
 
         timed(told, "s", call)
         shutil.rmtree(out)
@@ -314,8 +317,8 @@ def query_growth(base: Path, largest: int) -> None:
             none = Gaussians(*(np.zeros((0, *rest), np.float32) for rest in SHAPES.values()))
             field = field_of(none, votes, np.zeros((count, 0), np.float32), cameras, regions)
             for _ in range(2):
-                timed(told, "one", lambda f=field: jsecon.query_in_blocks(f, texts[:1]))
-                timed(told, "many", lambda f=field: jsecon.query_in_blocks(f, texts))
+                timed(told, "one", lambda f=field: list(answers(f, texts[:1])))
+                timed(told, "many", lambda f=field: [own.mask.sum() for own in answers(f, texts)])
             rows.append((count, told["one of CPU"], told["many of CPU"]))
             print(f"| {count:,} | {' | '.join(f'{value:.3f}' for value in told.values())} |", flush=True)
     for k, name in ((1, "one query"), (2, "100 queries")):

@@ -24,7 +24,7 @@ from metrics import Metric, interleaved, show
 import jsecon
 from jsecon.errors import InputError
 from jsecon.files import read_arrays
-from jsecon.parallel import accumulate_over_views
+from jsecon.parallel import map_views
 from jsecon.types import Camera, Gaussians
 
 
@@ -54,15 +54,14 @@ def measure(run: Path, width: int, size: int, repeats: int) -> list[Metric]:
     capacity = jsecon.plan_capacity(gaussians, cameras, margin=1.0, devices=1)
     features = jnp.asarray(np.random.default_rng(0).normal(size=(gaussians.count, size)), jnp.float32)
 
-    def add(state, common, view):
-        image = jsecon.render(common[0], view, common[1], capacity=capacity)
-        return state + image.features.mean(), None
+    def image(t: int):
+        return jsecon.render(gaussians, cameras[t], features, capacity=capacity).features.block_until_ready()
 
     def votes(by_view: bool):
         return jsecon.region_votes(gaussians, cameras, labels, regions, capacity=capacity, by_view=by_view)
 
     calls = {
-        "rendered": lambda: accumulate_over_views(add, jnp.float32(0), jnp.add, (gaussians, features), cameras)[0],
+        "rendered": lambda: map_views(len(labels), image)[-1],
         "votes": lambda: votes(False).weights,
         "votes by view": lambda: votes(True).weights,
     }

@@ -21,8 +21,8 @@ from experiments import results
 from experiments.datasets.depth_points import confirmed_depths
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import accuracy_at, iou, mean_iou
+from jsecon.field.evidence import region_votes
 from jsecon.field.membership import add_visible_weight
-from jsecon.field.votes import region_votes
 from jsecon.fit.depth import points_from_depth
 from jsecon.fit.quality import measure_quality
 from jsecon.fit.start import gaussians_from_points

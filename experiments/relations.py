@@ -41,10 +41,10 @@ from experiments.rooms.room import (
 from experiments.rooms.shapes import SHAPES, Body, box, contains, ellipsoid, place
 from jsecon import Scene
 from jsecon.errors import InputError
+from jsecon.field.evidence import region_votes
 from jsecon.field.field import load_field, save_field
 from jsecon.field.membership import normalise_votes
 from jsecon.field.regions import region_embeddings
-from jsecon.field.votes import region_votes
 from jsecon.fit.depth import points_from_depth
 from jsecon.fit.start import gaussians_from_points
 from jsecon.types import Camera, Capture, LanguageField

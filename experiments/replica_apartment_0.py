@@ -26,7 +26,7 @@ from experiments.datasets.depth_points import labels_of_points
 from experiments.protocols.points import point_accuracy, point_class_means
 from experiments.tables.codes import region_codes
 from jsecon.errors import InputError
-from jsecon.field.votes import region_votes
+from jsecon.field.evidence import region_votes
 from jsecon.fit.depth import DepthPoints, points_from_depth
 from jsecon.fit.start import gaussians_from_points
 from jsecon.numerics import cosine_matrix

@@ -30,7 +30,7 @@ from experiments.tables import twins
 from experiments.tables.association import associated
 from experiments.tables.ours import field_of, parts_of
 from experiments.tables.setting import Setting
-from jsecon.field.votes import region_votes
+from jsecon.field.evidence import region_votes
 from jsecon.fit.start import gaussians_from_points
 from jsecon.process import clear_programs
 from jsecon.query.answer import match_regions, query_anchored, query_several

@@ -20,17 +20,13 @@ from .evaluate.metrics import (
     localization_accuracy as localization_accuracy,
     mean_iou as mean_iou,
 )
+from .field.evidence import region_votes as region_votes
 from .field.field import check_field as check_field, load_field as load_field, save_field as save_field
 from .field.membership import (
-    add_visible_weight as add_visible_weight,
     membership_probability as membership_probability,
     normalise_votes as normalise_votes,
-    normalise_votes_in_blocks as normalise_votes_in_blocks,
-    with_overlap as with_overlap,
 )
 from .field.regions import region_embeddings as region_embeddings
-from .field.streaming import region_votes_in_blocks as region_votes_in_blocks
-from .field.votes import region_votes as region_votes, scan_region_votes as scan_region_votes
 from .paper.algorithm1 import masklets as masklets
 from .paper.autoencoder import encode as encode, train_autoencoder as train_autoencoder
 from .paper.distill import distill_l1 as distill_l1, distill_votes as distill_votes
@@ -44,7 +40,6 @@ from .query.answer import (
     query_several as query_several,
     select_gaussians as select_gaussians,
 )
-from .query.blocks import query_in_blocks as query_in_blocks
 from .query.classes import query_classes as query_classes
 from .query.object_shapes import ObjectShapes as ObjectShapes, object_shapes as object_shapes
 from .query.outliers import remove_outliers as remove_outliers

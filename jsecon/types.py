@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeAlias, dataclass_transform
 
 import jax
@@ -284,9 +284,27 @@ class Codes:
     """What encodes a text in the same way, an `Autoencoder`."""
 
 
-@record
+class _Texts(tuple):
+    """Texts of a record that jit shall not compile for: any two are equal to it."""
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Texts)
+
+    def __ne__(self, other: object) -> bool:
+        return not isinstance(other, _Texts)
+
+    def __hash__(self) -> int:
+        return hash(_Texts)
+
+
+@jax.tree_util.register_pytree_with_keys_class
+@dataclasses.dataclass(frozen=True)
 class LanguageField(_Shown):
-    """Everything a query needs, in one file: the scene, its votes, its regions, and where they came from."""
+    """Everything a query needs, in one file: the scene, its votes, its regions, and where they came from.
+
+    jit compiles once for all fields of the same shapes. So a field has no names, embedder and provenance inside of a
+    trace, and neither has one that a compiled function returns.
+    """
 
     gaussians: Gaussians
     votes: Votes
@@ -310,6 +328,23 @@ class LanguageField(_Shown):
     measured against (jsecon.query.scores). None: a field of an earlier version."""
     codes: Codes | None = None
     """codes of Gaussians and regions, which only queries by code read; None if the run was not asked for them."""
+
+    def tree_flatten_with_keys(self) -> tuple[tuple, _Texts]:
+        """The arrays with their names, and the texts, for jax."""
+        parts = {part.name: getattr(self, part.name) for part in dataclasses.fields(self)}
+        texts = _Texts(parts.pop(name) for name in _TEXTS)
+        return tuple((jax.tree_util.GetAttrKey(name), part) for name, part in parts.items()), texts
+
+    @classmethod
+    def tree_unflatten(cls, texts: _Texts, arrays: Iterable) -> LanguageField:
+        """Makes a field of what `tree_flatten_with_keys` gives, for jax."""
+        parts = dict(zip((part.name for part in dataclasses.fields(cls) if part.name not in _TEXTS), arrays))
+        traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(parts))
+        return cls(**parts, **dict(zip(_TEXTS, _Texts(((), "", "{}")) if traced else texts)))
+
+
+_TEXTS = ("names", "embedder", "provenance")
+"""Static fields of LanguageField."""
 
 
 @record

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jsecon.field.evidence import region_votes
 from jsecon.field.membership import LABELLED_PART, SEEN_PART
-from jsecon.field.votes import region_votes
 from jsecon.paper.distill import distill_votes
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.render import render

@@ -11,8 +11,8 @@ import pytest
 from small_field import REGIONS, field_of, make_field, shares, true_regions, unit_rows
 
 from jsecon.errors import InputError
+from jsecon.field.evidence import region_votes
 from jsecon.field.membership import add_visible_weight, normalise_votes, vote_shares
-from jsecon.field.votes import region_votes
 from jsecon.query.answer import (
     match_region,
     match_regions,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from conftest import gaussians_at
 
-from jsecon.field.votes import region_votes
+from jsecon.field.evidence import region_votes
 from jsecon.parallel import host_mesh
 from jsecon.process import compilation_counts
 from jsecon.query.render import selection_mask

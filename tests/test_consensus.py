@@ -14,7 +14,7 @@ from jsecon.association.consensus import (
     track_masks,
 )
 from jsecon.association.scene import SceneSuperpixels, assign_superpixels
-from jsecon.field.votes import region_votes
+from jsecon.field.evidence import region_votes
 
 
 @pytest.fixture(scope="module")

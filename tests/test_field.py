@@ -9,8 +9,9 @@ import pytest
 from safetensors.numpy import load_file, save_file
 from small_field import REGIONS, make_field, unit_rows
 
-from jsecon import InputError, check_field, encode, load_field, save_field, train_autoencoder, with_overlap
+from jsecon import InputError, check_field, encode, load_field, save_field, train_autoencoder
 from jsecon.field import field as module
+from jsecon.field.membership import with_overlap
 from jsecon.files import read_arrays, write_arrays
 from jsecon.types import Parts
 

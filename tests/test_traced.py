@@ -37,9 +37,6 @@ def calls(field, labels):
         "render_rgb": lambda: jsecon.render_rgb(scene, camera, background=jnp.ones(3)),
         "render_depth": lambda: jsecon.render_depth(scene, camera),
         "region_votes": by_view,
-        "scan_region_votes": lambda: jsecon.scan_region_votes(scene, cameras, labels, REGIONS),
-        "add_visible_weight": lambda: jsecon.add_visible_weight(by_view(), field.regions),
-        "with_overlap": lambda: jsecon.with_overlap(field.votes),
         "normalise_votes": lambda: jsecon.normalise_votes(by_view(), field.regions),
         "membership_probability": lambda: jsecon.membership_probability(jnp.full(scene.count, 0.5), field.votes),
         "distill_votes": lambda: jsecon.distill_votes(field.votes, field.codes.regions),
@@ -66,9 +63,8 @@ def calls(field, labels):
 
 HOST = {
     *("to_html", "to_png", "locate", "masklets", "check_backend", "load_capture", "load_gaussians"),
-    *("save_gaussians", "load_gaussians", "save_gaussians", "region_votes_in_blocks", "check_field"),
-    "normalise_votes_in_blocks",
-    *("load_field", "save_field", "region_embeddings", "host_mesh", "query_in_blocks", "lift", "remove_outliers"),
+    *("save_gaussians", "load_gaussians", "save_gaussians", "check_field"),
+    *("load_field", "save_field", "region_embeddings", "host_mesh", "lift", "remove_outliers"),
     *("region_at", "plan_capacity", "objects", "object_shapes", "open_scene"),
 }
 """public functions that read files or need numbers, as they say"""
@@ -82,14 +78,11 @@ def test_every_pure_function_can_be_traced_on_arrays_that_are_closed_over(made):
         jax.eval_shape(call)  # as jit does, without the compilation
 
 
-def test_labels_that_are_no_regions_are_refused(made, tmp_path):
+def test_labels_that_are_no_regions_are_refused(made):
     field, labels = made
     given, most = (field.gaussians, field.cameras), REGIONS - 1
     functions = {
         "region_votes": lambda labels, count: jsecon.region_votes(*given, labels, count),
-        "region_votes_in_blocks": lambda labels, count: jsecon.region_votes_in_blocks(
-            *given, labels, count, folder=tmp_path / str(count)
-        ),
         "distill_l1": lambda labels, count: jsecon.distill_l1(
             *given, labels, field.codes.regions[:count], steps=1, key=jax.random.key(0)
         ),

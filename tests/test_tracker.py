@@ -5,7 +5,7 @@ from conftest import look_at
 from mask_overlaps import iou_matrix
 
 from jsecon.association.consensus import clean_tracks
-from jsecon.association.superpixels import superpixels
+from jsecon.association.scene import superpixels
 from jsecon.paper.algorithm1 import masklets
 from jsecon.paper.tracker import GeometricTracker
 from jsecon.types import Camera

@@ -19,12 +19,13 @@ pytest.importorskip("viser", reason="the extra viewer is not installed")
 from browser import CHROMIUM, opened, until
 from small_field import colour_field
 
-from jsecon import Camera, InputError, load_gaussians, save_field, with_overlap
+from jsecon import Camera, InputError, load_gaussians, save_field
 from jsecon.app.cli import main
 from jsecon.app.records import Answer
 from jsecon.app.viewer import view_state
 from jsecon.app.viewer.view_state import ViewState
 from jsecon.app.viewer.window import Viewer, open_viewer
+from jsecon.field.membership import with_overlap
 from jsecon.query.pointing import region_shares_seen
 from jsecon.vision.colours import BASIC, ColourEmbedder
 

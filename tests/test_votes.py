@@ -1,16 +1,26 @@
-"""Votes against the float64 twin's weights."""
+"""Votes against the float64 twin's weights; the same bits in any order, in memory and on disk."""
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import sparse
 
 from jsecon import plan_view
-from jsecon.association.superpixels import superpixel_votes
-from jsecon.field.votes import region_votes, votes_memory
+from jsecon.association.scene import superpixel_votes
+from jsecon.errors import InputError
+from jsecon.field import columns, evidence
+from jsecon.field.evidence import region_votes, strongest, sum_evidence, view_evidence
+from jsecon.field.membership import normalise_votes
 from jsecon.splat.reference import weights_reference
+from jsecon.splat.render import render_rgb
+from jsecon.splat.visible import geometry_of_rows, render_in_blocks, visible_rows
+from jsecon.types import Camera, Gaussians, Regions, Votes
 
 REGIONS = 11
+COLUMNS = "regions", "weights", "labelled", "total", "max_pixel_weight", "views"
 
 
 @pytest.fixture(scope="module")
@@ -43,21 +53,143 @@ def cast(scene, cameras, labels):
     return region_votes(scene, cameras, labels, REGIONS, top=REGIONS, by_view=True)
 
 
+def assert_same_bits(found: Votes, votes: Votes, names=(*COLUMNS, "by_view")):
+    for name in names:
+        np.testing.assert_array_equal(getattr(found, name), getattr(votes, name), err_msg=name)
+
+
+def ball(count, views, width, height, *, opaque=0.0, seed=0):
+    rng = np.random.default_rng(seed)
+    size = 0.7 * count ** (-1 / 3)
+    arrays = rng.normal(size=(count, 3)), np.log(rng.uniform(0.1 * size, size, (count, 3)))
+    arrays = *arrays, rng.normal(size=(count, 4)), rng.normal(opaque, 1, count), np.zeros((count, 1, 3))
+    poses = np.tile(np.eye(4, dtype=np.float32), (views, 1, 1))
+    poses[:, 2, 3] = 4 - 0.3 * np.arange(views)
+    lens = (np.full(views, v, np.float32) for v in (0.9 * width, 0.9 * width, width / 2, height / 2))
+    return Gaussians(*(a.astype(np.float32) for a in arrays)), Camera(poses, *lens, width, height)
+
+
 def test_equals_the_oracles_weights(cast, expected):
     votes, total, peak, views = expected
     assert int(cast.overflow) == 0
     # float32, and alphas that fall on the other side of the 1/255 cut on single pixels
     np.testing.assert_allclose(cast.dense(), votes, rtol=2e-4, atol=0.02)
     assert np.linalg.norm(cast.dense() - votes) <= 1e-4 * np.linalg.norm(votes)
+    np.testing.assert_allclose(cast.labelled, votes.sum(1), rtol=2e-4, atol=0.02)
     np.testing.assert_allclose(cast.by_view, total, rtol=2e-4, atol=0.02)
     np.testing.assert_allclose(cast.total, total.sum(0), rtol=2e-4, atol=0.02)
     np.testing.assert_allclose(cast.max_pixel_weight, peak, atol=1e-4)
     np.testing.assert_array_equal(cast.views, views)
 
 
+def test_inside_a_trace_they_are_the_same_also_under_vmap(cast, scene, cameras, labels):
+    def votes_of(labels):
+        return region_votes(scene, cameras, labels, REGIONS, top=REGIONS, by_view=True)
+
+    batched = jax.tree.map(lambda a: a[0], jax.vmap(votes_of)(jnp.asarray(labels)[None]))
+    for inside in (jax.jit(votes_of)(labels), batched):
+        np.testing.assert_allclose(inside.dense(), cast.dense(), rtol=1e-5, atol=1e-5)
+        for name in ("labelled", "total", "by_view"):
+            np.testing.assert_allclose(getattr(inside, name), getattr(cast, name), rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(inside.max_pixel_weight, cast.max_pixel_weight, atol=1e-5)
+        np.testing.assert_array_equal(inside.views, cast.views)
+
+
+@pytest.mark.parametrize("name", ["opacity_logits", "means"])
+def test_they_have_the_derivative_of_the_twins_weights(scene, cameras, labels, name):
+    """Along a direction, of the votes of some regions, against central differences in float64."""
+    pair, some = cameras[:1], labels[1:2]
+    rng = np.random.default_rng(3)
+    along, weight = rng.normal(size=getattr(scene, name).shape), rng.random(REGIONS)
+
+    def weighted(column):
+        votes = region_votes(dataclasses.replace(scene, **{name: column}), pair, some, REGIONS, top=REGIONS)
+        return (votes.weights * jnp.asarray(weight)[votes.regions]).sum() + votes.labelled.sum()
+
+    def exact(step):
+        moved = dataclasses.replace(scene, **{name: getattr(scene, name).astype(np.float64) + step * along})
+        weights = weights_reference(moved, pair[0]).sum(-1)
+        return (weights * np.append(1 + weight, 0)[some[0]]).sum()
+
+    slope = float((jax.jit(jax.grad(weighted))(getattr(scene, name)) * along).sum())
+    assert slope == pytest.approx((exact(1e-7) - exact(-1e-7)) / 2e-7, rel=0.01)  # no alpha meets the cut
+
+
+def test_no_order_of_views_changes_a_bit(cast, scene, cameras, labels):
+    """Nor do parts that are added up apart: each is exact."""
+    views = [view_evidence(scene, cameras[t], labels[t], REGIONS) for t in range(4)]
+    order = [2, 0, 3, 1]
+    turned = sum_evidence([views[t] for t in order], scene.count, REGIONS, top=REGIONS, by_view=True)
+    assert_same_bits(turned, cast, COLUMNS)
+    np.testing.assert_array_equal(turned.by_view, cast.by_view[order])
+    some = sum_evidence([views[t] for t in (3, 1)], scene.count, REGIONS, top=REGIONS)
+    alone = region_votes(scene, cameras[np.array([1, 3])], labels[[1, 3]], REGIONS, top=REGIONS)
+    assert_same_bits(some, alone, COLUMNS)
+    many = [views[0]._replace(weights=np.float32(2.0**t) * views[0].weights) for t in range(20)]
+    sums = [sum_evidence(own, scene.count, REGIONS, top=REGIONS) for own in (many, many[::-1])]
+    assert_same_bits(*sums, COLUMNS)
+
+
+def test_on_disk_and_in_blocks_they_are_the_same_to_the_bit(cast, scene, cameras, labels, tmp_path, monkeypatch):
+    monkeypatch.setattr(evidence, "_MAX_ENTRIES", 4 * 16)  # blocks of 16 rows
+    options = {"top": REGIONS, "by_view": True}
+    assert_same_bits(region_votes(scene, cameras, labels, REGIONS, **options), cast)
+
+    class Streamed:
+        """Labels, a view at a time; keeps which were asked for."""
+
+        def __init__(self):
+            self.asked = []
+
+        def __len__(self):
+            return len(labels)
+
+        def __getitem__(self, t):
+            self.asked.append(t)
+            return labels[t]
+
+    told, streamed = [], Streamed()
+    options |= {"folder": tmp_path / "v", "progress": lambda *count: told.append(count)}
+    mapped = region_votes(scene, cameras, streamed, REGIONS, **options)
+    assert_same_bits(mapped, cast)
+    assert sorted(streamed.asked) == [0, 1, 2, 3]
+    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert isinstance(mapped.weights, np.memmap)
+    assert isinstance(mapped.by_view, np.memmap)
+    assert mapped.weights.flags.writeable is False
+    assert {file.name for file in (tmp_path / "v").iterdir()} == {f"{name}.npy" for name in (*COLUMNS, "by_view")}
+
+
+@pytest.mark.parametrize("opaque", [0.0, pytest.param(4.0, marks=pytest.mark.long)])
+def test_a_scene_cut_to_what_a_view_sees_has_the_same_votes(monkeypatch, opaque):
+    """40,000 Gaussians; opaque, most lie behind what stopped every pixel. A pixel's last weight, of at most 0.01, may
+    come to lie on the other side of the stop: another program rounds a splat's place its own way."""
+    count = 40_000
+    scene, cameras = ball(count, 2, 160, 120, opaque=opaque)
+    scene.means[: count // 2, 0] += 50  # beside every view
+    blocks = np.random.default_rng(1).integers(-1, 7, (2, 6, 8)).repeat(20, 1).repeat(20, 2)
+    whole = region_votes(scene, cameras, blocks, 7, top=3)
+    monkeypatch.setattr(evidence, "_MAX_WHOLE", 1000)
+    cut = region_votes(scene, cameras, blocks, 7, top=3)
+    assert not np.asarray(cut.views[: count // 2]).any()
+    for name in ("weights", "labelled", "total", "weight_beyond_top_k"):
+        own, other = (np.asarray(getattr(votes, name), np.float64) for votes in (cut, whole))
+        np.testing.assert_allclose(own, other, rtol=1e-4, atol=0.011)
+        assert np.linalg.norm(own - other) <= 1e-4 * np.linalg.norm(other) + 0.02
+    for name in ("regions", "views"):
+        assert (np.asarray(getattr(cut, name)) != np.asarray(getattr(whole, name))).sum() <= 4
+
+
+def test_equal_depths_keep_the_order_of_indices(scene, cameras, labels):
+    """All Gaussians in one place: each sees what those before it leave."""
+    alike = {"means": np.zeros_like(scene.means), "log_scales": np.full_like(scene.log_scales, -1)}
+    scene = dataclasses.replace(scene, **alike, opacity_logits=np.full_like(scene.opacity_logits, -3))
+    assert (np.diff(region_votes(scene, cameras, labels, REGIONS).total) < 0).all()
+
+
 @pytest.mark.parametrize("share", [0.4, pytest.param(1.0, marks=pytest.mark.long)])
 def test_at_the_centre_they_are_the_weights_of_that_pixel(scene, cameras, labels, cast, share):
-    found = region_votes(scene, cameras, labels, REGIONS, top=REGIONS, by_view=True, centre=share)
+    found = region_votes(scene, cameras, labels, REGIONS, top=REGIONS, by_view=True, centre_pixel_weight=share)
     votes, total = np.zeros((scene.count, REGIONS)), np.zeros((4, scene.count))
     for t in range(4):
         weights, splats = weights_reference(scene, cameras[t]), np.asarray(plan_view(scene, cameras[t]).splats)
@@ -74,76 +206,120 @@ def test_at_the_centre_they_are_the_weights_of_that_pixel(scene, cameras, labels
 
 
 @pytest.mark.parametrize("t", [1, *(pytest.param(t, marks=pytest.mark.long) for t in (0, 2))])
-def test_votes_on_atoms_are_those_of_the_view(scene, cameras, labels, expected, t):
-    """Also where a tile shows more atoms than one walk counts (the noise of view 1)."""
-    camera, atoms = cameras[t], labels[t] + 1
-    got = superpixel_votes(scene, camera, atoms, negligible=0.0).toarray()
-    same = region_votes(scene, cameras[t : t + 1], atoms[None], REGIONS + 1, top=REGIONS + 1)
-    np.testing.assert_allclose(got, same.dense(), rtol=1e-5, atol=1e-6)
-    few = superpixel_votes(scene, camera, atoms, negligible=0.3).toarray()
+def test_votes_on_superpixels_are_those_of_the_view(scene, cameras, labels, t):
+    camera, pieces = cameras[t], labels[t] + 1
+    got = superpixel_votes(scene, camera, pieces, negligible=0.0).toarray()
+    same = region_votes(scene, cameras[t : t + 1], pieces[None], REGIONS + 1, top=REGIONS + 1)
+    np.testing.assert_array_equal(got, same.dense())
+    few = superpixel_votes(scene, camera, pieces, negligible=0.3).toarray()
     np.testing.assert_array_equal(few, np.where(got > 0.3 * got.sum(1, keepdims=True), got, 0.0))
-    middle = superpixel_votes(scene, camera, atoms, negligible=0.0, centre=1.0).toarray()
-    at_centre = region_votes(scene, cameras[t : t + 1], atoms[None], REGIONS + 1, top=REGIONS + 1, centre=1.0)
-    np.testing.assert_allclose(middle, at_centre.dense(), rtol=1e-5, atol=1e-6)
-    assert (middle > 0).sum(1).max() == 1
 
 
 def test_strongest_first_and_what_is_cut_is_counted(cast, scene, cameras, labels):
     few = region_votes(scene, cameras, labels, REGIONS, top=2)
-    assert few.regions.shape == (scene.count, 2)
     assert few.by_view is None
-    np.testing.assert_allclose(few.weights, cast.weights[:, :2], rtol=1e-6)
+    np.testing.assert_array_equal(few.weights, cast.weights[:, :2])
     np.testing.assert_allclose(few.weight_beyond_top_k, cast.weights[:, 2:].sum(-1), rtol=1e-4, atol=1e-4)
     assert bool((cast.weights[:, :-1] >= cast.weights[:, 1:]).all())
     np.testing.assert_array_equal(cast.regions >= 0, cast.weights > 0)
 
-
-def test_what_they_take_is_told_beforehand(monkeypatch):
-    count, regions, dense = 1000, 50, 4 * 1000 * 50
-    for devices, lanes in ((1, 1), (2, 2), (6, 4), (16, 8)):
-        local = jax.local_devices()[:1] * devices
-        monkeypatch.setattr(jax, "devices", lambda local=local: local)
-        assert votes_memory(count, 100, regions) == (4 * 100 + 56) * count + (lanes + 1) * dense
-    # a block of 1 GiB in each of two lanes, and one of their sum
-    assert votes_memory(1 << 22, 100, 100) == (4 * 100 + 56) * (1 << 22) + 3 * (1 << 30)
+    rng = np.random.default_rng(0)
+    dense = rng.integers(0, 4, (500, 9)).astype(np.float64) * (rng.random((500, 9)) < 0.6)
+    ids, weights = strongest(sparse.csr_matrix(dense), 4)
+    expected, places = jax.lax.top_k(jnp.asarray(dense), 4)  # equal ones by region
+    np.testing.assert_array_equal(weights, expected)
+    np.testing.assert_array_equal(ids, np.where(np.asarray(expected) > 0, places, -1))
 
 
-def test_regions_in_blocks_are_the_same_votes(monkeypatch, cast, scene, cameras, labels):
-    from jsecon.field import votes as module
+@pytest.mark.parametrize("traced", [False, True])
+@pytest.mark.parametrize(("count", "views", "regions"), [(0, 4, 3), (64, 0, 3), (64, 4, 0), (1, 1, 1), (0, 0, 0)])
+@pytest.mark.parametrize("dtype", [np.int32, np.uint8, np.uint16])
+def test_no_gaussians_no_views_no_regions(scene, cameras, tmp_path, count, views, regions, traced, dtype):
+    if traced and dtype != np.int32:
+        pytest.skip("one type of labels is enough inside a trace")
+    some, seen = jax.tree.map(lambda a: a[:count], scene), jax.tree.map(lambda a: a[:views], cameras)
+    images = np.zeros((views, 40, 48), dtype) if regions else np.full((views, 40, 48), -1, np.int32)
 
-    monkeypatch.setattr(module, "DENSE_BYTES", 4 * 4 * scene.count)  # four regions a pass
-    blocks = region_votes(scene, cameras, labels, REGIONS, top=REGIONS)
-    np.testing.assert_allclose(blocks.dense(), cast.dense(), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(blocks.labelled, cast.labelled, rtol=1e-5)
-    np.testing.assert_allclose(blocks.total, cast.total, rtol=1e-6)
+    def cast(images):
+        return region_votes(some, seen, images, regions, by_view=True)
+
+    votes = jax.jit(cast)(images) if traced else cast(images)
+    width = min(8, max(regions, 1))
+    assert votes.regions.shape == votes.weights.shape == (count, width)
+    assert votes.by_view.shape == (views, count)
+    assert votes.dense().shape == (count, regions)
+    assert (float(votes.total.sum()) > 0) == (count > 0 and views > 0)
+    assert float(votes.labelled.sum()) == pytest.approx(float(votes.total.sum()) if regions else 0.0, rel=1e-5)
+    if not traced:
+        assert_same_bits(region_votes(some, seen, images, regions, by_view=True, folder=tmp_path / "v"), votes)
 
 
-def test_what_nobody_sees_has_no_votes_and_views_are_counted(scene, cameras, labels):
+def test_what_nobody_sees_has_no_votes(scene, cameras, labels):
     hidden = jax.tree.map(np.copy, scene)
     hidden.means[0] = [0, -1e4, 0]  # far above every view
-    seen = []
-    cast = region_votes(hidden, cameras, labels, REGIONS, progress=lambda done, total: seen.append((done, total)))
-    assert seen[-1] == (4, 4)
-    assert sorted(seen) == seen
-    assert int(cast.views[0]) == 0
-    assert float(cast.total[0]) == 0
-    assert bool((cast.regions[0] == -1).all())
+    votes = region_votes(hidden, cameras, labels, REGIONS)
+    assert (int(votes.views[0]), float(votes.total[0])) == (0, 0)
+    assert bool((votes.regions[0] == -1).all())
 
 
-def test_no_regions_at_all(scene, cameras):
-    cast = region_votes(scene, cameras, np.full((4, 40, 48), -1, np.int32), 0)
-    assert cast.dense().shape == (scene.count, 0)
-    assert bool((cast.regions == -1).all())
-    assert float(cast.total.sum()) > 0
+def test_what_does_not_fit_raises(scene, cameras, camera, labels, tmp_path, monkeypatch):
+    def cast(*given, **how):
+        return region_votes(*given, REGIONS, folder=tmp_path / "v", **how)
 
-
-def test_shapes_that_disagree_raise(scene, cameras, camera, labels):
     with pytest.raises(ValueError, match="leading axis"):
-        region_votes(scene, camera, labels, REGIONS)
-    with pytest.raises(ValueError, match="labels"):
-        region_votes(scene, cameras, labels[:2], REGIONS)
+        cast(scene, camera, labels)
+    with pytest.raises(ValueError, match="one per view"):
+        cast(scene, cameras, labels[:2])
+    for images in (labels[:, 1:], list(labels[:, 1:])):
+        with pytest.raises(ValueError, match="size"):
+            cast(scene, cameras, images)
+    (tmp_path / "v").mkdir(exist_ok=True)
+    (tmp_path / "v" / "mine").touch()
+    with pytest.raises(InputError, match="not empty"):
+        cast(scene, cameras, labels)
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="can be written"):
+        region_votes(scene, cameras, labels, REGIONS, folder=tmp_path / "file" / "v")
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "save", full)
+    with pytest.raises(InputError, match="No space left"):
+        region_votes(scene, cameras, labels, REGIONS, folder=tmp_path / "w")
+    assert not list((tmp_path / "w").iterdir())  # nor does the scratch folder stay
 
 
-def test_votes_are_the_transpose_of_rendering(cast, scene, cameras, labels):
-    """<W f, onehot> = <f, W^T onehot> for any f: here with f = 1 a region's votes are its rendered weight."""
-    assert abs(float(cast.labelled.sum()) - float(jnp.sum(cast.dense()))) < 1e-2
+def test_normalised_on_disk_they_are_those_in_memory(scene, cameras, labels, tmp_path, monkeypatch):
+    embeddings = np.random.default_rng(0).normal(size=(REGIONS, 4)).astype(np.float32)
+    embeddings /= np.linalg.norm(embeddings, axis=1, keepdims=True)
+    pixels = np.stack([(labels == r).sum((1, 2)) for r in range(REGIONS)]).astype(np.int32)
+    pixels[:5, 1] = 0  # as if the noise of that view showed but half of them
+    regions = Regions(embeddings, pixels)
+    options = {"top": 4, "by_view": True}
+    memory = normalise_votes(region_votes(scene, cameras, labels, REGIONS, **options), regions)
+    monkeypatch.setattr(columns, "ROWS", 24)
+    mapped = normalise_votes(region_votes(scene, cameras, labels, REGIONS, **options, folder=tmp_path / "w"), regions)
+    for name in ("weight_where_region_visible", "overlap"):
+        np.testing.assert_allclose(getattr(mapped, name), getattr(memory, name), rtol=1e-5, atol=1e-6)
+    assert mapped.by_view is None
+
+
+def test_a_view_is_rendered_from_what_it_can_see():
+    scene, cameras = ball(3_000, 3, 60, 40)
+    scene.means[:1500, 0] += 50  # beside every view
+    for t in range(3):
+        ids = visible_rows(scene, cameras[t], rows=700)
+        assert 0 < len(ids) <= 1500
+        assert (ids >= 1500).all()
+        expected = render_rgb(scene, cameras[t]).features
+        np.testing.assert_allclose(render_in_blocks(scene, cameras[t]), expected, atol=1e-5)
+    away = scene.means.copy()
+    away[:, 0] += 500
+    empty = dataclasses.replace(scene, means=away)
+    np.testing.assert_array_equal(render_in_blocks(empty, cameras[0]), 0)
+    counts = range(0, 300_000, 4_999)
+    sizes = [geometry_of_rows(scene, np.zeros(count, int)).count for count in counts]
+    assert sizes == sorted(sizes)
+    assert len(set(sizes)) < 40
+    assert all(count <= size <= max(1.13 * count, count + 4096) for count, size in zip(counts, sizes))

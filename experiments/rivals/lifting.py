@@ -21,7 +21,7 @@ from scipy import sparse
 from scipy.spatial import KDTree
 
 from experiments.rivals.evidence import Evidence, local_masks
-from jsecon.association.superpixels import superpixel_votes
+from jsecon.association.scene import superpixel_votes
 from jsecon.paper.queries import relevancies
 from jsecon.splat.fusion import compute_once
 from jsecon.splat.plan import ViewPlan, plan_view

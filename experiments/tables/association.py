@@ -78,7 +78,7 @@ def by_consensus(
       The regions.
     """
     given = jax.tree.map(jnp.asarray, (levels[0].gaussians, levels[0].cameras))
-    scene = SceneSuperpixels(*given, lambda t: proposals(levels, t), centre=centre)
+    scene = SceneSuperpixels(*given, lambda t: proposals(levels, t), centre_pixel_weight=centre)
     return associated(levels, clean_tracks(track_masks(frames, scene, seed=seed, **how)))
 
 

@@ -13,9 +13,9 @@ from experiments.tables.codes import encode, region_codes
 from experiments.tables.setting import Setting
 from jsecon.association.consensus import pieces_on_masks
 from jsecon.association.scene import SceneSuperpixels
+from jsecon.field.evidence import region_votes
 from jsecon.field.membership import membership_probability, normalise_votes
 from jsecon.field.regions import scene_parts
-from jsecon.field.votes import region_votes
 from jsecon.paper.autoencoder import train_autoencoder
 from jsecon.paper.distill import distill_l1, distill_votes
 from jsecon.paper.queries import query_canonical, query_one_step
@@ -72,7 +72,7 @@ def field_of(
 
     def cast() -> Votes:
         given = evidence.gaussians, evidence.cameras, found, len(embeddings)
-        return normalise_votes(region_votes(*given, by_view=True, centre=centre), known)
+        return normalise_votes(region_votes(*given, by_view=True, centre_pixel_weight=centre), known)
 
     votes = shared.get(("votes", by, uniform, centre, agreement), cast)
     if latent == "auto":

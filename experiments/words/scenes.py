@@ -31,7 +31,7 @@ from experiments.rivals import lifting
 from experiments.rivals.evidence import Evidence, unit
 from experiments.words.conse import WORDS, Conse
 from jsecon.errors import InputError
-from jsecon.field.votes import region_votes
+from jsecon.field.evidence import region_votes
 from jsecon.fit.start import starting_gaussians
 from jsecon.pipeline.objects import TrainingView, associate_masks, frame_proposals
 from jsecon.pipeline.options import Options as RunOptions

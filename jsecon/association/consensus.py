@@ -10,8 +10,14 @@ import numpy as np
 from jaxtyping import Float, Int, Int16, Integer, UInt8
 from scipy import sparse
 
-from jsecon.association.scene import FrameSuperpixels, SceneSuperpixels, assign_superpixels
-from jsecon.association.superpixels import Sparse, one_hot, sum_entries
+from jsecon.association.scene import (
+    FrameSuperpixels,
+    SceneSuperpixels,
+    Sparse,
+    assign_superpixels,
+    one_hot,
+    sum_entries,
+)
 from jsecon.errors import require
 from jsecon.types import Progress
 from jsecon.vision.region_graph import relabel_sequential
@@ -229,7 +235,7 @@ def track_masks(
 ) -> Int16[np.ndarray, "t h w"]:
     """Follows objects through the frames by consensus, independent of the order of the frames.
 
-    The Gaussians are grouped by `group_by_consensus`, and the groups claim the atoms of each frame
+    The Gaussians are grouped by `group_by_consensus`, and the groups claim the superpixels of each frame
     (`assign_superpixels`).
 
     Args:
@@ -243,6 +249,7 @@ def track_masks(
     Returns:
       (T, H, W) int16 labels, -1 for no object.
     """
+    require(seed >= 0, "seed", seed, "at least 0", "Give another seed.")
     views, means = scene.all(frames, progress), np.asarray(scene.gaussians.means, np.float32)
     owner = group_by_consensus(
         *mask_signatures(views, scene.count, abstain_if_unlabelled=abstain_if_unlabelled),
@@ -303,6 +310,7 @@ def pieces_on_masks(
       (N,) piece of each Gaussian, -1 if it is never seen; and the sparse matrix (N, M) of the weight of each Gaussian
       on each of the M masks of all frames, in their order.
     """
+    require(seed >= 0, "seed", seed, "at least 0", "Give another seed.")
     views, means = scene.all(frames, progress), np.asarray(scene.gaussians.means, np.float32)
     piece = scene_pieces(*mask_signatures(views, scene.count), means, pieces=MAX_PIECES, seed=seed)
     entries, start = [], 0

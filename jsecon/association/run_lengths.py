@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool
 from scipy import sparse
 
-from jsecon.association.superpixels import Sparse
+from jsecon.association.scene import Sparse
 
 
 @dataclasses.dataclass(frozen=True)

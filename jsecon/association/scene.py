@@ -1,27 +1,34 @@
-"""Votes of the Gaussians on the atoms of each frame, by which masks are associated. Host code.
+"""Superpixels of the frames, and the weights of the Gaussians on them, by which masks are associated. Host code.
 
-With frozen geometry an image is linear in the features of the Gaussians: a pixel is sum_i w_ip f_i with w = alpha T,
-occlusion included. One pass per frame sums w over the pixels of atoms (superpixels cut along the proposals of the
-frame). Lifting a mask to the Gaussians and rendering it into another frame are then products with sparse matrices
-(n Gaussians x A atoms) instead of renderings. Masks follow the outlines of atoms, and so the edges of the image.
+With fixed geometry an image is linear in the features of the Gaussians: a pixel is sum_i w_ip f_i with w = alpha T,
+occlusion included. One pass per frame sums w over the pixels of superpixels, which are cut along the proposals of the
+frame. Lifting a mask to the Gaussians and rendering it into another frame are then products with sparse matrices
+(n Gaussians x A superpixels) instead of renderings. Masks follow the outlines of superpixels, and so the edges of the
+image.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
 
+import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 from scipy import sparse
 
-from jsecon.association.superpixels import MIN_ATOM_PX, Sparse, superpixel_coverage, superpixel_votes, superpixels
 from jsecon.errors import require
-from jsecon.parallel import LANES, map_over_processes
-from jsecon.process import cores
+from jsecon.field.evidence import view_evidence
+from jsecon.parallel import map_views
 from jsecon.types import Camera, Gaussians, Progress
+from jsecon.vision.region_graph import relabel_sequential
+from jsecon.vision.surfaces import fill_nearest
 
+Sparse: TypeAlias = Any
+"""scipy.sparse.csr_matrix, which type checkers cannot resolve."""
+MIN_SUPERPIXEL_PX = 12
+"""Least size in px; smaller pieces are slivers along an edge."""
 MIN_PROPOSAL_SHARE = 0.4
-MIN_ATOM_SHARE = 0.6
+MIN_SUPERPIXEL_SHARE = 0.6
 MIN_MERGED_SHARE = 0.5
 MIN_KNOWN_SHARE = 0.5
 MIN_COVERAGE = 0.2
@@ -30,16 +37,16 @@ MIN_COVERAGE = 0.2
 
 @dataclasses.dataclass(frozen=True)
 class FrameSuperpixels:
-    """Votes of the Gaussians in one frame."""
+    """The superpixels of one frame, and the weights of the Gaussians on them."""
 
     labels: np.ndarray
-    """(H, W) int32 atom of each pixel, 0 .. A-1."""
+    """(H, W) int32 superpixel of each pixel, 0 .. A-1."""
     seen: np.ndarray
     """(n,) indices of the Gaussians that the frame shows."""
     votes: Sparse
-    """(n, A) sum of alpha T over the pixels of each atom."""
+    """(n, A) sum of alpha T over the pixels of each superpixel."""
     proposals: np.ndarray
-    """(M, A) float32 share of each atom that lies in each proposal."""
+    """(M, A) float32 share of each superpixel that lies in each proposal."""
     clarity: np.ndarray
     """(n,) in (0, 1]: visible cross-section of each, relative to the frame that sees most of it."""
 
@@ -55,7 +62,7 @@ class FrameSuperpixels:
 
 
 class SceneSuperpixels:
-    """Votes of one scene in all frames, computed once.
+    """The superpixels of all frames of one scene, computed once.
 
     Args:
       gaussians: Scene of N Gaussians.
@@ -63,8 +70,7 @@ class SceneSuperpixels:
       proposals: Masks (M, H, W) bool of each frame, which may overlap: a sequence, or a function of the index of a
         frame, which is called in several threads.
       superpixels_per_frame: Approximate number of superpixels per frame before the cut along proposals.
-      centre: Weight of a Gaussian's centre against its footprint, see `region_votes`; above 0 if answers are judged at
-        the centres of Gaussians.
+      centre_pixel_weight: As for `region_votes`; above 0 if answers are judged at the centres of Gaussians.
     """
 
     def __init__(
@@ -74,63 +80,40 @@ class SceneSuperpixels:
         proposals: Callable[[int], np.ndarray] | Sequence[np.ndarray],
         *,
         superpixels_per_frame: int = 256,
-        centre: float = 0.0,
+        centre_pixel_weight: float = 0.0,
     ):
-        require(
-            superpixels_per_frame > 0,
-            "superpixels_per_frame",
-            superpixels_per_frame,
-            "at least 1",
-            "Use 200 for small frames.",
-        )
+        remedy = "Use 200 for small frames."
+        require(superpixels_per_frame > 0, "superpixels_per_frame", superpixels_per_frame, "at least 1", remedy)
         self.gaussians, self.cameras, self.count = gaussians, cameras, gaussians.count
-        self.superpixels_per_frame, self.centre = superpixels_per_frame, centre
+        self.superpixels_per_frame, self.centre_pixel_weight = superpixels_per_frame, centre_pixel_weight
         self.propose = proposals if callable(proposals) else proposals.__getitem__
         self._views: list[FrameSuperpixels] = []
         self.shared = np.zeros((0, 0), np.float32)
         """(T, T) overlap of two frames: the cosine of their visible cross-sections of all Gaussians. Set by `all`."""
 
     def _view(self, frame: UInt8[np.ndarray, "h w 3"], t: int) -> tuple:
-        """Atoms, visible Gaussians, arrays and shape of the votes, and proposals of a frame."""
+        """Superpixels, visible Gaussians, arrays and shape of their weights, and proposals of a frame."""
         masks = np.asarray(self.propose(t), bool)
-        atoms = superpixels(frame, masks, count=self.superpixels_per_frame)
-        within = superpixel_coverage(atoms, masks, int(atoms.max()) + 1)
-        votes = superpixel_votes(self.gaussians, self.cameras[t], atoms, centre=self.centre)
+        labels = superpixels(frame, masks, count=self.superpixels_per_frame)
+        within = superpixel_coverage(labels, masks, int(labels.max()) + 1)
+        options = {"centre_pixel_weight": self.centre_pixel_weight}
+        votes = superpixel_votes(self.gaussians, self.cameras[t], labels, **options)
         seen = np.flatnonzero(np.diff(votes.indptr))
         votes = votes[seen]
-        return atoms, seen, [votes.data, votes.indices, votes.indptr], votes.shape, within
-
-    def _views_of(self, frames: UInt8[np.ndarray, "t h w 3"], indices: Sequence[int]) -> Iterator[tuple]:
-        """Results of `_view` for the frames of `indices`, in order; threads work on several frames at a time."""
-        pool = ThreadPoolExecutor(min(cores(), LANES))
-        try:
-            yield from pool.map(self._view, (frames[t] for t in indices), indices)
-        finally:
-            pool.shutdown(cancel_futures=True)
+        return labels, seen, [votes.data, votes.indices, votes.indptr], votes.shape, within
 
     def all(self, frames: UInt8[np.ndarray, "t h w 3"], progress: Progress | None = None) -> list[FrameSuperpixels]:
-        """Computes the votes of all frames; several processes (`jax.distributed`) divide the frames.
-
-        Args:
-          frames: (T, H, W, 3) uint8 frames of the cameras, the same at every call.
-          progress: Called with the number of frames done and of all.
-
-        Returns:
-          One `FrameSuperpixels` per frame.
-
-        Raises:
-          ValueError: The frames have another number or size than the cameras.
-        """
+        """Computes the superpixels of all frames, which are the same at every call; several processes divide them."""
         expected = (*self.cameras.fx.shape, self.cameras.height, self.cameras.width)
         remedy = "Pass the frames of the cameras of the scene."
         require(frames.shape[:3] == expected, "frames", frames.shape, f"{(*expected, 3)}", remedy)
         if not self._views:
             views = [
                 FrameSuperpixels(
-                    atoms, seen, sparse.csr_matrix((*votes,), shape=shape), within, np.ones(len(seen), np.float32)
+                    labels, seen, sparse.csr_matrix((*votes,), shape=shape), within, np.ones(len(seen), np.float32)
                 )
-                for atoms, seen, votes, shape, within in map_over_processes(
-                    len(frames), lambda indices: self._views_of(frames, indices), progress
+                for labels, seen, votes, shape, within in map_views(
+                    len(frames), lambda t: self._view(frames[t], t), progress
                 )
             ]
             cross_sections = np.zeros((len(views), self.count), np.float32)
@@ -152,43 +135,101 @@ class SceneSuperpixels:
 def assign_superpixels(
     view: FrameSuperpixels, mass: Float[np.ndarray, "a c"], known_mass: Float[np.ndarray, "a 1"]
 ) -> Int[np.ndarray, " a"]:
-    """Assigns the atoms of a view to classes of Gaussians.
+    """Assigns the superpixels of a view to classes of Gaussians: (A,) class of each, -1 if unassigned.
 
-    With t_a the weight of all Gaussians on an atom a, and sums over a proposal p that weigh an atom by its share in p:
+    With t_a the weight of all Gaussians on a superpixel a, and sums over a proposal p that weigh it by its share in p:
 
-        share of an atom       s_ac = m_ac / k_a,  reliable if k_a >= MIN_KNOWN_SHARE t_a and t_a >= MIN_COVERAGE px(a)
+        share of a superpixel  s_ac = m_ac / k_a,  reliable if k_a >= MIN_KNOWN_SHARE t_a and t_a >= MIN_COVERAGE px(a)
         share of a proposal    s_pc = m_pc / k_p,  reliable if k_p >= MIN_KNOWN_SHARE t_p
 
-    1. A reliable atom goes to the class with the largest share, if that is at least MIN_ATOM_SHARE.
+    1. A reliable superpixel goes to the class with the largest share, if that is at least MIN_SUPERPIXEL_SHARE.
     2. Then each reliable proposal, from the weakest to the strongest in v = max_c s_pc, if v >= MIN_PROPOSAL_SHARE,
-       assigns the atoms that lie in it by more than half to the class w of that share. If the proposal merges w with
-       classes of m_pc >= MIN_MERGED_SHARE sum_a m_ac and m_pc >= MIN_ATOM_PX, a reliable atom goes to the one of them
-       with the largest s_ac.
+       assigns the superpixels that lie in it by more than half to the class w of that share. If the proposal merges w
+       with classes of m_pc >= MIN_MERGED_SHARE sum_a m_ac and m_pc >= MIN_SUPERPIXEL_PX, a reliable superpixel goes to
+       the one of them with the largest s_ac.
 
-    Args:
-      view: Votes of one frame.
-      mass: (A, C) weight m_ac on each atom of the Gaussians of each class.
-      known_mass: (A, 1) weight k_a on each atom of the Gaussians whose class is known.
-
-    Returns:
-      (A,) class of each atom, -1 if unassigned.
+    `mass` is m_ac, the weight of the Gaussians of each class on each superpixel, and `known_mass` k_a, that of the
+    Gaussians whose class is known.
     """
     total = view.votes.T @ np.ones((len(view.seen), 1), np.float32)
-    share_of_atom = mass / np.maximum(known_mass, 1e-6)
+    share_of_superpixel = mass / np.maximum(known_mass, 1e-6)
     area = np.bincount(view.labels.reshape(-1), minlength=len(total))
-    reliable_atom = (known_mass >= MIN_KNOWN_SHARE * total)[:, 0] & (total[:, 0] >= MIN_COVERAGE * area)
+    is_reliable = (known_mass >= MIN_KNOWN_SHARE * total)[:, 0] & (total[:, 0] >= MIN_COVERAGE * area)
     inside, known_inside = view.proposals @ mass, view.proposals @ known_mass  # (M, C), (M, 1)
     share = inside / np.maximum(known_inside, 1e-6)
     reliable = (known_inside >= MIN_KNOWN_SHARE * (view.proposals @ total))[:, 0]
-    merged = (inside >= MIN_MERGED_SHARE * mass.sum(0)) & (inside >= MIN_ATOM_PX)
+    merged = (inside >= MIN_MERGED_SHARE * mass.sum(0)) & (inside >= MIN_SUPERPIXEL_PX)
 
-    owner = np.where(reliable_atom & (share_of_atom.max(1) >= MIN_ATOM_SHARE), share_of_atom.argmax(1), -1)
+    certain = is_reliable & (share_of_superpixel.max(1) >= MIN_SUPERPIXEL_SHARE)
+    owner = np.where(certain, share_of_superpixel.argmax(1), -1)
     strongest = np.where(reliable, share.max(1), 0.0) if len(share) else np.zeros(0)
     for m in np.argsort(strongest, kind="stable"):
         if strongest[m] >= MIN_PROPOSAL_SHARE:
             winner = share[m].argmax()
             merged[m, winner] = True
-            members, rivals = np.flatnonzero(view.proposals[m] > 0.5), np.flatnonzero(merged[m])
-            strongest_rival = rivals[share_of_atom[np.ix_(members, rivals)].argmax(1)]
-            owner[members] = np.where(reliable_atom[members], strongest_rival, winner)
+            members, competing = np.flatnonzero(view.proposals[m] > 0.5), np.flatnonzero(merged[m])
+            nearest = competing[share_of_superpixel[np.ix_(members, competing)].argmax(1)]
+            owner[members] = np.where(is_reliable[members], nearest, winner)
     return owner
+
+
+def superpixels(
+    frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m h w"], *, count: int
+) -> Int32[np.ndarray, "h w"]:
+    """Segments a frame into about `count` superpixels (SLICO, Achanta et al. 2012), cut along the outlines of masks.
+
+    Pieces below MIN_SUPERPIXEL_PX pixels join the nearest other piece.
+    """
+    lab = cv2.cvtColor(np.ascontiguousarray(frame), cv2.COLOR_RGB2LAB)
+    size = max(round(float(np.sqrt(frame.shape[0] * frame.shape[1] / count))), 4)
+    slic = cv2.ximgproc.createSuperpixelSLIC(lab, cv2.ximgproc.SLICO, size)
+    slic.iterate(6)
+    pieces = np.asarray(slic.getLabels(), np.int64)
+    for eight in np.packbits(masks, axis=0):
+        pieces = relabel_sequential(pieces * 256 + eight)
+    large = np.bincount(pieces.reshape(-1))[pieces] >= MIN_SUPERPIXEL_PX
+    if large.any() and not large.all():
+        pieces = fill_nearest(pieces, large)
+    return relabel_sequential(pieces).astype(np.int32)
+
+
+def superpixel_coverage(
+    labels: Int32[np.ndarray, "h w"], masks: Bool[np.ndarray, "m h w"], count: int
+) -> Float32[np.ndarray, "m a"]:
+    """Computes the share of the pixels of each of `count` superpixels that lies in each mask."""
+    area = np.bincount(labels.reshape(-1), minlength=count)
+    inside = [np.bincount(labels[mask], minlength=count) for mask in masks]
+    return (np.asarray(inside, np.float32).reshape(len(masks), count) / np.maximum(area, 1)).astype(np.float32)
+
+
+def superpixel_votes(
+    gaussians: Gaussians,
+    camera: Camera,
+    labels: Int32[np.ndarray, "h w"],
+    *,
+    negligible: float = 0.005,
+    centre_pixel_weight: float = 0.0,
+) -> Sparse:
+    """Adds up the weights alpha T of N Gaussians on the A superpixels of one view, sparse (N, A).
+
+    Entries up to the share `negligible` of a Gaussian's total are left out.
+    """
+    count = int(labels.max()) + 1
+    evidence = view_evidence(gaussians, camera, labels, count, centre_pixel_weight=centre_pixel_weight)
+    votes = evidence.matrix(gaussians.count, count)[:, :-1]
+    total = np.repeat(np.asarray(votes.sum(1)).ravel(), np.diff(votes.indptr))
+    votes.data[votes.data <= negligible * total] = 0.0
+    votes.eliminate_zeros()
+    return votes
+
+
+def sum_entries(entries: list[tuple[np.ndarray, np.ndarray, np.ndarray]], shape: tuple[int, int]) -> Sparse:
+    """Builds a sparse matrix of parts of values, rows and columns; repeated entries are added up."""
+    values, rows, columns = (np.concatenate(parts) for parts in zip(*entries))
+    return sparse.csr_matrix((values, (rows, columns)), shape=shape)
+
+
+def one_hot(labels: Int[np.ndarray, " a"], count: int) -> Sparse:
+    """Encodes labels, -1 for none, as a sparse matrix (A, `count`) of float32 ones."""
+    rows = np.flatnonzero(labels >= 0)
+    return sparse.csr_matrix((np.ones(len(rows), np.float32), (rows, labels[rows])), shape=(len(labels), count))

@@ -72,8 +72,8 @@ _SHAPES = {
     (4, 4): "source_from_scene",
 }
 _OPTIONAL = (
-    "votes.weight_where_region_visible", "votes.overlap", "parts.part", "parts.embeddings", "unrelated_words",
-    "codes.gaussians", "codes.regions",
+    "gaussians.sh", "votes.weight_where_region_visible", "votes.overlap", "parts.part", "parts.embeddings",
+    "unrelated_words", "codes.gaussians", "codes.regions",
 )  # fmt: skip
 
 
@@ -134,15 +134,12 @@ def _read(path: Path, mapped: int, checked: bool) -> LanguageField:
     if not path.is_file():
         raise InputError(path, "a folder" if path.is_dir() else "no such file", "a field file", _REMEDY)
     changed = f"It may have been changed or cut short in copying. {_REMEDY}"
-    if path.suffix == ".npz":
-        raise InputError(path, "it is a field of an earlier version of jsecon", "field.safetensors", _REMEDY)
     try:
         header, members = read_arrays(path, memory_map_above=mapped, verify=checked)
         if not isinstance(header, dict) or header.get("format") != FORMAT:
             raise InputError(path, "it is a file of jsecon, but no field", "a field file", _REMEDY)
         if (version := header.get("version")) != VERSION:
-            remedy = f"Read it with the jsecon that wrote it. {_REMEDY}"
-            raise InputError(path, f"version {version}", f"version {VERSION}", remedy)
+            raise InputError(path, f"it was written by another version of jsecon (format {version})", remedy=_REMEDY)
         field = unpack_tree(_known(header["field"]), members, _RECORDS.__getitem__)
         whole = isinstance(field, LanguageField)
         problem = _disagreement(field) or _oddity(field, checked) if whole else "no field at its root"
@@ -216,7 +213,7 @@ def _oddity(field: LanguageField, checked: bool = True) -> str | None:
                 return f"{name} with numbers that are not finite{' or zero' if column_name == 'quaternions' else ''}"
             if name in sizes and not (numbers.dtype.kind == "i" and ((numbers >= -1) & (numbers < sizes[name])).all()):
                 return f"{name} with numbers beyond {sizes[name]}"
-    if field.gaussians.sh.shape[1] not in COEFFICIENT_COUNTS:
+    if field.gaussians.sh is not None and field.gaussians.sh.shape[1] not in COEFFICIENT_COUNTS:
         return f"harmonics of {field.gaussians.sh.shape[1]} functions"
     texts = (*field.names, field.embedder, field.provenance)
     if not all(isinstance(text, str) for text in texts) or not isinstance(parse_json(field.provenance), dict):

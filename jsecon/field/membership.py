@@ -24,7 +24,7 @@ from jax.scipy.special import betainc
 from jaxtyping import Bool, Float, Int
 
 from jsecon.errors import require
-from jsecon.field.columns import row_slices, votes_of_rows
+from jsecon.field.columns import is_mapped, row_slices, votes_of_rows
 from jsecon.field.regions import ALIKE_THRESHOLD, mean_residuals
 from jsecon.numerics import FULL_PRECISION, cosine_matrix
 from jsecon.programs import stored_jit
@@ -57,76 +57,51 @@ class InsideFraction(NamedTuple):
 
 
 def normalise_votes(votes: Votes, regions: Regions) -> Votes:
-    """Adds what queries read to votes that were cast `by_view`. Pure.
-
-    Args:
-      votes: Votes of N Gaussians, cast `by_view`. Memory-mapped ones need `normalise_votes_in_blocks`.
-      regions: Regions made from the labels that voted.
-
-    Returns:
-      The votes with `shown` (N, K) and `overlap` (R, R), without `by_view`.
-
-    Raises:
-      ValueError: The votes have no `by_view`, or other views than `regions`.
-    """
-    return with_overlap(add_visible_weight(votes, regions))
-
-
-def normalise_votes_in_blocks(votes: Votes, regions: Regions) -> Votes:
-    """Finishes memory-mapped votes as `normalise_votes` does, block by block. Host code.
-
-    Args:
-      votes: Votes of N Gaussians, cast `by_view`; votes in memory are one block.
-      regions: Regions made from the labels that voted.
-
-    Returns:
-      The votes with `shown` (N, K), in memory, and `overlap` (R, R), without `by_view`.
-
-    Raises:
-      ValueError: The votes have no `by_view`.
-    """
-    shows = _views_that_show(regions)
-    sums = jnp.zeros((regions.count, regions.count), jnp.float32)
-    shown = [np.zeros((0, votes.regions.shape[1]), np.float32)]
-    by_view = votes.by_view
-    if by_view is None:
-        raise ValueError(
-            "normalise_votes_in_blocks: got votes without by_view, expected by_view (T, N). Cast them with it."
-        )
-    for rows in row_slices(votes, len(votes.views)):
-        block = dataclasses.replace(votes_of_rows(votes, rows), by_view=np.asarray(by_view[:, rows]))
-        block = _add_shown(block, shows)
-        sums += _overlap_sums(jnp.asarray(block.regions), vote_shares(block), regions.count)
-        shown.append(np.asarray(block.weight_where_region_visible))
-    return dataclasses.replace(
-        votes, by_view=None, weight_where_region_visible=np.concatenate(shown), overlap=_soft_iou(sums)
-    )
-
-
-def add_visible_weight(votes: Votes, regions: Regions) -> Votes:
-    """Replaces `by_view` by `shown`: the weight with which the views that show a vote's region see the Gaussian. Pure.
-
-    The share that follows is the object posterior of B3-Seg: weight inside over inside and outside, over the views that
-    contain the object.
+    """Adds what queries read to votes that were cast `by_view`. Pure; memory-mapped votes are read in blocks.
 
     Args:
       votes: Votes of N Gaussians, cast `by_view`.
       regions: Regions made from the labels that voted.
 
     Returns:
-      The votes with `shown` (N, K).
+      The votes with `weight_where_region_visible` (N, K) and `overlap` (R, R), without `by_view`.
 
     Raises:
       ValueError: The votes have no `by_view`, or other views than `regions`.
     """
+    if not is_mapped(votes):
+        return with_overlap(add_visible_weight(votes, regions))
+    shows = _views_that_show(regions)
+    sums = jnp.zeros((regions.count, regions.count), jnp.float32)
+    visible = [np.zeros((0, votes.regions.shape[1]), np.float32)]
+    for rows in row_slices(votes, len(votes.views)):
+        block = dataclasses.replace(votes_of_rows(votes, rows), by_view=np.asarray(_by_view(votes, regions)[:, rows]))
+        block = _add_visible_weight(block, shows)
+        sums += _overlap_sums(jnp.asarray(block.regions), vote_shares(block), regions.count)
+        visible.append(np.asarray(block.weight_where_region_visible))
+    visible = np.concatenate(visible)
+    return dataclasses.replace(votes, by_view=None, weight_where_region_visible=visible, overlap=_soft_iou(sums))
+
+
+def add_visible_weight(votes: Votes, regions: Regions) -> Votes:
+    """Replaces `by_view` by the weight with which the views that show a vote's region see the Gaussian. Pure.
+
+    The share that follows is the object posterior of B3-Seg: weight inside over inside and outside, over the views that
+    contain the object.
+    """
+    return _add_visible_weight(dataclasses.replace(votes, by_view=_by_view(votes, regions)), _views_that_show(regions))
+
+
+def _by_view(votes: Votes, regions: Regions) -> Array:
+    """The weight of each view; ValueError without it, or if other regions or views voted."""
     views = None if votes.by_view is None else votes.by_view.shape[0]
     remedy = "Cast them with region_votes(..., by_view=True)."
-    require(views is not None, "add_visible_weight", "votes without the weight of each view", "by_view (T, N)", remedy)
+    require(views is not None, "normalise_votes", "votes without the weight of each view", "by_view (T, N)", remedy)
     sizes = f"{votes.num_regions} regions and {views} views voted, of {regions.pixel_counts.shape}"
     expected = "the pixels (R, T) of the same regions in the same views"
     same = views == regions.pixel_counts.shape[1] and votes.num_regions == regions.count
-    require(same, "add_visible_weight", sizes, expected, "Give the regions that were made from the labels that voted.")
-    return _add_shown(votes, _views_that_show(regions))
+    require(same, "normalise_votes", sizes, expected, "Give the regions that were made from the labels that voted.")
+    return votes.by_view
 
 
 @jax.jit
@@ -139,7 +114,7 @@ def _views_that_show(regions: Regions) -> Bool[Array, "r t"]:
 
 
 @jax.jit
-def _add_shown(votes: Votes, shows: Bool[Array, "r t"]) -> Votes:
+def _add_visible_weight(votes: Votes, shows: Bool[Array, "r t"]) -> Votes:
     """Replaces `by_view` by `shown`, with the (R, T) views that show a region; Gaussian by Gaussian."""
     by_view, regions = jnp.asarray(votes.by_view), jnp.asarray(votes.regions)
     count = regions.shape[0]

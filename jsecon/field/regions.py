@@ -105,7 +105,8 @@ def _pool_embeddings(
 ) -> Regions:
     """`region_embeddings` for an `embed` that takes the index of a frame. Several processes share the frames."""
     require_one_of("weighting", weighting, ("pixels", "uniform"), "Use 'pixels', as the paper does.")
-    count = int(labels.max(initial=-1)) + 1 if num_regions is None else num_regions
+    largest = int(labels.max()) if labels.size else -1
+    count = largest + 1 if num_regions is None else num_regions
     require_labels(labels, count)
     areas = [np.bincount(image[image >= 0].reshape(-1), minlength=count)[:count] for image in labels]
     pixels = np.stack(areas, axis=1).astype(np.int32) if len(areas) else np.zeros((count, 0), np.int32)
@@ -123,7 +124,9 @@ def _pool_embeddings(
             total = np.zeros((count, rows.shape[1])) if total is None else total
             weight = pixels[seen, t].astype(np.float64) if weighting == "pixels" else np.ones(len(seen))
             total[seen] += weight[:, None] * rows
-    if total is None:  # without a label the embedder alone knows E
+    if not len(labels):
+        total = np.zeros((count, 0))
+    elif total is None:  # without a label the embedder alone knows E
         total = np.zeros((count, np.asarray(embed(0, np.zeros((1, *labels.shape[1:]), bool))).shape[1]))
     return Regions(embeddings=_unit_rows(total), pixel_counts=pixels)
 

@@ -13,7 +13,7 @@ from scipy import sparse
 
 from jsecon.association.consensus import clean_tracks
 from jsecon.association.run_lengths import RunLengthMasks, encode_masks, encode_rows
-from jsecon.association.superpixels import Sparse, one_hot
+from jsecon.association.scene import Sparse, one_hot
 from jsecon.errors import require, require_shape
 from jsecon.types import Progress
 from jsecon.vision.protocols import Segmenter, Tracker

@@ -9,8 +9,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int16, Integer, UInt8
 from scipy import sparse
 
-from jsecon.association.scene import FrameSuperpixels, SceneSuperpixels, assign_superpixels
-from jsecon.association.superpixels import Sparse, one_hot, sum_entries, superpixel_coverage
+from jsecon.association.scene import (
+    FrameSuperpixels,
+    SceneSuperpixels,
+    Sparse,
+    assign_superpixels,
+    one_hot,
+    sum_entries,
+    superpixel_coverage,
+)
 from jsecon.errors import require_shape
 from jsecon.types import Camera, Gaussians
 

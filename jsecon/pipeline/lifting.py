@@ -7,9 +7,8 @@ import numpy as np
 
 from jsecon.errors import InputError
 from jsecon.field.columns import is_mapped, vote_blocks
-from jsecon.field.membership import normalise_votes_in_blocks
-from jsecon.field.streaming import region_votes_in_blocks
-from jsecon.field.votes import region_votes, votes_memory
+from jsecon.field.evidence import region_votes, votes_memory
+from jsecon.field.membership import normalise_votes
 from jsecon.paper.autoencoder import encode, train_autoencoder
 from jsecon.paper.distill import distill_votes
 from jsecon.pipeline.options import Options
@@ -24,21 +23,20 @@ CODE_LENGTH = 3
 
 
 def accumulate_votes(stage: StageInput) -> StageResult:
-    """Accumulates votes; in blocks on disk if they do not fit into memory, to the same up to float32's rounding."""
+    """Accumulates votes, on disk if they do not fit into memory; the votes are the same."""
     options, capture, scene = stage.context.options, stage.results.load, stage.results.gaussians
     labels, folder = stage.results.objects, stage.checkpoint.folder
     cameras = capture.cameras[vision_frames(capture, options)]
     count = int(labels.max()) + 1
-    settings = {"centre": options.centre_pixel_weight, "by_view": True, "progress": stage.progress}
-    needed, budget = votes_memory(scene.count, len(labels), count), memory_budget()
+    settings = {"centre_pixel_weight": options.centre_pixel_weight, "by_view": True, "progress": stage.progress}
+    needed, budget = votes_memory(scene.count, len(labels)), memory_budget()
+    on_disk = needed > budget and jax.process_count() == 1  # several processes exchange them in memory
     notes = ()
-    if needed > budget and jax.process_count() == 1:  # several processes accumulate them together, in memory
+    if on_disk:
         shutil.rmtree(folder, ignore_errors=True)  # of a run that was stopped
-        accumulated = region_votes_in_blocks(scene, cameras, labels, count, folder=folder, **settings)
         sizes = f"{needed / 2**30:.2g} GiB otherwise, where memory has room for {budget / 2**30:.2g}"
-        notes = (f"votes are cast in blocks: {sizes}",)
-    else:
-        accumulated = region_votes(scene, cameras, labels, count, **settings)
+        notes = (f"votes are kept on disk: {sizes}",)
+    accumulated = region_votes(scene, cameras, labels, count, folder=folder if on_disk else None, **settings)
     unseen = int((np.asarray(accumulated.views) == 0).sum())
     skipped = {"unseen Gaussians": f"{unseen} of {scene.count}, which no frame sees"} if unseen else {}
     return StageResult(accumulated, skipped, notes)
@@ -64,7 +62,7 @@ def join_field(results: Results, embedder: Embedder, provenance: str, options: O
     pixels[:, vision_frames(capture, options)] = embedded.pixel_counts
     return LanguageField(
         gaussians=results.gaussians,
-        votes=normalise_votes_in_blocks(results.votes, embedded),
+        votes=normalise_votes(results.votes, embedded),
         regions=Regions(embedded.embeddings, pixels),
         cameras=capture.cameras,
         canonical_phrases=np.asarray(embedder.canonical_phrases, np.float32),

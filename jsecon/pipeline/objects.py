@@ -133,7 +133,7 @@ def associate_masks(
     """Associates proposals by consensus or by a tracker: (T, H, W) int16 labels, -1 for no region."""
     options, frames, cameras = context.options, view.frames, view.cameras
     if options.associated_by == "consensus":
-        scene = SceneSuperpixels(gaussians, cameras, proposals, centre=options.centre_pixel_weight)
+        scene = SceneSuperpixels(gaussians, cameras, proposals, centre_pixel_weight=options.centre_pixel_weight)
         labels = track_masks(frames, scene, agreement=options.agreement, seed=options.seed, progress=progress)
         return clean_tracks(labels)
     tracker = context.models.tracker or GeometricTracker(gaussians, cameras, proposals)
@@ -189,7 +189,9 @@ def find_parts(stage: StageInput) -> StageResult:
     view = TrainingView(stage.results.load, options)
     frames = view.frames
     masks, embed = _masks_with_embeddings(context, view, stage.results)
-    views = SceneSuperpixels(stage.results.gaussians, view.cameras, masks, centre=options.centre_pixel_weight)
+    views = SceneSuperpixels(
+        stage.results.gaussians, view.cameras, masks, centre_pixel_weight=options.centre_pixel_weight
+    )
     piece, weights = pieces_on_masks(frames, views, seed=options.seed, progress=stage.progress)
     rows = np.concatenate([embed(t, masks(t)) for t in range(len(frames))])
     context.models.close()

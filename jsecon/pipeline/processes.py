@@ -6,7 +6,7 @@
 jax.distributed connects them: it reads number, index and address from what the launcher sets. The first process runs
 the stages: it alone reads and writes the cache, holds the lock of the output folder and prints. For a stage that is
 `distributed`, it sends the others the results that the stage reads. All compute the stage together, each its part of
-the views (`parallel.map_over_processes`, `parallel.accumulate_over_views`). Then the others wait for the next one. Only
+the views (`parallel.map_over_processes`). Then the others wait for the next one. Only
 the inputs and the models need to be on every machine.
 
 A process that fails prints why, and the launcher ends the others.

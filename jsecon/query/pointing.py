@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float, Int
 
 from jsecon.errors import InputError, require
 from jsecon.field.columns import row_slices, votes_of_rows
+from jsecon.field.evidence import region_votes
 from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction, vote_shares
-from jsecon.field.votes import region_votes
 from jsecon.numerics import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from jsecon.splat.project import project
 from jsecon.types import Array, Camera, Gaussians, LanguageField, Selection

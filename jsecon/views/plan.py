@@ -12,7 +12,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from jsecon.errors import InputError, require
-from jsecon.field.votes import region_votes
+from jsecon.field.evidence import region_votes
 from jsecon.types import Camera, Gaussians, Progress
 from jsecon.views.frame import SceneFrame, scene_frame, surface_points
 

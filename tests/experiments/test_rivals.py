@@ -184,7 +184,7 @@ def test_lifting(world, train):
 
 def test_backprojection_is_the_sum_over_all_pixels(world):
     """Against the votes' own total: every labelled pixel's weight is in it, once."""
-    from jsecon.field.votes import region_votes
+    from jsecon.field.evidence import region_votes
 
     evidence = world[0]
     lifted = lifting.train_backprojection(evidence)

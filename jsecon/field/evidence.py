@@ -1,0 +1,485 @@
+"""Evidence: the weight that each region casts on each Gaussian, view by view, and its sum over the views, the votes.
+
+With the geometry fixed, rendering is linear in the features of the Gaussians (image = W f, W the weights alpha T), and
+the labels of the pixels take only R values. So the votes, W^T onto one-hot labels, hold all that a later choice of
+embeddings or codes needs (Eq. 3 of the paper with one-hot labels).
+
+A view gives one sparse list of (Gaussian, region, weight), and the votes are the sum of the lists. Weights of a view
+are rounded to multiples of 2^-24 px, which float64 adds up without error: the votes do not depend, to the last bit, on
+the order of the views, nor on how devices, processes or blocks of Gaussians share the work.
+"""
+
+import contextlib
+import functools
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Float, Float32, Int, Int32, Shaped
+from scipy import sparse
+
+from jsecon.errors import InputError, require, require_shape
+from jsecon.files import map_npy
+from jsecon.numerics import FULL_PRECISION, NEAR, is_traced, require_labels
+from jsecon.parallel import MESH_OPTIONS, map_views
+from jsecon.splat.capacity import plan_capacity
+from jsecon.splat.fusion import compute_once
+from jsecon.splat.plan import ViewPlan, plan_view, render_plan
+from jsecon.splat.scan import CHUNK, blend_weights, make_batches, make_table, scan_tiles, to_tiles
+from jsecon.splat.visible import geometry_of_rows, visible_rows
+from jsecon.types import Array, Camera, Gaussians, Progress, Votes
+
+_RESOLUTION = 2.0**24
+"""Weights of a view are multiples of its inverse, px. The faintest weight of a pixel is 4e-7 (1/255 of the last
+transmittance), and float64 adds up 2^29 px of weight without error."""
+_SLOTS = 4
+"""Labels of a tile that are summed at once. A tile of 8x8 pixels seldom shows more; then its batch is scanned again."""
+_MAX_WHOLE = 1 << 21
+"""Gaussians of a scene above which each view is planned for those alone that it can see."""
+_MAX_ENTRIES = 1 << 24
+"""Entries, at most one a view and Gaussian on average, that are added up at once."""
+
+
+class ViewEvidence(NamedTuple):
+    """What one view casts on the Gaussians: a sparse list, by Gaussian and then by region."""
+
+    gaussians: Int[np.ndarray, " m"]
+    """(M,) int32 the Gaussians with any weight, ascending."""
+    starts: Int[np.ndarray, " m+1"]
+    """(M + 1,) int32 where the entries of each begin, and the end of the last."""
+    regions: Int32[np.ndarray, " e"]
+    """(E,) region of each entry; R for pixels of no region."""
+    weights: Float32[np.ndarray, " e"]
+    """(E,) sum of alpha T over the pixels of that region."""
+    max_pixel_weights: Float32[np.ndarray, " m"]
+    """(M,) largest alpha T of each Gaussian at any pixel."""
+    overflow: int = 0
+    """Pairs beyond the capacity; 0 if the list is exact."""
+
+    def of_rows(self, rows: slice) -> "ViewEvidence":
+        """Takes the Gaussians of a slice, which are then counted from its start."""
+        first, last = np.searchsorted(self.gaussians, [rows.start, rows.stop])
+        starts = np.asarray(self.starts[first : last + 1])
+        entries = slice(starts[0], starts[-1])
+        columns = self.gaussians[first:last] - rows.start, starts - starts[0]
+        columns = *columns, self.regions[entries], self.weights[entries], self.max_pixel_weights[first:last]
+        return ViewEvidence(*map(np.asarray, columns))
+
+    def matrix(self, count: int, num_regions: int) -> Any:
+        """Lays the list out as a scipy.sparse.csr_matrix (N, R + 1)."""
+        lengths = np.zeros(count + 1, np.int32)
+        lengths[1 + self.gaussians] = np.diff(self.starts)
+        columns = self.weights, self.regions, np.cumsum(lengths, dtype=np.int32)
+        return sparse.csr_matrix(columns, shape=(count, num_regions + 1))
+
+
+def region_votes(
+    gaussians: Gaussians,
+    cameras: Camera,
+    labels: Any,
+    num_regions: int,
+    *,
+    top: int = 8,
+    by_view: bool = False,
+    centre_pixel_weight: float = 0.0,
+    capacity: int | None = None,
+    near: float = NEAR,
+    folder: str | os.PathLike | None = None,
+    progress: Progress | None = None,
+) -> Votes:
+    """Adds up the weight that each region casts on each Gaussian over all views.
+
+    Host code: the views are spread over the cores, and over processes that all make the same call
+    (`jax.distributed`), to the same bits on any number of them. Inside a trace it is a pure function that scans the
+    views on one device, with arrays that are dense in the regions: for small scenes. There it has reverse derivatives.
+
+    Args:
+      gaussians: Scene of N Gaussians; its columns may be memory-mapped.
+      cameras: Batch of T cameras.
+      labels: (T, H, W) integers below `num_regions`, -1 where a pixel belongs to no region; or T images (H, W), of
+        which `labels[t]` reads one. Inside a trace R and more count as -1.
+      num_regions: R.
+      top: Number of strongest regions that each Gaussian keeps; `Votes.weight_beyond_top_k` counts the rest.
+      by_view: Whether to keep each view's total too (`Votes.by_view`), as `normalise_votes` needs it.
+      centre_pixel_weight: In [0, 1]. A weight away from the pixel that holds the Gaussian's centre counts
+        1 - `centre_pixel_weight`: at 1 a Gaussian is what its centre is, at 0 what its whole footprint is.
+      capacity: Number of (block, Gaussian) pairs of a view, see `render`. By default, outside of a trace, a view that
+        overflows is planned again with enough.
+      near: Near plane, world units.
+      folder: New or empty folder that keeps the views' lists while they are added up, and the columns of the votes as
+        long as they are used: for scenes larger than memory.
+      progress: Called as progress(done, total), in views.
+
+    Returns:
+      Votes of the N Gaussians; memory maps with `folder`. `overflow` is 0 if they are exact.
+
+    Raises:
+      ValueError: Shapes disagree, or labels are no integers or too large.
+      InputError: The folder cannot be written, or is not empty.
+    """
+    views, top = len(cameras.world_to_camera), min(top, max(num_regions, 1))
+    remedy = "Add a leading axis to all arrays of a single camera."
+    require_shape("cameras.world_to_camera", cameras.world_to_camera, ("T", 4, 4), remedy)
+    require(len(labels) == views, "labels", f"{len(labels)} images", f"{views}, one per view", "Give one per view.")
+    require(num_regions >= 0, "num_regions", num_regions, ">= 0", "Count the regions.")
+    require(gaussians.count < 1 << 31, "region_votes", gaussians.count, "fewer than 2^31 Gaussians", "Split the scene.")
+    options = {"centre_pixel_weight": centre_pixel_weight, "capacity": capacity, "near": near}
+    if hasattr(labels, "ndim"):
+        expected = views, cameras.height, cameras.width
+        require_shape("labels", labels, expected, "Give one label image per view, of the camera's size.")
+        require_labels(labels, num_regions)
+    if is_traced((gaussians, cameras, labels)):
+        return _scan_votes(gaussians, cameras, labels, num_regions, top, by_view, **options)
+    cameras = jax.tree.map(np.asarray, cameras)
+    with _scratch_folder(folder) as scratch:
+
+        def view(t: int) -> ViewEvidence:
+            evidence = view_evidence(gaussians, cameras[t], np.asarray(labels[t]), num_regions, **options)
+            return evidence if scratch is None else _on_disk(evidence, scratch / str(t))
+
+        lists = [ViewEvidence(*evidence) for evidence in map_views(views, view, progress)]
+        return sum_evidence(lists, gaussians.count, num_regions, top=top, by_view=by_view, folder=folder)
+
+
+def view_evidence(
+    gaussians: Gaussians,
+    camera: Camera,
+    labels: Shaped[np.ndarray, "h w"],
+    num_regions: int,
+    *,
+    centre_pixel_weight: float = 0.0,
+    capacity: int | None = None,
+    near: float = NEAR,
+) -> ViewEvidence:
+    """Lists what one view casts on N Gaussians; options as for `region_votes`. Host code."""
+    require_shape("labels", labels, (camera.height, camera.width), "Give images of the camera's size.")
+    require_labels(labels, num_regions)
+    rows = None
+    if gaussians.count > _MAX_WHOLE:
+        rows = visible_rows(gaussians, camera, near=near)
+        gaussians = geometry_of_rows(gaussians, rows)
+        measured = plan_capacity(gaussians, camera, margin=1.0, devices=1, near=near)
+        capacity = max(measured, 1) if capacity is None else capacity
+    elif not gaussians.count:
+        nothing = np.zeros(0, np.int32)
+        return ViewEvidence(nothing, np.zeros(1, np.int32), nothing, *np.zeros((2, 0), np.float32))
+    plan = plan_view(gaussians, camera, capacity=capacity, near=near)
+    labels = np.asarray(labels, np.int32)
+    labels = np.where(labels < 0, num_regions, labels).astype(np.int32)
+    steps = int(_count_steps(plan, labels))
+    room = 64 << (2 * max(-(-(steps - 1).bit_length() // 2) - 3, 0))  # powers of 4: views share a program
+    done, *chunks = _list_chunks(plan, labels, room, centre_pixel_weight)
+    ids, slots, sums, largest = (np.asarray(chunk)[: int(done)] for chunk in chunks)
+    entries = np.flatnonzero(sums)
+    pairs = entries // _SLOTS
+    regions = slots.reshape(-1, _SLOTS)[pairs // CHUNK, entries % _SLOTS]
+    columns = sums.reshape(-1)[entries].astype(np.float64), (ids.reshape(-1)[pairs], regions)
+    weights = sparse.csr_matrix(columns, shape=(gaussians.count, num_regions + 1))
+    peaks = np.zeros(gaussians.count, np.float32)
+    np.maximum.at(peaks, ids.reshape(-1), largest.reshape(-1))
+    seen = np.flatnonzero(np.diff(weights.indptr))
+    rounded = np.rint(weights.data.astype(np.float32) * np.float32(_RESOLUTION)) / np.float32(_RESOLUTION)
+    starts = np.append(weights.indptr[seen], len(rounded)).astype(np.int32)
+    own = (seen if rows is None else rows[seen]).astype(np.int32)
+    return ViewEvidence(own, starts, weights.indices.astype(np.int32), rounded, peaks[seen], int(plan.overflow))
+
+
+@jax.jit
+def _count_steps(plan: ViewPlan, labels: Array) -> Array:
+    """Counts the chunks that `_list_chunks` lists at most, and so bounds their memory."""
+    batches = make_batches(plan.lists, plan.width)
+    names = distinct_labels(to_tiles(labels + 1, plan.lists.tile) - 1, _SLOTS)
+    chunks = -(-batches.lengths[batches.tiles].max(1) // CHUNK)
+    passes = -(-(names[batches.tiles] >= 0).sum(2).max(1) // _SLOTS)
+    return (chunks * passes).sum()
+
+
+# Views run side by side, each on one core.
+@functools.partial(jax.jit, static_argnums=(2, 3), compiler_options=MESH_OPTIONS)
+def _list_chunks(plan: ViewPlan, labels: Array, room: int, centre_pixel_weight: float) -> tuple[Array, ...]:
+    """Lists the chunks of all tiles one after the other, in room for `room` of them.
+
+    Returns their number, and for each the Gaussians (B, CHUNK), the labels of the slots (B, _SLOTS), the weights on
+    them (B, CHUNK, _SLOTS) and the largest weight of a pixel (B, CHUNK), for the B tiles of a batch.
+    """
+    dtype, tiles = plan.splats.dtype, make_batches(plan.lists, plan.width).tiles.shape[1]
+    shapes = (
+        ((tiles, CHUNK), np.int32),
+        ((tiles, _SLOTS), np.int32),
+        ((tiles, CHUNK, _SLOTS), dtype),
+        ((tiles, CHUNK), dtype),
+    )
+
+    def emit(state, chunk, slots, sums, largest):
+        done, *columns = state
+        rows = chunk.ids, slots, sums, largest
+        return done + 1, *(lax.dynamic_update_index_in_dim(a, row, done, 0) for a, row in zip(columns, rows))
+
+    empty = (lax.empty((room, *shape), kind) for shape, kind in shapes)
+    return _scan_regions(plan, labels, centre_pixel_weight, (jnp.int32(0), *empty), emit)
+
+
+def _scan_regions(plan: ViewPlan, labels: Array, centre_pixel_weight: float, state: Any, emit: Callable) -> Any:
+    """Sums each chunk's weights on the labels of its tiles: `state = emit(state, chunk, slots, sums, largest)`."""
+    splats, lists = plan.splats, plan.lists
+    integer = jnp.int32 if splats.dtype == jnp.float32 else jnp.int64
+    batches = make_batches(lists, plan.width)
+    tiles = to_tiles(labels + 1, lists.tile) - 1  # -1 outside of the image
+    distinct = distinct_labels(tiles, _SLOTS)
+    table = make_table(splats)
+
+    def one_batch(state, ids_of_tiles):
+        local, names = tiles[ids_of_tiles], distinct[ids_of_tiles]
+        corners = batches.corners(ids_of_tiles, splats.dtype)
+        needed = (names >= 0).sum(1).max()
+
+        def one_pass(carry):
+            first, state = carry
+            slots = lax.dynamic_slice_in_dim(names, first, _SLOTS, axis=1)
+            is_slot = (slots[:, :, None] == local[:, None, :]).astype(splats.dtype)
+
+            def body(transmittance, state, chunk):
+                weight, transmittance = compute_once(chunk.always, blend_weights, transmittance, chunk.alpha)
+                if centre_pixel_weight:
+                    at_centre = _centre_pixels(chunk.attributes, corners, lists.tile)
+                    weight = weight * (1 - centre_pixel_weight + centre_pixel_weight * at_centre)
+                sums = jnp.einsum("bcp,bsp->bcs", weight, is_slot, precision=FULL_PRECISION)
+                # Weights are not negative, so their bits are ordered as they are; a maximum of integers is vectorised.
+                bits = lax.bitcast_convert_type(jnp.where(local[:, None] >= 0, weight, 0.0), integer)
+                largest = lax.bitcast_convert_type(bits.max(-1), splats.dtype)
+                return transmittance, emit(state, chunk, slots, sums, largest)
+
+            return first + _SLOTS, scan_tiles(table, lists, batches, ids_of_tiles, body, state)[0]
+
+        return lax.while_loop(lambda carry: carry[0] < needed, one_pass, (jnp.int32(0), state))[1], None
+
+    return lax.scan(one_batch, state, batches.tiles)[0]
+
+
+def _scan_votes(
+    gaussians: Gaussians,
+    cameras: Camera,
+    labels: Array,
+    num_regions: int,
+    top: int,
+    by_view: bool,
+    *,
+    centre_pixel_weight: float,
+    capacity: int | None,
+    near: float | Array,
+) -> Votes:
+    """Adds up votes as a pure function, dense in the regions; R and more count as no region."""
+    count, dtype = gaussians.count, gaussians.means.dtype
+
+    def one_view(state, view):
+        camera, image = view
+        image = image.astype(jnp.int32)
+        image = jnp.where((image >= 0) & (image < num_regions), image, num_regions)
+        scene = gaussians, camera, jnp.asarray(near, dtype)
+        own, peaks, missing = _dense_view(scene, image, num_regions + 1, centre_pixel_weight, capacity)
+        seen = own.sum(1)
+        weights, total, peak, views, overflow = state
+        state = weights + own, total + seen, jnp.maximum(peak, peaks), views + (seen > 0), overflow + missing
+        return state, seen if by_view else None
+
+    nothing = jnp.zeros(count, dtype)
+    state = jnp.zeros((count, num_regions + 1), dtype), nothing, nothing, jnp.zeros(count, jnp.int32), jnp.int32(0)
+    each = jnp.zeros((len(labels), count), dtype) if by_view else None
+    if count:
+        state, each = lax.scan(one_view, state, (cameras, labels))
+    weights, total, peak, views, overflow = state
+    weights = weights[:, :num_regions] if num_regions else weights * 0
+    largest, ids = lax.top_k(weights, top)
+    ids = jnp.where(largest > 0, ids, -1)
+    return Votes(ids, largest, weights.sum(1), total, peak, views, overflow, num_regions, each)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3, 4))
+def _dense_view(
+    scene: tuple[Gaussians, Camera, Array],
+    labels: Array,
+    columns: int,
+    centre_pixel_weight: float,
+    capacity: int | None,
+) -> tuple[Array, Array, Array]:
+    """Sums one view's weights on labels 0 .. `columns` - 1, (N, columns); with each one's largest, and the overflow."""
+    gaussians, camera, near = scene
+    plan = plan_view(gaussians, camera, capacity=capacity, near=near)
+
+    def emit(state, chunk, slots, sums, largest):
+        weights, peaks = state
+        target = jnp.where(slots >= 0, slots, columns)[:, None]  # an empty slot's are dropped
+        weights = weights.at[chunk.ids[:, :, None], target].add(sums, mode="drop")
+        return weights, peaks.at[chunk.ids].max(largest)
+
+    dtype = gaussians.means.dtype
+    start = jnp.zeros((gaussians.count, columns), dtype), jnp.zeros(gaussians.count, dtype)
+    return *_scan_regions(plan, labels, centre_pixel_weight, start, emit), plan.overflow
+
+
+def _dense_view_forward(scene, labels, columns, centre_pixel_weight, capacity):
+    return _dense_view(scene, labels, columns, centre_pixel_weight, capacity), (scene, labels)
+
+
+def _dense_view_backward(columns, centre_pixel_weight, capacity, kept, cotangents):
+    """The scan has no derivative. But <C, W^T onehot> is the sum of the pixels' own channels of an image of C."""
+    del columns
+    scene, labels = kept
+    remedy = "Cast them with a weight of 0."
+    require(not centre_pixel_weight, "region_votes", "a centre_pixel_weight", "votes with a derivative", remedy)
+
+    def along_cotangent(scene):
+        gaussians, camera, near = scene
+        plan = plan_view(gaussians, camera, capacity=capacity, near=near)
+        image = render_plan(plan, cotangents[0]).features
+        return jnp.take_along_axis(image, labels[..., None], axis=-1).sum()
+
+    return jax.grad(along_cotangent)(scene), None
+
+
+_dense_view.defvjp(_dense_view_forward, _dense_view_backward)
+
+
+def sum_evidence(
+    views: Sequence[ViewEvidence],
+    count: int,
+    num_regions: int,
+    *,
+    top: int = 8,
+    by_view: bool = False,
+    folder: str | os.PathLike | None = None,
+) -> Votes:
+    """Adds up the lists of views to votes of `count` Gaussians, a block of rows at a time; see `region_votes`."""
+    size = max(_MAX_ENTRIES // max(len(views), 1), 1)
+    blocks = (slice(first, min(first + size, count)) for first in range(0, max(count, 1), size))
+    columns = (_sum_rows([view.of_rows(rows) for view in views], rows, num_regions, top, by_view) for rows in blocks)
+    joined = _join(columns) if folder is None else _write_columns(Path(folder), columns, count)
+    if by_view:
+        joined["by_view"] = joined["by_view"].T
+    return Votes(**joined, overflow=np.asarray(sum(view.overflow for view in views), np.int32), num_regions=num_regions)
+
+
+def _sum_rows(
+    views: Sequence[ViewEvidence], rows: slice, num_regions: int, top: int, by_view: bool
+) -> dict[str, np.ndarray]:
+    """Sums a block of rows over all views: the columns of its votes."""
+    count = rows.stop - rows.start
+    total, seen, peak = np.zeros(count), np.zeros(count, np.int32), np.zeros(count, np.float32)
+    each = np.zeros((count, len(views) if by_view else 0), np.float32)
+    for t, view in enumerate(views):
+        own = np.add.reduceat(view.weights, view.starts[:-1], dtype=np.float64) if len(view.gaussians) else 0.0
+        total[view.gaussians] += own
+        seen[view.gaussians] += 1
+        peak[view.gaussians] = np.maximum(peak[view.gaussians], view.max_pixel_weights)
+        if by_view:
+            each[view.gaussians, t] = own
+    nothing = np.zeros(0, np.int32)
+    owners = np.concatenate([nothing, *(np.repeat(view.gaussians, np.diff(view.starts)) for view in views)])
+    regions = np.concatenate([nothing, *(view.regions for view in views)])
+    weights = np.concatenate([np.zeros(0), *(view.weights for view in views)])
+    inside = regions < num_regions
+    votes = sparse.csr_matrix((weights[inside], (owners[inside], regions[inside])), shape=(count, max(num_regions, 1)))
+    columns = dict(zip(("regions", "weights"), strongest(votes, top)))
+    columns |= {"labelled": np.asarray(votes.sum(1)).reshape(-1), "total": total, "max_pixel_weight": peak}
+    columns = {name: a.astype(np.float32) if a.dtype == np.float64 else a for name, a in columns.items()}
+    return columns | {"views": seen} | ({"by_view": each} if by_view else {})
+
+
+def strongest(votes: Any, top: int) -> tuple[Int32[np.ndarray, "n k"], Float32[np.ndarray, "n k"]]:
+    """Finds the `top` largest weights of each row of a csr_matrix (N, R), equal ones by id; then -1 and 0."""
+    lengths, weights = np.diff(votes.indptr), votes.data.astype(np.float32)
+    rows = np.repeat(np.arange(votes.shape[0]), lengths)
+    # One key of row and falling weight: positive float32 sort like their bits.
+    order = np.argsort((rows << 32) | (0xFFFFFFFF - weights.view(np.uint32).astype(np.int64)), kind="stable")
+    rank = np.arange(len(order)) - np.repeat(votes.indptr[:-1], lengths)
+    kept = (rank < top) & (weights[order] > 0)
+    ids, largest = np.full((votes.shape[0], top), -1, np.int32), np.zeros((votes.shape[0], top), np.float32)
+    ids[rows[kept], rank[kept]] = votes.indices[order][kept]
+    largest[rows[kept], rank[kept]] = weights[order][kept]
+    return ids, largest
+
+
+def votes_memory(count: int, views: int) -> int:
+    """Bounds the bytes of `region_votes` with `by_view`, beside its inputs, if every view sees all Gaussians."""
+    return (4 + 24) * views * count
+
+
+def _centre_pixels(
+    splats: Float[Array, "b c 6"], corners: tuple[Array, Array], tile: int
+) -> Float[Array, "b c pixels"]:
+    """Marks the pixel of a tile that holds the centre of a splat: 1 there, 0 elsewhere."""
+    x, y = (jnp.floor(splats[..., k] - corners[k][:, None]) for k in range(2))
+    inside = (x >= 0) & (x < tile) & (y >= 0) & (y < tile)
+    pixel = jnp.where(inside, y * tile + x, -1).astype(jnp.int32)
+    return (pixel[..., None] == lax.iota(jnp.int32, tile * tile)).astype(splats.dtype)
+
+
+def distinct_labels(tiles: Int[Array, "n p"], slots: int) -> Int[Array, "n q"]:
+    """Finds the distinct labels of each tile, ascending, -2 after the last and in `slots` more columns.
+
+    `tiles` are the labels of the pixels, -1 for none.
+    """
+    ordered = jnp.sort(tiles, axis=1)
+    first = jnp.ones_like(ordered[:, :1], bool)
+    new = jnp.concatenate([first, ordered[:, 1:] != ordered[:, :-1]], axis=1) & (ordered >= 0)
+    place = jnp.where(new, jnp.cumsum(new, axis=1) - 1, tiles.shape[1] + slots)
+    table = jnp.full((tiles.shape[0], tiles.shape[1] + slots), -2, tiles.dtype)
+    return table.at[jnp.arange(tiles.shape[0])[:, None], place].set(ordered, mode="drop")
+
+
+@contextlib.contextmanager
+def _scratch_folder(folder: str | os.PathLike | None) -> Iterator[Path | None]:
+    """A folder inside `folder` that is removed afterwards; None if there is none."""
+    if folder is None:
+        yield None
+        return
+    home, remedy, scratch = Path(folder), "Name a new folder on a disk with room for the votes.", None
+    try:
+        home.mkdir(parents=True, exist_ok=True)
+        if any(home.iterdir()):
+            raise InputError(home, "a folder that is not empty", "an empty or a new one", remedy)
+        scratch = Path(tempfile.mkdtemp(prefix=".scratch-", dir=home))
+        yield scratch
+    except OSError as error:
+        problem = f"{error.strerror or error} on writing votes to it"
+        raise InputError(home, problem, "a folder that can be written, and has room", remedy) from error
+    finally:
+        if scratch is not None:
+            shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _on_disk(view: ViewEvidence, path: Path) -> ViewEvidence:
+    """Writes a list to PATH-<column>.npy and maps it."""
+    columns = view._asdict()
+    overflow = columns.pop("overflow")
+    for name, column in columns.items():
+        np.save(f"{path}-{name}.npy", column)
+    return ViewEvidence(*(map_npy(Path(f"{path}-{name}.npy")) for name in columns), overflow)
+
+
+def _join(blocks: Iterator[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """The columns of all blocks, in memory."""
+    parts = list(blocks)
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _write_columns(folder: Path, blocks: Iterator[dict[str, np.ndarray]], count: int) -> dict[str, np.ndarray]:
+    """Memory maps of FOLDER/<name>.npy, written block after block."""
+    # Written, not mapped: a full disk is then an error, not a signal.
+    with contextlib.ExitStack() as stack:
+        files: dict[str, Any] = {}
+        for block in blocks:
+            for name, column in block.items():
+                if name not in files:
+                    files[name] = stack.enter_context(open(folder / f"{name}.npy", "wb"))
+                    header = {"descr": column.dtype.str, "fortran_order": False, "shape": (count, *column.shape[1:])}
+                    np.lib.format.write_array_header_1_0(files[name], header)
+                files[name].write(np.ascontiguousarray(column).tobytes())
+    return {name: map_npy(folder / f"{name}.npy") for name in files}
