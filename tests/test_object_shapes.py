@@ -62,3 +62,12 @@ def test_up_is_across_the_x_axes_of_cameras_that_look_down():
         ones = np.ones(7)
         up = scene_up(Camera(pose, ones, ones, ones, ones, 4, 4)[chosen])
         assert up[2] > (0.999 if chosen == slice(None) else 0.8)
+
+
+@pytest.mark.parametrize("pose", [np.eye(4), np.diag([-1.0, -1, 1, 1])], ids=["alike", "turned round"])
+def test_cameras_whose_upper_edges_cancel_have_an_up_axis(pose):
+    poses = np.stack([pose, pose @ np.diag([1.0, -1, -1, 1])])  # the second stands on its head
+    ones = np.ones(2)
+    up = scene_up(Camera(poses, ones, ones, ones, ones, 4, 4))
+    np.testing.assert_allclose(np.linalg.norm(up), 1)
+    assert abs(up[0]) < 1e-6  # level: across the x axes

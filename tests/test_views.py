@@ -14,7 +14,7 @@ from jsecon.app.cli import main
 from jsecon.splat.transform import transform_gaussians_float64
 from jsecon.views import plan
 from jsecon.views.frame import scene_frame, surface_points
-from jsecon.views.plan import free_places, greedy_cover, place_cameras
+from jsecon.views.plan import place_cameras
 
 BALLS = {"red": (0.8, 0.1, 0.1), "blue": (0.1, 0.2, 0.8), "green": (0.1, 0.6, 0.15)}
 CENTRES = np.array([(-1.2, -0.8, 0.4), (1.0, 0.2, 0.4), (-0.2, 1.1, 0.4)])
@@ -197,7 +197,7 @@ def test_the_up_axis_can_be_given(room):
 def test_free_places_lie_in_the_room_away_from_its_things(room):
     points = surface_points(room)
     frame = scene_frame(points)
-    places = free_places(points, frame)
+    places = plan._free_places(points, frame)
     assert len(places) == plan.PLACES
     assert (np.abs(places[:, 0]) < 3).all()
     assert (np.abs(places[:, 1]) < 2.5).all()
@@ -209,7 +209,7 @@ def test_greedy_cover_gains_at_each_step_the_most_that_any_view_would():
     rng = np.random.default_rng(0)
     weights = rng.exponential(0.2, (12, 40)) * (rng.random((12, 40)) < 0.3)
     importance = rng.random(40)
-    chosen, share = greedy_cover(weights, importance, 5)
+    chosen, share = plan._greedy_cover(weights, importance, 5)
     shown = weights / 0.3
 
     def value(rows):

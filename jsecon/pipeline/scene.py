@@ -27,8 +27,9 @@ from jsecon.read.captures.photographs import list_photographs
 from jsecon.read.captures.video import is_video, write_frames
 from jsecon.splat.transform import transform_gaussians_float64
 from jsecon.types import Camera, Capture, Gaussians, Progress, Quality
-from jsecon.views.capture import capture_from_cameras, render_capture
+from jsecon.views.capture import render_capture
 from jsecon.views.frame import scene_frame, surface_points
+from jsecon.views.plan import place_cameras
 
 SECONDS_PER_STEP = 0.024
 """s of a step of the fit, on two cores of an AMD EPYC; estimates how many steps --minutes allows"""
@@ -172,15 +173,17 @@ def render_planned_views(stage: StageInput) -> StageResult:
     options = stage.context.options
     source, _ = read_scene(options.capture)
     source_from_scene = _world_of_scene(source)
-    capture = render_capture(
-        _into_world(source, source_from_scene),
-        source_from_scene,
+    scene = _into_world(source, source_from_scene)
+    planned = place_cameras(
+        scene,
         views=options.views,
         width=options.long_side,
         height=options.long_side * 3 // 4,
         up=None if options.up is None else np.array(options.up, np.float64),
         progress=stage.progress,
     )
+    names = tuple(f"view_{index:03d}" for index in range(len(planned.cameras)))
+    capture = render_capture(scene, planned.cameras, names, source_from_scene, notes=(f"{planned}.",))
     return StageResult(capture, notes=capture.notes)
 
 
@@ -195,7 +198,7 @@ def render_given_poses(stage: StageInput) -> StageResult:
     cameras = dataclasses.replace(cameras, world_to_camera=poses)
     scene = _into_world(source, source_from_scene)
     check_overlap(scene, cameras, str(options.cameras))
-    return StageResult(capture_from_cameras(scene, cameras, names, source_from_scene))
+    return StageResult(render_capture(scene, cameras, names, source_from_scene))
 
 
 def _world_of_scene(gaussians: Gaussians) -> np.ndarray:

@@ -17,70 +17,41 @@ from jsecon.errors import InputError
 from jsecon.types import Camera, Gaussians, LanguageField
 from jsecon.views.upright import TRIM, find_up
 
-SAMPLES = 20_000
-"""points that stand for the scene's surface, drawn by opacity times area"""
-VISIBLE_OPACITY = 0.1
-"""opacity from which a Gaussian counts as surface"""
-WIDEST = 0.1
-"""largest standard deviation of a surface Gaussian, in units of the scene's diagonal: wider ones are sky or fog"""
-PARALLEL = 0.01
+_PARALLEL = 0.01
 """share of the cameras' x axes off their common line up to which they tell the up axis only up to their tilt"""
-SAME_WAY = 0.7
-"""cosine of the ground's normal with the cameras' up axis from which it is the same way up"""
 
 
 @dataclasses.dataclass(frozen=True)
 class SceneFrame:
-    """The robust box of a scene, one axis of which is up.
-
-    Attributes:
-      axes: (3, 3) orthonormal rows: two horizontal axes along the box's sides, then up; world.
-      centre: (3,) centre of the box, world.
-      half: (3,) half extents along the axes, world units.
-      sure: Whether the up axis is trusted.
-      evidence: What the up axis was taken from, in words.
-    """
+    """The robust box of a scene, one axis of which is up."""
 
     axes: np.ndarray
+    """(3, 3) orthonormal rows: two horizontal axes along the box's sides, then up; world."""
     centre: np.ndarray
+    """(3,) centre of the box, world."""
     half: np.ndarray
+    """(3,) half extents along the axes, world units."""
     sure: bool
+    """Whether the up axis is trusted."""
     evidence: str
+    """What the up axis was taken from, in words."""
 
     @property
     def diagonal(self) -> float:
         """Length of the box's diagonal, world units."""
         return 2 * float(np.linalg.norm(self.half))
 
-    def to_world(self, local: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
-        """Maps points in the box into the world.
-
-        Args:
-          local: (..., 3), -1 to 1 along each axis.
-
-        Returns:
-          (..., 3) points, world.
-        """
-        return (np.asarray(local) * self.half) @ self.axes + self.centre
-
 
 def surface_points(gaussians: Gaussians) -> Float[np.ndarray, "p 3"]:
-    """Draws points of the scene's surface: centres of Gaussians, by opacity times area.
+    """Draws up to 20,000 points of a scene's surface: centres of Gaussians, by opacity times area.
 
-    Args:
-      gaussians: Scene of N Gaussians.
-
-    Returns:
-      (P, 3) float64 points, at most `SAMPLES`, the same ones however the scene is turned.
-
-    Raises:
-      InputError: The scene has no visible surface.
+    They are the same ones however the scene is turned. InputError is raised if the scene has no visible surface.
     """
     means = np.asarray(gaussians.means, np.float64)
     scales = np.sort(np.exp(np.asarray(gaussians.log_scales, np.float64)), axis=1)
     opacity = 1 / (1 + np.exp(-np.asarray(gaussians.opacity_logits, np.float64)))
     finite = np.isfinite(means).all(1) & np.isfinite(scales).all(1) & np.isfinite(opacity)
-    visible = finite & (opacity >= VISIBLE_OPACITY)
+    visible = finite & (opacity >= 0.1)
     if visible.sum() < 4:
         remedy = "Open it in a viewer to check it. A scene needs visible Gaussians, and more than a few."
         raise InputError("scene", f"{int(visible.sum())} of its {len(means)} Gaussians are visible", "", remedy)
@@ -88,14 +59,14 @@ def surface_points(gaussians: Gaussians) -> Float[np.ndarray, "p 3"]:
     size = float(np.linalg.norm(high - low))
     if not size > 0:
         raise InputError("scene", "all of its Gaussians lie in one place", "", "Check how it was exported.")
-    visible &= scales[:, 2] <= WIDEST * size
+    visible &= scales[:, 2] <= 0.1 * size  # wider ones are sky or fog
     chosen = np.flatnonzero(visible)
     if len(chosen) < 4:
         raise InputError("scene", "its Gaussians are as wide as itself", "", "Check the scales of the file.")
     weights = opacity[chosen] * scales[chosen, 1] * scales[chosen, 2]
     weights = np.minimum(weights, np.quantile(weights, 0.99))
     rng = np.random.default_rng(0)
-    drawn = rng.choice(chosen, min(SAMPLES, 4 * len(chosen)), p=weights / weights.sum())
+    drawn = rng.choice(chosen, min(20_000, 4 * len(chosen)), p=weights / weights.sum())
     return means[drawn]
 
 
@@ -103,14 +74,8 @@ def scene_frame(points: Float[np.ndarray, "p 3"], up: np.ndarray | None = None) 
     """Finds the robust box of a scene and its up axis.
 
     Args:
-      points: (P, 3) points of the surface (`surface_points`).
-      up: (3,) the up axis where it is known; None finds it (`find_up`).
-
-    Returns:
-      The frame.
-
-    Raises:
-      InputError: `up` has no direction.
+      points: Points of the surface (`surface_points`).
+      up: (3,) the up axis where it is known, of any length; None finds it (`find_up`).
     """
     if up is None:
         up, sure, evidence = find_up(points)
@@ -143,48 +108,44 @@ def _direction(up: Any) -> np.ndarray:
 
 
 def scene_up(cameras: Camera) -> Float[np.ndarray, " 3"]:
-    """Finds the up axis of a scene from its cameras, which people and planners hold level.
+    """Finds the up axis (unit, world) of a scene from its cameras, which people and planners hold level.
 
     It is the direction that is most nearly perpendicular to the x axes of all cameras, on the side of their upper
-    edges. If all cameras have nearly the same x axis, it is the mean direction of their upper edges.
-
-    Args:
-      cameras: T cameras, T >= 1.
-
-    Returns:
-      (3,) float64 unit vector, world.
+    edges. If all cameras have nearly the same x axis, it is the mean direction of their upper edges, unless these
+    cancel.
     """
+    up = _perpendicular_up(cameras)[0]
+    return up / np.linalg.norm(up)
+
+
+def _perpendicular_up(cameras: Camera) -> tuple[np.ndarray, bool]:
+    """Returns the direction of `scene_up`, and whether all cameras have nearly the same x axis."""
     pose = np.asarray(cameras.world_to_camera, np.float64)
     right = pose[:, 0, :3]
     mean_up = -pose[:, 1, :3].mean(0)
     values, vectors = np.linalg.eigh(right.T @ right / len(right))
     up = vectors[:, 0] * (np.sign(vectors[:, 0] @ mean_up) or 1.0)
-    if values[1] < PARALLEL and np.linalg.norm(mean_up) > 0:
-        up = mean_up
-    return up / np.linalg.norm(up)
+    is_parallel = bool(values[1] < _PARALLEL)
+    return mean_up if is_parallel and np.linalg.norm(mean_up) > 1e-6 else up, is_parallel
 
 
 def field_up(field: LanguageField, up: Sequence[Any] | np.ndarray | None = None) -> Float[np.ndarray, " 3"]:
-    """Finds the up axis of a field: that of its cameras; of cameras that all look one way, the ground's if it is sure.
+    """Finds the up axis of a field (unit, the field's world).
+
+    It is that of its cameras, or of cameras that all look one way the ground's if it is sure.
 
     Args:
       field: The field.
       up: (3,) the up axis in the capture's world where it is known.
-
-    Returns:
-      (3,) float64 unit vector in the field's world.
-
-    Raises:
-      InputError: `up` has no direction.
     """
     if up is not None:
-        own = np.asarray(field.source_from_scene, np.float64)[:3, :3].T @ _direction(up)
-        return own / np.linalg.norm(own)
-    axis = scene_up(field.cameras)
-    right = np.asarray(field.cameras.world_to_camera, np.float64)[:, 0, :3]
-    if np.linalg.eigvalsh(right.T @ right / len(right))[1] < PARALLEL:
+        turned = np.asarray(field.source_from_scene, np.float64)[:3, :3].T @ _direction(up)
+        return turned / np.linalg.norm(turned)
+    axis, is_parallel = _perpendicular_up(field.cameras)
+    axis = axis / np.linalg.norm(axis)
+    if is_parallel:
         with contextlib.suppress(InputError):  # a scene without a surface has no ground
             ground = scene_frame(surface_points(field.gaussians))
-            if ground.sure and ground.axes[2] @ axis >= SAME_WAY:
+            if ground.sure and ground.axes[2] @ axis >= 0.7:  # the same way up
                 return ground.axes[2]
     return axis

@@ -6,6 +6,7 @@ they stand on orbits. The two kinds are never mixed: from outside a room, the th
 
 import dataclasses
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -24,59 +25,28 @@ PLACES = 24
 """free places in a room"""
 YAWS, PITCHES = 8, (-45.0, -20.0, 5.0)
 """directions that are looked at from each place: how many around, and degrees above the horizon"""
-GRID = 12
-"""places that are tried along each side of a room"""
-FREE_DISTANCE = 0.06
-"""distance of a free place from any surface, in units of the box's diagonal"""
-HEIGHTS = (-0.2, 0.9)
-"""range of the free places between the middle of a room (0) and its upper end (1)"""
-ENCLOSED_ALPHA, ENCLOSED_YAWS, ROOM_SHARE = 0.8, 0.75, 0.5
-"""a view is closed from this mean alpha on; a place is enclosed if this share of its downward views is closed; a scene
-is a room if this share of its places is enclosed"""
-FILL = 0.92
-"""share of the frame that the box fills from an orbit"""
 ORBIT_YAWS, ORBIT_PITCHES, ORBIT_DISTANCES = 16, (5.0, 25.0, 50.0), (1.0, 0.5)
 """orbits around an object: views around, degrees above the horizon, distances in units of the fitting one"""
-BELOW = (-25.0, -50.0)
-"""degrees of further orbits where the up axis is not sure"""
-BLANK_ALPHA = 0.03
-"""mean alpha below which a view shows no scene"""
-FOG_WIDTH, FOG_SHARE = 0.1, 0.4
-"""a view is fog if Gaussians with a standard deviation above this share of its width have this share of its weight"""
-FULL_WEIGHT = 0.3
-"""px of rendering weight, in a candidate, with which a Gaussian counts as seen"""
-COVERED_GAUSSIANS = 100_000
-"""Gaussians that the cover looks at, evenly spaced"""
+FOG_SHARE = 0.4
+"""a view is fog if Gaussians with a standard deviation above a tenth of its width have this share of its weight"""
 VIEWS_AT_ONCE = 64
 """candidates that are rendered between two reports"""
-NEAR = 0.01
-"""near plane of the candidates, in units of the box's diagonal"""
 
 
 @dataclasses.dataclass(frozen=True)
 class PlannedViews:
-    """Virtual views of a bare scene.
-
-    Attributes:
-      cameras: Batch of T cameras, in the scene's world.
-      frame: The scene's box and up axis.
-      kind: "room" or "object".
-      coverage: Share of the scene, by opacity, that the views show.
-      candidates: Number of views that were looked at.
-    """
+    """Virtual views of a bare scene."""
 
     cameras: Camera
+    """Batch of T cameras, in the scene's world."""
     frame: SceneFrame
-    kind: str
+    """The scene's box and up axis."""
+    kind: Literal["room", "object"]
     coverage: float
-    candidates: int
+    """Share of the scene, by opacity, that the views show."""
 
-    def describe(self) -> str:
-        """Describes the plan.
-
-        Returns:
-          One line: number of views, kind of scene, coverage and up axis.
-        """
+    def __str__(self) -> str:
+        """Describes the plan on one line: number of views, kind of scene, coverage and up axis."""
         up = ", ".join(f"{number:.2f}" for number in self.frame.axes[2])
         trust = "" if self.frame.sure else "; not sure, --up X Y Z sets it"
         return (
@@ -94,7 +64,7 @@ def place_cameras(
     up: np.ndarray | None = None,
     progress: Progress | None = None,
 ) -> PlannedViews:
-    """Plans virtual views of a scene from its Gaussians alone.
+    """Plans virtual views of a scene from its Gaussians alone, or raises InputError if no view can show it.
 
     Args:
       gaussians: Scene of N Gaussians.
@@ -103,60 +73,46 @@ def place_cameras(
       height: Height of the views, px.
       up: (3,) up axis of the world; None finds it (`scene_frame`).
       progress: Called as progress(done, total) while candidates are rendered.
-
-    Returns:
-      The views.
-
-    Raises:
-      InputError: The scene cannot be judged: it has no visible surface, or no view shows it.
-      ValueError: `views` is not positive.
     """
     require(views >= 1, "views", views, ">= 1", "Ask for at least one view.")
     points = surface_points(gaussians)
     frame = scene_frame(points, up)
-    places = free_places(points, frame)
+    places = _free_places(points, frame)
     inside = _interior_cameras(frame, places)
     orbits = _orbit_cameras(frame)
-    counted = np.unique(np.linspace(0, gaussians.count - 1, min(gaussians.count, COVERED_GAUSSIANS)).astype(int))
+    counted = np.unique(np.linspace(0, gaussians.count - 1, min(gaussians.count, 100_000)).astype(int))
     total = len(inside) + len(orbits)
 
     def report(start: int) -> Callable[[int], None]:
         return lambda done: None if progress is None else progress(start + done, total)
 
     seen, alpha, fog = _weights_by_view(gaussians, inside, counted, frame.diagonal, report(0))
-    kind = "room" if _is_room(alpha, len(places)) else "object"
+    kind: Literal["room", "object"] = "room" if _is_room(alpha, len(places)) else "object"
     candidates = inside
     if kind == "object":
         candidates = orbits
         seen, alpha, fog = _weights_by_view(gaussians, orbits, counted, frame.diagonal, report(len(inside)))
-    usable = np.flatnonzero(alpha >= BLANK_ALPHA)
+    usable = np.flatnonzero(alpha >= 0.03)  # those that show some of the scene
     clear = usable[fog[usable] < FOG_SHARE]
     usable = clear if len(clear) >= views else usable  # a scene of few large Gaussians has no clear view
     if not len(usable):
         remedy = "Open it in a viewer to check it, or give cameras of your own with --cameras FILE."
         raise InputError("scene", "no virtual view shows it", "", remedy)
     opacity = 1 / (1 + np.exp(-np.asarray(gaussians.opacity_logits, np.float64)[counted]))
-    chosen, coverage = greedy_cover(seen[usable], opacity, views)
+    chosen, coverage = _greedy_cover(seen[usable], opacity, views)
     chosen = usable[chosen]
     cameras = _cameras(candidates[chosen], width, height)
-    return PlannedViews(cameras, frame, kind, coverage, total)
+    return PlannedViews(cameras, frame, kind, coverage)
 
 
-def free_places(points: Float[np.ndarray, "p 3"], frame: SceneFrame) -> Float[np.ndarray, "k 3"]:
-    """Finds places inside the box of a scene that are away from every surface, far from each other.
-
-    Args:
-      points: (P, 3) points of the surface.
-      frame: The scene's frame.
-
-    Returns:
-      (K, 3) places, K <= `PLACES`; none where the box has no free place.
-    """
-    ticks = np.linspace(-0.9, 0.9, GRID)
-    grid = np.stack(np.meshgrid(ticks, ticks, np.linspace(*HEIGHTS, 5), indexing="ij"), axis=-1).reshape(-1, 3)
-    world = frame.to_world(grid)
+def _free_places(points: Float[np.ndarray, "p 3"], frame: SceneFrame) -> Float[np.ndarray, "k 3"]:
+    """Finds up to `PLACES` places in the box of a scene, 0.06 diagonals from every surface, far from each other."""
+    ticks = np.linspace(-0.9, 0.9, 12)
+    heights = np.linspace(-0.2, 0.9, 5)  # from below the middle of a room (0) to below its upper end (1)
+    grid = np.stack(np.meshgrid(ticks, ticks, heights, indexing="ij"), axis=-1).reshape(-1, 3)
+    world = _in_world(frame, grid)
     distance = KDTree(points).query(world)[0]
-    free = np.flatnonzero(distance >= FREE_DISTANCE * frame.diagonal)
+    free = np.flatnonzero(distance >= 0.06 * frame.diagonal)
     if not len(free):
         return np.zeros((0, 3))
     chosen = [free[np.argmin(np.abs(grid[free]).sum(1))]]
@@ -167,7 +123,12 @@ def free_places(points: Float[np.ndarray, "p 3"], frame: SceneFrame) -> Float[np
     return world[chosen]
 
 
-def greedy_cover(
+def _in_world(frame: SceneFrame, local: np.ndarray) -> Float[np.ndarray, "... 3"]:
+    """Maps points in the box, -1 to 1 along each axis, into the world."""
+    return (local * frame.half) @ frame.axes + frame.centre
+
+
+def _greedy_cover(
     weights: Float[np.ndarray, "v n"], importance: Float[np.ndarray, " n"], views: int
 ) -> tuple[np.ndarray, float]:
     """Chooses views that show the scene, one after the other, each time the one that adds most.
@@ -177,14 +138,14 @@ def greedy_cover(
     best one.
 
     Args:
-      weights: (V, N) rendering weight of each Gaussian in each candidate, px.
-      importance: (N,) weight of each Gaussian in the gain.
+      weights: Rendering weight of each Gaussian in each candidate, px; from 0.3 px on a Gaussian counts as seen.
+      importance: Weight of each Gaussian in the gain.
       views: Number of views to choose.
 
     Returns:
-      Indices of the chosen candidates, at most `views`; and the share of the importance that they show at least once.
+      Indices of the chosen candidates; and the share of the importance that they show at least once.
     """
-    shown = (weights / FULL_WEIGHT).astype(np.float32)
+    shown = (weights / 0.3).astype(np.float32)
     importance = importance.astype(np.float32)
     covered = np.zeros(weights.shape[1], np.float32)
     chosen: list[int] = []
@@ -205,12 +166,12 @@ def greedy_cover(
 
 
 def _is_room(alpha: np.ndarray, places: int) -> bool:
-    """Whether at least half of the places are enclosed, by the mean alpha of their views."""
+    """Whether half of the places are enclosed: three quarters of their downward views have a mean alpha of 0.8."""
     if not places:
         return False
     down = [index for index, pitch in enumerate(PITCHES) if pitch < 0]
-    closed = alpha.reshape(places, YAWS, len(PITCHES))[:, :, down].min(2) >= ENCLOSED_ALPHA
-    return bool((closed.mean(1) >= ENCLOSED_YAWS).mean() >= ROOM_SHARE)
+    closed = alpha.reshape(places, YAWS, len(PITCHES))[:, :, down].min(2) >= 0.8
+    return bool((closed.mean(1) >= 0.75).mean() >= 0.5)
 
 
 def _interior_cameras(frame: SceneFrame, places: np.ndarray) -> np.ndarray:
@@ -225,8 +186,9 @@ def _interior_cameras(frame: SceneFrame, places: np.ndarray) -> np.ndarray:
 def _orbit_cameras(frame: SceneFrame) -> np.ndarray:
     """(K, 4, 4) poses on orbits from where the scene's box fills the frame, and from half as far."""
     poses = []
-    corners = frame.to_world(np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3))
-    for pitch in ORBIT_PITCHES if frame.sure else (*ORBIT_PITCHES, *BELOW):
+    corners = _in_world(frame, np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3))
+    from_below = () if frame.sure else (-25.0, -50.0)  # where the up axis may be wrong
+    for pitch in (*ORBIT_PITCHES, *from_below):
         for yaw in np.arange(ORBIT_YAWS) * 2 * np.pi / ORBIT_YAWS:
             forward = -_direction(frame, yaw, pitch)
             distance = _fitting_distance(frame, corners, forward)
@@ -235,10 +197,10 @@ def _orbit_cameras(frame: SceneFrame) -> np.ndarray:
 
 
 def _fitting_distance(frame: SceneFrame, corners: np.ndarray, forward: np.ndarray) -> float:
-    """Distance from the centre at which all corners of the box lie within `FILL` of the frame."""
+    """Distance from the centre at which the corners of the box fill 0.92 of the frame."""
     pose = _look(frame.centre, forward, frame.axes[2])
     x, y, z = pose[:3, :3] @ (corners - frame.centre).T
-    tangent = FILL * np.tan(np.radians(FIELD_OF_VIEW) / 2)
+    tangent = 0.92 * np.tan(np.radians(FIELD_OF_VIEW) / 2)
     ratio = CANDIDATE_HEIGHT / CANDIDATE_WIDTH
     return float(np.max(np.maximum(np.abs(x), np.abs(y) / ratio) / tangent - z))
 
@@ -281,14 +243,14 @@ def _weights_by_view(
     widest = np.exp(np.asarray(gaussians.log_scales, np.float64)[counted].max(1))
     for start in range(0, len(poses), VIEWS_AT_ONCE):
         rows = np.minimum(np.arange(start, start + VIEWS_AT_ONCE), len(poses) - 1)  # one program for all chunks
-        votes = region_votes(gaussians, cameras[rows], labels, 1, top=1, by_view=True, near=NEAR * diagonal)
+        votes = region_votes(gaussians, cameras[rows], labels, 1, top=1, by_view=True, near=0.01 * diagonal)
         by_view = np.asarray(votes.by_view)[: len(poses) - start]
         for view, weights in enumerate(by_view, start):
             seen[view] = weights[counted]
             alpha[view] = weights.sum() / (CANDIDATE_WIDTH * CANDIDATE_HEIGHT)
             with np.errstate(invalid="ignore"):  # centres that are not finite have no weight
                 depth = means @ poses[view, 2, :3] + poses[view, 2, 3]
-            wide = widest * cameras.fx[view] > FOG_WIDTH * CANDIDATE_WIDTH * depth
+            wide = widest * cameras.fx[view] > 0.1 * CANDIDATE_WIDTH * depth
             fog[view] = seen[view, wide].sum() / max(seen[view].sum(), 1e-30)
         report(min(start + VIEWS_AT_ONCE, len(poses)))
     return seen, alpha, fog

@@ -21,60 +21,24 @@ from scipy.spatial import KDTree
 
 TRIM = 0.02
 """share of the surface that lies outside the robust bounds on each side of an axis: floaters and far background"""
-PLANE_TOLERANCE = 0.01
+_PLANE_TOLERANCE = 0.01
 """distance of a plane's points from it, in units of the scene's size"""
-TRIPLES = 2000
-"""planes that are tried, each through three points: half through neighbours, which find small planes"""
-PLANE_SAMPLES = 2000
-"""points that planes are searched among"""
-LOCAL = 100
-"""neighbours among which two points of such a triple are drawn"""
-MAX_PLANES, MAX_TRIES = 10, 60
-"""planes that are kept, and that are fitted at most"""
-MIN_SHARE = 0.04
+_MIN_SHARE = 0.04
 """share of the points in a plane"""
-SHARP, ROUGHLY_SHARP = 2.4, 1.6
-"""ratio of the points near a plane to those in the next layer as thick, from which it is a surface and no cut through
-things; and the same before the plane is fitted"""
-CELLS, FILLED = 8, 0.6
-"""cells along each side of a plane, and the share of them that has points: a cut through things is mostly empty"""
-TILTED = (0.9, 0.998)
-"""cosines between the normals of two planes of which the smaller is a cut through things on the larger"""
-LEVEL = 0.985
+_LEVEL = 0.985
 """cosine of a plane's normal with a direction from which the plane is level"""
-DISTINCT = np.cos(np.radians(20))
+_DISTINCT = np.cos(np.radians(20))
 """cosine below which two directions differ"""
-THING_POINTS, THING_SHARE = 12, 0.004
-"""points of a thing at least, and their share of all: less is what sticks out of a wall"""
-THING_LINKS = 12
-"""nearest points that a point of a thing is linked with"""
-RESTS, HANGS = 1.1, -1.95
+_RESTS, _HANGS = 1.1, -1.95
 """log-odds of a direction for a thing that rests on something, and for one that hangs in the air, if 0.9 of the things
 rest along the true direction and 0.3 along another"""
-MOST_THINGS = 6
-"""number of things that count at most: what is on one table is not independent"""
-STABLE = 0.2
-"""share of the scene's footprint that its base covers"""
-WIDE = 0.5
-"""share of the footprint from which a plane is a floor or a ceiling"""
-FEET, FEET_BASE = 3, 0.4
-"""number of things that end at one level where no plane is, and the share of the footprint between them, from which
-they are legs"""
-UPSIDE_DOWN, ROOF_ONLY = -2.0, -1.5
-"""log-odds of a direction in which legs point up, and in which there is a ceiling without a floor"""
-LOW, FLAT = 1.0, 0.3
-"""weights of the log of the things' median height and of the scene's height"""
-LIKELY = 0.5
-"""score from which a direction is taken, unless it is far ahead of all others; pieces of walls and floaters of a fitted
-room rest on nothing"""
-ONE_SIDED, RIVAL = 0.85, 0.5
-"""share of the remaining surface above a plane, and size in units of the largest one's, from which it may be the ground
-of such a scene"""
-SURE = 2.5
+_BASE = 0.2
+"""share of the scene's footprint that a base covers which carries it"""
+_FEET = 3
+"""number of things that end at one level where no plane is, from which they are legs"""
+_SURE = 2.5
 """difference of the best two scores from which the direction is trusted, if at least half of the things rest; twice as
-much where there are fewer than FEET things"""
-NEIGHBOURS = 32
-"""points that tell which way the surface around a point faces"""
+much where there are fewer than _FEET things"""
 
 
 class Upright(NamedTuple):
@@ -110,42 +74,39 @@ class _Candidate(NamedTuple):
 
 
 def find_up(points: np.ndarray) -> Upright:
-    """Finds the up axis of a scene.
+    """Finds the up axis of a scene from points (P, 3) of its surface.
 
-    Args:
-      points: (P, 3) points of the surface.
-
-    Returns:
-      The axis. Where too little rests, as in a fitted room with floaters, it is the normal of a large plane with nearly
-      all of the scene above it. Without such a plane it is the direction that fewest surfaces face, as walls do not; it
-      is then not trusted.
+    Where too little rests, as in a fitted room with floaters, it is the normal of a large plane with nearly all of the
+    scene above it. Without such a plane it is the direction that fewest surfaces face, as walls do not; it is then not
+    trusted.
     """
     size = 2 * float(np.quantile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 1 - TRIM))
-    tolerance = PLANE_TOLERANCE * size
+    tolerance = _PLANE_TOLERANCE * size
     planes = _planes(points, tolerance)
     outside = np.all([np.abs(points @ plane.normal - plane.offset) > 1.5 * tolerance for plane in planes], axis=0)
     loose = points[outside] if planes and outside.any() else points
     distinct = np.unique(points, axis=0)
     spacing = float(np.median(KDTree(distinct).query(distinct[::3], min(4, len(distinct)))[0][:, -1]))
-    least = max(THING_POINTS, THING_SHARE * len(distinct))
-    things = _things(loose, max(2 * tolerance, 3 * spacing), least) if planes else []
+    min_points = max(12, 0.004 * len(distinct))  # less is what sticks out of a wall
+    things = _things(loose, max(2 * tolerance, 3 * spacing), min_points) if planes else []
     normals = [sign * plane.normal for plane in planes for sign in (1, -1)]
     candidates = [_judge(normal, points, planes, loose, things, size, spacing) for normal in normals]
     scores = []
-    for one in candidates:
-        inverted = any(other.legs and other.up @ one.up < -DISTINCT for other in candidates)
-        scores.append(one.score + UPSIDE_DOWN * inverted if one.carries else -np.inf)
+    for candidate in candidates:
+        legs_point_up = any(other.legs and other.up @ candidate.up < -_DISTINCT for other in candidates)
+        scores.append(candidate.score - 2.0 * legs_point_up if candidate.carries else -np.inf)
     order = np.argsort(scores)[::-1]
     best = candidates[order[0]] if len(order) and np.isfinite(scores[order[0]]) else None
-    rivals = [score for score, one in zip(scores, candidates) if best is not None and one.up @ best.up < DISTINCT]
-    margin = 0.0 if best is None else scores[order[0]] - max(rivals, default=-np.inf)
-    if best is None or (scores[order[0]] < LIKELY and margin < SURE):
+    others = [score for score, each in zip(scores, candidates) if best is not None and each.up @ best.up < _DISTINCT]
+    margin = 0.0 if best is None else scores[order[0]] - max(others, default=-np.inf)
+    # Pieces of walls and floaters of a fitted room rest on nothing.
+    if best is None or (scores[order[0]] < 0.5 and margin < _SURE):
         ground = _ground_normal(points, planes, loose, tolerance)
         if ground is None:
             return Upright(_along_walls(points), False, "walls: fewest surfaces face it, as no plane carries the scene")
         return Upright(ground, False, "a plane with nearly all of the scene above it, and low things")
     count = len(things)
-    sure = count and best.share >= 0.5 and margin >= (SURE if count >= FEET else 2 * SURE)
+    sure = count and best.share >= 0.5 and margin >= (_SURE if count >= _FEET else 2 * _SURE)
     evidence = f"{best.resting} of {count} thing{'s' * (count != 1)} that rest{'s' * (count == 1)} on what is below"
     evidence = evidence if count else "the base on which the scene is widest and lowest"
     return Upright(_exact(best.up, planes, points, tolerance), bool(sure), evidence)
@@ -153,7 +114,7 @@ def find_up(points: np.ndarray) -> Upright:
 
 def _exact(up: np.ndarray, planes: list[_Plane], points: np.ndarray, tolerance: float) -> np.ndarray:
     """Returns the direction again, as all points of its largest level plane tell it."""
-    plane = max((plane for plane in planes if abs(plane.normal @ up) > LEVEL), key=lambda plane: len(plane.points))
+    plane = max((plane for plane in planes if abs(plane.normal @ up) > _LEVEL), key=lambda plane: len(plane.points))
     normal, _ = _refined(points, plane.normal, plane.offset, tolerance)
     return normal * np.sign(normal @ up)
 
@@ -162,11 +123,11 @@ def _ground_normal(points: np.ndarray, planes: list[_Plane], loose: np.ndarray, 
     """Returns the normal of the plane that the scene is lowest above, if nearly all of it is on one side of any."""
     best, lowest = None, np.inf
     largest = max((len(plane.points) for plane in planes), default=0)
-    large = [plane for plane in planes if len(plane.points) >= RIVAL * largest]
+    large = [plane for plane in planes if len(plane.points) >= 0.5 * largest]
     for normal, offset in ((sign * plane.normal, sign * plane.offset) for plane in large for sign in (1, -1)):
         heights = points @ normal - offset
         rest = heights[np.abs(heights) > tolerance]
-        if len(rest) and (rest > 0).mean() >= ONE_SIDED:
+        if len(rest) and (rest > 0).mean() >= 0.85:
             height = np.subtract(*np.quantile(heights, [1 - TRIM, TRIM])) * np.median(np.abs(loose @ normal - offset))
             best, lowest = (normal, height) if height < lowest else (best, lowest)
     return best
@@ -182,52 +143,52 @@ def _judge(
     spacing: float,
 ) -> _Candidate:
     """Judges a direction by what would rest on what."""
-    tolerance = PLANE_TOLERANCE * size
+    tolerance = _PLANE_TOLERANCE * size
     touch = 1.5 * (tolerance + spacing)
     heights = points @ up
     low, high = np.quantile(heights, [0.005, 1 - TRIM])
     whole = max(_footprint(points[(heights >= low) & (heights <= high)], up), 1e-30)
     base = _footprint(points[heights <= low + 1.5 * tolerance], up) / whole
-    level = [plane for plane in planes if abs(plane.normal @ up) > LEVEL]
+    level = [plane for plane in planes if abs(plane.normal @ up) > _LEVEL]
     places = [float(np.sign(plane.normal @ up) * plane.offset) for plane in level]
     covered = [_footprint(plane.points, up) / whole for plane in level]
-    wide = [place for place, share in zip(places, covered) if share >= WIDE]
-    roof_only = any(place >= high - 3 * tolerance for place in wide) and not any(
-        place <= low + 3 * tolerance for place in wide
-    )
+    wide = [place for place, share in zip(places, covered) if share >= 0.5]  # floors and ceilings
+    has_ceiling = any(place >= high - 3 * tolerance for place in wide)
+    has_floor = any(place <= low + 3 * tolerance for place in wide)
     on_ground = any(abs(place - low) <= 2 * tolerance for place in places)
     trees = [KDTree(plane.points) for plane in level]
     rests, weights, feet = [], [], 0
     for thing in things:
-        own = thing @ up
-        bottom = float(np.partition(own, 4)[4])  # a few strays may lie below
-        foot = thing[own <= bottom + tolerance]
-        stands = bottom <= low + touch and base >= STABLE
+        thing_heights = thing @ up
+        bottom = float(np.partition(thing_heights, 4)[4])  # a few strays may lie below
+        foot = thing[thing_heights <= bottom + tolerance]
+        stands = bottom <= low + touch and base >= _BASE
         feet += stands and not on_ground
         for place, tree in zip(places, trees):
             stands = stands or (abs(bottom - place) <= touch and tree.query(foot)[0].min() <= 2 * touch)
         rests.append(stands)
         weights.append(np.sqrt(len(thing)))
     share = float(np.average(rests, weights=weights)) if things else 0.0
-    score = min(len(things), MOST_THINGS) * (RESTS * share + HANGS * (1 - share)) + ROOF_ONLY * roof_only
-    score -= LOW * np.log(np.median(np.maximum(loose @ up - low, 0)) / max(high - low, 1e-30) + 0.1)
-    score -= FLAT * np.log(max(high - low, 1e-30) / size)
+    # What is on one table is not independent: at most six things count.
+    score = min(len(things), 6) * (_RESTS * share + _HANGS * (1 - share)) - 1.5 * (has_ceiling and not has_floor)
+    score -= np.log(np.median(np.maximum(loose @ up - low, 0)) / max(high - low, 1e-30) + 0.1)
+    score -= 0.3 * np.log(max(high - low, 1e-30) / size)
     widest = max([base, *covered])
     score += np.log(max(widest, 1e-3))
-    carries = widest >= STABLE
-    return _Candidate(up, float(score), feet >= FEET and widest > FEET_BASE, int(sum(rests)), share, carries)
+    carries = widest >= _BASE
+    return _Candidate(up, float(score), feet >= _FEET and widest > 0.4, int(sum(rests)), share, carries)
 
 
-def _things(points: np.ndarray, reach: float, least: float | int) -> list[np.ndarray]:
-    """Returns the points of each thing: `least` or more that steps of at most `reach` connect."""
+def _things(points: np.ndarray, reach: float, min_points: float) -> list[np.ndarray]:
+    """Returns the points of each thing: `min_points` or more that steps of at most `reach` connect."""
     points = np.unique(points, axis=0)
-    distance, near = KDTree(points).query(points, THING_LINKS)
+    distance, near = KDTree(points).query(points, 12)
     linked = np.asarray(distance) <= reach
     ends = np.asarray(near)[linked], np.concatenate([[0], np.cumsum(linked.sum(1))])
     graph = csr_array((np.ones(len(ends[0])), *ends), shape=(len(points), len(points)))
     count, thing = connected_components(graph, directed=False)
     sizes = np.bincount(thing, minlength=count)
-    return [points[thing == k] for k in np.flatnonzero(sizes >= least)]
+    return [points[thing == k] for k in np.flatnonzero(sizes >= min_points)]
 
 
 def _footprint(points: np.ndarray, up: np.ndarray) -> float:
@@ -244,42 +205,44 @@ def _footprint(points: np.ndarray, up: np.ndarray) -> float:
 
 def _planes(points: np.ndarray, tolerance: float) -> list[_Plane]:
     """Finds planes, the largest first; the points of one count for no other."""
-    sample = points[:: max(len(points) // PLANE_SAMPLES, 1)]
+    sample = points[:: max(len(points) // 2000, 1)]
     normals, offsets = _trial_planes(sample)
     distance = np.abs(sample @ normals.T - offsets)
-    sharp = _is_sharp(distance, tolerance, ROUGHLY_SHARP)
+    sharp = _is_sharp(distance, tolerance, 1.6)  # roughly: they are not fitted yet
     normals, offsets, near = normals[sharp], offsets[sharp], distance[:, sharp] <= tolerance
     left = np.ones(len(sample), bool)
     counts = near.sum(0)
     planes: list[_Plane] = []
-    for _ in range(MAX_TRIES if len(counts) else 0):
+    for _ in range(60 if len(counts) else 0):
         trial = int(counts.argmax())
-        if counts[trial] < MIN_SHARE * len(sample) or len(planes) == MAX_PLANES:
+        if counts[trial] < _MIN_SHARE * len(sample) or len(planes) == 10:
             break
         normal, offset = normals[trial], float(offsets[trial])
         for _ in range(2):
             normal, offset = _refined(sample[left], normal, offset, tolerance)
         distance = np.abs(sample @ normal - offset)
         inside = left & (distance <= tolerance)
-        tilted = any(TILTED[0] < abs(normal @ other.normal) < TILTED[1] for other in planes)
-        is_surface = inside.sum() >= MIN_SHARE * len(sample) and bool(_is_sharp(distance[left], tolerance, SHARP))
-        if tilted or not is_surface or _filled(sample[inside], normal) < FILLED:
+        # A plane at a small angle to a larger one cuts through things on it. One that cuts through things is mostly
+        # empty.
+        is_tilted = any(0.9 < abs(normal @ other.normal) < 0.998 for other in planes)
+        is_surface = inside.sum() >= _MIN_SHARE * len(sample) and bool(_is_sharp(distance[left], tolerance, 2.4))
+        if is_tilted or not is_surface or _filled(sample[inside], normal) < 0.6:
             counts[trial] = 0
             continue
-        taken = left & (distance <= 1.5 * tolerance)
-        left &= ~taken
-        counts = counts - near[taken].sum(0)
+        near_plane = left & (distance <= 1.5 * tolerance)
+        left &= ~near_plane
+        counts = counts - near[near_plane].sum(0)
         planes.append(_Plane(normal, offset, points[np.abs(points @ normal - offset) <= tolerance]))
     return planes
 
 
 def _trial_planes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns normals and offsets of planes through random triples of points, of which half are neighbours."""
+    """Returns normals and offsets of planes through 2,000 triples of points, half of neighbours: for small planes."""
     draw = np.random.default_rng(1)
     count = len(points)
-    first = draw.integers(count, size=TRIPLES)
-    others = draw.integers(count, size=(TRIPLES, 2))
-    near = np.asarray(KDTree(points).query(points[first[1::2]], min(LOCAL, count))[1])
+    first = draw.integers(count, size=2000)
+    others = draw.integers(count, size=(2000, 2))
+    near = np.asarray(KDTree(points).query(points[first[1::2]], min(100, count))[1])
     picks = draw.integers(near.shape[1], size=(len(near), 2))
     others[1::2] = np.take_along_axis(near, picks, axis=1)
     corners = points[first], points[others[:, 0]], points[others[:, 1]]
@@ -311,19 +274,19 @@ def _refined(points: np.ndarray, normal: np.ndarray, offset: float, tolerance: f
 
 
 def _filled(points: np.ndarray, normal: np.ndarray) -> float:
-    """Share of the cells of a grid over points of a plane that have points."""
+    """Share of the cells of an 8 x 8 grid over points of a plane that have points."""
     offsets = points - points.mean(0)
     offsets -= (offsets @ normal)[:, None] * normal
     flat = offsets @ np.linalg.eigh(offsets.T @ offsets)[1][:, 1:]
     ends = np.quantile(flat, [TRIM, 1 - TRIM], axis=0)
-    cells = np.histogram2d(*flat.T, bins=CELLS, range=ends.T)[0]
+    cells = np.histogram2d(*flat.T, bins=8, range=ends.T)[0]
     return float((cells > 0).mean())
 
 
 def _along_walls(points: np.ndarray) -> np.ndarray:
     """Returns the direction that fewest surfaces face, on the side of the sparser half of the points."""
     unique = np.unique(points, axis=0)
-    near = unique[KDTree(unique).query(unique, min(NEIGHBOURS, len(unique)))[1]]
+    near = unique[KDTree(unique).query(unique, min(32, len(unique)))[1]]
     centred = near - near.mean(1, keepdims=True)
     spread, axes = np.linalg.eigh(centred.mT @ centred)
     flatness = (spread[:, 1] - spread[:, 0]) / spread[:, 2]

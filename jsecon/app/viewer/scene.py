@@ -12,6 +12,7 @@ from jsecon.numerics import sigmoid
 from jsecon.splat.project import is_usable
 from jsecon.splat.sh import C0
 from jsecon.types import LanguageField
+from jsecon.views.frame import scene_up
 
 GROUPS = 16
 """number of groups of Gaussians; only groups whose colours change are sent again, since viser sends all of a group"""
@@ -80,12 +81,11 @@ class FieldScene:
         self.frustums = self._add_frustums(server)
         self._frame = 0
         self._frames_shown = False
-        self._set_start(server.initial_camera, poses, centers)
+        self._set_start(server.initial_camera, scene_up(field.cameras), centers)
 
-    def _set_start(self, camera: Any, poses: np.ndarray, centers: np.ndarray) -> None:
-        """Starts the window at the first frame, with the mean up direction of all frames."""
-        up = -poses[:, 1, :3].mean(0)
-        self._server.scene.set_up_direction(up / np.linalg.norm(up))
+    def _set_start(self, camera: Any, up: np.ndarray, centers: np.ndarray) -> None:
+        """Starts the window at the first frame, with the up direction of all frames."""
+        self._server.scene.set_up_direction(up)
         forward = self._rotations[0].apply([0, 0, 1])
         depth = (centers - self._centers[0]) @ forward
         distance = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0

@@ -27,6 +27,7 @@ from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console
 from jsecon.splat.sh import C0
 from jsecon.types import Gaussians, LanguageField
+from jsecon.views.frame import scene_up
 
 NO_REGION = 65535
 """code of a Gaussian without a region"""
@@ -113,7 +114,7 @@ def page(field: LanguageField, answers: Sequence[Answer], *, title: str) -> str:
 
 
 def _camera(field: LanguageField, means: Float[np.ndarray, "n 3"]) -> dict[str, Any]:
-    """Returns the first view: the first frame, with the mean up direction of all, turning about what it looks at."""
+    """Returns the first view: the first frame, with the up direction of all, turning about what it looks at."""
     poses = np.asarray(field.cameras.world_to_camera, np.float64)
     eye = -poses[0, :3, :3].T @ poses[0, :3, 3]
     forward = poses[0, 2, :3]
@@ -124,7 +125,7 @@ def _camera(field: LanguageField, means: Float[np.ndarray, "n 3"]) -> dict[str, 
     return {
         "eye": eye.tolist(),
         "target": (eye + distance * forward).tolist(),
-        "up": (-poses[:, 1, :3].mean(0)).tolist(),
+        "up": scene_up(field.cameras).tolist(),
         "focal": float(np.asarray(field.cameras.fx)[0]),
         "size": [field.cameras.width, field.cameras.height],
     }
