@@ -41,7 +41,7 @@ from jsecon.query.classes import query_classes
 from jsecon.query.rules import MIN_COSINE, MIN_RANK, SAME_CLASS_SCORE
 from jsecon.query.scores import view_count_weight
 from jsecon.types import LanguageField, Regions, Selection
-from jsecon.vision.reference_words import reference_of
+from jsecon.vision.unrelated_words import embed_unrelated_words
 
 CROPS = tuple(
     Crop(margin, shape, surroundings)
@@ -108,7 +108,7 @@ def case_of(scene: WordScene, embedder: Conse, variant: str) -> Case:
         source_from_scene=np.eye(4),
         names=tuple(map(str, range(len(scene.frames)))),
         embedder=embedder.name,
-        unrelated_words=reference_of(embedder),
+        unrelated_words=embed_unrelated_words(embedder),
     )
     return Case(scene, crops, regions, embedder.embed_text(list(scene.texts)), field)
 

@@ -493,7 +493,7 @@ def kept(folder: Path) -> Iterator[Case]:
 
     yield Case([folder / "stage-0.safetensors"], read, whole)
     frame, mask = np.zeros((6, 8, 3), np.uint8), np.ones((6, 8), bool)
-    store = EmbeddingStore(folder, "model")
+    store = EmbeddingStore(folder / "embeddings", "model")
     store.write(frame, {bytes(range(16)): np.ones(4, np.float32), bytes(16): np.ones(4, np.float32)})
 
     def whole_store(found: dict) -> None:
@@ -501,7 +501,7 @@ def kept(folder: Path) -> Iterator[Case]:
         for row in found.values():
             _finite(row)
 
-    yield Case([store._path(frame)], lambda: store.read(frame), whole_store)
+    yield Case(sorted((folder / "embeddings").iterdir()), lambda: store.read(frame), whole_store)
 
     class Fixed:
         name = "fixed"
@@ -523,9 +523,8 @@ def tokenizer(folder: Path) -> Iterator[Case]:
     write_tokenizer(folder / "tokenizer.json")
 
     def read() -> np.ndarray:
-        return TextTokenizer(folder / "tokenizer.json", None)(
-            ["a red mug's 12 handles", "", "é<end_of_text>"], CLIP_LENGTH
-        )[0]
+        texts = ["a red mug's 12 handles", "", "é<end_of_text>"]
+        return TextTokenizer(folder / "tokenizer.json", None)(texts, CLIP_LENGTH)[0]
 
     yield Case([folder / "tokenizer.json"], read, _array((3, 77), np.int64, 0))
 

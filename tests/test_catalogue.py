@@ -13,7 +13,7 @@ import jsecon
 from jsecon import InputError, Regions, Votes, load_gaussians, save_field
 from jsecon.read.splats.ply import read_vertices
 from jsecon.vision.colours import ColourEmbedder
-from jsecon.vision.reference_words import REFERENCE_WORDS
+from jsecon.vision.unrelated_words import UNRELATED_WORDS
 
 EMBEDDER = ColourEmbedder()
 COLOURS = ["red", "green", "blue", "orange", "pink"]
@@ -135,9 +135,9 @@ def test_names_come_from_the_vocabulary_that_is_given(field):
 
 
 def test_a_field_of_words_or_without_a_model_needs_none(field):
-    words = np.tile(np.array(EMBEDDER.unrelated_words[:1], np.float16), (len(REFERENCE_WORDS), 1))
+    words = np.tile(np.array(EMBEDDER.unrelated_words[:1], np.float16), (len(UNRELATED_WORDS), 1))
     named = jsecon.objects(dataclasses.replace(field, embedder="clip-x", unrelated_words=words))
-    assert set(named.names[:, 0]) <= set(REFERENCE_WORDS)
+    assert set(named.names[:, 0]) <= set(UNRELATED_WORDS)
     bare = jsecon.objects(dataclasses.replace(field, embedder=f"given-{EMBEDDER.dim}", unrelated_words=words[:0]))
     assert (bare.names == "").all()
     assert len(bare) == len(named)

@@ -12,7 +12,7 @@ from onnx_files import node, write_graph
 from jsecon.errors import InputError
 from jsecon.networks.clip import ClipEmbedder, masked_crop, read_preprocessing
 from jsecon.vision.protocols import CANONICAL, Embedder
-from jsecon.vision.reference_words import REFERENCE_WORDS, cached_reference
+from jsecon.vision.unrelated_words import UNRELATED_WORDS, cached_unrelated_words
 
 LAYOUTS = ("immich", "transformers.js")
 
@@ -211,11 +211,11 @@ def test_unrelated_words_are_embedded_once_for_a_model(tmp_path, monkeypatch):
         asked.append(len(texts))
         return np.random.default_rng(0).standard_normal((len(texts), 5)).astype(np.float32)
 
-    first = cached_reference("model a", embed_text)
-    np.testing.assert_array_equal(cached_reference("model a", embed_text), first)
-    assert asked == [len(REFERENCE_WORDS)]
+    first = cached_unrelated_words("model a", embed_text)
+    np.testing.assert_array_equal(cached_unrelated_words("model a", embed_text), first)
+    assert asked == [len(UNRELATED_WORDS)]
     (kept,) = tmp_path.rglob("*.safetensors")
     kept.write_bytes(kept.read_bytes()[:-7])  # damaged: embedded anew
-    np.testing.assert_array_equal(cached_reference("model a", embed_text), first)
-    cached_reference("model b", embed_text)
+    np.testing.assert_array_equal(cached_unrelated_words("model a", embed_text), first)
+    cached_unrelated_words("model b", embed_text)
     assert len(asked) == 3

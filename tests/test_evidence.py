@@ -13,7 +13,7 @@ import jsecon
 from jsecon import Camera, Regions, Votes, normalise_votes, save_field
 from jsecon.app import cli
 from jsecon.vision.colours import PALETTE, ColourEmbedder
-from jsecon.vision.reference_words import reference_of
+from jsecon.vision.unrelated_words import embed_unrelated_words
 
 FRIDGE, WALL, SOFA = 0, 1, 2
 COLOURS = ColourEmbedder()
@@ -140,7 +140,7 @@ def asked_of(embeddings, pixels, text):
     own = np.arange(count, dtype=np.int32)[:, None]
     ones = np.ones(count, np.float32)
     votes = Votes(own, ones[:, None], ones, ones, ones, ones.astype(np.int32), np.int32(0), count)
-    own = {"canonical_phrases": COLOURS.canonical_phrases, "unrelated_words": reference_of(COLOURS)}
+    own = {"canonical_phrases": COLOURS.canonical_phrases, "unrelated_words": embed_unrelated_words(COLOURS)}
     field = field_of(votes, Regions(embeddings, np.repeat(pixels[:, None], 10, 1)), **own)
     rules = jsecon.QueryRules(min_rank=0.0)  # all colours but one are there, so most other words match as well
     found = jsecon.query_anchored(field, jnp.asarray(COLOURS.embed_text([text])[0]), rules=rules)

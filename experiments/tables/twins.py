@@ -38,7 +38,7 @@ from jsecon.files import write_text
 from jsecon.read.captures.images import write_image
 from jsecon.read.masks.langsplat import LEVELS
 from jsecon.vision.protocols import CANONICAL
-from jsecon.vision.reference_words import REFERENCE_WORDS
+from jsecon.vision.unrelated_words import UNRELATED_WORDS
 
 PERFECT = Faults(0, 2, 0, 0, 0, 0, 0, 0, object_noise=1.0, view_noise=0)
 """true masks that agree in all views, each object embedded alike in all; texts and images lie apart, as in CLIP"""
@@ -123,13 +123,13 @@ class Words(NamedTuple):
     absent: np.ndarray
     """(ABSENT, E) vectors of names that nothing in the twin has."""
     unrelated_words: np.ndarray
-    """(W, E) vectors of the unrelated words, one for each of `REFERENCE_WORDS`."""
+    """(W, E) vectors of the unrelated words, one for each of `UNRELATED_WORDS`."""
 
 
 def space_of(words: list[str], world: World, seed: int) -> Words:
     """The texts of a twin with these words."""
     absent = [f"absent{n}" for n in range(ABSENT)]
-    reference = [f"reference{n}" for n in range(len(REFERENCE_WORDS))]
+    reference = [f"reference{n}" for n in range(len(UNRELATED_WORDS))]
     ends = np.cumsum([len(words), len(absent), len(reference)])
     if world.lvis:
         real = load_text_space(*(results.CAPTURES.parent / "text" / name for name in LVIS))

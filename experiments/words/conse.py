@@ -22,7 +22,7 @@ from experiments.rivals.evidence import unit
 from experiments.words.minilm import MiniLM
 from jsecon.errors import InputError, describe_error, require_one_of, require_shape
 from jsecon.vision.protocols import CANONICAL
-from jsecon.vision.reference_words import REFERENCE_WORDS
+from jsecon.vision.unrelated_words import UNRELATED_WORDS
 
 WORDS = results.CAPTURES.parent / "words"
 """the labeller and the vectors beside the checkout"""
@@ -255,7 +255,7 @@ class Conse:
         self.class_vectors = self.texts.embed(list(self.labeller.names))
         self.canonical_phrases = self.embed_text(list(CANONICAL))
         # Without a model for the vectors the table lacks some of the words: those that it has are enough.
-        self.unrelated_words = self.embed_text([word for word in REFERENCE_WORDS if word in self.texts])
+        self.unrelated_words = self.embed_text([word for word in UNRELATED_WORDS if word in self.texts])
         self.dim = self.class_vectors.shape[1]
         digest = hashlib.sha256(self.class_vectors.tobytes() + self.labeller.file.read_bytes()).hexdigest()[:12]
         self.name = f"conse-{digest}-{crop.margin:g}-{crop.shape}-{crop.surroundings}-{top}"

@@ -22,7 +22,7 @@ from jsecon.query.outliers import MIN_SAMPLES
 from jsecon.splat.transform import transform_gaussians_float64
 from jsecon.types import LanguageField
 from jsecon.views.frame import field_up
-from jsecon.vision.reference_words import REFERENCE_WORDS, reference_of
+from jsecon.vision.unrelated_words import UNRELATED_WORDS, embed_unrelated_words
 
 NAMES = 3
 """names of each object"""
@@ -214,10 +214,10 @@ def region_objects(field: LanguageField, up: np.ndarray) -> Int[np.ndarray, " r"
 
 def _vocabulary(field: LanguageField, vocabulary: Sequence[str] | None, embedder: Any) -> _Names:
     """Returns the names to choose from, with their embeddings."""
-    words_known = field.unrelated_words is not None and len(field.unrelated_words) == len(REFERENCE_WORDS)
+    words_known = field.unrelated_words is not None and len(field.unrelated_words) == len(UNRELATED_WORDS)
     if vocabulary is None and embedder is None and words_known and not field.embedder.startswith("colours"):
         return _Names(
-            REFERENCE_WORDS, np.asarray(field.unrelated_words, np.float32), SOFTMAX_SCALE
+            UNRELATED_WORDS, np.asarray(field.unrelated_words, np.float32), SOFTMAX_SCALE
         )  # without the model
     if embedder is None:
         from jsecon.pipeline.model_loading import external_dim, field_embedder
@@ -227,10 +227,10 @@ def _vocabulary(field: LanguageField, vocabulary: Sequence[str] | None, embedder
         embedder = field_embedder(field)
     logits = getattr(embedder, "logits", None)
     scale = getattr(embedder, "softmax_scale", SOFTMAX_SCALE) if logits is None else logits.scale
-    texts = tuple(getattr(embedder, "vocabulary", REFERENCE_WORDS) if vocabulary is None else vocabulary)
+    texts = tuple(getattr(embedder, "vocabulary", UNRELATED_WORDS) if vocabulary is None else vocabulary)
     if not texts:
         raise InputError("vocabulary", "it has no names", remedy="Give at least one name.")
-    rows = reference_of(embedder) if texts == REFERENCE_WORDS else np.asarray(embedder.embed_text(list(texts)))
+    rows = embed_unrelated_words(embedder) if texts == UNRELATED_WORDS else np.asarray(embedder.embed_text(list(texts)))
     return _Names(texts, rows, scale)
 
 

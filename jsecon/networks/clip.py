@@ -22,8 +22,8 @@ from jsecon.networks.session import Graph, Tensor, batches, content_digest, grap
 from jsecon.networks.tokenizer import CLIP_LENGTH, TextTokenizer, read_text_rules
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.vision.protocols import CANONICAL, Logits
-from jsecon.vision.reference_words import cached_reference
 from jsecon.vision.stores import EmbeddingStore, mask_key
+from jsecon.vision.unrelated_words import cached_unrelated_words
 
 LOGITS = "logits.json"
 """file of a model folder with the scale and bias of a model trained with a sigmoid"""
@@ -148,7 +148,7 @@ class ClipEmbedder:
     @functools.cached_property
     def unrelated_words(self) -> Float32[np.ndarray, "w e"]:
         """(W, E) unit embeddings of the unrelated words; they are cached."""
-        return cached_reference(self.name, self.embed_text)
+        return cached_unrelated_words(self.name, self.embed_text)
 
     @property
     def size(self) -> int:

@@ -16,7 +16,7 @@ from jsecon.pipeline.results import Results, StageInput, StageResult, vision_fra
 from jsecon.process import memory_budget
 from jsecon.types import Codes, LanguageField, Regions
 from jsecon.vision.protocols import Embedder
-from jsecon.vision.reference_words import reference_of
+from jsecon.vision.unrelated_words import embed_unrelated_words
 
 CODE_LENGTH = 3
 """numbers of a code in the paper"""
@@ -71,6 +71,6 @@ def join_field(results: Results, embedder: Embedder, provenance: str, options: O
         embedder=embedder.name,
         provenance=provenance,
         parts=results.parts,
-        unrelated_words=reference_of(embedder).astype(np.float16),
+        unrelated_words=embed_unrelated_words(embedder).astype(np.float16),
         codes=results.codes,
     )

@@ -24,18 +24,9 @@ GRANULARITIES: dict[str, dict[str, Any]] = {
 """Settings of ClassicalSegmenter by the size of its regions. The coarse one joins the colours of an object, and so
 needs depth to separate objects."""
 
-DARK, LIGHT = 0.22, 0.3
-"""Medians of the linear luminance up to which a frame is brightened, and down to which it is darkened."""
-MAX_GAIN = 8.0
-"""Largest factor on the odds of a luminance, and inverse of the smallest."""
-
 
 def require_contrib() -> None:
-    """Checks that OpenCV has its contrib modules.
-
-    Raises:
-      InputError: It has none, because OpenCV's packages overwrite each other's folder.
-    """
+    """Raises InputError if OpenCV lacks its contrib modules, because its packages overwrite each other's folder."""
     if not hasattr(getattr(cv2, "ximgproc", None), "createSuperpixelSLIC"):
         remedy = (
             "Run: pip uninstall opencv-python opencv-python-headless opencv-contrib-python; then: "
@@ -79,37 +70,24 @@ class ClassicalSegmenter:
         return _masks_best_first(frame, labels, max_regions=self.max_regions, min_area=self.min_area)
 
     def partition(self, frame: np.ndarray, index: int) -> Int32[np.ndarray, "h w"]:
-        """Partitions a frame into connected regions.
-
-        Args:
-          frame: (H, W, 3) uint8 RGB.
-          index: Index of the frame, for `depths` and `surfaces`.
-
-        Returns:
-          (H, W) int32 labels 0 .. M-1.
-
-        Raises:
-          ValueError: The frame, its depth or its surface has a wrong shape or dtype.
-        """
+        """Partitions a frame (H, W, 3) uint8 into connected regions, labels 0 .. M-1."""
         fits = frame.ndim == 3 and frame.shape[2] == 3 and frame.dtype == np.uint8
         require(fits, "frame", (frame.shape, frame.dtype), "(H, W, 3) uint8", "Pass RGB frames as 8-bit arrays.")
         features = _colour_features(frame, lightness_weight=self.lightness_weight, smoothing=self.smoothing)
-        minimum = self.min_area * frame.shape[0] * frame.shape[1]
+        settings = {"distance": self.merge_distance, "min_area": self.min_area * frame.shape[0] * frame.shape[1]}
         surface = None if self.surfaces is None else self.surfaces(index)
         if surface is not None:
             features, seeds = self._with_surface(features, surface)
-            atoms = _oversegment(seeds)
-            edges = region_borders(atoms, features, surface, steepness=self.merge_distance / self.depth_jump)
-            return merge_regions(atoms, features, edges, distance=self.merge_distance, min_area=minimum)
+            superpixels = _oversegment(seeds)
+            edges = region_borders(superpixels, features, surface, steepness=self.merge_distance / self.depth_jump)
+            return merge_regions(superpixels, features, edges, **settings)
         shape = None
         if self.depths is not None:
             depth = self.depths(index)
             require_shape("depths", depth, frame.shape[:2], "Pass depth of the size of the frame.")
             shape = log_depth(depth) * np.float32(self.merge_distance / np.log1p(self.depth_jump))
-        atoms = _oversegment(features if shape is None else np.concatenate([features, shape], -1))
-        return merge_regions(
-            atoms, features, region_borders(atoms, features, shape), distance=self.merge_distance, min_area=minimum
-        )
+        superpixels = _oversegment(features if shape is None else np.concatenate([features, shape], -1))
+        return merge_regions(superpixels, features, region_borders(superpixels, features, shape), **settings)
 
     def _with_surface(self, colour: np.ndarray, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
         """Joins colours and normals as features of pixels.
@@ -144,18 +122,12 @@ def adapt_exposure(frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 
     Steps in CIELAB are those of an eye adapted to the white of the scene: they are too small between dark objects of a
     dark photograph and between white walls of a bright one. The map x -> g x / (1 + (g - 1) x) multiplies the odds by g
     and keeps black and white.
-
-    Args:
-      frame: (H, W, 3) uint8 RGB.
-
-    Returns:
-      (H, W, 3) uint8.
     """
     linear = (np.arange(256, dtype=np.float32) / 255.0) ** 2.2
     luminance = linear[frame] @ np.asarray([0.2126, 0.7152, 0.0722], np.float32)
     middle = min(max(float(np.median(luminance)), 1e-6), 1.0 - 1e-6)
-    target = min(max(middle, DARK), LIGHT)
-    gain = min(max(target * (1.0 - middle) / (middle * (1.0 - target)), 1.0 / MAX_GAIN), MAX_GAIN)
+    target = min(max(middle, 0.22), 0.3)
+    gain = min(max(target * (1.0 - middle) / (middle * (1.0 - target)), 1.0 / 8.0), 8.0)
     table = np.round(255.0 * (gain * linear / (1.0 + (gain - 1.0) * linear)) ** (1.0 / 2.2)).astype(np.uint8)
     return table[frame]
 

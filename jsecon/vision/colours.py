@@ -7,6 +7,8 @@ which has the basic colour terms (Berlin & Kay 1969) and common mixed ones.
 import functools
 import itertools
 import re
+import tomllib
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -15,83 +17,34 @@ from jaxtyping import Bool, Float32, UInt8
 
 from jsecon.errors import InputError, require_shape
 
-# sRGB of a typical matt object of each name. A name of two words is a variant of the basic term in it.
-# fmt: off
-PALETTE: dict[str, tuple[int, int, int]] = {
-    "black": (22, 22, 24), "dark grey": (72, 72, 74), "grey": (128, 128, 128), "light grey": (190, 190, 190),
-    "white": (242, 242, 240),
-    "dark red": (115, 18, 22), "red": (205, 32, 36), "light red": (236, 120, 116),
-    "dark orange": (190, 88, 14), "orange": (242, 132, 28), "light orange": (250, 186, 122),
-    "dark brown": (66, 40, 22), "brown": (120, 74, 40), "light brown": (172, 126, 84),
-    "dark yellow": (178, 150, 22), "yellow": (244, 214, 40), "light yellow": (250, 238, 150),
-    "dark green": (18, 78, 34), "green": (40, 148, 60), "light green": (142, 214, 142),
-    "dark blue": (20, 36, 110), "blue": (36, 84, 196), "light blue": (140, 190, 238),
-    "dark purple": (66, 22, 96), "purple": (126, 52, 160), "light purple": (192, 160, 226),
-    "dark pink": (206, 52, 122), "pink": (242, 142, 178), "light pink": (250, 200, 214),
-    "maroon": (100, 16, 40), "crimson": (180, 20, 56), "salmon": (246, 144, 116), "coral": (250, 116, 84),
-    "peach": (252, 200, 160), "beige": (222, 206, 174), "cream": (250, 242, 210), "tan": (204, 172, 124),
-    "gold": (210, 168, 50), "mustard": (206, 166, 36), "olive": (112, 114, 36), "khaki": (180, 170, 110),
-    "lime": (160, 222, 40), "mint": (166, 232, 200), "teal": (14, 124, 124), "dark teal": (8, 74, 78),
-    "turquoise": (54, 196, 186), "cyan": (40, 210, 230), "sky": (130, 196, 240), "navy": (16, 26, 76),
-    "indigo": (62, 30, 130), "violet": (140, 70, 210), "lavender": (198, 180, 234), "lilac": (204, 164, 208),
-    "magenta": (216, 36, 168), "burgundy": (112, 18, 46), "rose": (236, 96, 136), "bronze": (150, 106, 46),
-    "copper": (184, 106, 62), "silver": (192, 194, 198), "ivory": (246, 240, 222), "charcoal": (52, 54, 58),
-}
-_SYNONYMS = {
-    "gray": "grey", "azure": "sky", "scarlet": "red", "aqua": "cyan", "fuchsia": "magenta", "golden": "gold",
-    "silvery": "silver", "aquamarine": "turquoise", "amber": "gold", "chocolate": "dark brown", "mauve": "lilac",
-    "plum": "dark purple", "ochre": "mustard", "rust": "dark orange", "emerald": "green", "ruby": "dark red",
-    "sapphire": "blue", "ebony": "black", "snowy": "white", "sandy": "tan", "wine": "burgundy", "rosy": "rose",
-    "creamy": "cream", "rusty": "dark orange", "peachy": "peach",
-}
-# Words for the surroundings of objects; they turn the extent's coordinate towards large regions.
-_SURROUNDINGS = {
-    "wall", "walls", "floor", "ceiling", "ground", "carpet", "rug", "background", "table", "tabletop", "tablecloth",
-    "curtain", "curtains", "desk", "counter", "countertop", "lawn",
-}
-# fmt: on
+_TABLES = tomllib.loads(Path(__file__).with_name("colours.toml").read_text())
+PALETTE: dict[str, tuple[int, int, int]] = {name: tuple(rgb) for name, rgb in _TABLES["palette"].items()}
+"""name -> sRGB of a typical matt object; a name of two words is a variant of the basic term in it"""
+_WORDS = {kind: frozenset(words) for kind, words in _TABLES["words"].items()}
 BASIC = ("black", "white", "red", "green", "yellow", "blue", "brown", "orange", "pink", "purple", "grey")
 """the eleven basic colour terms"""
 VOCABULARY = (*(name for name in PALETTE if name.split()[-1] in BASIC), "turquoise", "lilac")
 """Names that objects get: basic terms, their dark and light variants, and the two that came to be basic terms in
 English since (Mylonas & MacDonald 2016)."""
-SOFTMAX_SCALE = 20.0
-"""Scale of cosines in the softmax over names."""
-# A bare basic term names a family of colours: itself and these shades, and so their neighbours (burgundy, sky) too.
 _SHADES = {basic: tuple(f"{shade} {basic}" for shade in ("dark", "light")) for basic in BASIC} | {
     "black": ("charcoal",),
     "white": (),
     "blue": ("dark blue", "light blue", "navy"),
 }
-_DARK, _LIGHT = {"dark", "deep", "darker"}, {"light", "pale", "pastel", "lighter", "faint", "soft"}
-_PLAIN = {"bright", "vivid", "pure", "plain", "medium", "mid", "saturated", "solid"}
-_NEGATION = {"not", "no", "non", "without", "except", "isnt", "never"}
-# A colour word names a range: its point, a darker and a lighter neighbour.
-_SPREAD = np.asarray([[0, 0, 0], [-10, 0, 0], [10, 0, 0]], np.float32)
-_SPREAD_WEIGHTS = np.asarray([0.7, 0.15, 0.15], np.float32)
-SHADE, GREY_SHADE = 0.7, 0.85
+"""A bare basic term names a family of colours: itself and these shades, and so their neighbours (burgundy, sky) too."""
+_SHADE, _GREY_SHADE = 0.7, 0.85
 """Similarity of a bare basic term to the shades of its family, relative to its typical colour: a dark red wall is red,
 and a red mug before it is redder. Greys differ only in lightness, part of which the canonical neutrals remove."""
-
-KERNEL_WIDTH = 22.0
+_KERNEL_WIDTH = 22.0
 """CIELAB distance at which the similarity of two colours is exp(-1/2): about the step from plain to dark or light."""
-LIGHTNESS_WEIGHT = 0.8
+_LIGHTNESS_WEIGHT = 0.8
 """Weight of L relative to a and b in the kernel: lighting changes L, but names depend on it too."""
-EXTENT_WEIGHT = 0.12
+_EXTENT_WEIGHT = 0.12
 """Share of the cosine for the size of a region in the frame: `white plate` is not the white wall."""
-EXTENT_FULL = 0.25
-"""Share of the frame from which a region counts fully as surroundings."""
 
 
-def lab_of(rgb: np.ndarray) -> Float32[np.ndarray, "n 3"]:
-    """Converts sRGB to CIELAB (D65).
-
-    Args:
-      rgb: (n, 3) in 0 .. 255.
-
-    Returns:
-      (n, 3): L in 0 .. 100, a and b about 0.
-    """
+def _lab_of(rgb: np.ndarray) -> Float32[np.ndarray, "n 3"]:
+    """Converts sRGB to CIELAB (D65)."""
     pixels = np.asarray(rgb, np.float32).reshape(-1, 1, 3) / 255.0
     return cv2.cvtColor(pixels, cv2.COLOR_RGB2LAB).reshape(-1, 3)
 
@@ -104,8 +57,8 @@ class ColourEmbedder:
     each other), several colours of one object (`red and white striped box`, with equal weights), and whether the object
     is part of the surroundings (wall, floor, table ...). Other nouns, shapes and materials have no influence.
 
-    An embedding is the kernel mean over the palette's P prototypes, times sqrt(1 - EXTENT_WEIGHT), followed by two
-    coordinates of length sqrt(EXTENT_WEIGHT) that turn from `thing` to `surroundings` with the share of the frame.
+    An embedding is the kernel mean over the palette's P prototypes, times sqrt(1 - _EXTENT_WEIGHT), followed by two
+    coordinates of length sqrt(_EXTENT_WEIGHT) that turn from `thing` to `surroundings` with the share of the frame.
 
     `canonical_phrases` has the place of object / things / stuff / texture in LERF's relevancy: the mean of the palette
     (any colour), mid grey, and a pale and a dark neutral (walls, shadow).
@@ -116,11 +69,11 @@ class ColourEmbedder:
 
     name = "colours-1"
     vocabulary = (*VOCABULARY, *(f"{name} background" for name in VOCABULARY))
-    softmax_scale = SOFTMAX_SCALE
+    softmax_scale = 20.0
 
     def __init__(self):
         self.names = tuple(PALETTE)
-        self._points = lab_of(np.asarray(list(PALETTE.values())))
+        self._points = _lab_of(np.asarray(list(PALETTE.values())))
         self._by_name = dict(zip(self.names, self._points))
         gram = _kernel(self._points, self._points)
         # k(x, .) is projected on the span of the prototypes: phi(x) = K^(-1/2) k(x). Small eigenvalues are rounding
@@ -130,7 +83,7 @@ class ColourEmbedder:
         self._projection = (vectors[:, kept] / np.sqrt(values[kept])).astype(np.float32)
         self.dim = int(kept.sum()) + 2
         self._family = functools.cache(self._make_family)
-        neutral = lab_of(np.asarray([(128, 128, 128), (190, 182, 170), (64, 62, 60)]))
+        neutral = _lab_of(np.asarray([(128, 128, 128), (190, 182, 170), (64, 62, 60)]))
         colours = [self._mean(self._points), *(self._mean(point[None]) for point in neutral)]
         self.canonical_phrases = np.stack([_joined(c, angle) for c, angle in zip(colours, (0.25, 0.25, 0.5, 0.25))])
 
@@ -143,65 +96,33 @@ class ColourEmbedder:
     def embed_regions(
         self, frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m _ _"]
     ) -> Float32[np.ndarray, "m e"]:
-        """Embeds masks of a frame.
-
-        Args:
-          frame: (H, W, 3) RGB.
-          masks: (M, H, W).
-
-        Returns:
-          (M, E) unit rows, zero for an empty mask.
-
-        Raises:
-          ValueError: The masks have another size than the frame.
-        """
+        """Embeds masks of a frame: unit rows, zero for an empty mask."""
         require_shape("masks", masks, ("M", *frame.shape[:2]), "Pass masks of the size of the frame.")
         lab = cv2.cvtColor(np.ascontiguousarray(frame).astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
 
         out = np.zeros((len(masks), self.dim), np.float32)
-
-        def embed(row: np.ndarray, mask: np.ndarray) -> None:
+        for row, mask in zip(out, masks.astype(bool)):
             pixels = _pixels_inside(lab, mask)
             if len(pixels):
                 colour = self._mean(_without_shadow_and_shine(pixels))
-                row[:] = _joined(colour, np.count_nonzero(mask) / mask.size / EXTENT_FULL)
-
-        for row, mask in zip(out, masks.astype(bool)):
-            embed(row, mask)
+                # A quarter of the frame counts fully as surroundings.
+                row[:] = _joined(colour, np.count_nonzero(mask) / mask.size / 0.25)
         return out
 
     def embed_text(self, texts: list[str]) -> Float32[np.ndarray, "q e"]:
-        """Embeds texts.
-
-        Args:
-          texts: Q texts with colour words.
-
-        Returns:
-          (Q, E) unit rows.
-
-        Raises:
-          InputError: A text has no colour word, or a negation.
-        """
+        """Embeds texts with colour words: unit rows. A text without any, or with a negation, raises InputError."""
         out = np.zeros((len(texts), self.dim), np.float32)
         for row, text in zip(out, texts):
             named = [self._distribution(phrase) for phrase in self._phrases(text)]
             points, weights = (np.concatenate(column) for column in zip(*named))
-            surrounds = float(bool(_SURROUNDINGS & set(_words(text))))
+            surrounds = float(bool(_WORDS["surroundings"] & set(_words(text))))
             row[:] = _joined(self._mean(*_spread(points, weights)), surrounds)
         return out
 
     def narrower(self, text: str) -> list[str]:
-        """Lists texts for the shades of a bare basic colour term.
+        """Lists texts for the shades of a bare basic colour term: "dark blue mug", "light blue mug", "navy mug".
 
-        Args:
-          text: A text, such as "blue mug".
-
-        Returns:
-          One text for each shade ("dark blue mug", "light blue mug", "navy mug"); empty if the text has several
-          colours, or one that is not a bare basic term.
-
-        Raises:
-          InputError: The text has no colour word, or a negation.
+        There is none if the text has several colours, or one that is not a bare basic term.
         """
         phrases = self._phrases(text)
         word, basic = phrases[0][0], self._base(phrases[0][0])[0]
@@ -219,11 +140,11 @@ class ColourEmbedder:
     def _make_family(self, basic: str) -> tuple[Float32[np.ndarray, "p 3"], Float32[np.ndarray, " p"]]:
         """Colours of a bare basic term, and their weights.
 
-        The weights are the least non-negative ones with a similarity of 1 to the typical colour and of SHADE to each
+        The weights are the least non-negative ones with a similarity of 1 to the typical colour and of _SHADE to each
         shade, so that nearby shades do not count twice.
         """
         points = np.stack([self._by_name[name] for name in (basic, *_SHADES[basic])])
-        shade = GREY_SHADE if basic == "grey" else SHADE
+        shade = _GREY_SHADE if basic == "grey" else _SHADE
         similarity = np.where(np.arange(len(points)) == 0, 1.0, shade)
         return points, scipy.optimize.nnls(_kernel(points, points).astype(np.float64), similarity)[0].astype(np.float32)
 
@@ -241,7 +162,7 @@ class ColourEmbedder:
     def _phrases(self, text: str) -> list[list[str]]:
         """Splits a text into runs of modifiers and colour words, one run per colour."""
         words = _words(text, separators=True)
-        if _NEGATION & set(words):
+        if _WORDS["negation"] & set(words):
             remedy = "Name the colours of the object instead."
             raise InputError(f"query {text!r}", "the text has a negation", remedy=remedy)
         phrases: list[list[str]] = []
@@ -254,7 +175,7 @@ class ColourEmbedder:
                 else:
                     phrases.append([*modifiers, word])
                 modifiers, run_open = [], True
-            elif word in _DARK | _LIGHT | _PLAIN:
+            elif word in _WORDS["dark"] | _WORDS["light"] | _WORDS["plain"]:
                 modifiers, run_open = [*modifiers, word], False
             else:
                 modifiers, run_open = [], False
@@ -270,14 +191,14 @@ class ColourEmbedder:
 
     def _base(self, word: str) -> tuple[str | None, bool]:
         """Palette name of a word, or None, and whether the word ends in `-ish` (reddish, bluish, greyish)."""
-        word = _SYNONYMS.get(word, word)
+        word = _TABLES["synonyms"].get(word, word)
         if word in self._by_name:
             return word, False
         if word.endswith("ish"):
             stem = word[:-3]
             doubled = [stem[:-1]] if len(stem) > 3 and stem[-1] == stem[-2] else []  # reddish
             for candidate in (stem, stem + "e", *doubled):
-                candidate = _SYNONYMS.get(candidate, candidate)
+                candidate = _TABLES["synonyms"].get(candidate, candidate)
                 if candidate in self._by_name:
                     return candidate, True
         return None, False
@@ -286,7 +207,7 @@ class ColourEmbedder:
         """CIELAB (3,) of a run like [dark, bluish, green]."""
         bases = [self._base(word) for word in phrase]
         names = [(base, ish) for base, ish in bases if base is not None]
-        dark, light = bool(_DARK & set(phrase)), bool(_LIGHT & set(phrase))
+        dark, light = bool(_WORDS["dark"] & set(phrase)), bool(_WORDS["light"] & set(phrase))
         prefix = "dark " if dark and not light else "light " if light and not dark else ""
         points, weights = [], []
         for base, ish in names:
@@ -306,7 +227,7 @@ class ColourEmbedder:
 
 def _kernel(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """(n, m) Gaussian similarity of CIELAB colours (n, 3) and (m, 3), 1 for equal ones."""
-    scale = np.asarray([LIGHTNESS_WEIGHT, 1.0, 1.0], np.float32) / KERNEL_WIDTH
+    scale = np.asarray([_LIGHTNESS_WEIGHT, 1.0, 1.0], np.float32) / _KERNEL_WIDTH
     x, y = x * scale, y * scale
     products = x @ y.T
     products *= 2.0
@@ -318,16 +239,17 @@ def _kernel(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _spread(points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colours (P, 3) with their darker and lighter neighbours (3 P, 3), and their weights."""
-    spread = (points[:, None] + _SPREAD).clip([0, -128, -128], [100, 128, 128]).reshape(-1, 3)
-    return spread.astype(np.float32), (weights[:, None] * _SPREAD_WEIGHTS).reshape(-1)
+    """Colours (P, 3) with their darker and lighter neighbours (3 P, 3), and their weights: a word names a range."""
+    steps = np.asarray([[0, 0, 0], [-10, 0, 0], [10, 0, 0]], np.float32)
+    spread = (points[:, None] + steps).clip([0, -128, -128], [100, 128, 128]).reshape(-1, 3)
+    return spread.astype(np.float32), (weights[:, None] * np.asarray([0.7, 0.15, 0.15], np.float32)).reshape(-1)
 
 
 def _joined(colour: np.ndarray, extent: float) -> np.ndarray:
     """Unit vector of the joint space from a unit colour vector and an extent (0 object .. 1 surroundings)."""
     angle = 0.5 * np.pi * min(max(float(extent), 0.0), 1.0)
-    turned = np.sqrt(EXTENT_WEIGHT) * np.asarray([np.cos(angle), np.sin(angle)])
-    return np.concatenate([np.sqrt(1.0 - EXTENT_WEIGHT) * colour, turned]).astype(np.float32)
+    turned = np.sqrt(_EXTENT_WEIGHT) * np.asarray([np.cos(angle), np.sin(angle)])
+    return np.concatenate([np.sqrt(1.0 - _EXTENT_WEIGHT) * colour, turned]).astype(np.float32)
 
 
 def _pixels_inside(lab: np.ndarray, mask: np.ndarray) -> np.ndarray:

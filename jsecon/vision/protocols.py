@@ -18,15 +18,7 @@ class Segmenter(Protocol):
     """Proposes regions of one frame."""
 
     def __call__(self, frame: np.ndarray, index: int) -> np.ndarray:
-        """Proposes masks.
-
-        Args:
-          frame: (H, W, 3) uint8 RGB.
-          index: Index of the frame in the capture.
-
-        Returns:
-          (M, H, W) bool masks, best first; they may overlap.
-        """
+        """Proposes masks (M, H, W) bool of a frame (H, W, 3) of the capture, best first; they may overlap."""
         ...
 
 
@@ -35,15 +27,9 @@ class Tracker(Protocol):
     """Follows regions of one frame through all frames."""
 
     def __call__(self, frames: np.ndarray, index: int, prompts: np.ndarray) -> np.ndarray:
-        """Tracks masks.
+        """Follows the masks (B, H, W) bool of the frame at an index through frames (T, H, W, 3).
 
-        Args:
-          frames: (T, H, W, 3) uint8 RGB.
-          index: Frame of the prompts.
-          prompts: (B, H, W) bool masks.
-
-        Returns:
-          (T, H, W) int16 index of a prompt, or -1; the tracker resolves overlaps.
+        Returns (T, H, W) int16: the index of a mask, or -1. The tracker resolves overlaps.
         """
         ...
 
@@ -54,12 +40,8 @@ class Network(Protocol):
     name: str
     """Identifies content and settings."""
 
-    def check(self) -> None:
-        """Checks that it can work.
-
-        Raises:
-          InputError: It cannot.
-        """
+    def check(self) -> str:
+        """Describes the network in a sentence, or raises InputError if it cannot work."""
         ...
 
     def close(self) -> None:
@@ -72,7 +54,6 @@ class NamedSegmenter(Segmenter, Network, Protocol):
     """A segmenter that holds a network."""
 
 
-@runtime_checkable
 class NamedTracker(Tracker, Network, Protocol):
     """A tracker that holds a network."""
 
@@ -82,9 +63,9 @@ class Embedder(Protocol):
     """A joint space of images and texts; every vector has unit length, so that a cosine is a similarity.
 
     An embedder may also have `unrelated_words`, (W, E) float32 unit: embeddings of texts unrelated to any scene.
-    Without it `REFERENCE_WORDS` are embedded (`reference_words.reference_of`). Texts in a tuple `vocabulary` are the
-    names that a catalogue gives to objects by default, and `softmax_scale` scales their cosines before a softmax. A
-    function `narrower(text) -> list[str]` lists texts that answer in place of one that no region matches.
+    Without it `UNRELATED_WORDS` are embedded (`embed_unrelated_words`). Texts in a tuple `vocabulary` are the names
+    that a catalogue gives to objects by default, and `softmax_scale` scales their cosines before a softmax. A function
+    `narrower(text) -> list[str]` lists texts that answer in place of one that no region matches.
     """
 
     name: str
@@ -95,29 +76,11 @@ class Embedder(Protocol):
     """(C, E) float32 unit embeddings that a query must exceed, such as those of `CANONICAL`."""
 
     def embed_regions(self, frame: np.ndarray, masks: np.ndarray) -> np.ndarray:
-        """Embeds masks of a frame.
-
-        Args:
-          frame: (H, W, 3) uint8 RGB.
-          masks: (M, H, W) bool.
-
-        Returns:
-          (M, E) float32 unit embeddings, zero for an empty mask.
-        """
+        """Embeds the masks (M, H, W) bool of a frame (H, W, 3): unit rows (M, E) float32, zero for an empty mask."""
         ...
 
     def embed_text(self, texts: list[str]) -> np.ndarray:
-        """Embeds texts.
-
-        Args:
-          texts: Q texts.
-
-        Returns:
-          (Q, E) float32 unit embeddings.
-
-        Raises:
-          InputError: This space cannot represent a text.
-        """
+        """Embeds Q texts: unit rows (Q, E) float32; raises InputError for one that the space cannot represent."""
         ...
 
 
@@ -139,22 +102,15 @@ class Models:
     """None: through the Gaussians."""
 
     def require_ready(self, stages: Collection[str]) -> None:
-        """Checks the networks before the long work starts.
-
-        Args:
-          stages: Names of the stages that will run.
-
-        Raises:
-          InputError: A network cannot serve them.
-        """
-        for stage, used in (("objects", self.segmenter), ("objects", self.tracker), ("regions", self.embedder)):
-            check = getattr(used, "check", None)
+        """Checks the networks of stages before the long work starts; raises InputError if one cannot work."""
+        for stage, model in (("objects", self.segmenter), ("objects", self.tracker), ("regions", self.embedder)):
+            check = getattr(model, "check", None)
             if stage in stages and check is not None:
                 check()
 
     def close(self) -> None:
         """Frees the memory of the networks until they are needed again."""
-        for used in (self.embedder, self.segmenter, self.tracker):
-            close = getattr(used, "close", None)
+        for model in (self.embedder, self.segmenter, self.tracker):
+            close = getattr(model, "close", None)
             if close is not None:
                 close()

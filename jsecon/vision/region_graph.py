@@ -15,14 +15,13 @@ from jaxtyping import Float32, Int, Int32, Int64
 
 from jsecon.vision.surfaces import Surface
 
-MAX_STEP = 40.0
+_MAX_STEP = 40.0
 """Largest step of shape per pixel, so that one distant background does not outweigh the rest of an outline."""
-BORDER_SHARE = 0.4
+_BORDER_SHARE = 0.4
 """Weight of the step across the border in a dissimilarity; the rest is the difference of the means."""
-GROWN_AREA = 0.006
-"""Area from which a region has full dissimilarity, as a share of the frame."""
-SMALLEST_FACTOR = 0.22
-"""Least factor on the dissimilarity of small regions, which texture consists of; it grows with the root of the area."""
+_FULL_AREA, _SMALLEST_FACTOR = 0.006, 0.22
+"""Area from which a region has full dissimilarity, as a share of the frame; and the factor on the dissimilarity of the
+smallest regions, which texture consists of. The factor grows with the root of the area."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +39,7 @@ class RegionBorders:
 
 
 def region_borders(
-    atoms: Int32[np.ndarray, "h w"],
+    superpixels: Int32[np.ndarray, "h w"],
     features: Float32[np.ndarray, "h w d"],
     shape: Float32[np.ndarray, "h w c"] | Surface | None,
     *,
@@ -49,22 +48,13 @@ def region_borders(
     """Measures the borders between regions.
 
     Steps are measured between pixels two px to either side of a border, so that the blur of an edge does not hide them.
-
-    Args:
-      atoms: (H, W) regions 0 .. A-1.
-      features: (H, W, D) colour features.
-      shape: (H, W, C) features of shape, or the surface of the frame, or None.
-      steepness: Factor on the distance from a surface's plane.
-
-    Returns:
-      The borders of all neighbours.
     """
     keys, colours, shapes = [], [], []
     for axis in (0, 1):
-        n = atoms.shape[axis]
+        n = superpixels.shape[axis]
         near, far = np.arange(n - 1), np.arange(1, n)
         inner, outer = np.maximum(near - 2, 0), np.minimum(far + 2, n - 1)
-        a, b = np.take(atoms, near, axis), np.take(atoms, far, axis)
+        a, b = np.take(superpixels, near, axis), np.take(superpixels, far, axis)
         cut = a != b
 
         def step(values, axis=axis, inner=inner, outer=outer, cut=cut):
@@ -75,10 +65,10 @@ def region_borders(
         if shape is None:
             shapes.append(np.zeros(len(colours[-1])))
         elif isinstance(shape, Surface):
-            shapes.append(np.minimum(steepness * shape.off_plane(axis, inner, outer)[cut], MAX_STEP))
+            shapes.append(np.minimum(steepness * shape.off_plane(axis, inner, outer)[cut], _MAX_STEP))
         else:
-            shapes.append(np.minimum(step(shape), MAX_STEP))
-    count = int(atoms.max()) + 1
+            shapes.append(np.minimum(step(shape), _MAX_STEP))
+    count = int(superpixels.max()) + 1
     first, second = np.concatenate(keys).T.astype(np.int64)
     pairs, inverse = np.unique(first * count + second, return_inverse=True)
     return RegionBorders(
@@ -90,7 +80,7 @@ def region_borders(
 
 
 def merge_regions(
-    atoms: Int32[np.ndarray, "h w"],
+    superpixels: Int32[np.ndarray, "h w"],
     features: Float32[np.ndarray, "h w d"],
     edges: RegionBorders,
     *,
@@ -102,25 +92,15 @@ def merge_regions(
     The dissimilarity mixes the step of colour across the border with the difference of the mean colours, with a lower
     weight for small regions, which texture consists of; the step of shape is the other leg of a right triangle. Finally
     regions that are too small or too thin join their most similar neighbour.
-
-    Args:
-      atoms: (H, W) regions 0 .. A-1.
-      features: (H, W, D) colour features.
-      edges: Borders of the regions.
-      distance: Dissimilarity from which neighbours stay separate.
-      min_area: Least area, px.
-
-    Returns:
-      (H, W) int32 labels 0 .. M-1.
     """
-    # Numbered by first appearance, so that ties do not depend on the numbers of the atoms.
-    flat = relabel_sequential(atoms.reshape(-1))
+    # Numbered by first appearance, so that ties do not depend on the numbers of the superpixels.
+    flat = relabel_sequential(superpixels.reshape(-1))
     count = int(flat.max()) + 1
     first = np.empty(count, np.int64)
     first[flat[::-1]] = np.arange(flat.size)[::-1]
     number = np.argsort(np.argsort(first))
-    atoms, pairs = number[flat].reshape(atoms.shape), np.sort(number[edges.pairs], axis=-1)
-    flat = atoms.reshape(-1)
+    superpixels, pairs = number[flat].reshape(superpixels.shape), np.sort(number[edges.pairs], axis=-1)
+    flat = superpixels.reshape(-1)
     sums_of = np.stack([edges.colour, edges.shape, edges.length], -1)
     # Python numbers from here on: they are faster than small NumPy arrays.
     area = np.bincount(flat, minlength=count).astype(np.float64).tolist()
@@ -135,13 +115,13 @@ def merge_regions(
     parent = list(range(count))
     version = [0] * count
 
-    full = GROWN_AREA * atoms.size
+    full = _FULL_AREA * superpixels.size
 
     def dissimilarity(a: int, b: int) -> float:
         colour, shape, border = links[a][b]
         gap = math.dist(means[a], means[b])
-        grown = min(max((min(area[a], area[b]) / full) ** 0.5, SMALLEST_FACTOR), 1.0)
-        return math.hypot(grown * (BORDER_SHARE * colour / border + (1.0 - BORDER_SHARE) * gap), shape / border)
+        grown = min(max((min(area[a], area[b]) / full) ** 0.5, _SMALLEST_FACTOR), 1.0)
+        return math.hypot(grown * (_BORDER_SHARE * colour / border + (1.0 - _BORDER_SHARE) * gap), shape / border)
 
     def absorb(a: int, b: int) -> None:
         """Joins b to a."""
@@ -153,8 +133,8 @@ def merge_regions(
         for other, (colour, shape, border) in links[b].items():
             del links[other][b]
             if other != a:
-                known = links[a].get(other, (0.0, 0.0, 0.0))
-                links[a][other] = links[other][a] = (known[0] + colour, known[1] + shape, known[2] + border)
+                sums_a = links[a].get(other, (0.0, 0.0, 0.0))
+                links[a][other] = links[other][a] = (sums_a[0] + colour, sums_a[1] + shape, sums_a[2] + border)
         links[b] = {}
 
     heap = [(dissimilarity(a, b), a, b, 0, 0) for a in range(count) for b in links[a] if a < b]
@@ -170,22 +150,15 @@ def merge_regions(
         absorb(a, b)
         for other in links[a]:
             heapq.heappush(heap, (dissimilarity(a, other), a, other, version[a], version[other]))
-    thin = ~np.isin(np.arange(count), _cores(_roots(parent)[atoms]))
+    thin = ~np.isin(np.arange(count), _cores(_roots(parent)[superpixels]))
     for a in sorted((a for a in range(count) if parent[a] == a), key=lambda a: area[a]):
         if parent[a] == a and (area[a] < min_area or thin[a]) and links[a]:
             absorb(min(links[a], key=lambda other: dissimilarity(a, other)), a)
-    return relabel_sequential(_roots(parent)[atoms]).astype(np.int32)
+    return relabel_sequential(_roots(parent)[superpixels]).astype(np.int32)
 
 
 def relabel_sequential(ids: Int[np.ndarray, "*shape"]) -> Int64[np.ndarray, "*shape"]:
-    """Renumbers ids without gaps, in the same order: the inverse of np.unique without sorting.
-
-    Args:
-      ids: Small ids >= 0, of any shape; at least one.
-
-    Returns:
-      Ids 0 .. K-1 of the same shape.
-    """
+    """Renumbers small ids >= 0 without gaps, in the same order: the inverse of np.unique without sorting."""
     used = np.zeros(int(ids.max()) + 1, bool)
     used[ids] = True
     return (np.cumsum(used) - 1)[ids]

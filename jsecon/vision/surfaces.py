@@ -18,11 +18,7 @@ from jsecon.types import Camera
 def smooth_depth(depth: Float32[np.ndarray, "h w"]) -> np.ndarray:
     """Removes noise from rendered z-depth and keeps its jumps: a median, then bilateral filters of its logarithm.
 
-    Args:
-      depth: (H, W), 0 = unknown.
-
-    Returns:
-      (H, W) with unknown pixels filled from the nearest known one; unchanged if all are unknown.
+    Unknown pixels (0) are filled from the nearest known one; depth that is unknown everywhere stays so.
     """
     known = np.asarray(depth > 0)
     if not known.any():
@@ -34,29 +30,14 @@ def smooth_depth(depth: Float32[np.ndarray, "h w"]) -> np.ndarray:
 
 
 def log_depth(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w 1"]:
-    """Computes the logarithm of z-depth.
-
-    Args:
-      depth: (H, W), 0 = unknown.
-
-    Returns:
-      (H, W, 1) float32; unknown pixels are filled from the nearest known one, with 0 if there is none.
-    """
+    """Computes the logarithm of z-depth; unknown pixels (0) are filled from the nearest known one, else with 0."""
     known = np.asarray(depth > 0)
     depth = fill_nearest(depth, known) if known.any() else np.ones_like(depth)
     return np.log(np.maximum(depth, 1e-12))[..., None].astype(np.float32)
 
 
 def fill_nearest(values: Shaped[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]) -> Shaped[np.ndarray, "h w"]:
-    """Fills unknown pixels from the nearest known one.
-
-    Args:
-      values: (H, W).
-      known: (H, W) bool, true somewhere.
-
-    Returns:
-      (H, W) values.
-    """
+    """Fills unknown pixels from the nearest known one; there must be one."""
     _, nearest = cv2.distanceTransformWithLabels(
         (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
@@ -64,13 +45,6 @@ def fill_nearest(values: Shaped[np.ndarray, "h w"], known: Bool[np.ndarray, "h w
     table = np.zeros(int(nearest.max()) + 1, values.dtype)
     table[nearest[known]] = values[known]
     return table[nearest]
-
-
-NEIGHBOURS = 24
-"""Number of points that the normal of a point is fitted to."""
-_ROUNDS = 4
-_SHARPNESS = 0.1
-"""Scale of 1 - cosine: neighbours whose normals differ more do not smooth each other."""
 
 
 class Surface(NamedTuple):
@@ -84,13 +58,8 @@ class Surface(NamedTuple):
     def off_plane(self, axis: int, near: Int[np.ndarray, " n"], far: Int[np.ndarray, " n"]) -> Float[np.ndarray, "_ _"]:
         """Computes the distance of pixels from each other's planes, 0 along any plane however steeply it is seen.
 
-        Args:
-          axis: Image axis of the indices.
-          near: Indices of the first pixels.
-          far: Indices of the second pixels.
-
-        Returns:
-          The smaller of both distances, as a share of the smaller z.
+        The pixels are those of two indices along an image axis. The distance is the smaller one, as a share of the
+        smaller z.
         """
         a, b = np.take(self.points, near, axis), np.take(self.points, far, axis)
         off = [np.abs(np.einsum("...k,...k", b - a, np.take(self.normals, which, axis))) for which in (near, far)]
@@ -98,26 +67,20 @@ class Surface(NamedTuple):
 
 
 def cloud_normals(points: Float[np.ndarray, "p 3"]) -> Float64[np.ndarray, "p 3"]:
-    """Estimates the normals of a point cloud.
+    """Estimates the normals of a cloud of at least three points, unit vectors of either sign.
 
     A normal is the direction of least spread of the nearest points. Rounds of averaging weigh neighbours by agreement,
     which keeps creases sharp (a bilateral filter).
-
-    Args:
-      points: (P, 3) surface points, P >= 3.
-
-    Returns:
-      (P, 3) unit normals of either sign.
     """
     points = np.asarray(points, np.float64)
-    near = np.asarray(KDTree(points).query(points, k=min(NEIGHBOURS, len(points)), workers=-1)[1])
+    near = np.asarray(KDTree(points).query(points, k=min(24, len(points)), workers=-1)[1])
     normals = np.empty_like(points)
     for part in np.array_split(np.arange(len(points)), len(points) // 65536 + 1):
         spread = points[near[part]] - points[near[part]].mean(1, keepdims=True)
         normals[part] = np.linalg.eigh(np.einsum("pki,pkj->pij", spread, spread))[1][:, :, 0]
-    for _ in range(_ROUNDS):
+    for _ in range(4):
         cosines = np.einsum("pki,pi->pk", normals[near], normals)
-        weights = np.sign(cosines) * np.exp((np.abs(cosines) - 1.0) / _SHARPNESS)
+        weights = np.sign(cosines) * np.exp((np.abs(cosines) - 1.0) / 0.1)
         normals = np.einsum("pk,pki->pi", weights, normals[near])
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     return normals
@@ -126,15 +89,12 @@ def cloud_normals(points: Float[np.ndarray, "p 3"]) -> Float64[np.ndarray, "p 3"
 def surfaces_from_depth(
     depths: Float[np.ndarray, "t h w"], cameras: Camera, points: Float[np.ndarray, "p 3"]
 ) -> Callable[[int], Surface | None]:
-    """Makes a function from the index of a frame to its surface.
+    """Makes a function from the index of a frame to its surface; None for a frame without depth.
 
     Args:
-      depths: (T, H, W) z-depth, 0 = unknown; smoothed and filled by `smooth_depth`.
+      depths: z-depth, 0 = unknown.
       cameras: Batch of T cameras.
-      points: (P, 3) points of all frames together, world, thinned (a few centimetres apart in a room).
-
-    Returns:
-      The function; it returns None for a frame without depth.
+      points: Points of all frames together, world, thinned (a few centimetres apart in a room).
     """
     tree, normals = KDTree(points), cloud_normals(points)
     poses = np.asarray(cameras.world_to_camera, np.float64)
@@ -143,13 +103,14 @@ def surfaces_from_depth(
         if not (depths[t] > 0).any():
             return None
         rotation, camera = poses[t, :3, :3], cameras[t]
-        here = _camera_points(smooth_depth(np.asarray(depths[t], np.float32)), camera)
+        local_points = _camera_points(smooth_depth(np.asarray(depths[t], np.float32)), camera)
         # Normals change slowly: every second pixel in each direction is enough.
-        sampled = here[::2, ::2].reshape(-1, 3)
-        normal = normals[tree.query((sampled - poses[t, :3, 3]) @ rotation, workers=-1)[1]] @ rotation.T
-        normal = normal.reshape(*here[::2, ::2].shape).repeat(2, 0).repeat(2, 1)[: here.shape[0], : here.shape[1]]
-        away = np.einsum("hwk,hwk->hw", normal, here) > 0
-        return Surface(here.astype(np.float32), np.where(away[..., None], -normal, normal).astype(np.float32))
+        sampled = local_points[::2, ::2]
+        nearest = tree.query((sampled.reshape(-1, 3) - poses[t, :3, 3]) @ rotation, workers=-1)[1]
+        normal = (normals[nearest] @ rotation.T).reshape(sampled.shape).repeat(2, 0).repeat(2, 1)
+        normal = normal[: camera.height, : camera.width]
+        away = np.einsum("hwk,hwk->hw", normal, local_points) > 0
+        return Surface(local_points.astype(np.float32), np.where(away[..., None], -normal, normal).astype(np.float32))
 
     return surface_of
 
