@@ -75,4 +75,3 @@ class StoredSegmenter:
             masks = np.asarray(self._segmenter(frame, index), bool)
         _write(path, bits=np.packbits(masks.reshape(len(masks), height * width), axis=1))
         return masks
-
