@@ -20,6 +20,7 @@ from jsecon.errors import InputError
 from jsecon.files import atomic_write, write_text
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console, Listener
+from jsecon.query.outliers import MIN_SAMPLES
 from jsecon.query.render import selection_mask
 from jsecon.read.splats.files import require_writable_format
 from jsecon.types import LanguageField
@@ -159,8 +160,10 @@ def _print_catalogue(catalogue: Catalogue, listener: Listener) -> None:
         place = f"{_size(catalogue, n)}, at ({_center(catalogue, n)})"
         ending = ", surroundings" if catalogue.surroundings[n] else ""
         listener.say(f"{n:>4}  {name:<{wide}}  {figures}  {catalogue.confidence[n]:5.2f}  {place}{ending}")
-    if not len(catalogue):
-        listener.say("  there are no objects: the field has no regions with Gaussians")
+    if hidden := int((catalogue.regions < 0).sum()):
+        listener.say(f"  too small to be listed, with fewer than {MIN_SAMPLES} Gaussians: {hidden} regions")
+    elif not len(catalogue):
+        listener.say("  there are no objects: the field has no regions")
 
 
 def _write_catalogue(scene: Scene, catalogue: Catalogue, out: Path, listener: Listener) -> dict[str, Path]:
