@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from jsecon.app import pictures, report, verbs
@@ -21,25 +20,12 @@ from jsecon.files import atomic_write, write_text
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console, Listener
 from jsecon.query.outliers import MIN_SAMPLES
-from jsecon.query.render import selection_mask
 from jsecon.read.splats.files import require_writable_format
 from jsecon.types import LanguageField
 
-THUMBNAIL_PX = 150
-"""longer side of an object's small picture"""
-MAX_NAME_BYTES = 60
-"""bytes of an object's name in the name of a file"""
-
 
 def object_records(catalogue: Catalogue) -> list[dict[str, Any]]:
-    """Makes the records of a catalogue for JSON.
-
-    Args:
-      catalogue: The catalogue.
-
-    Returns:
-      Plain values of each object by name, in the capture's world. The columns of "axes" are the axes of the box.
-    """
+    """Plain values of each object for JSON, in the capture's world; the columns of "axes" are the axes of the box."""
     records = []
     for n in range(len(catalogue)):
         shape = catalogue.shapes[n]
@@ -100,7 +86,7 @@ def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
     with console.progress("field"):
         if verb.out is not None:
             require_writable_format(verb.out)
-        scene = open_scene(verb.field, embedder=_embedder_of(verb, console))
+        scene = open_scene(verb.field, embedder=None if text is None else _embedder_of(verb, console))
     answer = None if text is None else scene.ask(text)
     if answer is not None and not len(answer.rows):
         option = "--only" if verb.only is not None else "--without"
@@ -187,7 +173,7 @@ def _save_objects(scene: Scene, catalogue: Catalogue, folder: Path) -> list[Path
     """Writes a .ply of each object, named by its id and name; of a whole with the Gaussians of its parts."""
     files = []
     for n in range(len(catalogue)):
-        name = slug(_title(catalogue, n)).encode()[:MAX_NAME_BYTES].decode("utf-8", "ignore")
+        name = slug(_title(catalogue, n)).encode()[:60].decode("utf-8", "ignore")
         files.append(folder / f"{n:03d}-{name}.ply")
         scene.export(files[-1], catalogue.mask(n))
     return files
@@ -195,24 +181,17 @@ def _save_objects(scene: Scene, catalogue: Catalogue, folder: Path) -> list[Path
 
 def _page(scene: Scene, catalogue: Catalogue, listener: Listener) -> str:
     """Returns the page: a card for each object, which opens to its views."""
-    field = scene.field
-    renderer = pictures.Renderer(field.gaussians, field.cameras)
-    cameras = jax.tree.map(np.asarray, field.cameras)
-    gaussians = jax.device_put(field.gaussians)
     cards: dict[bool, list[str]] = {False: [], True: []}
     with listener.progress("pictures") as progress:
         for n in range(len(catalogue)):
             mask = catalogue.mask(n)
             frames = [int(t) for t in catalogue.frames[n] if t >= 0]
-            figures = []
-            for t in frames:
-                seen = np.asarray(selection_mask(gaussians, cameras[t], mask))
-                figures.append(report.figure(pictures.selection_overlay(renderer.photo(t), seen), field.names[t]))
+            figures = [report.figure(scene.render(t, mask), scene.field.names[t]) for t in frames]
             best = frames[0] if frames else 0
             parent = catalogue.parent[n]
             cards[bool(catalogue.surroundings[n])].append(
                 report.card(
-                    pictures.fitted(renderer.crop(best, mask), THUMBNAIL_PX),
+                    pictures.fitted(scene.renderer.crop(best, mask), 150),
                     _title(catalogue, n),
                     f"{n} · {_size(catalogue, n)}" + (f" · part of {parent}" if parent >= 0 else ""),
                     report.grid(figures, 3),
@@ -221,14 +200,7 @@ def _page(scene: Scene, catalogue: Catalogue, listener: Listener) -> str:
                 )
             )
             progress(n + 1, len(catalogue))
-    things = int((~catalogue.surroundings & (catalogue.parent < 0)).sum())
-    figures = {
-        "objects": str(things),
-        "parts of them": str(int((catalogue.parent >= 0).sum())),
-        "surroundings": str(int(catalogue.surroundings.sum())),
-        "of the Gaussians in objects": f"{float((catalogue.labels >= 0).mean() if len(catalogue.labels) else 0):.0%}",
-    }
-    parts = [report.tiles(figures), report.cards(cards[False], search="Search names and ids")]
+    parts = [report.cards(cards[False], search="Search names and ids")]
     if cards[True]:
         words = "Walls, floors and the like, by their names."
         parts.append(report.section("Surroundings", words, report.cards(cards[True])))

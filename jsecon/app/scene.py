@@ -449,6 +449,7 @@ class Scene:
 
     @functools.cached_property
     def _catalogue(self) -> Catalogue:
+        """All objects, named by an embedder that was given, else by the words that the field holds."""
         return objects(self.field, None, self._embedder and self.embedder, up=self._up)
 
     def objects(self, vocabulary: Sequence[str] | None = None) -> Catalogue:
@@ -464,9 +465,9 @@ class Scene:
           InputError: The vocabulary is empty, or the embedder cannot represent a name.
         """
         with self._lock:
-            return (
-                self._catalogue if vocabulary is None else objects(self.field, vocabulary, self.embedder, up=self._up)
-            )
+            if vocabulary is None:
+                return self._catalogue
+            return objects(self.field, vocabulary, self.embedder, up=self._up)
 
     def prepare(self) -> None:
         """Compiles what questions need, and measures all objects, so that the first question is as fast as later ones.
@@ -535,11 +536,11 @@ class Scene:
         order = np.argsort(-visible, kind="stable")[:count]
         return [int(t) for t in order if visible[t] > 0]
 
-    def mask(self, answer: Answer, frame: int | str) -> Bool[np.ndarray, "h w"]:
+    def mask(self, selected: Answer | Bool[np.ndarray, " n"], frame: int | str) -> Bool[np.ndarray, "h w"]:
         """Renders an answer alone in a frame.
 
         Args:
-          answer: The answer.
+          selected: The answer, or a mask of Gaussians.
           frame: Name or index of the frame.
 
         Returns:
@@ -549,11 +550,12 @@ class Scene:
           InputError: There is no such frame.
         """
         with self._lock:
-            gaussians, mask = self._device_gaussians, answer.mask
+            gaussians, mask = self._device_gaussians, selected.mask if isinstance(selected, Answer) else selected
             if gaussians is None:
-                rows = np.zeros(_padded(len(answer.rows), self.field.gaussians.count), np.int64)
-                rows[: len(answer.rows)] = answer.rows
-                mask = np.arange(len(rows)) < len(answer.rows)
+                chosen = np.flatnonzero(mask)
+                rows = np.zeros(_padded(len(chosen), self.field.gaussians.count), np.int64)
+                rows[: len(chosen)] = chosen
+                mask = np.arange(len(rows)) < len(chosen)
                 gaussians = jax.device_put(gaussian_rows(self.field.gaussians, rows))
             return np.asarray(selection_mask(gaussians, self._cameras[self.frame_index(frame)], jnp.asarray(mask)))
 
@@ -574,12 +576,14 @@ class Scene:
         """The Gaussians on jax's device; None for a mapped field."""
         return None if is_mapped(self.field.gaussians) else jax.device_put(self.field.gaussians)
 
-    def render(self, frame: int | str, answer: Answer | None = None) -> UInt8[np.ndarray, "h w 3"]:
+    def render(
+        self, frame: int | str, selected: Answer | Bool[np.ndarray, " n"] | None = None
+    ) -> UInt8[np.ndarray, "h w 3"]:
         """Renders a frame of the scene.
 
         Args:
           frame: Name or index of the frame.
-          answer: Answer that is lit up in it.
+          selected: Answer, or mask of Gaussians, that is lit up in it.
 
         Returns:
           (H, W, 3) RGB.
@@ -590,11 +594,12 @@ class Scene:
         from jsecon.app import pictures
 
         with self._lock:
-            photo = self._renderer.photo(self.frame_index(frame))
-            return photo if answer is None else pictures.selection_overlay(photo, self.mask(answer, frame))
+            photo = self.renderer.photo(self.frame_index(frame))
+            return photo if selected is None else pictures.selection_overlay(photo, self.mask(selected, frame))
 
     @functools.cached_property
-    def _renderer(self) -> Any:
+    def renderer(self) -> Any:
+        """Renders frames in the scene's colours or in others (`pictures.Renderer`)."""
         from jsecon.app.pictures import Renderer
 
         mapped = self._device_gaussians is None
