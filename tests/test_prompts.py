@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jsecon.networks.prompts import MAX_PROMPTS, GuidedPrompts, innermost_pixels
+from jsecon.networks.prompts import MAX_PROMPTS, GuidedPrompts, _innermost_pixels
 
 
 def frame_of_two_things():
@@ -18,9 +18,9 @@ def test_each_patch_has_its_pixel_farthest_from_the_outline():
     patches = np.full((40, 60), -1, np.int32)
     patches[5:26, 10:31] = 7  # 21 px a side
     patches[30:33, 40:49] = 2
-    assert innermost_pixels(patches).tolist() == [[20, 15], [41, 31]]
-    assert innermost_pixels(patches, min_radius=2.0).tolist() == [[20, 15]]
-    assert innermost_pixels(np.full((4, 4), -1, np.int32)).shape == (0, 2)
+    assert _innermost_pixels(patches).tolist() == [[20, 15], [41, 31]]
+    assert _innermost_pixels(patches, min_radius=2.0).tolist() == [[20, 15]]
+    assert _innermost_pixels(np.full((4, 4), -1, np.int32)).shape == (0, 2)
 
 
 def test_what_the_masks_of_a_region_leave_gets_the_next_points():

@@ -13,7 +13,7 @@ from PIL import Image
 from sam2_files import CHANNELS, MEAN, MEMORY, POINTERS, SIZE, SLOTS, STD, write_sam2
 
 from jsecon.errors import InputError
-from jsecon.networks.sam2 import HOLE_AREA, Bank, Memory, Sam2Tracker, fill_holes, follow, open_sam2
+from jsecon.networks.sam2 import HOLE_AREA, Bank, Memory, Sam2Tracker, _fill_holes, follow, open_sam2
 from jsecon.networks.session import Graph
 from jsecon.vision.protocols import Tracker
 
@@ -162,7 +162,7 @@ def test_tracker_gives_each_pixel_to_the_highest_logit(folder):
     assert labels.dtype == np.int16
     assert set(np.unique(labels)) <= {-1, 0, 2}
     for t, logits in follow(open_sam2(folder), frames, 2, [prompts[0], prompts[2]]):
-        whole = np.stack([cv2.resize(fill_holes(low, HOLE_AREA), (WIDTH, HEIGHT)) for low in logits])
+        whole = np.stack([cv2.resize(_fill_holes(low, HOLE_AREA), (WIDTH, HEIGHT)) for low in logits])
         wanted = np.where(whole.max(0) > 0, np.array([0, 2])[whole.argmax(0)], -1)
         np.testing.assert_array_equal(labels[t], wanted)
     assert (tracker(frames, 2, prompts[1:2]) == -1).all()
@@ -205,12 +205,12 @@ def test_holes_are_filled_up_to_their_area():
     logits = np.ones((9, 9), np.float32)
     logits[1, 1] = logits[2, 2] = -3.0  # one hole of two, through the corner
     logits[5:8, 5:8] = -2.0
-    filled = fill_holes(logits, 2)
+    filled = _fill_holes(logits, 2)
     assert (filled[[1, 2], [1, 2]] == np.float32(0.1)).all()
     assert (filled[5:8, 5:8] == -2).all()
-    np.testing.assert_array_equal(fill_holes(logits, 0), logits)
-    np.testing.assert_array_equal(fill_holes(logits, 1), logits)
-    assert (fill_holes(np.full((2, 2), -1.0, np.float32), 4) == np.float32(0.1)).all()
+    np.testing.assert_array_equal(_fill_holes(logits, 0), logits)
+    np.testing.assert_array_equal(_fill_holes(logits, 1), logits)
+    assert (_fill_holes(np.full((2, 2), -1.0, np.float32), 4) == np.float32(0.1)).all()
 
 
 def test_prompts_outside_the_sequence_are_refused(folder):

@@ -54,7 +54,7 @@ def test_texts_are_cleaned_as_the_configurations_say(folders):
         "whitespace": "Tea & MILK, d\u00e9j\u00e0_vu!",
     }
     for clean, text in expected.items():
-        assert TextTokenizer(path, TextRules(LENGTH, "</s>", clean)).clean(said) == text
+        assert TextTokenizer(path, TextRules(LENGTH, "</s>", clean))._clean(said) == text
 
 
 def test_siglip_2_has_another_vocabulary_padding_and_case(tmp_path):

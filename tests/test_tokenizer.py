@@ -51,7 +51,7 @@ def test_the_ids_spell_the_cleaned_text(tokenizer, text):
     name_of = {number: token for token, number in vocabulary().items()}
     ids, mask = tokenizer([text], 1000)
     spelled = "".join(name_of[id] for id in ids[0, 1 : mask[0].sum() - 1]).replace("</w>", "")
-    assert decoders.ByteLevel().decode([spelled]) == "".join(tokenizer.clean(text).lower().split())
+    assert decoders.ByteLevel().decode([spelled]) == "".join(tokenizer._clean(text).lower().split())
 
 
 @pytest.mark.parametrize("content", [

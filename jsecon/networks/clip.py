@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float32, UInt8
 from jsecon.errors import InputError, require
 from jsecon.files import read_json, reading
 from jsecon.networks.hub import Precision, find_files
-from jsecon.networks.session import Graph, Tensor, batches, content_digest, graph_files
+from jsecon.networks.session import Graph, Tensor, batches, content_digest
 from jsecon.networks.tokenizer import CLIP_LENGTH, TextTokenizer, read_text_rules
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.vision.protocols import CANONICAL, Logits
@@ -118,18 +118,12 @@ class ClipEmbedder:
       logits: Scale and bias of a model trained with a sigmoid if the folder has them, else None.
     """
 
-    def __init__(
-        self,
-        folder: str | Path,
-        *,
-        precision: Precision | None = None,
-        store: Path | None = None,
-    ):
+    def __init__(self, folder: str | Path, *, precision: Precision | None = None, store: Path | None = None):
         visual, textual, config, tokenizer = find_files(folder, "embedder", precision)
         mean, std, size = read_preprocessing(config)
         rules = read_text_rules(Path(folder), tokenizer)
-        files = [*graph_files(visual), *graph_files(textual), tokenizer]
-        self.name = f"clip-{content_digest(files, extra=repr((mean, std, size, *(rules or ()))))}"
+        extra = repr((mean, std, size, *(rules or ())))
+        self.name = f"clip-{content_digest([visual, textual], [tokenizer], extra=extra)}"
         self.logits = _read_logits(Path(folder)) if rules is not None else None
         self._visual_path, self._textual_path, self._tokenizer_path = visual, textual, tokenizer
         self._mean, self._std, self._size, self._rules = mean, std, size, rules
@@ -151,7 +145,7 @@ class ClipEmbedder:
         return cached_unrelated_words(self.name, self.embed_text)
 
     @property
-    def size(self) -> int:
+    def _side(self) -> int:
         """Side of an image in px."""
         return self._size or self._visual_input.fixed(3) or 224
 
@@ -170,7 +164,7 @@ class ClipEmbedder:
                 missing.append(index)
         for start in range(0, len(missing), _BATCH):
             chunk = missing[start : start + _BATCH]
-            crops = np.stack([masked_crop(frame, masks[index], self.size) for index in chunk])
+            crops = np.stack([masked_crop(frame, masks[index], self._side) for index in chunk])
             rows[chunk] = _normalize(self._run_visual(crops), self._visual_path)
         if self._store is not None and missing:
             self._store.write(frame, known | {keys[index]: rows[index] for index in missing})
@@ -187,7 +181,7 @@ class ClipEmbedder:
         """Runs the graphs on a black image and a word, closes them, and describes the model in a sentence."""
         self._run_visual(self._black_image())
         self._embed_phrases(["word"])
-        summary = f"images of {self.size}x{self.size} px and texts to {self.dim} numbers"
+        summary = f"images of {self._side}x{self._side} px and texts to {self.dim} numbers"
         self.close()
         if self._rules is None:
             return summary
@@ -204,7 +198,7 @@ class ClipEmbedder:
             self.__dict__.pop(name, None)
 
     def _black_image(self) -> UInt8[np.ndarray, "1 s s 3"]:
-        return np.zeros((1, self.size, self.size, 3), np.uint8)
+        return np.zeros((1, self._side, self._side, 3), np.uint8)
 
     @functools.cached_property
     def _visual(self) -> Graph:

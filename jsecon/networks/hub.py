@@ -145,7 +145,7 @@ def catalogue() -> tuple[HubModel, ...]:
     return tuple(HubModel(**row) for row in rows)
 
 
-def published(role: Role) -> str:
+def _published(role: Role) -> str:
     """Says in a sentence where models of a role are published."""
     names = ", ".join(row.repository for row in catalogue() if row.role == role)
     return f"Such models are published on huggingface.co: {names}, and others of the same layout."
@@ -230,11 +230,11 @@ def find_files(folder: str | Path, role: Role, precision: Precision | None = Non
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(folder, "no such folder", "", published(role))
+        raise InputError(folder, "no such folder", "", _published(role))
     precisions = [precision] if precision is not None else []
     if precision is None or role != "embedder":
         precisions += SUFFIXES
-    layout = _present_layout(role, precisions, lambda name: (folder / name).is_file(), folder, published(role))
+    layout = _present_layout(role, precisions, lambda name: (folder / name).is_file(), folder, _published(role))
     return [folder / name for name in layout.required]
 
 

@@ -42,7 +42,7 @@ class GuidedPrompts:
             patches = patches - 1
             min_radius = 0.008 * min(patches.shape)  # thinner patches lie along outlines
         remaining = self._left if self._rounds < _MAX_ROUNDS else 0
-        pixels = innermost_pixels(patches, min_radius)[:remaining]
+        pixels = _innermost_pixels(patches, min_radius)[:remaining]
         self._rounds += 1
         self._left -= len(pixels)
         self._prompted[pixels[:, 1], pixels[:, 0]] = True
@@ -54,7 +54,7 @@ class GuidedPrompts:
         self._explained[level] |= mask & (self._regions == self._regions[row, column])
 
 
-def innermost_pixels(patches: Int32[np.ndarray, "h w"], min_radius: float = 0.0) -> Int64[np.ndarray, "p 2"]:
+def _innermost_pixels(patches: Int32[np.ndarray, "h w"], min_radius: float = 0.0) -> Int64[np.ndarray, "p 2"]:
     """Finds the pixel (column, row) of each patch that is farthest from its outline, the farthest first.
 
     Args:

@@ -29,7 +29,7 @@ from jsecon.networks.clip import read_preprocessing
 from jsecon.networks.hub import Precision, find_files
 from jsecon.networks.prompts import GuidedPrompts
 from jsecon.networks.sam_masks import box_nms, box_of, langsplat_nms, remove_small_regions, stability
-from jsecon.networks.session import Graph, batches, content_digest, graph_files
+from jsecon.networks.session import Graph, batches, content_digest
 
 BATCH = 4
 """prompts of one run, if the decoder does not fix it: of EdgeTAM's decoder on two cores, 8 take 42 ms each, one alone
@@ -171,10 +171,8 @@ class SamSegmenter:
         self._files = find_files(folder, "segmenter", precision)
         encoder, decoder, config = self._files
         self._level = level
-        digest = content_digest(
-            [*graph_files(encoder), *graph_files(decoder)], extra=f"{level} {read_preprocessing(config)}"
-        )
-        self.name = f"sam-{digest}"
+        extra = f"{level} {read_preprocessing(config)}"
+        self.name = f"sam-{content_digest([encoder, decoder], extra=extra)}"
 
     def __call__(self, frame: UInt8[np.ndarray, "h w 3"], index: int) -> Bool[np.ndarray, "m h w"]:
         """Returns the masks (M, H, W) of a frame, best score first; they may overlap."""

@@ -27,8 +27,8 @@ from PIL import Image
 
 from jsecon.errors import InputError, require
 from jsecon.files import read_json, reading
-from jsecon.networks.hub import find_files, published
-from jsecon.networks.session import Graph, Shape, content_digest, graph_files
+from jsecon.networks.hub import find_files
+from jsecon.networks.session import Graph, Shape, content_digest
 from jsecon.numerics import is_finite_and_bounded
 
 SLOTS = 7
@@ -37,6 +37,7 @@ POINTERS = 16
 """object pointers that a frame attends to, the prompted one among them"""
 HOLE_AREA = 8
 """pixels of a low-resolution mask: holes up to this size are filled"""
+_FETCH = "Fetch the folder again, all of it from one repository."
 _MASK_LOGIT = 10.0
 """logit of a pixel of a mask prompt; its negative outside"""
 _ENCODED_FRAMES = 16
@@ -76,7 +77,7 @@ Points = tuple[np.ndarray, np.ndarray]
 bottom right)"""
 
 
-class Constants(NamedTuple):
+class _Constants(NamedTuple):
     """Content of constants.json."""
 
     mean: np.ndarray
@@ -118,7 +119,7 @@ class Sam2Graphs:
       sizes: Sizes S of the image, G of the grid of the coarsest features, C of their channels, T = G^2 and M.
     """
 
-    def __init__(self, graphs: Mapping[str, Any], constants: Constants, sizes: Mapping[str, int]):
+    def __init__(self, graphs: Mapping[str, Any], constants: _Constants, sizes: Mapping[str, int]):
         self.graphs, self.constants, self.sizes = graphs, constants, sizes
         self._encode = functools.lru_cache(_ENCODED_FRAMES)(self._encode_bytes)
 
@@ -138,7 +139,7 @@ class Sam2Graphs:
         """Runs a graph by name."""
         return self.graphs[name].run(feeds)
 
-    def prompted(self, features: Features, prompt: np.ndarray | Points, size: tuple[int, int]) -> _Prediction:
+    def _prompted(self, features: Features, prompt: np.ndarray | Points, size: tuple[int, int]) -> _Prediction:
         """Predicts the object of a mask or of points in a frame of size (H, W) from that frame alone."""
         side = self.sizes["S"]
         scale = np.array([side / size[1], side / size[0]], np.float32)
@@ -154,7 +155,7 @@ class Sam2Graphs:
         score = np.full((1, 1), _MASK_LOGIT, np.float32)
         return _Prediction(_resize(mask, len(decoded.logits)), mask, decoded.pointer, score)
 
-    def tracked(
+    def _tracked(
         self, features: Features, bank: "Bank", t: int, step: int, count: int, position: np.ndarray
     ) -> _Prediction:
         """Predicts the object of a bank in frame t of `count`; `position` (K, M) is the spatial code of a memory."""
@@ -187,7 +188,7 @@ class Sam2Graphs:
         masks = outputs["low_res_mask"][0, 0], outputs["high_res_mask"][0, 0]
         return _Prediction(*masks, outputs["object_pointer"][0, 0], outputs["object_score_logits"].reshape(1, 1))
 
-    def memorize(self, features: Features, prediction: _Prediction, *, binarize: bool) -> tuple[Memory, np.ndarray]:
+    def _memorize(self, features: Features, prediction: _Prediction, *, binarize: bool) -> tuple[Memory, np.ndarray]:
         """Encodes the memory of an object in a frame, binary if it was prompted there; and returns its spatial code."""
         outputs = self._run(
             "memory_encoder",
@@ -227,7 +228,7 @@ def open_sam2(folder: Path) -> Sam2Graphs:
     side, channels, grid = image.fixed(2), features.fixed(1), features.fixed(2)
     if side is None or channels is None or grid is None:
         expected = "an image and features of fixed sizes"
-        raise InputError(decoder.path, f"{image} and {features}", expected, published("tracker"))
+        raise InputError(decoder.path, f"{image} and {features}", expected, _FETCH)
     sizes = {"S": side, "C": channels, "G": grid, "T": grid * grid, "M": constants.temporal_code.shape[1]}
     for name, graph in graphs.items():
         for tensors, kind in zip(_SIGNATURES[name], ("input", "output")):
@@ -237,17 +238,16 @@ def open_sam2(folder: Path) -> Sam2Graphs:
     return Sam2Graphs(graphs, constants, sizes)
 
 
-def _read_constants(path: Path) -> Constants:
+def _read_constants(path: Path) -> _Constants:
     expected = f"image_mean, image_std and memory_temporal_positional_encoding of {SLOTS} rows"
-    remedy = published("tracker")
-    content = read_json(path, expected, remedy)
-    with reading(path, expected, remedy):
+    content = read_json(path, expected, _FETCH)
+    with reading(path, expected, _FETCH):
         names = ("image_mean", "image_std", "memory_temporal_positional_encoding")
-        constants = Constants(*(np.asarray(content[name], np.float32) for name in names))
+        constants = _Constants(*(np.asarray(content[name], np.float32) for name in names))
     shapes = [array.shape for array in constants]
     fits = shapes[:2] == [(3,), (3,)] and len(shapes[2]) == 2 and shapes[2][0] == SLOTS and shapes[2][1] > 0
     if not fits or not is_finite_and_bounded(*constants) or constants.std.min() <= 0:
-        raise InputError(path, f"shapes {shapes}, or numbers that are not finite", expected, remedy)
+        raise InputError(path, f"shapes {shapes}, or numbers that are not finite", expected, _FETCH)
     return constants
 
 
@@ -323,8 +323,8 @@ def follow(
     require(0 <= start < count, "follow", f"frame {start}", f"a frame below {count}", "Prompt a frame of the sequence.")
     require(len(prompts) > 0, "follow", "no prompt", "at least one", "Prompt an object.")
     features = model.encode(frames[start])
-    first = [model.prompted(features, prompt, frames.shape[1:3]) for prompt in prompts]
-    memories = [model.memorize(features, prediction, binarize=True) for prediction in first]
+    first = [model._prompted(features, prompt, frames.shape[1:3]) for prompt in prompts]
+    memories = [model._memorize(features, prediction, binarize=True) for prediction in first]
     banks = [Bank(start, memory) for memory, _ in memories]
     position = memories[0][1]
     yield start, [prediction.logits for prediction in first]
@@ -333,8 +333,8 @@ def follow(
             features = model.encode(frames[t])
             logits = []
             for number, bank in enumerate(banks):
-                prediction = model.tracked(features, bank, t, step, count, position)
-                memory, _ = model.memorize(features, prediction, binarize=False)
+                prediction = model._tracked(features, bank, t, step, count, position)
+                memory, _ = model._memorize(features, prediction, binarize=False)
                 banks[number] = bank.with_tracked(t, memory, step)
                 logits.append(prediction.logits)
             yield t, logits
@@ -351,8 +351,8 @@ class Sam2Tracker:
 
     def __init__(self, folder: Path):
         files = _sam2_files(folder)
-        graphs = [part for name in _SIGNATURES for part in graph_files(files[name])]
-        self.name = f"sam2-{content_digest([*graphs, files['constants']], extra=repr(HOLE_AREA))}"
+        graphs = [files[name] for name in _SIGNATURES]
+        self.name = f"sam2-{content_digest(graphs, [files['constants']], extra=repr(HOLE_AREA))}"
         self._folder = folder
 
     @functools.cached_property
@@ -389,13 +389,13 @@ class Sam2Tracker:
         for t, logits in follow(self._graphs, frames, index, [prompts[b] for b in objects]):
             best = np.zeros((height, width), np.float32)
             for number, low_res in zip(objects, logits):
-                resized = cv2.resize(fill_holes(low_res, HOLE_AREA), (width, height))
+                resized = cv2.resize(_fill_holes(low_res, HOLE_AREA), (width, height))
                 above = resized > best
                 best[above], labels[t, above] = resized[above], number
         return labels
 
 
-def fill_holes(logits: np.ndarray, area: int) -> np.ndarray:
+def _fill_holes(logits: np.ndarray, area: int) -> np.ndarray:
     """Fills the holes of a mask's logits (8-connected, at or below 0) of up to `area` pixels with 0.1."""
     number, labels, stats, _ = cv2.connectedComponentsWithStats((logits <= 0).astype(np.uint8), connectivity=8)
     small = stats[:, cv2.CC_STAT_AREA] <= area

@@ -204,7 +204,7 @@ def batches(rows: np.ndarray, fixed: int | None, free: int) -> Iterator[tuple[np
         yield part, count
 
 
-def graph_files(path: Path) -> tuple[Path, ...]:
+def _graph_files(path: Path) -> tuple[Path, ...]:
     """Lists the .onnx file of a graph and the external data files that it names beneath its folder."""
     _check_bytes(path)
     content = path.read_bytes()
@@ -212,10 +212,13 @@ def graph_files(path: Path) -> tuple[Path, ...]:
     return path, *(file for file in beside if os.fsencode(file.relative_to(path.parent).as_posix()) in content)
 
 
-def content_digest(files: Iterable[Path], *, extra: str = "") -> str:
-    """Hashes a text and the contents of files, in their order, to 32 hex digits; names and times do not count."""
+def content_digest(graphs: Sequence[Path], files: Sequence[Path] = (), *, extra: str = "") -> str:
+    """Hashes the contents of graphs with their external data, of other files and of a text to 32 hex digits.
+
+    Names and times do not count.
+    """
     digest = hashlib.blake2b(extra.encode(), digest_size=16)
-    for file in files:
+    for file in (*(part for graph in graphs for part in _graph_files(graph)), *files):
         try:
             with open(file, "rb") as stream:
                 digest.update(hashlib.file_digest(stream, lambda: hashlib.blake2b(digest_size=16)).digest())

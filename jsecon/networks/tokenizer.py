@@ -73,12 +73,12 @@ class TextTokenizer:
         with self._errors(f"{length} tokens for every text"):
             self._tokenizer.enable_truncation(max_length=length)
             self._tokenizer.enable_padding(length=length, pad_id=self._pad)
-            rows = self._tokenizer.encode_batch([self.clean(text) for text in texts])
+            rows = self._tokenizer.encode_batch([self._clean(text) for text in texts])
             ids = np.array([row.ids for row in rows], np.int64).reshape(len(texts), length)
             mask = np.array([row.attention_mask for row in rows], np.int64).reshape(ids.shape)
         return ids, mask if self._rules is None else np.ones_like(ids)
 
-    def clean(self, text: str) -> str:
+    def _clean(self, text: str) -> str:
         """Cleans a text as the model was trained on it: straight quotes, no HTML, single spaces, its letter case."""
         text = text.encode("utf-16", "surrogatepass").decode("utf-16", "replace")  # half of a pair has no encoding
         text = unicodedata.normalize("NFC", html.unescape(html.unescape(text)))
