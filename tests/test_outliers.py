@@ -11,8 +11,8 @@ from jsecon.query.outliers import default_eps, remove_outliers, split_outliers
 def test_one_component_is_seen_where_points_are_dense():
     sphere = np.random.default_rng(0).normal(size=(4_000, 3))
     sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
-    for points, whole in ((sphere, True), (np.concatenate([sphere, [[1.5, 0, 0]]]), False), (sphere[:1], True)):
-        found = split_outliers(points, np.ones(len(points), bool), eps=default_eps(sphere), min_samples=1)
+    for points, whole in ((sphere, True), (np.concatenate([sphere, [[1.5, 0, 0]]]), False), (sphere[:20], False)):
+        found = split_outliers(points, np.ones(len(points), bool), eps=default_eps(sphere))
         assert found.skipped == ("the selection is one component" if whole else "")
 
 
@@ -33,6 +33,9 @@ def test_strays_go_and_eps_follows_the_scale(scale):
     assert not every[400:].any()
     largest = remove_outliers(points, everything, keep="largest")
     np.testing.assert_array_equal(largest, every & (np.arange(len(points)) < 300))
+    np.testing.assert_array_equal(remove_outliers(points, everything), every)  # a third of the largest has support
+    weight = np.where(np.arange(len(points)) < 300, 1.0, 0.01)
+    np.testing.assert_array_equal(remove_outliers(points, everything, weight=weight), largest)
 
 
 def test_only_what_was_selected_is_looked_at():
@@ -54,21 +57,14 @@ def test_centres_that_are_not_finite_are_never_kept():
 
 
 @pytest.mark.parametrize("count", [0, 1, 5, 9])
-def test_too_few_to_tell_come_back_as_they_are(count):
-    points = np.random.default_rng(0).normal(size=(20, 3)) * 100
-    mask = np.arange(20) < count
+def test_what_dbscan_cannot_tell_comes_back_as_it_is(count):
+    points = np.random.default_rng(0).normal(size=(40, 3)) * 100
+    mask = np.arange(40) < count
     np.testing.assert_array_equal(remove_outliers(points, mask), mask)
-
-
-def test_a_selection_without_any_cluster_comes_back_as_it_is():
-    points = np.random.default_rng(0).uniform(-1, 1, (40, 3))
-    np.testing.assert_array_equal(remove_outliers(points, np.ones(40, bool), eps=1e-3), np.ones(40, bool))
-
-
-def test_one_component_is_kept_whole():
+    assert remove_outliers(points, np.ones(40, bool), eps=1e-3).all()  # no cluster
     turn = np.linspace(0, 6, 2_000)
     ring = np.stack([np.cos(turn), np.sin(turn), 0.1 * turn], axis=1)
-    assert remove_outliers(ring, np.ones(2_000, bool)).all()
+    assert remove_outliers(ring, np.ones(2_000, bool)).all()  # one component
 
 
 def test_points_on_top_of_each_other():
@@ -89,7 +85,7 @@ def test_half_a_million_points_in_seconds():
     points[200_000:250_000] = 0.02 * points[200_000:250_000] - [3, 0, 0]  # thousands of neighbours each
     points[:2_000] = rng.uniform(-30, 30, (2_000, 3))
     start = time.process_time()
-    kept = remove_outliers(points, np.ones(500_000, bool))
+    kept = remove_outliers(points, np.ones(500_000, bool), keep="largest")
     assert time.process_time() - start < 15  # about 2 s; scikit-learn runs out of memory on the dense ball's lists
     assert kept[250_000:].all()
     assert not kept[:250_000].any()
@@ -97,19 +93,6 @@ def test_half_a_million_points_in_seconds():
 
 def test_options_out_of_range_are_told():
     points, mask = np.zeros((20, 3)), np.ones(20, bool)
-    for options in ({"keep": "some"}, {"eps": 0.0}, {"eps": -1.0}, {"min_samples": 0}, {"eps": float("nan")}):
+    for options in ({"keep": "some"}, {"eps": 0.0}, {"eps": -1.0}, {"eps": float("nan")}):
         with pytest.raises(ValueError, match="remove_outliers"):
             remove_outliers(points, mask, **options)
-
-
-def test_a_selection_looked_at_before_is_answered_alike_and_other_options_are_not_its():
-    rng = np.random.default_rng(5)
-    means = np.concatenate([rng.normal(size=(200, 3)), rng.normal(size=(80, 3)) + 30, [[100.0, 0, 0]]])
-    whole = np.ones(len(means), bool)
-    first = remove_outliers(means, whole)
-    again = remove_outliers(means, whole)
-    np.testing.assert_array_equal(first, again)
-    again[:] = False  # what is given out is the caller's
-    np.testing.assert_array_equal(remove_outliers(means, whole), first)
-    assert first.sum() < remove_outliers(means, whole, keep="all").sum()
-    assert remove_outliers(means, whole, eps=1000.0).all()

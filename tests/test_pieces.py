@@ -76,15 +76,6 @@ def test_several_regions_take_their_pieces_with_them(broken):
         np.testing.assert_allclose(found.similarity, shares(field, regions), atol=1e-6, err_msg=str(options))
 
 
-def test_texts_by_vmap_are_the_loop(broken):
-    texts = jnp.asarray(broken.regions.embeddings)
-
-    def ask(text):
-        return query_anchored(broken, text).similarity
-
-    np.testing.assert_allclose(jax.jit(jax.vmap(ask))(texts), np.stack([ask(t) for t in texts]), rtol=1e-6)
-
-
 def test_a_region_takes_its_pieces_with_it_where_that_is_asked_for(broken):
     """As a text would whose embedding is the region's own."""
     unknown = with_other(broken, None)

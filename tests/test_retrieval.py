@@ -61,20 +61,6 @@ def test_rows_without_a_direction_are_unknown(rows):
     assert got.shape == known.shape == (0,)
 
 
-def test_jit_and_vmap_over_texts_equal_the_loop_for_many_regions():
-    rng = np.random.default_rng(3)
-    embeddings, texts, words = unit_rows(rng, 400, SIZE), unit_rows(rng, 3, SIZE), unit_rows(rng, 4, SIZE)
-
-    def ask(text):
-        return region_similarities(embeddings, text, words, "contrast")
-
-    together, known = jax.jit(jax.vmap(ask))(texts)
-    assert np.asarray(known).all()
-    for got, text in zip(together, texts):
-        np.testing.assert_allclose(got, ask(text)[0], atol=1e-6)
-        np.testing.assert_allclose(got, exact(embeddings, text, words), atol=5e-6)
-
-
 def test_gradient_equals_central_differences(rows, x64):
     given = tuple(jnp.asarray(a, jnp.float64) for a in rows)
     similar = jax.jit(lambda *given: region_similarities(*given, "contrast")[0])
@@ -190,13 +176,6 @@ def test_a_text_is_refused_by_its_rank_among_words_unrelated_words(worded):
     assert int(query_anchored(field, texts[0], rules=QueryRules(min_rank=0.0)).region) >= 0
     by_threshold = query_anchored(field, texts[0], rules=QueryRules(min_score=-1.0, min_rank=1.0))
     assert int(by_threshold.region) >= 0  # a threshold that is given decides
-
-
-def test_of_unrelated_texts_about_one_minus_the_quantile_is_answered(worded):
-    field, texts = worded
-    shares = np.asarray(jax.vmap(lambda text: query_anchored(field, text).rank)(texts))
-    for q in (0.5, 0.8, 0.9):
-        assert np.mean(shares >= q) == pytest.approx(1 - q, abs=0.1)
 
 
 def test_unrelated_words_that_tell_nothing_refuse_nothing_and_no_words_fall_back(worded):
