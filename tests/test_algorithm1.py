@@ -80,14 +80,6 @@ def test_the_order_of_proposals_only_renames(seed):
     np.testing.assert_array_equal(canonical(labels), canonical(truth))
 
 
-def test_running_again_on_its_own_result_changes_nothing():
-    truth = squares()
-    first = masklets(frames_of(truth), segmenter(truth), tracker(truth))
-    again = masklets(frames_of(truth), segmenter(first), tracker(first))
-    np.testing.assert_array_equal(again, first)
-    np.testing.assert_array_equal(clean_tracks(first), first)
-
-
 def test_an_object_that_enters_late_is_prompted_where_it_enters():
     truth = squares()
     truth[:2][truth[:2] == 0] = 2
@@ -178,16 +170,6 @@ def test_specks_and_glimpses_are_dropped_and_what_is_beyond_the_number_wanted():
     assert (masklets(frames, lambda frame, index: np.zeros((0, 40, 40), bool), tracker(truth)) == -1).all()
 
 
-def test_bad_shapes_are_refused():
-    truth = squares()
-    with pytest.raises(ValueError, match="frames"):
-        masklets(frames_of(truth)[0], segmenter(truth), tracker(truth))
-    with pytest.raises(ValueError, match="segment"):
-        masklets(frames_of(truth), lambda f, i: np.ones((1, 3, 3), bool), tracker(truth))
-    with pytest.raises(ValueError, match="track"):
-        masklets(frames_of(truth), segmenter(truth), lambda f, i, p: np.zeros((1, 40, 40), np.int16))
-
-
 @settings(deadline=None, max_examples=25)
 @given(st.integers(0, 2**32 - 1))
 def test_clean_tracks(seed):
@@ -246,15 +228,6 @@ def test_goes_on_in_the_middle_of_the_sequence_to_the_same_result(stop, tmp_path
     assert told[0] == (stop + 1, 6)
 
 
-def test_the_state_of_another_sequence_is_refused():
-    truth = squares(4)
-    kept = []
-    masklets(frames_of(truth), segmenter(truth), tracker(truth), on_checkpoint=lambda state: kept.append(state()))
-    assert [state.done for state in kept] == [1, 2, 3, 4]
-    with pytest.raises(ValueError, match="a state of 5 frames"):
-        masklets(frames_of(squares(5)), segmenter(truth), tracker(truth), state=kept[0])
-
-
 @settings(deadline=None, max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.integers(0, 4), st.sampled_from([0.0, 0.1, 0.5, 0.95, 1.0]))
 def test_masks_come_back(seed, count, share):
@@ -278,3 +251,18 @@ def test_a_frame_is_asked_once():
     for t in (1, 0, 1, 1):
         np.testing.assert_array_equal(masks_of(t), masks[t])
     assert calls == [1, 0]
+
+
+def test_bad_shapes_and_the_state_of_another_sequence_are_refused():
+    truth, kept = squares(), []
+    masklets(frames_of(truth), segmenter(truth), tracker(truth), on_checkpoint=lambda state: kept.append(state()))
+    assert [state.done for state in kept] == [1, 2, 3, 4, 5]
+    good = {"frames": frames_of(truth), "segment": segmenter(truth), "track": tracker(truth)}
+    for match, wrong in (
+        ("frames", {"frames": frames_of(truth)[0]}),
+        ("segment", {"segment": lambda frame, index: np.ones((1, 3, 3), bool)}),
+        ("track", {"track": lambda frames, index, prompts: np.zeros((1, 40, 40), np.int16)}),
+        ("a state of 4 frames", {"frames": frames_of(squares(4)), "state": kept[0]}),
+    ):
+        with pytest.raises(ValueError, match=match):
+            masklets(**(good | wrong))

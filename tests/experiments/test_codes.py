@@ -1,5 +1,4 @@
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_field import unit_rows
@@ -50,15 +49,6 @@ def test_a_rotation_keeps_every_cosine(regions, latent):
     np.testing.assert_allclose(encode(coder, embeddings), codes, atol=1e-6)
 
 
-def test_equal_and_unknown_embeddings_fit_in_one_number():
-    embeddings = np.repeat(unit_rows(np.random.default_rng(0), 1, 32), 70, axis=0)
-    embeddings[5] = 0
-    codes, coder, _ = region_codes(embeddings, latent=1, key=KEY)
-    assert isinstance(coder, Rotation)
-    assert (np.asarray(codes[5]) == 0).all()
-    np.testing.assert_allclose(np.abs(np.delete(np.asarray(codes), 5, axis=0)), 1, atol=1e-6)
-
-
 def test_an_autoencoder_where_regions_do_not_fit_and_what_is_refused():
     embeddings = unit_rows(np.random.default_rng(0), 12, 40)
     codes, coder, reason = region_codes(embeddings, latent=3, key=KEY, epochs=50)
@@ -83,16 +73,6 @@ def test_spread_codes_keep_crowded_regions_apart_where_a_rotation_does_not(count
     np.testing.assert_array_equal(codes, spread_codes(units, latent))  # nothing is drawn
 
 
-def test_what_is_nearer_stays_nearer_in_spread_codes():
-    rng = np.random.default_rng(0)
-    groups = unit_rows(rng, 6, 64)
-    units = unit_rows_of(np.repeat(groups, 5, axis=0) + 0.5 * unit_rows(rng, 30, 64))
-    codes = np.asarray(spread_codes(units, 6), np.float64)
-    same = np.repeat(np.arange(6), 5)[:, None] == np.repeat(np.arange(6), 5)
-    cosines = codes @ codes.T
-    assert cosines[same].mean() > cosines[~same].mean() + 0.5
-
-
 def test_spread_codes_of_twins_and_of_the_unknown():
     units = crowded(20)
     units[7], units[9] = units[3], 0
@@ -106,18 +86,6 @@ def test_spread_codes_of_twins_and_of_the_unknown():
         assert some.shape == (few, 3)
         assert np.isfinite(some).all()
     assert (np.asarray(spread_codes(np.zeros((3, 8), np.float32), 3)) == 0).all()
-
-
-def test_a_spread_coder_knows_its_regions_and_places_a_text_beside_its_region():
-    units = crowded(30)
-    codes = spread_codes(units, 6)
-    coder = Spread(units, codes)
-    own = np.asarray(coder.encode(units))
-    assert ((own @ np.asarray(codes).T).argmax(1) == np.arange(30)).all()
-    text = unit_rows_of(units + 0.2 * unit_rows(np.random.default_rng(5), 30, 64))
-    found = np.asarray(jax.jit(jax.vmap(coder.encode))(jnp.asarray(text)))
-    np.testing.assert_allclose(found, coder.encode(text), atol=1e-5)
-    assert ((found @ np.asarray(codes).T).argmax(1) == (text @ units.T).argmax(1)).mean() > 0.9
 
 
 def test_auto_takes_the_smallest_code_that_keeps_regions_apart():
@@ -138,9 +106,3 @@ def test_auto_takes_the_smallest_code_that_keeps_regions_apart():
     short = unit_rows(np.random.default_rng(0), 40, 2)  # no size tried is smaller than two numbers
     codes, coder, why = region_codes(short, latent="auto", key=KEY)
     assert coder is None
-
-
-def test_pairs_that_must_stay_apart():
-    units = unit_rows_of(np.asarray([[1.0, 0, 0], [1, 0.01, 0], [0, 1, 0], [0, 0, 0.0001]]))
-    units[3] = 0
-    assert confused_pairs(units, np.ones((4, 1), np.float32)) == 2

@@ -1,7 +1,5 @@
 """The ascent of the expected IoU: against a slow twin, against real renderings, and on a thing with a blurred rim."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +7,6 @@ import pytest
 from balls import ring_of_balls
 
 from experiments.tables.silhouette import (
-    SILHOUETTE_WEIGHTS,
     SWEEPS,
     WEIGHTS,
     Footprints,
@@ -53,22 +50,6 @@ def test_what_is_rendered_fits_better_than_what_the_threshold_takes(world):
     views = choose_views(gaussians, cameras, before)
     assert expected(gaussians, views, share, after) > expected(gaussians, views, share, before) + 0.005
     assert not after[share <= 0.1].any()
-
-
-@pytest.mark.long
-def test_each_weighting_fits_best_what_it_weighs(world):
-    gaussians, cameras, share = world
-    before = share >= 0.5
-    views = choose_views(gaussians, cameras, before)
-
-    def fit(weights):
-        return np.asarray(fit_silhouette(gaussians, cameras, share, weights=weights))
-
-    found = {weights: fit(weights) for weights in SILHOUETTE_WEIGHTS.values()}
-    for weights in SILHOUETTE_WEIGHTS.values():
-        value = {other: expected(gaussians, views, share, mask, weights) for other, mask in found.items()}
-        assert value[weights] > max(value.values()) - 1e-3
-        assert value[weights] > expected(gaussians, views, share, before, weights)
 
 
 def test_footprints_add_up_to_what_a_rendering_absorbs(world):
@@ -145,24 +126,3 @@ def test_nothing_to_choose_from_stays_nothing(world):
     few = np.zeros_like(share)
     few[2500] = 1.0
     assert np.asarray(fit_silhouette(gaussians, cameras, few)).sum() == 1
-
-
-def test_a_thing_that_no_camera_sees_is_left_as_it_is(world):
-    gaussians, cameras, share = world
-    behind = dataclasses.replace(gaussians, means=gaussians.means + np.float32([0, 50, 0]))
-    np.testing.assert_array_equal(fit_silhouette(behind, cameras, share), share >= 0.5)
-
-
-def test_shares_of_another_scene_are_refused(world):
-    with pytest.raises(ValueError, match="fit_silhouette"):
-        fit_silhouette(world[0], world[1], world[2][1:])
-
-
-@pytest.mark.long
-def test_float64_in_this_thread_alone_changes_nothing(world):
-    gaussians, cameras, share = world
-    found = fit_silhouette(gaussians, cameras, share)
-    with jax.enable_x64(True):
-        double = jax.tree.map(lambda a: jnp.asarray(a, jnp.float64), (gaussians, cameras))
-        again = fit_silhouette(*double, share)
-    np.testing.assert_array_equal(np.asarray(again), np.asarray(found))
