@@ -27,12 +27,7 @@ READERS = (
         Reader(_COLMAP, (f"{place}{MODEL_MARK}",), read_colmap)
         for place in ("colmap/sparse/*/", "colmap/sparse/", "colmap_text/", "")
     ),
-    Reader("ScanNet", ("color", "pose", "intrinsic/intrinsic_color.txt"), rgbd.read_scannet),
-    Reader("TUM", ("rgb.txt", "groundtruth.txt"), rgbd.read_tum),
-    Reader("ARKitScenes", ("lowres_wide", "lowres_wide.traj"), rgbd.read_arkitscenes),
-    Reader("Polycam", ("keyframes",), rgbd.read_polycam),
-    Reader("Record3D", ("rgb", "metadata.json"), rgbd.read_record3d),
-    Reader("Record3D", ("rgbd", "metadata"), rgbd.read_record3d),
+    *rgbd.READERS,
 )
 """The formats, the preferred first: a folder of both COLMAP and nerfstudio is read as COLMAP, which has the points."""
 

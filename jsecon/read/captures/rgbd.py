@@ -23,6 +23,7 @@ from jsecon.read.captures.coordinates import make_rigid
 from jsecon.read.captures.frames import PosedImage, PosedImages
 from jsecon.read.captures.images import MAX_PIXELS, image_header
 from jsecon.read.captures.lens import Lens
+from jsecon.read.registry import Reader
 
 _TUM_INTRINSICS = {
     "1": (517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
@@ -100,7 +101,7 @@ def _posed_images(path: Path, images: list[PosedImage], count: int, *notes: str)
     return PosedImages(images, path, notes=(*lost_note, *notes))
 
 
-def read_scannet(path: Path) -> PosedImages:
+def _read_scannet(path: Path) -> PosedImages:
     """Reads ScanNet's exported folders."""
     images, lenses = _list_images(path / "color"), {}
     for kind in ("color", "depth"):
@@ -134,7 +135,7 @@ def _nearest_times(times: np.ndarray, queries: np.ndarray) -> np.ndarray:
     return np.where(gap <= _MAX_GAP, index, -1)
 
 
-def read_tum(path: Path) -> PosedImages:
+def _read_tum(path: Path) -> PosedImages:
     """Reads a sequence of TUM's RGB-D benchmark."""
     (times, images), poses = _read_tum_list(path / "rgb.txt"), _numbers(path / "groundtruth.txt", 8)
     file = path / "intrinsics.txt"
@@ -162,7 +163,7 @@ def read_tum(path: Path) -> PosedImages:
     return _posed_images(path, posed, len(images))
 
 
-def read_arkitscenes(path: Path) -> PosedImages:
+def _read_arkitscenes(path: Path) -> PosedImages:
     """Reads ARKitScenes' low resolution frames."""
     images, rows = _list_images(path / "lowres_wide"), _numbers(path / "lowres_wide.traj", 7)
     lens_files = sorted((path / "lowres_wide_intrinsics").glob("*.pincam"))
@@ -183,7 +184,7 @@ def read_arkitscenes(path: Path) -> PosedImages:
     return _posed_images(path, posed, len(images))
 
 
-def read_polycam(path: Path) -> PosedImages:
+def _read_polycam(path: Path) -> PosedImages:
     """Reads Polycam's raw data."""
     frames = path / "keyframes"
     is_corrected = all((frames / f"corrected_{kind}").is_dir() for kind in ("images", "cameras"))
@@ -219,7 +220,7 @@ def _polycam_size(camera: Any, uncorrected: Path, image: Path) -> tuple[Any, Any
     return (width, height) if abs(width * size[1] - height * size[0]) <= max(width, height) else size
 
 
-def read_record3d(path: Path) -> PosedImages:
+def _read_record3d(path: Path) -> PosedImages:
     """Reads Record3D's exported or unpacked folders."""
     is_unpacked = (path / "rgbd").is_dir()  # a .r3d is an archive
     images, posed = _list_images(path / ("rgbd" if is_unpacked else "rgb")), []
@@ -237,3 +238,13 @@ def read_record3d(path: Path) -> PosedImages:
                 size = (metadata["w"], metadata["h"]) if has_size else image_header(image).upright
                 posed.append(_posed_image(image, _lens(*size, *intrinsics[n]), pose))
     return _posed_images(path, posed, len(images), "Record3D's depth was not read: its compression is not supported.")
+
+
+READERS = (
+    Reader("ScanNet", ("color", "pose", "intrinsic/intrinsic_color.txt"), _read_scannet),
+    Reader("TUM", ("rgb.txt", "groundtruth.txt"), _read_tum),
+    Reader("ARKitScenes", ("lowres_wide", "lowres_wide.traj"), _read_arkitscenes),
+    Reader("Polycam", ("keyframes",), _read_polycam),
+    Reader("Record3D", ("rgb", "metadata.json"), _read_record3d),
+    Reader("Record3D", ("rgbd", "metadata"), _read_record3d),
+)

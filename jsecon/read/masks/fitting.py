@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import collections
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ from jaxtyping import Int16
 from jsecon.errors import InputError
 from jsecon.read.captures.images import TRANSPOSED, apply_orientation
 from jsecon.read.masks.names import AllFrames
-from jsecon.types import ImageFile
 
 MAX_REGIONS = int(np.iinfo(np.int16).max)
 
@@ -33,26 +31,13 @@ def _same_aspect(rows: int, columns: int, width: int, height: int) -> bool:
 class MaskFitter:
     """Brings masks to the size (H, W) of the frames, and counts the changes.
 
-    Masks have the size of the frames' images, upright or as stored, at any scale. `shape` returns the (H, W) of a
-    frame's mask, or None. If masks of images that lie on their side are of the stored pixels, so are those of images
-    that stand on their head, whose size cannot tell.
+    Masks have the size of the frames' images, upright or as stored, at any scale.
     """
 
-    def __init__(self, frames: AllFrames, size: tuple[int, int], shape: Callable[[str], tuple[int, ...] | None]):
-        self.files = files = {name: file for name, file in frames.items() if file is not None}
+    def __init__(self, frames: AllFrames, size: tuple[int, int]):
+        self.files = {name: file for name, file in frames.items() if file is not None}
         self.height, self.width = size
         self.count: collections.Counter[str] = collections.Counter()
-        self.of_stored_pixels = False
-        if any(1 < file.orientation < 5 for file in files.values()):
-            lying = [name for name, file in files.items() if file.orientation in TRANSPOSED]
-            self.of_stored_pixels = any(self._fits_stored_only(files[name], shape(name)) for name in lying[:8])
-
-    def _fits_stored_only(self, file: ImageFile, shape: tuple[int, ...] | None) -> bool:
-        """Whether a mask fits the stored pixels of an image, and not its upright ones."""
-        if shape is None:
-            return False
-        stored = _same_aspect(shape[0], shape[1], file.height, file.width)
-        return stored and not _same_aspect(shape[0], shape[1], file.width, file.height)
 
     def __call__(self, path: Path, image: np.ndarray, name: str) -> np.ndarray:
         """Turns and resizes the mask of a frame to (H, W); raises InputError, with its file, for another aspect."""
@@ -62,7 +47,7 @@ class MaskFitter:
         stored = upright[::-1] if orientation in TRANSPOSED else upright
         rows, columns = image.shape
         fits_upright = _same_aspect(rows, columns, *upright)
-        if orientation != 1 and _same_aspect(rows, columns, *stored) and (self.of_stored_pixels or not fits_upright):
+        if orientation != 1 and _same_aspect(rows, columns, *stored) and not fits_upright:
             image = apply_orientation(image, orientation)
             self.count["turned"] += 1
         elif not fits_upright and not _same_aspect(rows, columns, self.width, self.height):

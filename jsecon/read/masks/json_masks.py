@@ -2,8 +2,8 @@
 
 A mask is run-length encoded or polygons. Run lengths are {"size": [H, W], "counts": ...}: runs of 0 and 1 in turn, 0
 first, down the columns. `counts` is a list of them, or COCO's text of 6-bit digits, decoded here: that also checks that
-the runs fill the mask, and needs no compiled dependency. Polygons are [[x, y, x, y, ...], ...] in px of the image; a
-polygon within another is a hole in it.
+the runs fill the mask, and needs no compiled dependency. Polygons are [[x, y, x, y, ...], ...] in px of the image, and
+add up.
 """
 
 from pathlib import Path, PurePosixPath
@@ -63,7 +63,7 @@ def _parse_runs(text: str) -> list[int]:
 
 
 def _fill_polygons(polygons: Any, width: int, height: int, where: str | Path) -> Bool[np.ndarray, "h w"]:
-    """Draws COCO's polygons [[x, y, x, y, ...], ...], px, as a mask; a polygon within another is a hole in it."""
+    """Draws COCO's polygons [[x, y, x, y, ...], ...], px, as one mask, edges included."""
     expected = "[[x, y, x, y, ...], ...] with three corners or more each"
     nested = isinstance(polygons, list) and all(isinstance(polygon, list) for polygon in polygons)
     try:
@@ -78,22 +78,9 @@ def _fill_polygons(polygons: Any, width: int, height: int, where: str | Path) ->
         problem = f"the mask's polygons reach from {far.min(0).tolist()} to {far.max(0).tolist()} px"
         remedy = 'Give the size of the image that they were drawn on ("images" with "width" and "height").'
         raise InputError(where, problem, f"corners within {width}x{height}", remedy)
-    distinct = {each.tobytes(): each for each in (np.round(each).astype(np.int32) for each in corners)}.values()
-    filled = [(_fill([each], width, height), each) for each in distinct]
-    groups: list[tuple[np.ndarray, list[np.ndarray]]] = []
-    for mask, each in sorted(filled, key=lambda pair: -int(pair[0].sum())):
-        outer = next((group for group in groups if not (mask & ~group[0]).any()), None)
-        if outer is None:
-            groups.append((mask, [each]))
-        else:
-            outer[1].append(each)
-    return np.any([_fill(group, width, height) for _, group in groups], axis=0)
-
-
-def _fill(polygons: list[np.ndarray], width: int, height: int) -> np.ndarray:
-    """(H, W) bool: inside an odd number of polygons, edges included."""
     canvas = np.zeros((height, width), np.uint8)
-    cv2.fillPoly(canvas, polygons, 1)
+    for each in corners:
+        cv2.fillPoly(canvas, [np.round(each).astype(np.int32)], 1)
     return canvas.astype(bool)
 
 
@@ -145,7 +132,7 @@ def _image_size(image: Any) -> tuple[int, int] | None:
     return (width, height) if 0 < width * height <= MAX_PIXELS and width > 0 else None
 
 
-class CocoFile:
+class _CocoFile:
     """A COCO file of all frames."""
 
     def __init__(self, file: Path, content: Any, frame_names: FrameNames):
@@ -173,7 +160,7 @@ class CocoFile:
         return _decode_records(self.file, records, _image_size(image) or size)
 
 
-def open_coco(folder: Path, frame_names: FrameNames) -> CocoFile | None:
+def open_coco(folder: Path, frame_names: FrameNames) -> _CocoFile | None:
     """Opens the COCO file of all frames: `folder` itself, or the only JSON in it if that lists images."""
     files = [folder] if folder.is_file() else sorted(folder.glob("*.json")) if folder.is_dir() else []
     if len(files) != 1 or (files[0] != folder and frame_names.match(files[0], (), ".json") is not None):
@@ -182,4 +169,4 @@ def open_coco(folder: Path, frame_names: FrameNames) -> CocoFile | None:
         return None
     content = read_json(files[0], _JSON, _REMEDY)
     is_coco = files[0] == folder or (isinstance(content, dict) and "images" in content)
-    return CocoFile(files[0], content, frame_names) if is_coco else None
+    return _CocoFile(files[0], content, frame_names) if is_coco else None

@@ -68,12 +68,12 @@ def load_features(
     Masks that vanish at the size asked for are skipped. `frames` are all frames of the capture, each with its image.
     """
     every = frames or dict.fromkeys(names)
-    found = find_masks(folder, every, (Reader("LangSplat", ("_s.npy",), read_level),), lambda path: False)
+    found = find_masks(folder, every, (Reader("LangSplat", ("_s.npy",), read_level),))
 
     def masks_of(name: str) -> Path:
         return found.path(name) or folder / f"{name}_s.npy"  # a missing file is an error of its reader
 
-    fit = MaskFitter(every, size, lambda name: read_level(masks_of(name), level).shape)
+    fit = MaskFitter(every, size)
     labels = np.full((len(names), *size), -1, np.int32)
     rows: list[np.ndarray] = []
     frame: list[int] = []

@@ -8,7 +8,6 @@ entry points in the group jsecon.masks. `jsecon.read.masks.names` says which fil
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -22,7 +21,7 @@ from jsecon.read.captures.images import read_label_image
 from jsecon.read.masks.fitting import MAX_REGIONS, MaskFitter, compact_ids
 from jsecon.read.masks.json_masks import open_coco, read_json_masks
 from jsecon.read.masks.langsplat import read_level
-from jsecon.read.masks.names import AllFrames, FrameNames, MaskFiles, find_masks, natural_order
+from jsecon.read.masks.names import AllFrames, FrameNames, MaskFiles, find_masks
 from jsecon.read.registry import Reader, readers
 from jsecon.types import Progress
 
@@ -51,7 +50,7 @@ class TrackedMasks(NamedTuple):
     labels: Int16[np.ndarray, "t h w"]
     """-1 = none, else 0..R-1, the same region in every frame."""
     ids: tuple[int, ...]
-    """R ids as the files have them (of a colour: R*65536 + G*256 + B), or numbers in their frame."""
+    """R ids as the files have them (of a colour: R*65536 + G*256 + B), or numbers of objects or of masks in a frame."""
     notes: tuple[str, ...]
     """What was skipped or changed, a sentence each."""
 
@@ -74,23 +73,18 @@ class _Source:
         self.coco = open_coco(folder, FrameNames(self.frames))
         self.files: MaskFiles | None = None
         if self.coco is None:
-            self.files = find_masks(folder, self.frames, readers("jsecon.masks", READERS), _is_black_and_white)
+            self.files = find_masks(folder, self.frames, readers("jsecon.masks", READERS))
         self.names = [name for name in names if self._has(name)]
         if not self.names:
             problem = f"it has masks, but of none of the {len(names)} frames in use"
             raise InputError(folder, problem, f"a mask of {names[0]} and others", "Name each mask like its frame.")
         self.missing = [name for name in names if not self._has(name)]
-        objects = {key for by_object in (self.files.files.values() if self.files else ()) for key in by_object if key}
-        self.object_ids = _object_ids(objects)
-        self.objects = sorted(objects, key=lambda name: (self.object_ids[name], name))
-        self.fit = MaskFitter(self.frames, size, self._shape)
+        by_frame = self.files.files.values() if self.files else ()
+        self.objects = list(dict.fromkeys(key for by_object in by_frame for key in by_object if key))
+        self.fit = MaskFitter(self.frames, size)
 
     def _has(self, name: str) -> bool:
         return name in self.coco if self.coco is not None else self.files is not None and name in self.files.files
-
-    def _shape(self, name: str) -> tuple[int, ...] | None:
-        stored = self._read(name)[1] if self._has(name) else []
-        return (stored[0].shape if stored else None) if isinstance(stored, list) else stored.shape
 
     def _read(self, name: str) -> tuple[Path, np.ndarray | list[np.ndarray]]:
         """The file of a frame, and its ids or masks as they are stored; of objects, the first one's."""
@@ -210,11 +204,7 @@ def load_labels(
         notes.append("The masks hold negative ids: these count as unlabelled, and 0 as a region.")
     if not is_shared:
         notes.append("Each frame's masks count as regions of their own, since their ids are not shared.")
-    if not all(map(str.isdecimal, source.objects)):
-        numbers = ", ".join(f"{name} is {source.object_ids[name]}" for name in source.objects[:8])
-        notes.append(f"The objects are numbered: {numbers}{' ...' if len(source.objects) > 8 else ''}.")
-    file_ids = (source.object_ids[source.objects[n]] if source.objects else int(n) for n in ids)
-    return TrackedMasks(labels, tuple(file_ids), tuple(notes))
+    return TrackedMasks(labels, tuple(map(int, ids)), tuple(notes))
 
 
 def load_proposals(
@@ -233,20 +223,3 @@ def load_proposals(
         return np.stack([np.zeros(size, bool), *masks])[1:]
 
     return Proposals(read, tuple(source.notes()))
-
-
-def _is_black_and_white(path: Path) -> bool:
-    """Whether a file holds the mask of one object: only the values 0 and 1, or 0 and the largest of its type."""
-    if path.suffix.lower() == ".json" or path.name.endswith("_s.npy"):
-        return False
-    values = np.unique(read_label_image(path)[0])
-    white = 1, 255, 65535, (1 << 24) - 1
-    return len(values) <= 2 and set(values.tolist()) <= {0, int(values.max())} and values.max() in (0, *white)
-
-
-def _object_ids(folders: set[str]) -> dict[str, int]:
-    """The id of each object: the number in its folder's name if all are named alike (001, obj_2), else 1, 2, ..."""
-    parts = {name: re.fullmatch(r"(\D*)([0-9]+)", name) for name in folders}
-    if all(parts.values()) and len({part[1] for part in parts.values() if part}) == 1:
-        return {name: int(part[2]) for name, part in parts.items() if part}
-    return {name: number for number, name in enumerate(sorted(folders, key=natural_order), start=1)}

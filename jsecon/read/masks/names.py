@@ -2,8 +2,8 @@
 
 A mask is named like its frame: `<frame>.png`, like the image's whole name (`<frame>.jpg.png`, as COLMAP has it), or
 with a word for what it is (`<frame>_mask.png`). It lies in the folder itself, or in subfolders named like those of the
-images (`cam0/<frame>.png`). Any other subfolder stands for an object (`<object>/<frame>.png`, black and white, as SAM 2
-writes them with --per_obj_png_file), or merely divides the files.
+images (`cam0/<frame>.png`). Any other subfolders stand for objects (`<object>/<frame>.png`, black and white, as SAM 2
+writes them with --per_obj_png_file).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import collections
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple, TypeAlias
 
@@ -130,13 +130,8 @@ def _list_files(folder: Path) -> list[tuple[Path, tuple[str, ...]]]:
     return files
 
 
-def find_masks(
-    folder: Path, frames: AllFrames, readers: Sequence[Reader], is_black_and_white: Callable[[Path], bool]
-) -> MaskFiles:
-    """Finds the masks of frames, which must be of one format.
-
-    Folders of objects and folders that divide files are told by their masks: those of objects are black and white.
-    """
+def find_masks(folder: Path, frames: AllFrames, readers: Sequence[Reader]) -> MaskFiles:
+    """Finds the masks of frames, which must be of one format."""
     if not folder.is_dir():
         problem = "this is a file" if folder.exists() else "there is no such folder"
         raise InputError(folder, problem, "a folder of masks", "Check the path.")
@@ -167,7 +162,7 @@ def find_masks(
         problem = f"there are both {first} and {second} masks of these frames"
         raise InputError(folder, problem, "one kind", "Put each kind into a folder of its own.")
     ((reader, matches),) = matched.items()
-    return _arrange(reader, matches, unmatched[reader], is_black_and_white)
+    return _arrange(reader, matches, unmatched[reader])
 
 
 def _unsupported(path: Path) -> InputError:
@@ -178,10 +173,8 @@ def _unsupported(path: Path) -> InputError:
     return InputError(path, f"masks are not read from {path.suffix.lower()} files", "a PNG or .npy", "Convert it.")
 
 
-def _arrange(
-    reader: Reader, matches: list[_Match], unmatched: list[Path], is_black_and_white: Callable[[Path], bool]
-) -> MaskFiles:
-    """Arranges files as one of each frame, or as one of each object in it."""
+def _arrange(reader: Reader, matches: list[_Match], unmatched: list[Path]) -> MaskFiles:
+    """Arranges files as one of each frame, or as one of each object in it: in folders that the images do not have."""
     by_frame: dict[str, list[_Match]] = collections.defaultdict(list)
     for match in sorted(matches, key=lambda match: (len(match.extra), match.rank)):
         by_frame[match.frame].append(match)
@@ -190,50 +183,24 @@ def _arrange(
         verb = "belongs" if len(unmatched) == 1 else "belong"
         first = unmatched[0].name
         notes = [f"{len(unmatched)} of the {reader.marks[0]} files {verb} to no frame of this capture, first {first}."]
-    if _are_objects(matches, by_frame, is_black_and_white):
-        folders = sorted({_object_of(match) for match in matches}, key=natural_order)
-        notes = [f"The folders {shorten(folders)} are read as objects: each has black and white masks of one.", *notes]
-        by_object = {frame: {_object_of(m): m.path for m in reversed(some)} for frame, some in by_frame.items()}
-        objects = {frame: {name: some[name] for name in folders if name in some} for frame, some in by_object.items()}
-        return MaskFiles(reader, objects, tuple(notes))
-    is_plain = any(not match.extra for match in matches)
-    best = {frame: some[0] for frame, some in by_frame.items() if not (is_plain and some[0].extra)}
-    if unused := {"/".join(match.folders) for match in matches if is_plain and match.extra}:
-        notes = [f"Masks in other folders ({shorten(sorted(unused))}) were not used.", *notes]
-    if len(folders := sorted({match.folders for match in best.values()})) > 1:
-        places = shorten(["/".join(each) or "." for each in folders])
-        reason = "they are named like those of the images" if is_plain else "their masks are not black and white"
-        notes = [f"The folders {places} are read as cameras, not as objects: {reason}.", *notes]
+    extras = {"/".join(match.extra) for match in matches}
+    if "" not in extras and len(extras) > 1:
+        objects = sorted(extras, key=_natural_order)
+        notes = [f"The folders {_shorten(objects)} are read as objects: each has black and white masks of one.", *notes]
+        by_object = {frame: {"/".join(m.extra): m.path for m in reversed(some)} for frame, some in by_frame.items()}
+        files = {frame: {name: some[name] for name in objects if name in some} for frame, some in by_object.items()}
+        return MaskFiles(reader, files, tuple(notes))
+    best = {frame: some[0] for frame, some in by_frame.items() if "/".join(some[0].extra) == min(extras)}
+    if unused := {"/".join(match.folders) for match in matches if "" in extras and match.extra}:
+        notes = [f"Masks in other folders ({_shorten(sorted(unused))}) were not used.", *notes]
     return MaskFiles(reader, {frame: {"": match.path} for frame, match in best.items()}, tuple(notes))
 
 
-def _are_objects(
-    matches: list[_Match], by_frame: Mapping[str, list[_Match]], is_black_and_white: Callable[[Path], bool]
-) -> bool:
-    """Whether the subfolders stand for objects, not for cameras."""
-    extra = {match.extra[-1] for match in matches if match.extra}
-    if not extra or any(not match.folders for match in matches):
-        return False
-    is_plain = any(not match.extra for match in matches)
-    is_several = any(len(some) > 1 for some in by_frame.values())
-    if not is_several and (is_plain or (len(extra) == 1 and not all(map(str.isdecimal, extra)))):
-        return False
-    if is_several and not is_plain:
-        return True
-    paths = [match.path for match in matches]
-    return all(is_black_and_white(path) for path in paths[:: -(-len(paths) // 64)])  # 64 are enough to tell
-
-
-def _object_of(match: _Match) -> str:
-    """The folder that stands for the object of a mask."""
-    return match.extra[-1] if match.extra else match.folders[-1]
-
-
-def natural_order(name: str) -> tuple[str, int, str]:
+def _natural_order(name: str) -> tuple[str, int, str]:
     """Sort key that puts 9 before 10."""
     return re.sub(r"\d+", lambda number: number[0].zfill(20), name), len(name), name
 
 
-def shorten(names: Sequence[str]) -> str:
+def _shorten(names: Sequence[str]) -> str:
     """Joins the first of some names."""
     return ", ".join(names[:4]) + (f", ... ({len(names)})" if len(names) > 4 else "")

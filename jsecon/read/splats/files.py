@@ -12,16 +12,9 @@ from jaxtyping import Float, Int
 from jsecon.errors import InputError
 from jsecon.files import reading
 from jsecon.read.registry import Reader, find_reader
+from jsecon.read.splats import packed
 from jsecon.read.splats.gltf import read_glb, save_glb
-from jsecon.read.splats.packed import (
-    antialiasing_note,
-    import_gsply,
-    read_compressed_ply,
-    read_sog,
-    read_splat,
-    read_spz,
-    save_spz,
-)
+from jsecon.read.splats.packed import antialiasing_note, import_gsply, read_compressed_ply, save_spz
 from jsecon.read.splats.ply import in_float32, read_ply, read_ply_file, save_ply
 from jsecon.types import Array, Gaussians
 
@@ -45,9 +38,7 @@ def _names_antialiasing(comment: str) -> bool:
 READERS = (
     Reader("PLY", (".ply",), _read_ply),
     Reader("glTF", (".glb",), lambda path: (read_glb(path), ())),
-    Reader("SPZ", (".spz",), read_spz),
-    Reader("SOG", (".sog",), read_sog),
-    Reader("splat", (".splat",), read_splat),
+    *packed.READERS,
 )
 
 

@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 from jsecon.errors import InputError, describe_error
 from jsecon.files import atomic_write, parse_json
+from jsecon.read.registry import Reader
 from jsecon.read.splats.ply import Header, drawable_gaussians, usable_blocks
 from jsecon.splat.sh import C0
 from jsecon.splat.transform import transform_axes
@@ -90,7 +91,7 @@ def antialiasing_note(path: Path) -> tuple[str, ...]:
     return (f"{path.name} was trained with antialiasing (Mip-Splatting), and is drawn without it.",)
 
 
-def read_spz(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
+def _read_spz(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
     """Reads Niantic's .spz (github.com/nianticlabs/spz) of version 2 to 4, from the axes that it names, else RUB.
 
     Versions 2 and 3 are one gzip stream, with records behind the numbers; version 4 has them behind the header.
@@ -191,7 +192,7 @@ def read_compressed_ply(path: Path, header: Header) -> Gaussians:
         return _gaussians(path, gsply.plyread(path))
 
 
-def read_sog(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
+def _read_sog(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
     """Reads PlayCanvas' .sog, images in a zip."""
     with _decoding(path) as gsply:
         with zipfile.ZipFile(path) as archive:
@@ -202,7 +203,7 @@ def read_sog(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
         return _gaussians(path, gsply.sogread(path)), antialiasing_note(path) if meta.get("antialias") is True else ()
 
 
-def read_splat(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
+def _read_splat(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
     """Reads antimatter15's .splat: 32 bytes a Gaussian, degree 0, without a header."""
     data = path.read_bytes()
     if len(data) % _SPLAT.itemsize:
@@ -221,3 +222,10 @@ def read_splat(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
         "sh": (rows["rgba"][:, None, :3] / 255.0 - 0.5) / C0,
     }
     return drawable_gaussians(path, {name: np.ascontiguousarray(a, np.float32) for name, a in arrays.items()}), ()
+
+
+READERS = (
+    Reader("SPZ", (".spz",), _read_spz),
+    Reader("SOG", (".sog",), _read_sog),
+    Reader("splat", (".splat",), _read_splat),
+)
