@@ -88,6 +88,31 @@ def test_empty_scene_and_no_regions(field, tmp_path):
     assert_same(load_field(tmp_path / "a.field"), changed)
 
 
+def test_without_harmonics(field, path):
+    bare = dataclasses.replace(field, gaussians=dataclasses.replace(field.gaussians, sh=None))
+    save_field(path, bare)
+    assert_same(load_field(path), bare)
+
+
+def test_jit_compiles_once_for_fields_of_the_same_shapes(field):
+    """Their texts are not compiled for, stay where no trace is, and are not handed on by a compiled function."""
+    other = dataclasses.replace(field, names=tuple(f"other {name}" for name in field.names), embedder="another")
+    traces = []
+
+    @jax.jit
+    def moved(field):
+        traces.append((field.names, field.embedder, field.provenance))
+        return jax.tree.map(lambda a: a + 1, field)
+
+    results = [moved(field), moved(other)]
+    assert traces == [((), "", "{}")]
+    assert [(result.names, result.embedder) for result in results] == [((), "")] * 2
+    same = jax.tree.map(lambda a: a, other)
+    assert (same.names, same.embedder, same.provenance) == (other.names, other.embedder, other.provenance)
+    arrays = jax.vmap(lambda field: field.votes.total)(jax.tree.map(lambda a: np.stack([a, a]), field))
+    np.testing.assert_array_equal(arrays[1], field.votes.total)
+
+
 def fails(path, match, **options):
     with pytest.raises(InputError, match=match) as caught:
         load_field(path, **options)
@@ -102,7 +127,7 @@ def test_no_file_a_folder_an_empty_file_and_another_kind(tmp_path):
         (tmp_path / name).write_bytes(content)
         fails(tmp_path / name, "damaged")
     np.savez(tmp_path / "field.npz", a=np.ones(3))
-    fails(tmp_path / "field.npz", "earlier version")
+    fails(tmp_path / "field.npz", "field file")
     save_file({"a": np.ones(3)}, tmp_path / "other.safetensors")
     fails(tmp_path / "other.safetensors", "another program")
     for description in ({"format": "something"}, [1, 2], None):
@@ -133,7 +158,7 @@ def exchanged(header, record, name, other):
 
 
 @pytest.mark.parametrize(("change", "match"), [
-    (lambda h, a: h.update(version=99), "version 99"), (lambda h, a: h.pop("field"), "damaged"),
+    (lambda h, a: h.update(version=2), "another version of jsecon"), (lambda h, a: h.pop("field"), "damaged"),
     (lambda h, a: a.pop("codes.gaussians"), "damaged"),
     (lambda h, a: a.update({"codes.regions": a["codes.regions"][:-1]}), "damaged"),
     (lambda h, a: h["field"]["fields"].pop("votes"), "damaged"),
@@ -191,7 +216,7 @@ def test_mapped_columns_are_not_read_until_they_are_asked_for(field, path, monke
 
 
 def test_numbers_that_are_not_finite_are_found_a_piece_at_a_time(path, monkeypatch):
-    for name in ("MAPPED", "_ROWS"):
+    for name in ("MAPPED", "ROWS"):
         monkeypatch.setattr(module, name, 10)
     rewritten(path, lambda header, arrays: arrays["gaussians.means"].__setitem__((63, 2), np.nan))
     with pytest.raises(InputError, match=r"gaussians\.means with numbers that are not finite"):

@@ -12,7 +12,7 @@ from jsecon import plan_view
 from jsecon.association.scene import superpixel_votes
 from jsecon.errors import InputError
 from jsecon.field import columns, evidence
-from jsecon.field.evidence import region_votes, strongest, sum_evidence, view_evidence
+from jsecon.field.evidence import ViewEvidence, region_votes, sum_evidence, view_evidence
 from jsecon.field.membership import normalise_votes
 from jsecon.splat.reference import weights_reference
 from jsecon.splat.render import render_rgb
@@ -225,10 +225,14 @@ def test_strongest_first_and_what_is_cut_is_counted(cast, scene, cameras, labels
 
     rng = np.random.default_rng(0)
     dense = rng.integers(0, 4, (500, 9)).astype(np.float64) * (rng.random((500, 9)) < 0.6)
-    ids, weights = strongest(sparse.csr_matrix(dense), 4)
+    matrix = sparse.csr_matrix(dense)
+    seen = np.flatnonzero(np.diff(matrix.indptr)).astype(np.int32)
+    starts = np.append(matrix.indptr[seen], matrix.nnz).astype(np.int32)
+    view = ViewEvidence(seen, starts, matrix.indices, matrix.data.astype(np.float32), np.ones(len(seen), np.float32))
+    votes = sum_evidence([view], 500, 9, top=4)
     expected, places = jax.lax.top_k(jnp.asarray(dense), 4)  # equal ones by region
-    np.testing.assert_array_equal(weights, expected)
-    np.testing.assert_array_equal(ids, np.where(np.asarray(expected) > 0, places, -1))
+    np.testing.assert_array_equal(votes.weights, expected)
+    np.testing.assert_array_equal(votes.regions, np.where(np.asarray(expected) > 0, places, -1))
 
 
 @pytest.mark.parametrize("traced", [False, True])

@@ -24,13 +24,8 @@ from jsecon.vision.region_graph import relabel_sequential
 
 MAX_PIECES = 3000
 """Maximum number of pieces of a scene."""
-SKETCH_SIZE = 24
-"""Dimension of the random projection of a Gaussian's masks while pieces are formed."""
-KMEANS_ROUNDS = 2
 MIN_SHARED_VIEWS = 0.02
 """Least share of their visibility that two groups must have in common to be joined."""
-MIN_MASK_SHARE = 0.05
-"""Least share of a Gaussian in a mask that counts, for masks in one layer."""
 
 
 def group_by_consensus(
@@ -43,7 +38,7 @@ def group_by_consensus(
     pieces: int = MAX_PIECES,
     seed: int = 0,
 ) -> Int[np.ndarray, " n"]:
-    """Groups Gaussians into objects by the consensus of the views.
+    """Groups Gaussians into objects by the consensus of the views: (N,) object 0 .. R-1, -1 if it is never seen.
 
     The Gaussians are first gathered into small pieces (`scene_pieces`). Then `average_linkage` joins pieces while the
     views that see two groups put both into one mask with a probability of at least `agreement`. Groups that hardly any
@@ -57,12 +52,6 @@ def group_by_consensus(
       agreement: Probability of a common mask above which groups are joined.
       pieces: Maximum number of pieces.
       seed: Seed of the random projection.
-
-    Returns:
-      (N,) object of each Gaussian, 0 .. R-1, -1 if it is never seen.
-
-    Raises:
-      ValueError: The numbers of rows differ.
     """
     shapes = [rows.shape for rows in (membership, visible, weights, means)]
     equal = len({shape[0] for shape in shapes}) == 1
@@ -90,22 +79,12 @@ def scene_pieces(
     pieces: int,
     seed: int = 0,
 ) -> Int[np.ndarray, " n"]:
-    """Gathers Gaussians into pieces that are compact and lie in the same masks.
+    """Gathers Gaussians into pieces that are compact and lie in the same masks: (N,) piece, -1 if its weight is 0.
 
     It runs k-means over the centres (compressed outside of the middle half of the scene, so that distant objects get
     few pieces) and a random projection of the masks, initialised by `split_cells`. Two rounds end within 6 % of the sum
     of squares of k-means++ and mini-batches (bonsai, replica_apartment_0), in a tenth to a third of the time.
-
-    Args:
-      membership: (N, M) share of each Gaussian in each mask, times its visibility there.
-      visible: (N, T) visibility of each Gaussian in each frame, in [0, 1].
-      weights: (N,) total rendering weight of each Gaussian.
-      means: (N, 3) centres, world units.
-      pieces: Maximum number of pieces.
-      seed: Seed of the random projection.
-
-    Returns:
-      (N,) piece of each Gaussian, -1 if its weight is 0.
+    Arguments as for `group_by_consensus`.
     """
     piece = np.full(len(means), -1, np.int64)
     live = np.flatnonzero(weights > 0)
@@ -116,12 +95,12 @@ def scene_pieces(
     reach = np.maximum(np.linalg.norm(centred, axis=1, keepdims=True), 1.0)
     centred = centred * (2.0 - 1.0 / reach) / reach
     rng = np.random.default_rng(seed)
-    basis = rng.standard_normal((membership.shape[1], SKETCH_SIZE)).astype(np.float32)
+    basis = rng.standard_normal((membership.shape[1], 24)).astype(np.float32)
     sketch = membership[live] @ basis
     sketch /= np.maximum(np.linalg.norm(sketch, axis=1, keepdims=True), 1e-12)
     points = np.concatenate([4.0 * centred, sketch], axis=1).astype(np.float32)
     centres = _cell_means(points, split_cells(points, min(pieces, max(len(live) // 4, 1))))
-    for _ in range(KMEANS_ROUNDS):
+    for _ in range(2):
         # |p - c|^2 / 2 but for |p|^2 / 2, which is the same for all centres
         lines = np.concatenate([-centres, 0.5 * np.square(centres).sum(1, keepdims=True)], axis=1).astype(np.float32)
         parts = np.array_split(np.pad(points, [(0, 0), (0, 1)], constant_values=1.0), len(points) // 4096 + 1)
@@ -132,14 +111,9 @@ def scene_pieces(
 
 
 def split_cells(points: Float[np.ndarray, "n d"], count: int) -> Int[np.ndarray, " n"]:
-    """Divides points into cells: each round splits the cells with the largest spread along an axis at their mean.
+    """Divides points (N, D) into at most `count` cells: each round splits those with the largest spread at their mean.
 
-    Args:
-      points: (N, D).
-      count: Maximum number of cells; up to half of all cells are split per round.
-
-    Returns:
-      (N,) cell of each point, 0 .. K-1; equal points share a cell.
+    Up to half of all cells are split per round, along the axis of their spread. Equal points share a cell.
     """
     cell = np.zeros(len(points), np.int64)
     while (have := int(cell.max()) + 1) < count:
@@ -163,7 +137,7 @@ def _cell_means(points: Float[np.ndarray, "n d"], cell: Int[np.ndarray, " n"]) -
 def average_linkage(
     together: Float[np.ndarray, "k k"], both: Float[np.ndarray, "k k"], *, least_ratio: float, least_shared: float = 0.0
 ) -> Int[np.ndarray, " k"]:
-    """Clusters K items by weighted average linkage.
+    """Clusters K items by weighted average linkage: (K,) group 0 .. R-1.
 
     The similarity of two groups a and b is
 
@@ -171,16 +145,8 @@ def average_linkage(
 
     if V_ab > 0 and V_ab >= least_shared sqrt(V_aa V_bb), and 0 otherwise: the mean of w / v over all pairs of members,
     weighted by v. Chains of nearest neighbours need O(K^2) time: s of a union lies between those of its parts, so they
-    end in the same groups as repeatedly joining the best pair.
-
-    Args:
-      together: (K, K) w.
-      both: (K, K) v.
-      least_ratio: Similarity below which groups stay separate.
-      least_shared: Least V_ab in units of sqrt(V_aa V_bb).
-
-    Returns:
-      (K,) group of each item, 0 .. R-1.
+    end in the same groups as repeatedly joining the best pair. `together` is w and `both` is v; groups of a similarity
+    below `least_ratio` stay separate.
     """
     together, both = ((matrix + matrix.T) / 2.0 for matrix in (together.astype(np.float64), both.astype(np.float64)))
     count = len(together)
@@ -229,34 +195,23 @@ def track_masks(
     scene: SceneSuperpixels,
     *,
     agreement: float = 0.4,
-    abstain_if_unlabelled: bool = True,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Int16[np.ndarray, "t h w"]:
     """Follows objects through the frames by consensus, independent of the order of the frames.
 
-    The Gaussians are grouped by `group_by_consensus`, and the groups claim the superpixels of each frame
-    (`assign_superpixels`).
+    The Gaussians are grouped by `group_by_consensus`, and the groups are assigned the superpixels of each frame.
 
     Args:
       frames: (T, H, W, 3) uint8.
       scene: Scene, cameras and proposals of these frames.
       agreement: Probability of a common mask above which Gaussians are grouped.
-      abstain_if_unlabelled: Whether a frame abstains on Gaussians that lie in no mask of it, see `mask_signatures`.
       seed: Seed of the random projection.
       progress: Called with the number of frames done and of all.
-
-    Returns:
-      (T, H, W) int16 labels, -1 for no object.
     """
     require(seed >= 0, "seed", seed, "at least 0", "Give another seed.")
     views, means = scene.all(frames, progress), np.asarray(scene.gaussians.means, np.float32)
-    owner = group_by_consensus(
-        *mask_signatures(views, scene.count, abstain_if_unlabelled=abstain_if_unlabelled),
-        means,
-        agreement=agreement,
-        seed=seed,
-    )
+    owner = group_by_consensus(*mask_signatures(views, scene.count), means, agreement=agreement, seed=seed)
     count = int(owner.max(initial=-1)) + 1
     labels = np.full(frames.shape[:3], -1, np.int16)
     for image, view in zip(labels, views):
@@ -298,17 +253,9 @@ def pieces_on_masks(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> tuple[Int[np.ndarray, " n"], Sparse]:
-    """Computes pieces of a scene and the weight of each Gaussian on all masks, the input of `scene_parts`.
+    """Computes the pieces of a scene (N,) and the weight of each Gaussian on all masks (N, M), for `scene_parts`.
 
-    Args:
-      frames: (T, H, W, 3) uint8.
-      scene: Scene, cameras and proposals of these frames.
-      seed: Seed of the random projection.
-      progress: Called with the number of frames done and of all.
-
-    Returns:
-      (N,) piece of each Gaussian, -1 if it is never seen; and the sparse matrix (N, M) of the weight of each Gaussian
-      on each of the M masks of all frames, in their order.
+    The masks of all frames lie in their order. A Gaussian that is never seen has piece -1.
     """
     require(seed >= 0, "seed", seed, "at least 0", "Give another seed.")
     views, means = scene.all(frames, progress), np.asarray(scene.gaussians.means, np.float32)
@@ -321,23 +268,13 @@ def pieces_on_masks(
     return piece, sum_entries(entries, (scene.count, start))
 
 
-def mask_signatures(
-    views: list[FrameSuperpixels], count: int, *, abstain_if_unlabelled: bool = True
-) -> tuple[Sparse, Sparse, Float[np.ndarray, " n"]]:
-    """Computes the input of `group_by_consensus`.
+def mask_signatures(views: list[FrameSuperpixels], count: int) -> tuple[Sparse, Sparse, Float[np.ndarray, " n"]]:
+    """Computes the input of `group_by_consensus`: membership (N, M), visible (N, T) and weights (N,).
 
     The visibility of a Gaussian in a frame is its clarity, relative to the frame that sees it best: on an outline it
-    overlaps its neighbours. Its shares in the masks are squared and normalised, which favours the majority. Overlapping
-    masks divide it, so that a frame with many levels of masks counts no more than one with a single partition.
-
-    Args:
-      views: Votes of all frames.
-      count: N, number of Gaussians.
-      abstain_if_unlabelled: Whether a frame abstains on a Gaussian by the share that lies in no mask of it. Otherwise
-        such a Gaussian counts as separate from all others.
-
-    Returns:
-      membership (N, M), visible (N, T) and weights (N,), see `group_by_consensus`.
+    overlaps its neighbours. A frame abstains on a Gaussian by the share that lies in no mask of it. The shares in the
+    masks are squared and normalised, which favours the majority. Overlapping masks divide it, so that a frame with many
+    levels of masks counts no more than one with a single partition.
     """
     shares, looks, weights, start = [], [], np.zeros(count, np.float64), 0
     for t, view in enumerate(views):
@@ -350,8 +287,8 @@ def mask_signatures(
         share = cast.data / np.maximum(totals[cast.row] * layers, 1e-12)
         norm = np.bincount(cast.row, share**2, len(totals)) + outside**2 / layers
         share = share**2 / np.maximum(norm[cast.row], 1e-12)
-        visibility = view.clarity * (np.bincount(cast.row, share, len(totals)) if abstain_if_unlabelled else 1.0)
-        keep = share >= MIN_MASK_SHARE / layers
+        visibility = view.clarity * np.bincount(cast.row, share, len(totals))
+        keep = share >= 0.05 / layers  # less is an edge's blur
         share = (share * np.sqrt(layers) * view.clarity[cast.row])[keep].astype(np.float32)
         shares.append((share, view.seen[cast.row[keep]], start + cast.col[keep]))
         looks.append((visibility.astype(np.float32), view.seen, np.full(len(view.seen), t)))

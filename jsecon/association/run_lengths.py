@@ -25,11 +25,7 @@ class RunLengthMasks:
     """P, pixels of an image."""
 
     def rows(self) -> Sparse:
-        """Decodes the masks.
-
-        Returns:
-          Sparse matrix (R, P) of float32 ones.
-        """
+        """Decodes the masks as a sparse matrix (R, P) of float32 ones."""
         lengths = (self.stops - self.starts).astype(np.int64)
         ends = np.concatenate([[0], np.cumsum(lengths)])
         columns = np.arange(ends[-1]) + np.repeat(self.starts - ends[:-1], lengths)
@@ -38,39 +34,17 @@ class RunLengthMasks:
         return sparse.csr_matrix((np.ones(len(columns), np.float32), columns.astype(np.int32), ends), shape=shape)
 
     def masks(self, height: int, width: int) -> Bool[np.ndarray, "r h w"]:
-        """Decodes the masks into images.
-
-        Args:
-          height: H, px.
-          width: W, px; P = H W.
-
-        Returns:
-          (R, H, W) bool.
-        """
+        """Decodes the masks into images (R, H, W); P = H W."""
         return self.rows().astype(bool).toarray().reshape(len(self.counts), height, width)
 
     def concatenate(self, others: "RunLengthMasks") -> "RunLengthMasks":
-        """Appends masks.
-
-        Args:
-          others: Masks over the same pixels.
-
-        Returns:
-          The masks, then the others.
-        """
+        """Appends masks over the same pixels."""
         starts, stops = (np.concatenate(pair) for pair in zip((self.starts, self.stops), (others.starts, others.stops)))
         return RunLengthMasks(starts, stops, np.concatenate([self.counts, others.counts]), self.pixels)
 
 
 def encode_rows(rows: Sparse) -> RunLengthMasks:
-    """Encodes masks that are rows of a sparse matrix.
-
-    Args:
-      rows: csr_matrix (R, P) with sorted indices, whose nonzeros are the masks.
-
-    Returns:
-      R masks.
-    """
+    """Encodes masks that are the nonzeros of the rows of a csr_matrix (R, P) with sorted indices."""
     new = np.ones(rows.nnz, bool)
     new[1:] = np.diff(rows.indices) != 1
     new[rows.indptr[:-1][np.diff(rows.indptr) > 0]] = True
@@ -82,28 +56,14 @@ def encode_rows(rows: Sparse) -> RunLengthMasks:
 
 
 def encode_masks(masks: Bool[np.ndarray, "r h w"]) -> RunLengthMasks:
-    """Encodes masks.
-
-    Args:
-      masks: (R, H, W) bool.
-
-    Returns:
-      R masks over P = H W pixels.
-    """
+    """Encodes masks (R, H, W) over P = H W pixels."""
     return encode_rows(sparse.csr_matrix(masks.reshape(len(masks), masks.shape[1] * masks.shape[2])))
 
 
 def cache_masks_as_rle(
     propose: Callable[[int], Bool[np.ndarray, "m h w"]],
 ) -> Callable[[int], Bool[np.ndarray, "m h w"]]:
-    """Memoizes a function from the index of a frame to its masks, in run-length encoding.
-
-    Args:
-      propose: Maps an index to masks (M, H, W) bool.
-
-    Returns:
-      The function with memory, which calls `propose` once per index.
-    """
+    """Caches a function from the index of a frame to its masks, which it then calls once per index, in run lengths."""
 
     @functools.cache
     def encoded(index: int) -> tuple[RunLengthMasks, tuple[int, int]]:

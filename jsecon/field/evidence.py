@@ -63,7 +63,7 @@ class ViewEvidence(NamedTuple):
     overflow: int = 0
     """Pairs beyond the capacity; 0 if the list is exact."""
 
-    def of_rows(self, rows: slice) -> "ViewEvidence":
+    def _of_rows(self, rows: slice) -> "ViewEvidence":
         """Takes the Gaussians of a slice, which are then counted from its start."""
         first, last = np.searchsorted(self.gaussians, [rows.start, rows.stop])
         starts = np.asarray(self.starts[first : last + 1])
@@ -195,7 +195,7 @@ def view_evidence(
 def _count_steps(plan: ViewPlan, labels: Array) -> Array:
     """Counts the chunks that `_list_chunks` lists at most, and so bounds their memory."""
     batches = make_batches(plan.lists, plan.width)
-    names = distinct_labels(to_tiles(labels + 1, plan.lists.tile) - 1, _SLOTS)
+    names = _distinct_labels(to_tiles(labels + 1, plan.lists.tile) - 1, _SLOTS)
     chunks = -(-batches.lengths[batches.tiles].max(1) // CHUNK)
     passes = -(-(names[batches.tiles] >= 0).sum(2).max(1) // _SLOTS)
     return (chunks * passes).sum()
@@ -232,7 +232,7 @@ def _scan_regions(plan: ViewPlan, labels: Array, centre_pixel_weight: float, sta
     integer = jnp.int32 if splats.dtype == jnp.float32 else jnp.int64
     batches = make_batches(lists, plan.width)
     tiles = to_tiles(labels + 1, lists.tile) - 1  # -1 outside of the image
-    distinct = distinct_labels(tiles, _SLOTS)
+    distinct = _distinct_labels(tiles, _SLOTS)
     table = make_table(splats)
 
     def one_batch(state, ids_of_tiles):
@@ -359,7 +359,7 @@ def sum_evidence(
     """Adds up the lists of views to votes of `count` Gaussians, a block of rows at a time; see `region_votes`."""
     size = max(_MAX_ENTRIES // max(len(views), 1), 1)
     blocks = (slice(first, min(first + size, count)) for first in range(0, max(count, 1), size))
-    columns = (_sum_rows([view.of_rows(rows) for view in views], rows, num_regions, top, by_view) for rows in blocks)
+    columns = (_sum_rows([view._of_rows(rows) for view in views], rows, num_regions, top, by_view) for rows in blocks)
     joined = _join(columns) if folder is None else _write_columns(Path(folder), columns, count)
     if by_view:
         joined["by_view"] = joined["by_view"].T
@@ -386,13 +386,13 @@ def _sum_rows(
     weights = np.concatenate([np.zeros(0), *(view.weights for view in views)])
     inside = regions < num_regions
     votes = sparse.csr_matrix((weights[inside], (owners[inside], regions[inside])), shape=(count, max(num_regions, 1)))
-    columns = dict(zip(("regions", "weights"), strongest(votes, top)))
+    columns = dict(zip(("regions", "weights"), _strongest(votes, top)))
     columns |= {"labelled": np.asarray(votes.sum(1)).reshape(-1), "total": total, "max_pixel_weight": peak}
     columns = {name: a.astype(np.float32) if a.dtype == np.float64 else a for name, a in columns.items()}
     return columns | {"views": seen} | ({"by_view": each} if by_view else {})
 
 
-def strongest(votes: Any, top: int) -> tuple[Int32[np.ndarray, "n k"], Float32[np.ndarray, "n k"]]:
+def _strongest(votes: Any, top: int) -> tuple[Int32[np.ndarray, "n k"], Float32[np.ndarray, "n k"]]:
     """Finds the `top` largest weights of each row of a csr_matrix (N, R), equal ones by id; then -1 and 0."""
     lengths, weights = np.diff(votes.indptr), votes.data.astype(np.float32)
     rows = np.repeat(np.arange(votes.shape[0]), lengths)
@@ -421,7 +421,7 @@ def _centre_pixels(
     return (pixel[..., None] == lax.iota(jnp.int32, tile * tile)).astype(splats.dtype)
 
 
-def distinct_labels(tiles: Int[Array, "n p"], slots: int) -> Int[Array, "n q"]:
+def _distinct_labels(tiles: Int[Array, "n p"], slots: int) -> Int[Array, "n q"]:
     """Finds the distinct labels of each tile, ascending, -2 after the last and in `slots` more columns.
 
     `tiles` are the labels of the pixels, -1 for none.

@@ -17,6 +17,7 @@ import jax
 import numpy as np
 
 from jsecon.errors import InputError, describe_error, require
+from jsecon.field.columns import ROWS
 from jsecon.files import (
     READ_ERRORS,
     ForeignFileError,
@@ -32,13 +33,10 @@ from jsecon.splat.project import unusable_rows
 from jsecon.splat.sh import COEFFICIENT_COUNTS
 from jsecon.types import Autoencoder, Camera, Codes, Gaussians, LanguageField, Parts, Regions, Votes
 
-FORMAT = "jsecon-field"
 VERSION = 3
 _RECORDS = {cls.__name__: cls for cls in (LanguageField, Gaussians, Votes, Regions, Parts, Camera, Codes, Autoencoder)}
 MAPPED = 1 << 20
 """bytes of a column from which a mapped field leaves it on disk"""
-_ROWS = 1 << 20
-"""rows of a column that are looked at at once"""
 _REMEDY = "Make the field again with `jsecon run`."
 _LETTERS = {
     "n": ("gaussians.means", 0),
@@ -92,7 +90,7 @@ def save_field(path: str | os.PathLike, field: LanguageField) -> None:
     require(problem is None, "save_field", problem, "what load_field reads", "Build the field from one run.")
     tree = pack_tree(field, "", arrays, lambda kind: kind.__name__ if kind in _RECORDS.values() else None)
     with atomic_write(path) as temporary:
-        write_arrays(temporary, arrays, {"format": FORMAT, "version": VERSION, "field": tree})
+        write_arrays(temporary, arrays, {"format": "jsecon-field", "version": VERSION, "field": tree})
 
 
 def load_field(path: str | os.PathLike, *, mapped: bool = False) -> LanguageField:
@@ -136,7 +134,7 @@ def _read(path: Path, mapped: int, checked: bool) -> LanguageField:
     changed = f"It may have been changed or cut short in copying. {_REMEDY}"
     try:
         header, members = read_arrays(path, memory_map_above=mapped, verify=checked)
-        if not isinstance(header, dict) or header.get("format") != FORMAT:
+        if not isinstance(header, dict) or header.get("format") != "jsecon-field":
             raise InputError(path, "it is a file of jsecon, but no field", "a field file", _REMEDY)
         if (version := header.get("version")) != VERSION:
             raise InputError(path, f"it was written by another version of jsecon (format {version})", remedy=_REMEDY)
@@ -206,7 +204,7 @@ def _oddity(field: LanguageField, checked: bool = True) -> str | None:
         if isinstance(leaf, np.memmap) and not checked:
             continue
         name, column = jax.tree_util.keystr(place).lstrip("."), np.atleast_1d(np.asarray(leaf))
-        for numbers in (column[first : first + _ROWS] for first in range(0, len(column), _ROWS)):
+        for numbers in (column[first : first + ROWS] for first in range(0, len(column), ROWS)):
             column_name = name.removeprefix("gaussians.")
             wrong = unusable_rows(column_name, numbers) if column_name != name else ~np.isfinite(numbers)
             if wrong.any():

@@ -40,11 +40,6 @@ SEEN_PART = 0.05
 """The same of its weight on all pixels, for scenes of which only a few objects have masks."""
 CORRELATION = 0.05
 """Correlation of two views' errors: a tracker's loss or a proposal's cut lasts, so views beyond about 20 add little."""
-_BLOCK = 1 << 15
-"""Gaussians at a time in `add_visible_weight`, where arrays are dense in the regions."""
-_WORD = 32
-_MOST_WORDS = 8
-"""Words of the table from which a lookup is cheaper than selections."""
 
 
 class InsideFraction(NamedTuple):
@@ -118,7 +113,7 @@ def _add_visible_weight(votes: Votes, shows: Bool[Array, "r t"]) -> Votes:
     """Replaces `by_view` by `shown`, with the (R, T) views that show a region; Gaussian by Gaussian."""
     by_view, regions = jnp.asarray(votes.by_view), jnp.asarray(votes.regions)
     count = regions.shape[0]
-    block = min(_BLOCK, max(count, 1))
+    block = min(1 << 15, max(count, 1))  # its arrays are dense in the regions
 
     def one_block(i, shown):
         first = jnp.minimum(i * block, count - block)  # the last block overlaps the one before it
@@ -142,12 +137,6 @@ def with_overlap(votes: Votes) -> Votes:
     with p the shares; 0 for a region without votes. Two pieces that masks cut out of one object in different views
     overlap in its Gaussians; two objects meet only where they touch, and what lies behind all of them is far larger
     than any.
-
-    Args:
-      votes: Votes of N Gaussians.
-
-    Returns:
-      The votes with `overlap`.
     """
     sums = _overlap_sums(jnp.asarray(votes.regions), vote_shares(votes), votes.num_regions)
     return dataclasses.replace(votes, overlap=_soft_iou(sums))
@@ -178,29 +167,16 @@ def _soft_iou(both: Float[Array, "r r"]) -> Float[Array, "r r"]:
 
 @stored_jit
 def vote_shares(votes: Votes) -> Float[Array, "n k"]:
-    """Computes the share p_nr of each vote. Pure.
-
-    Args:
-      votes: Votes of N Gaussians.
-
-    Returns:
-      (N, K) in [0, 1]: 0 without a vote, NaN if its numbers are not finite.
-    """
+    """Computes the share p_nr of each vote (N, K): 0 without a vote, NaN if its numbers are not finite. Pure."""
     visible = votes.weight_where_region_visible
     seen = votes.total[:, None] if visible is None else jnp.maximum(visible, _least_seen(votes)[:, None])
     return ratio(jnp.where(votes.regions >= 0, votes.weights, 0.0), jnp.where(votes.regions >= 0, seen, 0.0))
 
 
 def vote_columns(votes: Votes) -> Iterator[tuple[Int[Array, " n"], Float[Array, " n"], Float[Array, " n"]]]:
-    """Iterates over every Gaussian's k-th vote, k = 1 to K. For compiled code.
+    """Iterates over every Gaussian's k-th vote: region, -1 without a vote; weight w_nr; and what this is a share of.
 
     Column by column: a reduction over short rows does not vectorise (1 million Gaussians of 8 votes: 27 ms against 4).
-
-    Args:
-      votes: Votes of N Gaussians.
-
-    Yields:
-      The region r (N,), -1 without a vote; its weight w_nr (N,); and the weight that this is a share of (N,).
     """
     least, visible = _least_seen(votes), votes.weight_where_region_visible
     for k in range(votes.regions.shape[1]):
@@ -214,15 +190,7 @@ def _least_seen(votes: Votes) -> Array:
 
 
 def ratio(weight: Array, seen: Array) -> Array:
-    """Divides weights. Pure.
-
-    Args:
-      weight: Weights of any shape.
-      seen: Weights that they are a share of, of the same shape.
-
-    Returns:
-      Shares in [0, 1]; 0 if `seen` is 0, NaN if a number is not finite.
-    """
+    """Divides a weight by what it is a share of: in [0, 1], 0 if that is 0, NaN if a number is not finite. Pure."""
     share = jnp.where(seen > 0, jnp.clip(weight / jnp.where(seen > 0, seen, 1.0), 0.0, 1.0), 0.0)
     return jnp.where(jnp.isfinite(weight) & jnp.isfinite(seen), share, jnp.nan)
 
@@ -234,15 +202,8 @@ def inside_fraction(votes: Votes, chosen: Bool[Array, " r"]) -> InsideFraction:
         p_n = min(sum_r w_nr / max(max_r W_nr, LABELLED_PART L_n, SEEN_PART W_n), 1)
 
     with r the chosen regions among the K that n has votes for. The largest W_nr is that of all views that show any of
-    them, where one is shown wherever the others are, and no more elsewhere.
-
-    Args:
-      votes: Votes of N Gaussians.
-      chosen: (R,) bool.
-
-    Returns:
-      The share. It is not known for Gaussians that no view sees, that have no vote for a chosen region, or whose votes
-      are not finite.
+    them, where one is shown wherever the others are, and no more elsewhere. It is not known for Gaussians that no view
+    sees, that have no vote for a chosen region, or whose votes are not finite.
     """
     inside, weight = _lookup(chosen), jnp.zeros(votes.total.shape, votes.weights.dtype)
     seen = jnp.zeros_like(weight)
@@ -256,15 +217,7 @@ def inside_fraction(votes: Votes, chosen: Bool[Array, " r"]) -> InsideFraction:
 
 
 def inside_fraction_of_regions(votes: Votes, regions: Sequence[int]) -> Float[np.ndarray, " n"]:
-    """Computes `inside_fraction` a few regions with NumPy, for a few Gaussians. Host code, which compiles no program.
-
-    Args:
-      votes: Votes of N Gaussians.
-      regions: Ids of regions.
-
-    Returns:
-      (N,) the share, the same bits; 0 where it is not known.
-    """
+    """Computes the same bits as `inside_fraction` with NumPy, for a few regions: it compiles no program. Host code."""
     inside = np.isin(votes.regions, regions)
     weights, total = np.asarray(votes.weights), np.asarray(votes.total)
     least = np.maximum(np.float32(LABELLED_PART) * np.asarray(votes.labelled), np.float32(SEEN_PART) * total)
@@ -281,20 +234,20 @@ def _lookup(chosen: Bool[Array, " r"]) -> Callable[[Array], Array]:
 
     The chosen ones are bits of a few words that stay in registers: half the time of a table.
     """
-    count = chosen.shape[0]
-    words = -(-max(count, 1) // _WORD)
-    bits = jnp.pad(chosen, (0, words * _WORD - count)).reshape(words, _WORD).astype(jnp.uint32)
-    table = jnp.sum(bits << jnp.arange(_WORD, dtype=jnp.uint32), axis=-1, dtype=jnp.uint32)
+    count, word_size = chosen.shape[0], 32
+    words = -(-max(count, 1) // word_size)
+    bits = jnp.pad(chosen, (0, words * word_size - count)).reshape(words, word_size).astype(jnp.uint32)
+    table = jnp.sum(bits << jnp.arange(word_size, dtype=jnp.uint32), axis=-1, dtype=jnp.uint32)
 
     def inside(region: Array) -> Array:
         place = jnp.clip(region, 0, max(count - 1, 0))
-        if words <= _MOST_WORDS:
+        if words <= 8:  # selections are cheaper than a lookup
             word = jnp.full(place.shape, table[0])
             for i in range(1, words):
-                word = jnp.where(place >= _WORD * i, table[i], word)
+                word = jnp.where(place >= word_size * i, table[i], word)
         else:
-            word = table[place // _WORD]
-        return (((word >> (place % _WORD).astype(jnp.uint32)) & 1) > 0) & (region == place)
+            word = table[place // word_size]
+        return (((word >> (place % word_size).astype(jnp.uint32)) & 1) > 0) & (region == place)
 
     return inside
 
@@ -321,16 +274,7 @@ def membership_probability(
 
 
 def probability_inside(share: Float[Array, " n"], votes: Votes, mask: Bool[Array, " n"]) -> Float[np.ndarray, " m"]:
-    """Computes `membership_probability` of selected Gaussians alone, without a program. Host code.
-
-    Args:
-      share: (N,) in [0, 1].
-      votes: Votes of the N Gaussians.
-      mask: (N,) bool, the M selected Gaussians.
-
-    Returns:
-      (M,) in [0, 1].
-    """
+    """Computes `membership_probability` of the M selected Gaussians alone, without a program. Host code."""
     rows = np.flatnonzero(np.asarray(mask))
     share, views, total = (np.asarray(column)[rows] for column in (share, votes.views, votes.total))
     return _mass_above_half(share, views, total, CORRELATION, np, scipy.special.betainc)

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from scipy import sparse
 
-from jsecon.errors import require, require_one_of, require_shape
+from jsecon.errors import require, require_shape
 from jsecon.numerics import normalize, require_labels
 from jsecon.parallel import map_over_processes
 from jsecon.types import Array, Parts, Progress, Regions
@@ -30,7 +30,6 @@ def region_embeddings(
     labels: Shaped[np.ndarray, "t _ _"],
     embed: Callable[[np.ndarray, np.ndarray], np.ndarray],
     *,
-    weighting: Literal["pixels", "uniform"] = "pixels",
     num_regions: int | None = None,
     progress: Progress | None = None,
 ) -> Regions:
@@ -42,7 +41,6 @@ def region_embeddings(
       frames: (T, H, W, 3) uint8.
       labels: (T, H, W) integer region ids, -1 where a pixel belongs to no region.
       embed: `Embedder.embed_regions`: (H, W, 3) and masks (M, H, W) -> (M, E) unit embeddings.
-      weighting: "pixels" as above (the paper), or "uniform": omega_t = 1 / number of views of r.
       num_regions: R; None takes the largest label + 1.
       progress: Called as progress(done, total), in frames.
 
@@ -50,37 +48,33 @@ def region_embeddings(
       Regions. A view whose embedding is zero does not count; a region without any view has a zero embedding.
 
     Raises:
-      ValueError: Shapes disagree, a label is out of range, or the weighting is unknown.
+      ValueError: Shapes disagree, or a label is out of range.
     """
     require_shape("labels", labels, frames.shape[:3], "Give one label image per frame, of the frame's size.")
 
     def of_frame(t, masks):
         return embed(frames[t], masks)
 
-    return _pool_embeddings(labels, of_frame, weighting=weighting, num_regions=num_regions, progress=progress)
+    return _pool_embeddings(labels, of_frame, num_regions=num_regions, progress=progress)
 
 
 def embeddings_of_masks(
     labels: Int[np.ndarray, "t h w"],
     masks: Int[np.ndarray, "_ _ _"],
     embeddings: Float[np.ndarray, "m e"],
-    **options: Any,
+    *,
+    progress: Progress | None = None,
 ) -> Regions:
     """Embeds the regions of a labelled sequence from masks of its frames that have embeddings. Host code.
 
-    In each view a region has the mean of the embeddings under its pixels, scaled to unit length.
+    In each view a region has the mean of the embeddings under its pixels, scaled to unit length. Views in which it lies
+    on no mask do not count.
 
     Args:
-      labels: (T, H, W) integer region ids, -1 where a pixel belongs to no region.
+      labels: (T, H, W) region ids, -1 where a pixel belongs to no region.
       masks: (T, H, W) rows of `embeddings`, -1 where there is no mask.
       embeddings: (M, E) of the masks.
-      options: Other options of `region_embeddings`.
-
-    Returns:
-      Regions. Views in which a region lies on no mask do not count.
-
-    Raises:
-      ValueError: Shapes disagree, a label is out of range, or the weighting is unknown.
+      progress: Called as progress(done, total), in frames.
     """
     require_shape("masks", masks, labels.shape, "Give one image of rows per frame, of the labels' size.")
 
@@ -92,19 +86,17 @@ def embeddings_of_masks(
         sums = pixels @ embeddings[rows].astype(np.float64)
         return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
 
-    return _pool_embeddings(labels, under, **options)
+    return _pool_embeddings(labels, under, progress=progress)
 
 
 def _pool_embeddings(
     labels: Shaped[np.ndarray, "t h w"],
     embed: Embed,
     *,
-    weighting: Literal["pixels", "uniform"] = "pixels",
     num_regions: int | None = None,
     progress: Progress | None = None,
 ) -> Regions:
     """`region_embeddings` for an `embed` that takes the index of a frame. Several processes share the frames."""
-    require_one_of("weighting", weighting, ("pixels", "uniform"), "Use 'pixels', as the paper does.")
     largest = int(labels.max()) if labels.size else -1
     count = largest + 1 if num_regions is None else num_regions
     require_labels(labels, count)
@@ -122,8 +114,7 @@ def _pool_embeddings(
             seen = np.flatnonzero(pixels[:, t])
             require_shape("embed", rows, (len(seen), "E"), "An embedder returns one row per mask.")
             total = np.zeros((count, rows.shape[1])) if total is None else total
-            weight = pixels[seen, t].astype(np.float64) if weighting == "pixels" else np.ones(len(seen))
-            total[seen] += weight[:, None] * rows
+            total[seen] += pixels[seen, t, None] * rows
     if not len(labels):
         total = np.zeros((count, 0))
     elif total is None:  # without a label the embedder alone knows E
@@ -139,17 +130,11 @@ def _unit_rows(rows: np.ndarray) -> np.ndarray:
 
 @functools.partial(jax.jit, inline=True)
 def mean_residuals(embeddings: Float[Array, "r e"]) -> tuple[Float[Array, "r e"], Bool[Array, " r"]]:
-    """Computes what sets each of R regions apart from the others. Pure.
+    """Computes what sets each of R regions apart from the others, and which regions have an embedding. Pure.
 
         e_r - n / (n + 1) mean_q e_q
 
     with unit embeddings e of the n regions that have one. The factor lets a single region keep its own direction.
-
-    Args:
-      embeddings: (R, E), of any length.
-
-    Returns:
-      The residuals (R, E), 0 for regions without an embedding; and which regions have one (R,).
     """
     units = normalize(embeddings)
     known = jnp.all(jnp.isfinite(units), axis=-1) & jnp.any(units != 0, axis=-1)
@@ -164,13 +149,7 @@ def scene_parts(part: Int[np.ndarray, " n"], cast: Any, embeddings: Float[np.nda
     Args:
       part: (N,) part of each Gaussian, 0 .. P-1, -1 for no part.
       cast: (N, M) sparse matrix, the weight of each Gaussian on each mask.
-      embeddings: (M, E) of the masks.
-
-    Returns:
-      The parts. A part that lies in no mask has a zero embedding.
-
-    Raises:
-      ValueError: Sizes disagree.
+      embeddings: (M, E) of the masks; a part that lies in none has a zero embedding.
     """
     fit = cast.shape == (len(part), len(embeddings))
     shapes, expected = f"cast {cast.shape}", f"({len(part)} Gaussians, {len(embeddings)} masks)"

@@ -9,26 +9,19 @@ from jaxtyping import Bool, Float
 from jsecon.numerics import normalize, safe_scale
 from jsecon.types import Array
 
-NARROW = 32
-"""Codes of at most so many numbers are compared column by column."""
 Number = float | int | Array
 """A threshold: a Python number, or () under a trace."""
 
 
 @functools.partial(jax.jit, inline=True)
 def similarities(codes: Float[Array, "n d"], code: Float[Array, " d"]) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-    """Computes cosines of rows with one code. Pure.
+    """Computes the cosines of rows (N, d) with one code, both of any length. Pure.
 
-    Args:
-      codes: (N, d) rows of any length.
-      code: (d,) of any length.
-
-    Returns:
-      Cosines (N,), and whether they are known (N,): both finite and not zero; 0 if not.
+    A cosine is known where both are finite and not zero; else it is 0.
     """
     unit = normalize(code)
     usable = jnp.all(jnp.isfinite(unit)) & jnp.any(unit != 0)
-    narrow = codes.shape[1] <= NARROW
+    narrow = codes.shape[1] <= 32  # where columns are faster (`_by_column`)
     largest, dots, squares = (_by_column if narrow else _by_row)(codes, unit)
     known = (largest > 0) & jnp.isfinite(largest) & usable
     return jnp.where(known, dots / jnp.sqrt(jnp.where(known, squares, 1.0)), 0.0), known
