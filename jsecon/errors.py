@@ -3,9 +3,6 @@
 from collections.abc import Iterable
 from typing import Any
 
-MAX_QUOTED = 600
-"""characters of `where` and of `problem` in a message; longer texts are cut in the middle"""
-
 
 class InputError(ValueError):
     """Bad input from outside: a file, an option, a capture. The command line prints it and exits with code 2.
@@ -21,8 +18,7 @@ class InputError(ValueError):
     """
 
     def __init__(self, where: object, problem: str, expected: str = "", remedy: str = ""):
-        half = MAX_QUOTED // 2
-        texts = [t if len(t) <= MAX_QUOTED else f"{t[:half]} ... {t[-half:]}" for t in (str(where), problem)]
+        texts = [t if len(t) <= 600 else f"{t[:300]} ... {t[-300:]}" for t in (str(where), problem)]
         self.where, self.problem = texts
         self.expected = expected
         self.remedy = remedy

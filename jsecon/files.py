@@ -13,6 +13,7 @@ import importlib
 import json
 import math
 import os
+import re
 import struct
 import sys
 import uuid
@@ -20,7 +21,6 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -31,13 +31,15 @@ from jsecon.errors import InputError, describe_error, require
 
 READ_ERRORS = (
     *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ImportError, RuntimeError),
-    *(ArithmeticError, struct.error, zipfile.BadZipFile, zlib.error, SafetensorError, SyntaxError, TokenError),
+    *(ArithmeticError, struct.error, zipfile.BadZipFile, zlib.error, SafetensorError),
 )
 """exceptions that readers of damaged files raise"""
-MAX_NAME = 80
-"""characters of a name in a message"""
-_WITHOUT_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP)
-"""errors of a file system that has no locks"""
+_HEADER = (
+    rb"['\"]descr['\"] *: *['\"]([<>|=]?[biuf]\d+)['\"]",
+    rb"['\"]fortran_order['\"] *: *(True|False)",
+    rb"['\"]shape['\"] *: *\(([\dL, ]*)\)",
+)
+"""entries of the header of a .npy"""
 _DTYPES = {"BOOL": np.dtype(bool)} | {
     f"{letter}{8 * size}": np.dtype(f"<{letter.lower()}{size}")
     for letter, sizes in {"F": (2, 4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}.items()
@@ -86,7 +88,8 @@ def exclusive_lock(folder: Path) -> Iterator[None]:
     except NotImplementedError:  # a file system without locks
         pass
     except OSError as error:
-        if error.errno not in _WITHOUT_LOCKS:
+        without_locks = errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP  # of such a file system
+        if error.errno not in without_locks:
             raise _unwritten(folder / ".lock", error) from error
     try:
         yield
@@ -98,7 +101,7 @@ def path_within(folder: Path, name: str) -> Path:
     """Joins a folder and a name that comes from a file."""
     first = Path(os.path.normpath(name)).parts[:1]
     if "\0" in name or os.path.splitdrive(name)[0] or os.path.isabs(name) or first == ("..",):
-        problem = f"the name {name[:MAX_NAME]!r} leads out of the folder"
+        problem = f"the name {name[:80]!r} leads out of the folder"
         raise InputError(folder, problem, remedy="Rename it: names must lie beneath the folder.")
     return folder / name
 
@@ -168,12 +171,25 @@ def reading(
 
 
 def map_npy(path: Path) -> np.ndarray:
-    """Memory-maps a .npy file, read-only. Raises one of READ_ERRORS if it holds anything but numbers."""
-    array = np.lib.format.open_memmap(path, mode="r")
-    after = os.path.getsize(path) - array.offset
-    if array.dtype.kind not in "biuf" or array.nbytes != after:
-        raise ValueError(f"{after} bytes where the header announces {array.dtype} of shape {array.shape}")
-    return array
+    """Memory-maps the array of a .npy file.
+
+    The header is parsed here: NumPy's parser warns of damaged ones, and raises errors of Python's tokenizer.
+    """
+    with open(path, "rb") as file:
+        magic = file.read(8)
+        length = file.read(2 if magic[6:7] == b"\1" else 4)
+        header = file.read(min(int.from_bytes(length, "little"), 1 << 16))
+        start = file.tell()
+    fields = [re.search(key, header) for key in _HEADER]
+    if not magic.startswith(b"\x93NUMPY") or None in fields:
+        raise ValueError("no .npy of plain numbers")
+    kind, order, sizes = (match[1].decode() for match in fields if match)
+    dtype = np.dtype(kind)
+    shape = tuple(int(number) for number in re.findall(r"\d+", sizes))
+    after = os.path.getsize(path) - start
+    if math.prod(shape) * dtype.itemsize != after:
+        raise ValueError(f"{after} bytes of numbers where the header announces {dtype} of shape {shape}")
+    return np.memmap(path, dtype, "r", start, shape, "F" if order == "True" else "C")
 
 
 def write_npy(path: str | os.PathLike, shape: tuple[int, ...], dtype: Any, blocks: Iterable[np.ndarray]) -> None:

@@ -33,9 +33,6 @@ Gaussians 7.4 instead of 2.6 ms. Programs on one device are faster with the part
 
 MAX_VIEWS = 8
 """views of a process that are worked on at once: each holds its plan in memory"""
-_TREE = "__tree__"
-_PIECE = 1 << 26
-"""bytes of one exchange of `_allgather_bytes`"""
 
 
 def host_mesh(most: int | None = None) -> Mesh | None:
@@ -120,7 +117,7 @@ def allgather_tree(tree: Any) -> list[Any]:
     arrays: dict[str, np.ndarray] = {}
     description = json.dumps(pack_tree(tree, "root", arrays)).encode()
     stream = io.BytesIO()
-    np.savez(stream, allow_pickle=False, **{_TREE: np.frombuffer(description, np.uint8)}, **arrays)
+    np.savez(stream, allow_pickle=False, **{"__tree__": np.frombuffer(description, np.uint8)}, **arrays)
     return [_deserialize(data) for data in _allgather_bytes(stream.getvalue())]
 
 
@@ -128,13 +125,13 @@ def _deserialize(data: bytes) -> Any:
     """The tree in the bytes of one process."""
     with np.load(io.BytesIO(data)) as file:
         arrays = {name: file[name] for name in file.files}
-    return unpack_tree(json.loads(arrays.pop(_TREE).tobytes()), arrays)
+    return unpack_tree(json.loads(arrays.pop("__tree__").tobytes()), arrays)
 
 
 def _allgather_bytes(data: bytes) -> list[bytes]:
     """Exchanges bytes.
 
-    It uses all_gather in pieces of at most _PIECE bytes, whose lengths are powers of two, as jax compiles for each
+    It uses all_gather in pieces of at most 64 MiB, whose lengths are powers of two, as jax compiles for each
     length. (Gloo's psum_scatter fails if one process comes 30 s after the other: jax issue 40831.)
     """
     if jax.process_count() == 1:
@@ -142,8 +139,9 @@ def _allgather_bytes(data: bytes) -> list[bytes]:
     sizes = process_allgather(np.array(divmod(len(data), 1 << 31), np.int32))
     lengths = [int(high) * (1 << 31) + int(low) for high, low in sizes]
     parts = [bytearray() for _ in lengths]
-    for begin in range(0, max(lengths), _PIECE):
-        size = min(_PIECE, max(1 << 16, 1 << (max(lengths) - begin - 1).bit_length()))
+    largest = 1 << 26
+    for begin in range(0, max(lengths), largest):
+        size = min(largest, max(1 << 16, 1 << (max(lengths) - begin - 1).bit_length()))
         piece = np.zeros(size, np.uint8)
         mine = np.frombuffer(data[begin : begin + size], np.uint8)
         piece[: len(mine)] = mine

@@ -31,8 +31,6 @@ MEMORY = "JSECON_MEMORY"
 """environment variable: GiB for a scene's columns, in place of half of the free memory"""
 _OPENCV = {"OPENCV_LOG_LEVEL": "OFF", "OPENCV_FFMPEG_LOGLEVEL": "-8", "OPENCV_IO_MAX_IMAGE_PIXELS": str(1 << 27)}
 """no messages of OpenCV, as an InputError reports damaged files; and the largest image that it allocates"""
-_PROGRAM_DAYS = 60
-"""days after which a compiled program that no process has read is deleted: each upgrade makes new ones"""
 _counts: dict[str, int] = {}
 
 
@@ -51,8 +49,8 @@ def prepare_process(*, keep_programs: bool = True) -> None:
 
 
 def _remove_old_programs(home: Path) -> None:
-    """Deletes compiled programs, of any kind of machine, that were last read or written _PROGRAM_DAYS ago."""
-    oldest = time.time() - 86400 * _PROGRAM_DAYS
+    """Deletes compiled programs that were last read or written 60 days ago: each upgrade makes new ones."""
+    oldest = time.time() - 86400 * 60
     for file in home.glob("xla-*/*"):
         with contextlib.suppress(OSError):  # another process may have deleted it
             status = file.stat()

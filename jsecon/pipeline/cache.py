@@ -38,8 +38,6 @@ PACKAGES = ("association", "field", "fit", "networks", "paper", "pipeline", "pos
 """subpackages that stages compute with"""
 MAPPED = 1 << 30
 """bytes; larger arrays are memory-mapped"""
-STALE_SECONDS = 600.0
-"""s; a half-written file that has not grown for this long has no writer any more"""
 
 
 class CorruptCacheError(Exception):
@@ -100,7 +98,7 @@ def prepare(folder: Path) -> None:
         write_text(tag, "Signature: 8a477f597d28d172789f06886806bc55\n# Made by jsecon; see bford.info/cachedir\n")
     for partial in folder.glob(".*.partial.safetensors"):
         age = time.time() - partial.stat().st_mtime
-        if abs(age) > STALE_SECONDS:  # of the time to come where the clock was set back
+        if abs(age) > 600:  # s; its writer is gone, or the clock was set back
             partial.unlink(missing_ok=True)
 
 

@@ -28,17 +28,9 @@ from jsecon.splat.render import render_rgb
 from jsecon.splat.transform import transform_gaussians_float64
 from jsecon.types import Camera, Capture, Gaussians, Progress
 
-MIN_LEAD = 0.05
-"""correlation with the frames by which a less likely world must exceed a likelier one"""
 ROUGH_CORRELATION = 0.6
 """correlation with the frames below which a note says more: a fitted scene has 0.97 in its world, 0.56 a tenth of a
 metre beside it, 0.39 when turned by 20 degrees, and a crude one 0.81 in its world"""
-MIN_OVERLAP = 0.01
-"""share of the Gaussians that at least two views must see"""
-MAX_VIEWS = 8
-"""Number of training frames that are compared, evenly spaced."""
-LONG_SIDE = 64
-"""Longer side in px at which they are compared: crude scenes look right at this size."""
 MIN_CORRELATION = 0.85
 """Mean correlation with the photographs that identifies the right world. Fitted scenes have 0.8 to 0.97 in their world
 and -0.1 to 0.1 in others."""
@@ -51,7 +43,6 @@ MIN_VIEWS = 6
 MIN_CONTRAST = 4.0
 """Standard deviations above the correlation with shuffled photographs: 4.2 and 4.9 for these crude scenes in their
 world, up to 3.6 in others (4.0 if shifted by a tenth of the scene's size)."""
-_SHUFFLES = 500
 _COLMAP_TO_NERFSTUDIO = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """(x, y, z) to (x, z, -y), which nerfstudio applies first to a COLMAP model that it reads itself."""
 
@@ -94,7 +85,7 @@ class _Placement(NamedTuple):
 
     def leads(self, other: "_Placement") -> bool:
         """Whether it is clearly more like the photographs."""
-        return self.similarity.correlation > other.similarity.correlation + MIN_LEAD
+        return self.similarity.correlation > other.similarity.correlation + 0.05
 
 
 def place_in_capture(
@@ -175,9 +166,9 @@ def _rounding_note(gaussians: Gaussians, path: Path) -> tuple[str, ...]:
 
 
 def _photo_similarity(gaussians: Gaussians, capture: Capture) -> _PhotoSimilarity:
-    """Compares renderings of a scene with at most MAX_VIEWS training frames."""
+    """Compares renderings of a scene with at most eight training frames."""
     train = np.flatnonzero(~np.asarray(capture.held_out))
-    views = train[evenly_spaced(len(train), MAX_VIEWS)]
+    views = train[evenly_spaced(len(train), 8)]
     cameras = shrink_cameras(capture.cameras, QUICK_LONG_SIDE)
     gaussians = jax.device_put(gaussians)
     rendered, photos, psnr = [], [], []
@@ -189,7 +180,7 @@ def _photo_similarity(gaussians: Gaussians, capture: Capture) -> _PhotoSimilarit
         photos.append(_pattern(photo))
     table = np.stack(rendered) @ np.stack(photos).T
     draw, rows = np.random.default_rng(0), np.arange(len(views))
-    shuffled = np.array([table[rows, draw.permutation(len(views))].sum() for _ in range(_SHUFFLES)])
+    shuffled = np.array([table[rows, draw.permutation(len(views))].sum() for _ in range(500)])
     deviation = max(float(shuffled.std()), 1e-9)
     contrast = float((np.trace(table) - shuffled.mean()) / deviation)
     return _PhotoSimilarity(float(np.diag(table).mean()), contrast, float(np.mean(psnr)), len(views))
@@ -197,7 +188,7 @@ def _photo_similarity(gaussians: Gaussians, capture: Capture) -> _PhotoSimilarit
 
 def _pattern(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, " p"]:
     """The image as a small vector of length 1 whose channels have mean 0; zero for a plain colour."""
-    size = LONG_SIDE / max(image.shape[:2])
+    size = 64 / max(image.shape[:2])  # px: crude scenes look right at this size
     if size < 1:
         shape = max(round(image.shape[1] * size), 1), max(round(image.shape[0] * size), 1)
         image = cv2.resize(image, shape, interpolation=cv2.INTER_AREA)
@@ -273,7 +264,7 @@ def check_overlap(gaussians: Gaussians, cameras: Camera, where: str) -> None:
     each = jax.lax.map(lambda camera: project(gaussians, camera).visible, jax.tree.map(jnp.asarray, cameras))
     visible = np.asarray(each)
     share = float(np.mean(visible.sum(0) >= 2)) if gaussians.count else 0.0
-    if share < MIN_OVERLAP:
+    if share < 0.01:
         problem = f"{share:.1%} of {gaussians.count} points in the view of two or more of the {len(visible)} frames"
         remedy = "Check that the poses belong to these frames, and the Gaussians to this capture."
         raise InputError(where, problem, "views that overlap, and a scene in the world of their poses", remedy)
