@@ -192,7 +192,7 @@ def test_a_key_follows_the_source_that_a_stage_can_import_and_no_other(tmp_path,
         (package / file).write_bytes(text)
         return differs
 
-    behind = ("app/viewer/window.py", "query/answer.py", "evaluate/lerf.py", "demo/room.py")
+    behind = ("app/viewer/window.py", "query/answer.py", "evaluate/lerf.py", "demo/demo.py")
     assert not any(changed(file) for file in behind)
     ahead = (
         "association/consensus.py",
