@@ -27,10 +27,10 @@ import numpy as np
 from browser import Page, opened, until
 from serve import SHADES, WORDS, copied, free_port
 
-from jsecon.app.viewer.view_state import ViewState
+from jsecon.app.scene import Scene
+from jsecon.app.viewer.state import ViewState
 from jsecon.app.viewer.window import Viewer, open_viewer
 from jsecon.field.field import load_field, save_field
-from jsecon.pipeline.model_loading import field_embedder
 
 HOOK = """(undrawn => {
   const now = () => performance.timeOrigin + performance.now();
@@ -96,7 +96,7 @@ def asked(page: Page, viewer: Viewer, text: str) -> dict[str, float]:
     quiet(page)
     page.js("seen.upload = seen.enter = 0, seen.first = null")
     told: dict[str, float] = {}
-    paint, then = viewer.scene.paint, viewer.then
+    paint, then = viewer.layer.paint, viewer.then
 
     def timed_paint(*given) -> None:
         paint(*given)
@@ -106,12 +106,12 @@ def asked(page: Page, viewer: Viewer, text: str) -> dict[str, float]:
         told.setdefault("heard", 1000 * time.time())
         then(*given, **more)
 
-    viewer.scene.paint, viewer.then = timed_paint, timed_then
+    viewer.layer.paint, viewer.then = timed_paint, timed_then
     cpu = time.process_time()
     page.type(FIND, text)
     until(lambda: "sent" in told, "the answer is sent", 60)
     cpu = 1000 * (time.process_time() - cpu)
-    viewer.scene.paint, viewer.then = paint, then
+    viewer.layer.paint, viewer.then = paint, then
     try:
         page.until("seen.upload", UPLOAD_SECONDS)
     except TimeoutError:
@@ -142,8 +142,7 @@ def main() -> None:
         save_field(file, field)
         for name in ("first", "warm", "warm"):
             print(f"opened after {opening(file):.1f} s, {name}", flush=True)
-        embedder = field_embedder(field)
-        viewer = open_viewer(field, embedder, host="127.0.0.1", port=free_port(), name="field", state=ViewState())
+        viewer = open_viewer(Scene(field), host="127.0.0.1", port=free_port(), state=ViewState())
         address = f"http://127.0.0.1:{viewer.server.get_port()}/"
         same = {"deviceScaleFactor": 1, "mobile": False}
         with opened(address, Path(folder), width=640, height=480) as page:

@@ -317,7 +317,7 @@ def test_queries_that_cannot_be(room_run, tmp_path, capsys, options, says):
 
 
 @pytest.mark.parametrize(("verb", "module", "package"), [
-    ("serve", "jsecon.app.server.serve", "uvicorn"), ("mcp", "jsecon.app.mcp_server", "mcp"),
+    ("serve", "jsecon.app.server", "uvicorn"), ("mcp", "jsecon.app.mcp_server", "mcp"),
 ])  # fmt: skip
 def test_a_verb_without_its_extra_names_it(tmp_path, capsys, monkeypatch, verb, module, package):
     monkeypatch.delitem(sys.modules, module, raising=False)

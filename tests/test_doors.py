@@ -87,7 +87,7 @@ def test_http(door, tmp_path):
     pytest.importorskip("fastapi", reason="the extra serve is not installed")
     from starlette.testclient import TestClient
 
-    from jsecon.app.server.api import application
+    from jsecon.app.server import application
 
     scene, _, rows = door
     client = TestClient(application({"table": scene}), "http://127.0.0.1:8765")

@@ -16,7 +16,7 @@ from jsecon.app.mcp_server import make_server
 from jsecon.app.scene import Scene
 from jsecon.field.field import save_field
 
-TOOLS = {"find", "relation", "objects", "locate", "measure", "count", "render"}
+TOOLS = {"find", "objects", "locate", "measure", "render"}
 
 
 @pytest.fixture(scope="module")
@@ -50,23 +50,21 @@ def test_every_tool_has_a_schema_and_only_reads(server):
 
 def test_the_tools_answer(server):
     answers = {
-        "find": {"text": "dark blue box"},
-        "relation": {"text": "the red mug left of the dark green bottle", "frame": "frame_0"},
+        "find": {"text": "the red mug left of the dark green bottle", "frame": "frame_0"},
         "objects": {},
         "locate": {"text": "the leftmost red mug"},
         "measure": {"a": "dark blue box", "b": "dark green bottle", "field": "table"},
-        "count": {"text": "red mugs"},
     }
     told = {name: call(server, name, **arguments) for name, arguments in answers.items()}
     assert not any(result.is_error for result in told.values()), told
     values = {name: result.structured_content for name, result in told.items()}
+    assert values["find"]["objects"] == len(values["find"]["relation"]["objects"]) == 1
     assert values["find"]["count"] > 100
-    assert values["relation"]["count"] == 1
     assert values["objects"]["count"] == len(values["objects"]["objects"]) == 6
     assert values["locate"]["top"] == pytest.approx([-0.5, 0, 0.1], abs=0.02)
     assert values["measure"]["centers"] == pytest.approx(0.6, rel=0.05)
-    assert values["count"]["count"] == 2
-    assert len(str(values["relation"])) < 2000
+    assert len(str(values["find"])) < 4000
+    assert call(server, "find", text="how many red mugs").structured_content["objects"] == 2
     (image,) = call(server, "render", text="dark blue box").content
     assert cv2.imdecode(np.frombuffer(base64.b64decode(image.data), np.uint8), 1).shape == (80, 100, 3)
 
@@ -75,11 +73,10 @@ def test_the_tools_answer(server):
     ("name", "arguments", "words"),
     [
         ("find", {"text": "red mug", "field": "../etc"}, "no such field"),
-        ("find", {"text": " "}, "it is empty"),
+        ("find", {"text": " "}, "pattern"),
         ("find", {"text": "the meaning of life"}, "colour"),
-        ("relation", {"text": "red mug across from the plate"}, "'across'"),
-        ("relation", {"text": "word " * 90}, "at most"),
-        ("relation", {"text": "red mug", "frame": "nowhere"}, "no such frame"),
+        ("find", {"text": "word " * 200}, "at most"),
+        ("find", {"text": "the leftmost red mug", "frame": "nowhere"}, "no such frame"),
         ("locate", {"text": "two red mugs"}, "names 2 objects"),
         ("locate", {"text": "red mug"}, "names 2 objects"),
         ("measure", {"a": "red mug", "b": "dark blue box"}, "names 2 objects"),
@@ -96,5 +93,5 @@ def test_odd_calls_are_errors_that_say_what_to_change(server, name, arguments, w
 def test_over_standard_input_and_output(tmp_path):
     save_field(tmp_path / "field.safetensors", table_field()[0])
     line = ["-m", "jsecon", "mcp", str(tmp_path / "field.safetensors")]
-    result = call(StdioServerParameters(command=sys.executable, args=line), "count", text="red mugs")
-    assert result.structured_content["count"] == 2
+    result = call(StdioServerParameters(command=sys.executable, args=line), "find", text="how many red mugs")
+    assert result.structured_content["objects"] == 2

@@ -1,9 +1,11 @@
 """The page of a field: it holds the field within its digits, and in a browser it does what a person would try."""
 
 import base64
+import dataclasses
 import json
 import re
 
+import jax
 import numpy as np
 import pytest
 from browser import CHROMIUM, WEBGL, dumped
@@ -12,6 +14,7 @@ from small_field import make_field
 from jsecon.app.pictures import main_regions
 from jsecon.app.records import Answer, Query
 from jsecon.app.viewer.static_page import NO_REGION, page
+from jsecon.errors import InputError
 from jsecon.field.membership import vote_shares
 from jsecon.splat.sh import C0
 from jsecon.types import Selection
@@ -73,6 +76,32 @@ def test_a_region_has_at_least_half_of_what_is_its(made):
     for n, region in enumerate(found):
         own = share[n, regions[n] == region]
         assert (region == -1 and share[n].max() < 0.5) or own[0] >= 0.5
+
+
+@pytest.mark.parametrize("count", [1, 5])
+def test_coincident_gaussians_and_opposite_cameras_have_a_page(made, count):
+    field = made[0]
+    first = np.zeros(count, int)
+    gaussians = dataclasses.replace(jax.tree.map(lambda a: np.asarray(a)[first], field.gaussians))
+    votes = jax.tree.map(lambda a: np.asarray(a)[first] if np.shape(a)[:1] == (64,) else a, field.votes)
+    upside_down = np.array(field.cameras.world_to_camera)
+    upside_down[1::2, :2] *= -1  # rolled by half a turn
+    cameras = dataclasses.replace(field.cameras, world_to_camera=upside_down)
+    one = dataclasses.replace(field, gaussians=gaussians, votes=votes, cameras=cameras)
+    scene, columns = read(page(one, [], title="one"))
+    assert scene["count"] == count
+    places = np.array(scene["low"]) + columns["places"] / 65535 * np.array(scene["span"])
+    np.testing.assert_allclose(places, gaussians.means, atol=max(scene["span"]) / 65535)
+    numbers = *scene["eye"], *scene["target"], *scene["up"], scene["size_low"], scene["size_span"]
+    assert np.isfinite(numbers).all()
+    assert np.linalg.norm(scene["up"]) == pytest.approx(1)
+
+
+def test_a_field_without_a_visible_gaussian_has_no_page(made):
+    field = made[0]
+    invisible = dataclasses.replace(field.gaussians, opacity_logits=np.full(64, -50, np.float32))
+    with pytest.raises(InputError, match="no visible Gaussian"):
+        page(dataclasses.replace(field, gaussians=invisible), [], title="none")
 
 
 def test_a_page_asks_for_nothing_from_outside_and_no_text_breaks_it(made):

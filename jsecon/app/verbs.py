@@ -298,13 +298,12 @@ class View(ServerVerb, FieldVerb):
     """Shows a field in a browser and answers queries there.
 
     A page on loopback shows the Gaussians (extra viewer). A text highlights what it selects, a click what lies there.
-    The page has thresholds, other candidates, frames, files of the selection, and a link that restores what is seen.
+    The page has a threshold, the frames, and files of the selection.
     With --export, jsecon writes one HTML file instead, which opens by double click, without a server.
 
     Attributes:
       texts: Texts to highlight.
       export: HTML file to write instead of opening a page.
-      link: Link that the viewer showed, to restore its state.
     """
 
     examples = (
@@ -314,7 +313,6 @@ class View(ServerVerb, FieldVerb):
 
     texts: Positional[list[str]]
     export: Option[Path | None] = None
-    link: Option[str] = ""
     port: Annotated[Option[int], Range(0, 65535)] = 8766
 
 
@@ -431,7 +429,7 @@ VERBS: dict[type[Verb], str] = {
     Export: "app.exports:_export",
     View: "app.viewer.window:_view",
     Eval: "app.evaluation:_eval",
-    Serve: "app.server.serve:_serve",
+    Serve: "app.server:_serve",
     Mcp: "app.mcp_server:_mcp",
     Models: "app.models:_models",
     Doctor: "app.doctor:_doctor",

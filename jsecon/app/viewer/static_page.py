@@ -40,19 +40,7 @@ MIN_OPACITY = 4
 
 
 def export_page(verb: verbs.View, file: Path, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon view --export`.
-
-    Args:
-      verb: Options of the verb.
-      file: The .html to write.
-      console: Receives the figures.
-
-    Returns:
-      Number of Gaussians, answered texts, bytes, the file under "written", and the errors of the other texts.
-
-    Raises:
-      InputError: The file has another ending or cannot be written, or the field cannot be read.
-    """
+    """Does the work of `jsecon view --export`; the result has the texts that were answered."""
     if file.suffix != ".html":
         raise InputError("--export", f"{file} does not end in .html", remedy="For example: --export page.html")
     require_writable(file.parent)
@@ -73,25 +61,19 @@ def export_page(verb: verbs.View, file: Path, console: Console) -> verbs.VerbRes
 
 
 def page(field: LanguageField, answers: Sequence[Answer], *, title: str) -> str:
-    """Makes the page of a field.
-
-    Args:
-      field: The field.
-      answers: Answers to texts.
-      title: Title of the page.
-
-    Returns:
-      The HTML.
-    """
+    """Makes the page of a field with the answers to some texts."""
     gaussians = field.gaussians
     means = np.asarray(gaussians.means, np.float64)
-    finite = np.isfinite(means).all(1)
+    log_sizes = np.asarray(gaussians.log_scales, np.float64).max(1)
     opacity = np.asarray(sigmoid(np.asarray(gaussians.opacity_logits)))
-    low, high = np.quantile(means[finite], (BOX_TAIL, 1 - BOX_TAIL), axis=0)
-    low, high = low - 0.05 * (high - low), high + 0.05 * (high - low)
-    drawn = finite & ((means >= low) & (means <= high)).all(1) & (opacity * 255 >= MIN_OPACITY)
-    largest = MAX_SIZE * np.linalg.norm(high - low)
-    drawn &= np.asarray(gaussians.log_scales, np.float64).max(1) < np.log(largest)
+    drawn = np.isfinite(means).all(1) & np.isfinite(log_sizes) & (opacity * 255 >= MIN_OPACITY)
+    if not drawn.any():
+        raise InputError("--export", "the field has no visible Gaussian", remedy="Make it again: jsecon run.")
+    low, high = np.quantile(means[drawn], (BOX_TAIL, 1 - BOX_TAIL), axis=0)
+    margin = np.maximum(0.05 * (high - low), np.exp(np.median(log_sizes[drawn])))  # coincident ones have a box too
+    low, high = low - margin, high + margin
+    largest = max(MAX_SIZE * np.linalg.norm(high - low), np.exp(log_sizes[drawn].min()))
+    drawn &= ((means >= low) & (means <= high)).all(1) & (log_sizes <= np.log(largest))
     splats, size_range = _pack(gaussians, main_regions(field), opacity, drawn, low, high)
     texts = []
     for answer in answers:
@@ -114,14 +96,14 @@ def page(field: LanguageField, answers: Sequence[Answer], *, title: str) -> str:
 
 
 def _camera(field: LanguageField, means: Float[np.ndarray, "n 3"]) -> dict[str, Any]:
-    """Returns the first view: the first frame, with the up direction of all, turning about what it looks at."""
-    poses = np.asarray(field.cameras.world_to_camera, np.float64)
-    eye = -poses[0, :3, :3].T @ poses[0, :3, 3]
-    forward = poses[0, 2, :3]
+    """Returns the first view: the first frame, upright, turning about what it looks at."""
+    pose = np.asarray(field.cameras.world_to_camera, np.float64)[0]
+    eye = -pose[:3, :3].T @ pose[:3, 3]
+    forward = pose[2, :3]
     depth = (means - eye) @ forward
     off_axis = np.linalg.norm(means - eye - depth[:, None] * forward, axis=1)
     ahead = depth[(depth > 0) & (off_axis < 0.2 * np.maximum(depth, 1e-9))]
-    distance = float(np.median(ahead)) if len(ahead) else float(np.linalg.norm(np.ptp(means, axis=0)))
+    distance = float(np.median(ahead)) if len(ahead) else max(float(np.linalg.norm(np.ptp(means, axis=0))), 1e-6)
     return {
         "eye": eye.tolist(),
         "target": (eye + distance * forward).tolist(),
@@ -138,7 +120,7 @@ def _pack(
     places = (np.asarray(gaussians.means, np.float64)[drawn] - low) / np.maximum(high - low, 1e-12)
     sizes = np.asarray(gaussians.log_scales, np.float64)[drawn]
     finite = sizes[np.isfinite(sizes)]  # a flat Gaussian, of size 0, gets the smallest code
-    size_low, size_high = (float(np.quantile(finite, q)) for q in (0.001, 1.0)) if len(finite) else (0.0, 1.0)
+    size_low, size_high = (float(np.quantile(finite, q)) for q in (0.001, 1.0))
     size_span = max(size_high - size_low, 1e-6)
     quaternions = np.asarray(gaussians.quaternions, np.float64)[drawn]
     quaternions = quaternions / np.maximum(np.linalg.norm(quaternions, axis=1, keepdims=True), 1e-12)

@@ -1,7 +1,6 @@
-"""A field in the viewer's window: its Gaussians in groups, which are sent one by one, its frames, and the camera."""
+"""The Gaussians of a field in the viewer's window, and the cameras of its frames."""
 
 import time
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,14 +20,10 @@ MAX_STD = 200.0
 to 256"""
 MAX_FRUSTUMS = 150
 """number of frames whose cameras are drawn"""
-FLIGHT_SECONDS = 0.4
-"""duration of a flight to a frame, s"""
-FLIGHT_STEPS = 12
-"""number of steps of a flight"""
 
 
-class FieldScene:
-    """The field in the window: Gaussians, and cameras of the frames.
+class SplatLayer:
+    """The Gaussians in the window, in groups that are sent one by one, and the cameras of the frames.
 
     Args:
       server: The viser server.
@@ -55,6 +50,7 @@ class FieldScene:
         self.scale = 1 / float(np.median(positive)) if len(positive) else 1.0
         self.photo = (255 * np.clip(0.5 + C0 * np.asarray(gaussians.sh)[:, 0], 0, 1)).astype(np.uint8)
         self._server = server
+        self._up = scene_up(field.cameras)
         self._aspect = field.cameras.width / field.cameras.height
         self.fovs = 2 * np.arctan(field.cameras.height / 2 / np.asarray(field.cameras.fy, np.float64))
         opacity = np.nan_to_num(np.asarray(sigmoid(np.asarray(gaussians.opacity_logits))))
@@ -81,11 +77,11 @@ class FieldScene:
         self.frustums = self._add_frustums(server)
         self._frame = 0
         self._frames_shown = False
-        self._set_start(server.initial_camera, scene_up(field.cameras), centers)
+        self._set_start(server.initial_camera, centers)
 
-    def _set_start(self, camera: Any, up: np.ndarray, centers: np.ndarray) -> None:
-        """Starts the window at the first frame, with the up direction of all frames."""
-        self._server.scene.set_up_direction(up)
+    def _set_start(self, camera: Any, centers: np.ndarray) -> None:
+        """Starts the window at the first frame, upright."""
+        self._server.scene.set_up_direction(self._up)
         forward = self._rotations[0].apply([0, 0, 1])
         depth = (centers - self._centers[0]) @ forward
         distance = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
@@ -118,12 +114,7 @@ class FieldScene:
         }
 
     def paint(self, colours: np.ndarray, visible: np.ndarray) -> None:
-        """Colours the Gaussians. Only groups that change are sent.
-
-        Args:
-          colours: (N, 3) uint8 RGB.
-          visible: (N,) bool.
-        """
+        """Colours the Gaussians, (N, 3) uint8 RGB. Only groups that change are sent."""
         opacity = np.where(visible, self._opacity, np.uint8(0))
         packed = np.concatenate([colours, opacity[:, None]], axis=1).view(np.uint32)[:, 0]
         with self._server.atomic():
@@ -135,46 +126,22 @@ class FieldScene:
         self._server.flush()
 
     def show_frames(self, shown: bool) -> None:
-        """Shows or hides the cameras of the frames.
-
-        Args:
-          shown: Whether to show them, except for the one at the viewpoint, which would cover the view.
-        """
+        """Shows or hides the cameras of the frames, but for the one at the viewpoint, which would cover the view."""
         self._frames_shown = shown
         for frame, frustum in self.frustums.items():
             frustum.visible = shown and frame != self._frame
 
-    def look(self, camera: Sequence[float]) -> None:
-        """Moves all clients to a camera.
-
-        Args:
-          camera: As in `ViewState`, nine numbers.
-        """
-        position, target, up = np.asarray(camera, np.float64).reshape(3, 3)
-        start = self._server.initial_camera
-        start.position, start.look_at = position * self.scale, target * self.scale
-        for client in self._server.get_clients().values():
-            with client.atomic():
-                client.camera.up_direction = up
-                client.camera.position = position * self.scale
-                client.camera.look_at = target * self.scale
-
     def fly(self, client: Any, frame: int) -> None:
-        """Moves a client to the camera of a frame.
-
-        Args:
-          client: The viser client.
-          frame: Index of the frame.
-        """
+        """Moves a viser client to the camera of a frame, in 0.4 s."""
         start = np.asarray(client.camera.position)
         ends = [Rotation.from_quat(client.camera.wxyz, scalar_first=True), self._rotations[frame]]
         rotation = Slerp([0, 1], Rotation.concatenate(ends))
-        for step in np.linspace(0, 1, FLIGHT_STEPS + 1)[1:]:
+        for step in np.linspace(0, 1, 13)[1:]:
             with client.atomic():
                 client.camera.position = start + step * (self._centers[frame] - start)
                 client.camera.wxyz = rotation(step).as_quat(scalar_first=True)
             client.flush()
-            time.sleep(FLIGHT_SECONDS / FLIGHT_STEPS)
+            time.sleep(0.4 / 12)
         client.camera.fov = float(self.fovs[frame])
         self._frame = frame
         self.show_frames(self._frames_shown)
