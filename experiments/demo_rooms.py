@@ -8,7 +8,7 @@ text's own. Of the first room it also writes the film and the panels of docs/res
 """
 
 import dataclasses
-import functools
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -64,11 +64,15 @@ def fields_of_room(folder: Path, seed: int, quick: bool) -> tuple[pipeline.Run, 
     return run, pipeline.run(masked, folder / "true_masks", listener=Listener(), cache_folder=folder / "cache")
 
 
-def one_step(run: pipeline.Run, embedder, text: str) -> Selection:
-    """Selects the Gaussians whose code is similar to the text's."""
+def one_step(run: pipeline.Run, embedder) -> Callable[[str], Selection]:
+    """Returns what selects the Gaussians whose code is similar to a text's."""
     table, coder, _ = region_codes(jnp.asarray(run.field.regions.embeddings), latent=LATENT, key=jax.random.key(0))
-    code = encode(coder, jnp.asarray(embedder.embed_text([text])[0]))
-    return query_one_step(distill_votes(run.field.votes, table), code, ONE_STEP_THRESHOLD)
+    codes = distill_votes(run.field.votes, table)
+
+    def select(text: str) -> Selection:
+        return query_one_step(codes, encode(coder, jnp.asarray(embedder.embed_text([text])[0])), ONE_STEP_THRESHOLD)
+
+    return select
 
 
 def measure(folder: Path, seed: int, options: Options) -> tuple[dict[str, float], pipeline.Run, list[Row]]:
@@ -78,7 +82,7 @@ def measure(folder: Path, seed: int, options: Options) -> tuple[dict[str, float]
     cameras = {name: run.field.cameras[t] for t, name in enumerate(run.field.names)}
     rows, summary = evaluation.evaluate(scene, labels, Listener(), ("anchored",))["anchored"]
     _, exact = evaluation.evaluate(Scene(masked.field), labels, Listener(), ("anchored",))["anchored"]
-    select = functools.partial(one_step, run, scene.embedder)
+    select = one_step(run, scene.embedder)
     alpha = {"alpha_thresholds": (ALPHA_THRESHOLD,)}
     direct = evaluate_at_thresholds(run.field.gaussians, cameras, labels, select, **alpha)[ALPHA_THRESHOLD][1]
     kinds = {"mIoU": summary, "exact outlines": exact, "one-step": direct}

@@ -30,7 +30,7 @@ class Association:
     """(R, E) unit; mean of the embeddings of a region's masks, weighted by pixels (phi_bar)."""
     uniform_embeddings: np.ndarray
     """(R, E) The same with equal weights of views."""
-    pixels: np.ndarray
+    pixel_counts: np.ndarray
     """(R, T) int32 pixels in each view."""
 
 
