@@ -95,10 +95,10 @@ class Query:
 
     question: Question
     by: str = "votes"
-    threshold: float | None = None
-    min_rank: float = MIN_RANK
+    threshold: float | int | None = None
+    min_rank: float | int = MIN_RANK
     all_of_class: bool = False
-    fragment_score: float | None = None
+    fragment_score: float | int | None = None
     outliers: bool = True
     frame: int | str | None = None
 
