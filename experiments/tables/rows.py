@@ -22,11 +22,11 @@ from experiments.tables.methods import (
     langsplat_of,
     opengaussian_of,
 )
+from experiments.tables.neighbours import nearest_neighbours
 from experiments.tables.ours import ask_field, field_of, paper_field
 from experiments.tables.readings import CHOOSERS, RULES, SHARP, SHARPENED, as_share, chosen_by, read, scores
 from experiments.tables.setting import Setting
 from jsecon.field.membership import SHARE_THRESHOLD
-from jsecon.query.edits import nearest_neighbours
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.rules import RETRIEVALS
 from jsecon.types import Selection

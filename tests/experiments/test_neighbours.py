@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jsecon.query.edits import nearest_neighbours
+from experiments.tables.neighbours import nearest_neighbours
 
 
 def test_the_nearest_are_the_nearest_but_oneself():
