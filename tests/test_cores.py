@@ -60,7 +60,7 @@ def work(out: str, field: str, word: str, parts: tuple[str, ...]) -> None:
         held_out = np.arange(VIEWS) == 4
         capture = jsecon.Capture(frames, cameras, *points, held_out, None, np.eye(4), tuple("abcde"))
         given = {"steps": 3, "key": jax.random.key(0), "chunk": 2}
-        schedule = Schedule(sizes=((1.0, 1.0),), max_gaussians=2 * count, growth_start=0.9, growth_end=1.0)
+        schedule = Schedule(sizes=((1.0, 1.0),), max_gaussians=2 * count)
         fitted, found["losses"] = fit_gaussians(capture, start=scene, schedule=schedule, **given)
         found |= {"means": fitted.means, "colours": fitted.sh}
     np.savez(f"{out}/found.npz", **{name: np.asarray(array) for name, array in found.items()})

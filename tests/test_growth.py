@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jsecon.fit.growth import MIN_OPACITY, drop_free_rows, grow, in_use, pad_with_free_rows, sample_rows, split_in_two
+from jsecon.fit.growth import MIN_OPACITY, _sample_rows, _split_in_two, drop_free_rows, grow, in_use, pad_with_free_rows
 from jsecon.fit.resize import resize_frame, scale_cameras
 from jsecon.fit.schedule import LearningRates, Schedule, rates_at
 from jsecon.splat.capacity import round_capacity
@@ -31,7 +31,7 @@ def covariance(gaussians):
 
 def test_halves_have_the_mean_and_covariance_of_the_whole():
     whole = scene()
-    one, other = split_in_two(whole)
+    one, other = _split_in_two(whole)
     np.testing.assert_allclose((one.means + other.means) / 2, whole.means, atol=1e-6)
     offset = (one.means - whole.means)[:, :, None]
     both = covariance(one) + offset @ offset.transpose(0, 2, 1)
@@ -40,7 +40,7 @@ def test_halves_have_the_mean_and_covariance_of_the_whole():
 
 def test_halves_give_the_centre_the_alpha_it_had():
     whole = scene()
-    one, other = split_in_two(whole)
+    one, other = _split_in_two(whole)
 
     def alpha(g):
         return 1 / (1 + np.exp(-g.opacity_logits))
@@ -66,9 +66,9 @@ def test_draws_follow_the_votes_and_never_repeat():
     votes = np.array([0.0, 1.0, 2.0, 4.0, 0.0, 8.0])
     counts = np.zeros(6)
     for seed in range(2000):
-        counts[sample_rows(votes, 1, np.random.default_rng(seed))] += 1
+        counts[_sample_rows(votes, 1, np.random.default_rng(seed))] += 1
     np.testing.assert_allclose(counts / 2000, votes / votes.sum(), atol=0.04)
-    all_of_them = sample_rows(votes, 100, np.random.default_rng(0))
+    all_of_them = _sample_rows(votes, 100, np.random.default_rng(0))
     assert sorted(all_of_them) == [1, 2, 3, 5]
 
 
@@ -103,16 +103,15 @@ def test_faint_gaussians_make_room_and_nothing_is_added_where_nothing_is_wrong()
 
 
 def test_sizes_follow_each_other_the_number_rises_evenly_and_degrees_open_one_after_another():
-    schedule = Schedule(sizes=((0.25, 0.2), (0.5, 0.5), (1.0, 1.0)))
+    schedule = Schedule(sizes=((0.25, 0.2), (0.5, 0.5), (1.0, 1.0)), max_gaussians=280)
     assert [schedule.size(done) for done in (0.0, 0.19, 0.2, 0.49, 0.5, 1.0)] == [0.25, 0.25, 0.5, 0.5, 1.0, 1.0]
-    schedule = Schedule(max_gaussians=300, growth_start=0.1, growth_end=0.6)
-    assert [schedule.count(done, 100) for done in (0.05, 0.1, 0.35, 0.6, 0.61)] == [None, 100, 200, 300, None]
+    assert [schedule.next_size(done) for done in (0.0, 0.2, 0.5)] == [0.5, 1.0, None]
+    assert [schedule.count(done, 100) for done in (0.04, 0.05, 0.3, 0.5, 0.51)] == [None, 100, 200, 280, None]
     assert schedule.count(0.3, 400) is None
-    schedule = Schedule(degree_interval=0.1)
     assert [schedule.degree(done) for done in (0.0, 0.09, 0.11, 0.35)] == [0, 0, 1, 3]
 
 
-@pytest.mark.parametrize("wrong", [{"sizes": ((0.5, 0.5),)}, {"sizes": ((0.0, 1.0),)}, {"growth_end": 0.01}])
+@pytest.mark.parametrize("wrong", [{"sizes": ((0.5, 0.5),)}, {"sizes": ((0.0, 1.0),)}])
 def test_wrong_schedules_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         Schedule(**wrong)

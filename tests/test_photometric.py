@@ -123,6 +123,13 @@ def test_a_capture_of_spread_quality_has_none():
     assert is_weak(np.zeros(0)).shape == (0,)
 
 
+@pytest.mark.parametrize("odd", [np.nan, np.inf])
+def test_a_frame_without_a_figure_hides_no_weak_one(odd):
+    psnr = np.array([25.0, 25.5, 24.5, 25.2, 12.0, odd])
+    np.testing.assert_array_equal(np.flatnonzero(is_weak(psnr)), [4])
+    assert not is_weak(np.array([odd, odd])).any()
+
+
 BEHIND = gaussians_from_points(np.array([[0, 0, -5.0]], np.float32), np.zeros((1, 3), np.uint8))
 """a scene that no camera sees"""
 
@@ -161,6 +168,13 @@ def test_pixels_that_are_ignored_do_not_count():
         squares = (frames[t][~ignored[t]] / 255.0) ** 2
         np.testing.assert_allclose(result.psnr[t], -10 * np.log10(squares.mean()), atol=1e-4)
     np.testing.assert_array_equal(result.frames, [0, 1])
+    nearly = ignored.copy()
+    nearly[1] = True
+    nearly[1, 5, 5] = False  # one pixel measures nothing, and shrunk it is gone
+    for long_side in (None, 8):
+        few = measure_quality(BEHIND, dataclasses.replace(capture, ignored=nearly), long_side=long_side)
+        np.testing.assert_array_equal(few.frames, [0] if long_side is None else few.frames)
+        assert np.isfinite(few.psnr).all()
     other = np.where(ignored[..., None], 255 - frames, frames)
     again = measure_quality(BEHIND, dataclasses.replace(capture, frames=other))
     np.testing.assert_array_equal(again.psnr, result.psnr)

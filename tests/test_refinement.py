@@ -63,7 +63,7 @@ def _small(monkeypatch, truth):
 @pytest.mark.usefixtures("_small")
 def test_by_default_a_rough_capture_with_depth_is_corrected_once(capture, tmp_path):
     told = write(rough(capture, **errors()), tmp_path / "rough")
-    as_it_is, _, _ = load(told, tmp_path / "none", refine="none")
+    as_it_is, _, _ = load(told, tmp_path / "none", refine="never")
     better, notes, status = load(told, tmp_path / "out")
     assert status == "run"
     assert "are corrected" in notes
@@ -80,7 +80,7 @@ def test_by_default_an_exact_capture_stays_as_its_files_say(capture, tmp_path):
     exact = write(capture, tmp_path / "exact")
     kept, notes, _ = load(exact, tmp_path / "out")
     assert "stay as they are" in notes
-    assert alike(kept, load(exact, tmp_path / "none", refine="none")[0])
+    assert alike(kept, load(exact, tmp_path / "none", refine="never")[0])
 
 
 def test_without_depth_or_with_gaussians_nothing_is_tried(capture, tmp_path):
@@ -89,7 +89,10 @@ def test_without_depth_or_with_gaussians_nothing_is_tried(capture, tmp_path):
 
     plain = write(capture, tmp_path / "plain", depth=False)
     deep = write(capture, tmp_path / "deep")
-    for one, other in ((how(plain), how(plain, refine="none")), (how(deep, gaussians=plain), how(deep, refine="none"))):
+    for one, other in (
+        (how(plain), how(plain, refine="never")),
+        (how(deep, gaussians=plain), how(deep, refine="never")),
+    ):
         assert one.how == other.how
         assert one.key_options == other.key_options
     assert how(deep).key_options != how(deep, steps=300).key_options
@@ -105,5 +108,6 @@ def test_a_dry_run_lists_the_refinement(capture, tmp_path, capsys):
         assert cli.main(line) == 0
         return next(stage for stage in json.loads(capsys.readouterr().out)["stages"] if stage["name"] == "load")
 
-    assert "--refine auto" in load_stage()["why"]
-    assert "--refine" not in load_stage("--refine", "none")["why"]
+    assert "corrected by short fits in about half" in load_stage()["why"]
+    assert load_stage("--refine", "always")["why"].endswith("corrected by short fits")
+    assert "corrected" not in load_stage("--refine", "never")["why"]

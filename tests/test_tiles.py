@@ -16,12 +16,12 @@ from jsecon.splat.reference import project_reference
 from jsecon.splat.strips import BLOCK, FULL_IMAGE, Strip, join_strips, split_into_strips, tile_rows
 from jsecon.splat.tiles import (
     WORD,
+    _compact_tile_lists,
+    _depth_order,
     _sorted_pairs,
     _sorted_pairs_by_rank,
-    compact_tile_lists,
-    depth_order,
+    _tile_bits,
     pair_counts,
-    tile_bits,
     tile_grid,
     tile_lists,
 )
@@ -98,8 +98,8 @@ def test_both_sorts_of_pairs_agree():
 
 def test_equal_depths_keep_index_order():
     depths = jnp.asarray(np.random.default_rng(0).integers(1, 50, 40000).astype(np.float32))
-    np.testing.assert_array_equal(jax.jit(depth_order)(depths), np.argsort(np.asarray(depths), kind="stable"))
-    assert depth_order(depths).dtype == jnp.int32
+    np.testing.assert_array_equal(jax.jit(_depth_order)(depths), np.argsort(np.asarray(depths), kind="stable"))
+    assert _depth_order(depths).dtype == jnp.int32
 
 
 def test_what_does_not_fit_is_counted(scene, camera):
@@ -132,8 +132,8 @@ def test_lists_are_those_of_a_loop(words, density, filled):
 
     @jax.jit
     def lists(reached, owner, total):
-        members, before = tile_bits(lambda owner, reached: reached, owner, reached, 16, total, WORD)
-        return members, before, compact_tile_lists(members, before, owner, total, WORD)
+        members, before = _tile_bits(lambda owner, reached: reached, owner, reached, 16, total, WORD)
+        return members, before, _compact_tile_lists(members, before, owner, total, WORD)
 
     members, before, got = lists(jnp.asarray(reached), jnp.asarray(owner), jnp.int32(total))
     expected = np.concatenate([owner[bits[:, tile]] for tile in range(16)])

@@ -9,7 +9,7 @@ from conftest import look_at
 
 from jsecon import Camera, Capture, InputError
 from jsecon.fit.start import starting_gaussians
-from jsecon.fit.triangulate import triangulate_tracks, triangulated_points, view_pairs
+from jsecon.fit.triangulate import _view_pairs, triangulate_matches, triangulated_points
 
 WIDTH, HEIGHT, FOCAL = 240, 180, 200.0
 
@@ -44,34 +44,25 @@ def plane_capture(count=5, textured=True):
     return Capture(frames, camera, *nothing, held_out, None, np.eye(4), tuple(map(str, range(count))))
 
 
-def test_exact_tracks_give_exact_points():
-    rng = np.random.default_rng(0)
-    pose, truth = poses(4), rng.uniform(-0.5, 0.5, (50, 3))
-    camera = np.einsum("tab,pb->pta", pose[:, :3, :3], truth) + pose[:, :3, 3]
-    pixels = FOCAL * camera[..., :2] / camera[..., 2:] + [WIDTH / 2, HEIGHT / 2]
-    seen = rng.random((50, 4)) < 0.6
-    seen[:, :2] = True
-    pixels[~seen] = 0
-    views = np.broadcast_to(np.arange(4), (50, 4))
-    points, error, depth, angle = triangulate_tracks(pose, np.broadcast_to(INTRINSICS, (4, 3, 3)), views, pixels, seen)
+def test_exact_matches_give_exact_points_and_wrong_ones_are_told():
+    pose, truth = poses(2), np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3))
+    rays = []
+    for world_to_camera in pose:
+        seen = truth @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+        rays.append(seen[:, :2] / seen[:, 2:])
+    points, parallax = triangulate_matches(*pose, *rays, FOCAL)
     np.testing.assert_allclose(points, truth, atol=1e-8)
-    assert error.max() < 1e-6
-    np.testing.assert_allclose(depth, np.where(seen, camera[..., 2], np.inf).min(axis=1), atol=1e-8)
-    assert (angle > 0.1).all()
-    points, error, _, _ = triangulate_tracks(
-        pose,
-        np.broadcast_to(INTRINSICS, (4, 3, 3)),
-        views,
-        pixels + 3 * seen[..., None] * rng.standard_normal(pixels.shape),
-        seen,
-    )
-    assert error[seen.sum(1) > 2].min() > 0.1  # a track that fits no point says so
+    assert (parallax > 0.1).all()
+    rays[1][::2, 1] += 6 / FOCAL  # off the epipolar line
+    assert ((triangulate_matches(*pose, *rays, FOCAL)[1] > 0) == (np.arange(50) % 2 == 1)).all()
+    assert (triangulate_matches(pose[0], pose[0], rays[0], rays[0], FOCAL)[1] < 0).all()  # no parallax
 
 
 def test_neighbouring_views_are_paired():
-    pairs = view_pairs(poses(6), 2)
-    assert set(pairs) == {(i, j) for i in range(6) for j in range(i + 1, 6) if j - i == 1} | {(0, 2), (3, 5)}
-    assert view_pairs(poses(1), 4) == []
+    pairs = _view_pairs(poses(9))
+    assert {(i, i + 1) for i in range(8)} <= set(pairs)
+    assert (0, 8) not in pairs
+    assert _view_pairs(poses(1)) == []
 
 
 def test_points_of_a_textured_plane_lie_on_it():

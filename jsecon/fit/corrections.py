@@ -7,7 +7,7 @@ offset). Each view has a row, which Adam moves when that view is drawn, with sep
 
 import dataclasses
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,13 +15,9 @@ from jaxtyping import Float
 
 from jsecon.types import Array, Camera, record
 
-POSE_WEIGHT = 1e-3
-"""Weight of the squared twist (radians, shares of the extent) in the loss of a view: decides what the frames leave
-open."""
-COLOUR_WEIGHT = 1e-3
-"""Weight of the squared change of the colour map (shares of the colour range) in the loss of a view."""
-_SERIES_TERMS = 9
-"""Terms of the series of sine and cosine: exact to float64 for squared angles up to 1."""
+PENALTY = 1e-3
+"""Weight of the squared corrections in the loss of a view (radians and shares of the extent; shares of the colour
+range): decides what the frames leave open."""
 
 
 @record
@@ -39,75 +35,43 @@ class Corrections:
 class CorrectionState:
     """Corrections and the moments of their optimiser."""
 
-    current: Corrections
-    first_moment: Corrections
-    """Adam's running mean of the gradient."""
-    second_moment: Corrections
-    """Adam's running mean of the squared gradient."""
+    current: Any
+    """Corrections."""
+    first_moment: Any
+    """Adam's running mean of the gradient, in the same layout."""
+    second_moment: Any
+    """Adam's running mean of the squared gradient, in the same layout."""
 
 
-@dataclasses.dataclass(frozen=True)
-class RefineOptions:
-    """What to correct and how fast. Rates are Adam's step per visit of a view; they decay log-linearly."""
+class CorrectionRates(NamedTuple):
+    """Adam's first steps per visit of a view; they fall log-linearly to 3 %. Zero keeps what it belongs to."""
 
-    poses: bool = True
-    """Whether to correct camera poses."""
-    exposure: bool = True
-    """Whether to correct exposures."""
-    pose_rate: float = 3e-3
-    """First step of a pose: radians, and shares of the cameras' extent."""
-    colour_rate: float = 1e-2
-    """First step of each number of a colour map."""
-    final_rate_share: float = 0.03
-    """Rate at the last step, as a share of the first."""
+    pose: float = 3e-3
+    """Radians, and shares of the cameras' extent."""
+    colour: float = 1e-2
+    """Each number of a colour map."""
 
-    def rates(self, done: float, extent: float) -> Corrections:
-        """Computes the step sizes of one view.
-
-        Args:
-          done: Share of the fit that is done, in [0, 1].
-          extent: Extent of the cameras, world units.
-
-        Returns:
-          One rate per number of a twist (6,) and one for the colour map; zero for what is not corrected.
-        """
-        decay = self.final_rate_share**done
-        pose = self.poses * self.pose_rate * decay
-        colour = self.exposure * self.colour_rate * decay
+    def at(self, done: float, extent: float) -> Corrections:
+        """Computes the step sizes of one view when the share `done` of the fit is done."""
+        pose, colour = (rate * 0.03**done for rate in self)
         return Corrections(np.repeat(np.array([pose, pose * extent], np.float32), 3), np.float32(colour))
 
 
 def identity_corrections(views: int) -> Corrections:
-    """Makes corrections without effect.
-
-    Args:
-      views: T, number of views.
-
-    Returns:
-      Corrections of T views (NumPy).
-    """
+    """Makes corrections without effect (NumPy)."""
     return Corrections(np.zeros((views, 6), np.float32), np.tile(np.eye(3, 4, dtype=np.float32), (views, 1, 1)))
 
 
 def _series(squared: Array, first: int) -> Array:
-    """The sum over k of (-squared)^k / (2 k + first)!."""
+    """The sum over k of (-squared)^k / (2 k + first)!; nine terms are exact to float64 for squared angles up to 1."""
     total = jnp.zeros_like(squared)
-    for k in reversed(range(_SERIES_TERMS)):
+    for k in reversed(range(9)):
         total = total * -squared + 1 / math.factorial(2 * k + first)
     return total
 
 
 def se3_exp(twist: Float[Array, "6"]) -> Float[Array, "4 4"]:
-    """Computes the rigid motion of a twist (Lynch and Park 2017, eq. 3.88).
-
-    Smooth everywhere, zero included.
-
-    Args:
-      twist: (6,) rotation in radians, then translation.
-
-    Returns:
-      (4, 4) rigid motion, accurate to the last digits.
-    """
+    """Computes the rigid motion of a twist (Lynch and Park 2017, eq. 3.88), smooth everywhere, zero included."""
     x, y, z = twist[0], twist[1], twist[2]
     squared = x * x + y * y + z * z
     small = squared < 1
@@ -130,15 +94,7 @@ def se3_exp(twist: Float[Array, "6"]) -> Float[Array, "4 4"]:
 
 
 def corrected_camera(camera: Camera, twist: Float[Array, "6"]) -> Camera:
-    """Moves a camera by a twist in its frame: exp(twist) world_to_camera.
-
-    Args:
-      camera: One camera.
-      twist: (6,) rotation in radians, then translation in world units.
-
-    Returns:
-      The moved camera.
-    """
+    """Moves a camera by a twist in its frame: exp(twist) world_to_camera."""
     motion, pose = se3_exp(twist), camera.world_to_camera
     # Multiply-and-sum: exact float32 on every backend.
     moved = (motion[:, :, None] * pose[None, :, :].astype(motion.dtype)).sum(1)
@@ -146,30 +102,18 @@ def corrected_camera(camera: Camera, twist: Float[Array, "6"]) -> Camera:
 
 
 def apply_exposure(image: Float[Array, "h w 3"], colour: Float[Array, "3 4"]) -> Float[Array, "h w 3"]:
-    """Applies the colour map of a view to rendered colours.
-
-    Args:
-      image: (H, W, 3) rendered colours.
-      colour: (3, 4) map from r, g, b and 1.
-
-    Returns:
-      (H, W, 3), not clamped.
-    """
+    """Applies the colour map of a view to rendered colours, without clamping."""
     r, g, b = image[..., 0], image[..., 1], image[..., 2]
     return jnp.stack([row[0] * r + row[1] * g + row[2] * b + row[3] for row in colour], axis=-1)
 
 
-def correction_penalty(correction: Corrections, extent: Float[Array, ""]) -> Float[Array, ""]:
-    """Computes the regulariser of one view's corrections.
+def regularizer(correction: Corrections, extent: Float[Array, ""]) -> Float[Array, ""]:
+    """Computes the term of one view's corrections in its loss.
 
     Args:
       correction: Corrections of one view, without leading axis.
-      extent: () size of the cameras' arrangement in world units, 0 if they share one place. Translations count in
-        units of it.
-
-    Returns:
-      () the term to add to the loss of the view.
+      extent: Size of the cameras' arrangement, world units, the unit of translations; 0 if they share one place.
     """
     shift = correction.twists[3:] / jnp.where(extent > 0, extent, 1.0)
     poses = jnp.sum(correction.twists[:3] ** 2) + jnp.sum(shift**2)
-    return POSE_WEIGHT * poses + COLOUR_WEIGHT * jnp.sum((correction.colours - jnp.eye(3, 4)) ** 2)
+    return PENALTY * poses + PENALTY * jnp.sum((correction.colours - jnp.eye(3, 4)) ** 2)

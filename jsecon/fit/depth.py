@@ -28,18 +28,10 @@ class DepthPoints(NamedTuple):
 
 
 def back_project_frame(capture: Capture, frame: int, stride: int):
-    """Back-projects the known depths of one frame.
-
-    Args:
-      capture: Capture with depth.
-      frame: Index of the frame.
-      stride: Uses every so many pixels in each direction.
+    """Back-projects the known depths of one frame, of every `stride`-th pixel in each direction.
 
     Returns:
       World points (S, 3) float64, their colours (S, 3) uint8 and pixels (S, 2) row, column.
-
-    Raises:
-      InputError: The capture has no depth.
     """
     camera = capture.cameras[frame]
     if capture.depths is None:
@@ -85,18 +77,11 @@ def points_from_depth(
     """Back-projects the known depths and averages them in voxels.
 
     Args:
-      capture: Capture with depth.
+      capture: Capture with depth; without one, an InputError says what to do.
       voxel: Edge of a voxel, world units.
       max_points: Maximum number of points, in place of `voxel`: the smallest edge that gives so few is used.
       stride: Uses every so many pixels in each direction.
       frames: Indices of the frames to use; by default the training frames.
-
-    Returns:
-      The mean point and colour of each occupied voxel, and the pixels in it.
-
-    Raises:
-      InputError: The capture has no depth.
-      ValueError: Neither or both of `voxel` and `max_points` are given.
     """
     exclusive = (voxel is None) != (max_points is None)
     require(exclusive, "voxel, max_points", (voxel, max_points), "exactly one of the two", "voxel is in world units.")

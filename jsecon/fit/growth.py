@@ -21,48 +21,24 @@ MIN_OPACITY = 0.005
 """Opacity below which a Gaussian is pruned (Kerbl et al. 2023)."""
 MAX_GROWTH = 0.3
 """Largest share of the present Gaussians that one densification adds."""
-_FREE_ROW = {"opacity_logits": -20.0, "log_scales": -5.0, "quaternions": 1.0}
-"""Values of a free row: any finite ones that are invisible."""
 _OFFSET, _SHRINKAGE = 0.6, 0.8
 """Shift of the two halves along the longest axis, and the scale that is left of it, both in units of its standard
 deviation. As 0.6^2 + 0.8^2 = 1, both halves together have the variance of their parent."""
 
 
 def in_use(gaussians: Gaussians) -> Bool[np.ndarray, " n"]:
-    """Finds the rows that hold a visible Gaussian.
-
-    Args:
-      gaussians: N rows.
-
-    Returns:
-      (N,) bool.
-    """
+    """Finds the rows that hold a visible Gaussian."""
     return np.asarray(gaussians.opacity_logits) >= math.log(MIN_OPACITY / (1 - MIN_OPACITY))
 
 
 def drop_free_rows(gaussians: Gaussians) -> Gaussians:
-    """Removes the free rows.
-
-    Args:
-      gaussians: N rows.
-
-    Returns:
-      The visible Gaussians (NumPy).
-    """
+    """Removes the free rows (NumPy)."""
     keep = in_use(gaussians)
     return jax.tree.map(lambda a: np.asarray(a)[keep], gaussians)
 
 
 def pad_rows(tree: Any, rows: int) -> Any:
-    """Pads every array of a tree with zeros.
-
-    Args:
-      tree: Tree of arrays (N, ...).
-      rows: Number of rows afterwards, at least N.
-
-    Returns:
-      Tree of arrays (rows, ...), NumPy.
-    """
+    """Pads every array (N, ...) of a tree with zeros to `rows` rows (NumPy)."""
 
     def fill(a):
         return np.concatenate([a, np.zeros((rows - len(a), *a.shape[1:]), a.dtype)])
@@ -71,48 +47,25 @@ def pad_rows(tree: Any, rows: int) -> Any:
 
 
 def pad_with_free_rows(gaussians: Gaussians, rows: int) -> Gaussians:
-    """Pads Gaussians with free rows.
-
-    Args:
-      gaussians: N Gaussians.
-      rows: Number of rows afterwards, at least N.
-
-    Returns:
-      The rows (NumPy).
-    """
+    """Pads Gaussians with invisible ones to `rows` rows (NumPy)."""
     padded = pad_rows(gaussians, rows)
-    for name, value in _FREE_ROW.items():
+    for name, value in {"opacity_logits": -20.0, "log_scales": -5.0, "quaternions": 1.0}.items():
         getattr(padded, name)[gaussians.count :] = value
     return padded
 
 
-def sample_rows(votes: Float[Any, " n"], count: int, rng: np.random.Generator) -> Int[np.ndarray, " k"]:
-    """Draws rows without replacement, each in proportion to its votes (Gumbel top-k).
-
-    Args:
-      votes: (N,) weights, not negative.
-      count: Number of rows to draw.
-      rng: Random numbers.
-
-    Returns:
-      (k,) indices; k is below `count` if fewer rows have votes.
-    """
+def _sample_rows(votes: Float[Any, " n"], count: int, rng: np.random.Generator) -> Int[np.ndarray, " k"]:
+    """Draws rows without replacement, each in proportion to its votes (Gumbel top-k); fewer if fewer have votes."""
     with np.errstate(divide="ignore"):
         keys = np.log(np.asarray(votes, np.float64)) + rng.gumbel(size=len(votes))
     return np.argsort(-keys, kind="stable")[: min(count, int(np.count_nonzero(np.asarray(votes) > 0)))]
 
 
-def split_in_two(gaussians: Gaussians) -> tuple[Gaussians, Gaussians]:
+def _split_in_two(gaussians: Gaussians) -> tuple[Gaussians, Gaussians]:
     """Splits each Gaussian into two halves along its longest axis.
 
     Both together have the mass and the moments of the parent. Their opacity gives the centre of the parent the alpha
     that it had.
-
-    Args:
-      gaussians: N Gaussians.
-
-    Returns:
-      The first and the second halves, N each.
     """
     scales = np.asarray(gaussians.log_scales)
     rows, axis = np.arange(len(scales)), scales.argmax(axis=1)
@@ -159,9 +112,6 @@ def grow(
       max_gaussians: Number of Gaussians at the end of growth. If rows run out they are doubled, up to the rows of this
         number: jax compiles again for each number of rows.
       seed: Seed of the draw.
-
-    Returns:
-      Gaussians and moments, with at least N rows.
     """
     gaussians, moments = jax.tree.map(np.array, (gaussians, moments))
     used = in_use(gaussians)
@@ -173,9 +123,9 @@ def grow(
         gaussians = pad_with_free_rows(gaussians, rows)
         moments, votes = pad_rows((moments, np.asarray(votes)), rows)
         used = in_use(gaussians)
-    parents = sample_rows(np.where(used, votes, 0.0), added, np.random.default_rng(seed))
+    parents = _sample_rows(np.where(used, votes, 0.0), added, np.random.default_rng(seed))
     free = np.flatnonzero(~used)[: len(parents)]
-    first, second = split_in_two(jax.tree.map(lambda a: a[parents], gaussians))
+    first, second = _split_in_two(jax.tree.map(lambda a: a[parents], gaussians))
     for half, rows in ((first, parents), (second, free)):
         for column, values in zip(jax.tree.leaves(gaussians), jax.tree.leaves(half), strict=True):
             column[rows] = values

@@ -3,6 +3,7 @@
 The state between chunks of steps is a record of arrays: a fit can stop after any chunk and resume to the same result.
 """
 
+import dataclasses
 import functools
 import math
 import time
@@ -14,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from jsecon.errors import InputError, require
-from jsecon.fit.corrections import CorrectionState, RefineOptions, identity_corrections
+from jsecon.fit.corrections import CorrectionRates, CorrectionState, identity_corrections
 from jsecon.fit.growth import drop_free_rows, grow, pad_with_free_rows
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.step import StepConfig, StepRunner, TrainState, put_on_devices
@@ -22,7 +23,7 @@ from jsecon.parallel import host_mesh
 from jsecon.splat.capacity import round_capacity
 from jsecon.splat.strips import BLOCK
 from jsecon.splat.tiles import TILE
-from jsecon.types import Array, Capture, Gaussians, Progress, record
+from jsecon.types import Array, Capture, Gaussians, Leaf, Progress, record
 
 _RATES, _SCHEDULE = LearningRates(), Schedule()
 ALLOCATED_AT_START = 1 << 16
@@ -36,14 +37,8 @@ MAX_PENDING_STEPS = 2
 class FitState:
     """State of a fit between two chunks of steps."""
 
-    gaussians: Gaussians
-    """Scene so far; rows may be free (growth.py)."""
-    first_moment: Gaussians
-    """Adam's running mean of the gradient."""
-    second_moment: Gaussians
-    """Adam's running mean of the squared gradient."""
-    votes: Array
-    """(N,) sum of alpha T times the mean absolute error of the pixel, over the views since the last growth."""
+    train: Leaf
+    """TrainState."""
     done: Array
     """() share of the fit that is done."""
     pace: Array
@@ -54,8 +49,6 @@ class FitState:
     """() number of Gaussians at the start."""
     losses: Array
     """(steps,) loss of the view of each step, before the step."""
-    corrections: CorrectionState | None = None
-    """Corrections of the T frames of the capture; None if they are not refined."""
 
 
 class FitResult(NamedTuple):
@@ -66,18 +59,8 @@ class FitResult(NamedTuple):
     """Loss of the view of each step, before the step."""
 
 
-def view_order(key: PRNGKeyArray, views: int, first: int, last: int) -> Int[np.ndarray, " s"]:
-    """Draws the views of the steps first .. last - 1; each round of `views` steps visits every view once.
-
-    Args:
-      key: Key of the random order.
-      views: Number of views.
-      first: First step.
-      last: Step after the last.
-
-    Returns:
-      (last - first,) indices of views.
-    """
+def _view_order(key: PRNGKeyArray, views: int, first: int, last: int) -> Int[np.ndarray, " s"]:
+    """Draws the views of the steps first .. last - 1; each round of `views` steps visits every view once."""
     rounds = [np.asarray(_round(key, r, views)) for r in range(first // views, -(-last // views))]
     offset = first % views
     return np.concatenate([np.zeros(0, np.int64), *rounds])[offset : offset + last - first]
@@ -95,31 +78,16 @@ def init_fit_state(gaussians: Gaussians, corrected_frames: int | None = None, *,
       gaussians: Initial scene.
       corrected_frames: Number of frames whose corrections are refined, or None.
       min_rows: Number of Gaussians to allocate rows for.
-
-    Returns:
-      The state.
     """
-    count = np.asarray(gaussians.count)
-    rows = round_capacity(max(int(count), min_rows))
-    gaussians = pad_with_free_rows(jax.tree.map(lambda a: np.asarray(a, np.float32), gaussians), rows)
-    zeros, zero = jax.tree.map(np.zeros_like, gaussians), np.zeros((), np.float64)
-    corrections = None
+    rows = round_capacity(max(gaussians.count, min_rows))
+    scene = pad_with_free_rows(jax.tree.map(lambda a: np.asarray(a, np.float32), gaussians), rows)
+    zeros, zero, corrections = jax.tree.map(np.zeros_like, scene), np.zeros((), np.float64), None
     if corrected_frames is not None:
         identity = identity_corrections(corrected_frames)
         no_moments = jax.tree.map(np.zeros_like, identity)
         corrections = CorrectionState(identity, no_moments, no_moments)
-    return FitState(
-        gaussians,
-        zeros,
-        zeros,
-        votes=zeros.opacity_logits,
-        done=zero,
-        pace=zero,
-        seconds=zero,
-        started=count,
-        losses=np.zeros(0, np.float32),
-        corrections=corrections,
-    )
+    train = TrainState(scene, zeros, zeros, zeros.opacity_logits, corrections)
+    return FitState(train, zero, zero, zero, np.asarray(gaussians.count), np.zeros(0, np.float32))
 
 
 def fit_gaussians(
@@ -132,7 +100,7 @@ def fit_gaussians(
     state: FitState | None = None,
     schedule: Schedule = _SCHEDULE,
     rates: LearningRates = _RATES,
-    refine: RefineOptions | None = None,
+    refine: CorrectionRates | None = None,
     chunk: int = 50,
     on_checkpoint: Callable[[FitState], None] | None = None,
     progress: Progress | None = None,
@@ -150,9 +118,9 @@ def fit_gaussians(
       seconds: Time limit in place of `steps`, without compilation.
       start: Initial scene.
       state: State of a stopped fit, in place of `start`.
-      schedule: Sizes of the frames, growth and degree of colour over time.
+      schedule: Sizes of the frames and number of Gaussians over time.
       rates: Learning rates.
-      refine: Which corrections of the views to optimise too (`FitState.corrections`), or None.
+      refine: Rates at which poses and exposures are corrected too (`TrainState.corrections`), or None.
       chunk: Number of steps between checkpoints; Gaussians are added only then.
       on_checkpoint: Called with the state after every chunk.
       progress: Called with the number of steps (or seconds) done and of all.
@@ -161,11 +129,14 @@ def fit_gaussians(
       The fitted Gaussians and the loss of each step.
 
     Raises:
-      ValueError: Not exactly one of `steps` and `seconds`, or of `start` and `state`, or the state is of another fit.
+      ValueError: Not exactly one of `steps` and `seconds`, or of `start` and `state`; a limit that is not above 0 and
+        finite; or a state of another fit.
       InputError: Every frame is held out, or the fit diverges.
     """
     limits = steps, seconds
     require(limits.count(None) == 1, "steps, seconds", limits, "exactly one of the two", "Choose one limit.")
+    limit = cast(float, seconds if steps is None else steps)
+    require(0 < limit < math.inf, "steps, seconds", limits, "a finite number above 0", "Choose a longer fit.")
     exclusive = (start is None) != (state is None)
     got = start is not None, state is not None
     require(exclusive, "start, state", got, "exactly one of the two", "Pass state to resume a fit.")
@@ -179,24 +150,24 @@ def fit_gaussians(
     assert state is not None
     _check_resumable(state, steps, refine)
     seed = int(jax.random.bits(key))
-    train_state = put_on_devices(_train_state(state), mesh)
+    train = put_on_devices(state.train, mesh)
     while float(state.done) < 1:
-        first, done = len(state.losses), float(state.done)
+        first, done, elapsed = len(state.losses), float(state.done), float(state.seconds)
         pace = 1 / steps if steps is not None else float(state.pace) or 1e-4
         # A resumed fit has the same chunks.
         count = max(1, min(chunk - first % chunk, math.ceil((1 - done) / pace - 1e-6)))
-        size, order = schedule.size(done), view_order(key, frames, first, first + count)
+        size, order = schedule.size(done), _view_order(key, frames, first, first + count)
         config = StepConfig(schedule.degree(done), rates, refine)
-        program, later = runner.compile(train_state, size, config), schedule.next_size(done)
-        has_all_rows = train_state.gaussians.count >= schedule.max_gaussians
+        program, later = runner.compile(train, size, config), schedule.next_size(done)
+        has_all_rows = train.gaussians.count >= schedule.max_gaussians
         if later is not None and has_all_rows and steps is not None:  # a fit with a time limit would lose steps
-            runner.compile(train_state, later, config)
+            runner.compile(train, later, config)
         program.result()  # compilation is not counted as time of the fit
         began = time.monotonic()
         shares = done + pace * np.arange(count)
-        train_state, new_losses = _run_chunk(train_state, runner, size, order, first, shares, config)
+        train, new_losses = _run_chunk(train, runner, size, order, first, shares, config)
         losses = np.concatenate([state.losses, np.asarray(new_losses, np.float32)])
-        host = _to_host(train_state, state.gaussians.count)
+        host = _to_host(train, state.train.gaussians.count)
         # A Gaussian that is not finite is invisible: the loss alone does not show it.
         arrays = jax.tree.leaves((losses[-1], host.gaussians, host.corrections))
         if not all(np.isfinite(array).all() for array in arrays):
@@ -206,32 +177,22 @@ def fit_gaussians(
         target = schedule.count(done, int(state.started))
         if target is not None and len(losses) % chunk == 0:
             host = _densify(host, schedule, target, [seed, len(losses)])
-            train_state = put_on_devices(host, mesh)
-        elapsed = float(state.seconds) + time.monotonic() - began
-        now = len(losses) / steps if steps is not None else min(elapsed / cast(float, seconds), 1.0)
-        state = FitState(
-            gaussians=host.gaussians,
-            first_moment=host.first_moment,
-            second_moment=host.second_moment,
-            votes=host.votes,
-            done=np.asarray(now),
-            pace=np.asarray((now - done) / count),
-            seconds=np.asarray(elapsed),
-            started=state.started,
-            losses=losses,
-            corrections=host.corrections,
-        )
+            train = put_on_devices(host, mesh)
+        elapsed += time.monotonic() - began
+        now = len(losses) / steps if steps is not None else min(elapsed / limit, 1.0)
+        numbers = map(np.asarray, (now, (now - done) / count, elapsed))
+        state = FitState(host, *numbers, started=state.started, losses=losses)
         if on_checkpoint:
             on_checkpoint(state)
         if progress:
-            progress(*((len(losses), steps) if steps is not None else (round(elapsed), round(cast(float, seconds)))))
-    return FitResult(drop_free_rows(state.gaussians), np.asarray(state.losses))
+            progress(len(losses) if steps is not None else round(elapsed), round(limit))
+    return FitResult(drop_free_rows(state.train.gaussians), np.asarray(state.losses))
 
 
-def _check_resumable(state: FitState, steps: int | None, refine: RefineOptions | None) -> None:
+def _check_resumable(state: FitState, steps: int | None, refine: CorrectionRates | None) -> None:
     """Raises ValueError if a state was made with other options."""
     remedy = "Resume with the options of the first run."
-    got = state.corrections is not None
+    got = state.train.corrections is not None
     require(got == (refine is not None), "state with corrections", got, f"{refine is not None}", remedy)
     if steps is not None:
         same = abs(float(state.done) * steps - len(state.losses)) < 1e-6
@@ -239,14 +200,11 @@ def _check_resumable(state: FitState, steps: int | None, refine: RefineOptions |
         require(same, "state", got, f"a fit of {steps} steps", remedy)
 
 
-def _train_state(state: FitState) -> TrainState:
-    return TrainState(state.gaussians, state.first_moment, state.second_moment, state.votes, state.corrections)
-
-
 def _to_host(state: TrainState, rows: int) -> TrainState:
     """Copies a state to NumPy arrays, without the rows beyond `rows` that `put_on_devices` added."""
     host = jax.tree.map(np.asarray, state)
-    return jax.tree.map(lambda a: a[:rows], host._replace(corrections=None))._replace(corrections=host.corrections)
+    cut = jax.tree.map(lambda a: a[:rows], dataclasses.replace(host, corrections=None))
+    return dataclasses.replace(cut, corrections=host.corrections)
 
 
 def _run_chunk(

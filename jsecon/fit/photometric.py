@@ -23,16 +23,15 @@ from jsecon.types import Array
 
 RADIUS_PX = 5
 """Radius of the SSIM window: 11 = 2 * 5 + 1."""
-SIGMA_PX = 1.5
-C1 = 0.01**2
-"""Keeps the luminance term finite if both images are black."""
-C2 = 0.03**2
-"""Keeps the contrast term finite if both images are flat."""
+_C1, _C2 = 0.01**2, 0.03**2
+"""Keep the luminance and the contrast term finite if both images are black or flat."""
+SSIM_SHARE = 0.2
+"""Share of SSIM in the loss (Kerbl et al. 2023)."""
 
 
 def _window() -> np.ndarray:
     offsets = np.arange(-RADIUS_PX, RADIUS_PX + 1)
-    weights = np.exp(-(offsets**2) / (2 * SIGMA_PX**2))
+    weights = np.exp(-(offsets**2) / (2 * 1.5**2))
     return weights / weights.sum()
 
 
@@ -56,14 +55,7 @@ def _shifts(image: Array, axis: int, step: int) -> Array:
 
 @jax.custom_vjp
 def gaussian_blur(image: Float[Array, "h w c"]) -> Float[Array, "h w c"]:
-    """Blurs an image with the SSIM window, with zeros outside of the image. Reverse mode only.
-
-    Args:
-      image: (H, W, C).
-
-    Returns:
-      (H, W, C).
-    """
+    """Blurs an image with the SSIM window, with zeros outside of the image. Reverse mode only."""
     return _blur_once(_blur_once(image, 0), 1)
 
 
@@ -77,35 +69,13 @@ def _same_shape(image, target) -> None:
 
 
 def l1(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[Array, ""]:
-    """Computes the mean absolute difference of two images.
-
-    Args:
-      image: (H, W, C).
-      target: Image of the same shape.
-
-    Returns:
-      () loss.
-
-    Raises:
-      ValueError: The shapes differ.
-    """
+    """Computes the mean absolute difference of two images of one shape."""
     _same_shape(image, target)
     return jnp.mean(jnp.abs(image - target))
 
 
 def ssim_map(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[Array, "h w c"]:
-    """Computes the structural similarity of each pixel and channel (Wang 2004, eq. 13).
-
-    Args:
-      image: (H, W, C) in [0, 1].
-      target: Image of the same shape.
-
-    Returns:
-      (H, W, C) in [-1, 1]; 1 if the windows are equal.
-
-    Raises:
-      ValueError: The shapes differ.
-    """
+    """Computes the structural similarity of each pixel and channel, in [-1, 1] (Wang 2004, eq. 13)."""
     _same_shape(image, target)
     # Five blurs instead of one of a stack: slicing the gradient of the stack costs XLA four times the blurs.
     mean_i, mean_t = gaussian_blur(image), gaussian_blur(target)
@@ -113,29 +83,19 @@ def ssim_map(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Flo
     product = gaussian_blur(image * target)
     variance_i, variance_t = square_i - mean_i * mean_i, square_t - mean_t * mean_t
     covariance = product - mean_i * mean_t
-    numerator = (2 * mean_i * mean_t + C1) * (2 * covariance + C2)
-    return numerator / ((mean_i * mean_i + mean_t * mean_t + C1) * (variance_i + variance_t + C2))
-
-
-SSIM_SHARE = 0.2
-"""Share of SSIM in the loss (Kerbl et al. 2023)."""
+    numerator = (2 * mean_i * mean_t + _C1) * (2 * covariance + _C2)
+    return numerator / ((mean_i * mean_i + mean_t * mean_t + _C1) * (variance_i + variance_t + _C2))
 
 
 def photometric_loss(
     image: Float[Array, "h w c"], target: Float[Array, "_ _ _"], mesh: Mesh | None = None
 ) -> Float[Array, ""]:
-    """Computes 0.8 L1 + 0.2 (1 - SSIM) (Kerbl et al. 2023, eq. 7).
+    """Computes 0.8 L1 + 0.2 (1 - SSIM) of a rendering and a photograph (Kerbl et al. 2023, eq. 7).
 
     Args:
-      image: (H, W, C) rendering in [0, 1].
+      image: Rendering in [0, 1].
       target: Photograph of the same shape.
       mesh: Devices to divide the rows among. With a mesh only `image` is differentiable, in reverse mode.
-
-    Returns:
-      () loss.
-
-    Raises:
-      ValueError: The shapes differ.
     """
     _same_shape(image, target)
     if mesh is None:
@@ -192,8 +152,8 @@ def _loss_of_rows(x: Array, y: Array, inside: Array, channels: int) -> tuple[Arr
 
     def similarity(m, n, q, r, p):
         m, n, q, r, p = map(across, (m, n, q, r, p))
-        a, b = 2 * m * n + C1, 2 * (p - m * n) + C2
-        c, d = m * m + n * n + C1, q - m * m + r - n * n + C2
+        a, b = 2 * m * n + _C1, 2 * (p - m * n) + _C2
+        c, d = m * m + n * n + _C1, q - m * m + r - n * n + _C2
         s = a * b / (c * d)
         by = s, 2 * n * (b - a) / (c * d) - 2 * m * s * (1 / c - 1 / d), -s / d, 2 * a / (c * d)
         return [jnp.where(inside, value, 0.0) for value in by]
@@ -212,18 +172,7 @@ def _loss_of_rows(x: Array, y: Array, inside: Array, channels: int) -> tuple[Arr
 
 
 def psnr(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[Array, ""]:
-    """Computes the peak signal-to-noise ratio.
-
-    Args:
-      image: (H, W, C) in [0, 1]; clamp a rendering first.
-      target: Image of the same shape.
-
-    Returns:
-      () dB, infinite if the images are equal.
-
-    Raises:
-      ValueError: The shapes differ.
-    """
+    """Computes the peak signal-to-noise ratio in dB, infinite for equal images; clamp a rendering to [0, 1] first."""
     _same_shape(image, target)
     difference = image - target
     return -10.0 * jnp.log10(jnp.mean(difference * difference))

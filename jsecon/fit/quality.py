@@ -15,10 +15,10 @@ from jsecon.types import Array, Capture, Gaussians, Progress, Quality
 
 QUICK_LONG_SIDE = 400
 """Longer side in px at which weak frames are looked for: a thousand large frames would take half an hour."""
-MIN_GAP_DB = 5.0
-"""Least distance below the median PSNR at which a frame is called weak."""
-MIN_GAP_SPREADS = 5.0
-"""The same distance in units of the median absolute deviation."""
+MIN_COUNTED_SHARE = 0.01
+"""Least share of the pixels of a frame that must count: fewer measure nothing."""
+MIN_GAP_DB, MIN_GAP_SPREADS = 5.0, 5.0
+"""Least distance below the median PSNR at which a frame is called weak, in dB, and in median absolute deviations."""
 
 
 @jax.jit
@@ -51,22 +51,24 @@ def measure_quality(
       progress: Called with the number of frames done and of all.
 
     Returns:
-      PSNR and SSIM of each frame; frames that are ignored entirely are skipped.
+      PSNR and SSIM of each frame; frames of which less than MIN_COUNTED_SHARE counts are skipped.
     """
     chosen = np.flatnonzero(capture.held_out) if frames is None else np.asarray(frames)
-    if capture.ignored is not None:
-        chosen = np.array([t for t in chosen if not np.all(capture.ignored[t])], int)
     gaussians, cameras = jax.device_put(gaussians), capture.cameras
     if long_side is not None:
         cameras = shrink_cameras(cameras, long_side)
 
+    def counted_pixels(t: int) -> np.ndarray:
+        if capture.ignored is None:
+            return np.ones((cameras.height, cameras.width), bool)
+        return ~resize_mask(np.asarray(capture.ignored[t]), cameras)
+
+    chosen = np.array([t for t in chosen.tolist() if counted_pixels(t).mean() >= MIN_COUNTED_SHARE], int)
+
     def compare(t: int) -> list[float]:
         image = render_rgb(gaussians, cameras[t]).features
         frame = resize_frame(np.asarray(capture.frames[t]), cameras)
-        counted = np.ones(frame.shape[:2], bool)
-        if capture.ignored is not None:
-            counted = ~resize_mask(np.asarray(capture.ignored[t]), cameras)
-        return [float(value) for value in _compare(image, frame, counted)]
+        return [float(value) for value in _compare(image, frame, counted_pixels(t))]
 
     def rows(positions: Sequence[int]) -> Iterator[list[float]]:
         return map(compare, chosen[list(positions)].tolist())
@@ -76,15 +78,10 @@ def measure_quality(
 
 
 def is_weak(psnr: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
-    """Finds frames that the scene does not explain: wrong poses, moving things, a finger before the lens.
-
-    Args:
-      psnr: (F,) dB of each frame.
-
-    Returns:
-      (F,) bool, true for frames far below the median.
-    """
-    if not len(psnr):
-        return np.zeros(0, bool)
-    gap = np.median(psnr) - np.asarray(psnr)
-    return gap > max(MIN_GAP_DB, MIN_GAP_SPREADS * float(np.median(np.abs(gap))))
+    """Finds frames far below the median PSNR (dB): wrong poses, moving things, a finger before the lens."""
+    values = np.asarray(psnr, np.float64)
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return np.zeros(len(values), bool)
+    median = np.median(known)
+    return median - values > max(MIN_GAP_DB, MIN_GAP_SPREADS * float(np.median(np.abs(median - known))))

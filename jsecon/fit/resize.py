@@ -9,16 +9,7 @@ from jsecon.types import Camera
 
 
 def resize_camera(camera: Camera, width: int, height: int) -> Camera:
-    """Changes the image size of a view, or of a batch of views.
-
-    Args:
-      camera: One camera or a batch.
-      width: New width, px.
-      height: New height, px.
-
-    Returns:
-      Cameras with the same field of view.
-    """
+    """Changes the image size of one camera or a batch; the field of view stays."""
     x, y = np.float32(width / camera.width), np.float32(height / camera.height)
     return dataclasses.replace(
         camera, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y, width=width, height=height
@@ -26,55 +17,25 @@ def resize_camera(camera: Camera, width: int, height: int) -> Camera:
 
 
 def scale_cameras(cameras: Camera, scale: float) -> Camera:
-    """Scales the image size of cameras.
-
-    Args:
-      cameras: One camera or a batch.
-      scale: Factor on width and height, which are rounded to whole px.
-
-    Returns:
-      Cameras with the same field of view.
-    """
+    """Multiplies the image size of one camera or a batch, rounded to whole px."""
     return resize_camera(cameras, max(round(cameras.width * scale), 1), max(round(cameras.height * scale), 1))
 
 
 def shrink_cameras(cameras: Camera, long_side: int) -> Camera:
-    """Limits the image size of cameras.
-
-    Args:
-      cameras: One camera or a batch.
-      long_side: Maximum length of the longer side, px.
-
-    Returns:
-      Cameras with the same field of view.
-    """
+    """Limits the longer side of one camera or a batch to `long_side` px."""
     return scale_cameras(cameras, min(1.0, long_side / max(cameras.width, cameras.height)))
 
 
 def resize_frame(frame: np.ndarray, cameras: Camera) -> np.ndarray:
-    """Resizes a frame by area averaging.
-
-    Args:
-      frame: (h, w, 3) uint8.
-      cameras: Cameras whose image size it gets.
-
-    Returns:
-      (H, W, 3) uint8; the frame itself if it has that size.
-    """
+    """Resizes a frame (h, w, 3) uint8 to the image size of cameras by area averaging; of that size, it is returned."""
     if frame.shape[:2] == (cameras.height, cameras.width):
         return np.asarray(frame)
     return cv2.resize(np.asarray(frame), (cameras.width, cameras.height), interpolation=cv2.INTER_AREA)
 
 
 def resize_mask(mask: np.ndarray, cameras: Camera) -> np.ndarray:
-    """Resizes a mask; a pixel is set if any pixel that it covers is.
-
-    Args:
-      mask: (h, w) bool.
-      cameras: Cameras whose image size it gets.
-
-    Returns:
-      (H, W) bool.
-    """
+    """Resizes a mask (h, w) bool to the image size of cameras; a pixel is set if any pixel that it covers is."""
+    if mask.shape == (cameras.height, cameras.width):
+        return np.asarray(mask)
     size = cameras.width, cameras.height
     return cv2.resize(np.asarray(mask, np.float32), size, interpolation=cv2.INTER_AREA) > 0

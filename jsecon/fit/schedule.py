@@ -16,6 +16,10 @@ from jsecon.types import Array, Gaussians, record
 MAX_GAUSSIANS = 100_000
 """Default limit on the number of Gaussians: more make each step slower. bonsai at 400x266 after two minutes has 28.6 dB
 with 50,000, 28.8 with 100,000 and 28.2 with 200,000 (experiments/retired.md)."""
+GROWTH_START, GROWTH_END = 0.05, 0.5
+"""Shares of the fit between which the number of Gaussians rises linearly."""
+DEGREE_INTERVAL = 0.1
+"""Share of the fit after which the degree of the spherical harmonics rises by one."""
 
 
 @record
@@ -36,17 +40,14 @@ class LearningRates:
 
 
 def rates_at(done: Array, rates: LearningRates, gaussians: Gaussians, extent: Array, degree: Array) -> Gaussians:
-    """Computes the step sizes at one time. Pure.
+    """Computes the step size of each array when the share `done` of the fit is done. Pure.
 
     Args:
-      done: () share of the fit that is done.
+      done: Share of the fit that is done.
       rates: Step sizes over the fit.
       gaussians: Scene, for the number of its spherical harmonics.
-      extent: () cameras' extent in world units.
-      degree: () highest degree of the spherical harmonics that learns.
-
-    Returns:
-      One rate for each array in the layout of Gaussians; sh has one per coefficient, zero above `degree`.
+      extent: Cameras' extent, world units.
+      degree: Highest degree of the spherical harmonics that learns: the rate of higher coefficients is zero.
     """
     band = np.floor(np.sqrt(np.arange(gaussians.sh.shape[1]))).astype(np.int32)
     sh = jnp.where(band <= degree, jnp.where(band == 0, rates.colors, rates.colors / 20), 0.0)
@@ -60,73 +61,35 @@ def rates_at(done: Array, rates: LearningRates, gaussians: Gaussians, extent: Ar
 
 @dataclasses.dataclass(frozen=True)
 class Schedule:
-    """Schedule of a fit. Raises ValueError if its shares of the fit are out of order."""
+    """Schedule of a fit. Raises ValueError if the ends of its frame sizes are out of order."""
 
     sizes: tuple[tuple[float, float], ...] = ((0.5, 0.5), (1.0, 1.0))
     """Pairs of a frame size and the share of the fit at which it ends. Smaller frames cost less and move large things
     first (arXiv 2503.18402)."""
     max_gaussians: int = MAX_GAUSSIANS
     """Number of Gaussians after growth. A start with as many or more keeps its number: 0 means no growth."""
-    growth_start: float = 0.05
-    """Share of the fit at which growth begins."""
-    growth_end: float = 0.5
-    """Share of the fit at which the number of Gaussians, which rises linearly, reaches `max_gaussians`."""
-    degree_interval: float = 0.1
-    """Share of the fit after which the degree of the spherical harmonics rises by one."""
 
     def __post_init__(self) -> None:
-        """Checks the ranges of the numbers."""
+        """Checks the sizes."""
         ends = [end for _, end in self.sizes]
         ordered = ends == sorted(ends) and ends[-1:] == [1.0] and all(0 < size <= 1 for size, _ in self.sizes)
         require(ordered, "sizes", self.sizes, "sizes in (0, 1] with rising ends, the last 1", "((1, 1),) is one size.")
-        ordered = 0 <= self.growth_start < self.growth_end <= 1
-        got = self.growth_start, self.growth_end
-        require(ordered, "growth_start, growth_end", got, "0 <= start < end <= 1", "")
 
     def size(self, done: float) -> float:
-        """Returns the size of the frames.
-
-        Args:
-          done: Share of the fit that is done, in [0, 1].
-
-        Returns:
-          Share of their full size.
-        """
+        """Returns the size of the frames, as a share of their full size."""
         return next(size for size, end in self.sizes if done < end or end == 1.0)
 
     def next_size(self, done: float) -> float | None:
-        """Returns the size of the frames that follows.
-
-        Args:
-          done: Share of the fit that is done, in [0, 1].
-
-        Returns:
-          Share of their full size, or None if the present size is the last.
-        """
+        """Returns the size of the frames that follows, or None if the present size is the last."""
         return next((later for (_, end), (later, _) in pairwise(self.sizes) if done < end), None)
 
     def degree(self, done: float) -> int:
-        """Returns the degree of colour.
-
-        Args:
-          done: Share of the fit that is done, in [0, 1].
-
-        Returns:
-          Highest degree of the spherical harmonics that learns; it may exceed the scene's.
-        """
-        return int(done / self.degree_interval) if self.degree_interval > 0 else 3
+        """Returns the highest degree of the spherical harmonics that learns; it may exceed the scene's."""
+        return int(done / DEGREE_INTERVAL)
 
     def count(self, done: float, start: int) -> int | None:
-        """Returns the number of Gaussians.
-
-        Args:
-          done: Share of the fit that is done, in [0, 1].
-          start: Number of Gaussians at the start.
-
-        Returns:
-          The number to grow to, or None outside of the growth phase.
-        """
-        if not self.growth_start <= done <= self.growth_end or self.max_gaussians <= start:
+        """Returns the number of Gaussians to grow to from `start`, or None outside of the growth phase."""
+        if not GROWTH_START <= done <= GROWTH_END or self.max_gaussians <= start:
             return None
-        share = (done - self.growth_start) / (self.growth_end - self.growth_start)
+        share = (done - GROWTH_START) / (GROWTH_END - GROWTH_START)
         return round(start + share * (self.max_gaussians - start))

@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 from jsecon.errors import require
 from jsecon.fit.depth import points_from_depth
 from jsecon.fit.triangulate import MIN_POINTS, triangulated_points
+from jsecon.process import cores
 from jsecon.splat.sh import C0
 from jsecon.types import Array, Capture, Gaussians, Progress
 
@@ -50,12 +51,6 @@ def starting_gaussians(
       sh_degree: Degree of the spherical harmonics, 0 to 3.
       max_points: Maximum number of points from depth frames.
       progress: Called with the number of frames and pairs triangulated and of all.
-
-    Returns:
-      The Gaussians, and one clause on where they come from.
-
-    Raises:
-      InputError: The frames give too few points.
     """
     count = len(capture.points)
     if capture.depths is not None:
@@ -76,20 +71,16 @@ def starting_gaussians(
 
 
 def neighbour_distances(points: Float[Array, "p 3"]) -> Float[np.ndarray, " p"]:
-    """Computes the RMS distance to the three nearest neighbours (simple-knn of graphdeco-inria).
+    """Computes the RMS distance to the three nearest neighbours (simple-knn of graphdeco-inria), fewer if there are.
 
-    Args:
-      points: (P, 3) points.
-
-    Returns:
-      (P,) distances in world units, over fewer neighbours if there are fewer; a single point gets the minimum.
+    A single point gets the minimum.
     """
     points = np.asarray(points, np.float64)
     count = len(points)
     others = min(3, count - 1)
     if others < 1:
         return np.full(count, math.sqrt(MIN_SQUARED_DISTANCE))
-    distances, _ = KDTree(points).query(points, k=others + 1, workers=-1)
+    distances, _ = KDTree(points).query(points, k=others + 1, workers=cores())
     return np.sqrt(np.maximum(np.mean(distances[:, 1:] ** 2, axis=1), MIN_SQUARED_DISTANCE))
 
 
@@ -111,12 +102,6 @@ def gaussians_from_points(
       scale: Standard deviation in units of `neighbour_distances`.
       max_scale: Largest standard deviation, world units.
       sh_degree: Degree of the spherical harmonics, 0 to 3.
-
-    Returns:
-      P Gaussians (NumPy float32).
-
-    Raises:
-      ValueError: There is no point, a coordinate is not finite, or an option is out of range.
     """
     points, colors = np.asarray(points), np.asarray(colors)
     require(len(points) > 0, "points", 0, "at least one", "Triangulate points from the frames (fit.triangulate).")

@@ -12,12 +12,12 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jsecon.errors import InputError
 from jsecon.fit.corrections import (
+    CorrectionRates,
     Corrections,
     CorrectionState,
-    RefineOptions,
     apply_exposure,
     corrected_camera,
-    correction_penalty,
+    regularizer,
 )
 from jsecon.fit.growth import pad_rows, pad_with_free_rows
 from jsecon.fit.photometric import photometric_loss
@@ -27,7 +27,7 @@ from jsecon.parallel import AXIS, MESH_OPTIONS, map_rows
 from jsecon.splat.capacity import default_capacity, enough_capacity
 from jsecon.splat.render import render
 from jsecon.splat.sh import colours_from_sh
-from jsecon.types import Array, Camera, Capture, Gaussians, record
+from jsecon.types import Array, Camera, Capture, Leaf, record
 
 DEPTH_WEIGHT = 0.2
 """Weight of the mean relative depth error in the loss, for captures with depth."""
@@ -43,28 +43,21 @@ _ADAM = optax.scale_by_adam(eps=1e-15)
 class TrainingView:
     """One view that a step fits to."""
 
-    camera: Camera
-    frame: Array
+    camera: Leaf
+    """Camera of the view."""
+    frame: Leaf
     """(H, W, 3) uint8."""
-    depth: Array | None
+    depth: Leaf
     """(H, W) float32 z-depth, world units, 0 = unknown; or None."""
-    ignored: Array | None
+    ignored: Leaf
     """(H, W) bool: pixels without influence; or None."""
 
 
 class TrainingViews:
-    """Training frames of a capture at one size, read one at a time. Host code."""
+    """Training frames of a capture at one size, each resized when a step first takes it. Host code."""
 
     def __init__(self, capture: Capture, size: float = 1.0):
-        """Takes the training frames of a capture.
-
-        Args:
-          capture: Frames, cameras, depths and ignored pixels.
-          size: Size of the frames, as a share of their full size.
-
-        Raises:
-          InputError: Every frame is held out.
-        """
+        """Takes the training frames of a capture, at a share of their size. Raises InputError if there is none."""
         self.frame_indices = np.flatnonzero(~np.asarray(capture.held_out))
         if not len(self.frame_indices):
             raise InputError("capture", "every frame held out", "frames to fit to", "Hold out fewer frames.")
@@ -73,15 +66,22 @@ class TrainingViews:
         cameras = jax.tree.map(lambda a: np.asarray(a, np.float32), capture.cameras[self.frame_indices])
         self.extent = np.asarray(cameras_extent(cameras), np.float32)
         self.cameras = cameras if size == 1.0 else scale_cameras(cameras, size)
+        self._views: dict[int, TrainingView] = {}
 
     def __getitem__(self, index: int) -> TrainingView:
         """Returns a view by its position among the training frames."""
+        if index not in self._views:
+            self._views[index] = self._resized(index)
+        return self._views[index]
+
+    def _resized(self, index: int) -> TrainingView:
         capture, t = self._capture, self.frame_indices[index]
         size = self.cameras.width, self.cameras.height
         depth = ignored = None
         if capture.depths is not None:
             depth = np.asarray(capture.depths[t], np.float32)
-            depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+            if not (np.isfinite(depth) & (depth >= 0)).all():  # a copy, else the depth itself
+                depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
             depth = depth if depth.shape == size[::-1] else _shrink_depth(depth, size)
         if capture.ignored is not None:
             ignored = resize_mask(np.asarray(capture.ignored[t]), self.cameras)
@@ -101,20 +101,13 @@ def _shrink_depth(depth: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def cameras_extent(cameras: Camera) -> float:
-    """Computes the extent of a batch of cameras as INRIA's `spatial_lr_scale`.
-
-    Args:
-      cameras: Batch of T cameras.
-
-    Returns:
-      1.1 times the largest distance of a camera centre from their mean, world units.
-    """
+    """Computes the extent of cameras as INRIA: 1.1 times the largest distance of a centre from their mean."""
     centres = jax.tree.map(lambda a: np.asarray(a, np.float64), cameras).centres
     return 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
 
 
 def view_loss(
-    gaussians: Gaussians,
+    gaussians: Any,
     vote_channel: Array,
     correction: Corrections | None,
     view: TrainingView,
@@ -134,7 +127,7 @@ def view_loss(
         absolute error of the pixels.
       correction: Corrections of this view, or None.
       view: Camera, frame, depth and ignored pixels.
-      extent: () cameras' extent, world units.
+      extent: Cameras' extent, world units.
       capacity: Number of (block, Gaussian) pairs, see `render`.
       mesh: Devices to divide the work among, or None.
 
@@ -158,21 +151,25 @@ def view_loss(
         relative = jnp.abs(rendering.depth - view.depth) / jnp.where(known, view.depth, 1.0)
         value = value + DEPTH_WEIGHT * jnp.mean(jnp.where(known, relative, 0.0))
     if correction is not None:
-        value = value + correction_penalty(correction, extent)
+        value = value + regularizer(correction, extent)
     error = jax.lax.stop_gradient(jnp.abs(image - target).mean(-1))
     return value + jnp.sum(error * votes), (value, rendering.overflow)
 
 
-class TrainState(NamedTuple):
+@record
+class TrainState:
     """Arrays that a step updates."""
 
-    gaussians: Gaussians
-    first_moment: Gaussians
-    second_moment: Gaussians
-    votes: Array
-    """(N,) see `FitState`."""
-    corrections: CorrectionState | None
-    """Corrections of all frames, or None."""
+    gaussians: Leaf
+    """Scene so far; rows may be free (growth.py)."""
+    first_moment: Leaf
+    """Adam's running mean of the gradient, as Gaussians."""
+    second_moment: Leaf
+    """Adam's running mean of the squared gradient, as Gaussians."""
+    votes: Leaf
+    """(N,) sum of alpha T times the mean absolute error of the pixel, over the views since the last growth."""
+    corrections: Leaf = None
+    """CorrectionState of all frames of the capture; None if they are not refined."""
 
 
 class StepConfig(NamedTuple):
@@ -181,26 +178,29 @@ class StepConfig(NamedTuple):
     degree: int
     """Highest degree of the spherical harmonics that learns."""
     rates: LearningRates
-    refine: RefineOptions | None
+    refine: CorrectionRates | None
 
 
-class StepInputs(NamedTuple):
+@record
+class StepInputs:
     """Numbers of a step; traced, so that one program serves all steps."""
 
-    step: Any
+    step: Leaf
     """() int32 index of the step."""
-    frame: Any
+    frame: Leaf
     """() int32 index of the frame in the capture."""
-    visits: Any
+    visits: Leaf
     """() int32 number of earlier steps on this frame."""
-    done: Any
+    done: Leaf
     """() float32 share of the fit that is done."""
-    degree: Any
+    degree: Leaf
     """() int32, see `StepConfig`."""
-    extent: Any
+    extent: Leaf
     """() float32 cameras' extent, world units."""
-    rates: LearningRates
-    correction_rates: Corrections | None
+    rates: Leaf
+    """LearningRates."""
+    correction_rates: Leaf
+    """Corrections of one view, or None."""
 
 
 def step(
@@ -210,69 +210,46 @@ def step(
 
     Over a mesh, projection, compositing, loss and update are each divided among its devices.
 
-    Args:
-      state: Scene, moments, votes and corrections.
-      view: View to fit to.
-      inputs: Numbers of this step.
-      capacity: Number of (block, Gaussian) pairs, see `render`.
-      mesh: Devices to divide the work among, or None.
-
     Returns:
-      The state after the step, the loss before it, and the number of pairs that overflowed.
+      The state after the step, the loss before it, and the number of pairs that overflowed `capacity`.
     """
-    gaussians, first, second, votes, corrections = state
     # Always counted: a program without them would save 5 % of a step and cost its own compilation.
-    vote_channel = jnp.zeros((gaussians.count, 1))
+    vote_channel = jnp.zeros((state.gaussians.count, 1))
+    corrections = state.corrections
     correction = None if corrections is None else jax.tree.map(lambda a: a[inputs.frame], corrections.current)
 
     def loss(gaussians, vote_channel, correction):
         return view_loss(gaussians, vote_channel, correction, view, inputs.extent, capacity, mesh)
 
-    gradients = jax.value_and_grad(loss, (0, 1, 2), has_aux=True)(gaussians, vote_channel, correction)
+    gradients = jax.value_and_grad(loss, (0, 1, 2), has_aux=True)(state.gaussians, vote_channel, correction)
     (_, (value, overflow)), (gradient, vote_gradient, correction_gradient) = gradients
 
     def update(rows, common):
-        (gaussians, gradient, first, second), (index, rate) = rows, common
-        moments: Any = optax.ScaleByAdamState(*cast(Any, (index, first, second)))
-        direction, moments = _ADAM.update(gradient, moments)
-        return jax.tree.map(lambda p, u, r: p - r * u, gaussians, direction, rate), moments.mu, moments.nu
+        return _adam(*rows, *common)
 
-    rate = rates_at(inputs.done, inputs.rates, gaussians, inputs.extent, inputs.degree)
-    rows = gaussians, gradient, first, second
+    rate = rates_at(inputs.done, inputs.rates, state.gaussians, inputs.extent, inputs.degree)
+    rows = state.gaussians, gradient, state.first_moment, state.second_moment
     gaussians, first, second = map_rows(update, rows, (inputs.step, rate), mesh)
     if corrections is not None:
-        assert inputs.correction_rates is not None
-        corrections = _update_corrections(
-            corrections, inputs.frame, correction_gradient, inputs.visits, inputs.correction_rates
-        )
-    after = TrainState(gaussians, first, second, votes + vote_gradient[:, 0], corrections)
+        before = jax.tree.map(lambda a: a[inputs.frame], corrections)
+        moments = before.first_moment, before.second_moment
+        row = _adam(before.current, correction_gradient, *moments, inputs.visits, inputs.correction_rates)
+        corrections = jax.tree.map(lambda a, new: a.at[inputs.frame].set(new), corrections, CorrectionState(*row))
+    after = TrainState(gaussians, first, second, state.votes + vote_gradient[:, 0], corrections)
     if mesh is not None:  # the same shardings as before: one program serves every step
-        after = TrainState(*map(jax.lax.with_sharding_constraint, after, _shardings(mesh)))
+        after = jax.lax.with_sharding_constraint(after, _shardings(mesh))
     return after, value, overflow
 
 
-def _update_corrections(
-    state: CorrectionState, view: Array, gradient: Corrections, visits: Array, rates: Corrections
-) -> CorrectionState:
-    """Takes one Adam step for one view, at those rates; `visits` is the number of its earlier steps."""
-    row = jax.tree.map(lambda a: a[view], state)
-    moments: Any = optax.ScaleByAdamState(*cast(Any, (visits, row.first_moment, row.second_moment)))
-    direction, moments = _ADAM.update(cast(Any, gradient), moments)
-    corrected = jax.tree.map(lambda p, u, r: p - r * u, row.current, direction, rates)
-    row = CorrectionState(corrected, moments.mu, moments.nu)
-    return jax.tree.map(lambda a, new: a.at[view].set(new), state, row)
-
-
-def _step_of_leaves(leaves: list[Array], treedef: Any, capacity: int, mesh: Mesh | None):
-    """`step` of a tree that is taken apart: jax fills lowered trees with other things than arrays."""
-    state, view, inputs = jax.tree.unflatten(treedef, leaves)
-    return step(state, view, inputs, capacity, mesh)
+def _adam(parameters: Any, gradient: Any, first: Any, second: Any, steps: Array, rates: Any) -> tuple[Any, Any, Any]:
+    """Parameters and moments after one step of Adam; `steps` is the number of earlier ones."""
+    moments: Any = optax.ScaleByAdamState(*cast(Any, (steps, first, second)))
+    direction, moments = _ADAM.update(gradient, moments)
+    return jax.tree.map(lambda p, u, r: p - r * u, parameters, direction, rates), moments.mu, moments.nu
 
 
 # of one device, and over a mesh
-_step_compiled = [
-    jax.jit(_step_of_leaves, static_argnums=(1, 2, 3), compiler_options=options) for options in (None, MESH_OPTIONS)
-]
+_step_compiled = [jax.jit(step, static_argnums=(3, 4), compiler_options=options) for options in (None, MESH_OPTIONS)]
 
 
 def _shardings(mesh: Mesh) -> TrainState:
@@ -282,18 +259,13 @@ def _shardings(mesh: Mesh) -> TrainState:
     be exchanged at every step. Corrections are replicated.
     """
     replicated, rows = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(AXIS))
-    return cast(TrainState, TrainState(*cast(Any, (rows, rows, rows, rows, replicated))))
+    return TrainState(rows, rows, rows, rows, replicated)
 
 
 def put_on_devices(state: TrainState, mesh: Mesh | None) -> TrainState:
-    """Moves a state to devices.
+    """Moves a state to the devices of a mesh, or to the first device.
 
-    Args:
-      state: State of N rows.
-      mesh: Devices that divide the rows, or None for the first one.
-
-    Returns:
-      The state, padded with free rows so that all devices have the same number.
+    It is padded with free rows so that all devices have the same number.
     """
     if mesh is None:
         return jax.device_put(state)
@@ -301,7 +273,7 @@ def put_on_devices(state: TrainState, mesh: Mesh | None) -> TrainState:
     if rows > state.gaussians.count:
         first, second, votes = pad_rows((state.first_moment, state.second_moment, state.votes), rows)
         state = TrainState(pad_with_free_rows(state.gaussians, rows), first, second, votes, state.corrections)
-    return TrainState(*map(jax.device_put, state, _shardings(mesh)))
+    return jax.device_put(state, _shardings(mesh))
 
 
 class StepRunner:
@@ -319,38 +291,22 @@ class StepRunner:
         self._compiler = ThreadPoolExecutor(2)
 
     def views(self, size: float) -> TrainingViews:
-        """Returns the training frames at a size.
-
-        Args:
-          size: Share of their full size.
-
-        Returns:
-          The frames, made once.
-        """
+        """Returns the training frames at a share of their full size."""
         if size not in self._views:
             self._views[size] = TrainingViews(self._capture, size)
         return self._views[size]
 
     def compile(self, state: TrainState, size: float, config: StepConfig) -> Future:
-        """Starts to compile the program of steps in another thread, unless that has begun.
-
-        Args:
-          state: State whose number of rows counts.
-          size: Size of the frames, as a share of their full size.
-          config: Settings of the steps.
-
-        Returns:
-          The program, once it is compiled.
-        """
+        """Starts to compile the program for the rows of `state` in another thread, unless that has begun."""
         count, cameras = state.gaussians.count, self.views(size).cameras
         strips = 1 if self._mesh is None else self._mesh.size
         initial = default_capacity(count, cameras.width, cameras.height, strips=strips)
         capacity = self._capacity.setdefault((count, size), initial)
         program = count, size, capacity
         if program not in self._programs:
-            tree = jax.tree.flatten((state, *self._arguments(size, 0, 0, 0.0, config)))
+            arguments = state, *self._arguments(size, 0, 0, 0.0, config), capacity, self._mesh
             jitted = _step_compiled[self._mesh is not None]
-            self._programs[program] = self._compiler.submit(lambda: jitted.lower(*tree, capacity, self._mesh).compile())
+            self._programs[program] = self._compiler.submit(lambda: jitted.lower(*arguments).compile())
         return self._programs[program]
 
     def run_step(
@@ -365,12 +321,9 @@ class StepRunner:
           index: Number of earlier steps.
           done: Share of the fit that is done, in [0, 1].
           config: Settings of the step.
-
-        Returns:
-          The state after the step, the loss before it, and the number of pairs that overflowed.
         """
         program = self.compile(state, size, config).result()
-        return program(jax.tree.leaves((state, *self._arguments(size, view, index, done, config))))
+        return program(state, *self._arguments(size, view, index, done, config))
 
     def _arguments(self, size: float, view: int, index: int, done: float, config: StepConfig) -> tuple:
         views = self.views(size)
@@ -382,18 +335,12 @@ class StepRunner:
             degree=np.int32(config.degree),
             extent=views.extent,
             rates=config.rates,
-            correction_rates=None if config.refine is None else config.refine.rates(done, float(views.extent)),
+            correction_rates=None if config.refine is None else config.refine.at(done, float(views.extent)),
         )
         sharding = None if self._mesh is None else NamedSharding(self._mesh, PartitionSpec())
         return jax.device_put((views[view], inputs), sharding)
 
     def widen(self, state: TrainState, size: float, overflow: int) -> None:
-        """Raises the capacity of views.
-
-        Args:
-          state: State whose number of rows counts.
-          size: Size of the frames, as a share of their full size.
-          overflow: Number of pairs that found no room.
-        """
+        """Raises the capacity of views at a size by the number of pairs that found no room."""
         shape = state.gaussians.count, size
         self._capacity[shape] = enough_capacity(self._capacity[shape], np.array([overflow]))

@@ -183,7 +183,7 @@ def distill_l1(
 def _start(
     gaussians: Gaussians,
     cameras: Camera,
-    labels: Int[Array, "t h w"],
+    labels: Shaped[Array, "t h w"],
     region_codes: Float[Array, "r d"],
     *,
     steps: int,

@@ -109,11 +109,10 @@ class SceneOptions:
       long_side: Longest side of the frames in pixels, at least 16. Smaller frames keep their size.
       frames: Maximum number of frames, evenly spaced, at least 2. By default all frames are used, of a video 150.
       holdout: Every how many frames one is held out for measuring; 0 holds out no frame.
-      refine: What to correct by short fits before anything else: camera poses, exposures or both. Held-out frames are
-        aligned to the last of these fits, frozen. With auto, both are corrected for captures with depth if that lowers
-        the error of training frames kept aside, within half of the fit's time; captures without depth, and runs with
-        --gaussians, stay as they are.
-      drop_frames: With auto, training frames that a short fit does not explain are left out.
+      refine: When to correct camera poses and exposures by short fits before anything else. With auto, captures with
+        depth are corrected if that lowers the error of training frames kept aside, within half of the fit's time;
+        captures without depth, and runs with --gaussians, stay as they are. Held-out frames are aligned to the last of
+        these fits, frozen.
       steps: Number of optimisation steps of the photometric fit.
       minutes: Time limit of the photometric fit in minutes, at least 0.05. It replaces --steps, and the schedule makes
         the best of it on this machine.
@@ -123,8 +122,7 @@ class SceneOptions:
     long_side: Annotated[Option[int], Range(16, 16384)] = 400
     frames: Annotated[Option[int | None], Range(2, 1_000_000)] = None
     holdout: Annotated[Option[int], Range(0, 1_000_000)] = 8
-    refine: Option[Literal["none", "poses", "exposure", "both", "auto"]] = "auto"
-    drop_frames: Option[Literal["none", "auto"]] = "none"
+    refine: Option[Literal["never", "auto", "always"]] = "auto"
     steps: Count[Option[int]] = 2000
     minutes: Annotated[Option[float | None], Range(0.05, 10_000)] = None
     seed: Seed[Option[int]] = 0

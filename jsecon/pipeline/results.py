@@ -50,7 +50,7 @@ class Results:
     held_out: Quality
     """PSNR and SSIM of the held-out frames"""
     poses: Any
-    """report of structure from motion, if the capture had no poses"""
+    """None: structure from motion writes its poses to OUT/poses"""
 
     def __init__(self, **results: Any):
         vars(self).update(results)

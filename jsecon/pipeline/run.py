@@ -156,7 +156,7 @@ def _require_options_apply(options: Options) -> None:
         is_bare_scene(options.capture),
         {field.name: field.default for field in dataclasses.fields(options)},
     )
-    for name in ("frames", "holdout", "refine", "drop_frames") if bare else ("views", "up", "cameras"):
+    for name in ("frames", "holdout", "refine") if bare else ("views", "up", "cameras"):
         if getattr(options, name) != defaults[name]:
             kind = "a scene without photographs" if bare else "a capture, which has its own views"
             remedy = "--views sets the number of views." if bare else "--frames sets the most."

@@ -26,7 +26,7 @@ from jsecon.read.captures.nerfstudio import source_from_trained
 from jsecon.read.captures.photographs import list_photographs
 from jsecon.read.captures.video import is_video, write_frames
 from jsecon.splat.transform import transform_gaussians_float64
-from jsecon.types import Camera, Capture, Gaussians, Progress, Quality
+from jsecon.types import Camera, Capture, Gaussians, Quality
 from jsecon.views.capture import render_capture
 from jsecon.views.frame import scene_frame, surface_points
 from jsecon.views.plan import place_cameras
@@ -47,23 +47,23 @@ def estimate_poses(stage: StageInput) -> StageResult:
         photos = write_frames(capture, folder / "frames", frames=frames, progress=stage.progress)
     else:
         photos = list_photographs(capture)
-    report, posed = find_poses(photos, folder, where=capture, progress=stage.progress)
+    posed, notes = find_poses(photos, folder, where=capture, progress=stage.progress)
     if video:
         shutil.rmtree(posed / "images")
         (folder / "frames").rename(posed / "images")
     shutil.rmtree(out, ignore_errors=True)
     shutil.move(posed, out)
     write_text(out / KEY_FILE, folder.name)
-    return StageResult(report, notes=(*report.notes, f"The poses are in {out}: COLMAP opens them."))
+    return StageResult(None, notes=(*notes, f"The poses are in {out}: COLMAP opens them."))
 
 
 def refinement(options: Options, capture: Path) -> str:
-    """What a run corrects of poses and exposures: "auto" only if depth and the data can still decide it."""
+    """When a run corrects poses and exposures: "auto" only if depth and the data can still decide it."""
     if options.refine != "auto":
         return options.refine
     if options.gaussians is not None:  # they belong to the poses as they are
-        return "none"
-    return "auto" if has_depth(capture) else "none"
+        return "never"
+    return "auto" if has_depth(capture) else "never"
 
 
 def load_frames(stage: StageInput) -> StageResult:
@@ -77,32 +77,14 @@ def load_frames(stage: StageInput) -> StageResult:
     points = f"{len(capture.points)} sparse points{'' if capture.depths is None else ', depth'}"
     notes = (f"{frames}, {points}", *capture.notes)
     refine = refinement(options, folder)
-    if refine == "none" and options.drop_frames == "none":
+    if refine == "never" or (refine == "auto" and capture.depths is None):
         return StageResult(capture, notes=notes)
-    better = _refine(capture, options, refine, stage.progress)
-    training_frames(better.held_out)
+    from jsecon.poses.refine import refine_capture  # late, like all that imports optax: a plan needs none of it
+
+    limit = _fit_steps(options, capture) / 2 if refine == "auto" else None
+    key = jax.random.key(options.seed)
+    better = refine_capture(capture, key=key, max_fit_steps=limit, progress=stage.progress)
     return StageResult(better, notes=(*notes, *better.notes[len(capture.notes) :]))
-
-
-def _refine(capture: Capture, options: Options, refine: str, progress: Progress) -> Capture:
-    """Corrects poses and exposures by short fits, and leaves out the frames that these do not explain."""
-    from jsecon.fit.corrections import RefineOptions  # late, like all that imports optax: a plan needs none of it
-    from jsecon.poses.refine import refine_capture
-
-    what, max_fit_steps = None, None
-    if refine == "auto" and capture.depths is not None:
-        what, max_fit_steps = RefineOptions(), _fit_steps(options, capture) / 2
-    elif refine not in ("auto", "none"):
-        what = RefineOptions(refine in ("poses", "both"), refine in ("exposure", "both"))
-    return refine_capture(
-        capture,
-        key=jax.random.key(options.seed),
-        refine=what,
-        drop_weak=options.drop_frames == "auto",
-        decide=refine == "auto",
-        max_fit_steps=max_fit_steps,
-        progress=progress,
-    )
 
 
 def _fit_steps(options: Options, capture: Capture) -> float:
@@ -164,7 +146,7 @@ def measure_held_out(stage: StageInput) -> StageResult:
         names = ", ".join(f"{capture.names[fitted.frames[n]]} ({fitted.psnr[n]:.1f} dB)" for n in weak[:5])
         more = f" and {len(weak) - 5} more" if len(weak) > 5 else ""
         note = f"far below the median frame ({np.median(fitted.psnr):.1f} dB): {names}{more}; a wrong pose, or "
-        notes = (note + "something moved (--drop-frames auto leaves them out)",)
+        notes = (note + "something moved: leave them out if the scene is blurred there",)
     return StageResult(measure_quality(scene, capture, progress=stage.progress), notes=notes)
 
 

@@ -74,11 +74,10 @@ def _plan_load(context: RunContext, capture: Path) -> Stage:
     held_out = f"1 in {options.holdout} held out" if options.holdout else "none held out"
     how = f"{count}, long side at most {options.long_side} px, {held_out}"
     refine = scene.refinement(options, capture)
-    if refine != "none" or options.drop_frames != "none":
-        key_options |= context.key_options("drop_frames", "seed", "steps", "minutes") | {"refine": refine}
-        how += ", corrected by short fits in about half of the fit's time where that helps" * (refine == "auto")
-        how += f", corrected by short fits (--refine {refine})" * (refine not in ("auto", "none"))
-        how += ", frames that a short fit does not explain left out" * (options.drop_frames == "auto")
+    if refine != "never":
+        key_options |= context.key_options("seed", "steps", "minutes") | {"refine": refine}
+        how += ", corrected by short fits"
+        how += " in about half of the fit's time where that helps" * (refine == "auto")
     return Stage("load", how, scene.load_frames, key_options=key_options, files=capture)
 
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.ndimage import map_coordinates
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
@@ -29,12 +30,6 @@ MIN_OVERLAP = 0.3
 """Least share of the points of a frame that a partner must see."""
 MAX_RELATIVE_GAP = 0.1
 """Largest relative difference in depth between a point and the surface that a partner measured."""
-MAX_RESIDUAL = 0.02
-"""Largest RMS deviation of the depth in a window from its plane, relative to the depth."""
-WINDOW = 5
-"""Side in px of the window in which the surface is approximated by a plane."""
-MIN_KNOWN_SHARE = 0.4
-"""Least share of the window whose depth must be known."""
 PRIOR = 0.05
 """Standard deviation of the prior of a step, radians and shares of the cameras' extent: damps what the frames leave
 open."""
@@ -43,9 +38,6 @@ MAX_REMAINING_SHARE = 0.75
 room with poses off by 1 cm and 0.5 degrees, to 0.81 on apc_bin, to 0.86 on replica_apartment_0, to 1 in an exact
 room, and to 0.95 with the depth of soft Gaussians, which frames do not share (800 points per frame). Chosen after
 these runs."""
-_MIN_COMMON_POINTS = 50
-"""Least number of common points for two frames to be compared."""
-_BLOCK_INDICES = np.mgrid[:6, :6]
 
 
 class _Level(NamedTuple):
@@ -161,7 +153,10 @@ def _level(capture: Capture, chosen: Int[np.ndarray, " c"], side: int) -> _Level
 
 
 def _planes(depth: Float[np.ndarray, "h w"], camera: Camera) -> Float[np.ndarray, "_ _ 3"]:
-    """Fits a plane n x = 1 to the surface around each pixel (1 / z is linear in pixels); n is 0 without a plane."""
+    """Fits a plane n x = 1 to the surface in 5 x 5 px around each pixel (1 / z is linear in pixels).
+
+    Without a plane n is 0: where less than 40 % of the window is known, or its depth deviates by an RMS of 2 %.
+    """
     width, height = camera.width, camera.height
     down, across = depth.shape[0] / height, depth.shape[1] / width
     # Nearest depth, at its exact ray: between two depths there may be no surface.
@@ -177,7 +172,7 @@ def _planes(depth: Float[np.ndarray, "h w"], camera: Camera) -> Float[np.ndarray
     weight = known.astype(np.float64)
 
     def mean(a):
-        return cv2.boxFilter(a * weight, -1, (WINDOW, WINDOW), borderType=cv2.BORDER_CONSTANT)
+        return cv2.boxFilter(a * weight, -1, (5, 5), borderType=cv2.BORDER_CONSTANT)
 
     share = mean(weight)
     safe = np.maximum(share, 1e-9)
@@ -185,7 +180,7 @@ def _planes(depth: Float[np.ndarray, "h w"], camera: Camera) -> Float[np.ndarray
     uu, uv, vv = mean(u * u) / safe - m_u**2, mean(u * v) / safe - m_u * m_v, mean(v * v) / safe - m_v**2
     ud, vd, dd = mean(u * inverse) / safe - m_u * m_d, mean(v * inverse) / safe - m_v * m_d, mean(inverse**2) / safe
     determinant = uu * vv - uv * uv
-    is_plane = (share >= MIN_KNOWN_SHARE) & known & (determinant > 0.05)
+    is_plane = (share >= 0.4) & known & (determinant > 0.05)
     determinant = np.where(is_plane, determinant, 1)
     a, b = (ud * vv - vd * uv) / determinant, (vd * uu - ud * uv) / determinant
     residual = np.maximum(dd - m_d**2 - a * ud - b * vd, 0)
@@ -193,7 +188,7 @@ def _planes(depth: Float[np.ndarray, "h w"], camera: Camera) -> Float[np.ndarray
     fx, fy, cx, cy = (float(value) for value in (camera.fx, camera.fy, camera.cx, camera.cy))
     planes = np.stack([a * fx, b * fy, a * (cx - 0.5) + b * (cy - 0.5) + c], axis=-1)
     here = a * np.arange(width)[None, :] + b * np.arange(height)[:, None] + c
-    is_plane &= (residual <= (MAX_RESIDUAL * m_d) ** 2) & (here > 0.5 * m_d)
+    is_plane &= (residual <= (0.02 * m_d) ** 2) & (here > 0.5 * m_d)
     return np.where(is_plane[..., None], planes, 0)
 
 
@@ -212,7 +207,7 @@ def _residuals(level: _Level, poses: np.ndarray, pairs: np.ndarray, every: int =
     length = np.maximum(np.linalg.norm(planes, axis=-1), 1e-20)
     height = (moved * planes).sum(-1) - 1
     seen = inside & level.valid[a, subset] & planes.any(axis=-1) & (np.abs(height) < MAX_RELATIVE_GAP)
-    seen &= seen.sum(axis=1, keepdims=True) >= _MIN_COMMON_POINTS / every
+    seen &= seen.sum(axis=1, keepdims=True) >= 50 / every  # fewer common points do not compare two frames
     grey, point_grey = _bilinear(level.grey, at, u, v), level.point_grey[a, subset]
     gains = (grey * seen).sum(axis=1) / np.maximum((point_grey * seen).sum(axis=1), 1e-9)
     colour = grey - gains[:, None] * point_grey
@@ -254,10 +249,11 @@ def _step(
     if not residuals.seen.any():
         return poses, 0.0
     q, seen = residuals.moved, residuals.seen
-    slopes = _bilinear(level.slopes, b[:, None], residuals.pixels[..., 0], residuals.pixels[..., 1])
+    u, v = np.moveaxis(residuals.pixels, -1, 0)
+    slope_u, slope_v = (_bilinear(level.slopes[..., axis], b[:, None], u, v) for axis in (0, 1))
     fx, fy = (np.asarray(value, np.float64)[b][:, None] for value in _intrinsics(level.cameras)[:2])
     z = np.where(seen, q[..., 2], 1.0)
-    du, dv = slopes[..., 0] * fx / z, slopes[..., 1] * fy / z
+    du, dv = slope_u * fx / z, slope_v * fy / z
     along = np.stack([du, dv, -(du * q[..., 0] + dv * q[..., 1]) / z], axis=-1)
     diagonal, off_diagonal = np.zeros((count, 6, 6)), np.zeros((len(pairs), 6, 6))
     right_side = np.zeros((count, 6))
@@ -284,7 +280,7 @@ def _step(
     blocks = np.concatenate([off_diagonal[both], off_diagonal[both].swapaxes(1, 2), diagonal[moves]])
     i, j = (
         np.broadcast_to(6 * at[:, None, None] + index, blocks.shape)
-        for at, index in zip((rows, columns), _BLOCK_INDICES)
+        for at, index in zip((rows, columns), np.mgrid[:6, :6])
     )
     matrix = csc_matrix((blocks.ravel(), (i.ravel(), j.ravel())), shape=(6 * n, 6 * n))
     twists = np.zeros((count, 6))
@@ -296,13 +292,5 @@ def _step(
 
 
 def _bilinear(images: np.ndarray, at: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Values of the images (T, H, W, ...) with indices `at` at pixels (u, v); the first pixel centre is (0.5, 0.5)."""
-    height, width = images.shape[1:3]
-    x, y = np.clip(u - 0.5, 0, width - 1.001), np.clip(v - 0.5, 0, height - 1.001)
-    column, row = x.astype(int), y.astype(int)
-    x, y = x - column, y - row
-    if images.ndim == 4:
-        x, y = x[..., None], y[..., None]
-    top = images[at, row, column] * (1 - x) + images[at, row, column + 1] * x
-    bottom = images[at, row + 1, column] * (1 - x) + images[at, row + 1, column + 1] * x
-    return top * (1 - y) + bottom * y
+    """Values of the images (T, H, W) with indices `at` at pixels (u, v); the first pixel centre is (0.5, 0.5)."""
+    return map_coordinates(images, np.broadcast_arrays(at, v - 0.5, u - 0.5), np.float64, order=1, mode="nearest")

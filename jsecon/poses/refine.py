@@ -1,4 +1,4 @@
-"""Refines the poses and exposures of a capture before a fit, and drops frames that no scene explains. Host code.
+"""Refines the poses and exposures of a capture before a fit. Host code.
 
 A probe is a short fit with corrections (corrections.py); it measures how far each frame is off. The result is a capture
 again, in the same world, with its frames as under one exposure.
@@ -9,11 +9,11 @@ their frame puts them, and keep it there. So such a probe starts from few points
 and each further probe starts from points made with the poses of the one before. The first probes see small frames and
 end as soon as the poses are stable; the last sees larger ones.
 
-`decide` corrects only if it helps, measured on training frames kept aside: a first probe with corrections and one
-without are fitted to the other training frames and compared on these. A frame kept aside is aligned to either frozen
-probe on half of its pixels and compared on the other half, so that alignment alone has no advantage. Held-out frames
-have no part in the probes or in the decision. They are aligned to the last probe once it is frozen, each by its pose
-and exposure, as methods that refine poses are measured (Lin et al. 2021, BARF, section 4.2).
+With a limit of time, a capture is corrected only if it helps, measured on training frames kept aside: a first probe
+with corrections and one without are fitted to the other training frames and compared on these. A frame kept aside is
+aligned to either frozen probe on half of its pixels and compared on the other half, so that alignment alone has no
+advantage. Held-out frames have no part in the probes or in the decision. They are aligned to the last probe once it is
+frozen, each by its pose and exposure, as methods that refine poses are measured (Lin et al. 2021, BARF, section 4.2).
 """
 
 import dataclasses
@@ -28,15 +28,14 @@ from jaxtyping import Bool, Float, PRNGKeyArray
 
 from jsecon.errors import require
 from jsecon.fit.corrections import (
+    CorrectionRates,
     Corrections,
-    RefineOptions,
     apply_exposure,
     corrected_camera,
     identity_corrections,
     se3_exp,
 )
 from jsecon.fit.optimise import FitState, fit_gaussians
-from jsecon.fit.quality import QUICK_LONG_SIDE, is_weak, measure_quality
 from jsecon.fit.resize import resize_frame, scale_cameras
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.start import starting_gaussians
@@ -59,10 +58,8 @@ DECIDE_VISITS = 24
 """Visits of each frame kept aside while it is aligned to a probe of the decision."""
 FINE_SIZE = 0.5
 """Size of the frames in the last probe, which measures as well as full size in half the time."""
-COARSE_PX = 100
-"""Longer side in px of the frames in the probes before the last."""
-MIN_COARSE_SIZE = 0.25
-"""Smallest size of the frames in these probes."""
+COARSE_PX, MIN_COARSE_SIZE = 100, 0.25
+"""Longer side in px of the frames in the probes before the last, and their smallest size."""
 STABLE_PX = 0.25
 """Median movement of the image by a probe, px at full size, below which the poses are stable."""
 MIN_GAIN_DB = 0.5
@@ -74,17 +71,10 @@ ALIGNED_POSE_RATE = 1e-4
 """First step of poses that depth has aligned already, radians: what is left is small."""
 CHESS_SQUARES = 8
 """Squares of the chessboard on which frames kept aside are compared, along each side of a frame."""
-TOO_MANY = (
-    "{} frames are too many to correct them within half of the fit's time (use more --steps, fewer --frames, or "
-    "--refine both, which takes longer)"
-)
 _STEP_COST_PIXELS, _STEP_COST_GAUSSIANS = 0.46, 0.072
 """Time of a step of a probe in steps of the fit: for frames of full size, and for its Gaussians."""
-_DEPTH_ALIGNMENT_COST = 1.0
-"""Time to align a frame by colour and depth, in steps of the fit."""
-_REFINE = RefineOptions()
-_NO_CORRECTION = RefineOptions(poses=False, exposure=False)
-"""Options of a probe without corrections that shares the program of a probe with them."""
+_NO_CORRECTION = CorrectionRates(0.0, 0.0)
+"""Rates of a probe without corrections that shares the program of a probe with them."""
 _FROZEN = LearningRates(means=0.0, means_last=0.0, log_scales=0.0, quaternions=0.0, opacity_logits=0.0, colors=0.0)
 
 
@@ -98,32 +88,22 @@ class _Plan(NamedTuple):
     """Visits of each frame by each probe."""
 
 
-def _plan_probes(
-    capture: Capture,
-    refine: RefineOptions | None,
-    *,
-    visits: int,
-    probes: int,
-    decide: bool,
-    max_fit_steps: float | None,
-) -> _Plan | None:
+def _plan_probes(capture: Capture, visits: int, probes: int, max_fit_steps: float | None) -> _Plan | None:
     """Plans as many visits as fit into the time of `max_fit_steps` steps; None if these are below MIN_VISITS."""
     held_out = np.asarray(capture.held_out)
     train = int((~held_out).sum())
-    aligned = int(held_out.sum()) if refine is not None else 0
     coarse_size = min(FINE_SIZE, max(MIN_COARSE_SIZE, COARSE_PX / max(capture.cameras.width, capture.cameras.height)))
-    probes = probes if refine is not None and refine.poses else 1
+    if max_fit_steps is None:
+        return _Plan(coarse_size, probes, visits)
     coarse, fine = (_STEP_COST_PIXELS * size**2 + _STEP_COST_GAUSSIANS for size in (coarse_size, FINE_SIZE))
     # The decision takes one probe more, without corrections; two more if there is only one otherwise.
-    per_visit = train * (fine + coarse * (probes - 1 + decide + (decide and probes == 1)))
-    fixed = ALIGN_VISITS * aligned * fine + DECIDE_VISITS * min(MAX_ASIDE, train // 3) * coarse * 2 * decide
-    if capture.depths is not None:
-        fixed += _DEPTH_ALIGNMENT_COST * len(held_out) * (1 + decide)
+    per_visit = train * (fine + coarse * (probes + (probes == 1)))
+    fixed = ALIGN_VISITS * int(held_out.sum()) * fine + DECIDE_VISITS * min(MAX_ASIDE, train // 3) * coarse * 2
+    if capture.depths is not None:  # to align a frame by colour and depth takes about a step of the fit
+        fixed += 2 * len(held_out)
     # Alignments are never shortened: an unfinished pose would spoil the measurement of a held-out frame.
-    allowed = visits if max_fit_steps is None else min(visits, int((max_fit_steps - fixed) / per_visit))
-    if allowed < min(MIN_VISITS, visits):
-        return None
-    return _Plan(coarse_size, probes, max(1, allowed))
+    allowed = min(visits, int((max_fit_steps - fixed) / per_visit))
+    return None if allowed < min(MIN_VISITS, visits) else _Plan(coarse_size, probes, max(1, allowed))
 
 
 @dataclasses.dataclass
@@ -148,21 +128,20 @@ class _Prober:
         self,
         capture: Capture,
         start: Gaussians,
-        refine: RefineOptions | None,
+        refine: CorrectionRates,
         size: float,
         steps: int,
         rates: LearningRates | None = None,
     ) -> tuple[Gaussians, Corrections]:
-        """A short fit to frames of this size, and the corrections of all frames; identity without refinement."""
+        """A short fit to frames of this size, and the corrections of all frames."""
         states: list[FitState] = []
         # Soft Gaussians render a depth before the surface: as a target, depth would push every camera back.
-        capture = capture if refine is None else dataclasses.replace(capture, depths=None)
-        if capture.ignored is None:  # one program serves probes and alignments on parts of a frame
+        ignored = capture.ignored
+        if ignored is None:  # one program serves probes and alignments on parts of a frame
             ignored = np.broadcast_to(False, np.shape(capture.frames)[:3])
-            capture = dataclasses.replace(capture, ignored=ignored)
         before, self.done = self.done, self.done + steps
         scene, _ = fit_gaussians(
-            capture,
+            dataclasses.replace(capture, depths=None, ignored=ignored),
             key=self.key,
             steps=steps,
             start=start,
@@ -172,10 +151,7 @@ class _Prober:
             on_checkpoint=lambda state: states.__setitem__(slice(None), [state]),
             progress=lambda done, _: self.report(before + done),
         )
-        corrections = states[0].corrections
-        if corrections is None:
-            return scene, identity_corrections(len(capture.names))
-        return scene, jax.tree.map(np.asarray, corrections.current)
+        return scene, jax.tree.map(np.asarray, states[0].train.corrections.current)
 
     def align(
         self,
@@ -183,7 +159,7 @@ class _Prober:
         scene: Gaussians,
         corrections: Corrections,
         frames: Bool[np.ndarray, " t"],
-        refine: RefineOptions | None,
+        refine: CorrectionRates,
         size: float,
         visits: int,
     ) -> Corrections:
@@ -202,15 +178,12 @@ def refine_capture(
     start: Gaussians | None = None,
     *,
     key: PRNGKeyArray,
-    refine: RefineOptions | None = _REFINE,
-    drop_weak: bool = False,
-    decide: bool = False,
     max_fit_steps: float | None = None,
     visits: int = VISITS,
     probes: int = PROBES,
     progress: Progress | None = None,
 ) -> Capture:
-    """Corrects the poses and exposures of a capture by short fits, and drops frames that these do not explain.
+    """Corrects the poses and exposures of a capture by short fits; its notes say what was done and why.
 
     The world stays the same: the rigid motion that brings the training cameras nearest to their original places is
     removed from all corrections, and the mean colour map becomes the identity. A corrected frame is clipped to 8 bits;
@@ -220,67 +193,51 @@ def refine_capture(
       capture: Frames with the poses to correct. Held-out frames have no part in the probes.
       start: Gaussians that each probe starts from. By default points made with the poses of the probe before.
       key: Key of the order of the frames.
-      refine: What to correct, or None.
-      drop_weak: Whether to drop training frames that the last probe does not explain (`quality.is_weak`).
-      decide: Whether to correct only if that lowers the error of training frames kept aside.
-      max_fit_steps: Limits the probes to about the time of so many steps of the fit, by fewer visits. If that leaves
-        too few of them, the capture stays as it is.
-      visits: Visits of each frame by each probe.
-      probes: Maximum number of probes; one if no pose is refined.
+      max_fit_steps: Corrects only if that lowers the error of training frames kept aside, and in about the time of so
+        many steps of the fit, by fewer visits. If that leaves too few of them, the capture stays as it is. None
+        corrects in any case.
+      visits: Visits of each frame by each probe, at least 1.
+      probes: Maximum number of probes, at least 1.
       progress: Called with the number of steps done and of all.
-
-    Returns:
-      The corrected capture; its notes say what was done and why. Without `refine` and `drop_weak` the capture itself.
-
-    Raises:
-      ValueError: `visits` or `probes` is below 1.
-      InputError: A probe does not converge.
     """
-    if refine is None and not drop_weak:
-        return capture
     require(visits > 0, "visits", visits, "at least 1", f"{VISITS} are usual.")
     require(probes > 0, "probes", probes, "at least 1", f"{PROBES} are usual.")
-    original, train, notes = capture, ~np.asarray(capture.held_out), []
-    aligned = None
-    if refine is not None and refine.poses and capture.depths is not None:
-        aligned = _align_by_depth(capture, train, ~train)
-    by_depth = aligned is not None
-    if refine is not None and by_depth:
-        probes, refine = 1, dataclasses.replace(refine, pose_rate=ALIGNED_POSE_RATE)
-    plan = _plan_probes(capture, refine, visits=visits, probes=probes, decide=decide, max_fit_steps=max_fit_steps)
+    original, train, decide = capture, ~np.asarray(capture.held_out), max_fit_steps is not None
+    aligned = None if capture.depths is None else _align_by_depth(capture, train, ~train)
+    by_depth, refine = aligned is not None, CorrectionRates()
+    if by_depth:
+        probes, refine = 1, CorrectionRates(pose=ALIGNED_POSE_RATE)
+    plan = _plan_probes(capture, visits, probes, max_fit_steps)
     if plan is None:
-        refine, plan = None, _Plan(FINE_SIZE, 1, visits)
-        notes.append(f"poses and exposures stay as they are: {TOO_MANY.format(len(capture.names))}")
-    steps = plan.visits * int(train.sum())
-    held_out = int((~train).sum()) if refine is not None else 0
+        problem = f"{len(capture.names)} frames are too many to correct them within half of the fit's time"
+        remedy = "use more --steps, fewer --frames, or --refine always, which takes longer"
+        return _with_notes(capture, f"poses and exposures stay as they are: {problem} ({remedy})")
+    steps, held_out = plan.visits * int(train.sum()), int((~train).sum())
     prober = _Prober(key, start, steps * (plan.probes + 2 * decide) + ALIGN_VISITS * held_out, progress)
-    remaining = plan.probes
-    if decide and refine is not None:
-        decision = _decide(capture, prober, refine, plan, by_depth=by_depth)
-        notes.append(decision.note)
-        if decision.corrections is None:
-            refine, remaining = None, 1
-        elif remaining > 1:
-            capture = _apply(capture, decision.corrections, dataclasses.replace(refine, exposure=False))
-            remaining -= 1
-    if refine is None and not drop_weak:
-        return dataclasses.replace(original, notes=(*original.notes, *notes))
-    capture = aligned if aligned is not None and refine is not None else capture
-    while refine is not None and remaining > 1:
+    remaining, notes = plan.probes, []
+    if decide:
+        corrections, note = _decide(capture, prober, refine, plan, by_depth=by_depth)
+        if corrections is None:
+            return _with_notes(capture, note)
+        notes.append(note)
+        if remaining > 1:
+            capture, remaining = _move_cameras(capture, corrections), remaining - 1
+    capture = capture if aligned is None else aligned
+    while remaining > 1:
         scene, corrections = prober.fit(capture, prober.initial(capture), refine, plan.coarse_size, steps)
-        before, capture = capture, _apply(capture, corrections, dataclasses.replace(refine, exposure=False))
+        before, capture = capture, _move_cameras(capture, corrections)
         stable = _median_shift_px(scene, before.cameras[train], capture.cameras[train]) < STABLE_PX
         remaining = 1 if stable else remaining - 1
     scene, corrections = prober.fit(capture, prober.initial(capture), refine, FINE_SIZE, steps)
     if held_out:
         corrections = prober.align(capture, scene, corrections, ~train, refine, FINE_SIZE, ALIGN_VISITS)
-    # In the world and the colours of the probe.
-    as_probed = _apply(capture, corrections, refine, keep_world=False)
-    dropped = _weak_frames(scene, as_probed) if drop_weak else np.zeros(0, int)
-    refined = _apply(capture, corrections, refine)
+    refined = _even_exposures(_move_cameras(capture, corrections), corrections)
     prober.report(prober.total)
-    notes = (*original.notes, *notes, *_describe(original, refined, corrections, refine, by_depth=by_depth))
-    return _without_frames(dataclasses.replace(refined, notes=notes), dropped)
+    return _with_notes(refined, *notes, *_describe(original, refined, corrections, by_depth=by_depth))
+
+
+def _with_notes(capture: Capture, *notes: str) -> Capture:
+    return dataclasses.replace(capture, notes=(*capture.notes, *notes))
 
 
 def _align_by_depth(capture: Capture, train: Bool[np.ndarray, " t"], others: Bool[np.ndarray, " t"]) -> Capture | None:
@@ -300,21 +257,19 @@ def _with_poses(capture: Capture, poses: Float[np.ndarray, "t 4 4"]) -> Capture:
     return dataclasses.replace(capture, cameras=cameras)
 
 
-class _Decision(NamedTuple):
-    """Whether corrections help."""
+def _decide(
+    capture: Capture, prober: _Prober, refine: CorrectionRates, plan: _Plan, *, by_depth: bool
+) -> tuple[Corrections | None, str]:
+    """Compares a probe with corrections and one without on training frames kept aside.
 
-    corrections: Corrections | None
-    """Corrections of the training frames; None if they do not help."""
-    note: str
-
-
-def _decide(capture: Capture, prober: _Prober, refine: RefineOptions, plan: _Plan, *, by_depth: bool) -> _Decision:
-    """Compares a probe with corrections and one without on training frames kept aside."""
+    Returns:
+      Corrections of the training frames, None if they do not help; and a note.
+    """
     train = np.flatnonzero(~np.asarray(capture.held_out))
     count = min(MAX_ASIDE, len(train) // 3)
     too_few = "poses and exposures stay as they are: there are too few training frames to test on some of them"
     if count < MIN_ASIDE:
-        return _Decision(None, too_few)
+        return None, too_few
     aside = np.zeros(len(capture.names), bool)
     aside[train[((np.arange(count) + 0.5) * len(train) / count).astype(int)]] = True
     # Frames kept aside are aligned on the squares of one colour of a chessboard, and compared on the others.
@@ -334,14 +289,14 @@ def _decide(capture: Capture, prober: _Prober, refine: RefineOptions, plan: _Pla
     corrected_db = _mean_psnr(scene, aligned, corrections, aside, counted, size)
     plain_db = _mean_psnr(plain_scene, capture, plain, aside, counted, size)
     if math.isnan(corrected_db):  # every pixel to compare is ignored
-        return _Decision(None, too_few)
+        return None, too_few
     helps = corrected_db >= plain_db + MIN_GAIN_DB
     verdict = "are corrected" if helps else "stay as they are"
     note = (
         f"poses and exposures {verdict}: training frames kept aside have {corrected_db:.1f} dB in a short fit with "
         f"corrections, {plain_db:.1f} dB in one without"
     )
-    return _Decision(corrections if helps else None, note)
+    return corrections if helps else None, note
 
 
 def _mean_psnr(
@@ -386,32 +341,27 @@ def _project_points(points: Float[np.ndarray, "n 3"], cameras: Camera, t: int) -
     return cameras.fx[t] * x / z + cameras.cx[t], cameras.fy[t] * y / z + cameras.cy[t]
 
 
-def _apply(
-    capture: Capture, corrections: Corrections, refine: RefineOptions | None, *, keep_world: bool = True
-) -> Capture:
-    """Moves the cameras and undoes the exposures; `keep_world` keeps the original world and the mean colours."""
-    if refine is None:
-        return capture
-    train, cameras = ~np.asarray(capture.held_out), capture.cameras
-    if refine.poses:
-        poses = np.asarray(cameras.world_to_camera, np.float64)
-        moved = np.asarray(jax.vmap(se3_exp)(corrections.twists), np.float64) @ poses
-        if keep_world:
-            moved = moved @ _rigid_drift(moved[train], poses[train], cameras_extent(cameras[train]))
-        capture = _with_poses(capture, moved)
-    if refine.exposure:
-        maps = np.asarray(corrections.colours, np.float64)
-        maps = np.concatenate([maps, np.broadcast_to(np.eye(4)[3:], (len(maps), 1, 4))], axis=1)
-        maps = maps @ np.linalg.inv(maps[train].mean(axis=0)) if keep_world else maps
-        frames = np.asarray(capture.frames)
-        ignored = np.zeros(frames.shape[:3], bool) if capture.ignored is None else np.array(capture.ignored)
-        corrected = np.empty_like(frames)
-        for t, inverse in enumerate(np.linalg.inv(maps)):
-            colours = frames[t] @ inverse[:3, :3].T + 255 * inverse[:3, 3]
-            corrected[t] = np.rint(np.clip(colours, 0, 255)).astype(np.uint8)
-            ignored[t] |= ((frames[t] == 255) & (corrected[t] < 255)).any(axis=-1)
-        capture = dataclasses.replace(capture, frames=corrected, ignored=ignored if ignored.any() else None)
-    return capture
+def _move_cameras(capture: Capture, corrections: Corrections) -> Capture:
+    """Moves the cameras by their corrections, in the original world."""
+    train, poses = ~np.asarray(capture.held_out), np.asarray(capture.cameras.world_to_camera, np.float64)
+    moved = np.asarray(jax.vmap(se3_exp)(corrections.twists), np.float64) @ poses
+    drift = _rigid_drift(moved[train], poses[train], cameras_extent(capture.cameras[train]))
+    return _with_poses(capture, moved @ drift)
+
+
+def _even_exposures(capture: Capture, corrections: Corrections) -> Capture:
+    """Undoes the exposures, with the mean colour map of the training frames kept."""
+    maps = np.asarray(corrections.colours, np.float64)
+    maps = np.concatenate([maps, np.broadcast_to(np.eye(4)[3:], (len(maps), 1, 4))], axis=1)
+    maps = maps @ np.linalg.inv(maps[~np.asarray(capture.held_out)].mean(axis=0))
+    frames = np.asarray(capture.frames)
+    ignored = np.zeros(frames.shape[:3], bool) if capture.ignored is None else np.array(capture.ignored)
+    corrected = np.empty_like(frames)
+    for t, inverse in enumerate(np.linalg.inv(maps)):
+        colours = frames[t] @ inverse[:3, :3].T + 255 * inverse[:3, 3]
+        corrected[t] = np.rint(np.clip(colours, 0, 255)).astype(np.uint8)
+        ignored[t] |= ((frames[t] == 255) & (corrected[t] < 255)).any(axis=-1)
+    return dataclasses.replace(capture, frames=corrected, ignored=ignored if ignored.any() else None)
 
 
 def _rigid_drift(moved: Float[Array, "t 4 4"], poses: Float[Array, "t 4 4"], extent: float) -> Float[np.ndarray, "4 4"]:
@@ -434,55 +384,21 @@ def _rigid_drift(moved: Float[Array, "t 4 4"], poses: Float[Array, "t 4 4"], ext
     return motion
 
 
-def _describe(
-    before: Capture, after: Capture, corrections: Corrections, refine: RefineOptions | None, *, by_depth: bool
-) -> list[str]:
+def _describe(before: Capture, after: Capture, corrections: Corrections, *, by_depth: bool) -> list[str]:
     """How far the frames were off, a sentence each."""
-    notes: list[str] = []
-    if refine is None:
-        return notes
-    if refine.poses:
-        a, b = (np.asarray(c.cameras.world_to_camera, np.float64) for c in (before, after))
-        shift = np.linalg.norm(np.asarray(after.cameras.centres) - np.asarray(before.cameras.centres), axis=1)
-        cosine = (np.einsum("tij,tij->t", a[:, :3, :3], b[:, :3, :3]) - 1) / 2
-        turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-        median = f"{np.median(shift):.3g} world units and {np.median(turn):.2g} degrees in the median"
-        by = "by colour and depth of their frames, then by a probe fit" if by_depth else "by probe fits"
-        notes.append(f"poses refined {by}: {median}, {shift.max():.3g} and {turn.max():.2g} at most")
-    if refine.exposure:
-        gains = np.asarray(corrections.colours).sum(axis=(1, 2)) / 3  # of white: an affine map may spread a gain
-        notes.append(f"exposures evened out: frames were {gains.min():.2f} to {gains.max():.2f} times as bright")
+    a, b = (np.asarray(c.cameras.world_to_camera, np.float64) for c in (before, after))
+    shift = np.linalg.norm(np.asarray(after.cameras.centres) - np.asarray(before.cameras.centres), axis=1)
+    cosine = (np.einsum("tij,tij->t", a[:, :3, :3], b[:, :3, :3]) - 1) / 2
+    turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    median = f"{np.median(shift):.3g} world units and {np.median(turn):.2g} degrees in the median"
+    by = "by colour and depth of their frames, then by a probe fit" if by_depth else "by probe fits"
+    gains = np.asarray(corrections.colours).sum(axis=(1, 2)) / 3  # of white: an affine map may spread a gain
+    notes = [
+        f"poses refined {by}: {median}, {shift.max():.3g} and {turn.max():.2g} at most",
+        f"exposures evened out: frames were {gains.min():.2f} to {gains.max():.2f} times as bright",
+    ]
     if np.asarray(before.held_out).any():
-        parts = " and ".join(["pose"] * refine.poses + ["exposure"] * refine.exposure)
-        notes.append(f"each held-out frame has its {parts} by alignment to the frozen probe, which never saw it")
+        notes.append(
+            "each held-out frame has its pose and exposure by alignment to the frozen probe, which never saw it"
+        )
     return notes
-
-
-def _weak_frames(gaussians: Gaussians, capture: Capture) -> np.ndarray:
-    """Returns the indices of the training frames that a scene fitted to them does not explain (`is_weak`)."""
-    train = np.flatnonzero(~np.asarray(capture.held_out))
-    result = measure_quality(gaussians, capture, frames=train, long_side=QUICK_LONG_SIDE)
-    return np.asarray(result.frames)[is_weak(np.asarray(result.psnr))]
-
-
-def _without_frames(capture: Capture, dropped: np.ndarray) -> Capture:
-    """The capture without the frames at these indices."""
-    if not len(dropped):
-        return capture
-    keep = np.setdiff1d(np.arange(len(capture.names)), dropped)
-
-    def take(a):
-        return None if a is None else np.asarray(a)[keep]
-
-    names = ", ".join(capture.names[t] for t in dropped)
-    return dataclasses.replace(
-        capture,
-        frames=take(capture.frames),
-        cameras=capture.cameras[keep],
-        held_out=take(capture.held_out),
-        depths=take(capture.depths),
-        ignored=take(capture.ignored),
-        names=tuple(capture.names[t] for t in keep),
-        files=tuple(capture.files[t] for t in keep) if capture.files else (),
-        notes=(*capture.notes, f"frames dropped, as a probe fit does not explain them: {names}"),
-    )

@@ -6,27 +6,22 @@ ALL_PAIRS photographs, every pair is matched. Above, each photograph is matched 
 with those that look most alike, by a vocabulary of visual words made of the photographs themselves.
 
 COLMAP writes to the standard streams, ends its process when an internal check fails, and cannot be stopped within a
-step. Therefore `python -m jsecon.poses.sfm WORK` runs the steps in a process of its own. Features and
-matches stay in WORK/database.db: a stopped run resumes there.
+step. After `import pycolmap`, Pillow ends the process when it saves a PNG. Therefore the steps run in a process of
+their own. Features and matches stay in WORK/database.db: a stopped run resumes there.
 """
-
-from __future__ import annotations
 
 import collections
 import contextlib
-import dataclasses
 import importlib.util
-import json
+import multiprocessing
 import os
 import shutil
-import subprocess
-import sys
-import time
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -39,89 +34,54 @@ from jsecon.read.captures.images import image_header, read_image, write_image
 from jsecon.types import Progress
 
 MIN_PHOTOS = 3
-"""photographs that a model needs"""
+"""Photographs that a model needs."""
 LONG_SIDE = 1600
-"""px of the longer side at which features are detected"""
-MAX_FEATURES = 4096
-"""SIFT features of a photograph"""
+"""Longer side in px at which features are detected."""
 UPSAMPLED_SIDE = 1000
-"""px of the longer side up to which features are also detected at twice the size: 5,400 features instead of 880 on
-photographs of 799 x 532, where 880 gave wrong poses"""
+"""Longer side in px up to which features are also detected at twice the size: 5,400 features instead of 880 on
+photographs of 799 x 532, where 880 gave wrong poses."""
 ALL_PAIRS = 40
-"""photographs up to which every pair is matched"""
+"""Number of photographs up to which every pair is matched."""
 NEIGHBOURS, ALIKE = 10, 20
-"""neighbours in name order, and most similar photographs, that a photograph is matched with"""
-SAMPLED_DESCRIPTORS, DESCRIPTORS_PER_WORD, MAX_WORDS = 1000, 40, 4096
-"""descriptors of a photograph, descriptors per visual word (the least that k-means asks for) and words of the
-vocabulary"""
+"""Neighbours in name order, and most similar photographs, that a photograph is matched with."""
 MIN_EXPLAINED, MIN_EXPLAINED_OF_MEDIAN = 0.6, 0.3
 """Share of a photograph's matches that became common points: the least in the median photograph, and the least of any
 photograph relative to the median. In a right model of 125 photographs the median was 0.87 and the least 0.59; two
 wrongly placed ones had 0.08 and 0.12."""
-_FOCAL, _FOCAL_35MM, _MODEL, _EXIF_FOLDER = 0x920A, 0xA405, 0x0110, 0x8769
-"""EXIF tags; the last is the folder that holds the first two"""
 
 
-@dataclasses.dataclass(frozen=True)
-class SfmResult:
-    """Result of structure from motion."""
+class _Job(NamedTuple):
+    """Photographs, by the names of their links in WORK/links."""
 
-    registered: tuple[str, ...]
-    """Names of the photographs with a pose, with their folders where there are several."""
-    skipped: tuple[str, ...]
-    """Names of the other photographs."""
-    models: int
+    names: dict[str, str]
+    """Name of each link -> name of its photograph."""
+    lenses: list[list[str]]
+    """Links that share a lens, group by group."""
+    upsampled: bool
+    """Whether features are also detected at twice the size."""
+
+
+class _Model(NamedTuple):
+    """The model in WORK/capture."""
+
+    registered: set[str]
+    """Links of the photographs with a pose."""
+    models: int = 0
     """Number of separate models; the largest is kept."""
-    points: int
-    """Number of sparse points."""
-    error_px: float
+    points: int = 0
+    error_px: float = 0.0
     """Mean reprojection error, px of the photographs."""
-    seconds: dict[str, float]
-    """Seconds of each step."""
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """The result in sentences for the user."""
-        count = len(self.registered) + len(self.skipped)
-        steps = ", ".join(f"{name} {value:.0f} s" for name, value in self.seconds.items())
-        notes = [
-            f"Found the poses of {len(self.registered)} of {count} photographs, and {self.points} points; "
-            f"mean reprojection error {self.error_px:.2f} px ({steps})."
-        ]
-        if self.skipped:
-            names = ", ".join(self.skipped[:5]) + (" ..." if len(self.skipped) > 5 else "")
-            hint = "" if self.models == 1 else f" There are {self.models} separate models: photograph the gaps."
-            notes.append(f"{len(self.skipped)} photographs match the others too little and are skipped: {names}.{hint}")
-        return tuple(notes)
 
 
 def require_pycolmap(where: object) -> None:
-    """Checks that pycolmap is installed.
-
-    Args:
-      where: Name of the capture for errors.
-
-    Raises:
-      InputError: It is not.
-    """
+    """Checks that pycolmap is installed; `where` names the capture in the InputError."""
     if importlib.util.find_spec("pycolmap") is None:
         remedy = "Run: pip install 'jsecon[sfm]' (or give poses: sparse/0 of COLMAP, or transforms.json)."
         raise InputError(where, "photographs without poses need pycolmap, which is not installed", remedy=remedy)
 
 
 def check_photographs(photos: Sequence[Path], where: object) -> list[str]:
-    """Checks that structure from motion can be tried on photographs.
-
-    Args:
-      photos: The photographs.
-      where: Name of the capture for errors.
-
-    Returns:
-      Names of the photographs relative to their common folder, with "/".
-
-    Raises:
-      InputError: There are too few, or two have the same name but for the suffix.
-    """
+    """Checks that photographs are enough and have different names; returns these, relative to their common folder."""
     if len(photos) < MIN_PHOTOS:
         remedy = "Take more that overlap by two thirds."
         raise InputError(where, f"there are only {len(photos)} photographs", f"at least {MIN_PHOTOS}", remedy)
@@ -133,7 +93,7 @@ def check_photographs(photos: Sequence[Path], where: object) -> list[str]:
 
 def find_poses(
     photos: Sequence[Path], work: Path, *, where: object = "photographs", progress: Progress | None = None
-) -> tuple[SfmResult, Path]:
+) -> tuple[Path, tuple[str, ...]]:
     """Estimates the poses of photographs.
 
     The lens model is COLMAP's OPENCV. Photographs share one lens if they have one size and their EXIF names one camera
@@ -147,12 +107,8 @@ def find_poses(
       progress: Called with (done, total): photographs, then pairs, then photographs with a pose.
 
     Returns:
-      The result, and a COLMAP capture in `work` whose images/ holds links to the photographs (copies where the system
-      has no links).
-
-    Raises:
-      InputError: pycolmap is not installed, a photograph is damaged, there are too few, two have the same name but for
-        the suffix, or no model could be made.
+      A COLMAP capture in `work` whose images/ holds links to the photographs (copies where the system has no links),
+      and notes for the user.
     """
     require_pycolmap(where)
     original = check_photographs(photos, where)
@@ -164,25 +120,24 @@ def find_poses(
         copied = image_header(photo).orientation != 1 or photo.suffix.lower() in (".heic", ".heif")
         links.append(f"{number:06d}{'.png' if copied else photo.suffix.lower()}")  # COLMAP's lists split at spaces
         _link(photo, work / "links" / links[-1], upright_copy=copied)
-    job = {
-        "long_side": max(max(set(sizes), key=sizes.count)),
-        "lenses": [[links[n] for n in group] for group in _lens_groups(photos, sizes)],
-        "names": dict(zip(links, original)),
-    }
-    write_text(work / "job.json", json.dumps(job))
-    _run_steps(work, progress)
-    result = json.loads((work / "result.json").read_text())
-    registered = set(result.pop("registered"))
-    if len(registered) < MIN_PHOTOS:
+    lenses = [[links[n] for n in group] for group in _lens_groups(photos, sizes)]
+    upsampled = max(max(set(sizes), key=sizes.count)) <= UPSAMPLED_SIDE
+    model = _run_in_own_process(work, _Job(dict(zip(links, original)), lenses, upsampled), progress)
+    if len(model.registered) < MIN_PHOTOS:
         remedy = "Take more that overlap by two thirds: sharp photographs of a still scene, from different places."
         raise InputError(where, f"fewer than {MIN_PHOTOS} of {len(photos)} photographs match each other", remedy=remedy)
-    capture = work / "capture"
     for link, photo, name in zip(links, photos, original):
-        if link in registered:
-            _link(photo, capture / "images" / name)
-    with_pose = tuple(name for link, name in zip(links, original) if link in registered)
-    skipped = tuple(name for link, name in zip(links, original) if link not in registered)
-    return SfmResult(with_pose, skipped, **result), capture
+        if link in model.registered:
+            _link(photo, work / "capture" / "images" / name)
+    notes = [
+        f"Found the poses of {len(model.registered)} of {len(photos)} photographs, and {model.points} points; "
+        f"mean reprojection error {model.error_px:.2f} px."
+    ]
+    if skipped := [name for link, name in zip(links, original) if link not in model.registered]:
+        listed = ", ".join(skipped[:5]) + (" ..." if len(skipped) > 5 else "")
+        hint = "" if model.models == 1 else f" There are {model.models} separate models: photograph the gaps."
+        notes.append(f"{len(skipped)} photographs match the others too little and are skipped: {listed}.{hint}")
+    return work / "capture", tuple(notes)
 
 
 def _lens_groups(photos: Sequence[Path], sizes: Sequence[tuple[int, int]]) -> list[list[int]]:
@@ -193,8 +148,8 @@ def _lens_groups(photos: Sequence[Path], sizes: Sequence[tuple[int, int]]) -> li
         damaged_exif = contextlib.suppress(OSError, SyntaxError, ValueError)
         with damaged_exif, warnings.catch_warnings(action="ignore"), Image.open(photo) as image:
             exif = image.getexif()
-            folder = exif.get_ifd(_EXIF_FOLDER)
-            tags = exif.get(_MODEL), folder.get(_FOCAL), folder.get(_FOCAL_35MM)
+            folder = exif.get_ifd(0x8769)
+            tags = exif.get(0x0110), folder.get(0x920A), folder.get(0xA405)  # model, focal length, and of 35 mm film
             if any(tag is not None for tag in tags):
                 lens = tuple(map(str, tags))
         groups[size, lens].append(index)
@@ -214,75 +169,67 @@ def _link(photo: Path, link: Path, *, upright_copy: bool = False) -> None:
         shutil.copyfile(photo, link)
 
 
-def _run_steps(work: Path, progress: Progress | None) -> None:
+def _run_in_own_process(work: Path, job: _Job, progress: Progress | None) -> _Model:
     """Runs the steps in a process that ends with this one, and passes its progress on."""
-    home = str(Path(__file__).parents[2])
-    environ = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, (home, os.environ.get("PYTHONPATH"))))}
-    log = work / "log.txt"
-    with log.open("w") as stream:
-        child = subprocess.Popen(
-            [sys.executable, "-m", "jsecon.poses.sfm", str(work)],
-            stdout=subprocess.PIPE,
-            stderr=stream,
-            env=environ,
-            text=True,
-        )
-        try:
-            for line in child.stdout or ():
-                if progress is not None:
-                    progress(*map(int, line.split()))
-            code = child.wait()
-        finally:
-            child.kill()
-            child.wait()
-    if code != 0:
+    context = multiprocessing.get_context("spawn")
+    receiver, sender = context.Pipe(duplex=False)
+    child = context.Process(target=_run_steps, args=(work, job, sender), daemon=True)
+    child.start()
+    sender.close()
+    model = None
+    try:
+        with contextlib.suppress(EOFError):
+            while model is None:
+                message = receiver.recv()
+                if isinstance(message, _Model):
+                    model = message
+                elif progress is not None:
+                    progress(*message)
+        child.join(None if model is None else 10)
+    finally:
+        child.kill()
+        child.join()
+    if model is None:
+        log = work / "log.txt"
         last = (log.read_text(errors="replace").strip().splitlines() or ["no message"])[-1]
-        raise InputError("pycolmap", f"it ended with code {code} ({last})", remedy=f"The whole log is {log}.")
+        problem = f"it ended with code {child.exitcode} ({last})"
+        raise InputError("pycolmap", problem, remedy=f"The whole log is {log}.")
+    return model
 
 
-def main(work: Path) -> None:
-    """Runs the steps of a job, with a line "done total" on standard output for each bit of progress.
-
-    Args:
-      work: Folder with job.json and links/; capture/ and result.json are written to it.
-    """
+def _run_steps(work: Path, job: _Job, sender: Connection) -> None:
+    """Runs the steps and sends their progress, (done, total) each, and the model, which it writes to WORK/capture."""
+    log = os.open(work / "log.txt", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    for stream in (1, 2):
+        os.dup2(log, stream)
     import pycolmap
 
-    stdout = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # COLMAP prints to the standard output, too
-
     def progress(done: int, total: int) -> None:
-        print(done, total, file=stdout, flush=True)  # fails once the parent has ended, which ends this process
+        sender.send((done, total))  # fails once the parent has ended, which ends this process
 
     pycolmap.logging.minloglevel = pycolmap.logging.WARNING.value
     pycolmap.set_random_seed(0)
-    job = json.loads((work / "job.json").read_text())
-    times = [time.monotonic()]
     _extract(pycolmap, job, work, progress)
-    times.append(time.monotonic())
     _match(pycolmap, work, progress)
-    times.append(time.monotonic())
-    best, models = _map(pycolmap, len(job["names"]), work, progress)
-    times.append(time.monotonic())
-    seconds = dict(zip(("features", "matches", "mapping"), np.diff(times).tolist()))
-    result = {"registered": [], "models": models, "points": 0, "error_px": 0.0, "seconds": seconds}
-    if best is not None:
-        result["registered"] = [image.name for image in best.images.values() if image.has_pose]
-        result |= {"points": best.num_points3D(), "error_px": best.compute_mean_reprojection_error()}
-        for image in best.images.values():
-            image.name = os.fsencode(job["names"][image.name])  # a file name need not be UTF-8
-        shutil.rmtree(work / "capture", ignore_errors=True)
-        (work / "capture" / "sparse" / "0").mkdir(parents=True)
-        best.write_binary(work / "capture" / "sparse" / "0")
-    write_text(work / "result.json", json.dumps(result))
+    best, models = _map(pycolmap, len(job.names), work, progress)
+    if best is None:
+        sender.send(_Model(set(), models))
+        return
+    registered = {image.name for image in best.images.values() if image.has_pose}
+    for image in best.images.values():
+        image.name = os.fsencode(job.names[image.name])  # a file name need not be UTF-8
+    shutil.rmtree(work / "capture", ignore_errors=True)
+    (work / "capture" / "sparse" / "0").mkdir(parents=True)
+    best.write_binary(work / "capture" / "sparse" / "0")
+    sender.send(_Model(registered, models, best.num_points3D(), best.compute_mean_reprojection_error()))
 
 
-def _extract(colmap: Any, job: dict[str, Any], work: Path, progress: Progress) -> None:
+def _extract(colmap: Any, job: _Job, work: Path, progress: Progress) -> None:
     """Detects the features of the photographs that have none in the database."""
-    database, total = work / "database.db", len(job["names"])
+    database, total = work / "database.db", len(job.names)
     options, reader = colmap.FeatureExtractionOptions(), colmap.ImageReaderOptions()
-    options.max_image_size, options.sift.max_num_features = LONG_SIDE, MAX_FEATURES
-    options.sift.first_octave = -1 if min(job["long_side"], LONG_SIDE) <= UPSAMPLED_SIDE else 0
+    options.max_image_size, options.num_threads, options.sift.max_num_features = LONG_SIDE, cores(), 4096
+    options.sift.first_octave = -1 if job.upsampled else 0
     reader.camera_model = "OPENCV"
     with colmap.Database.open(database) as opened:
         imported = opened.num_images() == total
@@ -290,19 +237,17 @@ def _extract(colmap: Any, job: dict[str, Any], work: Path, progress: Progress) -
         for file in work.glob("database.db*"):
             file.unlink()
         colmap.Database.open(database).close()
-        for group in job["lenses"]:
+        for group in job.lenses:
             colmap.import_images(database, work / "links", colmap.CameraMode.SINGLE, image_names=group, options=reader)
-    with colmap.Database.open(database) as opened:
-        left = [image.name for image in opened.read_all_images() if not opened.exists_keypoints(image.image_id)]
-    for start in range(0, len(left), 4):
-        names = left[start : start + 4]
-        options_of_call = {"image_names": names, "reader_options": reader, "extraction_options": options}
-        colmap.extract_features(database, work / "links", device=colmap.Device.cpu, **options_of_call)
-        progress(total - len(left) + start + len(names), total)
+    names = list(job.names)
+    for start in range(0, total, 4):  # COLMAP skips those that have features
+        part = {"image_names": names[start : start + 4], "reader_options": reader, "extraction_options": options}
+        colmap.extract_features(database, work / "links", device=colmap.Device.cpu, **part)
+        progress(min(start + 4, total), total)
 
 
 def _match(colmap: Any, work: Path, progress: Progress) -> None:
-    """Matches and verifies the image pairs that are not in the database yet."""
+    """Matches and verifies image pairs."""
     database = work / "database.db"
     with colmap.Database.open(database) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
@@ -312,33 +257,33 @@ def _match(colmap: Any, work: Path, progress: Progress) -> None:
             sequential = colmap.SequentialPairingOptions(overlap=NEIGHBOURS, quadratic_overlap=False)
             pairs = colmap.SequentialPairGenerator(sequential, opened).all_pairs()
             pairs += _pairs_that_look_alike(colmap, opened, list(names), work / "vocabulary.bin")
-        pairs = sorted({(min(pair), max(pair)) for pair in pairs if pair[0] != pair[1]})
-        left = [pair for pair in pairs if not opened.exists_two_view_geometry(*pair)]
+    pairs = sorted({(min(pair), max(pair)) for pair in pairs if pair[0] != pair[1]})
     options, verification = colmap.FeatureMatchingOptions(), colmap.TwoViewGeometryOptions()
-    options.use_gpu, verification.ransac.random_seed = False, 0
+    options.use_gpu, options.num_threads, verification.ransac.random_seed = False, cores(), 0
     listed = colmap.ImportedPairingOptions()
     listed.match_list_path = work / "pairs.txt"
-    for start in range(0, len(left), 50):
-        chunk = left[start : start + 50]
+    for start in range(0, len(pairs), 50):  # COLMAP skips those that are matched
+        chunk = pairs[start : start + 50]
         write_text(listed.match_list_path, "".join(f"{names[a]} {names[b]}\n" for a, b in chunk))
         colmap.match_image_pairs(database, options, listed, verification, device=colmap.Device.cpu)
-        progress(len(pairs) - len(left) + start + len(chunk), len(pairs))
+        progress(start + len(chunk), len(pairs))
 
 
 def _pairs_that_look_alike(colmap: Any, opened: Any, images: list[int], file: Path) -> list[tuple[int, int]]:
-    """Pairs each image with the ALIKE most similar ones, by a vocabulary built of their own descriptors."""
+    """Pairs each image with the ALIKE most similar ones, by a vocabulary built of a sample of their own descriptors."""
     if not file.exists():
         draw = np.random.default_rng(0)
         samples = []
         for image in images:
             descriptors = opened.read_descriptors(image).to_float()
-            samples.append(draw.permutation(descriptors.data)[:SAMPLED_DESCRIPTORS])
+            samples.append(draw.permutation(descriptors.data)[:1000])
         sample = np.concatenate(samples)
-        words = min(len(sample) // DESCRIPTORS_PER_WORD, MAX_WORDS)
+        words = min(len(sample) // 40, 4096)  # k-means asks for 40 descriptors a word
         if words < ALIKE:
             return []
         index, options = colmap.VisualIndex.create(sample.shape[1], 64), colmap.VisualIndex.BuildOptions()
         options.num_visual_words, options.num_iterations, options.num_rounds = words, 10, 1
+        options.num_threads = cores()
         index.build(options, colmap.FeatureDescriptorsFloat(descriptors.type, sample))
         partial = file.with_suffix(".partial")
         index.write(partial)
@@ -359,7 +304,7 @@ def _map(colmap: Any, total: int, work: Path, progress: Progress) -> tuple[Any, 
             return None, 0
     colmap.calibrate_view_graph(database, colmap.ViewGraphCalibrationOptions(random_seed=0))
     progress(0, total)
-    options = colmap.GlobalPipelineOptions(random_seed=0, min_model_size=MIN_PHOTOS)
+    options = colmap.GlobalPipelineOptions(random_seed=0, min_model_size=MIN_PHOTOS, num_threads=cores())
     options.mapper.random_seed = 0
     (work / "global").mkdir(exist_ok=True)
     models = list(colmap.global_mapping(database, links, work / "global", options).values())
@@ -372,7 +317,7 @@ def _map(colmap: Any, total: int, work: Path, progress: Progress) -> tuple[Any, 
             count = min(count + 1, total)
             progress(count, total)
 
-        options = colmap.IncrementalPipelineOptions(random_seed=0, min_model_size=MIN_PHOTOS)
+        options = colmap.IncrementalPipelineOptions(random_seed=0, min_model_size=MIN_PHOTOS, num_threads=cores())
         (work / "incremental").mkdir(exist_ok=True)
         callbacks = {"initial_image_pair_callback": registered, "next_image_callback": registered}
         models = colmap.incremental_mapping(database, links, work / "incremental", options, **callbacks).values()
@@ -416,7 +361,3 @@ def _explained_matches(colmap: Any, database: Path, model: Any) -> tuple[dict[in
                 matches[image] += len(of_a)
                 explained[image] += int(((of_a == of_b) & (of_a >= 0)).sum())
     return explained, matches
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]))

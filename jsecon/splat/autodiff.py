@@ -119,14 +119,6 @@ def rasterize_nan_contained(
 ) -> tuple[Float[Array, "h w d"], Float[Array, "h w"]]:
     """Composites features of which some may be NaN or infinite.
 
-    Args:
-      splats: (N, 6) as in `ViewPlan`.
-      features: (N, D).
-      lists: Tile lists of the view.
-      width: Width of the image, px.
-      height: Height of the image, px.
-      mesh: Devices that hold the strips, or None.
-
     Returns:
       Image (H, W, D), NaN in exactly the pixels that a Gaussian with a non-finite feature touches, and final
       transmittance (H, W). Those pixels and features have gradient zero.

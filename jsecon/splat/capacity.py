@@ -13,9 +13,6 @@ from jsecon.splat.strips import BLOCK, Strip
 from jsecon.splat.tiles import TILE, WORD, pair_counts, tile_grid
 from jsecon.types import Array, Camera, Gaussians
 
-PAIRS_PER_GAUSSIAN, PAIRS_PER_BLOCK = 2, 256
-"""Pairs of the default capacity, see `default_capacity`."""
-
 
 @functools.partial(jax.jit, static_argnums=2)
 def _pairs_in_view(gaussians: Gaussians, camera: Camera, strips: int, near: float | Array) -> Array:
@@ -30,15 +27,10 @@ def _pairs_in_view(gaussians: Gaussians, camera: Camera, strips: int, near: floa
 
 
 def round_capacity(pairs: int) -> int:
-    """Rounds a capacity up, so that small scenes share programs.
+    """Rounds a number of pairs up to an eighth of a power of two, so that small scenes share programs.
 
-    A compilation takes seconds; 3,000 unneeded pairs cost a forward render 0.3 ms.
-
-    Args:
-      pairs: Number of pairs.
-
-    Returns:
-      A multiple of an eighth of a power of two; up to 16,384 a power of two, at least 4,096.
+    Up to 16,384 it is a power of two, at least 4,096: a compilation takes seconds, 3,000 unneeded pairs cost a forward
+    render 0.3 ms.
     """
     small = max(4096, 1 << (max(pairs, 1) - 1).bit_length())
     if small <= 16384:
@@ -48,36 +40,22 @@ def round_capacity(pairs: int) -> int:
 
 
 def default_capacity(count: int, width: int, height: int, *, strips: int = 1) -> int:
-    """Estimates a capacity from sizes alone.
+    """Estimates the number of pairs of all strips together from sizes alone.
 
-    It allows PAIRS_PER_GAUSSIAN pairs per Gaussian and PAIRS_PER_BLOCK per block, at most all Gaussians in all blocks.
-    In all views of seven scenes (1,000 to 1,000,000 Gaussians, 112x200 to 1944x1260) a view needs less than N pairs and
-    330 per block (benchmarks/results.md). Time hardly depends on the capacity; memory grows by 110 bytes per pair.
-
-    Args:
-      count: Number of Gaussians.
-      width: Width of the image, px.
-      height: Height of the image, px.
-      strips: Number of strips.
-
-    Returns:
-      Number of pairs of all strips together.
+    It allows 2 pairs per Gaussian and 256 per block, at most all Gaussians in all blocks. In all views of seven scenes
+    (1,000 to 1,000,000 Gaussians, 112x200 to 1944x1260) a view needs less than N pairs and 330 per block
+    (benchmarks/results.md). Time hardly depends on the capacity; memory grows by 110 bytes per pair.
     """
     across, down = tile_grid(width, height, BLOCK * TILE)
     blocks = across * -(-down // strips)
-    per_strip = min(count * blocks, -(-PAIRS_PER_GAUSSIAN * count // strips) + PAIRS_PER_BLOCK * blocks)
+    per_strip = min(count * blocks, -(-2 * count // strips) + 256 * blocks)
     return round_capacity(strips * per_strip)
 
 
 def enough_capacity(capacity: int, overflow: Int[Array, " strips"]) -> int:
-    """Enlarges a capacity so that it holds what overflowed.
+    """Enlarges a capacity of all strips together by the pairs of each strip that found no room.
 
-    Args:
-      capacity: Number of pairs of all strips together.
-      overflow: (strips,) pairs of each strip that found no room.
-
-    Returns:
-      Number of pairs of all strips; a power of two per strip, so that views share programs.
+    The result is a power of two per strip, so that views share programs.
     """
     per_strip = -(-capacity // (overflow.shape[0] * WORD)) * WORD + int(overflow.max())
     return overflow.shape[0] << (per_strip - 1).bit_length()

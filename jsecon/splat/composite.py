@@ -1,6 +1,6 @@
 """Front-to-back alpha compositing of tile lists, and its transpose, the gradient with respect to the features.
 
-The tiles of a batch are walked together (scan.py), one batch after another. Each device walks one strip.
+The tiles of a batch are scanned together (scan.py), one batch after another. Each device scans one strip.
 """
 
 import jax.numpy as jnp
@@ -27,15 +27,7 @@ def composite(
     height: int,
     mesh: Mesh | None = None,
 ) -> tuple[Float[Array, "h w d"], Float[Array, "h w"], Int[Array, " tiles"]]:
-    """Composites features: the sum of alpha T f.
-
-    Args:
-      splats: (N, 6) as in `ViewPlan`.
-      features: (N, D); bfloat16 is read as such.
-      lists: Tile lists.
-      width: Width of the image, px.
-      height: Height of the image, px.
-      mesh: Devices that hold the strips, or None.
+    """Composites features (N, D): the sum of alpha T f.
 
     Returns:
       Image (H, W, D) in the dtype of the splats, final transmittance (H, W), and (tiles,) int32 the visible length of
@@ -43,16 +35,15 @@ def composite(
     """
     channels = features.shape[1] + 1
     # Wide features are gathered from their array: a table with them would be written again in every render.
-    separate = channels > MAX_RECOMPUTED or features.dtype != splats.dtype
+    separate = channels > MAX_RECOMPUTED
 
     def local(strip, lists, common):
         (table, features), batches = common, make_batches(lists, width, strip)
 
         def body(transmittance, total, chunk):
             if separate:
-                columns = features[chunk.ids].astype(table.dtype)
-                chunk = chunk._replace(columns=jnp.concatenate([columns, chunk.columns], axis=-1))
-            if channels <= MAX_RECOMPUTED:
+                chunk = chunk._replace(columns=jnp.concatenate([features[chunk.ids], chunk.columns], axis=-1))
+            else:
                 return _add_recomputed(transmittance, total, chunk)
             weight, transmittance = compute_once(chunk.always, blend_weights, transmittance, chunk.alpha)
             for k in range(CHUNK):
@@ -100,17 +91,7 @@ def _add_recomputed(transmittance: Array, total: Array, chunk) -> tuple[Array, A
 def composite_features_vjp(
     splats: Float[Array, "n 6"], lists: TileLists, cotangent: Float[Array, "h w d"], mesh: Mesh | None = None
 ) -> Float[Array, "n d"]:
-    """Computes the gradient with respect to the features alone.
-
-    Args:
-      splats: (N, 6) as in `ViewPlan`.
-      lists: Tile lists.
-      cotangent: (H, W, D) gradient of the image.
-      mesh: Devices that hold the strips, or None.
-
-    Returns:
-      (N, D) W^T cotangent.
-    """
+    """Computes the gradient (N, D) with respect to the features alone: W^T cotangent."""
     width, channels = cotangent.shape[1:]
 
     def local(strip, divided, table):

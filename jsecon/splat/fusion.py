@@ -21,9 +21,6 @@ def compute_once(always: Array, compute: Callable, *operands: Any) -> Any:
       always: () bool that is true, which the compiler cannot know (`opaque_true`).
       compute: Pure function of arrays.
       *operands: Its arguments.
-
-    Returns:
-      Its result.
     """
     shapes = jax.eval_shape(compute, *operands)
 
@@ -34,13 +31,6 @@ def compute_once(always: Array, compute: Callable, *operands: Any) -> Any:
 
 
 def opaque_true(number: Array) -> Array:
-    """Makes a condition for `compute_once`.
-
-    Args:
-      number: () float of any value, NaN included.
-
-    Returns:
-      () bool, true; the compiler cannot infer it.
-    """
+    """Makes the condition of `compute_once`, true for any float, NaN included; the compiler cannot infer it."""
     bits = lax.bitcast_convert_type(number, jnp.int32 if number.dtype.itemsize == 4 else jnp.int64)
     return (bits | 1) != 0

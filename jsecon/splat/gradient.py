@@ -1,6 +1,6 @@
 """Hand-written gradient of compositing with respect to splats and features.
 
-It walks front to back like the image: with G the cotangent, dL/dalpha_i = T_i <G, f_i> - (S - S_i) / (1 - alpha_i),
+It goes front to back like the image: with G the cotangent, dL/dalpha_i = T_i <G, f_i> - (S - S_i) / (1 - alpha_i),
 where S_i is the running sum of w <G, f> up to i and S its total, known from the image. No memory per pair is needed.
 """
 
@@ -27,9 +27,6 @@ from jsecon.splat.strips import map_strips, split_into_strips
 from jsecon.splat.tiles import TileLists
 from jsecon.types import Array
 
-_UNROLLED = 8
-"""Number of channels up to which they are summed in one kernel; more are a matrix product."""
-
 
 def composite_vjp(
     splats: Float[Array, "n 6"],
@@ -41,7 +38,7 @@ def composite_vjp(
     cotangent_transmittance: Float[Array, "h w"],
     mesh: Mesh | None = None,
 ) -> tuple[Array, Array]:
-    """Computes the gradients of `composite`.
+    """Computes the gradients of `composite` with respect to splats (N, 6) and features (N, D).
 
     The transmittance is 1 - sum of w: its cotangent acts as minus the cotangent of a channel of ones.
 
@@ -49,14 +46,11 @@ def composite_vjp(
       splats: (N, 6) as in `ViewPlan`.
       features: (N, D).
       lists: Tile lists, cut to their visible lengths.
-      image: (H, W, D) result of `composite`.
-      transmittance: (H, W) result of `composite`.
-      cotangent: (H, W, D) gradient of the image.
-      cotangent_transmittance: (H, W) gradient of the transmittance.
+      image: Result of `composite`.
+      transmittance: Result of `composite`.
+      cotangent: Gradient of the image.
+      cotangent_transmittance: Gradient of the transmittance.
       mesh: Devices that hold the strips, or None.
-
-    Returns:
-      Gradients of the splats (N, 6) and of the features (N, D).
     """
     width, channels = cotangent.shape[1:]
     total = (image * cotangent).sum(-1) - (1 - transmittance) * cotangent_transmittance
@@ -100,7 +94,7 @@ def composite_vjp(
 
 def _along(features: Array, cotangent: Array) -> Array:
     """(B, CHUNK, D), (B, D, pixels) -> (B, CHUNK, pixels), the sum over the channels."""
-    if features.shape[-1] > _UNROLLED:
+    if features.shape[-1] > 8:  # fewer are summed in one kernel
         return jnp.einsum("bcd,bdp->bcp", features, cotangent, precision=FULL_PRECISION)
     terms = [features[..., d, None] * cotangent[:, None, d] for d in range(features.shape[-1])]
     return sum(terms[1:], terms[0])

@@ -28,9 +28,6 @@ from jsecon.splat.strips import map_strips
 from jsecon.splat.tiles import TileLists, tile_lists
 from jsecon.types import Array, Camera, Gaussians, Leaf, Rendering, record, static
 
-MAX_PLAN_BYTES = 1 << 30
-"""Largest memory of the plans of all views, above which they are not kept."""
-
 
 @record
 class ViewPlan:
@@ -136,7 +133,7 @@ def plan_view(
 
 
 def prepare_views(
-    gaussians: Gaussians, cameras: Camera, *, capacity: int | None = None, max_bytes: int = MAX_PLAN_BYTES
+    gaussians: Gaussians, cameras: Camera, *, capacity: int | None = None, max_bytes: int = 1 << 30
 ) -> ViewPlan | None:
     """Plans all views of a batch.
 
@@ -144,7 +141,7 @@ def prepare_views(
       gaussians: Scene of N Gaussians; its `sh` may be None.
       cameras: Batch of T cameras.
       capacity: Number of (block, Gaussian) pairs of a view, see `plan_view`.
-      max_bytes: Memory limit of all plans together.
+      max_bytes: Memory limit of all plans together; above it they are not kept.
 
     Returns:
       The plans stacked on a leading axis (`jax.tree.map(lambda a: a[t], plans)` is the plan of view t), outside of a
@@ -179,9 +176,7 @@ def _cut_lists(plan: ViewPlan, length: int | None = None) -> ViewPlan:
 
 def _composite_plan(plan: ViewPlan, features: Array, background: Array | None, depth: bool) -> Rendering:
     """Renders features through a plan. Pure; arguments as for `render_plan`."""
-    features = jnp.asarray(features)
-    if depth or features.dtype != jnp.bfloat16:
-        features = features.astype(plan.splats.dtype)
+    features = jnp.asarray(features).astype(plan.splats.dtype)
     columns = jnp.concatenate([features, plan.depths[:, None]], axis=1) if depth else features
     image, transmittance = rasterize_nan_contained(plan.splats, columns, plan.lists, plan.width, plan.height, plan.mesh)
     image, transmittance = (jnp.where(plan.camera_is_finite, a, jnp.nan) for a in (image, transmittance))
@@ -208,7 +203,7 @@ def render_plan(
 
     Args:
       plan: Plan of one view; its devices are used.
-      features: (N, D) numbers, float32 or bfloat16.
+      features: (N, D) numbers.
       background: (D,) numbers or one, added with weight 1 - alpha.
       depth: Whether to render the expected z-depth too.
 
@@ -220,21 +215,24 @@ def render_plan(
     """
     require_shape("features", features, (plan.splats.shape[0], "D"), "Pass one row of features per Gaussian.")
     require_background(background, features.shape[1])
+    if not plan.splats.shape[0]:
+        return _empty_rendering(plan, features.shape[1], background, depth)
     traced = is_traced((plan, features, background))
     run = _composite_plan if traced else _composite_plan_compiled[plan.mesh is not None]
     return run(plan, features, background, depth)
 
 
+def _empty_rendering(plan: ViewPlan, channels: int, background: Array | None, depth: bool) -> Rendering:
+    """The rendering of a plan without Gaussians."""
+    image = jnp.zeros((plan.height, plan.width, channels), plan.splats.dtype)
+    image = jnp.where(plan.camera_is_finite, image, jnp.nan)
+    alpha = jnp.where(plan.camera_is_finite, jnp.zeros(image.shape[:2], image.dtype), jnp.nan)
+    image = image if background is None else image + jnp.reshape(background, (1, 1, -1))
+    return Rendering(image, alpha, plan.overflow, alpha if depth else None)
+
+
 def require_background(background: Array | None, channels: int) -> None:
-    """Checks the shape of a background.
-
-    Args:
-      background: () or (D,) numbers, or None.
-      channels: D, number of channels of the features.
-
-    Raises:
-      ValueError: The shape is another.
-    """
+    """Checks that a background is None, one number, or one number per channel."""
     if background is not None:
         got, remedy = np.shape(background), "Pass one number per channel of the features."
         require(got in ((), (channels,)), "background", got, f"({channels},)", remedy)

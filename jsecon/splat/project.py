@@ -22,12 +22,6 @@ def is_usable(gaussians: Gaussians) -> Bool[Array, " n"]:
 
     A NaN, an infinite mean or quaternion, or an infinite size disables a Gaussian. A log scale of minus infinity is a
     size of 0 and an infinite opacity logit an opacity of 0 or 1: both are rendered.
-
-    Args:
-      gaussians: N Gaussians.
-
-    Returns:
-      (N,) bool.
     """
     geometry = jnp.concatenate([gaussians.means, gaussians.quaternions], axis=1)
     sizes = jnp.isnan(gaussians.log_scales) | jnp.isposinf(gaussians.log_scales)
@@ -35,16 +29,9 @@ def is_usable(gaussians: Gaussians) -> Bool[Array, " n"]:
 
 
 def unusable_rows(name: str, numbers: np.ndarray) -> Bool[np.ndarray, " m"]:
-    """Finds rows of a field of `Gaussians` that no file may hold. Host code (NumPy).
+    """Finds rows of the field `name` of `Gaussians` that no file may hold. Host code (NumPy).
 
     These are the rows that `is_usable` excludes, colours that are not finite, and quaternions of length 0.
-
-    Args:
-      name: Name of the field, for example "log_scales".
-      numbers: (M, ...) its values.
-
-    Returns:
-      (M,) bool.
     """
     if name == "opacity_logits":
         wrong = np.isnan(numbers)
@@ -58,18 +45,15 @@ def unusable_rows(name: str, numbers: np.ndarray) -> Bool[np.ndarray, " m"]:
 
 
 def count_non_finite(gaussians: Gaussians, features: Float[Array, "n d"] | None = None) -> Int[Array, ""]:
-    """Counts Gaussians that `render` hides or shows as NaN.
+    """Counts Gaussians that `render` hides, or shows as NaN in the pixels that they touch.
 
-    Args:
-      gaussians: N Gaussians.
-      features: (N, D) features to check; by default the spherical harmonics.
-
-    Returns:
-      () int32 number of Gaussians that are not usable (hidden) or whose features are not finite (NaN in the pixels that
-      they touch).
+    The latter have features (by default the spherical harmonics, if there are any) that are not finite.
     """
-    channels = gaussians.sh.reshape(gaussians.sh.shape[0], -1) if features is None else features
-    return jnp.sum(~(is_usable(gaussians) & jnp.isfinite(channels).all(1)), dtype=jnp.int32)
+    channels = gaussians.sh if features is None else features
+    usable = is_usable(gaussians)
+    if channels is not None:
+        usable &= jnp.isfinite(channels).all(tuple(range(1, channels.ndim)))
+    return jnp.sum(~usable, dtype=jnp.int32)
 
 
 _MAX_AXIS_PX = 1e15
@@ -98,12 +82,6 @@ class Projection:
     """(N, 2) half-width and half-height, px, of the box outside which alpha < 1/255."""
     visible: Leaf
     """(N,) bool: usable, in front of the near plane, opacity of at least 1/255, box touching the image."""
-
-    @property
-    def conics(self) -> Array:
-        """(N, 3) a, b, c of the inverse 2D covariance [[a, b], [b, c]], 1/px^2."""
-        l11, l21, l22 = self.whitening[:, 0], self.whitening[:, 1], self.whitening[:, 2]
-        return jnp.stack([l11 * l11, l11 * l21, l21 * l21 + l22 * l22], axis=-1)
 
 
 def _rotation(w: Array, x: Array, y: Array, z: Array) -> list[list[Array]]:
@@ -157,16 +135,7 @@ def _whitening(row_1: list[Array], row_2: list[Array]) -> tuple[Array, ...]:
 
 
 def check_gaussians(gaussians: Gaussians, camera: Camera | None = None, *, colour: bool = True) -> None:
-    """Checks the shapes of what is to be rendered or written.
-
-    Args:
-      gaussians: Scene of N Gaussians.
-      camera: One camera, or None to leave it out.
-      colour: Whether to check the spherical harmonics too.
-
-    Raises:
-      ValueError: Shapes disagree, the harmonics have an incomplete degree, or the camera is a batch.
-    """
+    """Checks the shapes of what is to be rendered or written: Gaussians, their harmonics (`colour`), and one camera."""
     require_shape("gaussians.means", gaussians.means, ("N", 3), "Pass one centre per Gaussian.")
     for name, rest in (("log_scales", (3,)), ("quaternions", (4,)), ("opacity_logits", ())):
         expected = gaussians.count, *rest

@@ -9,10 +9,6 @@ from jsecon.types import Camera, Gaussians
 def project_reference(gaussians: Gaussians, camera: Camera) -> dict[str, np.ndarray]:
     """Projects Gaussians, one at a time.
 
-    Args:
-      gaussians: N Gaussians.
-      camera: One camera.
-
     Returns:
       means_px (N, 2), covariances (N, 2, 2) px^2, conics (N, 3) a, b, c of their inverses, depths (N,), opacities (N,)
       and in_front (N,) bool.
@@ -60,15 +56,7 @@ def _rotation(quaternion: np.ndarray) -> np.ndarray:
 
 
 def weights_reference(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """Composites Gaussians, one at a time; those of equal depth in index order.
-
-    Args:
-      gaussians: N Gaussians.
-      camera: One camera.
-
-    Returns:
-      (H, W, N) weight alpha T of every Gaussian at every pixel.
-    """
+    """Computes the weight alpha T of every Gaussian at every pixel, (H, W, N); equal depths in index order."""
     splats = project_reference(gaussians, camera)
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     weights = np.zeros((camera.height, camera.width, len(splats["depths"])))
@@ -89,15 +77,6 @@ def weights_reference(gaussians: Gaussians, camera: Camera) -> np.ndarray:
 
 
 def render_reference(gaussians: Gaussians, camera: Camera, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Renders features.
-
-    Args:
-      gaussians: N Gaussians.
-      camera: One camera.
-      features: (N, D).
-
-    Returns:
-      The image (H, W, D) and alpha (H, W), float64.
-    """
+    """Renders features (N, D): the image (H, W, D) and alpha (H, W), float64."""
     weights = weights_reference(gaussians, camera)
     return weights @ np.asarray(features, np.float64), weights.sum(-1)

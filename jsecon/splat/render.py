@@ -53,8 +53,7 @@ def render(
     Args:
       gaussians: Scene of N Gaussians. Its `sh` has no influence and may be None.
       camera: One camera.
-      features: (N, D). bfloat16 features are read as such and summed in the dtype of the Gaussians: the error is that
-        of rounding the features (benchmarks/results.md), the time on a CPU is the same.
+      features: (N, D), in the dtype of the Gaussians.
       background: (D,), added with weight 1 - alpha.
       capacity: Number of (block, Gaussian) pairs; by default `default_capacity`, a multiple of what scenes need, so
         that one program serves all views of a size. A given capacity is used as it is (`plan_capacity`).
@@ -73,11 +72,6 @@ def render(
     check_gaussians(gaussians, camera, colour=False)
     require_shape("features", features, (gaussians.count, "D"), "Pass one row of features per Gaussian.")
     require_background(background, features.shape[1])
-    if gaussians.means.shape[0] == 0:
-        image = jnp.zeros((camera.height, camera.width, features.shape[1]), gaussians.means.dtype)
-        alpha = jnp.zeros(image.shape[:2], image.dtype)
-        image = image if background is None else image + jnp.reshape(background, (1, 1, -1))
-        return Rendering(image, alpha, jnp.int32(0), alpha if depth else None)
     plan = plan_view(gaussians, camera, capacity=capacity, near=near, mesh=mesh)
     # Outside of a trace these are two programs: all renderings of scenes of this size share the first.
     return render_plan(plan, features, background=background, depth=depth)

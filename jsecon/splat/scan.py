@@ -1,6 +1,6 @@
-"""Walks down the lists of a batch of tiles: Gaussians in chunks, front to back, until all pixels are opaque.
+"""Scans the lists of a batch of tiles: Gaussians in chunks, front to back, until all pixels are opaque.
 
-A batch holds tiles with lists of similar length. Arrays of a walk are (tiles, ..., pixels): the pixels of a tile are
+A batch holds tiles with lists of similar length. Arrays of a scan are (tiles, ..., pixels): the pixels of a tile are
 innermost and fill the vectors; numbers of a Gaussian are shared by a row of pixels.
 
 XLA's CPU backend decides the speed; measured on garden (benchmarks/results.md):
@@ -26,7 +26,7 @@ from jsecon.splat.tiles import TileLists, tile_grid
 from jsecon.types import Array
 
 MAX_BATCH = 64
-"""Maximum number of tiles that are walked side by side; affects only speed."""
+"""Maximum number of tiles that are scanned side by side; affects only speed."""
 MAX_BATCH_BACKWARD = 32
 """The same for gradients, which hold more arrays of a chunk at once."""
 
@@ -49,15 +49,7 @@ class Batches(NamedTuple):
     strip: Strip
 
     def corners(self, tiles: Array, dtype) -> tuple[Array, Array]:
-        """Finds the upper left corners of tiles in the image.
-
-        Args:
-          tiles: Tile ids, int, of any shape.
-          dtype: Type of the result.
-
-        Returns:
-          x and y, px.
-        """
+        """Finds x and y (px) of the upper left corners of tiles in the image."""
         x, y = tiles % self.across, self.strip.tile_row(tiles // self.across)
         return (x * self.tile).astype(dtype), (y * self.tile).astype(dtype)
 
@@ -65,16 +57,8 @@ class Batches(NamedTuple):
 def make_batches(lists: TileLists, width: int, strip: Strip = FULL_IMAGE, most: int | None = None) -> Batches:
     """Groups the tiles of one strip into batches, longest lists first.
 
-    A batch walks as far as its longest list. If there are few tiles, their lists differ more and batches are smaller.
-
-    Args:
-      lists: Tile lists of the strip.
-      width: Width of the image, px.
-      strip: The strip.
-      most: Maximum number of tiles of a batch, by default MAX_BATCH.
-
-    Returns:
-      The batches.
+    A batch is scanned as far as its longest list. If there are few tiles, their lists differ more and batches are
+    smaller, at most of `most` tiles (MAX_BATCH).
     """
     number = lists.lengths.shape[0]
     batch = min(most or MAX_BATCH, max(16, 1 << (max(number // 12, 1).bit_length() - 1)))
@@ -86,11 +70,7 @@ def make_batches(lists: TileLists, width: int, strip: Strip = FULL_IMAGE, most: 
 
 
 def to_tiles(image: Array, tile: int) -> Array:
-    """Divides an image into tiles, row by row.
-
-    Args:
-      image: (H, W, ...).
-      tile: Edge of a tile, px.
+    """Divides an image (H, W, ...) into tiles, row by row.
 
     Returns:
       (tiles + 1, tile * tile, ...), zero outside of the image; the last tile is empty.
@@ -121,7 +101,7 @@ _EXP2 = (
 )
 
 
-class Chunk(NamedTuple):
+class _Chunk(NamedTuple):
     """CHUNK Gaussians of each tile of a batch."""
 
     ids: Array
@@ -139,15 +119,7 @@ class Chunk(NamedTuple):
 
 
 def make_table(splats: Float[Array, "n 6"], *columns: Array) -> Float[Array, "n k"]:
-    """Makes the table that a walk gathers from.
-
-    Args:
-      splats: (N, 6) as in `ViewPlan`.
-      *columns: (N, ...) further columns.
-
-    Returns:
-      (N, 7 + ...) the splats, the binary logarithms of their opacities, and the columns.
-    """
+    """Makes the table that a scan gathers from: splats, the binary logarithms of their opacities, further columns."""
     opacity = splats[:, 5:]
     binary = jnp.where(opacity > 0, jnp.log2(jnp.where(opacity > 0, opacity, 1.0)), -jnp.inf)
     return jnp.concatenate([splats, binary, *columns], axis=1)
@@ -168,15 +140,7 @@ def _exp2(e: Array) -> Array:
 
 
 def pixel_centres(tile: int, dtype) -> tuple[Array, Array]:
-    """Finds the centres of the pixels of a tile, from its upper left corner.
-
-    Args:
-      tile: Edge of a tile, px.
-      dtype: Type of the result.
-
-    Returns:
-      x and y (tile * tile,), px, row by row; NumPy.
-    """
+    """Finds x and y of the centres of the pixels of a tile from its upper left corner, px, row by row; NumPy."""
     local = (np.arange(tile) + 0.5).astype(dtype)
     return np.tile(local, tile), np.repeat(local, tile)
 
@@ -203,29 +167,15 @@ def _coefficients(rows: Array, corner_x: Array, corner_y: Array, exponent: Array
 
 
 def pixel_alphas(splats: Float[Array, "p 6"], corners: tuple[Array, Array], tile: int) -> Float[Array, "p pixels"]:
-    """Computes the alpha of splats in the pixels of one tile each.
-
-    Args:
-      splats: (P, 6) splats.
-      corners: x and y (P,) of the upper left corner of the tile of each splat, px.
-      tile: Edge of a tile, px.
-
-    Returns:
-      (P, pixels) alpha.
-    """
+    """Computes the alpha (P, pixels) of splats (P, 6) in one tile each, whose upper left corners are given (px)."""
     exponent = make_table(splats)[:, ATTRIBUTES]
     return _alphas(_coefficients(splats, *corners, exponent)[:, None], tile)[:, 0]
 
 
 def cumulative(combine: Callable, start: Array, values: Array) -> tuple[Array, Array]:
-    """Computes an exclusive scan along the second axis.
+    """Computes an exclusive scan along the second axis with an associative operation.
 
     It runs in groups, so that a fused kernel reads each value a few times instead of CHUNK times.
-
-    Args:
-      combine: Associative operation.
-      start: (B, pixels) initial value.
-      values: (B, CHUNK, pixels).
 
     Returns:
       (B, CHUNK, pixels) `start` combined with all earlier values, and (B, pixels) with all values.
@@ -242,17 +192,10 @@ def cumulative(combine: Callable, start: Array, values: Array) -> tuple[Array, A
 
 
 def blend_weights(transmittance: Array, alpha: Array) -> tuple[Array, Array]:
-    """Computes the weights alpha T of a chunk.
+    """Computes the weights alpha T (B, CHUNK, pixels) of a chunk, and the transmittance behind it.
 
     The transmittance is the plain product of 1 - alpha. It only falls, so a Gaussian has weight exactly if the product
     behind it is still above MIN_TRANSMITTANCE.
-
-    Args:
-      transmittance: (B, pixels) before the chunk.
-      alpha: (B, CHUNK, pixels).
-
-    Returns:
-      Weights (B, CHUNK, pixels), and the transmittance (B, pixels) behind the chunk.
     """
     before, after = cumulative(jnp.multiply, transmittance, 1 - alpha)
     weight = before * alpha
@@ -262,7 +205,7 @@ def blend_weights(transmittance: Array, alpha: Array) -> tuple[Array, Array]:
 def scan_tiles(
     table: Array, lists: TileLists, batches: Batches, tiles: Array, body: Callable, state: Any
 ) -> tuple[Any, Array]:
-    """Walks down the lists of one batch, until the longest ends or every pixel is opaque.
+    """Scans the lists of one batch of tiles, until the longest ends or every pixel is opaque.
 
     Args:
       table: Result of `make_table`.
@@ -275,6 +218,8 @@ def scan_tiles(
     Returns:
       The last state, and (B,) int32 the visible length of each list.
     """
+    if not table.shape[0]:  # without Gaussians there is no row to gather
+        return state, jnp.zeros_like(tiles)
     start, length = batches.starts[tiles, None], batches.lengths[tiles, None]
     corner_x, corner_y = (corner[:, None] for corner in batches.corners(tiles, table.dtype))
     longest = length.max()
@@ -293,7 +238,7 @@ def scan_tiles(
         always = first < longest
         alpha = compute_once(always, functools.partial(_alphas, tile=batches.tile), coefficients)
         places = jnp.where(index < length, start + index, lists.gaussians.shape[0])
-        chunk = Chunk(ids, places, rows[..., ATTRIBUTES + 1 :], rows[..., :ATTRIBUTES], alpha, always)
+        chunk = _Chunk(ids, places, rows[..., ATTRIBUTES + 1 :], rows[..., :ATTRIBUTES], alpha, always)
         seen = jnp.where(transmittance.max(1) > MIN_TRANSMITTANCE, first + CHUNK, seen)
         transmittance, state = body(transmittance, state, chunk)
         return first + CHUNK, transmittance, seen, state

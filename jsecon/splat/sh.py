@@ -12,29 +12,13 @@ from jsecon.splat.fusion import compute_once, opaque_true
 from jsecon.types import Array, Camera, Gaussians
 
 C0 = 0.28209479177387814
-C1 = 0.4886025119029199
-C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
-C3 = (-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154, -0.4570457994644658,
-      1.445305721320277, -0.5900435899266435)  # fmt: skip
-
-
+"""The constant basis function."""
 COEFFICIENT_COUNTS = (1, 4, 9, 16)
 """Number of coefficients up to degree 0, 1, 2 and 3."""
 
 
 def sh_basis(directions: Float[Array, "n 3"], coefficients: int) -> Float[Array, "n k"]:
-    """Evaluates the first basis functions.
-
-    Args:
-      directions: (N, 3) unit vectors.
-      coefficients: K, 1, 4, 9 or 16.
-
-    Returns:
-      (N, K) values.
-
-    Raises:
-      ValueError: K is another number.
-    """
+    """Evaluates the first 1, 4, 9 or 16 basis functions at unit directions."""
     require(
         coefficients in COEFFICIENT_COUNTS, "coefficients", coefficients, "1, 4, 9 or 16", "Pad sh to a whole degree."
     )
@@ -45,13 +29,25 @@ def _basis(x: Array, y: Array, z: Array, coefficients: int) -> list:
     xx, yy, zz = x * x, y * y, z * z
     basis = [jnp.full_like(x, C0)]
     if coefficients > 1:
-        basis += [-C1 * y, C1 * z, -C1 * x]
+        basis += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
     if coefficients > 4:
-        basis += [C2[0] * x * y, C2[1] * y * z, C2[2] * (2 * zz - xx - yy), C2[3] * x * z, C2[4] * (xx - yy)]
+        basis += [
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.31539156525252005 * (2 * zz - xx - yy),
+            -1.0925484305920792 * x * z,
+            0.5462742152960396 * (xx - yy),
+        ]
     if coefficients > 9:
-        basis += [C3[0] * y * (3 * xx - yy), C3[1] * x * y * z, C3[2] * y * (4 * zz - xx - yy),
-                  C3[3] * z * (2 * zz - 3 * xx - 3 * yy), C3[4] * x * (4 * zz - xx - yy), C3[5] * z * (xx - yy),
-                  C3[6] * x * (xx - 3 * yy)]  # fmt: skip
+        basis += [
+            -0.5900435899266435 * y * (3 * xx - yy),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (4 * zz - xx - yy),
+            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+            -0.4570457994644658 * x * (4 * zz - xx - yy),
+            1.445305721320277 * z * (xx - yy),
+            -0.5900435899266435 * x * (xx - 3 * yy),
+        ]
     return basis
 
 
@@ -92,16 +88,8 @@ _colours.defvjp(lambda directions, sh: (_colours(directions, sh), (directions, s
 def colours_from_sh(gaussians: Gaussians, camera: Camera) -> Float[Array, "n 3"]:
     """Computes the colours of N Gaussians as a camera sees them. Reverse mode only.
 
-    Args:
-      gaussians: Scene of N Gaussians with spherical harmonics.
-      camera: One camera.
-
-    Returns:
-      (N, 3) RGB, 0.5 + sum over the basis, clamped at 0 (with gradient zero there) but not above. NaN, with gradient
-      zero, if a coefficient is not finite.
-
-    Raises:
-      ValueError: The spherical harmonics have an incomplete degree.
+    They are 0.5 + sum over the basis, clamped at 0 (with gradient zero there) but not above. NaN, with gradient zero,
+    if a coefficient is not finite.
     """
     coefficients = gaussians.sh.shape[1]
     require(

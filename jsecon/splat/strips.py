@@ -26,36 +26,15 @@ class Strip:
     count: int = 1
 
     def first_row(self, rows: Array) -> Array:
-        """Counts the strip's rows of blocks before rows of blocks of the image.
-
-        Args:
-          rows: Row numbers in the image, int.
-
-        Returns:
-          Their numbers in the strip.
-        """
+        """Counts the strip's rows of blocks before rows of blocks of the image."""
         return (rows - self.index + self.count - 1) // self.count
 
     def block_row(self, row: Array) -> Array:
-        """Finds the row of blocks in the image of a row of blocks in the strip.
-
-        Args:
-          row: Row numbers in the strip, int.
-
-        Returns:
-          Row numbers in the image.
-        """
+        """Finds the row of blocks in the image of a row of blocks in the strip."""
         return row * self.count + self.index
 
     def tile_row(self, row: Array) -> Array:
-        """Finds the row of tiles in the image of a row of tiles in the strip.
-
-        Args:
-          row: Row numbers in the strip, int.
-
-        Returns:
-          Row numbers in the image.
-        """
+        """Finds the row of tiles in the image of a row of tiles in the strip."""
         return self.block_row(row // BLOCK) * BLOCK + row % BLOCK
 
 
@@ -64,30 +43,12 @@ FULL_IMAGE = Strip()
 
 
 def tile_rows(height: int, tile: int, count: int) -> int:
-    """Counts the rows of tiles of each strip.
-
-    Args:
-      height: Height of the image, px.
-      tile: Edge of a tile, px.
-      count: Number of strips.
-
-    Returns:
-      Number of rows; with several strips a multiple of BLOCK.
-    """
+    """Counts the rows of tiles of each of `count` strips; with several strips a multiple of BLOCK."""
     return -(-height // tile) if count == 1 else -(-height // (BLOCK * tile * count)) * BLOCK
 
 
 def split_into_strips(image: Array, tile: int, count: int) -> Array:
-    """Divides an image into strips.
-
-    Args:
-      image: (H, W, ...).
-      tile: Edge of a tile, px.
-      count: Number of strips.
-
-    Returns:
-      (count, rows of a strip in px, W, ...), zero below the image.
-    """
+    """Divides an image (H, W, ...) into strips (count, rows of a strip in px, W, ...), zero below the image."""
     height, *rest = image.shape
     rows = tile_rows(height, tile, count) * tile
     image = jnp.pad(image, [(0, count * rows - height)] + [(0, 0)] * len(rest))
@@ -97,16 +58,7 @@ def split_into_strips(image: Array, tile: int, count: int) -> Array:
 
 
 def join_strips(strips: Array, tile: int, height: int) -> Array:
-    """Joins strips: the inverse of `split_into_strips`.
-
-    Args:
-      strips: (count, rows in px, W, ...).
-      tile: Edge of a tile, px.
-      height: Height of the image, px.
-
-    Returns:
-      (H, W, ...) image.
-    """
+    """Joins strips (count, rows in px, W, ...) to an image (H, W, ...): the inverse of `split_into_strips`."""
     count, rows, *rest = strips.shape
     if count == 1:
         return strips[0, :height]
@@ -123,9 +75,6 @@ def map_strips(local: Callable, divided: Any, common: Any, mesh: Mesh | None, *,
       common: Arrays that every device gets entirely.
       mesh: Devices, or None for one strip, the whole image.
       total: Whether to add up the results instead of joining them along their leading axes.
-
-    Returns:
-      The joined or added results.
     """
     if mesh is None:
         return local(FULL_IMAGE, divided, common)

@@ -59,16 +59,7 @@ class TileLists:
 
 
 def tile_grid(width: int, height: int, tile: int) -> tuple[int, int]:
-    """Counts the tiles of an image.
-
-    Args:
-      width: Width of the image, px.
-      height: Height of the image, px.
-      tile: Edge of a tile, px.
-
-    Returns:
-      Tiles across and down.
-    """
+    """Counts the tiles of an image across and down."""
     return -(-width // tile), -(-height // tile)
 
 
@@ -88,32 +79,16 @@ def _rectangles(projection: Projection, width: int, height: int, edge: int, stri
 
 
 def pair_counts(projection: Projection, width: int, height: int, *, strip: Strip = FULL_IMAGE) -> Int[Array, " n"]:
-    """Counts the blocks of BLOCK x BLOCK tiles that each splat touches.
-
-    Args:
-      projection: N splats.
-      width: Width of the image, px.
-      height: Height of the image, px.
-      strip: Strip whose blocks count.
-
-    Returns:
-      (N,) int32.
-    """
+    """Counts the blocks of BLOCK x BLOCK tiles of a strip that each splat touches, (N,) int32."""
     x0, x1, y0, y1 = _rectangles(projection, width, height, BLOCK * TILE, strip)
     return (x1 - x0) * (y1 - y0)
 
 
-def depth_order(depths: Float[Array, " n"]) -> Int[Array, " n"]:
+def _depth_order(depths: Float[Array, " n"]) -> Int[Array, " n"]:
     """Sorts positive depths, ties in index order.
 
     Positive float32 sort like their bits, so depth and index pack into one 64-bit key: XLA's CPU sort of one key is
     about five times faster than its sort of a key and a value. Float64 depths use a stable argsort.
-
-    Args:
-      depths: (N,) positive.
-
-    Returns:
-      (N,) int32 indices.
     """
     if depths.dtype != jnp.float32:
         return jnp.argsort(depths, stable=True).astype(jnp.int32)
@@ -154,7 +129,7 @@ def _sorted_pairs(blocks: Array, owner: Array, depths: Array, number: int) -> tu
 
 
 def _sorted_pairs_by_rank(blocks: Array, owner: Array, depths: Array) -> tuple[Array, Array]:
-    order = depth_order(depths)
+    order = _depth_order(depths)
     ranks = jnp.zeros_like(order).at[order].set(lax.iota(jnp.int32, order.shape[0]), unique_indices=True)
     blocks, rank = _sort_packed((blocks, 32), (ranks[owner], 32))
     return blocks, order[rank]
@@ -172,12 +147,6 @@ def tile_lists(
       capacity: Maximum number of (block, Gaussian) pairs; more are counted in `overflow`.
       tile: Edge of a tile, px.
       strip: The strip.
-
-    Returns:
-      The lists.
-
-    Raises:
-      ValueError: The capacity is not positive or exceeds int32.
     """
     most = (2**31 - 1) // _TILES - WORD  # so that int32 can count their tiles
     require(0 < capacity <= most, "capacity", capacity, f"1 to {most} pairs", "Render such a large image in parts.")
@@ -188,6 +157,9 @@ def tile_lists(
     rows = tile_rows(height, tile, strip.count)
     across, down = tile_grid(width, rows * tile, edge)
     number = across * down
+    if not projection.depths.shape[0]:
+        empty = jnp.zeros(rows * -(-width // tile), jnp.int32)
+        return TileLists(empty[:0], empty, empty, jnp.zeros(1, jnp.int32), tile)
     x0, x1, y0, y1 = _rectangles(projection, width, height, edge, strip)
     # Pairs are laid out Gaussian after Gaussian; `owner` is the Gaussian of each. The cumulative sum saturates instead
     # of wrapping at 2^31 pairs: beyond the capacity its exact value affects only the overflow.
@@ -219,8 +191,8 @@ def tile_lists(
     ellipses = [projection.means_px, projection.whitening, projection.opacities[:, None]]
     ellipses = lax.stop_gradient(jnp.concatenate(ellipses, axis=1))
     reach = functools.partial(_reached_tiles, ellipses, across=across, number=number, tile=tile, strip=strip)
-    members, before = tile_bits(reach, owner, blocks, _TILES, total, chunk)
-    gaussians = compact_tile_lists(members, before, owner, total, chunk)
+    members, before = _tile_bits(reach, owner, blocks, _TILES, total, chunk)
+    gaussians = _compact_tile_lists(members, before, owner, total, chunk)
 
     # The list of a tile runs from the first pair of its block to the first pair of the next block.
     first = jnp.searchsorted(blocks, lax.iota(jnp.int32, number + 1)).astype(jnp.int32)
@@ -302,7 +274,7 @@ def _transpose_words(reached: UInt[Array, " pairs"], tiles: int) -> UInt[Array, 
     return lax.reduce(bits, jnp.uint32(0), lax.bitwise_or, (1,))
 
 
-def tile_bits(
+def _tile_bits(
     reach: Callable[[Array, Array], Array], owner: Array, blocks: Array, tiles: int, total: Array, chunk: int
 ) -> tuple[UInt[Array, "words t"], Int[Array, "words t"]]:
     """Computes the bits of all segments, and the number of set bits before each.
@@ -312,7 +284,7 @@ def tile_bits(
       owner: (pairs,) Gaussian of each pair, in whole chunks.
       blocks: (pairs,) block of each pair.
       tiles: Number of tiles of a block.
-      total: () number of pairs in use.
+      total: Number of pairs in use.
       chunk: Number of pairs per chunk.
 
     Returns:
@@ -342,24 +314,21 @@ def tile_bits(
     return members, jnp.where(filled, before, of_tile) + (lax.cumsum(of_tile) - of_tile)
 
 
-def compact_tile_lists(
+def _compact_tile_lists(
     members: UInt[Array, "words t"],
     before: Int[Array, "words t"],
     owner: Int[Array, " pairs"],
     total: Array,
     chunk: int,
 ) -> Array:
-    """Lists the owners of the set bits.
+    """Lists the owners of the set bits in the order of `before`, (32 words tiles,) int32; arbitrary after the last.
 
     Args:
-      members: (words, tiles) bits of `tile_bits`.
-      before: (words, tiles) number of set bits before each word.
-      owner: (pairs,) Gaussian of each pair.
-      total: () number of pairs in use.
+      members: Bits of `_tile_bits`.
+      before: Number of set bits before each word.
+      owner: Gaussian of each pair.
+      total: Number of pairs in use.
       chunk: Number of pairs per chunk.
-
-    Returns:
-      (32 words tiles,) int32 owners in the order of `before`; arbitrary after the last.
     """
     words, tiles = members.shape
     slots, chunk = -(-WORD * words * tiles // _CHUNK_SLOTS) * _CHUNK_SLOTS, chunk // WORD

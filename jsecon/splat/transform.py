@@ -22,17 +22,11 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -
     """Transforms Gaussians: positions, sizes, orientations and spherical harmonics.
 
     A camera that is transformed too sees the same image. Arrays keep their kind (NumPy, jax) and dtype: float64 means
-    (NumPy) are transformed in float64.
+    (NumPy) are transformed in float64. The identity returns the same object.
 
     Args:
       gaussians: N Gaussians.
-      similarity: (4, 4) concrete matrix of x' = s R x + t, with R a rotation and s > 0.
-
-    Returns:
-      The Gaussians in the new world; the same object for the identity.
-
-    Raises:
-      ValueError: The matrix is not a similarity.
+      similarity: Concrete matrix of x' = s R x + t, with R a rotation and s > 0; a ValueError for any other.
     """
     matrix = np.asarray(similarity, np.float64)
     if np.array_equal(matrix, np.eye(4)):
@@ -60,33 +54,16 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -
 
 
 def transform_gaussians_float64(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -> Gaussians:
-    """Calls `transform_gaussians` on the host with float64 means.
+    """Calls `transform_gaussians` on the host (NumPy) with float64 means.
 
     Needed into and out of worlds with large coordinates (map projections), where float32 cannot represent millimetres.
-
-    Args:
-      gaussians: N Gaussians; means may be float64.
-      similarity: (4, 4) matrix of x' = s R x + t.
-
-    Returns:
-      The Gaussians in the new world, NumPy, means float64.
-
-    Raises:
-      ValueError: The matrix is not a similarity.
     """
     host = jax.tree.map(np.asarray, gaussians)
     return transform_gaussians(dataclasses.replace(host, means=host.means.astype(np.float64)), similarity)
 
 
 def float32_rounding(gaussians: Gaussians) -> Float[np.ndarray, " n"]:
-    """Measures what float32 would cost the means.
-
-    Args:
-      gaussians: N Gaussians with float64 means.
-
-    Returns:
-      (N,) the rounding of each mean in units of the largest standard deviation of its Gaussian.
-    """
+    """Measures what float32 would cost each float64 mean, in units of its Gaussian's largest standard deviation."""
     means = np.asarray(gaussians.means)
     moved = np.abs(means - means.astype(np.float32).astype(np.float64)).max(axis=1, initial=0.0)
     sizes = np.asarray(gaussians.log_scales, np.float64).max(axis=1, initial=-np.inf)
@@ -95,19 +72,9 @@ def float32_rounding(gaussians: Gaussians) -> Float[np.ndarray, " n"]:
 
 
 def transform_axes(gaussians: Gaussians, axes: Float[Array, "4 4"]) -> Gaussians:
-    """Transforms Gaussians between axes that may differ in handedness.
+    """Transforms Gaussians between axes that may differ in handedness, by a similarity that may mirror.
 
     A Gaussian equals its mirror image along its axes, so mirroring is a rotation.
-
-    Args:
-      gaussians: N Gaussians.
-      axes: (4, 4) similarity that may mirror.
-
-    Returns:
-      The Gaussians in the new world.
-
-    Raises:
-      ValueError: The matrix is not a similarity, mirrored or not.
     """
     matrix = np.asarray(axes, np.float64)
     if np.linalg.det(matrix[:3, :3]) > 0:
@@ -131,12 +98,8 @@ def transform_blocks(
 ) -> Iterator[tuple[slice, Gaussians]]:
     """Transforms Gaussians in blocks of BLOCK_ROWS rows; memory-mapped columns need not fit into memory.
 
-    Args:
-      gaussians: N Gaussians.
-      similarity: (4, 4) matrix of x' = s R x + t; None copies the blocks to NumPy.
-
     Yields:
-      The rows of each block, and its Gaussians (NumPy).
+      The rows of each block, and its Gaussians (NumPy); without a similarity they are copied.
     """
     for first in range(0, gaussians.count, BLOCK_ROWS):
         rows = slice(first, min(first + BLOCK_ROWS, gaussians.count))

@@ -20,27 +20,12 @@ from jsecon.types import Array, Camera, Gaussians
 
 ROWS = 1 << 18
 """Gaussians of a block."""
-_HIDDEN_LOGIT = -np.inf
-"""Opacity logit of the rows that fill a size up."""
 
 
 def visible_rows(
     gaussians: Gaussians, camera: Camera, *, near: float = NEAR, rows: int = ROWS
 ) -> Int[np.ndarray, " m"]:
-    """Finds the Gaussians that a view can see.
-
-    Args:
-      gaussians: Scene of N Gaussians; its columns may be memory-mapped.
-      camera: The view.
-      near: Near plane, world units.
-      rows: Gaussians that are read at once.
-
-    Returns:
-      (M,) int64 ids, ascending.
-
-    Raises:
-      ValueError: Shapes disagree.
-    """
+    """Finds the ids (ascending) of the Gaussians that a view can see, reading `rows` at a time."""
     check_gaussians(gaussians, camera)
     geometry = dataclasses.replace(gaussians, sh=np.zeros((gaussians.count, 0, 3), np.float32))
     ids = [np.zeros(0, np.int64)]
@@ -62,15 +47,7 @@ def _padded_size(count: int) -> int:
 
 
 def geometry_of_rows(gaussians: Gaussians, ids: Int[np.ndarray, " m"]) -> Gaussians:
-    """Reads the geometry of some Gaussians. Host code.
-
-    Args:
-      gaussians: Scene of N Gaussians; its columns may be memory-mapped.
-      ids: (M,) rows.
-
-    Returns:
-      The M Gaussians in black, float32 (NumPy), then transparent ones up to `_padded_size(M)`.
-    """
+    """Reads the geometry of some Gaussians, in black, then transparent ones up to `_padded_size(M)`. Host code."""
     size = _padded_size(len(ids))
     bare = dataclasses.replace(gaussians, sh=np.zeros((gaussians.count, 0, 3), np.float32))
 
@@ -78,23 +55,12 @@ def geometry_of_rows(gaussians: Gaussians, ids: Int[np.ndarray, " m"]) -> Gaussi
         return np.zeros((size - len(ids), *a.shape[1:]), np.float32)
 
     part = jax.tree.map(lambda a: np.concatenate([np.asarray(a[ids], np.float32), fill(a)]), bare)
-    part.opacity_logits[len(ids) :] = _HIDDEN_LOGIT
+    part.opacity_logits[len(ids) :] = -np.inf
     return dataclasses.replace(part, sh=np.zeros((size, 1, 3), np.float32))
 
 
 def render_in_blocks(gaussians: Gaussians, camera: Camera) -> Float[np.ndarray, "h w 3"]:
-    """Renders the features of `render_rgb` of N Gaussians whose columns may be memory-mapped.
-
-    Args:
-      gaussians: The scene. Its numbers must be finite.
-      camera: The view.
-
-    Returns:
-      The image.
-
-    Raises:
-      ValueError: Shapes disagree.
-    """
+    """Renders the features of `render_rgb` of N finite Gaussians whose columns may be memory-mapped."""
     camera = jax.tree.map(np.asarray, camera)
     ids = visible_rows(gaussians, camera)
     colours = np.zeros((_padded_size(len(ids)), 3), np.float32)

@@ -1,0 +1,229 @@
+"""Pure public functions at the ends of their input: no Gaussian or one, no region, no frame or one, one dimension, and
+unsigned labels. A row of CALLS is a function, the ends that apply to it, and the shapes of what it must return.
+
+To add a function, add a row: `name: (ends, call)`, where `call(world)` returns pairs (array, expected shape)."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from conftest import gaussians_at, look_at
+
+import jsecon
+from jsecon import Camera, Gaussians, LanguageField, Regions, Votes
+
+HEIGHT, WIDTH = 12, 16
+
+
+@dataclasses.dataclass(frozen=True)
+class World:
+    """A scene of `n` Gaussians with `t` views, `r` regions and vectors of `d` numbers."""
+
+    n: int = 3
+    t: int = 2
+    r: int = 2
+    d: int = 4
+    dtype: Any = np.int16
+
+    def rows(self, count: int) -> np.ndarray:
+        """(count, d) unit vectors."""
+        rows = np.random.default_rng(count).normal(size=(count, self.d)).astype(np.float32)
+        return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+    @property
+    def gaussians(self) -> Gaussians:
+        means = np.random.default_rng(1).uniform(-0.5, 0.5, (self.n, 3))
+        return gaussians_at(means, 0.2, sh=np.zeros((4, 3)))
+
+    @property
+    def cameras(self) -> Camera:
+        poses = np.array([look_at((0.2 * k, -0.3, -2.5)) for k in range(self.t)], np.float32).reshape(-1, 4, 4)
+        return Camera(poses, *(np.full(self.t, v, np.float32) for v in (16, 16, 8, 6)), width=WIDTH, height=HEIGHT)
+
+    @property
+    def camera(self) -> Camera:
+        return dataclasses.replace(self, t=1).cameras[0]
+
+    @property
+    def labels(self) -> np.ndarray:
+        """Each row of pixels one region in turn; unsigned labels have no -1."""
+        least = -1 if np.dtype(self.dtype).kind == "i" else 0
+        rows = np.arange(HEIGHT) % max(self.r - least, 1) + least if self.r else np.full(HEIGHT, -1)
+        return np.broadcast_to(rows[:, None], (self.t, HEIGHT, WIDTH)).astype(self.dtype)
+
+    @property
+    def votes(self) -> Votes:
+        """All Gaussians of region 0, seen in every view."""
+        ones = np.ones(self.n, np.float32) * (self.r > 0)
+        regions = np.full((self.n, 2), -1, np.int32)
+        regions[:, 0] = min(self.r, 1) - 1
+        weights = np.stack([ones, 0 * ones], axis=1)
+        views = np.full(self.n, self.t, np.int32)
+        by_view = np.broadcast_to(ones / max(self.t, 1), (self.t, self.n))
+        return Votes(regions, weights, ones, ones, 0.5 * ones, views, np.int32(0), self.r, by_view)
+
+    @property
+    def regions(self) -> Regions:
+        return Regions(self.rows(self.r), np.full((self.r, self.t), 50, np.int32))
+
+    @property
+    def field(self) -> LanguageField:
+        votes = jsecon.with_overlap(jsecon.normalise_votes(self.votes, self.regions))
+        names = tuple(f"f{t}" for t in range(self.t))
+        canonical, words = self.rows(4), self.rows(8)
+        given = (self.gaussians, votes, self.regions, self.cameras, canonical, np.eye(4), names)
+        return jax.tree.map(np.asarray, LanguageField(*given, unrelated_words=words))
+
+
+def image(rendering, channels: int) -> list:
+    return [(rendering.features, (HEIGHT, WIDTH, channels)), (rendering.alpha, (HEIGHT, WIDTH))]
+
+
+def selected(selection, world: World) -> list:
+    return [(selection.mask, (world.n,)), (selection.similarity, (world.n,))]
+
+
+def planned(world: World) -> list:
+    plan = jsecon.plan_view(world.gaussians, world.camera)
+    background = np.ones(world.d, np.float32)
+    return [
+        (plan.overflow, ()),
+        *image(jsecon.render_plan(plan, world.rows(world.n), background=background), world.d),
+    ]
+
+
+def accumulated(votes: Votes, world: World) -> list:
+    assert int(votes.overflow) == 0
+    kept = min(8, max(world.r, 1))
+    return [(votes.weights[:, :kept], (world.n, min(kept, votes.weights.shape[1]))), (votes.total, (world.n,))]
+
+
+def embedded(world: World) -> list:
+    def embed(frame, masks):
+        return world.rows(len(masks)) if len(masks) else np.zeros((0, world.d), np.float32)
+
+    frames = np.zeros((world.t, HEIGHT, WIDTH, 3), np.uint8)
+    regions = jsecon.region_embeddings(frames, world.labels, embed, num_regions=world.r)
+    return [(regions.pixel_counts, (world.r, world.t))]
+
+
+def tracked(world: World) -> list:
+    def segment(frame, index):
+        return np.arange(HEIGHT)[None, :, None] // 6 == np.arange(2)[:, None, None] + np.zeros((1, 1, WIDTH), int)
+
+    def follow(frames, *_):
+        return np.zeros(frames.shape[:3], int)
+
+    frames = np.zeros((world.t, HEIGHT, WIDTH, 3), np.uint8)
+    return [(jsecon.masklets(frames, segment, follow), (world.t, HEIGHT, WIDTH))]
+
+
+def distilled(world: World) -> list:
+    labels, codes = world.labels, world.rows(world.r)
+    result = jsecon.distill_l1(world.gaussians, world.cameras, labels, codes, steps=2, key=jax.random.key(0))
+    return [(result.codes, (world.n, world.d))]
+
+
+def shapes(world: World) -> list:
+    labels = np.zeros(world.n, np.int32) if world.r else np.full(world.n, -1, np.int32)
+    found = jsecon.object_shapes(np.asarray(world.gaussians.means), labels)
+    return [(found.center, (int(world.n * world.r > 0), 3))]
+
+
+def lifted(world: World) -> list:
+    masks = np.ones((world.t, HEIGHT, WIDTH), bool)
+    return selected(jsecon.lift(world.field, masks, list(range(world.t))), world)
+
+
+SCENE, FIELD = "n1 n0 d1", "n1 n0 t1 r0 d1"
+CALLS: dict[str, tuple[str, Callable[[World], list]]] = {
+    "project": ("n1 n0", lambda w: [(jsecon.project(w.gaussians, w.camera).means_px, (w.n, 2))]),
+    "render": (SCENE, lambda w: image(jsecon.render(w.gaussians, w.camera, w.rows(w.n)), w.d)),
+    "render_rgb": ("n1 n0", lambda w: image(jsecon.render_rgb(w.gaussians, w.camera), 3)),
+    "render_depth": ("n1 n0", lambda w: [(jsecon.render_depth(w.gaussians, w.camera).depth, (HEIGHT, WIDTH))]),
+    "plan_view": (SCENE, planned),
+    "plan_capacity": ("n1 n0 t1 t0", lambda w: [(np.asarray(jsecon.plan_capacity(w.gaussians, w.cameras)), ())]),
+    "region_votes": (
+        "n1 n0 t1 t0 r0 uint8 uint16",
+        lambda w: accumulated(jsecon.region_votes(w.gaussians, w.cameras, w.labels, w.r), w),
+    ),
+    "region_embeddings": ("t1 t0 r0 d1 uint8 uint16", embedded),
+    "normalise_votes": ("n1 n0 t1 t0 r0", lambda w: accumulated(jsecon.normalise_votes(w.votes, w.regions), w)),
+    "add_visible_weight": ("n1 n0 t1 t0 r0", lambda w: accumulated(jsecon.add_visible_weight(w.votes, w.regions), w)),
+    "with_overlap": ("n1 n0 t1 t0 r0", lambda w: [(jsecon.with_overlap(w.votes).overlap, (w.r, w.r))]),
+    "distill_votes": ("n1 n0 r0 d1", lambda w: [(jsecon.distill_votes(w.votes, w.rows(w.r)), (w.n, w.d))]),
+    "distill_l1": ("n1 n0 t1 d1 uint8", distilled),
+    "query_anchored": (FIELD, lambda w: selected(jsecon.query_anchored(w.field, w.rows(1)[0]), w)),
+    "query_several": (FIELD, lambda w: selected(jsecon.query_several(w.field, w.rows(2)), w)),
+    "query_region": ("n1 n0 t1 d1", lambda w: selected(jsecon.query_region(w.field, 0), w)),
+    "query_classes": ("n1 n0 t1 d1", lambda w: [(jsecon.query_classes(w.field, w.rows(3)).labels, (w.n,))]),
+    "query_one_step": (
+        "n1 n0 d1",
+        lambda w: selected(jsecon.query_one_step(w.rows(w.n), w.rows(1)[0], 0.5), w),
+    ),
+    "query_canonical": (
+        "n1 n0 d1",
+        lambda w: selected(jsecon.query_canonical(w.rows(w.n), w.rows(1)[0], w.rows(4), 0.5), w),
+    ),
+    "lift": ("n1 n0 t1 r0", lifted),
+    "region_at": ("n1 n0 t1", lambda w: [(np.asarray(jsecon.region_at(w.field, 0, 8, 6)), ())]),
+    "selection_mask": (
+        "n1 n0",
+        lambda w: [(jsecon.selection_mask(w.gaussians, w.camera, np.ones(w.n, bool)), (HEIGHT, WIDTH))],
+    ),
+    "remove_outliers": (
+        "n1 n0",
+        lambda w: [(jsecon.remove_outliers(np.asarray(w.gaussians.means), np.ones(w.n, bool)), (w.n,))],
+    ),
+    "object_shapes": ("n1 n0 r0", shapes),
+    "iou": ("n1 n0", lambda w: [(jsecon.iou(np.ones(w.n, bool), np.ones(w.n, bool)), ())]),
+    "train_autoencoder": (
+        "d1",
+        lambda w: [
+            (
+                jsecon.encode(
+                    jsecon.train_autoencoder(w.rows(5), latent=1, key=jax.random.key(0), epochs=1), w.rows(5)
+                ),
+                (5, 1),
+            )
+        ],
+    ),
+    "masklets": ("t1 t0", tracked),
+}
+ENDS = {
+    "n0": {"n": 0},
+    "n1": {"n": 1},
+    "t0": {"t": 0},
+    "t1": {"t": 1},
+    "r0": {"r": 0},
+    "d1": {"d": 1},
+    "uint8": {"dtype": np.uint8},
+    "uint16": {"dtype": np.uint16},
+}
+
+
+@pytest.mark.parametrize(("name", "end"), [(name, end) for name, (ends, _) in CALLS.items() for end in ends.split()])
+def test_a_function_takes_the_ends_of_its_input(name, end):
+    for array, shape in CALLS[name][1](World(**ENDS[end])):
+        assert np.shape(array) == shape
+        assert np.isfinite(np.asarray(array, np.float64)).all()
+
+
+def test_the_table_has_every_pure_function():
+    """Those that are left out read or write files, print, or take a record that a row's function makes."""
+    others = {
+        *("objects", "show", "to_html", "to_png", "locate", "open_scene", "check_backend", "host_mesh"),
+        *("check_field", "load_field", "save_field", "load_capture", "load_gaussians", "save_gaussians", "load_ply"),
+        *("save_ply", "mean_iou", "accuracy_at", "localization_accuracy", "encode", "decode", "match_regions"),
+        *("select_gaussians", "membership_probability", "render_plan", "scan_region_votes"),
+        *("region_votes_in_blocks", "normalise_votes_in_blocks", "query_in_blocks"),
+    }
+    functions = {
+        name
+        for name in jsecon.__all__
+        if callable(getattr(jsecon, name)) and not isinstance(getattr(jsecon, name), type)
+    }
+    assert functions <= CALLS.keys() | others
