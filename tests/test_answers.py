@@ -72,7 +72,7 @@ class Told(Listener):
     def __init__(self):
         self.lines = []
 
-    def say(self, text):
+    def print_line(self, text):
         self.lines.append(text)
 
 

@@ -21,7 +21,7 @@ class Ears(Listener):
     def __init__(self):
         self.said, self.fresh = [], {}
 
-    def say(self, text):
+    def print_line(self, text):
         self.said.append(text)
 
     def done(self, name, seconds, fresh):

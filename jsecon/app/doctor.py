@@ -79,7 +79,7 @@ def _doctor(verb: verbs.Doctor, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon doctor`; a check that fails and that every run depends on is an error."""
     with console.progress("checks"):
         checks = run_checks(verb.models)
-    console.say("\n".join(f"{check.status:<8} {check.name:<10} {check.message}" for check in checks))
+    console.print_line("\n".join(f"{check.status:<8} {check.name:<10} {check.message}" for check in checks))
     failed = [check for check in checks if check.remedy and check.status != "ok"]
     return {"checks": checks, "errors": [InputError(c.name, c.message, remedy=c.remedy) for c in failed]}
 

@@ -70,7 +70,7 @@ def _eval(verb: verbs.Eval, console: Console) -> verbs.VerbResult:
         for kind, (rows, summary) in results.items()
     }
     write_text(out / "evaluation.json", json.dumps(pairs, indent=2) + "\n")
-    console.say(f"all pairs  {out / 'evaluation.json'}")
+    console.print_line(f"all pairs  {out / 'evaluation.json'}")
     return {"written": {"pairs": out / "evaluation.json"}} | {kind: summary for kind, (_, summary) in results.items()}
 
 
@@ -83,8 +83,8 @@ def print_table(results: Evaluation, listener: Listener) -> None:
     """Prints the protocol, and mIoU, mAcc@0.25 and localisation accuracy of each kind of query."""
     _, first = next(iter(results.values()))
     counts = f"{first['pairs']} pairs of {first['queries']} queries in {first['frames']} frames"
-    listener.say(f"{first['protocol']}\n{counts}")
-    listener.say(f"  {'query':<14} {'mIoU':>6} {'mAcc@0.25':>10} {'Loc. acc.':>10} {'missing':>8}")
+    listener.print_line(f"{first['protocol']}\n{counts}")
+    listener.print_line(f"  {'query':<14} {'mIoU':>6} {'mAcc@0.25':>10} {'Loc. acc.':>10} {'missing':>8}")
     for kind, (_, summary) in results.items():
         shares = f"{summary['miou']:>6.3f} {summary['macc']:>10.3f} {summary['loc_acc']:>10.3f}"
-        listener.say(f"  {kind:<14} {shares} {summary['missing']:>8}")
+        listener.print_line(f"  {kind:<14} {shares} {summary['missing']:>8}")

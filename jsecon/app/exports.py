@@ -63,7 +63,7 @@ def _objects(verb: verbs.Objects, console: Console) -> verbs.VerbResult:
     if verb.out is None:
         return result
     files = _write_catalogue(scene, listed, verb.out, console)
-    console.say(f"pictures  {files['catalogue']}")
+    console.print_line(f"pictures  {files['catalogue']}")
     return result | {"written": files}
 
 
@@ -92,7 +92,7 @@ def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
         option = "--only" if verb.only is not None else "--without"
         raise InputError(option, f"{text!r} selects no Gaussian", answer.reason, "Ask with other words.")
     if answer is not None:
-        console.say(str(answer))
+        console.print_line(str(answer))
     mask = None if answer is None else ~answer.mask if verb.without is not None else answer.mask
     count = scene.field.gaussians.count if mask is None else int(mask.sum())
     result: verbs.VerbResult = {"written": {}, "gaussians": count}
@@ -101,18 +101,18 @@ def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
             scene.export(verb.out, mask, object_ids=scene.objects().labels if verb.with_labels else None)
             result["bytes"] = verb.out.stat().st_size
             result["written"]["scene"] = verb.out
-            console.say(f"{count} Gaussians, {result['bytes'] / 2**20:.1f} MiB  {verb.out}")
+            console.print_line(f"{count} Gaussians, {result['bytes'] / 2**20:.1f} MiB  {verb.out}")
         if verb.labels is not None:
             ids = scene.objects().labels.astype(np.int32)
             ids = ids if mask is None else ids[mask]
             with atomic_write(verb.labels) as temporary, temporary.open("wb") as stream:
                 np.save(stream, ids)
             result["written"]["labels"] = verb.labels
-            console.say(f"{len(ids)} ids of objects, {int((ids < 0).sum())} of them -1  {verb.labels}")
+            console.print_line(f"{len(ids)} ids of objects, {int((ids < 0).sum())} of them -1  {verb.labels}")
         if verb.objects is not None:
             files = _save_objects(scene, scene.objects(), verb.objects)
             result["written"]["objects"] = files
-            console.say(f"{len(files)} objects  {verb.objects}")
+            console.print_line(f"{len(files)} objects  {verb.objects}")
     return result
 
 
@@ -139,17 +139,17 @@ def _check_export(verb: verbs.Export) -> None:
 def _print_catalogue(catalogue: Catalogue, listener: Listener) -> None:
     """Prints a line for each object; parts are indented under their wholes."""
     wide = max((len(_title(catalogue, n)) for n in range(len(catalogue))), default=4) + 2
-    listener.say(f"{'id':>4}  {'name':<{wide}}  prob.  Gaussians  views  conf.  size, centre")
+    listener.print_line(f"{'id':>4}  {'name':<{wide}}  prob.  Gaussians  views  conf.  size, centre")
     for n in range(len(catalogue)):
         name = ("  " if catalogue.parent[n] >= 0 else "") + _title(catalogue, n)
         figures = f"{catalogue.probability[n, 0]:5.2f}  {catalogue.shapes.count[n]:9d}  {catalogue.views[n]:5d}"
         place = f"{_size(catalogue, n)}, at ({_center(catalogue, n)})"
         ending = ", surroundings" if catalogue.surroundings[n] else ""
-        listener.say(f"{n:>4}  {name:<{wide}}  {figures}  {catalogue.confidence[n]:5.2f}  {place}{ending}")
+        listener.print_line(f"{n:>4}  {name:<{wide}}  {figures}  {catalogue.confidence[n]:5.2f}  {place}{ending}")
     if hidden := int((catalogue.regions < 0).sum()):
-        listener.say(f"  too small to be listed, with fewer than {MIN_SAMPLES} Gaussians: {hidden} regions")
+        listener.print_line(f"  too small to be listed, with fewer than {MIN_SAMPLES} Gaussians: {hidden} regions")
     elif not len(catalogue):
-        listener.say("  there are no objects: the field has no regions")
+        listener.print_line("  there are no objects: the field has no regions")
 
 
 def _write_catalogue(scene: Scene, catalogue: Catalogue, out: Path, listener: Listener) -> dict[str, Path]:

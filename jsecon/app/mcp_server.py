@@ -111,5 +111,7 @@ def _mcp(verb: verbs.Mcp, console: Console) -> verbs.VerbResult:
     with console.progress("fields"):
         scenes = open_scenes(verb.fields, with_models(verb, console, yes=False).embedder)
     for scene in scenes.values():
-        console.say(f"{scene.name}: {scene.field.gaussians.count} Gaussians, {scene.field.regions.count} regions")
+        console.print_line(
+            f"{scene.name}: {scene.field.gaussians.count} Gaussians, {scene.field.regions.count} regions"
+        )
     return {"then": make_server(scenes).run}

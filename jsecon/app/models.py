@@ -117,13 +117,15 @@ def _models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
 def _list_models(console: Console) -> verbs.VerbResult:
     """Prints the catalogue: name, role, size, licence, whether it is on this machine, and what it is good for."""
     rows = []
-    console.say(f"{TABLE_HEAD:<34}  {'here':<10} {'licence':<25} adds")
+    console.print_line(f"{TABLE_HEAD:<34}  {'here':<10} {'licence':<25} adds")
     for row, line in zip(hub.catalogue(), _table_lines()):
         cached = [each for each in row.megabytes if row.in_precision(each).cached_folder is not None]
-        console.say(f"{line:<34}  {' '.join(cached) or '-':<10} {row.licence:<25} {row.purpose}")
+        console.print_line(f"{line:<34}  {' '.join(cached) or '-':<10} {row.licence:<25} {row.purpose}")
         rows.append(dataclasses.asdict(row) | {"cached": cached})
-    console.say(TABLE_NOTE)
-    console.say("jsecon models get NAME fetches one; hub:owner/name names any other repository of huggingface.co.")
+    console.print_line(TABLE_NOTE)
+    console.print_line(
+        "jsecon models get NAME fetches one; hub:owner/name names any other repository of huggingface.co."
+    )
     return {"models": rows}
 
 
@@ -138,7 +140,7 @@ def _get_models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
             except InputError as error:
                 errors.append(error)
                 continue
-            console.say(f"{name}  {model.role}  {folder}")
+            console.print_line(f"{name}  {model.role}  {folder}")
             folders[f"{name} ({model.role})"] = folder
     return {"models": folders, "errors": errors}
 
@@ -153,7 +155,7 @@ def _check_models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
         with console.progress("graphs"):
             report = inspect_models(_cached_model(name))
         for line in report.lines:
-            console.say(line)
+            console.print_line(line)
         results.append(dataclasses.asdict(report))
         if not report.usable:
             problem = f"no model that can be used: neither {', '.join(report.unusable)}"

@@ -75,7 +75,7 @@ def write_answers(
     with listener.progress("pictures") as progress:
         for n, answer in enumerate(answers):
             stem = file_stem(answer)
-            listener.say(str(answer))
+            listener.print_line(str(answer))
             if answer.outlier_words:
                 listener.note(f"{answer.outlier_words}; --keep-outliers keeps them")
             if stem not in records:  # else the question stands there twice
@@ -85,7 +85,7 @@ def write_answers(
             progress(n + 1, len(answers))
     lead = "The mask of each selection over the rendered scene."
     write_text(out / "answers.html", report.page("Answers", lead, list(sections.values())))
-    listener.say(f"pictures  {out / 'answers.html'}")
+    listener.print_line(f"pictures  {out / 'answers.html'}")
     written = {"folder": out, "pictures": out / "answers.html"}
     return {"written": written, "answers": [records[file_stem(answer)] for answer in answers]}
 

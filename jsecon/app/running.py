@@ -57,7 +57,7 @@ def _fit(verb: verbs.Fit, console: Console) -> verbs.VerbResult:
     gaussians, capture, held_out = pipeline.fit(verb.options, folder, listener=console)
     save_gaussians(verb.out, gaussians, similarity=capture.source_from_scene)
     _print_quality(held_out, console)
-    console.say(f"{gaussians.count} Gaussians  {verb.out}")
+    console.print_line(f"{gaussians.count} Gaussians  {verb.out}")
     return {"written": {"scene": verb.out}, "gaussians": gaussians.count} | _quality_metrics(held_out)
 
 
@@ -73,15 +73,15 @@ def _write_run(run: Run, out: Path, listener: Listener) -> dict[str, Any]:
         write_text(out / "report.html", report.page(title, "Made by jsecon from posed frames.", parts))
     _print_quality(run.held_out, listener)
     for note in warnings:
-        listener.say(f"{WARNING}{note}")
-    listener.say(
+        listener.print_line(f"{WARNING}{note}")
+    listener.print_line(
         f"{metrics['gaussians']} Gaussians, {metrics['regions']} regions, "
         f"{sum(run.seconds.values()):.0f} s, peak memory {metrics['peak_memory_mib']:.0f} MiB, "
         f"{run.programs['all']} programs compiled ({run.programs['from_disk']} of them read from disk)"
     )
     field = out / "field.safetensors"
-    listener.say(f"field   {field}\nreport  {out / 'report.html'}")
-    listener.say(f'next    jsecon query {field} "dark green bottle" --out {out / "answers"}')
+    listener.print_line(f"field   {field}\nreport  {out / 'report.html'}")
+    listener.print_line(f'next    jsecon query {field} "dark green bottle" --out {out / "answers"}')
     return metrics
 
 
@@ -99,7 +99,7 @@ def _print_quality(held_out: Quality, listener: Listener) -> None:
     count = len(held_out.frames)
     if count:
         psnr, ssim = float(np.mean(held_out.psnr)), float(np.mean(held_out.ssim))
-        listener.say(f"held-out PSNR {psnr:.2f} dB, SSIM {ssim:.3f} over {count} frames")
+        listener.print_line(f"held-out PSNR {psnr:.2f} dB, SSIM {ssim:.3f} over {count} frames")
 
 
 def run_metrics(run: Run) -> dict[str, Any]:

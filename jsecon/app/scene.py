@@ -122,7 +122,7 @@ def _field_of_gaussians(options: Options, folder: Path, listener: Listener) -> P
     if path is None:
         pipeline.run(options, folder, listener=listener)
         path = folder / FIELD_FILE
-        listener.say(f"field   {path}")
+        listener.print_line(f"field   {path}")
     return path
 
 

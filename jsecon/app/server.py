@@ -317,6 +317,6 @@ def _serve(verb: verbs.Serve, console: Console) -> verbs.VerbResult:
         embedder = with_models(verb, console, yes=False).embedder
         result, serve = prepare(verb.fields, embedder=embedder, **access)
     for scene in result["fields"]:
-        console.say(f"{scene['name']}: {scene['gaussians']} Gaussians, {scene['regions']} regions")
-    console.say(result["address"])
+        console.print_line(f"{scene['name']}: {scene['gaussians']} Gaussians, {scene['regions']} regions")
+    console.print_line(result["address"])
     return result | {"then": serve}

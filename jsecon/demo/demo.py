@@ -50,11 +50,11 @@ def run_demo(out: Path, *, listener: Listener, room: Path = ROOM, steps: int = 5
         metrics = running.run_metrics(run) | {"anchored": summary}
         write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
         write_text(out / "report.html", _page(run, rows, summary, labels))
-    listener.say("measured on the held-out views")
+    listener.print_line("measured on the held-out views")
     evaluation.print_table(results, listener)
     field = out / "field.safetensors"
-    listener.say(f"field   {field}\nanswers {out / 'queries'}\nreport  {out / 'report.html'}")
-    listener.say(f'view it jsecon view {field} "{texts[0]}"  (extra viewer; --export writes a page)')
+    listener.print_line(f"field   {field}\nanswers {out / 'queries'}\nreport  {out / 'report.html'}")
+    listener.print_line(f'view it jsecon view {field} "{texts[0]}"  (extra viewer; --export writes a page)')
     return metrics
 
 

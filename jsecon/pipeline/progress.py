@@ -31,23 +31,23 @@ class Step:
 
 
 class Listener:
-    """Receives the messages of a run. Each becomes a line for `say`, which this base class ignores."""
+    """Receives the messages of a run. Each becomes a line for `print_line`, which this base class ignores."""
 
-    def say(self, text: str) -> None:
+    def print_line(self, text: str) -> None:
         """Receives a line of results."""
 
     def step(self, step: Step) -> None:
         """Receives a step: first all that are planned, later also parts that only the data could settle."""
-        self.say(f"  {step.name:<16} {step.status:<9} {step.why}".rstrip())
+        self.print_line(f"  {step.name:<16} {step.status:<9} {step.why}".rstrip())
 
     def done(self, name: str, seconds: float, fresh: bool) -> None:
         """Receives the end of a stage."""
         if fresh:
-            self.say(f"  {name:<16} {'done':<9} {seconds:.1f} s")
+            self.print_line(f"  {name:<16} {'done':<9} {seconds:.1f} s")
 
     def note(self, text: str) -> None:
         """Receives a note."""
-        self.say(f"  note: {text}")
+        self.print_line(f"  note: {text}")
 
     @contextlib.contextmanager
     def progress(self, name: str) -> Iterator[Callable[[int, int], None]]:
@@ -64,7 +64,7 @@ class Console(Listener):
         self._lock = threading.RLock()  # of what is printed
         self._drawn = False  # a line of progress on the terminal
 
-    def say(self, text: str) -> None:
+    def print_line(self, text: str) -> None:
         """Prints a line, in place of a line of progress that is drawn."""
         with self._lock:
             self._erase()

@@ -212,7 +212,7 @@ def compute_stages(
         cache.prepare(folder)
         for name in plan.stale:
             plan.paths[name].unlink(missing_ok=True)
-        listener.say(f"{context.options.capture} -> {context.out}")
+        listener.print_line(f"{context.options.capture} -> {context.out}")
         for step in plan.steps:
             listener.step(step)
         context.models.require_ready(plan.running)
@@ -323,10 +323,10 @@ def dry_run(options: Options, out: Path, *, scene_only: bool = False, listener: 
         plan = _plan(context, stage_list, out / "cache")
         context.models.require_ready(plan.running)
         _check_inputs(context, plan)
-    listener.say(f"{options.capture} -> {out}, a dry run")
+    listener.print_line(f"{options.capture} -> {out}, a dry run")
     for step in plan.steps:
         listener.step(step)
-    listener.say("Nothing was written.")
+    listener.print_line("Nothing was written.")
     return {"stages": plan.steps}
 
 

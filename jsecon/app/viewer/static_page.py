@@ -53,9 +53,9 @@ def export_page(verb: verbs.View, file: Path, console: Console) -> verbs.VerbRes
         errors = [error for error in results if isinstance(error, InputError)]
         write_text(file, page(scene.field, answers, title=scene.name))
     for answer in answers:
-        console.say(str(answer))
+        console.print_line(str(answer))
     count, size = scene.field.gaussians.count, file.stat().st_size
-    console.say(f"{count} Gaussians, texts answered: {len(answers)}, {size / 2**20:.1f} MiB  {file}")
+    console.print_line(f"{count} Gaussians, texts answered: {len(answers)}, {size / 2**20:.1f} MiB  {file}")
     texts = [str(answer.query) for answer in answers]
     return {"written": {"page": file}, "gaussians": count, "answers": texts, "bytes": size, "errors": errors}
 

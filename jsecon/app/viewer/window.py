@@ -246,8 +246,8 @@ def _view(verb: verbs.View, console: Console) -> verbs.VerbResult:
     state = ViewState(tuple(dict.fromkeys(verb.texts)))
     access = {"host": verb.host, "port": verb.port, "token": token, "hosts": verb.allow_host}
     viewer = open_viewer(scene, state=state, **access)
-    console.say(f"{scene.name}: {scene.field.gaussians.count} Gaussians, {scene.field.regions.count} regions")
+    console.print_line(f"{scene.name}: {scene.field.gaussians.count} Gaussians, {scene.field.regions.count} regions")
     query = f"/?{urlencode({'token': token})}" if token else ""
-    console.say(f"http://{bracketed(verb.host)}:{viewer.server.get_port()}{query}")
+    console.print_line(f"http://{bracketed(verb.host)}:{viewer.server.get_port()}{query}")
     viewer.run()
     return {}
