@@ -16,7 +16,7 @@ import uvicorn
 from huggingface_hub import constants
 from starlette.applications import Starlette
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 LARGE = 1000
@@ -32,14 +32,12 @@ class Repository:
       licence: Licence on its card.
       gated: Status of its answers with GatedRepo: 401 to who is nobody, 403 to who has no access; 0 if it is open.
       corrupt: Paths whose content is sent with its first byte changed.
-      breaks: Path -> number of transfers that break in the middle.
     """
 
     files: dict[str, bytes]
     licence: str = "mit"
     gated: int = 0
     corrupt: frozenset[str] = frozenset()
-    breaks: dict[str, int] = dataclasses.field(default_factory=dict)
 
     @property
     def commit(self) -> str:
@@ -60,7 +58,7 @@ class Repository:
 
 
 class Hub:
-    """The server: `repositories` by name, `requests` as "METHOD path" and "METHOD path Range"."""
+    """The server: `repositories` by name, `requests` as "METHOD path"."""
 
     def __init__(self) -> None:
         self.repositories: dict[str, Repository] = {}
@@ -68,7 +66,7 @@ class Hub:
         self.endpoint = ""
 
     def _find(self, request: Request) -> Repository | Response:
-        self.requests.append(f"{request.method} {request.url.path} {request.headers.get('range', '')}".strip())
+        self.requests.append(f"{request.method} {request.url.path}")
         repository = self.repositories.get(f"{request.path_params['owner']}/{request.path_params['name']}")
         if repository is None:
             return JSONResponse({"error": "Repository not found"}, 404, {"X-Error-Code": "RepoNotFound"})
@@ -112,27 +110,12 @@ class Hub:
             return Response(status_code=404, headers={"X-Error-Code": "EntryNotFound"})
         content, entry = repository.files[path], repository.entry(path)
         etag = entry["lfs"]["oid"] if "lfs" in entry else entry["oid"]
-        headers = {"X-Repo-Commit": repository.commit, "ETag": f'"{etag}"', "Accept-Ranges": "bytes"}
+        headers = {"X-Repo-Commit": repository.commit, "ETag": f'"{etag}"'}
         if path in repository.corrupt:
             content = bytes([content[0] ^ 255]) + content[1:]
         if request.method == "HEAD":
             return Response(headers=headers | {"Content-Length": str(len(content))})
-        start = 0
-        if request.headers.get("range", "").startswith("bytes="):
-            start = int(request.headers["range"].removeprefix("bytes=").split("-")[0])
-            headers["Content-Range"] = f"bytes {start}-{len(content) - 1}/{len(content)}"
-        rest = content[start:]
-        headers["Content-Length"] = str(len(rest))
-        if repository.breaks.get(path, 0) > 0:
-            repository.breaks[path] -= 1
-            return StreamingResponse(_half(rest), 206 if start else 200, headers)
-        return Response(rest, 206 if start else 200, headers)
-
-
-async def _half(content: bytes):
-    """Yields half of a content, then breaks the connection."""
-    yield content[: len(content) // 2]
-    raise ConnectionResetError("the transfer breaks on purpose")
+        return Response(content, headers=headers | {"Content-Length": str(len(content))})
 
 
 @contextlib.contextmanager
