@@ -42,11 +42,11 @@ def connection(options: Options) -> Iterator[int]:
     atexit.unregister(jax.distributed.shutdown)  # it waits for the others, also if this process ends in an error
     index = jax.process_index()
     try:
-        own = f"jsecon {jsecon.__version__}, {options}"
+        settings = f"jsecon {jsecon.__version__}, {options}"
         with _silent():
-            first = allgather_tree(own)[0]
-        if first != own:
-            raise InputError(f"process {index}", own, first, "Give all processes the same options and version.")
+            first = allgather_tree(settings)[0]
+        if first != settings:
+            raise InputError(f"process {index}", settings, first, "Give all processes the same options and version.")
         yield index
     except KeyboardInterrupt:
         if index == 0:

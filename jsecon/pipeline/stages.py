@@ -125,7 +125,8 @@ def _plan_objects(context: RunContext) -> Stage:
     options, models, folder = context.options, context.models, context.options.masks
     key_options = context.key_options("vision_frames")
     if folder is not None:
-        skipped = dict.fromkeys(("segmenter", "association"), f"masks are given ({folder.name})")
+        reason = f"masks are given ({folder.name})"
+        skipped = {"segmenter": reason, "association": reason}
         key_options |= context.key_options("level")
         how, read = f"read from {folder.name}", objects.read_masks
         return Stage("objects", how, read, after=("load",), key_options=key_options, files=folder, skipped=skipped)
