@@ -51,9 +51,6 @@ def test_parts_that_are_all_equally_near_answer_nothing():
     np.testing.assert_array_equal(
         part_scores(parts, np.array([1, 0, 0], np.float32), None, retrieval="contrast"), np.zeros(4)
     )
-
-
-def test_a_scene_whose_parts_lie_in_no_mask():
     bare = Parts(np.zeros(5, np.int32), np.zeros((1, 2), np.float32), np.zeros(1, np.float32))
     np.testing.assert_array_equal(part_scores(bare, np.ones(2, np.float32), None, retrieval="contrast"), np.zeros(5))
 

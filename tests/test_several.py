@@ -11,22 +11,12 @@ from table_field import table_field
 from jsecon import InputError, QueryRules, Regions, Scene, match_regions
 from jsecon.app.outputs import write_answer
 from jsecon.query.answer import query_anchored, query_several
-from jsecon.query.rules import ALL_OF_CLASS
 
 
 @pytest.fixture(scope="module")
 def field(scene, cameras):
     field, _ = make_field(scene, cameras)
     return dataclasses.replace(field, regions=Regions(rows_of_a_kind(), field.regions.pixel_counts))
-
-
-def test_all_of_a_kind_are_found_and_no_others(field):
-    rows = field.regions.embeddings
-    chosen = match_regions(field, rows[:1], ALL_OF_CLASS).chosen
-    assert np.asarray(chosen).tolist() == [True, True, False, False, False]  # from 0.75 of the way from 0 to 1 on
-    for retrieval in ("contrast", "cosine"):
-        got = query_several(field, rows[:1], rules=QueryRules(all_of_class=True, retrieval=retrieval))
-        np.testing.assert_array_equal(got.mask, shares(field, [0, 1]) >= 0.5)
 
 
 def test_the_rule_is_the_stated_one(field):
@@ -66,6 +56,8 @@ def test_unwanted_regions_are_left_out_unless_the_wanted_text_fits_them_better(f
     same = query_several(field, wanted, wanted)
     assert int(same.region) == -1
     assert not same.mask.any()
+    with pytest.raises(ValueError, match="match_regions"):
+        query_several(field, np.zeros((1, 5), np.float32))
     both = query_several(field, field.regions.embeddings[3:5], rules=QueryRules())
     np.testing.assert_allclose(both.similarity, shares(field, [3, 4]), atol=1e-6)
 
@@ -77,14 +69,6 @@ def test_jit_and_vmap_over_texts_equal_the_loop(field):
         alone = query_several(field, text[None], texts[:1])
         np.testing.assert_array_equal(together.mask[index], alone.mask)
         assert int(together.region[index]) == int(alone.region)
-
-
-def test_no_region_no_answer(field):
-    nothing = query_several(field, np.zeros((1, 12), np.float32))
-    assert int(nothing.region) == -1
-    assert not nothing.mask.any()
-    with pytest.raises(ValueError, match="match_regions"):
-        query_several(field, np.zeros((1, 5), np.float32))
 
 
 @pytest.fixture

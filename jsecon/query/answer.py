@@ -81,14 +81,9 @@ def answer_texts(
     excluded: Float[Array, "u e"] | None = None,
     outliers: bool = True,
 ) -> Trimmed:
-    """Answers a question of one text or several: the path of this page. Host code.
+    """Answers a question of one text or several by the path of this page. Host code.
 
-    Args:
-      field: The field.
-      queries: Embeddings of the texts, by the field's embedder.
-      rules: How texts match regions, and regions Gaussians.
-      excluded: Embeddings of texts whose regions are left out.
-      outliers: Whether Gaussians that lie apart are dropped.
+    `outliers` drops the Gaussians that lie apart; regions of the `excluded` texts are left out.
     """
     match = match_regions(field, queries, rules, excluded=excluded)
     several = rules.all_of_class or len(queries) > 1 or (excluded is not None and len(excluded) > 0)
@@ -191,15 +186,9 @@ def _match(embeddings, pixels, overlap, queries, excluded, words, rules: QueryRu
 
 
 def match_region(field: LanguageField, region: Number, rules: QueryRules = ONE_REGION) -> RegionMatch:
-    """Matches a region in place of a text, with score 1. Pure.
+    """Matches a region in place of a text, with score 1, and by other rules those that belong to it. Pure.
 
-    Args:
-      field: Field of R regions.
-      region: Its id, an integer. For one that the field does not have, such as -1, region is -1 and score 0.
-      rules: Which regions join it; by default only that region.
-
-    Raises:
-      ValueError: The id is not an integer.
+    An id that the field does not have, such as -1, has region -1 and score 0; one that is no integer is a ValueError.
     """
     integral = jnp.issubdtype(jnp.asarray(region).dtype, jnp.integer)
     require(integral, "match_region", region, "the id of a region, an integer", "region_at finds the one of a pixel.")
@@ -241,13 +230,7 @@ def select_from_votes(votes: Votes, match: RegionMatch, min_share: Number) -> Se
 
 
 def trim(field: LanguageField, selection: Selection, keep: str | None = "supported") -> OutlierResult:
-    """Drops the selected Gaussians that lie apart from the rest (`remove_outliers`). Host code.
-
-    Args:
-      field: The field.
-      selection: Selection of its Gaussians.
-      keep: Clusters that stay; None keeps all Gaussians.
-    """
+    """Drops the selected Gaussians that lie apart (`remove_outliers`); None in `keep` drops none. Host code."""
     if keep is None:
         return OutlierResult(np.asarray(selection.mask), "outliers are kept", 0, 0)
     weight = np.clip(np.asarray(selection.similarity), 0.0, 1.0) * np.asarray(field.votes.total)

@@ -342,10 +342,7 @@ def _split(tokens: list[_Token]) -> tuple[list[list[_Token]], list[str], bool, s
 def _length_in_name(tokens: Sequence[_Token], place: int, named: bool) -> int:
     """Returns how many words from a preposition on belong to a name; 0 if it is a relation.
 
-    Args:
-      tokens: Words of the text.
-      place: Place of the preposition.
-      named: Whether words of the object stand before it.
+    `named` says whether words of the object stand before it.
     """
     following = [token.key for token in tokens[place + 1 :]]
     if tokens[place].key not in _PREPOSITIONS:
@@ -389,14 +386,9 @@ def _with_late_anchor(parts: list[list[_Token]], relations: list[str]) -> tuple[
 
 
 def _noun_phrase(tokens: Sequence[_Token], related: bool = False) -> tuple[NounPhrase, bool, str]:
-    """Reads an object with its determiner, number and order.
+    """Reads an object with its determiner, number and order; `related` if a relation follows.
 
-    Args:
-      tokens: Its words.
-      related: Whether a relation follows.
-
-    Returns:
-      The object, whether it has a number or a word such as "all", and what is wrong; empty if nothing is.
+    Also returns whether it has a number or a word such as "all", and what is wrong; empty if nothing is.
     """
     order, number, rank, every, definite = None, None, 1, False, False
     tokens = _without_fillers(tokens, (*_WORDS["fillers"], "and"))
@@ -447,10 +439,7 @@ def _noun_phrase(tokens: Sequence[_Token], related: bool = False) -> tuple[NounP
 def _unknown_word(keys: Sequence[str], definite: bool, related: bool) -> str:
     """Returns the first word of a name that looks like a relation or an order of the grammar and is none, or "".
 
-    Args:
-      keys: Words of the name.
-      definite: Whether "the" or the like stands before them.
-      related: Whether a relation follows.
+    `definite` if "the" or the like stands before the name, `related` if a relation follows.
     """
     for place, key in enumerate(keys):
         before, after = keys[place - 1] if place else "", keys[place + 1] if place + 1 < len(keys) else None

@@ -62,13 +62,8 @@ def regions_with(
 ) -> Bool[Array, " r"]:
     """Finds the regions that answer with the best one, by the rule of this module. Pure.
 
-    Args:
-      best: The best region.
-      similarity: Similarity of each of R regions with the question.
-      known: Where it means something.
-      embeddings: Of the regions.
-      overlap: `Votes.overlap`; None joins no fragments.
-      rules: The thresholds, each of which None disables.
+    `similarity` is that of each region with the question, where `known` it means something. Without `Votes.overlap` no
+    fragments are joined.
     """
     chosen = jnp.arange(embeddings.shape[0]) == best
     if rules.all_of_class:
@@ -93,12 +88,7 @@ def _reaches(similarity: Float[Array, " r"], known: Bool[Array, " r"], relative_
 def join_fragments(regions: Sequence[int] | np.ndarray, overlap: np.ndarray | None) -> list[tuple[int, ...]]:
     """Groups regions that overlap, directly or by way of others: the fragments of one object. Host code.
 
-    Args:
-      regions: Ids of regions.
-      overlap: `Votes.overlap`; None makes each region a group.
-
-    Returns:
-      The groups, each sorted.
+    The groups are sorted. None in place of `Votes.overlap` makes each region a group.
     """
     groups: list[set[int]] = []
     for region in map(int, regions):
@@ -113,11 +103,8 @@ def same_object(
 ) -> tuple[Bool[Array, "r r"], Bool[Array, "r r"]]:
     """Finds the pairs of regions that show one object, and those that look as if they did (`duplicate_cosine`).
 
-    A question for either region of the first pairs adds the other, and they overlap. Both relations are symmetric.
-
-    Args:
-      embeddings: Of the regions.
-      overlap: `Votes.overlap`; without it no two regions are joined.
+    A question for either region of the first pairs adds the other, and they overlap; without `Votes.overlap` no two
+    regions are joined. Both relations are symmetric.
     """
     count = embeddings.shape[0]
     itself = jnp.eye(count, dtype=bool)
@@ -142,9 +129,7 @@ def same_object(
 def containment(overlap: Float[Array, "r r"], size: Float[Array, " r"]) -> Float[Array, "r r"]:
     """Computes how much of region r lies in region s: sum_n min(p_nr, p_ns) / sum_n p_nr, with p the shares.
 
-    Args:
-      overlap: Soft IoU (`Votes.overlap`).
-      size: Sum of each region's shares.
+    `size` is the sum of each region's shares.
     """
     both = overlap * (size[:, None] + size) / (1 + overlap)
     return jnp.where(size[:, None] > 0, both / jnp.where(size > 0, size, 1.0)[:, None], 0.0)
@@ -155,11 +140,8 @@ def objects_of_gaussians(votes: Votes, objects: Int[Array, " r"]) -> tuple[Int[A
     """Assigns each Gaussian to the object with the largest share in it: (N,) the object, and its share.
 
     The share is that of all regions of the object together (`inside_fraction`), so a query for exactly these regions
-    selects the same Gaussians, and those that belong to another object even more. Each row stands for itself.
-
-    Args:
-      votes: Votes of N Gaussians.
-      objects: Object of each region, -1 for no object; so is the result for shares below SHARE_THRESHOLD.
+    selects the same Gaussians, and those that belong to another object even more. -1 is no object: of a region, and of
+    a Gaussian with a share below SHARE_THRESHOLD. Each row stands for itself.
     """
     columns = list(vote_columns(votes))
     owners = [jnp.where(region >= 0, objects[jnp.maximum(region, 0)], -1) for region, _, _ in columns]

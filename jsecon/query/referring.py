@@ -45,21 +45,18 @@ Find = Callable[[str], tuple[list[Object], float]]
 
 @dataclasses.dataclass
 class ReferringResult:
-    """The objects of one reading of a noun phrase with its conditions.
-
-    Attributes:
-      chosen: The objects, best first.
-      alternatives: Other objects of the name, with scores of at least WITHIN_REACH, best first.
-      used: The objects that they were compared with.
-      undecided: Objects among which the text does not choose; empty if it does.
-      reason: Why there is no object, or not the number that the text says; else empty.
-    """
+    """The objects of one reading of a noun phrase with its conditions."""
 
     chosen: list[Object]
+    """The objects, best first."""
     alternatives: list[Object] = dataclasses.field(default_factory=list)
+    """Other objects of the name, with scores of at least WITHIN_REACH, best first."""
     used: list[Object] = dataclasses.field(default_factory=list)
+    """The objects that they were compared with."""
     undecided: list[Object] = dataclasses.field(default_factory=list)
+    """Objects among which the text does not choose; empty if it does."""
     reason: str = ""
+    """Why there is no object, or not the number that the text says; else empty."""
 
 
 def stack_shapes(objects: Sequence[Object]) -> ObjectShapes:

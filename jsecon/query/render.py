@@ -56,18 +56,7 @@ def render_selection(
 ) -> Rendering:
     """Renders the selected Gaussians alone. The others become transparent, so selections share one program. Pure.
 
-    Args:
-      gaussians: Scene of N Gaussians.
-      camera: The view.
-      mask: (N,) the selected ones.
-      similarity: (N,) feature of each; ones by default.
-      capacity: Number of (block, Gaussian) pairs, see `render`.
-
-    Returns:
-      The rendering; features (H, W, 1) are sum alpha T similarity.
-
-    Raises:
-      ValueError: Shapes disagree.
+    Features (H, W, 1) are sum alpha T similarity; ones by default.
     """
     rendering = _rendered(gaussians, camera, mask, similarity, capacity)
     return dataclasses.replace(rendering, features=rendering.features[..., :1])

@@ -62,10 +62,7 @@ class QueryRules:
     def accept(self, rank, similarity, presence):
         """Decides whether the scene answers a text: the one refusal of texts, of regions and of parts.
 
-        Args:
-          rank: Share of unrelated words that match less; None without such words.
-          similarity: Cosine of what would answer.
-          presence: Probability that the text is true of it; None without `logits`.
+        `rank` is None without unrelated words, and `presence`, the probability that the text is true, without `logits`.
         """
         if self.min_score is None and rank is not None:
             return rank >= self.min_rank

@@ -67,16 +67,7 @@ def score_text(
     word_scores: Float[Array, "w r"] | None,
     rules: QueryRules,
 ) -> TextScores:
-    """Compares one text with all regions.
-
-    Args:
-      embeddings: Of the regions.
-      text: Embedding of the text.
-      pixels: Number of pixels of each region in each view.
-      words: Unrelated words, or None.
-      word_scores: Their `word_similarities`, or None.
-      rules: How texts match.
-    """
+    """Compares one text with all regions, and with unrelated words (`word_similarities`) if there are any."""
     similarity, known = region_similarities(embeddings, text, words, rules.retrieval)
     presence = None if rules.logits is None else presence_prob(embeddings, text, rules.logits)
     weight = view_count_weight(pixels).astype(similarity.dtype)
@@ -99,11 +90,7 @@ def region_similarities(
 ) -> tuple[Float[Array, " r"], Bool[Array, " r"]]:
     """Compares regions with a text: their cosines (R,), and whether they are known (R,); 0 if not.
 
-    Args:
-      embeddings: Of the regions.
-      text: Embedding of the text.
-      words: Unrelated words, or None.
-      retrieval: "contrast" subtracts the mean of the unrelated words from the text; "cosine" does not.
+    "contrast" subtracts the mean of the unrelated words from the text; "cosine" does not.
     """
     return similarities(embeddings, _text_direction(text, words, retrieval))
 
@@ -132,16 +119,10 @@ def _text_direction(
 def rank_among_words(
     best: Float[Array, ""], text: Float[Array, " e"], words: Float[Array, "w e"], scores: Float[Array, "w r"]
 ) -> Float[Array, ""]:
-    """Ranks a text among unrelated words by the largest similarity of each with any region.
+    """Ranks a text among unrelated words: the share of those that are less similar to the scene; 1 if no word is left.
 
-    Args:
-      best: Largest similarity of the text.
-      text: Embedding of the text.
-      words: Unrelated words, of which the NEAREST_WORDS share that is nearest to the text is left out.
-      scores: Their `word_similarities`.
-
-    Returns:
-      () share of the words with a smaller largest similarity; 1 if no word is left.
+    The NEAREST_WORDS share of the words that is nearest to the text is left out. `best` is the largest similarity of
+    the text with any region, and `scores` those of the words.
     """
     largest = jnp.max(jnp.where(jnp.isfinite(scores), scores, -jnp.inf), axis=1)
     units = normalize(words.astype(text.dtype))

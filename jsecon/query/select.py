@@ -19,13 +19,7 @@ def codes_of(field: LanguageField) -> Codes:
 
 
 def select_by_code(field: LanguageField, match: RegionMatch, threshold: Number = CODE_THRESHOLD) -> Selection:
-    """Selects the Gaussians whose code has at least a cosine with that of the best region. Pure.
-
-    Args:
-      field: The field of N Gaussians.
-      match: Its regions, of which only the best counts.
-      threshold: Smallest cosine.
-    """
+    """Selects the Gaussians whose code has at least a cosine with that of the best matched region. Pure."""
     codes = codes_of(field)
     if field.regions.count == 0:
         none = jnp.zeros(field.gaussians.count, bool)
