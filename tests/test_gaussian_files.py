@@ -122,8 +122,8 @@ def test_a_spz_of_a_wide_scene_of_sure_opacities_and_of_nothing(tmp_path):
     np.testing.assert_allclose(found.means, wide["means"], atol=5e4 / 2**22)
     alpha = opacity({"opacity_logits": np.asarray(found.opacity_logits)})
     np.testing.assert_allclose(alpha, [0] * 25 + [1] * 25, atol=2e-6)
-    save_gaussians(tmp_path / "none.spz", gaussians(scene(0, 1)))
-    assert load_gaussians(tmp_path / "none.spz").count == 0
+    with refused("none.spz", "no Gaussians to write"):
+        save_gaussians(tmp_path / "none.spz", gaussians(scene(0, 1)))
     wide["means"] *= 1e4
     with refused("a.spz", "units from the origin"):
         save_gaussians(tmp_path / "a.spz", gaussians(wide))

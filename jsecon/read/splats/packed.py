@@ -149,6 +149,8 @@ def _axes(path: Path, number: int) -> np.ndarray:
 def save_spz(path: Path, gaussians: Gaussians, *, similarity: Float[Array, "4 4"] | None = None) -> None:
     """Writes a .spz of version 3, with the finest positions that hold the farthest Gaussian in 24 bits."""
     gsply = import_gsply(path)
+    if not gaussians.count:
+        raise InputError(path, "there are no Gaussians to write", remedy="Write a .ply, which may be empty.")
     into = _SPZ_AXES if similarity is None else _SPZ_AXES @ np.asarray(similarity, np.float64)
     blocks = [block for _, block in usable_blocks(path, gaussians, into)]
     means, log_scales, quaternions, opacity_logits, sh = (
