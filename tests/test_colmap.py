@@ -269,33 +269,6 @@ def test_missing_images_are_counted_and_an_empty_one_is_told(folder):
         load_capture(folder)
 
 
-@pytest.mark.parametrize("content", [
-    struct.pack("<Q", 2**60), struct.pack("<Q", 1) + struct.pack("<Q3d3BdQ", 1, 0, 0, 0, 0, 0, 0, 0, 2**63),
-])  # fmt: skip
-def test_absurd_counts_end_in_the_same_message(folder, content):
-    (folder / "sparse/0/points3D.bin").write_bytes(content)
-    with refused("points3D.bin", "breaks off"):
-        load_capture(folder)
-
-
-@pytest.mark.parametrize(("file", "old", "new", "said"), [
-    ("images.txt", "2 frame_001.png", "frame_001.png", "line"),
-    ("images.txt", "3 frame_002.png", "9 frame_002.png", "camera 9"),
-    ("cameras.txt", "PINHOLE 24", "PINHOLE wide", "line"),
-    ("cameras.txt", "PINHOLE 24 16 20.25", "PINHOLE 24 16", "3 parameters"),
-    ("cameras.txt", "PINHOLE 24 16 20.25", "PINHOLE 24 16 -20.25", "-20.25"),
-    ("points3D.txt", "\n2 ", "\n2 x", "line 3"),
-])  # fmt: skip
-def test_damaged_text(tmp_path, file, old, new, said):
-    write_text_model(CAPTURE, tmp_path / "sparse")
-    write_images(CAPTURE, tmp_path / "images")
-    text = (tmp_path / "sparse" / file).read_text()
-    assert old in text
-    (tmp_path / "sparse" / file).write_text(text.replace(old, new, 1))
-    with refused(said):
-        load_capture(tmp_path)
-
-
 @pytest.mark.parametrize("numbers", [(np.nan, 0, 0, 0, 0, 0, 0), (1, 0, 0, 0, 0, np.inf, 0), (0, 0, 0, 0, 0, 0, 0)])
 def test_poses_that_are_none(folder, numbers):
     path = folder / "sparse/0/images.bin"

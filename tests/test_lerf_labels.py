@@ -88,13 +88,6 @@ def test_polygons_are_the_mask(seed, height, width, share, smooth):
     np.testing.assert_array_equal(pieces(mask), mask)
 
 
-def test_rings_within_rings_and_no_gap_at_all():
-    y, x = np.mgrid[:60, :80]
-    mask = (np.hypot(x - 41, y - 28).astype(int) // 5) % 2 == 0
-    np.testing.assert_array_equal(pieces(mask), mask)
-    np.testing.assert_array_equal(pieces(np.ones((4, 5), bool)), True)
-
-
 def test_round_trip(tmp_path):
     """Two mugs far apart, one split by an occluder and with a hole; a box that no polygon fits best."""
     mugs = np.zeros((30, 40), bool)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from capture_files import refused
 
-from jsecon.errors import InputError
 from jsecon.read.masks.langsplat import load_features
 from jsecon.read.masks.masks import load_labels, load_proposals
 from jsecon.types import ImageFile
@@ -265,22 +264,6 @@ def test_one_coco_file_of_all_frames(tmp_path):
     (tmp_path / "instances.json").write_text(json.dumps(content))
     with refused("instances.json", "'image_id' is missing"):
         load_proposals(tmp_path, ("a",), SIZE)
-
-
-@pytest.mark.parametrize(("segmentation", "words"), [
-    ([[1, 2, 3, 4]], "three corners"), ([[1, 2, 3, 4, 5]], "x and y in turn"),
-    ([["a", 2, 3, 4, 5, 6]], "x and y in turn"), ([[0, 0, 900, 0, 900, 900]], "900"),
-    ("61X13mN000`0", "61X13mN000`0"), (None, "None"), ({"size": ["a", 3], "counts": []}, "size"),
-    ({"size": [12, 16], "counts": {}}, "another kind"), ({"counts": [192]}, "'size' is missing"),
-])  # fmt: skip
-def test_wrong_masks_in_json_are_told_in_words(tmp_path, segmentation, words):
-    (tmp_path / "a.json").write_text(json.dumps([{"segmentation": segmentation}]))
-    read, _ = load_proposals(tmp_path, ("a",), SIZE)
-    with pytest.raises(InputError) as caught:
-        read(0)
-    assert "a.json, mask 0" in str(caught.value)
-    assert words in str(caught.value)
-    assert "Error" not in str(caught.value)
 
 
 def test_embeddings_lie_in_the_cameras_folders(tmp_path):
