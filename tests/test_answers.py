@@ -6,12 +6,11 @@ import json
 import numpy as np
 import pytest
 from capture_files import run_cli
-from small_field import REGIONS, make_field
+from small_field import make_field
 from test_gltf import read_glb
 
-from jsecon import Answer, Query, QueryRules, Scene, load_gaussians, query_region, save_field
+from jsecon import Answer, Query, QueryRules, Scene, load_gaussians, objects, query_region, save_field
 from jsecon.app.outputs import write_answers
-from jsecon.app.pictures import main_regions
 from jsecon.pipeline.progress import Listener
 
 
@@ -32,15 +31,11 @@ def test_a_field_is_exported_in_every_format(saved, tmp_path, capsys):
     for ending in ("ply", "spz"):
         assert run_cli("export", file, "--out", tmp_path / f"scene.{ending}") == 0
         np.testing.assert_allclose(load_gaussians(tmp_path / f"scene.{ending}").means, means, atol=2**-16)
-    assert run_cli("export", file, "--out", tmp_path / "scene.glb") == 0
+    assert run_cli("export", file, "--out", tmp_path / "scene.glb", "--with-labels") == 0
     assert f"{len(means)} Gaussians" in capsys.readouterr().out
     _, found = read_glb(tmp_path / "scene.glb")
     np.testing.assert_allclose(found["POSITION"], means * [-1, -1, 1], atol=1e-6)
-    codes = np.concatenate([found[name] for name in found if name.startswith("_CODE")], axis=1)
-    np.testing.assert_array_equal(codes, field.codes.gaussians)
-    regions = main_regions(field)
-    np.testing.assert_array_equal(found["_REGION"][:, 0], regions)
-    assert set(range(REGIONS)) <= set(found["_REGION"][:, 0].astype(int))
+    np.testing.assert_array_equal(found["_OBJECT_ID"][:, 0], objects(field).labels)
 
 
 @pytest.mark.parametrize("ending", ["ply", "spz", "glb"])
@@ -53,7 +48,7 @@ def test_a_selection_is_written_in_every_format(saved, tmp_path, ending):
     assert told["count"] > 0
     chosen = tmp_path / told[ending]
     if ending == "glb":
-        assert len(read_glb(chosen)[1]["_REGION"]) == told["count"]
+        assert len(read_glb(chosen)[1]["POSITION"]) == told["count"]
     else:
         means = np.asarray(load_gaussians(chosen).means, np.float64)
         np.testing.assert_allclose(means.mean(0), told["place"]["centroid"], atol=1e-4)

@@ -188,10 +188,11 @@ class Scene:
     @functools.cached_property
     def text_field(self) -> LanguageField:
         """The field with phrases and words that texts are compared with: embeddings from files came without them."""
-        field, words = self.field, getattr(self.embedder, "unrelated_words", None)
+        field = self.field
         if len(field.canonical_phrases):
             return field
-        words = field.unrelated_words if field.unrelated_words is None or words is None else np.float16(words)
+        words = None if field.unrelated_words is None else getattr(self.embedder, "unrelated_words", None)
+        words = field.unrelated_words if words is None else np.float16(words)
         canonical = np.float32(self.embedder.canonical_phrases)
         return dataclasses.replace(field, canonical_phrases=canonical, unrelated_words=words)
 

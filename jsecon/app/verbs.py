@@ -210,8 +210,7 @@ class Query(FieldVerb):
       keep_outliers: Keeps the Gaussians that stand apart from the rest of an answer. By default DBSCAN drops them, and
         clusters with less than a tenth of the largest one's weight in the views. The .json counts them.
       views: Number of masks to write for each query.
-      format: Format of the selected Gaussians. The glb is glTF with Khronos' KHR_gaussian_splatting, y up, and holds
-        their regions too.
+      format: Format of the selected Gaussians. The glb is glTF with Khronos' KHR_gaussian_splatting, y up.
     """
 
     examples = (
