@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from mask_overlaps import iou_matrix
 
-from jsecon.vision.classical import ClassicalSegmenter, adapt_exposure
+from jsecon.vision.classical import ClassicalSegmenter, _adapt_exposure
 from jsecon.vision.protocols import Segmenter
 from jsecon.vision.region_graph import merge_regions, region_borders
 
@@ -94,11 +94,11 @@ def test_dark_and_bright_frames_are_seen_by_adapted_eyes():
     for gain, low, high in ((0.2, 0.21, 0.23), (5.0, 0.29, 0.31)):
         exposed = (255 * (gain * linear / (1 + (gain - 1) * linear)) ** (1 / 2.2)).round().astype(np.uint8)
         assert not low <= median(exposed) <= high
-        assert low <= median(adapt_exposure(exposed)) <= high
+        assert low <= median(_adapt_exposure(exposed)) <= high
         exposed[0, :40], exposed[0, 40:80] = 0, 255
-        np.testing.assert_array_equal(adapt_exposure(exposed)[0, :80], exposed[0, :80])  # black and white stay
+        np.testing.assert_array_equal(_adapt_exposure(exposed)[0, :80], exposed[0, :80])  # black and white stay
     between = np.full((4, 5, 3), 140, np.uint8)  # 0.27
-    np.testing.assert_array_equal(adapt_exposure(between), between)
+    np.testing.assert_array_equal(_adapt_exposure(between), between)
 
 
 @pytest.mark.parametrize("frame", [

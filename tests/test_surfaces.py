@@ -5,7 +5,7 @@ import pytest
 
 from jsecon.types import Camera
 from jsecon.vision.classical import ClassicalSegmenter
-from jsecon.vision.surfaces import Surface, cloud_normals, surfaces_from_depth
+from jsecon.vision.surfaces import Surface, _cloud_normals, surfaces_from_depth
 
 
 def corridor(height=60, width=80, focal=40.0):
@@ -36,16 +36,16 @@ def test_normals_of_a_sphere_and_of_a_box_s_edge():
     rng = np.random.default_rng(0)
     sphere = rng.normal(size=(4000, 3))
     sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
-    assert np.percentile(angles(cloud_normals(2 + 3 * sphere), sphere), 99) < 6
+    assert np.percentile(angles(_cloud_normals(2 + 3 * sphere), sphere), 99) < 6
     flat = rng.uniform(-1, 1, (4000, 2))
     x, y = flat.T
     edge = np.where(x[:, None] < 0, np.stack([x, y, 0 * x], 1), np.stack([0 * x, y, x], 1))
     wanted = np.where(x[:, None] < 0, [0, 0, 1.0], [1.0, 0, 0])
     noisy = edge + rng.normal(0, 0.005, edge.shape)
-    off = angles(cloud_normals(noisy), wanted)
+    off = angles(_cloud_normals(noisy), wanted)
     assert np.median(off) < 4
     assert np.percentile(off[np.abs(x) > 0.1], 98) < 15  # the crease stays sharp
-    np.testing.assert_allclose(np.linalg.norm(cloud_normals(noisy[:3]), axis=1), 1)
+    np.testing.assert_allclose(np.linalg.norm(_cloud_normals(noisy[:3]), axis=1), 1)
 
 
 def test_a_plane_has_no_steps_however_steeply_it_is_seen():

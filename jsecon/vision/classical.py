@@ -108,7 +108,7 @@ def _colour_features(
     frame: UInt8[np.ndarray, "h w 3"], *, lightness_weight: float, smoothing: float
 ) -> Float32[np.ndarray, "h w 3"]:
     """Computes weighted L, a and b (H, W, 3) float32, CIELAB units, of a smoothed frame (H, W, 3) uint8."""
-    smooth = adapt_exposure(frame)
+    smooth = _adapt_exposure(frame)
     if smoothing > 0:
         smooth = cv2.pyrMeanShiftFiltering(smooth, 5, smoothing, maxLevel=0)
         smooth = cv2.bilateralFilter(smooth, 7, 2.0 * smoothing, 3.0)
@@ -116,7 +116,7 @@ def _colour_features(
     return lab * np.asarray([lightness_weight, 1.0, 1.0], np.float32)
 
 
-def adapt_exposure(frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+def _adapt_exposure(frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     """Brightens dark frames and darkens bright ones, by the median of their linear luminance.
 
     Steps in CIELAB are those of an eye adapted to the white of the scene: they are too small between dark objects of a

@@ -25,7 +25,7 @@ smallest regions, which texture consists of. The factor grows with the root of t
 
 
 @dataclasses.dataclass(frozen=True)
-class RegionBorders:
+class _RegionBorders:
     """Edges of the graph, one row per pair of neighbours."""
 
     pairs: np.ndarray
@@ -44,7 +44,7 @@ def region_borders(
     shape: Float32[np.ndarray, "h w c"] | Surface | None,
     *,
     steepness: float = 1.0,
-) -> RegionBorders:
+) -> _RegionBorders:
     """Measures the borders between regions.
 
     Steps are measured between pixels two px to either side of a border, so that the blur of an edge does not hide them.
@@ -71,7 +71,7 @@ def region_borders(
     count = int(superpixels.max()) + 1
     first, second = np.concatenate(keys).T.astype(np.int64)
     pairs, inverse = np.unique(first * count + second, return_inverse=True)
-    return RegionBorders(
+    return _RegionBorders(
         np.stack(np.divmod(pairs, count), -1),
         np.bincount(inverse, minlength=len(pairs)).astype(np.float64),
         np.bincount(inverse, np.concatenate(colours), len(pairs)),
@@ -82,7 +82,7 @@ def region_borders(
 def merge_regions(
     superpixels: Int32[np.ndarray, "h w"],
     features: Float32[np.ndarray, "h w d"],
-    edges: RegionBorders,
+    edges: _RegionBorders,
     *,
     distance: float,
     min_area: float,

@@ -66,7 +66,7 @@ class Surface(NamedTuple):
         return np.minimum(*off) / np.maximum(np.minimum(a[..., 2], b[..., 2]), 1e-6)
 
 
-def cloud_normals(points: Float[np.ndarray, "p 3"]) -> Float64[np.ndarray, "p 3"]:
+def _cloud_normals(points: Float[np.ndarray, "p 3"]) -> Float64[np.ndarray, "p 3"]:
     """Estimates the normals of a cloud of at least three points, unit vectors of either sign.
 
     A normal is the direction of least spread of the nearest points. Rounds of averaging weigh neighbours by agreement,
@@ -96,7 +96,7 @@ def surfaces_from_depth(
       cameras: Batch of T cameras.
       points: Points of all frames together, world, thinned (a few centimetres apart in a room).
     """
-    tree, normals = KDTree(points), cloud_normals(points)
+    tree, normals = KDTree(points), _cloud_normals(points)
     poses = np.asarray(cameras.world_to_camera, np.float64)
 
     def surface_of(t: int) -> Surface | None:
