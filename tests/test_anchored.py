@@ -274,7 +274,7 @@ def test_a_field_without_regions_answers_nothing(field):
 def test_wrong_arguments_are_told(field):
     with pytest.raises(ValueError, match=r"12.*random"):
         query_anchored(field, np.ones(11, np.float32))
-    for region in (1.5, np.float32(1)):
+    for region in (1.5, np.asarray(1.0)):
         with pytest.raises(ValueError, match="an integer"):
             query_region(field, region)
 

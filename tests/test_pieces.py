@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_field import make_field, rows_of_a_kind, shares
@@ -23,10 +24,12 @@ def test_a_fragment_is_near_the_text_and_shares_gaussians_with_the_best_region()
         near = known & (similarity >= middle + 0.5 * (best - middle)) & (best > middle)
         expected = near & (overlap[first] >= MIN_FRAGMENT_OVERLAP)
         expected[first] = True
-        np.testing.assert_array_equal(regions_with(first, similarity, known, EMBEDDINGS, overlap, rules), expected)
+        got = regions_with(jnp.asarray(first), similarity, known, EMBEDDINGS, overlap, rules)
+        np.testing.assert_array_equal(got, expected)
     alone = np.arange(9) == first
     for values, usable in ((similarity, np.zeros(9, bool)), (np.zeros(9, np.float32), np.ones(9, bool))):
-        np.testing.assert_array_equal(regions_with(first, values, usable, EMBEDDINGS, overlap, rules), alone)
+        got = regions_with(jnp.asarray(first), values, usable, EMBEDDINGS, overlap, rules)
+        np.testing.assert_array_equal(got, alone)
 
 
 @pytest.fixture(scope="module")
