@@ -169,20 +169,6 @@ def test_a_lone_quoted_text_is_embedded_without_its_quotes(field, word):
         assert set(heard) == {word}
 
 
-def test_an_outline_is_not_selected_by_codes(field, tmp_path, capsys):
-    save_field(tmp_path / "field.safetensors", field)
-    box = "--box", "#1", 0, 0, 40, 30
-    assert run("query", tmp_path / "field.safetensors", *box, "--by", "code", "--out", tmp_path / "out") == 2
-    assert "--by" in capsys.readouterr().err
-    assert not list((tmp_path / "out").glob("*.json"))
-
-
-def test_a_question_by_codes_of_a_field_without_them_says_how_to_get_them(field, tmp_path, capsys):
-    save_field(tmp_path / "field.safetensors", dataclasses.replace(field, codes=None))
-    assert run("query", tmp_path / "field.safetensors", "red", "--by", "code", "--out", tmp_path / "out") == 2
-    assert "This field has no codes. Run jsecon run --paper" in capsys.readouterr().err
-
-
 def test_one_centroid_in_the_world_of_a_map_projection(field, tmp_path):
     """Of the .json, of `locate` and of the server: the mean of the centres, to less than a millimetre at 5e6 m."""
     moved = np.eye(4)

@@ -57,13 +57,6 @@ def test_it_is_in_the_world_of_the_capture(answer):
     np.testing.assert_allclose(there.place.half_size, 2 * asked.place.half_size, rtol=1e-3)
 
 
-def test_what_selects_nothing_has_no_place(answer):
-    nothing = dataclasses.replace(answer[0], mask=np.zeros(64, bool), count=0)
-    assert nothing.as_dict()["place"] is None
-    with pytest.raises(InputError, match="no Gaussian is selected"):
-        _ = nothing.place
-
-
 def test_two_objects_of_a_name_are_counted_and_have_no_place_together():
     scene = Scene(*table_field())
     mugs, box = (scene.ask(text) for text in ("red mug", "dark blue box"))
@@ -75,4 +68,8 @@ def test_two_objects_of_a_name_are_counted_and_have_no_place_together():
     np.testing.assert_allclose(left.place.center[:2], [-0.5, 0], atol=0.02)
     with pytest.raises(InputError, match="names 0 objects"):
         scene.locate("the red mug on the dark blue box")
+    nothing = scene.ask("the red mug on the dark blue box")
+    assert nothing.as_dict()["place"] is None
+    with pytest.raises(InputError, match="not on dark blue box"):
+        _ = nothing.place
     np.testing.assert_array_equal(jsecon.locate(scene, "dark blue box").place.center, box.place.center)
