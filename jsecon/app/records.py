@@ -106,7 +106,9 @@ class Query:
         """Refuses numbers out of their ranges."""
         require_one_of("query", self.by, METHODS, "'votes' is the default.")
         low = -1 if self.by == "code" else 0
-        for name, value, least in (("threshold", self.threshold, low), ("min_rank", self.min_rank, 0)):
+        numbers = {"threshold": self.threshold, "min_rank": self.min_rank, "fragment_score": self.fragment_score}
+        for name, value in numbers.items():
+            least = low if name == "threshold" else 0
             if value is not None and not least <= value <= 1:
                 raise InputError(
                     name, f"{value:g}", f"a number from {least} to 1", f"Leave {name} out for the default."
@@ -140,7 +142,7 @@ def _names(frame: int | str, mask: np.ndarray | str | Path) -> tuple[int | str, 
     return frame, str(mask) if isinstance(mask, str | Path) else hashlib.sha256(np.asarray(mask).tobytes()).hexdigest()
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Answer:
     """What a query selects of a field of N Gaussians. `str` of it is the line that the command line prints.
 
