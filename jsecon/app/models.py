@@ -197,7 +197,3 @@ def _usable(models: Sequence[HubModel]) -> HubModel:
     remedy = "jsecon models list has models that work."
     problem = f"it holds no model in {models[0].precision} that jsecon reads"
     raise InputError(models[0].address, problem, "", remedy)
-
-
-VERBS = {verbs.Models: _models}
-"""what does the work of each verb"""

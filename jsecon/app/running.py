@@ -209,7 +209,3 @@ def _work_parts(run: Run) -> list[str]:
         report.section("Stages", "What ran, and what this scene does not need.", stages, notes),
         report.section("Settings", "", changed, *folded),
     ]
-
-
-VERBS = {verbs.Run: _run, verbs.Fit: _fit}
-"""what does the work of each verb"""

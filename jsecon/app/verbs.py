@@ -407,16 +407,11 @@ class Doctor(Verb):
     """Checks whether this machine has what runs need.
 
     It prints a line each about the backend's numbers, jax and its devices, cores, memory, disk, the folder of compiled
-    programs, models, and each extra with the command that installs it. The exit code is 2 if a check fails that every
-    run depends on.
-
-    Attributes:
-      models: Folder with .onnx files, or of such folders, to examine.
+    programs, and each extra with the command that installs it. The exit code is 2 if a check fails that every run
+    depends on. `jsecon models check` examines models.
     """
 
-    examples = ("jsecon doctor", "jsecon doctor --models my_models")
-
-    models: Option[Path | None] = None
+    examples = ("jsecon doctor",)
 
 
 VERBS: dict[type[Verb], str] = {

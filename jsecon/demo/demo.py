@@ -99,7 +99,3 @@ def _page(run: Run, rows: list[Row], summary: dict[str, Any], labels: list[Label
     lead += "on a plain CPU and without any learned weights."
     parts = [tiles, report.section("Queries", words, report.grid(cells, 4)), *running.run_parts(run)]
     return report.page("jsecon demo", lead, parts)
-
-
-VERBS = {verbs.Demo: _demo}
-"""what does the work of each verb"""
