@@ -120,6 +120,15 @@ def test_objects_are_in_some_of_the_frames_and_the_lower_id_lies_on_top(tmp_path
         load_labels(tmp_path, tuple("bcef"), SIZE)
 
 
+def test_objects_keep_their_order_whichever_frame_shows_them_first(tmp_path):
+    for frame, folder in (("a", "obj_10"), ("b", "obj_9"), ("b", "obj_10")):
+        write(tmp_path / folder / f"{frame}.png", np.full(SIZE, 255))
+    labels, ids, _ = load_labels(tmp_path, ("a", "b"), SIZE)
+    assert ids == (0, 1)
+    assert (labels[0] == 1).all()
+    assert (labels[1] == 0).all()
+
+
 @pytest.mark.parametrize("width", [5, 16, 23, 31, 32, 47, 80])
 def test_resizing_takes_the_value_at_each_centre(tmp_path, width):
     image = RNG.integers(1, 9, (12 * width // 16 or 1, width))

@@ -79,51 +79,44 @@ class _Source:
             problem = f"it has masks, but of none of the {len(names)} frames in use"
             raise InputError(folder, problem, f"a mask of {names[0]} and others", "Name each mask like its frame.")
         self.missing = [name for name in names if not self._has(name)]
-        by_frame = self.files.files.values() if self.files else ()
-        self.objects = list(dict.fromkeys(key for by_object in by_frame for key in by_object if key))
+        self.objects = self.files.objects if self.files else ()
         self.fit = MaskFitter(self.frames, size)
 
     def _has(self, name: str) -> bool:
         return name in self.coco if self.coco is not None else self.files is not None and name in self.files.files
 
-    def _read(self, name: str) -> tuple[Path, np.ndarray | list[np.ndarray]]:
-        """The file of a frame, and its ids or masks as they are stored; of objects, the first one's."""
+    def read(self, name: str) -> tuple[Path, np.ndarray | list[np.ndarray]]:
+        """The file of a frame, and its ids or masks at the size of the frames."""
         file = self.frames.get(name)
         size = self.size[::-1] if file is None else (file.width, file.height)
         if self.coco is not None:
-            return self.coco.file, self.coco.read(name, size)
-        assert self.files is not None
-        path = self.files.path(name)
-        assert path is not None
-        with reading(path, remedy="Write the masks again."):
-            return path, self.files.reader.read(path, size, self.level)
-
-    def ids(self, name: str) -> np.ndarray | None:
-        """(H, W) ids of a frame; None if its masks are its own."""
-        path, stored = self._read(name)
-        return None if isinstance(stored, list) else self.fit(path, stored, name)
+            path, stored = self.coco.file, self.coco.read(name, size)
+        else:
+            assert self.files is not None
+            path = self.files.files[name][""]
+            with reading(path, remedy="Write the masks again."):
+                stored = self.files.reader.read(path, size, self.level)
+        if not isinstance(stored, list):
+            return path, self.fit(path, stored, name)
+        masks = (self.fit(path, mask, name) for mask in stored)
+        return path, [mask for mask in masks if mask.any()]
 
     def masks(self, name: str) -> list[np.ndarray]:
         """The masks (H, W) of a frame that have pixels at this size, one for each object, id or mask."""
         if self.objects:
-            assert self.files is not None
-            by_object = self.files.files[name]
-            masks = [self._object(by_object[key], name) for key in self.objects if key in by_object]
-        else:
-            path, stored = self._read(name)
-            if not isinstance(stored, list):
-                stored = [stored == number for number in np.unique(stored) if number > 0]
-            masks = [self.fit(path, mask, name) for mask in stored]
-        return [mask for mask in masks if mask.any()]
+            paths = self.files.files[name] if self.files else {}
+            masks = [self._object(path, name) for path in paths.values()]
+            return [mask for mask in masks if mask.any()]
+        _, stored = self.read(name)
+        return stored if isinstance(stored, list) else [stored == number for number in np.unique(stored) if number > 0]
 
-    def object_labels(self, name: str) -> np.ndarray:
-        """(H, W) index of the object of each pixel, the first on top, -1 for none."""
-        assert self.files is not None
+    def object_labels(self, name: str) -> tuple[Path, np.ndarray]:
+        """A file of a frame, and (H, W) index of the object of each pixel, the first on top, -1 for none."""
+        paths = self.files.files[name] if self.files else {}
         labels = np.full(self.size, -1, np.int16)
-        for index, key in reversed(list(enumerate(self.objects))):
-            if (path := self.files.files[name].get(key)) is not None:
-                labels[self._object(path, name)] = index
-        return labels
+        for key, path in reversed(paths.items()):
+            labels[self._object(path, name)] = self.objects.index(key)
+        return next(iter(paths.values())), labels
 
     def _object(self, path: Path, name: str) -> np.ndarray:
         """(H, W) mask of one object."""
@@ -172,16 +165,15 @@ def load_labels(
     for t, name in enumerate(names):
         ids = np.zeros(0, np.int64)
         if name not in source.missing:
-            image = source.object_labels(name) if source.objects else source.ids(name)
-            if image is None:
+            path, stored = source.object_labels(name) if source.objects else source.read(name)
+            if isinstance(stored, list):
                 is_shared = False
-                masks = source.masks(name)
-                ids = np.arange(len(masks))
+                ids = np.arange(len(stored))
                 for number in reversed(ids):
-                    labels[t][masks[number]] = number
+                    labels[t][stored[number]] = number
             else:
-                has_negative |= not source.objects and bool(image.min() < 0)
-                ids, labels[t] = compact_ids(source.folder / name, image)
+                has_negative |= not source.objects and bool(stored.min() < 0)
+                ids, labels[t] = compact_ids(path, stored)
         frame_ids.append(ids)
         if progress is not None:
             progress(t + 1, len(names))

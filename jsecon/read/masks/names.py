@@ -37,6 +37,8 @@ class MaskFiles(NamedTuple):
     reader: Reader
     files: dict[str, dict[str, Path]]
     """Frame -> folder of an object, or "" for the mask of all objects -> file."""
+    objects: tuple[str, ...]
+    """The folders of objects; empty if there is one file a frame."""
     notes: tuple[str, ...]
     """How the files were understood, a sentence each."""
 
@@ -189,11 +191,11 @@ def _arrange(reader: Reader, matches: list[_Match], unmatched: list[Path]) -> Ma
         notes = [f"The folders {_shorten(objects)} are read as objects: each has black and white masks of one.", *notes]
         by_object = {frame: {"/".join(m.extra): m.path for m in reversed(some)} for frame, some in by_frame.items()}
         files = {frame: {name: some[name] for name in objects if name in some} for frame, some in by_object.items()}
-        return MaskFiles(reader, files, tuple(notes))
+        return MaskFiles(reader, files, tuple(objects), tuple(notes))
     best = {frame: some[0] for frame, some in by_frame.items() if "/".join(some[0].extra) == min(extras)}
     if unused := {"/".join(match.folders) for match in matches if "" in extras and match.extra}:
         notes = [f"Masks in other folders ({_shorten(sorted(unused))}) were not used.", *notes]
-    return MaskFiles(reader, {frame: {"": match.path} for frame, match in best.items()}, tuple(notes))
+    return MaskFiles(reader, {frame: {"": match.path} for frame, match in best.items()}, (), tuple(notes))
 
 
 def _natural_order(name: str) -> tuple[str, int, str]:
