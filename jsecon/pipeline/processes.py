@@ -66,15 +66,18 @@ def connection(options: Options) -> Iterator[int]:
 @contextlib.contextmanager
 def _silent() -> Iterator[None]:
     """Drops what C++ code prints in the body of a `with`: Gloo reports its connections."""
-    kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     sys.stdout.flush()
-    os.dup2(nowhere, 1)
+    sys.stderr.flush()
+    kept, nowhere = [os.dup(1), os.dup(2)], os.open(os.devnull, os.O_WRONLY)
     try:
+        for number in (1, 2):
+            os.dup2(nowhere, number)
         yield
     finally:
-        os.dup2(kept, 1)
-        os.close(kept)
-        os.close(nowhere)
+        for number, stream in enumerate(kept, 1):
+            os.dup2(stream, number)
+        for stream in (*kept, nowhere):
+            os.close(stream)
 
 
 class Coordinator:
