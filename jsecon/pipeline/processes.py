@@ -43,8 +43,7 @@ def connection(options: Options) -> Iterator[int]:
     index = jax.process_index()
     try:
         settings = f"jsecon {jsecon.__version__}, {options}"
-        with _silent():
-            first = allgather_tree(settings)[0]
+        first = allgather_tree(settings)[0]
         if first != settings:
             raise InputError(f"process {index}", settings, first, "Give all processes the same options and version.")
         yield index
@@ -61,23 +60,6 @@ def connection(options: Options) -> Iterator[int]:
         sys.stderr.flush()
         os._exit(2)  # gloo's threads wait for the others
     jax.distributed.shutdown()
-
-
-@contextlib.contextmanager
-def _silent() -> Iterator[None]:
-    """Drops what C++ code prints in the body of a `with`: Gloo reports its connections."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    kept, nowhere = [os.dup(1), os.dup(2)], os.open(os.devnull, os.O_WRONLY)
-    try:
-        for number in (1, 2):
-            os.dup2(nowhere, number)
-        yield
-    finally:
-        for number, stream in enumerate(kept, 1):
-            os.dup2(stream, number)
-        for stream in (*kept, nowhere):
-            os.close(stream)
 
 
 class Coordinator:
