@@ -32,9 +32,6 @@ from jsecon.query.rules import ALL_OF_CLASS, ONE_REGION, RULES, QueryRules
 from jsecon.query.scores import score_text, unrelated_words, word_similarities
 from jsecon.types import Array, LanguageField, Selection, Votes
 
-ROUNDING = 1e-5
-"""Similarities that differ by no more count as equal: a text that is both included and excluded matches nothing."""
-
 
 class RegionMatch(NamedTuple):
     """The regions of a field, R of them, that match a question."""
@@ -163,7 +160,8 @@ def _match(embeddings, pixels, overlap, queries, excluded, words, rules: QueryRu
     scores, chosen, similarity = match_each(queries)
     if len(excluded):
         _, rejected, against = match_each(excluded)
-        chosen &= ~(rejected & (against >= similarity - ROUNDING))
+        # Equal up to rounding: a text that is both included and excluded matches nothing.
+        chosen &= ~(rejected & (against >= similarity - 1e-5))
     # The best region of a text is before those that join it, whose similarity may be larger: similarities span 2.
     is_best = jnp.any((jnp.arange(len(embeddings)) == scores.best[:, None]) & scores.accepted[:, None], axis=0)
     best = jnp.argmax(jnp.where(chosen, similarity + 4.0 * is_best, -jnp.inf))

@@ -39,8 +39,6 @@ ANCHORED_ORDERS = ("nearest to", "farthest from")
 MAX_WORDS, MAX_RELATIONS = 60, 2
 """Of an expression."""
 _ORDINALS, _NUMBERS = _WORDS["ordinals"], _WORDS["numbers"]
-_QUESTIONS = ("how many", "count of", "count", "where is", "where are", "which is", "which are", "which", "what is")
-_QUESTIONS += ("find", "show me", "show", "select")
 _QUOTES = "\"'“”"
 _QUOTED = re.compile(r"""(?<!\S)(?:"([^"]+)"|'(.+?)'|“([^”]+)”)(?=[\s,.?!]|$)""", re.DOTALL)
 """A text in quotes; an apostrophe within a word is not a quote."""
@@ -49,17 +47,8 @@ _JOINED = re.compile(r"\s+(?:(but\s+not)|or)(?=\s)", re.IGNORECASE)
 _REMEDY = 'For example "the red mug left of the bottle". Words of an object that look like these go in quotes.'
 
 
-class QueryTexts(NamedTuple):
-    """The texts of a query."""
-
-    included: list[str]
-    """Texts whose regions match; at least one."""
-    excluded: list[str]
-    """Texts whose regions are left out."""
-
-
-def parse_query(query: str) -> QueryTexts:
-    """Splits a query such as `"red mug" or "bowl" but not "handle"` into its texts.
+def parse_query(query: str) -> tuple[list[str], list[str]]:
+    """Splits a query such as `"red mug" or "bowl" but not "handle"` into texts to include, and texts to exclude.
 
     Quotes are optional. They are removed, and "or" and "but not" between a pair of them belong to the text: "tea or
     coffee" in quotes is one text. Raises InputError for a part without words, or a query that is not UTF-8.
@@ -77,7 +66,7 @@ def parse_query(query: str) -> QueryTexts:
     if not all(included + excluded) or re.match(r"but not\b", query, re.IGNORECASE):
         remedy = 'For example: "red mug" or "bowl" but not "handle"'
         raise InputError(f"query {query!r}", "a part without words", 'texts joined by "or" and "but not"', remedy)
-    return QueryTexts(included, excluded)
+    return included, excluded
 
 
 def _require_utf8(text: str) -> None:
@@ -273,7 +262,7 @@ def _longest(tokens: Sequence[_Token], start: int, table: Container[tuple[str, .
 
 def _question(tokens: list[_Token]) -> tuple[bool, list[_Token]]:
     """Returns whether a text asks for a number, and its words without those of the question."""
-    for words in _QUESTIONS:
+    for words in _LEXICON["questions"]:
         length = len(words.split())
         if [token.key for token in tokens[:length]] == words.split() and len(tokens) > length:
             rest = tokens[length:]

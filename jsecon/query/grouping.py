@@ -182,9 +182,7 @@ def parts_fallback(
     parts, text, words = cast(Parts, field.parts), jnp.asarray(text), unrelated_words(field)
     scores = np.asarray(_compiled_part_scores(parts, text, words, retrieval=rules.retrieval))
     on_scale, of_scores = np.array([0.0, SHARE_THRESHOLD, 1.0]), np.array([0.0, PART_SCORE, 1.0])
-    least = PART_SCORE
-    if rules.min_share != SHARE_THRESHOLD:
-        least = float(np.interp(rules.min_share, on_scale, of_scores))
+    least = float(np.interp(rules.min_share, on_scale, of_scores))
     mask = _best_cluster(scores >= least, scores, field.gaussians.means)
     similarity = np.interp(scores, of_scores, on_scale).astype(np.float32)
     similarity = np.where(mask | (scores < least), similarity, np.minimum(similarity, _REJECTED_SIMILARITY))
