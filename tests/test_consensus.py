@@ -10,7 +10,6 @@ from jsecon.association.consensus import (
     mask_signatures,
     pieces_on_masks,
     scene_pieces,
-    split_cells,
     track_masks,
 )
 from jsecon.association.scene import SceneSuperpixels, assign_superpixels
@@ -246,22 +245,3 @@ def test_pieces_are_near_and_deterministic_and_far_things_do_not_swallow_them():
     for number in range(piece.max() + 1):
         assert len(np.unique(truth[piece[:-1] == number])) <= 1
     assert len(np.unique(piece[:-1])) >= 12
-
-
-@pytest.mark.parametrize("count", [1, 2, 7, 200])
-def test_cells_are_as_many_as_asked_and_part_what_is_far_apart(count):
-    rng = np.random.default_rng(0)
-    points = rng.standard_normal((500, 4)).astype(np.float32)
-    cell = split_cells(points, count)
-    np.testing.assert_array_equal(np.unique(cell), np.arange(count))
-    within = sum(points[cell == k].var(0).sum() * (cell == k).sum() for k in range(count))
-    at_random = rng.integers(0, count, 500)
-    chance = sum(points[at_random == k].var(0).sum() * (at_random == k).sum() for k in np.unique(at_random))
-    assert within <= chance if count == 1 else within < 0.9 * chance
-
-
-def test_equal_points_share_a_cell():
-    points = np.repeat(np.asarray([[0.1, 3e4], [0.1, -7.3], [1e-3, 5.0]], np.float32), 50, axis=0)
-    cell = split_cells(points, 100)
-    np.testing.assert_array_equal(cell.reshape(3, 50), cell[::50, None].repeat(50, 1))
-    assert len(np.unique(cell)) == 3

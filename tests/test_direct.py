@@ -1,4 +1,4 @@
-"""Queries on codes: query_one_step at the ends of the floats (in test_window.py where jax was silently wrong);
+"""Queries on codes: query_one_step at the ends of the floats (in test_many_rows.py where jax was silently wrong);
 query_canonical against LERF's definition, written as the softmax it is, in float64."""
 
 import jax

@@ -82,8 +82,8 @@ def scene_pieces(
     """Gathers Gaussians into pieces that are compact and lie in the same masks: (N,) piece, -1 if its weight is 0.
 
     It runs k-means over the centres (compressed outside of the middle half of the scene, so that distant objects get
-    few pieces) and a random projection of the masks, initialised by `split_cells`. Two rounds end within 6 % of the sum
-    of squares of k-means++ and mini-batches (bonsai, replica_apartment_0), in a tenth to a third of the time.
+    few pieces) and a random projection of the masks, initialised by `_split_cells`. Two rounds end within 6 % of the
+    sum of squares of k-means++ and mini-batches (bonsai, replica_apartment_0), in a tenth to a third of the time.
     Arguments as for `group_by_consensus`.
     """
     piece = np.full(len(means), -1, np.int64)
@@ -99,7 +99,7 @@ def scene_pieces(
     sketch = membership[live] @ basis
     sketch /= np.maximum(np.linalg.norm(sketch, axis=1, keepdims=True), 1e-12)
     points = np.concatenate([4.0 * centred, sketch], axis=1).astype(np.float32)
-    centres = _cell_means(points, split_cells(points, min(pieces, max(len(live) // 4, 1))))
+    centres = _cell_means(points, _split_cells(points, min(pieces, max(len(live) // 4, 1))))
     for _ in range(2):
         # |p - c|^2 / 2 but for |p|^2 / 2, which is the same for all centres
         lines = np.concatenate([-centres, 0.5 * np.square(centres).sum(1, keepdims=True)], axis=1).astype(np.float32)
@@ -110,7 +110,7 @@ def scene_pieces(
     return piece
 
 
-def split_cells(points: Float[np.ndarray, "n d"], count: int) -> Int[np.ndarray, " n"]:
+def _split_cells(points: Float[np.ndarray, "n d"], count: int) -> Int[np.ndarray, " n"]:
     """Divides points (N, D) into at most `count` cells: each round splits those with the largest spread at their mean.
 
     Up to half of all cells are split per round, along the axis of their spread. Equal points share a cell.

@@ -10,6 +10,7 @@ the order of the views, nor on how devices, processes or blocks of Gaussians sha
 """
 
 import contextlib
+import dataclasses
 import functools
 import os
 import shutil
@@ -104,7 +105,7 @@ def region_votes(
       gaussians: Scene of N Gaussians; its columns may be memory-mapped.
       cameras: Batch of T cameras.
       labels: (T, H, W) integers below `num_regions`, -1 where a pixel belongs to no region; or T images (H, W), of
-        which `labels[t]` reads one. Inside a trace R and more count as -1.
+        which `labels[t]` reads one, in several threads. Inside a trace R and more count as -1.
       num_regions: R.
       top: Number of strongest regions that each Gaussian keeps; `Votes.weight_beyond_top_k` counts the rest.
       by_view: Whether to keep each view's total too (`Votes.by_view`), as `normalise_votes` needs it.
@@ -138,6 +139,8 @@ def region_votes(
     if is_traced((gaussians, cameras, labels)):
         return _scan_votes(gaussians, cameras, labels, num_regions, top, by_view, **options)
     cameras = jax.tree.map(np.asarray, cameras)
+    if gaussians.count <= _MAX_WHOLE:  # once for all views
+        gaussians = jax.device_put(dataclasses.replace(gaussians, sh=None))
     with _scratch_folder(folder) as scratch:
 
         def view(t: int) -> ViewEvidence:
