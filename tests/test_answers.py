@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 from capture_files import run_cli
-from small_field import make_field
+from small_field import colour_field, make_field
 from test_gltf import read_glb
 
 from jsecon import Answer, Query, QueryRules, Scene, load_gaussians, objects, query_region, save_field
@@ -19,7 +19,7 @@ def saved(scene, cameras, tmp_path_factory):
     """A small field whose source lies 2 units to the side of its world, and its file."""
     moved = np.eye(4)
     moved[0, 3] = 2
-    field = dataclasses.replace(make_field(scene, cameras)[0], source_from_scene=moved)
+    field = dataclasses.replace(colour_field(scene, cameras), source_from_scene=moved)
     file = tmp_path_factory.mktemp("field") / "field.safetensors"
     save_field(file, field)
     return field, file
