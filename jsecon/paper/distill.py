@@ -112,10 +112,10 @@ class _State(NamedTuple):
 class Distillation(NamedTuple):
     """What `distill_l1` trains. A loss is NaN for a view that overflowed the capacity."""
 
-    codes: Float[
-        Array, "n d"
-    ]  # unit; zero for Gaussians that no labelled pixel sees, if they started at zero or random
-    losses: Float[Array, " steps"]  # before each step
+    codes: Float[Array, "n d"]
+    """Unit; zero for Gaussians that no labelled pixel sees, unless `init` gave them a code."""
+    losses: Float[Array, " steps"]
+    """Before each step."""
 
 
 def distill_l1(
