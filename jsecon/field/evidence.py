@@ -143,9 +143,9 @@ def region_votes(
         gaussians = jax.device_put(dataclasses.replace(gaussians, sh=None))
     with _scratch_folder(folder) as scratch:
 
-        def view(t: int) -> ViewEvidence:
+        def view(t: int) -> tuple:  # a plain one, which processes can exchange
             evidence = view_evidence(gaussians, cameras[t], np.asarray(labels[t]), num_regions, **options)
-            return evidence if scratch is None else _on_disk(evidence, scratch / str(t))
+            return tuple(evidence if scratch is None else _on_disk(evidence, scratch / str(t)))
 
         lists = [ViewEvidence(*evidence) for evidence in map_views(views, view, progress)]
         return sum_evidence(lists, gaussians.count, num_regions, top=top, by_view=by_view, folder=folder)
