@@ -88,7 +88,7 @@ class _Source:
     def read(self, name: str) -> tuple[Path, np.ndarray | list[np.ndarray]]:
         """The file of a frame, and its ids or masks at the size of the frames."""
         file = self.frames.get(name)
-        size = self.size[::-1] if file is None else (file.width, file.height)
+        size = (self.size[1], self.size[0]) if file is None else (file.width, file.height)
         if self.coco is not None:
             path, stored = self.coco.file, self.coco.read(name, size)
         else:
