@@ -87,7 +87,7 @@ def find_up(points: np.ndarray) -> Upright:
     loose = points[outside] if planes and outside.any() else points
     distinct = np.unique(points, axis=0)
     spacing = float(np.median(KDTree(distinct).query(distinct[::3], min(4, len(distinct)))[0][:, -1]))
-    min_points = max(12, 0.004 * len(distinct))  # less is what sticks out of a wall
+    min_points = max(12.0, 0.004 * len(distinct))  # less is what sticks out of a wall
     things = _things(loose, max(2 * tolerance, 3 * spacing), min_points) if planes else []
     normals = [sign * plane.normal for plane in planes for sign in (1, -1)]
     candidates = [_judge(normal, points, planes, loose, things, size, spacing) for normal in normals]
