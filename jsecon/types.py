@@ -263,13 +263,12 @@ class Parts:
 
 @record
 class Autoencoder:
-    """Parameters of one scene's autoencoder (`train_autoencoder`), layer by layer."""
+    """Parameters of one scene's autoencoder (`train_autoencoder`)."""
 
     encoder: Leaf
-    """Tuple of dicts: weight (in, out), bias (out,), and but for the last layer scale, shift, mean and variance (out,)
-    of the batch normalisation behind it."""
+    """{"params", "batch_stats"}: nested dicts of arrays, flax's layout."""
     decoder: Leaf
-    """Tuple of dicts: weight (in, out), bias (out,)."""
+    """{"params"}: nested dicts of arrays."""
 
 
 @record

@@ -424,13 +424,15 @@ def _coder() -> Autoencoder:
     """Layers of the true layout: 8 -> 4 -> 4, and back."""
 
     def layer(a, b):
-        return {"weight": np.full((a, b), 0.1, np.float32), "bias": np.zeros(b, np.float32)}
+        return {"kernel": np.full((a, b), 0.1, np.float32), "bias": np.zeros(b, np.float32)}
 
-    norm = {
-        name: np.full(4, value, np.float32)
-        for name, value in {"scale": 1, "shift": 0, "mean": 0, "variance": 1}.items()
-    }
-    return Autoencoder((layer(8, 4) | norm, layer(4, 4)), (layer(4, 4), layer(4, 8)))
+    def both(first, second):
+        return {name: np.full(4, value, np.float32) for name, value in (first, second)}
+
+    encoder = {"Dense_0": layer(8, 4), "Dense_1": layer(4, 4), "BatchNorm_0": both(("scale", 1), ("bias", 0))}
+    stats = {"BatchNorm_0": both(("mean", 0), ("var", 1))}
+    decoder = {"Dense_0": layer(4, 4), "Dense_1": layer(4, 8)}
+    return Autoencoder({"params": encoder, "batch_stats": stats}, {"params": decoder})
 
 
 def field(folder: Path) -> Iterator[Case]:

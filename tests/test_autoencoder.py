@@ -41,10 +41,14 @@ def shapes_of(size, latent):
 
 def test_layers_are_langsplats_and_wider_latents_are_no_bottleneck():
     coder, wide = shapes_of(512, 3), shapes_of(50, 40)
-    assert [layer["weight"].shape[1] for layer in coder.encoder] == [256, 128, 64, 32, 3]
-    assert [layer["weight"].shape[0] for layer in coder.decoder] == [3, 16, 32, 64, 128, 256, 256]
-    assert [len(layer) for layer in coder.encoder] == [6, 6, 6, 6, 2]  # all but the last are normalised
-    assert min(layer["weight"].shape[1] for layer in (*wide.encoder, *wide.decoder)) >= 40
+    inward, outward = (variables["params"] for variables in (coder.encoder, coder.decoder))
+    assert [inward[f"Dense_{n}"]["kernel"].shape[1] for n in range(5)] == [256, 128, 64, 32, 3]
+    assert [outward[f"Dense_{n}"]["kernel"].shape[0] for n in range(7)] == [3, 16, 32, 64, 128, 256, 256]
+    assert set(coder.encoder["batch_stats"]) == {f"BatchNorm_{n}" for n in range(4)}  # all but the last
+    kernels = [
+        leaf for leaf in jax.tree.leaves((wide.encoder["params"], wide.decoder["params"])) if len(leaf.shape) == 2
+    ]
+    assert min(kernel.shape[1] for kernel in kernels) >= 40
 
 
 def test_regions_come_back_from_three_numbers(trained):
@@ -64,12 +68,15 @@ def test_regions_come_back_from_three_numbers(trained):
 
 def encoded(coder, x):
     """The codes of rows (..., E) in float64."""
-    layers, x = jax.tree.map(lambda a: np.asarray(a, np.float64), coder.encoder), x.astype(np.float64)
-    for layer in layers[:-1]:
-        x = x @ layer["weight"] + layer["bias"]
-        x = (x - layer["mean"]) / np.sqrt(layer["variance"] + 1e-5) * layer["scale"] + layer["shift"]
+    variables, x = jax.tree.map(lambda a: np.asarray(a, np.float64), coder.encoder), x.astype(np.float64)
+    layers, stats = variables["params"], variables["batch_stats"]
+    for n in range(len(stats)):
+        layer, norm, moments = layers[f"Dense_{n}"], layers[f"BatchNorm_{n}"], stats[f"BatchNorm_{n}"]
+        x = x @ layer["kernel"] + layer["bias"]
+        x = (x - moments["mean"]) / np.sqrt(moments["var"] + 1e-5) * norm["scale"] + norm["bias"]
         x = np.maximum(x, 0)
-    x = x @ layers[-1]["weight"] + layers[-1]["bias"]
+    last = layers[f"Dense_{len(stats)}"]
+    x = x @ last["kernel"] + last["bias"]
     return x / np.linalg.norm(x, axis=1, keepdims=True)
 
 
@@ -78,8 +85,10 @@ def test_forward_pass_equals_numpy_float64(trained):
     codes = encoded(coder, embeddings)
     np.testing.assert_allclose(encode(coder, embeddings), codes, atol=2e-4)
     x = codes
-    for n, layer in enumerate(jax.tree.map(lambda a: np.asarray(a, np.float64), coder.decoder)):
-        x = (np.maximum(x, 0) if n else x) @ layer["weight"] + layer["bias"]
+    layers = jax.tree.map(lambda a: np.asarray(a, np.float64), coder.decoder["params"])
+    for n in range(len(layers)):
+        layer = layers[f"Dense_{n}"]
+        x = (np.maximum(x, 0) if n else x) @ layer["kernel"] + layer["bias"]
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     np.testing.assert_allclose(decode(coder, codes.astype(np.float32)), x, atol=1e-5)
 
@@ -122,10 +131,18 @@ def test_gradients_are_those_of_finite_differences(trained):
         coder, rows = jax.tree.map(lambda a: jnp.asarray(a, jnp.float64), (coder, embeddings[:3]))
 
         def back(rows, bias):
-            last = coder.decoder[-1] | {"bias": bias}
-            return decode(dataclasses.replace(coder, decoder=(*coder.decoder[:-1], last)), encode(coder, rows))
+            params = coder.decoder["params"]
+            changed = {"params": params | {"Dense_6": params["Dense_6"] | {"bias": bias}}}
+            return decode(dataclasses.replace(coder, decoder=changed), encode(coder, rows))
 
-        check_grads(jax.jit(back), (rows, coder.decoder[-1]["bias"]), order=1, modes=["rev"], eps=1e-6, rtol=1e-4)
+        check_grads(
+            jax.jit(back),
+            (rows, coder.decoder["params"]["Dense_6"]["bias"]),
+            order=1,
+            modes=["rev"],
+            eps=1e-6,
+            rtol=1e-4,
+        )
 
 
 @pytest.mark.long

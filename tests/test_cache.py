@@ -21,7 +21,7 @@ def _tree(scene, cameras):
         "cameras": cameras,
         "pair": (np.arange(3, dtype=np.int16), None),
         "list": [1, 2.5, "x", True],
-        "coder": Autoencoder(({"weight": np.ones((4, 2), np.float32)},), ()),
+        "coder": Autoencoder({"params": {"Dense_0": {"kernel": np.ones((4, 2), np.float32)}}}, {}),
         "nan": float("nan"),
         "empty": np.zeros((0, 3)),
         "outcome": StageResult(np.ones(2, bool), {"part": "why"}, ("a note",)),

@@ -55,8 +55,12 @@ def test_with_an_autoencoder_and_without_codes(field, tmp_path):
     texts = unit_rows(np.random.default_rng(1), 3, 12)
     read = load_field(tmp_path / "a.field").codes.autoencoder
     np.testing.assert_array_equal(encode(read, texts), encode(coder, texts))
-    for encoder in (coder.encoder[1:], coder.encoder[:-1], (coder.encoder[-1], *coder.encoder[1:])):
-        broken = dataclasses.replace(coder, encoder=encoder)
+    params = coder.encoder["params"]
+    without_first = {name: layer for name, layer in params.items() if name != "Dense_0"}
+    without_last = {name: layer for name, layer in params.items() if name != "Dense_4"}
+    swapped = params | {"Dense_0": params["Dense_4"], "Dense_4": params["Dense_0"]}
+    for wrong in (without_first, without_last, swapped):
+        broken = dataclasses.replace(coder, encoder=coder.encoder | {"params": wrong})
         with pytest.raises(ValueError, match="layers do not lead"):
             save_field(
                 tmp_path / "b.field",

@@ -227,16 +227,17 @@ def _oddity(field: LanguageField, checked: bool = True) -> str | None:
 
 def _layers_fit(autoencoder: Autoencoder, dim: int, latent: int) -> bool:
     """Whether the layers lead from `dim` numbers to `latent` ones and back."""
-    normalised = {"scale", "shift", "mean", "variance"}
-    ways = (autoencoder.encoder, normalised, dim, latent), (autoencoder.decoder, set(), latent, dim)
-    for layers, more, inputs, outputs in ways:
-        for n, layer in enumerate(layers):
-            width = len(layer["bias"])
-            if set(layer) != {"weight", "bias"} | (more if n < len(layers) - 1 else set()):
-                return False
-            if any(a.shape != ((inputs, width) if name == "weight" else (width,)) for name, a in layer.items()):
-                return False
-            inputs = width
-        if inputs != outputs:
+    ways = ("encoder", autoencoder.encoder, dim, latent), ("decoder", autoencoder.decoder, latent, dim)
+    for name, variables, inputs, outputs in ways:
+        params = variables.get("params", {})
+        count = sum(layer.startswith("Dense_") for layer in params)
+        widths = [int(np.size(params.get(f"Dense_{n}", {}).get("bias", ()))) for n in range(count)]
+        sizes = zip((inputs, *widths), widths)
+        expected: dict = {"params": {f"Dense_{n}": {"kernel": size, "bias": size[1:]} for n, size in enumerate(sizes)}}
+        norms = {f"BatchNorm_{n}": (width,) for n, width in enumerate(widths[:-1]) if name == "encoder"}
+        expected["params"] |= {norm: {"scale": size, "bias": size} for norm, size in norms.items()}
+        if norms:
+            expected["batch_stats"] = {norm: {"mean": size, "var": size} for norm, size in norms.items()}
+        if jax.tree.map(np.shape, variables) != expected or widths[-1:] != [outputs]:
             return False
     return True

@@ -5,7 +5,6 @@ bring the embeddings back, min |D(E(phi_bar)) - phi_bar|^2 + w (1 - cos(D(E(phi_
 """
 
 import functools
-import itertools
 from typing import Any, NamedTuple
 
 import jax
@@ -14,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jsecon.errors import require, require_shape
-from jsecon.numerics import FULL_PRECISION, cosine, normalize
+from jsecon.numerics import FULL_PRECISION, cosine, is_traced, normalize
 from jsecon.types import Array, Autoencoder, Key, Progress
 
 ENCODER_WIDTHS = (256, 128, 64, 32)
@@ -37,7 +36,7 @@ def encode(autoencoder: Autoencoder, embeddings: Float[Array, "*batch e"]) -> Fl
     Raises:
       ValueError: Embeddings of another size.
     """
-    size = autoencoder.encoder[0]["weight"].shape[0]
+    size = autoencoder.encoder["params"]["Dense_0"]["kernel"].shape[0]
     require_shape("embeddings", embeddings, (..., size), "Embed with what the autoencoder was trained on.")
     units = normalize(jnp.asarray(embeddings))
     codes = _encode(autoencoder.encoder, units.reshape(-1, size))
@@ -46,7 +45,7 @@ def encode(autoencoder: Autoencoder, embeddings: Float[Array, "*batch e"]) -> Fl
 
 def decode(autoencoder: Autoencoder, codes: Float[Array, "*batch d"]) -> Float[Array, "*batch e"]:
     """Decodes codes (..., d) of any length to unit embeddings (..., E): phi = D(l)."""
-    size = autoencoder.decoder[0]["weight"].shape[0]
+    size = autoencoder.decoder["params"]["Dense_0"]["kernel"].shape[0]
     require_shape("codes", codes, (..., size), "Decode codes of this autoencoder.")
     codes = jnp.asarray(codes)
     rows = _decode(autoencoder.decoder, codes.reshape(-1, size))
@@ -89,8 +88,8 @@ def train_autoencoder(
     count, dim = units.shape
     batches = -(-count // 64)  # of similar sizes: batch normalisation cannot learn from one or two regions
     total = epochs if epochs is not None else max(100, -(-MIN_STEPS // batches))
-    inward = (dim, *(max(w, latent) for w in ENCODER_WIDTHS), latent)
-    outward = (latent, *(max(w, latent) for w in DECODER_WIDTHS), dim)
+    inward = (*(max(w, latent) for w in ENCODER_WIDTHS), latent)
+    outward = (*(max(w, latent) for w in DECODER_WIDTHS), dim)
     plan = _Plan(inward, outward, batches)
     init_key, shuffle_key = jax.random.split(key)
     carry = _start(units, init_key, plan)
@@ -101,9 +100,10 @@ def train_autoencoder(
         if progress is not None:
             jax.block_until_ready(carry)
             progress(stop, total)
-    _, vector, moments = carry[1]
-    encoder, decoder = _unflatten(vector, plan)
-    return Autoencoder((*(a | b for a, b in zip(encoder, moments)), encoder[-1]), tuple(decoder))
+    _, vector, stats = carry[1]
+    vector = vector if is_traced(vector) else np.asarray(vector)  # NumPy's slices need no compilation
+    params = jax.device_put(_unflatten(vector, _shapes(units, plan)[0]))
+    return Autoencoder({"params": params["encoder"], "batch_stats": stats}, {"params": params["decoder"]})
 
 
 class _Plan(NamedTuple):
@@ -113,46 +113,43 @@ class _Plan(NamedTuple):
     decoder_widths: tuple[int, ...]
     batches: int
 
-    def shapes(self) -> tuple[list[dict], list[dict]]:
-        """Shapes of the trained parameters of encoder and decoder, layer by layer."""
-        encoder, decoder = (
-            [{"weight": (inputs, outputs), "bias": (outputs,)} for inputs, outputs in itertools.pairwise(widths)]
-            for widths in (self.encoder_widths, self.decoder_widths)
-        )
-        normalised = [layer | {"scale": layer["bias"], "shift": layer["bias"]} for layer in encoder[:-1]]
-        return [*normalised, encoder[-1]], decoder
-
 
 @functools.partial(jax.jit, static_argnames="plan")
 def _start(units: Array, key: Key, plan: _Plan) -> Any:
-    """((parameters as one vector, running moments, Adam's state), best so far: (loss, vector, running moments))."""
+    """((parameters as one vector, batch statistics, Adam's moments), best so far: (loss, vector, batch statistics))."""
+    shapes, stats = _shapes(units, plan)
     middle, spread = [], []
-    for layer in (*plan.shapes()[0], *plan.shapes()[1]):
-        for name, shape in layer.items():
-            size = int(np.prod(shape))
-            middle.append(np.full(size, float(name == "scale")))
-            # PyTorch's default, which LangSplat starts from: weights and biases uniform in +-1/sqrt(inputs).
-            spread.append(np.full(size, layer["weight"][0] ** -0.5 if name in ("weight", "bias") else 0.0))
+    for path, leaf in jax.tree_util.tree_leaves_with_path(shapes):
+        part, name, kind = (step.key for step in path)
+        norm = name.startswith("BatchNorm")
+        middle.append(np.full(leaf.size, float(norm and kind == "scale")))
+        # PyTorch's default, which LangSplat starts from: weights and biases uniform in +-1/sqrt(inputs).
+        spread.append(np.full(leaf.size, 0.0 if norm else shapes[part][name]["kernel"].shape[0] ** -0.5))
     middle, spread = (jnp.asarray(np.concatenate(values), units.dtype) for values in (middle, spread))
-    # One draw for all layers compiles several times faster than a draw a layer.
+    # One draw for all layers compiles several times faster than flax's initialisers, a draw a layer.
     vector = middle + spread * jax.random.uniform(key, middle.shape, units.dtype, -1.0, 1.0)
-    hidden = plan.encoder_widths[1:-1]
-    moments = [{"mean": jnp.zeros(n, units.dtype), "variance": jnp.ones(n, units.dtype)} for n in hidden]
-    return (vector, moments, _optimizer().init(vector)), (jnp.asarray(jnp.inf, units.dtype), vector, moments)
+    stats = {
+        name: {"mean": jnp.zeros_like(norm["mean"]), "var": jnp.ones_like(norm["var"])} for name, norm in stats.items()
+    }
+    moments = _optimizer().init(vector)
+    return (vector, stats, moments), (jnp.asarray(jnp.inf, units.dtype), vector, stats)
 
 
-def _unflatten(vector: Array, plan: _Plan) -> tuple[list[dict], list[dict]]:
-    """Parameters of encoder and decoder, which `vector` holds end to end."""
-    start, parts = 0, ([], [])
-    for layers, shapes in zip(parts, plan.shapes()):
-        for shape_of in shapes:
-            layer = {}
-            for name, shape in shape_of.items():
-                stop = start + int(np.prod(shape))
-                layer[name] = vector[start:stop].reshape(shape)
-                start = stop
-            layers.append(layer)
-    return parts
+def _shapes(units: Array, plan: _Plan) -> tuple[Any, Any]:
+    """Shapes of the parameters {"encoder", "decoder"} and of the batch statistics."""
+    key, codes = jax.random.key(0), jnp.zeros((1, plan.encoder_widths[-1]), units.dtype)
+    encoder, decoder = _layers()
+    first = jax.eval_shape(lambda: encoder(plan.encoder_widths).init(key, units[:1], train=False))
+    second = jax.eval_shape(lambda: decoder(plan.decoder_widths).init(key, codes))
+    return {"encoder": first["params"], "decoder": second["params"]}, first["batch_stats"]
+
+
+def _unflatten(vector: Any, shapes: Any) -> Any:
+    """The tree of parameters that `vector` holds end to end."""
+    leaves, tree = jax.tree.flatten(shapes)
+    ends = np.cumsum([leaf.size for leaf in leaves])
+    parts = [vector[end - leaf.size : end].reshape(leaf.shape) for end, leaf in zip(ends, leaves, strict=True)]
+    return jax.tree.unflatten(tree, parts)
 
 
 def _optimizer() -> Any:
@@ -168,23 +165,25 @@ def _epochs(
 ) -> Any:
     count = units.shape[0]
     size = -(-count // plan.batches)
+    encoder, decoder = (layers(widths) for layers, widths in zip(_layers(), (plan.encoder_widths, plan.decoder_widths)))
     optimizer = _optimizer()
+    shapes, _ = _shapes(units, plan)
 
-    def difference(decoder, codes, x, weight):
-        out = _decode(decoder, codes)
+    def difference(params, codes, x, weight):
+        out: Any = decoder.apply({"params": params["decoder"]}, codes)
         return jnp.mean((out - x) ** 2) + weight * (1 - jnp.mean(cosine(out, x)))
 
-    def loss(vector, moments, x):
-        encoder, decoder = _unflatten(vector, plan)
-        codes, of_batch = _forward(encoder, None, x)
-        moments = jax.tree.map(lambda old, new: 0.9 * old + 0.1 * new, moments, of_batch)
-        return difference(decoder, codes, x, 0.001), moments
+    def loss(vector, stats, x):
+        params = _unflatten(vector, shapes)
+        variables = {"params": params["encoder"], "batch_stats": stats}
+        codes, changed = encoder.apply(variables, x, train=True, mutable=["batch_stats"])
+        return difference(params, codes, x, 0.001), changed["batch_stats"]
 
     def step(state, x) -> tuple[Any, None]:
-        vector, moments, adam = state
-        gradient, moments = jax.grad(loss, has_aux=True)(vector, moments, x)
-        updates, adam = optimizer.update(gradient, adam)
-        return (vector + updates, moments, adam), None
+        vector, stats, moments = state
+        gradient, stats = jax.grad(loss, has_aux=True)(vector, stats, x)
+        updates, moments = optimizer.update(gradient, moments)
+        return (vector + updates, stats, moments), None
 
     def epoch(index, carry):
         state, best = carry
@@ -193,42 +192,58 @@ def _epochs(
         state, _ = jax.lax.scan(lambda s, rows: step(s, units[rows]), state, order)
 
         def judge(best):
-            vector, moments, _ = state
-            encoder, decoder = _unflatten(vector, plan)
-            codes, _ = _forward(encoder, moments, units)
+            vector, stats, _ = state
+            params = _unflatten(vector, shapes)
+            codes = encoder.apply({"params": params["encoder"], "batch_stats": stats}, units, train=False)
             # LangSplat trains with the cosine term at 0.001 and chooses its checkpoint with it at full weight.
-            value = difference(decoder, codes, units, 1.0)
-            return jax.tree.map(lambda new, old: jnp.where(value < best[0], new, old), (value, vector, moments), best)
+            value = difference(params, codes, units, 1.0)
+            return jax.tree.map(lambda new, old: jnp.where(value < best[0], new, old), (value, vector, stats), best)
 
         return state, jax.lax.cond(index >= judged_from, judge, lambda best: best, best)
 
     return jax.lax.fori_loop(start, stop, epoch, carry)
 
 
+def _widths(params: Any) -> tuple[int, ...]:
+    layers = sum(name.startswith("Dense_") for name in params)
+    return tuple(params[f"Dense_{i}"]["kernel"].shape[-1] for i in range(layers))
+
+
 @jax.jit
-def _encode(layers: Any, rows: Array) -> Array:
-    codes, _ = _forward(layers, layers, rows)
+def _encode(variables: Any, rows: Array) -> Array:
+    codes: Any = _layers()[0](_widths(variables["params"])).apply(variables, rows, train=False)
     return jnp.where(jnp.any(rows != 0, axis=-1, keepdims=True), codes, 0.0)
 
 
-def _forward(layers: Any, moments: Any, x: Array) -> tuple[Array, list[dict[str, Array]]]:
-    """E(x): unit codes of rows, and the moments of each normalisation; these are the batch's own if none are given."""
-    used = []
-    for n, layer in enumerate(layers[:-1]):
-        x = _affine(layer, x)
-        mean, variance = (moments[n]["mean"], moments[n]["variance"]) if moments else (x.mean(0), x.var(0))
-        used.append({"mean": mean, "variance": variance})
-        x = jax.nn.relu((x - mean) * jax.lax.rsqrt(variance + 1e-5) * layer["scale"] + layer["shift"])
-    return normalize(_affine(layers[-1], x)), used
-
-
 @jax.jit
-def _decode(layers: Any, x: Array) -> Array:
-    """D(x): unit embeddings of codes."""
-    for layer in layers[:-1]:
-        x = jax.nn.relu(_affine(layer, x))
-    return normalize(_affine(layers[-1], x))
+def _decode(variables: Any, rows: Array) -> Any:
+    return _layers()[1](_widths(variables["params"])).apply(variables, rows)
 
 
-def _affine(layer: dict[str, Array], x: Array) -> Array:
-    return jnp.matmul(x, layer["weight"], precision=FULL_PRECISION) + layer["bias"]
+@functools.cache
+def _layers() -> tuple[Any, Any]:
+    """Encoder and decoder, by their widths. flax is imported here, late: a field is read without it."""
+    from flax import linen as nn
+
+    class Encoder(nn.Module):
+        widths: tuple[int, ...]
+
+        @nn.compact
+        def __call__(self, x, train: bool):
+            x = nn.Dense(self.widths[0], param_dtype=x.dtype, precision=FULL_PRECISION)(x)
+            for width in self.widths[1:]:
+                norm = nn.BatchNorm(use_running_average=not train, momentum=0.9, epsilon=1e-5, param_dtype=x.dtype)
+                x = nn.relu(norm(x))
+                x = nn.Dense(width, param_dtype=x.dtype, precision=FULL_PRECISION)(x)
+            return normalize(x)
+
+    class Decoder(nn.Module):
+        widths: tuple[int, ...]
+
+        @nn.compact
+        def __call__(self, x):
+            for index, width in enumerate(self.widths):
+                x = nn.Dense(width, param_dtype=x.dtype, precision=FULL_PRECISION)(nn.relu(x) if index else x)
+            return normalize(x)
+
+    return Encoder, Decoder
