@@ -37,7 +37,6 @@ from jsecon.read.masks.labels import load_lerf_labels
 from jsecon.read.masks.langsplat import embedding_size, load_features
 from jsecon.read.masks.masks import load_labels, load_proposals
 from jsecon.read.splats.files import read_gaussians, save_gaussians
-from jsecon.read.splats.gltf import save_glb
 from jsecon.read.splats.ply import load_point_cloud
 from jsecon.types import Autoencoder, Camera, Codes, Gaussians, LanguageField, Parts, Regions, Votes
 from jsecon.vision.stores import EmbeddingStore, StoredSegmenter
@@ -111,7 +110,7 @@ def splats(folder: Path) -> Iterator[Case]:
     made |= {f"v{version}.spz": spz(arrays, version) for version in (2, 3, 4)}
     for name, data in made.items():
         (folder / name).write_bytes(data)
-    save_glb(folder / "g.glb", _gaussians(30, 4))
+    save_gaussians(folder / "g.glb", _gaussians(30, 4))
     for name in [*made, "g.glb"]:
         yield Case([folder / name], lambda file=folder / name: read_gaussians(file)[0], _whole_gaussians)
 

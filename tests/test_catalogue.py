@@ -11,7 +11,7 @@ from small_field import REGIONS, make_field, shares, true_regions
 
 import jsecon
 from jsecon import InputError, Regions, Votes, load_gaussians, save_field
-from jsecon.read.splats.ply import read_vertices
+from jsecon.read.splats.ply import read_ply_file
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.unrelated_words import UNRELATED_WORDS
 
@@ -172,6 +172,11 @@ def test_the_command_line_writes_a_table_records_and_a_page(field, file, tmp_pat
     (tmp_path / "names.txt").write_text("#\n")
     assert run_cli("objects", file, "--vocabulary", tmp_path / "names.txt") == 2
     assert "names.txt" in capsys.readouterr().err
+
+
+def read_vertices(path) -> np.ndarray:
+    data, header = read_ply_file(path)
+    return np.frombuffer(data, header.elements[0].dtype("<"), offset=header.start)
 
 
 def test_exported_objects_and_labels_are_those_of_the_catalogue(field, file, tmp_path):

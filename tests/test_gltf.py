@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 from splat_files import C0, opacity, scene
 from test_gaussian_files import gaussians, image
 
-from jsecon import Gaussians, load_gaussians
-from jsecon.read.splats.gltf import save_glb
+from jsecon import Gaussians, load_gaussians, save_gaussians
 from jsecon.splat.transform import transform_gaussians
 
 COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -42,7 +41,7 @@ def read_glb(path) -> tuple[dict, dict[str, np.ndarray]]:
 @pytest.mark.parametrize("basis", [1, 4, 9, 16])
 def test_attributes_are_the_extensions(tmp_path, basis):
     given = scene(101, basis)
-    save_glb(tmp_path / "a.glb", gaussians(given | {"quaternions": 3 * given["quaternions"]}))
+    save_gaussians(tmp_path / "a.glb", gaussians(given | {"quaternions": 3 * given["quaternions"]}))
     told, found = read_glb(tmp_path / "a.glb")
     degrees = range({1: 1, 4: 2, 9: 3, 16: 4}[basis])
     harmonics = [f"{NAME}:SH_DEGREE_{degree}_COEF_{n}" for degree in degrees for n in range(2 * degree + 1)]
@@ -70,7 +69,7 @@ def test_attributes_are_the_extensions(tmp_path, basis):
 def test_what_it_holds_shows_the_same_image(tmp_path):
     """Back from the file's axes by hand: turns and harmonics have followed the places."""
     given = gaussians(scene(600, 16))
-    save_glb(tmp_path / "a.glb", given)
+    save_gaussians(tmp_path / "a.glb", given)
     _, found = read_glb(tmp_path / "a.glb")
     rotation, scale, alpha = (found[f"{NAME}:{kind}"] for kind in ("ROTATION", "SCALE", "OPACITY"))
     harmonics = [array for name, array in found.items() if ":SH_" in name]
@@ -86,7 +85,7 @@ def test_what_it_holds_shows_the_same_image(tmp_path):
 def test_read_back_as_written(tmp_path, basis):
     """To float32: sizes and opacities by way of their exponential and sigmoid."""
     given = scene(101, basis)
-    save_glb(tmp_path / "a.glb", gaussians(given), object_ids=np.arange(101) - 1)
+    save_gaussians(tmp_path / "a.glb", gaussians(given), object_ids=np.arange(101) - 1)
     np.testing.assert_array_equal(read_glb(tmp_path / "a.glb")[1]["_OBJECT_ID"][:, 0], np.arange(101) - 1)
     found = load_gaussians(tmp_path / "a.glb")
     sign = np.sign((np.asarray(found.quaternions) * given["quaternions"]).sum(1, keepdims=True))  # q and -q turn alike
@@ -94,7 +93,7 @@ def test_read_back_as_written(tmp_path, basis):
         assert getattr(found, name).dtype == np.float32
         np.testing.assert_allclose(getattr(found, name), array, atol=3e-6)
     sure = given | {"opacity_logits": np.where(np.arange(101) % 2, np.inf, -np.inf)}
-    save_glb(tmp_path / "a.glb", gaussians(sure))
+    save_gaussians(tmp_path / "a.glb", gaussians(sure))
     np.testing.assert_array_equal(load_gaussians(tmp_path / "a.glb").opacity_logits, sure["opacity_logits"])
 
 
@@ -122,7 +121,7 @@ def extension(told):
 def test_other_writers_ways(tmp_path):
     """Two primitives, under nodes of which one turns and the other is a matrix; rows apart; opacities of 8 bits."""
     given, turn = gaussians(scene(30, 4)), Rotation.from_rotvec([0.1, -0.5, 0.3])
-    save_glb(tmp_path / "a.glb", given)
+    save_gaussians(tmp_path / "a.glb", given)
 
     def change(told):
         outer = {"rotation": turn.as_quat().tolist(), "translation": [1, 2, 3], "scale": [2, 2, 2], "children": [1, 2]}
@@ -155,20 +154,19 @@ def test_other_writers_ways(tmp_path):
     (lambda told: primitive(told)["attributes"].pop(f"{NAME}:SCALE"), f"no attribute {NAME}:SCALE"),
     (lambda told: primitive(told)["attributes"].pop(f"{NAME}:SH_DEGREE_1_COEF_1"), "3 coeff"),
     (lambda told: told["nodes"][0].update(children=[0]), "node 0 is in its scene twice"),
-    (lambda told: told["nodes"][0].update(scale=[1, 2, 1]), "node 0 scales its axes unequally, by 1, 2, 1"),
-    (lambda told: told["nodes"][0].update(scale=[1, 1, -1]), "mirrors"),
-    (lambda told: told["nodes"][0].update(scale=[0, 0, 0]), "no usable transform"),
-    (lambda told: told["nodes"][0].update(matrix=[1, 0, 0, 0, 1, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), "axes"),
+    (lambda told: told["nodes"][0].update(scale=[1, 2, 1]), "one positive scale"),
+    (lambda told: told["nodes"][0].update(scale=[1, 1, -1]), "one positive scale"),
+    (lambda told: told["nodes"][0].update(scale=[0, 0, 0]), "one positive scale"),
+    (lambda told: told["nodes"][0].update(matrix=[1, 0, 0, 0, 1, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), "a rotation"),
     (lambda told: extension(told).update(colorSpace="lin_rec709_display"), "lin_rec709_display"),
     (lambda told: extension(told).update(projection="fisheye"), "projection of its Gaussians is fisheye"),
-    (lambda told: extension(told).update(extensions={"EXT_x": {}}), "use the extension EXT_x"),
-    (lambda told: told["accessors"][2].update(componentType=5121), "not normalised"),
+    (lambda told: extension(told).update(extensions={"EXT_x": {}}), "EXT_x"),
     (lambda told: extension(told).update(kernel="cube"), "kernel of its Gaussians is cube"),
     (lambda told: told["accessors"][4].update(bufferView=0, byteOffset=0), "not finite"),
-    (lambda told: told.update(extensionsRequired=["KHR_materials_unlit", NAME, "KHR_x"]), "extension KHR_x"),
+    (lambda told: told.update(extensionsRequired=[NAME, "KHR_x"]), "extension KHR_x"),
 ])  # fmt: skip
 def test_what_is_none_or_not_known(tmp_path, change, says):
-    save_glb(tmp_path / "a.glb", gaussians(scene(30, 4)))
+    save_gaussians(tmp_path / "a.glb", gaussians(scene(30, 4)))
     rewritten(tmp_path / "a.glb", change)
     with refused("a.glb", says):
         load_gaussians(tmp_path / "a.glb")
@@ -176,7 +174,7 @@ def test_what_is_none_or_not_known(tmp_path, change, says):
 
 def test_nothing_to_write_and_nowhere_to_write_it(tmp_path):
     with refused("a.glb", "no Gaussians to write"):
-        save_glb(tmp_path / "a.glb", gaussians(scene(0, 1)))
+        save_gaussians(tmp_path / "a.glb", gaussians(scene(0, 1)))
     (tmp_path / "file").write_text("in the way")
     with refused("a.glb", "a folder"):
-        save_glb(tmp_path / "file" / "a.glb", gaussians(scene(3, 1)))
+        save_gaussians(tmp_path / "file" / "a.glb", gaussians(scene(3, 1)))

@@ -21,8 +21,7 @@ from jsecon.fit.resize import resize_frame, shrink_cameras
 from jsecon.pipeline.results import WARNING
 from jsecon.read.captures.coordinates import transform_poses
 from jsecon.read.captures.frames import evenly_spaced
-from jsecon.read.splats.files import read_gaussians
-from jsecon.read.splats.ply import MAX_READ_ROUNDING
+from jsecon.read.splats.files import MAX_READ_ROUNDING, read_gaussians
 from jsecon.splat.project import project
 from jsecon.splat.render import render_rgb
 from jsecon.splat.transform import transform_gaussians_float64

@@ -2,32 +2,226 @@
 
 `READERS` is the table of formats. A reader takes the file, and returns Gaussians (NumPy) in the world of the .ply that
 they were made from, and notes. Other packages add readers by entry points in the group jsecon.splats.
+
+gsply (extra formats) decodes .spz, .sog and SuperSplat's compressed .ply. What it passes over is done here: it ignores
+the axes that a .spz names and the flag of antialiasing, misreads version 1 of .spz, and reads a .ply and the codebooks
+of a .sog without a check of their sizes. It returns linear positions, log scales, quaternions wxyz and logits of
+opacities.
 """
 
+import contextlib
+import gzip
+import struct
 import warnings
+import zipfile
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float, Int
 
-from jsecon.errors import InputError
-from jsecon.files import reading
+from jsecon.errors import InputError, describe_error
+from jsecon.files import atomic_write, parse_json, reading
 from jsecon.read.registry import Reader, find_reader
-from jsecon.read.splats import packed
 from jsecon.read.splats.gltf import read_glb, save_glb
-from jsecon.read.splats.packed import antialiasing_note, import_gsply, read_compressed_ply, save_spz
-from jsecon.read.splats.ply import in_float32, read_ply, read_ply_file, save_ply
+from jsecon.read.splats.ply import Header, drawable_gaussians, read_ply, read_ply_file, save_ply, usable_blocks
+from jsecon.splat.sh import C0
+from jsecon.splat.transform import float32_rounding, transform_gaussians, transform_gaussians_float64
 from jsecon.types import Array, Gaussians
 
 _FORMATS = "Gaussians as .ply (INRIA's or SuperSplat's compressed), .glb, .spz, .sog or .splat"
-_CONVERTIBLE = (".ksplat", ".lcc", ".mjs")
-"""suffixes that splat-transform reads, besides meta.json of an unpacked .sog"""
+MAX_READ_ROUNDING = 0.25
+"""Rounding of a Gaussian's centre by float32, relative to its largest standard deviation, above which a file is not
+read."""
+_AGAIN = "Export it again, or as an uncompressed .ply."
+_SPZ_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
+"""from a .ply's x right, y down, z forward to .spz's x right, y up, z back; and back again"""
+_CHUNK_SIZE = 256
+"""Gaussians of a compressed .ply that share bounds"""
+_CHUNK_FIELDS = [
+    (f"{end}_{kind}", "f4")
+    for kinds in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
+    for end in ("min", "max")
+    for kind in kinds
+]
+_VERTEX_FIELDS = [(f"packed_{name}", "u4") for name in ("position", "rotation", "scale", "color")]
+_SPLAT = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
+"""a Gaussian of antimatter15's .splat"""
+
+
+def _import_gsply(path: Path) -> Any:
+    """Imports gsply, of the extra formats; `path` is the file that needs it."""
+    try:
+        import gsply
+    except ImportError as error:
+        problem = f"a {path.suffix.lower()} like this needs the package gsply, which is not installed"
+        raise InputError(path, problem, remedy="Run: pip install 'jsecon[formats]' (or use a plain .ply).") from error
+    return gsply
+
+
+@contextlib.contextmanager
+def _decoding(path: Path) -> Iterator[Any]:
+    """Yields gsply; whatever it raises on damaged bytes becomes an InputError."""
+    gsply = _import_gsply(path)
+    try:
+        with np.errstate(invalid="ignore", over="ignore"):
+            yield gsply
+    except InputError:
+        raise
+    except Exception as error:
+        problem = f"the file is damaged or cut short ({describe_error(error).replace(f': {path}', '')})"
+        raise InputError(path, problem, remedy=_AGAIN) from error
+
+
+def _gaussians(path: Path, data: Any) -> Gaussians:
+    """Makes Gaussians of gsply's arrays."""
+    rest = np.zeros((len(data.means), 0, 3)) if data.shN is None else data.shN
+    if rest.shape[1] not in (0, 3, 8, 15):
+        raise ValueError(f"{rest.shape[1]} harmonics above the constant")
+    arrays = {
+        "means": data.means,
+        "log_scales": data.scales,
+        "quaternions": data.quats,
+        "opacity_logits": np.reshape(data.opacities, -1),
+        "sh": np.concatenate([np.asarray(data.sh0)[:, None], rest], axis=1),
+    }
+    return drawable_gaussians(path, {name: np.ascontiguousarray(a, np.float32) for name, a in arrays.items()})
+
+
+def _antialiasing_note(path: Path) -> tuple[str, ...]:
+    """Notes that a file was trained with antialiasing."""
+    return (f"{path.name} was trained with antialiasing (Mip-Splatting), and is drawn without it.",)
+
+
+def _read_spz(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
+    """Reads Niantic's .spz (github.com/nianticlabs/spz) of version 2 to 4.
+
+    Versions 2 and 3 are one gzip stream, with records behind the numbers; version 4 has them behind the header.
+    """
+    with _decoding(path) as gsply:
+        data = path.read_bytes()
+        is_gzip = data.startswith(b"\x1f\x8b")
+        body = gzip.decompress(data) if is_gzip else data
+        magic, version, count, degree, _, flags = struct.unpack("<4sIIBBB", body[:15])
+        if magic != b"NGSP":
+            raise InputError(path, "it does not begin as a .spz does", remedy=_AGAIN)
+        if not 2 <= version <= 4:
+            raise InputError(path, f"it is of version {version}", "a .spz of version 2 to 4", _AGAIN)
+        if count > 1000 * len(data):
+            raise ValueError(f"it announces {count} Gaussians")
+        if is_gzip:
+            row = 16 + (4 if version > 2 else 3) + 3 * ((degree + 1) ** 2 - 1)
+            records = body[16 + count * row :]
+        else:
+            records = data[32 : int.from_bytes(data[16:20], "little")]
+        _check_axes(path, records if flags & 2 else b"")
+        gaussians = _gaussians(path, gsply.read_spz(path))
+    return transform_gaussians(gaussians, _SPZ_AXES), _antialiasing_note(path) if flags & 1 else ()
+
+
+def _check_axes(path: Path, records: bytes) -> None:
+    """Raises InputError if the records of a .spz name axes other than its makers' (0: unspecified, 4: RUB)."""
+    offset = 0
+    while offset + 8 <= len(records):
+        kind, length = struct.unpack_from("<II", records, offset)
+        if offset + 8 + length > len(records):
+            raise EOFError
+        number = int.from_bytes(records[offset + 8 : offset + 12], "little")
+        if kind == 0xADBE0003 and number not in (0, 4):
+            remedy = "Export the scene again, in Niantic's own axes (RUB)."
+            raise InputError(path, f"its coordinate system has the number {number}", "4, right up back", remedy)
+        offset += 8 + length
+
+
+def _save_spz(path: Path, gaussians: Gaussians, *, similarity: Float[Array, "4 4"] | None = None) -> None:
+    """Writes a .spz of version 3, with the finest positions that hold the farthest Gaussian in 24 bits."""
+    gsply = _import_gsply(path)
+    if not gaussians.count:
+        raise InputError(path, "there are no Gaussians to write", remedy="Write a .ply, which may be empty.")
+    into = _SPZ_AXES if similarity is None else _SPZ_AXES @ np.asarray(similarity, np.float64)
+    blocks = [block for _, block in usable_blocks(path, gaussians, into)]
+    means, log_scales, quaternions, opacity_logits, sh = (
+        np.concatenate([np.asarray(getattr(block, name)) for block in blocks])
+        for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh")
+    )
+    reach = float(np.abs(means).max(initial=0))
+    largest = log_scales.max(axis=1)
+    finest = 16 if reach > 1 else 24
+    bits = next((n for n in range(finest, 0, -1) if reach * 2.0**n < 1 << 23), 0)
+    if bits == 0 or (bits < finest and (np.exp(largest) < 2.0 ** (1 - bits)).mean() > 0.5):
+        problem = f"positions up to {reach:,.0f} units from the origin would be rounded to {2.0**-bits:.3g} units"
+        remedy = "Write a .ply or a .glb, or bring the scene nearer to its origin."
+        raise InputError(path, problem, "a rounding below the size of most Gaussians", remedy)
+    if (largest > 5.95).any() or (largest < -10.05).sum() > 0.01 * len(largest):
+        problem = f"its Gaussians are up to {np.exp(largest.max()):.3g} units large, or many are tiny"
+        remedy = "Write a .ply, or scale the scene."
+        raise InputError(path, problem, "sizes from 4.5e-5 to 379 units in a .spz", remedy)
+    columns = {"means": means, "scales": log_scales, "quats": quaternions, "opacities": opacity_logits, "sh0": sh[:, 0]}
+    arrays = {name: np.ascontiguousarray(a, np.float32) for name, a in columns.items()}
+    rest = np.ascontiguousarray(sh[:, 1:], np.float32) if sh.shape[1] > 1 else None
+    with atomic_write(path) as temporary, np.errstate(over="ignore"):
+        data = gsply.GSData.from_arrays(**arrays, shN=rest, format="ply")
+        gsply.write_spz(temporary, data, version=3, fractional_bits=bits)
+
+
+def _read_compressed_ply(path: Path, header: Header) -> Gaussians:
+    """Reads SuperSplat's compressed .ply (github.com/playcanvas/splat-transform, decompress-ply.ts)."""
+    with _decoding(path) as gsply:
+        chunk, vertex, *rest = header.elements
+        sh_fields = [(f"f_rest_{n}", "u1") for n in range(len(rest[0].fields) if rest else 0)]
+        fields = [_CHUNK_FIELDS, _VERTEX_FIELDS, *([sh_fields] if rest else [])]
+        if header.form != "binary_little_endian" or [element.fields for element in header.elements] != fields:
+            remedy = f"Run: npx @playcanvas/splat-transform {path.name} plain.ply"
+            raise InputError(path, "its elements are not those of SuperSplat 2's compressed .ply", remedy=remedy)
+        size = sum(element.count * element.dtype("<").itemsize for element in header.elements)
+        if path.stat().st_size < header.start + size or chunk.count * _CHUNK_SIZE < vertex.count:
+            raise EOFError
+        if rest and rest[0].count != vertex.count:
+            raise ValueError(f"it has {rest[0].count} rows of harmonics for {vertex.count} Gaussians")
+        return _gaussians(path, gsply.plyread(path))
+
+
+def _read_sog(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
+    """Reads PlayCanvas' .sog, images in a zip."""
+    with _decoding(path) as gsply:
+        with zipfile.ZipFile(path) as archive:
+            meta = parse_json(archive.read("meta.json"))
+        # gsply indexes a codebook without a check of its size
+        if any(len(part.get("codebook", [0] * 256)) < 256 for part in meta.values() if isinstance(part, dict)):
+            raise ValueError("a codebook of fewer than 256 numbers")
+        return _gaussians(path, gsply.sogread(path)), _antialiasing_note(path) if meta.get("antialias") is True else ()
+
+
+def _read_splat(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
+    """Reads antimatter15's .splat: 32 bytes a Gaussian, degree 0, without a header."""
+    data = path.read_bytes()
+    if len(data) % _SPLAT.itemsize:
+        problem = f"it has {len(data)} bytes, which is not a multiple of {_SPLAT.itemsize}, the size of a Gaussian"
+        raise InputError(path, problem, remedy="The file is cut short or of another format: export it again.")
+    rows = np.frombuffer(data, _SPLAT)
+    half_step = 0.5 / 255
+    opacity = np.clip(rows["rgba"][:, 3] / 255, half_step, 1 - half_step)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_scales = np.log(rows["scales"])  # a size of 0 is that of a flat Gaussian
+    arrays = {
+        "means": rows["means"],
+        "log_scales": log_scales,
+        "quaternions": (rows["rotation"].astype(np.float32) - 128) / 128,
+        "opacity_logits": np.log(opacity / (1 - opacity)),
+        "sh": (rows["rgba"][:, None, :3] / 255.0 - 0.5) / C0,
+    }
+    return drawable_gaussians(path, {name: np.ascontiguousarray(a, np.float32) for name, a in arrays.items()}), ()
 
 
 def _read_ply(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
     """Reads a .ply, compressed or not."""
     header = read_ply_file(path)[1]
-    notes = antialiasing_note(path) if any(map(_names_antialiasing, header.comments)) else ()
-    return (read_compressed_ply(path, header) if header.is_compressed else read_ply(path)), notes
+    notes = _antialiasing_note(path) if any(map(_names_antialiasing, header.comments)) else ()
+    is_compressed = any(name == "packed_position" for element in header.elements for name, _ in element.fields)
+    return (_read_compressed_ply(path, header) if is_compressed else read_ply(path)), notes
 
 
 def _names_antialiasing(comment: str) -> bool:
@@ -38,7 +232,9 @@ def _names_antialiasing(comment: str) -> bool:
 READERS = (
     Reader("PLY", (".ply",), _read_ply),
     Reader("glTF", (".glb",), lambda path: (read_glb(path), ())),
-    *packed.READERS,
+    Reader("SPZ", (".spz",), _read_spz),
+    Reader("SOG", (".sog",), _read_sog),
+    Reader("splat", (".splat",), _read_splat),
 )
 
 
@@ -65,7 +261,22 @@ def load_gaussians(path: str | Path, *, similarity: Float[Array, "4 4"] | None =
     gaussians, notes = read_gaussians(path)
     for note in notes:
         warnings.warn(note, stacklevel=2)
-    return in_float32(Path(path), gaussians, similarity)
+    return _in_float32(Path(path), gaussians, similarity)
+
+
+def _in_float32(path: Path, gaussians: Gaussians, similarity: Float[Array, "4 4"] | None) -> Gaussians:
+    """Puts the Gaussians (NumPy) of a file on jax's device, after a (4, 4) transform into another world in float64."""
+    if similarity is not None:
+        gaussians = transform_gaussians_float64(gaussians, similarity)
+    rounding = float32_rounding(gaussians)
+    if len(rounding) and np.median(rounding) > MAX_READ_ROUNDING:
+        place = ", ".join(f"{number:.10g}" for number in np.median(gaussians.means, axis=0))
+        remedy = (
+            "Give load_gaussians a similarity that brings them near 0, as numpy.linalg.inv(capture.source_from_scene)."
+        )
+        problem = f"the Gaussians lie about ({place}), where float32 does not tell them apart"
+        raise InputError(path, problem, remedy=remedy)
+    return jax.tree.map(jnp.asarray, gaussians)
 
 
 def read_gaussians(path: str | Path) -> tuple[Gaussians, tuple[str, ...]]:
@@ -80,7 +291,7 @@ def read_gaussians(path: str | Path) -> tuple[Gaussians, tuple[str, ...]]:
     reader = find_reader("jsecon.splats", READERS, path)
     if reader is None:
         remedy = "Export the scene as a .ply."
-        if path.suffix.lower() in _CONVERTIBLE or path.name == "meta.json":
+        if path.suffix.lower() in (".ksplat", ".lcc", ".mjs") or path.name == "meta.json":  # of an unpacked .sog
             remedy = f"Run: npx @playcanvas/splat-transform {path.name} {path.stem}.ply"
         elif path.suffix.lower() == ".gltf":
             remedy = "Export it as one .glb file, or as a .ply."
@@ -116,7 +327,7 @@ def save_gaussians(
     require_writable_format(path)
     suffix = path.suffix.lower()
     if suffix == ".spz":
-        save_spz(path, gaussians, similarity=similarity)
+        _save_spz(path, gaussians, similarity=similarity)
     else:
         save = save_glb if suffix == ".glb" else save_ply
         save(path, gaussians, object_ids=object_ids, similarity=similarity)
@@ -128,4 +339,4 @@ def require_writable_format(path: Path) -> None:
         remedy = f"For example: {path.stem}.ply; npx @playcanvas/splat-transform makes other formats of it."
         raise InputError(path, f"its name ends in {path.suffix or 'no suffix'}", ".ply or .spz or .glb", remedy)
     if path.suffix.lower() == ".spz":
-        import_gsply(path)
+        _import_gsply(path)

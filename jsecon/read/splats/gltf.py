@@ -36,10 +36,6 @@ _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _FLOAT, _BYTE, _VERTICES, _POINTS = 5126, 5121, 34962, 0
 """glTF's numbers for component types, a target of buffers and a mode of primitives"""
 _DTYPES = {5120: "i1", _BYTE: "u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
-_SUPPORTED = {_EXTENSION, "KHR_mesh_quantization"}
-"""extensions that a file may require"""
-_APPEARANCE = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "KHR_xmp", "EXT_texture_", "EXT_lights_")
-"""prefixes of the extensions that change nothing about Gaussians"""
 _SRGB = "srgb_rec709_display"
 _REMEDY = "Export the scene again, or as a .ply."
 
@@ -154,7 +150,7 @@ def read_glb(path: Path) -> Gaussians:
     colour spaces, numbers in another file, and nodes that shear, mirror or scale their axes unequally.
     """
     parts, count = [], 0
-    problem = "its description (JSON) is damaged or incomplete"
+    problem = "its Gaussians cannot be read"
     with reading(path, remedy=_REMEDY, problem=problem), path.open("rb") as file:
         glb = _open(path, file)
         for matrix, primitive in _primitives(glb):
@@ -192,26 +188,18 @@ class _Glb:
 def _open(path: Path, file: BinaryIO) -> _Glb:
     """Reads the container of a .glb, and checks that it is complete."""
     size = path.stat().st_size
-    if size < 20:
-        raise InputError(path, "the file is cut short", remedy=_REMEDY)
     magic, version, length = struct.unpack("<4sII", file.read(12))
     if (magic, version) != (b"glTF", 2):
         raise InputError(path, "it does not begin as a .glb of version 2 does", remedy=_REMEDY)
-    if length != size:
-        raise InputError(path, f"the file is cut short: {size} of {length} bytes", remedy=_REMEDY)
     text, kind = struct.unpack("<I4s", file.read(8))
-    if kind != b"JSON" or text > size - 20:
-        raise InputError(path, "it does not begin with its description (JSON)", remedy=_REMEDY)
-    document, start, length = parse_json(file.read(text)), 28 + text, 0
-    if start <= size:
-        length, kind = struct.unpack("<I4s", file.read(8))
-        if kind != b"BIN\0" or start + length > size:
-            raise InputError(path, "its numbers (the binary chunk) are cut short", remedy=_REMEDY)
-    required = {str(name) for name in document.get("extensionsRequired", ())}
-    if unsupported := sorted(name for name in required - _SUPPORTED if not name.startswith(_APPEARANCE)):
-        remedy = "Export the scene without compression, or as a .ply."
-        raise InputError(path, f"it requires the extension {', '.join(unsupported)}", remedy=remedy)
-    return _Glb(path, file, document, start, length)
+    document, start = parse_json(file.read(text)), 28 + text
+    body, binary = struct.unpack("<I4s", file.read(8)) if start <= size else (0, b"BIN\0")
+    if length != size or start + body > max(size, start) or (kind, binary) != (b"JSON", b"BIN\0"):
+        raise InputError(path, f"the file is cut short or damaged: {size} of {length} bytes", remedy=_REMEDY)
+    if unsupported := set(document.get("extensionsRequired", ())) - {_EXTENSION, "KHR_mesh_quantization"}:
+        remedy = "Export the Gaussians alone and without compression, or as a .ply."
+        raise InputError(path, f"it requires the extension {', '.join(sorted(unsupported))}", remedy=remedy)
+    return _Glb(path, file, document, start, body)
 
 
 def _primitives(glb: _Glb) -> Iterator[tuple[np.ndarray, Any]]:
@@ -230,42 +218,16 @@ def _primitives(glb: _Glb) -> Iterator[tuple[np.ndarray, Any]]:
         for primitive in glb.document["meshes"][node["mesh"]]["primitives"] if "mesh" in node else ():
             if (properties := primitive.get("extensions", {}).get(_EXTENSION)) is not None:
                 _require_supported(glb, properties)
-                _require_similarity(glb, index, matrix)
                 yield matrix, primitive
 
 
 def _require_supported(glb: _Glb, properties: Any) -> None:
     """Raises InputError if a primitive's Gaussians have a property that jsecon does not draw."""
-    if extensions := sorted(map(str, properties.get("extensions", ()))):
-        problem = f"its Gaussians use the extension {', '.join(extensions)}"
-        raise glb.error(problem, remedy="Export them uncompressed, or as a .ply.")
-    for key, words, supported in (
-        ("kernel", "kernel", "ellipse"),
-        ("projection", "projection", "perspective"),
-        ("colorSpace", "colour space", _SRGB),
-    ):
-        if (value := properties.get(key, supported)) != supported:
-            remedy = "Export the scene with sRGB colours, or as a .ply."
-            raise glb.error(f"the {words} of its Gaussians is {value}", supported, remedy)
-
-
-def _require_similarity(glb: _Glb, index: int, matrix: np.ndarray) -> None:
-    """Raises InputError if the transform of a node is more than a rotation, one positive scale and a shift."""
-    axes = matrix[:3, :3]
-    sizes = np.linalg.norm(axes, axis=0)
-    rounding = 1e-4
-    if not (np.isfinite(matrix).all() and sizes.min() > 0 and np.allclose(matrix[3], [0, 0, 0, 1])):
-        problem = "has no usable transform"
-    elif sizes.max() > (1 + rounding) * sizes.min():
-        problem = f"scales its axes unequally, by {', '.join(f'{size:.6g}' for size in sizes)}"
-    elif np.abs(axes.T @ axes - np.diag(sizes**2)).max() > 2 * rounding * sizes.max() ** 2:
-        problem = "shears its axes"
-    elif np.linalg.det(axes) < 0:
-        problem = "mirrors its axes"
-    else:
-        return
-    remedy = "Apply that transform to the Gaussians in the program that wrote the file, and export again."
-    raise glb.error(f"its node {index} {problem}", "a rotation, one positive scale and a shift", remedy)
+    supported = {"kernel": "ellipse", "projection": "perspective", "colorSpace": _SRGB, "extensions": {}}
+    for key, value in supported.items():
+        if (found := properties.get(key, value)) != value:
+            remedy = "Export the scene uncompressed and with sRGB colours, or as a .ply."
+            raise glb.error(f"the {key} of its Gaussians is {found}", str(value or "none"), remedy)
 
 
 def _node_matrix(node: Any) -> np.ndarray:
@@ -311,24 +273,18 @@ def _fields(glb: _Glb, primitive: Any) -> dict[str, np.ndarray]:
 def _column(glb: _Glb, name: str, index: int) -> Float[np.ndarray, "n c"]:
     """(N, components) float32 of an attribute's accessor; reads and allocates no more than the binary chunk."""
     accessor = glb.document["accessors"][index]
-    if "sparse" in accessor or "bufferView" not in accessor:
-        raise glb.error(f"the numbers of {name} are sparse")
     view, count = glb.document["bufferViews"][accessor["bufferView"]], int(accessor["count"])
     kind, size = np.dtype(_DTYPES[accessor["componentType"]]), _COMPONENTS[accessor["type"]]
     row = kind.itemsize * size
     stride = int(view.get("byteStride", row))
     offset = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
     needed = (count - 1) * stride + row if count else 0
-    if view["buffer"] != 0 or "uri" in glb.document["buffers"][0]:
-        raise glb.error(f"the numbers of {name} lie in another file", remedy="Export one .glb file, or a .ply.")
+    if "sparse" in accessor or view["buffer"] != 0 or "uri" in glb.document["buffers"][0]:
+        raise glb.error(f"the numbers of {name} are sparse or lie in another file")
     if count < 0 or stride < row or offset < 0 or offset + needed > glb.length:
         raise glb.error(f"{name} has {count} rows of {stride} bytes from {offset} on, in {glb.length} bytes")
     glb.file.seek(glb.start + offset)
     array = np.ndarray((count, size), kind, glb.file.read(needed), strides=(stride, kind.itemsize))
-    if kind.kind == "f":
+    if kind.kind == "f" or accessor.get("normalized") is not True:
         return array.astype(np.float32)
-    if accessor.get("normalized") is True:
-        return np.maximum(array.astype(np.float32) / np.iinfo(kind).max, -1)
-    if name not in ("POSITION", f"{_EXTENSION}:SCALE"):
-        raise glb.error(f"the whole numbers of {name} are not normalised", "normalised ones, or floats")
-    return array.astype(np.float32)
+    return np.maximum(array.astype(np.float32) / np.iinfo(kind).max, -1)

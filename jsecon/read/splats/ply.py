@@ -12,24 +12,18 @@ import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from jsecon.errors import InputError, describe_error, require_shape
-from jsecon.files import atomic_write
+from jsecon.errors import InputError, require_shape
+from jsecon.files import atomic_write, reading
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.splat.project import check_gaussians, unusable_rows
-from jsecon.splat.sh import C0
-from jsecon.splat.transform import float32_rounding, transform_blocks, transform_gaussians_float64
+from jsecon.splat.transform import float32_rounding, transform_blocks
 from jsecon.types import Array, Gaussians
 
 ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 """format of a .ply -> NumPy's byte order"""
-MAX_READ_ROUNDING = 0.25
-"""Rounding of a Gaussian's centre by float32, relative to its largest standard deviation, above which a file is not
-read."""
 _TYPE_NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float"}
 _TYPES = {name: kind for kind, old in (_TYPE_NAMES | {"f8": "double"}).items() for name in (old, np.dtype(kind).name)}
 """a property's type, by its old name or with its size (uchar, uint8) -> NumPy's"""
@@ -81,11 +75,6 @@ class Header:
     start: int
     """Offset of the first byte after the header."""
 
-    @property
-    def is_compressed(self) -> bool:
-        """Whether the vertices are packed as in SuperSplat's compressed .ply."""
-        return any(name == "packed_position" for element in self.elements for name, _ in element.fields)
-
 
 def _parse_header(path: Path, data: memoryview) -> Header:
     """Parses the header at the start of some bytes."""
@@ -118,33 +107,22 @@ def _parse_header(path: Path, data: memoryview) -> Header:
             raise _error(path, f"the header line {line.strip()!r} is not valid") from error
     if form not in ORDERS:
         raise _error(path, f"its format is {form!r}", f"one of {', '.join(ORDERS)}")
-    for element in elements:
-        if len({name for name, _ in element.fields}) < len(element.fields):
-            raise _error(path, f"its element {element.name} has two properties of one name")
     return Header(form, elements, tuple(comments), end.end())
 
 
 def read_ply_file(path: Path) -> tuple[memoryview, Header]:
     """Maps a .ply into memory: all its bytes, and its header."""
-    try:
-        data = np.memmap(path, np.uint8, "r").data if path.stat().st_size else memoryview(b"")
-    except OSError as error:
-        raise _error(path, describe_error(error), remedy="Check the path.") from error
+    data = np.memmap(path, np.uint8, "r").data if path.stat().st_size else memoryview(b"")
     return data, _parse_header(path, data)
 
 
-def read_vertices(path: Path) -> np.ndarray:
+def _read_vertices(path: Path) -> np.ndarray:
     """(N,) structured array of the vertices' properties; of a binary file, mapped into memory."""
     data, header = read_ply_file(path)
     names = [element.name for element in header.elements]
     if "vertex" not in names:
         raise _error(path, f"its elements are {', '.join(names) or 'missing'}", "an element vertex")
-    if header.is_compressed:
-        remedy = f"Read it with jsecon.load_gaussians, or run: npx @playcanvas/splat-transform {path.name} plain.ply"
-        raise _error(path, "it is compressed (SuperSplat's packed chunks)", remedy=remedy)
     *before, vertices = header.elements[: names.index("vertex") + 1]
-    if not vertices.fields:
-        raise _error(path, "its element vertex has no properties", "x y z and more")
     if lists := [element.name for element in (*before, vertices) if not element.fixed]:
         raise _error(path, f"its element {lists[0]} has lists", "lists behind the vertices only")
     if header.form == "ascii":
@@ -176,11 +154,8 @@ def _parse_text(path: Path, lines: list[bytes], vertices: _Element) -> np.ndarra
         raise _truncated(path, len(lines), vertices)
     result = np.empty(vertices.count, vertices.dtype("="))
     for column, name in enumerate(names):
-        kind = result.dtype[name]
-        with np.errstate(over="ignore", invalid="ignore"):  # checked below, and infinite numbers by the caller
+        with np.errstate(over="ignore", invalid="ignore"):  # infinite numbers are refused by the caller
             result[name] = numbers[:, column]
-        if kind.kind != "f" and (result[name] != numbers[:, column]).any():
-            raise _error(path, f"numbers of {name} do not fit its type {kind.name}")
     return result
 
 
@@ -206,17 +181,13 @@ def read_ply(path: Path) -> Gaussians:
 
     - 2D Gaussians (no scale_2, or -inf there) are flat.
     - Mip-Splatting's `filter_3D` is fused into sizes and opacities, as by its create_fused_ply.py.
-    - Colours red, green, blue replace f_dc (nerfstudio's --ply-color-mode rgb): whole numbers of 8 or 16 bits, or
-      floats (0..1, or 0..255 if any is above 1).
 
     Other properties and elements are ignored.
     """
-    table = read_vertices(path)
+    table = _read_vertices(path)
     count, names = len(table), table.dtype.names or ()
     scales = _SCALE if "scale_2" in names else _SCALE[:2]
-    has_rgb = all(name in names for name in _RGB) and not any(name in names for name in _DC)
-    colours = _RGB if has_rgb else _DC
-    if missing := [name for name in (*_POSITION, *colours, *_OPACITY, *scales, *_ROTATION) if name not in names]:
+    if missing := [name for name in (*_POSITION, *_DC, *_OPACITY, *scales, *_ROTATION) if name not in names]:
         expected = "3D Gaussians in INRIA's layout (x y z, f_dc_0..2, opacity, scale_0..2, rot_0..3)"
         remedy = "A plain point cloud is not enough: export the trained Gaussians as an uncompressed .ply."
         raise _error(path, f"its vertices have no {', '.join(missing)}", expected, remedy)
@@ -226,13 +197,11 @@ def read_ply(path: Path) -> Gaussians:
         expected = "0, 9, 24 or 45 of them, counted from f_rest_0 (spherical harmonics of degree 0 to 3)"
         remedy = "Export the file again, with harmonics of degree 3 or less."
         raise _error(path, f"its vertices have {rest} properties f_rest", expected, remedy)
-    filters = [name for name in ("filter_3D", "filter_3d") if name in names][:1]  # Mip-Splatting's, or of others
     exact = all(np.can_cast(table.dtype[name], np.float32) for name in _POSITION)
     arrays: dict[str, np.ndarray] = {name: np.empty((count, size), np.float32) for name, size in _SIZES.items()}
     arrays["means"] = np.empty((count, 3), np.float32 if exact else np.float64)
     arrays["opacity_logits"] = np.empty(count, np.float32)
     arrays["sh"] = np.empty((count, 1 + rest // 3, 3), np.float32)
-    brightest = 1.0
     for first in range(0, count, _BLOCK):
         rows = slice(first, first + _BLOCK)
         vertices = table[rows]
@@ -241,25 +210,13 @@ def read_ply(path: Path) -> Gaussians:
         arrays["log_scales"][rows, : len(scales)] = _columns(vertices, scales)
         arrays["quaternions"][rows] = _columns(vertices, _ROTATION)
         arrays["opacity_logits"][rows] = _columns(vertices, _OPACITY)[:, 0]
-        arrays["sh"][rows, 0] = _columns(vertices, colours)
+        arrays["sh"][rows, 0] = _columns(vertices, _DC)
         others = _columns(vertices, rest_names).reshape(len(vertices), 3, rest // 3)
         arrays["sh"][rows, 1:] = others.transpose(0, 2, 1)
-        if filters:
+        if "filter_3D" in names:
             block = {name: array[rows] for name, array in arrays.items()}
-            _fuse_filter(path, block, _columns(vertices, filters)[:, 0])
-        if has_rgb:
-            brightest = max(brightest, _brightest(vertices))
-    if has_rgb:
-        arrays["sh"][:, 0] = (arrays["sh"][:, 0].astype(np.float64) / brightest - 0.5) / C0
+            _fuse_filter(path, block, _columns(vertices, ["filter_3D"])[:, 0])
     return drawable_gaussians(path, arrays)
-
-
-def _brightest(vertices: np.ndarray) -> float:
-    """The number of the brightest red, green or blue; for floats, it follows from the vertices."""
-    kinds = [vertices.dtype[name] for name in _RGB]
-    if all(kind.kind == "f" for kind in kinds):
-        return 255.0 if max(np.nanmax(vertices[name], initial=0) for name in _RGB) > 1 else 1.0
-    return 65535.0 if max(kind.itemsize for kind in kinds) == 2 else 255.0
 
 
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")
@@ -284,21 +241,6 @@ def drawable_gaussians(path: Path, arrays: Mapping[str, np.ndarray]) -> Gaussian
     """Makes Gaussians of NumPy arrays of a file, by the names of their fields; refuses numbers that cannot be drawn."""
     _require_drawable(path, arrays, 0, "Remove these Gaussians (SuperSplat drops them on loading), or train again.")
     return Gaussians(**arrays)
-
-
-def in_float32(path: Path, gaussians: Gaussians, similarity: Float[Array, "4 4"] | None = None) -> Gaussians:
-    """Puts the Gaussians (NumPy) of a file on jax's device, after a (4, 4) transform into another world in float64."""
-    if similarity is not None:
-        gaussians = transform_gaussians_float64(gaussians, similarity)
-    rounding = float32_rounding(gaussians)
-    if len(rounding) and np.median(rounding) > MAX_READ_ROUNDING:
-        place = ", ".join(f"{number:.10g}" for number in np.median(gaussians.means, axis=0))
-        remedy = (
-            "Give load_gaussians a similarity that brings them near 0, as numpy.linalg.inv(capture.source_from_scene)."
-        )
-        problem = f"the Gaussians lie about ({place}), where float32 does not tell them apart"
-        raise _error(path, problem, remedy=remedy)
-    return jax.tree.map(jnp.asarray, gaussians)
 
 
 def usable_blocks(
@@ -388,10 +330,11 @@ def _table(block: Gaussians, is_double: bool, object_ids: np.ndarray | None) -> 
 def load_point_cloud(path: str | Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
     """Reads a plain point cloud (.ply): (P, 3) float64 points and uint8 colours, grey if the file has none.
 
-    Colours red green blue have 8 or 16 bits, or are floats (0..1, or 0..255 if any is above 1).
+    Colours red green blue are whole numbers of 8 or 16 bits, or floats from 0 to 1.
     """
     path = Path(path)
-    vertices = read_vertices(path)
+    with reading(path, remedy="Export the file again."):
+        vertices = _read_vertices(path)
     names = vertices.dtype.names or ()
     if missing := [name for name in _POSITION if name not in names]:
         raise _error(path, f"its vertices have no {', '.join(missing)}", "a point cloud with x y z")
@@ -400,5 +343,7 @@ def load_point_cloud(path: str | Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[
         raise _error(path, "its points have NaN, infinite or absurd coordinates")
     if not all(name in names for name in _RGB):
         return points, np.full((len(points), 3), 128, np.uint8)
-    colours = np.stack([np.nan_to_num(vertices[name].astype(np.float64)) for name in _RGB], axis=-1)
-    return points, np.clip(colours * (255 / _brightest(vertices)), 0, 255).round().astype(np.uint8)
+    kind = vertices.dtype["red"]
+    brightest = np.iinfo(kind).max if kind.kind in "iu" else 1.0
+    colours = np.nan_to_num(_columns(vertices, _RGB, np.float64))
+    return points, np.clip(colours * (255 / brightest), 0, 255).round().astype(np.uint8)
