@@ -34,8 +34,7 @@ from jsecon.pipeline import cache
 from jsecon.read.captures import images, video
 from jsecon.read.captures.capture import load_capture
 from jsecon.read.masks.labels import load_lerf_labels
-from jsecon.read.masks.langsplat import embedding_size, load_features
-from jsecon.read.masks.masks import load_labels, load_proposals
+from jsecon.read.masks.masks import embedding_size, load_features, load_labels, load_proposals
 from jsecon.read.splats.files import read_gaussians, save_gaussians
 from jsecon.read.splats.ply import load_point_cloud
 from jsecon.types import Autoencoder, Camera, Codes, Gaussians, LanguageField, Parts, Regions, Votes

@@ -9,8 +9,7 @@ from capture_files import png, refused
 
 from experiments.datasets.feature_files import load_text_features, write_features, write_text_features
 from jsecon.read.captures.images import write_image
-from jsecon.read.masks.langsplat import LEVELS, embedding_size, load_features
-from jsecon.read.masks.masks import load_labels
+from jsecon.read.masks.masks import LEVELS, embedding_size, load_features, load_labels
 from jsecon.vision.protocols import CANONICAL
 
 NAMES = ("b", "a", "c")

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from capture_files import refused
 
-from jsecon.read.masks.langsplat import load_features
-from jsecon.read.masks.masks import load_labels, load_proposals
+from jsecon.read.masks.masks import load_features, load_labels, load_proposals
 from jsecon.types import ImageFile
 
 SIZE = (12, 16)

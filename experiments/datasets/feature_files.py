@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from jsecon.errors import InputError
 from jsecon.files import atomic_write, write_text
-from jsecon.read.masks.langsplat import LEVELS
+from jsecon.read.masks.masks import LEVELS
 from jsecon.vision.protocols import CANONICAL
 
 

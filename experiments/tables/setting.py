@@ -17,8 +17,7 @@ from experiments.tables.association import Association, Shared, associated
 from jsecon.fit.optimise import fit_gaussians
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.start import gaussians_from_points, starting_gaussians
-from jsecon.read.masks.langsplat import load_features
-from jsecon.read.masks.masks import load_labels
+from jsecon.read.masks.masks import load_features, load_labels
 from jsecon.read.splats.files import load_gaussians, save_gaussians
 from jsecon.types import Camera, Gaussians
 

@@ -36,7 +36,7 @@ from experiments.simulated_vision.masks import LEVELS as NOISE, Faults, Simulate
 from experiments.simulated_vision.worlds import Seen, World, seen_in, world_of
 from jsecon.files import write_text
 from jsecon.read.captures.images import write_image
-from jsecon.read.masks.langsplat import LEVELS
+from jsecon.read.masks.masks import LEVELS
 from jsecon.vision.protocols import CANONICAL
 from jsecon.vision.unrelated_words import UNRELATED_WORDS
 

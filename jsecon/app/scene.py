@@ -47,7 +47,7 @@ from jsecon.query.rules import ONE_REGION, QueryRules
 from jsecon.query.select import CODE_THRESHOLD, select_by_code
 from jsecon.read.captures.capture import has_depth
 from jsecon.read.captures.images import read_pixels
-from jsecon.read.masks.fitting import resize_nearest
+from jsecon.read.masks.masks import resize_nearest
 from jsecon.read.splats.files import save_gaussians
 from jsecon.types import LanguageField
 

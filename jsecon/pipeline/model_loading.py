@@ -88,7 +88,7 @@ def open_models(options: Options, store: Path) -> Models:
         tracker = Sam2Tracker(options.tracker)
     name = None
     if options.features is not None:
-        from jsecon.read.masks.langsplat import embedding_size
+        from jsecon.read.masks.masks import embedding_size
 
         external = ExternalSpace(embedding_size(options.features))
         if options.embedder is None:

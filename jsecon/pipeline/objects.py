@@ -20,8 +20,7 @@ from jsecon.paper.algorithm1 import masklets
 from jsecon.paper.tracker import GeometricTracker
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import Checkpoint, Results, RunContext, StageInput, StageResult, vision_frames
-from jsecon.read.masks.langsplat import load_features
-from jsecon.read.masks.masks import load_labels, load_proposals
+from jsecon.read.masks.masks import load_features, load_labels, load_proposals
 from jsecon.splat.render import render_depth
 from jsecon.types import Camera, Capture, Gaussians, Progress
 from jsecon.vision.classical import GRANULARITIES, ClassicalSegmenter

@@ -42,8 +42,7 @@ from jsecon.read.captures.frames import CaptureExtent, FrameOptions, evenly_spac
 from jsecon.read.captures.images import image_header
 from jsecon.read.captures.photographs import list_photographs
 from jsecon.read.captures.video import DEFAULT_VIDEO_FRAMES, is_video, video_size
-from jsecon.read.masks.langsplat import load_features
-from jsecon.read.masks.masks import load_labels, load_proposals
+from jsecon.read.masks.masks import load_features, load_labels, load_proposals
 from jsecon.types import Capture, Gaussians, ImageFile, LanguageField, Quality
 from jsecon.vision.classical import require_contrib
 

@@ -15,7 +15,7 @@ from experiments.tables import fill, layout, published
 from experiments.tables.methods import METHODS, RECOMMENDED
 from experiments.tables.setting import levels_of, prepare
 from jsecon.fit.start import gaussians_from_points
-from jsecon.read.masks.langsplat import LEVELS, load_features
+from jsecon.read.masks.masks import LEVELS, load_features
 from jsecon.read.splats.files import load_gaussians, save_gaussians
 
 TRACKED = "ours, tracks"
