@@ -112,13 +112,12 @@ def test_round_trip(tmp_path):
 
 
 @pytest.mark.parametrize(("entry", "info", "said"), [
-    (label(segmentation=[]), {}, "segmentation of object 0"),
-    (label(segmentation=[[1, 2, 3]]), {}, "segmentation of object 0"),
-    (label(segmentation=[[1, "x"], [2, 3], [4, 5]]), {}, "segmentation of object 0"),
+    (label(segmentation=[]), {}, "segmentation is empty"), (label(segmentation=[[1, 2, 3]]), {}, "object 0"),
+    (label(segmentation=[[1, "x"], [2, 3], [4, 5]]), {}, "object 0"),
     (label(segmentation=[[1, float("nan")], [2, 3], [4, 5]]), {}, "out of all range"),
-    (label(bbox=[1, 2, 3]), {}, "bbox of object 0"), (label(category=7), {}, "'category' in object 0"),
-    ({"category": "mug"}, {}, "'segmentation' in object 0"), ("mug", {}, "'category' in object 0"),
-    (label(), {"width": "wide"}, "'width' in info"), (label(), {"height": 0}, "20x0"),
+    (label(bbox=[1, 2, 3]), {}, "object 0"), (label(category=7), {}, "category is 7"),
+    ({"category": "mug"}, {}, "'segmentation' is missing"), ("mug", {}, "object 0"),
+    (label(), {"width": "wide"}, "wide"), (label(), {"height": 0}, "20x0"),
 ])  # fmt: skip
 def test_damage_is_told(tmp_path, entry, info, said):
     write(tmp_path, entry, **info)

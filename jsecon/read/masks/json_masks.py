@@ -23,7 +23,7 @@ _RLE = '{"size": [H, W], "counts": a text or a list}'
 _JSON = 'a list of {"segmentation": ...}, or COCO\'s {"images", "annotations"}'
 
 
-def decode_rle(rle: Any, where: str | Path) -> Bool[np.ndarray, "h w"]:
+def _decode_rle(rle: Any, where: str | Path) -> Bool[np.ndarray, "h w"]:
     """Decodes a run-length encoded mask; `where` names it for errors."""
     with reading(where, _RLE, _REMEDY, problem="the mask cannot be read"):
         height, width = rle["size"]
@@ -66,13 +66,10 @@ def _fill_polygons(polygons: Any, width: int, height: int, where: str | Path) ->
     """Draws COCO's polygons [[x, y, x, y, ...], ...], px, as one mask, edges included."""
     expected = "[[x, y, x, y, ...], ...] with three corners or more each"
     nested = isinstance(polygons, list) and all(isinstance(polygon, list) for polygon in polygons)
-    try:
+    with reading(where, expected, _REMEDY, problem="the mask's polygons cannot be read"):
         corners = [np.asarray(each, np.float64).reshape(-1, 2) for each in (polygons if nested else [polygons])]
-    except (ValueError, TypeError) as error:
-        problem = "the mask's polygons are no lists of x and y in turn"
-        raise InputError(where, problem, expected, _REMEDY) from error
-    if not corners or not all(len(each) > 2 and np.isfinite(each).all() for each in corners):
-        raise InputError(where, "the mask has a polygon without three corners", expected, _REMEDY)
+        if not corners or not all(len(each) > 2 and np.isfinite(each).all() for each in corners):
+            raise ValueError("one has no three corners")
     far = np.concatenate(corners)
     if (far < -1).any() or (far > np.array([width, height]) + 1).any():  # corners may lie on the far edges
         problem = f"the mask's polygons reach from {far.min(0).tolist()} to {far.max(0).tolist()} px"
@@ -115,7 +112,7 @@ def _decode_records(file: Path, records: list[Any], size: tuple[int, int]) -> li
     for number in np.argsort(-np.asarray(scores), kind="stable"):
         segmentation, where = records[number]["segmentation"], f"{file}, mask {number}"
         if isinstance(segmentation, dict):
-            masks.append(decode_rle(segmentation, where))
+            masks.append(_decode_rle(segmentation, where))
         elif isinstance(segmentation, list):
             masks += [_fill_polygons(segmentation, *size, where)] if segmentation else []
         else:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from jsecon.errors import InputError
-from jsecon.files import read_json
+from jsecon.files import read_json, reading
 from jsecon.read.captures.images import MAX_PIXELS
 from jsecon.types import record, static
 
@@ -56,34 +56,24 @@ def load_lerf_labels(folder: str | Path) -> list[LabelledFrame]:
     return [_read(file) for file in files]
 
 
-def _error(file: Path, problem: str, expected: str) -> InputError:
-    """An error of a label file."""
-    return InputError(file, problem, expected, _REMEDY)
-
-
-def _get(file: Path, record: Any, key: str, kind: type | tuple[type, ...], where: str) -> Any:
-    """A required value of some type; `where` names the record."""
-    if not isinstance(record, dict) or not isinstance(record.get(key), kind):
-        expected = "info (name, width, height) and objects (category, segmentation, bbox)"
-        raise _error(file, f"there is no usable {key!r} in {where}", expected)
-    return record[key]
-
-
 def _read(file: Path) -> LabelledFrame:
     """Reads one label file."""
     content = read_json(file, "a label file", _REMEDY)
-    info = _get(file, content, "info", dict, "the file")
-    name = Path(_get(file, info, "name", str, "info")).stem
-    width, height = (int(_get(file, info, key, int, "info")) for key in ("width", "height"))
-    if min(width, height) < 1 or width * height > MAX_PIXELS:
-        raise _error(file, f"the image is {width}x{height}", f"a positive size, at most {MAX_PIXELS} pixels")
+    expected = "info (name, width, height) and objects (category, segmentation, bbox)"
     objects: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-    for index, entry in enumerate(_get(file, content, "objects", list, "the file")):
-        where = f"object {index}"
-        category = _get(file, entry, "category", str, where)
-        polygon = _numbers(file, _get(file, entry, "segmentation", list, where), (-1, 2), f"segmentation of {where}")
-        box = _numbers(file, _get(file, entry, "bbox", list, where), (1, 4), f"bbox of {where}").astype(np.float32)
-        mask = cv2.fillPoly(np.zeros((height, width), np.uint8), [polygon.astype(np.int32)], 1).astype(bool)
+    with reading(file, expected, _REMEDY):
+        info, entries = content["info"], list(content["objects"])
+        name, width, height = Path(info["name"]).stem, int(info["width"]), int(info["height"])
+        if min(width, height) < 1 or width * height > MAX_PIXELS:
+            raise ValueError(f"the image is {width}x{height}")
+    for index, entry in enumerate(entries):
+        with reading(file, expected, _REMEDY, problem=f"object {index} cannot be read"):
+            category = entry["category"]
+            if not isinstance(category, str):
+                raise ValueError(f"its category is {category!r}")
+            polygon = _numbers(entry, "segmentation", (-1, 2)).astype(np.int32)
+            box = _numbers(entry, "bbox", (1, 4)).astype(np.float32)
+        mask = cv2.fillPoly(np.zeros((height, width), np.uint8), [polygon], 1).astype(bool)
         if category in objects:
             before, boxes = objects[category]
             mask = mask | before
@@ -92,13 +82,9 @@ def _read(file: Path) -> LabelledFrame:
     return LabelledFrame(name, width, height, objects)
 
 
-def _numbers(file: Path, values: list, shape: tuple[int, int], what: str) -> np.ndarray:
-    """An array of a list of numbers; a dimension of `shape` may be -1."""
-    try:
-        array = np.array(values, np.float64).reshape(shape)
-    except (TypeError, ValueError) as error:
-        problem = f"the {what} is not a list of {shape[1]} numbers each"
-        raise _error(file, problem, "[x, y] corners, and x1 y1 x2 y2") from error
+def _numbers(entry: Any, key: str, shape: tuple[int, int]) -> np.ndarray:
+    """The numbers of an entry as an array; a dimension of `shape` may be -1."""
+    array = np.array(entry[key], np.float64).reshape(shape)
     if not np.isfinite(array).all() or np.abs(array).max(initial=0) > 1e6 or not len(array):
-        raise _error(file, f"the {what} is empty or out of all range", "pixels")
+        raise ValueError(f"its {key} is empty or out of all range")
     return array

@@ -42,10 +42,6 @@ class MaskFiles(NamedTuple):
     notes: tuple[str, ...]
     """How the files were understood, a sentence each."""
 
-    def path(self, name: str) -> Path | None:
-        """Looks up the file of a frame, or one of those of its objects."""
-        return next(iter(self.files.get(name, {}).values()), None)
-
 
 class _Frame(NamedTuple):
     """A frame: its name, its image's name without suffix, and its image's folders."""
