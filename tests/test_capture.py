@@ -8,7 +8,6 @@ from capture_files import refused, small_capture, transforms, write_transforms
 
 from experiments.rooms.writers import write_colmap
 from jsecon.read.captures.capture import load_capture
-from jsecon.read.captures.coordinates import camera_jumps
 from jsecon.read.captures.frames import evenly_spaced
 
 CAPTURE = small_capture()
@@ -81,32 +80,26 @@ def test_spread(count, wanted):
     assert len(gaps) == 0 or (gaps.min() >= 1 and gaps.max() - gaps.min() <= 1)
 
 
-def walk(count=40):
-    """(T, 4, 4) poses on an arc, steps of a tenth to twice the usual, and their names."""
-    along = np.cumsum(np.random.default_rng(0).uniform(0.1, 2.0, count)) / count
-    centres = np.stack([np.cos(along), np.zeros(count), np.sin(along)], axis=1)
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3] = np.linalg.qr(np.random.default_rng(1).normal(size=(count, 3, 3)))[0]
+def jumps(centres, folder) -> list[str]:
+    """The notes on jumps of a capture with these camera centres."""
+    capture = small_capture(len(centres))
+    poses = np.tile(np.eye(4), (len(centres), 1, 1))
+    poses[:, :3, :3] = np.linalg.qr(np.random.default_rng(1).normal(size=(len(centres), 3, 3)))[0]
+    poses[:, :3, :3] *= np.linalg.det(poses[:, :3, :3])[:, None, None]
     poses[:, :3, 3] = -np.einsum("tij,tj->ti", poses[:, :3, :3], centres)
-    return poses, [f"frame_{t:03d}" for t in range(count)]
+    cameras = dataclasses.replace(capture.cameras, world_to_camera=poses)
+    write_transforms(dataclasses.replace(capture, cameras=cameras), folder)
+    return [note for note in load_capture(folder).notes if "jumps in" in note]
 
 
-def test_poses_that_jump_are_told_and_frames_that_do_not_move_or_have_no_order_do_not_jump():
-    poses, names = walk()
-    assert camera_jumps(poses, names) == []
-    order = np.random.default_rng(2).permutation(len(poses))
-    assert camera_jumps(poses[order], names) == []
-    assert camera_jumps(np.tile(np.eye(4), (9, 1, 1)), names) == []
-    assert camera_jumps(poses[:1], names) == []
-    poses[12:15, :3, 3] -= poses[12:15, :3, :3] @ [15 / 40, 0, 0]  # the centres move along x
-    (note,) = camera_jumps(poses, names)
+def test_poses_that_jump_are_told_and_frames_that_do_not_move_or_have_no_order_do_not_jump(tmp_path):
+    along = np.cumsum(np.random.default_rng(0).uniform(0.1, 2.0, 40)) / 40  # steps of a tenth to twice the usual
+    centres = np.stack([np.cos(along), np.zeros(40), np.sin(along)], axis=1)
+    assert jumps(centres, tmp_path) == []
+    assert jumps(centres[np.random.default_rng(2).permutation(40)], tmp_path) == []
+    assert jumps(np.zeros((9, 3)), tmp_path) == []
+    assert jumps(centres[:1], tmp_path) == []
+    centres[12:15, 0] += 15 / 40
+    (note,) = jumps(centres, tmp_path)
     assert "2 places" in note
     assert "frame_011 to frame_012, frame_014 to frame_015)" in note
-
-
-def test_a_loaded_capture_says_where_its_poses_jump(tmp_path):
-    poses = np.array(CAPTURE.cameras.world_to_camera)
-    poses[-1, :3, 3] += 1000
-    moved = dataclasses.replace(CAPTURE, cameras=dataclasses.replace(CAPTURE.cameras, world_to_camera=poses))
-    write_transforms(moved, tmp_path)
-    assert any("jumps in" in note for note in load_capture(tmp_path).notes)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from jsecon.errors import require
 from jsecon.files import atomic_write, path_within, write_text
-from jsecon.read.captures.coordinates import transform_poses
+from jsecon.read.captures.frames import transform_poses
 from jsecon.read.captures.images import write_image
 from jsecon.read.masks.labels import LabelledFrame
 from jsecon.types import Capture

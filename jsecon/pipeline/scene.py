@@ -20,8 +20,7 @@ from jsecon.pipeline.results import KEY_FILE, StageInput, StageResult, training_
 from jsecon.pipeline.scene_files import check_overlap, place_in_capture, read_scene
 from jsecon.poses.sfm import find_poses
 from jsecon.read.captures.capture import has_depth, load_capture, read_posed_images
-from jsecon.read.captures.coordinates import make_rigid, transform_poses
-from jsecon.read.captures.frames import FrameOptions, frame_names
+from jsecon.read.captures.frames import FrameOptions, frame_names, make_rigid, transform_poses
 from jsecon.read.captures.nerfstudio import source_from_trained
 from jsecon.read.captures.photographs import list_photographs
 from jsecon.read.captures.video import is_video, write_frames

@@ -1,4 +1,9 @@
-"""From posed image files to a Capture, on the host: the part of loading that every capture format shares."""
+"""From posed image files to a Capture, on the host: the part of loading that every capture format shares.
+
+The world of a capture becomes one of ordinary numbers. Float32 has 24 bits: of a map projection's coordinates (5e6 m)
+they leave half a metre. Later steps have constants in world units made for metres, such as the near plane, which would
+cut off a scene in kilometres.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +25,6 @@ from jaxtyping import Float, UInt8
 from jsecon.errors import InputError
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.process import cores
-from jsecon.read.captures.coordinates import camera_jumps, make_rigid, normalizing_transform, transform_poses
 from jsecon.read.captures.frames import (
     CaptureExtent,
     FrameOptions,
@@ -29,15 +33,23 @@ from jsecon.read.captures.frames import (
     evenly_spaced,
     frame_names,
     holdout_mask,
+    make_rigid,
+    transform_poses,
 )
 from jsecon.read.captures.images import TRANSPOSED, ImageHeader, apply_orientation, image_header, read_depth, read_image
-from jsecon.read.captures.lens import Lens, distort, resample_depth, undistorted_pinhole, undistortion_maps
+from jsecon.read.captures.lens import Lens, resample_depth, undistorted_pinhole, undistortion_maps
 from jsecon.types import Camera, Capture, ImageFile, Progress
 
 _MIN_FOCAL = 1e-3
 """px: smaller focal lengths are errors"""
 _MAX_IN_MEMORY = 1 << 30
 """bytes of frames that stay in memory; more go to a temporary file"""
+_UNIT_STEP = 1000.0
+"""units change by a power of this, as from millimetres to metres: a scene comes out the same from each unit"""
+_MIN_DEPTH, _MAX_DEPTH = 0.1, 100.0
+"""distance of the nearest things from the cameras, world units, within which the units are kept"""
+_MAX_SPREAD = 1000.0
+"""spread of the cameras, world units, up to which the units are kept if only the cameras are known"""
 
 
 class _Frame(NamedTuple):
@@ -62,7 +74,7 @@ def _resolve_orientations(images: Sequence[PosedImage], posed: PosedImages) -> t
 
     A camera model belongs to the stored pixels or to the upright image: COLMAP ignores EXIF, other programs apply it.
     If only one of the two has the model's aspect, it is that one. If both have it (a square, or a turn by 180 degrees),
-    the other images of the capture decide, else the colours of its sparse points, else EXIF is applied.
+    the other images of the capture decide, else the program (`PosedImages.ignores_exif`).
     """
     headers = [image_header(_path_of(image)) for image in images]
     fits = [_fitting_pixels(image, header) for image, header in zip(images, headers)]
@@ -111,35 +123,12 @@ def _fitting_pixels(image: PosedImage, header: ImageHeader) -> str:
 
 
 def _poses_ignore_exif(posed: PosedImages) -> bool:
-    """Whether the poses of a capture belong to stored pixels, by other images of it, else by colours of its points."""
+    """Whether the poses of a capture belong to stored pixels, by all its images, else by the program."""
     images = [image for image in posed.images if image.image is not None]
-    fits = [_fitting_pixels(image, image_header(_path_of(image))) for image in images]
-    if "upright" in fits or "stored" in fits:
+    fits = {_fitting_pixels(image, image_header(_path_of(image))) for image in images}
+    if fits & {"stored", "upright"}:
         return "upright" not in fits
-    undecided = [image for image, fit in zip(images, fits) if fit == "both"]
-    if not len(posed.colours) or (posed.colours == posed.colours[0]).all():
-        return False
-    votes = 0
-    for image in undecided[:: -(-len(undecided) // 4)]:  # four images are enough
-        errors = [_colour_error(image, posed, upright=upright) for upright in (False, True)]
-        votes += int(np.sign(errors[1] - errors[0]))
-    return votes > 0
-
-
-def _colour_error(image: PosedImage, posed: PosedImages, *, upright: bool) -> float:
-    """Mean absolute difference between the points' colours and the pixels that show them; 255 if no point is seen."""
-    pixels, _ = read_image(_path_of(image), upright=upright)
-    height, width = pixels.shape[:2]
-    local = np.asarray(posed.points, np.float64) @ image.world_to_camera[:3, :3].T + image.world_to_camera[:3, 3]
-    is_front = local[:, 2] > 0
-    directions = local[is_front, :2] / local[is_front, 2:]
-    is_central = np.abs(directions).max(1, initial=0) < 2  # a polynomial lens folds back beyond its range
-    places = np.floor(distort(_lens_of(image).resized(width, height), directions[is_central])).astype(int)
-    is_inside = ((places >= 0) & (places < (width, height))).all(1)
-    if not is_inside.any():
-        return 255.0
-    shown = pixels[places[is_inside, 1], places[is_inside, 0]].astype(np.float64)
-    return float(np.abs(shown - posed.colours[is_front][is_central][is_inside]).mean())
+    return posed.ignores_exif
 
 
 def _fits(lens: Lens, width: int, height: int) -> bool:
@@ -259,14 +248,14 @@ def build_capture(
 
     Distorted images are resampled (bilinear) to the widest pinhole lens without empty pixels, then shrunk (area
     average). Images of other sizes than the commonest are resized to it, focal lengths with them. Large coordinates and
-    units far from metres are changed in float64 (`normalizing_transform`), by the same for any choice of frames;
+    units far from metres are changed in float64 (`_normalizing_transform`), by the same for any choice of frames;
     `Capture.source_from_scene` leads back. `only` names the frames to read.
     """
     images, poses, names, notes = _in_order(posed)
     deep = [image for image in images if image.depth is not None and not len(posed.points)]
     samples = [deep[index] for index in evenly_spaced(len(deep), 8)] if deep else []
     depths = [read_depth(image.depth, image.depth_unit) for image in samples if image.depth is not None]
-    world, world_notes = normalizing_transform(poses, posed.points, depths)  # of all frames, whichever are taken
+    world, world_notes = _normalizing_transform(poses, posed.points, depths)  # of all frames, whichever are taken
     poses, from_world = transform_poses(poses, world), np.linalg.inv(world)
     if only is not None:
         missing = sorted(set(only) - set(names))
@@ -275,7 +264,7 @@ def build_capture(
             raise InputError(posed.where, problem, remedy="Give the capture that these names are of.")
         kept = [i for i, name in enumerate(names) if name in only]
         images, poses, names = [images[i] for i in kept], poses[kept], tuple(names[i] for i in kept)
-    notes = [*notes, *posed.notes, *world_notes, *camera_jumps(poses, names)]
+    notes = [*notes, *posed.notes, *world_notes, *_camera_jumps(poses, names)]
     chosen = evenly_spaced(len(images), options.frames)
     if len(chosen) < len(images):
         notes.append(f"{len(chosen)} of {len(images)} frames were taken, evenly spaced.")
@@ -336,3 +325,83 @@ def build_capture(
         files=_files(frames),
         poses_from_scene=from_world,
     )
+
+
+def _camera_jumps(poses: Float[np.ndarray, "t 4 4"], names: Sequence[str]) -> list[str]:
+    """Reports places where neighbouring world-to-camera poses lie more than ten median steps apart: a note, or none.
+
+    A reconstruction of 125 photographs with five errors had steps of 11 to 20 there; when right, its largest was 2.2,
+    and that of a walk with one cut 9.9.
+    """
+    centres = _centres(poses)
+    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    median = float(np.median(steps)) if len(steps) else 0.0
+    far = np.flatnonzero(steps > 10 * median)
+    if median == 0 or not len(far):
+        return []
+    places = ", ".join(f"{names[t]} to {names[t + 1]}" for t in far[:5]) + (" ..." if len(far) > 5 else "")
+    return [
+        f"The camera jumps in {len(far)} places, by up to {steps.max() / median:.0f} of its usual steps ({places}). "
+        "If the frames are one walk, poses there are wrong: check them before you trust the fit."
+    ]
+
+
+def _centres(poses: np.ndarray) -> np.ndarray:
+    """(T, 3) camera centres of world-to-camera poses."""
+    return -np.einsum("tji,tj->ti", poses[:, :3, :3], poses[:, :3, 3])
+
+
+def _normalizing_transform(
+    poses: Float[np.ndarray, "t 4 4"], points: Float[np.ndarray, "p 3"], depths: Sequence[Float[np.ndarray, "h w"]] = ()
+) -> tuple[Float[np.ndarray, "4 4"], tuple[str, ...]]:
+    """Finds the similarity (shift and scale, no rotation) from a capture's world to one of ordinary numbers, and notes.
+
+    That is near the origin, and of the size of metres; for most captures it is the identity. A scene that is moved, or
+    scaled by a power of 1000, comes out in the same world up to a shift of its own size. Depth maps of a few views, in
+    world units with 0 where unknown, stand in for missing points.
+    """
+    centres = _centres(poses)
+    middle = np.median(centres, axis=0)
+    spread = float(np.median(np.linalg.norm(centres - middle, axis=1)))
+    near = _near_depth(poses, np.asarray(points, np.float64), depths)
+    size = max(near or 0.0, spread)
+    if near is None and size < max(1e-6, 1e-12 * np.abs(middle).max()):  # rounding: the cameras stand in one place
+        size = 1.0
+        near = size
+    origin, notes = np.zeros(3), []
+    if np.abs(middle).max() > 100 * size:
+        step = 10.0 ** np.ceil(np.log10(size))
+        origin = np.round(middle / step) * step
+        place = ", ".join(f"{number:.10g}" for number in origin)
+        notes.append(f"The coordinates are large. jsecon works relative to ({place}) and adds it to what it writes.")
+    factor = _UNIT_STEP ** _power(size if near is None else near, _MAX_SPREAD if near is None else _MAX_DEPTH)
+    if factor != 1:
+        notes.append(
+            f"The units are far from metres: the near things are {size if near is None else near:.3g} away. "
+            f"jsecon works at {factor:g} times the size and writes the units of the files."
+        )
+    result = np.diag([factor, factor, factor, 1.0])
+    result[:3, 3] = -factor * origin
+    return result, tuple(notes)
+
+
+def _power(size: float, limit: float) -> int:
+    """Power of _UNIT_STEP that brings `size` into [_MIN_DEPTH, limit)."""
+    if _MIN_DEPTH <= size < limit:
+        return 0
+    low = int(np.ceil(np.log(_MIN_DEPTH / size) / np.log(_UNIT_STEP) - 1e-9))
+    return low if size < _MIN_DEPTH else int(np.floor(np.log(limit / size) / np.log(_UNIT_STEP) - 1e-9))
+
+
+def _near_depth(poses: np.ndarray, points: np.ndarray, depths: Sequence[np.ndarray]) -> float | None:
+    """Distance of the near things from the cameras, in the median view; None if neither points nor depths are known."""
+    if len(points):
+        chosen = points[evenly_spaced(len(points), 20000)]
+        depths = []
+        for pose in poses[evenly_spaced(len(poses), 64)]:
+            x, y, z = pose[:3, :3] @ chosen.T + pose[:3, 3:]
+            depths.append(z[(z > 0) & (np.maximum(np.abs(x), np.abs(y)) <= z)])
+    else:
+        depths = [depth[depth > 0] for depth in depths]
+    near = [np.quantile(depth, 0.1) for depth in depths if len(depth)]
+    return float(np.median(near)) if near else None

@@ -89,8 +89,8 @@ def read_colmap(path: Path) -> PosedImages:
         posed.append(PosedImage(name, files.get(name), lenses[camera], pose))
     if _model_file(model, "points3D") is None:
         notes.append("The model has no points3D file: there are no sparse points.")
-        return PosedImages(posed, model, notes=tuple(notes))
-    return PosedImages(posed, model, *_read_points(model), notes=tuple(notes))
+        return PosedImages(posed, model, notes=tuple(notes), ignores_exif=True)
+    return PosedImages(posed, model, *_read_points(model), notes=tuple(notes), ignores_exif=True)
 
 
 def _model_file(model: Path, kind: str) -> Path | None:

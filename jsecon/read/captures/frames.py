@@ -1,4 +1,4 @@
-"""Records of a capture before its pixels are read, the choice of its frames, and their names, on the host."""
+"""Records of a capture before its pixels are read: frames, their choice, names and rigid poses, on the host."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from jsecon.errors import InputError
+from jsecon.numerics import is_finite_and_bounded
 from jsecon.read.captures.lens import Lens
 from jsecon.types import ImageFile
 
@@ -48,6 +49,8 @@ class PosedImages:
     source_from_poses: Float[np.ndarray, "4 4"] = dataclasses.field(default_factory=lambda: np.eye(4))
     """Similarity from the world of the poses to that of the files that they were made from."""
     notes: tuple[str, ...] = ()
+    ignores_exif: bool = False
+    """Whether the program that found the poses takes images as they are stored, as COLMAP does."""
 
 
 class CaptureExtent(NamedTuple):
@@ -125,3 +128,34 @@ def frame_names(files: Sequence[str], where: object) -> tuple[str, ...]:
     first, second = [file for file, name in zip(files, names) if name == twice][:2]
     remedy = "Rename the images, or take one of the two out."
     raise InputError(where, f"two frames, {first} and {second}, differ in their suffixes only", remedy=remedy)
+
+
+def make_rigid(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Float[np.ndarray, "4 4"]:
+    """Makes the rotation of a (4, 4) pose exactly orthonormal; `where` and `name` are its file and frame for errors."""
+    pose = np.asarray(pose, np.float64)
+    remedy = "Estimate the poses again, or take this frame out of the capture."
+    if not is_finite_and_bounded(pose):
+        raise InputError(where, f"the pose of {name} has NaN, infinite or absurd numbers", remedy=remedy)
+    rotation = pose[:3, :3]
+    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if error > 1e-3 or np.linalg.det(rotation) < 0 or not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):
+        measured = f"R R^T is off by {error:.2g}, determinant {np.linalg.det(rotation):.3g}"
+        expected = "a rotation and a translation, without scale, shear or mirror"
+        raise InputError(where, f"the pose of {name} is not rigid ({measured})", expected, remedy)
+    left, _, right = np.linalg.svd(rotation)
+    result = pose.copy()
+    result[:3, :3] = left @ right
+    return result
+
+
+def transform_poses(
+    poses: Float[np.ndarray, "... 4 4"], world: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "... 4 4"]:
+    """Moves world-to-camera poses by a similarity of the world, without rotation: the cameras see the same."""
+    if np.array_equal(world, np.eye(4)):
+        return poses
+    factor = world[0, 0]
+    origin = -world[:3, 3] / factor
+    moved = np.array(poses, np.float64)
+    moved[..., :3, 3] = factor * (poses[..., :3, 3] + poses[..., :3, :3] @ origin)
+    return moved

@@ -43,12 +43,11 @@ _DECODERS: dict[bytes, type[ImageFile]] = {
     b"MM\0*": TiffImageFile,
 }
 """first bytes of a file -> Pillow's decoder"""
-_HEIC = (b"ftypheic", b"ftypheix", b"ftypmif1", b"ftyphevc")
 _ORIENTATION = 0x0112
 """EXIF tag: 1 is upright; 6, the commonest of a phone held upright, asks for a turn clockwise by 90 degrees"""
 _MODES = {"1": "L"} | dict.fromkeys(("RGBA", "PA", "LA", "La", "RGBa"), "RGBA")
-"""Pillow's mode of a file -> mode of the returned pixels; grey and deep modes stay, others become RGB"""
-_KEPT_MODES = ("L", "I;16", "I;16B", "I", "F")
+_MODES |= {mode: mode for mode in ("L", "I;16", "I;16B", "I", "F")}
+"""Pillow's mode of a file -> mode of the returned pixels; others become RGB"""
 
 
 @contextlib.contextmanager
@@ -61,7 +60,7 @@ def _open(path: Path) -> Iterator[ImageFile]:
             if not head:
                 raise ValueError("the file is empty")
             decoder = next((kind for magic, kind in _DECODERS.items() if head.startswith(magic)), None)
-            if decoder is None and head[4:12] in _HEIC:
+            if decoder is None and head[4:12] in (b"ftypheic", b"ftypheix", b"ftypmif1", b"ftyphevc"):
                 decoder = _heic_decoder(path)
             if decoder is None:
                 raise ValueError("it is not an image of a known kind")
@@ -132,8 +131,7 @@ def _decode(path: Path, *, upright: bool = True, native: bool = False) -> tuple[
                 copy.verify()  # compares the checksums, and leaves an image that cannot be decoded
         orientation = _orientation(image)
         image.load()
-        is_kept = native or image.mode in _KEPT_MODES
-        mode = image.mode if is_kept else _MODES.get(image.mode, "RGB")
+        mode = image.mode if native else _MODES.get(image.mode, "RGB")
         if mode in ("L", "RGB") and "transparency" in image.info and not native:
             mode = "RGBA"
         pixels = np.asarray(image if mode == image.mode else image.convert(mode))

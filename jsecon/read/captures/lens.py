@@ -17,10 +17,6 @@ from jaxtyping import Float
 
 from jsecon.errors import InputError
 
-_MIN_ZOOM, _MAX_ZOOM = 0.5, 8.0
-"""zooms searched for a pinhole lens without empty pixels: below the one the centre would lose over half its resolution,
-above the other the coefficients are nonsense"""
-
 
 @dataclasses.dataclass(frozen=True)
 class Lens:
@@ -79,7 +75,7 @@ def _opencv(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     return matrix, np.pad(np.array(lens.distortion, np.float64), (0, size - len(lens.distortion)))
 
 
-def distort(lens: Lens, directions: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+def _distort(lens: Lens, directions: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
     """Projects directions, x/z and y/z in the camera's frame, into the distorted image, px."""
     points = np.ascontiguousarray(directions, np.float64)
     spatial = np.concatenate([points, np.ones((len(points), 1))], axis=1)
@@ -105,7 +101,7 @@ def _covered(lens: Lens, zoom: float) -> bool:
     border = np.concatenate([np.stack(edge, -1) for edge in edges])
     ends = (border - [lens.cx, lens.cy]) / [lens.fx * zoom, lens.fy * zoom]
     rays = ends[:, None] * np.linspace(0, 1, 65)[:, None]
-    pixels = distort(lens, rays.reshape(-1, 2)).reshape(rays.shape)
+    pixels = _distort(lens, rays.reshape(-1, 2)).reshape(rays.shape)
     if not np.isfinite(pixels).all():
         return False
     radius = np.linalg.norm((pixels - pixels[:, :1]) / [lens.fx, lens.fy], axis=-1)
@@ -122,7 +118,8 @@ def undistorted_pinhole(lens: Lens, where: object) -> Lens:
     if not lens.distorted:
         return dataclasses.replace(lens, distortion=())
     # Covered at a zoom means covered at every larger one: its rays are the same, but shorter. So bisection is exact.
-    low, high = _MIN_ZOOM, _MAX_ZOOM
+    # Below a zoom of 0.5 the centre would lose over half its resolution, above 8 the coefficients are nonsense.
+    low, high = 0.5, 8.0
     if not _covered(lens, high):
         remedy = "Calibrate again, or undistort the images first (colmap image_undistorter)."
         raise InputError(where, f"the distortion {lens.distortion} leaves no undistorted image", remedy=remedy)
@@ -140,7 +137,7 @@ def undistortion_maps(lens: Lens, pinhole: Lens) -> tuple[np.ndarray, np.ndarray
         columns = (np.arange(pinhole.width) + 0.5 - pinhole.cx) / pinhole.fx
         rows = (np.arange(pinhole.height) + 0.5 - pinhole.cy) / pinhole.fy
         directions = np.stack(np.meshgrid(columns, rows), axis=-1)
-        pixels = distort(lens, directions.reshape(-1, 2)).reshape(directions.shape) - 0.5
+        pixels = _distort(lens, directions.reshape(-1, 2)).reshape(directions.shape) - 0.5
         return pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32)
     matrix, coefficients = _opencv(lens)
     target, _ = _opencv(pinhole)

@@ -17,8 +17,7 @@ from jaxtyping import Float
 from jsecon.errors import InputError
 from jsecon.files import read_json
 from jsecon.numerics import is_finite_and_bounded
-from jsecon.read.captures.coordinates import make_rigid
-from jsecon.read.captures.frames import PosedImage, PosedImages
+from jsecon.read.captures.frames import PosedImage, PosedImages, make_rigid
 from jsecon.read.captures.images import find_image, image_header
 from jsecon.read.captures.lens import Lens
 from jsecon.read.splats.ply import load_point_cloud

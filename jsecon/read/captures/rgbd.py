@@ -19,8 +19,7 @@ from scipy.spatial.transform import Rotation
 from jsecon.errors import InputError
 from jsecon.files import parse_json, read_text, reading
 from jsecon.numerics import is_finite_and_bounded
-from jsecon.read.captures.coordinates import make_rigid
-from jsecon.read.captures.frames import PosedImage, PosedImages
+from jsecon.read.captures.frames import PosedImage, PosedImages, make_rigid
 from jsecon.read.captures.images import MAX_PIXELS, image_header
 from jsecon.read.captures.lens import Lens
 from jsecon.read.registry import Reader
