@@ -24,10 +24,9 @@ import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
 from jsecon.fit.growth import pad_with_free_rows
-from jsecon.fit.photometric import l1, photometric_loss
-from jsecon.fit.schedule import LearningRates
+from jsecon.fit.photometric import photometric_loss
 from jsecon.fit.start import starting_gaussians
-from jsecon.fit.step import StepConfig, StepRunner, TrainState, put_on_devices
+from jsecon.fit.step import LearningRates, StepConfig, StepRunner, TrainState, put_on_devices
 from jsecon.parallel import MESH_OPTIONS, host_mesh, map_rows
 from jsecon.read.captures.capture import load_capture
 from jsecon.splat.capacity import default_capacity, round_capacity
@@ -59,7 +58,7 @@ def main() -> None:
     def absolute(gaussians, camera, frame):
         colours = map_rows(colours_from_sh, gaussians, camera, mesh)
         image = render(gaussians, camera, colours, capacity=room, mesh=mesh).features
-        return l1(image, frame.astype(jnp.float32) / 255)
+        return jnp.abs(image - frame.astype(jnp.float32) / 255).mean()
 
     zeros = jax.tree.map(np.zeros_like, gaussians)
     current = put_on_devices(TrainState(gaussians, zeros, zeros, zeros.opacity_logits, None), mesh)

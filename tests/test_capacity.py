@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 from conftest import gaussians_at
+from reference import render_reference
 
 from jsecon.field.evidence import region_votes
 from jsecon.parallel import host_mesh
@@ -13,7 +14,6 @@ from jsecon.process import compilation_counts
 from jsecon.query.render import selection_mask
 from jsecon.splat.capacity import default_capacity, enough_capacity, plan_capacity
 from jsecon.splat.plan import prepare_views, render_plan
-from jsecon.splat.reference import render_reference
 from jsecon.splat.render import render, render_depth
 from jsecon.types import Gaussians
 

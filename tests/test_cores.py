@@ -31,8 +31,7 @@ def work(out: str, field: str, word: str, parts: tuple[str, ...]) -> None:
     import jsecon
     from experiments.rooms.capture import look_at
     from jsecon.app.cli import main
-    from jsecon.fit.optimise import fit_gaussians
-    from jsecon.fit.schedule import Schedule
+    from jsecon.fit.optimise import Schedule, fit_gaussians
 
     rng = np.random.default_rng(0)
     count = 61

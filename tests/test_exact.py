@@ -5,9 +5,9 @@ In every run the rows of the stability table have images and gradients of one ca
 
 import numpy as np
 import pytest
+from reference import render_reference
 
 from jsecon import host_mesh, render
-from jsecon.splat.reference import render_reference
 
 pytestmark = [pytest.mark.as_shipped, pytest.mark.long]
 

@@ -10,11 +10,10 @@ from conftest import gaussians_at, look_at
 
 from jsecon import Camera, Capture, InputError, render, render_rgb
 from jsecon.fit import step as one_step
-from jsecon.fit.growth import in_use
-from jsecon.fit.optimise import _view_order, fit_gaussians, init_fit_state
+from jsecon.fit.growth import drop_free_rows
+from jsecon.fit.optimise import Schedule, _init_fit_state, _view_order, fit_gaussians
 from jsecon.fit.quality import measure_quality
-from jsecon.fit.schedule import LearningRates, Schedule
-from jsecon.fit.step import cameras_extent
+from jsecon.fit.step import LearningRates, cameras_extent
 
 KEY = jax.random.key(0)
 RATES = LearningRates(means=1e-3, means_last=1e-4, log_scales=0.02, colors=0.02, quaternions=0.01)
@@ -82,12 +81,17 @@ def test_fit_brings_the_held_out_view_closer(capture, start, truth, fitted):
     assert measure_quality(truth, capture).psnr[0] > 50  # the photographs are 8-bit copies of it
 
 
-def test_held_out_frames_are_never_fitted_to(capture, start, fitted):
+def test_held_out_frames_are_never_fitted_to_and_the_others_resized_once_for_each_size(
+    capture, start, fitted, monkeypatch
+):
+    widths, resize = [], one_step.resize_frame
+    monkeypatch.setattr(one_step, "resize_frame", lambda frame, to: widths.append(to.width) or resize(frame, to))
     frames = capture.frames.copy()
     frames[2] = 255 - frames[2]
     again, losses = fit_gaussians(dataclasses.replace(capture, frames=frames), start=start, **FITTED)
     assert same(again, fitted[0])
     np.testing.assert_array_equal(losses, fitted[1])
+    assert sorted(widths) == [16] * 4 + [32] * 4
 
 
 def test_a_fit_goes_on_from_a_checkpoint_to_the_same_result(capture, fitted):
@@ -128,7 +132,7 @@ def test_a_growing_fit_gains_gaussians_where_the_picture_is_wrong_and_resumes_to
     schedule = dataclasses.replace(WHOLE, max_gaussians=MOST)
     given, states = {"steps": STEPS, "key": KEY, "schedule": schedule, "rates": RATES, "chunk": 5}, []
     gaussians, _ = fit_gaussians(capture, start=few, on_checkpoint=states.append, **given)
-    counts = [int(in_use(state.train.gaussians).sum()) for state in states]
+    counts = [drop_free_rows(state.train.gaussians).count for state in states]
     assert counts == sorted(counts)
     assert 50 <= gaussians.count <= MOST
     assert measure_quality(gaussians, capture).psnr > measure_quality(few, capture).psnr + 2
@@ -164,14 +168,14 @@ def test_a_fit_of_seconds_ends_about_then_and_says_how_far_it_is(capture, start)
 @pytest.mark.long
 def test_one_program_serves_a_size_and_a_number_of_rows(capture, start, monkeypatch):
     """Two sizes, rows that suffice: two programs, whatever the number of steps."""
-    traced, step = [], one_step.step
+    traced, step = [], one_step._step
 
     def counted(*args, **options):
         traced.append(args[1].frame.shape)
         return step(*args, **options)
 
     jax.clear_caches()  # a program that an earlier test compiled is not traced again
-    monkeypatch.setattr(one_step, "step", counted)
+    monkeypatch.setattr(one_step, "_step", counted)
     schedule = dataclasses.replace(SCHEDULE, sizes=((0.75, 0.5), (1.0, 1.0)), max_gaussians=MOST)
     fit_gaussians(capture, steps=STEPS, key=KEY, start=start, schedule=schedule, chunk=5)
     assert len(traced) == len(set(traced)) == 2
@@ -201,7 +205,7 @@ def test_first_step_is_adams_sign_step_at_the_stated_rates(capture, start):
     assert float(moved.opacity_logits) == pytest.approx(5e-2, rel=1e-2)
     assert np.abs(after.sh[:, 0] - start.sh[:, 0]).max() == pytest.approx(2.5e-3, rel=1e-2)
     assert not np.asarray(after.sh[:, 1:]).any()  # degree 1 waits for its turn
-    half = dataclasses.replace(init_fit_state(start), done=np.asarray(0.5), losses=np.ones(1, np.float32))
+    half = dataclasses.replace(_init_fit_state(start), done=np.asarray(0.5), losses=np.ones(1, np.float32))
     opened, _ = fit_gaussians(capture, steps=2, key=KEY, state=half, rates=rates, schedule=WHOLE)
     second = (0.1 / (1 - 0.9**2)) / np.sqrt(0.001 / (1 - 0.999**2))  # Adam's second step from moments of zero
     assert np.abs(opened.sh[:, 1:]).max() == pytest.approx(second * 2.5e-3 / 20, rel=1e-2)
@@ -224,7 +228,7 @@ def test_a_fit_needs_one_limit_above_zero(capture, start, limits):
 def test_wrong_fits_are_refused(capture, start):
     with pytest.raises(ValueError, match="exactly one"):
         fit_gaussians(capture, steps=1, key=KEY)
-    half = dataclasses.replace(init_fit_state(start), done=np.asarray(0.5), losses=np.ones(1, np.float32))
+    half = dataclasses.replace(_init_fit_state(start), done=np.asarray(0.5), losses=np.ones(1, np.float32))
     with pytest.raises(ValueError, match="a fit of 4 steps"):
         fit_gaussians(capture, steps=4, key=KEY, state=half)
     with pytest.raises(InputError, match="held out"):

@@ -6,9 +6,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jsecon.fit.growth import MIN_OPACITY, _sample_rows, _split_in_two, drop_free_rows, grow, in_use, pad_with_free_rows
+from jsecon.fit.growth import (
+    MIN_OPACITY,
+    _in_use,
+    _sample_rows,
+    _split_in_two,
+    drop_free_rows,
+    grow,
+    pad_with_free_rows,
+)
+from jsecon.fit.optimise import Schedule
 from jsecon.fit.resize import resize_frame, scale_cameras
-from jsecon.fit.schedule import LearningRates, Schedule, rates_at
+from jsecon.fit.step import LearningRates, _rates_at
 from jsecon.splat.capacity import round_capacity
 from jsecon.types import Camera, Gaussians
 
@@ -57,7 +66,7 @@ def test_free_rows_are_not_in_use_and_go_when_compacted():
     whole = scene()
     longer = pad_with_free_rows(whole, 64)
     assert longer.count == 64
-    np.testing.assert_array_equal(in_use(longer), np.arange(64) < 30)
+    np.testing.assert_array_equal(_in_use(longer), np.arange(64) < 30)
     jax.tree.map(np.testing.assert_array_equal, drop_free_rows(longer), whole)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(longer))
 
@@ -79,13 +88,13 @@ def test_grown_scenes_have_as_many_as_wanted_and_their_moments_begin_anew(target
     votes = np.where(np.arange(32) < 30, 1.0 + np.arange(32), 7.0).astype(np.float32)
     after, (first, second) = grow(whole, moments, votes, target, 2000, [0, 1])
     added = min(target - 30, 10)  # at most 0.3 of those there are, and one
-    assert in_use(after).sum() == 30 + added
+    assert _in_use(after).sum() == 30 + added
     assert after.count == round_capacity(64)  # both, as few rows as there can be
-    fresh = ~first.opacity_logits.astype(bool) & in_use(after)
+    fresh = ~first.opacity_logits.astype(bool) & _in_use(after)
     assert fresh.sum() == 2 * added
     assert not second.means[fresh].any()
-    assert second.means[in_use(after) & ~fresh].all()
-    untouched = in_use(after) & ~fresh & (np.arange(after.count) < 30)
+    assert second.means[_in_use(after) & ~fresh].all()
+    untouched = _in_use(after) & ~fresh & (np.arange(after.count) < 30)
     np.testing.assert_array_equal(after.means[untouched], whole.means[: after.count][untouched[:32]])
 
 
@@ -95,7 +104,7 @@ def test_faint_gaussians_make_room_and_nothing_is_added_where_nothing_is_wrong()
     moments = jax.tree.map(np.zeros_like, whole), jax.tree.map(np.zeros_like, whole)
     after, _ = grow(whole, moments, np.ones(30, np.float32), 30, 30, [0])
     assert after.count == 30
-    assert in_use(after).all()
+    assert _in_use(after).all()
     whole = pad_with_free_rows(scene(), 64)
     moments = jax.tree.map(np.zeros_like, whole), jax.tree.map(np.zeros_like, whole)
     after, _ = grow(whole, moments, np.zeros(64, np.float32), 60, 60, [0])
@@ -104,11 +113,11 @@ def test_faint_gaussians_make_room_and_nothing_is_added_where_nothing_is_wrong()
 
 def test_sizes_follow_each_other_the_number_rises_evenly_and_degrees_open_one_after_another():
     schedule = Schedule(sizes=((0.25, 0.2), (0.5, 0.5), (1.0, 1.0)), max_gaussians=280)
-    assert [schedule.size(done) for done in (0.0, 0.19, 0.2, 0.49, 0.5, 1.0)] == [0.25, 0.25, 0.5, 0.5, 1.0, 1.0]
-    assert [schedule.next_size(done) for done in (0.0, 0.2, 0.5)] == [0.5, 1.0, None]
-    assert [schedule.count(done, 100) for done in (0.04, 0.05, 0.3, 0.5, 0.51)] == [None, 100, 200, 280, None]
-    assert schedule.count(0.3, 400) is None
-    assert [schedule.degree(done) for done in (0.0, 0.09, 0.11, 0.35)] == [0, 0, 1, 3]
+    assert [schedule._size(done) for done in (0.0, 0.19, 0.2, 0.49, 0.5, 1.0)] == [0.25, 0.25, 0.5, 0.5, 1.0, 1.0]
+    assert [schedule._next_size(done) for done in (0.0, 0.2, 0.5)] == [0.5, 1.0, None]
+    assert [schedule._count(done, 100) for done in (0.04, 0.05, 0.3, 0.5, 0.51)] == [None, 100, 200, 280, None]
+    assert schedule._count(0.3, 400) is None
+    assert [schedule._degree(done) for done in (0.0, 0.09, 0.11, 0.35)] == [0, 0, 1, 3]
 
 
 @pytest.mark.parametrize("wrong", [{"sizes": ((0.5, 0.5),)}, {"sizes": ((0.0, 1.0),)}])
@@ -120,11 +129,11 @@ def test_wrong_schedules_are_refused(wrong):
 def test_rates_decay_log_linearly_and_frozen_positions_stay():
     shape = Gaussians(*(np.zeros((2, *rest), np.float32) for rest in ((3,), (3,), (4,), (), (9, 3))))
     rates = LearningRates(means=1e-2, means_last=1e-4, colors=1.0, rest_last=0.25)
-    half = rates_at(jnp.float32(0.5), rates, shape, jnp.float32(3.0), jnp.int32(1))
+    half = _rates_at(jnp.float32(0.5), rates, shape, jnp.float32(3.0), jnp.int32(1))
     assert float(half.means) == pytest.approx(3e-3, rel=1e-5)
     assert float(half.log_scales) == pytest.approx(1e-2, rel=1e-5)
     np.testing.assert_allclose(half.sh[0, :, 0], [0.5] + 3 * [0.025] + 5 * [0.0], rtol=1e-5)
-    frozen = rates_at(jnp.float32(0.5), LearningRates(means=0.0), shape, jnp.float32(3.0), jnp.int32(1))
+    frozen = _rates_at(jnp.float32(0.5), LearningRates(means=0.0), shape, jnp.float32(3.0), jnp.int32(1))
     assert float(frozen.means) == 0
 
 

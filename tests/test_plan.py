@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reference import project_reference, weights_reference
 
 from jsecon import host_mesh, plan_view, render, render_depth, render_plan
-from jsecon.splat.reference import project_reference, weights_reference
 from jsecon.splat.scan import cumulative
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jsecon.networks.prompts import MAX_PROMPTS, GuidedPrompts, _innermost_pixels
+from jsecon.networks.sam import _MAX_PROMPTS, _GuidedPrompts, _innermost_pixels
 
 
 def frame_of_two_things():
@@ -25,7 +25,7 @@ def test_each_patch_has_its_pixel_farthest_from_the_outline():
 
 def test_what_the_masks_of_a_region_leave_gets_the_next_points():
     frame, things = frame_of_two_things()
-    prompts = GuidedPrompts(frame, 1)
+    prompts = _GuidedPrompts(frame, 1)
     first = prompts.next_points().astype(int)
     inside = [point for point in first if things[:, point[1], point[0]].any()]
     assert len(first) == 2
@@ -41,10 +41,10 @@ def test_what_the_masks_of_a_region_leave_gets_the_next_points():
 
 def test_prompts_end_where_no_mask_explains_anything():
     frame = np.random.default_rng(0).integers(0, 256, (12, 16, 3), dtype=np.uint8).repeat(20, 0).repeat(20, 1)
-    prompts = GuidedPrompts(frame, 3)
+    prompts = _GuidedPrompts(frame, 3)
     rounds = []
     while len(points := prompts.next_points()):
         rounds.append(points)
     every = np.concatenate(rounds)
     assert len(rounds) <= 4
-    assert len(np.unique(every, axis=0)) == len(every) <= MAX_PROMPTS
+    assert len(np.unique(every, axis=0)) == len(every) <= _MAX_PROMPTS

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import gaussians_at, look_at
+from reference import project_reference, render_reference
 
 from jsecon import Camera, Gaussians, project, render, render_depth, render_rgb
-from jsecon.splat.reference import project_reference, render_reference
 
 
 def to64(tree):

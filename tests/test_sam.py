@@ -12,9 +12,7 @@ from scipy import ndimage
 
 from jsecon.errors import InputError
 from jsecon.networks.hub import find_files
-from jsecon.networks.prompts import GuidedPrompts
-from jsecon.networks.sam import TOKENS, SamGraphs, SamSegmenter
-from jsecon.networks.sam_masks import box_nms, box_of, langsplat_nms
+from jsecon.networks.sam import TOKENS, SamGraphs, SamSegmenter, _box_nms, _box_of, _GuidedPrompts, _langsplat_nms
 from jsecon.vision.protocols import Segmenter
 
 KINDS = [("sam", 1), ("sam", "batch"), ("sam", 7), ("sam2", "batch")]
@@ -71,8 +69,8 @@ def by_definition(folder, frame, token_of_level):
             stable = (full > 1).sum() / max((full > -1).sum(), 1)
             if ious[0, token] > 0.7 and stable >= 0.85:
                 found.append((full > 0, ious[0, token], stable))
-    boxes = np.asarray([box_of(mask) for mask, *_ in found], float)
-    found = [found[i] for i in box_nms(boxes, np.asarray([iou for _, iou, _ in found]), 0.7)]
+    boxes = np.asarray([_box_of(mask) for mask, *_ in found], float)
+    found = [found[i] for i in _box_nms(boxes, np.asarray([iou for _, iou, _ in found]), 0.7)]
     clean = []
     for mask, *_ in found:
         for hole in (True, False):
@@ -87,16 +85,16 @@ def by_definition(folder, frame, token_of_level):
                 mask = mask & ~np.isin(labels, small)
         clean.append(mask)
     unchanged = np.asarray([float((a == b[0]).all()) for a, b in zip(clean, found)])
-    kept = sorted(box_nms(np.asarray([box_of(m) for m in clean], float), unchanged, 0.7))
+    kept = sorted(_box_nms(np.asarray([_box_of(m) for m in clean], float), unchanged, 0.7))
     masks = np.stack([clean[i] for i in kept])
     scores = np.asarray([float(found[i][1]) * found[i][2] for i in kept])
-    order = langsplat_nms(masks, scores)
+    order = _langsplat_nms(masks, scores)
     return masks[order], scores[order]
 
 
 @pytest.mark.parametrize("level", ["l", "default"])
 def test_masks_are_those_of_the_definition(folders, frame, level):
-    masks, scores = GridSam(folders["sam", "batch"], level=level).segment(frame)
+    masks, scores = GridSam(folders["sam", "batch"], level=level)._segment(frame)
     expected, expected_scores = by_definition(folders["sam", "batch"], frame, TOKENS[level])
     assert len(masks) >= 3
     np.testing.assert_array_equal(masks, expected)
@@ -122,7 +120,7 @@ def test_every_dialect_and_batch_finds_the_same_things(folders, frame, kind):
 def test_guided_prompts_find_the_things_of_the_grid_with_fewer_points(folders, frame):
     asked = []
 
-    class Counted(GuidedPrompts):
+    class Counted(_GuidedPrompts):
         def next_points(self):
             asked.append(len(points := super().next_points()))
             return points
@@ -168,7 +166,7 @@ def test_colours_are_scaled_as_the_configuration_says(frame, tmp_path):
 
 def test_a_level_is_one_of_the_three_masks_of_a_point(folders, frame):
     for level, token in (("s", 1), ("m", 2), ("l", 3)):
-        masks, scores = GridSam(folders["sam", "batch"], level=level).segment(frame)
+        masks, scores = GridSam(folders["sam", "batch"], level=level)._segment(frame)
         assert len(masks) >= 1
         assert scores.max() <= IOUS[token] + 1e-6
 

@@ -13,7 +13,7 @@ from PIL import Image
 from sam2_files import CHANNELS, MEAN, MEMORY, POINTERS, SIZE, SLOTS, STD, write_sam2
 
 from jsecon.errors import InputError
-from jsecon.networks.sam2 import HOLE_AREA, Bank, Memory, Sam2Tracker, _fill_holes, follow, open_sam2
+from jsecon.networks.sam2 import HOLE_AREA, Sam2Tracker, _Bank, _fill_holes, _Memory, follow, open_sam2
 from jsecon.networks.session import Graph
 from jsecon.vision.protocols import Tracker
 
@@ -253,7 +253,7 @@ def test_a_wrong_folder_is_named(damage, said, tmp_path):
 
 
 def memory(t):
-    return Memory(np.full((2, 3), t, np.float32), np.full(4, t, np.float32))
+    return _Memory(np.full((2, 3), t, np.float32), np.full(4, t, np.float32))
 
 
 def attended(bank, t, step, count=100):
@@ -263,31 +263,31 @@ def attended(bank, t, step, count=100):
 
 
 def test_the_prompted_frame_and_the_six_before_are_attended_to():
-    bank = Bank(0, memory(0), {t: memory(t) for t in range(1, 20)})
+    bank = _Bank(0, memory(0), {t: memory(t) for t in range(1, 20)})
     memories, pointers = attended(bank, 20, 1)
     assert memories == [(6, 0), (0, 19), (1, 18), (2, 17), (3, 16), (4, 15), (5, 14)]
     assert pointers == [(20, 0), *[(d, 20 - d) for d in range(1, POINTERS)]]
-    just_turned = Bank(10, memory(10), {t: memory(t) for t in range(11, 14)})  # what the forward pass left beyond
+    just_turned = _Bank(10, memory(10), {t: memory(t) for t in range(11, 14)})  # what the forward pass left beyond
     assert attended(just_turned, 9, -1)[0] == [(6, 10), (1, 11), (2, 12), (3, 13), (1, 11), (1, 11), (1, 11)]
     assert attended(just_turned, 9, -1, count=3)[1] == [(1, 10), (2, 11), *[(2, 11)] * 14]
-    assert attended(Bank(3, memory(3)), 4, 1) == ([(6, 3)] * SLOTS, [(1, 3)] * POINTERS)
+    assert attended(_Bank(3, memory(3)), 4, 1) == ([(6, 3)] * SLOTS, [(1, 3)] * POINTERS)
 
 
 @settings(max_examples=30, deadline=None)
 @given(count=st.integers(2, 60), start=st.integers(0, 59))
 def test_what_is_dropped_was_never_to_be_read(count, start):
     start = min(start, count - 1)
-    bank, whole = Bank(start, memory(start)), Bank(start, memory(start))
+    bank, whole = _Bank(start, memory(start)), _Bank(start, memory(start))
     for step, order in ((1, range(start + 1, count)), (-1, range(start - 1, -1, -1))):
         for t in order:
             assert attended(bank, t, step, count) == attended(whole, t, step, count)
-            whole = Bank(start, memory(start), {**whole.tracked, t: memory(t)})
+            whole = _Bank(start, memory(start), {**whole.tracked, t: memory(t)})
             bank = bank.with_tracked(t, memory(t), step)
             assert sum(m.tokens is not None for m in bank.tracked.values()) <= 2 * (SLOTS - 1)
             assert len(bank.tracked) <= 2 * (POINTERS - 1)
 
 
 def test_reading_what_was_dropped_is_an_error():
-    bank = Bank(0, memory(0), {1: memory(1), 2: memory(2)._replace(tokens=None)})
+    bank = _Bank(0, memory(0), {1: memory(1), 2: memory(2)._replace(tokens=None)})
     with pytest.raises(ValueError, match="dropped"):
         bank.attended(4, 1, 100)

@@ -5,27 +5,27 @@ import pytest
 from hypothesis import example, given, settings, strategies as st
 from scipy import ndimage
 
-from jsecon.networks.sam_masks import (
-    box_nms,
-    box_of,
-    langsplat_nms,
-    remove_small_regions,
-    stability,
+from jsecon.networks.sam import (
+    _box_nms,
+    _box_of,
+    _langsplat_nms,
+    _remove_small_regions,
+    _stability,
 )
 
 
 def test_stability_is_the_iou_of_two_thresholds():
     logits = np.asarray([[-2.0, -0.5, 0.5, 2.0, 3.0]])
-    assert stability(logits, 1.0) == 2 / 4
-    assert stability(logits, 0.0) == 1.0
-    assert stability(logits - 9, 1.0) == 0.0
+    assert _stability(logits, 1.0) == 2 / 4
+    assert _stability(logits, 0.0) == 1.0
+    assert _stability(logits - 9, 1.0) == 0.0
 
 
 def test_a_box_holds_the_outermost_pixels():
     mask = np.zeros((6, 9), bool)
-    assert box_of(mask) == (0, 0, 0, 0)
+    assert _box_of(mask) == (0, 0, 0, 0)
     mask[2, 3] = mask[4, 7] = True
-    assert box_of(mask) == (3, 2, 7, 4)
+    assert _box_of(mask) == (3, 2, 7, 4)
 
 
 @settings(max_examples=50, deadline=None)
@@ -45,7 +45,7 @@ def test_box_nms_is_greedy(seed, count, threshold):
     for i in sorted(range(count), key=lambda i: (-scores[i], i)):
         if all(iou(boxes[i], boxes[j]) <= threshold for j in kept):
             kept.append(i)
-    assert box_nms(boxes, scores, threshold).tolist() == kept
+    assert _box_nms(boxes, scores, threshold).tolist() == kept
 
 
 @settings(max_examples=50, deadline=None)
@@ -61,7 +61,7 @@ def test_small_holes_are_filled_then_small_islands_removed(seed, least, density)
     islands, count = ndimage.label(expected, np.ones((3, 3)))
     areas = [(islands == label).sum() for label in range(1, count + 1)]
     largest = max(areas, default=0)
-    clean, changed = remove_small_regions(mask, least)
+    clean, changed = _remove_small_regions(mask, least)
     # Where every island is small one of the largest stays: of several alike, any.
     chosen = [area == largest and clean[islands == label].all() for label, area in enumerate(areas, 1)]
     stays = 1 + chosen.index(True) if any(chosen) else 0
@@ -113,13 +113,13 @@ def test_the_kept_set_is_that_of_the_definition(seed, count):
     rng = np.random.default_rng(seed)
     masks, scores = blobs(rng, count), rng.choice([0.6, 0.7, 0.75, 0.8, 0.9, 0.99], count)
     masks[rng.integers(0, count)] = masks[0]
-    np.testing.assert_array_equal(langsplat_nms(masks, scores), by_definition(masks, scores))
+    np.testing.assert_array_equal(_langsplat_nms(masks, scores), by_definition(masks, scores))
 
 
 def test_empty_masks_are_dropped_and_no_masks_stay_none():
     masks = np.zeros((2, 4, 5), bool)
     masks[1, 1:3, 1:3] = True
-    assert langsplat_nms(masks, np.asarray([0.9, 0.8])).tolist() == [1]
-    assert langsplat_nms(masks[:0], np.zeros(0)).tolist() == []
+    assert _langsplat_nms(masks, np.asarray([0.9, 0.8])).tolist() == [1]
+    assert _langsplat_nms(masks[:0], np.zeros(0)).tolist() == []
     with pytest.raises(ValueError, match="One score per mask"):
-        langsplat_nms(masks, np.zeros(3))
+        _langsplat_nms(masks, np.zeros(3))

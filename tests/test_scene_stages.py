@@ -16,7 +16,7 @@ from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import Checkpoint, Results, RunContext, StageInput
 from jsecon.pipeline.stages import run_stages
 from jsecon.read.captures.nerfstudio import source_from_trained
-from jsecon.splat.transform import transform_gaussians, transform_gaussians_float64
+from jsecon.splat.transform import transform_gaussians
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Models
 
@@ -155,7 +155,7 @@ def test_a_file_whose_float32_has_rounded_the_places_is_told(tmp_path, near):
     capture = dataclasses.replace(
         photographed(near), source_from_scene=source_from_scene, poses_from_scene=source_from_scene
     )
-    far = transform_gaussians_float64(near, source_from_scene)
+    far = transform_gaussians(near, source_from_scene)
     save_gaussians(tmp_path / "scene.ply", dataclasses.replace(far, means=far.means.astype(np.float32)))
     found, _ = read(capture, tmp_path / "scene.ply")
     assert any("scene.ply holds positions in float32" in note for note in found.notes)

@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reference import weights_reference
 from stability.case import GRADIENT, VALUE, ordinary
 from stability.cases import CANCELS, cases
 from stability.measure import evaluate
 from stability.render import engine
 
 from jsecon.splat.project import count_non_finite, is_usable
-from jsecon.splat.reference import weights_reference
 from jsecon.splat.render import render, render_depth, render_rgb
 
 CAPACITY = 64 * 30

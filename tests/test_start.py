@@ -9,7 +9,7 @@ from hypothesis import given, settings, strategies as st
 from experiments.datasets.depth_points import labels_of_points
 from jsecon import Camera, Capture, InputError
 from jsecon.fit.depth import points_from_depth
-from jsecon.fit.start import gaussians_from_points, neighbour_distances, starting_gaussians
+from jsecon.fit.start import _neighbour_distances, gaussians_from_points, starting_gaussians
 from jsecon.splat.sh import C0
 
 
@@ -22,20 +22,20 @@ def brute_distances(points, neighbours=3):
 
 @settings(deadline=None, max_examples=20)
 @given(st.integers(2, 40), st.integers(0, 1000))
-def test_neighbour_distances_equal_brute_force(count, seed):
+def test__neighbour_distances_equal_brute_force(count, seed):
     points = np.random.default_rng(seed).standard_normal((count, 3))
     points[: count // 3] = points[0]  # duplicates
-    np.testing.assert_allclose(neighbour_distances(points), brute_distances(points), rtol=1e-9)
+    np.testing.assert_allclose(_neighbour_distances(points), brute_distances(points), rtol=1e-9)
 
 
-def test_neighbour_distances_of_many_points_and_of_one():
+def test__neighbour_distances_of_many_points_and_of_one():
     points = np.random.default_rng(0).standard_normal((40_000, 3))
-    found = neighbour_distances(points)
+    found = _neighbour_distances(points)
     assert found.shape == (40_000,)
     some = slice(0, 3)
     distance = np.linalg.norm(points[some, None] - points[None], axis=-1)
     np.testing.assert_allclose(found[some], np.sqrt((np.sort(distance, axis=1)[:, 1:4] ** 2).mean(axis=1)), rtol=1e-9)
-    assert neighbour_distances(points[:1])[0] == pytest.approx(np.sqrt(1e-7))
+    assert _neighbour_distances(points[:1])[0] == pytest.approx(np.sqrt(1e-7))
 
 
 def test_gaussians_from_points_hold_the_colour_opacity_and_scale():
@@ -146,9 +146,9 @@ def test_a_start_takes_depth_before_sparse_points_and_says_so():
     capture = wall_capture()
     points = np.random.default_rng(0).standard_normal((60, 3)).astype(np.float32)
     sparse = dataclasses.replace(capture, points=points, point_colors=np.zeros((60, 3), np.uint8))
-    start = starting_gaussians(sparse, sh_degree=1)
-    assert "depth frames" in start.origin
-    assert start.gaussians.sh.shape[1:] == (4, 3)
-    start = starting_gaussians(dataclasses.replace(sparse, depths=None))
-    assert start.origin == "60 sparse points of the capture"
-    np.testing.assert_array_equal(start.gaussians.means, points)
+    gaussians, origin = starting_gaussians(sparse, sh_degree=1)
+    assert "depth frames" in origin
+    assert gaussians.sh.shape[1:] == (4, 3)
+    gaussians, origin = starting_gaussians(dataclasses.replace(sparse, depths=None))
+    assert origin == "60 sparse points of the capture"
+    np.testing.assert_array_equal(gaussians.means, points)

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from conftest import gaussians_at
 from hypothesis import given, settings, strategies as st
+from reference import project_reference
 
 from jsecon import Gaussians, project
 from jsecon.splat.capacity import plan_capacity, round_capacity
-from jsecon.splat.reference import project_reference
-from jsecon.splat.strips import BLOCK, FULL_IMAGE, Strip, join_strips, split_into_strips, tile_rows
+from jsecon.splat.composite import _join_strips, _split_into_strips
+from jsecon.splat.strips import BLOCK, FULL_IMAGE, Strip, tile_rows
 from jsecon.splat.tiles import (
     WORD,
     _compact_tile_lists,
@@ -146,8 +147,8 @@ def test_lists_are_those_of_a_loop(words, density, filled):
 
 @functools.partial(jax.jit, static_argnums=(1, 2))
 def there_and_back(image, tile, count):
-    strips = split_into_strips(image, tile, count)
-    return strips, join_strips(strips, tile, len(image))
+    strips = _split_into_strips(image, tile, count)
+    return strips, _join_strips(strips, tile, len(image))
 
 
 @settings(deadline=None, max_examples=30)

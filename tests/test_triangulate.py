@@ -9,7 +9,7 @@ from conftest import look_at
 
 from jsecon import Camera, Capture, InputError
 from jsecon.fit.start import starting_gaussians
-from jsecon.fit.triangulate import _view_pairs, triangulate_matches, triangulated_points
+from jsecon.fit.triangulate import _triangulate_matches, _view_pairs, triangulated_points
 
 WIDTH, HEIGHT, FOCAL = 240, 180, 200.0
 
@@ -50,12 +50,12 @@ def test_exact_matches_give_exact_points_and_wrong_ones_are_told():
     for world_to_camera in pose:
         seen = truth @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
         rays.append(seen[:, :2] / seen[:, 2:])
-    points, parallax = triangulate_matches(*pose, *rays, FOCAL)
+    points, parallax = _triangulate_matches(*pose, *rays, FOCAL)
     np.testing.assert_allclose(points, truth, atol=1e-8)
     assert (parallax > 0.1).all()
     rays[1][::2, 1] += 6 / FOCAL  # off the epipolar line
-    assert ((triangulate_matches(*pose, *rays, FOCAL)[1] > 0) == (np.arange(50) % 2 == 1)).all()
-    assert (triangulate_matches(pose[0], pose[0], rays[0], rays[0], FOCAL)[1] < 0).all()  # no parallax
+    assert ((_triangulate_matches(*pose, *rays, FOCAL)[1] > 0) == (np.arange(50) % 2 == 1)).all()
+    assert (_triangulate_matches(pose[0], pose[0], rays[0], rays[0], FOCAL)[1] < 0).all()  # no parallax
 
 
 def test_neighbouring_views_are_paired():

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import jsecon
 from jsecon.app.cli import main
-from jsecon.splat.transform import transform_gaussians_float64
+from jsecon.splat.transform import transform_gaussians
 from jsecon.views import plan
 from jsecon.views.frame import scene_frame, surface_points
 from jsecon.views.plan import place_cameras
@@ -86,7 +86,7 @@ def moved(gaussians, seed, scale=None):
     factor = np.exp(rng.uniform(-2, 2))
     similarity[:3, :3] = Rotation.random(random_state=seed).as_matrix() * (scale or factor)
     similarity[:3, 3] = rng.normal(size=3) * 20
-    return transform_gaussians_float64(gaussians, similarity), similarity
+    return transform_gaussians(gaussians, similarity), similarity
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reference import weights_reference
 from scipy import sparse
 
 from jsecon import plan_view
@@ -14,7 +15,6 @@ from jsecon.errors import InputError
 from jsecon.field import columns, evidence
 from jsecon.field.evidence import ViewEvidence, region_votes, sum_evidence, view_evidence
 from jsecon.field.membership import normalise_votes
-from jsecon.splat.reference import weights_reference
 from jsecon.splat.render import render_rgb
 from jsecon.splat.visible import geometry_of_rows, render_in_blocks, visible_rows
 from jsecon.types import Camera, Gaussians, Regions, Votes

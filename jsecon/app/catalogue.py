@@ -19,7 +19,7 @@ from jsecon.field.membership import SHARE_THRESHOLD, membership_probability, vot
 from jsecon.query.grouping import containment, objects_of_gaussians, same_object
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.outliers import MIN_SAMPLES
-from jsecon.splat.transform import transform_gaussians_float64
+from jsecon.splat.transform import transform_gaussians
 from jsecon.types import LanguageField
 from jsecon.views.frame import field_up
 from jsecon.vision.unrelated_words import UNRELATED_WORDS, embed_unrelated_words
@@ -368,7 +368,7 @@ def _shapes(
     own = np.concatenate([labels[labels >= 0], part_labels[part_labels >= 0]])
     plain = dataclasses.replace(field.gaussians, sh=field.gaussians.sh[:, :1])  # the place does not need colours
     taken = gaussian_rows(plain, chosen)
-    placed = transform_gaussians_float64(taken, field.source_from_scene)
+    placed = transform_gaussians(taken, field.source_from_scene)
     source_from_scene = np.asarray(field.source_from_scene, np.float64)
     means = np.asarray(taken.means, np.float64) @ source_from_scene[:3, :3].T + source_from_scene[:3, 3]
     return object_shapes(means, own, up, spreads=gaussian_spreads(placed))

@@ -21,7 +21,7 @@ from jsecon.field.membership import probability_inside
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.referring import Object
 from jsecon.query.rules import MIN_RANK
-from jsecon.splat.transform import transform_gaussians_float64
+from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Gaussians, LanguageField, Selection
 
 METHODS = ("votes", "code")
@@ -206,7 +206,7 @@ class Answer:
             problem = self.reason or f"no Gaussian is selected (score {float(self.selection.score):.3f})"
             raise InputError(f"query {str(self.query)!r}", problem, remedy="Ask with other words, or by a pixel.")
         plain = dataclasses.replace(self.field.gaussians, sh=self.field.gaussians.sh[:, :1])  # the place has no colours
-        selected = transform_gaussians_float64(gaussian_rows(plain, self.rows), self.field.source_from_scene)
+        selected = transform_gaussians(gaussian_rows(plain, self.rows), self.field.source_from_scene)
         return object_shapes(self.points, np.zeros(len(self.rows), int), spreads=gaussian_spreads(selected))[0]
 
     @property

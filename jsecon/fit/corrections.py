@@ -15,10 +15,6 @@ from jaxtyping import Float
 
 from jsecon.types import Array, Camera, record
 
-PENALTY = 1e-3
-"""Weight of the squared corrections in the loss of a view (radians and shares of the extent; shares of the colour
-range): decides what the frames leave open."""
-
 
 @record
 class Corrections:
@@ -50,11 +46,6 @@ class CorrectionRates(NamedTuple):
     """Radians, and shares of the cameras' extent."""
     colour: float = 1e-2
     """Each number of a colour map."""
-
-    def at(self, done: float, extent: float) -> Corrections:
-        """Computes the step sizes of one view when the share `done` of the fit is done."""
-        pose, colour = (rate * 0.03**done for rate in self)
-        return Corrections(np.repeat(np.array([pose, pose * extent], np.float32), 3), np.float32(colour))
 
 
 def identity_corrections(views: int) -> Corrections:
@@ -105,15 +96,3 @@ def apply_exposure(image: Float[Array, "h w 3"], colour: Float[Array, "3 4"]) ->
     """Applies the colour map of a view to rendered colours, without clamping."""
     r, g, b = image[..., 0], image[..., 1], image[..., 2]
     return jnp.stack([row[0] * r + row[1] * g + row[2] * b + row[3] for row in colour], axis=-1)
-
-
-def regularizer(correction: Corrections, extent: Float[Array, ""]) -> Float[Array, ""]:
-    """Computes the term of one view's corrections in its loss.
-
-    Args:
-      correction: Corrections of one view, without leading axis.
-      extent: Size of the cameras' arrangement, world units, the unit of translations; 0 if they share one place.
-    """
-    shift = correction.twists[3:] / jnp.where(extent > 0, extent, 1.0)
-    poses = jnp.sum(correction.twists[:3] ** 2) + jnp.sum(shift**2)
-    return PENALTY * poses + PENALTY * jnp.sum((correction.colours - jnp.eye(3, 4)) ** 2)

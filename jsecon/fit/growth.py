@@ -19,21 +19,19 @@ from jsecon.types import Gaussians
 
 MIN_OPACITY = 0.005
 """Opacity below which a Gaussian is pruned (Kerbl et al. 2023)."""
-MAX_GROWTH = 0.3
-"""Largest share of the present Gaussians that one densification adds."""
 _OFFSET, _SHRINKAGE = 0.6, 0.8
 """Shift of the two halves along the longest axis, and the scale that is left of it, both in units of its standard
 deviation. As 0.6^2 + 0.8^2 = 1, both halves together have the variance of their parent."""
 
 
-def in_use(gaussians: Gaussians) -> Bool[np.ndarray, " n"]:
+def _in_use(gaussians: Gaussians) -> Bool[np.ndarray, " n"]:
     """Finds the rows that hold a visible Gaussian."""
     return np.asarray(gaussians.opacity_logits) >= math.log(MIN_OPACITY / (1 - MIN_OPACITY))
 
 
 def drop_free_rows(gaussians: Gaussians) -> Gaussians:
     """Removes the free rows (NumPy)."""
-    keep = in_use(gaussians)
+    keep = _in_use(gaussians)
     return jax.tree.map(lambda a: np.asarray(a)[keep], gaussians)
 
 
@@ -114,15 +112,15 @@ def grow(
       seed: Seed of the draw.
     """
     gaussians, moments = jax.tree.map(np.array, (gaussians, moments))
-    used = in_use(gaussians)
+    used = _in_use(gaussians)
     count = int(used.sum())
-    added = min(max(target - count, 0), int(MAX_GROWTH * count) + 1)
+    added = min(max(target - count, 0), int(0.3 * count) + 1)  # at most three tenths at once
     if count + added > len(used):
         doubled = min(round_capacity(max_gaussians), round_capacity(2 * len(used)))
         rows = max(round_capacity(count + added), doubled)
         gaussians = pad_with_free_rows(gaussians, rows)
         moments, votes = pad_rows((moments, np.asarray(votes)), rows)
-        used = in_use(gaussians)
+        used = _in_use(gaussians)
     parents = _sample_rows(np.where(used, votes, 0.0), added, np.random.default_rng(seed))
     free = np.flatnonzero(~used)[: len(parents)]
     first, second = _split_in_two(jax.tree.map(lambda a: a[parents], gaussians))

@@ -1,5 +1,7 @@
 """Photometric fit of Gaussians to the frames of a capture, by Adam and a schedule (Kerbl et al. 2023). Host code.
 
+Time is the share of the fit that is done, in [0, 1], so that fits limited by steps and by minutes behave alike.
+
 The state between chunks of steps is a record of arrays: a fit can stop after any chunk and resume to the same result.
 """
 
@@ -8,7 +10,8 @@ import functools
 import math
 import time
 from collections.abc import Callable
-from typing import NamedTuple, cast
+from itertools import pairwise
+from typing import cast
 
 import jax
 import numpy as np
@@ -17,20 +20,56 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from jsecon.errors import InputError, require
 from jsecon.fit.corrections import CorrectionRates, CorrectionState, identity_corrections
 from jsecon.fit.growth import drop_free_rows, grow, pad_with_free_rows
-from jsecon.fit.schedule import LearningRates, Schedule
-from jsecon.fit.step import StepConfig, StepRunner, TrainState, put_on_devices
+from jsecon.fit.step import LearningRates, StepConfig, StepRunner, TrainState, put_on_devices
 from jsecon.parallel import host_mesh
 from jsecon.splat.capacity import round_capacity
 from jsecon.splat.strips import BLOCK
 from jsecon.splat.tiles import TILE
 from jsecon.types import Array, Capture, Gaussians, Leaf, Progress, record
 
+GROWTH_START, GROWTH_END = 0.05, 0.5
+"""Shares of the fit between which the number of Gaussians rises linearly."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Schedule:
+    """Schedule of a fit. Raises ValueError if the ends of its frame sizes are out of order."""
+
+    sizes: tuple[tuple[float, float], ...] = ((0.5, 0.5), (1.0, 1.0))
+    """Pairs of a frame size and the share of the fit at which it ends. Smaller frames cost less and move large things
+    first (arXiv 2503.18402)."""
+    max_gaussians: int = 100_000
+    """Number of Gaussians after growth. A start with as many or more keeps its number: 0 means no growth.
+    More make each step slower: bonsai at 400x266 after two minutes has 28.6 dB with 50,000, 28.8 with 100,000 and 28.2
+    with 200,000 (experiments/retired.md)."""
+
+    def __post_init__(self) -> None:
+        """Checks the sizes."""
+        ends = [end for _, end in self.sizes]
+        ordered = ends == sorted(ends) and ends[-1:] == [1.0] and all(0 < size <= 1 for size, _ in self.sizes)
+        require(ordered, "sizes", self.sizes, "sizes in (0, 1] with rising ends, the last 1", "((1, 1),) is one size.")
+
+    def _size(self, done: float) -> float:
+        """Returns the size of the frames, as a share of their full size."""
+        return next(size for size, end in self.sizes if done < end or end == 1.0)
+
+    def _next_size(self, done: float) -> float | None:
+        """Returns the size of the frames that follows, or None if the present size is the last."""
+        return next((later for (_, end), (later, _) in pairwise(self.sizes) if done < end), None)
+
+    def _degree(self, done: float) -> int:
+        """Returns the highest degree of the spherical harmonics that learns; it may exceed the scene's."""
+        return int(done / 0.1)
+
+    def _count(self, done: float, start: int) -> int | None:
+        """Returns the number of Gaussians to grow to from `start`, or None outside of the growth phase."""
+        if not GROWTH_START <= done <= GROWTH_END or self.max_gaussians <= start:
+            return None
+        share = (done - GROWTH_START) / (GROWTH_END - GROWTH_START)
+        return round(start + share * (self.max_gaussians - start))
+
+
 _RATES, _SCHEDULE = LearningRates(), Schedule()
-ALLOCATED_AT_START = 1 << 16
-"""Number of Gaussians up to which a fit allocates all rows at its start; larger fits allocate half. Each doubling costs
-a compilation, as long as hundreds of steps over free rows."""
-MAX_PENDING_STEPS = 2
-"""Steps that are dispatched before the oldest is done; each holds a scene and its moments."""
 
 
 @record
@@ -51,14 +90,6 @@ class FitState:
     """(steps,) loss of the view of each step, before the step."""
 
 
-class FitResult(NamedTuple):
-    """Result of a fit."""
-
-    gaussians: Gaussians
-    losses: Float[np.ndarray, " steps"]
-    """Loss of the view of each step, before the step."""
-
-
 def _view_order(key: PRNGKeyArray, views: int, first: int, last: int) -> Int[np.ndarray, " s"]:
     """Draws the views of the steps first .. last - 1; each round of `views` steps visits every view once."""
     rounds = [np.asarray(_round(key, r, views)) for r in range(first // views, -(-last // views))]
@@ -71,7 +102,7 @@ def _round(key: PRNGKeyArray, index: Array | int, views: int) -> Array:
     return jax.random.permutation(jax.random.fold_in(key, index), views)
 
 
-def init_fit_state(gaussians: Gaussians, corrected_frames: int | None = None, *, min_rows: int = 0) -> FitState:
+def _init_fit_state(gaussians: Gaussians, corrected_frames: int | None = None, *, min_rows: int = 0) -> FitState:
     """Makes the state before the first step.
 
     Args:
@@ -104,7 +135,7 @@ def fit_gaussians(
     chunk: int = 50,
     on_checkpoint: Callable[[FitState], None] | None = None,
     progress: Progress | None = None,
-) -> FitResult:
+) -> tuple[Gaussians, Float[np.ndarray, " steps"]]:
     """Fits Gaussians to the training frames of a capture.
 
     Each step takes one view; all views are visited once before any is visited again. The background is black. All
@@ -126,7 +157,7 @@ def fit_gaussians(
       progress: Called with the number of steps (or seconds) done and of all.
 
     Returns:
-      The fitted Gaussians and the loss of each step.
+      The fitted Gaussians, and the loss of the view of each step, before the step.
 
     Raises:
       ValueError: Not exactly one of `steps` and `seconds`, or of `start` and `state`; a limit that is not above 0 and
@@ -142,11 +173,11 @@ def fit_gaussians(
     require(exclusive, "start, state", got, "exactly one of the two", "Pass state to resume a fit.")
     mesh = host_mesh(-(-capture.cameras.height // (BLOCK * TILE)))  # no strip is empty
     runner = StepRunner(capture, mesh)
-    frames = len(runner.views(1.0).frame_indices)
     if start is not None:
-        divisor = 1 if schedule.max_gaussians <= ALLOCATED_AT_START else 2
+        # Each doubling costs a compilation, as long as hundreds of steps over free rows: larger fits allocate half.
+        divisor = 1 if schedule.max_gaussians <= 1 << 16 else 2
         min_rows = schedule.max_gaussians // divisor if schedule.max_gaussians > start.count else 0
-        state = init_fit_state(start, None if refine is None else len(capture.names), min_rows=min_rows)
+        state = _init_fit_state(start, None if refine is None else len(capture.names), min_rows=min_rows)
     assert state is not None
     _check_resumable(state, steps, refine)
     seed = int(jax.random.bits(key))
@@ -156,9 +187,9 @@ def fit_gaussians(
         pace = 1 / steps if steps is not None else float(state.pace) or 1e-4
         # A resumed fit has the same chunks.
         count = max(1, min(chunk - first % chunk, math.ceil((1 - done) / pace - 1e-6)))
-        size, order = schedule.size(done), _view_order(key, frames, first, first + count)
-        config = StepConfig(schedule.degree(done), rates, refine)
-        program, later = runner.compile(train, size, config), schedule.next_size(done)
+        size, order = schedule._size(done), _view_order(key, runner.frames, first, first + count)
+        config = StepConfig(schedule._degree(done), rates, refine)
+        program, later = runner.compile(train, size, config), schedule._next_size(done)
         has_all_rows = train.gaussians.count >= schedule.max_gaussians
         if later is not None and has_all_rows and steps is not None:  # a fit with a time limit would lose steps
             runner.compile(train, later, config)
@@ -174,7 +205,7 @@ def fit_gaussians(
             problem = f"the fit has numbers that are not finite after step {len(losses)}"
             remedy = "Check the initial points, the poses and the intrinsics, or lower the learning rates."
             raise InputError("", problem, remedy=remedy)
-        target = schedule.count(done, int(state.started))
+        target = schedule._count(done, int(state.started))
         if target is not None and len(losses) % chunk == 0:
             host = _densify(host, schedule, target, [seed, len(losses)])
             train = put_on_devices(host, mesh)
@@ -186,7 +217,7 @@ def fit_gaussians(
             on_checkpoint(state)
         if progress:
             progress(len(losses) if steps is not None else round(elapsed), round(limit))
-    return FitResult(drop_free_rows(state.train.gaussians), np.asarray(state.losses))
+    return drop_free_rows(state.train.gaussians), np.asarray(state.losses)
 
 
 def _check_resumable(state: FitState, steps: int | None, refine: CorrectionRates | None) -> None:
@@ -223,8 +254,8 @@ def _run_chunk(
             after, loss, missing = runner.run_step(after, size, int(view), first + n, float(done[n]), config)
             losses.append(loss)
             overflow.append(missing)
-            if n >= MAX_PENDING_STEPS:
-                jax.block_until_ready(losses[n - MAX_PENDING_STEPS])
+            if n >= 2:  # every pending step holds a scene and its moments
+                jax.block_until_ready(losses[n - 2])
         most = int(max(jax.device_get(overflow)))
         if not most:
             return after, jax.device_get(losses)

@@ -54,13 +54,13 @@ def _shifts(image: Array, axis: int, step: int) -> Array:
 
 
 @jax.custom_vjp
-def gaussian_blur(image: Float[Array, "h w c"]) -> Float[Array, "h w c"]:
+def _gaussian_blur(image: Float[Array, "h w c"]) -> Float[Array, "h w c"]:
     """Blurs an image with the SSIM window, with zeros outside of the image. Reverse mode only."""
     return _blur_once(_blur_once(image, 0), 1)
 
 
 # The window is even and the padding zero, so the map is symmetric and equals its transpose.
-gaussian_blur.defvjp(lambda image: (gaussian_blur(image), None), lambda _, cotangent: (gaussian_blur(cotangent),))
+_gaussian_blur.defvjp(lambda image: (_gaussian_blur(image), None), lambda _, cotangent: (_gaussian_blur(cotangent),))
 
 
 def _same_shape(image, target) -> None:
@@ -68,19 +68,13 @@ def _same_shape(image, target) -> None:
     require(image.shape == target.shape, "image and target", got, "the same (H, W, C)", "Render at the photo's size.")
 
 
-def l1(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[Array, ""]:
-    """Computes the mean absolute difference of two images of one shape."""
-    _same_shape(image, target)
-    return jnp.mean(jnp.abs(image - target))
-
-
 def ssim_map(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[Array, "h w c"]:
     """Computes the structural similarity of each pixel and channel, in [-1, 1] (Wang 2004, eq. 13)."""
     _same_shape(image, target)
     # Five blurs instead of one of a stack: slicing the gradient of the stack costs XLA four times the blurs.
-    mean_i, mean_t = gaussian_blur(image), gaussian_blur(target)
-    square_i, square_t = gaussian_blur(image * image), gaussian_blur(target * target)
-    product = gaussian_blur(image * target)
+    mean_i, mean_t = _gaussian_blur(image), _gaussian_blur(target)
+    square_i, square_t = _gaussian_blur(image * image), _gaussian_blur(target * target)
+    product = _gaussian_blur(image * target)
     variance_i, variance_t = square_i - mean_i * mean_i, square_t - mean_t * mean_t
     covariance = product - mean_i * mean_t
     numerator = (2 * mean_i * mean_t + _C1) * (2 * covariance + _C2)
@@ -99,7 +93,8 @@ def photometric_loss(
     """
     _same_shape(image, target)
     if mesh is None:
-        return (1 - SSIM_SHARE) * l1(image, target) + SSIM_SHARE * (1 - jnp.mean(ssim_map(image, target)))
+        absolute = jnp.mean(jnp.abs(image - target))
+        return (1 - SSIM_SHARE) * absolute + SSIM_SHARE * (1 - jnp.mean(ssim_map(image, target)))
     return _over_mesh(image, target, mesh)
 
 

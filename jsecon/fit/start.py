@@ -1,7 +1,6 @@
 """Initial scene of a fit: points of the capture, and Gaussians made from points. Host code (NumPy)."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -14,29 +13,18 @@ from jsecon.process import cores
 from jsecon.splat.sh import C0
 from jsecon.types import Array, Capture, Gaussians, Progress
 
-MIN_SQUARED_DISTANCE = 1e-7
+_MIN_SQUARED_DISTANCE = 1e-7
 """Least squared distance to the neighbours, world units^2 (INRIA): duplicate points get a scale too."""
-
-MAX_DEPTH_POINTS = 100_000
-"""Maximum number of points from depth frames."""
-
-
-class Start(NamedTuple):
-    """Initial scene of a fit."""
-
-    gaussians: Gaussians
-    origin: str
-    """One clause on where they come from."""
 
 
 def starting_gaussians(
     capture: Capture,
     *,
     sh_degree: int = 0,
-    max_points: int = MAX_DEPTH_POINTS,
+    max_points: int = 100_000,
     progress: Progress | None = None,
-) -> Start:
-    """Makes the Gaussians that a fit of `capture` starts from.
+) -> tuple[Gaussians, str]:
+    """Makes the Gaussians that a fit of `capture` starts from, and a clause on where they come from.
 
     Points come from depth frames where there are any, else from the capture's sparse points, else by triangulation of
     the training frames.
@@ -59,7 +47,7 @@ def starting_gaussians(
             cloud.points, cloud.colors, opacity=0.9, scale=0.5, max_scale=2 * cloud.voxel, sh_degree=sh_degree
         )
         origin = f"{len(cloud.points)} points from the depth frames, one per voxel of {cloud.voxel:.3g} world units"
-        return Start(gaussians, origin)
+        return gaussians, origin
     if count >= MIN_POINTS:
         points, colors = capture.points, capture.point_colors
         origin = f"{count} sparse points of the capture"
@@ -67,10 +55,10 @@ def starting_gaussians(
         points, colors = triangulated_points(capture, progress=progress)
         few = f"only {count} points" if count else "no points"
         origin = f"the capture has {few}: {len(points)} points triangulated from feature matches between its views"
-    return Start(gaussians_from_points(points, colors, opacity=0.7, scale=0.6, sh_degree=sh_degree), origin)
+    return gaussians_from_points(points, colors, opacity=0.7, scale=0.6, sh_degree=sh_degree), origin
 
 
-def neighbour_distances(points: Float[Array, "p 3"]) -> Float[np.ndarray, " p"]:
+def _neighbour_distances(points: Float[Array, "p 3"]) -> Float[np.ndarray, " p"]:
     """Computes the RMS distance to the three nearest neighbours (simple-knn of graphdeco-inria), fewer if there are.
 
     A single point gets the minimum.
@@ -79,9 +67,9 @@ def neighbour_distances(points: Float[Array, "p 3"]) -> Float[np.ndarray, " p"]:
     count = len(points)
     others = min(3, count - 1)
     if others < 1:
-        return np.full(count, math.sqrt(MIN_SQUARED_DISTANCE))
+        return np.full(count, math.sqrt(_MIN_SQUARED_DISTANCE))
     distances, _ = KDTree(points).query(points, k=others + 1, workers=cores())
-    return np.sqrt(np.maximum(np.mean(distances[:, 1:] ** 2, axis=1), MIN_SQUARED_DISTANCE))
+    return np.sqrt(np.maximum(np.mean(distances[:, 1:] ** 2, axis=1), _MIN_SQUARED_DISTANCE))
 
 
 def gaussians_from_points(
@@ -99,7 +87,7 @@ def gaussians_from_points(
       points: (P, 3) centres, world units.
       colors: (P, 3) uint8 RGB, the same from all directions.
       opacity: Opacity of all Gaussians, in (0, 1).
-      scale: Standard deviation in units of `neighbour_distances`.
+      scale: Standard deviation in units of `_neighbour_distances`.
       max_scale: Largest standard deviation, world units.
       sh_degree: Degree of the spherical harmonics, 0 to 3.
     """
@@ -110,7 +98,7 @@ def gaussians_from_points(
     require(0 < opacity < 1, "opacity", opacity, "between 0 and 1", "0.1 is usual, 0.9 on depth.")
     require(scale > 0, "scale", scale, "positive", "1 is usual.")
     require(sh_degree in (0, 1, 2, 3), "sh_degree", sh_degree, "0 to 3", "0 is colour alone.")
-    deviations = scale * neighbour_distances(points)
+    deviations = scale * _neighbour_distances(points)
     if max_scale is not None:
         deviations = np.minimum(deviations, max_scale)
     count = len(points)

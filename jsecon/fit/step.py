@@ -11,36 +11,60 @@ import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jsecon.errors import InputError
-from jsecon.fit.corrections import (
-    CorrectionRates,
-    Corrections,
-    CorrectionState,
-    apply_exposure,
-    corrected_camera,
-    regularizer,
-)
+from jsecon.fit.corrections import CorrectionRates, Corrections, CorrectionState, apply_exposure, corrected_camera
 from jsecon.fit.growth import pad_rows, pad_with_free_rows
 from jsecon.fit.photometric import photometric_loss
 from jsecon.fit.resize import resize_frame, resize_mask, scale_cameras
-from jsecon.fit.schedule import LearningRates, rates_at
 from jsecon.parallel import AXIS, MESH_OPTIONS, map_rows
 from jsecon.splat.capacity import default_capacity, enough_capacity
 from jsecon.splat.render import render
 from jsecon.splat.sh import colours_from_sh
-from jsecon.types import Array, Camera, Capture, Leaf, record
+from jsecon.types import Array, Camera, Capture, Gaussians, Leaf, record
 
 DEPTH_WEIGHT = 0.2
 """Weight of the mean relative depth error in the loss, for captures with depth."""
-MAX_DEPTH_SPREAD = 0.05
-"""Largest spread of the depths under one pixel of a smaller frame, as a share of their mean; above it the pixel covers
-several surfaces."""
-MIN_DEPTH_ALPHA = 0.5
-"""Alpha from which the rendered depth of a pixel is compared."""
 _ADAM = optax.scale_by_adam(eps=1e-15)
 
 
 @record
-class TrainingView:
+class LearningRates:
+    """Step sizes of Adam for each group of parameters. All decay log-linearly over the fit."""
+
+    means: Any = 5e-4
+    """First step size of the positions, in units of the cameras' extent."""
+    means_last: Any = 5e-6
+    """Last step size of the positions, in the same unit."""
+    log_scales: Any = 2e-2
+    quaternions: Any = 1e-2
+    opacity_logits: Any = 5e-2
+    colors: Any = 1.5e-2
+    """Step size of the constant band of the spherical harmonics; higher bands take a twentieth."""
+    rest_last: Any = 0.3
+    """Last step size of all other groups, as a share of their first."""
+
+
+def _rates_at(done: Array, rates: LearningRates, gaussians: Gaussians, extent: Array, degree: Array) -> Gaussians:
+    """Computes the step size of each array when the share `done` of the fit is done. Pure.
+
+    Args:
+      done: Share of the fit that is done.
+      rates: Step sizes over the fit.
+      gaussians: Scene, for the number of its spherical harmonics.
+      extent: Cameras' extent, world units.
+      degree: Highest degree of the spherical harmonics that learns: the rate of higher coefficients is zero.
+    """
+    band = np.floor(np.sqrt(np.arange(gaussians.sh.shape[1]))).astype(np.int32)
+    sh = jnp.where(band <= degree, jnp.where(band == 0, rates.colors, rates.colors / 20), 0.0)
+    # Log-linear; written so that a rate of 0 (frozen positions) stays 0.
+    decay = jnp.where(rates.means > 0, rates.means_last / jnp.where(rates.means > 0, rates.means, 1.0), 0.0)
+    means, rest = extent * rates.means * decay**done, rates.rest_last**done
+    return Gaussians(
+        means, rest * rates.log_scales, rest * rates.quaternions, rest * rates.opacity_logits, rest * sh[None, :, None]
+    )
+
+
+@record
+class _TrainingView:
     """One view that a step fits to."""
 
     camera: Leaf
@@ -53,7 +77,7 @@ class TrainingView:
     """(H, W) bool: pixels without influence; or None."""
 
 
-class TrainingViews:
+class _TrainingViews:
     """Training frames of a capture at one size, each resized when a step first takes it. Host code."""
 
     def __init__(self, capture: Capture, size: float = 1.0):
@@ -66,15 +90,15 @@ class TrainingViews:
         cameras = jax.tree.map(lambda a: np.asarray(a, np.float32), capture.cameras[self.frame_indices])
         self.extent = np.asarray(cameras_extent(cameras), np.float32)
         self.cameras = cameras if size == 1.0 else scale_cameras(cameras, size)
-        self._views: dict[int, TrainingView] = {}
+        self._views: dict[int, _TrainingView] = {}
 
-    def __getitem__(self, index: int) -> TrainingView:
+    def __getitem__(self, index: int) -> _TrainingView:
         """Returns a view by its position among the training frames."""
         if index not in self._views:
             self._views[index] = self._resized(index)
         return self._views[index]
 
-    def _resized(self, index: int) -> TrainingView:
+    def _resized(self, index: int) -> _TrainingView:
         capture, t = self._capture, self.frame_indices[index]
         size = self.cameras.width, self.cameras.height
         depth = ignored = None
@@ -86,7 +110,7 @@ class TrainingViews:
         if capture.ignored is not None:
             ignored = resize_mask(np.asarray(capture.ignored[t]), self.cameras)
         frame = resize_frame(np.asarray(capture.frames[t]), self.cameras)
-        return TrainingView(self.cameras[index], frame, depth, ignored)
+        return _TrainingView(self.cameras[index], frame, depth, ignored)
 
 
 def _shrink_depth(depth: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -96,7 +120,7 @@ def _shrink_depth(depth: np.ndarray, size: tuple[int, int]) -> np.ndarray:
         return cv2.resize(a, size, interpolation=cv2.INTER_AREA).astype(np.float64)
 
     mean, square, known = shrink(depth), shrink(depth.astype(np.float64) ** 2), shrink(np.float32(depth > 0))
-    one_surface = square - mean**2 <= (MAX_DEPTH_SPREAD * mean) ** 2
+    one_surface = square - mean**2 <= (0.05 * mean) ** 2  # depths spread by more belong to several surfaces
     return np.where((known > 0.999) & one_surface, mean, 0).astype(np.float32)
 
 
@@ -106,11 +130,11 @@ def cameras_extent(cameras: Camera) -> float:
     return 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
 
 
-def view_loss(
+def _view_loss(
     gaussians: Any,
     vote_channel: Array,
     correction: Corrections | None,
-    view: TrainingView,
+    view: _TrainingView,
     extent: Array,
     capacity: int | None = None,
     mesh: Mesh | None = None,
@@ -118,8 +142,8 @@ def view_loss(
     """Computes the loss of one view. Pure.
 
     It is the photometric loss of the rendering, plus DEPTH_WEIGHT times the mean of |rendered - known| / known depth
-    over the pixels of the view (zero where the depth is unknown or little is rendered), plus the regulariser of the
-    corrections. Ignored pixels have no gradient and no votes.
+    over the pixels of the view (zero where the depth is unknown or little is rendered), plus the squared corrections
+    (radians and shares of the extent; shares of the colour range). Ignored pixels have no gradient and no votes.
 
     Args:
       gaussians: Scene of N Gaussians.
@@ -147,11 +171,14 @@ def view_loss(
         image, target = jnp.where(ignored, rendered, image), jnp.where(ignored, rendered, target)
     value = photometric_loss(image, target, mesh)
     if view.depth is not None and rendering.depth is not None:
-        known = (view.depth > 0) & (rendering.alpha > MIN_DEPTH_ALPHA)
+        known = (view.depth > 0) & (rendering.alpha > 0.5)
         relative = jnp.abs(rendering.depth - view.depth) / jnp.where(known, view.depth, 1.0)
         value = value + DEPTH_WEIGHT * jnp.mean(jnp.where(known, relative, 0.0))
     if correction is not None:
-        value = value + regularizer(correction, extent)
+        # Decides what the frames leave open; without extent the cameras share one place.
+        shift = correction.twists[3:] / jnp.where(extent > 0, extent, 1.0)
+        poses = jnp.sum(correction.twists[:3] ** 2) + jnp.sum(shift**2)
+        value = value + 1e-3 * poses + 1e-3 * jnp.sum((correction.colours - jnp.eye(3, 4)) ** 2)
     error = jax.lax.stop_gradient(jnp.abs(image - target).mean(-1))
     return value + jnp.sum(error * votes), (value, rendering.overflow)
 
@@ -182,7 +209,7 @@ class StepConfig(NamedTuple):
 
 
 @record
-class StepInputs:
+class _StepInputs:
     """Numbers of a step; traced, so that one program serves all steps."""
 
     step: Leaf
@@ -203,8 +230,8 @@ class StepInputs:
     """Corrections of one view, or None."""
 
 
-def step(
-    state: TrainState, view: TrainingView, inputs: StepInputs, capacity: int, mesh: Mesh | None
+def _step(
+    state: TrainState, view: _TrainingView, inputs: _StepInputs, capacity: int, mesh: Mesh | None
 ) -> tuple[TrainState, Array, Array]:
     """Takes one Adam step on one view. Pure.
 
@@ -219,7 +246,7 @@ def step(
     correction = None if corrections is None else jax.tree.map(lambda a: a[inputs.frame], corrections.current)
 
     def loss(gaussians, vote_channel, correction):
-        return view_loss(gaussians, vote_channel, correction, view, inputs.extent, capacity, mesh)
+        return _view_loss(gaussians, vote_channel, correction, view, inputs.extent, capacity, mesh)
 
     gradients = jax.value_and_grad(loss, (0, 1, 2), has_aux=True)(state.gaussians, vote_channel, correction)
     (_, (value, overflow)), (gradient, vote_gradient, correction_gradient) = gradients
@@ -227,7 +254,7 @@ def step(
     def update(rows, common):
         return _adam(*rows, *common)
 
-    rate = rates_at(inputs.done, inputs.rates, state.gaussians, inputs.extent, inputs.degree)
+    rate = _rates_at(inputs.done, inputs.rates, state.gaussians, inputs.extent, inputs.degree)
     rows = state.gaussians, gradient, state.first_moment, state.second_moment
     gaussians, first, second = map_rows(update, rows, (inputs.step, rate), mesh)
     if corrections is not None:
@@ -249,7 +276,7 @@ def _adam(parameters: Any, gradient: Any, first: Any, second: Any, steps: Array,
 
 
 # of one device, and over a mesh
-_step_compiled = [jax.jit(step, static_argnums=(3, 4), compiler_options=options) for options in (None, MESH_OPTIONS)]
+_step_compiled = [jax.jit(_step, static_argnums=(3, 4), compiler_options=options) for options in (None, MESH_OPTIONS)]
 
 
 def _shardings(mesh: Mesh) -> TrainState:
@@ -276,29 +303,39 @@ def put_on_devices(state: TrainState, mesh: Mesh | None) -> TrainState:
     return jax.device_put(state, _shardings(mesh))
 
 
+def _correction_steps(rates: CorrectionRates, done: float, extent: np.ndarray) -> Corrections:
+    """Step sizes of one view when the share `done` of the fit is done; they fall log-linearly to 3 %."""
+    pose, colour = (rate * 0.03**done for rate in rates)
+    return Corrections(np.repeat(np.array([pose, pose * float(extent)], np.float32), 3), np.float32(colour))
+
+
 class StepRunner:
     """Runs steps on the training frames of a capture.
 
     Each number of rows and size of the frames has a program of its own and its own capacity of the tile lists.
+
+    Attributes:
+      frames: Number of training frames.
     """
 
     def __init__(self, capture: Capture, mesh: Mesh | None):
-        """Prepares steps on `mesh`."""
+        """Prepares steps on `mesh`. Raises InputError if every frame is held out."""
         self._capture, self._mesh = capture, mesh
-        self._views: dict[float, TrainingViews] = {}
+        self._by_size: dict[float, _TrainingViews] = {}
         self._capacity: dict[tuple[int, float], int] = {}
         self._programs: dict[tuple[int, float, int], Future] = {}
         self._compiler = ThreadPoolExecutor(2)
+        self.frames = len(self._views(1.0).frame_indices)
 
-    def views(self, size: float) -> TrainingViews:
+    def _views(self, size: float) -> _TrainingViews:
         """Returns the training frames at a share of their full size."""
-        if size not in self._views:
-            self._views[size] = TrainingViews(self._capture, size)
-        return self._views[size]
+        if size not in self._by_size:
+            self._by_size[size] = _TrainingViews(self._capture, size)
+        return self._by_size[size]
 
     def compile(self, state: TrainState, size: float, config: StepConfig) -> Future:
         """Starts to compile the program for the rows of `state` in another thread, unless that has begun."""
-        count, cameras = state.gaussians.count, self.views(size).cameras
+        count, cameras = state.gaussians.count, self._views(size).cameras
         strips = 1 if self._mesh is None else self._mesh.size
         initial = default_capacity(count, cameras.width, cameras.height, strips=strips)
         capacity = self._capacity.setdefault((count, size), initial)
@@ -312,7 +349,7 @@ class StepRunner:
     def run_step(
         self, state: TrainState, size: float, view: int, index: int, done: float, config: StepConfig
     ) -> tuple[TrainState, Array, Array]:
-        """Takes one step, see `step`.
+        """Takes one step, see `_step`.
 
         Args:
           state: State before the step.
@@ -326,8 +363,8 @@ class StepRunner:
         return program(state, *self._arguments(size, view, index, done, config))
 
     def _arguments(self, size: float, view: int, index: int, done: float, config: StepConfig) -> tuple:
-        views = self.views(size)
-        inputs = StepInputs(
+        views = self._views(size)
+        inputs = _StepInputs(
             step=np.int32(index),
             frame=np.int32(views.frame_indices[view]),
             visits=np.int32(index // len(views.frame_indices)),
@@ -335,7 +372,7 @@ class StepRunner:
             degree=np.int32(config.degree),
             extent=views.extent,
             rates=config.rates,
-            correction_rates=None if config.refine is None else config.refine.at(done, float(views.extent)),
+            correction_rates=None if config.refine is None else _correction_steps(config.refine, done, views.extent),
         )
         sharding = None if self._mesh is None else NamedSharding(self._mesh, PartitionSpec())
         return jax.device_put((views[view], inputs), sharding)

@@ -17,12 +17,6 @@ from jsecon.types import Camera, Capture, Progress
 
 MIN_POINTS = 50
 """Least number of points for a scene: with fewer the views do not overlap or have no texture."""
-NEIGHBOURS = 6
-"""Number of views that each view is matched with."""
-MAX_ERROR_PX = 2.0
-"""Largest reprojection error."""
-MIN_ANGLE_DEG = 2.0
-"""Least parallax."""
 
 
 class _Features(NamedTuple):
@@ -47,7 +41,7 @@ def _detect(frame: np.ndarray, camera: Camera) -> _Features:
 
 
 def _view_pairs(poses: np.ndarray) -> list[tuple[int, int]]:
-    """Pairs each view with the NEIGHBOURS nearest in place (in units of the median spacing) and direction."""
+    """Pairs each view with the six nearest in place (in units of the median spacing) and direction."""
     rotation = poses[:, :3, :3]
     centres = -np.einsum("tji,tj->ti", rotation, poses[:, :3, 3])
     distance = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
@@ -55,7 +49,7 @@ def _view_pairs(poses: np.ndarray) -> list[tuple[int, int]]:
     spread = float(np.median(apart)) if apart.size else 1.0
     angle = np.arccos(np.clip(rotation[:, 2] @ rotation[:, 2].T, -1, 1))
     cost = distance / spread + angle + 1e9 * np.eye(len(rotation))
-    nearest = np.argsort(cost, axis=1, kind="stable")[:, : min(NEIGHBOURS, len(rotation) - 1)]
+    nearest = np.argsort(cost, axis=1, kind="stable")[:, : min(6, len(rotation) - 1)]
     return sorted({(min(i, int(j)), max(i, int(j))) for i in range(len(rotation)) for j in nearest[i]})
 
 
@@ -73,7 +67,7 @@ def _match(a: _Features, b: _Features) -> np.ndarray:
     return np.stack([rows[keep], forward[keep]], axis=1)
 
 
-def triangulate_matches(pose_a, pose_b, rays_a, rays_b, focal: float) -> tuple[np.ndarray, np.ndarray]:
+def _triangulate_matches(pose_a, pose_b, rays_a, rays_b, focal: float) -> tuple[np.ndarray, np.ndarray]:
     """Triangulates the matches of two views.
 
     Args:
@@ -84,7 +78,8 @@ def triangulate_matches(pose_a, pose_b, rays_a, rays_b, focal: float) -> tuple[n
       focal: Focal length, px.
 
     Returns:
-      Points (M, 3), world, and their parallax (M,) in radians; negative for those that do not fit the views.
+      Points (M, 3), world, and their parallax (M,) in radians; negative for those that do not fit the
+      views: behind a camera, more than 2 px off, or with a parallax below 2 degrees.
     """
     homogeneous = cv2.triangulatePoints(pose_a[:3], pose_b[:3], rays_a.T, rays_b.T)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -93,10 +88,10 @@ def triangulate_matches(pose_a, pose_b, rays_a, rays_b, focal: float) -> tuple[n
         for pose, rays in ((pose_a, rays_a), (pose_b, rays_b)):
             seen = points @ pose[:3, :3].T + pose[:3, 3]
             error = focal * np.linalg.norm(seen[:, :2] / seen[:, 2:] - rays, axis=1)
-            fits &= (seen[:, 2] > 0) & (error < MAX_ERROR_PX)
+            fits &= (seen[:, 2] > 0) & (error < 2)
             directions.append(seen @ pose[:3, :3] / np.linalg.norm(seen, axis=1, keepdims=True))
         parallax = np.arccos(np.clip((directions[0] * directions[1]).sum(axis=1), -1, 1))
-    return points, np.where(fits & (parallax > np.deg2rad(MIN_ANGLE_DEG)), parallax, -1.0)
+    return points, np.where(fits & (parallax > np.deg2rad(2)), parallax, -1.0)
 
 
 def triangulated_points(capture: Capture, *, progress: Progress | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -125,7 +120,7 @@ def triangulated_points(capture: Capture, *, progress: Progress | None = None) -
         matches = _match(features[i], features[j])
         if len(matches):
             rays = features[i].rays[matches[:, 0]], features[j].rays[matches[:, 1]]
-            of_pair, angle = triangulate_matches(poses[i], poses[j], *rays, float(cameras.fx[i]))
+            of_pair, angle = _triangulate_matches(poses[i], poses[j], *rays, float(cameras.fx[i]))
             edges.append(matches[angle > 0] + first[[i, j]])
             points.append(of_pair[angle > 0])
             parallax.append(angle[angle > 0])

@@ -40,8 +40,6 @@ HOLE_AREA = 8
 _FETCH = "Fetch the folder again, all of it from one repository."
 _MASK_LOGIT = 10.0
 """logit of a pixel of a mask prompt; its negative outside"""
-_ENCODED_FRAMES = 16
-"""frames whose features are kept for later calls, about 16 MiB each at 1024 px"""
 
 # Letters are sizes that must agree across the files: S image, G grid of the coarsest features, T = G^2, C channels, M
 # numbers of a memory token; None is free.
@@ -101,7 +99,7 @@ class _Prediction(NamedTuple):
     """(1, 1) float32 logit of the object's presence"""
 
 
-class Memory(NamedTuple):
+class _Memory(NamedTuple):
     """What a frame adds to the memory of an object."""
 
     tokens: np.ndarray | None
@@ -121,7 +119,7 @@ class Sam2Graphs:
 
     def __init__(self, graphs: Mapping[str, Any], constants: _Constants, sizes: Mapping[str, int]):
         self.graphs, self.constants, self.sizes = graphs, constants, sizes
-        self._encode = functools.lru_cache(_ENCODED_FRAMES)(self._encode_bytes)
+        self._encode = functools.lru_cache(16)(self._encode_bytes)  # about 16 MiB for each frame at 1024 px
 
     def encode(self, frame: np.ndarray) -> Features:
         """Encodes a frame (H, W, 3), stretched to a square; the last frames are remembered by their content."""
@@ -156,7 +154,7 @@ class Sam2Graphs:
         return _Prediction(_resize(mask, len(decoded.logits)), mask, decoded.pointer, score)
 
     def _tracked(
-        self, features: Features, bank: "Bank", t: int, step: int, count: int, position: np.ndarray
+        self, features: Features, bank: "_Bank", t: int, step: int, count: int, position: np.ndarray
     ) -> _Prediction:
         """Predicts the object of a bank in frame t of `count`; `position` (K, M) is the spatial code of a memory."""
         memories, pointers = bank.attended(t, step, count)
@@ -188,7 +186,7 @@ class Sam2Graphs:
         masks = outputs["low_res_mask"][0, 0], outputs["high_res_mask"][0, 0]
         return _Prediction(*masks, outputs["object_pointer"][0, 0], outputs["object_score_logits"].reshape(1, 1))
 
-    def _memorize(self, features: Features, prediction: _Prediction, *, binarize: bool) -> tuple[Memory, np.ndarray]:
+    def _memorize(self, features: Features, prediction: _Prediction, *, binarize: bool) -> tuple[_Memory, np.ndarray]:
         """Encodes the memory of an object in a frame, binary if it was prompted there; and returns its spatial code."""
         outputs = self._run(
             "memory_encoder",
@@ -198,7 +196,7 @@ class Sam2Graphs:
             binarize=np.asarray(binarize, np.float32),
         )
         tokens = outputs["memory_tokens"][:, 0].astype(jnp.bfloat16)
-        return Memory(tokens, prediction.pointer), outputs["memory_pos"][:, 0]
+        return _Memory(tokens, prediction.pointer), outputs["memory_pos"][:, 0]
 
 
 def _as_tokens(grid: np.ndarray) -> np.ndarray:
@@ -252,14 +250,14 @@ def _read_constants(path: Path) -> _Constants:
 
 
 @dataclasses.dataclass(frozen=True)
-class Bank:
+class _Bank:
     """The memories of one object."""
 
     start: int
     """The prompted frame."""
-    prompted: Memory
+    prompted: _Memory
     """Its memory."""
-    tracked: Mapping[int, Memory] = dataclasses.field(default_factory=dict)
+    tracked: Mapping[int, _Memory] = dataclasses.field(default_factory=dict)
     """Memories of tracked frames that a later frame can still reach, by frame."""
 
     def attended(
@@ -290,7 +288,7 @@ class Bank:
         pointers += [pointers[newest[1]]] * (POINTERS - len(pointers))
         return memories, pointers
 
-    def with_tracked(self, t: int, memory: Memory, step: int) -> "Bank":
+    def with_tracked(self, t: int, memory: _Memory, step: int) -> "_Bank":
         """Adds the memory of a frame, and drops what no later frame can reach.
 
         The backward pass begins before the prompted frame and reads what the forward pass left beyond it.
@@ -325,7 +323,7 @@ def follow(
     features = model.encode(frames[start])
     first = [model._prompted(features, prompt, frames.shape[1:3]) for prompt in prompts]
     memories = [model._memorize(features, prediction, binarize=True) for prediction in first]
-    banks = [Bank(start, memory) for memory, _ in memories]
+    banks = [_Bank(start, memory) for memory, _ in memories]
     position = memories[0][1]
     yield start, [prediction.logits for prediction in first]
     for step, order in ((1, range(start + 1, count)), (-1, range(start - 1, -1, -1))):

@@ -24,7 +24,7 @@ from jsecon.read.captures.frames import FrameOptions, frame_names, make_rigid, t
 from jsecon.read.captures.nerfstudio import source_from_trained
 from jsecon.read.captures.photographs import list_photographs
 from jsecon.read.captures.video import is_video, write_frames
-from jsecon.splat.transform import transform_gaussians_float64
+from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Camera, Capture, Gaussians, Quality
 from jsecon.views.capture import render_capture
 from jsecon.views.frame import scene_frame, surface_points
@@ -108,8 +108,7 @@ def read_gaussians_of_capture(stage: StageInput) -> StageResult:
 
 def fit_scene(stage: StageInput) -> StageResult:
     """Fits Gaussians to the training frames. A long fit may have one for each pixel of a frame, a short one half."""
-    from jsecon.fit.optimise import fit_gaussians
-    from jsecon.fit.schedule import MAX_GAUSSIANS, Schedule
+    from jsecon.fit.optimise import Schedule, fit_gaussians
 
     options, capture, state = stage.context.options, stage.results.load, stage.checkpoint.read()
     start, notes = None, ()
@@ -119,7 +118,7 @@ def fit_scene(stage: StageInput) -> StageResult:
         notes = (f"start of the fit: {origin}",)
     pixels, minutes = capture.cameras.width * capture.cameras.height, options.minutes
     is_long = options.steps >= 3000 if minutes is None else minutes >= 3
-    most = min(pixels if is_long else pixels // 2, MAX_GAUSSIANS)
+    most = min(pixels if is_long else pixels // 2, Schedule.max_gaussians)
     fitted, losses = fit_gaussians(
         capture,
         key=jax.random.key(options.seed),
@@ -199,7 +198,7 @@ def _world_of_scene(gaussians: Gaussians) -> np.ndarray:
 
 def _into_world(gaussians: Gaussians, source_from_scene: np.ndarray) -> Gaussians:
     """Moves Gaussians from the world of their file into that of the capture, in float32."""
-    moved = transform_gaussians_float64(gaussians, np.linalg.inv(source_from_scene))
+    moved = transform_gaussians(gaussians, np.linalg.inv(source_from_scene))
     return dataclasses.replace(moved, means=np.asarray(moved.means, np.float32))
 
 

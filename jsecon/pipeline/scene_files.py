@@ -23,7 +23,7 @@ from jsecon.read.captures.frames import evenly_spaced, transform_poses
 from jsecon.read.splats.files import MAX_READ_ROUNDING, read_gaussians
 from jsecon.splat.project import project
 from jsecon.splat.render import render_rgb
-from jsecon.splat.transform import transform_gaussians_float64
+from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Camera, Capture, Gaussians, Progress
 
 ROUGH_CORRELATION = 0.6
@@ -118,7 +118,7 @@ def place_in_capture(
         )
 
     def place(name: str, world: np.ndarray) -> _Placement:
-        moved = transform_gaussians_float64(gaussians, np.linalg.inv(source_from_scene) @ world)
+        moved = transform_gaussians(gaussians, np.linalg.inv(source_from_scene) @ world)
         scene = jax.tree.map(jnp.asarray, moved)
         return _Placement(name, scene, _photo_similarity(scene, capture))
 

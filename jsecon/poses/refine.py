@@ -35,11 +35,10 @@ from jsecon.fit.corrections import (
     identity_corrections,
     se3_exp,
 )
-from jsecon.fit.optimise import FitState, fit_gaussians
+from jsecon.fit.optimise import FitState, Schedule, fit_gaussians
 from jsecon.fit.resize import resize_frame, scale_cameras
-from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.start import starting_gaussians
-from jsecon.fit.step import cameras_extent
+from jsecon.fit.step import LearningRates, cameras_extent
 from jsecon.poses.alignment import align_cameras
 from jsecon.splat.render import render_rgb
 from jsecon.types import Array, Camera, Capture, Gaussians, Progress
@@ -50,8 +49,6 @@ MIN_VISITS = 6
 """Visits below which poses do not become stable."""
 PROBES = 4
 """Maximum number of probes, one after the other."""
-PROBE_POINTS = 12_000
-"""Maximum number of points from depth that a probe starts from."""
 ALIGN_VISITS = 120
 """Visits of each held-out frame while it is aligned to the last probe."""
 DECIDE_VISITS = 24
@@ -60,22 +57,13 @@ FINE_SIZE = 0.5
 """Size of the frames in the last probe, which measures as well as full size in half the time."""
 COARSE_PX, MIN_COARSE_SIZE = 100, 0.25
 """Longer side in px of the frames in the probes before the last, and their smallest size."""
-STABLE_PX = 0.25
-"""Median movement of the image by a probe, px at full size, below which the poses are stable."""
 MIN_GAIN_DB = 0.5
 """PSNR that corrections must gain on the frames kept aside. In the demo's room they gain 0.1 dB without errors,
 0.9 if poses are off by 3 mm and 0.15 degrees, and 2 to 3 at three times as much."""
 MIN_ASIDE, MAX_ASIDE = 2, 8
 """Number of training frames kept aside for the decision, a third of all at most."""
-ALIGNED_POSE_RATE = 1e-4
-"""First step of poses that depth has aligned already, radians: what is left is small."""
-CHESS_SQUARES = 8
-"""Squares of the chessboard on which frames kept aside are compared, along each side of a frame."""
 _STEP_COST_PIXELS, _STEP_COST_GAUSSIANS = 0.46, 0.072
 """Time of a step of a probe in steps of the fit: for frames of full size, and for its Gaussians."""
-_NO_CORRECTION = CorrectionRates(0.0, 0.0)
-"""Rates of a probe without corrections that shares the program of a probe with them."""
-_FROZEN = LearningRates(means=0.0, means_last=0.0, log_scales=0.0, quaternions=0.0, opacity_logits=0.0, colors=0.0)
 
 
 class _Plan(NamedTuple):
@@ -118,7 +106,7 @@ class _Prober:
 
     def initial(self, capture: Capture) -> Gaussians:
         """Gaussians that a probe of this capture starts from."""
-        return starting_gaussians(capture, max_points=PROBE_POINTS)[0] if self.start is None else self.start
+        return starting_gaussians(capture, max_points=12_000)[0] if self.start is None else self.start
 
     def report(self, done: int) -> None:
         if self.progress is not None:
@@ -165,7 +153,10 @@ class _Prober:
     ) -> Corrections:
         """The corrections, with those of `frames` replaced by alignment to the frozen scene."""
         only = dataclasses.replace(capture, held_out=~frames)
-        _, aligned = self.fit(only, scene, refine, size, visits * int(frames.sum()), _FROZEN)
+        frozen = LearningRates(
+            means=0.0, means_last=0.0, log_scales=0.0, quaternions=0.0, opacity_logits=0.0, colors=0.0
+        )
+        _, aligned = self.fit(only, scene, refine, size, visits * int(frames.sum()), frozen)
 
         def pick(a, b):
             return np.where(frames.reshape(-1, *[1] * (a.ndim - 1)), b, a)
@@ -206,7 +197,7 @@ def refine_capture(
     aligned = None if capture.depths is None else _align_by_depth(capture, train, ~train)
     by_depth, refine = aligned is not None, CorrectionRates()
     if by_depth:
-        probes, refine = 1, CorrectionRates(pose=ALIGNED_POSE_RATE)
+        probes, refine = 1, CorrectionRates(pose=1e-4)  # what is left after depth is small
     plan = _plan_probes(capture, visits, probes, max_fit_steps)
     if plan is None:
         problem = f"{len(capture.names)} frames are too many to correct them within half of the fit's time"
@@ -226,7 +217,8 @@ def refine_capture(
     while remaining > 1:
         scene, corrections = prober.fit(capture, prober.initial(capture), refine, plan.coarse_size, steps)
         before, capture = capture, _move_cameras(capture, corrections)
-        stable = _median_shift_px(scene, before.cameras[train], capture.cameras[train]) < STABLE_PX
+        # px at full size, below which the poses are stable
+        stable = _median_shift_px(scene, before.cameras[train], capture.cameras[train]) < 0.25
         remaining = 1 if stable else remaining - 1
     scene, corrections = prober.fit(capture, prober.initial(capture), refine, FINE_SIZE, steps)
     if held_out:
@@ -273,7 +265,7 @@ def _decide(
     aside = np.zeros(len(capture.names), bool)
     aside[train[((np.arange(count) + 0.5) * len(train) / count).astype(int)]] = True
     # Frames kept aside are aligned on the squares of one colour of a chessboard, and compared on the others.
-    rows, columns = (np.arange(length) * CHESS_SQUARES // length for length in np.shape(capture.frames)[1:3])
+    rows, columns = (np.arange(length) * 8 // length for length in np.shape(capture.frames)[1:3])
     even = np.add.outer(rows, columns) % 2 == 0
     ignored = np.zeros(np.shape(capture.frames)[:3], bool) if capture.ignored is None else np.asarray(capture.ignored)
     held_out = np.asarray(capture.held_out) | aside
@@ -282,7 +274,8 @@ def _decide(
     aligned = (_align_by_depth(half, ~held_out, aside) if by_depth else None) or half
     size = plan.coarse_size
     scene, corrections = prober.fit(aligned, prober.initial(aligned), refine, size, steps)
-    plain_scene, _ = prober.fit(half, prober.initial(half), _NO_CORRECTION, size, steps)
+    no_correction = CorrectionRates(0.0, 0.0)  # shares the program of a probe with corrections
+    plain_scene, _ = prober.fit(half, prober.initial(half), no_correction, size, steps)
     corrections = prober.align(aligned, scene, corrections, aside, refine, size, DECIDE_VISITS)
     plain = prober.align(half, plain_scene, identity_corrections(len(aside)), aside, refine, size, DECIDE_VISITS)
     counted = even & ~ignored

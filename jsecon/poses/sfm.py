@@ -35,11 +35,6 @@ from jsecon.types import Progress
 
 MIN_PHOTOS = 3
 """Photographs that a model needs."""
-LONG_SIDE = 1600
-"""Longer side in px at which features are detected."""
-UPSAMPLED_SIDE = 1000
-"""Longer side in px up to which features are also detected at twice the size: 5,400 features instead of 880 on
-photographs of 799 x 532, where 880 gave wrong poses."""
 ALL_PAIRS = 40
 """Number of photographs up to which every pair is matched."""
 NEIGHBOURS, ALIKE = 10, 20
@@ -121,7 +116,9 @@ def find_poses(
         links.append(f"{number:06d}{'.png' if copied else photo.suffix.lower()}")  # COLMAP's lists split at spaces
         _link(photo, work / "links" / links[-1], upright_copy=copied)
     lenses = [[links[n] for n in group] for group in _lens_groups(photos, sizes)]
-    upsampled = max(max(set(sizes), key=sizes.count)) <= UPSAMPLED_SIDE
+    # Features of small photographs are also detected at twice the size: 5,400 instead of 880 on photographs of 799 x
+    # 532, where 880 gave wrong poses.
+    upsampled = max(max(set(sizes), key=sizes.count)) <= 1000
     model = _run_in_own_process(work, _Job(dict(zip(links, original)), lenses, upsampled), progress)
     if len(model.registered) < MIN_PHOTOS:
         remedy = "Take more that overlap by two thirds: sharp photographs of a still scene, from different places."
@@ -228,7 +225,7 @@ def _extract(colmap: Any, job: _Job, work: Path, progress: Progress) -> None:
     """Detects the features of the photographs that have none in the database."""
     database, total = work / "database.db", len(job.names)
     options, reader = colmap.FeatureExtractionOptions(), colmap.ImageReaderOptions()
-    options.max_image_size, options.num_threads, options.sift.max_num_features = LONG_SIDE, cores(), 4096
+    options.max_image_size, options.num_threads, options.sift.max_num_features = 1600, cores(), 4096
     options.sift.first_octave = -1 if job.upsampled else 0
     reader.camera_model = "OPENCV"
     with colmap.Database.open(database) as opened:

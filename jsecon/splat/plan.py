@@ -21,8 +21,8 @@ from jsecon.errors import require, require_shape
 from jsecon.numerics import NEAR, all_finite, is_traced
 from jsecon.parallel import MESH_OPTIONS, map_rows
 from jsecon.programs import stored_jit
-from jsecon.splat.autodiff import rasterize_nan_contained
 from jsecon.splat.capacity import default_capacity, enough_capacity, round_capacity
+from jsecon.splat.composite import rasterize_nan_contained
 from jsecon.splat.project import Projection, check_gaussians, project
 from jsecon.splat.strips import map_strips
 from jsecon.splat.tiles import TileLists, tile_lists
@@ -214,7 +214,7 @@ def render_plan(
       ValueError: Shapes disagree.
     """
     require_shape("features", features, (plan.splats.shape[0], "D"), "Pass one row of features per Gaussian.")
-    require_background(background, features.shape[1])
+    _require_background(background, features.shape[1])
     if not plan.splats.shape[0]:
         return _empty_rendering(plan, features.shape[1], background, depth)
     traced = is_traced((plan, features, background))
@@ -231,7 +231,7 @@ def _empty_rendering(plan: ViewPlan, channels: int, background: Array | None, de
     return Rendering(image, alpha, plan.overflow, alpha if depth else None)
 
 
-def require_background(background: Array | None, channels: int) -> None:
+def _require_background(background: Array | None, channels: int) -> None:
     """Checks that a background is None, one number, or one number per channel."""
     if background is not None:
         got, remedy = np.shape(background), "Pass one number per channel of the features."

@@ -58,10 +58,6 @@ def count_non_finite(gaussians: Gaussians, features: Float[Array, "n d"] | None 
 
 _MAX_AXIS_PX = 1e15
 """Longest axis of a splat in px, flat over any image; longer axes are shrunk to it, so that squares fit float32."""
-_MAX_OFFSET_PX = 1e17
-"""Distance in px from which no splat reaches the image, as its axes end at _MAX_AXIS_PX."""
-_MAX_LOG_SCALE = 60.0
-"""exp(60) is beyond any scene, and its products with a focal length over a depth still fit float32."""
 
 
 @record
@@ -99,7 +95,8 @@ def _covariance_root(w2c: Array, unit: list[Array], log_scales: Array, rays: tup
     x_ratio, y_ratio, focal_x, focal_y = rays
     row_1, row_2 = [], []
     for axis in range(3):
-        scale = jnp.exp(jnp.minimum(log_scales[:, axis], _MAX_LOG_SCALE))
+        # exp(60) is beyond any scene, and its products with a focal length over a depth still fit float32.
+        scale = jnp.exp(jnp.minimum(log_scales[:, axis], 60.0))
         along = [sum(w2c[i, k] * rotation[k][axis] for k in range(3)) * scale for i in range(3)]
         row_1.append(focal_x * (along[0] - x_ratio * along[2]))
         row_2.append(focal_y * (along[1] - y_ratio * along[2]))
@@ -176,8 +173,9 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float | Array = NEAR)
     # take five times as long.
     mean_x, mean_y, mean_z = (gaussians.means[:, i] for i in range(3))
     x, y, z = (mean_x * w2c[i, 0] + mean_y * w2c[i, 1] + mean_z * w2c[i, 2] + w2c[i, 3] for i in range(3))
-    # Gaussians extremely far aside are hidden before their ratio overflows.
-    max_offset = _MAX_OFFSET_PX * z
+    # Gaussians extremely far aside are hidden before their ratio overflows: as axes end at _MAX_AXIS_PX, none from
+    # farther reaches the image.
+    max_offset = 1e17 * z
     in_front = drawn & (z > near) & (jnp.abs(camera.fx * x) < max_offset) & (jnp.abs(camera.fy * y) < max_offset)
     z_safe = jnp.where(in_front, z, 1.0)
     x_ratio, y_ratio = jnp.where(in_front, x, 0.0) / z_safe, jnp.where(in_front, y, 0.0) / z_safe

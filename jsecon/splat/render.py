@@ -1,28 +1,16 @@
 """Renders features, colour and depth of one view. Differentiable in every array, in reverse mode."""
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 from jaxtyping import Float
 
-from jsecon.errors import require_shape
 from jsecon.numerics import NEAR
 from jsecon.programs import stored_jit
-from jsecon.splat.plan import plan_view, render_plan, require_background
+from jsecon.splat.plan import plan_view, render_plan
 from jsecon.splat.project import check_gaussians
 from jsecon.splat.sh import colours_from_sh
 from jsecon.types import Array, Camera, Gaussians, Rendering
-
-
-class DepthImage(NamedTuple):
-    """Rendered depth of one view."""
-
-    depth: Float[Array, "h w"]
-    """(H, W) expected z-depth, world units; 0 where no Gaussian is rendered."""
-    alpha: Float[Array, "h w"]
-    """(H, W) sum of alpha T, in [0, 1)."""
 
 
 def render(
@@ -69,9 +57,6 @@ def render(
     Raises:
       ValueError: Shapes disagree.
     """
-    check_gaussians(gaussians, camera, colour=False)
-    require_shape("features", features, (gaussians.count, "D"), "Pass one row of features per Gaussian.")
-    require_background(background, features.shape[1])
     plan = plan_view(gaussians, camera, capacity=capacity, near=near, mesh=mesh)
     # Outside of a trace these are two programs: all renderings of scenes of this size share the first.
     return render_plan(plan, features, background=background, depth=depth)
@@ -112,7 +97,7 @@ _colours = stored_jit(colours_from_sh)
 
 def render_depth(
     gaussians: Gaussians, camera: Camera, *, capacity: int | None = None, near: float = NEAR
-) -> DepthImage:
+) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
     """Renders the expected z-depth sum(w z) / sum(w).
 
     Args:
@@ -122,7 +107,8 @@ def render_depth(
       near: Near plane, world units.
 
     Returns:
-      Depth and alpha, (H, W) each; NaN if pairs overflowed the capacity.
+      Depth (H, W) in world units, 0 where no Gaussian is rendered, and alpha (H, W), the sum of alpha T; NaN if pairs
+      overflowed the capacity.
 
     Raises:
       ValueError: Shapes disagree.
@@ -132,8 +118,8 @@ def render_depth(
 
 
 @jax.jit
-def _nan_on_overflow(rendering: Rendering) -> DepthImage:
+def _nan_on_overflow(rendering: Rendering) -> tuple[Array, Array]:
     def mask(image):
         return jnp.where(rendering.overflow > 0, jnp.nan, image)
 
-    return DepthImage(mask(rendering.depth), mask(rendering.alpha))
+    return mask(rendering.depth), mask(rendering.alpha)

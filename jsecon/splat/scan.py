@@ -25,11 +25,6 @@ from jsecon.splat.strips import FULL_IMAGE, Strip
 from jsecon.splat.tiles import TileLists, tile_grid
 from jsecon.types import Array
 
-MAX_BATCH = 64
-"""Maximum number of tiles that are scanned side by side; affects only speed."""
-MAX_BATCH_BACKWARD = 32
-"""The same for gradients, which hold more arrays of a chunk at once."""
-
 
 class Batches(NamedTuple):
     """Tiles sorted by list length, in batches of B; the last is padded with empty tiles."""
@@ -54,14 +49,14 @@ class Batches(NamedTuple):
         return (x * self.tile).astype(dtype), (y * self.tile).astype(dtype)
 
 
-def make_batches(lists: TileLists, width: int, strip: Strip = FULL_IMAGE, most: int | None = None) -> Batches:
+def make_batches(lists: TileLists, width: int, strip: Strip = FULL_IMAGE, most: int = 64) -> Batches:
     """Groups the tiles of one strip into batches, longest lists first.
 
     A batch is scanned as far as its longest list. If there are few tiles, their lists differ more and batches are
-    smaller, at most of `most` tiles (MAX_BATCH).
+    smaller. `most` limits the tiles of a batch; it affects only speed.
     """
     number = lists.lengths.shape[0]
-    batch = min(most or MAX_BATCH, max(16, 1 << (max(number // 12, 1).bit_length() - 1)))
+    batch = min(most, max(16, 1 << (max(number // 12, 1).bit_length() - 1)))
     order = jnp.argsort(-lists.lengths).astype(jnp.int32)
     order = jnp.concatenate([order, jnp.full(-number % batch, number, jnp.int32)])
     empty = jnp.zeros(1, jnp.int32)
@@ -89,16 +84,6 @@ _GROUP = 4
 """Recurrences over a chunk run within and over groups of this many."""
 ATTRIBUTES = 6
 """Columns of splats (N, 6): centre x, y (px), l11, l21, l22 (1/px, times sqrt(1/2)), opacity; see plan.py"""
-
-# 2^f on [-1/2, 1/2] with a relative error of 7.5e-8 (minimax, by iterated reweighting), highest power first.
-_EXP2 = (
-    1.3276472064403862e-3,
-    9.675541407375587e-3,
-    5.550713273907222e-2,
-    2.4022119722496582e-1,
-    6.931469670641166e-1,
-    1.000000071654955,
-)
 
 
 class _Chunk(NamedTuple):
@@ -131,8 +116,15 @@ def _exp2(e: Array) -> Array:
         return jnp.exp2(e)
     whole = lax.round(e, lax.RoundingMethod.TO_NEAREST_EVEN)
     fraction = e - whole
-    power = jnp.float32(_EXP2[0])
-    for coefficient in _EXP2[1:]:
+    # Relative error of 7.5e-8 on [-1/2, 1/2] (minimax, by iterated reweighting), highest power first.
+    power = jnp.float32(1.3276472064403862e-3)
+    for coefficient in (
+        9.675541407375587e-3,
+        5.550713273907222e-2,
+        2.4022119722496582e-1,
+        6.931469670641166e-1,
+        1.000000071654955,
+    ):
         power = power * fraction + jnp.float32(coefficient)
     # 1.5 * 2^23 + n holds the integer n in its low bits; added to the exponent's bits it multiplies by 2^n.
     shift = lax.bitcast_convert_type(whole + jnp.float32(12582912.0), jnp.int32) << 23

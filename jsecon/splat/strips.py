@@ -8,7 +8,6 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from jsecon.parallel import map_over_devices
@@ -45,25 +44,6 @@ FULL_IMAGE = Strip()
 def tile_rows(height: int, tile: int, count: int) -> int:
     """Counts the rows of tiles of each of `count` strips; with several strips a multiple of BLOCK."""
     return -(-height // tile) if count == 1 else -(-height // (BLOCK * tile * count)) * BLOCK
-
-
-def split_into_strips(image: Array, tile: int, count: int) -> Array:
-    """Divides an image (H, W, ...) into strips (count, rows of a strip in px, W, ...), zero below the image."""
-    height, *rest = image.shape
-    rows = tile_rows(height, tile, count) * tile
-    image = jnp.pad(image, [(0, count * rows - height)] + [(0, 0)] * len(rest))
-    if count == 1:
-        return image[None]
-    return jnp.moveaxis(image.reshape(-1, count, BLOCK * tile, *rest), 1, 0).reshape(count, rows, *rest)
-
-
-def join_strips(strips: Array, tile: int, height: int) -> Array:
-    """Joins strips (count, rows in px, W, ...) to an image (H, W, ...): the inverse of `split_into_strips`."""
-    count, rows, *rest = strips.shape
-    if count == 1:
-        return strips[0, :height]
-    blocks = jnp.moveaxis(strips.reshape(count, -1, BLOCK * tile, *rest), 0, 1)
-    return blocks.reshape(count * rows, *rest)[:height]
 
 
 def map_strips(local: Callable, divided: Any, common: Any, mesh: Mesh | None, *, total: bool = False) -> Any:

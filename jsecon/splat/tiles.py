@@ -28,9 +28,6 @@ from jsecon.types import Array, Leaf, record, static
 
 TILE = 8
 """Edge of a tile, px; affects only speed."""
-_TILES = BLOCK * BLOCK
-CHUNK_PAIRS = 8192
-"""Number of pairs per chunk: their arrays fit the second-level cache, and empty chunks take no time."""
 _SLACK_PX = 0.02
 """Slack of the ellipse test: far above the rounding of a float32 exponent at the rim, far below a pixel."""
 WORD = 32
@@ -148,10 +145,10 @@ def tile_lists(
       tile: Edge of a tile, px.
       strip: The strip.
     """
-    most = (2**31 - 1) // _TILES - WORD  # so that int32 can count their tiles
+    most = (2**31 - 1) // BLOCK**2 - WORD  # so that int32 can count their tiles
     require(0 < capacity <= most, "capacity", capacity, f"1 to {most} pairs", "Render such a large image in parts.")
     capacity = -(-capacity // WORD) * WORD
-    chunk = min(CHUNK_PAIRS, capacity)
+    chunk = min(8192, capacity)  # pairs whose arrays fit the second-level cache; empty chunks take no time
     room = -(-capacity // chunk) * chunk
     edge = BLOCK * tile
     rows = tile_rows(height, tile, strip.count)
@@ -191,7 +188,7 @@ def tile_lists(
     ellipses = [projection.means_px, projection.whitening, projection.opacities[:, None]]
     ellipses = lax.stop_gradient(jnp.concatenate(ellipses, axis=1))
     reach = functools.partial(_reached_tiles, ellipses, across=across, number=number, tile=tile, strip=strip)
-    members, before = _tile_bits(reach, owner, blocks, _TILES, total, chunk)
+    members, before = _tile_bits(reach, owner, blocks, BLOCK**2, total, chunk)
     gaussians = _compact_tile_lists(members, before, owner, total, chunk)
 
     # The list of a tile runs from the first pair of its block to the first pair of the next block.

@@ -19,47 +19,35 @@ BLOCK_ROWS = 1 << 18
 
 @np.errstate(over="ignore", invalid="ignore")  # non-finite numbers stay so; callers check
 def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -> Gaussians:
-    """Transforms Gaussians: positions, sizes, orientations and spherical harmonics.
+    """Transforms Gaussians: positions, sizes, orientations and spherical harmonics. Host code (NumPy).
 
-    A camera that is transformed too sees the same image. Arrays keep their kind (NumPy, jax) and dtype: float64 means
-    (NumPy) are transformed in float64. The identity returns the same object.
+    A camera that is transformed too sees the same image. Means become float64, which worlds with large coordinates (map
+    projections) need: float32 cannot represent millimetres there.
 
     Args:
       gaussians: N Gaussians.
-      similarity: Concrete matrix of x' = s R x + t, with R a rotation and s > 0; a ValueError for any other.
+      similarity: Matrix of x' = s R x + t, with R a rotation and s > 0; a ValueError for any other.
     """
+    gaussians = jax.tree.map(np.asarray, gaussians)
+    means, log_scales, turns, sh = gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.sh
+    means = means.astype(np.float64)
     matrix = np.asarray(similarity, np.float64)
     if np.array_equal(matrix, np.eye(4)):
-        return gaussians
+        return dataclasses.replace(gaussians, means=means)
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     rotation = matrix[:3, :3] / scale if scale > 0 else np.zeros((3, 3))
     rigid = scale > 0 and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
     similar = bool(rigid and np.allclose(matrix[3], [0, 0, 0, 1]))
     expected, remedy = "a rotation, one positive scale and a shift", "Remove shear, mirrors and unequal scales."
     require(similar, "similarity", matrix.tolist(), expected, remedy)
-    xp = gaussians.means.__array_namespace__()
-
-    def like(column, array):
-        return xp.asarray(array, column.dtype)
-
-    means, turns, sh = gaussians.means, gaussians.quaternions, gaussians.sh
-    with jax.default_matmul_precision("highest"):  # of jax's arrays
-        return Gaussians(
-            means=means @ like(means, scale * rotation.T) + like(means, matrix[:3, 3]),
-            log_scales=gaussians.log_scales + like(gaussians.log_scales, np.log(scale)),
-            quaternions=turns @ like(turns, _product_matrix(Rotation.from_matrix(rotation).as_quat(scalar_first=True))),
-            opacity_logits=gaussians.opacity_logits,
-            sh=like(sh, _sh_rotation(rotation, sh.shape[1])) @ sh,
-        )
-
-
-def transform_gaussians_float64(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -> Gaussians:
-    """Calls `transform_gaussians` on the host (NumPy) with float64 means.
-
-    Needed into and out of worlds with large coordinates (map projections), where float32 cannot represent millimetres.
-    """
-    host = jax.tree.map(np.asarray, gaussians)
-    return transform_gaussians(dataclasses.replace(host, means=host.means.astype(np.float64)), similarity)
+    turn = _product_matrix(Rotation.from_matrix(rotation).as_quat(scalar_first=True))
+    return Gaussians(
+        means=means @ (scale * rotation.T) + matrix[:3, 3],
+        log_scales=log_scales + np.asarray(np.log(scale), log_scales.dtype),
+        quaternions=turns @ turn.astype(turns.dtype),
+        opacity_logits=gaussians.opacity_logits,
+        sh=_sh_rotation(rotation, sh.shape[1]).astype(sh.dtype) @ sh,
+    )
 
 
 def float32_rounding(gaussians: Gaussians) -> Float[np.ndarray, " n"]:
@@ -82,7 +70,7 @@ def transform_blocks(
     for first in range(0, gaussians.count, BLOCK_ROWS):
         rows = slice(first, min(first + BLOCK_ROWS, gaussians.count))
         part = jax.tree.map(lambda a, rows=rows: np.asarray(a[rows]), gaussians)
-        yield rows, part if similarity is None else transform_gaussians_float64(part, similarity)
+        yield rows, part if similarity is None else transform_gaussians(part, similarity)
 
 
 def _product_matrix(q: np.ndarray) -> np.ndarray:

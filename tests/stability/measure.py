@@ -1,6 +1,6 @@
 """What is measured of a case: whether every number is finite, and how far image and gradients are from float64.
 
-The image is held against brute force in float64 (jsecon.splat.reference), the gradients, with respect to every array
+The image is held against brute force in float64 (tests/reference.py), the gradients, with respect to every array
 and the camera, against automatic differentiation of a dense float64 compositor. A pixel where a cut (alpha at 1/255,
 transmittance at 1e-4, the cap at 0.99) is decided by less than float32 can tell is left out of both, counted, and
 bounded by what the cut can cause.
@@ -11,9 +11,9 @@ from typing import Any
 
 import jax
 import numpy as np
+from reference import project_reference, render_reference
 
 from jsecon.numerics import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
-from jsecon.splat.reference import project_reference, render_reference
 from jsecon.types import Camera, Gaussians
 from stability.case import ARGUMENTS, VALUE, Case
 from stability.render import dense, engine

@@ -10,6 +10,7 @@ opacities.
 """
 
 import contextlib
+import dataclasses
 import gzip
 import struct
 import warnings
@@ -29,7 +30,7 @@ from jsecon.read.registry import Reader, find_reader
 from jsecon.read.splats.gltf import read_glb, save_glb
 from jsecon.read.splats.ply import Header, drawable_gaussians, read_ply, read_ply_file, save_ply, usable_blocks
 from jsecon.splat.sh import C0
-from jsecon.splat.transform import float32_rounding, transform_gaussians, transform_gaussians_float64
+from jsecon.splat.transform import float32_rounding, transform_gaussians
 from jsecon.types import Array, Gaussians
 
 _FORMATS = "Gaussians as .ply (INRIA's or SuperSplat's compressed), .glb, .spz, .sog or .splat"
@@ -118,8 +119,9 @@ def _read_spz(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
         else:
             records = data[32 : int.from_bytes(data[16:20], "little")]
         _check_axes(path, records if flags & 2 else b"")
-        gaussians = _gaussians(path, gsply.read_spz(path))
-    return transform_gaussians(gaussians, _SPZ_AXES), _antialiasing_note(path) if flags & 1 else ()
+        gaussians = transform_gaussians(_gaussians(path, gsply.read_spz(path)), _SPZ_AXES)
+    gaussians = dataclasses.replace(gaussians, means=gaussians.means.astype(np.float32))
+    return gaussians, _antialiasing_note(path) if flags & 1 else ()
 
 
 def _check_axes(path: Path, records: bytes) -> None:
@@ -267,7 +269,7 @@ def load_gaussians(path: str | Path, *, similarity: Float[Array, "4 4"] | None =
 def _in_float32(path: Path, gaussians: Gaussians, similarity: Float[Array, "4 4"] | None) -> Gaussians:
     """Puts the Gaussians (NumPy) of a file on jax's device, after a (4, 4) transform into another world in float64."""
     if similarity is not None:
-        gaussians = transform_gaussians_float64(gaussians, similarity)
+        gaussians = transform_gaussians(gaussians, similarity)
     rounding = float32_rounding(gaussians)
     if len(rounding) and np.median(rounding) > MAX_READ_ROUNDING:
         place = ", ".join(f"{number:.10g}" for number in np.median(gaussians.means, axis=0))

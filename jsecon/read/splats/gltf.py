@@ -26,7 +26,7 @@ from jsecon.files import atomic_write, parse_json, reading
 from jsecon.read.splats.ply import drawable_gaussians, needs_float64, usable_blocks
 from jsecon.splat.project import check_gaussians
 from jsecon.splat.sh import C0, COEFFICIENT_COUNTS
-from jsecon.splat.transform import transform_blocks, transform_gaussians_float64
+from jsecon.splat.transform import transform_blocks, transform_gaussians
 from jsecon.types import Array, Gaussians
 
 _EXTENSION = "KHR_gaussian_splatting"
@@ -158,7 +158,7 @@ def read_glb(path: Path) -> Gaussians:
             count += len(arrays["means"])
             if 12 * count > glb.length:
                 raise glb.error(f"{count} Gaussians do not fit into {glb.length} bytes")
-            parts.append(transform_gaussians_float64(drawable_gaussians(path, arrays), _AXES @ matrix))
+            parts.append(transform_gaussians(drawable_gaussians(path, arrays), _AXES @ matrix))
     if not parts:
         raise InputError(path, f"no primitive of its scene holds Gaussians ({_EXTENSION})", remedy=_REMEDY)
     counts = {part.sh.shape[1] for part in parts}
