@@ -1,17 +1,24 @@
 """What a program sets before jax starts."""
 
 import ast
+import json
 import os
 import re
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from jsecon import InputError, process
+from jsecon.poses import sfm
 from jsecon.process import settings
+from jsecon.read.captures import build
+from jsecon.read.captures.capture import load_capture
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -141,3 +148,27 @@ def test_a_stop_that_python_drops_comes_again():
     assert (done.returncode, done.stdout) == (130, "went on\n")
     assert "ZeroDivisionError" in done.stderr
     assert "KeyboardInterrupt" not in done.stderr
+
+
+@pytest.mark.parametrize("module", [build, sfm])
+def test_images_are_read_by_as_many_threads_as_the_process_has_cores(module, tmp_path, monkeypatch):
+    workers = []
+
+    class CountedThreads(ThreadPoolExecutor):
+        def __init__(self, count):
+            workers.append(count)
+            super().__init__(count)
+
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1, 2})
+    monkeypatch.setattr(module, "ThreadPoolExecutor", CountedThreads)
+    photos = [tmp_path / f"{n}.png" for n in range(3)]
+    noise = np.random.default_rng(0).integers(0, 256, (32, 32, 3), np.uint8)
+    for photo in photos:
+        photo.write_bytes(cv2.imencode(".png", noise)[1].tobytes()[:1000])  # its header tells the size, then it ends
+    lens = {"fl_x": 8.0, "fl_y": 8.0, "cx": 4.0, "cy": 4.0, "w": 32, "h": 32}
+    frames = [{"file_path": photo.name, "transform_matrix": np.eye(4).tolist()} for photo in photos]
+    (tmp_path / "transforms.json").write_text(json.dumps(lens | {"frames": frames}))
+    read = {build: lambda: load_capture(tmp_path), sfm: lambda: sfm.find_poses(photos, tmp_path / "work")}
+    with pytest.raises(InputError):
+        read[module]()
+    assert workers == [3]

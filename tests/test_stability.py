@@ -116,6 +116,7 @@ def test_colour_and_depth_of_bad_gaussians(touched):
     assert bool(jnp.isfinite(render_depth(broken, case.camera)[0]).all())
     np.testing.assert_array_equal(np.flatnonzero(~np.asarray(is_usable(broken))), [7])
     assert int(count_non_finite(broken)) == 2
+    assert int(count_non_finite(dataclasses.replace(broken, sh=None))) == 1
 
 
 @pytest.mark.as_shipped  # so are the rows whose program it shares
