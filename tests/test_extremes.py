@@ -143,7 +143,7 @@ CALLS: dict[str, tuple[str, Callable[[World], list]]] = {
     "project": ("n1 n0", lambda w: [(jsecon.project(w.gaussians, w.camera).means_px, (w.n, 2))]),
     "render": (SCENE, lambda w: image(jsecon.render(w.gaussians, w.camera, w.rows(w.n)), w.d)),
     "render_rgb": ("n1 n0", lambda w: image(jsecon.render_rgb(w.gaussians, w.camera), 3)),
-    "render_depth": ("n1 n0", lambda w: [(jsecon.render_depth(w.gaussians, w.camera).depth, (HEIGHT, WIDTH))]),
+    "render_depth": ("n1 n0", lambda w: [(jsecon.render_depth(w.gaussians, w.camera)[0], (HEIGHT, WIDTH))]),
     "plan_view": (SCENE, planned),
     "plan_capacity": ("n1 n0 t1 t0", lambda w: [(np.asarray(jsecon.plan_capacity(w.gaussians, w.cameras)), ())]),
     "region_votes": (
