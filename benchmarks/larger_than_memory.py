@@ -18,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from jsecon.process import peak_memory_mib, prepare_process
@@ -29,7 +29,7 @@ import jax
 import numpy as np
 
 import jsecon
-from jsecon.files import map_npy, write_npy
+from jsecon.files import map_npy
 from jsecon.types import Camera, Gaussians, LanguageField, Regions, Selection, Votes
 
 SIDE, ACROSS, SQUARES, PART = 100.0, 64, 10, 2_000_000
@@ -49,6 +49,15 @@ def landscape(count: int, first: int, rows: int) -> Gaussians:
     sizes = 0.6 * spacing * rng.uniform(0.5, 1.5, (rows, 3)) * [1, 0.3, 1]
     columns = np.stack([x, -height, z], 1), np.log(sizes), rng.normal(size=(rows, 4)), rng.normal(1.5, 1.5, rows)
     return Gaussians(*(a.astype(np.float32) for a in columns), rng.normal(0, 0.3, (rows, 1, 3)).astype(np.float32))
+
+
+def write_npy(path: Path, shape: tuple[int, ...], dtype: type, blocks: Iterable[np.ndarray]) -> None:
+    """Writes a .npy block by block. On a full disk a write raises; a memory map would end the process."""
+    with open(path, "wb") as file:
+        header = {"descr": np.lib.format.dtype_to_descr(np.dtype(dtype)), "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(file, header)
+        for block in blocks:
+            file.write(np.ascontiguousarray(block, dtype).tobytes())
 
 
 def write_landscape(folder: Path, count: int) -> None:

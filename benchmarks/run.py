@@ -36,7 +36,7 @@ def measure(capture: Path, out: Path, steps: int) -> None:
         "seconds": run.seconds,
         "programs": run.programs,
         "peak_mib": peak_memory_mib(),
-        "psnr": float(np.mean(run.psnr)),
+        "psnr": float(np.mean(run.held_out.psnr)),
         "gaussians": run.field.gaussians.count,
         "regions": run.field.regions.count,
     }

@@ -87,7 +87,7 @@ def measure(folder: Path, seed: int, options: Options) -> tuple[dict[str, float]
     direct = evaluate_at_thresholds(run.field.gaussians, cameras, labels, select, **alpha)[ALPHA_THRESHOLD][1]
     kinds = {"mIoU": summary, "exact outlines": exact, "one-step": direct}
     figures = {name: float(kind["miou"]) for name, kind in kinds.items()}
-    return figures | {"PSNR, dB": float(np.mean(run.psnr))}, run, rows
+    return figures | {"PSNR, dB": float(np.mean(run.held_out.psnr))}, run, rows
 
 
 def draw(run: pipeline.Run, rows: list[Row], out: Path) -> None:

@@ -13,13 +13,13 @@ import importlib
 import json
 import math
 import os
-import re
 import struct
 import sys
+import tokenize
 import uuid
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,15 +31,10 @@ from jsecon.errors import InputError, describe_error, require
 
 READ_ERRORS = (
     *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ImportError, RuntimeError),
-    *(ArithmeticError, struct.error, zipfile.BadZipFile, zlib.error, SafetensorError),
+    *(ArithmeticError, SyntaxError, tokenize.TokenError, struct.error, zipfile.BadZipFile, zlib.error),
+    SafetensorError,
 )
 """exceptions that readers of damaged files raise"""
-_HEADER = (
-    rb"['\"]descr['\"] *: *['\"]([<>|=]?[biuf]\d+)['\"]",
-    rb"['\"]fortran_order['\"] *: *(True|False)",
-    rb"['\"]shape['\"] *: *\(([\dL, ]*)\)",
-)
-"""entries of the header of a .npy"""
 _DTYPES = {"BOOL": np.dtype(bool)} | {
     f"{letter}{8 * size}": np.dtype(f"<{letter.lower()}{size}")
     for letter, sizes in {"F": (2, 4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}.items()
@@ -171,34 +166,14 @@ def reading(
 
 
 def map_npy(path: Path) -> np.ndarray:
-    """Memory-maps the array of a .npy file.
-
-    The header is parsed here: NumPy's parser warns of damaged ones, and raises errors of Python's tokenizer.
-    """
-    with open(path, "rb") as file:
-        magic = file.read(8)
-        length = file.read(2 if magic[6:7] == b"\1" else 4)
-        header = file.read(min(int.from_bytes(length, "little"), 1 << 16))
-        start = file.tell()
-    fields = [re.search(key, header) for key in _HEADER]
-    if not magic.startswith(b"\x93NUMPY") or None in fields:
+    """Memory-maps the array of a .npy file."""
+    array = np.lib.format.open_memmap(path, mode="r")
+    if array.dtype.kind not in "biuf":
         raise ValueError("no .npy of plain numbers")
-    kind, order, sizes = (match[1].decode() for match in fields if match)
-    dtype = np.dtype(kind)
-    shape = tuple(int(number) for number in re.findall(r"\d+", sizes))
-    after = os.path.getsize(path) - start
-    if math.prod(shape) * dtype.itemsize != after:
-        raise ValueError(f"{after} bytes of numbers where the header announces {dtype} of shape {shape}")
-    return np.memmap(path, dtype, "r", start, shape, "F" if order == "True" else "C")
-
-
-def write_npy(path: str | os.PathLike, shape: tuple[int, ...], dtype: Any, blocks: Iterable[np.ndarray]) -> None:
-    """Writes a .npy block by block. On a full disk a write raises; a memory map would end the process."""
-    with open(path, "wb") as file:
-        header = {"descr": np.lib.format.dtype_to_descr(np.dtype(dtype)), "fortran_order": False, "shape": shape}
-        np.lib.format.write_array_header_1_0(file, header)
-        for block in blocks:
-            file.write(np.ascontiguousarray(block, dtype).tobytes())
+    after = os.path.getsize(path) - array.offset
+    if array.nbytes != after:
+        raise ValueError(f"{after} bytes of numbers where the header announces {array.dtype} of shape {array.shape}")
+    return array
 
 
 def write_arrays(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], description: Any = None) -> None:

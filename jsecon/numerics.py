@@ -28,14 +28,12 @@ NEAR = 0.01
 FULL_PRECISION = jax.lax.Precision.HIGHEST
 """precision of matrix products, all of float32. By default a GPU keeps 10 bits of each factor (TF32; cosines off by
 5e-4 on an H100). A CPU computes the same digits either way"""
-MAX_MAGNITUDE = 1e18
-"""largest coordinate, focal length or coefficient in a file: float32 holds its square"""
 
 
 @np.errstate(invalid="ignore")  # a signalling NaN
 def is_finite_and_bounded(*numbers: Any) -> bool:
-    """Whether all numbers are finite and at most MAX_MAGNITUDE in size."""
-    return all(bool((np.abs(np.asarray(values, np.float64)) <= MAX_MAGNITUDE).all()) for values in numbers)
+    """Whether all numbers are finite and at most 1e18 in size: float32 holds the square of such a coordinate."""
+    return all(bool((np.abs(np.asarray(values, np.float64)) <= 1e18).all()) for values in numbers)
 
 
 def safe_scale(size: Array) -> Array:

@@ -31,9 +31,6 @@ MESH_OPTIONS = {"xla_disable_hlo_passes": "cpu-parallel-task-assigner"}
 each device into parts for the threads of all, and such kernels take up to three times as long: projecting 111,785
 Gaussians 7.4 instead of 2.6 ms. Programs on one device are faster with the parts."""
 
-MAX_VIEWS = 8
-"""views of a process that are worked on at once: each holds its plan in memory"""
-
 
 def host_mesh(most: int | None = None) -> Mesh | None:
     """Makes a mesh of this process's devices for the strips of one view. It is a constant to jit.
@@ -103,7 +100,7 @@ def map_views(count: int, view: Callable[[int], Any], progress: Progress | None 
     """
 
     def on_cores(indices: Sequence[int]) -> Iterator[Any]:
-        pool = ThreadPoolExecutor(min(cores(), MAX_VIEWS))
+        pool = ThreadPoolExecutor(min(cores(), 8))  # each view at work holds its plan in memory
         try:
             yield from pool.map(view, indices)
         finally:

@@ -119,10 +119,10 @@ def available_memory() -> tuple[int | None, int | None]:
     if found is None:
         return None, None
     free = int(found[1]) << 10
-    limit = read_cgroup("memory.max", "memory/memory.limit_in_bytes")
+    limit = _read_cgroup("memory.max", "memory/memory.limit_in_bytes")
     if not limit or not limit[0].isdecimal() or int(limit[0]) >= 1 << 60:  # more is no limit
         return free, None
-    used = read_cgroup("memory.current", "memory/memory.usage_in_bytes") or ["0"]
+    used = _read_cgroup("memory.current", "memory/memory.usage_in_bytes") or ["0"]
     return min(free, int(limit[0]) - int(used[0])), int(limit[0])
 
 
@@ -150,13 +150,8 @@ def memory_budget() -> float:
         raise InputError(MEMORY, repr(text), "GiB, a number", f"For example: export {MEMORY}=4") from None
 
 
-def read_cgroup(new: str, old: str) -> list[str]:
-    """Reads a file of this process's cgroup, split into words; empty if there is none.
-
-    Args:
-      new: Name of the file in version 2.
-      old: Its path in version 1, controller first.
-    """
+def _read_cgroup(new: str, old: str) -> list[str]:
+    """Words of a file of this process's cgroup, by its name in version 2 and its path in version 1; or none."""
     try:
         groups = dict(line.split(":", 2)[1:] for line in Path("/proc/self/cgroup").read_text().splitlines())
     except (OSError, ValueError):

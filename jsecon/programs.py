@@ -20,9 +20,6 @@ from jsecon.errors import InputError
 from jsecon.files import atomic_write
 from jsecon.numerics import is_traced
 
-_CHECKSUM = 16
-"""bytes before a trace"""
-
 
 def stored_jit(function: Callable, *, static_argnums: tuple[int, ...] = ()) -> Callable:
     """Compiles a function like jax.jit, and keeps each trace in jax's folder of compiled programs, if there is one.
@@ -75,8 +72,9 @@ def _stored(file: Path, function: Any, types: list[Any]) -> export.Exported:
     """Reads the trace of a function for arguments of some types, or makes and writes it."""
     with contextlib.suppress(OSError):
         data = file.read_bytes()
-        if _checksum(data[_CHECKSUM:]) == data[:_CHECKSUM]:
-            return export.deserialize(bytearray(data[_CHECKSUM:]))
+        checksum, trace = data[:16], data[16:]
+        if _checksum(trace) == checksum:
+            return export.deserialize(bytearray(trace))
     shapes = [jax.ShapeDtypeStruct(t.shape, t.dtype, weak_type=t.weak_type) for t in types]
     traced = export.export(function)(*shapes)
     data = bytes(traced.serialize())
@@ -91,7 +89,7 @@ def _is_placed(leaf: Any) -> bool:
 
 
 def _checksum(data: bytes) -> bytes:
-    return hashlib.blake2b(data, digest_size=_CHECKSUM).digest()
+    return hashlib.blake2b(data, digest_size=16).digest()
 
 
 @functools.cache

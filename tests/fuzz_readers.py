@@ -486,10 +486,11 @@ def kept(folder: Path) -> Iterator[Case]:
     def read():
         return cache.fetch(folder / "stage-0.safetensors", lambda: value)
 
-    def whole(found: cache.CachedResult) -> None:
-        if found.fresh:
+    def whole(found: tuple) -> None:
+        _, seconds, fresh = found
+        if fresh:
             raise InputError("cache", "computed again", "-", "-")
-        assert isinstance(found.seconds, float)
+        assert isinstance(seconds, float)
 
     yield Case([folder / "stage-0.safetensors"], read, whole)
     frame, mask = np.zeros((6, 8, 3), np.uint8), np.ones((6, 8), bool)

@@ -77,9 +77,9 @@ def test_fit_writes_a_scene_in_the_captures_world_and_says_how_good_it_is(room, 
     assert run_cli(*line) == 0
     words = capsys.readouterr().out
     assert "gaussians        cached" in words
-    assert f"held-out PSNR {run.psnr.mean():.2f} dB, SSIM 0." in words
+    assert f"held-out PSNR {run.held_out.psnr.mean():.2f} dB, SSIM 0." in words
     told, _ = _object(capsys, *line)
-    assert told["held_out_psnr"] == pytest.approx(run.psnr.mean(), abs=1e-3)
+    assert told["held_out_psnr"] == pytest.approx(run.held_out.psnr.mean(), abs=1e-3)
     scene = load_gaussians(told["written"]["scene"])
     assert scene.count == told["gaussians"]
     expected = transform_gaussians(run.field.gaussians, run.capture.source_from_scene)

@@ -59,6 +59,6 @@ def test_it_knows_the_extras_of_the_project():
 
 def test_the_limit_of_a_cgroup_is_read(monkeypatch):
     files = {"memory.max": ["1073741824"], "memory.current": ["1000"]}
-    monkeypatch.setattr(process, "read_cgroup", lambda new, old: files.get(new, []))
+    monkeypatch.setattr(process, "_read_cgroup", lambda new, old: files.get(new, []))
     memory = _check("memory")
     assert (memory.status, "limit 1.0 GiB (cgroup)" in memory.message) == ("wrong", True)

@@ -18,7 +18,7 @@ from jsecon.files import exclusive_lock, write_text
 from jsecon.pipeline import cache, run as pipeline, scene
 from jsecon.pipeline.progress import Listener
 from jsecon.pipeline.results import RunContext
-from jsecon.pipeline.stages import capture_stages
+from jsecon.pipeline.scene import plan_capture
 from jsecon.read.captures import build
 from jsecon.read.captures.images import write_image
 from jsecon.vision.colours import ColourEmbedder
@@ -100,7 +100,7 @@ def test_a_file_that_changes_while_it_is_read_is_told_and_nothing_of_it_is_kept(
     (tmp_path / "out").mkdir()
 
     def loaded_by(listener):
-        pipeline.compute_stages(work, capture_stages(work), tmp_path / "out" / "cache", listener=listener)
+        pipeline.compute_stages(work, plan_capture(work), tmp_path / "out" / "cache", listener=listener)
         return listener.fresh["load"]
 
     with refused(capture, "files that changed while stage load read them", "same command again"):

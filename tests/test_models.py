@@ -27,10 +27,10 @@ def folders(tmp_path_factory):
 ])  # fmt: skip
 def test_what_a_folder_is_good_for(folders, model, words):
     findings = inspect_models(folders[model])
-    assert list(findings.usable) == [model]
+    assert list(findings["usable"]) == [model]
     for word in words:
-        assert word in findings.usable[model]
-    for problem in findings.unusable.values():
+        assert word in findings["usable"][model]
+    for problem in findings["unusable"].values():
         assert "since it lacks onnx/" in problem
         assert "huggingface.co" in problem
 
@@ -48,8 +48,8 @@ def test_every_graph_is_told_with_its_tensors(folders, capsys):
     ):
         assert line in told.splitlines()
     findings = inspect_models(folders["SAM"])
-    assert len(findings.graphs) == 2
-    assert any("input_points float32[1, batch, points, 2]" in line for line in findings.lines)
+    assert len(findings["graphs"]) == 2
+    assert any("input_points float32[1, batch, points, 2]" in graph for graph in findings["graphs"].values())
 
 
 def test_damage_and_emptiness_end_in_exit_code_2(tmp_path, capsys):

@@ -21,7 +21,7 @@ from jsecon.pipeline import run as pipeline
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Listener
 from jsecon.pipeline.results import KEY_FILE, RunContext
-from jsecon.pipeline.stages import capture_stages
+from jsecon.pipeline.scene import plan_capture
 from jsecon.poses import sfm
 from jsecon.poses.sfm import find_poses
 from jsecon.read.captures.capture import load_capture, read_posed_images
@@ -230,7 +230,7 @@ def test_an_output_folder_among_the_photographs_is_no_input(photos, tmp_path):
 
     def stage(out):
         work = RunContext(Options(folder), Models(ColourEmbedder()), out)
-        return capture_stages(work)[0], work
+        return plan_capture(work)[0], work
 
     (one, work), (other, other_work) = stage(folder / "f"), stage(folder / "g")
     before = one.files_digest(work)
@@ -326,7 +326,7 @@ def test_a_run_finds_the_poses_first_and_keeps_them(photos, at_once, tmp_path):
 def test_only_captures_without_poses_have_the_stage(photos, room, found, tmp_path):
     def names(capture):
         work = RunContext(Options(capture), Models(ColourEmbedder()), tmp_path)
-        return [stage.name for stage in capture_stages(work)]
+        return [stage.name for stage in plan_capture(work)]
 
     assert names(photos[0]) == ["poses", "load"]
     for capture in (room, found[0], tmp_path):

@@ -19,7 +19,7 @@ from jsecon.app import cli
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import RunContext
 from jsecon.pipeline.run import compute_stages
-from jsecon.pipeline.stages import capture_stages
+from jsecon.pipeline.scene import plan_capture
 from jsecon.poses import refine
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Models
@@ -42,7 +42,7 @@ def load(folder, out, **options):
     """What the first stage of a run makes of a capture, and what it told."""
     given = Options(capture=folder, holdout=6, steps=2000, **options)
     work = RunContext(given, Models(ColourEmbedder()), out)
-    done = compute_stages(work, capture_stages(work), out / "cache")
+    done = compute_stages(work, plan_capture(work), out / "cache")
     return done.results.load, " ".join(done.notes), done.steps[0].status
 
 
@@ -85,7 +85,7 @@ def test_by_default_an_exact_capture_stays_as_its_files_say(capture, tmp_path):
 
 def test_without_depth_or_with_gaussians_nothing_is_tried(capture, tmp_path):
     def how(folder, **options):
-        return capture_stages(RunContext(Options(folder, **options), Models(ColourEmbedder()), tmp_path / "out"))[-1]
+        return plan_capture(RunContext(Options(folder, **options), Models(ColourEmbedder()), tmp_path / "out"))[-1]
 
     plain = write(capture, tmp_path / "plain", depth=False)
     deep = write(capture, tmp_path / "deep")

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from jsecon import load_capture
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import RunContext
-from jsecon.pipeline.stages import capture_stages
+from jsecon.pipeline.scene import plan_capture
 from jsecon.read.captures.images import read_depth
 from jsecon.read.captures.lens import Lens, resample_depth
 from jsecon.vision.colours import ColourEmbedder
@@ -143,7 +143,7 @@ def test_the_capture_comes_back(tmp_path, name):
     if name == "scannet":
         assert found.names == tuple(map(str, kept))
     work = RunContext(Options(tmp_path / name), Models(ColourEmbedder()), tmp_path / "out")
-    assert [stage.name for stage in capture_stages(work)] == ["load"]  # a run looks for no poses
+    assert [stage.name for stage in plan_capture(work)] == ["load"]  # a run looks for no poses
 
 
 def test_a_depth_camera_of_its_own_is_seen_through_the_colour_camera(tmp_path):

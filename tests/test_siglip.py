@@ -177,7 +177,7 @@ def test_numbers_that_are_no_scale_and_bias_are_refused(tmp_path, content):
 
 
 def _told(folder) -> str:
-    return model_loading.inspect_models(folder).usable["CLIP"]
+    return model_loading.inspect_models(folder)["usable"]["CLIP"]
 
 
 # The probability in place of the cosine's threshold

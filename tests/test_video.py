@@ -7,7 +7,7 @@ from capture_files import refused
 
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import RunContext
-from jsecon.pipeline.stages import capture_stages
+from jsecon.pipeline.scene import plan_capture
 from jsecon.read.captures.video import is_video, write_frames
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Models
@@ -56,7 +56,7 @@ def test_a_run_on_a_video_takes_as_many_frames_as_it_is_told(video, tmp_path):
     keys = []
     for frames in (None, 20, 30):
         work = RunContext(Options(video, frames=frames), Models(ColourEmbedder()), tmp_path)
-        poses, load = capture_stages(work)
+        poses, load = plan_capture(work)
         assert f"the {frames or 150} sharpest frames of walk.avi" in poses.how
         assert load.after == ("poses",)
         keys.append(poses.key({}, poses.files_digest(work)))

@@ -33,9 +33,9 @@ from experiments.words.conse import WORDS, Conse
 from jsecon.errors import InputError
 from jsecon.field.evidence import region_votes
 from jsecon.fit.start import starting_gaussians
-from jsecon.pipeline.objects import TrainingView, associate_masks, frame_proposals
+from jsecon.pipeline.objects import plan_objects
 from jsecon.pipeline.options import Options as RunOptions
-from jsecon.pipeline.results import RunContext
+from jsecon.pipeline.results import Checkpoint, Results, RunContext, StageInput
 from jsecon.read.captures.capture import load_capture
 from jsecon.types import Camera, Capture, Gaussians, Regions, Votes
 from jsecon.vision.colours import ColourEmbedder
@@ -139,10 +139,9 @@ class WordScene:
 
 def _default_masks(capture: Capture, gaussians: Gaussians) -> np.ndarray:
     """labels (T, H, W) of the views that vote, by the vision without weights as `jsecon run` has it."""
-    work, scene = RunContext(RunOptions(capture=Path()), Models(ColourEmbedder()), Path()), _on_device(gaussians)
-    view = TrainingView(capture, work.options)
-    propose = functools.cache(frame_proposals(work, view, scene)[0])
-    return associate_masks(work, view, scene, propose, lambda done, total: None)
+    work, loaded = RunContext(RunOptions(Path()), Models(ColourEmbedder()), Path()), Results(load=capture)
+    loaded.gaussians = _on_device(gaussians)
+    return plan_objects(work).compute(StageInput(work, loaded, lambda done, total: None, Checkpoint(Path()))).value
 
 
 def _on_device(tree):

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import sys
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -154,13 +155,17 @@ def _check_models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
     for name in verb.names:
         with console.progress("graphs"):
             report = inspect_models(_cached_model(name))
-        for line in report.lines:
-            console.print_line(line)
-        results.append(dataclasses.asdict(report))
-        if not report.usable:
-            problem = f"no model that can be used: neither {', '.join(report.unusable)}"
+        console.print_line(f"{report['folder']}: {len(report['graphs'])} graphs")
+        for path, signature in report["graphs"].items():
+            console.print_line(f"  {path}\n{textwrap.indent(signature, '    ')}")
+        for key, word in (("usable", "usable"), ("unusable", "not usable")):
+            for kind, summary in report[key].items():
+                console.print_line(f"{kind}: {word}\n  {summary}")
+        results.append(report)
+        if not report["usable"]:
+            problem = f"no model that can be used: neither {', '.join(report['unusable'])}"
             remedy = "See above for what is missing and where such exports are published."
-            errors.append(InputError(report.folder, problem, "", remedy))
+            errors.append(InputError(report["folder"], problem, "", remedy))
     return {"models": results, "errors": errors}
 
 

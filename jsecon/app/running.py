@@ -38,9 +38,7 @@ def _run(verb: verbs.Run, console: Console) -> verbs.VerbResult:
         return pipeline.dry_run(options, verb.out, listener=console)
     with processes.connection(options) if verb.distributed else contextlib.nullcontext(0) as index:
         if index == 0:
-            coordinator = processes.Coordinator(several=verb.distributed)
-            run = pipeline.run(options, verb.out, listener=console, coordinator=coordinator)
-            coordinator.shutdown()
+            run = pipeline.run(options, verb.out, listener=console)
         else:
             pipeline.run_worker(options, verb.out)
     if index > 0:
@@ -161,9 +159,9 @@ def _scene_parts(run: Run) -> list[str]:
         "A region has one colour in all views, and so has each Gaussian by its strongest region; a grey one has none."
     )
     parts = [report.section("Frames, masks, regions", words, report.grid(cells, 4)), _object_part(run, train)]
-    if len(run.psnr):
+    if len(run.held_out.frames):
         held_out = np.flatnonzero(run.capture.held_out)
-        psnr = dict(zip(held_out.tolist(), run.psnr.tolist()))
+        psnr = dict(zip(held_out.tolist(), run.held_out.psnr.tolist()))
         cells = []
         for t in held_out[evenly_spaced(len(held_out), 4)].tolist():
             cells.append(report.figure(np.asarray(run.capture.frames[t]), run.capture.names[t]))

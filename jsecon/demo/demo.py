@@ -81,7 +81,7 @@ def _page(run: Run, rows: list[Row], summary: dict[str, Any], labels: list[Label
             "mIoU, text to Gaussians": f"{summary['miou']:.3f}",
             "mAcc@0.25": f"{summary['macc']:.3f}",
             "localisation accuracy": f"{summary['loc_acc']:.3f}",
-            "held-out PSNR": f"{float(np.mean(run.psnr)):.2f} dB",
+            "held-out PSNR": f"{float(np.mean(run.held_out.psnr)):.2f} dB",
             "of work": f"{sum(run.seconds.values()):.0f} s",
         }
     )

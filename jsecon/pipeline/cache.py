@@ -8,7 +8,6 @@ used. A file holds arrays and a JSON description of their tree, without pickle.
 """
 
 import contextlib
-import dataclasses
 import functools
 import hashlib
 import os
@@ -44,31 +43,16 @@ class CorruptCacheError(Exception):
     """A cache file cannot be read, so the stage must be computed again."""
 
 
-@dataclasses.dataclass(frozen=True)
-class CachedResult:
-    """The result of a stage."""
-
-    value: Any
-    """The result, with NumPy arrays."""
-    seconds: float
-    """Wall time of its computation, also of one in an earlier run."""
-    fresh: bool
-    """Whether it was computed in this run, and not read from the cache."""
-
-
-_WRITTEN = (".spz", ".glb", ".splat", ".sog", ".html")
-"""endings of files that programs write beside a capture, and that are never input"""
-
-
 def files_digest(paths: Iterable[Path], *, exclude: Path | None = None) -> str:
     """Hashes names, sizes and times of files, and of all files beneath folders (`list_files`)."""
     entries = []
+    outputs = (".spz", ".glb", ".splat", ".sog", ".html")  # of programs, beside a capture
     for root in paths:
         output = None if exclude is None or exclude.resolve() == root.resolve() else exclude
         written = None if output is None else output.resolve().with_name(f"{output.name}.ply")
         for path in list_files(root, exclude=output) if root.is_dir() else [root]:
             inside = path.relative_to(root) if path != root else Path(path.name)
-            if path != root and (path.suffix.lower() in _WRITTEN or path.absolute() == written):
+            if path != root and (path.suffix.lower() in outputs or path.absolute() == written):
                 continue
             with contextlib.suppress(FileNotFoundError):  # gone since it was listed
                 stat = path.stat()
@@ -102,21 +86,24 @@ def prepare(folder: Path) -> None:
             partial.unlink(missing_ok=True)
 
 
-def fetch(path: Path, compute: Callable[[], Any], *, note: Callable[[str], None] | None = None) -> CachedResult:
-    """Reads the result of a stage, or computes and stores it."""
+def fetch(
+    path: Path, compute: Callable[[], Any], *, note: Callable[[str], None] = lambda text: None
+) -> tuple[Any, float, bool]:
+    """Reads the result of a stage, or computes and stores it.
+
+    Returns the result with NumPy arrays, the wall time of its computation, also of one in an earlier run, and whether
+    it was computed now.
+    """
     if path.exists():
         try:
-            value, seconds = load(path)
-            return CachedResult(value, seconds, fresh=False)
+            return *load(path), False
         except CorruptCacheError as error:
-            if note is not None:
-                stage = path.stem.partition("-")[0]
-                note(f"{path.name} cannot be read ({error}); {stage} is computed again")
+            note(f"{path.name} cannot be read ({error}); {path.stem.partition('-')[0]} is computed again")
     started = time.monotonic()
     value = compute()
     jax.block_until_ready(value)
     seconds = time.monotonic() - started
-    return CachedResult(save(path, value, seconds), seconds, fresh=True)
+    return save(path, value, seconds), seconds, True
 
 
 def save(path: Path, value: Any, seconds: float = 0.0) -> Any:

@@ -1,4 +1,4 @@
-"""Lifts the labels of the frames to the Gaussians: votes, the paper's codes on request, and the field of it all."""
+"""The stages that lift labels of frames to the Gaussians: votes, the paper's codes on request; and the field of all."""
 
 import shutil
 
@@ -12,17 +12,28 @@ from jsecon.field.membership import normalise_votes
 from jsecon.paper.autoencoder import encode, train_autoencoder
 from jsecon.paper.distill import distill_votes
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.results import Results, StageInput, StageResult, vision_frames
+from jsecon.pipeline.results import Results, RunContext, Stage, StageInput, StageResult, vision_frames
 from jsecon.process import memory_budget
 from jsecon.types import Codes, LanguageField, Regions
 from jsecon.vision.protocols import Embedder
 from jsecon.vision.unrelated_words import embed_unrelated_words
 
-CODE_LENGTH = 3
-"""numbers of a code in the paper"""
+
+def plan_votes(context: RunContext) -> Stage:
+    """Plans the votes of the regions for each Gaussian."""
+    how, after = "the strongest regions of each Gaussian", ("load", "gaussians", "objects")
+    key_options, accumulate = context.key_options("centre_pixel_weight"), _accumulate_votes
+    return Stage("votes", how, accumulate, after=after, key_options=key_options, distributed=True)
 
 
-def accumulate_votes(stage: StageInput) -> StageResult:
+def plan_codes(context: RunContext) -> Stage:
+    """Plans the codes of the paper."""
+    how = "3 numbers per region by an autoencoder, distilled into the Gaussians by their votes"
+    key_options = context.key_options("seed")
+    return Stage("codes", how, _compute_codes, after=("regions", "votes"), key_options=key_options)
+
+
+def _accumulate_votes(stage: StageInput) -> StageResult:
     """Accumulates votes, on disk if they do not fit into memory; the votes are the same."""
     options, capture, scene = stage.context.options, stage.results.load, stage.results.gaussians
     labels, folder = stage.results.objects, stage.checkpoint.folder
@@ -42,13 +53,13 @@ def accumulate_votes(stage: StageInput) -> StageResult:
     return StageResult(accumulated, skipped, notes)
 
 
-def compute_codes(stage: StageInput) -> StageResult:
+def _compute_codes(stage: StageInput) -> StageResult:
     """Trains the paper's autoencoder, and distils the codes of the regions into the Gaussians by their votes."""
     options, embeddings, cast = stage.context.options, stage.results.regions.embeddings, stage.results.votes
     if not np.any(np.asarray(embeddings)):
         raise InputError("--paper", "no region has an embedding to train the autoencoder on", remedy="Leave it out.")
     key = jax.random.key(options.seed)
-    autoencoder = train_autoencoder(embeddings, latent=CODE_LENGTH, key=key, progress=stage.progress)
+    autoencoder = train_autoencoder(embeddings, latent=3, key=key, progress=stage.progress)
     table = encode(autoencoder, embeddings)
     blocks = vote_blocks(cast) if is_mapped(cast) else [cast]
     codes = np.concatenate([np.asarray(distill_votes(block, table)) for block in blocks])

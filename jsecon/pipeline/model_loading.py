@@ -55,7 +55,7 @@ def _missing_model(dim: int) -> InputError:
     return InputError("field", problem, "the CLIP model that made them", remedy)
 
 
-def local_folder(choice: str | Path, role: Role, precision: Precision | None = None) -> Path:
+def _local_folder(choice: str | Path, role: Role, precision: Precision | None = None) -> Path:
     """Finds the folder of a model that is on this machine, by a name, an address or a folder, or raises InputError."""
     model = parse_model(choice, role, precision)
     folder = model.cached_folder if isinstance(model, HubModel) else model
@@ -68,7 +68,7 @@ def with_folders(options: Options) -> Options:
     """Replaces the models in options by their folders on this machine, or raises InputError."""
     choices = {role: getattr(options, role) for role in get_args(Role)}
     folders = {
-        role: local_folder(choice, role, options.precision) for role, choice in choices.items() if choice is not None
+        role: _local_folder(choice, role, options.precision) for role, choice in choices.items() if choice is not None
     }
     return dataclasses.replace(options, **folders)
 
@@ -116,7 +116,7 @@ def open_embedder(
     if folder is not None:
         from jsecon.networks.clip import ClipEmbedder
 
-        folder = local_folder(folder, "embedder", precision)
+        folder = _local_folder(folder, "embedder", precision)
         clip = ClipEmbedder(folder, precision=precision, store=store)
         return _of_space(clip, name, "Give the model that the field was made with: --embedder DIR.")
     if (dim := external_dim(name)) is not None:
@@ -181,32 +181,12 @@ def find_model(field: LanguageField) -> "ClipEmbedder | HubModel | None":
     return on_hub
 
 
-@dataclasses.dataclass(frozen=True)
-class ModelReport:
-    """Content of a folder of models."""
+def inspect_models(folder: Path) -> dict[str, Any]:
+    """Opens every graph of a folder and its subfolders, and tries the folder as each kind of model.
 
-    folder: Path
-    graphs: dict[str, str]
-    """Inputs and outputs of each .onnx file by its path within the folder, or why it cannot be opened."""
-    usable: dict[str, str]
-    """Kind of model that the folder holds (CLIP, SAM, SAM 2) -> what it is and how to use it."""
-    unusable: dict[str, str]
-    """Kind of model -> what is wrong with the folder."""
-
-    @property
-    def lines(self) -> list[str]:
-        """The content as lines of text."""
-        lines = [f"{self.folder}: {len(self.graphs)} graphs"]
-        for path, signature in self.graphs.items():
-            lines += [f"  {path}", *(f"    {line}" for line in signature.splitlines())]
-        for word, uses in (("usable", self.usable), ("not usable", self.unusable)):
-            for kind, summary in uses.items():
-                lines += [f"{kind}: {word}", f"  {summary}"]
-        return lines
-
-
-def inspect_models(folder: Path) -> ModelReport:
-    """Opens every graph of a folder and its subfolders, and tries the folder as each kind of model."""
+    Returns the "folder"; "graphs": inputs and outputs of each .onnx file by its path, or why it cannot be opened; and
+    by kind of model what is "usable" and how, and what is "unusable" and why.
+    """
     from jsecon.networks.clip import ClipEmbedder
     from jsecon.networks.sam import SamSegmenter
     from jsecon.networks.sam2 import Sam2Tracker
@@ -225,7 +205,7 @@ def inspect_models(folder: Path) -> ModelReport:
             usable[kind] = f"{open_model(folder).check()}: jsecon run --{role} {folder}"
         except InputError as error:
             unusable[kind] = str(error)
-    return ModelReport(folder, graphs, usable, unusable)
+    return {"folder": folder, "graphs": graphs, "usable": usable, "unusable": unusable}
 
 
 def _signature(path: Path) -> str:

@@ -1,4 +1,4 @@
-"""What the stages of objects compute: labels of the training frames, embeddings of the regions, parts of the scene."""
+"""The stages of objects: labels of the training frames, embeddings of the regions, parts of the scene."""
 
 import functools
 import itertools
@@ -16,10 +16,11 @@ from jsecon.association.scene import SceneSuperpixels
 from jsecon.errors import InputError
 from jsecon.field.regions import Embed, embeddings_of_masks, region_embeddings, scene_parts
 from jsecon.fit.depth import points_from_depth
+from jsecon.networks.hub import model_name
 from jsecon.paper.algorithm1 import masklets
 from jsecon.paper.tracker import GeometricTracker
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.results import Checkpoint, Results, RunContext, StageInput, StageResult, vision_frames
+from jsecon.pipeline.results import Checkpoint, Results, RunContext, Stage, StageInput, StageResult, vision_frames
 from jsecon.read.masks.masks import load_features, load_labels, load_proposals
 from jsecon.splat.render import render_depth
 from jsecon.types import Camera, Capture, Gaussians, Progress
@@ -27,13 +28,63 @@ from jsecon.vision.classical import GRANULARITIES, ClassicalSegmenter
 from jsecon.vision.protocols import Segmenter
 from jsecon.vision.surfaces import smooth_depth, surfaces_from_depth
 
-MAX_CLOUD_POINTS = 100_000
-"""points from depth whose normals are estimated"""
-MIN_CLOUD_SPACING = 0.02
-"""least distance between them, as a share of the median depth: closer points show a sensor's noise, not the surface"""
+
+def plan_objects(context: RunContext) -> Stage:
+    """Plans the labels of the training frames: from mask files, or proposals associated over the frames."""
+    options, models, folder = context.options, context.models, context.options.masks
+    key_options = context.key_options("vision_frames")
+    if folder is not None:
+        reason = f"masks are given ({folder.name})"
+        skipped = {"segmenter": reason, "association": reason}
+        key_options |= context.key_options("level")
+        how, read = f"read from {folder.name}", _read_masks
+        return Stage("objects", how, read, after=("load",), key_options=key_options, files=folder, skipped=skipped)
+    if options.proposals is not None:
+        how = f"proposals read from {options.proposals.name}"
+        key_options |= context.key_options("level")
+    elif models.segmenter is not None:
+        how = f"proposals of level {options.level} by {model_name(options.segmenter, 'segmenter')}"
+        key_options["model"] = models.segmenter.name
+    else:
+        how = f"{options.granularity} proposals by colour and texture"
+        key_options |= context.key_options("granularity")
+    if consensus := options.associated_by == "consensus":
+        how += ", what the views agree on"
+        key_options |= context.key_options("agreement", "seed", "centre_pixel_weight")
+    else:
+        by = "through the Gaussians" if options.tracker is None else f"by {model_name(options.tracker, 'tracker')}"
+        how += f", followed {by}"
+    if options.vision_frames is not None:
+        how += f", in at most {options.vision_frames} frames"
+    tracker = None if models.tracker is None else models.tracker.name
+    key_options |= {"association": options.associated_by, "tracker": tracker}
+    after, files = ("load", "gaussians"), options.proposals
+    find = _find_objects
+    return Stage("objects", how, find, after=after, key_options=key_options, files=files, distributed=consensus)
 
 
-class TrainingView:
+def plan_regions(context: RunContext) -> Stage:
+    """Plans an embedding of each region: by the embedder, or from files."""
+    options, embedder, after = context.options, context.models.embedder.name, ("load", "objects")
+    if options.features is None:
+        how, key_options = f"embedded by {embedder!r}, views weighted by pixels", {"embedder": embedder}
+        return Stage("regions", how, _embed_objects, after=after, key_options=key_options, distributed=True)
+    how = f"embeddings read from {options.features.name}, level {options.level}, views weighted by pixels"
+    key_options, read = context.key_options("level"), _read_embeddings
+    skipped = {"embedder": f"embeddings are given ({options.features.name})"}
+    return Stage("regions", how, read, after=after, key_options=key_options, files=options.features, skipped=skipped)
+
+
+def plan_parts(context: RunContext) -> Stage:
+    """Plans small parts of the scene."""
+    how, after = "of the scene, by what single masks say of them", ("load", "gaussians", "objects")
+    key_options = context.key_options("seed", "level", "granularity", "centre_pixel_weight")
+    key_options["embedder"] = context.models.embedder.name
+    find, files = _find_parts, context.options.features
+    return Stage("parts", how, find, after=after, key_options=key_options, files=files)
+
+
+class _TrainingView:
     """The training frames in which masks are found and embedded."""
 
     def __init__(self, capture: Capture, options: Options):
@@ -56,28 +107,28 @@ class TrainingView:
         return jax.tree.map(jnp.asarray, self.capture.cameras[self.train])
 
 
-def read_masks(stage: StageInput) -> StageResult:
+def _read_masks(stage: StageInput) -> StageResult:
     """Reads the labels of the training frames from mask files."""
-    folder, view = stage.context.options.masks, TrainingView(stage.results.load, stage.context.options)
+    folder, view = stage.context.options.masks, _TrainingView(stage.results.load, stage.context.options)
     assert folder is not None
     loaded = load_labels(folder, view.names, view.size, **view.mask_layout, progress=stage.progress)
     _require_regions(loaded.labels, str(folder))
     return StageResult(loaded.labels, notes=(f"{len(loaded.ids)} regions in the masks", *loaded.notes))
 
 
-def find_objects(stage: StageInput) -> StageResult:
+def _find_objects(stage: StageInput) -> StageResult:
     """Finds proposals in the training frames, and associates them over the frames to labels of objects."""
     context, scene = stage.context, stage.results.gaussians
-    view = TrainingView(stage.results.load, context.options)
-    proposals, notes = frame_proposals(context, view, scene)
-    labels = associate_masks(context, view, scene, proposals, stage.progress, stage.checkpoint)
+    view = _TrainingView(stage.results.load, context.options)
+    proposals, notes = _frame_proposals(context, view, scene)
+    labels = _associate_masks(context, view, scene, proposals, stage.progress, stage.checkpoint)
     context.models.close()
     _require_regions(labels, str(context.options.capture))
     return StageResult(labels, notes=notes)
 
 
-def frame_proposals(
-    context: RunContext, view: TrainingView, gaussians: Gaussians
+def _frame_proposals(
+    context: RunContext, view: _TrainingView, gaussians: Gaussians
 ) -> tuple[Callable[[int], np.ndarray], tuple[str, ...]]:
     """Opens the proposals, masks (M, H, W) of the t-th training frame: from files, a segmenter, or by colour."""
     options, frames, segmenter = context.options, view.frames, context.models.segmenter
@@ -95,7 +146,7 @@ def frame_proposals(
     return cache_masks_as_rle(lambda t: classical(frames[t], t)), ()
 
 
-def _classical_segmenter(options: Options, view: TrainingView, gaussians: Gaussians) -> Segmenter:
+def _classical_segmenter(options: Options, view: _TrainingView, gaussians: Gaussians) -> Segmenter:
     """Opens the segmenter without weights for the training frames.
 
     Surfaces come from the capture's depth. Without depth, the coarse granularity takes the depth that the Gaussians
@@ -105,10 +156,11 @@ def _classical_segmenter(options: Options, view: TrainingView, gaussians: Gaussi
     depths = None if capture.depths is None else np.asarray(capture.depths)[view.train]
     if depths is not None and depths[:, ::4, ::4].any():
         known = depths[:, ::4, ::4]
-        spacing = MIN_CLOUD_SPACING * float(np.median(known[known > 0]))
+        spacing = 0.02 * float(np.median(known[known > 0]))  # closer points show a sensor's noise, not the surface
+        most = 100_000  # points whose normals are estimated
         cloud = points_from_depth(capture, voxel=spacing, stride=4)
-        if len(cloud.points) > MAX_CLOUD_POINTS:
-            cloud = points_from_depth(capture, max_points=MAX_CLOUD_POINTS, stride=4)
+        if len(cloud.points) > most:
+            cloud = points_from_depth(capture, max_points=most, stride=4)
         surfaces = surfaces_from_depth(depths, cameras, cloud.points)
         return ClassicalSegmenter(**setting, surfaces=surfaces)
     if options.granularity != "coarse":
@@ -121,13 +173,13 @@ def _classical_segmenter(options: Options, view: TrainingView, gaussians: Gaussi
     return ClassicalSegmenter(**setting, depths=rendered)
 
 
-def associate_masks(
+def _associate_masks(
     context: RunContext,
-    view: TrainingView,
+    view: _TrainingView,
     gaussians: Gaussians,
     proposals: Callable[[int], np.ndarray],
     progress: Progress,
-    checkpoint: Checkpoint | None = None,
+    checkpoint: Checkpoint,
 ) -> np.ndarray:
     """Associates proposals by consensus or by a tracker: (T, H, W) int16 labels, -1 for no region."""
     options, frames, cameras = context.options, view.frames, view.cameras
@@ -140,8 +192,8 @@ def associate_masks(
         frames,
         lambda frame, index: proposals(index),
         tracker,
-        state=None if checkpoint is None else checkpoint.read(),
-        on_checkpoint=None if checkpoint is None else checkpoint.keep,
+        state=checkpoint.read(),
+        on_checkpoint=checkpoint.keep,
         progress=progress,
     )
     if isinstance(tracker, GeometricTracker):
@@ -155,19 +207,19 @@ def _require_regions(labels: np.ndarray, where: str) -> None:
         raise InputError(where, "no region in any frame", "at least one", remedy)
 
 
-def embed_objects(stage: StageInput) -> StageResult:
+def _embed_objects(stage: StageInput) -> StageResult:
     """Embeds each region by the embedder of the run."""
     context = stage.context
-    frames, embed = TrainingView(stage.results.load, context.options).frames, context.models.embedder.embed_regions
+    frames, embed = _TrainingView(stage.results.load, context.options).frames, context.models.embedder.embed_regions
     embedded = region_embeddings(frames, stage.results.objects, embed, progress=stage.progress)
     context.models.close()
     return StageResult(embedded)
 
 
-def read_embeddings(stage: StageInput) -> StageResult:
+def _read_embeddings(stage: StageInput) -> StageResult:
     """Reads the embeddings of masks from files, and pools them to those of the regions."""
     options, labels = stage.context.options, stage.results.objects
-    view = TrainingView(stage.results.load, options)
+    view = _TrainingView(stage.results.load, options)
     assert options.features is not None
     features = load_features(options.features, view.names, view.size, **view.mask_layout)
     if not len(features.embeddings):
@@ -182,10 +234,10 @@ def read_embeddings(stage: StageInput) -> StageResult:
     return StageResult(embedded, notes=notes)
 
 
-def find_parts(stage: StageInput) -> StageResult:
+def _find_parts(stage: StageInput) -> StageResult:
     """Finds small parts of the scene, each with the embeddings of all single-frame masks that contain it."""
     context, options = stage.context, stage.context.options
-    view = TrainingView(stage.results.load, options)
+    view = _TrainingView(stage.results.load, options)
     frames = view.frames
     masks, embed = _masks_with_embeddings(context, view, stage.results)
     views = SceneSuperpixels(
@@ -198,7 +250,7 @@ def find_parts(stage: StageInput) -> StageResult:
 
 
 def _masks_with_embeddings(
-    context: RunContext, view: TrainingView, results: Results
+    context: RunContext, view: _TrainingView, results: Results
 ) -> tuple[Callable[[int], np.ndarray], Embed]:
     """Masks (M, H, W) of the t-th training frame and their embeddings: of --features, of --masks, or proposals."""
     options, frames = context.options, view.frames
@@ -219,4 +271,4 @@ def _masks_with_embeddings(
     if options.masks is not None:
         labels = results.objects
         return lambda t: labels[t][None] == np.unique(labels[t][labels[t] >= 0])[:, None, None], by_model
-    return frame_proposals(context, view, results.gaussians)[0], by_model
+    return _frame_proposals(context, view, results.gaussians)[0], by_model

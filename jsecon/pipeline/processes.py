@@ -62,24 +62,19 @@ def connection(options: Options) -> Iterator[int]:
     jax.distributed.shutdown()
 
 
-class Coordinator:
-    """Lets the other processes compute with the first one. Without others its methods have no effect."""
+def broadcast(stage: Stage | None, results: Results, sent: set[str]) -> None:
+    """Lets all processes compute a stage that is distributed, or ends the work of the others if there is no stage.
 
-    def __init__(self, several: bool = False):
-        self._several = several
-        self._sent: set[str] = set()
-
-    def broadcast(self, stage: Stage, results: Results) -> None:
-        """Lets all compute a stage with this process, if it is distributed; each result is sent once."""
-        if self._several and stage.distributed:
-            new = {name: getattr(results, name) for name in stage.after if name not in self._sent}
-            self._sent |= set(new)
-            allgather_tree({"stage": stage.name, "results": new})
-
-    def shutdown(self) -> None:
-        """Ends the work of the others."""
-        if self._several:
-            allgather_tree({"stage": ""})
+    `sent` holds the names of the results that the others have.
+    """
+    if jax.process_count() == 1:
+        return
+    if stage is None:
+        allgather_tree({"stage": ""})
+    elif stage.distributed:
+        new = {name: getattr(results, name) for name in stage.after if name not in sent}
+        sent |= set(new)
+        allgather_tree({"stage": stage.name, "results": new})
 
 
 def run_worker(context: RunContext, stages: Sequence[Stage]) -> None:

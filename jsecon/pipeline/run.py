@@ -21,7 +21,6 @@ from jsecon.field.field import load_field, save_field
 from jsecon.files import exclusive_lock
 from jsecon.pipeline import cache, lifting, model_loading, processes, stages
 from jsecon.pipeline.options import Options, check_ranges, is_bare_scene, require_writable
-from jsecon.pipeline.processes import Coordinator
 from jsecon.pipeline.progress import Listener, Step
 from jsecon.pipeline.results import (
     KEY_FILE,
@@ -50,7 +49,7 @@ FIELD_FILE = "field.safetensors"
 
 
 @dataclasses.dataclass(frozen=True)
-class Computed:
+class _Computed:
     """Output of stages."""
 
     results: Results
@@ -62,6 +61,16 @@ class Computed:
     """Wall time of each stage, also of one that was computed in an earlier run."""
     notes: list[str] = dataclasses.field(default_factory=list)
     """What the user should know, a sentence each."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Run(_Computed):
+    """A finished run."""
+
+    field: LanguageField
+    options: Options
+    programs: dict[str, int]
+    """Number of programs that jax compiled ("all"), and of those that it read "from_disk"."""
 
     @property
     def capture(self) -> Capture:
@@ -79,24 +88,9 @@ class Computed:
         return self.results.held_out
 
     @property
-    def psnr(self) -> np.ndarray:
-        """(F,) PSNR of the held-out frames in dB."""
-        return np.asarray(self.held_out.psnr)
-
-    @property
     def skipped(self) -> dict[str, str]:
         """Parts that were not needed, each with the reason."""
         return {step.name: step.why for step in self.steps if step.status == "skipped"}
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Run(Computed):
-    """A finished run."""
-
-    field: LanguageField
-    options: Options
-    programs: dict[str, int]
-    """Number of programs that jax compiled ("all"), and of those that it read "from_disk"."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -200,10 +194,9 @@ def compute_stages(
     folder: Path,
     *,
     listener: Listener | None = None,
-    coordinator: Coordinator | None = None,
-) -> Computed:
+) -> _Computed:
     """Plans stages, reports the plan, then computes each or reads it from the cache."""
-    listener, coordinator = listener or Listener(), coordinator or Coordinator(several=False)
+    listener, sent = listener or Listener(), set()
     with listener.progress("plan"):
         plan = _plan(context, stage_list, folder)
         require_writable(context.out)
@@ -215,21 +208,22 @@ def compute_stages(
         for step in plan.steps:
             listener.step(step)
         context.models.require_ready(plan.running)
-        computed = Computed(Results(), plan.keys, plan.steps)
+        computed = _Computed(Results(), plan.keys, plan.steps)
         for stage in stage_list:
-            _compute_stage(context, stage, plan, computed, listener, coordinator)
+            _compute_stage(context, stage, plan, computed, listener, sent)
+        processes.broadcast(None, computed.results, sent)
     return computed
 
 
 def _compute_stage(
-    context: RunContext, stage: Stage, plan: _Plan, computed: Computed, listener: Listener, coordinator: Coordinator
+    context: RunContext, stage: Stage, plan: _Plan, computed: _Computed, listener: Listener, sent: set[str]
 ) -> None:
     """Computes one stage or reads it from the cache, and adds it to `computed`."""
     path = plan.paths[stage.name]
     checkpoint = Checkpoint(_checkpoint_file(path))
 
     def compute(progress: Any) -> StageResult:
-        coordinator.broadcast(stage, computed.results)
+        processes.broadcast(stage, computed.results, sent)
         result = stage.compute(StageInput(context, computed.results, progress, checkpoint))
         if plan.files[stage.name] != stage.files_digest(context):  # then the key does not describe the result
             where = stage.files if isinstance(stage.files, Path) else context.options.capture
@@ -240,18 +234,17 @@ def _compute_stage(
 
     with listener.progress(stage.name) as progress:
         try:
-            cached = cache.fetch(path, functools.partial(compute, progress), note=listener.note)
+            result, seconds, fresh = cache.fetch(path, functools.partial(compute, progress), note=listener.note)
         except (MemoryError, jax.errors.JaxRuntimeError) as error:
             if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
                 problem = f"no memory left ({str(error)[:200]})"
                 remedy = "Take smaller frames (--long-side), or fewer (--frames). Finished stages are kept."
                 raise InputError(f"stage {stage.name}", problem, "more memory", remedy) from error
             raise
-    result: StageResult = cached.value
     setattr(computed.results, stage.name, result.value)
-    computed.seconds[stage.name] = cached.seconds
+    computed.seconds[stage.name] = seconds
     checkpoint.remove()
-    listener.done(stage.name, cached.seconds, cached.fresh)
+    listener.done(stage.name, seconds, fresh)
     for part, why in result.skipped.items():
         computed.steps.append(Step(part, "skipped", why))
         listener.step(computed.steps[-1])
@@ -266,7 +259,6 @@ def run(
     *,
     listener: Listener | None = None,
     cache_folder: Path | None = None,
-    coordinator: Coordinator | None = None,
 ) -> Run:
     """Builds the field of a capture and writes OUT/field.safetensors.
 
@@ -276,7 +268,7 @@ def run(
     folder = cache_folder or out / "cache"
     context = _open_context(options, out, folder)
     options = context.options
-    computed = compute_stages(context, stages.run_stages(context), folder, listener=listener, coordinator=coordinator)
+    computed = compute_stages(context, stages.run_stages(context), folder, listener=listener)
     results, embedder = computed.results, context.models.embedder
     started = time.monotonic()
     with listener.progress("field"):

@@ -1,10 +1,11 @@
-"""What the stages of a scene compute: poses, frames, Gaussians and their quality, with photographs or without.
+"""The stages of a scene: poses, frames, Gaussians and their quality, with photographs or without.
 
-A scene that comes without photographs is rendered from virtual views, or from given poses. Only `load_frames` and
-`measure_held_out` read held-out frames.
+A scene that comes without photographs is rendered from virtual views, or from given poses. Only `_load_frames` and
+`_measure_held_out` read held-out frames.
 """
 
 import dataclasses
+import functools
 import shutil
 from pathlib import Path
 
@@ -15,28 +16,98 @@ from jsecon.errors import InputError
 from jsecon.files import write_text
 from jsecon.fit.quality import QUICK_LONG_SIDE, is_weak, measure_quality
 from jsecon.fit.start import starting_gaussians
-from jsecon.pipeline.options import Options
-from jsecon.pipeline.results import KEY_FILE, StageInput, StageResult, training_frames
+from jsecon.pipeline.options import Options, is_bare_scene
+from jsecon.pipeline.results import KEY_FILE, RunContext, Stage, StageInput, StageResult, training_frames
 from jsecon.pipeline.scene_files import check_overlap, place_in_capture, read_scene
 from jsecon.poses.sfm import find_poses
-from jsecon.read.captures.capture import has_depth, load_capture, read_posed_images
+from jsecon.read.captures.capture import has_depth, load_capture, read_posed_images, unposed_photographs
 from jsecon.read.captures.frames import FrameOptions, frame_names, make_rigid, transform_poses
 from jsecon.read.captures.nerfstudio import source_from_trained
 from jsecon.read.captures.photographs import list_photographs
-from jsecon.read.captures.video import is_video, write_frames
+from jsecon.read.captures.video import DEFAULT_VIDEO_FRAMES, is_video, write_frames
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Camera, Capture, Gaussians, Quality
 from jsecon.views.capture import render_capture
 from jsecon.views.frame import scene_frame, surface_points
 from jsecon.views.plan import place_cameras
 
-SECONDS_PER_STEP = 0.024
-"""s of a step of the fit, on two cores of an AMD EPYC; estimates how many steps --minutes allows"""
-SECONDS_PER_MEGAPIXEL = 0.2
-"""s more of a step per million pixels of a frame"""
+
+def plan_capture(context: RunContext) -> list[Stage]:
+    """Plans the capture, and before it the poses if there are photographs or a video without poses."""
+    options, capture = context.options, context.options.capture
+    if is_bare_scene(capture):
+        return [_plan_rendered_views(context)]
+    if is_video(capture):
+        what = f"the {options.frames or DEFAULT_VIDEO_FRAMES} sharpest frames of {capture.name}, evenly spread"
+        key_options, files = context.key_options("frames"), capture
+    elif unposed_photographs(capture):
+        photographs = list_photographs(capture)
+        what = f"{len(photographs)} photographs, which have none"
+        key_options = {"names": [photo.relative_to(capture).as_posix() for photo in photographs]}
+        files = functools.partial(list_photographs, capture)
+    else:
+        return [_plan_load(context, capture)]
+    how = f"found by structure from motion (pycolmap) for {what}"
+    folder = context.out / "poses"
+    poses = Stage("poses", how, _estimate_poses, key_options=key_options, files=files, output_dir=folder)
+    return [poses, dataclasses.replace(_plan_load(context, folder), after=("poses",), files=None)]
 
 
-def estimate_poses(stage: StageInput) -> StageResult:
+def _plan_load(context: RunContext, capture: Path) -> Stage:
+    """Plans the frames at the size that the options ask for, corrected if they ask for that."""
+    options = context.options
+    key_options = context.key_options("long_side", "frames", "holdout")
+    count = "all frames" if options.frames is None else f"at most {options.frames} frames"
+    held_out = f"1 in {options.holdout} held out" if options.holdout else "none held out"
+    how = f"{count}, long side at most {options.long_side} px, {held_out}"
+    refine = _refinement(options, capture)
+    if refine != "never":
+        key_options |= context.key_options("seed", "steps", "minutes") | {"refine": refine}
+        how += ", corrected by short fits"
+        how += " in about half of the fit's time where that helps" * (refine == "auto")
+    return Stage("load", how, _load_frames, key_options=key_options, files=capture)
+
+
+def _plan_rendered_views(context: RunContext) -> Stage:
+    """Plans the stage "load" of a scene without photographs."""
+    options, skipped = context.options, {"photographs": "the scene comes without any"}
+    if options.cameras is not None:
+        poses, both = options.cameras, [options.cameras, options.capture]
+        how, key_options = f"the scene rendered from the poses of {poses.name}", context.key_options("long_side")
+        skipped["planned views"] = f"the poses are given ({poses.name})"
+        render = _render_given_poses
+        return Stage("load", how, render, key_options=key_options, files=lambda: both, skipped=skipped)
+    how = f"{options.views} virtual views, planned from the Gaussians of {options.capture.name}"
+    key_options, render = context.key_options("views", "up", "long_side"), _render_planned_views
+    return Stage("load", how, render, key_options=key_options, files=options.capture, skipped=skipped)
+
+
+def plan_gaussians(context: RunContext) -> Stage:
+    """Plans the scene's Gaussians: of a file, brought into the capture's world, or fitted to the training frames."""
+    options = context.options
+    bare = is_bare_scene(options.capture)
+    path = options.capture if bare else options.gaussians
+    if path is None:
+        length = f"{options.steps} steps" if options.minutes is None else f"{options.minutes:g} minutes"
+        how, key_options = f"fitted to the frames in {length}", context.key_options("steps", "minutes", "seed")
+        return Stage("gaussians", how, _fit_scene, after=("load",), key_options=key_options)
+    transform = path.parent / "dataparser_transforms.json"
+    key_options = {"trained": transform.read_text(errors="replace")} if transform.is_file() and not bare else {}
+    skipped = {"photometric fit": f"the scene's Gaussians are given ({path.name})"}
+    read = _read_bare_scene if bare else _read_gaussians_of_capture
+    how = f"read from {path.name}"
+    return Stage("gaussians", how, read, after=("load",), key_options=key_options, files=path, skipped=skipped)
+
+
+def plan_held_out(context: RunContext) -> Stage:
+    """Plans PSNR and SSIM of the held-out frames."""
+    if is_bare_scene(context.options.capture):
+        return Stage("held_out", "no photograph to compare with", _measure_nothing)
+    how = "PSNR and SSIM of the rendered colours"
+    return Stage("held_out", how, _measure_held_out, after=("load", "gaussians"), distributed=True)
+
+
+def _estimate_poses(stage: StageInput) -> StageResult:
     """Finds the poses of photographs or of a video's frames, and writes them as a COLMAP capture to OUT/poses."""
     context, folder = stage.context, stage.checkpoint.folder
     capture, out = context.options.capture, context.out / "poses"
@@ -56,7 +127,7 @@ def estimate_poses(stage: StageInput) -> StageResult:
     return StageResult(None, notes=(*notes, f"The poses are in {out}: COLMAP opens them."))
 
 
-def refinement(options: Options, capture: Path) -> str:
+def _refinement(options: Options, capture: Path) -> str:
     """When a run corrects poses and exposures: "auto" only if depth and the data can still decide it."""
     if options.refine != "auto":
         return options.refine
@@ -65,7 +136,7 @@ def refinement(options: Options, capture: Path) -> str:
     return "auto" if has_depth(capture) else "never"
 
 
-def load_frames(stage: StageInput) -> StageResult:
+def _load_frames(stage: StageInput) -> StageResult:
     """Loads the capture, in OUT/poses if its poses were estimated, and corrects it as the options ask."""
     options, sizes = stage.context.options, stage.context.key_options("long_side", "frames", "holdout")
     folder = stage.context.out / "poses" if hasattr(stage.results, "poses") else options.capture
@@ -75,7 +146,7 @@ def load_frames(stage: StageInput) -> StageResult:
     frames = f"{count} frames of {width}x{height}, {count - len(train)} of them held out"
     points = f"{len(capture.points)} sparse points{'' if capture.depths is None else ', depth'}"
     notes = (f"{frames}, {points}", *capture.notes)
-    refine = refinement(options, folder)
+    refine = _refinement(options, folder)
     if refine == "never" or (refine == "auto" and capture.depths is None):
         return StageResult(capture, notes=notes)
     from jsecon.poses.refine import refine_capture  # late, like all that imports optax: a plan needs none of it
@@ -91,10 +162,11 @@ def _fit_steps(options: Options, capture: Capture) -> float:
     if options.minutes is None:
         return float(options.steps)
     megapixels = capture.cameras.width * capture.cameras.height / 1e6
-    return 60 * options.minutes / (SECONDS_PER_STEP + SECONDS_PER_MEGAPIXEL * megapixels)
+    seconds_per_step = 0.024 + 0.2 * megapixels  # on two cores of an AMD EPYC
+    return 60 * options.minutes / seconds_per_step
 
 
-def read_gaussians_of_capture(stage: StageInput) -> StageResult:
+def _read_gaussians_of_capture(stage: StageInput) -> StageResult:
     """Reads the Gaussians of a file into the world of the capture."""
     path, capture = stage.context.options.gaussians, stage.results.load
     assert path is not None
@@ -106,7 +178,7 @@ def read_gaussians_of_capture(stage: StageInput) -> StageResult:
     return StageResult(placed, notes=(*notes, *read_notes))
 
 
-def fit_scene(stage: StageInput) -> StageResult:
+def _fit_scene(stage: StageInput) -> StageResult:
     """Fits Gaussians to the training frames. A long fit may have one for each pixel of a frame, a short one half."""
     from jsecon.fit.optimise import Schedule, fit_gaussians
 
@@ -133,7 +205,7 @@ def fit_scene(stage: StageInput) -> StageResult:
     return StageResult(fitted, notes=(*notes, f"{fitted.count} Gaussians after {len(losses)} steps"))
 
 
-def measure_held_out(stage: StageInput) -> StageResult:
+def _measure_held_out(stage: StageInput) -> StageResult:
     """Measures the held-out frames, and names training frames that the scene does not explain."""
     capture, scene = stage.results.load, stage.results.gaussians
     train = np.flatnonzero(~np.asarray(capture.held_out))
@@ -148,7 +220,7 @@ def measure_held_out(stage: StageInput) -> StageResult:
     return StageResult(measure_quality(scene, capture, progress=stage.progress), notes=notes)
 
 
-def render_planned_views(stage: StageInput) -> StageResult:
+def _render_planned_views(stage: StageInput) -> StageResult:
     """Plans virtual views of a scene without photographs, and renders them."""
     options = stage.context.options
     source, _ = read_scene(options.capture)
@@ -167,7 +239,7 @@ def render_planned_views(stage: StageInput) -> StageResult:
     return StageResult(capture, notes=capture.notes)
 
 
-def render_given_poses(stage: StageInput) -> StageResult:
+def _render_given_poses(stage: StageInput) -> StageResult:
     """Renders a scene without photographs from the poses of a file."""
     options = stage.context.options
     assert options.cameras is not None
@@ -224,12 +296,12 @@ def _load_poses(path: Path, long_side: int) -> tuple[Camera, tuple[str, ...]]:
     return cameras, frame_names([image.name for image in images], path)
 
 
-def read_bare_scene(stage: StageInput) -> StageResult:
+def _read_bare_scene(stage: StageInput) -> StageResult:
     """Reads a scene without photographs into the world of its rendered views."""
     source, notes = read_scene(stage.context.options.capture)
     return StageResult(_into_world(source, np.asarray(stage.results.load.source_from_scene, np.float64)), notes=notes)
 
 
-def measure_nothing(stage: StageInput) -> StageResult:
+def _measure_nothing(stage: StageInput) -> StageResult:
     """Returns the quality of no frame: renders are no photographs."""
     return StageResult(Quality(np.zeros(0, int), np.zeros(0), np.zeros(0)))
