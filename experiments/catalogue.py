@@ -29,7 +29,7 @@ from jsecon.app.catalogue import Catalogue
 from jsecon.errors import InputError
 from jsecon.pipeline import run as pipeline
 from jsecon.pipeline.options import Options as RunOptions
-from jsecon.pipeline.progress import Listener
+from jsecon.pipeline.progress import Console
 from jsecon.read.masks.masks import load_labels
 from jsecon.types import LanguageField
 
@@ -61,7 +61,7 @@ def field_of_room(folder: Path, seed: int, options: Options) -> LanguageField:
     if not (folder / pipeline.FIELD_FILE).is_file():
         steps = 60 if options.quick else 550
         run = RunOptions(capture, holdout=HOLDOUT, steps=steps, seed=seed)
-        pipeline.run(run, folder, listener=Listener())
+        pipeline.run(run, folder, listener=Console())
     return jsecon.load_field(folder / pipeline.FIELD_FILE)
 
 

@@ -29,7 +29,7 @@ from jsecon.paper.distill import distill_votes
 from jsecon.paper.queries import query_one_step
 from jsecon.pipeline import run as pipeline
 from jsecon.pipeline.options import Options as RunOptions
-from jsecon.pipeline.progress import Listener
+from jsecon.pipeline.progress import Console
 from jsecon.query.render import ALPHA_THRESHOLD
 from jsecon.read.masks.labels import load_lerf_labels
 from jsecon.types import Selection
@@ -59,9 +59,9 @@ def fields_of_room(folder: Path, seed: int, quick: bool) -> tuple[pipeline.Run, 
     if not (capture / "scene.json").is_file():
         write_room(capture, crowded_room(seed), holdout=HOLDOUT, **(QUICK_ROOM if quick else {}))
     options = RunOptions(capture, holdout=HOLDOUT, steps=60 if quick else 550, seed=seed)
-    run = pipeline.run(options, folder, listener=Listener())
+    run = pipeline.run(options, folder, listener=Console())
     masked = dataclasses.replace(options, masks=capture / "masks")
-    return run, pipeline.run(masked, folder / "true_masks", listener=Listener(), cache_folder=folder / "cache")
+    return run, pipeline.run(masked, folder / "true_masks", listener=Console(), cache_folder=folder / "cache")
 
 
 def one_step(run: pipeline.Run, embedder) -> Callable[[str], Selection]:
@@ -80,8 +80,8 @@ def measure(folder: Path, seed: int, options: Options) -> tuple[dict[str, float]
     run, masked = fields_of_room(folder, seed, options.quick)
     labels, scene = load_lerf_labels(folder / "capture" / "label"), Scene(run.field)
     cameras = {name: run.field.cameras[t] for t, name in enumerate(run.field.names)}
-    rows, summary = evaluation.evaluate(scene, labels, Listener(), ("anchored",))["anchored"]
-    _, exact = evaluation.evaluate(Scene(masked.field), labels, Listener(), ("anchored",))["anchored"]
+    rows, summary = evaluation.evaluate(scene, labels, Console(), ("anchored",))["anchored"]
+    _, exact = evaluation.evaluate(Scene(masked.field), labels, Console(), ("anchored",))["anchored"]
     select = one_step(run, scene.embedder)
     alpha = {"alpha_thresholds": (ALPHA_THRESHOLD,)}
     direct = evaluate_at_thresholds(run.field.gaussians, cameras, labels, select, **alpha)[ALPHA_THRESHOLD][1]

@@ -11,7 +11,7 @@ from test_gltf import read_glb
 
 from jsecon import Answer, Query, QueryRules, Scene, load_gaussians, objects, query_region, save_field
 from jsecon.app.outputs import write_answers
-from jsecon.pipeline.progress import Listener
+from jsecon.pipeline.progress import Console
 
 
 @pytest.fixture(scope="module")
@@ -63,8 +63,9 @@ def test_an_ending_that_cannot_be_written_is_refused_before_anything_is_read(tmp
     assert "npx @playcanvas/splat-transform" in told
 
 
-class Told(Listener):
+class Told(Console):
     def __init__(self):
+        super().__init__()
         self.lines = []
 
     def print_line(self, text):

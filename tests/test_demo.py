@@ -8,17 +8,18 @@ import pytest
 from jsecon import load_capture, load_field, load_gaussians
 from jsecon.app import pictures
 from jsecon.demo import demo
-from jsecon.pipeline.progress import Listener
+from jsecon.pipeline.progress import Console
 from jsecon.read.masks.labels import load_lerf_labels
 from jsecon.read.masks.masks import load_labels
 
 pytestmark = pytest.mark.long  # .ci/run makes the whole demo
 
 
-class Ears(Listener):
+class Ears(Console):
     """Keeps what is said."""
 
     def __init__(self):
+        super().__init__()
         self.said, self.fresh = [], {}
 
     def print_line(self, text):

@@ -13,7 +13,7 @@ from table_field import THINGS, table_field
 
 from jsecon import At, Box, InputError, Mask, Region, Scene, load_gaussians, open_scene, save_field
 from jsecon.app.evaluation import evaluate
-from jsecon.pipeline.progress import Listener
+from jsecon.pipeline.progress import Console
 from jsecon.read.masks.labels import LabelledFrame
 
 TEXTS = (
@@ -138,7 +138,7 @@ def test_the_evaluation(door):
     scene, _, rows = door
     outline = np.ones((80, 100), bool), np.array([[0, 0, 100, 80]], np.float32)
     labels = [LabelledFrame("frame_0", 100, 80, dict.fromkeys(TEXTS, outline))]
-    measured = evaluate(scene, labels, Listener(), ("anchored",))["anchored"][0]
+    measured = evaluate(scene, labels, Console(), ("anchored",))["anchored"][0]
     assert {row.query: row.selected for row in measured} == {text: len(rows[text]) for text in TEXTS}
 
 

@@ -11,7 +11,6 @@ import pytest
 from jsecon.app import cli
 from jsecon.read.captures.capture import capture_extent, load_capture
 from jsecon.read.captures.frames import CaptureExtent, FrameOptions
-from jsecon.read.captures.video import video_size
 
 STAGES = ["load", "gaussians", "objects", "regions", "votes", "held_out"]
 
@@ -47,7 +46,6 @@ def test_a_video_is_listed_with_the_frames_that_are_taken_of_it(tmp_path, capsys
     for _ in range(5):
         writer.write(np.zeros((48, 64, 3), np.uint8))
     writer.release()
-    assert video_size(tmp_path / "walk.avi") == (64, 48)
     _, stages = _dry(capsys, "run", tmp_path / "walk.avi", "--out", tmp_path / "out")
     assert "150 sharpest frames" in stages["poses"]["why"]
 
@@ -109,8 +107,6 @@ def test_a_dry_run_on_photographs_lists_their_poses_and_needs_what_finds_them(ro
     _, stages = _dry(capsys, *line, "--masks", room / "masks")
     assert stages["poses"]["status"] == stages["gaussians"]["status"] == "run"
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
-    assert cli.main([*map(str, [*line, *_wrong_masks(room, tmp_path)]), "--dry-run"]) == 2
-    assert "wrong" in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     assert cli.main([*map(str, line), "--dry-run"]) == 2
     assert "jsecon[sfm]" in capsys.readouterr().err

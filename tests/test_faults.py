@@ -16,7 +16,7 @@ from fuzz_readers import _field
 from jsecon import load_capture, save_field, save_gaussians
 from jsecon.files import exclusive_lock, write_text
 from jsecon.pipeline import cache, run as pipeline, scene
-from jsecon.pipeline.progress import Listener
+from jsecon.pipeline.progress import Console
 from jsecon.pipeline.results import RunContext
 from jsecon.pipeline.scene import plan_capture
 from jsecon.read.captures import build
@@ -76,10 +76,11 @@ def test_frames_that_lie_on_a_full_disk_are_told(capture, no_room, monkeypatch):
         load_capture(capture)
 
 
-class Meddler(Listener):
+class Meddler(Console):
     """Writes to a file while a stage runs."""
 
     def __init__(self, file):
+        super().__init__()
         self.file, self.fresh = file, {}
 
     @contextlib.contextmanager

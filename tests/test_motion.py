@@ -19,7 +19,7 @@ from PIL import Image
 from jsecon.app import cli
 from jsecon.pipeline import run as pipeline
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.progress import Listener
+from jsecon.pipeline.progress import Console
 from jsecon.pipeline.results import KEY_FILE, RunContext
 from jsecon.pipeline.scene import plan_capture
 from jsecon.poses import sfm
@@ -267,10 +267,11 @@ class Loaded(Exception):
     """The frames are there: what comes after is not looked at."""
 
 
-class UntilLoaded(Listener):
+class UntilLoaded(Console):
     """Keeps what it is told, and stops the run once the frames are there."""
 
     def __init__(self):
+        super().__init__()
         self.planned, self.notes = {}, []
 
     def step(self, step):

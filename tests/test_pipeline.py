@@ -24,16 +24,17 @@ from jsecon.field import field as field_file
 from jsecon.files import write_arrays
 from jsecon.paper import autoencoder
 from jsecon.pipeline import cache, model_loading, results, run as pipeline
-from jsecon.pipeline.progress import Listener
+from jsecon.pipeline.progress import Console
 from jsecon.process import peak_memory_mib
 
 STAGES = ("load", "gaussians", "objects", "regions", "votes", "held_out")
 
 
-class Recorder(Listener):
+class Recorder(Console):
     """Keeps what it is told."""
 
     def __init__(self):
+        super().__init__()
         self.planned, self.fresh, self.notes = {}, {}, []
 
     def step(self, step):

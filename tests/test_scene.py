@@ -16,7 +16,7 @@ from jsecon import At, Box, InputError, Mask, Query, Region, Scene
 from jsecon.app import scene as scenes
 from jsecon.pipeline import run as pipeline
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.progress import Listener
+from jsecon.pipeline.progress import Console
 from jsecon.types import Regions
 
 
@@ -128,7 +128,7 @@ def test_the_field_of_a_splat_is_kept_with_its_model(tmp_path):
     model, folder = write_clip(tmp_path / "clip", "transformers.js"), tmp_path / "scene_field"
     made = pipeline.run(dataclasses.replace(options, embedder=model), folder)
     before = (folder / "field.safetensors").read_bytes()
-    path = scenes._field_of_gaussians(options, folder, Listener())
+    path = scenes._field_of_gaussians(options, folder, Console())
     assert path.read_bytes() == before
     assert jsecon.load_field(path).embedder == made.field.embedder
     assert jsecon.open_scene(folder).name == "scene_field"

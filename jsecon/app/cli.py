@@ -75,7 +75,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         output = verb.output
         if output.debug:
             os.environ.setdefault("JAX_TRACEBACK_FILTERING", "off")  # before jax is imported
-        result = _run_verb(verb, Console(sys.stderr if output.json else None))
+        result = _run_verb(verb, Console(sys.stderr if output.json else sys.stdout, sys.stderr))
     except SystemExit as stop:  # --help
         return int(stop.code or 0)
     except (KeyboardInterrupt, Exception) as error:

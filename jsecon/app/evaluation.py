@@ -12,7 +12,7 @@ from jsecon.errors import InputError
 from jsecon.evaluate.lerf import Row, evaluate_at_thresholds
 from jsecon.files import write_text
 from jsecon.pipeline.options import require_writable
-from jsecon.pipeline.progress import Console, Listener
+from jsecon.pipeline.progress import Console
 from jsecon.query.render import ALPHA_THRESHOLD
 from jsecon.read.masks.labels import LabelledFrame, load_lerf_labels
 from jsecon.types import Selection
@@ -28,7 +28,7 @@ KINDS: dict[str, dict[str, Any]] = {
 
 
 def evaluate(
-    scene: Scene, labels: Sequence[LabelledFrame], listener: Listener, kinds: Sequence[str] = tuple(KINDS)
+    scene: Scene, labels: Sequence[LabelledFrame], listener: Console, kinds: Sequence[str] = tuple(KINDS)
 ) -> Evaluation:
     """Measures kinds of queries. A text that the scene's embedder has no words for counts as 0."""
     field = scene.field
@@ -79,7 +79,7 @@ def _rounded(value: Any) -> Any:
     return round(value, 4) if isinstance(value, float) else value
 
 
-def print_table(results: Evaluation, listener: Listener) -> None:
+def print_table(results: Evaluation, listener: Console) -> None:
     """Prints the protocol, and mIoU, mAcc@0.25 and localisation accuracy of each kind of query."""
     _, first = next(iter(results.values()))
     counts = f"{first['pairs']} pairs of {first['queries']} queries in {first['frames']} frames"

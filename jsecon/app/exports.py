@@ -18,7 +18,7 @@ from jsecon.app.scene import Scene, open_scene
 from jsecon.errors import InputError
 from jsecon.files import atomic_write, write_text
 from jsecon.pipeline.options import require_writable
-from jsecon.pipeline.progress import Console, Listener
+from jsecon.pipeline.progress import Console
 from jsecon.query.outliers import MIN_SAMPLES
 from jsecon.read.splats.files import require_writable_format
 from jsecon.types import LanguageField
@@ -136,7 +136,7 @@ def _check_export(verb: verbs.Export) -> None:
         raise InputError("--labels", f"{verb.labels} does not end in .npy", remedy="For example: --labels ids.npy")
 
 
-def _print_catalogue(catalogue: Catalogue, listener: Listener) -> None:
+def _print_catalogue(catalogue: Catalogue, listener: Console) -> None:
     """Prints a line for each object; parts are indented under their wholes."""
     wide = max((len(_title(catalogue, n)) for n in range(len(catalogue))), default=4) + 2
     listener.print_line(f"{'id':>4}  {'name':<{wide}}  prob.  Gaussians  views  conf.  size, centre")
@@ -152,7 +152,7 @@ def _print_catalogue(catalogue: Catalogue, listener: Listener) -> None:
         listener.print_line("  there are no objects: the field has no regions")
 
 
-def _write_catalogue(scene: Scene, catalogue: Catalogue, out: Path, listener: Listener) -> dict[str, Path]:
+def _write_catalogue(scene: Scene, catalogue: Catalogue, out: Path, listener: Console) -> dict[str, Path]:
     """Writes OUT/objects.json, OUT/objects.csv and OUT/catalogue.html; returns the files."""
     files = {"objects": out / "objects.json", "catalogue": out / "catalogue.html", "table": out / "objects.csv"}
     content = {"frame": "the capture's world", "up": catalogue.up.round(6).tolist()}
@@ -179,7 +179,7 @@ def _save_objects(scene: Scene, catalogue: Catalogue, folder: Path) -> list[Path
     return files
 
 
-def _page(scene: Scene, catalogue: Catalogue, listener: Listener) -> str:
+def _page(scene: Scene, catalogue: Catalogue, listener: Console) -> str:
     """Returns the page: a card for each object, which opens to its views."""
     cards: dict[bool, list[str]] = {False: [], True: []}
     with listener.progress("pictures") as progress:

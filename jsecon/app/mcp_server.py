@@ -107,7 +107,7 @@ def _tool(method: Callable[..., Any]) -> Callable[..., Any]:
 
 def _mcp(verb: verbs.Mcp, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon mcp`; standard output belongs to the protocol, so the console is on standard error."""
-    console = Console(sys.stderr)
+    console = Console(sys.stderr, sys.stderr)
     with console.progress("fields"):
         scenes = open_scenes(verb.fields, with_models(verb, console, yes=False).embedder)
     for scene in scenes.values():

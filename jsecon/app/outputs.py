@@ -19,7 +19,7 @@ from jsecon.app import pictures, report
 from jsecon.app.records import Answer, Mask
 from jsecon.app.scene import Scene
 from jsecon.files import write_text
-from jsecon.pipeline.progress import Listener
+from jsecon.pipeline.progress import Console
 from jsecon.read.captures.images import write_image
 
 MAX_SLUG_BYTES = 80
@@ -55,7 +55,7 @@ def write_answer(
 
 
 def write_answers(
-    scene: Scene, answers: Sequence[Answer], out: Path, listener: Listener, *, views: int = 3, ending: str = "ply"
+    scene: Scene, answers: Sequence[Answer], out: Path, listener: Console, *, views: int = 3, ending: str = "ply"
 ) -> dict[str, Any]:
     """Writes the files of answers and OUT/answers.html, and prints a line for each.
 

@@ -13,7 +13,7 @@ from jsecon.app import pictures, report, verbs
 from jsecon.app.models import with_models
 from jsecon.files import write_text
 from jsecon.pipeline import processes, run as pipeline
-from jsecon.pipeline.progress import Console, Listener
+from jsecon.pipeline.progress import Console
 from jsecon.pipeline.results import WARNING, vision_frames
 from jsecon.pipeline.run import Run
 from jsecon.process import peak_memory_mib
@@ -59,7 +59,7 @@ def _fit(verb: verbs.Fit, console: Console) -> verbs.VerbResult:
     return {"written": {"scene": verb.out}, "gaussians": gaussians.count} | _quality_metrics(held_out)
 
 
-def _write_run(run: Run, out: Path, listener: Listener) -> dict[str, Any]:
+def _write_run(run: Run, out: Path, listener: Console) -> dict[str, Any]:
     """Writes OUT/metrics.json and OUT/report.html of a run, prints its figures, and returns the metrics."""
     metrics = run_metrics(run)
     write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
@@ -92,7 +92,7 @@ def _quality_metrics(held_out: Quality) -> dict[str, float | None]:
     }
 
 
-def _print_quality(held_out: Quality, listener: Listener) -> None:
+def _print_quality(held_out: Quality, listener: Console) -> None:
     """Prints mean PSNR and SSIM if there are held-out frames."""
     count = len(held_out.frames)
     if count:

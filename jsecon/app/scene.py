@@ -28,7 +28,7 @@ from jsecon.field.field import check_field, load_field
 from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.field.regions import ALIKE_THRESHOLD
 from jsecon.pipeline.options import Options, is_bare_scene
-from jsecon.pipeline.progress import Listener
+from jsecon.pipeline.progress import Console
 from jsecon.process import MEMORY, memory_budget
 from jsecon.query.answer import (
     NO_REGIONS,
@@ -66,7 +66,7 @@ def open_scene(
     embedder: Any = None,
     up: Sequence[float | int] | None = None,
     out: str | Path | None = None,
-    listener: Listener | None = None,
+    listener: Console | None = None,
 ) -> "Scene":
     """Opens a field, or a file of Gaussians, to be asked.
 
@@ -92,7 +92,7 @@ def open_scene(
     if is_bare_scene(file):
         folder = file.with_name(f"{file.stem}_field") if out is None else Path(out)
         axis: Any = None if up is None else tuple(map(float, up))
-        file = _field_of_gaussians(Options(file, embedder=model, up=axis), folder, listener or Listener())
+        file = _field_of_gaussians(Options(file, embedder=model, up=axis), folder, listener or Console())
     elif file.is_dir():
         file = file / FIELD_FILE
     large = file.is_file() and file.stat().st_size > memory_budget()
@@ -107,7 +107,7 @@ def open_scene(
     return Scene(field, embedder, up=up, name=file.parent.name if file.name == FIELD_FILE else file.stem)
 
 
-def _field_of_gaussians(options: Options, folder: Path, listener: Listener) -> Path:
+def _field_of_gaussians(options: Options, folder: Path, listener: Console) -> Path:
     """Finds the field of a file of Gaussians in a folder, or makes it there.
 
     Without a model of its own the options take that of the field which is there.

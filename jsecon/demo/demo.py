@@ -17,7 +17,7 @@ from jsecon.evaluate.lerf import Row
 from jsecon.files import write_text
 from jsecon.pipeline import run as pipeline
 from jsecon.pipeline.options import Options, require_writable
-from jsecon.pipeline.progress import Console, Listener
+from jsecon.pipeline.progress import Console
 from jsecon.pipeline.run import Run
 from jsecon.read.masks.labels import LabelledFrame, load_lerf_labels
 
@@ -25,7 +25,7 @@ ROOM = Path(__file__).with_name("room")
 """The capture: COLMAP, images, masks of the objects, LERF labels of the held-out frames."""
 
 
-def run_demo(out: Path, *, listener: Listener, room: Path = ROOM, steps: int = 550) -> dict[str, Any]:
+def run_demo(out: Path, *, listener: Console, room: Path = ROOM, steps: int = 550) -> dict[str, Any]:
     """Builds the field of the room, answers the texts of its labels, and writes answers, report.html and metrics.json.
 
     Args:

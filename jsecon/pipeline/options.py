@@ -227,13 +227,9 @@ class Options(FieldOptions, ModelOptions, MaskOptions, BareOptions, SceneOptions
         return self.association if self.tracker is None else "tracking"
 
 
-SPLATS = (".ply", ".spz", ".sog", ".splat", ".glb")
-"""endings of files that are scenes of Gaussians"""
-
-
 def is_bare_scene(capture: Path) -> bool:
     """Whether the input of a run is a file of Gaussians instead of a capture."""
-    return capture.suffix.lower() in SPLATS and not capture.is_dir()
+    return capture.suffix.lower() in (".ply", ".spz", ".sog", ".splat", ".glb") and not capture.is_dir()
 
 
 def require_writable(folder: Path, *, create: bool = True) -> None:

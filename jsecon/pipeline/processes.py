@@ -77,7 +77,7 @@ def broadcast(stage: Stage | None, results: Results, sent: set[str]) -> None:
         allgather_tree({"stage": stage.name, "results": new})
 
 
-def run_worker(context: RunContext, stages: Sequence[Stage]) -> None:
+def compute_called_stages(context: RunContext, stages: Sequence[Stage]) -> None:
     """Computes each stage that the first process calls for, until it shuts down. It writes no file."""
     by_name, results = {stage.name: stage for stage in stages}, Results()
     while (call := allgather_tree(None)[0])["stage"]:

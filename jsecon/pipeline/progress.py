@@ -1,12 +1,7 @@
-"""Progress of a run: its stages, notes, results, and the time that is left.
-
-A run reports to a `Listener`. The command line passes a `Console`, which prints results to standard output and draws
-progress on standard error.
-"""
+"""Progress of a run: its stages, notes, results, and the time that is left."""
 
 import contextlib
 import dataclasses
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -30,49 +25,40 @@ class Step:
     """How it is computed, or why it is left out."""
 
 
-class Listener:
-    """Receives the messages of a run. Each becomes a line for `print_line`, which this base class ignores."""
-
-    def print_line(self, text: str) -> None:
-        """Receives a line of results."""
-
-    def step(self, step: Step) -> None:
-        """Receives a step: first all that are planned, later also parts that only the data could settle."""
-        self.print_line(f"  {step.name:<16} {step.status:<9} {step.why}".rstrip())
-
-    def done(self, name: str, seconds: float, fresh: bool) -> None:
-        """Receives the end of a stage."""
-        if fresh:
-            self.print_line(f"  {name:<16} {'done':<9} {seconds:.1f} s")
-
-    def note(self, text: str) -> None:
-        """Receives a note."""
-        self.print_line(f"  note: {text}")
-
-    @contextlib.contextmanager
-    def progress(self, name: str) -> Iterator[Callable[[int, int], None]]:
-        """Reports the progress of a step, for the body of a `with`."""
-        yield lambda done, total: None
-
-
-class Console(Listener):
-    """The listener of the command line."""
+class Console:
+    """Prints the messages of a run as lines to `out`, and draws its progress on `err`. Without these it is silent."""
 
     def __init__(self, out: Any = None, err: Any = None):
-        self._out = out or sys.stdout
-        self._err = err or sys.stderr
+        self._out, self._err = out, err
         self._lock = threading.RLock()  # of what is printed
         self._drawn = False  # a line of progress on the terminal
 
     def print_line(self, text: str) -> None:
         """Prints a line, in place of a line of progress that is drawn."""
-        with self._lock:
-            self._erase()
-            print(text, file=self._out, flush=True)
+        if self._out is not None:
+            with self._lock:
+                self._erase()
+                print(text, file=self._out, flush=True)
+
+    def step(self, step: Step) -> None:
+        """Prints a step: first all that are planned, later also parts that only the data could settle."""
+        self.print_line(f"  {step.name:<16} {step.status:<9} {step.why}".rstrip())
+
+    def done(self, name: str, seconds: float, fresh: bool) -> None:
+        """Prints the end of a stage."""
+        if fresh:
+            self.print_line(f"  {name:<16} {'done':<9} {seconds:.1f} s")
+
+    def note(self, text: str) -> None:
+        """Prints a note."""
+        self.print_line(f"  note: {text}")
 
     @contextlib.contextmanager
     def progress(self, name: str) -> Iterator[Callable[[int, int], None]]:
         """Shows the time left: in one line that is drawn again on a terminal, in a line now and then elsewhere."""
+        if self._err is None:
+            yield lambda done, total: None
+            return
         clock, ended, terminal = _Clock(name), threading.Event(), self._err.isatty()
 
         def draw() -> None:

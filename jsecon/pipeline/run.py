@@ -4,7 +4,6 @@ The keys of all stages are known before any runs, so the plan is printed first: 
 is skipped and why. `stages` is the table of the stages.
 """
 
-import contextlib
 import dataclasses
 import functools
 import itertools
@@ -21,7 +20,7 @@ from jsecon.field.field import load_field, save_field
 from jsecon.files import exclusive_lock
 from jsecon.pipeline import cache, lifting, model_loading, processes, stages
 from jsecon.pipeline.options import Options, check_ranges, is_bare_scene, require_writable
-from jsecon.pipeline.progress import Listener, Step
+from jsecon.pipeline.progress import Console, Step
 from jsecon.pipeline.results import (
     KEY_FILE,
     Checkpoint,
@@ -34,15 +33,12 @@ from jsecon.pipeline.results import (
 )
 from jsecon.pipeline.scene_files import read_scene
 from jsecon.pipeline.sources import provenance
-from jsecon.poses.sfm import check_photographs, require_pycolmap
+from jsecon.poses.sfm import require_pycolmap
 from jsecon.process import compilation_counts
 from jsecon.read.captures.capture import capture_extent
-from jsecon.read.captures.frames import CaptureExtent, FrameOptions, evenly_spaced, frame_names, holdout_mask
-from jsecon.read.captures.images import image_header
-from jsecon.read.captures.photographs import list_photographs
-from jsecon.read.captures.video import DEFAULT_VIDEO_FRAMES, is_video, video_size
+from jsecon.read.captures.frames import FrameOptions, evenly_spaced, holdout_mask
 from jsecon.read.masks.masks import load_features, load_labels, load_proposals
-from jsecon.types import Capture, Gaussians, ImageFile, LanguageField, Quality
+from jsecon.types import Capture, Gaussians, LanguageField, Quality
 from jsecon.vision.classical import require_contrib
 
 FIELD_FILE = "field.safetensors"
@@ -193,10 +189,10 @@ def compute_stages(
     stage_list: list[Stage],
     folder: Path,
     *,
-    listener: Listener | None = None,
+    listener: Console | None = None,
 ) -> _Computed:
     """Plans stages, reports the plan, then computes each or reads it from the cache."""
-    listener, sent = listener or Listener(), set()
+    listener, sent = listener or Console(), set()
     with listener.progress("plan"):
         plan = _plan(context, stage_list, folder)
         require_writable(context.out)
@@ -216,7 +212,7 @@ def compute_stages(
 
 
 def _compute_stage(
-    context: RunContext, stage: Stage, plan: _Plan, computed: _Computed, listener: Listener, sent: set[str]
+    context: RunContext, stage: Stage, plan: _Plan, computed: _Computed, listener: Console, sent: set[str]
 ) -> None:
     """Computes one stage or reads it from the cache, and adds it to `computed`."""
     path = plan.paths[stage.name]
@@ -257,14 +253,14 @@ def run(
     options: Options,
     out: Path,
     *,
-    listener: Listener | None = None,
+    listener: Console | None = None,
     cache_folder: Path | None = None,
 ) -> Run:
     """Builds the field of a capture and writes OUT/field.safetensors.
 
     A run that was stopped resumes where it stopped, to the same result.
     """
-    listener, before = listener or Listener(), compilation_counts()
+    listener, before = listener or Console(), compilation_counts()
     folder = cache_folder or out / "cache"
     context = _open_context(options, out, folder)
     options = context.options
@@ -303,10 +299,10 @@ def current_field(options: Options, out: Path) -> Path | None:
 def run_worker(options: Options, out: Path) -> None:
     """Does the part of a run of every process but the first (`processes`)."""
     context = _open_context(options, out)
-    processes.run_worker(context, stages.run_stages(context))
+    processes.compute_called_stages(context, stages.run_stages(context))
 
 
-def dry_run(options: Options, out: Path, *, scene_only: bool = False, listener: Listener) -> dict[str, Any]:
+def dry_run(options: Options, out: Path, *, scene_only: bool = False, listener: Console) -> dict[str, Any]:
     """Lists the stages that `run` would compute, and writes no file."""
     with listener.progress("plan"):
         context = _open_context(options, out)
@@ -324,64 +320,33 @@ def dry_run(options: Options, out: Path, *, scene_only: bool = False, listener: 
 def _check_inputs(context: RunContext, plan: _Plan) -> None:
     """Raises InputError for inputs that a run would refuse, as its stages check them before their long work.
 
-    Those of stages that would run are checked, by headers and a few files.
+    Those of stages that would run are checked, by headers and a few files; masks only if the frames have poses.
     """
     options, running = context.options, plan.running
     require_writable(context.out, create=False)
-    if "poses" in running:
-        require_pycolmap(options.capture)
-        if is_video(options.capture) and min(video_size(options.capture)) < 1:
-            remedy = "Copy it again, or convert it (ffmpeg -i VIDEO walk.mp4)."
-            raise InputError(options.capture, "no frame that OpenCV can read", "a video", remedy)
     if is_bare_scene(options.capture):
         read_scene(options.capture)
         return
-    extent = _extent(context, plan)
-    train = training_frames(holdout_mask(extent.frames, options.holdout))
     if options.gaussians is not None and "gaussians" in running:
         read_scene(options.gaussians)
-    if extent.names:
-        seen = train[evenly_spaced(len(train), options.vision_frames)]
-        _check_masks(options, running, extent, [extent.names[t] for t in seen])
-
-
-def _extent(context: RunContext, plan: _Plan) -> CaptureExtent:
-    """Returns number, size and names of the frames that a run would load. A video's frames have no names yet."""
-    options = context.options
-    frame_options = FrameOptions(long_side=options.long_side, frames=options.frames)
-    if "load" not in plan.running:
-        with contextlib.suppress(cache.CorruptCacheError):  # a run would compute it again
-            capture = cache.load(plan.paths["load"])[0].value
-            size = capture.cameras.width, capture.cameras.height
-            return CaptureExtent(len(capture.names), size, capture.names, capture.files)
-    if "poses" not in plan.running:
-        return capture_extent(context.out / "poses" if "poses" in plan.paths else options.capture, frame_options)
-    if is_video(options.capture):
-        size = frame_options.size(video_size(options.capture))
-        return CaptureExtent(options.frames or DEFAULT_VIDEO_FRAMES, size)
-    photos = list_photographs(options.capture)
-    paths = check_photographs(photos, options.capture)
-    names = frame_names(paths, options.capture)
-    sizes = [image_header(photo).upright for photo in photos]
-    chosen = evenly_spaced(len(photos), options.frames)
-    files = tuple(ImageFile(paths[i], *sizes[i]) for i in chosen)
-    size = frame_options.size(max(set(sizes), key=sizes.count))
-    return CaptureExtent(len(chosen), size, tuple(names[i] for i in chosen), files)
-
-
-def _check_masks(options: Options, running: list[str], extent: CaptureExtent, train_names: list[str]) -> None:
-    """Checks that files of masks, proposals and features belong to the frames."""
+    if "poses" in running:
+        require_pycolmap(options.capture)
+        return
+    folder = context.out / "poses" if "poses" in plan.paths else options.capture
+    extent = capture_extent(folder, FrameOptions(long_side=options.long_side, frames=options.frames))
+    train = training_frames(holdout_mask(extent.frames, options.holdout))
+    names = [extent.names[t] for t in train[evenly_spaced(len(train), options.vision_frames)]]
     size = extent.size[1], extent.size[0]
     layout = {"level": options.level, "frames": dict(itertools.zip_longest(extent.names, extent.files))}
     if options.masks is not None and "objects" in running:
-        load_labels(options.masks, train_names, size, **layout, limit=1)
+        load_labels(options.masks, names, size, **layout, limit=1)
     if options.proposals is not None and "objects" in running:
-        load_proposals(options.proposals, train_names, size, **layout).read(0)
+        load_proposals(options.proposals, names, size, **layout).read(0)
     if options.features is not None and "regions" in running:
-        load_features(options.features, train_names[:1], size, **layout)
+        load_features(options.features, names[:1], size, **layout)
 
 
-def fit(options: Options, out: Path, *, listener: Listener | None = None) -> tuple[Gaussians, Capture, Quality]:
+def fit(options: Options, out: Path, *, listener: Console | None = None) -> tuple[Gaussians, Capture, Quality]:
     """Computes the stages of `run` that make and measure the scene, into the same cache, so that a `run` continues."""
     context = _open_context(options, out)
     results = compute_stages(context, stages.fit_stages(context), out / "cache", listener=listener).results

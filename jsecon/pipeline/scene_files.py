@@ -26,24 +26,6 @@ from jsecon.splat.render import render_rgb
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Camera, Capture, Gaussians, Progress
 
-ROUGH_CORRELATION = 0.6
-"""correlation with the frames below which a note says more: a fitted scene has 0.97 in its world, 0.56 a tenth of a
-metre beside it, 0.39 when turned by 20 degrees, and a crude one 0.81 in its world"""
-MIN_CORRELATION = 0.85
-"""Mean correlation with the photographs that identifies the right world. Fitted scenes have 0.8 to 0.97 in their world
-and -0.1 to 0.1 in others."""
-MIN_CRUDE_CORRELATION = 0.3
-"""The same if MIN_CONTRAST holds too. Scenes of one Gaussian per sparse point, not fitted, have 0.40 (fox) and 0.50
-(bonsai) in their world, and up to 0.40 in others."""
-MIN_CORRELATION_FEW_VIEWS = 0.5
-"""The same for fewer than MIN_VIEWS views, whose contrast is not significant."""
-MIN_VIEWS = 6
-MIN_CONTRAST = 4.0
-"""Standard deviations above the correlation with shuffled photographs: 4.2 and 4.9 for these crude scenes in their
-world, up to 3.6 in others (4.0 if shifted by a tenth of the scene's size)."""
-_COLMAP_TO_NERFSTUDIO = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""(x, y, z) to (x, z, -y), which nerfstudio applies first to a COLMAP model that it reads itself."""
-
 
 def read_scene(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
     """Reads a file of Gaussians."""
@@ -67,11 +49,15 @@ class _PhotoSimilarity(NamedTuple):
 
     @property
     def explained(self) -> bool:
-        """Whether the photographs show this scene from these cameras."""
-        if self.views < MIN_VIEWS:
-            return self.correlation >= MIN_CORRELATION_FEW_VIEWS
-        crude = self.correlation >= MIN_CRUDE_CORRELATION and self.contrast >= MIN_CONTRAST
-        return self.correlation >= MIN_CORRELATION or crude
+        """Whether the photographs show this scene from these cameras.
+
+        Fitted scenes have a correlation of 0.8 to 0.97 in their world, and -0.1 to 0.1 in others. Scenes of one
+        Gaussian per sparse point, not fitted, have 0.40 (fox) and 0.50 (bonsai) in theirs, and up to 0.40 in others;
+        but their contrast is 4.2 and 4.9, and up to 3.6 in others (4.0 if shifted by a tenth of the scene's size).
+        """
+        if self.views < 6:  # whose contrast is not significant
+            return self.correlation >= 0.5
+        return self.correlation >= 0.85 or (self.correlation >= 0.3 and self.contrast >= 4.0)
 
 
 class _Placement(NamedTuple):
@@ -141,7 +127,9 @@ def place_in_capture(
                 best = other
     figures = f"correlation with the frames {best.similarity.correlation:.2f}, {best.similarity.psnr:.1f} dB"
     note = f"The Gaussians were read in the world of {best.name} ({figures})."
-    if best.similarity.correlation < ROUGH_CORRELATION:
+    # A fitted scene has 0.97 in its world, 0.56 a tenth of a metre beside it, 0.39 when turned by 20 degrees; a crude
+    # one 0.81 in its world.
+    if best.similarity.correlation < 0.6:
         note += " They show the frames only roughly: the scene is crude, or its world or poses are a bit off."
     if not best.similarity.explained:
         note = (
@@ -227,7 +215,9 @@ def _training_worlds(
                 aligned[:3, 3] = -aligned[:3, :3] @ centre
                 worlds.append(("gsplat", aligned @ plain))
         worlds.append(("gsplat", plain))
-    for before in (np.eye(4), _COLMAP_TO_NERFSTUDIO):
+    # What nerfstudio applies first to a COLMAP model that it reads itself: (x, y, z) to (x, z, -y).
+    from_colmap = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    for before in (np.eye(4), from_colmap):
         turn = _least_turn(before[:3, :3] @ up, np.array([0.0, 0.0, 1.0]))
         places = centres @ (turn @ before[:3, :3]).T
         middle = places.mean(0)

@@ -75,7 +75,7 @@ def require_pycolmap(where: object) -> None:
         raise InputError(where, "photographs without poses need pycolmap, which is not installed", remedy=remedy)
 
 
-def check_photographs(photos: Sequence[Path], where: object) -> list[str]:
+def _check_photographs(photos: Sequence[Path], where: object) -> list[str]:
     """Checks that photographs are enough and have different names; returns these, relative to their common folder."""
     if len(photos) < MIN_PHOTOS:
         remedy = "Take more that overlap by two thirds."
@@ -106,7 +106,7 @@ def find_poses(
       and notes for the user.
     """
     require_pycolmap(where)
-    original = check_photographs(photos, where)
+    original = _check_photographs(photos, where)
     with ThreadPoolExecutor(cores()) as pool:  # reads all pixels: a damaged photograph is an error now
         sizes = [image.shape[1::-1] for image, _ in pool.map(read_image, photos)]
     links: list[str] = []

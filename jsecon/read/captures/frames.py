@@ -60,10 +60,10 @@ class CaptureExtent(NamedTuple):
     """Number of frames."""
     size: tuple[int, int]
     """(width, height) of the frames, px."""
-    names: tuple[str, ...] = ()
-    """Names of the frames; empty if they are not known yet."""
-    files: tuple[ImageFile, ...] = ()
-    """Image of each named frame."""
+    names: tuple[str, ...]
+    """Names of the frames."""
+    files: tuple[ImageFile, ...]
+    """Image of each frame."""
 
 
 @dataclasses.dataclass(frozen=True)

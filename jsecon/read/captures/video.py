@@ -25,15 +25,6 @@ def is_video(path: Path) -> bool:
     return path.suffix.lower() in _SUFFIXES and path.is_file()
 
 
-def video_size(path: Path) -> tuple[int, int]:
-    """Reads (width, height) of a video's frames from its header, px; zeros if OpenCV cannot read it."""
-    reader = cv2.VideoCapture(os.fspath(path))
-    try:
-        return int(reader.get(cv2.CAP_PROP_FRAME_WIDTH)), int(reader.get(cv2.CAP_PROP_FRAME_HEIGHT))
-    finally:
-        reader.release()
-
-
 def write_frames(
     video: Path, folder: Path, *, frames: int | None = None, progress: Progress | None = None
 ) -> list[Path]:
