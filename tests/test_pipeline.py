@@ -59,7 +59,7 @@ def test_a_run_ends_in_a_field_that_can_be_read_and_asked(room_run):
     assert field.names == run.capture.names
     assert field.codes is None
     assert field.votes.overlap.shape == (field.regions.count, field.regions.count)
-    assert len(run.psnr) == run.capture.held_out.sum() == 2
+    assert len(run.held_out.psnr) == run.capture.held_out.sum() == 2
     assert (np.asarray(field.regions.pixel_counts)[:, run.capture.held_out] == 0).all()
     assert (np.asarray(field.regions.pixel_counts)[:, ~run.capture.held_out].sum(1) > 0).all()
     assert set(run.seconds) == {*STAGES, "field"}
@@ -108,7 +108,7 @@ def test_votes_of_a_scene_larger_than_memory_are_cast_in_blocks_to_the_same_fiel
     monkeypatch.setenv("JSECON_MEMORY", "1e-6")
     monkeypatch.setattr(cache, "MAPPED", 1000)  # what is kept of them is mapped, as were it larger
     _, listener = _again(run, tmp_path / "out", paper=True)  # codes are made of them too
-    assert any("votes are cast in blocks: " in note for note in listener.notes)
+    assert any("votes are kept on disk: " in note for note in listener.notes)
     assert {path.suffix for path in (tmp_path / "out" / "cache").iterdir()} == {".TAG", ".safetensors"}
     blocks, memory = (load_field(folder / "field.safetensors").votes for folder in (tmp_path / "out", out))
     np.testing.assert_allclose(blocks.weights, memory.weights, rtol=1e-4, atol=0.02)
@@ -158,7 +158,7 @@ def test_the_same_scene_far_away_in_another_world_and_unit_gives_the_same_answer
     options = dataclasses.replace(given.options, capture=tmp_path / "capture", gaussians=scene)
     there = pipeline.run(options, out)
     assert not [note for note in there.notes if "WARNING" in note]
-    np.testing.assert_allclose(there.psnr, given.psnr, atol=0.1)
+    np.testing.assert_allclose(there.held_out.psnr, given.held_out.psnr, atol=0.1)
     text = next(iter(json.loads((room / "scene.json").read_text())["objects"].values()))
     place = jsecon.locate(given.field, text)
     assert cli.main(["query", str(out / "field.safetensors"), text, "--out", str(out), "--views", "1"]) == 0

@@ -25,9 +25,6 @@ from jsecon.query.render import ALPHA_THRESHOLD, VALA_THRESHOLD, render_selectio
 from jsecon.read.masks.labels import LabelledFrame
 from jsecon.types import Camera, Gaussians, Progress, Selection
 
-LOCALISATION_WINDOW = 0.04
-"""Side of the box filter before the maximum is taken, as a share of the image height: LangSplat's 30 px of 730."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Row:
@@ -53,7 +50,6 @@ def evaluate_at_thresholds(
     select: Callable[[str], Selection | None],
     *,
     alpha_thresholds: tuple[float, ...] = (ALPHA_THRESHOLD, VALA_THRESHOLD),
-    expected_pairs: int | None = None,
     progress: Progress | None = None,
 ) -> dict[float, tuple[list[Row], dict]]:
     """Evaluates selections at several alpha thresholds, from one rendering per pair.
@@ -64,7 +60,6 @@ def evaluate_at_thresholds(
       labels: Labelled frames.
       select: Maps a category to a selection of Gaussians; None, no answer, counts as missing.
       alpha_thresholds: Thresholds of the mask, by default those of OpenGaussian and VALA.
-      expected_pairs: Number of pairs of the protocol, which is checked.
       progress: Called with the number of pairs done and of all.
 
     Returns:
@@ -72,7 +67,9 @@ def evaluate_at_thresholds(
     """
     for frame in labels:
         _check(frame, cameras)
-    pairs = _labelled_pairs(labels, expected_pairs)
+    pairs = [(frame, query) for frame in labels for query in frame.objects]
+    if not pairs:
+        raise InputError("labels", "0 (frame, query) pairs", "at least one", "Give the folder of the label files.")
     answers: dict[str, Selection | None] = {}
     rows: dict[float, list[Row]] = {threshold: [] for threshold in alpha_thresholds}
     for done, (frame, category) in enumerate(pairs, start=1):
@@ -103,15 +100,6 @@ def _summary(rows: Sequence[Row], alpha_threshold: float) -> dict:
         "loc_mask": float(np.mean([row.touched for row in rows])) if rows else float("nan"),
         "loc_box": float(np.mean([row.centred for row in rows])) if rows else float("nan"),
     }
-
-
-def _labelled_pairs(labels: Sequence[LabelledFrame], expected: int | None) -> list[tuple[LabelledFrame, str]]:
-    """All (frame, query) pairs, which must be as many as `expected`."""
-    pairs = [(frame, query) for frame in labels for query in frame.objects]
-    if not pairs or (expected is not None and len(pairs) != expected):
-        remedy = "Evaluate on all label files of the protocol."
-        raise InputError("labels", f"{len(pairs)} (frame, query) pairs", f"{expected or 'at least one'}", remedy)
-    return pairs
 
 
 def _rows(
@@ -145,7 +133,7 @@ def _rows(
 
 def _peak(image: np.ndarray) -> np.ndarray:
     """(H, W) bool the largest pixels of the smoothed image, if they are positive."""
-    window = 2 * round(LOCALISATION_WINDOW * image.shape[0] / 2) + 1
+    window = 2 * round(0.04 * image.shape[0] / 2) + 1  # side of a box filter, px: LangSplat's 30 of 730
     smooth = cv2.blur(image.astype(np.float64), (window, window), borderType=cv2.BORDER_REFLECT_101)
     return (smooth >= smooth.max() * (1 - 1e-6)) & (image.max() > 0)
 
