@@ -171,8 +171,8 @@ def test_a_compressed_ply_is_read(tmp_path, near):
 def test_what_a_trained_world_must_be(tmp_path):
     file = tmp_path / "dataparser_transforms.json"
     for told, says in (
-        ({"scale": 1.0}, "no key 'transform'"),
-        ({"transform": TURN[:3].tolist(), "scale": 0}, "scale = 0"),
+        ({"scale": 1.0}, "'transform' is missing"),
+        ({"transform": TURN[:3].tolist(), "scale": 0}, "scale is 0"),
         ({"transform": (2 * TURN[:3]).tolist(), "scale": 1.0}, "not rigid"),
         ({"transform": [[1, 2]], "scale": 1.0}, "shape (1, 2)"),
     ):
