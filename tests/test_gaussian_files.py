@@ -114,19 +114,13 @@ def test_a_spz_holds_harmonics_of_every_degree(tmp_path, basis):
     assert basis == 9 or psnr(found, gaussians(given)) > 35
 
 
-def test_a_spz_of_a_wide_scene_of_sure_opacities_and_of_nothing(tmp_path):
-    wide = scene(50, 1) | {"opacity_logits": np.repeat([-np.inf, np.inf], 25)}
-    wide["means"] *= 1e4
-    save_gaussians(tmp_path / "a.spz", gaussians(wide))
-    found = load_gaussians(tmp_path / "a.spz")
-    np.testing.assert_allclose(found.means, wide["means"], atol=5e4 / 2**22)
-    alpha = opacity({"opacity_logits": np.asarray(found.opacity_logits)})
+def test_a_spz_of_sure_opacities_and_of_nothing(tmp_path):
+    sure = scene(50, 1) | {"opacity_logits": np.repeat([-np.inf, np.inf], 25)}
+    save_gaussians(tmp_path / "a.spz", gaussians(sure))
+    alpha = opacity({"opacity_logits": np.asarray(load_gaussians(tmp_path / "a.spz").opacity_logits)})
     np.testing.assert_allclose(alpha, [0] * 25 + [1] * 25, atol=2e-6)
     with refused("none.spz", "no Gaussians to write"):
         save_gaussians(tmp_path / "none.spz", gaussians(scene(0, 1)))
-    wide["means"] *= 1e4
-    with refused("a.spz", "units from the origin"):
-        save_gaussians(tmp_path / "a.spz", gaussians(wide))
 
 
 def test_too_few_chunks_of_a_compressed_ply_and_a_short_codebook_of_a_sog(tmp_path):

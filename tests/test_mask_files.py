@@ -128,16 +128,6 @@ def test_langsplat_levels(tmp_path, level):
     assert len(notes) == 1
 
 
-def test_langsplat_ids_are_a_frames_own(tmp_path):
-    """Id 0 of one frame is not id 0 of another."""
-    for name in NAMES:
-        np.save(tmp_path / f"{name}_s.npy", np.tile(np.float32([0, 1, -1]), (4, 12, 6)))
-    labels, ids, notes = load_labels(tmp_path, NAMES, SIZE)
-    np.testing.assert_array_equal(labels[:, 0, :3], [[0, 1, -1], [2, 3, -1], [4, 5, -1]])
-    assert ids == (0, 1, 0, 1, 0, 1)
-    assert "regions of their own" in notes[0]
-
-
 def test_langsplat_misfits(tmp_path):
     path = tmp_path / "b_s.npy"
     np.save(path, np.zeros((3, *SIZE)))

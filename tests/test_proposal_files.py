@@ -72,16 +72,6 @@ def test_masks_of_single_frames_are_regions_of_their_own(tmp_path, masks):
     assert any("regions of their own" in note for note in notes)
 
 
-def test_masks_of_larger_frames_are_resized_and_others_refused(tmp_path, masks):
-    large = masks.repeat(2, 1).repeat(2, 2)
-    (tmp_path / "a.json").write_text(json.dumps(records(large)))
-    read, _ = load_proposals(tmp_path, ("a",), SIZE)
-    np.testing.assert_array_equal(read(0), masks)
-    read, _ = load_proposals(tmp_path, ("a",), (20, 20))
-    with pytest.raises(InputError, match="60x40"):
-        read(0)
-
-
 @pytest.mark.parametrize(("content", "words"), [
     ("[{", "not JSON"), ('[{"bbox": [1, 2, 3, 4]}]', "'segmentation' is missing"),
     ('{"info": 1}', "'annotations' is missing"), ('[{"segmentation": [[1, 2, 3, 4]]}]', "mask 0"),
@@ -93,13 +83,6 @@ def test_damaged_json_is_named(tmp_path, content, words):
     with pytest.raises(InputError, match=words) as caught:
         read(0)
     assert caught.value.where.startswith(str(tmp_path / "a.json"))
-
-
-def test_folders_without_masks_are_refused(tmp_path):
-    with pytest.raises(InputError, match="it holds 0 masks"):
-        load_proposals(tmp_path, ("a",), SIZE)
-    with pytest.raises(InputError, match="no such folder"):
-        load_proposals(tmp_path / "nowhere", ("a",), SIZE)
 
 
 def runs_of(mask) -> list[int]:

@@ -10,12 +10,9 @@ from fuzz_readers import READERS, Case
 from splat_files import scene
 
 from jsecon import Gaussians, InputError, load_capture, load_gaussians
-from jsecon.read.captures import capture as captures
 from jsecon.read.captures.images import image_header
-from jsecon.read.masks import masks
 from jsecon.read.masks.masks import load_labels, load_proposals
 from jsecon.read.registry import Reader
-from jsecon.read.splats import files as splats
 
 FILE_READERS = (
     *("ply", "splats", "points", "colmap", "colmap_text", "nerfstudio", "rgbd", "image", "masks", "langsplat"),
@@ -48,23 +45,6 @@ def test_an_empty_file_is_one_clear_error_or_nothing(tmp_path, name):
                 assert error.remedy, file  # noqa: PT017
                 assert len(str(error)) < 700  # noqa: PT017
             file.write_bytes(intact)
-
-
-def test_every_row_has_a_name_marks_and_a_function():
-    for reader in (*captures.READERS, *masks.READERS, *splats.READERS):
-        assert reader.name
-        assert reader.marks
-        assert callable(reader.read)
-        is_file = [mark.startswith((".", "_")) for mark in reader.marks]
-        assert all(is_file) or not any(is_file)
-
-
-def test_the_preferred_row_of_a_folder_of_two_formats_is_read(tmp_path):
-    capture = small_capture()
-    write_transforms(capture, tmp_path)
-    (tmp_path / "rgb").mkdir()
-    (tmp_path / "metadata.json").write_text("{}")
-    assert load_capture(tmp_path).names == capture.names
 
 
 PLUGIN = """

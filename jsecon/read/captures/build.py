@@ -36,7 +36,7 @@ from jsecon.read.captures.frames import (
     make_rigid,
     transform_poses,
 )
-from jsecon.read.captures.images import TRANSPOSED, ImageHeader, apply_orientation, image_header, read_depth, read_image
+from jsecon.read.captures.images import ImageHeader, image_header, read_depth, read_image
 from jsecon.read.captures.lens import Lens, resample_depth, undistorted_pinhole, undistortion_maps
 from jsecon.types import Camera, Capture, ImageFile, Progress
 
@@ -224,8 +224,6 @@ def _read_depth(
     lens, depth = frame.lens, read_depth(file, frame.posed.depth_unit * unit)
     if frame.posed.depth_lens is not None:
         depth = resample_depth(depth, frame.posed.depth_lens, lens)
-    elif not _fits(lens, *depth.shape[1::-1]) and frame.orientation in TRANSPOSED:
-        depth = apply_orientation(depth, frame.orientation)  # measured like the stored pixels
     if abs(depth.shape[1] * lens.height / depth.shape[0] - lens.width) > 1:
         problem = f"the depth map is {depth.shape[1]}x{depth.shape[0]}"
         expected = f"the aspect of its image, {lens.width}x{lens.height}"

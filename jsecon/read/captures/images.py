@@ -170,12 +170,6 @@ class ImageHeader(NamedTuple):
         width, height = self.stored
         return (height, width) if self.orientation in TRANSPOSED else (width, height)
 
-    def closest_to_centre(self, cx: object, cy: object) -> tuple[int, int]:
-        """Chooses the size, stored or upright, whose middle is nearer to a principal point, px; upright if unknown."""
-        if not isinstance(cx, int | float) or not isinstance(cy, int | float):
-            return self.upright
-        return min(self.upright, self.stored, key=lambda size: abs(2 * cx - size[0]) + abs(2 * cy - size[1]))
-
 
 def image_header(path: str | Path) -> ImageHeader:
     """Reads size and orientation of an image file, from its header alone."""

@@ -131,7 +131,7 @@ def _lens(file: Path, keys: dict[str, Any], name: str, image: Path | None) -> Le
     if keys.get("w") is not None and keys.get("h") is not None:
         width, height = (round(_number(keys, key, 0.0)) for key in ("w", "h"))
     elif image is not None:
-        width, height = image_header(image).closest_to_centre(keys.get("cx"), keys.get("cy"))
+        width, height = image_header(image).upright
     else:
         return None
     fx, fy = _focal(keys, "fl_x", "camera_angle_x", width), _focal(keys, "fl_y", "camera_angle_y", height)

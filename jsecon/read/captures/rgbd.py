@@ -197,26 +197,13 @@ def _read_polycam(path: Path) -> PosedImages:
         if file.is_file():
             with _parsing(file):
                 camera = parse_json(file.read_bytes())
-                size = _polycam_size(camera, _sibling(frames / "cameras", image.stem, ".json"), image)
+                # Recent corrected_cameras/ have no sizes.
+                size = (camera["width"], camera["height"]) if "width" in camera else image_header(image).upright
                 lens = _lens(*size, *(camera[name] for name in ("fx", "fy", "cx", "cy")))
                 rows = [[camera[f"t_{i}{j}"] for j in range(4)] for i in range(3)]
                 pose = np.array([*rows, [0, 0, 0, 1]], np.float64) @ _PHONE_AXES
             posed.append(_posed_image(image, lens, pose, _sibling(frames / "depth", image.stem, ".png")))
     return _posed_images(path, posed, len(images))
-
-
-def _polycam_size(camera: Any, uncorrected: Path, image: Path) -> tuple[Any, Any]:
-    """(width, height) that a camera's intrinsics are for.
-
-    That is the size in its file, or in that of the uncorrected camera, or else the image's. Recent corrected_cameras/
-    have no sizes, and images can be smaller than their intrinsics say.
-    """
-    if "width" in camera and "height" in camera:
-        return camera["width"], camera["height"]
-    size = image_header(image).closest_to_centre(camera.get("cx"), camera.get("cy"))
-    before = parse_json(uncorrected.read_bytes()) if uncorrected.is_file() else {}
-    width, height = before.get("width", size[0]), before.get("height", size[1])
-    return (width, height) if abs(width * size[1] - height * size[0]) <= max(width, height) else size
 
 
 def _read_record3d(path: Path) -> PosedImages:

@@ -249,8 +249,6 @@ def _fields(glb: _Glb, primitive: Any) -> dict[str, np.ndarray]:
         expected = "all of degree 0, and of each higher degree up to 3 all or none of them"
         raise glb.error(f"it has {count} coefficients of harmonics", expected)
     names = {kind: f"{_EXTENSION}:{kind.upper()}" for kind in ("rotation", "scale", "opacity")} | {"means": "POSITION"}
-    if missing := [name for name in names.values() if name not in accessors]:
-        raise glb.error(f"its Gaussians have no attribute {', '.join(missing)}")
     columns = {name: _column(glb, name, accessors[name]) for name in (*names.values(), *harmonics[:count])}
     rows = len(columns["POSITION"])
     sizes = {names["rotation"]: 4, names["opacity"]: 1}
