@@ -151,46 +151,21 @@ def _whole_capture(found) -> None:
 
 
 def colmap(folder: Path) -> Iterator[Case]:
-    """A model in binary, read with its images."""
+    """Models in binary and in text, read with their images: test_colmap.py has the other lenses."""
     capture = small_capture(3, points=12)
-    for kind, number, more in (
-        ("pinhole", 1, ()),
-        ("opencv", 4, (0.01, 0.002, 0.001, 0.0)),
-        ("fisheye", 5, (0.01, 0.002, 0, 0)),
-    ):
-        write_colmap(capture, folder / kind)
-        model = folder / kind / "sparse" / "0"
-        if more:
-            lens = np.array([20.0, 21.0, 11.75, 8.5, *more], "<f8")
-            cameras = b"".join(
-                np.array([n, number], "<i4").tobytes() + np.array([24, 16], "<u8").tobytes() + lens.tobytes()
-                for n in (1, 2)
-            )
-            (model / "cameras.bin").write_bytes(np.array(2, "<u8").tobytes() + cameras)
-        tracks = b"".join(
-            (model / "points3D.bin").read_bytes()[8 + 51 * n : 51 + 51 * n] + np.array(2, "<u8").tobytes() + bytes(16)
-            for n in range(12)
-        )
-        (model / "points3D.bin").write_bytes(np.array(12, "<u8").tobytes() + tracks)
-        yield Case(sorted(model.iterdir()), lambda kind=kind: load_capture(folder / kind, holdout=2), _whole_capture)
-
-
-def colmap_text(folder: Path) -> Iterator[Case]:
-    """A model in text, read with its images."""
-    capture = small_capture(3, points=12)
-    lenses = {
-        "pinhole": None,
-        "opencv": ["1 OPENCV 24 16 20 21 11.5 8.5 0.01 0.002 0.001 0"],
-        "radial": ["1 RADIAL_FISHEYE 48 32 40 23 16 0.01 0.001"],
-    }
-    for name, lens in lenses.items():
-        write_images(capture, folder / name / "images")
-        write_text_model(capture, folder / name / "sparse" / "0", lens)
-        yield Case(
-            sorted((folder / name / "sparse" / "0").iterdir()),
-            lambda name=name: load_capture(folder / name),
-            _whole_capture,
-        )
+    write_colmap(capture, folder / "binary")
+    model = folder / "binary" / "sparse" / "0"
+    lens = np.array([20.0, 21.0, 11.75, 8.5, 0.01, 0.002, 0.001, 0.0], "<f8").tobytes()
+    cameras = b"".join(np.array([n, 4], "<i4").tobytes() + np.array([24, 16], "<u8").tobytes() + lens for n in (1, 2))
+    (model / "cameras.bin").write_bytes(np.array(2, "<u8").tobytes() + cameras)
+    data, track = (model / "points3D.bin").read_bytes(), np.array(2, "<u8").tobytes() + bytes(16)
+    tracks = b"".join(data[8 + 51 * n : 51 + 51 * n] + track for n in range(12))
+    (model / "points3D.bin").write_bytes(np.array(12, "<u8").tobytes() + tracks)
+    write_images(capture, folder / "text" / "images")
+    write_text_model(capture, folder / "text" / "sparse" / "0", ["1 RADIAL_FISHEYE 48 32 40 23 16 0.01 0.001"])
+    for kind in ("binary", "text"):
+        files = sorted((folder / kind / "sparse" / "0").iterdir())
+        yield Case(files, lambda kind=kind: load_capture(folder / kind, holdout=2), _whole_capture)
 
 
 def nerfstudio(folder: Path) -> Iterator[Case]:
@@ -198,7 +173,6 @@ def nerfstudio(folder: Path) -> Iterator[Case]:
     capture = small_capture(3)
     for name, more in {
         "plain": {},
-        "distorted": {"camera_model": "OPENCV", "k1": 0.01, "k2": 0.001, "p1": 0.001, "p2": 0.0},
         "fisheye": {"camera_model": "OPENCV_FISHEYE", "k1": 0.01, "k2": 0.001},
         "deep": {
             "ply_file_path": "cloud.ply",
@@ -613,7 +587,7 @@ def videos(folder: Path) -> Iterator[Case]:
 READERS: dict[str, Callable[[Path], Iterator[Case]]] = {
     own.__name__: own
     for own in (
-        *(ply, splats, points, colmap, colmap_text, nerfstudio, rgbd, image, masks, langsplat, proposals, labels),
+        *(ply, splats, points, colmap, nerfstudio, rgbd, image, masks, langsplat, proposals, labels),
         *(field, kept, tokenizer, clip, siglip, sam, sam2, videos),
     )
 }

@@ -205,20 +205,16 @@ def test_damaged_png_missing_file_and_no_image(tmp_path):
 def test_label_bits(tmp_path, bits):
     ids = RNG.integers(0, 2**bits, (9, 11))
     (tmp_path / "grey.png").write_bytes(png(ids, bits=bits, colour_type=0))
-    read, coloured = read_label_image(tmp_path / "grey.png")
-    np.testing.assert_array_equal(read, ids)
-    assert not coloured
+    np.testing.assert_array_equal(read_label_image(tmp_path / "grey.png"), ids)
     if bits <= 8:
         palette = RNG.integers(0, 256, 3 * 2**bits, np.uint8).tobytes()
         (tmp_path / "palette.png").write_bytes(png(ids, bits=bits, colour_type=3, palette=palette))
-        np.testing.assert_array_equal(read_label_image(tmp_path / "palette.png")[0], ids)
+        np.testing.assert_array_equal(read_label_image(tmp_path / "palette.png"), ids)
 
 
 def test_label_colours_and_refusals(tmp_path):
     write_image(tmp_path / "a.png", FRAME)
-    ids, coloured = read_label_image(tmp_path / "a.png")
-    assert coloured
-    np.testing.assert_array_equal(ids, FRAME.astype(int) @ [65536, 256, 1])
+    np.testing.assert_array_equal(read_label_image(tmp_path / "a.png"), FRAME.astype(int) @ [65536, 256, 1])
     cv2.imwrite(str(tmp_path / "four.png"), np.dstack([FRAME, FRAME[..., 0]]))
     with refused("four.png", "half transparent"):
         read_label_image(tmp_path / "four.png")
@@ -235,11 +231,11 @@ def test_label_transparency(tmp_path):
     opaque = np.where(np.arange(17) < 5, 0, 255).astype(np.uint8) * np.ones((13, 1), np.uint8)
     cv2.imwrite(str(tmp_path / "a.png"), np.dstack([FRAME[..., ::-1], opaque]))
     expected = np.where(opaque > 0, FRAME.astype(int) @ [65536, 256, 1], 0)
-    np.testing.assert_array_equal(read_label_image(tmp_path / "a.png")[0], expected)
+    np.testing.assert_array_equal(read_label_image(tmp_path / "a.png"), expected)
     cv2.imwrite(str(tmp_path / "b.png"), np.dstack([FRAME * 0, opaque]))
-    np.testing.assert_array_equal(read_label_image(tmp_path / "b.png")[0], opaque > 0)
+    np.testing.assert_array_equal(read_label_image(tmp_path / "b.png"), opaque > 0)
     PIL.Image.fromarray(np.stack([FRAME[..., 0], opaque], -1), "LA").save(tmp_path / "c.png")
-    np.testing.assert_array_equal(read_label_image(tmp_path / "c.png")[0], np.where(opaque > 0, FRAME[..., 0], 0))
+    np.testing.assert_array_equal(read_label_image(tmp_path / "c.png"), np.where(opaque > 0, FRAME[..., 0], 0))
 
 
 @pytest.mark.parametrize("dtype", [bool, np.uint8, np.int32, np.int64, np.float32])
@@ -247,7 +243,7 @@ def test_label_arrays(tmp_path, dtype):
     ids = RNG.integers(0, 2 if dtype is bool else 200, (9, 11)).astype(dtype)
     for shape in (ids, ids[None], ids[..., None]):
         np.save(tmp_path / "a.npy", shape)
-        np.testing.assert_array_equal(read_label_image(tmp_path / "a.npy")[0], ids)
+        np.testing.assert_array_equal(read_label_image(tmp_path / "a.npy"), ids)
     for wrong, words in ((np.zeros((3, 9, 11)), "shape"), (ids + 0.5, "not ids"), (ids[0], "shape")):
         np.save(tmp_path / "a.npy", wrong)
         with refused("a.npy", words):

@@ -188,9 +188,6 @@ def test_arrays_of_ids(tmp_path):
     np.testing.assert_array_equal(labels, [image, image - 1])
     assert ids == (0, 1, 2, 3, 4)
     assert "negative" in notes[0]
-    np.save(tmp_path / "a.npy", np.zeros((3, *SIZE), bool))
-    with refused("a.npy", "shape (3, 12, 16)"):
-        load_labels(tmp_path, ("a", "b"), SIZE)
 
 
 def test_masks_of_stored_pixels_are_turned_like_their_photographs(tmp_path):

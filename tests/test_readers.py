@@ -15,7 +15,7 @@ from jsecon.read.masks.masks import load_labels, load_proposals
 from jsecon.read.registry import Reader
 
 FILE_READERS = (
-    *("ply", "splats", "points", "colmap", "colmap_text", "nerfstudio", "rgbd", "image", "masks", "langsplat"),
+    *("ply", "splats", "points", "colmap", "nerfstudio", "rgbd", "image", "masks", "langsplat"),
     *("proposals", "labels", "videos"),
 )
 ODD_NAME = "Gr\xf6\xdfe [1] * 50%, \u6e2c\u8a66 'x'"

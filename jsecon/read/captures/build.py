@@ -40,8 +40,6 @@ from jsecon.read.captures.images import ImageHeader, image_header, read_depth, r
 from jsecon.read.captures.lens import Lens, resample_depth, undistorted_pinhole, undistortion_maps
 from jsecon.types import Camera, Capture, ImageFile, Progress
 
-_MIN_FOCAL = 1e-3
-"""px: smaller focal lengths are errors"""
 _MAX_IN_MEMORY = 1 << 30
 """bytes of frames that stay in memory; more go to a temporary file"""
 _UNIT_STEP = 1000.0
@@ -140,7 +138,7 @@ def _lens_at_size(image: PosedImage, width: int, height: int) -> Lens:
     """The lens of an image at the size that it is read at."""
     lens = _lens_of(image)
     numbers = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
-    if not is_finite_and_bounded(numbers) or min(lens.fx, lens.fy) < _MIN_FOCAL:
+    if not is_finite_and_bounded(numbers) or min(lens.fx, lens.fy) < 1e-3:
         problem = f"its camera has focal lengths {lens.fx:g}, {lens.fy:g}, centre {lens.cx:g}, {lens.cy:g}"
         problem += f" and distortion {lens.distortion}"
         raise InputError(image.image, problem, "finite pixels", "Estimate the cameras again.")

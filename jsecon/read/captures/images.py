@@ -27,8 +27,8 @@ from PIL.WebPImagePlugin import WebPImageFile
 from jsecon.errors import InputError, describe_error
 from jsecon.files import atomic_write, map_npy, reading
 
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif")
-IMAGE_SUFFIXES = (*_SUFFIXES, *(suffix.upper() for suffix in _SUFFIXES))
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif")
+IMAGE_SUFFIXES += tuple(suffix.upper() for suffix in IMAGE_SUFFIXES)
 """suffixes tried, in this order, if a capture names an image without one"""
 MAX_PIXELS = 1 << 27
 """pixels of an image: 134 million"""
@@ -218,8 +218,8 @@ def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"] | UInt[np.nd
         temporary.write_bytes(data.tobytes())
 
 
-def read_label_image(path: str | Path) -> tuple[Int[np.ndarray, "h w"], bool]:
-    """Reads the ids of a label image (.png or .npy), and whether they are colours.
+def read_label_image(path: str | Path) -> Int[np.ndarray, "h w"]:
+    """Reads the ids of a label image (.png or .npy).
 
     A grey PNG of 1 to 16 bits has its values as ids; a palette PNG the indices into it, never its colours; an RGB PNG
     of 8 bits R*65536 + G*256 + B. Fully transparent pixels are 0; if all colours are black, the opaque pixels are the
@@ -227,7 +227,7 @@ def read_label_image(path: str | Path) -> tuple[Int[np.ndarray, "h w"], bool]:
     """
     path = Path(path)
     if path.suffix.lower() == ".npy":
-        return _read_id_array(path), False
+        return _read_id_array(path)
     expected = "ids as grey values (8 or 16 bits), palette indices or 8 bit colours"
     remedy = "Write one id per pixel as an 8 or 16 bit grey PNG without transparency, or as integers in a .npy."
     image, decoder = _decode(path, native=True)
@@ -237,19 +237,18 @@ def read_label_image(path: str | Path) -> tuple[Int[np.ndarray, "h w"], bool]:
     if image.ndim == 2:
         ids = image.astype(np.int32)
         is_stretched = decoder.mode == "L"  # Pillow stretches 2 and 4 bits
-        return ids // (255 // (2**bits - 1)) if is_stretched else ids, False
+        return ids // (255 // (2**bits - 1)) if is_stretched else ids
     if bits > 8:
         raise InputError(path, f"the mask has {bits} bits in each of its channels", expected, remedy)
-    is_grey = image.shape[2] == 2
     colours = image.astype(np.int32)
-    ids = colours[..., 0] if is_grey else colours[..., :3] @ np.array([65536, 256, 1], np.int32)
+    ids = colours[..., 0] if image.shape[2] == 2 else colours[..., :3] @ np.array([65536, 256, 1], np.int32)
     if image.shape[2] in (2, 4):
         alpha = image[..., -1]
         opaque = alpha == 255
         if not (opaque | (alpha == 0)).all():
             raise InputError(path, "the mask has half transparent pixels", expected, remedy)
         ids = np.where(opaque, ids, 0) if ids.any() else opaque.astype(np.int32)
-    return ids, not is_grey
+    return ids
 
 
 def _read_id_array(path: Path) -> Int[np.ndarray, "h w"]:

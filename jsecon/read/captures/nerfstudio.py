@@ -24,8 +24,6 @@ from jsecon.read.splats.ply import load_point_cloud
 
 _PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE"}
 _FISHEYE = {"OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
-_OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular")
-"""keys of instant-ngp's lenses that are neither perspective nor OpenCV's fisheye"""
 _REMEDY = "Write the file anew (ns-process-data, colmap2nerf.py)."
 
 
@@ -124,7 +122,7 @@ def _lens(file: Path, keys: dict[str, Any], name: str, image: Path | None) -> Le
     if model not in _PERSPECTIVE | _FISHEYE:
         known = ", ".join(sorted(_PERSPECTIVE | _FISHEYE))
         raise InputError(file, f"camera_model {model}", f"one of {known}", undistort)
-    if other := next((key for key in _OTHER_LENSES if keys.get(key)), None):
+    if other := next((key for key in ("ftheta_p0", "latlong", "equirectangular") if keys.get(key)), None):
         problem = f"the lens of {name} is one of instant-ngp's own ({other})"
         raise InputError(file, problem, "a perspective or an OpenCV fisheye lens", undistort)
     is_fisheye = model in _FISHEYE or keys.get("is_fisheye") is True

@@ -30,8 +30,6 @@ _TUM_INTRINSICS = {
     "3": (535.4, 539.2, 320.1, 247.6),
 }
 """fx fy cx cy k1 k2 p1 p2 k3 of the benchmark's cameras freiburg1 to 3, the centre of the first pixel at (0, 0)"""
-_MAX_GAP = 0.02
-"""seconds between an image and its pose or depth"""
 _PHONE_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 _EXPORT = "Export the capture again."
 _parsing = functools.partial(reading, remedy=_EXPORT)
@@ -127,11 +125,11 @@ def _read_tum_list(file: Path) -> tuple[np.ndarray, list[Path]]:
 
 
 def _nearest_times(times: np.ndarray, queries: np.ndarray) -> np.ndarray:
-    """(Q,) index of the time nearest to each query; -1 if it is more than _MAX_GAP away."""
+    """(Q,) index of the time nearest to each query; -1 if it is more than 20 ms away."""
     if not len(times):
         return np.full(len(queries), -1)
     gap, index = KDTree(times[:, None]).query(queries[:, None])
-    return np.where(gap <= _MAX_GAP, index, -1)
+    return np.where(gap <= 0.02, index, -1)
 
 
 def _read_tum(path: Path) -> PosedImages:

@@ -15,14 +15,14 @@ from jsecon.errors import InputError
 from jsecon.files import atomic_write
 from jsecon.types import Progress
 
-_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".3gp")
 DEFAULT_VIDEO_FRAMES = 150
 """frames taken by default: two or three rounds about a table top"""
 
 
 def is_video(path: Path) -> bool:
     """Whether a path is a file with the suffix of a video."""
-    return path.suffix.lower() in _SUFFIXES and path.is_file()
+    suffixes = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".3gp")
+    return path.suffix.lower() in suffixes and path.is_file()
 
 
 def write_frames(

@@ -55,7 +55,7 @@ def _read_level(path: Path, level: str) -> Int[np.ndarray, "h w"]:
 
 def _read_ids(path: Path, size: tuple[int, int], level: str) -> np.ndarray:
     """The ids of a .png or .npy."""
-    return read_label_image(path)[0]
+    return read_label_image(path)
 
 
 def _read_langsplat(path: Path, size: tuple[int, int], level: str) -> list[np.ndarray]:
@@ -232,7 +232,7 @@ class _Source:
 
     def _object(self, path: Path, name: str) -> np.ndarray:
         """(H, W) mask of one object."""
-        image = self.fit(path, read_label_image(path)[0], name)
+        image = self.fit(path, read_label_image(path), name)
         if len(values := np.unique(image[image > 0])) > 1:
             objects = ", ".join(self.objects[:4])
             problem = f"the mask has {len(values)} values besides 0, but the folders {objects} hold objects"

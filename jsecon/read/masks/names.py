@@ -24,8 +24,6 @@ from jsecon.types import ImageFile
 _WORD = r"masks?|seg|segs|segmentations?|labels?|ids?|instances?|objects?|annotations?"
 _AFFIX = re.compile(rf"(?:(?:{_WORD})[_.-])?(.+?)(?:[_.-](?:{_WORD}))?", re.IGNORECASE)
 """a frame's name within that of its mask"""
-_UNSUPPORTED = (*IMAGE_SUFFIXES, ".npz", ".gif", ".exr")
-"""suffixes of files that may be meant as masks and are not read as such"""
 
 AllFrames: TypeAlias = Mapping[str, ImageFile | None]
 """all frames of a capture in order, by name, each with its image or None"""
@@ -148,8 +146,9 @@ def find_masks(folder: Path, frames: AllFrames, readers: Sequence[Reader]) -> Ma
         else:
             unmatched[reader].append(path)
     if not matched:
+        image_suffixes = (*IMAGE_SUFFIXES, ".npz", ".gif", ".exr")  # may be meant as masks
         for path, folders in others:
-            if path.suffix.lower() in _UNSUPPORTED and frame_names.match(path, folders, path.suffix) is not None:
+            if path.suffix.lower() in image_suffixes and frame_names.match(path, folders, path.suffix) is not None:
                 raise _unsupported(path)
         count = sum(map(len, unmatched.values()))
         problem = f"it holds {count} masks{', none of which is called like a frame' if count else ''}"

@@ -40,17 +40,6 @@ read."""
 _AGAIN = "Export it again, or as an uncompressed .ply."
 _SPZ_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 """from a .ply's x right, y down, z forward to .spz's x right, y up, z back; and back again"""
-_CHUNK_SIZE = 256
-"""Gaussians of a compressed .ply that share bounds"""
-_CHUNK_FIELDS = [
-    (f"{end}_{kind}", "f4")
-    for kinds in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
-    for end in ("min", "max")
-    for kind in kinds
-]
-_VERTEX_FIELDS = [(f"packed_{name}", "u4") for name in ("position", "rotation", "scale", "color")]
-_SPLAT = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
-"""a Gaussian of antimatter15's .splat"""
 
 
 def _import_gsply(path: Path) -> Any:
@@ -173,13 +162,17 @@ def _read_compressed_ply(path: Path, header: Header) -> Gaussians:
     """Reads SuperSplat's compressed .ply (github.com/playcanvas/splat-transform, decompress-ply.ts)."""
     with _decoding(path) as gsply:
         chunk, vertex, *rest = header.elements
-        sh_fields = [(f"f_rest_{n}", "u1") for n in range(len(rest[0].fields) if rest else 0)]
-        fields = [_CHUNK_FIELDS, _VERTEX_FIELDS, *([sh_fields] if rest else [])]
+        bounds = ("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b")
+        fields = [
+            [(f"{end}_{name}", "f4") for names in bounds for end in ("min", "max") for name in names],
+            [(f"packed_{name}", "u4") for name in ("position", "rotation", "scale", "color")],
+            *([(f"f_rest_{n}", "u1") for n in range(len(harmonics.fields))] for harmonics in rest[:1]),
+        ]
         if header.form != "binary_little_endian" or [element.fields for element in header.elements] != fields:
             remedy = f"Run: npx @playcanvas/splat-transform {path.name} plain.ply"
             raise InputError(path, "its elements are not those of SuperSplat 2's compressed .ply", remedy=remedy)
         size = sum(element.count * element.dtype("<").itemsize for element in header.elements)
-        if path.stat().st_size < header.start + size or chunk.count * _CHUNK_SIZE < vertex.count:
+        if path.stat().st_size < header.start + size or chunk.count * 256 < vertex.count:  # 256 share their bounds
             raise EOFError
         if rest and rest[0].count != vertex.count:
             raise ValueError(f"it has {rest[0].count} rows of harmonics for {vertex.count} Gaussians")
@@ -200,10 +193,11 @@ def _read_sog(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
 def _read_splat(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
     """Reads antimatter15's .splat: 32 bytes a Gaussian, degree 0, without a header."""
     data = path.read_bytes()
-    if len(data) % _SPLAT.itemsize:
-        problem = f"it has {len(data)} bytes, which is not a multiple of {_SPLAT.itemsize}, the size of a Gaussian"
+    row = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
+    if len(data) % row.itemsize:
+        problem = f"it has {len(data)} bytes, which is not a multiple of {row.itemsize}, the size of a Gaussian"
         raise InputError(path, problem, remedy="The file is cut short or of another format: export it again.")
-    rows = np.frombuffer(data, _SPLAT)
+    rows = np.frombuffer(data, row)
     half_step = 0.5 / 255
     opacity = np.clip(rows["rgba"][:, 3] / 255, half_step, 1 - half_step)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -19,18 +19,14 @@ from jsecon.errors import InputError, require_shape
 from jsecon.files import atomic_write, reading
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.splat.project import check_gaussians, unusable_rows
-from jsecon.splat.transform import float32_rounding, transform_blocks
+from jsecon.splat.transform import BLOCK_ROWS, float32_rounding, transform_blocks
 from jsecon.types import Array, Gaussians
 
 ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 """format of a .ply -> NumPy's byte order"""
-_TYPE_NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float"}
-_TYPES = {name: kind for kind, old in (_TYPE_NAMES | {"f8": "double"}).items() for name in (old, np.dtype(kind).name)}
+_TYPES = dict(char="i1", uchar="u1", short="i2", ushort="u2", int="i4", uint="u4", float="f4", double="f8")
+_TYPES |= {np.dtype(kind).name: kind for kind in _TYPES.values()}
 """a property's type, by its old name or with its size (uchar, uint8) -> NumPy's"""
-_END = re.compile(rb"[\r\n]end_header[ \t]*(?:\r\n|\n|\r|\Z)")
-"""last line of a header, as Unix, Windows and old Macs end it"""
-_BLOCK = 1 << 18
-"""Gaussians that are converted at a time"""
 _POSITION, _OPACITY, _RGB = ("x", "y", "z"), ("opacity",), ("red", "green", "blue")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALE = ("scale_0", "scale_1", "scale_2")
@@ -78,7 +74,9 @@ class Header:
 
 def _parse_header(path: Path, data: memoryview) -> Header:
     """Parses the header at the start of some bytes."""
-    end = _END.search(data[: 1 << 24]) if data[:3] == b"ply" else None
+    # The last line of a header, as Unix, Windows and old Macs end it.
+    last = rb"[\r\n]end_header[ \t]*(?:\r\n|\n|\r|\Z)"
+    end = re.search(last, data[: 1 << 24]) if data[:3] == b"ply" else None
     if end is None:
         problem = "it has no .ply header" if len(data) else "the file is empty"
         raise _error(path, problem, "a file that starts with 'ply' and a header")
@@ -202,8 +200,8 @@ def read_ply(path: Path) -> Gaussians:
     arrays["means"] = np.empty((count, 3), np.float32 if exact else np.float64)
     arrays["opacity_logits"] = np.empty(count, np.float32)
     arrays["sh"] = np.empty((count, 1 + rest // 3, 3), np.float32)
-    for first in range(0, count, _BLOCK):
-        rows = slice(first, first + _BLOCK)
+    for first in range(0, count, BLOCK_ROWS):
+        rows = slice(first, first + BLOCK_ROWS)
         vertices = table[rows]
         arrays["means"][rows] = _columns(vertices, _POSITION, arrays["means"].dtype.type)
         arrays["log_scales"][rows, 2] = -np.inf
