@@ -102,7 +102,6 @@ EMPTY = "format ascii 1.0\nelement vertex 0"
 
 
 @pytest.mark.parametrize(("header", "said"), [
-    ("format binary_middle_endian 1.0\nelement vertex 0", "binary_middle_endian"),
     ("format ascii 1.0\nelement face 0", "elements are face"),
     ("format ascii 1.0\nelement vertex many", "element vertex many"),
     ("format ascii 1.0\nelement vertex -1\nproperty float x", "element vertex -1"),
