@@ -92,31 +92,23 @@ def read_json_masks(file: Path, size: tuple[int, int]) -> list[Bool[np.ndarray, 
 
 
 def _records(content: Any) -> list[Any]:
-    """The records of a file's masks: a list, or "annotations". Raises ValueError with the problem."""
-    if isinstance(content, dict) and "annotations" not in content:
-        raise ValueError("'annotations' is missing")
-    records = content["annotations"] if isinstance(content, dict) else content
-    if not isinstance(records, list):
-        raise ValueError("it is not a list")
-    for number, record in enumerate(records):
-        if not isinstance(record, dict) or "segmentation" not in record:
-            raise ValueError(f"'segmentation' is missing in record {number}")
-    return records
+    """The records of a file's masks: a list, or "annotations"."""
+    return list(content["annotations"] if isinstance(content, dict) else content)
 
 
 def _decode_records(file: Path, records: list[Any], size: tuple[int, int]) -> list[np.ndarray]:
     """The masks of records, those with the best scores (SAM's stability times predicted IoU) first."""
-    with reading(file, remedy=_REMEDY, problem="a mask's score is not a number"):
+    with reading(file, _JSON, _REMEDY, problem="a mask's score cannot be read"):
         scores = [float(r.get("predicted_iou", 1.0)) * float(r.get("stability_score", 1.0)) for r in records]
     masks = []
     for number in np.argsort(-np.asarray(scores), kind="stable"):
-        segmentation, where = records[number]["segmentation"], f"{file}, mask {number}"
-        if isinstance(segmentation, dict):
-            masks.append(_decode_rle(segmentation, where))
-        elif isinstance(segmentation, list):
-            masks += [_fill_polygons(segmentation, *size, where)] if segmentation else []
-        else:
-            raise InputError(where, f"the mask is {str(segmentation)[:40]!r}", "run lengths or polygons", _REMEDY)
+        where = f"{file}, mask {number}"
+        with reading(where, "run lengths or polygons", _REMEDY, problem="the mask cannot be read"):
+            segmentation = records[number]["segmentation"]
+            if isinstance(segmentation, dict):
+                masks.append(_decode_rle(segmentation, where))
+            elif segmentation != []:
+                masks.append(_fill_polygons(segmentation, *size, where))
     return masks
 
 
