@@ -19,8 +19,7 @@ import numpy as np
 from metrics import Metric, interleaved, show
 
 from jsecon.paper.queries import query_one_step
-from jsecon.query.answer import match_regions, query_anchored
-from jsecon.query.select import select_by_code
+from jsecon.query.answer import match_regions, query_anchored, select_by_code
 from jsecon.types import Camera, Codes, Gaussians, LanguageField, Regions, Votes
 
 REGIONS, TOP, TEXTS, SAMPLE, SIZE = 40, 8, 100, 20_000, 3

@@ -38,7 +38,7 @@ from experiments.words.scenes import DEFAULT, GIVEN, RIVALS, WordScene, load_sce
 from jsecon.field.membership import normalise_votes
 from jsecon.query.answer import match_regions, query_anchored, query_several
 from jsecon.query.classes import query_classes
-from jsecon.query.rules import MIN_COSINE, MIN_RANK, SAME_CLASS_SCORE
+from jsecon.query.rules import MIN_COSINE, MIN_RANK, QueryRules
 from jsecon.query.scores import view_count_weight
 from jsecon.types import LanguageField, Regions, Selection
 from jsecon.vision.unrelated_words import embed_unrelated_words
@@ -125,7 +125,7 @@ def _by_regions(kind: str, way: str) -> Chooser:
         chosen = {
             "best region": lambda: rules.best_of(table),
             "best region by evidence": lambda: rules.best_of(np.where(table > 0, table * weight, table)),
-            "all near": lambda: rules.near_best(table, SAME_CLASS_SCORE),
+            "all near": lambda: rules.near_best(table, QueryRules().same_class_score),
             CLASS_LIST: lambda: rules.best_text(table),
             f"{CLASS_LIST}, standardised": lambda: rules.best_text(rules.standardised(table)),
             f"{CLASS_LIST}, standardised by evidence": lambda: rules.best_text(rules.standardised(table, weight)),

@@ -13,10 +13,12 @@ from table_field import THINGS, table_field
 import jsecon
 from jsecon import InputError, ObjectShapes, Regions, Scene, save_field
 from jsecon.app import cli
-from jsecon.query.relations import PAIRS, Viewpoint, between_scores, gap, order_values, pair_scores
+from jsecon.query.expressions import ANCHORED_ORDERS, RELATIONS
+from jsecon.query.relations import Viewpoint, between_scores, gap, order_values, pair_scores
 
 CORNERS = np.stack(np.meshgrid(*[np.linspace(-1, 1, 3)] * 3), -1).reshape(-1, 3)
 PLACES = st.tuples(*[st.floats(-2, 2, width=32)] * 3)
+PAIRS = [name for name in RELATIONS if name not in ("between", *ANCHORED_ORDERS)]
 SIDES = st.tuples(*[st.floats(0.125, 0.5, width=32)] * 3)
 
 

@@ -15,7 +15,7 @@ from jsecon.app import cli
 from jsecon.field.similarity import similarities
 from jsecon.pipeline import model_loading
 from jsecon.query.rules import MIN_COSINE, MIN_RANK, QueryRules
-from jsecon.query.scores import NEAREST_WORDS, region_similarities, view_count_weight, word_similarities
+from jsecon.query.scores import region_similarities, view_count_weight, word_similarities
 
 SIZE = 12
 
@@ -140,7 +140,7 @@ def exact_quantile(embeddings, text, words):
     """The share of words, without the tenth that is nearest to the text, that are less similar to their best region."""
     rows, words, text = (unit(np.asarray(a, np.float64)) for a in (embeddings, words, text))
     mean = words.mean(0)
-    order = np.argsort(-(unit(words - mean) @ unit(text - mean)), kind="stable")[int(NEAREST_WORDS * len(words)) :]
+    order = np.argsort(-(unit(words - mean) @ unit(text - mean)), kind="stable")[int(0.1 * len(words)) :]
     scores = (unit(words - mean) @ rows.T).max(1)[order]
     return np.mean(scores < (rows @ unit(text - mean)).max())
 

@@ -18,13 +18,12 @@ from jsecon.field.membership import membership_probability, normalise_votes
 from jsecon.field.regions import scene_parts
 from jsecon.paper.autoencoder import train_autoencoder
 from jsecon.paper.distill import distill_l1, distill_votes
-from jsecon.paper.queries import query_canonical, query_one_step
-from jsecon.query.answer import match_regions, query_anchored, query_several
+from jsecon.paper.queries import CODE_THRESHOLD, query_canonical, query_one_step
+from jsecon.query.answer import match_regions, query_anchored, query_several, select_by_code
 from jsecon.query.classes import query_classes
 from jsecon.query.grouping import parts_fallback
 from jsecon.query.outliers import remove_outliers
-from jsecon.query.rules import FRAGMENT_SCORE, QueryRules
-from jsecon.query.select import CODE_THRESHOLD, codes_of, select_by_code
+from jsecon.query.rules import RULES, QueryRules
 from jsecon.types import Codes, LanguageField, Parts, Regions, Selection, Votes
 
 BY_COSINE = {"retrieval": "cosine"}
@@ -139,14 +138,14 @@ def ask_field(
     votes, parts answer where no region does (`parts_fallback`)."""
     means = np.asarray(setting.evidence.gaussians.means)
     field = of_all_views(field) if way == "all_views" else field
-    phrases, codes = jnp.asarray(field.canonical_phrases), codes_of(field)
+    phrases, codes = jnp.asarray(field.canonical_phrases), field.codes
     rules = QueryRules(retrieval=retrieval, min_score=min_score)
     rules = rules if pieces else dataclasses.replace(rules, fragment_score=None)
 
     def ask(k: int) -> Selection:
         text = jnp.asarray(setting.texts[k])
         if way == "all":
-            every = dataclasses.replace(rules, all_of_class=True, fragment_score=FRAGMENT_SCORE)
+            every = dataclasses.replace(rules, all_of_class=True, fragment_score=RULES.fragment_score)
             found = query_several(field, text[None], rules=every)
             return dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, found.mask, keep="all")))
         if way == "one_step":

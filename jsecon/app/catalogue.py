@@ -15,12 +15,15 @@ from scipy.special import softmax
 from jsecon.app.records import gaussian_rows
 from jsecon.errors import InputError
 from jsecon.field.columns import vote_blocks
-from jsecon.field.membership import SHARE_THRESHOLD, membership_probability, vote_shares
-from jsecon.query.grouping import containment, objects_of_gaussians, same_object
+from jsecon.field.membership import SHARE_THRESHOLD, membership_probability, ratio, vote_columns, vote_shares
+from jsecon.field.similarity import similarities
+from jsecon.programs import stored_jit
+from jsecon.query.grouping import MIN_FRAGMENT_OVERLAP, regions_with
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.outliers import MIN_SAMPLES
+from jsecon.query.rules import QueryRules
 from jsecon.splat.transform import transform_gaussians
-from jsecon.types import LanguageField
+from jsecon.types import Array, LanguageField, Votes
 from jsecon.views.frame import field_up
 from jsecon.vision.unrelated_words import UNRELATED_WORDS, embed_unrelated_words
 
@@ -141,7 +144,7 @@ def objects(
 ) -> Catalogue:
     """Lists the objects of a field.
 
-    Regions that show one object are joined by the rules that queries use for pieces and duplicates (`same_object`). So
+    Regions that show one object are joined by the rules that queries use for pieces and duplicates (`regions_with`). So
     are two of like size that look the same, touch, and fill a common box: the ends of a beam whose middle is hidden. An
     object most of which lies in another one's masks is a part of it. Every Gaussian belongs to one whole at most.
 
@@ -263,10 +266,38 @@ def _sizes(field: LanguageField) -> tuple[Float[np.ndarray, " r"], Int[np.ndarra
     return size, np.concatenate(main)
 
 
+@stored_jit
+def _same_object(
+    embeddings: Float[Array, "r e"], overlap: Float[Array, "r r"] | None
+) -> tuple[Bool[Array, "r r"], Bool[Array, "r r"]]:
+    """Finds the pairs of regions that show one object, and those that look as if they did (`duplicate_cosine`).
+
+    A question for either region of the first pairs adds the other, and they overlap; without `Votes.overlap` no two
+    regions are joined. Both relations are symmetric.
+    """
+    count = embeddings.shape[0]
+    itself = jnp.eye(count, dtype=bool)
+    if count == 0:
+        return (itself, itself)
+
+    def matched(rules: QueryRules) -> Array:
+        def with_region(region):
+            cosines, known = similarities(embeddings, embeddings[region])
+            return regions_with(region, cosines, known, embeddings, overlap, rules)
+
+        chosen = jax.vmap(with_region)(jnp.arange(count))
+        return chosen & chosen.T
+
+    alike = itself | matched(QueryRules(fragment_score=None))
+    if overlap is None:
+        return (itself, alike)
+    return (itself | (matched(QueryRules()) & (overlap >= MIN_FRAGMENT_OVERLAP)), alike)
+
+
 def _groups(field: LanguageField, main: np.ndarray, up: np.ndarray) -> Int[np.ndarray, " r"]:
     """Returns the group of each region: those that show one object have the same one."""
     joined, alike = map(
-        np.array, same_object(*jax.tree.map(jnp.asarray, (field.regions.embeddings, field.votes.overlap)))
+        np.array, _same_object(*jax.tree.map(jnp.asarray, (field.regions.embeddings, field.votes.overlap)))
     )
     if not len(joined):
         return np.zeros(0, int)
@@ -309,7 +340,10 @@ def _wholes(
     whole = np.full(len(members), -1)
     if field.votes.overlap is None or not len(groups):
         return whole
-    inside = np.asarray(containment(jnp.asarray(field.votes.overlap), jnp.asarray(size)))
+    # How much of region r lies in region s: sum_n min(p_nr, p_ns) / sum_n p_nr, with p the shares.
+    overlap = np.asarray(field.votes.overlap, np.float64)
+    both = overlap * (size[:, None] + size) / (1 + overlap)
+    inside = both / np.where(size > 0, size, np.inf)[:, None]
     sizes = members @ size
     for group in np.argsort(-sizes, kind="stable"):  # wholes before their parts
         largest = int(np.argmax(np.where(members[group], size, -1)))
@@ -318,6 +352,31 @@ def _wholes(
         if larger[region] and inside[largest, region] >= PART_CONTAINMENT and not surroundings[group]:
             whole[group] = groups[region] if whole[groups[region]] < 0 else whole[groups[region]]
     return whole
+
+
+@stored_jit
+def _objects_of_gaussians(votes: Votes, objects: Int[Array, " r"]) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
+    """Assigns each Gaussian to the object with the largest share in it: (N,) the object, and its share.
+
+    The share is that of all regions of the object together (`inside_fraction`), so a query for exactly these regions
+    selects the same Gaussians, and those that belong to another object even more. -1 is no object: of a region, and of
+    a Gaussian with a share below SHARE_THRESHOLD. Each row stands for itself.
+    """
+    columns = list(vote_columns(votes))
+    owners = [jnp.where(region >= 0, objects[jnp.maximum(region, 0)], -1) for region, _, _ in columns]
+    best_share = jnp.zeros(votes.total.shape, votes.weights.dtype)
+    best = jnp.full(votes.total.shape, -1, jnp.int32)
+    for owner in owners:
+
+        def of_owner(k, combine, owner=owner):
+            return functools.reduce(
+                combine, (jnp.where(other == owner, columns[j][k], 0.0) for j, other in enumerate(owners))
+            )
+
+        share = jnp.nan_to_num(ratio(of_owner(1, jnp.add), of_owner(2, jnp.maximum)))
+        better = (owner >= 0) & (votes.views > 0) & (share > best_share)
+        best, best_share = jnp.where(better, owner, best), jnp.where(better, share, best_share)
+    return jnp.where(best_share >= SHARE_THRESHOLD, best, -1).astype(jnp.int32), best_share
 
 
 def _assign(field: LanguageField, groups: np.ndarray, whole: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -330,8 +389,8 @@ def _assign(field: LanguageField, groups: np.ndarray, whole: np.ndarray) -> tupl
             labels.append(np.full(len(votes.views), -1, np.int32))
             part_labels.append(labels[-1])
             continue
-        top, top_share = objects_of_gaussians(votes, tops)
-        part, part_share = objects_of_gaussians(votes, parts)
+        top, top_share = _objects_of_gaussians(votes, tops)
+        part, part_share = _objects_of_gaussians(votes, parts)
         top, part = np.array(top), np.array(part)
         part[(part >= 0) & (whole[part] != top)] = -1
         for label, share in ((top, top_share), (part, part_share)):

@@ -27,6 +27,7 @@ from jsecon.field.columns import is_mapped
 from jsecon.field.field import check_field, load_field
 from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.field.regions import ALIKE_THRESHOLD
+from jsecon.paper.queries import CODE_THRESHOLD
 from jsecon.pipeline.options import Options, is_bare_scene
 from jsecon.pipeline.progress import Console
 from jsecon.process import MEMORY, memory_budget
@@ -38,13 +39,13 @@ from jsecon.query.answer import (
     answer_texts,
     match_region,
     match_regions,
+    select_by_code,
     trim,
 )
 from jsecon.query.expressions import is_expression, parse_query
 from jsecon.query.pointing import box_mask, lift, region_at
 from jsecon.query.render import selection_mask
 from jsecon.query.rules import ONE_REGION, QueryRules
-from jsecon.query.select import CODE_THRESHOLD, select_by_code
 from jsecon.read.captures.capture import has_depth
 from jsecon.read.captures.images import read_pixels
 from jsecon.read.masks.masks import resize_nearest

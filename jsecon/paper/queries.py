@@ -116,6 +116,7 @@ def query_gt_anchored(
     return Selection(near.mask, near.similarity, region, jnp.where(region >= 0, similarity[best], 0.0))
 
 
+@jax.jit
 def select_near_region(
     codes: Float[Array, "n d"], region_codes: Float[Array, "r d"], region: Array, threshold: Number
 ) -> Selection:

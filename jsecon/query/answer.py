@@ -25,6 +25,7 @@ from jsecon.errors import require
 from jsecon.field.columns import is_mapped, vote_blocks
 from jsecon.field.membership import inside_fraction
 from jsecon.field.similarity import Number, similarities
+from jsecon.paper.queries import CODE_THRESHOLD, select_near_region
 from jsecon.programs import stored_jit
 from jsecon.query.grouping import join_fragments, parts_fallback, regions_with
 from jsecon.query.outliers import OutlierResult, split_outliers
@@ -210,21 +211,35 @@ def select_gaussians(field: LanguageField, match: RegionMatch, rules: QueryRules
     Gaussians that no view sees, or with votes that are not finite, stay out. Mapped votes are read in blocks.
     """
     if field.regions.count == 0:
-        none = jnp.zeros(field.gaussians.count, bool)
-        return Selection(none, none.astype(jnp.float32), *map(jnp.asarray, match[1:5]))
+        return _select_none(field, match)
     if not is_mapped(field.votes):
-        return select_from_votes(jax.tree.map(jnp.asarray, field.votes), match, rules.min_share)
-    parts = [select_from_votes(votes, match, rules.min_share) for votes in vote_blocks(field.votes)]
+        return _select_from_votes(jax.tree.map(jnp.asarray, field.votes), match, rules.min_share)
+    parts = [_select_from_votes(votes, match, rules.min_share) for votes in vote_blocks(field.votes)]
     mask, share = (np.concatenate(column) for column in zip(*((part.mask, part.similarity) for part in parts)))
     return Selection(mask, share, *match[1:])
 
 
 @stored_jit
-def select_from_votes(votes: Votes, match: RegionMatch, min_share: Number) -> Selection:
+def _select_from_votes(votes: Votes, match: RegionMatch, min_share: Number) -> Selection:
     """Selects any Gaussians as `select_gaussians` does: each row of the votes stands for itself. Pure."""
     share, known = inside_fraction(votes, match.chosen)
     mask = known & (share >= min_share) & (match.region >= 0)
     return Selection(mask, share, *match[1:])
+
+
+def _select_none(field: LanguageField, match: RegionMatch) -> Selection:
+    none = jnp.zeros(field.gaussians.count, bool)
+    return Selection(none, none.astype(jnp.float32), *map(jnp.asarray, match[1:5]))
+
+
+def select_by_code(field: LanguageField, match: RegionMatch, threshold: Number = CODE_THRESHOLD) -> Selection:
+    """Selects the Gaussians whose code has at least a cosine with that of the best matched region (the paper). Pure."""
+    codes = field.codes
+    require(codes is not None, "field.codes", None, "codes", "Make the field with jsecon run --paper.")
+    if field.regions.count == 0:
+        return _select_none(field, match)
+    near = select_near_region(jnp.asarray(codes.gaussians), jnp.asarray(codes.regions), match.region, threshold)
+    return Selection(near.mask, near.similarity, *match[1:])
 
 
 def trim(field: LanguageField, selection: Selection, keep: str | None = "supported") -> OutlierResult:

@@ -39,11 +39,8 @@ ANCHORED_ORDERS = ("nearest to", "farthest from")
 MAX_WORDS, MAX_RELATIONS = 60, 2
 """Of an expression."""
 _ORDINALS, _NUMBERS = _WORDS["ordinals"], _WORDS["numbers"]
-_QUOTES = "\"'“”"
 _QUOTED = re.compile(r"""(?<!\S)(?:"([^"]+)"|'(.+?)'|“([^”]+)”)(?=[\s,.?!]|$)""", re.DOTALL)
 """A text in quotes; an apostrophe within a word is not a quote."""
-_JOINED = re.compile(r"\s+(?:(but\s+not)|or)(?=\s)", re.IGNORECASE)
-"""What stands between the texts of a query."""
 _REMEDY = 'For example "the red mug left of the bottle". Words of an object that look like these go in quotes.'
 
 
@@ -57,12 +54,12 @@ def parse_query(query: str) -> tuple[list[str], list[str]]:
     query = query.strip()
     quoted = [match.span() for match in _QUOTED.finditer(query)]
     parts, side, start = ([], []), 0, 0
-    for word in _JOINED.finditer(query):
+    for word in re.finditer(r"\s+(?:(but\s+not)|or)(?=\s)", query, re.IGNORECASE):
         if not any(first < word.start() < last for first, last in quoted):
             parts[side].append(query[start : word.start()])
             side, start = max(side, int(word[1] is not None)), word.end()
     parts[side].append(query[start:])
-    included, excluded = ([part.strip().strip(_QUOTES).strip() for part in texts] for texts in parts)
+    included, excluded = ([part.strip().strip("\"'“”").strip() for part in texts] for texts in parts)
     if not all(included + excluded) or re.match(r"but not\b", query, re.IGNORECASE):
         remedy = 'For example: "red mug" or "bowl" but not "handle"'
         raise InputError(f"query {query!r}", "a part without words", 'texts joined by "or" and "but not"', remedy)

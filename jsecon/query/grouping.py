@@ -23,11 +23,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jsecon.errors import require
-from jsecon.field.membership import SHARE_THRESHOLD, ratio, vote_columns
+from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.field.regions import mean_residuals
 from jsecon.field.similarity import Number, similarities
 from jsecon.numerics import normalize
-from jsecon.programs import stored_jit
 from jsecon.query.outliers import MIN_SAMPLES, dbscan, default_eps
 from jsecon.query.rules import QueryRules
 from jsecon.query.scores import (
@@ -37,7 +36,7 @@ from jsecon.query.scores import (
     unrelated_words,
     word_similarities,
 )
-from jsecon.types import Array, LanguageField, Parts, Selection, Votes
+from jsecon.types import Array, LanguageField, Parts, Selection
 
 MIN_FRAGMENT_OVERLAP = 0.1
 """Smallest soft IoU of the Gaussians of two fragments. In twins of two scenes 106 of 115 pieces reach it, and 4 of 58
@@ -48,8 +47,6 @@ MIN_REGION_RATIO = 0.7
 """A region answers if its similarity is at least this share of that of the best parts. Chosen with PART_SCORE on twins
 of nine scenes, seeds 0 to 2, medium and high noise: regions that show the object have 0.81 and more of it, others 0.51
 and less where the object's parts differ from their surroundings (9 of 468 texts)."""
-_REJECTED_SIMILARITY = 0.25
-"""Largest similarity of a Gaussian whose part matches but lies outside the chosen cluster."""
 
 
 def regions_with(
@@ -97,69 +94,6 @@ def join_fragments(regions: Sequence[int] | np.ndarray, overlap: np.ndarray | No
     return sorted(tuple(sorted(group)) for group in groups)
 
 
-@stored_jit
-def same_object(
-    embeddings: Float[Array, "r e"], overlap: Float[Array, "r r"] | None
-) -> tuple[Bool[Array, "r r"], Bool[Array, "r r"]]:
-    """Finds the pairs of regions that show one object, and those that look as if they did (`duplicate_cosine`).
-
-    A question for either region of the first pairs adds the other, and they overlap; without `Votes.overlap` no two
-    regions are joined. Both relations are symmetric.
-    """
-    count = embeddings.shape[0]
-    itself = jnp.eye(count, dtype=bool)
-    if count == 0:
-        return (itself, itself)
-
-    def matched(rules: QueryRules) -> Array:
-        def with_region(region):
-            cosines, known = similarities(embeddings, embeddings[region])
-            return regions_with(region, cosines, known, embeddings, overlap, rules)
-
-        chosen = jax.vmap(with_region)(jnp.arange(count))
-        return chosen & chosen.T
-
-    alike = itself | matched(QueryRules(fragment_score=None))
-    if overlap is None:
-        return (itself, alike)
-    return (itself | (matched(QueryRules()) & (overlap >= MIN_FRAGMENT_OVERLAP)), alike)
-
-
-@stored_jit
-def containment(overlap: Float[Array, "r r"], size: Float[Array, " r"]) -> Float[Array, "r r"]:
-    """Computes how much of region r lies in region s: sum_n min(p_nr, p_ns) / sum_n p_nr, with p the shares.
-
-    `size` is the sum of each region's shares.
-    """
-    both = overlap * (size[:, None] + size) / (1 + overlap)
-    return jnp.where(size[:, None] > 0, both / jnp.where(size > 0, size, 1.0)[:, None], 0.0)
-
-
-@stored_jit
-def objects_of_gaussians(votes: Votes, objects: Int[Array, " r"]) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
-    """Assigns each Gaussian to the object with the largest share in it: (N,) the object, and its share.
-
-    The share is that of all regions of the object together (`inside_fraction`), so a query for exactly these regions
-    selects the same Gaussians, and those that belong to another object even more. -1 is no object: of a region, and of
-    a Gaussian with a share below SHARE_THRESHOLD. Each row stands for itself.
-    """
-    columns = list(vote_columns(votes))
-    owners = [jnp.where(region >= 0, objects[jnp.maximum(region, 0)], -1) for region, _, _ in columns]
-    best_share = jnp.zeros(votes.total.shape, votes.weights.dtype)
-    best = jnp.full(votes.total.shape, -1, jnp.int32)
-    for owner in owners:
-
-        def of_owner(k, combine, owner=owner):
-            return functools.reduce(
-                combine, (jnp.where(other == owner, columns[j][k], 0.0) for j, other in enumerate(owners))
-            )
-
-        share = jnp.nan_to_num(ratio(of_owner(1, jnp.add), of_owner(2, jnp.maximum)))
-        better = (owner >= 0) & (votes.views > 0) & (share > best_share)
-        best, best_share = jnp.where(better, owner, best), jnp.where(better, share, best_share)
-    return jnp.where(best_share >= SHARE_THRESHOLD, best, -1).astype(jnp.int32), best_share
-
-
 def parts_fallback(
     field: LanguageField, text: Float[Array, " e"], region_score: Float[Array, ""] | float, rules: QueryRules
 ) -> Selection | None:
@@ -185,7 +119,8 @@ def parts_fallback(
     least = float(np.interp(rules.min_share, on_scale, of_scores))
     mask = _best_cluster(scores >= least, scores, field.gaussians.means)
     similarity = np.interp(scores, of_scores, on_scale).astype(np.float32)
-    similarity = np.where(mask | (scores < least), similarity, np.minimum(similarity, _REJECTED_SIMILARITY))
+    # Parts that match but lie outside of the chosen cluster are shown as unlike the text.
+    similarity = np.where(mask | (scores < least), similarity, np.minimum(similarity, 0.25))
     part = np.asarray(parts.part)
 
     def count(rows):

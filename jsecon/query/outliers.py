@@ -21,17 +21,10 @@ EPS_SPACINGS = 6.0
 weakly textured parts leave between splats, and is far below the distance between objects."""
 MIN_SAMPLES = 10
 """Neighbours within eps, itself included, that make a core point; a surface has about 100 within 6 spacings."""
-MIN_CLUSTER_SUPPORT = 0.1
-"""Share of the heaviest cluster's weight from which a cluster is a piece of the object, not an outlier."""
-KEEP = ("largest", "supported", "all")
-"""Which clusters stay: the one with most Gaussians (the paper), those that the views support, or every one."""
 _EXACT_POINTS = 5_000
 """Up to so many points are clustered one by one: their lists of neighbours have at most 25 million entries."""
 _LINKS = 16
 """Nearest neighbours that are tried first to connect all points."""
-_VOXELS_PER_EPS = 3.0
-"""Voxels along eps. A splat lies about half a voxel from the mean of its voxel, so gaps are measured to about a third
-of eps. 4 takes three times as long for a million splats."""
 
 
 class OutlierResult(NamedTuple):
@@ -66,8 +59,8 @@ def remove_outliers(
       mask: (N,) the selected Gaussians.
       weight: (N,) how much the views' masks show of each Gaussian, in pixels. `jsecon query` takes similarity *
         votes.total of the selection; None counts each as 1.
-      keep: "supported" keeps each cluster that has at least MIN_CLUSTER_SUPPORT of the weight of the heaviest: a mask
-        may show one object in several pieces. "largest" keeps the cluster with most Gaussians (the paper). "all" keeps
+      keep: "supported" keeps each cluster that has at least a tenth of the weight of the heaviest: a mask may show one
+        object in several pieces. "largest" keeps the cluster with most Gaussians (the paper). "all" keeps
         every cluster.
       eps: Radius, world units; None takes `default_eps` of the selection, which follows its scale.
 
@@ -89,7 +82,7 @@ def split_outliers(
     eps: float | None = None,
 ) -> OutlierResult:
     """Removes outliers as `remove_outliers` does, and counts the clusters."""
-    require_one_of("remove_outliers", keep, KEEP, "Use 'all' to keep several objects.")
+    require_one_of("remove_outliers", keep, ("largest", "supported", "all"), "Use 'all' to keep several objects.")
     remedy = "Leave eps out to have it follow the selection's spacing."
     require(eps is None or eps > 0, "remove_outliers", f"eps={eps}", "eps > 0", remedy)
     if weight is not None:
@@ -119,7 +112,7 @@ def split_outliers(
     elif keep == "supported":
         support = np.ones(len(chosen)) if weight is None else np.asarray(weight, np.float64)[chosen]
         support = np.bincount(labels[clustered], np.nan_to_num(support[clustered], posinf=0.0))
-        stays = support >= MIN_CLUSTER_SUPPORT * support.max()
+        stays = support >= 0.1 * support.max()
     mask[chosen[~(clustered & stays[labels])]] = False
     return OutlierResult(mask, "", int(stays.sum()), int((~stays).sum()))
 
@@ -184,7 +177,9 @@ def _places(points: np.ndarray, eps: float) -> tuple[np.ndarray, Int[np.ndarray,
     """The points, or the means of the voxels of many; the place of each point, and how many points each has."""
     if len(points) <= _EXACT_POINTS:
         return points, np.arange(len(points)), np.ones(len(points), int)
-    voxel, count = _voxels(points, eps / _VOXELS_PER_EPS)
+    # A splat lies about half a voxel from the mean of its voxel, so gaps are measured to about a third of eps. 4 voxels
+    # along eps take three times as long for a million splats.
+    voxel, count = _voxels(points, eps / 3.0)
     sums = [np.bincount(voxel, axis) for axis in points.T]
     return np.stack(sums, axis=1) / count[:, None], voxel, count
 

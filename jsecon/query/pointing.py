@@ -78,7 +78,7 @@ def region_shares_seen(field: LanguageField, camera: Camera, x: int, y: int) -> 
     return shares
 
 
-def region_at(field: LanguageField, frame: int, x: int, y: int, *, min_share: float = MIN_SHARE) -> int:
+def region_at(field: LanguageField, frame: int, x: int, y: int) -> int:
     """Finds the region that makes up most of a pixel.
 
     Args:
@@ -86,7 +86,6 @@ def region_at(field: LanguageField, frame: int, x: int, y: int, *, min_share: fl
       frame: Index of the frame.
       x: Column of the pixel.
       y: Row of the pixel.
-      min_share: Smallest part of the pixel that it must make up.
 
     Returns:
       The region, or -1 for background.
@@ -102,7 +101,7 @@ def region_at(field: LanguageField, frame: int, x: int, y: int, *, min_share: fl
         known = f"column 0 to {width - 1}, row 0 to {height - 1}"
         raise InputError("pixel", f"column {x}, row {y} is outside the frame", known, remedy)
     shares = region_shares_seen(field, jax.tree.map(jnp.asarray, field.cameras)[frame], x, y)
-    return int(shares.argmax()) if shares.size and shares.max() >= min_share else -1
+    return int(shares.argmax()) if shares.size and shares.max() >= MIN_SHARE else -1
 
 
 def lift(

@@ -14,9 +14,6 @@ from jsecon.query.expressions import ANCHORED_ORDERS, Condition, NounPhrase
 from jsecon.query.object_shapes import ObjectShapes
 from jsecon.query.relations import SATISFIED, Viewpoint, between_scores, gap, order_values, pair_scores, size_of
 
-WITHIN_REACH = 0.2
-"""Score from which an object that was not chosen is an alternative."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Object:
@@ -44,13 +41,13 @@ Find = Callable[[str], tuple[list[Object], float]]
 
 
 @dataclasses.dataclass
-class ReferringResult:
+class _ReferringResult:
     """The objects of one reading of a noun phrase with its conditions."""
 
     chosen: list[Object]
     """The objects, best first."""
     alternatives: list[Object] = dataclasses.field(default_factory=list)
-    """Other objects of the name, with scores of at least WITHIN_REACH, best first."""
+    """Other objects of the name, with scores of at least 0.2, best first."""
     used: list[Object] = dataclasses.field(default_factory=list)
     """The objects that they were compared with."""
     undecided: list[Object] = dataclasses.field(default_factory=list)
@@ -64,12 +61,12 @@ def stack_shapes(objects: Sequence[Object]) -> ObjectShapes:
     return jax.tree.map(lambda *columns: np.concatenate(columns), *(found.shape for found in objects))
 
 
-def evaluate(find: Find, thing: NounPhrase, conditions: Sequence[Condition], view: Viewpoint) -> ReferringResult:
+def evaluate(find: Find, thing: NounPhrase, conditions: Sequence[Condition], view: Viewpoint) -> _ReferringResult:
     """Finds the objects of a name that meet conditions, one reading of a text, and chooses among them by the order."""
     candidates, rank = find(thing.text)
     if not candidates:
         known = "" if np.isnan(rank) else f" ({int(100 * rank)} % of unrelated words are less like the scene)"
-        return ReferringResult([], reason=f"there is no {thing.text!r} in the scene{known}")
+        return _ReferringResult([], reason=f"there is no {thing.text!r} in the scene{known}")
     shapes = stack_shapes(candidates)
     used: list[Object] = []
     orders: list[tuple[str, np.ndarray]] = []
@@ -78,7 +75,7 @@ def evaluate(find: Find, thing: NounPhrase, conditions: Sequence[Condition], vie
         for anchor in condition.anchors:
             result = evaluate(find, anchor, condition.conditions if anchor is condition.anchors[-1] else (), view)
             if not result.chosen:
-                return ReferringResult([], used=used, reason=f"nothing to compare with: {result.reason}")
+                return _ReferringResult([], used=used, reason=f"nothing to compare with: {result.reason}")
             anchors.append(result.chosen)
             used += [found for found in result.chosen if found not in used]
         scores = _condition_scores(candidates, shapes, condition, anchors, view)
@@ -89,9 +86,9 @@ def evaluate(find: Find, thing: NounPhrase, conditions: Sequence[Condition], vie
         candidates = [dataclasses.replace(found, conditions=row) for found, row in zip(candidates, named)]
     valid = [k for k, found in enumerate(candidates) if found.score >= SATISFIED]
     valid = [k for k in valid if all(np.isfinite(values[k]) for _, values in orders)]
-    rest = [k for k in range(len(candidates)) if k not in valid and candidates[k].score >= WITHIN_REACH]
+    rest = [k for k in range(len(candidates)) if k not in valid and candidates[k].score >= 0.2]
     if not valid:
-        return ReferringResult([], [candidates[k] for k in rest], used, reason=_nearest_miss(candidates))
+        return _ReferringResult([], [candidates[k] for k in rest], used, reason=_nearest_miss(candidates))
     valid.sort(key=lambda k: -candidates[k].score)
     if thing.order is not None:
         orders.append((thing.order, np.asarray(order_values(shapes, view)[thing.order])))
@@ -102,7 +99,7 @@ def evaluate(find: Find, thing: NounPhrase, conditions: Sequence[Condition], vie
         valid, close, others = _ordered(shapes, valid, values, thing, name)
         if not valid:
             reason = f"there are {count} {thing.text!r}, so none is number {thing.rank}"
-            return ReferringResult([], [candidates[k] for k in others], used, reason=reason)
+            return _ReferringResult([], [candidates[k] for k in others], used, reason=reason)
     chosen = [candidates[k] for k in valid]
     alternatives = [candidates[k] for k in dict.fromkeys([*close, *others, *rest])]
     undecided = [chosen[-1], *(candidates[k] for k in close)] if close else []
@@ -110,7 +107,7 @@ def evaluate(find: Find, thing: NounPhrase, conditions: Sequence[Condition], vie
         undecided = chosen
     wrong = thing.number is not None and len(chosen) != thing.number
     reason = f"the text says {thing.number} and {len(chosen)} match" if wrong else ""
-    return ReferringResult(chosen, alternatives, used, undecided, reason)
+    return _ReferringResult(chosen, alternatives, used, undecided, reason)
 
 
 def _apart(a: Sequence[Object], b: Sequence[Object]) -> Bool[np.ndarray, "k l"]:

@@ -34,11 +34,6 @@ class Viewpoint:
     up: Array
     """(3,) unit."""
 
-    @property
-    def right(self) -> Array:
-        """(3,) horizontal unit vector to the right."""
-        return _module(self.up).cross(self.forward, self.up)
-
 
 def viewpoint(camera: Camera, up: Float[Array, " 3"]) -> Viewpoint:
     """Makes the viewpoint of a camera. One that looks straight up or down has its upper edge as forward."""
@@ -281,12 +276,10 @@ _PREDICATES = {
     "far from": lambda a, b, _: 1.0 - _within(_relative_gap(a, b) / 2.0),
     "touching": lambda a, b, _: _within(_over(gap(a, b), 0.12 * _module(a.points).minimum(size_of(a), size_of(b)))),
 }
-PAIRS = tuple(_PREDICATES)
-"""Relations of `pair_scores`."""
 
 
 def pair_scores(relation: str, a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> Float[Array, "k l"]:
-    """Scores "object of a RELATION object of b" for all pairs, by one of PAIRS; from SATISFIED on it holds."""
+    """Scores "object of a RELATION object of b" for all pairs; from SATISFIED on it holds."""
     return _PREDICATES[relation](a[:, None], b[None], view)
 
 
@@ -314,7 +307,8 @@ def order_values(shapes: ObjectShapes, view: Viewpoint) -> dict[str, Float[Array
     height = 2.0 * shapes.half_size[:, 2]
     level = _dot(shapes.center, view.up)
     away = shapes.center - view.eye
-    bearing = _module(away).arctan2(_dot(away, view.right), _dot(away, view.forward))
+    xp = _module(away)
+    bearing = xp.arctan2(_dot(away, xp.cross(view.forward, view.up)), _dot(away, view.forward))
     distance = _length(away)
     pairs = {"smallest": volume, "shortest": height, "lowest": level, "leftmost": bearing, "nearest": distance}
     opposite = dict(zip(pairs, ("largest", "tallest", "highest", "rightmost", "farthest")))

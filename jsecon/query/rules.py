@@ -25,10 +25,6 @@ MIN_PRESENCE = 0.01
 """Smallest probability that a text is true of the best region, for embedders with logits and fields without unrelated
 words. SigLIP (arXiv 2303.15343) is trained at one true pair in 32,768, where 0.01 says that a pair is 300 times
 likelier true than at random. Not measured: no trained weights could be had."""
-SAME_CLASS_SCORE = 0.75
-"""Relative score, 0 at the median region and 1 at the best, from which a region is of the same class as the best."""
-FRAGMENT_SCORE = 0.5
-"""Relative score from which a region that overlaps the best one is another fragment of the same object."""
 
 
 @jax.tree_util.register_dataclass
@@ -44,11 +40,12 @@ class QueryRules:
     """Smallest similarity of the best region, in place of `min_rank`; a probability where there are `logits`."""
     duplicate_cosine: Number | None = ALIKE_THRESHOLD
     """Cosine from which two regions are one object seen twice, and both answer; None disables it."""
-    fragment_score: Number | None = FRAGMENT_SCORE
-    """Relative score from which a region that overlaps the best is a fragment of it, and joins it; None disables it."""
+    fragment_score: Number | None = 0.5
+    """Relative score, 0 at the median region and 1 at the best, from which a region that overlaps the best is a
+    fragment of it, and joins it; None disables it."""
     all_of_class: bool = static(default=False)
     """Whether all regions of the best one's class answer."""
-    same_class_score: Number = SAME_CLASS_SCORE
+    same_class_score: Number = 0.75
     """Relative score from which a region is of that class."""
     min_share: Number = SHARE_THRESHOLD
     """Smallest share of the regions in a selected Gaussian."""

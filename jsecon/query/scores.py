@@ -19,12 +19,6 @@ from jsecon.query.rules import QueryRules
 from jsecon.types import Array, LanguageField
 from jsecon.vision.protocols import Logits
 
-NEAREST_WORDS = 0.1
-"""Share of the unrelated words, those nearest to the text, that are left out: the scene often has what is like it."""
-PRIOR_VIEWS = 2.0
-"""Views at which the weight of a region is one half."""
-FULL_VIEW_PX = 400.0
-"""Pixels of a region that make a full view; a crop of 20 x 20 pixels shows an image encoder little."""
 OFFSET, SLOPE = -5.6, 3.5
 """Of the logistic curve of `answer_confidence`: an answer that stands out like that of an unrelated word is right in 1
 of 9 cases, at 1.6 times its height in half of them. Fitted to answers on simulated rooms where half of the texts name
@@ -40,7 +34,7 @@ def unrelated_words(field: LanguageField) -> Array | None:
     )
 
 
-class TextScores(NamedTuple):
+class _TextScores(NamedTuple):
     """How well R regions match one text."""
 
     similarity: Float[Array, " r"]
@@ -66,7 +60,7 @@ def score_text(
     words: Float[Array, "w e"] | None,
     word_scores: Float[Array, "w r"] | None,
     rules: QueryRules,
-) -> TextScores:
+) -> _TextScores:
     """Compares one text with all regions, and with unrelated words (`word_similarities`) if there are any."""
     similarity, known = region_similarities(embeddings, text, words, rules.retrieval)
     presence = None if rules.logits is None else presence_prob(embeddings, text, rules.logits)
@@ -82,7 +76,7 @@ def score_text(
     accepted = rules.accept(
         None if words is None else rank, similarity[best], None if presence is None else presence[best]
     )
-    return TextScores(similarity, known, presence, best, accepted, rank, confidence)
+    return _TextScores(similarity, known, presence, best, accepted, rank, confidence)
 
 
 def region_similarities(
@@ -121,14 +115,14 @@ def rank_among_words(
 ) -> Float[Array, ""]:
     """Ranks a text among unrelated words: the share of those that are less similar to the scene; 1 if no word is left.
 
-    The NEAREST_WORDS share of the words that is nearest to the text is left out. `best` is the largest similarity of
-    the text with any region, and `scores` those of the words.
+    The tenth of the words that is nearest to the text is left out: the scene often has what is like it. `best` is the
+    largest similarity of the text with any region, and `scores` those of the words.
     """
     largest = jnp.max(jnp.where(jnp.isfinite(scores), scores, -jnp.inf), axis=1)
     units = normalize(words.astype(text.dtype))
     mean = jnp.mean(units, axis=0)
     near = cosine_matrix((normalize(text) - mean)[None], units - mean)[0]
-    largest = largest[jnp.argsort(-near)[int(NEAREST_WORDS * len(words)) :]]
+    largest = largest[jnp.argsort(-near)[int(0.1 * len(words)) :]]
     known = jnp.isfinite(largest)
     below = jnp.sum(known & (largest < best), dtype=text.dtype)
     return jnp.where(jnp.any(known), below / jnp.maximum(jnp.sum(known), 1), 1.0)
@@ -144,12 +138,13 @@ def presence_prob(embeddings: Float[Array, "r e"], text: Float[Array, " e"], log
 def view_count_weight(pixels: Shaped[Array, "r t"]) -> Float[Array, " r"]:
     """Weights each region by the number of views that show it; 1 everywhere if no pixels are known.
 
-        v / (v + PRIOR_VIEWS) over its largest value,  v = sum_t min(pixels_t / FULL_VIEW_PX, 1)
+        v / (v + 2) over its largest value,  v = sum_t min(pixels_t / 400, 1)
 
-    A sliver that few views show has one colour, so its embedding is purer than that of the object that it belongs to.
+    So 400 pixels make a full view: a crop of 20 x 20 pixels shows an image encoder little. A sliver that few views show
+    has one colour, so its embedding is purer than that of the object that it belongs to.
     """
-    views = jnp.sum(jnp.minimum(jnp.asarray(pixels) / FULL_VIEW_PX, 1.0), axis=-1)
-    weight = views / (views + PRIOR_VIEWS)
+    views = jnp.sum(jnp.minimum(jnp.asarray(pixels) / 400.0, 1.0), axis=-1)
+    weight = views / (views + 2.0)
     largest = jnp.max(weight, initial=0.0)
     return jnp.where(largest > 0, weight / jnp.where(largest > 0, largest, 1.0), 1.0)
 
