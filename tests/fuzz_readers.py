@@ -488,7 +488,7 @@ def kept(folder: Path) -> Iterator[Case]:
 
         def close(self): ...
 
-    stored = StoredSegmenter(Fixed(), folder / "masks")  # pyright: ignore[reportArgumentType]
+    stored = StoredSegmenter(Fixed(), folder / "masks")
     stored(frame, 0)
     yield Case(sorted((folder / "masks").iterdir()), lambda: stored(frame, 0), _array((None, 6, 8), bool))
 

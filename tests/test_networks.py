@@ -28,7 +28,7 @@ from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import Checkpoint, Results, RunContext, StageInput
 from jsecon.pipeline.stages import run_stages
 from jsecon.query.scores import view_count_weight
-from jsecon.vision.protocols import NamedSegmenter
+from jsecon.vision.protocols import Segmenter
 from jsecon.vision.stores import StoredSegmenter
 
 
@@ -240,7 +240,7 @@ def test_proposals_are_kept_by_content(models, tmp_path):
     frame = np.zeros((60, 80, 3), np.uint8)
     frame[10:40, 10:50] = (200, 30, 30)
     stored, failing = (StoredSegmenter(SamSegmenter(models[0]), tmp_path) for _ in range(2))
-    assert isinstance(stored, NamedSegmenter)
+    assert isinstance(stored, Segmenter)
     masks = stored(frame, 0)
     assert len(masks) >= 1
     failing._segmenter = None  # whatever is asked of it now must come from disk

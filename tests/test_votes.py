@@ -10,7 +10,6 @@ from reference import weights_reference
 from scipy import sparse
 
 from jsecon import plan_view
-from jsecon.association.scene import superpixel_votes
 from jsecon.errors import InputError
 from jsecon.field import columns, evidence
 from jsecon.field.evidence import ViewEvidence, region_votes, sum_evidence, view_evidence
@@ -206,13 +205,11 @@ def test_at_the_centre_they_are_the_weights_of_that_pixel(scene, cameras, labels
 
 
 @pytest.mark.parametrize("t", [1, *(pytest.param(t, marks=pytest.mark.long) for t in (0, 2))])
-def test_votes_on_superpixels_are_those_of_the_view(scene, cameras, labels, t):
+def test_the_list_of_a_view_has_its_votes(scene, cameras, labels, t):
     camera, pieces = cameras[t], labels[t] + 1
-    got = superpixel_votes(scene, camera, pieces, negligible=0.0).toarray()
+    got = view_evidence(scene, camera, pieces, REGIONS + 1).matrix(scene.count, REGIONS + 1).toarray()[:, :-1]
     same = region_votes(scene, cameras[t : t + 1], pieces[None], REGIONS + 1, top=REGIONS + 1)
     np.testing.assert_array_equal(got, same.dense())
-    few = superpixel_votes(scene, camera, pieces, negligible=0.3).toarray()
-    np.testing.assert_array_equal(few, np.where(got > 0.3 * got.sum(1, keepdims=True), got, 0.0))
 
 
 def test_strongest_first_and_what_is_cut_is_counted(cast, scene, cameras, labels):

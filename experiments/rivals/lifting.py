@@ -21,7 +21,7 @@ from scipy import sparse
 from scipy.spatial import KDTree
 
 from experiments.rivals.evidence import Evidence, local_masks
-from jsecon.association.scene import superpixel_votes
+from jsecon.field.evidence import view_evidence
 from jsecon.paper.queries import relevancies
 from jsecon.splat.fusion import compute_once
 from jsecon.splat.plan import ViewPlan, plan_view
@@ -72,7 +72,8 @@ def train_backprojection(evidence: Evidence) -> Lifted:
     gaussians, cameras = jax.tree.map(jnp.asarray, (evidence.gaussians, evidence.cameras))
     blocks = []
     for t, image in enumerate(local):
-        cast = superpixel_votes(gaussians, cameras[t], image, negligible=0.0).tocoo()
+        count = int(image.max()) + 1
+        cast = view_evidence(gaussians, cameras[t], image, count).matrix(gaussians.count, count)[:, :count].tocoo()
         blocks.append((cast.data, cast.row, names[t][cast.col]))
     return _lifted(_sparse(blocks, evidence), evidence)
 

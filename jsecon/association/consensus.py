@@ -24,8 +24,6 @@ from jsecon.vision.region_graph import relabel_sequential
 
 MAX_PIECES = 3000
 """Maximum number of pieces of a scene."""
-MIN_SHARED_VIEWS = 0.02
-"""Least share of their visibility that two groups must have in common to be joined."""
 
 
 def group_by_consensus(
@@ -41,8 +39,8 @@ def group_by_consensus(
     """Groups Gaussians into objects by the consensus of the views: (N,) object 0 .. R-1, -1 if it is never seen.
 
     The Gaussians are first gathered into small pieces (`scene_pieces`). Then `average_linkage` joins pieces while the
-    views that see two groups put both into one mask with a probability of at least `agreement`. Groups that hardly any
-    view sees together (MIN_SHARED_VIEWS) stay separate.
+    views that see two groups put both into one mask with a probability of at least `agreement`. Groups that have
+    less than 0.02 of their visibility in common stay separate.
 
     Args:
       membership: (N, M) share of each Gaussian in each of the M masks of all frames, times its visibility there.
@@ -66,7 +64,7 @@ def group_by_consensus(
     in_masks, in_view = gather @ membership, gather @ visible
     together = (in_masks @ in_masks.T).toarray()
     both = (in_view @ in_view.T).toarray()
-    owner[live] = average_linkage(together, both, least_ratio=agreement, least_shared=MIN_SHARED_VIEWS)[piece[live]]
+    owner[live] = average_linkage(together, both, least_ratio=agreement, least_shared=0.02)[piece[live]]
     return owner
 
 

@@ -27,12 +27,6 @@ Sparse: TypeAlias = Any
 """scipy.sparse.csr_matrix, which type checkers cannot resolve."""
 MIN_SUPERPIXEL_PX = 12
 """Least size in px; smaller pieces are slivers along an edge."""
-MIN_PROPOSAL_SHARE = 0.4
-MIN_SUPERPIXEL_SHARE = 0.6
-MIN_MERGED_SHARE = 0.5
-MIN_KNOWN_SHARE = 0.5
-MIN_COVERAGE = 0.2
-"""Thresholds of `assign_superpixels`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,13 +88,23 @@ class SceneSuperpixels:
     def _view(self, frame: UInt8[np.ndarray, "h w 3"], t: int) -> tuple:
         """Superpixels, visible Gaussians, arrays and shape of their weights, and proposals of a frame."""
         masks = np.asarray(self.propose(t), bool)
-        labels = superpixels(frame, masks, count=self.superpixels_per_frame)
+        labels = _superpixels(frame, masks, count=self.superpixels_per_frame)
         within = superpixel_coverage(labels, masks, int(labels.max()) + 1)
-        options = {"centre_pixel_weight": self.centre_pixel_weight}
-        votes = superpixel_votes(self.gaussians, self.cameras[t], labels, **options)
+        votes = self._superpixel_votes(t, labels)
         seen = np.flatnonzero(np.diff(votes.indptr))
         votes = votes[seen]
         return labels, seen, [votes.data, votes.indices, votes.indptr], votes.shape, within
+
+    def _superpixel_votes(self, t: int, labels: Int32[np.ndarray, "h w"]) -> Sparse:
+        """Adds up the weights of N Gaussians on the A superpixels of a frame, (N, A), but for the faintest."""
+        count = int(labels.max()) + 1
+        options = {"centre_pixel_weight": self.centre_pixel_weight}
+        evidence = view_evidence(self.gaussians, self.cameras[t], labels, count, **options)
+        votes = evidence.matrix(self.count, count)[:, :-1]
+        total = np.repeat(np.asarray(votes.sum(1)).ravel(), np.diff(votes.indptr))
+        votes.data[votes.data <= 0.005 * total] = 0.0
+        votes.eliminate_zeros()
+        return votes
 
     def all(self, frames: UInt8[np.ndarray, "t h w 3"], progress: Progress | None = None) -> list[FrameSuperpixels]:
         """Computes the superpixels of all frames, which are the same at every call; several processes divide them."""
@@ -139,14 +143,14 @@ def assign_superpixels(
 
     With t_a the weight of all Gaussians on a superpixel a, and sums over a proposal p that weigh it by its share in p:
 
-        share of a superpixel  s_ac = m_ac / k_a,  reliable if k_a >= MIN_KNOWN_SHARE t_a and t_a >= MIN_COVERAGE px(a)
-        share of a proposal    s_pc = m_pc / k_p,  reliable if k_p >= MIN_KNOWN_SHARE t_p
+        share of a superpixel  s_ac = m_ac / k_a,  reliable if k_a >= 0.5 t_a and t_a >= 0.2 px(a)
+        share of a proposal    s_pc = m_pc / k_p,  reliable if k_p >= 0.5 t_p
 
-    1. A reliable superpixel goes to the class with the largest share, if that is at least MIN_SUPERPIXEL_SHARE.
-    2. Then each reliable proposal, from the weakest to the strongest in v = max_c s_pc, if v >= MIN_PROPOSAL_SHARE,
-       assigns the superpixels that lie in it by more than half to the class w of that share. If the proposal merges w
-       with classes of m_pc >= MIN_MERGED_SHARE sum_a m_ac and m_pc >= MIN_SUPERPIXEL_PX, a reliable superpixel goes to
-       the one of them with the largest s_ac.
+    1. A reliable superpixel goes to the class with the largest share, if that is at least 0.6.
+    2. Then each reliable proposal, from the weakest to the strongest in v = max_c s_pc, if v >= 0.4, assigns
+       the superpixels that lie in it by more than half to the class w of that share. If the proposal merges w with
+       classes of m_pc >= 0.5 sum_a m_ac and m_pc >= MIN_SUPERPIXEL_PX, a reliable superpixel goes to the one of them
+       with the largest s_ac.
 
     `mass` is m_ac, the weight of the Gaussians of each class on each superpixel, and `known_mass` k_a, that of the
     Gaussians whose class is known.
@@ -154,17 +158,17 @@ def assign_superpixels(
     total = view.votes.T @ np.ones((len(view.seen), 1), np.float32)
     share_of_superpixel = mass / np.maximum(known_mass, 1e-6)
     area = np.bincount(view.labels.reshape(-1), minlength=len(total))
-    is_reliable = (known_mass >= MIN_KNOWN_SHARE * total)[:, 0] & (total[:, 0] >= MIN_COVERAGE * area)
+    is_reliable = (known_mass >= 0.5 * total)[:, 0] & (total[:, 0] >= 0.2 * area)
     inside, known_inside = view.proposals @ mass, view.proposals @ known_mass  # (M, C), (M, 1)
     share = inside / np.maximum(known_inside, 1e-6)
-    reliable = (known_inside >= MIN_KNOWN_SHARE * (view.proposals @ total))[:, 0]
-    merged = (inside >= MIN_MERGED_SHARE * mass.sum(0)) & (inside >= MIN_SUPERPIXEL_PX)
+    reliable = (known_inside >= 0.5 * (view.proposals @ total))[:, 0]
+    merged = (inside >= 0.5 * mass.sum(0)) & (inside >= MIN_SUPERPIXEL_PX)
 
-    certain = is_reliable & (share_of_superpixel.max(1) >= MIN_SUPERPIXEL_SHARE)
+    certain = is_reliable & (share_of_superpixel.max(1) >= 0.6)
     owner = np.where(certain, share_of_superpixel.argmax(1), -1)
     strongest = np.where(reliable, share.max(1), 0.0) if len(share) else np.zeros(0)
     for m in np.argsort(strongest, kind="stable"):
-        if strongest[m] >= MIN_PROPOSAL_SHARE:
+        if strongest[m] >= 0.4:
             winner = share[m].argmax()
             merged[m, winner] = True
             members, competing = np.flatnonzero(view.proposals[m] > 0.5), np.flatnonzero(merged[m])
@@ -173,7 +177,7 @@ def assign_superpixels(
     return owner
 
 
-def superpixels(
+def _superpixels(
     frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m h w"], *, count: int
 ) -> Int32[np.ndarray, "h w"]:
     """Segments a frame into about `count` superpixels (SLICO, Achanta et al. 2012), cut along the outlines of masks.
@@ -200,27 +204,6 @@ def superpixel_coverage(
     area = np.bincount(labels.reshape(-1), minlength=count)
     inside = [np.bincount(labels[mask], minlength=count) for mask in masks]
     return (np.asarray(inside, np.float32).reshape(len(masks), count) / np.maximum(area, 1)).astype(np.float32)
-
-
-def superpixel_votes(
-    gaussians: Gaussians,
-    camera: Camera,
-    labels: Int32[np.ndarray, "h w"],
-    *,
-    negligible: float = 0.005,
-    centre_pixel_weight: float = 0.0,
-) -> Sparse:
-    """Adds up the weights alpha T of N Gaussians on the A superpixels of one view, sparse (N, A).
-
-    Entries up to the share `negligible` of a Gaussian's total are left out.
-    """
-    count = int(labels.max()) + 1
-    evidence = view_evidence(gaussians, camera, labels, count, centre_pixel_weight=centre_pixel_weight)
-    votes = evidence.matrix(gaussians.count, count)[:, :-1]
-    total = np.repeat(np.asarray(votes.sum(1)).ravel(), np.diff(votes.indptr))
-    votes.data[votes.data <= negligible * total] = 0.0
-    votes.eliminate_zeros()
-    return votes
 
 
 def sum_entries(entries: list[tuple[np.ndarray, np.ndarray, np.ndarray]], shape: tuple[int, int]) -> Sparse:

@@ -110,7 +110,7 @@ def load_field(path: str | os.PathLike, *, mapped: bool = False) -> LanguageFiel
     return _read(Path(path), MAPPED if mapped else sys.maxsize, checked=not mapped)
 
 
-class Provenance(str):
+class _Provenance(str):
     """A field's provenance that knows the folder of the file that it was read from."""
 
     folder: Path
@@ -151,7 +151,7 @@ def _read(path: Path, mapped: int, checked: bool) -> LanguageField:
         raise InputError(path, problem, "a whole one", changed) from error
     if problem is not None:
         raise InputError(path, problem, "arrays of one N, R, d, E and T", _REMEDY)
-    provenance = Provenance(field.provenance)
+    provenance = _Provenance(field.provenance)
     provenance.folder = path.resolve().parent
     return dataclasses.replace(field, provenance=provenance)
 

@@ -42,7 +42,7 @@ CORRELATION = 0.05
 """Correlation of two views' errors: a tracker's loss or a proposal's cut lasts, so views beyond about 20 add little."""
 
 
-class InsideFraction(NamedTuple):
+class _InsideFraction(NamedTuple):
     """How much of each Gaussian lies in some regions."""
 
     fraction: Float[Array, " n"]
@@ -196,7 +196,7 @@ def ratio(weight: Array, seen: Array) -> Array:
 
 
 @jax.jit
-def inside_fraction(votes: Votes, chosen: Bool[Array, " r"]) -> InsideFraction:
+def inside_fraction(votes: Votes, chosen: Bool[Array, " r"]) -> _InsideFraction:
     """Computes the share of several regions together in each Gaussian. Pure; differentiable in the votes' weights.
 
         p_n = min(sum_r w_nr / max(max_r W_nr, LABELLED_PART L_n, SEEN_PART W_n), 1)
@@ -213,7 +213,7 @@ def inside_fraction(votes: Votes, chosen: Bool[Array, " r"]) -> InsideFraction:
         seen = jnp.maximum(seen, jnp.where(here, region_seen, 0.0))
     known = (votes.views > 0) & (seen > 0) & jnp.isfinite(seen) & jnp.isfinite(weight)
     # Written out, not by `ratio`: XLA then keeps the two sums instead of gathering them anew for each use.
-    return InsideFraction(jnp.where(known, jnp.clip(weight / jnp.where(known, seen, 1.0), 0.0, 1.0), 0.0), known)
+    return _InsideFraction(jnp.where(known, jnp.clip(weight / jnp.where(known, seen, 1.0), 0.0, 1.0), 0.0), known)
 
 
 def inside_fraction_of_regions(votes: Votes, regions: Sequence[int]) -> Float[np.ndarray, " n"]:

@@ -8,6 +8,7 @@ it is.
 """
 
 import functools
+import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from jsecon.networks.session import Graph, Tensor, batches, content_digest
 from jsecon.networks.tokenizer import CLIP_LENGTH, TextTokenizer, read_text_rules
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.vision.protocols import CANONICAL, Logits
-from jsecon.vision.stores import EmbeddingStore, mask_key
+from jsecon.vision.stores import EmbeddingStore
 from jsecon.vision.unrelated_words import cached_unrelated_words
 
 LOGITS = "logits.json"
@@ -153,7 +154,7 @@ class ClipEmbedder:
         self, frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m h w"]
     ) -> Float32[np.ndarray, "m e"]:
         """Embeds the regions of a frame: unit rows, zero for an empty mask."""
-        keys = [mask_key(mask) for mask in masks]
+        keys = [hashlib.blake2b(np.packbits(mask).tobytes(), digest_size=16).digest() for mask in masks]
         known = {} if self._store is None else self._store.read(frame)
         rows = np.zeros((len(keys), self.dim), np.float32)
         missing = []

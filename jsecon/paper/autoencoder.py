@@ -16,9 +16,6 @@ from jsecon.errors import require, require_shape
 from jsecon.numerics import FULL_PRECISION, cosine, is_traced, normalize
 from jsecon.types import Array, Autoencoder, Key, Progress
 
-ENCODER_WIDTHS = (256, 128, 64, 32)
-DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
-"""LangSplat's hidden layers for E = 512; one narrower than the latent is widened to it."""
 MIN_STEPS = 1_000
 """LangSplat's 100 epochs run over tens of thousands of crops; a few regions need more epochs to see as many steps."""
 
@@ -88,8 +85,9 @@ def train_autoencoder(
     count, dim = units.shape
     batches = -(-count // 64)  # of similar sizes: batch normalisation cannot learn from one or two regions
     total = epochs if epochs is not None else max(100, -(-MIN_STEPS // batches))
-    inward = (*(max(w, latent) for w in ENCODER_WIDTHS), latent)
-    outward = (*(max(w, latent) for w in DECODER_WIDTHS), dim)
+    # LangSplat's hidden layers for E = 512; one narrower than the latent is widened to it.
+    inward = (*(max(w, latent) for w in (256, 128, 64, 32)), latent)
+    outward = (*(max(w, latent) for w in (16, 32, 64, 128, 256, 256)), dim)
     plan = _Plan(inward, outward, batches)
     init_key, shuffle_key = jax.random.split(key)
     carry = _start(units, init_key, plan)

@@ -22,10 +22,6 @@ from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.plan import ViewPlan, plan_view, prepare_views, render_plan
 from jsecon.types import Array, Camera, Gaussians, Key, Progress, Votes
 
-ADAM_EPS = 1e-15
-"""3DGS's and LangSplat's: gradients per Gaussian are means over all pixels, far below the usual 1e-8"""
-NORMALISE_EPS = 1e-9
-"""LangSplat divides a feature by |f| + 1e-9 before rasterising"""
 _ROWS = 8192
 """Gaussians reduced at a time: (rows, K, d) is the largest array of a reduction, 134 MB at K = 8, d = 512"""
 MIN_LABELLED = 0.5
@@ -217,15 +213,15 @@ def rendered_l1(
 ) -> tuple[Float[Array, ""], Int[Array, ""]]:
     """Computes the paper's loss of one view, the mean over all H W d numbers of |F m - G m|, and the overflow.
 
-    F renders f / (|f| + 1e-9) without background or renormalisation, G has the unit code of each pixel's region, and m
-    is 1 on labelled pixels, so unlabelled ones (no region from 0 to R - 1, or a zero code) count in the denominator
-    alone.
+    F renders f / (|f| + 1e-9), as LangSplat does, without background or renormalisation, G has the unit code of each
+    pixel's region, and m is 1 on labelled pixels, so unlabelled ones (no region from 0 to R - 1, or a zero code) count
+    in the denominator alone.
     """
     ids = jnp.clip(labels, 0, len(region_codes) - 1)
     known = jnp.any(region_codes != 0, axis=-1)
     mask = ((labels >= 0) & (labels < len(region_codes)) & known[ids])[..., None]
     # safe_norm has a zero gradient at zero, which leaves 1e9 times the rendering's there, as in LangSplat.
-    units = features / (safe_norm(features, keepdims=True) + NORMALISE_EPS)
+    units = features / (safe_norm(features, keepdims=True) + 1e-9)
     rendering = render_plan(plan, units)
     return jnp.mean(jnp.where(mask, jnp.abs(rendering.features - region_codes[ids]), 0.0)), rendering.overflow
 
@@ -233,7 +229,8 @@ def rendered_l1(
 def _optimizer() -> Any:
     import optax  # late: a field is read without it
 
-    return optax.adam(0.0025, eps=ADAM_EPS)
+    # 3DGS's and LangSplat's eps: gradients per Gaussian are means over all pixels, far below the usual 1e-8.
+    return optax.adam(0.0025, eps=1e-15)
 
 
 @functools.partial(jax.jit, static_argnames="capacity")

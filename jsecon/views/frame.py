@@ -17,9 +17,6 @@ from jsecon.errors import InputError
 from jsecon.types import Camera, Gaussians, LanguageField
 from jsecon.views.upright import TRIM, find_up
 
-_PARALLEL = 0.01
-"""share of the cameras' x axes off their common line up to which they tell the up axis only up to their tilt"""
-
 
 @dataclasses.dataclass(frozen=True)
 class SceneFrame:
@@ -125,7 +122,7 @@ def _perpendicular_up(cameras: Camera) -> tuple[np.ndarray, bool]:
     mean_up = -pose[:, 1, :3].mean(0)
     values, vectors = np.linalg.eigh(right.T @ right / len(right))
     up = vectors[:, 0] * (np.sign(vectors[:, 0] @ mean_up) or 1.0)
-    is_parallel = bool(values[1] < _PARALLEL)
+    is_parallel = bool(values[1] < 0.01)  # the x axes tell the up axis only up to the cameras' tilt
     return mean_up if is_parallel and np.linalg.norm(mean_up) > 1e-6 else up, is_parallel
 
 

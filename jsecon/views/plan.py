@@ -34,7 +34,7 @@ VIEWS_AT_ONCE = 64
 
 
 @dataclasses.dataclass(frozen=True)
-class PlannedViews:
+class _PlannedViews:
     """Virtual views of a bare scene."""
 
     cameras: Camera
@@ -63,7 +63,7 @@ def place_cameras(
     height: int = 300,
     up: np.ndarray | None = None,
     progress: Progress | None = None,
-) -> PlannedViews:
+) -> _PlannedViews:
     """Plans virtual views of a scene from its Gaussians alone, or raises InputError if no view can show it.
 
     Args:
@@ -102,7 +102,7 @@ def place_cameras(
     chosen, coverage = _greedy_cover(seen[usable], opacity, views)
     chosen = usable[chosen]
     cameras = _cameras(candidates[chosen], width, height)
-    return PlannedViews(cameras, frame, kind, coverage)
+    return _PlannedViews(cameras, frame, kind, coverage)
 
 
 def _free_places(points: Float[np.ndarray, "p 3"], frame: SceneFrame) -> Float[np.ndarray, "k 3"]:

@@ -41,7 +41,7 @@ _SURE = 2.5
 much where there are fewer than _FEET things"""
 
 
-class Upright(NamedTuple):
+class _Upright(NamedTuple):
     """The up axis of a scene."""
 
     up: np.ndarray
@@ -73,7 +73,7 @@ class _Candidate(NamedTuple):
     """whether the scene has a base in this direction"""
 
 
-def find_up(points: np.ndarray) -> Upright:
+def find_up(points: np.ndarray) -> _Upright:
     """Finds the up axis of a scene from points (P, 3) of its surface.
 
     Where too little rests, as in a fitted room with floaters, it is the normal of a large plane with nearly all of the
@@ -103,13 +103,15 @@ def find_up(points: np.ndarray) -> Upright:
     if best is None or (scores[order[0]] < 0.5 and margin < _SURE):
         ground = _ground_normal(points, planes, loose, tolerance)
         if ground is None:
-            return Upright(_along_walls(points), False, "walls: fewest surfaces face it, as no plane carries the scene")
-        return Upright(ground, False, "a plane with nearly all of the scene above it, and low things")
+            return _Upright(
+                _along_walls(points), False, "walls: fewest surfaces face it, as no plane carries the scene"
+            )
+        return _Upright(ground, False, "a plane with nearly all of the scene above it, and low things")
     count = len(things)
     sure = count and best.share >= 0.5 and margin >= (_SURE if count >= _FEET else 2 * _SURE)
     evidence = f"{best.resting} of {count} thing{'s' * (count != 1)} that rest{'s' * (count == 1)} on what is below"
     evidence = evidence if count else "the base on which the scene is widest and lowest"
-    return Upright(_exact(best.up, planes, points, tolerance), bool(sure), evidence)
+    return _Upright(_exact(best.up, planes, points, tolerance), bool(sure), evidence)
 
 
 def _exact(up: np.ndarray, planes: list[_Plane], points: np.ndarray, tolerance: float) -> np.ndarray:

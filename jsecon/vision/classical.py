@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32, UInt8
 
 from jsecon.errors import InputError, require, require_shape
-from jsecon.vision.region_graph import merge_regions, region_borders
+from jsecon.vision.region_graph import merge_regions
 from jsecon.vision.surfaces import Surface, log_depth
 
 GRANULARITIES: dict[str, dict[str, Any]] = {
@@ -79,15 +79,15 @@ class ClassicalSegmenter:
         if surface is not None:
             features, seeds = self._with_surface(features, surface)
             superpixels = _oversegment(seeds)
-            edges = region_borders(superpixels, features, surface, steepness=self.merge_distance / self.depth_jump)
-            return merge_regions(superpixels, features, edges, **settings)
+            steepness = self.merge_distance / self.depth_jump
+            return merge_regions(superpixels, features, surface, steepness=steepness, **settings)
         shape = None
         if self.depths is not None:
             depth = self.depths(index)
             require_shape("depths", depth, frame.shape[:2], "Pass depth of the size of the frame.")
             shape = log_depth(depth) * np.float32(self.merge_distance / np.log1p(self.depth_jump))
         superpixels = _oversegment(features if shape is None else np.concatenate([features, shape], -1))
-        return merge_regions(superpixels, features, region_borders(superpixels, features, shape), **settings)
+        return merge_regions(superpixels, features, shape, **settings)
 
     def _with_surface(self, colour: np.ndarray, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
         """Joins colours and normals as features of pixels.

@@ -5,7 +5,7 @@ Host code: NumPy in, NumPy out. Frames are uint8 RGB.
 
 import dataclasses
 from collections.abc import Collection
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -32,30 +32,6 @@ class Tracker(Protocol):
         Returns (T, H, W) int16: the index of a mask, or -1. The tracker resolves overlaps.
         """
         ...
-
-
-class Network(Protocol):
-    """A component that holds a network in memory."""
-
-    name: str
-    """Identifies content and settings."""
-
-    def check(self) -> str:
-        """Describes the network in a sentence, or raises InputError if it cannot work."""
-        ...
-
-    def close(self) -> None:
-        """Frees the memory of the network until it is needed again."""
-        ...
-
-
-@runtime_checkable
-class NamedSegmenter(Segmenter, Network, Protocol):
-    """A segmenter that holds a network."""
-
-
-class NamedTracker(Tracker, Network, Protocol):
-    """A tracker that holds a network."""
 
 
 @runtime_checkable
@@ -93,13 +69,17 @@ class Logits(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Models:
-    """Models of a run. A network is opened when first needed and closed when its stage is done."""
+    """Models of a run. A network is opened when first needed and closed when its stage is done.
+
+    Segmenters and trackers that hold a network have a `name` of its content and settings, `check()`, which describes
+    it or raises InputError if it cannot work, and `close()`, which frees its memory until it is needed again.
+    """
 
     embedder: Embedder
-    segmenter: NamedSegmenter | None = None
-    """None: by colour and texture."""
-    tracker: NamedTracker | None = None
-    """None: through the Gaussians."""
+    segmenter: Any = None
+    """A `Segmenter` with a network; None: by colour and texture."""
+    tracker: Any = None
+    """A `Tracker` with a network; None: through the Gaussians."""
 
     def require_ready(self, stages: Collection[str]) -> None:
         """Checks the networks of stages before the long work starts; raises InputError if one cannot work."""

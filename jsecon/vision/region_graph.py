@@ -38,12 +38,11 @@ class _RegionBorders:
     """(E,) sum of the step of shape across the border; 0 if the shape is unknown."""
 
 
-def region_borders(
+def _region_borders(
     superpixels: Int32[np.ndarray, "h w"],
     features: Float32[np.ndarray, "h w d"],
     shape: Float32[np.ndarray, "h w c"] | Surface | None,
-    *,
-    steepness: float = 1.0,
+    steepness: float,
 ) -> _RegionBorders:
     """Measures the borders between regions.
 
@@ -82,10 +81,11 @@ def region_borders(
 def merge_regions(
     superpixels: Int32[np.ndarray, "h w"],
     features: Float32[np.ndarray, "h w d"],
-    edges: _RegionBorders,
+    shape: Float32[np.ndarray, "h w c"] | Surface | None,
     *,
     distance: float,
     min_area: float,
+    steepness: float = 1.0,
 ) -> Int32[np.ndarray, "h w"]:
     """Merges the most similar neighbours first, until all are at least `distance` apart.
 
@@ -93,6 +93,7 @@ def merge_regions(
     weight for small regions, which texture consists of; the step of shape is the other leg of a right triangle. Finally
     regions that are too small or too thin join their most similar neighbour.
     """
+    edges = _region_borders(superpixels, features, shape, steepness)
     # Numbered by first appearance, so that ties do not depend on the numbers of the superpixels.
     flat = relabel_sequential(superpixels.reshape(-1))
     count = int(flat.max()) + 1

@@ -9,12 +9,12 @@ CPU. A file that cannot be read is computed again.
 
 import hashlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, UInt8
 
 from jsecon.files import READ_ERRORS, atomic_write, read_arrays, write_arrays
-from jsecon.vision.protocols import NamedSegmenter
 
 
 def _file_of_frame(folder: Path, model: str, frame: UInt8[np.ndarray, "h w 3"]) -> Path:
@@ -36,7 +36,7 @@ class EmbeddingStore:
         self._folder, self._model = folder, model
 
     def read(self, frame: UInt8[np.ndarray, "h w 3"]) -> dict[bytes, np.ndarray]:
-        """Reads the cached vectors (E,) of a frame by `mask_key`."""
+        """Reads the cached vectors (E,) of a frame by the digests of their masks."""
         try:
             stored = read_arrays(_file_of_frame(self._folder, self._model, frame))[1]
             pairs = zip(stored["keys"], stored["vectors"], strict=True)
@@ -45,20 +45,15 @@ class EmbeddingStore:
             return {}
 
     def write(self, frame: UInt8[np.ndarray, "h w 3"], vectors: dict[bytes, np.ndarray]) -> None:
-        """Replaces the cached vectors (E,) of a frame by `mask_key`; there must be one."""
+        """Replaces the cached vectors (E,) of a frame by the digests of their masks; there must be one."""
         keys = np.stack([np.frombuffer(key, np.uint8) for key in vectors])
         _write(_file_of_frame(self._folder, self._model, frame), keys=keys, vectors=np.stack(list(vectors.values())))
 
 
-def mask_key(mask: Bool[np.ndarray, "h w"]) -> bytes:
-    """Identifies a mask by its content, in 16 bytes."""
-    return hashlib.blake2b(np.packbits(mask).tobytes(), digest_size=16).digest()
-
-
 class StoredSegmenter:
-    """Segmenter (jsecon.vision.protocols) with a cache on disk. The name must identify its model and settings."""
+    """Segmenter with a network (`jsecon.vision.protocols.Models`), and a cache on disk by its name."""
 
-    def __init__(self, segmenter: NamedSegmenter, folder: Path):
+    def __init__(self, segmenter: Any, folder: Path):
         self.name = segmenter.name
         self.check, self.close = segmenter.check, segmenter.close
         self._segmenter, self._folder = segmenter, folder
