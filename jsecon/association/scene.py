@@ -88,7 +88,7 @@ class SceneSuperpixels:
     def _view(self, frame: UInt8[np.ndarray, "h w 3"], t: int) -> tuple:
         """Superpixels, visible Gaussians, arrays and shape of their weights, and proposals of a frame."""
         masks = np.asarray(self.propose(t), bool)
-        labels = _superpixels(frame, masks, count=self.superpixels_per_frame)
+        labels = superpixels(frame, masks, count=self.superpixels_per_frame)
         within = superpixel_coverage(labels, masks, int(labels.max()) + 1)
         votes = self._superpixel_votes(t, labels)
         seen = np.flatnonzero(np.diff(votes.indptr))
@@ -177,7 +177,7 @@ def assign_superpixels(
     return owner
 
 
-def _superpixels(
+def superpixels(
     frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m h w"], *, count: int
 ) -> Int32[np.ndarray, "h w"]:
     """Segments a frame into about `count` superpixels (SLICO, Achanta et al. 2012), cut along the outlines of masks.
