@@ -44,9 +44,9 @@ def test_without_an_up_axis_the_box_follows_the_points():
 def test_spreads_make_boxes_larger_and_few_points_are_repeated():
     points = np.array([[0.0, 0, 0], [1, 0, 0]])
     spreads = np.broadcast_to(0.1 * np.eye(3), (2, 3, 3))
-    shapes = object_shapes(points, np.zeros(2, int), np.array([0, 0, 1.0]), spreads=spreads, points=8)
+    shapes = object_shapes(points, np.zeros(2, int), np.array([0, 0, 1.0]), spreads=spreads)
     np.testing.assert_allclose(shapes.half_size[0], [0.6, 0.1, 0.1], atol=0.02)
-    assert shapes.points.shape == (1, 8, 3)
+    assert shapes.points.shape == (1, 256, 3)
     assert {tuple(point) for point in shapes.points[0]} == {(0, 0, 0), (1, 0, 0)}
     assert len(object_shapes(points, np.full(2, -1))) == 0
     with pytest.raises(ValueError, match="no Gaussian"):

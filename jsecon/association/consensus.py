@@ -38,7 +38,7 @@ def group_by_consensus(
 ) -> Int[np.ndarray, " n"]:
     """Groups Gaussians into objects by the consensus of the views: (N,) object 0 .. R-1, -1 if it is never seen.
 
-    The Gaussians are first gathered into small pieces (`scene_pieces`). Then `average_linkage` joins pieces while the
+    The Gaussians are first gathered into small pieces (`_scene_pieces`). Then `average_linkage` joins pieces while the
     views that see two groups put both into one mask with a probability of at least `agreement`. Groups that have
     less than 0.02 of their visibility in common stay separate.
 
@@ -54,7 +54,7 @@ def group_by_consensus(
     shapes = [rows.shape for rows in (membership, visible, weights, means)]
     equal = len({shape[0] for shape in shapes}) == 1
     require(equal, "membership, visible, weights, means", shapes, "N rows each", "Pass one row per Gaussian.")
-    piece = scene_pieces(membership, visible, weights, means, pieces=pieces, seed=seed)
+    piece = _scene_pieces(membership, visible, weights, means, pieces=pieces, seed=seed)
     live = np.flatnonzero(piece >= 0)
     owner = np.full(len(piece), -1, np.int64)
     if not len(live):
@@ -68,7 +68,7 @@ def group_by_consensus(
     return owner
 
 
-def scene_pieces(
+def _scene_pieces(
     membership: Sparse,
     visible: Sparse,
     weights: Float[np.ndarray, " n"],
@@ -257,7 +257,7 @@ def pieces_on_masks(
     """
     require(seed >= 0, "seed", seed, "at least 0", "Give another seed.")
     views, means = scene.all(frames, progress), np.asarray(scene.gaussians.means, np.float32)
-    piece = scene_pieces(*mask_signatures(views, scene.count), means, pieces=MAX_PIECES, seed=seed)
+    piece = _scene_pieces(*mask_signatures(views, scene.count), means, pieces=MAX_PIECES, seed=seed)
     entries, start = [], 0
     for view in views:
         cast = view.on_masks.tocoo()

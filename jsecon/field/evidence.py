@@ -176,9 +176,10 @@ def view_evidence(
     plan = plan_view(gaussians, camera, capacity=capacity, near=near)
     labels = np.asarray(labels, np.int32)
     labels = np.where(labels < 0, num_regions, labels).astype(np.int32)
-    steps = int(_count_steps(plan, labels))
+    tiles, names, steps = _tile_labels(plan, labels)
+    steps = int(steps)
     room = 64 << (2 * max(-(-(steps - 1).bit_length() // 2) - 3, 0))  # powers of 4: views share a program
-    done, *chunks = _list_chunks(plan, labels, room, centre_pixel_weight)
+    done, *chunks = _list_chunks(plan, (tiles, names), room, centre_pixel_weight)
     ids, slots, sums, largest = (np.asarray(chunk)[: int(done)] for chunk in chunks)
     entries = np.flatnonzero(sums)
     pairs = entries // _SLOTS
@@ -195,19 +196,25 @@ def view_evidence(
 
 
 @jax.jit
-def _count_steps(plan: ViewPlan, labels: Array) -> Array:
-    """Counts the chunks that `_list_chunks` lists at most, and so bounds their memory."""
+def _tile_labels(plan: ViewPlan, labels: Array) -> tuple[Array, Array, Array]:
+    """Finds the labels of the pixels of each tile, -1 outside of the image; the distinct ones; and a number of chunks.
+
+    `_list_chunks` lists no more chunks than that.
+    """
     batches = make_batches(plan.lists, plan.width)
-    names = _distinct_labels(to_tiles(labels + 1, plan.lists.tile) - 1, _SLOTS)
+    tiles = to_tiles(labels + 1, plan.lists.tile) - 1
+    names = _distinct_labels(tiles, _SLOTS)
     chunks = -(-batches.lengths[batches.tiles].max(1) // CHUNK)
     passes = -(-(names[batches.tiles] >= 0).sum(2).max(1) // _SLOTS)
-    return (chunks * passes).sum()
+    return tiles, names, (chunks * passes).sum()
 
 
 # Views run side by side, each on one core.
 @functools.partial(jax.jit, static_argnums=(2, 3), compiler_options=MESH_OPTIONS)
-def _list_chunks(plan: ViewPlan, labels: Array, room: int, centre_pixel_weight: float) -> tuple[Array, ...]:
-    """Lists the chunks of all tiles one after the other, in room for `room` of them.
+def _list_chunks(
+    plan: ViewPlan, labels: tuple[Array, Array], room: int, centre_pixel_weight: float
+) -> tuple[Array, ...]:
+    """Lists the chunks of all tiles one after the other, in room for `room` of them, by `_tile_labels`.
 
     Returns their number, and for each the Gaussians (B, CHUNK), the labels of the slots (B, _SLOTS), the weights on
     them (B, CHUNK, _SLOTS) and the largest weight of a pixel (B, CHUNK), for the B tiles of a batch.
@@ -229,13 +236,13 @@ def _list_chunks(plan: ViewPlan, labels: Array, room: int, centre_pixel_weight: 
     return _scan_regions(plan, labels, centre_pixel_weight, (jnp.int32(0), *empty), emit)
 
 
-def _scan_regions(plan: ViewPlan, labels: Array, centre_pixel_weight: float, state: Any, emit: Callable) -> Any:
+def _scan_regions(
+    plan: ViewPlan, labels: tuple[Array, Array], centre_pixel_weight: float, state: Any, emit: Callable
+) -> Any:
     """Sums each chunk's weights on the labels of its tiles: `state = emit(state, chunk, slots, sums, largest)`."""
     splats, lists = plan.splats, plan.lists
     integer = jnp.int32 if splats.dtype == jnp.float32 else jnp.int64
-    batches = make_batches(lists, plan.width)
-    tiles = to_tiles(labels + 1, lists.tile) - 1  # -1 outside of the image
-    distinct = _distinct_labels(tiles, _SLOTS)
+    batches, (tiles, distinct) = make_batches(lists, plan.width), labels
     table = make_table(splats)
 
     def one_batch(state, ids_of_tiles):
@@ -324,7 +331,7 @@ def _dense_view(
 
     dtype = gaussians.means.dtype
     start = jnp.zeros((gaussians.count, columns), dtype), jnp.zeros(gaussians.count, dtype)
-    return *_scan_regions(plan, labels, centre_pixel_weight, start, emit), plan.overflow
+    return *_scan_regions(plan, _tile_labels(plan, labels)[:2], centre_pixel_weight, start, emit), plan.overflow
 
 
 def _dense_view_forward(scene, labels, columns, centre_pixel_weight, capacity):

@@ -14,7 +14,7 @@ from jsecon.types import Array, Gaussians, Leaf, record
 
 BOX_TAIL = 0.02
 """Share of the Gaussians at each end of an axis that a box leaves out as strays."""
-POINTS = 256
+_POINTS = 256
 """Points of each object."""
 _YAW_STEPS = 18
 """Directions, evenly spaced over a right angle, that an upright box tries."""
@@ -41,8 +41,8 @@ class ObjectShapes:
     high: Leaf
     """(K, 3) upper corner of that box."""
     points: Leaf
-    """(K, P, 3) centres of Gaussians in the oriented box, spread evenly over them, for distances between surfaces. An
-    object with fewer than P repeats them."""
+    """(K, 256, 3) centres of Gaussians in the oriented box, spread evenly over them, for distances between surfaces. An
+    object with fewer repeats them."""
     count: Leaf
     """(K,) int number of Gaussians."""
 
@@ -61,7 +61,6 @@ def object_shapes(
     up: Float[Array, " 3"] | None = None,
     *,
     spreads: Float[Array, "n 3 3"] | None = None,
-    points: int = POINTS,
 ) -> ObjectShapes:
     """Measures objects.
 
@@ -71,7 +70,6 @@ def object_shapes(
       up: (3,) up axis; boxes stand upright along it, turned so that their footprint is smallest. None takes the
         principal axes of each object.
       spreads: (N, 3, 3) `gaussian_spreads` of the Gaussians; None takes them as points.
-      points: P, number of points of each object.
 
     Returns:
       The shapes, in the world of the means. Equal inputs give equal bits.
@@ -91,14 +89,14 @@ def object_shapes(
     shapes = []
     for rows in np.split(order, np.cumsum(count)[:-1]) if len(count) else ():
         own = np.zeros((len(rows), 3, 3)) if spreads is None else np.asarray(spreads, np.float64)[rows]
-        shapes.append(_measure(means[rows], own, turns, points))
-    sizes = ((3,), (3, 3), (3,), (3,), (3,), (points, 3))
+        shapes.append(_measure(means[rows], own, turns))
+    sizes = ((3,), (3, 3), (3,), (3,), (3,), (_POINTS, 3))
     columns = [np.stack(column) for column in zip(*shapes)] if shapes else [np.zeros((0, *size)) for size in sizes]
     center, axes, half_size, low, high, spaced = columns
     return ObjectShapes(center, axes, half_size, low, high, spaced, count)
 
 
-def _measure(points: np.ndarray, spreads: np.ndarray, turns: np.ndarray | None, count: int) -> tuple[np.ndarray, ...]:
+def _measure(points: np.ndarray, spreads: np.ndarray, turns: np.ndarray | None) -> tuple[np.ndarray, ...]:
     """Returns the fields of `ObjectShapes` of one object, without its count."""
     axes = _principal_axes(points) if turns is None else _upright_axes(points, spreads, turns)
     ends = _box_ends(points, spreads, np.concatenate([axes, np.eye(3)], axis=1))
@@ -106,7 +104,7 @@ def _measure(points: np.ndarray, spreads: np.ndarray, turns: np.ndarray | None, 
     along = points @ axes
     inside = ((along >= ends[0]) & (along <= ends[1])).all(1)
     kept = points[inside] if inside.any() else points
-    return axes @ ends.mean(0), axes, (ends[1] - ends[0]) / 2, low, high, _spaced_points(kept, count)
+    return axes @ ends.mean(0), axes, (ends[1] - ends[0]) / 2, low, high, _spaced_points(kept)
 
 
 def _principal_axes(points: np.ndarray) -> np.ndarray:
@@ -155,13 +153,13 @@ def _box_ends(points: np.ndarray, spreads: np.ndarray, axes: np.ndarray) -> np.n
     return np.stack([(1 - part) * ends[:, 0] + part * ends[:, -1] for ends in (low, high)]) * [[1], [-1]]
 
 
-def _spaced_points(points: np.ndarray, count: int) -> np.ndarray:
-    """Returns `count` of the points, evenly spaced along a curve through all of them (Morton order)."""
+def _spaced_points(points: np.ndarray) -> np.ndarray:
+    """Returns _POINTS of the points, evenly spaced along a curve through all of them (Morton order)."""
     low, high = points.min(0), points.max(0)
     cell = ((points - low) / max((high - low).max(), 1e-300) * 1023).astype(np.int64)
     x, y, z = _EVERY_THIRD[cell].T
     order = np.argsort(4 * x + 2 * y + z, kind="stable")
-    return points[order[(np.arange(count) * len(points)) // count]]
+    return points[order[(np.arange(_POINTS) * len(points)) // _POINTS]]
 
 
 def gaussian_spreads(gaussians: Gaussians) -> Float[np.ndarray, "n 3 3"]:

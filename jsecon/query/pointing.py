@@ -93,9 +93,7 @@ def region_at(field: LanguageField, frame: int, x: int, y: int) -> int:
     Raises:
       InputError: The field does not have the frame or the pixel.
     """
-    frames, width, height = field.cameras.world_to_camera.shape[0], field.cameras.width, field.cameras.height
-    if not 0 <= frame < frames:
-        raise InputError("frame", str(frame), f"0 to {frames - 1}", "Frames are numbered in the order of their names.")
+    frame, width, height = _frame(field, frame), field.cameras.width, field.cameras.height
     if not (0 <= x < width and 0 <= y < height):
         remedy = f"Give x and y in the frames as the run used them, {width}x{height}."
         known = f"column 0 to {width - 1}, row 0 to {height - 1}"

@@ -45,10 +45,6 @@ class ClassicalSegmenter:
 
     merge_distance: float = 16.0
     """Dissimilarity below which neighbours are joined, CIELAB units."""
-    lightness_weight: float = 1.0
-    """Weight of L relative to a and b; a lower weight joins more shading, and more objects of similar hue."""
-    smoothing: float = 20.0
-    """Colour radius of the mean-shift filter, 8-bit units; 0 skips it."""
     min_area: float = 0.0012
     """Least area of a region, as a share of the frame; smaller ones join their most similar neighbour or are
     dropped."""
@@ -58,8 +54,6 @@ class ClassicalSegmenter:
     """Returns the z-depth (H, W) of a frame, 0 = unknown; a jump separates neighbours."""
     depth_jump: float = 0.04
     """Relative step of depth equivalent to `merge_distance`."""
-    crease_degrees: float = 50.0
-    """Angle between normals equivalent to `merge_distance`."""
     surfaces: Callable[[int], Surface | None] | None = None
     """Returns the surface of a frame, None = unknown, in place of `depths`. Creases separate neighbours too, and steps
     of depth are measured from the plane, because the depth of a wall seen from the side changes everywhere."""
@@ -73,7 +67,7 @@ class ClassicalSegmenter:
         """Partitions a frame (H, W, 3) uint8 into connected regions, labels 0 .. M-1."""
         fits = frame.ndim == 3 and frame.shape[2] == 3 and frame.dtype == np.uint8
         require(fits, "frame", (frame.shape, frame.dtype), "(H, W, 3) uint8", "Pass RGB frames as 8-bit arrays.")
-        features = _colour_features(frame, lightness_weight=self.lightness_weight, smoothing=self.smoothing)
+        features = _colour_features(frame)
         settings = {"distance": self.merge_distance, "min_area": self.min_area * frame.shape[0] * frame.shape[1]}
         surface = None if self.surfaces is None else self.surfaces(index)
         if surface is not None:
@@ -92,28 +86,24 @@ class ClassicalSegmenter:
     def _with_surface(self, colour: np.ndarray, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
         """Joins colours and normals as features of pixels.
 
-        Returns (H, W, 6) colours and normals, where a crease equals a step of `merge_distance`; and (H, W, 7) features
+        Returns (H, W, 6) colours and normals, where a crease of 50 degrees equals a step of `merge_distance`; and (H, W, 7) features
         for the oversegmentation: colours, normals at half weight, and depth.
         """
         for array in (surface.points, surface.normals):
             require_shape("surface", array, colour.shape, "Pass surfaces of the size of the frame.")
-        crease = 2.0 * np.sin(np.radians(self.crease_degrees) / 2.0)
+        crease = 2.0 * np.sin(np.radians(50.0) / 2.0)
         turned = surface.normals * np.float32(self.merge_distance / crease)
         jump = np.float32(0.5 * self.merge_distance / np.log1p(self.depth_jump))
         depth = np.log(np.maximum(surface.points[..., 2:], 1e-6)) * jump
         return np.concatenate([colour, turned], -1), np.concatenate([colour, 0.5 * turned, depth], -1)
 
 
-def _colour_features(
-    frame: UInt8[np.ndarray, "h w 3"], *, lightness_weight: float, smoothing: float
-) -> Float32[np.ndarray, "h w 3"]:
-    """Computes weighted L, a and b (H, W, 3) float32, CIELAB units, of a smoothed frame (H, W, 3) uint8."""
-    smooth = _adapt_exposure(frame)
-    if smoothing > 0:
-        smooth = cv2.pyrMeanShiftFiltering(smooth, 5, smoothing, maxLevel=0)
-        smooth = cv2.bilateralFilter(smooth, 7, 2.0 * smoothing, 3.0)
-    lab = cv2.cvtColor(smooth.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
-    return lab * np.asarray([lightness_weight, 1.0, 1.0], np.float32)
+def _colour_features(frame: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
+    """Computes L, a and b (H, W, 3) float32, CIELAB units, of a smoothed frame (H, W, 3) uint8."""
+    radius = 20.0  # of colours that are joined, 8-bit units
+    smooth = cv2.pyrMeanShiftFiltering(_adapt_exposure(frame), 5, radius, maxLevel=0)
+    smooth = cv2.bilateralFilter(smooth, 7, 2.0 * radius, 3.0)
+    return cv2.cvtColor(smooth.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
 
 
 def _adapt_exposure(frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:

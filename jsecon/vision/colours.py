@@ -35,10 +35,6 @@ _SHADES = {basic: tuple(f"{shade} {basic}" for shade in ("dark", "light")) for b
 _SHADE, _GREY_SHADE = 0.7, 0.85
 """Similarity of a bare basic term to the shades of its family, relative to its typical colour: a dark red wall is red,
 and a red mug before it is redder. Greys differ only in lightness, part of which the canonical neutrals remove."""
-_KERNEL_WIDTH = 22.0
-"""CIELAB distance at which the similarity of two colours is exp(-1/2): about the step from plain to dark or light."""
-_LIGHTNESS_WEIGHT = 0.8
-"""Weight of L relative to a and b in the kernel: lighting changes L, but names depend on it too."""
 _EXTENT_WEIGHT = 0.12
 """Share of the cosine for the size of a region in the frame: `white plate` is not the white wall."""
 
@@ -227,7 +223,9 @@ class ColourEmbedder:
 
 def _kernel(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """(n, m) Gaussian similarity of CIELAB colours (n, 3) and (m, 3), 1 for equal ones."""
-    scale = np.asarray([_LIGHTNESS_WEIGHT, 1.0, 1.0], np.float32) / _KERNEL_WIDTH
+    # exp(-1/2) at a distance of 22: about the step from plain to dark or light. Lighting changes L, so that it counts
+    # for less, but names depend on it too.
+    scale = np.asarray([0.8, 1.0, 1.0], np.float32) / 22.0
     x, y = x * scale, y * scale
     products = x @ y.T
     products *= 2.0
