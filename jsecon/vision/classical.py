@@ -86,8 +86,8 @@ class ClassicalSegmenter:
     def _with_surface(self, colour: np.ndarray, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
         """Joins colours and normals as features of pixels.
 
-        Returns (H, W, 6) colours and normals, where a crease of 50 degrees equals a step of `merge_distance`; and (H, W, 7) features
-        for the oversegmentation: colours, normals at half weight, and depth.
+        Returns (H, W, 6) colours and normals, where a crease of 50 degrees equals a step of `merge_distance`; and
+        (H, W, 7) features for the oversegmentation: colours, normals at half weight, and depth.
         """
         for array in (surface.points, surface.normals):
             require_shape("surface", array, colour.shape, "Pass surfaces of the size of the frame.")
