@@ -114,14 +114,6 @@ def test_the_weight_on_masks_is_that_of_the_splatting(world, scene):
         start += len(masks)
 
 
-@pytest.mark.long
-def test_nothing_proposed_anywhere_gives_one_thing_or_none(world):
-    _, _, frames, _, _ = world
-    nothing = [np.zeros((0, HEIGHT, WIDTH), bool)] * VIEWS
-    labels = track_masks(frames, scene_of(world, nothing))
-    assert labels.shape == frames.shape[:3]
-
-
 def test_claims_without_a_class_or_a_proposal(world, scene):
     view = scene.all(world[2])[0]
     atoms = view.votes.shape[1]

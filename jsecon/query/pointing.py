@@ -29,7 +29,7 @@ PRIOR_PX = 4.0
 """Weight of the regions against that of the outline, px."""
 
 
-def pixel_weights(
+def _pixel_weights(
     gaussians: Gaussians, camera: Camera, x: int, y: int
 ) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Composites one pixel: the ids of the Gaussians that make it up, front to back, and their weights alpha T.
@@ -67,7 +67,7 @@ def region_shares_seen(field: LanguageField, camera: Camera, x: int, y: int) -> 
 
     Each is at most the pixel's alpha.
     """
-    ids, weights = pixel_weights(field.gaussians, camera, x, y)
+    ids, weights = _pixel_weights(field.gaussians, camera, x, y)
     shares = np.zeros(field.regions.count)
     if not len(ids):
         return shares
