@@ -78,12 +78,12 @@ def region_shares_seen(field: LanguageField, camera: Camera, x: int, y: int) -> 
     return shares
 
 
-def region_at(field: LanguageField, frame: int, x: int, y: int) -> int:
+def region_at(field: LanguageField, frame: int | str, x: int, y: int) -> int:
     """Finds the region that makes up most of a pixel.
 
     Args:
       field: The field.
-      frame: Index of the frame.
+      frame: Index or name of the frame.
       x: Column of the pixel.
       y: Row of the pixel.
 
