@@ -10,7 +10,8 @@ from small_field import KnownTexts, field_of, lone_votes, unit_rows
 
 from jsecon import QueryRules, Scene, load_field, query_anchored, save_field
 from jsecon.field import field as field_file
-from jsecon.query.grouping import MIN_REGION_RATIO, PART_SCORE, _best_cluster, part_scores, parts_fallback
+from jsecon.query.grouping import MIN_REGION_RATIO, PART_SCORE, part_scores, parts_fallback
+from jsecon.query.outliers import best_cluster
 from jsecon.types import Parts, Regions
 from jsecon.vision.protocols import Logits
 
@@ -59,14 +60,14 @@ def test_the_best_cluster_stays_and_specks_do_not_rule():
     rng = np.random.default_rng(0)
     means = np.concatenate([c + 0.1 * rng.normal(size=(n, 3)) for c, n in ((0, 300), (5, 200), (9, 15))])
     scores = np.repeat([0.6, 0.55, 0.5], [300, 200, 15])
-    kept = _best_cluster(np.ones(515, bool), scores, means)
+    kept = best_cluster(np.ones(515, bool), scores, means)
     assert kept[:300].mean() > 0.95
     assert not kept[300:].any()
-    assert not _best_cluster(np.zeros(515, bool), scores, means).any()
+    assert not best_cluster(np.zeros(515, bool), scores, means).any()
     few = np.arange(515) < 5
-    np.testing.assert_array_equal(_best_cluster(few, scores, means), few)
+    np.testing.assert_array_equal(best_cluster(few, scores, means), few)
     means[0] = np.nan
-    assert not _best_cluster(np.ones(515, bool), scores, means)[0]
+    assert not best_cluster(np.ones(515, bool), scores, means)[0]
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,7 @@ from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.field.regions import mean_residuals
 from jsecon.field.similarity import Number, similarities
 from jsecon.numerics import normalize
-from jsecon.query.outliers import MIN_SAMPLES, dbscan, default_eps
+from jsecon.query.outliers import best_cluster
 from jsecon.query.rules import QueryRules
 from jsecon.query.scores import (
     presence_prob,
@@ -117,7 +117,7 @@ def parts_fallback(
     scores = np.asarray(_compiled_part_scores(parts, text, words, retrieval=rules.retrieval))
     on_scale, of_scores = np.array([0.0, SHARE_THRESHOLD, 1.0]), np.array([0.0, PART_SCORE, 1.0])
     least = float(np.interp(rules.min_share, on_scale, of_scores))
-    mask = _best_cluster(scores >= least, scores, field.gaussians.means)
+    mask = best_cluster(scores >= least, scores, field.gaussians.means)
     similarity = np.interp(scores, of_scores, on_scale).astype(np.float32)
     # Parts that match but lie outside of the chosen cluster are shown as unlike the text.
     similarity = np.where(mask | (scores < least), similarity, np.minimum(similarity, 0.25))
@@ -163,28 +163,3 @@ def _pooled(
     if words is None:
         return pooled, similar, jnp.asarray(jnp.nan)
     return pooled, similar, rank_among_words(similar, text, words, word_similarities(embeddings, words, retrieval))
-
-
-def _best_cluster(
-    mask: Bool[np.ndarray, " n"], scores: Float[np.ndarray, " n"], means: Float[Array, "n 3"]
-) -> Bool[np.ndarray, " n"]:
-    """Finds the cluster of Gaussians whose upper quartile of scores is best; all if there are too few to cluster.
-
-    Parts at the rim of a cluster are mixed with what lies behind. Clusters with less than a tenth of the largest's
-    Gaussians do not compete.
-    """
-    mask = mask & np.isfinite(np.asarray(means)).all(axis=1)
-    chosen = np.flatnonzero(mask)
-    if len(chosen) < MIN_SAMPLES:
-        return mask
-    points = np.asarray(means)[chosen].astype(np.float64)
-    # A smaller radius than for outliers, so that neighbouring objects part.
-    cluster = dbscan(points, default_eps(points, spacings=3.0))
-    if cluster.max() < 0:
-        return mask
-    sizes = np.bincount(cluster[cluster >= 0])
-    upper = np.array([np.quantile(scores[chosen][cluster == c], 0.75) for c in range(len(sizes))])
-    stays = upper >= upper[sizes >= 0.1 * sizes.max()].max()
-    result = np.zeros_like(mask)
-    result[chosen[(cluster >= 0) & stays[cluster]]] = True
-    return result

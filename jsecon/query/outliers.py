@@ -62,7 +62,7 @@ def remove_outliers(
       keep: "supported" keeps each cluster that has at least a tenth of the weight of the heaviest: a mask may show one
         object in several pieces. "largest" keeps the cluster with most Gaussians (the paper). "all" keeps
         every cluster.
-      eps: Radius, world units; None takes `default_eps` of the selection, which follows its scale.
+      eps: Radius, world units; None takes 6 times the spacing of the selection.
 
     Returns:
       (N,) bool.
@@ -98,10 +98,10 @@ def split_outliers(
     links = _links(points) if len(points) <= _EXACT_POINTS else None
     if eps is None:  # the links tell, unless more than half of the points coincide
         eps = EPS_SPACINGS * float(np.median(links[0][:, min(3, len(points) - 1)])) if links else 0.0
-        eps = eps or default_eps(points)
+        eps = eps or _default_eps(points)
     if _one_component(points, eps, links):  # then nothing lies apart, and DBSCAN is not needed
         return OutlierResult(mask, "the selection is one component", 1, 0)
-    labels = dbscan(points, eps)
+    labels = _dbscan(points, eps)
     if labels.max() < 0:
         return OutlierResult(mask, "", 0, 0)
     clustered = labels >= 0
@@ -117,7 +117,32 @@ def split_outliers(
     return OutlierResult(mask, "", int(stays.sum()), int((~stays).sum()))
 
 
-def default_eps(points: Float[Array, "m 3"], *, spacings: float = EPS_SPACINGS) -> float:
+def best_cluster(
+    mask: Bool[np.ndarray, " n"], scores: Float[np.ndarray, " n"], means: Float[Array, "n 3"]
+) -> Bool[np.ndarray, " n"]:
+    """Finds the cluster of Gaussians whose upper quartile of scores is best; all if there are too few to cluster.
+
+    Parts at the rim of a cluster are mixed with what lies behind. Clusters with less than a tenth of the largest's
+    Gaussians do not compete.
+    """
+    mask = mask & np.isfinite(np.asarray(means)).all(axis=1)
+    chosen = np.flatnonzero(mask)
+    if len(chosen) < MIN_SAMPLES:
+        return mask
+    points = np.asarray(means)[chosen].astype(np.float64)
+    # A smaller radius than for outliers, so that neighbouring objects part.
+    cluster = _dbscan(points, _default_eps(points, spacings=3.0))
+    if cluster.max() < 0:
+        return mask
+    sizes = np.bincount(cluster[cluster >= 0])
+    upper = np.array([np.quantile(scores[chosen][cluster == c], 0.75) for c in range(len(sizes))])
+    stays = upper >= upper[sizes >= 0.1 * sizes.max()].max()
+    result = np.zeros_like(mask)
+    result[chosen[(cluster >= 0) & stays[cluster]]] = True
+    return result
+
+
+def _default_eps(points: Float[Array, "m 3"], *, spacings: float = EPS_SPACINGS) -> float:
     """Chooses DBSCAN's radius: `spacings` times the median distance of points to their third neighbour.
 
     The median is taken over at most 20,000 points. If more than half of the points coincide the spacing is that of the
@@ -134,7 +159,7 @@ def default_eps(points: Float[Array, "m 3"], *, spacings: float = EPS_SPACINGS) 
     return 1.0
 
 
-def dbscan(points: Float[Array, "m 3"], eps: float, min_samples: int = MIN_SAMPLES) -> Int[np.ndarray, " m"]:
+def _dbscan(points: Float[Array, "m 3"], eps: float, min_samples: int = MIN_SAMPLES) -> Int[np.ndarray, " m"]:
     """Clusters points by scikit-learn's DBSCAN: counted from 0 in the order of their first core point, -1 for noise.
 
     Above 5,000 points those of one voxel have one label.
@@ -170,7 +195,7 @@ def _one_component(points: np.ndarray, eps: float, links: tuple[np.ndarray, np.n
     # a component is so small that the links of its points show all that is near.
     if count == 1 or np.bincount(component).min() < _LINKS:
         return count == 1
-    return bool((dbscan(points, eps, 1) == 0).all())
+    return bool((_dbscan(points, eps, 1) == 0).all())
 
 
 def _places(points: np.ndarray, eps: float) -> tuple[np.ndarray, Int[np.ndarray, " m"], Int[np.ndarray, " v"]]:
