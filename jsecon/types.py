@@ -133,8 +133,6 @@ class ImageFile:
     width: int
     """px of the image as it was read: upright, unless its pose belongs to the stored pixels."""
     height: int
-    orientation: int = 1
-    """EXIF's, 1 to 8, that was applied to the stored pixels."""
 
 
 @record

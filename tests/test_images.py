@@ -13,7 +13,6 @@ from capture_files import png, png_chunk, refused
 
 from jsecon.errors import InputError
 from jsecon.read.captures.images import (
-    apply_orientation,
     image_header,
     read_depth,
     read_image,
@@ -106,7 +105,7 @@ def test_images_come_upright(tmp_path, ending, orientation):
     read, _ = read_image(file)
     assert np.abs(read.astype(int) - image).mean() < (6 if ending == ".jpg" else 0.1)
     stored, _ = read_image(file, upright=False)
-    np.testing.assert_array_equal(apply_orientation(stored, orientation), read)
+    np.testing.assert_array_equal(with_orientation(stored, orientation), read)
     assert stored.shape[:2] == ((48, 32) if orientation > 4 else (32, 48))
 
 

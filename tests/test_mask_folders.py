@@ -1,4 +1,4 @@
-"""Folders of masks: which are cameras and which objects, how files may be called, and masks of turned photographs."""
+"""Folders of masks: which are cameras and which objects, how files may be called."""
 
 import json
 
@@ -27,12 +27,12 @@ def black_and_white():
     return 255 * (RNG.random(SIZE) < 0.5)
 
 
-def photographs(*paths, size=(16, 12), orientation=1):
+def photographs(*paths, size=(16, 12)):
     """Frames of a capture, named as `load_capture` names them."""
     stems = [path.rsplit("/")[-1].removesuffix(".jpg") for path in paths]
     whole = [path.removesuffix(".jpg").replace("/", "_") for path in paths]
     names = stems if len(set(stems)) == len(stems) else whole
-    return {name: ImageFile(path, *size, orientation) for name, path in zip(names, paths)}
+    return {name: ImageFile(path, *size) for name, path in zip(names, paths)}
 
 
 def expected(*images):
@@ -188,25 +188,6 @@ def test_arrays_of_ids(tmp_path):
     np.testing.assert_array_equal(labels, [image, image - 1])
     assert ids == (0, 1, 2, 3, 4)
     assert "negative" in notes[0]
-
-
-def test_masks_of_stored_pixels_are_turned_like_their_photographs(tmp_path):
-    """A lies on its side (6: its stored pixels are turned clockwise), b does the other way round, c is upright."""
-    upright = [ids_image() for _ in range(3)]
-    files = {"a": ImageFile("a.jpg", 16, 12, 6), "b": ImageFile("b.jpg", 16, 12, 8), "c": ImageFile("c.jpg", 16, 12, 1)}
-    for name, image in zip("abc", upright):
-        write(tmp_path / f"{name}.png", image)
-    labels, _, notes = load_labels(tmp_path, tuple("abc"), SIZE, frames=files)
-    np.testing.assert_array_equal(labels, expected(*upright))
-    assert notes == ()
-    for name, image in zip("abc", (np.rot90(upright[0]), np.rot90(upright[1], -1), upright[2])):
-        write(tmp_path / f"{name}.png", image.repeat(2, 0).repeat(2, 1))
-    labels, _, notes = load_labels(tmp_path, tuple("abc"), SIZE, frames=files)
-    np.testing.assert_array_equal(labels, expected(*upright))
-    assert any("2 masks were of the stored pixels" in note for note in notes)
-    read, _ = load_proposals(tmp_path, tuple("abc"), SIZE, frames=files)
-    np.testing.assert_array_equal(read(0), [upright[0] == id for id in range(1, 5)])
-    np.testing.assert_array_equal(read(1), [upright[1] == id for id in range(1, 5)])
 
 
 def test_masks_of_photographs_of_another_aspect_follow_them(tmp_path):

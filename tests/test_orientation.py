@@ -29,7 +29,6 @@ def test_mixed_exif_orientations_come_upright(tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps(transforms(capture)))
     read = jsecon.load_capture(tmp_path)
     np.testing.assert_array_equal(read.frames, capture.frames)
-    assert [file.orientation for file in read.files] == list(range(1, 9))
     assert {(file.width, file.height) for file in read.files} == {(24, 16)}
     assert any("7 images were turned upright" in note for note in read.notes)
     one = jsecon.load_capture(tmp_path, only=[capture.names[2]])  # 3: its size could be that of the stored pixels
@@ -54,5 +53,4 @@ def test_poses_of_stored_pixels_keep_them(tmp_path, orientation, upright):
     write_turned(capture, tmp_path / "images", [orientation, 1, 1], upright=upright)
     read = jsecon.load_capture(tmp_path)
     np.testing.assert_array_equal(read.frames, capture.frames)
-    assert read.files[0].orientation == (orientation if upright else 1)
     assert any(("turned upright" if upright else "as they are stored") in note for note in read.notes)

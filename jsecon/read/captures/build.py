@@ -179,7 +179,7 @@ def planned_extent(posed: PosedImages, options: FrameOptions) -> CaptureExtent:
 
 def _files(frames: Sequence[_Frame]) -> tuple[ImageFile, ...]:
     """The images of frames as `Capture.files` has them."""
-    return tuple(ImageFile(frame.name, *frame.size, frame.orientation) for frame in frames)
+    return tuple(ImageFile(frame.name, *frame.size) for frame in frames)
 
 
 def _in_order(posed: PosedImages) -> tuple[list[PosedImage], np.ndarray, tuple[str, ...], list[str]]:

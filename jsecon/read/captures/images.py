@@ -32,7 +32,7 @@ IMAGE_SUFFIXES += tuple(suffix.upper() for suffix in IMAGE_SUFFIXES)
 """suffixes tried, in this order, if a capture names an image without one"""
 MAX_PIXELS = 1 << 27
 """pixels of an image: 134 million"""
-TRANSPOSED = (5, 6, 7, 8)
+_TRANSPOSED = (5, 6, 7, 8)
 """EXIF orientations that swap width and height"""
 _DECODERS: dict[bytes, type[ImageFile]] = {
     b"\x89PNG": PngImageFile,
@@ -109,9 +109,9 @@ def _orientation(image: ImageFile) -> int:
     return value if value in range(1, 9) else 1
 
 
-def apply_orientation(image: np.ndarray, orientation: int) -> np.ndarray:
+def _apply_orientation(image: np.ndarray, orientation: int) -> np.ndarray:
     """Turns stored pixels (H, W, ...) upright, by their EXIF orientation."""
-    if orientation in TRANSPOSED:
+    if orientation in _TRANSPOSED:
         image = image.swapaxes(0, 1)
     if orientation in (2, 3, 6, 7):
         image = image[:, ::-1]
@@ -137,8 +137,8 @@ def _decode(path: Path, *, upright: bool = True, native: bool = False) -> tuple[
         pixels = np.asarray(image if mode == image.mode else image.convert(mode))
         pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
         if isinstance(image, TiffImageFile):  # Pillow has turned it
-            return pixels if upright else apply_orientation(pixels, {6: 8, 8: 6}.get(orientation, orientation)), image
-        return apply_orientation(pixels, orientation) if upright else pixels, image
+            return pixels if upright else _apply_orientation(pixels, {6: 8, 8: 6}.get(orientation, orientation)), image
+        return _apply_orientation(pixels, orientation) if upright else pixels, image
 
 
 def find_image(folder: Path, name: str) -> Path | None:
@@ -168,14 +168,14 @@ class ImageHeader(NamedTuple):
     def upright(self) -> tuple[int, int]:
         """(width, height) once the orientation is applied, px."""
         width, height = self.stored
-        return (height, width) if self.orientation in TRANSPOSED else (width, height)
+        return (height, width) if self.orientation in _TRANSPOSED else (width, height)
 
 
 def image_header(path: str | Path) -> ImageHeader:
     """Reads size and orientation of an image file, from its header alone."""
     with _open(Path(path)) as image:
         orientation, (width, height) = _orientation(image), image.size
-        is_swapped = isinstance(image, TiffImageFile) and orientation in TRANSPOSED
+        is_swapped = isinstance(image, TiffImageFile) and orientation in _TRANSPOSED
         return ImageHeader((height, width) if is_swapped else (width, height), orientation)
 
 

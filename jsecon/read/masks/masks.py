@@ -11,7 +11,6 @@ LangSplat's `<frame>_s.npy` float32 (4, H, W) has ids by level, -1 = none, which
 
 from __future__ import annotations
 
-import collections
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -22,7 +21,7 @@ from jaxtyping import Bool, Int, Int16
 from jsecon.errors import InputError
 from jsecon.files import map_npy, reading
 from jsecon.numerics import is_finite_and_bounded
-from jsecon.read.captures.images import TRANSPOSED, apply_orientation, read_label_image
+from jsecon.read.captures.images import read_label_image
 from jsecon.read.masks.json_masks import open_coco, read_json_masks
 from jsecon.read.masks.names import AllFrames, FrameNames, MaskFiles, find_masks
 from jsecon.read.registry import Reader, readers
@@ -116,45 +115,29 @@ def _same_aspect(rows: int, columns: int, width: int, height: int) -> bool:
 
 
 class _MaskFitter:
-    """Brings masks to the size (H, W) of the frames, and counts the changes.
-
-    Masks have the size of the frames' images, upright or as stored, at any scale.
-    """
+    """Brings masks, upright like their frames' images and at any scale, to the size (H, W) of the frames."""
 
     def __init__(self, frames: AllFrames, size: tuple[int, int]):
         self.files = {name: file for name, file in frames.items() if file is not None}
         self.height, self.width = size
-        self.count: collections.Counter[str] = collections.Counter()
+        self.resized = 0
 
     def __call__(self, path: Path, image: np.ndarray, name: str) -> np.ndarray:
-        """Turns and resizes the mask of a frame to (H, W); raises InputError, with its file, for another aspect."""
+        """Resizes the mask of a frame to (H, W); raises InputError, with its file, for another aspect."""
         file = self.files.get(name)
-        upright = (self.width, self.height) if file is None else (file.width, file.height)
-        orientation = 1 if file is None else file.orientation
-        stored = upright[::-1] if orientation in TRANSPOSED else upright
-        rows, columns = image.shape
-        fits_upright = _same_aspect(rows, columns, *upright)
-        if orientation != 1 and _same_aspect(rows, columns, *stored) and not fits_upright:
-            image = apply_orientation(image, orientation)
-            self.count["turned"] += 1
-        elif not fits_upright and not _same_aspect(rows, columns, self.width, self.height):
+        width, height = (self.width, self.height) if file is None else (file.width, file.height)
+        if not any(_same_aspect(*image.shape, *size) for size in ((width, height), (self.width, self.height))):
             remedy = "Make the masks from the frames as they are loaded (undistorted, upright), at any scale."
-            expected = f"{upright[0]}x{upright[1]} like its frame, or that aspect"
-            raise InputError(path, f"the mask is {columns}x{rows}", expected, remedy)
+            expected = f"{width}x{height} like its frame, or that aspect"
+            raise InputError(path, f"the mask is {image.shape[1]}x{image.shape[0]}", expected, remedy)
         if image.shape == (self.height, self.width):
             return image
-        self.count["resized"] += 1
+        self.resized += 1
         return resize_nearest(image, self.width, self.height)
 
-    @property
     def notes(self) -> list[str]:
-        """The changes, a sentence each."""
-        notes = []
-        if count := self.count["resized"]:
-            notes.append(f"{count} masks were resized to {self.width}x{self.height} (nearest).")
-        if count := self.count["turned"]:
-            notes.append(f"{count} masks were of the stored pixels, and were turned upright like their images.")
-        return notes
+        """What was changed."""
+        return [f"{self.resized} masks were resized to {self.width}x{self.height} (nearest)."] if self.resized else []
 
 
 def _compact_ids(path: Path, image: np.ndarray) -> tuple[np.ndarray, Int16[np.ndarray, "h w"]]:
@@ -246,7 +229,7 @@ class _Source:
         if self.missing:
             count = len(self.missing) + len(self.names)
             notes.insert(0, f"{len(self.missing)} of {count} frames have no masks (the first: {self.missing[0]}).")
-        return notes + self.fit.notes
+        return notes + self.fit.notes()
 
 
 def load_labels(
@@ -263,8 +246,8 @@ def load_labels(
 
     Ids mean the same object in every frame; the masks of single frames (SAM's, COCO's, LangSplat's) are regions of
     their own. Where masks overlap, the first lies on top. Masks must be of the frames as the capture was loaded,
-    undistorted; other sizes of the same aspect are resized (nearest), and masks of stored pixels are turned like their
-    images. A frame without a mask is -1 everywhere.
+    undistorted and upright; other sizes of the same aspect are resized (nearest). A frame without a mask is -1
+    everywhere.
 
     `level` is LangSplat's, a name of LEVELS. `frames` are all frames of the capture in order, each with its image.
     `limit` is the most masks to read, for a check: other frames are left out.
