@@ -4,7 +4,7 @@ Pillow decodes them and raises on truncated files; its classes are called direct
 photographs. OpenCV encodes: after `import pycolmap`, Pillow ends the process when it saves a PNG.
 
 Images are returned upright, as their EXIF orientation asks. If poses belong to the stored pixels
-(`jsecon.read.captures.frames` decides that), images are read with `upright=False`.
+(`jsecon.read.captures.build` decides that), images are read with `upright=False`.
 """
 
 import contextlib
