@@ -23,7 +23,6 @@ from jsecon.networks.hub import catalogue
 from jsecon.networks.sam import SamSegmenter
 from jsecon.networks.sam2 import Sam2Tracker
 from jsecon.pipeline import model_loading, run as pipeline
-from jsecon.pipeline.model_loading import ExternalSpace
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import Checkpoint, Results, RunContext, StageInput
 from jsecon.pipeline.stages import run_stages
@@ -221,8 +220,6 @@ def test_texts_need_the_model_of_embeddings_from_files(seen, models, tmp_path, c
     ask = ["query", str(tmp_path / "field.safetensors"), "red", "--views", "0", "--out", str(tmp_path / "answers")]
     assert cli.main(ask) == 2
     assert "came from files, 3 numbers each" in capsys.readouterr().err
-    with pytest.raises(InputError, match="--embedder DIR"):
-        ExternalSpace(3).embed_text(["red"])
     assert cli.main([*ask, "--embedder", str(models[1]), "--min-rank", "0"]) == 0
     assert 0 < json.loads((tmp_path / "answers" / "red.json").read_text())["score"] < 1
     with pytest.raises(InputError, match="5, as those from files have"):

@@ -27,7 +27,7 @@ _EXTERNAL = "given-"
 """prefix of the names of external spaces, as fields hold them"""
 
 
-class ExternalSpace:
+class _ExternalSpace:
     """Embedder (jsecon.vision.protocols) of embeddings from files of `dim` numbers each, whose model is missing.
 
     It embeds neither texts nor regions; its regions can be queried by a pixel.
@@ -90,7 +90,7 @@ def open_models(options: Options, store: Path) -> Models:
     if options.features is not None:
         from jsecon.read.masks.masks import embedding_size
 
-        external = ExternalSpace(embedding_size(options.features))
+        external = _ExternalSpace(embedding_size(options.features))
         if options.embedder is None:
             return Models(external, segmenter, tracker)
         name = external.name
