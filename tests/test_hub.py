@@ -131,19 +131,15 @@ def test_a_branch_that_moved_keeps_the_cached_commit_until_it_is_fetched(local):
     assert hub.parse_model(hub.cached_address(first), "segmenter").cached_folder == first
 
 
-@pytest.mark.parametrize(("number", "clause"), [
-    (errno.ENOSPC, "no space left for it in .*HF_HOME"), (errno.EACCES, "no permission to write in .*HF_HOME"),
-    (errno.EIO, "Input/output error.*jsecon models get slimsam"),
-])  # fmt: skip
-def test_what_the_disk_refuses_is_said_in_a_sentence(local, monkeypatch, number, clause):
-    """The error of a disk that is full, read-only or broken, which no test can make as root."""
+def test_what_the_disk_refuses_is_said_in_a_sentence(local, monkeypatch):
+    """The error of a disk that is full, which no test can make as root."""
 
     def refuse(*args, **options):
-        raise OSError(number, os.strerror(number))
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     plan = hub.plan_download(slimsam())
     monkeypatch.setattr("huggingface_hub.snapshot_download", refuse)
-    with pytest.raises(InputError, match=clause):
+    with pytest.raises(InputError, match=r"No space left on device.*the disk.*jsecon models get slimsam"):
         hub.fetch(plan)
 
 

@@ -9,7 +9,6 @@ so that the user can be asked. Afterwards huggingface_hub compares each file wit
 import contextlib
 import dataclasses
 import difflib
-import errno
 import functools
 import re
 import tomllib
@@ -338,8 +337,5 @@ def _explain(model: HubModel, error: BaseException) -> tuple[str, str]:
         case errors.RepositoryNotFoundError():
             remedy = "Check the name; for a private one set HF_TOKEN."
             return "the hub has no such repository, or it is private", remedy
-        case OSError(errno=errno.ENOSPC):
-            return f"no space left for it in {constants.HF_HUB_CACHE}", "Free some, or set HF_HOME to another disk."
-        case OSError(errno=errno.EACCES | errno.EPERM | errno.EROFS):
-            return f"no permission to write in {constants.HF_HUB_CACHE}", "Set HF_HOME to a folder of yours."
-    return f"not fetched from {constants.ENDPOINT} ({describe_error(error)})", f"Check the network. Run it again: {get}"
+    remedy = f"Check the network and the disk. Run it again: {get}"
+    return f"not fetched from {constants.ENDPOINT} ({describe_error(error)})", remedy
