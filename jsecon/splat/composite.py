@@ -173,17 +173,8 @@ def _composite_vjp(
 ) -> tuple[Array, Array]:
     """Computes the gradients of `composite` with respect to splats (N, 6) and features (N, D).
 
-    The transmittance is 1 - sum of w: its cotangent acts as minus the cotangent of a channel of ones.
-
-    Args:
-      splats: (N, 6) as in `ViewPlan`.
-      features: (N, D).
-      lists: Tile lists, cut to their visible lengths.
-      image: Result of `composite`.
-      transmittance: Result of `composite`.
-      cotangent: Gradient of the image.
-      cotangent_transmittance: Gradient of the transmittance.
-      mesh: Devices that hold the strips, or None.
+    The lists are cut to their visible lengths. The transmittance is 1 - sum of w: its cotangent acts as minus the
+    cotangent of a channel of ones.
     """
     width, channels = cotangent.shape[1:]
     total = (image * cotangent).sum(-1) - (1 - transmittance) * cotangent_transmittance
