@@ -272,7 +272,6 @@ def test_models_by_name_are_fetched_once_and_found_again_for_a_moved_field(
     query = ["query", str(field), "a red thing", "--out", str(tmp_path / "answers"), "--min-rank", "0"]
     assert cli.main(query) == 0
     assert len(hub.requests) == asked
-    assert "SAM: 3 frames, about" in planned
     assert "by edgetam, what the views agree on" in planned
     assert (np.asarray(load_field(field).regions.pixel_counts).sum(0) > 0).sum() == 5
     use_hub(hub, tmp_path / "empty", monkeypatch)
