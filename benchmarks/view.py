@@ -142,7 +142,7 @@ def main() -> None:
         save_field(file, field)
         for name in ("first", "warm", "warm"):
             print(f"opened after {opening(file):.1f} s, {name}", flush=True)
-        viewer = open_viewer(Scene(field), host="127.0.0.1", port=free_port(), state=ViewState())
+        viewer = open_viewer(Scene(field), port=free_port(), state=ViewState())
         address = f"http://127.0.0.1:{viewer.server.get_port()}/"
         same = {"deviceScaleFactor": 1, "mobile": False}
         with opened(address, Path(folder), width=640, height=480) as page:

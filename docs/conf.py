@@ -18,7 +18,7 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
 import jsecon
-from jsecon.app import cli
+from jsecon.app import cli, verbs
 
 project = "jsecon"
 author = "the jsecon authors"
@@ -97,7 +97,7 @@ class CommandHelp(SphinxDirective):
         """Returns the sections."""
         os.environ["COLUMNS"] = "92"
         sections = []
-        for verb in cli.VERB_NAMES:
+        for verb in (kind.__name__.lower() for kind in verbs.VERBS):
             printed = io.StringIO()
             with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
                 cli.parse([verb, "--help"])

@@ -7,7 +7,7 @@ Gaussian is the one with most of its weight in the true masks of these frames, o
 Found: an object and a whole of the catalogue overlap by an IoU of at least 0.5 of their Gaussians. One row: of the
 objects to which most Gaussians of any row belong, those with exactly one such row. Box: along the axes of the world,
 against that of the solids. Named: the best name of a found object is the colour that it was made with; objects without
-a name do not count. Located: of the objects with a name of their own, those for which the `center` of `jsecon.locate`
+a name do not count. Located: of the objects with a name of their own, those for which the `center` of `Scene.locate`
 lies in the true box; centre and grasp are its median distances to the middle and to the middle of the upper side, mm.
 Seeds 20 to 22 chose the constants.
 """
@@ -27,6 +27,7 @@ from experiments.rooms.room import Room, RoomObject, crowded_room
 from experiments.rooms.shapes import contains
 from jsecon.app.catalogue import Catalogue
 from jsecon.errors import InputError
+from jsecon.field.field import FIELD_FILE
 from jsecon.pipeline import run as pipeline
 from jsecon.pipeline.options import Options as RunOptions
 from jsecon.pipeline.progress import Console
@@ -58,11 +59,11 @@ def field_of_room(folder: Path, seed: int, options: Options) -> LanguageField:
     capture = folder / "capture"
     if not (capture / "scene.json").is_file():
         write_room(capture, crowded_room(seed), holdout=HOLDOUT, **(QUICK_ROOM if options.quick else {}))
-    if not (folder / pipeline.FIELD_FILE).is_file():
+    if not (folder / FIELD_FILE).is_file():
         steps = 60 if options.quick else 550
         run = RunOptions(capture, holdout=HOLDOUT, steps=steps, seed=seed)
         pipeline.run(run, folder, listener=Console())
-    return jsecon.load_field(folder / pipeline.FIELD_FILE)
+    return jsecon.load_field(folder / FIELD_FILE)
 
 
 def true_objects(field: LanguageField, capture: Path) -> Int[np.ndarray, " n"]:
@@ -106,7 +107,7 @@ def located(field: LanguageField, room: Room) -> tuple[float, float, float]:
         low, high = points.min(0), points.max(0)
         middle, top = (low + high) / 2, np.array([*(low + high)[:2] / 2, high[2]])
         try:
-            place = jsecon.locate(field, item.name).place
+            place = jsecon.Scene(field).locate(item.name).place
         except InputError as error:
             print(f"  not located: {item.name}: {error}")
             inside.append(False)

@@ -1,7 +1,7 @@
 """Public names of `jsecon`, and the module of each."""
 
 from .app.catalogue import Catalogue as Catalogue, objects as objects
-from .app.notebook import to_html as to_html, to_png as to_png
+from .app.notebook import to_html as to_html
 from .app.records import (
     Answer as Answer,
     At as At,
@@ -11,7 +11,7 @@ from .app.records import (
     Query as Query,
     Region as Region,
 )
-from .app.scene import Scene as Scene, locate as locate, open_scene as open_scene
+from .app.scene import Scene as Scene, open_scene as open_scene
 from .backend import check_backend as check_backend
 from .errors import InputError as InputError
 from .evaluate.metrics import (

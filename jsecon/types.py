@@ -56,11 +56,6 @@ class _Shown:
 
         return jsecon.to_html(self)
 
-    def _repr_png_(self) -> bytes:
-        import jsecon
-
-        return jsecon.to_png(self)
-
 
 @record
 class Gaussians:

@@ -22,7 +22,6 @@ from test_rgbd import FORMATS as RGBD
 
 from experiments.datasets.feature_files import write_features
 from experiments.rooms.writers import write_colmap
-from jsecon.app.scene import read_mask
 from jsecon.errors import InputError
 from jsecon.field.field import check_field, load_field, save_field
 from jsecon.networks.clip import ClipEmbedder
@@ -281,12 +280,6 @@ def masks(folder: Path) -> Iterator[Case]:
     for name, image in zip(names, ids):
         np.save(folder / "levels" / f"{name}_s.npy", np.broadcast_to(image - 1, (4, 24, 36)).astype(np.float32))
     yield Case(sorted((folder / "levels").iterdir()), lambda: load_labels(folder / "levels", names, (24, 36)), whole)
-    field = dataclasses.replace(_field(), cameras=Camera(np.eye(4)[None], *np.ones((4, 1)), 36, 24))
-    for kind in ("grey", "colour", "bits"):
-        file = folder / kind / "a.png"
-        yield Case(
-            [file], lambda file=file: read_mask(file, field.cameras.width, field.cameras.height), _array((24, 36), bool)
-        )
 
 
 def langsplat(folder: Path) -> Iterator[Case]:

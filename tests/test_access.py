@@ -1,6 +1,5 @@
-"""Who may reach the server and the viewer: names of this machine, tokens, content types, IPv4 and IPv6."""
+"""Who may reach the server and the viewer: names of this machine, tokens, IPv4 and IPv6."""
 
-import http.client
 import socket
 
 import pytest
@@ -41,70 +40,3 @@ def test_addresses_of_both_families_are_listened_on():
             listen(host, 0)
     with pytest.raises(InputError, match="cannot listen"):
         listen("127.0.0.1", 70000)
-
-
-@pytest.fixture(scope="module")
-def pages():
-    """(host, port, token) of viser servers: on loopback, on IPv6, and with a token."""
-    viser = pytest.importorskip("viser", reason="the extra viewer is not installed")
-    from jsecon.app.access import guarded_pages
-
-    servers = []
-    for host, token in (("127.0.0.1", ""), ("::1", ""), ("127.0.0.1", "s&cret ü")):
-        try:
-            with listen(host, 0) as found:
-                port = found.getsockname()[1]
-        except InputError:
-            continue  # a machine without IPv6
-        with guarded_pages(token, (host, "proxy.example")):
-            servers.append((viser.ViserServer(host, port, verbose=False), host, token))
-    yield [(host, server.get_port(), token) for server, host, token in servers]
-    for server, _, _ in servers:
-        server.stop()
-
-
-def asked(host, port, path="/", **headers):
-    """(status, headers) of a page; a header's name has _ for -."""
-    connection = http.client.HTTPConnection(host, port, timeout=20)
-    connection.request("GET", path, headers={name.replace("_", "-"): value for name, value in headers.items()})
-    answer = connection.getresponse()
-    answer.read()
-    connection.close()
-    return answer.status, answer.headers
-
-
-SOCKET = {
-    "Upgrade": "websocket",
-    "Connection": "Upgrade",
-    "Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ==",
-    "Sec_WebSocket_Version": "13",
-    "Sec_WebSocket_Protocol": "viser-v1.0.0",
-}
-
-
-def test_the_page_is_shown_to_who_names_this_machine(pages):
-    for host, port, token in pages:
-        if token:
-            continue
-        assert asked(host, port)[0] == 200
-        assert asked(host, port, Host="proxy.example")[0] == 200
-        assert asked(host, port, Host="evil.example")[0] == 403
-        own = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-        assert asked(host, port, Origin=f"http://{own}")[0] == 200
-        for origin in ("https://evil.example", "null", "http://localhost:1"):
-            assert asked(host, port, **SOCKET, Origin=origin)[0] == 403, origin
-
-
-def test_the_page_with_a_token_is_shown_to_who_has_it(pages):
-    host, port, _ = pages[-1]
-    for path in ("/", "/?token=", "/?token=wrong", "/assets/x.js"):
-        assert asked(host, port, path)[0] == 401
-    assert asked(host, port, **SOCKET)[0] == 401
-    status, headers = asked(host, port, "/?token=s%26cret+%C3%BC", Host="any.name")
-    assert (status, headers["Location"]) == (302, "/")
-    cookie = headers["Set-Cookie"]
-    assert "HttpOnly" in cookie
-    assert "SameSite=Strict" in cookie
-    kept = cookie.partition(";")[0]
-    assert asked(host, port, Cookie=kept, Host="any.name")[0] == 200
-    assert asked(host, port, Cookie=kept[:-1] + "x")[0] == 401

@@ -1,6 +1,5 @@
 """The catalogue of a small field of known regions: rows, names, parts, files, and exports that follow it."""
 
-import csv
 import dataclasses
 import json
 
@@ -129,9 +128,9 @@ def test_names_come_from_the_vocabulary_that_is_given(field):
         jsecon.objects(field, [])
     with pytest.raises(InputError, match="no colour word"):
         jsecon.objects(field, ["mug"])
-    columns = catalogue.to_dict()
-    assert {len(column) for column in columns.values()} == {len(catalogue)}
-    assert columns["name"][floor] == "red floor"
+    records = catalogue.records()
+    assert len(records) == len(catalogue)
+    assert records[floor]["names"][0]["name"] == "red floor"
 
 
 def test_a_field_of_words_or_without_a_model_needs_none(field):
@@ -151,7 +150,7 @@ def test_a_field_without_regions_has_an_empty_catalogue(field):
     empty = jsecon.objects(dataclasses.replace(field, votes=votes, regions=regions))
     assert len(empty) == 0
     assert (empty.labels == -1).all()
-    assert empty.to_dict()["id"] == []
+    assert empty.records() == []
 
 
 def test_the_command_line_writes_a_table_records_and_a_page(field, file, tmp_path, capsys):
@@ -162,10 +161,8 @@ def test_the_command_line_writes_a_table_records_and_a_page(field, file, tmp_pat
     catalogue = jsecon.objects(field, ["red mug", "green mug", "blue wall"])
     assert [row["gaussians"] for row in listed] == catalogue.shapes.count.tolist()
     assert listed[-1]["surroundings"]
-    with (tmp_path / "out" / "objects.csv").open() as table:
-        rows = list(csv.DictReader(table))
-    assert [row["name"] for row in rows] == catalogue.names[:, 0].tolist()
-    np.testing.assert_allclose([float(row["center_x"]) for row in rows], catalogue.shapes.center[:, 0])
+    assert [row["names"][0]["name"] for row in listed] == catalogue.names[:, 0].tolist()
+    np.testing.assert_allclose([row["box"]["center"] for row in listed], catalogue.shapes.center, atol=1e-5)
     page = (tmp_path / "out" / "catalogue.html").read_text()
     assert page.count('class="card"') == len(catalogue)
     assert all(f"{row['names'][0]['name']}" in printed and row["frames"][0] in page for row in listed)
@@ -180,14 +177,11 @@ def read_vertices(path) -> np.ndarray:
 
 
 def test_exported_objects_and_labels_are_those_of_the_catalogue(field, file, tmp_path):
-    scene, ids, folder = tmp_path / "scene.ply", tmp_path / "ids.npy", tmp_path / "objects"
-    assert run_cli("export", file, "--out", scene, "--with-labels", "--labels", ids, "--objects", folder) == 0
+    scene, folder = tmp_path / "scene.ply", tmp_path / "objects"
+    assert run_cli("export", file, "--out", scene, "--with-labels", "--objects", folder) == 0
     catalogue = jsecon.objects(field)
-    labels = np.load(ids)
-    assert labels.dtype == np.int32
-    np.testing.assert_array_equal(labels, catalogue.labels)
-    vertices = read_vertices(scene)
-    np.testing.assert_array_equal(vertices["object_id"], labels)
+    labels = catalogue.labels
+    np.testing.assert_array_equal(read_vertices(scene)["object_id"], labels)
     whole = load_gaussians(scene)
     np.testing.assert_array_equal(whole.means, field.gaussians.means)
     files = sorted(folder.iterdir())
@@ -201,9 +195,7 @@ def test_only_and_without_part_the_scene_bit_for_bit(field, file, tmp_path, caps
     paths = {name: tmp_path / f"{name}.ply" for name in ("scene", "only", "without")}
     assert run_cli("export", file, "--out", paths["scene"]) == 0
     for name in ("only", "without"):
-        ids = tmp_path / f"{name}.npy"
-        assert run_cli("export", file, f"--{name}", "red thing", "--out", paths[name], "--labels", ids) == 0
-        assert len(np.load(ids)) == load_gaussians(paths[name]).count
+        assert run_cli("export", file, f"--{name}", "red thing", "--out", paths[name]) == 0
     rows = {name: [row.tobytes() for row in read_vertices(path)] for name, path in paths.items()}
     assert sorted(rows["only"] + rows["without"]) == sorted(rows["scene"])
     assert 0 < len(rows["only"]) < len(rows["scene"])
@@ -213,7 +205,6 @@ def test_only_and_without_part_the_scene_bit_for_bit(field, file, tmp_path, caps
         ("--only", "red", "--without", "red", "--out", paths["only"]),
         ("--with-labels", "--out", tmp_path / "scene.spz"),
         ("--only", "red", "--objects", tmp_path / "objects"),
-        ("--labels", tmp_path / "ids.txt"),
     ):
         assert run_cli("export", file, *wrong) == 2
         assert "jsecon:" in capsys.readouterr().err

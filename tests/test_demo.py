@@ -7,6 +7,7 @@ import pytest
 
 from jsecon import load_capture, load_field, load_gaussians
 from jsecon.app import pictures
+from jsecon.app.catalogue import main_regions
 from jsecon.demo import demo
 from jsecon.pipeline.progress import Console
 from jsecon.read.masks.labels import load_lerf_labels
@@ -54,7 +55,7 @@ def test_field_answers_and_figures_are_on_disk(finished):
     page = (out / "report.html").read_text()
     for text in (*(record["query"] for record in records), "mAcc@0.25", "Seconds of each stage", "Held-out frames"):
         assert text in page
-    assert page.count('class="pair"') == len(records)
+    assert page.count("IoU ") > len(records)
     assert "http" not in page
 
 
@@ -71,7 +72,7 @@ def test_regions_are_shown_in_colours_that_tell_them_apart(finished):
     _, out = finished
     field = load_field(out / "field.safetensors")
     colours = pictures.region_colours(field)
-    known = pictures.main_regions(field) >= 0
+    known = main_regions(field) >= 0
     assert colours.shape == (field.gaussians.count, 3)
     assert ((colours >= 0) & (colours <= 1)).all()
     np.testing.assert_array_equal(colours[~known], np.full((int((~known).sum()), 3), pictures.UNKNOWN))

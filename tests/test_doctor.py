@@ -13,8 +13,11 @@ from jsecon.app import cli, doctor
 PROJECT = tomllib.loads((Path(__file__).resolve().parent.parent / "pyproject.toml").read_text())["project"]
 
 
-def _check(name):
-    return next(check for check in doctor.run_checks() if check.name == name)
+def _check(name, capsys):
+    """What the doctor says of one thing."""
+    cli.main(["doctor", "--json"])
+    checks = json.loads(capsys.readouterr().out)["checks"]
+    return next(check for check in checks if check["name"] == name)
 
 
 def test_it_prints_what_is_here_and_what_is_not(capsys, monkeypatch):
@@ -45,20 +48,21 @@ def test_what_every_run_needs_and_is_wrong_is_exit_code_2(capsys, monkeypatch):
     assert printed["errors"][0]["remedy"] == backend.REMEDY
 
 
-def test_a_package_that_lacks_a_part_is_named(monkeypatch):
+def test_a_package_that_lacks_a_part_is_named(capsys, monkeypatch):
     monkeypatch.delattr("cv2.ximgproc.createSuperpixelSLIC")
-    check = _check("packages")
-    assert check.status == "missing"
-    assert "without ximgproc" in check.message
-    assert check.remedy
+    check = _check("packages", capsys)
+    assert check["status"] == "missing"
+    assert "without ximgproc" in check["message"]
+    assert check["remedy"]
 
 
 def test_it_knows_the_extras_of_the_project():
     assert set(doctor.EXTRAS) == set(PROJECT["optional-dependencies"]) - {"dev", "all"}
 
 
-def test_the_limit_of_a_cgroup_is_read(monkeypatch):
+def test_the_limit_of_a_cgroup_is_read(capsys, monkeypatch):
     files = {"memory.max": ["1073741824"], "memory.current": ["1000"]}
     monkeypatch.setattr(process, "_read_cgroup", lambda new, old: files.get(new, []))
-    memory = _check("memory")
-    assert (memory.status, "limit 1.0 GiB (cgroup)" in memory.message) == ("wrong", True)
+    memory = _check("memory", capsys)
+    assert memory["status"] == "wrong"
+    assert "limit 1.0 GiB (cgroup)" in memory["message"]

@@ -215,7 +215,7 @@ def test_a_function_takes_the_ends_of_its_input(name, end):
 def test_the_table_has_every_pure_function():
     """Those that are left out read or write files, print, or take a record that a row's function makes."""
     others = {
-        *("objects", "show", "to_html", "to_png", "locate", "open_scene", "check_backend", "host_mesh"),
+        *("objects", "show", "to_html", "open_scene", "check_backend", "host_mesh"),
         *("check_field", "load_field", "save_field", "load_capture", "load_gaussians", "save_gaussians", "load_ply"),
         *("save_ply", "mean_iou", "accuracy_at", "localization_accuracy", "encode", "decode", "match_regions"),
         *("select_gaussians", "membership_probability", "render_plan", "scan_region_votes"),

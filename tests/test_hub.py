@@ -68,10 +68,11 @@ def test_a_name_brings_its_files_and_no_others(local, capsys):
     assert cached["sam2", "tracker"] == []
 
 
-def test_the_role_of_an_address_is_that_of_its_files(local, capsys):
-    for _ in ("on the hub", "in the cache"):
-        assert cli.main(["models", "get", f"hub:{NAME}", "--yes"]) == 0
-        assert f"hub:{NAME}  segmenter  " in capsys.readouterr().out
+def test_an_address_is_fetched_for_a_role(local, capsys):
+    assert cli.main(["models", "get", f"hub:{NAME}"]) == 2
+    assert "--role" in capsys.readouterr().err
+    assert cli.main(["models", "get", f"hub:{NAME}", "--role", "segmenter"]) == 0
+    assert f"hub:{NAME}  segmenter  " in capsys.readouterr().out
 
 
 def test_a_model_in_the_cache_is_used_without_a_request(local, monkeypatch):

@@ -257,10 +257,11 @@ def test_models_by_name_are_fetched_once_and_found_again_for_a_moved_field(
     out = tmp_path / "out"
     command = ["run", str(room), "--gaussians", str(splat), "--holdout", "4", "--out", str(out), "--models", "auto"]
     command += ["--level", "m", "--vision-frames", "5"]
-    assert cli.main(command) == 2  # without a terminal nothing is fetched unasked
+    assert cli.main(command) == 2  # a run fetches nothing
     assert "jsecon models get edgetam" in (said := capsys.readouterr().err)
     assert "jsecon models get siglip2" in said
-    assert cli.main([*command, "--yes"]) == 0
+    assert cli.main(["models", "get", "auto"]) == 0
+    assert cli.main(command) == 0
     planned = capsys.readouterr().out
     asked = len(hub.requests)
     use_hub(hub, tmp_path / "cache", monkeypatch, offline=True)
@@ -278,8 +279,10 @@ def test_models_by_name_are_fetched_once_and_found_again_for_a_moved_field(
     capsys.readouterr()
     assert cli.main(query) == 2
     commit = hub.repositories["onnx-community/siglip2-base-patch16-224-ONNX"].commit
-    assert f"siglip2-base-patch16-224-ONNX@{commit}" in capsys.readouterr().err
-    assert cli.main([*query, "--yes"]) == 0
+    address = f"hub:onnx-community/siglip2-base-patch16-224-ONNX@{commit}"
+    assert f"jsecon models get {address} --role embedder" in capsys.readouterr().err
+    assert cli.main(["models", "get", address, "--role", "embedder"]) == 0
+    assert cli.main(query) == 0
 
 
 def test_models_of_masks_stay_in_full_precision_where_there_is_no_other(room, hub, tmp_path, monkeypatch):
@@ -287,7 +290,8 @@ def test_models_of_masks_stay_in_full_precision_where_there_is_no_other(room, hu
     for name in ("onnx/vision_model.onnx", "onnx/text_model.onnx"):
         files[name.replace(".onnx", "_quantized.onnx")] = files.pop(name)
     use_hub(hub, tmp_path / "cache", monkeypatch)
-    command = ["run", str(room), "--out", str(tmp_path / "out"), "--models", "auto", "--yes", "--dry-run"]
+    command = ["run", str(room), "--out", str(tmp_path / "out"), "--models", "auto", "--dry-run"]
+    assert cli.main(["models", "get", "auto", "--precision", "int8"]) == 0
     assert cli.main([*command, "--precision", "int8"]) == 0
     fetched = {path.name for path in (tmp_path / "cache").rglob("*.onnx")}
     assert {"vision_model_quantized.onnx", "vision_encoder.onnx"} <= fetched
@@ -296,7 +300,7 @@ def test_models_of_masks_stay_in_full_precision_where_there_is_no_other(room, hu
 
 def test_models_are_listed_fetched_and_checked_by_name(hub, tmp_path, monkeypatch, capsys):
     use_hub(hub, tmp_path / "cache", monkeypatch)
-    assert cli.main(["models", "get", "edgetam", "siglip2", "--yes"]) == 2  # this hub has no tracker of the first name
+    assert cli.main(["models", "get", "edgetam", "siglip2"]) == 2  # this hub has no tracker of the first name
     assert "has no such repository" in capsys.readouterr().err
     assert cli.main(["models", "list", "--json"]) == 0
     rows = {
@@ -310,6 +314,6 @@ def test_models_are_listed_fetched_and_checked_by_name(hub, tmp_path, monkeypatc
     assert "CLIP: usable" in capsys.readouterr().out
     assert cli.main(["models", "check", "clip"]) == 2
     assert "jsecon models get clip" in capsys.readouterr().err
-    assert cli.main(["models", "get", "auto", "--yes"]) == 0
-    assert cli.main(["models", "get", "clap", "--yes"]) == 2
+    assert cli.main(["models", "get", "auto"]) == 0
+    assert cli.main(["models", "get", "clap"]) == 2
     assert cli.main(["models", "get"]) == 2

@@ -156,13 +156,13 @@ def test_the_same_scene_far_away_in_another_world_and_unit_gives_the_same_answer
     assert not [note for note in there.notes if "WARNING" in note]
     np.testing.assert_allclose(there.held_out.psnr, given.held_out.psnr, atol=0.1)
     text = next(iter(json.loads((room / "scene.json").read_text())["objects"].values()))
-    place = jsecon.locate(given.field, text)
+    place = jsecon.Scene(given.field).locate(text)
     assert cli.main(["query", str(out / "field.safetensors"), text, "--out", str(out), "--views", "1"]) == 0
     answer = json.loads(next(out.glob("*.json")).read_text())
     chosen = jsecon.load_gaussians(out / answer["ply"], similarity=np.linalg.inv(source_from_scene))
     assert chosen.count == answer["count"] == len(place.points)
     np.testing.assert_allclose(chosen.means, place.points, atol=1e-4)
-    found = jsecon.locate(jsecon.load_field(out / "field.safetensors"), text)
+    found = jsecon.open_scene(out).locate(text)
     np.testing.assert_allclose(found.points.mean(0) / scale - shift, place.points.mean(0), atol=1e-3)
     box = answer["place"]["bounding_box"]
     np.testing.assert_allclose(np.array(box["min"]) / scale - shift, place.points.min(0), atol=1e-3)

@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 from small_field import make_field
 from table_field import table_field
 
-import jsecon
 from jsecon import Answer, InputError, Query, Scene, Selection
 
 SIZE = np.array([0.5, 0.3, 0.1])
@@ -72,4 +71,4 @@ def test_two_objects_of_a_name_are_counted_and_have_no_place_together():
     assert nothing.as_dict()["place"] is None
     with pytest.raises(InputError, match="none on dark blue box"):
         _ = nothing.place
-    np.testing.assert_array_equal(jsecon.locate(scene, "dark blue box").place.center, box.place.center)
+    np.testing.assert_array_equal(scene.locate("dark blue box").place.center, box.place.center)

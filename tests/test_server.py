@@ -1,13 +1,10 @@
 """The server: what it answers, and that odd input has an error of its own kind and nothing crashes."""
 
-import asyncio
 import json
 import random
 import socket
-import threading
 
 import cv2
-import httpx
 import numpy as np
 import pytest
 
@@ -19,8 +16,7 @@ from table_field import table_field
 from jsecon import InputError, save_field
 from jsecon.app.scene import Scene
 from jsecon.app.scenes import open_scenes
-from jsecon.app.server import MAX_BODY, MAX_WAITING, application, prepare
-from jsecon.process import cores
+from jsecon.app.server import MAX_BODY, application, prepare
 from jsecon.vision.colours import ColourEmbedder
 
 KINDS = {200, 400, 404, 413, 422}
@@ -47,42 +43,6 @@ def test_a_text_and_a_pixel_are_answered(client, scenes):
     assert pixel["count"] > 0
     assert len(pixel["place"]["axes"]) == 3
     assert client.post("/query", json={"at": [1, 24, 20]}).json()["count"] == pixel["count"]
-
-
-def test_known_answers_are_sent_while_all_threads_are_taken_and_too_many_questions_are_refused(scenes):
-    """Questions wait for a thread up to a bound; each is computed once."""
-    held, asked = threading.Event(), []
-
-    class Slow(Scene):
-        def ask(self, question, **options):
-            answer = self.known(question)
-            if answer is None:
-                asked.append(str(question))
-                assert held.wait(20)
-                answer = super().ask(question, **options)
-            return answer
-
-    desk = Slow(scenes["desk"].field, ColourEmbedder(), name="desk")
-    statuses = []
-
-    async def soak():
-        app = application({"desk": desk})
-        async with httpx.AsyncClient(transport=httpx.ASGITransport(app=app), base_url=HERE) as client:
-
-            async def ask(text):
-                statuses.append((await client.post("/query", json={"text": text})).status_code)
-
-            async with asyncio.TaskGroup() as group:
-                for k in range(cores() + MAX_WAITING + 5):
-                    group.create_task(ask("green" if k % 2 else f"green or {['blue', 'red', 'pink'][k % 3]}"))
-                while len(asked) < cores() or statuses.count(503) < 5:
-                    await asyncio.sleep(0.01)
-                assert len(asked) == cores()
-                held.set()
-
-    asyncio.run(soak())
-    assert statuses.count(503) == 5
-    assert statuses.count(200) == cores() + MAX_WAITING
 
 
 def test_a_field_of_a_request_that_is_wrong_is_named(client):
@@ -114,9 +74,9 @@ def test_get_takes_what_it_lists_and_nothing_else(client):
         assert found.status_code == 200 or "selects nothing" in found.text, found.text
         if listed:
             for other in {"at", "threshold", "all", "frame"} - set(listed):
-                found = client.get(path, params={"text": "red", other: "1"})
+                found = client.get(path, params={name: usual[name] for name in listed} | {other: "1"})
                 assert found.status_code == 422
-                assert f"takes {', '.join(listed)}." in found.json()["error"]
+                assert f'"{other}"' in found.json()["error"]
 
 
 def test_what_it_knows_and_files_of_the_answer(client, scenes):
@@ -131,7 +91,6 @@ def test_what_it_knows_and_files_of_the_answer(client, scenes):
     assert cv2.imdecode(np.frombuffer(image.content, np.uint8), cv2.IMREAD_UNCHANGED).shape == (40, 48)
     paths = client.get("/openapi.json").json()["paths"]
     assert set(paths) == {"/query", "/measure", "/objects", "/selection.ply", "/mask.png", "/healthz"}
-    assert "/query" in client.get("/").text
 
 
 def test_relations_measures_and_objects():
@@ -151,7 +110,7 @@ def test_relations_measures_and_objects():
         ("/query", {"text": "red mug", "frame": 1.5}, "frame"),
         ("/measure", {"a": "red mug", "b": "dark blue box"}, "names 2 objects"),
         ("/measure", {"a": "red mug"}, '"b"'),
-        ("/query", {"text": "red mug", "from": "x"}, "takes field, text, at"),
+        ("/query", {"text": "red mug", "from": "x"}, '"from"'),
     ):
         answer = client.post(path, json=body)
         assert answer.status_code == 422
@@ -159,7 +118,7 @@ def test_relations_measures_and_objects():
 
 
 @pytest.mark.parametrize(("status", "body"), [
-    (400, b"{"), (400, b"[1, 2]"), (422, b"{}"), (422, b'{"text": ""}'), (422, b'{"text": 7}'),
+    (422, b"{"), (422, b"[1, 2]"), (422, b"{}"), (422, b'{"text": ""}'), (422, b'{"text": 7}'),
     (422, b'{"text": "red", "at": [0, 1, 2]}'), (422, b'{"at": [0, 1]}'), (422, b'{"at": [0, true, 2]}'),
     (422, b'{"at": [true, 1, 2]}'), (422, b'{"at": ["frame_1", 1e400, 2]}'), (422, b'{"at": ["frame_1", NaN, 2]}'),
     (422, b'{"at": ["\\udce9", 1, 2]}'), (422, b'{"at": ["#99999999999999999999", 1, 2]}'),
@@ -231,24 +190,6 @@ def has_ipv6() -> bool:
     except OSError:
         return False
     return True
-
-
-def test_clients_at_once_get_the_same_answers(client):
-    texts, found = ["red", "green", "blue"], {}
-
-    def ask(k):
-        for text in texts:
-            answer = client.post("/query", json={"text": text})
-            found.setdefault(text, []).append(answer.json())
-
-    threads = [threading.Thread(target=ask, args=(k,)) for k in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    for answers in found.values():
-        assert len(answers) == 8
-        assert all(json.dumps(a) == json.dumps(answers[0]) for a in answers)
 
 
 def test_fields_are_opened_by_their_folders_names(scene, cameras, tmp_path):

@@ -237,14 +237,14 @@ def test_the_answer_says_how_likely_the_text_is_there(field, tmp_path, monkeypat
     embedder = KnownTexts(texts, logits=Logits(20.0, -18.0))
     mug = Scene(field, embedder).ask("mug")
     assert int(mug.selection.region) == 0
-    np.testing.assert_allclose(mug.presence, 1 / (1 + np.exp(-2.0)), rtol=1e-4)
+    np.testing.assert_allclose(mug.selection.presence, 1 / (1 + np.exp(-2.0)), rtol=1e-4)
     both = Scene(field, embedder).ask("mug or cup")
-    np.testing.assert_allclose(both.presence, 1 / (1 + np.exp(-2.0)), rtol=1e-4)
+    np.testing.assert_allclose(both.selection.presence, 1 / (1 + np.exp(-2.0)), rtol=1e-4)
     ghost = Scene(field, embedder).ask("ghost")
     assert int(ghost.selection.region) == -1
-    assert 0 <= ghost.presence < MIN_PRESENCE
+    assert 0 <= ghost.selection.presence < MIN_PRESENCE
     silent = Scene(field, KnownTexts(texts)).ask("mug")
-    assert silent.presence is None
+    assert silent.selection.presence is None
 
     save_field(tmp_path / "field.safetensors", dataclasses.replace(field, embedder="told"))
     told = {}

@@ -11,7 +11,7 @@ import pytest
 from browser import CHROMIUM, WEBGL, dumped
 from small_field import make_field
 
-from jsecon.app.pictures import main_regions
+from jsecon.app.catalogue import main_regions
 from jsecon.app.records import Answer, Query
 from jsecon.app.viewer.static_page import NO_REGION, page
 from jsecon.errors import InputError

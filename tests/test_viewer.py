@@ -1,6 +1,7 @@
 """The viewer: its states and colours, what its steps do to a field, and in a browser what a person would try."""
 
 import dataclasses
+import http.client
 import io
 import itertools
 import socket
@@ -21,10 +22,10 @@ from browser import CHROMIUM, opened, until
 from small_field import colour_field, make_field
 
 from jsecon import Camera, InputError, load_gaussians, region_at, save_field
-from jsecon.app.pictures import main_regions
+from jsecon.app.catalogue import main_regions
 from jsecon.app.records import Query, Region
 from jsecon.app.scene import Scene
-from jsecon.app.viewer.state import COLOURINGS, ViewState, answer_colours, highlight, score_colours
+from jsecon.app.viewer.state import COLOURINGS, ViewState, answer_colours, highlight
 from jsecon.app.viewer.window import Viewer, open_viewer, region_along
 from jsecon.query.pointing import region_shares_seen
 from jsecon.vision.colours import BASIC, ColourEmbedder
@@ -77,14 +78,6 @@ def test_answers_are_tinted_and_the_rest_is_dimmed():
     np.testing.assert_array_equal(base, [[200, 100, 0]] * 4)
 
 
-def test_scores_as_colours():
-    most = score_colours([np.array([0, 0.5, np.nan, 1], np.float32), np.array([0, 0.2, 0, 0.3], np.float32)], 4)
-    assert most[0].tolist() == most[2].tolist() == [18, 20, 60]
-    assert most[3].tolist() == [252, 250, 190]
-    assert np.argmax(most[1]) == 0
-    assert (score_colours([], 3) == 110).all()
-
-
 def free_port() -> int:
     with socket.create_server(("127.0.0.1", 0)) as found:
         return found.getsockname()[1]
@@ -93,7 +86,7 @@ def free_port() -> int:
 @pytest.fixture(scope="module")
 def viewer(scene, cameras):
     asked = Scene(colour_field(scene, cameras), ColourEmbedder(), name="<desk>")
-    viewer = open_viewer(asked, host="127.0.0.1", port=free_port(), state=ViewState(("orange", "pink")))
+    viewer = open_viewer(asked, port=free_port(), state=ViewState(("orange", "pink")))
     yield viewer
     viewer.stop()
     viewer.server.stop()
@@ -176,7 +169,7 @@ def test_every_colouring(viewer, colouring):
     settled(viewer, lambda: viewer.then(lambda state: dataclasses.replace(state, colouring=colouring)))
     before = colours(viewer)
     kinds = len(np.unique(before[:, :3], axis=0))
-    assert kinds == 1 if colouring == "score" else kinds > 2
+    assert kinds > 2
     ask(viewer, word_of(viewer))
     assert (colours(viewer)[:, :3] != before[:, :3]).any()
 
@@ -212,12 +205,39 @@ def test_files_of_the_answers(viewer, tmp_path):
 
 def test_a_taken_port_and_a_missing_extra_are_refused(viewer, monkeypatch):
     with pytest.raises(InputError, match="--port"):
-        open_viewer(viewer.scene, host="127.0.0.1", port=viewer.server.get_port(), state=ViewState())
-    with pytest.raises(InputError, match="--port"):
-        open_viewer(viewer.scene, host="no.such.host.invalid", port=8766, state=ViewState())
+        open_viewer(viewer.scene, port=viewer.server.get_port(), state=ViewState())
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(InputError, match=r'pip install "jsecon\[viewer\]"'):
-        open_viewer(viewer.scene, host="127.0.0.1", port=0, state=ViewState())
+        open_viewer(viewer.scene, port=0, state=ViewState())
+
+
+def asked(port, **headers):
+    """Status of the page; a header's name has _ for -."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+    connection.request("GET", "/", headers={name.replace("_", "-"): value for name, value in headers.items()})
+    answer = connection.getresponse()
+    answer.read()
+    connection.close()
+    return answer.status
+
+
+SOCKET = {
+    "Upgrade": "websocket",
+    "Connection": "Upgrade",
+    "Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ==",
+    "Sec_WebSocket_Version": "13",
+    "Sec_WebSocket_Protocol": "viser-v1.0.0",
+}
+
+
+def test_the_page_is_shown_to_who_names_this_machine(viewer):
+    port = viewer.server.get_port()
+    assert asked(port) == 200
+    assert asked(port, Host=f"localhost:{port}") == 200
+    assert asked(port, Host="evil.example") == 403
+    assert asked(port, Origin=f"http://127.0.0.1:{port}") == 200
+    for origin in ("https://evil.example", "null", "http://localhost:1"):
+        assert asked(port, **SOCKET, Origin=origin) == 403, origin
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 from scipy.special import softmax
 
-from jsecon.app.records import gaussian_rows
+from jsecon.app.records import gaussian_rows, rounded
 from jsecon.errors import InputError
 from jsecon.field.columns import vote_blocks
 from jsecon.field.membership import SHARE_THRESHOLD, membership_probability, ratio, vote_columns, vote_shares
@@ -29,18 +29,9 @@ from jsecon.vision.unrelated_words import UNRELATED_WORDS, embed_unrelated_words
 
 NAMES = 3
 """names of each object"""
-FRAMES = 3
-"""frames of each object, those that show most of it"""
 PART_CONTAINMENT = 0.4
 """Share of a region inside another one from which it is a part of it. A handle that half of the views take for a part
 of its mug lies in the mug by one half."""
-TOUCHING = 0.1
-"""Largest gap from one piece's box to another piece that looks the same, in diagonals of the smaller box. Two mugs side
-by side are farther apart."""
-FILLED = 0.7
-"""Share of the volume of their common box that these two fill at least."""
-SIZE_RATIO = 3.0
-"""Largest ratio of their volumes: a large thing alone fills its box and that of a small thing at its side."""
 SOFTMAX_SCALE = 100.0
 """Scale of cosines in CLIP's softmax over texts, to which its training is clipped (arXiv 2103.00020)."""
 # fmt: off
@@ -103,26 +94,32 @@ class Catalogue:
         """
         return self.labels == index if self.parent[index] < 0 else self.part_labels == index
 
-    def to_dict(self) -> dict[str, list[Any]]:
-        """Makes a table, as `pandas.DataFrame` takes it.
+    def records(self) -> list[dict[str, Any]]:
+        """Plain values of each object for JSON; the columns of a box's "axes" are its axes.
 
-        Returns:
-          Name of a column -> K plain values. "length", "width" and "height" are sides of the oriented box.
+        `pandas.json_normalize` makes a table of them.
         """
-        columns: dict[str, Any] = {"id": np.arange(len(self)), "parent": self.parent}
-        for n in range(NAMES):
-            suffix = f"_{n + 1}" if n else ""
-            columns |= {f"name{suffix}": self.names[:, n], f"probability{suffix}": self.probability[:, n].round(4)}
-        columns |= {"surroundings": self.surroundings, "gaussians": self.shapes.count}
-        columns |= {"confidence": self.confidence.round(4), "views": self.views}
-        shapes = self.shapes
-        for name, values in (("center", shapes.center), ("low", shapes.low), ("high", shapes.high)):
-            columns |= {f"{name}_{axis}": values[:, k] for k, axis in enumerate("xyz")}
-        for k, name in enumerate(("length", "width", "height")):
-            columns[name] = 2 * shapes.half_size[:, k]
-            columns |= {f"{name}_{axis}": shapes.axes[:, j, k].round(6) for j, axis in enumerate("xyz")}
-        columns["frames"] = [[self.frame_names[t] for t in frames if t >= 0] for frames in self.frames]
-        return {name: column if isinstance(column, list) else column.tolist() for name, column in columns.items()}
+        return [self._record(n) for n in range(len(self))]
+
+    def _record(self, n: int) -> dict[str, Any]:
+        """Plain values of one object."""
+        shape = self.shapes[n]
+        length = float(np.linalg.norm(shape.high - shape.low))
+        names = zip(self.names[n], self.probability[n])
+        box = {"center": rounded(shape.center, length), "size": rounded(2 * shape.half_size, length)}
+        return {
+            "id": n,
+            "names": [{"name": name, "probability": round(float(p), 4)} for name, p in names if name],
+            "surroundings": bool(self.surroundings[n]),
+            "parent": int(self.parent[n]) if self.parent[n] >= 0 else None,
+            "gaussians": int(shape.count),
+            "confidence": round(float(self.confidence[n]), 4),
+            "views": int(self.views[n]),
+            "frames": [self.frame_names[t] for t in self.frames[n] if t >= 0],
+            "box": box | {"axes": np.round(shape.axes, 6).tolist()},
+            "low": rounded(shape.low, length),
+            "high": rounded(shape.high, length),
+        }
 
 
 class _Names(NamedTuple):
@@ -180,7 +177,7 @@ def objects(
     renumber[rows] = np.arange(len(rows))
     labels, part_labels = renumber[labels], renumber[part_labels]
     shown = members[rows] @ pixels
-    best = np.argsort(-shown, axis=1, kind="stable")[:, :FRAMES]
+    best = np.argsort(-shown, axis=1, kind="stable")[:, :3]  # those that show most of it
     best = np.where(np.take_along_axis(shown, best, axis=1) > 0, best, -1)
     source_from_scene = np.asarray(field.source_from_scene, np.float64)
     upright = source_from_scene[:3, :3] @ upright
@@ -192,7 +189,7 @@ def objects(
         parent=renumber[whole[rows]],
         confidence=confidence[rows],
         views=(shown > 0).sum(1),
-        frames=np.pad(best, ((0, 0), (0, FRAMES - best.shape[1])), constant_values=-1),
+        frames=np.pad(best, ((0, 0), (0, 3 - best.shape[1])), constant_values=-1),
         shapes=_shapes(field, labels, part_labels, renumber[whole[rows]], upright),
         labels=labels,
         part_labels=part_labels,
@@ -251,6 +248,11 @@ def _name(embeddings: np.ndarray, names: _Names) -> tuple[Int[np.ndarray, "k m"]
     missing = ((0, 0), (0, NAMES - order.shape[1]))
     best = np.pad(np.take_along_axis(probability, order, axis=1), missing)
     return np.pad(order, missing, constant_values=len(names.texts)), best
+
+
+def main_regions(field: LanguageField) -> Int[np.ndarray, " n"]:
+    """Finds the region that has at least half of each Gaussian's weight, or -1. The votes are read in blocks."""
+    return _sizes(field)[1]
 
 
 def _sizes(field: LanguageField) -> tuple[Float[np.ndarray, " r"], Int[np.ndarray, " n"]]:
@@ -323,14 +325,19 @@ def _groups(field: LanguageField, main: np.ndarray, up: np.ndarray) -> Int[np.nd
 
 
 def _is_continued(first: ObjectShapes, second: ObjectShapes, common: Callable[[], ObjectShapes]) -> bool:
-    """Whether two objects touch, are of like size and fill the box of their `common` shape, which costs the most."""
+    """Whether two objects touch, are of like size and fill the box of their `common` shape, which costs the most.
+
+    The gap is at most 0.1 diagonals of the smaller box: two mugs side by side are farther apart. The larger one has at
+    most three times the volume of the other, for a large thing alone fills its box and that of a small thing at its
+    side. The two fill 0.7 of their common box at least.
+    """
     pair = jax.tree.map(lambda *columns: np.concatenate(columns), first, second)
     local = [np.abs((pair.points[1 - k] - pair.center[k]) @ pair.axes[k]) for k in (0, 1)]
     gap = min(np.linalg.norm(np.maximum(local[k] - pair.half_size[k], 0), axis=1).min() for k in (0, 1))
     volume = np.prod(pair.half_size, axis=1)
     size = 2 * np.linalg.norm(pair.half_size, axis=1).min()
-    comparable = volume.max() <= SIZE_RATIO * volume.min()
-    return bool(comparable and gap <= TOUCHING * size and volume.sum() >= FILLED * np.prod(common().half_size))
+    comparable = volume.max() <= 3 * volume.min()
+    return bool(comparable and gap <= 0.1 * size and volume.sum() >= 0.7 * np.prod(common().half_size))
 
 
 def _wholes(

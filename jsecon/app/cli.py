@@ -26,35 +26,6 @@ from jsecon.errors import InputError, describe_error
 from jsecon.pipeline.options import check_ranges
 from jsecon.pipeline.progress import Console
 
-ABOUT = """Finds things in 3D Gaussian scenes by text, at the level of points, on a plain CPU.
-
-examples
-  jsecon demo                                           a made-up room, from frames to answers and a report
-  jsecon run my_capture --out my_field                  COLMAP or nerfstudio folder -> my_field/field.safetensors
-  jsecon run my_photos --out my_field                   photographs or a video: finds their poses first (extra sfm)
-  jsecon run my_capture --out my_field --gaussians point_cloud.ply
-                                                        the same on a scene that is already splatted
-  jsecon query scene.ply "red mug" --out answers        a splat without photographs: plans and renders views of it
-  jsecon fit my_capture --out scene.ply --minutes 5     only the Gaussians, the best that five minutes give
-  jsecon query my_field/field.safetensors "red mug" "dark green bottle" --out answers
-  jsecon query my_field/field.safetensors --at frame_00012 310 145 --out answers
-  jsecon objects my_field/field.safetensors --out catalogue
-                                                        what is in it: names, boxes, sizes, a page of pictures
-  jsecon export my_field/field.safetensors --out scene.glb
-                                                        the whole scene for other programs, regions included
-  jsecon view my_field/field.safetensors "red mug"      in a browser; --export page.html writes a page
-  jsecon eval my_field/field.safetensors --labels my_capture/label --out evaluation
-  jsecon run my_capture --out my_field --models auto
-                                                        with EdgeTAM and SigLIP 2, fetched after asking
-  jsecon models list                                    models by name, sizes, licences; get NAME fetches
-  jsecon run my_capture --out my_field --dry-run        what would run, and why
-  jsecon doctor                                         whether this machine has what runs need
-
-jsecon VERB --help has the options of a verb. Repeat the command of a stopped run to resume it. jsecon --version prints
-the version."""
-
-MARKERS = (tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff, tyro.conf.PositionalMetavarFromFieldName)
-
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command line.
@@ -108,7 +79,11 @@ def parse(argv: Sequence[str]) -> Verb:
     if argv and not argv[0].startswith("-"):
         similar = "".join(f"Did you mean {name}? " for name in difflib.get_close_matches(argv[0], _VERBS, 1))
         raise InputError("jsecon", f"{argv[0]} is not a verb", remedy=f"{similar}jsecon --help lists the verbs.")
-    return _read(_all_verbs(), "jsecon", argv, description=ABOUT)
+    about = "Finds things in 3D Gaussian scenes by text, at the level of points, on a plain CPU."
+    ending = """jsecon VERB --help has the options of a verb. Repeat the command of a stopped run to resume it.
+jsecon --version prints the version."""
+    examples = "\n".join(["examples", *(f"  {kind.examples[0]}" for kind in VERBS)])
+    return _read(_all_verbs(), "jsecon", argv, description=f"{about}\n\n{examples}\n\n{ending}")
 
 
 def _summary(kind: type[Verb]) -> str:
@@ -130,7 +105,9 @@ def _read(kind: Any, prog: str, argv: Sequence[str], description: str | None = N
     printed = io.StringIO()
     try:
         with contextlib.redirect_stderr(printed):
-            return tyro.cli(kind, prog=prog, args=argv, description=description, config=MARKERS)
+            conf = tyro.conf
+            markers = conf.DisallowNone, conf.FlagCreatePairsOff, conf.PositionalMetavarFromFieldName
+            return tyro.cli(kind, prog=prog, args=argv, description=description, config=markers)
     except SystemExit as stop:
         if not stop.code:
             raise
@@ -203,5 +180,3 @@ def _run_verb(verb: Verb, console: Console) -> VerbResult:
 
 
 _VERBS: dict[str, type[Verb]] = {kind.__name__.lower(): kind for kind in VERBS}
-VERB_NAMES = tuple(_VERBS)
-"""Names of the verbs, in the order of the help."""

@@ -18,10 +18,6 @@ from jsecon.process import available_memory, cores
 
 MIN_MEMORY = 2 << 30
 """bytes that `jsecon demo` takes, rounded up"""
-MIN_DISK = 200 << 20
-"""bytes that `jsecon demo` writes, rounded up"""
-MODULES = {"opencv-contrib-python-headless": "cv2", "pillow": "PIL", "scikit-learn": "sklearn"}
-"""package -> the module that it installs, where their names differ"""
 EXTRAS = {
     "sfm": (("pycolmap",), "poses of photographs and videos"),
     "formats": (("gsply", "pillow_heif"), ".spz, .sog, compressed .ply, HEIC photographs"),
@@ -37,7 +33,7 @@ EXTRAS = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Check:
+class _Check:
     """Result of one check."""
 
     name: str
@@ -48,18 +44,13 @@ class Check:
     """What to do about it, if every run depends on it."""
 
 
-def run_checks() -> list[Check]:
-    """Runs all checks."""
-    machine = Check("python", "ok", f"{platform.python_version()}, {platform.platform(terse=True)}")
-    cores_check = Check("cores", "ok", f"{cores()} of {os.cpu_count()} may be used")
-    checks = [machine, _check_packages(), *_check_jax(), cores_check, _check_memory(), _check_disk(), _check_programs()]
-    return [*checks, *map(_check_extra, EXTRAS)]
-
-
 def _doctor(verb: verbs.Doctor, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon doctor`; a check that fails and that every run depends on is an error."""
     with console.progress("checks"):
-        checks = run_checks()
+        checks = [_Check("python", "ok", f"{platform.python_version()}, {platform.platform(terse=True)}")]
+        checks += [_check_packages(), *_check_jax()]
+        checks.append(_Check("cores", "ok", f"{cores()} of {os.cpu_count()} may be used"))
+        checks += [_check_memory(), _check_disk(), _check_programs(), *map(_check_extra, EXTRAS)]
     console.print_line("\n".join(f"{check.status:<8} {check.name:<10} {check.message}" for check in checks))
     failed = [check for check in checks if check.remedy and check.status != "ok"]
     return {"checks": checks, "errors": [InputError(c.name, c.message, remedy=c.remedy) for c in failed]}
@@ -70,10 +61,11 @@ def _required_modules() -> list[str]:
     needs = [
         re.split(r"[<>=!~; \[]", need)[0] for need in importlib.metadata.requires("jsecon") or [] if "extra" not in need
     ]
-    return [MODULES.get(name, name.replace("-", "_")) for name in needs]
+    modules = {"opencv-contrib-python-headless": "cv2", "pillow": "PIL", "scikit-learn": "sklearn"}
+    return [modules.get(name, name.replace("-", "_")) for name in needs]
 
 
-def _check_packages() -> Check:
+def _check_packages() -> _Check:
     """Imports the packages that jsecon requires."""
     broken = {}
     for name in _required_modules():
@@ -84,11 +76,11 @@ def _check_packages() -> Check:
         except Exception as error:  # a broken wheel raises anything
             broken[name] = f"{name} ({error})"
     if not broken:
-        return Check("packages", "ok", f"all {len(_required_modules())} required packages can be imported")
-    return Check("packages", "missing", ", ".join(broken.values()), 'Run: pip install --force-reinstall "jsecon"')
+        return _Check("packages", "ok", f"all {len(_required_modules())} required packages can be imported")
+    return _Check("packages", "missing", ", ".join(broken.values()), 'Run: pip install --force-reinstall "jsecon"')
 
 
-def _check_jax() -> list[Check]:
+def _check_jax() -> list[_Check]:
     """Checks the devices of jax, and whether it computes right numbers on them."""
     try:
         import jax
@@ -99,53 +91,54 @@ def _check_jax() -> list[Check]:
         devices = ", ".join(f"{kinds.count(kind)} {kind}" for kind in sorted(set(kinds)))
     except Exception as error:  # whatever a driver or a wheel raises
         remedy = 'Run: pip install --force-reinstall "jsecon"'
-        return [Check("jax", "wrong", str(error) or describe_error(error), remedy)]
-    jax_check = Check("jax", "ok", f"{jax.__version__}, devices: {devices}")
+        return [_Check("jax", "wrong", str(error) or describe_error(error), remedy)]
+    jax_check = _Check("jax", "ok", f"{jax.__version__}, devices: {devices}")
     try:
         report = check_backend()
     except RuntimeError as error:
-        return [jax_check, Check("backend", "wrong", str(error), REMEDY)]
+        return [jax_check, _Check("backend", "wrong", str(error), REMEDY)]
     message = f"cosines are right to {report.cosine_error:.0e}"
     if report.has_jax_39103:
         message += "; this jax has issue 39103, which jsecon avoids but your code may meet"
-    return [jax_check, Check("backend", "ok", message)]
+    return [jax_check, _Check("backend", "ok", message)]
 
 
-def _check_memory() -> Check:
+def _check_memory() -> _Check:
     """Measures the free memory."""
     free, limit = available_memory()
     if free is None:
-        return Check("memory", "ok", "this system does not report the free memory")
+        return _Check("memory", "ok", "this system does not report the free memory")
     message = f"{_size(free)} free" + ("" if limit is None else f", limit {_size(limit)} (cgroup)")
     if free < MIN_MEMORY:
         message += f"; jsecon demo takes {_size(MIN_MEMORY)}"
-    return Check("memory", "ok" if free >= MIN_MEMORY else "wrong", message, "End other programs, or raise the limit.")
+    return _Check("memory", "ok" if free >= MIN_MEMORY else "wrong", message, "End other programs, or raise the limit.")
 
 
-def _check_disk() -> Check:
+def _check_disk() -> _Check:
     """Measures the free space of the current folder."""
     free = shutil.disk_usage(".").free
+    # jsecon demo writes less than 200 MiB.
     writable = os.access(".", os.W_OK)
     message = f"{_size(free)} free in {Path.cwd()}{'' if writable else ', which cannot be written: use --out'}"
-    return Check("disk", "ok" if writable and free >= MIN_DISK else "wrong", message)
+    return _Check("disk", "ok" if writable and free >= 200 << 20 else "wrong", message)
 
 
-def _check_programs() -> Check:
+def _check_programs() -> _Check:
     """Examines the folder of compiled programs."""
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     if folder is None:
-        return Check("programs", "missing", "no folder can be written, so that every run compiles anew (set HOME)")
+        return _Check("programs", "missing", "no folder can be written, so that every run compiles anew (set HOME)")
     files = [file for file in Path(folder).rglob("*") if file.is_file()]
-    return Check("programs", "ok", f"{len(files)} files, {_size(sum(f.stat().st_size for f in files))} in {folder}")
+    return _Check("programs", "ok", f"{len(files)} files, {_size(sum(f.stat().st_size for f in files))} in {folder}")
 
 
-def _check_extra(name: str) -> Check:
+def _check_extra(name: str) -> _Check:
     """Checks whether the modules of an extra are installed."""
     modules, purpose = EXTRAS[name]
     absent = [module for module in modules if importlib.util.find_spec(module) is None]
     if not absent:
-        return Check(name, "ok", purpose)
-    return Check(name, "missing", f'{purpose}: pip install "jsecon[{name}]" ({", ".join(absent)})')
+        return _Check(name, "ok", purpose)
+    return _Check(name, "missing", f'{purpose}: pip install "jsecon[{name}]" ({", ".join(absent)})')
 
 
 def _size(count: int) -> str:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 from jsecon.app import verbs
-from jsecon.app.models import open_embedder
 from jsecon.app.scene import Scene, open_scene
 from jsecon.errors import InputError
 from jsecon.evaluate.lerf import Row, evaluate_at_thresholds
@@ -60,7 +59,7 @@ def _eval(verb: verbs.Eval, console: Console) -> verbs.VerbResult:
     out = verb.out or verb.field.parent
     require_writable(out)
     with console.progress("field"):
-        scene = open_scene(verb.field, embedder=lambda field: open_embedder(field, verb, console))
+        scene = open_scene(verb.field, embedder=verb.embedder)
         _ = scene.embedder  # else its absence would count as 0 for every text
     results = evaluate(scene, load_lerf_labels(verb.labels), console)
     print_table(results, console)

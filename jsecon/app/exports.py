@@ -1,52 +1,24 @@
-"""`jsecon objects` and `jsecon export`: a catalogue as a page, JSON and CSV; a scene, or objects of it, as files."""
+"""`jsecon objects` and `jsecon export`: a catalogue as a page and JSON; a scene, or objects of it, as files."""
 
-import csv
-import io
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from jaxtyping import UInt8
 
-from jsecon.app import pictures, report, verbs
+from jsecon.app import report, verbs
 from jsecon.app.catalogue import Catalogue
-from jsecon.app.models import open_embedder
 from jsecon.app.outputs import slug
-from jsecon.app.records import decimals, rounded
+from jsecon.app.records import decimals
 from jsecon.app.scene import Scene, open_scene
 from jsecon.errors import InputError
-from jsecon.files import atomic_write, write_text
+from jsecon.files import write_text
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console
 from jsecon.query.outliers import MIN_SAMPLES
 from jsecon.read.splats.files import require_writable_format
-from jsecon.types import LanguageField
-
-
-def object_records(catalogue: Catalogue) -> list[dict[str, Any]]:
-    """Plain values of each object for JSON, in the capture's world; the columns of "axes" are the axes of the box."""
-    records = []
-    for n in range(len(catalogue)):
-        shape = catalogue.shapes[n]
-        length = float(np.linalg.norm(shape.high - shape.low))
-        names = zip(catalogue.names[n], catalogue.probability[n])
-        box = {"center": rounded(shape.center, length), "size": rounded(2 * shape.half_size, length)}
-        record = {
-            "id": n,
-            "names": [{"name": name, "probability": round(float(p), 4)} for name, p in names if name],
-            "surroundings": bool(catalogue.surroundings[n]),
-            "parent": int(catalogue.parent[n]) if catalogue.parent[n] >= 0 else None,
-            "gaussians": int(shape.count),
-            "confidence": round(float(catalogue.confidence[n]), 4),
-            "views": int(catalogue.views[n]),
-            "frames": [catalogue.frame_names[t] for t in catalogue.frames[n] if t >= 0],
-            "box": box | {"axes": np.round(shape.axes, 6).tolist()},
-            "low": rounded(shape.low, length),
-            "high": rounded(shape.high, length),
-        }
-        records.append(record)
-    return records
 
 
 def _objects(verb: verbs.Objects, console: Console) -> verbs.VerbResult:
@@ -55,16 +27,22 @@ def _objects(verb: verbs.Objects, console: Console) -> verbs.VerbResult:
         require_writable(verb.out)
     with console.progress("field"):
         names = None if verb.vocabulary is None else _read_vocabulary(verb.vocabulary)
-        by_model = names is not None or verb.embedder is not None  # else its words may be in the field
-        scene = open_scene(verb.field, embedder=_embedder_of(verb, console) if by_model else None)
+        scene = open_scene(verb.field, embedder=verb.embedder)
         listed = scene.objects(names)
-    _print_catalogue(listed, console)
-    result: verbs.VerbResult = {"objects": object_records(listed)}
+    records = listed.records()
+    _print_objects(records, console)
+    if hidden := int((listed.regions < 0).sum()):
+        console.print_line(f"  too small to be listed, with fewer than {MIN_SAMPLES} Gaussians: {hidden} regions")
+    elif not records:
+        console.print_line("  there are no objects: the field has no regions")
     if verb.out is None:
-        return result
-    files = _write_catalogue(scene, listed, verb.out, console)
+        return {"objects": records}
+    files = {"objects": verb.out / "objects.json", "catalogue": verb.out / "catalogue.html"}
+    content = {"frame": "the capture's world", "up": listed.up.round(6).tolist(), "objects": records}
+    write_text(files["objects"], json.dumps(content, indent=2) + "\n")
+    write_text(files["catalogue"], _page(scene, listed, records, console))
     console.print_line(f"pictures  {files['catalogue']}")
-    return result | {"written": files}
+    return {"objects": records, "written": files}
 
 
 def _read_vocabulary(file: Path) -> list[str]:
@@ -86,7 +64,7 @@ def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
     with console.progress("field"):
         if verb.out is not None:
             require_writable_format(verb.out)
-        scene = open_scene(verb.field, embedder=None if text is None else _embedder_of(verb, console))
+        scene = open_scene(verb.field, embedder=verb.embedder)
     answer = None if text is None else scene.ask(text)
     if answer is not None and not len(answer.rows):
         option = "--only" if verb.only is not None else "--without"
@@ -102,105 +80,66 @@ def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
             result["bytes"] = verb.out.stat().st_size
             result["written"]["scene"] = verb.out
             console.print_line(f"{count} Gaussians, {result['bytes'] / 2**20:.1f} MiB  {verb.out}")
-        if verb.labels is not None:
-            ids = scene.objects().labels.astype(np.int32)
-            ids = ids if mask is None else ids[mask]
-            with atomic_write(verb.labels) as temporary, temporary.open("wb") as stream:
-                np.save(stream, ids)
-            result["written"]["labels"] = verb.labels
-            console.print_line(f"{len(ids)} ids of objects, {int((ids < 0).sum())} of them -1  {verb.labels}")
         if verb.objects is not None:
-            files = _save_objects(scene, scene.objects(), verb.objects)
+            files = _save_objects(scene, verb.objects)
             result["written"]["objects"] = files
             console.print_line(f"{len(files)} objects  {verb.objects}")
     return result
 
 
-def _embedder_of(verb: verbs.FieldVerb, console: Console) -> Callable[[LanguageField], Any]:
-    """Opens the embedder of a verb's field when a text needs it."""
-    return lambda field: open_embedder(field, verb, console)
-
-
 def _check_export(verb: verbs.Export) -> None:
     """Raises InputError for options of an export that say nothing, or that cannot be combined."""
-    if verb.out is None and verb.labels is None and verb.objects is None:
-        raise InputError("export", "there is nothing to write", remedy="Give --out scene.ply, --labels or --objects.")
+    if verb.out is None and verb.objects is None:
+        raise InputError("export", "there is nothing to write", remedy="Give --out scene.ply or --objects.")
     if verb.with_labels and (verb.out is None or verb.out.suffix.lower() == ".spz"):
-        raise InputError("--with-labels", "only a .ply or .glb holds them", remedy="Give --out scene.ply, or --labels.")
+        raise InputError("--with-labels", "only a .ply or .glb holds them", remedy="Give --out scene.ply.")
     if verb.only is not None and verb.without is not None:
         raise InputError("--only", "it cannot be combined with --without", remedy="Export twice, with one of them.")
     if verb.objects is not None and (verb.only is not None or verb.without is not None):
         problem = "it writes all objects, so --only and --without cannot be combined with it"
         raise InputError("--objects", problem, remedy="Leave one of them out.")
-    if verb.labels is not None and verb.labels.suffix != ".npy":
-        raise InputError("--labels", f"{verb.labels} does not end in .npy", remedy="For example: --labels ids.npy")
 
 
-def _print_catalogue(catalogue: Catalogue, listener: Console) -> None:
+def _print_objects(records: list[dict[str, Any]], listener: Console) -> None:
     """Prints a line for each object; parts are indented under their wholes."""
-    wide = max((len(_title(catalogue, n)) for n in range(len(catalogue))), default=4) + 2
+    wide = max((len(_title(record)) for record in records), default=4) + 2
     listener.print_line(f"{'id':>4}  {'name':<{wide}}  prob.  Gaussians  views  conf.  size, centre")
-    for n in range(len(catalogue)):
-        name = ("  " if catalogue.parent[n] >= 0 else "") + _title(catalogue, n)
-        figures = f"{catalogue.probability[n, 0]:5.2f}  {catalogue.shapes.count[n]:9d}  {catalogue.views[n]:5d}"
-        place = f"{_size(catalogue, n)}, at ({_center(catalogue, n)})"
-        ending = ", surroundings" if catalogue.surroundings[n] else ""
-        listener.print_line(f"{n:>4}  {name:<{wide}}  {figures}  {catalogue.confidence[n]:5.2f}  {place}{ending}")
-    if hidden := int((catalogue.regions < 0).sum()):
-        listener.print_line(f"  too small to be listed, with fewer than {MIN_SAMPLES} Gaussians: {hidden} regions")
-    elif not len(catalogue):
-        listener.print_line("  there are no objects: the field has no regions")
+    for record in records:
+        name = ("" if record["parent"] is None else "  ") + _title(record)
+        probability = record["names"][0]["probability"] if record["names"] else 0.0
+        figures = f"{probability:5.2f}  {record['gaussians']:9d}  {record['views']:5d}  {record['confidence']:5.2f}"
+        size, center = _size_and_center(record)
+        ending = ", surroundings" if record["surroundings"] else ""
+        listener.print_line(f"{record['id']:>4}  {name:<{wide}}  {figures}  {size}, at ({center}){ending}")
 
 
-def _write_catalogue(scene: Scene, catalogue: Catalogue, out: Path, listener: Console) -> dict[str, Path]:
-    """Writes OUT/objects.json, OUT/objects.csv and OUT/catalogue.html; returns the files."""
-    files = {"objects": out / "objects.json", "catalogue": out / "catalogue.html", "table": out / "objects.csv"}
-    content = {"frame": "the capture's world", "up": catalogue.up.round(6).tolist()}
-    content |= {"objects": object_records(catalogue)}
-    write_text(files["objects"], json.dumps(content, indent=2) + "\n")
-    columns = catalogue.to_dict()
-    table = io.StringIO()
-    writer = csv.writer(table, lineterminator="\n")
-    writer.writerow(columns)
-    for row in zip(*columns.values()):
-        writer.writerow([" ".join(value) if isinstance(value, list) else value for value in row])
-    write_text(files["table"], table.getvalue())
-    write_text(files["catalogue"], _page(scene, catalogue, listener))
-    return files
-
-
-def _save_objects(scene: Scene, catalogue: Catalogue, folder: Path) -> list[Path]:
+def _save_objects(scene: Scene, folder: Path) -> list[Path]:
     """Writes a .ply of each object, named by its id and name; of a whole with the Gaussians of its parts."""
     files = []
-    for n in range(len(catalogue)):
-        name = slug(_title(catalogue, n)).encode()[:60].decode("utf-8", "ignore")
-        files.append(folder / f"{n:03d}-{name}.ply")
-        scene.export(files[-1], catalogue.mask(n))
+    catalogue = scene.objects()
+    for record in catalogue.records():
+        name = slug(_title(record)).encode()[:60].decode("utf-8", "ignore")
+        files.append(folder / f"{record['id']:03d}-{name}.ply")
+        scene.export(files[-1], catalogue.mask(record["id"]))
     return files
 
 
-def _page(scene: Scene, catalogue: Catalogue, listener: Console) -> str:
+def _page(scene: Scene, catalogue: Catalogue, records: list[dict[str, Any]], listener: Console) -> str:
     """Returns the page: a card for each object, which opens to its views."""
     cards: dict[bool, list[str]] = {False: [], True: []}
     with listener.progress("pictures") as progress:
-        for n in range(len(catalogue)):
-            mask = catalogue.mask(n)
-            frames = [int(t) for t in catalogue.frames[n] if t >= 0]
-            figures = [report.figure(scene.render(t, mask), scene.field.names[t]) for t in frames]
-            best = frames[0] if frames else 0
-            parent = catalogue.parent[n]
-            cards[bool(catalogue.surroundings[n])].append(
-                report.card(
-                    pictures.fitted(scene.renderer.crop(best, mask), 150),
-                    _title(catalogue, n),
-                    f"{n} · {_size(catalogue, n)}" + (f" · part of {parent}" if parent >= 0 else ""),
-                    report.grid(figures, 3),
-                    report.table(("", ""), _facts(catalogue, n), numbers_from=2),
-                    search=" ".join((str(n), *map(str, catalogue.names[n]))),
-                )
-            )
-            progress(n + 1, len(catalogue))
-    parts = [report.cards(cards[False], search="Search names and ids")]
+        for record in records:
+            mask = catalogue.mask(record["id"])
+            figures = [report.figure(scene.render(name, mask), name) for name in record["frames"]]
+            best = scene.frame_index(record["frames"][0]) if record["frames"] else 0
+            part = "" if record["parent"] is None else f" · part of {record['parent']}"
+            picture = _fitted(scene.renderer.crop(best, mask), 150)
+            words = f"{record['id']} · {_size_and_center(record)[0]}{part}"
+            facts = report.table(("", ""), _facts(record, records))
+            card = report.card(picture, _title(record), words, report.grid(figures, 3), facts)
+            cards[record["surroundings"]].append(card)
+            progress(record["id"] + 1, len(records))
+    parts = [report.cards(cards[False])]
     if cards[True]:
         words = "Walls, floors and the like, by their names."
         parts.append(report.section("Surroundings", words, report.cards(cards[True])))
@@ -208,35 +147,35 @@ def _page(scene: Scene, catalogue: Catalogue, listener: Console) -> str:
     return report.page("Objects", lead, parts)
 
 
-def _facts(catalogue: Catalogue, n: int) -> list[tuple[str, str]]:
+def _fitted(image: UInt8[np.ndarray, "h w 3"], side: int) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """Scales an image to a longer side, px."""
+    scale = side / max(image.shape[:2])
+    size = max(round(scale * image.shape[1]), 1), max(round(scale * image.shape[0]), 1)
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+
+
+def _facts(record: dict[str, Any], records: list[dict[str, Any]]) -> list[tuple[str, str]]:
     """Returns the lines of an object's table."""
-    names = [f"{name} {p:.0%}" for name, p in zip(catalogue.names[n], catalogue.probability[n]) if name]
+    size, center = _size_and_center(record)
+    parts = [f"{other['id']} {_title(other)}" for other in records if other["parent"] == record["id"]]
     rows = [
-        ("names", ", ".join(names)),
-        ("size", _size(catalogue, n)),
-        ("centre", _center(catalogue, n)),
-        ("Gaussians", str(catalogue.shapes.count[n])),
-        ("frames that show it", str(catalogue.views[n])),
-        ("confidence", f"{catalogue.confidence[n]:.0%}"),
+        ("names", ", ".join(f"{name['name']} {name['probability']:.0%}" for name in record["names"])),
+        ("size", size),
+        ("centre", center),
+        ("Gaussians", str(record["gaussians"])),
+        ("frames that show it", str(record["views"])),
+        ("confidence", f"{record['confidence']:.0%}"),
     ]
-    if children := np.flatnonzero(catalogue.parent == n).tolist():
-        rows.append(("parts", ", ".join(f"{k} {_title(catalogue, k)}" for k in children)))
-    return rows
+    return [*rows, ("parts", ", ".join(parts))] if parts else rows
 
 
-def _title(catalogue: Catalogue, n: int) -> str:
+def _title(record: dict[str, Any]) -> str:
     """Returns the best name of an object, or "object" where there is no vocabulary."""
-    return str(catalogue.names[n, 0]) or "object"
+    return record["names"][0]["name"] if record["names"] else "object"
 
 
-def _size(catalogue: Catalogue, n: int) -> str:
-    """Returns length, width and height of an object, to a hundredth of its size."""
-    size = 2 * catalogue.shapes.half_size[n]
+def _size_and_center(record: dict[str, Any]) -> tuple[str, str]:
+    """Returns length, width and height of an object, and its centre, to a hundredth of its size."""
+    size, center = record["box"]["size"], record["box"]["center"]
     digits = decimals(float(np.linalg.norm(size)), 0.01)
-    return " x ".join(f"{side:.{digits}f}" for side in size)
-
-
-def _center(catalogue: Catalogue, n: int) -> str:
-    """Returns the centre of an object, to a hundredth of its size."""
-    digits = decimals(2 * float(np.linalg.norm(catalogue.shapes.half_size[n])), 0.01)
-    return ", ".join(f"{x:.{digits}f}" for x in catalogue.shapes.center[n])
+    return " x ".join(f"{x:.{digits}f}" for x in size), ", ".join(f"{x:.{digits}f}" for x in center)

@@ -18,20 +18,11 @@ from mcp.types import ToolAnnotations
 from pydantic import Field
 
 from jsecon.app import verbs
-from jsecon.app.exports import object_records
-from jsecon.app.models import with_models
 from jsecon.app.scene import Scene
 from jsecon.app.scenes import find_scene, open_scenes
 from jsecon.errors import InputError
 from jsecon.pipeline.progress import Console
 
-INSTRUCTIONS = (
-    "Finds things in 3D scenes. Coordinates are in the scene's own world, in metres where the capture has metres. "
-    'A text names a thing, or tells it apart by place, order or number: "the second red mug from the left", "the ball '
-    'on the plate next to the bowl", "how many bottles".'
-)
-MAX_OBJECTS = 100
-"""objects in an answer of the tool `objects`"""
 Words: TypeAlias = Annotated[str, Field(description="What is asked for, in words", pattern=r"\S", max_length=500)]
 Frame: TypeAlias = Annotated[
     str | None, Field(description="Name of the frame that it is seen from, or #3 for the fourth")
@@ -55,9 +46,9 @@ class _Tools:
         return {"field": scene.name} | scene.ask(text, frame=frame).as_dict()
 
     def objects(self, field: FieldName = None) -> dict[str, Any]:
-        """Lists the objects of a scene with names, sizes and places, the largest first."""
-        rows = object_records(find_scene(self._scenes, field).objects())
-        return {"count": len(rows), "objects": rows[:MAX_OBJECTS]}
+        """Lists the objects of a scene with names, sizes and places, the largest first; at most 100."""
+        rows = find_scene(self._scenes, field).objects().records()
+        return {"count": len(rows), "objects": rows[:100]}
 
     def locate(self, text: Words, frame: Frame = None, field: FieldName = None) -> dict[str, Any]:
         """Locates one thing: oriented box, and the middle of its top, where a gripper from above would close."""
@@ -82,7 +73,12 @@ class _Tools:
 
 def make_server(scenes: Mapping[str, Scene]) -> MCPServer:
     """Makes the server of scenes by name, the first of which is the default."""
-    server = MCPServer("jsecon", instructions=f"{INSTRUCTIONS} Fields: {', '.join(scenes)}.")
+    instructions = (
+        "Finds things in 3D scenes. Coordinates are in the scene's own world, in metres where the capture has metres. "
+        'A text names a thing, or tells it apart by place, order or number: "the second red mug from the left", "the '
+        'ball on the plate next to the bowl", "how many bottles".'
+    )
+    server = MCPServer("jsecon", instructions=f"{instructions} Fields: {', '.join(scenes)}.")
     tools = _Tools(scenes)
     annotations = ToolAnnotations(read_only_hint=True, open_world_hint=False, idempotent_hint=True)
     for method in (tools.find, tools.objects, tools.locate, tools.measure, tools.render):
@@ -109,7 +105,7 @@ def _mcp(verb: verbs.Mcp, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon mcp`; standard output belongs to the protocol, so the console is on standard error."""
     console = Console(sys.stderr, sys.stderr)
     with console.progress("fields"):
-        scenes = open_scenes(verb.fields, with_models(verb, console, yes=False).embedder)
+        scenes = open_scenes(verb.fields, verb.embedder)
     for scene in scenes.values():
         console.print_line(
             f"{scene.name}: {scene.field.gaussians.count} Gaussians, {scene.field.regions.count} regions"

@@ -1,108 +1,15 @@
-"""Models by name on the command line: which ones there are, fetching them after asking, and examining them."""
+"""`jsecon models`: which models there are, fetching them, and examining them."""
 
-import contextlib
 import dataclasses
-import sys
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import get_args
 
 from jsecon.app import verbs
 from jsecon.errors import InputError
 from jsecon.networks import hub
 from jsecon.networks.hub import HubModel, Precision, Role
 from jsecon.pipeline.progress import Console
-
-T = TypeVar("T", bound=Any)
-OLD_FIELD = (
-    "an earlier version made this field, without the unrelated words that texts are compared with. Fixed thresholds "
-    "decide which texts are answered. Make it again with `jsecon run`."
-)
-
-
-def with_models(options: T, console: Console, *, yes: bool) -> T:
-    """Replaces the names of models in options by the folders of their files, fetching what is missing.
-
-    Args:
-      options: A dataclass with attributes named like roles (embedder, segmenter, tracker) that hold a name, an
-        address or a folder; and perhaps `models` and `precision`.
-      console: Where to print and ask.
-      yes: Fetch without asking.
-    """
-    precision = getattr(options, "precision", None)
-    recommended = hub.RECOMMENDED if getattr(options, "models", None) == AUTO else {}
-    models = {}
-    for role in get_args(Role):
-        choice = getattr(options, role, None)
-        choice = recommended.get(role) if choice is None else choice
-        if choice is not None:
-            models[role] = hub.parse_model(choice, role, precision)
-    return dataclasses.replace(options, **_folders_of_models(models, console, yes=yes))
-
-
-def _folders_of_models(
-    models: Mapping[Role, HubModel | Path], console: Console, *, yes: bool, fresh: bool = False
-) -> dict[Role, Path]:
-    """Returns the folders of models, after fetching those that are missing; `fresh` fetches all as they are now."""
-    folders: dict[Role, Path] = {}
-    missing: dict[Role, HubModel] = {}
-    for role, model in models.items():
-        if isinstance(model, Path):
-            folders[role] = model
-        elif not fresh and (cached := model.cached_folder) is not None:
-            folders[role] = cached
-        else:
-            missing[role] = model
-    if not missing:
-        return folders
-    with console.progress("hub"):
-        downloads: dict[Role, hub.Download] = {role: hub.plan_download(model) for role, model in missing.items()}
-    for download in downloads.values():
-        console.note(f"fetching {download}" if yes else f"needs {download}")
-    if not yes:
-        commands = "; ".join(model.get_command for model in missing.values())
-        where = " ".join(model.address for model in missing.values())
-        if not sys.stdin.isatty():
-            raise InputError(where, "not on this machine", "", f"Fetch with: {commands}. Or add --yes.")
-        if input("Fetch now? [y/N] ").strip().lower() not in ("y", "yes"):
-            raise InputError(where, "not fetched", "", f"To fetch later: {commands}.")
-    for role, download in downloads.items():
-        folders[role] = hub.fetch(download)
-    return folders
-
-
-def open_embedder(field: Any, verb: verbs.FieldVerb, console: Console) -> Any:
-    """Opens the embedder of a field for a verb, which states the model, and warns of a field of an earlier version."""
-    from jsecon.pipeline import model_loading
-
-    if field.unrelated_words is None:
-        console.note(OLD_FIELD)
-    folder = with_models(verb, console, yes=verb.yes).embedder
-    if folder is None and (verb.yes or sys.stdin.isatty()):
-        missing = model_loading.find_model(field)
-        if isinstance(missing, HubModel):
-            folder = _folders_of_models({"embedder": missing}, console, yes=verb.yes)["embedder"]
-    return model_loading.field_embedder(field, folder)
-
-
-AUTO = "auto"
-"""in place of a name: the recommended models"""
-TABLE_HEAD = f"{'name':<11} {'role':<10} {'MB':>5} {'s/frame':>7}"
-TABLE_NOTE = "MB and seconds are of fp32: a frame of 400x300 on two cores, 40 regions or one object in it."
-
-
-def _table_lines() -> Iterator[str]:
-    """Yields name, role, size and seconds of each named model, under TABLE_HEAD."""
-    for row in hub.catalogue():
-        seconds = "-" if row.seconds is None else f"{row.seconds:.1f}"
-        yield f"{row.name:<11} {row.role:<10} {row.megabytes['fp32']:>5} {seconds:>7}"
-
-
-def help_table() -> str:
-    """Makes a table of the named models, for the help of a run: name, role, size, seconds and what each model adds."""
-    lines = [f"{line}  {row.purpose}" for row, line in zip(hub.catalogue(), _table_lines())]
-    return "\n".join(["models", *(f"  {line}" for line in (f"{TABLE_HEAD}  adds", *lines, TABLE_NOTE))])
 
 
 def _models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
@@ -118,12 +25,16 @@ def _models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
 def _list_models(console: Console) -> verbs.VerbResult:
     """Prints the catalogue: name, role, size, licence, whether it is on this machine, and what it is good for."""
     rows = []
-    console.print_line(f"{TABLE_HEAD:<34}  {'here':<10} {'licence':<25} adds")
-    for row, line in zip(hub.catalogue(), _table_lines()):
+    columns = "{:<11} {:<10} {:>5} {:>7}  {:<10} {:<25} {}".format
+    console.print_line(columns("name", "role", "MB", "s/frame", "here", "licence", "adds"))
+    for row in hub.catalogue():
         cached = [each for each in row.megabytes if row.in_precision(each).cached_folder is not None]
-        console.print_line(f"{line:<34}  {' '.join(cached) or '-':<10} {row.licence:<25} {row.purpose}")
+        seconds = "-" if row.seconds is None else f"{row.seconds:.1f}"
+        here = " ".join(cached) or "-"
+        line = columns(row.name, row.role, row.megabytes["fp32"], seconds, here, row.licence, row.purpose)
+        console.print_line(line)
         rows.append(dataclasses.asdict(row) | {"cached": cached})
-    console.print_line(TABLE_NOTE)
+    console.print_line("MB and seconds are of fp32: a frame of 400x300 on two cores, 40 regions or one object in it.")
     console.print_line(
         "jsecon models get NAME fetches one; hub:owner/name names any other repository of huggingface.co."
     )
@@ -134,10 +45,15 @@ def _get_models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
     """Fetches models, also if an older revision of them is on this machine. One that fails does not stop the others."""
     folders, errors = {}, []
     for name in verb.names:
-        models = _candidates(name, verb.role, verb.precision)
-        for model in [_usable(models)] if name.startswith(hub.PREFIX) and verb.role is None else models:
+        if name.startswith(hub.PREFIX) and verb.role is None:
+            errors.append(InputError(name, "an address does not tell what the model is for", remedy="Give --role."))
+            continue
+        for model in _candidates(name, verb.role, verb.precision):
             try:
-                folder = _folders_of_models({model.role: model}, console, yes=verb.yes, fresh=True)[model.role]
+                with console.progress("hub"):
+                    download = hub.plan_download(model)
+                console.note(f"fetching {download}")
+                folder = hub.fetch(download)
             except InputError as error:
                 errors.append(error)
                 continue
@@ -184,21 +100,7 @@ def _candidates(name: str, role: Role | None, precision: Precision | None) -> li
     """Returns the models of a name, one for each of its roles; of an address one for each role that it may have."""
     if name.startswith(hub.PREFIX):
         return [hub.parse_address(name, each, precision) for each in get_args(Role) if role in (None, each)]
-    if name != AUTO:
+    if name != "auto":
         return [row.in_precision(precision) for row in hub.models_of_name(name, role)]
     rows = [hub.models_of_name(each, of)[0] for of, each in hub.RECOMMENDED.items() if role in (None, of)]
     return [row.in_precision(precision) for row in rows]
-
-
-def _usable(models: Sequence[HubModel]) -> HubModel:
-    """Returns the first of the models of a repository that has its files on this machine, else on the hub."""
-    for model in models:
-        if model.cached_folder is not None:
-            return model
-    for model in models:
-        with contextlib.suppress(hub.NoSuchFilesError):
-            hub.plan_download(model)
-            return model
-    remedy = "jsecon models list has models that work."
-    problem = f"it holds no model in {models[0].precision} that jsecon reads"
-    raise InputError(models[0].address, problem, "", remedy)

@@ -1,11 +1,10 @@
 """Fields and captures in a notebook: a picture and a line of each.
 
-jsecon.types calls `to_html` and `to_png` through the table of contents when a notebook asks.
+jsecon.types calls `to_html` through the table of contents when a notebook asks.
 """
 
 import html
 
-import cv2
 import jax
 import numpy as np
 from jaxtyping import UInt8
@@ -14,11 +13,6 @@ from jsecon.app import pictures, report
 from jsecon.fit.resize import resize_frame, scale_cameras
 from jsecon.read.captures.frames import evenly_spaced
 from jsecon.types import Capture, LanguageField
-
-LONG_SIDE = 240
-"""longer side of a picture, px"""
-CAPTURE_FRAMES = 4
-"""number of frames in the picture of a capture"""
 
 
 def to_html(value: LanguageField | Capture) -> str:
@@ -34,24 +28,12 @@ def to_html(value: LanguageField | Capture) -> str:
     return f'<div><img alt="" src="{report.data_uri(image)}"><br>{html.escape(words)}</div>'
 
 
-def to_png(value: LanguageField | Capture) -> bytes:
-    """Draws the picture of a value.
-
-    Args:
-      value: A LanguageField or a Capture.
-
-    Returns:
-      The content of a PNG file.
-    """
-    return cv2.imencode(".png", cv2.cvtColor(_picture(value)[0], cv2.COLOR_RGB2BGR))[1].tobytes()
-
-
 def _picture(value: LanguageField | Capture) -> tuple[UInt8[np.ndarray, "h w 3"], str]:
     """Returns the picture and the line of a value."""
     cameras = jax.tree.map(np.asarray, value.cameras)
-    small = scale_cameras(cameras, min(LONG_SIDE / max(cameras.width, cameras.height), 1.0))
+    small = scale_cameras(cameras, min(240 / max(cameras.width, cameras.height), 1.0))
     if isinstance(value, Capture):
-        chosen = evenly_spaced(len(value.names), CAPTURE_FRAMES)
+        chosen = evenly_spaced(len(value.names), 4)
         image = np.concatenate([resize_frame(np.asarray(value.frames[t]), small) for t in chosen], axis=1)
         words = f"Capture of {len(value.names)} frames of {cameras.width}x{cameras.height}, "
         words += f"{int(np.asarray(value.held_out).sum())} held out, {len(value.points):,} sparse points"

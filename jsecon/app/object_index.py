@@ -7,8 +7,7 @@ several objects, with what came nearest or what would settle which is meant.
 
 import dataclasses
 import functools
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -16,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import KDTree
 
-from jsecon.app.catalogue import Catalogue, region_objects
+from jsecon.app.catalogue import region_objects
 from jsecon.app.records import Answer, Object, Query, gaussian_rows, rounded, world_scale
 from jsecon.field.columns import votes_of_rows
 from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction_of_regions
@@ -31,14 +30,41 @@ from jsecon.query.rules import QueryRules
 from jsecon.types import LanguageField, Selection
 from jsecon.views.frame import field_up
 
-ONE_WAY = 0.5
-"""length of the mean of the cameras' horizontal directions from which they look one way"""
-SAME_NAME = 1e-4
-"""cosine by which a name must be nearer to an object than the text, to fit it better"""
 MAX_KEPT = 1024
 """number of phrases, and of objects, that are kept"""
 SEEN = ("left of", "right of", "in front of", "behind", "leftmost", "rightmost", "nearest", "farthest")
 """relations and orders that depend on the viewpoint"""
+
+
+def choose_shades(
+    field: LanguageField, embedder: Any, texts: Sequence[str], rules: QueryRules, *, every: bool
+) -> list[str]:
+    """Replaces texts that no region matches by narrower ones that some region does.
+
+    Among colours "blue" is a family, and a room may have nothing of its typical colour but a dark and a light blue
+    thing. Each is far from the word and near to its own shade.
+
+    The embedder's `narrower(text)`, if it has one, lists texts that name a part of what the text names. With `every`,
+    all of these that match replace the text, instead of the best of them.
+    """
+    if not hasattr(embedder, "narrower"):
+        return list(texts)
+
+    def score(text: str, rules: QueryRules) -> float:
+        match = match_regions(field, jnp.asarray(embedder.embed_text([text])), rules)
+        return float(match.score) if int(match.region) >= 0 else -np.inf
+
+    replaced: list[str] = []
+    for text in texts:
+        narrower = embedder.narrower(text)
+        best: list[str] = []
+        if narrower and np.isinf(score(text, rules)):
+            # Of n attempts one succeeds by chance as often as one attempt that is n times as strict.
+            strict = dataclasses.replace(rules, min_rank=1 - (1 - rules.min_rank) / len(narrower))
+            scores = {option: score(option, strict) for option in narrower}
+            best = [option for option in sorted(narrower, key=scores.__getitem__) if scores[option] > -np.inf]
+        replaced.extend(best[0 if every else -1 :] or [text])
+    return replaced
 
 
 class ObjectIndex:
@@ -48,8 +74,6 @@ class ObjectIndex:
       field: The field, with what texts are compared with.
       embedder: Its embedder.
       up: (3,) up axis in the capture's world; None finds it.
-      catalogue: Lists all objects with names, which tell objects of one name apart.
-      shades: Replaces texts by narrower ones that the field has (`choose_shades`).
     """
 
     def __init__(
@@ -57,8 +81,6 @@ class ObjectIndex:
         field: LanguageField,
         embedder: Any,
         up: Sequence[float | int] | None,
-        catalogue: Callable[[], Catalogue],
-        shades: Callable[..., list[str]],
     ):
         """Finds the up axis; objects are measured when they are first asked for."""
         self.up = field_up(field, up)
@@ -68,7 +90,6 @@ class ObjectIndex:
         self._field = dataclasses.replace(field, regions=regions, unrelated_words=reference, cameras=cameras)
         self._embedder = embedder
         self._rules = QueryRules(all_of_class=True, logits=getattr(embedder, "logits", None))
-        self._catalogue, self._shades = catalogue, shades
         self._votes = jax.tree.map(np.asarray, field.votes)
         self._object = functools.lru_cache(MAX_KEPT)(self._measure_object)
         self._objects_of = functools.lru_cache(MAX_KEPT)(self._find_objects)
@@ -79,7 +100,7 @@ class ObjectIndex:
             for regions in {(region,) for region in group} | {group}:
                 self._object(regions)
         match_regions(self._field, self._field.regions.embeddings[:1], self._rules)  # compiles it
-        _ = self._catalogue(), self._names
+        _ = self._names
 
     def _find_objects(self, phrase: str) -> tuple[list[Object], float]:
         """Finds the objects that a phrase names: regions that match it, those of one object joined.
@@ -88,7 +109,7 @@ class ObjectIndex:
         the best name of some of the objects, the others do not count. The second value is the share of unrelated words
         that are less similar to the scene than the phrase.
         """
-        texts = self._shades(self._field, self._embedder, [phrase], self._rules, every=True)
+        texts = choose_shades(self._field, self._embedder, [phrase], self._rules, every=True)
         embedded = jax.device_put(self._embedder.embed_text(texts))
         match = match_regions(self._field, embedded, self._rules)
         regions = np.flatnonzero(np.asarray(match.chosen)) if int(match.region) >= 0 else np.zeros(0, int)
@@ -105,7 +126,8 @@ class ObjectIndex:
             return groups
         embeddings = np.asarray(self._field.regions.embeddings)
         similarity = embeddings @ np.asarray(self._embedder.embed_text(list(texts)))[0]
-        fits = similarity >= (embeddings @ self._names.T).max(1) - SAME_NAME
+        # A name that is as near within rounding fits no better.
+        fits = similarity >= (embeddings @ self._names.T).max(1) - 1e-4
         return [group for group in groups if fits[list(group)].any()] or groups
 
     @functools.cached_property
@@ -157,7 +179,7 @@ class ObjectIndex:
             ahead = ahead - (ahead @ self.up)[:, None] * self.up
             ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
             mean = ahead.mean(0)
-            if np.linalg.norm(mean) >= ONE_WAY:
+            if np.linalg.norm(mean) >= 0.5:  # they look one way
                 middle = np.asarray(cameras.centres, np.float64).mean(0)
                 return Viewpoint(middle, mean / np.linalg.norm(mean), self.up), "as seen from the mean of the cameras"
             pixels = np.asarray(self._field.regions.pixel_counts, np.int64)
@@ -207,26 +229,11 @@ class ObjectIndex:
         )
 
     def _tell_apart(self, objects: Sequence[Object], view: Viewpoint) -> str:
-        """Says how objects of one name could be told apart: by what stands nearest to each, or from left to right."""
-        listed = self._catalogue()
-        same_regions = {int(listed.regions[region]) for found in objects for region in found.regions}
-        name_of = [str(name) for name in listed.names[:, 0]]
-        times = Counter(name_of)
-        marks = [
-            k
-            for k, name in enumerate(name_of)
-            if times[name] == 1 and k not in same_regions and not listed.surroundings[k]
-        ]
+        """Says how objects of one name could be told apart: from left to right."""
         source_from_scene = np.asarray(self._field.source_from_scene, np.float64)
         centers = np.stack(
             [source_from_scene[:3, :3] @ found.shape.center[0] + source_from_scene[:3, 3] for found in objects]
         )
-        if marks:
-            away = np.linalg.norm(centers[:, None] - np.asarray(listed.shapes.center)[marks], axis=2)
-            nearest = [name_of[marks[k]] for k in away.argmin(1)]
-            if len(set(nearest)) == len(nearest):
-                words = [f"the one near the {name}" for name in nearest]
-                return f"{', '.join(words[:-1])} or {words[-1]}"
         bearing = order_values(stack_shapes(objects), view)["leftmost"]
         places = ["the left one", *["a middle one"] * (len(objects) - 2), "the right one"]
         words = [

@@ -24,10 +24,6 @@ from jsecon.read.captures.images import write_image
 
 MAX_SLUG_BYTES = 80
 """bytes of a slug; a file name may have 255 bytes, two slugs and their hashes among them"""
-DEVICES = frozenset(("con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(10))))
-"""names that Windows reserves for devices, whatever their ending"""
-POINTED = re.compile(r"(at|box|region) .*\d", re.DOTALL)
-"""names of queries without a text: a pixel, a box, a region"""
 
 
 def write_answer(
@@ -39,7 +35,7 @@ def write_answer(
       answer: The answer.
       scene: The scene that gave it.
       out: Output folder.
-      masks: Index of a frame -> mask to write (`Scene.masks`).
+      masks: Index of a frame -> mask to write (`Scene.mask`).
       ending: Format of the Gaussians: ply, spz or glb.
     """
     stem = file_stem(answer)
@@ -79,7 +75,7 @@ def write_answers(
             if answer.outlier_words:
                 listener.note(f"{answer.outlier_words}; --keep-outliers keeps them")
             if stem not in records:  # else the question stands there twice
-                masks = scene.masks(answer, max(views, 1))
+                masks = {t: scene.mask(answer, t) for t in scene.best_frames(answer, max(views, 1))}
                 records[stem] = write_answer(answer, scene, out, dict(list(masks.items())[:views]), ending=ending)
                 sections[stem] = _section(scene, answer, masks)
             progress(n + 1, len(answers))
@@ -102,9 +98,10 @@ def file_stem(answer: Answer) -> str:
     """Names the files of an answer without ending: the same name in every run, and not that of any other query."""
     name, key = str(answer.query), answer.query.key
     plain = slug(name)
-    pointed = POINTED.fullmatch(name) is not None  # a text may be called like a pixel
-    by_name = pointed == (key is not None) and not isinstance(answer.query.question, Mask)
-    short = len(plain.encode()) <= MAX_SLUG_BYTES and plain not in DEVICES
+    pointed = re.fullmatch(r"(at|box|region) .*\d", name, re.DOTALL)  # a text may be called like a pixel
+    by_name = bool(pointed) == (key is not None) and not isinstance(answer.query.question, Mask)
+    device = re.fullmatch(r"con|prn|aux|nul|(com|lpt)\d", plain)  # on Windows, whatever its ending
+    short = len(plain.encode()) <= MAX_SLUG_BYTES and not device
     if by_name and short and plain.replace("-", " ") == name:
         return plain
     return _hashed(plain, name if key is None else key + "\0")

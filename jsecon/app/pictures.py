@@ -8,50 +8,26 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from jsecon.field.columns import vote_blocks
-from jsecon.field.membership import SHARE_THRESHOLD, vote_shares
+from jsecon.app.catalogue import main_regions
 from jsecon.splat.render import render, render_rgb
 from jsecon.splat.visible import render_in_blocks
 from jsecon.types import Array, Camera, Gaussians, LanguageField
 
 SELECTED = (255, 64, 160)
 """RGB of a selection, which no natural object has"""
-TRUTH = (255, 255, 255)
-"""RGB of the ground truth's outline, over a black line"""
 UNKNOWN = 0.25
 """grey of Gaussians without a region, 0 to 1"""
-GOLDEN_ANGLE = 0.61803398875
-"""difference of neighbouring hues, in turns"""
-MARGIN = 0.3
-"""margin around an object in its picture, as a share of its size"""
-MIN_CROP_PX = 16
-"""smallest size of an object in its picture"""
 
 
 def palette(count: int) -> UInt8[np.ndarray, "n 3"]:
-    """Chooses the colours of regions: hues a golden angle apart, three lightnesses in turn.
-
-    Args:
-      count: Number of regions.
-
-    Returns:
-      RGB of regions 0 .. count-1, each of which does not depend on `count`.
-    """
-    hues = (0.11 + GOLDEN_ANGLE * np.arange(count)) % 1.0
+    """Chooses RGB of regions 0 .. count-1, none of which depends on `count`: hues a golden angle apart."""
+    hues = (0.11 + 0.61803398875 * np.arange(count)) % 1.0
     colours = [colorsys.hls_to_rgb(h, (0.62, 0.42, 0.72)[i % 3], 0.85) for i, h in enumerate(hues)]
     return (np.asarray(colours, np.float64).reshape(count, 3) * 255).astype(np.uint8)
 
 
 def label_overlay(frame: UInt8[np.ndarray, "h w 3"], labels: Int[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Paints regions over a frame.
-
-    Args:
-      frame: RGB of the frame.
-      labels: Region ids of its pixels, -1 outside of regions.
-
-    Returns:
-      The frame in grey, with each region in its colour (`palette`) and a dark line between regions.
-    """
+    """Paints regions (-1 for none) over a frame in grey: each in its colour (`palette`), a dark line between them."""
     grey = np.repeat(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=2).astype(np.float32)
     colours = palette(int(labels.max(initial=0)) + 1)[np.maximum(labels, 0)]
     image = np.where((labels >= 0)[..., None], 0.28 * grey + 0.72 * colours, 0.55 * grey)
@@ -65,65 +41,13 @@ def label_overlay(frame: UInt8[np.ndarray, "h w 3"], labels: Int[np.ndarray, "h 
 def selection_overlay(
     frame: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], truth: Bool[np.ndarray, "h w"] | None = None
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Shows a selection in a frame.
-
-    Args:
-      frame: RGB of the frame.
-      mask: Pixels of the selection.
-      truth: Pixels of the ground truth, if there is one.
-
-    Returns:
-      The frame, dark outside of the selection and tinted inside, with the outline of the ground truth.
-    """
+    """Shows a selection in a frame: dark outside, tinted inside, with the outline of the ground truth, if any."""
     image = frame.astype(np.float32)
     image = np.where(mask[..., None], 0.55 * image + 0.45 * np.array(SELECTED, np.float32), 0.5 * image)
     image = _outlined(image.astype(np.uint8), mask, SELECTED, 1)
     if truth is not None:
-        image = _outlined(_outlined(image, truth, (0, 0, 0), 3), truth, TRUTH, 1)
+        image = _outlined(_outlined(image, truth, (0, 0, 0), 3), truth, (255, 255, 255), 1)
     return image
-
-
-def object_strip(
-    frames: UInt8[np.ndarray, "t h w 3"], labels: Int[np.ndarray, "t h w"], region: int, *, side: int = 96
-) -> UInt8[np.ndarray, "{side} w2 3"]:
-    """Shows one region through frames.
-
-    Args:
-      frames: T frames.
-      labels: Region ids of their pixels, -1 outside of regions.
-      region: Id of the region.
-      side: Side of a tile, px.
-
-    Returns:
-      T tiles side by side: the region cut out and outlined; dark if a frame does not show it.
-    """
-    tiles = []
-    for frame, mask in zip(frames, labels == region):
-        rows, columns = np.nonzero(mask)
-        tile = np.full((side, side, 3), 40, np.uint8)
-        if len(rows):
-            (top, low), (left, right) = ((int(a.min()), int(a.max()) + 1) for a in (rows, columns))
-            scale = side / (1.3 * max(low - top, right - left) + 8)
-            shift = [side / 2 - scale * (left + right) / 2, side / 2 - scale * (top + low) / 2]
-            matrix = np.array([[scale, 0, shift[0]], [0, scale, shift[1]]])
-            tile = cv2.warpAffine(_outlined(frame, mask, SELECTED, 1), matrix, (side, side), borderValue=(40, 40, 40))
-        tiles += [tile, np.full((side, 3, 3), 128, np.uint8)]
-    return np.concatenate(tiles[:-1], axis=1)
-
-
-def fitted(image: UInt8[np.ndarray, "h w 3"], side: int) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Scales an image.
-
-    Args:
-      image: The image.
-      side: Longer side of the result, px.
-
-    Returns:
-      The image at that size.
-    """
-    scale = side / max(image.shape[:2])
-    size = max(round(scale * image.shape[1]), 1), max(round(scale * image.shape[0]), 1)
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
 
 
 def _outlined(image: np.ndarray, mask: np.ndarray, colour: tuple[int, ...], thickness: int) -> np.ndarray:
@@ -132,17 +56,6 @@ def _outlined(image: np.ndarray, mask: np.ndarray, colour: tuple[int, ...], thic
     image = np.ascontiguousarray(image)
     cv2.drawContours(image, contours, -1, colour, thickness)
     return image
-
-
-def main_regions(field: LanguageField) -> Int[np.ndarray, " n"]:
-    """Finds the region that has at least half of each Gaussian's weight, or -1. The votes are read in blocks."""
-    blocks = [np.zeros(0, np.int32)]
-    for votes in vote_blocks(field.votes):
-        shares = np.nan_to_num(np.asarray(vote_shares(votes)))
-        best = shares.argmax(1)
-        rows = np.arange(len(best))
-        blocks.append(np.where(shares[rows, best] >= SHARE_THRESHOLD, np.asarray(votes.regions)[rows, best], -1))
-    return np.concatenate(blocks)
 
 
 def region_colours(field: LanguageField) -> Float[np.ndarray, "n 3"]:
@@ -175,27 +88,13 @@ class Renderer:
         return _to_bytes(render_rgb(self._gaussians, self._cameras[view]).features)
 
     def colours(self, view: int, rgb: Float[Array, "n 3"]) -> UInt8[np.ndarray, "h w 3"]:
-        """Renders a view in other colours than the scene's.
-
-        Args:
-          view: Index of the view.
-          rgb: Colour of each Gaussian, in [0, 1].
-
-        Returns:
-          The picture, uint8.
-        """
+        """Renders a view in other colours than the scene's, each in [0, 1]."""
         return _to_bytes(render(self._gaussians, self._cameras[view], np.asarray(rgb, np.float32)).features)
 
     def crop(self, view: int, mask: Bool[np.ndarray, " n"]) -> UInt8[np.ndarray, "h2 w2 3"]:
-        """Cuts out the part of a view that shows some Gaussians.
+        """Cuts out the part of a view that shows some Gaussians; the whole view if it shows none of them.
 
-        Args:
-          view: Index of the view.
-          mask: The Gaussians.
-
-        Returns:
-          A square with a margin around all but 3 % of their centres on each side, as far as the view reaches; the whole
-          view if it shows none of them.
+        A square with a margin around all but 3 % of their centres on each side, as far as the view reaches.
         """
         photo, camera = self.photo(view), self._cameras[view]
         pose = np.asarray(camera.world_to_camera)
@@ -207,7 +106,7 @@ class Renderer:
         if not inside.any():
             return photo
         (left, right), (top, bottom) = (np.quantile(a[inside], (0.03, 0.97)) for a in (u, v))
-        half = max(right - left, bottom - top, MIN_CROP_PX) * (0.5 + MARGIN)
+        half = 0.8 * max(right - left, bottom - top, 16)  # px; the margin is 0.3 of the object's size
         x, y = (left + right) / 2, (top + bottom) / 2
         rows = slice(int(max(y - half, 0)), int(min(y + half, camera.height)) + 1)
         return photo[rows, int(max(x - half, 0)) : int(min(x + half, camera.width)) + 1]

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 from jsecon.app import verbs
-from jsecon.app.models import open_embedder, with_models
 from jsecon.app.outputs import write_answers
 from jsecon.app.records import At, Box, Mask, Query, Question
 from jsecon.app.scene import open_scene
@@ -19,10 +18,8 @@ def _query(verb: verbs.Query, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon query`; the result has the records of the answers, and the errors of failed queries."""
     queries = _queries(verb)
     require_writable(verb.out)
-    verb = with_models(verb, console, yes=verb.yes)
     require_writable_format(verb.out / f"answer.{verb.format}")
-    model = verb.embedder if is_bare_scene(verb.field) else lambda field: open_embedder(field, verb, console)
-    scene = open_scene(verb.field, embedder=model, up=verb.up, out=verb.out / "field", listener=console)
+    scene = open_scene(verb.field, embedder=verb.embedder, up=verb.up, out=verb.out / "field", listener=console)
     with console.progress("answers"):
         if verb.texts:
             _ = scene.embedder  # without it one error stands for all texts

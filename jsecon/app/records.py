@@ -6,7 +6,6 @@ gives it to `Scene.ask`, and shows the `Answer`: its words (`str`), its record (
 
 import dataclasses
 import functools
-import hashlib
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -82,8 +81,6 @@ class Query:
       threshold: Smallest similarity of a selected Gaussian; None takes 0.5 for votes and 0.9 for codes.
       min_rank: Share of unrelated words that must be less similar to the scene than a text, else it has no match.
       all_of_class: Whether to select all regions of the class, such as all chairs, instead of the best one.
-      fragment_score: How near to the question other fragments of the best region's object must be, 0 to 1; 1 adds none.
-        None takes 0.5 for texts and adds none to the region of a pixel or of an id.
       outliers: Whether to drop the Gaussians that stand apart from the rest.
       frame: Frame from which left, right, front and behind are seen. None takes the mean camera, or the frame that
         shows most objects where the cameras look in all directions.
@@ -98,7 +95,6 @@ class Query:
     threshold: float | int | None = None
     min_rank: float | int = MIN_RANK
     all_of_class: bool = False
-    fragment_score: float | int | None = None
     outliers: bool = True
     frame: int | str | None = None
 
@@ -106,7 +102,7 @@ class Query:
         """Refuses numbers out of their ranges."""
         require_one_of("query", self.by, METHODS, "'votes' is the default.")
         low = -1 if self.by == "code" else 0
-        numbers = {"threshold": self.threshold, "min_rank": self.min_rank, "fragment_score": self.fragment_score}
+        numbers = {"threshold": self.threshold, "min_rank": self.min_rank}
         for name, value in numbers.items():
             least = low if name == "threshold" else 0
             if value is not None and not least <= value <= 1:
@@ -132,14 +128,9 @@ class Query:
     def key(self) -> str | None:
         """What tells it from any other query in the names of its files; None for a text, which does so itself."""
         if isinstance(self.question, Mask):
-            parts = [str(part) for pair in self.question.frames.items() for part in _names(*pair)]
+            parts = [str(part) for pair in self.question.frames.items() for part in pair]
             return "\0".join(("mask", *parts))
         return None if isinstance(self.question, str) else str(self)
-
-
-def _names(frame: int | str, mask: np.ndarray | str | Path) -> tuple[int | str, str]:
-    """A frame and the path of its mask, or the digest of an array."""
-    return frame, str(mask) if isinstance(mask, str | Path) else hashlib.sha256(np.asarray(mask).tobytes()).hexdigest()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -210,22 +201,12 @@ class Answer:
         return object_shapes(self.points, np.zeros(len(self.rows), int), spreads=gaussian_spreads(selected))[0]
 
     @property
-    def rank(self) -> float | None:
-        """Share of unrelated words that are less similar to the scene than the text; None if it is unknown."""
-        return _known(self.selection.rank)
-
-    @property
     def confidence(self) -> float | None:
         """Estimated probability that the answer shows what the text names; None if it is unknown."""
         return _known(self.selection.confidence)
 
     @property
-    def presence(self) -> float | None:
-        """Probability that the text is true of the best region; None for embedders without `Logits`."""
-        return _known(self.selection.presence)
-
-    @property
-    def outliers(self) -> dict[str, int]:
+    def _outliers(self) -> dict[str, int]:
         """Numbers of selected Gaussians, of those that were dropped, and of clusters that were kept and dropped."""
         selected = int(np.asarray(self.selection.mask).sum())
         kept, dropped = self.clusters
@@ -235,7 +216,8 @@ class Answer:
     def as_dict(self) -> dict[str, Any]:
         """The record of the answer as plain values for JSON, in the capture's world: the same at every door."""
         region = int(self.selection.region)
-        probability = {} if self.presence is None else {"presence": self.presence}
+        presence = _known(self.selection.presence)
+        probability = {} if presence is None else {"presence": presence}
         if len(self.rows) and self.by == "votes":
             inside = probability_inside(self.selection.similarity, self.field.votes, self.mask)
             probability["mean"] = round(float(inside.mean()), 4)
@@ -247,11 +229,11 @@ class Answer:
             "gaussians": self.field.gaussians.count,
             "objects": self.count,
             "score": round(float(self.selection.score), 6),
-            "rank": self.rank,
+            "rank": _known(self.selection.rank),
             "confidence": self.confidence,
             "region": region if region >= 0 else None,
             "probability": probability or None,
-            "outliers": self.outliers,
+            "outliers": self._outliers,
             "place": self._place_record() if len(self.rows) else None,
             "reason": self.reason,
             "skipped": dict(self.skipped),
@@ -307,7 +289,8 @@ class Answer:
         parts += [f"{self.count} objects"] if self.count > 1 else []
         if self.by != "relation":
             parts.append(f"score {float(self.selection.score):.3f}")
-            parts += [self.rank_words] if self.rank_words else []
+            if (rank := _known(self.selection.rank)) is not None:
+                parts.append(f"more similar than {int(100 * rank + 1e-6)} % of unrelated words")
             if self.confidence is not None and region >= 0:
                 parts.append(f"confidence {int(100 * self.confidence)} %")
         if region >= 0:
@@ -323,15 +306,9 @@ class Answer:
         return ", ".join([*parts, f"around ({centroid})"])
 
     @property
-    def rank_words(self) -> str:
-        """The rank in words, in whole percent and rounded down; "" if it is unknown."""
-        known = self.rank is not None
-        return f"more similar than {int(100 * self.rank + 1e-6)} % of unrelated words" if known else ""
-
-    @property
     def outlier_words(self) -> str:
         """What DBSCAN dropped, in a sentence; "" if it dropped no Gaussian."""
-        counts = self.outliers
+        counts = self._outliers
         if not counts["dropped"]:
             return ""
         many = counts["clusters_dropped"]

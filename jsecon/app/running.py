@@ -4,13 +4,13 @@ import contextlib
 import dataclasses
 import html
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jsecon.app import pictures, report, verbs
-from jsecon.app.models import with_models
 from jsecon.files import write_text
 from jsecon.pipeline import processes, run as pipeline
 from jsecon.pipeline.progress import Console
@@ -23,17 +23,11 @@ from jsecon.types import Quality
 
 FILES = ("field.safetensors", "report.html", "metrics.json")
 """files of a run"""
-FRAMES = 6
-"""number of frames that are shown with masks and regions"""
-OBJECTS = 10
-"""number of objects that are shown through as many frames"""
-LARGE = 0.15
-"""share of a frame; an object that fills more in some frame is not shown by itself"""
 
 
 def _run(verb: verbs.Run, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon run`; the result has the metrics, or the plan of a dry run."""
-    options = with_models(verb.options, console, yes=verb.yes)
+    options = verb.options
     if verb.dry_run:
         return pipeline.dry_run(options, verb.out, listener=console)
     with processes.connection(options) if verb.distributed else contextlib.nullcontext(0) as index:
@@ -43,7 +37,11 @@ def _run(verb: verbs.Run, console: Console) -> verbs.VerbResult:
             pipeline.run_worker(options, verb.out)
     if index > 0:
         raise SystemExit(0)
-    return {"written": [verb.out / name for name in FILES]} | _write_run(run, verb.out, console)
+    title = f"Language field of {options.capture.resolve().name}"
+    metrics = write_run(run, verb.out, console, title, "Made by jsecon from posed frames.")
+    query = f'jsecon query {verb.out / "field.safetensors"} "dark green bottle" --out {verb.out / "answers"}'
+    console.print_line(f"next    {query}")
+    return {"written": [verb.out / name for name in FILES]} | metrics
 
 
 def _fit(verb: verbs.Fit, console: Console) -> verbs.VerbResult:
@@ -59,16 +57,19 @@ def _fit(verb: verbs.Fit, console: Console) -> verbs.VerbResult:
     return {"written": {"scene": verb.out}, "gaussians": gaussians.count} | _quality_metrics(held_out)
 
 
-def _write_run(run: Run, out: Path, listener: Console) -> dict[str, Any]:
-    """Writes OUT/metrics.json and OUT/report.html of a run, prints its figures, and returns the metrics."""
-    metrics = run_metrics(run)
+def write_run(
+    run: Run, out: Path, listener: Console, title: str, lead: str, parts: Sequence[str] = (), **figures: Any
+) -> dict[str, Any]:
+    """Writes OUT/metrics.json and OUT/report.html of a run, prints its figures, and returns the metrics.
+
+    `parts` are sections that come first in the report (`jsecon.app.report`), and `figures` more metrics.
+    """
+    metrics = _run_metrics(run) | figures
     write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
     warnings = [note.removeprefix(WARNING) for note in run.notes if note.startswith(WARNING)]
     with listener.progress("report"):
-        parts = [report.section("Warning", note) for note in warnings]
-        parts += [report.tiles(_tiles(metrics)), *run_parts(run)]
-        title = f"Language field of {run.options.capture.resolve().name}"
-        write_text(out / "report.html", report.page(title, "Made by jsecon from posed frames.", parts))
+        parts = [*(report.section("Warning", note) for note in warnings), _figures(metrics), *parts]
+        write_text(out / "report.html", report.page(title, lead, [*parts, *_scene_parts(run), *_work_parts(run)]))
     _print_quality(run.held_out, listener)
     for note in warnings:
         listener.print_line(f"{WARNING}{note}")
@@ -79,7 +80,6 @@ def _write_run(run: Run, out: Path, listener: Console) -> dict[str, Any]:
     )
     field = out / "field.safetensors"
     listener.print_line(f"field   {field}\nreport  {out / 'report.html'}")
-    listener.print_line(f'next    jsecon query {field} "dark green bottle" --out {out / "answers"}')
     return metrics
 
 
@@ -100,7 +100,7 @@ def _print_quality(held_out: Quality, listener: Console) -> None:
         listener.print_line(f"held-out PSNR {psnr:.2f} dB, SSIM {ssim:.3f} over {count} frames")
 
 
-def run_metrics(run: Run) -> dict[str, Any]:
+def _run_metrics(run: Run) -> dict[str, Any]:
     """Returns the figures of a run for metrics.json."""
     return {
         "gaussians": run.field.gaussians.count,
@@ -116,28 +116,17 @@ def run_metrics(run: Run) -> dict[str, Any]:
     }
 
 
-def _tiles(metrics: dict[str, Any]) -> dict[str, str]:
-    """Returns the headline figures of the report."""
+def _figures(metrics: dict[str, Any]) -> str:
+    """Returns the table of the headline figures."""
     psnr = metrics["held_out_psnr"]
-    return {
+    figures = {
         "Gaussians": f"{metrics['gaussians']:,}",
         "regions": str(metrics["regions"]),
         "held-out PSNR": "no held-out frames" if psnr is None else f"{psnr:.2f} dB",
         "total": f"{sum(metrics['seconds'].values()):.0f} s",
         "peak memory": f"{metrics['peak_memory_mib']:,.0f} MiB",
     }
-
-
-def run_parts(run: Run) -> list[str]:
-    """Makes the parts of a page that show a run.
-
-    Args:
-      run: The run.
-
-    Returns:
-      Sections (`jsecon.app.report`): frames, masks, regions, held-out frames, seconds, stages and settings.
-    """
-    return [*_scene_parts(run), *_work_parts(run)]
+    return report.table(tuple(figures), [tuple(figures.values())])
 
 
 def _scene_parts(run: Run) -> list[str]:
@@ -146,7 +135,7 @@ def _scene_parts(run: Run) -> list[str]:
     renderer = pictures.Renderer(run.field.gaussians, run.field.cameras)
     colours = pictures.region_colours(run.field)
     cells = []
-    for row in evenly_spaced(len(train), FRAMES):
+    for row in evenly_spaced(len(train), 6):
         t = int(train[row])
         frame = np.asarray(run.capture.frames[t])
         cells += [
@@ -158,7 +147,7 @@ def _scene_parts(run: Run) -> list[str]:
     words = (
         "A region has one colour in all views, and so has each Gaussian by its strongest region; a grey one has none."
     )
-    parts = [report.section("Frames, masks, regions", words, report.grid(cells, 4)), _object_part(run, train)]
+    parts = [report.section("Frames, masks, regions", words, report.grid(cells, 4))]
     if len(run.held_out.frames):
         held_out = np.flatnonzero(run.capture.held_out)
         psnr = dict(zip(held_out.tolist(), run.held_out.psnr.tolist()))
@@ -171,39 +160,20 @@ def _scene_parts(run: Run) -> list[str]:
     return parts
 
 
-def _object_part(run: Run, train: np.ndarray) -> str:
-    """Returns the part of a page that shows the largest objects through the frames."""
-    views = evenly_spaced(len(train), OBJECTS)
-    frames = np.asarray(run.capture.frames)[train[views]]
-    labels = run.labels[views]
-    sizes = np.stack([np.bincount(view[view >= 0], minlength=run.field.regions.count) for view in labels])
-    small = np.flatnonzero(sizes.max(0) < LARGE * labels[0].size)
-    largest = small[np.argsort(-sizes.sum(0)[small], kind="stable")][:OBJECTS]
-    rows = []
-    for region in largest[sizes.sum(0)[largest] > 0].tolist():
-        count = int((np.asarray(run.field.regions.pixel_counts)[region] > 0).sum())
-        tiles = pictures.object_strip(frames, labels, region)
-        caption = f"in {count} of {len(run.labels)} frames"
-        rows.append(report.figure(tiles, caption, strong=f"region {region}", wide=True))
-    words = "Each row is one region, cut out of frames around the scene. A dark tile is a frame that does not show it."
-    return report.section("Objects through the frames", words, *rows)
-
-
 def _work_parts(run: Run) -> list[str]:
     """Returns the parts that show seconds, stages, notes and settings."""
-    steps = [(step.name, step.status, step.why) for step in run.steps]
-    stages = report.table(["step", "", "how, or why not"], steps, numbers_from=9)
-    notes = report.table(["notes"], [[note] for note in run.notes], numbers_from=9) if run.notes else ""
+    seconds = [(name, round(value, 1)) for name, value in run.seconds.items()]
+    stages = report.table(["step", "", "how, or why not"], [(step.name, step.status, step.why) for step in run.steps])
+    notes = report.table(["notes"], [[note] for note in run.notes]) if run.notes else ""
     options = [(f.name, getattr(run.options, f.name), f.default) for f in dataclasses.fields(run.options)]
-    changed, default = (
-        report.table([head, "value"], [row[:2] for row in options if (row[1] == row[2]) == is_default], numbers_from=9)
-        for head, is_default in (("changed", False), ("setting", True))
+    changed = report.table(
+        ["changed", "value"], [(name, str(value)) for name, value, default in options if value != default]
     )
-    provenance = f"<pre>{html.escape(json.dumps(json.loads(run.field.provenance), indent=2))}</pre>"
-    folded = report.folded("settings at their defaults", default), report.folded("provenance of the field", provenance)
+    provenance = html.escape(json.dumps(json.loads(run.field.provenance), indent=2))
+    folded = f"<details><summary>provenance of the field</summary><pre>{provenance}</pre></details>"
     measured = "Wall time of each stage, also of those that an earlier run computed."
     return [
-        report.section("Seconds of each stage", measured, report.bars(run.seconds)),
+        report.section("Seconds of each stage", measured, report.table(["stage", "s"], seconds)),
         report.section("Stages", "What ran, and what this scene does not need.", stages, notes),
-        report.section("Settings", "", changed, *folded),
+        report.section("Settings", "", changed, folded),
     ]

@@ -20,13 +20,14 @@ import numpy as np
 from jaxtyping import Bool, Int, UInt8
 
 from jsecon.app.catalogue import Catalogue, objects
-from jsecon.app.object_index import ObjectIndex
+from jsecon.app.object_index import ObjectIndex, choose_shades
 from jsecon.app.records import Answer, Box, Mask, Query, Question, Region, gaussian_rows
 from jsecon.errors import InputError
 from jsecon.field.columns import is_mapped
-from jsecon.field.field import check_field, load_field
+from jsecon.field.field import FIELD_FILE, check_field, load_field
 from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.field.regions import ALIKE_THRESHOLD
+from jsecon.networks.hub import parse_model
 from jsecon.paper.queries import CODE_THRESHOLD
 from jsecon.pipeline.options import Options, is_bare_scene
 from jsecon.pipeline.progress import Console
@@ -52,13 +53,8 @@ from jsecon.read.masks.masks import resize_nearest
 from jsecon.read.splats.files import save_gaussians
 from jsecon.types import LanguageField
 
-FIELD_FILE = "field.safetensors"
 CACHED_BYTES = 1 << 28
 """bytes of the answers that a scene keeps, of five bytes a Gaussian each"""
-PARTS_ANSWER = "no region holds the object, so the parts that match the text were selected"
-"""why a text is answered by parts"""
-MIN_BLOCK_ROWS = 1 << 12
-"""rows of an answer to a mapped field are padded to powers of two from here on, so that few sizes are compiled"""
 
 
 def open_scene(
@@ -74,8 +70,8 @@ def open_scene(
     Args:
       path: A field file, a folder with field.safetensors, or a file of Gaussians without photographs (.ply, .spz ...),
         of which a field is made once, as `jsecon query scene.ply` does.
-      embedder: What embeds texts: an embedder, a folder or a name of a CLIP model that is on this machine, or a
-        function that returns an embedder for a field when the first text is asked. None takes the model that the field
+      embedder: What embeds texts: an embedder, a folder or a name of a CLIP model that is on this machine and is opened
+        when a text needs it, or a function that returns an embedder for a field. None takes the model that the field
         was made with.
       up: Up axis of the capture's world, three numbers. None takes that of the cameras, or the normal of the ground.
       out: Folder for the field of a file of Gaussians; by default NAME_field beside NAME.ply.
@@ -86,7 +82,7 @@ def open_scene(
       the same answers.
 
     Raises:
-      InputError: The file cannot be read, or the model is not on this machine.
+      InputError: The file cannot be read, or no model has such a name.
     """
     file = Path(path)
     model = embedder if isinstance(embedder, str | Path) else None
@@ -103,7 +99,8 @@ def open_scene(
     if model is not None:
         from jsecon.pipeline.model_loading import field_embedder
 
-        embedder = field_embedder(field, model)
+        parse_model(model, "embedder")
+        embedder = functools.partial(field_embedder, folder=model)
     file = file.resolve()
     return Scene(field, embedder, up=up, name=file.parent.name if file.name == FIELD_FILE else file.stem)
 
@@ -187,7 +184,7 @@ class Scene:
             return self._embedder if hasattr(self._embedder, "embed_text") else self._embedder(self.field)
 
     @functools.cached_property
-    def text_field(self) -> LanguageField:
+    def _text_field(self) -> LanguageField:
         """The field with phrases and words that texts are compared with: embeddings from files came without them."""
         field = self.field
         if len(field.canonical_phrases):
@@ -203,7 +200,7 @@ class Scene:
         self._require_memory("a relation, an order or a number")
         if self.field.regions.count == 0:
             raise InputError("field", "it has no regions, so no objects", remedy="Make it again with other --masks.")
-        return ObjectIndex(self.text_field, self.embedder, self._up, self.objects, choose_shades)
+        return ObjectIndex(self._text_field, self.embedder, self._up)
 
     def _require_memory(self, what: str) -> None:
         """Raises InputError if the field is mapped, which `what` needs in memory."""
@@ -219,8 +216,7 @@ class Scene:
 
         Args:
           question: A text, `At`, `Box`, `Mask` or `Region`; or a `Query`, which has its options.
-          **options: Options of `Query` for a question: by, threshold, min_rank, all_of_class, fragment_score, outliers,
-            frame.
+          **options: Options of `Query` for a question: by, threshold, min_rank, all_of_class, outliers, frame.
 
         Returns:
           The answer. Its mask is empty if the scene does not have what the question names; `reason` and `str` say why.
@@ -230,11 +226,11 @@ class Scene:
             or pixel, no region lies at a pixel, or an option is out of its range.
         """
         query = question if isinstance(question, Query) else Query(question, **options)
-        answer = self.known(query)
+        answer = self._answers.get(query)
         if answer is not None:
             return answer
         with self._lock:
-            answer = self.known(query) or self._answer(query)
+            answer = self._answers.get(query) or self._answer(query)
             if not isinstance(query.question, Mask):  # an array may change
                 self._answers[query] = answer
             while len(self._answers) > max(CACHED_BYTES // (5 * max(self.field.gaussians.count, 1)), 1):
@@ -263,10 +259,6 @@ class Scene:
                 results[query] = error
         return [results[query] for query in queries]
 
-    def known(self, query: Query) -> Answer | None:
-        """The answer to a query if it is among the last ones, without waiting for what is computed; else None."""
-        return self._answers.get(query)
-
     def _answer(self, query: Query) -> Answer:
         """Answers a query that is not among the last ones."""
         question = query.question
@@ -290,7 +282,7 @@ class Scene:
 
     def _answer_text(self, query: Query) -> Answer:
         """Selects the Gaussians that a text names."""
-        field, embedder = self.text_field, self.embedder
+        field, embedder = self._text_field, self.embedder
         included, excluded = parse_query(str(query))
         rules = self._rules(query, QueryRules())
         included = choose_shades(field, embedder, included, rules, every=query.all_of_class or bool(excluded))
@@ -303,7 +295,9 @@ class Scene:
         if query.by == "code":
             return self._answer_by_code(query, match_regions(field, texts, rules), {})
         found = answer_texts(field, texts, rules, excluded=without, outliers=query.outliers)
-        return self._finish(query, found, {"regions": PARTS_ANSWER} if found.by_parts else {})
+        by_parts = "no region holds the object, so the parts that match the text were selected"
+        skipped = {"regions": by_parts} if found.by_parts else {}
+        return self._finish(query, found, skipped)
 
     def _answer_region(self, query: Query, region: int, why: str) -> Answer:
         """Selects the Gaussians of a region, and of those that the query's options add to it."""
@@ -321,8 +315,6 @@ class Scene:
         options: dict[str, Any] = {"min_rank": query.min_rank, "all_of_class": query.all_of_class}
         if query.threshold is not None and query.by == "votes":
             options["min_share"] = query.threshold
-        if query.fragment_score is not None:
-            options["fragment_score"] = query.fragment_score
         if isinstance(query.question, str):
             # Of an embedder trained to tell whether a text is true of an image; the cosines of all others only rank.
             options["logits"] = getattr(self.embedder, "logits", None)
@@ -350,7 +342,7 @@ class Scene:
             if len(given) < len(question.frames):
                 raise InputError("mask", "a frame has two masks", remedy="Give one mask of an object in each frame.")
             size = self.field.cameras.width, self.field.cameras.height
-            masks = {t: read_mask(m, *size) if isinstance(m, str | Path) else m for t, m in given.items()}
+            masks = {t: _read_mask(m, *size) if isinstance(m, str | Path) else m for t, m in given.items()}
             question = Mask({self.field.names[index]: mask for index, mask in given.items()})
         threshold = SHARE_THRESHOLD if query.threshold is None else query.threshold
         stack = np.stack([np.asarray(mask).astype(int) for mask in masks.values()])
@@ -432,17 +424,17 @@ class Scene:
           Plain values: the texts "a" and "b"; "surfaces", the smallest distance between Gaussians of the two;
           "centers", that of the middles of their boxes; "gap", the free way between their boxes on the line between the
           middles, 0 where they meet; "angle", degrees of the second above the horizontal as seen from the first; and
-          the "unit" of the lengths (`unit`).
+          the "unit" of the lengths (metres where the capture has depth).
 
         Raises:
           InputError: As for `relate`; or a text names no object, or several.
         """
         with self._lock:
             first, second = (self.locate(text, frame=frame, relate=True).objects[0] for text in (a, b))
-            return {"a": a, "b": b} | self._index.distances(first, second) | {"unit": self.unit}
+            return {"a": a, "b": b} | self._index.distances(first, second) | {"unit": self._unit}
 
     @functools.cached_property
-    def unit(self) -> str:
+    def _unit(self) -> str:
         """Unit of the capture's world: "metres", or "capture units" where its scale is not known to be metres."""
         from jsecon.pipeline.sources import locate_sources
 
@@ -480,6 +472,7 @@ class Scene:
         with self._lock:
             self.mask(self.ask("red"), 0)
             self._index.prepare()
+            _ = self._catalogue
 
     def frame_index(self, frame: int | str) -> int:
         """Finds a frame.
@@ -561,18 +554,6 @@ class Scene:
                 gaussians = jax.device_put(gaussian_rows(self.field.gaussians, rows))
             return np.asarray(selection_mask(gaussians, self._cameras[self.frame_index(frame)], jnp.asarray(mask)))
 
-    def masks(self, answer: Answer, count: int) -> dict[int, Bool[np.ndarray, "h w"]]:
-        """Renders an answer alone in the frames that show it best.
-
-        Args:
-          answer: The answer.
-          count: Maximum number of frames.
-
-        Returns:
-          Index of a frame -> its `mask`, best first.
-        """
-        return {t: self.mask(answer, t) for t in self.best_frames(answer, count)}
-
     @functools.cached_property
     def _device_gaussians(self) -> Any:
         """The Gaussians on jax's device; None for a mapped field."""
@@ -633,27 +614,7 @@ class Scene:
         save_gaussians(file, gaussians, similarity=self.field.source_from_scene, object_ids=object_ids)
 
 
-def locate(
-    scene: Scene | LanguageField, text: str, *, frame: int | str | None = None, up: Sequence[float | int] | None = None
-) -> Answer:
-    """Finds the one thing that a text names, as `Scene.locate` does.
-
-    Args:
-      scene: The scene, or a field.
-      text: For example "orange ball" or "the red mug left of the bottle".
-      frame: Frame from which left, right, front and behind are seen.
-      up: Up axis of a field's world; None finds it.
-
-    Returns:
-      The answer, of one object: see its `place`.
-
-    Raises:
-      InputError: The text names no object, or several.
-    """
-    return (scene if isinstance(scene, Scene) else Scene(scene, up=up)).locate(text, frame=frame)
-
-
-def read_mask(file: str | Path, width: int, height: int) -> Bool[np.ndarray, "h w"]:
+def _read_mask(file: str | Path, width: int, height: int) -> Bool[np.ndarray, "h w"]:
     """Reads an image, in which black is outside, as a mask at the size of a field's frames, px."""
     image = read_pixels(Path(file))
     inside = np.asarray(image[..., :3].any(-1) if image.ndim == 3 else image > 0, np.uint8)
@@ -665,40 +626,5 @@ def read_mask(file: str | Path, width: int, height: int) -> Bool[np.ndarray, "h 
 
 
 def _padded(count: int, most: int) -> int:
-    """A power of two of at least `count` and MIN_BLOCK_ROWS rows, at most `most`."""
-    return min(max(1 << max(count - 1, 0).bit_length(), MIN_BLOCK_ROWS), most)
-
-
-def choose_shades(
-    field: LanguageField, embedder: Any, texts: Sequence[str], rules: QueryRules, *, every: bool
-) -> list[str]:
-    """Replaces texts that no region matches by narrower ones that some region does.
-
-    Among colours "blue" is a family, and a room may have nothing of its typical colour but a dark and a light blue
-    thing. Each is far from the word and near to its own shade.
-
-    Args:
-      field: The field.
-      embedder: Its embedder. Its `narrower(text)`, if it has one, lists texts that name a part of what the text names.
-      texts: The texts.
-      rules: How texts match. Each of n narrower texts may lose to an n-th of the unrelated words that one may lose to.
-      every: Whether all narrower texts that match replace a text, instead of the best of them.
-    """
-    if not hasattr(embedder, "narrower"):
-        return list(texts)
-
-    def score(text: str, rules: QueryRules) -> float:
-        match = match_regions(field, jnp.asarray(embedder.embed_text([text])), rules)
-        return float(match.score) if int(match.region) >= 0 else -np.inf
-
-    replaced: list[str] = []
-    for text in texts:
-        narrower = embedder.narrower(text)
-        best: list[str] = []
-        if narrower and np.isinf(score(text, rules)):
-            # Of n attempts one succeeds by chance as often as one attempt that is n times as strict.
-            strict = dataclasses.replace(rules, min_rank=1 - (1 - rules.min_rank) / len(narrower))
-            scores = {option: score(option, strict) for option in narrower}
-            best = [option for option in sorted(narrower, key=scores.__getitem__) if scores[option] > -np.inf]
-        replaced.extend(best[0 if every else -1 :] or [text])
-    return replaced
+    """A power of two of at least `count` and 4,096 rows, so that few sizes are compiled; at most `most`."""
+    return min(max(1 << max(count - 1, 0).bit_length(), 1 << 12), most)

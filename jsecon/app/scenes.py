@@ -3,16 +3,15 @@
 import contextlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from jsecon.app.scene import Scene, open_scene
 from jsecon.errors import InputError
 
 
-def open_scenes(files: Sequence[Path], embedder: Path | None) -> dict[str, Scene]:
+def open_scenes(files: Sequence[Path], embedder: str | Path | None) -> dict[str, Scene]:
     """Opens fields, each named like its folder, and prepares them for questions.
 
-    `embedder` is the folder of the CLIP model of the fields; None takes the one that each run used.
+    `embedder` is the CLIP model of the fields (`open_scene`); None takes the one that each run used.
     """
     scenes: dict[str, Scene] = {}
     for file in files:
@@ -33,11 +32,3 @@ def find_scene(scenes: Mapping[str, Scene], name: str | None) -> Scene:
     if name not in scenes:
         raise InputError(f"field {name!r}", "there is no such field", remedy=f"There are {', '.join(scenes)}.")
     return scenes[name]
-
-
-def describe_scene(scene: Scene) -> dict[str, Any]:
-    """Plain values: name, numbers of Gaussians and regions, frames and their size."""
-    field = scene.field
-    size = [field.cameras.width, field.cameras.height]
-    counts = {"gaussians": field.gaussians.count, "regions": field.regions.count}
-    return {"name": scene.name, **counts, "frames": list(field.names), "size": size}

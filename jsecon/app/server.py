@@ -1,16 +1,15 @@
 """`jsecon serve`: fields over HTTP (extra `serve`).
 
-FastAPI makes /openapi.json from the models below. Answers that a scene still knows are sent at once; others are
-computed by as many threads as there are cores. A request reads only the fields: no name in it is a path.
+FastAPI makes /openapi.json from the models below, and answers each question in a thread; a scene computes one at a
+time. A request reads only the fields: no name in it is a path.
 """
 
-import asyncio
 import contextlib
+import hmac
 import json
 import re
 import tempfile
-from collections.abc import AsyncIterator, Callable, Collection, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
@@ -19,29 +18,22 @@ import numpy as np
 import uvicorn
 from fastapi import FastAPI, HTTPException, Query as Parameters, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import HTMLResponse, JSONResponse, Response
+from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictFloat, StrictInt, StrictStr, StringConstraints
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException as AnyHTTPException
 
 import jsecon
 from jsecon.app import verbs
-from jsecon.app.access import bracketed, is_allowed_host, listen, token_for, token_matches
-from jsecon.app.exports import object_records
-from jsecon.app.models import with_models
+from jsecon.app.access import bracketed, is_allowed_host, listen, token_for
 from jsecon.app.records import At, Query
 from jsecon.app.scene import Scene
-from jsecon.app.scenes import describe_scene, find_scene, open_scenes
+from jsecon.app.scenes import find_scene, open_scenes
 from jsecon.errors import InputError
 from jsecon.pipeline.progress import Console
-from jsecon.process import cores
 
 MAX_BODY = 64 * 1024
 """bytes of a request's body"""
-MAX_WAITING = 64
-"""questions that wait for a thread; others are refused (503)"""
-MAX_REQUESTS = 256
-"""requests at once, the cheap ones included; uvicorn refuses others (503)"""
 
 Text = Annotated[str, StringConstraints(strict=True, min_length=1, max_length=500, pattern=r"\S")]
 Frame: TypeAlias = StrictStr | StrictInt
@@ -76,19 +68,6 @@ class _Selection(_Request):
 
 class _MaskOf(_Selection):
     frame: str | None = None
-
-
-class _Failure(BaseModel):
-    error: str
-
-
-MODELS: dict[str, type[BaseModel]] = {
-    "/query": _Question,
-    "/measure": _Pair,
-    "/objects": _Request,
-    "/selection.ply": _Selection,
-    "/mask.png": _MaskOf,
-}
 
 
 class _AsciiResponse(JSONResponse):
@@ -127,7 +106,8 @@ class _Guard:
     def _refusal(self, headers: Headers, method: str) -> tuple[int, str] | None:
         """The status and the message of a request that is refused."""
         if self._token:
-            if not token_matches(headers.get("authorization", "").encode("latin-1"), f"Bearer {self._token}"):
+            sent = headers.get("authorization", "").encode("latin-1")
+            if not hmac.compare_digest(sent, f"Bearer {self._token}".encode("utf-8", "surrogateescape")):
                 return 401, "A token is required. Send the header Authorization: Bearer TOKEN."
         elif not is_allowed_host(headers.get("host", ""), self._hosts):
             return 403, "The Host header does not name this server. Allow it with jsecon serve --allow-host NAME."
@@ -142,23 +122,13 @@ def application(scenes: Mapping[str, Scene], *, token: str = "", hosts: Collecti
 
     Requests must carry the token, or without one name this machine: by loopback or one of `hosts`.
     """
-    threads = ThreadPoolExecutor(cores(), thread_name_prefix="jsecon-answer")
-    pending = 0
-
-    @contextlib.asynccontextmanager
-    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        yield
-        threads.shutdown(cancel_futures=True)
-
     app = FastAPI(
         title="jsecon",
         version=jsecon.__version__,
-        docs_url=None,  # its page loads scripts of another host; the page at / lists the paths instead
+        docs_url=None,  # its page loads scripts of another host
         redoc_url=None,
         redirect_slashes=False,
         default_response_class=_AsciiResponse,
-        lifespan=lifespan,
-        responses={status: {"model": _Failure} for status in (400, 404, 422, 503)},
     )
     app.add_middleware(_Guard, token=token, hosts=hosts)
 
@@ -168,94 +138,63 @@ def application(scenes: Mapping[str, Scene], *, token: str = "", hosts: Collecti
         except InputError as error:
             raise HTTPException(404, f'Field "field": {error}') from error
 
-    async def compute(work: Callable[[], Any], part: str) -> Any:
-        """Runs a function in a thread; `part` is the part of the request that its InputError is about."""
-        nonlocal pending
-        if pending >= cores() + MAX_WAITING:
-            raise HTTPException(503, "Too many questions wait for an answer. Try again.")
-        pending += 1
-        try:
-            return await asyncio.get_running_loop().run_in_executor(threads, work)
-        except InputError as error:
-            raise HTTPException(422, f'Field "{part}": {_in_words_of_the_api(str(error))}') from error
-        finally:
-            pending -= 1
-
     @app.post("/query", summary="Count, score and place of the answer to a text or a pixel")
-    async def query(request: _Question) -> Response:
+    def query(request: _Question) -> Response:
         scene = scene_of(request)
         if (request.text is None) == (request.at is None):
             raise HTTPException(422, 'Field "text": give it, or "at", and not both.')
         part, question = ("text", request.text) if request.at is None else ("at", At(*request.at))
         options = {"by": request.by, "threshold": request.threshold, "all_of_class": request.all}
-
-        def work() -> Any:
-            return scene.ask(Query(question, frame=request.frame, **options))
-
-        answer = await compute(work, part)
-        return _AsciiResponse({"field": scene.name} | answer.as_dict())
+        with _errors_of(part):
+            answer = scene.ask(Query(question, frame=request.frame, **options))
+            return _AsciiResponse({"field": scene.name} | answer.as_dict())
 
     @app.post("/measure", summary="Distances between two objects: surfaces, centres, free gap, angle")
-    async def measure(request: _Pair) -> Response:
+    def measure(request: _Pair) -> Response:
         scene = scene_of(request)
-        distances = await compute(lambda: scene.measure(request.a, request.b, frame=request.frame), "a or b")
+        with _errors_of("a or b"):
+            distances = scene.measure(request.a, request.b, frame=request.frame)
         return _AsciiResponse({"field": scene.name} | distances)
 
     @app.get("/objects", summary="The objects of a field: names, boxes, Gaussians")
-    async def objects(request: Annotated[_Request, Parameters()]) -> Response:
+    def objects(request: Annotated[_Request, Parameters()]) -> Response:
         scene = scene_of(request)
-        rows = await compute(lambda: object_records(scene.objects()), "field")
-        return _AsciiResponse({"field": scene.name, "objects": rows})
+        with _errors_of("field"):
+            return _AsciiResponse({"field": scene.name, "objects": scene.objects().records()})
 
     @app.get("/selection.ply", summary="The selected Gaussians in the capture's world")
-    async def selection(request: Annotated[_Selection, Parameters()]) -> Response:
+    def selection(request: Annotated[_Selection, Parameters()]) -> Response:
         scene = scene_of(request)
-
-        def work() -> bytes:
+        with _errors_of("text"), tempfile.TemporaryDirectory() as folder:
             answer = scene.ask(request.text, by=request.by)
             if not len(answer.rows):
                 raise InputError(f"query {request.text!r}", "no Gaussian is selected", remedy="Ask with other words.")
-            with tempfile.TemporaryDirectory() as folder:
-                file = Path(folder, "selection.ply")
-                scene.export(file, answer)
-                return file.read_bytes()
-
-        return Response(await compute(work, "text"), media_type="application/octet-stream")
+            file = Path(folder, "selection.ply")
+            scene.export(file, answer)
+            return Response(file.read_bytes(), media_type="application/octet-stream")
 
     @app.get("/mask.png", summary="The selection alone in a frame, alpha above 0.7")
-    async def mask(request: Annotated[_MaskOf, Parameters()]) -> Response:
+    def mask(request: Annotated[_MaskOf, Parameters()]) -> Response:
         scene = scene_of(request)
-        frame = None
-        if request.frame is not None:
-            frame = await compute(lambda: scene.frame_index(request.frame), "frame")
-
-        def work() -> tuple[int, np.ndarray]:
+        with _errors_of("frame"):
+            frame = None if request.frame is None else scene.frame_index(request.frame)
+        with _errors_of("text"):
             answer = scene.ask(request.text, by=request.by)
-            index = [*scene.best_frames(answer, 1), 0][0] if frame is None else frame
-            return index, scene.mask(answer, index)
-
-        index, pixels = await compute(work, "text")
-        image = cv2.imencode(".png", pixels.astype(np.uint8) * 255)[1].tobytes()
+        index = [*scene.best_frames(answer, 1), 0][0] if frame is None else frame
+        image = cv2.imencode(".png", scene.mask(answer, index).astype(np.uint8) * 255)[1].tobytes()
         name = re.sub("[^ -~]", "?", scene.field.names[index])
         return Response(image, media_type="image/png", headers={"x-frame": name})
 
     @app.get("/healthz", summary="The fields and their frames")
     async def health() -> Response:
-        return _AsciiResponse({"status": "ok", "fields": [describe_scene(scene) for scene in scenes.values()]})
-
-    @app.get("/", include_in_schema=False)
-    async def page() -> Response:
-        rows = ""
-        for path, operations in app.openapi()["paths"].items():
-            for method, operation in operations.items():
-                rows += f"<li><code>{method.upper()} {path}</code> {operation['summary']}</li>"
-        return HTMLResponse(f"<!doctype html><title>jsecon</title><h1>jsecon</h1><ul>{rows}</ul>")
+        return _AsciiResponse({"status": "ok", "fields": [_describe(scene) for scene in scenes.values()]})
 
     @app.exception_handler(RequestValidationError)
     async def invalid(request: Request, error: Exception) -> Response:
         assert isinstance(error, RequestValidationError)
-        status, message = _invalid(request.url.path, error)
-        return _AsciiResponse({"error": message}, status)
+        fault = error.errors()[0]
+        name = next((part for part in fault["loc"][1:] if isinstance(part, str)), "body")
+        return _AsciiResponse({"error": f'Field "{name[:60]}": {fault["msg"]}.'}, 422)
 
     @app.exception_handler(AnyHTTPException)
     async def refused(request: Request, error: Exception) -> Response:
@@ -269,31 +208,27 @@ def application(scenes: Mapping[str, Scene], *, token: str = "", hosts: Collecti
     return app
 
 
-def _invalid(path: str, error: RequestValidationError) -> tuple[int, str]:
-    """The status and the message of a request that does not fit its model."""
-    faults = error.errors()
-    known = MODELS[path].model_fields
-    unknown = [fault["loc"][1] for fault in faults if fault["type"] == "extra_forbidden"]
-    if isinstance(error.body, dict):  # pydantic does not tell which of odd names
-        unknown = [name for name in error.body if name not in known]
-    if unknown:
-        names = ", ".join(sorted(repr(name)[:60] for name in unknown)[:5])
-        return 422, f"Unknown fields: {names}. {path} takes {', '.join(known)}."
-    if faults[0]["type"] == "json_invalid":
-        return 400, f"The body is not JSON: {faults[0]['ctx']['error']}."
-    if len(faults[0]["loc"]) < 2:
-        return 400, 'The body must be a JSON object, such as {"text": "red mug"}.'
-    return 422, f'Field "{faults[0]["loc"][1]}": {faults[0]["msg"]}.'
+@contextlib.contextmanager
+def _errors_of(part: str) -> Iterator[None]:
+    """Makes an InputError one of a part of the request, in whose words --at is "at"."""
+    try:
+        yield
+    except InputError as error:
+        message = str(error).replace("--at FRAME X Y", '"at": [frame, column, row]')
+        message = re.sub(r"--([a-z]+)", r'"\1"', message)
+        raise HTTPException(422, f'Field "{part}": {message}') from error
 
 
-def _in_words_of_the_api(message: str) -> str:
-    """Replaces the options of the command line in a message by the fields of a request: --at becomes "at"."""
-    message = message.replace("--at FRAME X Y", '"at": [frame, column, row]')
-    return re.sub(r"--([a-z]+)", r'"\1"', message)
+def _describe(scene: Scene) -> dict[str, Any]:
+    """Plain values: name, numbers of Gaussians and regions, frames and their size."""
+    field = scene.field
+    size = [field.cameras.width, field.cameras.height]
+    counts = {"gaussians": field.gaussians.count, "regions": field.regions.count}
+    return {"name": scene.name, **counts, "frames": list(field.names), "size": size}
 
 
 def prepare(
-    files: Sequence[Path], *, host: str, port: int, token: str, embedder: Path | None, hosts: Collection[str] = ()
+    files: Sequence[Path], *, host: str, port: int, token: str, embedder: str | Path | None, hosts: Collection[str] = ()
 ) -> tuple[dict[str, Any], Callable[[], None]]:
     """Opens fields and listens; returns address and fields, and the function that answers requests until it is stopped.
 
@@ -303,10 +238,13 @@ def prepare(
     listening = listen(host, port)
     scenes = open_scenes(files, embedder)
     app = application(scenes, token=token, hosts=(host, *hosts))
-    options: dict[str, Any] = {"timeout_keep_alive": 5, "limit_concurrency": MAX_REQUESTS}
+    options: dict[str, Any] = {
+        "timeout_keep_alive": 5,
+        "limit_concurrency": 256,
+    }  # the cheap ones included; others get 503
     config = uvicorn.Config(app, log_level="warning", ws="none", server_header=False, **options)
     address = f"http://{bracketed(host)}:{listening.getsockname()[1]}"
-    description = {"address": address, "fields": [describe_scene(scene) for scene in scenes.values()]}
+    description = {"address": address, "fields": [_describe(scene) for scene in scenes.values()]}
     return description, lambda: uvicorn.Server(config).run(sockets=[listening])
 
 
@@ -314,8 +252,7 @@ def _serve(verb: verbs.Serve, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon serve`; the result is as of `prepare`, with its function under "then"."""
     access = {"host": verb.host, "port": verb.port, "token": verb.token, "hosts": verb.allow_host}
     with console.progress("fields"):
-        embedder = with_models(verb, console, yes=False).embedder
-        result, serve = prepare(verb.fields, embedder=embedder, **access)
+        result, serve = prepare(verb.fields, embedder=verb.embedder, **access)
     for scene in result["fields"]:
         console.print_line(f"{scene['name']}: {scene['gaussians']} Gaussians, {scene['regions']} regions")
     console.print_line(result["address"])

@@ -86,7 +86,6 @@ class Run(Verb, InputOptions):
     Attributes:
       out: Output folder.
       dry_run: Only lists the stages that would run, and checks their inputs. It writes no file.
-      yes: Fetches models that are not on this machine without asking.
       distributed: Shares the masks, the embeddings, the votes and the held-out frames with the other processes that
         mpirun or srun starts. The field stays the same.
     """
@@ -100,7 +99,6 @@ class Run(Verb, InputOptions):
 
     out: Option[Path]
     dry_run: Option[bool] = False
-    yes: Option[bool] = False
     distributed: Option[bool] = False
     scene: SceneOptions = dataclasses.field(default_factory=SceneOptions)
     bare: BareOptions = dataclasses.field(default_factory=BareOptions)
@@ -143,42 +141,21 @@ class Fit(Verb):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ServerVerb(Verb):
-    """Options of the verbs that listen.
-
-    Attributes:
-      host: Address to listen on. Beyond loopback a token is required.
-      port: Port to listen on.
-      token: Token that requests must carry: a page in its address, as that is printed, others behind "Bearer" in the
-        header Authorization. By default it is JSECON_TOKEN of the environment, and without that no token is needed.
-      allow_host: Name by which clients reach this server besides localhost and --host, such as that of a proxy. Without
-        a token, requests by other names are refused.
-    """
-
-    host: Option[str] = "127.0.0.1"
-    port: Annotated[Option[int], Range(0, 65535)] = 8765
-    token: Option[str] = ""
-    allow_host: Repeated[str] = dataclasses.field(default_factory=list)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class FieldVerb(Verb):
+class _FieldVerb(Verb):
     """Options of the verbs that read a field and understand texts.
 
     Attributes:
       field: Path of field.safetensors, written by jsecon run.
       embedder: The CLIP model that the field was made with: a name, hub:owner/name, or a folder. By default it is the
         one that the run used.
-      yes: Fetches a model that is not on this machine without asking.
     """
 
     field: Positional[Path]
     embedder: ModelOption = None
-    yes: Option[bool] = False
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Query(FieldVerb):
+class Query(_FieldVerb):
     """Selects the Gaussians of a text, of a pixel, or of an outline.
 
     For each text, pixel or outline, writes to the output folder: the selected Gaussians as a .ply (INRIA's layout, in
@@ -240,11 +217,11 @@ class Query(FieldVerb):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Objects(FieldVerb):
+class Objects(_FieldVerb):
     """Lists the objects of a field with names, boxes and sizes.
 
-    Prints a table. With --out it also writes objects.json, objects.csv and catalogue.html, a page with pictures of each
-    object. Regions that show one object are joined, and parts are listed under their whole. Boxes stand upright, in the
+    Prints a table. With --out it also writes objects.json and catalogue.html, a page with pictures of each object.
+    Regions that show one object are joined, and parts are listed under their whole. Boxes stand upright, in the
     capture's world. An object's id is that of jsecon export.
 
     Attributes:
@@ -263,7 +240,7 @@ class Objects(FieldVerb):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Export(FieldVerb):
+class Export(_FieldVerb):
     """Writes the scene of a field, or objects of it, for other programs.
 
     The scene is in the capture's world. A .glb is glTF with Khronos' KHR_gaussian_splatting, y up. A .spz needs the
@@ -272,7 +249,6 @@ class Export(FieldVerb):
     Attributes:
       out: The .ply (INRIA's layout), .spz or .glb to write.
       with_labels: Adds object_id, the id of each Gaussian's object in jsecon objects or -1, to the .ply or .glb.
-      labels: File (.npy) to write with these ids, int32, in the order of the Gaussians in the .ply.
       objects: Folder to write a .ply of each object to, named by its id and name.
       only: Exports only the Gaussians that jsecon query selects for this text.
       without: Exports all other Gaussians than those. Both exports together hold each Gaussian of the scene once.
@@ -280,29 +256,29 @@ class Export(FieldVerb):
 
     examples = (
         "jsecon export my_field/field.safetensors --out scene.glb",
-        "jsecon export my_field/field.safetensors --objects objects --labels ids.npy",
+        "jsecon export my_field/field.safetensors --objects objects",
         'jsecon export my_field/field.safetensors --without "red mug" --out rest.ply',
     )
 
     out: Option[Path | None] = None
     with_labels: Option[bool] = False
-    labels: Option[Path | None] = None
     objects: Option[Path | None] = None
     only: Option[str | None] = None
     without: Option[str | None] = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class View(ServerVerb, FieldVerb):
+class View(_FieldVerb):
     """Shows a field in a browser and answers queries there.
 
-    A page on loopback shows the Gaussians (extra viewer). A text highlights what it selects, a click what lies there.
-    The page has a threshold, the frames, and files of the selection.
-    With --export, jsecon writes one HTML file instead, which opens by double click, without a server.
+    A page on this machine shows the Gaussians (extra viewer). A text highlights what it selects, a click what lies
+    there. The page has a threshold, the frames, and files of the selection. With --export, jsecon writes one HTML file
+    instead, which opens by double click, without a server.
 
     Attributes:
       texts: Texts to highlight.
       export: HTML file to write instead of opening a page.
+      port: Port of the page.
     """
 
     examples = (
@@ -316,7 +292,7 @@ class View(ServerVerb, FieldVerb):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Eval(FieldVerb):
+class Eval(_FieldVerb):
     """Measures a field against labels.
 
     The protocol is point-level and rendered, on LERF-style labels (one .json per frame): the selected Gaussians alone
@@ -335,16 +311,22 @@ class Eval(FieldVerb):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Serve(ServerVerb):
+class Serve(Verb):
     """Answers queries over HTTP, with fields that are loaded once.
 
-    Answers POST /query {"text": "red mug"} with Content-Type application/json, and more: see GET / and /openapi.json
-    (extra serve).
+    Answers POST /query {"text": "red mug"} with Content-Type application/json, and more: see /openapi.json (extra
+    serve).
 
     Attributes:
       fields: Paths of field.safetensors files. Each field is known by the name of its folder.
       embedder: The CLIP model that the fields were made with: a name, hub:owner/name, or a folder. By default it is the
         one that the runs used.
+      host: Address to listen on. Beyond loopback a token is required.
+      port: Port to listen on.
+      token: Token that requests must carry behind "Bearer" in the header Authorization. By default it is JSECON_TOKEN
+        of the environment, and without that no token is needed.
+      allow_host: Name by which clients reach this server besides localhost and --host, such as that of a proxy. Without
+        a token, requests by other names are refused.
     """
 
     examples = ("jsecon serve my_field/field.safetensors other_field/field.safetensors",)
@@ -352,6 +334,10 @@ class Serve(ServerVerb):
 
     fields: Positional[list[Path]]
     embedder: ModelOption = None
+    host: Option[str] = "127.0.0.1"
+    port: Annotated[Option[int], Range(0, 65535)] = 8765
+    token: Option[str] = ""
+    allow_host: Repeated[str] = dataclasses.field(default_factory=list)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -388,9 +374,8 @@ class Models(Verb):
       action: What to do.
       names: Names, addresses (hub:owner/name or hub:owner/name@revision), and for check also folders. auto stands for
         the models of `jsecon run --models auto`.
-      role: What the models are for. By default every role that a name has.
+      role: What the models are for: for get an address needs it, and a name has by default every role of its models.
       precision: Precision of the graphs. By default it is the one that jsecon uses.
-      yes: Fetches the models without asking first.
     """
 
     examples = ("jsecon models list", "jsecon models get auto", "jsecon models check my_models")
@@ -399,7 +384,6 @@ class Models(Verb):
     names: Positional[list[str]] = dataclasses.field(default_factory=list)
     role: Option[Role | None] = None
     precision: Option[Precision | None] = None
-    yes: Option[bool] = False
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

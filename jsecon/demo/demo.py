@@ -14,7 +14,6 @@ from jsecon.app import evaluation, pictures, report, running, verbs
 from jsecon.app.outputs import write_answer
 from jsecon.app.scene import Scene
 from jsecon.evaluate.lerf import Row
-from jsecon.files import write_text
 from jsecon.pipeline import run as pipeline
 from jsecon.pipeline.options import Options, require_writable
 from jsecon.pipeline.progress import Console
@@ -42,19 +41,20 @@ def run_demo(out: Path, *, listener: Console, room: Path = ROOM, steps: int = 55
     scene, labels = Scene(run.field), load_lerf_labels(capture / "label")
     results = evaluation.evaluate(scene, labels, listener, ("anchored",))
     rows, summary = results["anchored"]
-    with listener.progress("report"):
-        texts = sorted({name for frame in labels for name in frame.objects})
+    texts = sorted({name for frame in labels for name in frame.objects})
+    with listener.progress("answers"):
         for text in texts:
             answer = scene.ask(text)
-            write_answer(answer, scene, out / "queries", scene.masks(answer, 2))
-        metrics = running.run_metrics(run) | {"anchored": summary}
-        write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
-        write_text(out / "report.html", _page(run, rows, summary, labels))
+            masks = {t: scene.mask(answer, t) for t in scene.best_frames(answer, 2)}
+            write_answer(answer, scene, out / "queries", masks)
+    lead = "A made-up room as an ordinary capture: frames, poses and sparse points in, answers to texts out, "
+    lead += "on a plain CPU and without any learned weights."
+    parts = [_queries(run, rows, summary, labels)]
+    metrics = running.write_run(run, out, listener, "jsecon demo", lead, parts, anchored=summary)
     listener.print_line("measured on the held-out views")
     evaluation.print_table(results, listener)
-    field = out / "field.safetensors"
-    listener.print_line(f"field   {field}\nanswers {out / 'queries'}\nreport  {out / 'report.html'}")
-    listener.print_line(f'view it jsecon view {field} "{texts[0]}"  (extra viewer; --export writes a page)')
+    view = f'jsecon view {out / "field.safetensors"} "{texts[0]}"  (extra viewer; --export writes a page)'
+    listener.print_line(f"answers {out / 'queries'}\nview it {view}")
     return metrics
 
 
@@ -74,17 +74,14 @@ def _copy_capture(room: Path, out: Path) -> Path:
     return capture
 
 
-def _page(run: Run, rows: list[Row], summary: dict[str, Any], labels: list[LabelledFrame]) -> str:
-    """Returns the report: the figures, the best view of each answer beside the truth, and the run."""
-    tiles = report.tiles(
-        {
-            "mIoU, text to Gaussians": f"{summary['miou']:.3f}",
-            "mAcc@0.25": f"{summary['macc']:.3f}",
-            "localisation accuracy": f"{summary['loc_acc']:.3f}",
-            "held-out PSNR": f"{float(np.mean(run.held_out.psnr)):.2f} dB",
-            "of work": f"{sum(run.seconds.values()):.0f} s",
-        }
-    )
+def _queries(run: Run, rows: list[Row], summary: dict[str, Any], labels: list[LabelledFrame]) -> str:
+    """Returns the part of the report with the best view of each answer beside the truth, and its figures."""
+    figures = {
+        "mIoU, text to Gaussians": f"{summary['miou']:.3f}",
+        "mAcc@0.25": f"{summary['macc']:.3f}",
+        "localisation accuracy": f"{summary['loc_acc']:.3f}",
+    }
+    table = report.table(tuple(figures), [tuple(figures.values())])
     frames = dict(zip(run.capture.names, np.asarray(run.capture.frames)))
     truth = {(frame.name, name): mask for frame in labels for name, (mask, _) in frame.objects.items()}
     cells = []
@@ -92,10 +89,7 @@ def _page(run: Run, rows: list[Row], summary: dict[str, Any], labels: list[Label
         row = max((row for row in rows if row.query == text), key=lambda row: truth[row.frame, text].sum())
         overlay = pictures.selection_overlay(frames[row.frame], row.mask, truth[row.frame, text])
         words = f"IoU {row.iou:.2f}, {row.selected} Gaussians, region {row.region}, score {row.score:.2f}"
-        cells.append(report.pair(frames[row.frame], overlay, words, strong=text))
-    words = "Pink: the selected Gaussians, rendered alone, over a held-out view; move the line to see the photograph. "
+        cells.append(report.figure(overlay, words, strong=text))
+    words = "Pink: the selected Gaussians, rendered alone, over a held-out view. "
     words += f"White line: the ground truth. Figures: {summary['protocol']}; a missing prediction counts as 0."
-    lead = "A made-up room as an ordinary capture: frames, poses and sparse points in, answers to texts out, "
-    lead += "on a plain CPU and without any learned weights."
-    parts = [tiles, report.section("Queries", words, report.grid(cells, 4)), *running.run_parts(run)]
-    return report.page("jsecon demo", lead, parts)
+    return report.section("Queries", words, table, report.grid(cells, 4))

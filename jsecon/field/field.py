@@ -33,6 +33,8 @@ from jsecon.splat.project import unusable_rows
 from jsecon.splat.sh import COEFFICIENT_COUNTS
 from jsecon.types import Autoencoder, Camera, Codes, Gaussians, LanguageField, Parts, Regions, Votes
 
+FIELD_FILE = "field.safetensors"
+"""name of a field in its folder"""
 VERSION = 3
 _RECORDS = {cls.__name__: cls for cls in (LanguageField, Gaussians, Votes, Regions, Parts, Camera, Codes, Autoencoder)}
 MAPPED = 1 << 20

@@ -29,10 +29,6 @@ RECOMMENDED: Mapping[Role, str] = {"segmenter": "edgetam", "embedder": "siglip2"
 """what `--models auto` takes"""
 
 
-class NoSuchFilesError(InputError):
-    """A folder or repository lacks files of every layout of a role."""
-
-
 class _Layout(NamedTuple):
     """The files of one public layout of a model. `{p}` stands for the suffix of the precision."""
 
@@ -104,7 +100,7 @@ class HubModel:
     def get_command(self) -> str:
         """The command that fetches the model."""
         precision = "" if self.precision == "fp32" else f" --precision {self.precision}"
-        return f"jsecon models get {self.name or self.address} --role {self.role}{precision} --yes"
+        return f"jsecon models get {self.name or self.address} --role {self.role}{precision}"
 
     @property
     def cached_folder(self) -> Path | None:
@@ -248,7 +244,7 @@ def _present_layout(
             missing.append([name for name in named.required if not exists(name)])
             if not missing[-1]:
                 return named
-    raise NoSuchFilesError(where, f"no {role}, since it lacks {', '.join(min(missing, key=len))}", "", remedy)
+    raise InputError(where, f"no {role}, since it lacks {', '.join(min(missing, key=len))}", "", remedy)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -268,7 +264,7 @@ class Download:
 
 
 def plan_download(model: HubModel) -> Download:
-    """Asks the hub which files a model needs, or raises InputError (NoSuchFilesError if it lacks some)."""
+    """Asks the hub which files a model needs, or raises InputError."""
     from huggingface_hub import HfApi
 
     with _hub_errors(model):

@@ -6,14 +6,14 @@ closed when its stage is done, to free its memory.
 
 import contextlib
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, get_args
 
 import numpy as np
 
 from jsecon.errors import InputError
-from jsecon.networks.hub import HubModel, Precision, Role, parse_model
+from jsecon.networks.hub import RECOMMENDED, HubModel, Precision, Role, parse_model
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.sources import locate_sources
 from jsecon.types import LanguageField
@@ -55,22 +55,27 @@ def _missing_model(dim: int) -> InputError:
     return InputError("field", problem, "the CLIP model that made them", remedy)
 
 
-def _local_folder(choice: str | Path, role: Role, precision: Precision | None = None) -> Path:
-    """Finds the folder of a model that is on this machine, by a name, an address or a folder, or raises InputError."""
-    model = parse_model(choice, role, precision)
-    folder = model.cached_folder if isinstance(model, HubModel) else model
-    if folder is None:
-        raise InputError(str(choice), "not on this machine", "", f"Fetch it with: {model.get_command}. Or add --yes.")
-    return folder
+def _local_folders(models: Mapping[Role, HubModel | Path]) -> dict[Role, Path]:
+    """Finds the folders of models on this machine, or raises InputError with the commands that fetch the others."""
+    folders = {role: m if isinstance(m, Path) else m.cached_folder for role, m in models.items()}
+    missing = [m for role, m in models.items() if isinstance(m, HubModel) and folders[role] is None]
+    if missing:
+        commands = "; ".join(model.get_command for model in missing)
+        addresses = " ".join(model.address for model in missing)
+        raise InputError(addresses, "not on this machine", "", f"Fetch with: {commands}.")
+    return {role: folder for role, folder in folders.items() if folder is not None}
 
 
 def with_folders(options: Options) -> Options:
     """Replaces the models in options by their folders on this machine, or raises InputError."""
-    choices = {role: getattr(options, role) for role in get_args(Role)}
-    folders = {
-        role: _local_folder(choice, role, options.precision) for role, choice in choices.items() if choice is not None
-    }
-    return dataclasses.replace(options, **folders)
+    recommended = RECOMMENDED if options.models == "auto" else {}
+    models = {}
+    for role in get_args(Role):
+        choice = getattr(options, role)
+        choice = recommended.get(role) if choice is None else choice
+        if choice is not None:
+            models[role] = parse_model(choice, role, options.precision)
+    return dataclasses.replace(options, **_local_folders(models))
 
 
 def open_models(options: Options, store: Path) -> Models:
@@ -116,7 +121,7 @@ def open_embedder(
     if folder is not None:
         from jsecon.networks.clip import ClipEmbedder
 
-        folder = _local_folder(folder, "embedder", precision)
+        folder = _local_folders({"embedder": parse_model(folder, "embedder", precision)})["embedder"]
         clip = ClipEmbedder(folder, precision=precision, store=store)
         return _of_space(clip, name, "Give the model that the field was made with: --embedder DIR.")
     if (dim := external_dim(name)) is not None:
@@ -150,16 +155,16 @@ def field_embedder(field: LanguageField, folder: str | Path | None = None) -> Em
         only if its content is the same.
     """
     if folder is None:
-        model = find_model(field)
+        model = _find_model(field)
         if isinstance(model, HubModel):
             problem = f"its texts need the model {model.address}, which is not on this machine"
-            raise InputError("field", problem, "", f"Fetch it with: {model.get_command}. Or add --yes.")
+            raise InputError("field", problem, "", f"Fetch it with: {model.get_command}.")
         if model is not None:
             return _of_space(model, field.embedder, "")
     return open_embedder(field.embedder, folder=folder)
 
 
-def find_model(field: LanguageField) -> "ClipEmbedder | HubModel | None":
+def _find_model(field: LanguageField) -> "ClipEmbedder | HubModel | None":
     """Looks for the CLIP model that a field was made with, in its folder and in the hub's cache.
 
     Returns the model if it is on this machine, else the one of the hub that is to be fetched; None for a field without

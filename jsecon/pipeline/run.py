@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from jsecon.errors import InputError
-from jsecon.field.field import load_field, save_field
+from jsecon.field.field import FIELD_FILE, load_field, save_field
 from jsecon.files import exclusive_lock
 from jsecon.pipeline import cache, lifting, model_loading, processes, stages
 from jsecon.pipeline.options import Options, check_ranges, is_bare_scene, require_writable
@@ -40,8 +40,6 @@ from jsecon.read.captures.frames import FrameOptions, evenly_spaced, holdout_mas
 from jsecon.read.masks.masks import load_features, load_labels, load_proposals
 from jsecon.types import Capture, Gaussians, LanguageField, Quality
 from jsecon.vision.classical import require_contrib
-
-FIELD_FILE = "field.safetensors"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,12 +1,11 @@
 """The Gaussians of a field in the viewer's window, and the cameras of its frames."""
 
-import time
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
-from jsecon.app.pictures import main_regions
+from jsecon.app.catalogue import main_regions
 from jsecon.numerics import sigmoid
 from jsecon.splat.project import is_usable
 from jsecon.splat.sh import C0
@@ -18,8 +17,6 @@ GROUPS = 16
 MAX_STD = 200.0
 """largest standard deviation in units of the window, whose median is 1; viser holds covariances in 16 bits, from 0.008
 to 256"""
-MAX_FRUSTUMS = 150
-"""number of frames whose cameras are drawn"""
 
 
 class SplatLayer:
@@ -93,7 +90,7 @@ class SplatLayer:
 
     def _add_frustums(self, server: Any) -> dict[int, Any]:
         """Adds the cameras of the frames to the window, invisible."""
-        frames = range(0, len(self._centers), -(-len(self._centers) // MAX_FRUSTUMS))
+        frames = range(0, len(self._centers), -(-len(self._centers) // 150))  # more would cover the scene
         size = 0.06 * float(np.linalg.norm(np.std(self._centers, axis=0))) or 0.1 * self.scale
         wxyz = self._rotations.as_quat(scalar_first=True)
         return {
@@ -131,17 +128,11 @@ class SplatLayer:
         for frame, frustum in self.frustums.items():
             frustum.visible = shown and frame != self._frame
 
-    def fly(self, client: Any, frame: int) -> None:
-        """Moves a viser client to the camera of a frame, in 0.4 s."""
-        start = np.asarray(client.camera.position)
-        ends = [Rotation.from_quat(client.camera.wxyz, scalar_first=True), self._rotations[frame]]
-        rotation = Slerp([0, 1], Rotation.concatenate(ends))
-        for step in np.linspace(0, 1, 13)[1:]:
-            with client.atomic():
-                client.camera.position = start + step * (self._centers[frame] - start)
-                client.camera.wxyz = rotation(step).as_quat(scalar_first=True)
-            client.flush()
-            time.sleep(0.4 / 12)
+    def go_to(self, client: Any, frame: int) -> None:
+        """Moves a viser client to the camera of a frame."""
+        with client.atomic():
+            client.camera.position = self._centers[frame]
+            client.camera.wxyz = self._rotations[frame].as_quat(scalar_first=True)
         client.camera.fov = float(self.fovs[frame])
         self._frame = frame
         self.show_frames(self._frames_shown)

@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float, UInt8
 from jsecon.app.records import Query, Region
 from jsecon.field.membership import SHARE_THRESHOLD
 
-Colouring: TypeAlias = Literal["photo", "region", "score"]
+Colouring: TypeAlias = Literal["photo", "region"]
 COLOURINGS: tuple[Colouring, ...] = get_args(Colouring)
-"""What the colours of the Gaussians show: the photographs, regions, or how far each belongs to the answers."""
+"""What the colours of the Gaussians show: the photographs, or regions."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,13 +87,3 @@ def highlight(
         best[rows] = similarity[rows]
         colours[rows] = (0.45 * base[rows] + 0.55 * tint).astype(np.uint8)
     return colours
-
-
-def score_colours(similarities: Sequence[Float[np.ndarray, " n"]], count: int) -> UInt8[np.ndarray, "n 3"]:
-    """RGB of the largest similarity of each Gaussian: dark blue 0, red 0.5, pale yellow 1; grey without answers."""
-    if not similarities:
-        return np.full((count, 3), 110, np.uint8)
-    largest = np.nan_to_num(np.max(similarities, axis=0))
-    stops = np.array([[18, 20, 60], [90, 24, 120], [205, 50, 70], [250, 150, 40], [252, 250, 190]], np.float32)
-    table = np.stack([np.interp(np.linspace(0, 1, 256), np.linspace(0, 1, 5), c) for c in stops.T], 1)
-    return table.astype(np.uint8)[(255 * np.clip(largest, 0, 1)).astype(np.uint8)]

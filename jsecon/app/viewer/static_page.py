@@ -16,8 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jsecon.app import verbs
-from jsecon.app.models import open_embedder
-from jsecon.app.pictures import main_regions
+from jsecon.app.catalogue import main_regions
 from jsecon.app.records import Answer
 from jsecon.app.scene import open_scene
 from jsecon.errors import InputError
@@ -31,12 +30,6 @@ from jsecon.views.frame import scene_up
 
 NO_REGION = 65535
 """code of a Gaussian without a region"""
-BOX_TAIL = 0.002
-"""share of the Gaussians at each end of an axis that the box leaves out, since its 16 bits would be spent on strays"""
-MAX_SIZE = 0.25
-"""largest standard deviation of a Gaussian that is drawn, as a share of the box's diagonal"""
-MIN_OPACITY = 4
-"""smallest opacity of a Gaussian that is drawn, of 255"""
 
 
 def export_page(verb: verbs.View, file: Path, console: Console) -> verbs.VerbResult:
@@ -45,7 +38,7 @@ def export_page(verb: verbs.View, file: Path, console: Console) -> verbs.VerbRes
         raise InputError("--export", f"{file} does not end in .html", remedy="For example: --export page.html")
     require_writable(file.parent)
     with console.progress("page"):
-        scene = open_scene(verb.field, embedder=lambda field: open_embedder(field, verb, console))
+        scene = open_scene(verb.field, embedder=verb.embedder)
         if verb.texts:
             _ = scene.embedder  # without it one error stands for all texts
         results = scene.ask_all(verb.texts)
@@ -66,13 +59,14 @@ def page(field: LanguageField, answers: Sequence[Answer], *, title: str) -> str:
     means = np.asarray(gaussians.means, np.float64)
     log_sizes = np.asarray(gaussians.log_scales, np.float64).max(1)
     opacity = np.asarray(sigmoid(np.asarray(gaussians.opacity_logits)))
-    drawn = np.isfinite(means).all(1) & np.isfinite(log_sizes) & (opacity * 255 >= MIN_OPACITY)
+    drawn = np.isfinite(means).all(1) & np.isfinite(log_sizes) & (opacity * 255 >= 4)
     if not drawn.any():
         raise InputError("--export", "the field has no visible Gaussian", remedy="Make it again: jsecon run.")
-    low, high = np.quantile(means[drawn], (BOX_TAIL, 1 - BOX_TAIL), axis=0)
+    low, high = np.quantile(means[drawn], (0.002, 0.998), axis=0)  # else strays take the box's 16 bits
     margin = np.maximum(0.05 * (high - low), np.exp(np.median(log_sizes[drawn])))  # coincident ones have a box too
     low, high = low - margin, high + margin
-    largest = max(MAX_SIZE * np.linalg.norm(high - low), np.exp(log_sizes[drawn].min()))
+    # Larger ones veil the page.
+    largest = max(0.25 * np.linalg.norm(high - low), np.exp(log_sizes[drawn].min()))
     drawn &= ((means >= low) & (means <= high)).all(1) & (log_sizes <= np.log(largest))
     splats, size_range = _pack(gaussians, main_regions(field), opacity, drawn, low, high)
     texts = []

@@ -6,31 +6,32 @@ empty, so that a slider that moves faster than answers come skips what lies betw
 
 import contextlib
 import dataclasses
+import html
+import http
 import io
 import queue
+import shutil
 import tempfile
 import threading
+import time
 import traceback
-import zipfile
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlencode
+from urllib.parse import urlsplit
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jsecon.app import verbs
-from jsecon.app.access import bracketed, guarded_pages, listen, token_for
-from jsecon.app.models import open_embedder
+from jsecon.app.access import is_allowed_host, listen
 from jsecon.app.outputs import file_stem, write_answer
 from jsecon.app.pictures import UNKNOWN, palette
 from jsecon.app.records import Answer, Query
 from jsecon.app.scene import Scene, open_scene
 from jsecon.app.viewer.layer import SplatLayer
-from jsecon.app.viewer.panel import Panel
-from jsecon.app.viewer.state import ViewState, highlight, score_colours
+from jsecon.app.viewer.state import COLOURINGS, ViewState, answer_colours, highlight
 from jsecon.app.viewer.static_page import export_page
 from jsecon.errors import InputError
 from jsecon.pipeline.progress import Console
@@ -62,20 +63,20 @@ class Viewer:
         self.state = ViewState()
         self.drawn: ViewState | None = None
         self.layer = SplatLayer(server, scene.field)
-        self.panel = Panel(self, server)
+        self.panel = _Panel(self, server)
         table = np.concatenate([palette(scene.field.regions.count), np.full((1, 3), 255 * UNKNOWN, np.uint8)])
         self._base_colours = {"photo": self.layer.photo, "region": table[self.layer.regions]}
         self._steps: queue.SimpleQueue[Callable[[], Any] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, daemon=True)
 
-    def start(self, state: ViewState) -> None:
+    def _start(self, state: ViewState) -> None:
         """Draws the first state, and starts the thread, which first compiles what questions need."""
         self.state = state
         self._draw()
         self._steps.put(self._prepare)
         self._thread.start()
 
-    def run(self) -> None:
+    def _run(self) -> None:
         """Keeps the viewer running until it is interrupted."""
         try:
             self.server.sleep_forever()
@@ -95,7 +96,7 @@ class Viewer:
 
         self._steps.put(act)
 
-    def click(self, origin: Sequence[float], direction: Sequence[float], focal: float, *, add: bool) -> None:
+    def _click(self, origin: Sequence[float], direction: Sequence[float], focal: float, *, add: bool) -> None:
         """Queues highlighting the region that a ray in the window's world meets; focal length in px."""
         start = np.asarray(origin) / self.layer.scale
 
@@ -109,14 +110,14 @@ class Viewer:
         self._steps.put(act)
 
     def go_to_frame(self, client: Any, frame: int) -> None:
-        """Queues the flight of a client to a frame."""
-        self._steps.put(lambda: self.layer.fly(client, frame))
+        """Queues moving a client to the camera of a frame."""
+        self._steps.put(lambda: self.layer.go_to(client, frame))
 
     def export(self, client: Any) -> None:
         """Queues sending the highlighted answers as a .zip: .ply, .json and masks of each."""
 
         def act() -> None:
-            answers = [self.answer(query) for query in self.state.queries]
+            answers = [self._answer(query) for query in self.state.queries]
             answers = [answer for answer in answers if isinstance(answer, Answer) and len(answer.rows)]
             if not answers:
                 raise InputError("", "no Gaussian is selected, so there is no file to export")
@@ -124,20 +125,17 @@ class Viewer:
 
         self._steps.put(act)
 
-    def answer(self, query: Query) -> Answer | InputError:
+    def _answer(self, query: Query) -> Answer | InputError:
         """Answers a query, or returns why it cannot be answered."""
         return self.scene.ask_all([query])[0]
 
     def _zipped(self, answers: Sequence[Answer]) -> bytes:
-        packed = io.BytesIO()
-        options: dict[str, Any] = {"compression": zipfile.ZIP_DEFLATED}
-        options["strict_timestamps"] = False  # for clocks before 1980
-        with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(packed, "w", **options) as archive:
+        with tempfile.TemporaryDirectory() as folder:
             for answer in answers:
-                write_answer(answer, self.scene, Path(folder), self.scene.masks(answer, 3))
-            for file in sorted(Path(folder).iterdir()):
-                archive.write(file, file.name)
-        return packed.getvalue()
+                masks = {t: self.scene.mask(answer, t) for t in self.scene.best_frames(answer, 3)}
+                write_answer(answer, self.scene, Path(folder, "answers"), masks)
+            packed = shutil.make_archive(str(Path(folder, "packed")), "zip", Path(folder, "answers"))
+            return Path(packed).read_bytes()
 
     def _work(self) -> None:
         """Takes the steps in turn, and draws the last state when no step waits."""
@@ -165,7 +163,7 @@ class Viewer:
 
     def _selection(self, query: Query) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         """Mask and similarities of an answer; zeros for an error."""
-        answer = self.answer(query)
+        answer = self._answer(query)
         if isinstance(answer, InputError):
             count = self.scene.field.gaussians.count
             return np.zeros(count, bool), np.zeros(count, np.float32)
@@ -176,14 +174,136 @@ class Viewer:
         state = self.state
         selections = [self._selection(query) for query in state.queries]
         masks, similarities = [mask for mask, _ in selections], [similarity for _, similarity in selections]
-        if state.colouring == "score":
-            colours = score_colours(similarities, self.scene.field.gaussians.count)
-        else:
-            matched = masks if any(mask.any() for mask in masks) else []
-            colours = highlight(self._base_colours[state.colouring], matched, similarities)
+        matched = masks if any(mask.any() for mask in masks) else []
+        colours = highlight(self._base_colours[state.colouring], matched, similarities)
         self.layer.paint(colours, self._visible(state))
-        self.panel.show(state, [self.answer(query) for query in state.queries])
+        self.panel.show(state, [self._answer(query) for query in state.queries])
         self.drawn = state
+
+
+class _Panel:
+    """The controls, and the events by which they act on the viewer.
+
+    Args:
+      viewer: The viewer.
+      server: The viser server.
+    """
+
+    def __init__(self, viewer: Any, server: Any):
+        self._viewer = viewer
+        self._names = viewer.scene.field.names
+        self._ray = np.zeros(3)
+        self._clicked_at = 0.0
+        gui = server.gui
+        gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="medium")
+        gui.set_panel_label(f"jsecon · {viewer.scene.name}")
+        default = ViewState()
+        with gui.add_form(None) as text_form:
+            self._text = gui.add_text("find", "", hint="Text to find, then press enter")
+        hint = "Keep what is selected when you find or click something else"
+        self._add = gui.add_checkbox("add to selection", False, hint=hint)
+        self._messages = gui.add_html("")
+        self._notice = gui.add_html("", visible=False)
+        hint = "Select every region that matches, not only the best one"
+        all_of_class = gui.add_checkbox("all of its kind", default.all_of_class, hint=hint)
+        hint = "Smallest share of a Gaussian that must lie in the matching regions"
+        threshold = gui.add_slider("threshold", 0.0, 1.0, 0.01, default.threshold, hint=hint)
+        colouring = gui.add_dropdown("colour", COLOURINGS, initial_value=default.colouring)
+        self._controls = {"all_of_class": all_of_class, "threshold": threshold, "colouring": colouring}
+        buttons = gui.add_button_group("selection", ("isolate", "hide", "show all", "export"))
+        with gui.add_folder("frames", expand_by_default=False):
+            hint = "Go to the camera of a frame"
+            self._frame = gui.add_dropdown("frame", ("choose", *self._names), initial_value="choose", hint=hint)
+            cameras = gui.add_checkbox("show cameras", False, hint="Click a camera to go there")
+
+        text_form.on_submit(_in_order(self._find))
+        for name, control in self._controls.items():
+            control.on_update(_in_order(lambda event, name=name: self._set_control(name, event.target.value)))
+        buttons.on_click(_in_order(self._press))
+        self._frame.on_update(_in_order(self._choose_frame))
+        cameras.on_update(_in_order(lambda event: viewer.layer.show_frames(event.target.value)))
+        for frame, frustum in viewer.layer.frustums.items():
+            frustum.on_click(_in_order(lambda event, frame=frame: self._click_frame(event, frame)))
+        for modifier in (None, "shift"):
+            server.scene.on_click(modifier=modifier)(_in_order(self._click_scene))
+
+    def _find(self, event: Any) -> None:
+        text, add = self._text.value, self._add.value
+        self._viewer.then(lambda state: state.with_question(text, add=add))
+
+    def _press(self, event: Any) -> None:
+        if event.target.value == "export":
+            self._viewer.export(event.client)
+        else:
+            steps = {"isolate": ViewState.isolate, "hide": ViewState.hide, "show all": ViewState.show_all}
+            self._viewer.then(steps[event.target.value])
+
+    def _set_control(self, name: str, value: Any) -> None:
+        if getattr(self._viewer.state, name) != value:
+            self._viewer.then(lambda state: dataclasses.replace(state, **{name: value}))
+
+    def _choose_frame(self, event: Any) -> None:
+        if event.client is not None and event.target.value in self._names:
+            self._viewer.go_to_frame(event.client, self._names.index(event.target.value))
+
+    def _click_frame(self, event: Any, frame: int) -> None:
+        self._ray = np.asarray(event.ray_direction)
+        self._clicked_at = time.monotonic()
+        self._frame.value = self._names[frame]
+        self._viewer.go_to_frame(event.client, frame)
+
+    def _click_scene(self, event: Any) -> None:
+        """Handles a click on the scene, unless it was one on a frame's camera."""
+        # viser reports a click on a frame's camera for the scene too, by a ray that is rounded otherwise.
+        recent = time.monotonic() - self._clicked_at <= 0.5
+        if recent and np.allclose(event.ray_direction, self._ray, atol=0.02):
+            return
+        camera = event.client.camera
+        focal = camera.image_height / 2 / np.tan(camera.fov / 2)
+        add = self._add.value or event.modifier == "shift"
+        self._viewer._click(event.ray_origin, event.ray_direction, focal, add=add)
+
+    def show(self, state: ViewState, answers: Sequence[Answer | InputError]) -> None:
+        """Sets the controls to a state, and describes the answer or the error of each of its questions."""
+        texts = [question for question in state.questions if isinstance(question, str)]
+        self._text.value = texts[-1] if texts else ""
+        for name, control in self._controls.items():
+            control.value = getattr(state, name)
+        self._messages.content = "".join(map(_message, range(len(answers)), state.queries, answers))
+        self.show_notice("")
+
+    def show_notice(self, text: str | InputError) -> None:
+        """Shows a notice above the answers; "" removes it."""
+        self._notice.content = _box(_error(text) if isinstance(text, InputError) else html.escape(text))
+        self._notice.visible = text != ""
+
+
+def _in_order(act: Callable[[Any], Any]) -> Any:
+    """Returns a callback that runs in the order of the page's events, as viser's coroutines do."""
+
+    async def callback(event: Any) -> None:
+        act(event)
+
+    return callback
+
+
+def _message(place: int, query: Any, answer: Answer | InputError) -> str:
+    """An answer or an error behind a square in its colour."""
+    colour = "#{:02x}{:02x}{:02x}".format(*answer_colours(place + 1)[place])
+    swatch = f'<span style="display:inline-block;width:.8em;height:.8em;border-radius:2px;background:{colour}"></span>'
+    failed = isinstance(answer, InputError)
+    words = _error(answer) if failed else html.escape(answer.describe())
+    return _box(f"{swatch} <b>{html.escape(str(query))}</b>: {words}", "#fa0" if failed else colour)
+
+
+def _error(error: InputError) -> str:
+    """An error whose remedy a click shows."""
+    return f"<details><summary>{html.escape(error.sentence)}</summary>{html.escape(error.remedy)}</details>"
+
+
+def _box(text: str, colour: str = "#fa0") -> str:
+    style = f"margin:0 .8em .5em;padding:.4em .6em;border-left:3px solid {colour};font-size:.8em"
+    return f'<div style="{style}">{text}</div>'
 
 
 def region_along(
@@ -212,25 +332,63 @@ def region_along(
     return int(shares.argmax()) if shares.size and shares.max() >= MIN_SHARE else -1
 
 
-def open_viewer(
-    scene: Scene, *, host: str, port: int, state: ViewState, token: str = "", hosts: Collection[str] = ()
-) -> Viewer:
-    """Opens a viewer, which listens at a port (0 takes a free one).
+@contextlib.contextmanager
+def _guarded_pages() -> Iterator[None]:
+    """Guards the viser servers that are started inside of this context.
 
-    Without a token its page is shown to requests that name this machine: loopback, `host` or one of `hosts`.
+    They take requests whose Host header names loopback, and which no page of another site sends. viser has no hook for
+    requests, so this wraps the function of the package websockets by which it listens, while the server starts.
+    RuntimeError: This viser listens in another way, so its page would be open to everybody.
     """
+    import websockets.asyncio.server as sockets
+
+    listen = sockets.serve
+    wrapped = []
+
+    def serve(handler: Any, *address: Any, process_request: Callable[..., Any], **kwargs: Any) -> Any:
+        def checked(connection: Any, request: Any) -> Any:
+            return _refusal(request) or process_request(connection, request)
+
+        wrapped.append(True)
+        return listen(handler, *address, process_request=checked, **kwargs)
+
+    sockets.serve = serve  # pyright: ignore[reportAttributeAccessIssue]
+    try:
+        yield
+    finally:
+        sockets.serve = listen
+    if not wrapped:
+        raise RuntimeError("this viser does not listen through websockets.asyncio.server.serve")
+
+
+def _refusal(request: Any) -> Any:
+    """Returns the response to a request that may not see the page, None for one that may go on."""
+    from websockets.datastructures import Headers
+    from websockets.http11 import Response
+
+    host = request.headers.get("Host", "")
+    origin = request.headers.get("Origin")
+    if is_allowed_host(host) and (origin is None or urlsplit(origin).netloc.lower() == host.lower()):
+        return None
+    body = b"This page is shown to this machine alone, under the address that jsecon view printed."
+    headers = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))})
+    return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", headers, body)
+
+
+def open_viewer(scene: Scene, *, port: int, state: ViewState) -> Viewer:
+    """Opens a viewer on loopback, at a port (0 takes a free one)."""
     try:
         import viser
     except ImportError as error:
         remedy = 'Run: pip install "jsecon[viewer]". Or write a page with --export.'
         raise InputError("jsecon view", "the package viser is missing", remedy=remedy) from error
+    host = "127.0.0.1"
     listen(host, port).close()  # viser would go on to the next port
-    token = token_for(host, token)
     no_banner = contextlib.redirect_stdout(io.StringIO())  # it would come before the viewer can answer
-    with no_banner, guarded_pages(token, (host, *hosts)):
-        server = viser.ViserServer(host.strip("[]"), port, label=f"jsecon · {scene.name}", verbose=False)
+    with no_banner, _guarded_pages():
+        server = viser.ViserServer(host, port, label=f"jsecon · {scene.name}", verbose=False)
     viewer = Viewer(scene, server)
-    viewer.start(state)
+    viewer._start(state)
     return viewer
 
 
@@ -238,16 +396,13 @@ def _view(verb: verbs.View, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon view`; the result is {} once the viewer is stopped."""
     if verb.export is not None:
         return export_page(verb, verb.export, console)
-    token = token_for(verb.host, verb.token)
     # Without its model a field can be clicked, so the model is opened when the first text is asked.
-    scene = open_scene(verb.field, embedder=lambda field: open_embedder(field, verb, console))
+    scene = open_scene(verb.field, embedder=verb.embedder)
     if verb.texts:
         _ = scene.embedder
     state = ViewState(tuple(dict.fromkeys(verb.texts)))
-    access = {"host": verb.host, "port": verb.port, "token": token, "hosts": verb.allow_host}
-    viewer = open_viewer(scene, state=state, **access)
+    viewer = open_viewer(scene, port=verb.port, state=state)
     console.print_line(f"{scene.name}: {scene.field.gaussians.count} Gaussians, {scene.field.regions.count} regions")
-    query = f"/?{urlencode({'token': token})}" if token else ""
-    console.print_line(f"http://{bracketed(verb.host)}:{viewer.server.get_port()}{query}")
-    viewer.run()
+    console.print_line(f"http://127.0.0.1:{viewer.server.get_port()}")
+    viewer._run()
     return {}
