@@ -7,13 +7,28 @@ import numpy as np
 import pytest
 import splat_files
 from capture_files import refused
-from splat_files import opacity, ply_columns, scene, write_ply
+from splat_files import C0, opacity, ply_columns, scene, write_ply
 from test_gaussian_files import STEPS, compare, gaussians
 from test_gltf import NAME, rewritten
 
 import jsecon
 
 SCENE = scene(300, 4)
+
+
+# --- places in .spz: the bits behind the point
+
+
+# --- .spz: versions, axes, flags
+
+
+def record(kind, body):
+    return struct.pack("<II", kind, len(body)) + body
+
+
+SYSTEMS = "LDB RDB LUB RUB LDF RDF LUF RUF"
+TOWARDS = {"R": (0, 1), "L": (0, -1), "D": (1, 1), "U": (1, -1), "F": (2, 1), "B": (2, -1)}
+"""a direction -> the axis of a .ply that it lies along, and its sign there"""
 
 
 # --- places in .spz: the bits behind the point
@@ -66,8 +81,15 @@ def test_a_glb_refuses_sizes_beyond_float32(tmp_path):
 # --- .spz: versions, axes, flags
 
 
-def record(kind, body):
-    return struct.pack("<II", kind, len(body)) + body
+@pytest.mark.parametrize(("number", "name"), [*enumerate(SYSTEMS.split(), 1)])
+@pytest.mark.parametrize("version", [3, 4])
+def test_a_spz_is_turned_from_the_axes_that_it_names(tmp_path, number, name, version):
+    """Left-handed ones too, in which the scene stands mirrored."""
+    axes = np.array([TOWARDS[letter][1] for letter in name])
+    records = record(0xADBE0002, bytes(12)) + record(0xADBE0003, struct.pack("<I", number))
+    (tmp_path / "a.spz").write_bytes(splat_files.spz(SCENE, version, axes=axes, records=records))
+    found = jsecon.load_gaussians(tmp_path / "a.spz")
+    compare(found, SCENE, STEPS["four.spz"])
 
 
 def test_what_a_spz_says_and_is_not_done_is_told(tmp_path):
@@ -78,14 +100,11 @@ def test_what_a_spz_says_and_is_not_done_is_told(tmp_path):
                 jsecon.load_gaussians(tmp_path / "a.spz")
         else:
             jsecon.load_gaussians(tmp_path / "a.spz")
-    own = record(0xADBE0002, bytes(12)) + record(0xADBE0003, struct.pack("<I", 4))  # right, up, back, by number
-    (tmp_path / "a.spz").write_bytes(splat_files.spz(SCENE, 4, records=own))
-    compare(jsecon.load_gaussians(tmp_path / "a.spz"), SCENE, STEPS["four.spz"])
 
 
 @pytest.mark.parametrize(("how", "says"), [
     ({"degree": 4}, ("degree 4",)), ({"version": 5}, ("version 5",)),
-    ({"records": record(0xADBE0003, struct.pack("<I", 5))}, ("the number 5", "RUB")),
+    ({"records": record(0xADBE0003, struct.pack("<I", 17))}, ("unknown number 17",)),
     ({"records": record(0xADBE0003, b"")[:-1] + b"\1"}, ("damaged",)), ({"fraction": 31}, ("fractional_bits",)),
 ])  # fmt: skip
 def test_a_spz_of_another_kind_is_refused_by_name(tmp_path, how, says):
@@ -118,6 +137,18 @@ def test_a_flat_gaussian_has_no_thickness(tmp_path, third):
     found = jsecon.load_gaussians(tmp_path / "a.PLY")
     assert np.isneginf(found.log_scales[:, 2]).all()
     np.testing.assert_array_equal(found.log_scales[:, :2], PLAIN["log_scales"][:, :2].astype(np.float32))
+
+
+def test_colours_of_8_bits_in_place_of_coefficients(tmp_path):
+    rgb = np.random.default_rng(0).integers(0, 256, (40, 3))
+    numbers = {name: rgb[:, n] for n, name in enumerate(("red", "green", "blue"))}
+    kinds = dict.fromkeys(numbers, "uchar")
+    without = dict.fromkeys(("f_dc_0", "f_dc_1", "f_dc_2"))
+    write_ply(tmp_path / "a.ply", plys(PLAIN, **without, **numbers), types=kinds)
+    found = jsecon.load_gaussians(tmp_path / "a.ply")
+    np.testing.assert_allclose(found.sh[:, 0], (rgb / 255 - 0.5) / C0, atol=1e-5)
+    write_ply(tmp_path / "a.ply", plys(PLAIN, **numbers), types=kinds)  # beside coefficients, they are a viewer's
+    np.testing.assert_array_equal(jsecon.load_gaussians(tmp_path / "a.ply").sh, PLAIN["sh"].astype(np.float32))
 
 
 def test_mip_splattings_filter_is_fused_as_it_fuses_it(tmp_path):

@@ -30,7 +30,7 @@ from jsecon.read.registry import Reader, find_reader
 from jsecon.read.splats.gltf import read_glb, save_glb
 from jsecon.read.splats.ply import Header, drawable_gaussians, read_ply, read_ply_file, save_ply, usable_blocks
 from jsecon.splat.sh import C0
-from jsecon.splat.transform import float32_rounding, transform_gaussians
+from jsecon.splat.transform import float32_rounding, transform_axes, transform_gaussians
 from jsecon.types import Array, Gaussians
 
 _FORMATS = "Gaussians as .ply (INRIA's or SuperSplat's compressed), .glb, .spz, .sog or .splat"
@@ -40,6 +40,13 @@ read."""
 _AGAIN = "Export it again, or as an uncompressed .ply."
 _SPZ_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 """from a .ply's x right, y down, z forward to .spz's x right, y up, z back; and back again"""
+_SPZ_SYSTEMS = (
+    *("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
+    *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
+)
+"""axes 1 to 16: where x, y and z point to, left or right, up or down, forward or back"""
+_DIRECTIONS = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
+"""a direction in the axes of a .ply"""
 
 
 def _import_gsply(path: Path) -> Any:
@@ -107,24 +114,28 @@ def _read_spz(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
             records = body[16 + count * row :]
         else:
             records = data[32 : int.from_bytes(data[16:20], "little")]
-        _check_axes(path, records if flags & 2 else b"")
-        gaussians = transform_gaussians(_gaussians(path, gsply.read_spz(path)), _SPZ_AXES)
+        axes = _spz_axes(path, records if flags & 2 else b"")
+        gaussians = transform_axes(_gaussians(path, gsply.read_spz(path)), axes)
     gaussians = dataclasses.replace(gaussians, means=gaussians.means.astype(np.float32))
     return gaussians, _antialiasing_note(path) if flags & 1 else ()
 
 
-def _check_axes(path: Path, records: bytes) -> None:
-    """Raises InputError if the records of a .spz name axes other than its makers' (0: unspecified, 4: RUB)."""
-    offset = 0
+def _spz_axes(path: Path, records: bytes) -> np.ndarray:
+    """(4, 4) from the axes that the records of a .spz name to those of a .ply; by default from its makers' (RUB)."""
+    axes, offset = _SPZ_AXES, 0
     while offset + 8 <= len(records):
         kind, length = struct.unpack_from("<II", records, offset)
         if offset + 8 + length > len(records):
             raise EOFError
         number = int.from_bytes(records[offset + 8 : offset + 12], "little")
-        if kind == 0xADBE0003 and number not in (0, 4):
+        if kind == 0xADBE0003 and number > len(_SPZ_SYSTEMS):
             remedy = "Export the scene again, in Niantic's own axes (RUB)."
-            raise InputError(path, f"its coordinate system has the number {number}", "4, right up back", remedy)
+            raise InputError(path, f"its coordinate system has the unknown number {number}", "1 to 16", remedy)
+        if kind == 0xADBE0003 and number > 0:  # 0: unspecified
+            axes = np.eye(4)
+            axes[:3, :3] = np.array([_DIRECTIONS[letter] for letter in _SPZ_SYSTEMS[number - 1]]).T
         offset += 8 + length
+    return axes
 
 
 def _save_spz(path: Path, gaussians: Gaussians, *, similarity: Float[Array, "4 4"] | None = None) -> None:

@@ -19,6 +19,7 @@ from jsecon.errors import InputError, require_shape
 from jsecon.files import atomic_write, reading
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.splat.project import check_gaussians, unusable_rows
+from jsecon.splat.sh import C0
 from jsecon.splat.transform import BLOCK_ROWS, float32_rounding, transform_blocks
 from jsecon.types import Array, Gaussians
 
@@ -179,13 +180,16 @@ def read_ply(path: Path) -> Gaussians:
 
     - 2D Gaussians (no scale_2, or -inf there) are flat.
     - Mip-Splatting's `filter_3D` is fused into sizes and opacities, as by its create_fused_ply.py.
+    - Colours red, green, blue of 8 bits replace f_dc (nerfstudio's --ply-color-mode rgb).
 
     Other properties and elements are ignored.
     """
     table = _read_vertices(path)
     count, names = len(table), table.dtype.names or ()
     scales = _SCALE if "scale_2" in names else _SCALE[:2]
-    if missing := [name for name in (*_POSITION, *_DC, *_OPACITY, *scales, *_ROTATION) if name not in names]:
+    has_rgb = not set(_DC) & set(names) and all(name in names and table.dtype[name] == np.uint8 for name in _RGB)
+    colours = _RGB if has_rgb else _DC
+    if missing := [name for name in (*_POSITION, *colours, *_OPACITY, *scales, *_ROTATION) if name not in names]:
         expected = "3D Gaussians in INRIA's layout (x y z, f_dc_0..2, opacity, scale_0..2, rot_0..3)"
         remedy = "A plain point cloud is not enough: export the trained Gaussians as an uncompressed .ply."
         raise _error(path, f"its vertices have no {', '.join(missing)}", expected, remedy)
@@ -208,7 +212,8 @@ def read_ply(path: Path) -> Gaussians:
         arrays["log_scales"][rows, : len(scales)] = _columns(vertices, scales)
         arrays["quaternions"][rows] = _columns(vertices, _ROTATION)
         arrays["opacity_logits"][rows] = _columns(vertices, _OPACITY)[:, 0]
-        arrays["sh"][rows, 0] = _columns(vertices, _DC)
+        first_band = _columns(vertices, colours)
+        arrays["sh"][rows, 0] = (first_band / 255 - 0.5) / C0 if has_rgb else first_band
         others = _columns(vertices, rest_names).reshape(len(vertices), 3, rest // 3)
         arrays["sh"][rows, 1:] = others.transpose(0, 2, 1)
         if "filter_3D" in names:
