@@ -81,9 +81,9 @@ def test_the_python_of_a_page_runs_one_block_after_the_other(page, demo_folder):
         for block in _blocks("python", page.read_text()):
             exec(compile(block, _name(page), "exec"), names)
     printed = printed.getvalue()
-    assert printed
+    assert printed or "print(" not in page.read_text()
     if page.name == "README.md":
-        assert re.search(r"[1-9]\d* Gaussians, score 0\.\d+, at \[", printed), printed
+        assert re.search(r"read as .*: 1 object .*[1-9]\d* of \d+ Gaussians, around \(", printed), printed
     if page.name == "python.md":
         assert "left out: 0" in printed
 
