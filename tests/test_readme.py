@@ -32,7 +32,6 @@ TOOLS = {
     "curl",
     "ssh",
     "hf",
-    "mpirun",
     ".ci/run",
     ".ci/newest",
 }
@@ -93,10 +92,10 @@ def test_every_command_line_of_a_page_is_one_that_its_program_takes(page):
     text = page.read_text()
     whole = _commands(re.sub(r"^\|.*$", "", text, flags=re.MULTILINE))
     for line in _commands(text):
-        words = shlex.split(line.partition(" > ")[0])
+        words = shlex.split(line.partition(" > ")[0].partition("  #")[0])
         words = ["1" if word in NUMBERS else word for word in words if not re.fullmatch(r"[A-Z_]+=\S*", word)]
-        if words[0] == "taskset":
-            words = words[3:]
+        if words[0] in ("taskset", "mpirun", "srun"):
+            words = words[words.index("jsecon") :]
         if words[0] == "jsecon" and "..." not in words:
             _check_jsecon(words[1:], whole=line in whole)
         elif words[:2] == ["python", "-m"] and words[2] != "venv":
