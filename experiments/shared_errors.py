@@ -42,7 +42,7 @@ REAL = {
     "present above absent, by what sets it apart from words": "",
 }
 """what is measured, and the real embedder's figures where they are known"""
-RULES = {"cosine": "cosine", "centred": "centred", "what sets it apart from words": "contrast"}
+RULES = {"cosine": "cosine", "centred cosine": "centred", "what sets it apart from words": "contrast"}
 """names of some of `rules.SCORES` there"""
 
 
@@ -105,12 +105,12 @@ def pooled(bench: Benchmark, root: Path, level: str, seed: int) -> Pooled:
 
 def figures_of(found: Pooled) -> dict[str, float]:
     """The figures of REAL, of one twin."""
-    here = (found.pixel_counts.sum(1) > 0) & (found.objects >= 0)
+    here = (found.pixels.sum(1) > 0) & (found.objects >= 0)
     own = found.objects[here]
     rows = found.embeddings[here]
     different = ~np.eye(len(found.texts), dtype=bool)
     to_text = found.masks[:, here] @ found.texts.T
-    shown = found.pixel_counts[here].T > 0
+    shown = found.pixels[here].T > 0
     to_own = np.take_along_axis(to_text, np.broadcast_to(own[None, :, None], (*shown.shape, 1)), axis=2)[..., 0]
     views = np.einsum("tre,sre->rts", found.masks[:, here], found.masks[:, here])
     pairs = shown.T[:, :, None] & shown.T[:, None, :] & ~np.eye(len(shown), dtype=bool)
@@ -127,7 +127,7 @@ def figures_of(found: Pooled) -> dict[str, float]:
     every = np.concatenate([found.texts, found.absent])
     words = found.absent[: len(found.absent) // 2]
     for rule, kind in RULES.items():
-        scores = rules.scores(found.embeddings, every, found.canonical_phrases, words, found.pixel_counts, kind)
+        scores = rules.scores(found.embeddings, every, found.canonical_phrases, words, found.pixels, kind)
         texts, absent = scores[: len(found.texts)], scores[len(found.texts) + len(words) :]
         told[f"own text is the best, by {rule}"] = (texts[:, here].argmax(0) == own).mean()
         answer = texts[found.asked].argmax(1)

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import export
+from jax.core import Tracer
 from jaxtyping import PRNGKeyArray, UInt32
 
 Array: TypeAlias = jax.Array | np.ndarray
@@ -54,7 +55,7 @@ class _Shown:
     def _repr_html_(self) -> str:
         import jsecon
 
-        return jsecon.to_html(self)
+        return jsecon.to_html(self)  # pyright: ignore[reportArgumentType]
 
 
 @record
@@ -331,7 +332,7 @@ class LanguageField(_Shown):
     def tree_unflatten(cls, texts: _Texts, arrays: Iterable) -> LanguageField:
         """Makes a field of what `tree_flatten_with_keys` gives, for jax."""
         parts = dict(zip((part.name for part in dataclasses.fields(cls) if part.name not in _TEXTS), arrays))
-        traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(parts))
+        traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(parts))
         return cls(**parts, **dict(zip(_TEXTS, _Texts(((), "", "{}")) if traced else texts)))
 
 

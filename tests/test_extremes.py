@@ -71,7 +71,7 @@ class World:
 
     @property
     def field(self) -> LanguageField:
-        votes = jsecon.with_overlap(jsecon.normalise_votes(self.votes, self.regions))
+        votes = jsecon.normalise_votes(self.votes, self.regions)
         names = tuple(f"f{t}" for t in range(self.t))
         canonical, words = self.rows(4), self.rows(8)
         given = (self.gaussians, votes, self.regions, self.cameras, canonical, np.eye(4), names)
@@ -152,8 +152,6 @@ CALLS: dict[str, tuple[str, Callable[[World], list]]] = {
     ),
     "region_embeddings": ("t1 t0 r0 d1 uint8 uint16", embedded),
     "normalise_votes": ("n1 n0 t1 t0 r0", lambda w: accumulated(jsecon.normalise_votes(w.votes, w.regions), w)),
-    "add_visible_weight": ("n1 n0 t1 t0 r0", lambda w: accumulated(jsecon.add_visible_weight(w.votes, w.regions), w)),
-    "with_overlap": ("n1 n0 t1 t0 r0", lambda w: [(jsecon.with_overlap(w.votes).overlap, (w.r, w.r))]),
     "distill_votes": ("n1 n0 r0 d1", lambda w: [(jsecon.distill_votes(w.votes, w.rows(w.r)), (w.n, w.d))]),
     "distill_l1": ("n1 n0 t1 d1 uint8", distilled),
     "query_anchored": (FIELD, lambda w: selected(jsecon.query_anchored(w.field, w.rows(1)[0]), w)),

@@ -59,7 +59,7 @@ def _frames_of(pairs: list[str]) -> dict[int | str, Path]:
     """The masks of a frame, a file, a frame, a file ..."""
     if len(pairs) % 2:
         raise InputError("--mask", " ".join(pairs), "FRAME PNG, in pairs", "For example: --mask frame_00012 mug.png")
-    frames = dict(zip(pairs[::2], map(Path, pairs[1::2])))
+    frames: dict[int | str, Path] = dict(zip(pairs[::2], map(Path, pairs[1::2])))
     if 2 * len(frames) < len(pairs):
         raise InputError("--mask", "a frame has two masks", remedy="Give one mask of an object in each frame.")
     return frames

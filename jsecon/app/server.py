@@ -143,7 +143,8 @@ def application(scenes: Mapping[str, Scene], *, token: str = "", hosts: Collecti
         scene = scene_of(request)
         if (request.text is None) == (request.at is None):
             raise HTTPException(422, 'Field "text": give it, or "at", and not both.')
-        part, question = ("text", request.text) if request.at is None else ("at", At(*request.at))
+        part = "text" if request.at is None else "at"
+        question = request.text or "" if request.at is None else At(*request.at)
         options = {"by": request.by, "threshold": request.threshold, "all_of_class": request.all}
         with _errors_of(part):
             answer = scene.ask(Query(question, frame=request.frame, **options))

@@ -98,8 +98,8 @@ class SceneSuperpixels:
     def _superpixel_votes(self, t: int, labels: Int32[np.ndarray, "h w"]) -> Sparse:
         """Adds up the weights of N Gaussians on the A superpixels of a frame, (N, A), but for the faintest."""
         count = int(labels.max()) + 1
-        options = {"centre_pixel_weight": self.centre_pixel_weight}
-        evidence = view_evidence(self.gaussians, self.cameras[t], labels, count, **options)
+        centre = self.centre_pixel_weight
+        evidence = view_evidence(self.gaussians, self.cameras[t], labels, count, centre_pixel_weight=centre)
         votes = evidence.matrix(self.count, count)[:, :-1]
         total = np.repeat(np.asarray(votes.sum(1)).ravel(), np.diff(votes.indptr))
         votes.data[votes.data <= 0.005 * total] = 0.0

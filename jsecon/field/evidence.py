@@ -71,7 +71,8 @@ class ViewEvidence(NamedTuple):
         entries = slice(starts[0], starts[-1])
         columns = self.gaussians[first:last] - rows.start, starts - starts[0]
         columns = *columns, self.regions[entries], self.weights[entries], self.max_pixel_weights[first:last]
-        return ViewEvidence(*map(np.asarray, columns))
+        gaussians, starts, regions, weights, largest = map(np.asarray, columns)
+        return ViewEvidence(gaussians, starts, regions, weights, largest)
 
     def matrix(self, count: int, num_regions: int) -> Any:
         """Lays the list out as a scipy.sparse.csr_matrix (N, R + 1)."""
@@ -171,8 +172,8 @@ def view_evidence(
         measured = plan_capacity(gaussians, camera, margin=1.0, devices=1, near=near)
         capacity = max(measured, 1) if capacity is None else capacity
     elif not gaussians.count:
-        nothing = np.zeros(0, np.int32)
-        return ViewEvidence(nothing, np.zeros(1, np.int32), nothing, *np.zeros((2, 0), np.float32))
+        nothing, weightless = np.zeros(0, np.int32), np.zeros(0, np.float32)
+        return ViewEvidence(nothing, np.zeros(1, np.int32), nothing, weightless, weightless)
     plan = plan_view(gaussians, camera, capacity=capacity, near=near)
     labels = np.asarray(labels, np.int32)
     labels = np.where(labels < 0, num_regions, labels).astype(np.int32)
@@ -467,11 +468,10 @@ def _scratch_folder(folder: str | os.PathLike | None) -> Iterator[Path | None]:
 
 def _on_disk(view: ViewEvidence, path: Path) -> ViewEvidence:
     """Writes a list to PATH-<column>.npy and maps it."""
-    columns = view._asdict()
-    overflow = columns.pop("overflow")
+    columns = {name: column for name, column in view._asdict().items() if name != "overflow"}
     for name, column in columns.items():
         np.save(f"{path}-{name}.npy", column)
-    return ViewEvidence(*(map_npy(Path(f"{path}-{name}.npy")) for name in columns), overflow)
+    return view._replace(**{name: map_npy(Path(f"{path}-{name}.npy")) for name in columns})
 
 
 def _join(blocks: Iterator[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:

@@ -221,8 +221,8 @@ def _oddity(field: LanguageField, checked: bool = True) -> str | None:
     if not 0 < field.cameras.width * field.cameras.height <= MAX_PIXELS:
         return f"views of {field.cameras.width}x{field.cameras.height} px"
     codes, dim = field.codes, field.regions.embeddings.shape[1]
-    coder = None if codes is None else codes.autoencoder
-    if isinstance(coder, Autoencoder) and not _layers_fit(coder, dim, codes.regions.shape[1]):
+    coder, latent = (None, 0) if codes is None else (codes.autoencoder, codes.regions.shape[1])
+    if isinstance(coder, Autoencoder) and not _layers_fit(coder, dim, latent):
         return "an autoencoder whose layers do not lead from embeddings to codes and back"
     return None
 

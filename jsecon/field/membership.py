@@ -13,7 +13,7 @@ weight in views of its own room. Where the votes do not know which views show a 
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -96,7 +96,7 @@ def _by_view(votes: Votes, regions: Regions) -> Array:
     expected = "the pixels (R, T) of the same regions in the same views"
     same = views == regions.pixel_counts.shape[1] and votes.num_regions == regions.count
     require(same, "normalise_votes", sizes, expected, "Give the regions that were made from the labels that voted.")
-    return votes.by_view
+    return cast(Array, votes.by_view)
 
 
 @jax.jit

@@ -5,7 +5,7 @@ front of both cameras, with enough parallax (Hartley and Zisserman, ch. 12). Fea
 views become one point, that of the match with the largest parallax.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -127,12 +127,14 @@ def triangulated_points(capture: Capture, *, progress: Progress | None = None) -
         report(len(used) + n + 1, total)
     edge, point, angle = (np.concatenate(parts) for parts in (edges, points, parallax))
     graph = coo_array((np.ones(len(edge), bool), tuple(edge.T)), shape=(first[-1], first[-1]))
-    track = connected_components(graph, directed=False)[1][edge[:, 0]]
+    tracks: Any = connected_components(graph, directed=False)[1]
+    track = tracks[edge[:, 0]]
     widest = np.lexsort((-angle, track))
     widest = widest[np.unique(track[widest], return_index=True)[1]]
     if len(widest) < MIN_POINTS:
         problem = f"feature matching gives {len(widest)} points from {len(used)} views"
         remedy = "Use views that overlap and have texture, with correct poses, or pass points or --gaussians."
         raise InputError("capture", problem, f"at least {MIN_POINTS}", remedy)
-    colors = np.concatenate([f.colors for f in features])[edge[widest]]
+    ends: Any = edge[widest]
+    colors = np.concatenate([f.colors for f in features])[ends]
     return point[widest].astype(np.float32), np.rint(colors.mean(axis=1)).astype(np.uint8)

@@ -200,8 +200,9 @@ def _row_of_repository(role: Role, repository: str) -> HubModel | None:
     return next((row for row in catalogue() if (row.role, row.repository) == (role, repository)), None)
 
 
-def model_name(folder: Path, role: Role) -> str:
+def model_name(folder: str | Path, role: Role) -> str:
     """Returns the name of the model of a folder: that of the catalogue, or that of the folder."""
+    folder = Path(folder)
     repository = (cached_address(folder) or "").removeprefix(PREFIX).partition("@")[0]
     row = _row_of_repository(role, repository)
     return folder.name if row is None else row.name
@@ -226,7 +227,7 @@ def find_files(folder: str | Path, role: Role, precision: Precision | None = Non
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(folder, "no such folder", "", _published(role))
-    precisions = [precision] if precision is not None else []
+    precisions: list[Precision] = [precision] if precision is not None else []
     if precision is None or role != "embedder":
         precisions += SUFFIXES
     layout = _present_layout(role, precisions, lambda name: (folder / name).is_file(), folder, _published(role))

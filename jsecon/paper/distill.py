@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Float, Int, Integer, Shaped
 
 from jsecon.errors import require, require_one_of, require_shape
 from jsecon.numerics import is_traced, normalize, require_labels, safe_norm
@@ -209,7 +209,7 @@ def _start(
 
 
 def rendered_l1(
-    features: Float[Array, "n d"], plan: ViewPlan, labels: Int[Array, "h w"], region_codes: Float[Array, "r d"]
+    features: Float[Array, "n d"], plan: ViewPlan, labels: Integer[Array, "h w"], region_codes: Float[Array, "r d"]
 ) -> tuple[Float[Array, ""], Int[Array, ""]]:
     """Computes the paper's loss of one view, the mean over all H W d numbers of |F m - G m|, and the overflow.
 

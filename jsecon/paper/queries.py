@@ -46,7 +46,8 @@ def query_one_step(codes: Float[Array, "n d"], text_code: Float[Array, " d_text"
 
 @jax.jit
 def _one_step(codes: Array, text_code: Array, threshold: Number) -> Selection:
-    return _selection(*similarities(codes, text_code), threshold)
+    similarity, known = similarities(codes, text_code)
+    return _selection(similarity, known, threshold)
 
 
 def query_canonical(
@@ -121,7 +122,8 @@ def select_near_region(
     codes: Float[Array, "n d"], region_codes: Float[Array, "r d"], region: Array, threshold: Number
 ) -> Selection:
     """Selects the Gaussians whose code is close to that of a region: the second step. Region -1 selects none."""
-    near = _selection(*similarities(codes, region_codes[jnp.maximum(region, 0)]), threshold)
+    similarity, known = similarities(codes, region_codes[jnp.maximum(region, 0)])
+    near = _selection(similarity, known, threshold)
     found = region >= 0
     return Selection(near.mask & found, jnp.where(found, near.similarity, 0.0), region, near.score)
 

@@ -57,7 +57,9 @@ def _missing_model(dim: int) -> InputError:
 
 def _local_folders(models: Mapping[Role, HubModel | Path]) -> dict[Role, Path]:
     """Finds the folders of models on this machine, or raises InputError with the commands that fetch the others."""
-    folders = {role: m if isinstance(m, Path) else m.cached_folder for role, m in models.items()}
+    folders: dict[Role, Path | None] = {}
+    for role, model in models.items():
+        folders[role] = model if isinstance(model, Path) else model.cached_folder
     missing = [m for role, m in models.items() if isinstance(m, HubModel) and folders[role] is None]
     if missing:
         commands = "; ".join(model.get_command for model in missing)
@@ -85,12 +87,12 @@ def open_models(options: Options, store: Path) -> Models:
     if options.segmenter is not None:
         from jsecon.networks.sam import SamSegmenter
 
-        sam = SamSegmenter(options.segmenter, level=options.level, precision=precision)
+        sam = SamSegmenter(Path(options.segmenter), level=options.level, precision=precision)
         segmenter = StoredSegmenter(sam, store / "proposals")
     if options.tracker is not None:
         from jsecon.networks.sam2 import Sam2Tracker
 
-        tracker = Sam2Tracker(options.tracker)
+        tracker = Sam2Tracker(Path(options.tracker))
     name = None
     if options.features is not None:
         from jsecon.read.masks.masks import embedding_size

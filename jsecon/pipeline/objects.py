@@ -43,7 +43,7 @@ def plan_objects(context: RunContext) -> Stage:
         how = f"proposals read from {options.proposals.name}"
         key_options |= context.key_options("level")
     elif models.segmenter is not None:
-        how = f"proposals of level {options.level} by {model_name(options.segmenter, 'segmenter')}"
+        how = f"proposals of level {options.level} by {model_name(options.segmenter or '', 'segmenter')}"
         key_options["model"] = models.segmenter.name
     else:
         how = f"{options.granularity} proposals by colour and texture"

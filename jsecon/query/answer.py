@@ -13,7 +13,7 @@ paper's GT-anchored query). Gaussians are then compared with regions, so almost 
 All but `trim` and the two functions that call it can be traced: jit them, or vmap them over texts.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -175,7 +175,7 @@ def _match(embeddings, pixels, overlap, queries, excluded, words, rules: QueryRu
     nearest = jnp.where(jnp.any(known), jnp.max(jnp.where(known, of_best(scores.similarity), -jnp.inf)), 0.0)
     presence = None if scores.presence is None else jnp.max(scores.presence, axis=0)
     return RegionMatch(
-        chosen,
+        jnp.asarray(chosen),
         jnp.where(matches, best, -1).astype(jnp.int32),
         jnp.where(matches, similarity[best], nearest),
         jnp.nanmax(jnp.where(known, scores.rank, jnp.nan)),
@@ -234,7 +234,7 @@ def _select_none(field: LanguageField, match: RegionMatch) -> Selection:
 
 def select_by_code(field: LanguageField, match: RegionMatch, threshold: Number = CODE_THRESHOLD) -> Selection:
     """Selects the Gaussians whose code has at least a cosine with that of the best matched region (the paper). Pure."""
-    codes = field.codes
+    codes: Any = field.codes
     require(codes is not None, "field.codes", None, "codes", "Make the field with jsecon run --paper.")
     if field.regions.count == 0:
         return _select_none(field, match)

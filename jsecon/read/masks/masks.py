@@ -126,7 +126,9 @@ class _MaskFitter:
         """Resizes the mask of a frame to (H, W); raises InputError, with its file, for another aspect."""
         file = self.files.get(name)
         width, height = (self.width, self.height) if file is None else (file.width, file.height)
-        if not any(_same_aspect(*image.shape, *size) for size in ((width, height), (self.width, self.height))):
+        rows, columns = image.shape
+        sizes = (width, height), (self.width, self.height)
+        if not any(_same_aspect(rows, columns, *size) for size in sizes):
             remedy = "Make the masks from the frames as they are loaded (undistorted, upright), at any scale."
             expected = f"{width}x{height} like its frame, or that aspect"
             raise InputError(path, f"the mask is {image.shape[1]}x{image.shape[0]}", expected, remedy)
