@@ -177,7 +177,6 @@ def measure(setting: Setting, answers: Answers) -> dict:
         setting.cameras,
         bench.frames,
         lambda query: answers.select(bench.queries.index(query)),
-        expected_pairs=bench.pairs,
     )
     (rows, strict), (beside, lenient) = both[ALPHA_THRESHOLD], both[VALA_THRESHOLD]
     texts = {
