@@ -62,7 +62,7 @@ def field_of_room(folder: Path, seed: int, options: Options) -> LanguageField:
     if not (folder / FIELD_FILE).is_file():
         steps = 60 if options.quick else 550
         run = RunOptions(capture, holdout=HOLDOUT, steps=steps, seed=seed)
-        pipeline.run(run, folder, listener=Console())
+        pipeline.run(run, folder, console=Console())
     return jsecon.load_field(folder / FIELD_FILE)
 
 

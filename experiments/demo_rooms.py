@@ -59,9 +59,9 @@ def fields_of_room(folder: Path, seed: int, quick: bool) -> tuple[pipeline.Run, 
     if not (capture / "scene.json").is_file():
         write_room(capture, crowded_room(seed), holdout=HOLDOUT, **(QUICK_ROOM if quick else {}))
     options = RunOptions(capture, holdout=HOLDOUT, steps=60 if quick else 550, seed=seed)
-    run = pipeline.run(options, folder, listener=Console())
+    run = pipeline.run(options, folder, console=Console())
     masked = dataclasses.replace(options, masks=capture / "masks")
-    return run, pipeline.run(masked, folder / "true_masks", listener=Console(), cache_folder=folder / "cache")
+    return run, pipeline.run(masked, folder / "true_masks", console=Console(), cache_folder=folder / "cache")
 
 
 def one_step(run: pipeline.Run, embedder) -> Callable[[str], Selection]:

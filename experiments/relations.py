@@ -375,7 +375,7 @@ def default_field(room: Room, folder: Path) -> LanguageField:
 
     write_room(folder / "capture", room)
     options = Options(folder / "capture", holdout=5, steps=550, seed=room.seed)
-    return pipeline.run(options, folder, listener=Console(sys.stdout, sys.stderr)).field
+    return pipeline.run(options, folder, console=Console(sys.stdout, sys.stderr)).field
 
 
 def ask_room(seed: int, vision: str, rooms: Path) -> list[tuple[str, int, int, bool, str]]:

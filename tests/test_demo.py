@@ -33,7 +33,7 @@ class Ears(Console):
 @pytest.fixture(scope="module")
 def finished(room, tmp_path_factory):
     out, ears = tmp_path_factory.mktemp("demo"), Ears()
-    metrics = demo.run_demo(out, steps=150, listener=ears, room=room)
+    metrics = demo.run_demo(out, steps=150, console=ears, room=room)
     assert any("jsecon view" in line for line in ears.said)
     return metrics, out
 
@@ -62,7 +62,7 @@ def test_field_answers_and_figures_are_on_disk(finished):
 def test_a_second_call_finds_it_all_done(finished, room):
     metrics, out = finished
     before, ears = (out / "field.safetensors").read_bytes(), Ears()
-    again = demo.run_demo(out, steps=150, listener=ears, room=room)
+    again = demo.run_demo(out, steps=150, console=ears, room=room)
     assert {name for name, fresh in ears.fresh.items() if fresh} == {"field"}
     assert (out / "field.safetensors").read_bytes() == before
     assert again["anchored"] == metrics["anchored"]

@@ -100,9 +100,9 @@ def test_a_file_that_changes_while_it_is_read_is_told_and_nothing_of_it_is_kept(
     work = RunContext(pipeline.Options(capture), Models(ColourEmbedder()), tmp_path / "out")
     (tmp_path / "out").mkdir()
 
-    def loaded_by(listener):
-        pipeline.compute_stages(work, plan_capture(work), tmp_path / "out" / "cache", listener=listener)
-        return listener.fresh["load"]
+    def loaded_by(console):
+        pipeline.compute_stages(work, plan_capture(work), tmp_path / "out" / "cache", console=console)
+        return console.fresh["load"]
 
     with refused(capture, "files that changed while stage load read them", "same command again"):
         loaded_by(Meddler(sorted((capture / "images").iterdir())[-1]))

@@ -300,10 +300,10 @@ def test_a_run_finds_the_poses_first_and_keeps_them(photos, at_once, tmp_path):
     out, options = tmp_path / "out", Options(photos[0], holdout=4)
 
     def again(**changes):
-        listener = UntilLoaded()
+        console = UntilLoaded()
         with pytest.raises(Loaded):
-            pipeline.run(dataclasses.replace(options, **changes), out, listener=listener)
-        return listener
+            pipeline.run(dataclasses.replace(options, **changes), out, console=console)
+        return console
 
     first = again()
     assert list(first.planned)[:2] == ["poses", "load"]

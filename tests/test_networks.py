@@ -61,14 +61,14 @@ def splat(room, tmp_path_factory):
 @pytest.fixture(scope="module")
 def seen(room, splat, models, tmp_path_factory):
     """A run with both: the run, its folder, and what it told."""
-    folder, listener = tmp_path_factory.mktemp("seen"), Recorder()
+    folder, console = tmp_path_factory.mktemp("seen"), Recorder()
     options = Options(room, gaussians=splat, holdout=4, segmenter=models[0], embedder=models[1], level="m")
-    return pipeline.run(options, folder, listener=listener), folder, listener
+    return pipeline.run(options, folder, console=console), folder, console
 
 
 def test_a_run_with_sam_and_clip_finds_things_by_their_names(seen):
-    run, folder, listener = seen
-    assert "proposals of level m by sam" in listener.planned["objects"].why
+    run, folder, console = seen
+    assert "proposals of level m by sam" in console.planned["objects"].why
     field = load_field(folder / "field.safetensors")
     assert field.embedder.startswith("clip-")
     assert field.regions.embeddings.shape[1] == 3
@@ -87,14 +87,14 @@ def test_the_same_models_elsewhere_are_cached_and_others_are_not(seen, models, t
     shutil.copytree(folder, tmp_path / "out")
     moved = [shutil.copytree(model, tmp_path / f"moved{n}") for n, model in enumerate(models)]
     options = dataclasses.replace(run.options, segmenter=moved[0], embedder=moved[1])
-    listener = Recorder()
-    pipeline.run(options, tmp_path / "out", listener=listener)
-    assert not any(fresh for name, fresh in listener.fresh.items() if name != "field")
+    console = Recorder()
+    pipeline.run(options, tmp_path / "out", console=console)
+    assert not any(fresh for name, fresh in console.fresh.items() if name != "field")
 
     write_visual(moved[1] / "onnx" / "vision_model.onnx", ("pixel_values", "image_embeds"), "batch", std=(0.1, 1, 1))
-    listener = Recorder()
-    pipeline.run(options, tmp_path / "out", listener=listener)
-    fresh = {name for name, value in listener.fresh.items() if value}
+    console = Recorder()
+    pipeline.run(options, tmp_path / "out", console=console)
+    fresh = {name for name, value in console.fresh.items() if value}
     assert "regions" in fresh
     assert not fresh & {"load", "gaussians", "objects", "votes"}
 
@@ -104,22 +104,22 @@ def test_a_damaged_model_is_said_before_any_work(seen, models, tmp_path):
     folder = shutil.copytree(models[0], tmp_path / "sam")
     decoder = folder / "onnx" / "prompt_encoder_mask_decoder.onnx"
     decoder.write_bytes(decoder.read_bytes()[:400])
-    listener = Recorder()
+    console = Recorder()
     with pytest.raises(InputError, match=r"prompt_encoder_mask_decoder\.onnx: ONNX Runtime"):
-        pipeline.run(dataclasses.replace(run.options, segmenter=folder), tmp_path / "out", listener=listener)
-    assert listener.fresh == {}
+        pipeline.run(dataclasses.replace(run.options, segmenter=folder), tmp_path / "out", console=console)
+    assert console.fresh == {}
 
 
 def test_sam_2_follows_what_sam_proposes(seen, tmp_path):
     """Random weights track nothing in earnest; the run, its plan and its key are what is tested."""
     run, folder, _ = seen
     shutil.copytree(folder / "cache", tmp_path / "out" / "cache")
-    listener = Recorder()
+    console = Recorder()
     options = dataclasses.replace(run.options, tracker=write_sam2(tmp_path / "sam2"))
-    followed = pipeline.run(options, tmp_path / "out", listener=listener)
-    assert listener.planned["objects"].why.endswith("followed by sam2")
-    assert listener.fresh["objects"]
-    assert not listener.fresh["gaussians"]
+    followed = pipeline.run(options, tmp_path / "out", console=console)
+    assert console.planned["objects"].why.endswith("followed by sam2")
+    assert console.fresh["objects"]
+    assert not console.fresh["gaussians"]
     assert not np.array_equal(followed.labels, run.labels)
 
 

@@ -44,8 +44,8 @@ class Recorder(Console):
 
 
 def _again(run, out, **changes):
-    listener = Recorder()
-    return pipeline.run(dataclasses.replace(run.options, **changes), out, listener=listener), listener
+    console = Recorder()
+    return pipeline.run(dataclasses.replace(run.options, **changes), out, console=console), console
 
 
 def test_a_run_ends_in_a_field_that_can_be_read_and_asked(room_run):
@@ -65,9 +65,9 @@ def test_a_run_ends_in_a_field_that_can_be_read_and_asked(room_run):
 def test_a_second_run_reads_every_stage_and_writes_the_same_bytes(room_run, tmp_path):
     run, out = room_run
     before = (out / "field.safetensors").read_bytes()
-    again, listener = _again(run, out)
-    assert {name: fresh for name, fresh in listener.fresh.items() if name != "field"} == dict.fromkeys(STAGES, False)
-    assert all(listener.planned[name].status == "cached" for name in STAGES)
+    again, console = _again(run, out)
+    assert {name: fresh for name, fresh in console.fresh.items() if name != "field"} == dict.fromkeys(STAGES, False)
+    assert all(console.planned[name].status == "cached" for name in STAGES)
     assert (out / "field.safetensors").read_bytes() == before
     assert again.seconds["gaussians"] == run.seconds["gaussians"]
     assert again.skipped == run.skipped
@@ -80,9 +80,9 @@ def test_a_changed_option_reruns_only_what_depends_on_it(room_run, tmp_path, mon
     monkeypatch.setattr(autoencoder, "MIN_STEPS", 1)  # it is enough that one is trained, by LangSplat's 100 epochs
     run, out = room_run
     shutil.copytree(out, tmp_path / "out")
-    _, listener = _again(run, tmp_path / "out", **changes)
-    assert {name for name, fresh in listener.fresh.items() if fresh} - {"field"} == rerun
-    assert {name for name, step in listener.planned.items() if step.status == "run"} == rerun
+    _, console = _again(run, tmp_path / "out", **changes)
+    assert {name for name, fresh in console.fresh.items() if fresh} - {"field"} == rerun
+    assert {name for name, step in console.planned.items() if step.status == "run"} == rerun
 
 
 def test_a_damaged_stage_is_said_and_computed_again_to_the_same_field(room_run, tmp_path):
@@ -90,9 +90,9 @@ def test_a_damaged_stage_is_said_and_computed_again_to_the_same_field(room_run, 
     shutil.copytree(out, tmp_path / "out")
     path = next((tmp_path / "out" / "cache").glob("votes-*.safetensors"))
     path.write_bytes(path.read_bytes()[:1000])
-    _, listener = _again(run, tmp_path / "out")
-    assert {name for name, fresh in listener.fresh.items() if fresh} == {"votes", "field"}
-    assert any("votes is computed again" in note for note in listener.notes)
+    _, console = _again(run, tmp_path / "out")
+    assert {name for name, fresh in console.fresh.items() if fresh} == {"votes", "field"}
+    assert any("votes is computed again" in note for note in console.notes)
     assert (tmp_path / "out" / "field.safetensors").read_bytes() == (out / "field.safetensors").read_bytes()
 
 
@@ -103,8 +103,8 @@ def test_votes_of_a_scene_larger_than_memory_are_cast_in_blocks_to_the_same_fiel
         file.unlink()
     monkeypatch.setenv("JSECON_MEMORY", "1e-6")
     monkeypatch.setattr(cache, "MAPPED", 1000)  # what is kept of them is mapped, as were it larger
-    _, listener = _again(run, tmp_path / "out", paper=True)  # codes are made of them too
-    assert any("votes are kept on disk: " in note for note in listener.notes)
+    _, console = _again(run, tmp_path / "out", paper=True)  # codes are made of them too
+    assert any("votes are kept on disk: " in note for note in console.notes)
     assert {path.suffix for path in (tmp_path / "out" / "cache").iterdir()} == {".TAG", ".safetensors"}
     blocks, memory = (load_field(folder / "field.safetensors").votes for folder in (tmp_path / "out", out))
     np.testing.assert_allclose(blocks.weights, memory.weights, rtol=1e-4, atol=0.02)
@@ -117,19 +117,19 @@ def test_votes_of_a_scene_larger_than_memory_are_cast_in_blocks_to_the_same_fiel
 @pytest.fixture(scope="module")
 def on_given_gaussians(room_run, tmp_path_factory):
     """The run on its own Gaussians given as a file, and what was told."""
-    folder, listener = tmp_path_factory.mktemp("given"), Recorder()
+    folder, console = tmp_path_factory.mktemp("given"), Recorder()
     save_gaussians(folder / "scene.ply", room_run[0].field.gaussians)
     options = dataclasses.replace(room_run[0].options, gaussians=folder / "scene.ply")
-    return pipeline.run(options, folder / "out", listener=listener), listener
+    return pipeline.run(options, folder / "out", console=console), console
 
 
 def test_the_plan_says_what_is_left_out_and_why(room_run, on_given_gaussians, tmp_path):
     run, _ = room_run
-    given, listener = on_given_gaussians
+    given, console = on_given_gaussians
     assert {"segmenter", "association"} <= set(run.skipped)
     assert "scene.ply" in given.skipped["photometric fit"]
-    assert listener.planned["photometric fit"].status == "skipped"
-    assert listener.planned["gaussians"].status == "run"
+    assert console.planned["photometric fit"].status == "skipped"
+    assert console.planned["gaussians"].status == "run"
     np.testing.assert_array_equal(given.field.gaussians.means, run.field.gaussians.means)
 
 
@@ -191,8 +191,8 @@ def test_what_is_held_out_never_reaches_the_field(room_run, room, tmp_path):
 def test_parts_of_the_scene_are_a_stage_of_their_own(room_run, tmp_path):
     run, out = room_run
     shutil.copytree(out, tmp_path / "out")
-    _, listener = _again(run, tmp_path / "out", parts=True)
-    assert {name for name, fresh in listener.fresh.items() if fresh} == {"parts", "field"}
+    _, console = _again(run, tmp_path / "out", parts=True)
+    assert {name for name, fresh in console.fresh.items() if fresh} == {"parts", "field"}
     field = load_field(tmp_path / "out" / "field.safetensors")
     part, units = np.asarray(field.parts.part), np.asarray(field.parts.embeddings)
     assert part.shape == (field.gaussians.count,)
@@ -214,10 +214,10 @@ def test_default_vision_finds_regions_by_itself(room, room_run, tmp_path):
     """Segmenter, tracker and colours on the tiny room: the whole default path, on the Gaussians of the other run."""
     run, out = room_run
     shutil.copytree(out / "cache", tmp_path / "cache")
-    listener = Recorder()
-    found = pipeline.run(dataclasses.replace(run.options, masks=None), tmp_path, listener=listener)
-    assert not listener.fresh["gaussians"]
-    assert listener.fresh["objects"]
+    console = Recorder()
+    found = pipeline.run(dataclasses.replace(run.options, masks=None), tmp_path, console=console)
+    assert not console.fresh["gaussians"]
+    assert console.fresh["objects"]
     assert "segmenter" not in found.skipped
     overlap = iou_matrix(
         *(labels.ravel() == np.arange(labels.max() + 1)[:, None] for labels in (run.labels, found.labels))
@@ -234,10 +234,10 @@ def test_default_vision_finds_regions_by_itself(room, room_run, tmp_path):
 ])  # fmt: skip
 def test_what_cannot_be_is_refused_before_any_work(room_run, tmp_path, changes, where):
     run, _ = room_run
-    listener = Recorder()
+    console = Recorder()
     with refused(where):
-        pipeline.run(dataclasses.replace(run.options, **changes), tmp_path / "out", listener=listener)
-    assert listener.fresh == {}
+        pipeline.run(dataclasses.replace(run.options, **changes), tmp_path / "out", console=console)
+    assert console.fresh == {}
 
 
 def test_gaussians_of_another_world_are_refused(room_run, tmp_path):

@@ -27,7 +27,7 @@ KINDS: dict[str, dict[str, Any]] = {
 
 
 def evaluate(
-    scene: Scene, labels: Sequence[LabelledFrame], listener: Console, kinds: Sequence[str] = tuple(KINDS)
+    scene: Scene, labels: Sequence[LabelledFrame], console: Console, kinds: Sequence[str] = tuple(KINDS)
 ) -> Evaluation:
     """Measures kinds of queries. A text that the scene's embedder has no words for counts as 0."""
     field = scene.field
@@ -45,7 +45,7 @@ def evaluate(
                 return None
             return dataclasses.replace(answer.selection, mask=answer.mask)
 
-        with listener.progress(f"evaluate {kind}") as progress:
+        with console.progress(f"evaluate {kind}") as progress:
             thresholds = (ALPHA_THRESHOLD,)
             measured = evaluate_at_thresholds(
                 field.gaussians, cameras, labels, select, alpha_thresholds=thresholds, progress=progress
@@ -78,12 +78,12 @@ def _rounded(value: Any) -> Any:
     return round(value, 4) if isinstance(value, float) else value
 
 
-def print_table(results: Evaluation, listener: Console) -> None:
+def print_table(results: Evaluation, console: Console) -> None:
     """Prints the protocol, and mIoU, mAcc@0.25 and localisation accuracy of each kind of query."""
     _, first = next(iter(results.values()))
     counts = f"{first['pairs']} pairs of {first['queries']} queries in {first['frames']} frames"
-    listener.print_line(f"{first['protocol']}\n{counts}")
-    listener.print_line(f"  {'query':<14} {'mIoU':>6} {'mAcc@0.25':>10} {'Loc. acc.':>10} {'missing':>8}")
+    console.print_line(f"{first['protocol']}\n{counts}")
+    console.print_line(f"  {'query':<14} {'mIoU':>6} {'mAcc@0.25':>10} {'Loc. acc.':>10} {'missing':>8}")
     for kind, (_, summary) in results.items():
         shares = f"{summary['miou']:>6.3f} {summary['macc']:>10.3f} {summary['loc_acc']:>10.3f}"
-        listener.print_line(f"  {kind:<14} {shares} {summary['missing']:>8}")
+        console.print_line(f"  {kind:<14} {shares} {summary['missing']:>8}")

@@ -100,17 +100,17 @@ def _check_export(verb: verbs.Export) -> None:
         raise InputError("--objects", problem, remedy="Leave one of them out.")
 
 
-def _print_objects(records: list[dict[str, Any]], listener: Console) -> None:
+def _print_objects(records: list[dict[str, Any]], console: Console) -> None:
     """Prints a line for each object; parts are indented under their wholes."""
     wide = max((len(_title(record)) for record in records), default=4) + 2
-    listener.print_line(f"{'id':>4}  {'name':<{wide}}  prob.  Gaussians  views  conf.  size, centre")
+    console.print_line(f"{'id':>4}  {'name':<{wide}}  prob.  Gaussians  views  conf.  size, centre")
     for record in records:
         name = ("" if record["parent"] is None else "  ") + _title(record)
         probability = record["names"][0]["probability"] if record["names"] else 0.0
         figures = f"{probability:5.2f}  {record['gaussians']:9d}  {record['views']:5d}  {record['confidence']:5.2f}"
         size, center = _size_and_center(record)
         ending = ", surroundings" if record["surroundings"] else ""
-        listener.print_line(f"{record['id']:>4}  {name:<{wide}}  {figures}  {size}, at ({center}){ending}")
+        console.print_line(f"{record['id']:>4}  {name:<{wide}}  {figures}  {size}, at ({center}){ending}")
 
 
 def _save_objects(scene: Scene, folder: Path) -> list[Path]:
@@ -124,10 +124,10 @@ def _save_objects(scene: Scene, folder: Path) -> list[Path]:
     return files
 
 
-def _page(scene: Scene, catalogue: Catalogue, records: list[dict[str, Any]], listener: Console) -> str:
+def _page(scene: Scene, catalogue: Catalogue, records: list[dict[str, Any]], console: Console) -> str:
     """Returns the page: a card for each object, which opens to its views."""
     cards: dict[bool, list[str]] = {False: [], True: []}
-    with listener.progress("pictures") as progress:
+    with console.progress("pictures") as progress:
         for record in records:
             mask = catalogue.mask(record["id"])
             figures = [report.figure(scene.render(name, mask), name) for name in record["frames"]]

@@ -51,7 +51,7 @@ def write_answer(
 
 
 def write_answers(
-    scene: Scene, answers: Sequence[Answer], out: Path, listener: Console, *, views: int = 3, ending: str = "ply"
+    scene: Scene, answers: Sequence[Answer], out: Path, console: Console, *, views: int = 3, ending: str = "ply"
 ) -> dict[str, Any]:
     """Writes the files of answers and OUT/answers.html, and prints a line for each.
 
@@ -59,7 +59,7 @@ def write_answers(
       scene: The scene.
       answers: The answers.
       out: Output folder.
-      listener: Receives the lines.
+      console: Receives the lines.
       views: Number of masks of each answer.
       ending: Format of the Gaussians: ply, spz or glb.
 
@@ -68,12 +68,12 @@ def write_answers(
     """
     sections: dict[str, str] = {}
     records: dict[str, dict[str, Any]] = {}
-    with listener.progress("pictures") as progress:
+    with console.progress("pictures") as progress:
         for n, answer in enumerate(answers):
             stem = file_stem(answer)
-            listener.print_line(str(answer))
+            console.print_line(str(answer))
             if answer.outlier_words:
-                listener.note(f"{answer.outlier_words}; --keep-outliers keeps them")
+                console.note(f"{answer.outlier_words}; --keep-outliers keeps them")
             if stem not in records:  # else the question stands there twice
                 masks = {t: scene.mask(answer, t) for t in scene.best_frames(answer, max(views, 1))}
                 records[stem] = write_answer(answer, scene, out, dict(list(masks.items())[:views]), ending=ending)
@@ -81,7 +81,7 @@ def write_answers(
             progress(n + 1, len(answers))
     lead = "The mask of each selection over the rendered scene."
     write_text(out / "answers.html", report.page("Answers", lead, list(sections.values())))
-    listener.print_line(f"pictures  {out / 'answers.html'}")
+    console.print_line(f"pictures  {out / 'answers.html'}")
     written = {"folder": out, "pictures": out / "answers.html"}
     return {"written": written, "answers": [records[file_stem(answer)] for answer in answers]}
 

@@ -19,7 +19,7 @@ def _query(verb: verbs.Query, console: Console) -> verbs.VerbResult:
     queries = _queries(verb)
     require_writable(verb.out)
     require_writable_format(verb.out / f"answer.{verb.format}")
-    scene = open_scene(verb.field, embedder=verb.embedder, up=verb.up, out=verb.out / "field", listener=console)
+    scene = open_scene(verb.field, embedder=verb.embedder, up=verb.up, out=verb.out / "field", console=console)
     with console.progress("answers"):
         if verb.texts:
             _ = scene.embedder  # without it one error stands for all texts

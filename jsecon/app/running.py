@@ -29,10 +29,10 @@ def _run(verb: verbs.Run, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon run`; the result has the metrics, or the plan of a dry run."""
     options = verb.options
     if verb.dry_run:
-        return pipeline.dry_run(options, verb.out, listener=console)
+        return pipeline.dry_run(options, verb.out, console=console)
     with processes.connection(options) if verb.distributed else contextlib.nullcontext(0) as index:
         if index == 0:
-            run = pipeline.run(options, verb.out, listener=console)
+            run = pipeline.run(options, verb.out, console=console)
         else:
             pipeline.run_worker(options, verb.out)
     if index > 0:
@@ -49,8 +49,8 @@ def _fit(verb: verbs.Fit, console: Console) -> verbs.VerbResult:
     require_writable_format(verb.out)
     folder = verb.out.with_suffix("")
     if verb.dry_run:
-        return pipeline.dry_run(verb.options, folder, scene_only=True, listener=console)
-    gaussians, capture, held_out = pipeline.fit(verb.options, folder, listener=console)
+        return pipeline.dry_run(verb.options, folder, scene_only=True, console=console)
+    gaussians, capture, held_out = pipeline.fit(verb.options, folder, console=console)
     save_gaussians(verb.out, gaussians, similarity=capture.source_from_scene)
     _print_quality(held_out, console)
     console.print_line(f"{gaussians.count} Gaussians  {verb.out}")
@@ -58,7 +58,7 @@ def _fit(verb: verbs.Fit, console: Console) -> verbs.VerbResult:
 
 
 def write_run(
-    run: Run, out: Path, listener: Console, title: str, lead: str, parts: Sequence[str] = (), **figures: Any
+    run: Run, out: Path, console: Console, title: str, lead: str, parts: Sequence[str] = (), **figures: Any
 ) -> dict[str, Any]:
     """Writes OUT/metrics.json and OUT/report.html of a run, prints its figures, and returns the metrics.
 
@@ -67,19 +67,19 @@ def write_run(
     metrics = _run_metrics(run) | figures
     write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
     warnings = [note.removeprefix(WARNING) for note in run.notes if note.startswith(WARNING)]
-    with listener.progress("report"):
+    with console.progress("report"):
         parts = [*(report.section("Warning", note) for note in warnings), _figures(metrics), *parts]
         write_text(out / "report.html", report.page(title, lead, [*parts, *_scene_parts(run), *_work_parts(run)]))
-    _print_quality(run.held_out, listener)
+    _print_quality(run.held_out, console)
     for note in warnings:
-        listener.print_line(f"{WARNING}{note}")
-    listener.print_line(
+        console.print_line(f"{WARNING}{note}")
+    console.print_line(
         f"{metrics['gaussians']} Gaussians, {metrics['regions']} regions, "
         f"{sum(run.seconds.values()):.0f} s, peak memory {metrics['peak_memory_mib']:.0f} MiB, "
         f"{run.programs['all']} programs compiled ({run.programs['from_disk']} of them read from disk)"
     )
     field = out / "field.safetensors"
-    listener.print_line(f"field   {field}\nreport  {out / 'report.html'}")
+    console.print_line(f"field   {field}\nreport  {out / 'report.html'}")
     return metrics
 
 
@@ -92,12 +92,12 @@ def _quality_metrics(held_out: Quality) -> dict[str, float | None]:
     }
 
 
-def _print_quality(held_out: Quality, listener: Console) -> None:
+def _print_quality(held_out: Quality, console: Console) -> None:
     """Prints mean PSNR and SSIM if there are held-out frames."""
     count = len(held_out.frames)
     if count:
         psnr, ssim = float(np.mean(held_out.psnr)), float(np.mean(held_out.ssim))
-        listener.print_line(f"held-out PSNR {psnr:.2f} dB, SSIM {ssim:.3f} over {count} frames")
+        console.print_line(f"held-out PSNR {psnr:.2f} dB, SSIM {ssim:.3f} over {count} frames")
 
 
 def _run_metrics(run: Run) -> dict[str, Any]:

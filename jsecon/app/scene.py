@@ -63,7 +63,7 @@ def open_scene(
     embedder: Any = None,
     up: Sequence[float | int] | None = None,
     out: str | Path | None = None,
-    listener: Console | None = None,
+    console: Console | None = None,
 ) -> "Scene":
     """Opens a field, or a file of Gaussians, to be asked.
 
@@ -75,7 +75,7 @@ def open_scene(
         was made with.
       up: Up axis of the capture's world, three numbers. None takes that of the cameras, or the normal of the ground.
       out: Folder for the field of a file of Gaussians; by default NAME_field beside NAME.ply.
-      listener: Receives the progress where a field is made.
+      console: Receives the progress where a field is made.
 
     Returns:
       The scene. A field of more than the memory budget (JSECON_MEMORY, GiB) stays on disk and is read in blocks, with
@@ -89,7 +89,7 @@ def open_scene(
     if is_bare_scene(file):
         folder = file.with_name(f"{file.stem}_field") if out is None else Path(out)
         axis: Any = None if up is None else tuple(map(float, up))
-        file = _field_of_gaussians(Options(file, embedder=model, up=axis), folder, listener or Console())
+        file = _field_of_gaussians(Options(file, embedder=model, up=axis), folder, console or Console())
     elif file.is_dir():
         file = file / FIELD_FILE
     large = file.is_file() and file.stat().st_size > memory_budget()
@@ -105,22 +105,22 @@ def open_scene(
     return Scene(field, embedder, up=up, name=file.parent.name if file.name == FIELD_FILE else file.stem)
 
 
-def _field_of_gaussians(options: Options, folder: Path, listener: Console) -> Path:
+def _field_of_gaussians(options: Options, folder: Path, console: Console) -> Path:
     """Finds the field of a file of Gaussians in a folder, or makes it there.
 
     Without a model of its own the options take that of the field which is there.
     """
     from jsecon.pipeline import run as pipeline  # late: questions to a field need none of it
 
-    with listener.progress("plan"):
+    with console.progress("plan"):
         path = pipeline.current_field(options, folder)
         if path is None and options.embedder is None and (folder / FIELD_FILE).is_file():
             options = dataclasses.replace(options, embedder=_model_of(folder / FIELD_FILE))
             path = pipeline.current_field(options, folder)
     if path is None:
-        pipeline.run(options, folder, listener=listener)
+        pipeline.run(options, folder, console=console)
         path = folder / FIELD_FILE
-        listener.print_line(f"field   {path}")
+        console.print_line(f"field   {path}")
     return path
 
 

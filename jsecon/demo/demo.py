@@ -24,12 +24,12 @@ ROOM = Path(__file__).with_name("room")
 """The capture: COLMAP, images, masks of the objects, LERF labels of the held-out frames."""
 
 
-def run_demo(out: Path, *, listener: Console, room: Path = ROOM, steps: int = 550) -> dict[str, Any]:
+def run_demo(out: Path, *, console: Console, room: Path = ROOM, steps: int = 550) -> dict[str, Any]:
     """Builds the field of the room, answers the texts of its labels, and writes answers, report.html and metrics.json.
 
     Args:
       out: Folder to write to.
-      listener: Receives messages and progress.
+      console: Receives messages and progress.
       room: The capture to copy.
       steps: Number of optimisation steps of the photometric fit.
     """
@@ -37,12 +37,12 @@ def run_demo(out: Path, *, listener: Console, room: Path = ROOM, steps: int = 55
     capture = _copy_capture(room, out)
     holdout = json.loads((capture / "scene.json").read_text())["holdout"]
     options = Options(capture, holdout=holdout, steps=steps)
-    run = pipeline.run(options, out, listener=listener)
+    run = pipeline.run(options, out, console=console)
     scene, labels = Scene(run.field), load_lerf_labels(capture / "label")
-    results = evaluation.evaluate(scene, labels, listener, ("anchored",))
+    results = evaluation.evaluate(scene, labels, console, ("anchored",))
     rows, summary = results["anchored"]
     texts = sorted({name for frame in labels for name in frame.objects})
-    with listener.progress("answers"):
+    with console.progress("answers"):
         for text in texts:
             answer = scene.ask(text)
             masks = {t: scene.mask(answer, t) for t in scene.best_frames(answer, 2)}
@@ -50,17 +50,17 @@ def run_demo(out: Path, *, listener: Console, room: Path = ROOM, steps: int = 55
     lead = "A made-up room as an ordinary capture: frames, poses and sparse points in, answers to texts out, "
     lead += "on a plain CPU and without any learned weights."
     parts = [_queries(run, rows, summary, labels)]
-    metrics = running.write_run(run, out, listener, "jsecon demo", lead, parts, anchored=summary)
-    listener.print_line("measured on the held-out views")
-    evaluation.print_table(results, listener)
+    metrics = running.write_run(run, out, console, "jsecon demo", lead, parts, anchored=summary)
+    console.print_line("measured on the held-out views")
+    evaluation.print_table(results, console)
     view = f'jsecon view {out / "field.safetensors"} "{texts[0]}"  (extra viewer; --export writes a page)'
-    listener.print_line(f"answers {out / 'queries'}\nview it {view}")
+    console.print_line(f"answers {out / 'queries'}\nview it {view}")
     return metrics
 
 
 def _demo(verb: verbs.Demo, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon demo`."""
-    result = run_demo(verb.out, listener=console)
+    result = run_demo(verb.out, console=console)
     return {"written": [verb.out / name for name in (*running.FILES, "queries")]} | result
 
 

@@ -187,30 +187,30 @@ def compute_stages(
     stage_list: list[Stage],
     folder: Path,
     *,
-    listener: Console | None = None,
+    console: Console | None = None,
 ) -> _Computed:
     """Plans stages, reports the plan, then computes each or reads it from the cache."""
-    listener, sent = listener or Console(), set()
-    with listener.progress("plan"):
+    console, sent = console or Console(), set()
+    with console.progress("plan"):
         plan = _plan(context, stage_list, folder)
         require_writable(context.out)
     with exclusive_lock(context.out):
         cache.prepare(folder)
         for name in plan.stale:
             plan.paths[name].unlink(missing_ok=True)
-        listener.print_line(f"{context.options.capture} -> {context.out}")
+        console.print_line(f"{context.options.capture} -> {context.out}")
         for step in plan.steps:
-            listener.step(step)
+            console.step(step)
         context.models.require_ready(plan.running)
         computed = _Computed(Results(), plan.keys, plan.steps)
         for stage in stage_list:
-            _compute_stage(context, stage, plan, computed, listener, sent)
+            _compute_stage(context, stage, plan, computed, console, sent)
         processes.broadcast(None, computed.results, sent)
     return computed
 
 
 def _compute_stage(
-    context: RunContext, stage: Stage, plan: _Plan, computed: _Computed, listener: Console, sent: set[str]
+    context: RunContext, stage: Stage, plan: _Plan, computed: _Computed, console: Console, sent: set[str]
 ) -> None:
     """Computes one stage or reads it from the cache, and adds it to `computed`."""
     path = plan.paths[stage.name]
@@ -226,9 +226,9 @@ def _compute_stage(
             raise InputError(where, problem, "files that stay as they are during a run", remedy)
         return result
 
-    with listener.progress(stage.name) as progress:
+    with console.progress(stage.name) as progress:
         try:
-            result, seconds, fresh = cache.fetch(path, functools.partial(compute, progress), note=listener.note)
+            result, seconds, fresh = cache.fetch(path, functools.partial(compute, progress), note=console.note)
         except (MemoryError, jax.errors.JaxRuntimeError) as error:
             if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
                 problem = f"no memory left ({str(error)[:200]})"
@@ -238,38 +238,38 @@ def _compute_stage(
     setattr(computed.results, stage.name, result.value)
     computed.seconds[stage.name] = seconds
     checkpoint.remove()
-    listener.done(stage.name, seconds, fresh)
+    console.done(stage.name, seconds, fresh)
     for part, why in result.skipped.items():
         computed.steps.append(Step(part, "skipped", why))
-        listener.step(computed.steps[-1])
+        console.step(computed.steps[-1])
     for note in result.notes:
         computed.notes.append(note)
-        listener.note(note)
+        console.note(note)
 
 
 def run(
     options: Options,
     out: Path,
     *,
-    listener: Console | None = None,
+    console: Console | None = None,
     cache_folder: Path | None = None,
 ) -> Run:
     """Builds the field of a capture and writes OUT/field.safetensors.
 
     A run that was stopped resumes where it stopped, to the same result.
     """
-    listener, before = listener or Console(), compilation_counts()
+    console, before = console or Console(), compilation_counts()
     folder = cache_folder or out / "cache"
     context = _open_context(options, out, folder)
     options = context.options
-    computed = compute_stages(context, stages.run_stages(context), folder, listener=listener)
+    computed = compute_stages(context, stages.run_stages(context), folder, console=console)
     results, embedder = computed.results, context.models.embedder
     started = time.monotonic()
-    with listener.progress("field"):
+    with console.progress("field"):
         field = lifting.join_field(results, embedder, provenance(options, computed.keys, embedder.name, out), options)
         save_field(out / FIELD_FILE, field)
     computed.seconds["field"] = time.monotonic() - started
-    listener.done("field", computed.seconds["field"], True)
+    console.done("field", computed.seconds["field"], True)
     programs = {name: count - before[name] for name, count in compilation_counts().items()}
     return Run(**vars(computed), field=field, options=options, programs=programs)
 
@@ -300,18 +300,18 @@ def run_worker(options: Options, out: Path) -> None:
     processes.compute_called_stages(context, stages.run_stages(context))
 
 
-def dry_run(options: Options, out: Path, *, scene_only: bool = False, listener: Console) -> dict[str, Any]:
+def dry_run(options: Options, out: Path, *, scene_only: bool = False, console: Console) -> dict[str, Any]:
     """Lists the stages that `run` would compute, and writes no file."""
-    with listener.progress("plan"):
+    with console.progress("plan"):
         context = _open_context(options, out)
         stage_list = stages.fit_stages(context) if scene_only else stages.run_stages(context)
         plan = _plan(context, stage_list, out / "cache")
         context.models.require_ready(plan.running)
         _check_inputs(context, plan)
-    listener.print_line(f"{options.capture} -> {out}, a dry run")
+    console.print_line(f"{options.capture} -> {out}, a dry run")
     for step in plan.steps:
-        listener.step(step)
-    listener.print_line("Nothing was written.")
+        console.step(step)
+    console.print_line("Nothing was written.")
     return {"stages": plan.steps}
 
 
@@ -344,8 +344,8 @@ def _check_inputs(context: RunContext, plan: _Plan) -> None:
         load_features(options.features, names[:1], size, **layout)
 
 
-def fit(options: Options, out: Path, *, listener: Console | None = None) -> tuple[Gaussians, Capture, Quality]:
+def fit(options: Options, out: Path, *, console: Console | None = None) -> tuple[Gaussians, Capture, Quality]:
     """Computes the stages of `run` that make and measure the scene, into the same cache, so that a `run` continues."""
     context = _open_context(options, out)
-    results = compute_stages(context, stages.fit_stages(context), out / "cache", listener=listener).results
+    results = compute_stages(context, stages.fit_stages(context), out / "cache", console=console).results
     return results.gaussians, results.load, results.held_out
