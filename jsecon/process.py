@@ -12,6 +12,7 @@ A program that runs long and sees many scenes calls `clear_programs()` from time
 
 import _thread
 import contextlib
+import ctypes
 import gc
 import hashlib
 import os
@@ -35,7 +36,7 @@ _counts: dict[str, int] = {}
 
 
 def prepare_process(*, keep_programs: bool = True) -> None:
-    """Sets XLA's flags and the folder of compiled programs (see `settings`), and silences OpenCV.
+    """Sets XLA's flags and the folder of compiled programs (see `settings`), silences OpenCV, keeps freed memory.
 
     Call it before jax makes its first array and OpenCV is imported. Variables that the user has set stay.
     """
@@ -46,6 +47,12 @@ def prepare_process(*, keep_programs: bool = True) -> None:
     if (folder := chosen.get("JAX_COMPILATION_CACHE_DIR")) is not None:
         _remove_old_programs(Path(folder).parent)
         _remove_damaged_programs(Path(folder))
+    if sys.platform == "linux" and not any(name.startswith("MALLOC_") for name in os.environ):
+        # M_MMAP_THRESHOLD, M_TRIM_THRESHOLD and M_TOP_PAD of glibc: a large array takes pages that were touched before,
+        # which makes a forward render of garden 1.15 times as fast.
+        mallopt = getattr(ctypes.CDLL(None), "mallopt", lambda parameter, value: None)
+        for parameter, value in ((-3, (1 << 31) - 1), (-1, (1 << 31) - 1), (-2, 1 << 26)):
+            mallopt(parameter, value)
 
 
 def _remove_old_programs(home: Path) -> None:
