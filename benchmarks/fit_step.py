@@ -64,7 +64,7 @@ def main() -> None:
     current = put_on_devices(TrainState(gaussians, zeros, zeros, zeros.opacity_logits, None), mesh)
     steps = StepRunner(dataclasses.replace(capture, held_out=np.arange(9) != 4), mesh)
     whole_step = functools.partial(steps.run_step, current, 1.0, 0, 0, 0.0, StepConfig(3, LearningRates(), None))
-    reference = functools.partial(jax.jit(jax.value_and_grad(absolute), **options), current[0], camera, frame)
+    reference = functools.partial(jax.jit(jax.value_and_grad(absolute), **options), current.gaussians, camera, frame)
     runs = {"l1": reference, "step": whole_step}
     seconds: dict[str, list[float]] = {name: [] for name in runs}
     for run in runs.values():
