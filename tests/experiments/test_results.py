@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments import export_models, results
+from experiments import results
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,13 +75,3 @@ def test_options_come_from_the_command_line(words, seeds, folder, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["rooms", *words.split()])
     options = results.read_options(RoomOptions, "rooms", "Rooms.", {"seeds": (0,)})
     assert options == RoomOptions(seeds, "--quick" in words, str(folder))
-
-
-def test_the_table_says_what_is_within_the_bounds():
-    graph = {"graph": "a.onnx", "outputs": {"x": 1e-6}, "scales": {"x": 3.0}, "same_signs": {"x": 1.0}}
-    graphs = [graph, graph | {"outputs": {"x": 1e-6, "y": 2e-3}}, graph | {"same_signs": {"x": 0.998}}]
-    metrics = {"sam_images": {"tiny": {"graphs": graphs}}}
-    rows = export_models.table(metrics).splitlines()[2:]
-    assert [row.split("|")[-2].strip() for row in rows] == ["yes", "no", "no"]
-    assert "2.0e-03" in rows[1]
-    assert "99.80000%" in rows[2]

@@ -1,1 +1,0 @@
-"""Stiff and extreme scenes, a row each."""
