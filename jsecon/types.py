@@ -129,6 +129,8 @@ class ImageFile:
     width: int
     """px of the image as it was read: upright, unless its pose belongs to the stored pixels."""
     height: int
+    orientation: int = 1
+    """EXIF's that was applied; 1 if none."""
 
 
 @record

@@ -80,11 +80,11 @@ def test_other_folders_of_black_and_white_masks_are_objects(tmp_path, paths, pat
             camera, _, name = file.path.removesuffix(".jpg").rpartition("/")
             write(tmp_path / (pattern.format(object=number, camera=camera, name=name) + ".png"), mask)
     labels, ids, notes = load_labels(tmp_path, tuple(files), SIZE, frames=files)
-    assert ids == (0, 1)
+    assert ids == (1, 2)
     np.testing.assert_array_equal(labels, np.where(masks[0] > 0, 0, np.where(masks[1] > 0, 1, -1)))
     assert any("objects" in note for note in notes)
     read, _ = load_proposals(tmp_path, tuple(files), SIZE, frames=files)
-    np.testing.assert_array_equal(read(1), masks[:, 1] > 0)
+    np.testing.assert_array_equal(read(1), [masks[0, 1] > 0, (masks[1, 1] > 0) & (masks[0, 1] == 0)])
 
 
 def test_objects_called_by_words_are_numbered_and_those_of_many_values_refused(tmp_path):
@@ -92,7 +92,7 @@ def test_objects_called_by_words_are_numbered_and_those_of_many_values_refused(t
     for folder, mask in masks.items():
         write(tmp_path / folder / "a.png", 255 * mask)
     labels, ids, notes = load_labels(tmp_path, ("a",), SIZE)
-    assert ids == (0, 1)
+    assert ids == (1, 2)
     np.testing.assert_array_equal(labels[0], masks["mug"])
     assert any("bowl, mug" in note for note in notes)
     write(tmp_path / "mug" / "a.png", ids_image())
@@ -109,13 +109,13 @@ def test_objects_are_in_some_of_the_frames_and_the_lower_id_lies_on_top(tmp_path
     (tmp_path / "other").mkdir()
     (tmp_path / "011").mkdir()
     labels, ids, notes = load_labels(tmp_path, tuple("bcef"), SIZE)
-    assert ids == (0, 1)
+    assert ids == (1, 2)
     np.testing.assert_array_equal(labels[1], np.where(low, 0, np.where(high, 1, -1)))
     np.testing.assert_array_equal(labels[0] == 0, low)
     assert (labels[3] == -1).all()
     assert "1 of 4 frames" in notes[0]
     write(tmp_path / "010" / "b.png", 255 * high[:6])
-    with refused("16x12"):
+    with refused("b.png", "16x12"):
         load_labels(tmp_path, tuple("bcef"), SIZE)
 
 
@@ -123,7 +123,7 @@ def test_objects_keep_their_order_whichever_frame_shows_them_first(tmp_path):
     for frame, folder in (("a", "obj_10"), ("b", "obj_9"), ("b", "obj_10")):
         write(tmp_path / folder / f"{frame}.png", np.full(SIZE, 255))
     labels, ids, _ = load_labels(tmp_path, ("a", "b"), SIZE)
-    assert ids == (0, 1)
+    assert ids == (1, 2)
     assert (labels[0] == 1).all()
     assert (labels[1] == 0).all()
 
@@ -188,6 +188,24 @@ def test_arrays_of_ids(tmp_path):
     np.testing.assert_array_equal(labels, [image, image - 1])
     assert ids == (0, 1, 2, 3, 4)
     assert "negative" in notes[0]
+
+
+def test_masks_of_stored_pixels_are_turned_like_their_photographs(tmp_path):
+    """A lies on its side (6: its stored pixels are turned clockwise), b stands on its head, c is upright."""
+    upright = [ids_image() for _ in range(3)]
+    files = {name: ImageFile(f"{name}.jpg", 16, 12, turn) for name, turn in zip("abc", (6, 3, 1))}
+    for name, image in zip("abc", upright):
+        write(tmp_path / f"{name}.png", image)
+    labels, _, notes = load_labels(tmp_path, tuple("abc"), SIZE, frames=files)
+    np.testing.assert_array_equal(labels, expected(*upright))
+    assert notes == ()
+    for name, image in zip("abc", (np.rot90(upright[0]), upright[1][::-1, ::-1], upright[2])):
+        write(tmp_path / f"{name}.png", image.repeat(2, 0).repeat(2, 1))
+    labels, _, notes = load_labels(tmp_path, tuple("abc"), SIZE, frames=files)
+    np.testing.assert_array_equal(labels, expected(*upright))
+    assert any("2 masks were of the stored pixels" in note for note in notes)
+    read, _ = load_proposals(tmp_path, tuple("abc"), SIZE, frames=files)
+    np.testing.assert_array_equal(read(1), [upright[1] == id for id in range(1, 5)])
 
 
 def test_masks_of_photographs_of_another_aspect_follow_them(tmp_path):

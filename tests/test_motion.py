@@ -24,9 +24,8 @@ from jsecon.pipeline.results import KEY_FILE, RunContext
 from jsecon.pipeline.scene import plan_capture
 from jsecon.poses import sfm
 from jsecon.poses.sfm import find_poses
-from jsecon.read.captures.capture import load_capture, read_posed_images
+from jsecon.read.captures.capture import list_photographs, load_capture, read_posed_images
 from jsecon.read.captures.images import read_image
-from jsecon.read.captures.photographs import list_photographs
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Models
 

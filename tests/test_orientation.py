@@ -54,3 +54,22 @@ def test_poses_of_stored_pixels_keep_them(tmp_path, orientation, upright):
     read = jsecon.load_capture(tmp_path)
     np.testing.assert_array_equal(read.frames, capture.frames)
     assert any(("turned upright" if upright else "as they are stored") in note for note in read.notes)
+
+
+def test_a_file_without_a_size_means_the_pixels_that_its_centre_lies_in_the_middle_of(tmp_path):
+    """Of photographs that lie on their side, stored and upright; depth is measured like the stored pixels."""
+    capture = small_capture(3)
+    write_turned(capture, tmp_path / "images", [6, 8, 1], upright=False)
+    content = transforms(capture)
+    del content["w"], content["h"]
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    np.testing.assert_array_equal(jsecon.load_capture(tmp_path).frames, capture.frames)
+    write_turned(capture, tmp_path / "images", [6, 8, 1], upright=True)
+    for n, (entry, turns) in enumerate(zip(content["frames"], (1, 3, 0))):
+        depth = np.arange(24 * 16, dtype=np.uint16).reshape(16, 24) + 1
+        entry["depth_file_path"] = f"depth_{n}.npy"
+        np.save(tmp_path / entry["depth_file_path"], np.rot90(depth, turns))
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    read = jsecon.load_capture(tmp_path)
+    np.testing.assert_array_equal(read.frames, capture.frames)
+    np.testing.assert_allclose(read.depths, np.broadcast_to(0.001 * depth, (3, 16, 24)), rtol=1e-5)

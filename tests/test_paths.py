@@ -16,7 +16,7 @@ from capture_files import run_cli
 
 from jsecon.pipeline.cache import files_digest
 from jsecon.read.captures import capture as captures
-from jsecon.read.captures.photographs import list_photographs
+from jsecon.read.captures.capture import list_photographs
 from jsecon.read.splats.files import load_gaussians, save_gaussians
 
 HOME = Path(__file__).resolve().parent.parent

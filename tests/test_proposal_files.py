@@ -110,7 +110,7 @@ def decoded(rle) -> np.ndarray:
     """The mask of a run-length encoding."""
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "a.json").write_text(json.dumps([{"segmentation": rle}]))
-        return load_proposals(folder, ("a",), tuple(rle["size"])).read(0).any(0)  # a mask without pixels is none
+        return load_proposals(folder, ("a",), tuple(rle["size"]))[0](0).any(0)  # a mask without pixels is none
 
 
 def test_the_example_of_cocos_own_tests():

@@ -51,10 +51,10 @@ PLUGIN = """
 import json
 import numpy as np
 from jsecon import Gaussians
-from jsecon.read.captures.nerfstudio import read_nerfstudio
+from jsecon.read.captures.nerfstudio import READERS
 from jsecon.read.registry import Reader
 
-capture = Reader("Rig", ("rig.txt", "poses"), lambda path: read_nerfstudio(path / "poses" / "cameras.json"))
+capture = Reader("Rig", ("rig.txt", "poses"), lambda path: READERS[0].read(path / "poses" / "cameras.json"))
 masks = Reader("runs", (".runs",), lambda path, size, level: np.array(json.loads(path.read_text())))
 
 def read_numbers(path):
@@ -102,7 +102,7 @@ def test_other_packages_add_rows_by_entry_points(tmp_path, plugin):
     labels, found, _ = load_labels(tmp_path / "masks", ("a",), (3, 4))
     np.testing.assert_array_equal(labels[0], ids - 1)
     assert found == (1, 2)
-    np.testing.assert_array_equal(load_proposals(tmp_path / "masks", ("a",), (3, 4)).read(0), [ids == 1, ids == 2])
+    np.testing.assert_array_equal(load_proposals(tmp_path / "masks", ("a",), (3, 4))[0](0), [ids == 1, ids == 2])
     (tmp_path / "masks" / "a.runs").write_text("[[")
     with refused("a.runs", "cannot be read"):
         load_labels(tmp_path / "masks", ("a",), (3, 4))

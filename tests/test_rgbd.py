@@ -183,25 +183,31 @@ def test_the_benchmarks_own_cameras_are_known_by_name(tmp_path, camera, fx, bent
         load_capture(tmp_path / "mine")
 
 
+@pytest.mark.parametrize("before", [None, SIZE])
 @pytest.mark.parametrize("smaller", [False, True])
-def test_polycam_without_sizes(tmp_path, smaller):
-    """Recent corrected_cameras/ name none: they are those of the images, which the numbers must fit."""
+def test_polycam_without_sizes(tmp_path, before, smaller):
+    """Recent corrected_cameras/ name none: cameras/ has them, or the images themselves."""
     write_polycam(tmp_path)
     frames = tmp_path / "keyframes"
+    (frames / "cameras").mkdir()
     for file in (frames / "corrected_cameras").iterdir():
         told = json.loads(file.read_text())
         told = {name: value for name, value in told.items() if name not in ("width", "height")}
         file.rename(file.with_suffix(".JSON"))
         file.with_suffix(".JSON").write_text(json.dumps(told))
+        if before is not None:
+            (frames / "cameras" / file.name).write_text(json.dumps({"width": SIZE[0], "height": SIZE[1]}))
     if smaller:
         for file in (frames / "corrected_images").iterdir():
             cv2.imwrite(str(file), cv2.imread(str(file))[::2, ::2])
+    if smaller and before is None:  # nothing says what size the numbers are for: they don't fit the images
         with refused("cameras", "12x8", "centre"):
             load_capture(tmp_path)
         return
     found = load_capture(tmp_path, holdout=0)
-    assert (found.cameras.width, found.cameras.height) == SIZE
-    np.testing.assert_allclose(found.cameras.fx, K[0], rtol=1e-6)
+    assert (found.cameras.width, found.cameras.height) == ((12, 8) if smaller else SIZE)
+    np.testing.assert_allclose(found.cameras.fx, K[0] / (2 if smaller else 1), rtol=1e-6)
+    np.testing.assert_allclose(found.cameras.cy, K[3] / (2 if smaller else 1), rtol=1e-6)
     assert len(found.names) == 11
 
 

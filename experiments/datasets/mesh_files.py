@@ -27,7 +27,7 @@ def read_faces(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         raise _error(path, f"{form} elements {', '.join(names) or 'none'}", "binary elements vertex and face")
     before, face = elements[: names.index("face")], elements[names.index("face")]
     kinds = [kind for element in elements for kind in element.lists.values()]
-    if not all(element.fixed for element in before) or len(kinds) != 1 or face.fixed:
+    if any(element.lists for element in before) or len(kinds) != 1 or not face.lists:
         raise _error(path, "list properties elsewhere than in one property of the faces", "faces with one list")
     offset += sum(element.count * element.dtype(ORDERS[form]).itemsize for element in before)
     order, (size, index) = ORDERS[form], kinds[0]

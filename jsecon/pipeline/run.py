@@ -6,7 +6,6 @@ is skipped and why. `stages` is the table of the stages.
 
 import dataclasses
 import functools
-import itertools
 import json
 import time
 from pathlib import Path
@@ -35,7 +34,8 @@ from jsecon.pipeline.scene_files import read_scene
 from jsecon.pipeline.sources import provenance
 from jsecon.poses.sfm import require_pycolmap
 from jsecon.process import compilation_counts
-from jsecon.read.captures.capture import capture_extent
+from jsecon.read.captures.build import plan_frames
+from jsecon.read.captures.capture import read_posed_images
 from jsecon.read.captures.frames import FrameOptions, evenly_spaced, holdout_mask
 from jsecon.read.masks.masks import load_features, load_labels, load_proposals
 from jsecon.types import Capture, Gaussians, LanguageField, Quality
@@ -331,15 +331,15 @@ def _check_inputs(context: RunContext, plan: _Plan) -> None:
         require_pycolmap(options.capture)
         return
     folder = context.out / "poses" if "poses" in plan.paths else options.capture
-    extent = capture_extent(folder, FrameOptions(long_side=options.long_side, frames=options.frames))
-    train = training_frames(holdout_mask(extent.frames, options.holdout))
-    names = [extent.names[t] for t in train[evenly_spaced(len(train), options.vision_frames)]]
-    size = extent.size[1], extent.size[0]
-    layout = {"level": options.level, "frames": dict(itertools.zip_longest(extent.names, extent.files))}
+    of_frames = FrameOptions(long_side=options.long_side, frames=options.frames)
+    frames, (width, height) = plan_frames(read_posed_images(folder), of_frames)
+    train = training_frames(holdout_mask(len(frames), options.holdout))
+    names = [list(frames)[t] for t in train[evenly_spaced(len(train), options.vision_frames)]]
+    size, layout = (height, width), {"level": options.level, "frames": frames}
     if options.masks is not None and "objects" in running:
         load_labels(options.masks, names, size, **layout, limit=1)
     if options.proposals is not None and "objects" in running:
-        load_proposals(options.proposals, names, size, **layout).read(0)
+        load_proposals(options.proposals, names, size, **layout)[0](0)
     if options.features is not None and "regions" in running:
         load_features(options.features, names[:1], size, **layout)
 

@@ -20,10 +20,15 @@ from jsecon.pipeline.options import Options, is_bare_scene
 from jsecon.pipeline.results import KEY_FILE, RunContext, Stage, StageInput, StageResult, training_frames
 from jsecon.pipeline.scene_files import check_overlap, place_in_capture, read_scene
 from jsecon.poses.sfm import find_poses
-from jsecon.read.captures.capture import has_depth, load_capture, read_posed_images, unposed_photographs
+from jsecon.read.captures.capture import (
+    has_depth,
+    list_photographs,
+    load_capture,
+    read_posed_images,
+    unposed_photographs,
+)
 from jsecon.read.captures.frames import FrameOptions, frame_names, make_rigid, transform_poses
 from jsecon.read.captures.nerfstudio import source_from_trained
-from jsecon.read.captures.photographs import list_photographs
 from jsecon.read.captures.video import DEFAULT_VIDEO_FRAMES, is_video, write_frames
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Camera, Capture, Gaussians, Quality

@@ -42,15 +42,15 @@ def _added_readers(group: str, path: tuple[str, ...]) -> tuple[Reader, ...]:
     """The readers of packages on a search path, whose listing takes some 10 ms."""
     added = []
     for entry in importlib.metadata.entry_points(group=group):
+        where, remedy = f"{group}:{entry.name}", "Update or uninstall the package that registers it."
         try:
             reader = entry.load()
         except Exception as error:  # whatever a foreign package raises when it is imported
             problem = f"the reader {entry.value} of another package cannot be loaded ({describe_error(error)})"
-            raise InputError(f"{group}:{entry.name}", problem, remedy="Update or uninstall that package.") from error
+            raise InputError(where, problem, remedy=remedy) from error
         if not isinstance(reader, Reader):
             problem = f"{entry.value} is a {type(reader).__name__}"
-            remedy = "Update or uninstall the package that registers it."
-            raise InputError(f"{group}:{entry.name}", problem, "a jsecon.read.registry.Reader", remedy)
+            raise InputError(where, problem, "a jsecon.read.registry.Reader", remedy)
         added.append(reader)
     return tuple(added)
 

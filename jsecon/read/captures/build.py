@@ -23,10 +23,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jsecon.errors import InputError
-from jsecon.numerics import is_finite_and_bounded
 from jsecon.process import cores
 from jsecon.read.captures.frames import (
-    CaptureExtent,
     FrameOptions,
     PosedImage,
     PosedImages,
@@ -34,121 +32,88 @@ from jsecon.read.captures.frames import (
     frame_names,
     holdout_mask,
     make_rigid,
+    same_aspect,
     transform_poses,
 )
-from jsecon.read.captures.images import ImageHeader, image_header, read_depth, read_image
+from jsecon.read.captures.images import apply_orientation, image_header, read_depth, read_image
 from jsecon.read.captures.lens import Lens, resample_depth, undistorted_pinhole, undistortion_maps
 from jsecon.types import Camera, Capture, ImageFile, Progress
 
 _MAX_IN_MEMORY = 1 << 30
 """bytes of frames that stay in memory; more go to a temporary file"""
-_UNIT_STEP = 1000.0
-"""units change by a power of this, as from millimetres to metres: a scene comes out the same from each unit"""
-_MIN_DEPTH, _MAX_DEPTH = 0.1, 100.0
-"""distance of the nearest things from the cameras, world units, within which the units are kept"""
-_MAX_SPREAD = 1000.0
-"""spread of the cameras, world units, up to which the units are kept if only the cameras are known"""
+_MIN_DEPTH, _UNIT_STEP = 0.1, 1000.0
+"""Units change by a power of the second, as from millimetres to metres, so that the near things are from 0.1 to 100
+world units away: a scene comes out the same from each unit."""
 
 
 class _Frame(NamedTuple):
     """A frame whose image is there."""
 
     name: str
-    image: Path
-    lens: Lens
-    """Lens of the pixels as they are read, at their size."""
-    orientation: int
-    """EXIF's that is applied; 1 if the pose belongs to the stored pixels."""
     posed: PosedImage
+    image: Path
+    pose: np.ndarray
+    """(4, 4) world-to-camera, exactly rigid."""
+    lens: Lens
+    """Lens of the pixels as they are read, at their size; until the header is read, as the capture has it."""
+    orientation: int = 1
+    """EXIF's that is applied; 1 if the pose belongs to the stored pixels."""
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height) of the pixels as they are read."""
+        """(width, height) of the lens."""
         return self.lens.width, self.lens.height
 
 
-def _resolve_orientations(images: Sequence[PosedImage], posed: PosedImages) -> tuple[list[_Frame], list[str]]:
-    """Decides how each image of a capture is read, and returns notes.
+def _resolve_orientations(frames: Sequence[_Frame], posed: PosedImages) -> tuple[list[_Frame], list[str]]:
+    """Decides how the image of each frame is read, and returns notes.
 
     A camera model belongs to the stored pixels or to the upright image: COLMAP ignores EXIF, other programs apply it.
     If only one of the two has the model's aspect, it is that one. If both have it (a square, or a turn by 180 degrees),
     the other images of the capture decide, else the program (`PosedImages.ignores_exif`).
     """
-    headers = [image_header(_path_of(image)) for image in images]
-    fits = [_fitting_pixels(image, header) for image, header in zip(images, headers)]
-    if "both" in fits and _poses_ignore_exif(posed):
-        fits = ["stored" if fit == "both" else fit for fit in fits]
-    frames = [
-        _Frame(
-            image.name,
-            _path_of(image),
-            _lens_at_size(image, *(header.stored if fit == "stored" else header.upright)),
-            1 if fit == "stored" else header.orientation,
-            image,
-        )
-        for image, header, fit in zip(images, headers, fits)
-    ]
+    fits = [_fitting_pixels(frame.image, frame.lens) for frame in frames]
+    ignores_exif = posed.ignores_exif
+    if (True, True) in fits:
+        others = {_fitting_pixels(image.image, image.lens) for image in posed.images if image.image and image.lens}
+        others &= {(True, False), (False, True)}
+        ignores_exif = others == {(True, False)} if others else ignores_exif
+    result, stored, turned = [], [], []
+    for frame, (fits_stored, fits_upright) in zip(frames, fits):
+        header = image_header(frame.image)
+        orientation = 1 if fits_stored and (ignores_exif or not fits_upright) else header.orientation
+        if orientation != 1:
+            turned.append(frame.posed.name)
+        elif header.orientation != 1:
+            stored.append(frame.posed.name)
+        lens = _lens_at_size(frame, *(header.upright if orientation != 1 else header.stored))
+        result.append(frame._replace(lens=lens, orientation=orientation))
     notes = []
-    if stored := [frame.name for frame, fit in zip(frames, fits) if fit == "stored"]:
-        example = f"(the first: {stored[0]})"
-        notes.append(
-            f"{len(stored)} images have an EXIF orientation that their camera models leave out {example}; they are "
-            "taken as they are stored."
-        )
-    if turned := [frame.name for frame in frames if frame.orientation != 1]:
+    if stored:
+        ignored = f"{len(stored)} images have an EXIF orientation that their camera models leave out"
+        notes.append(f"{ignored} (the first: {stored[0]}); they are taken as they are stored.")
+    if turned:
         notes.append(f"{len(turned)} images were turned upright by their EXIF orientation (the first: {turned[0]}).")
-    return frames, notes
+    return result, notes
 
 
-def _path_of(image: PosedImage) -> Path:
-    """The image's file, which is there."""
-    assert image.image is not None
-    return image.image
-
-
-def _lens_of(image: PosedImage) -> Lens:
-    """The image's lens, which every image that is there has."""
-    assert image.lens is not None
-    return image.lens
-
-
-def _fitting_pixels(image: PosedImage, header: ImageHeader) -> str:
-    """Which pixels of an image with an EXIF orientation have its lens's aspect: "stored", "upright", "both" or ""."""
+def _fitting_pixels(image: Path, lens: Lens) -> tuple[bool, bool]:
+    """Whether the stored, and the upright pixels of an image have its lens's aspect; False if it has no orientation."""
+    header = image_header(image)
     if header.orientation == 1:
-        return ""
-    fits = _fits(_lens_of(image), *header.stored), _fits(_lens_of(image), *header.upright)
-    return {(True, True): "both", (True, False): "stored", (False, True): "upright"}.get(fits, "")
+        return False, False
+    size = lens.width, lens.height
+    return same_aspect(size, header.stored), same_aspect(size, header.upright)
 
 
-def _poses_ignore_exif(posed: PosedImages) -> bool:
-    """Whether the poses of a capture belong to stored pixels, by all its images, else by the program."""
-    images = [image for image in posed.images if image.image is not None]
-    fits = {_fitting_pixels(image, image_header(_path_of(image))) for image in images}
-    if fits & {"stored", "upright"}:
-        return "upright" not in fits
-    return posed.ignores_exif
-
-
-def _fits(lens: Lens, width: int, height: int) -> bool:
-    """Whether an image of this size has the lens's aspect, to a pixel of the coarser of the two."""
-    return min(abs(lens.width * height / lens.height - width), abs(width * lens.height / height - lens.width)) <= 1
-
-
-def _lens_at_size(image: PosedImage, width: int, height: int) -> Lens:
+def _lens_at_size(frame: _Frame, width: int, height: int) -> Lens:
     """The lens of an image at the size that it is read at."""
-    lens = _lens_of(image)
-    numbers = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
-    if not is_finite_and_bounded(numbers) or min(lens.fx, lens.fy) < 1e-3:
-        problem = f"its camera has focal lengths {lens.fx:g}, {lens.fy:g}, centre {lens.cx:g}, {lens.cy:g}"
-        problem += f" and distortion {lens.distortion}"
-        raise InputError(image.image, problem, "finite pixels", "Estimate the cameras again.")
-    if (width, height) == (lens.width, lens.height):
-        return lens
-    if not _fits(lens, width, height):
+    lens = frame.lens
+    if not same_aspect(frame.size, (width, height)):
         remedy = "Use the images that the poses were estimated on (mind their rotation), or a scaled copy of them."
         expected = f"{lens.width}x{lens.height} of its camera, or that aspect"
-        raise InputError(image.image, f"the image is {width}x{height}", expected, remedy)
-    return lens.resized(width, height)
+        raise InputError(frame.image, f"the image is {width}x{height}", expected, remedy)
+    return lens if (width, height) == frame.size else lens.resized(width, height)
 
 
 def _allocate_frames(shape: tuple[int, ...]) -> np.ndarray:
@@ -166,24 +131,25 @@ def _allocate_frames(shape: tuple[int, ...]) -> np.ndarray:
             raise InputError(tempfile.gettempdir(), problem, remedy=remedy) from error
 
 
-def planned_extent(posed: PosedImages, options: FrameOptions) -> CaptureExtent:
-    """Computes the extent of `build_capture`'s result; of the images, only headers are read."""
-    images, _, names, _ = _in_order(posed)
-    chosen = evenly_spaced(len(images), options.frames)
-    frames, _ = _resolve_orientations([images[i] for i in chosen], posed)
+def plan_frames(posed: PosedImages, options: FrameOptions) -> tuple[dict[str, ImageFile], tuple[int, int]]:
+    """Plans `build_capture`'s result: its frames by name, and their (width, height), px.
+
+    Of the images, only headers are read.
+    """
+    frames, _ = _in_order(posed)
+    frames, _ = _resolve_orientations([frames[i] for i in evenly_spaced(len(frames), options.frames)], posed)
     for lens in {frame.lens for frame in frames}:
         undistorted_pinhole(lens, posed.where)
-    size = options.size(_commonest_size(frames))
-    return CaptureExtent(len(frames), size, tuple(names[i] for i in chosen), _files(frames))
+    return {frame.name: _file(frame) for frame in frames}, options.size(_commonest_size(frames))
 
 
-def _files(frames: Sequence[_Frame]) -> tuple[ImageFile, ...]:
-    """The images of frames as `Capture.files` has them."""
-    return tuple(ImageFile(frame.name, *frame.size) for frame in frames)
+def _file(frame: _Frame) -> ImageFile:
+    """The image of a frame as `Capture.files` has it."""
+    return ImageFile(frame.posed.name, *frame.size, frame.orientation)
 
 
-def _in_order(posed: PosedImages) -> tuple[list[PosedImage], np.ndarray, tuple[str, ...], list[str]]:
-    """The images that are there in name order, their poses (T, 4, 4) made exactly rigid, the frames' names, notes."""
+def _in_order(posed: PosedImages) -> tuple[list[_Frame], list[str]]:
+    """The frames whose images are there in name order, and notes."""
     images = [image for image in posed.images if image.image is not None]
     missing = [image.name for image in posed.images if image.image is None]
     first = f"(the first: {missing[0]})" if missing else ""
@@ -193,8 +159,12 @@ def _in_order(posed: PosedImages) -> tuple[list[PosedImage], np.ndarray, tuple[s
         raise InputError(posed.where, problem, remedy=remedy)
     notes = [f"{len(missing)} of {len(posed.images)} frames were left out: their images are missing {first}."]
     images.sort(key=lambda image: re.sub(r"\d+", lambda number: number[0].zfill(20), image.name))
-    poses = np.stack([make_rigid(image.world_to_camera, posed.where, image.name) for image in images])
-    return images, poses, frame_names([image.name for image in images], posed.where), notes if missing else []
+    frames = [
+        _Frame(name, image, image.image, make_rigid(image.world_to_camera, posed.where, image.name), image.lens)
+        for name, image in zip(frame_names([image.name for image in images], posed.where), images)
+        if image.image and image.lens
+    ]
+    return frames, notes if missing else []
 
 
 def _commonest_size(frames: Sequence[_Frame]) -> tuple[int, int]:
@@ -222,7 +192,9 @@ def _read_depth(
     lens, depth = frame.lens, read_depth(file, frame.posed.depth_unit * unit)
     if frame.posed.depth_lens is not None:
         depth = resample_depth(depth, frame.posed.depth_lens, lens)
-    if abs(depth.shape[1] * lens.height / depth.shape[0] - lens.width) > 1:
+    elif frame.orientation > 4 and not same_aspect(frame.size, depth.shape[1::-1]):  # measured like the stored pixels
+        depth = apply_orientation(depth, frame.orientation)
+    if not same_aspect(frame.size, depth.shape[1::-1]):
         problem = f"the depth map is {depth.shape[1]}x{depth.shape[0]}"
         expected = f"the aspect of its image, {lens.width}x{lens.height}"
         raise InputError(file, problem, expected, "Register it to the image.")
@@ -247,27 +219,26 @@ def build_capture(
     units far from metres are changed in float64 (`_normalizing_transform`), by the same for any choice of frames;
     `Capture.source_from_scene` leads back. `only` names the frames to read.
     """
-    images, poses, names, notes = _in_order(posed)
-    deep = [image for image in images if image.depth is not None and not len(posed.points)]
+    frames, notes = _in_order(posed)
+    deep = [frame.posed for frame in frames if frame.posed.depth is not None and not len(posed.points)]
     samples = [deep[index] for index in evenly_spaced(len(deep), 8)] if deep else []
     depths = [read_depth(image.depth, image.depth_unit) for image in samples if image.depth is not None]
+    poses = np.stack([frame.pose for frame in frames])
     world, world_notes = _normalizing_transform(poses, posed.points, depths)  # of all frames, whichever are taken
-    poses, from_world = transform_poses(poses, world), np.linalg.inv(world)
     if only is not None:
-        missing = sorted(set(only) - set(names))
+        missing = sorted(set(only) - {frame.name for frame in frames})
         if missing or not only:
-            problem = f"there is no frame called {[*missing, '...'][0]} among the {len(names)}, {names[0]} ..."
+            among = f"among the {len(frames)}, {frames[0].name} ..."
+            problem = f"there is no frame called {[*missing, '...'][0]} {among}"
             raise InputError(posed.where, problem, remedy="Give the capture that these names are of.")
-        kept = [i for i, name in enumerate(names) if name in only]
-        images, poses, names = [images[i] for i in kept], poses[kept], tuple(names[i] for i in kept)
-    notes = [*notes, *posed.notes, *world_notes, *_camera_jumps(poses, names)]
-    chosen = evenly_spaced(len(images), options.frames)
-    if len(chosen) < len(images):
-        notes.append(f"{len(chosen)} of {len(images)} frames were taken, evenly spaced.")
-    poses, names = poses[chosen], tuple(names[i] for i in chosen)
-    frames, orientation_notes = _resolve_orientations([images[i] for i in chosen], posed)
+        frames = [frame for frame in frames if frame.name in only]
+    notes += [*posed.notes, *world_notes, *_camera_jumps(frames)]
+    unsized = [frames[i] for i in evenly_spaced(len(frames), options.frames)]
+    if len(unsized) < len(frames):
+        notes.append(f"{len(unsized)} of {len(frames)} frames were taken, evenly spaced.")
+    frames, orientation_notes = _resolve_orientations(unsized, posed)
     notes += orientation_notes
-    if rescaled := sum(frame.size != (_lens_of(frame.posed).width, _lens_of(frame.posed).height) for frame in frames):
+    if rescaled := sum(frame.size != before.size for frame, before in zip(frames, unsized)):
         notes.append(f"{rescaled} images have another size than their camera model; its intrinsics were scaled.")
     pinholes = {lens: undistorted_pinhole(lens, posed.where) for lens in {frame.lens for frame in frames}}
     if bent := sum(frame.lens.distorted for frame in frames):
@@ -308,6 +279,7 @@ def build_capture(
         notes.append("No frame was held out, since there is only one.")
     final = [pinholes[frame.lens].resized(width, height) for frame in frames]
     fx, fy, cx, cy = np.array([(lens.fx, lens.fy, lens.cx, lens.cy) for lens in final], np.float32).T
+    poses, from_world = transform_poses(np.stack([frame.pose for frame in frames]), world), np.linalg.inv(world)
     return Capture(
         frames=pixels,
         cameras=Camera(poses.astype(np.float32), fx, fy, cx, cy, width, height),
@@ -316,30 +288,27 @@ def build_capture(
         held_out=held_out,
         depths=depth_maps,
         source_from_scene=np.asarray(posed.source_from_poses, np.float64) @ from_world,
-        names=names,
+        names=tuple(frame.name for frame in frames),
         notes=tuple(notes),
-        files=_files(frames),
+        files=tuple(map(_file, frames)),
         poses_from_scene=from_world,
     )
 
 
-def _camera_jumps(poses: Float[np.ndarray, "t 4 4"], names: Sequence[str]) -> list[str]:
-    """Reports places where neighbouring world-to-camera poses lie more than ten median steps apart: a note, or none.
+def _camera_jumps(frames: Sequence[_Frame]) -> list[str]:
+    """Reports places where neighbouring frames' cameras lie more than ten median steps apart: a note, or none.
 
     A reconstruction of 125 photographs with five errors had steps of 11 to 20 there; when right, its largest was 2.2,
     and that of a walk with one cut 9.9.
     """
-    centres = _centres(poses)
-    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(_centres(np.stack([frame.pose for frame in frames])), axis=0), axis=1)
     median = float(np.median(steps)) if len(steps) else 0.0
-    far = np.flatnonzero(steps > 10 * median)
-    if median == 0 or not len(far):
+    far = [f"{frames[t].name} to {frames[t + 1].name}" for t in np.flatnonzero(steps > 10 * median)]
+    if median == 0 or not far:
         return []
-    places = ", ".join(f"{names[t]} to {names[t + 1]}" for t in far[:5]) + (" ..." if len(far) > 5 else "")
-    return [
-        f"The camera jumps in {len(far)} places, by up to {steps.max() / median:.0f} of its usual steps ({places}). "
-        "If the frames are one walk, poses there are wrong: check them before you trust the fit."
-    ]
+    places = ", ".join(far[:5]) + (" ..." if len(far) > 5 else "")
+    jump = f"The camera jumps in {len(far)} places, by up to {steps.max() / median:.0f} of its usual steps ({places})."
+    return [f"{jump} If the frames are one walk, poses there are wrong: check them before you trust the fit."]
 
 
 def _centres(poses: np.ndarray) -> np.ndarray:
@@ -354,39 +323,27 @@ def _normalizing_transform(
 
     That is near the origin, and of the size of metres; for most captures it is the identity. A scene that is moved, or
     scaled by a power of 1000, comes out in the same world up to a shift of its own size. Depth maps of a few views, in
-    world units with 0 where unknown, stand in for missing points.
+    world units with 0 where unknown, stand in for missing points; without either, the spread of the cameras counts.
     """
     centres = _centres(poses)
     middle = np.median(centres, axis=0)
     spread = float(np.median(np.linalg.norm(centres - middle, axis=1)))
-    near = _near_depth(poses, np.asarray(points, np.float64), depths)
-    size = max(near or 0.0, spread)
-    if near is None and size < max(1e-6, 1e-12 * np.abs(middle).max()):  # rounding: the cameras stand in one place
-        size = 1.0
-        near = size
-    origin, notes = np.zeros(3), []
+    near = _near_depth(poses, np.asarray(points, np.float64), depths) or spread
+    if near < max(1e-6, 1e-12 * np.abs(middle).max()):  # rounding: the cameras stand in one place
+        near = 1.0
+    origin, notes, size = np.zeros(3), [], max(near, spread)
     if np.abs(middle).max() > 100 * size:
         step = 10.0 ** np.ceil(np.log10(size))
         origin = np.round(middle / step) * step
         place = ", ".join(f"{number:.10g}" for number in origin)
         notes.append(f"The coordinates are large. jsecon works relative to ({place}) and adds it to what it writes.")
-    factor = _UNIT_STEP ** _power(size if near is None else near, _MAX_SPREAD if near is None else _MAX_DEPTH)
+    factor = _UNIT_STEP ** np.ceil(np.log(_MIN_DEPTH / near) / np.log(_UNIT_STEP) - 1e-9)
     if factor != 1:
-        notes.append(
-            f"The units are far from metres: the near things are {size if near is None else near:.3g} away. "
-            f"jsecon works at {factor:g} times the size and writes the units of the files."
-        )
+        works = f"jsecon works at {factor:g} times the size and writes the units of the files."
+        notes.append(f"The units are far from metres: the near things are {near:.3g} away. {works}")
     result = np.diag([factor, factor, factor, 1.0])
     result[:3, 3] = -factor * origin
     return result, tuple(notes)
-
-
-def _power(size: float, limit: float) -> int:
-    """Power of _UNIT_STEP that brings `size` into [_MIN_DEPTH, limit)."""
-    if _MIN_DEPTH <= size < limit:
-        return 0
-    low = int(np.ceil(np.log(_MIN_DEPTH / size) / np.log(_UNIT_STEP) - 1e-9))
-    return low if size < _MIN_DEPTH else int(np.floor(np.log(limit / size) / np.log(_UNIT_STEP) - 1e-9))
 
 
 def _near_depth(poses: np.ndarray, points: np.ndarray, depths: Sequence[np.ndarray]) -> float | None:

@@ -1,35 +1,26 @@
-"""Captures of any known format, on the host.
+"""Captures of any known format, and photographs without poses, on the host.
 
 `READERS` is the table of formats. A reader takes a folder, or a file of poses, and returns PosedImages: images, lenses
 and poses in OpenCV axes. Other packages add readers by entry points in the group jsecon.captures.
 """
 
+import re
 from collections.abc import Collection
 from pathlib import Path
 
 from jsecon.errors import InputError
-from jsecon.files import is_output_folder, reading
-from jsecon.read.captures import rgbd
-from jsecon.read.captures.build import build_capture, planned_extent
-from jsecon.read.captures.colmap import MODEL_MARK, read_colmap
-from jsecon.read.captures.frames import CaptureExtent, FrameOptions, PosedImages
-from jsecon.read.captures.nerfstudio import read_nerfstudio
-from jsecon.read.captures.photographs import list_photographs
+from jsecon.files import is_output_folder, list_files, reading
+from jsecon.read.captures import colmap, nerfstudio, rgbd
+from jsecon.read.captures.build import build_capture
+from jsecon.read.captures.frames import FrameOptions, PosedImages
+from jsecon.read.captures.images import IMAGE_SUFFIXES
 from jsecon.read.registry import Reader, find_reader
 from jsecon.types import Capture, Progress
 
-_COLMAP = "COLMAP"
-READERS = (
-    *(Reader(_COLMAP, (f"{place}/{MODEL_MARK}",), read_colmap) for place in ("sparse/*", "sparse")),
-    Reader("nerfstudio", ("transforms.json",), read_nerfstudio),
-    Reader("nerfstudio", (".json",), read_nerfstudio),
-    *(
-        Reader(_COLMAP, (f"{place}{MODEL_MARK}",), read_colmap)
-        for place in ("colmap/sparse/*/", "colmap/sparse/", "colmap_text/", "")
-    ),
-    *rgbd.READERS,
-)
+READERS = (*colmap.READERS, *nerfstudio.READERS, *colmap.NESTED_READERS, *rgbd.READERS)
 """The formats, the preferred first: a folder of both COLMAP and nerfstudio is read as COLMAP, which has the points."""
+_OTHER_IMAGES = re.compile(r"mask|depth|segmentation|proposal|label|confidence|normal|thumb")
+"""in the name of a folder whose images are not photographs"""
 
 
 def load_capture(
@@ -67,11 +58,6 @@ def load_capture(
     return build_capture(read_posed_images(Path(path)), options, only=only, progress=progress)
 
 
-def capture_extent(path: str | Path, options: FrameOptions) -> CaptureExtent:
-    """Computes what frames `load_capture` would load, from image headers only."""
-    return planned_extent(read_posed_images(Path(path)), options)
-
-
 def read_posed_images(path: Path) -> PosedImages:
     """Reads a capture without its pixels; its images need not be there."""
     reader = _find_reader(path)
@@ -89,12 +75,39 @@ def _find_reader(path: Path) -> Reader | None:
 def has_depth(path: Path) -> bool:
     """Whether a capture names depth maps; False also for any path that cannot be read."""
     reader = _find_reader(path)
-    if reader is None or reader.name == _COLMAP:
+    if reader is None or reader.name == "COLMAP":
         return False
     try:
         return any(image.depth is not None for image in read_posed_images(path).images)
     except InputError:
         return False
+
+
+def list_photographs(path: Path) -> list[Path]:
+    """Lists the photographs of a folder, or of its images/, in name order.
+
+    If none lies directly in the folder, those of its subfolders are listed (cam0/, cam1/), except in folders of masks
+    or depth, masks named like the photograph beside them (a.jpg.png), and output of jsecon.
+    """
+    folder = path / "images" if (path / "images").is_dir() else path
+    if not folder.is_dir():
+        return []
+    direct = sorted(file for file in folder.iterdir() if _is_image(file) and file.is_file())
+    if direct:
+        return direct
+    images = [file for file in list_files(folder) if _is_image(file)]
+    masked = {image.with_suffix("") for image in images}.intersection(images)
+    return [
+        file
+        for file in images
+        if file.with_suffix("") not in masked
+        and not any(_OTHER_IMAGES.search(part.lower()) for part in file.relative_to(folder).parts[:-1])
+    ]
+
+
+def _is_image(file: Path) -> bool:
+    """Whether a file is named like a visible image."""
+    return file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".")
 
 
 def unposed_photographs(path: Path) -> list[Path]:

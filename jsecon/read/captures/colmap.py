@@ -8,6 +8,8 @@ package, and ends the process on a damaged file.
 
 from __future__ import annotations
 
+import functools
+import io
 import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,13 +20,14 @@ from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from jsecon.errors import InputError
-from jsecon.files import path_within, read_text
+from jsecon.files import path_within, read_text, reading
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.read.captures.frames import PosedImage, PosedImages
 from jsecon.read.captures.images import find_image
 from jsecon.read.captures.lens import Lens
+from jsecon.read.registry import Reader
 
-MODEL_MARK = "cameras.[bt][ix][nt]"
+_MARK = "cameras.[bt][ix][nt]"
 """cameras.bin or cameras.txt, which every model has"""
 _PARAMETERS = {
     "SIMPLE_PINHOLE": 3,
@@ -53,34 +56,22 @@ _REMEDY = "Copy the model again, or export it anew with colmap model_converter."
 _UNDISTORT = "Run colmap image_undistorter and load its output."
 
 
-def _find_models(path: Path) -> list[Path]:
-    """Folders of the COLMAP models of a capture, the one with the most images first.
-
-    They lie in sparse/0, sparse/1, ... or in sparse itself; else where nerfstudio (colmap/sparse) and instant-ngp
-    (colmap_text) put them, or in the folder itself.
-    """
-    for places in (("sparse/*", "sparse"), ("colmap/sparse/*", "colmap/sparse"), ("colmap_text",), ("",)):
-        models = [file.parent for place in places for file in path.glob(f"{place}/{MODEL_MARK}".lstrip("/"))]
-        if models:
-            models = sorted(set(models), key=lambda model: (not model.name.isdecimal(), len(model.name), model))
-            return sorted(models, key=_count_images, reverse=True) if len(models) > 1 else models
-    raise InputError(path, "it holds no COLMAP model", "cameras.bin or cameras.txt", "Check the path.")
-
-
-def read_colmap(path: Path) -> PosedImages:
-    """Reads the posed images and sparse points of the largest COLMAP model of a capture's folder.
+def _read_colmap(places: Sequence[str], path: Path) -> PosedImages:
+    """Reads the posed images and sparse points of the largest COLMAP model of a capture's folder, in some places.
 
     The images lie in images/, in the folder itself or in input/.
     """
-    models = _find_models(path)
-    model, notes = models[0], []
-    if len(models) > 1:
-        largest, *others = (f"{place.relative_to(path)} with {_count_images(place)} images" for place in models)
+    found = {file.parent for place in places for file in path.glob(place + _MARK)}
+    found = sorted(found, key=lambda model: (not model.name.isdecimal(), len(model.name), model))
+    models, notes = {model: _read_images(model) for model in found}, []
+    model, *others = sorted(models, key=lambda model: -len(models[model]))
+    if others:
+        largest, *rest = (f"{place.relative_to(path)} with {len(models[place])} images" for place in (model, *others))
         notes.append(
-            f"There are {len(models)} models. The largest, {largest}, is used; left out: {', '.join(others)}. "
+            f"There are {len(models)} models. The largest, {largest}, is used; left out: {', '.join(rest)}. "
             "Join them (colmap model_merger), or take photographs between them, to use all."
         )
-    lenses, images = _read_cameras(model), _read_images(model)
+    lenses, images = _read_cameras(model), models[model]
     files = _find_images(path, [name for name, _, _ in images])
     posed = []
     for name, camera, pose in images:
@@ -95,7 +86,7 @@ def read_colmap(path: Path) -> PosedImages:
 
 def _model_file(model: Path, kind: str) -> Path | None:
     """The binary or text file of a kind, or None."""
-    return next((model / (kind + ending) for ending in (".bin", ".txt") if (model / (kind + ending)).is_file()), None)
+    return next((file for end in (".bin", ".txt") if (file := model / (kind + end)).is_file()), None)
 
 
 def _require_file(model: Path, kind: str) -> Path:
@@ -119,42 +110,13 @@ def _find_images(path: Path, names: Sequence[str]) -> dict[str, Path]:
     return some
 
 
-class _BinaryReader:
-    """Reads a binary file from front to back, with one clear error if it ends too early."""
+_reading = functools.partial(reading, remedy=_REMEDY, problem="the file is damaged or breaks off")
+"""makes errors in reading a binary file InputErrors"""
 
-    def __init__(self, file: Path):
-        self.file, self.data, self.offset = file, file.read_bytes(), 0
 
-    def truncated(self) -> InputError:
-        """The error of a file that ends too early."""
-        return InputError(self.file, f"the file breaks off after {len(self.data)} bytes", remedy=_REMEDY)
-
-    def take(self, form: str) -> tuple:
-        """The next values of a struct format."""
-        size = struct.calcsize("<" + form)
-        self.skip(size)
-        return struct.unpack_from("<" + form, self.data, self.offset - size)
-
-    def records(self, min_size: int) -> range:
-        """As many records as the file announces next; checks that so many of `min_size` bytes fit."""
-        (count,) = self.take("Q")
-        if count * min_size > len(self.data) - self.offset:
-            raise self.truncated()
-        return range(count)
-
-    def skip(self, size: int) -> None:
-        """Skips bytes."""
-        if size < 0 or self.offset + size > len(self.data):
-            raise self.truncated()
-        self.offset += size
-
-    def name(self) -> str:
-        """The next text, up to a zero byte."""
-        end = self.data.find(b"\0", self.offset)
-        if end < 0:
-            raise self.truncated()
-        name, self.offset = self.data[self.offset : end], end + 1
-        return name.decode("utf-8", "surrogateescape")
+def _take(stream: io.BytesIO, form: str) -> tuple:
+    """The next values of a struct format; raises struct.error at the end of the file."""
+    return struct.unpack("<" + form, stream.read(struct.calcsize("<" + form)))
 
 
 def _parse_lines(
@@ -185,21 +147,17 @@ def _parse_lines(
 
 def _lens(file: Path, model: str, width: int, height: int, parameters: tuple[float, ...]) -> Lens:
     """The lens of a camera of a model file."""
-    if model not in _PARAMETERS:
-        known = ", ".join(name for name in _PARAMETERS if name != "EQUIRECTANGULAR")
-        raise InputError(file, f"the camera model {model} is unknown", f"one of {known}", _UNDISTORT)
     if model == "EQUIRECTANGULAR":
         remedy = "Cut perspective views out of the panoramas (colmap panorama_sfm.py does) and load those."
         raise InputError(file, f"the camera model {model} sees all around, which is not supported", remedy=remedy)
+    if model not in _PARAMETERS:
+        known = ", ".join(name for name in _PARAMETERS if name != "EQUIRECTANGULAR")
+        raise InputError(file, f"the camera model {model} is unknown", f"one of {known}", _UNDISTORT)
     if len(parameters) != _PARAMETERS[model]:
         raise InputError(file, f"a {model} camera has {len(parameters)} parameters", str(_PARAMETERS[model]), _REMEDY)
     focals = 1 if model.startswith("SIMPLE_") or model in ("RADIAL", "RADIAL_FISHEYE") else 2
     fx, fy = parameters[0], parameters[focals - 1]
     cx, cy, *distortion = parameters[focals:]
-    is_valid = fx > 0 and fy > 0 and 0 < width < 1 << 31 and 0 < height < 1 << 31
-    if not (is_finite_and_bounded(parameters) and is_valid):
-        problem = f"a camera of {width}x{height} px has the parameters {parameters}"
-        raise InputError(file, problem, "positive size and focal length", "Estimate the cameras again.")
     model = model.removeprefix("SIMPLE_")
     projection = model if model in _PYCOLMAP else None
     is_fisheye = "FISHEYE" in model and projection is None
@@ -216,13 +174,16 @@ def _read_cameras(model: Path) -> dict[int, Lens]:
 
     if file.suffix == ".txt":
         return dict(_parse_lines(file, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS", parse))
-    data, lenses, names = _BinaryReader(file), {}, list(_PARAMETERS)
-    for _ in data.records(48):
-        camera, number, width, height = data.take("iiQQ")
-        if not 0 <= number < len(names):
-            expected = f"one of 0 to {len(names) - 1} (COLMAP 4.2)"
-            raise InputError(file, f"the unknown camera model number {number}", expected, _UNDISTORT)
-        lenses[camera] = _lens(file, names[number], width, height, data.take(f"{_PARAMETERS[names[number]]}d"))
+    lenses, names = {}, list(_PARAMETERS)
+    with _reading(file):
+        stream = io.BytesIO(file.read_bytes())
+        for _ in range(*_take(stream, "Q")):
+            camera, number, width, height = _take(stream, "iiQQ")
+            if not 0 <= number < len(names):
+                expected = f"one of 0 to {len(names) - 1} (COLMAP 4.2)"
+                raise InputError(file, f"the unknown camera model number {number}", expected, _UNDISTORT)
+            parameters = _take(stream, f"{_PARAMETERS[names[number]]}d")
+            lenses[camera] = _lens(file, names[number], width, height, parameters)
     return lenses
 
 
@@ -249,12 +210,17 @@ def _read_images(model: Path) -> list[tuple[str, int, np.ndarray]]:
 
     if file.suffix == ".txt":
         return _parse_lines(file, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", parse, _are_observations)
-    data, images = _BinaryReader(file), []
-    for _ in data.records(73):
-        _, *numbers, camera = data.take("i7di")
-        name = data.name()
-        images.append((name, camera, _pose(file, name, tuple(numbers))))
-        data.skip(24 * data.take("Q")[0])
+    images = []
+    with _reading(file):
+        data = file.read_bytes()
+        stream = io.BytesIO(data)
+        for _ in range(*_take(stream, "Q")):
+            _, *numbers, camera = _take(stream, "i7di")
+            encoded = data[stream.tell() : data.index(0, stream.tell())]
+            name = encoded.decode("utf-8", "surrogateescape")
+            images.append((name, camera, _pose(file, name, tuple(numbers))))
+            stream.seek(len(encoded) + 1, 1)
+            _take(stream, f"{24 * _take(stream, 'Q')[0]}x")
     return images
 
 
@@ -264,17 +230,6 @@ def _are_observations(line: str) -> bool:
     Some programs omit these lines. An image's first line has 10 words, or more if its name has spaces.
     """
     return not line.strip("0123456789+-.eE \t") and len(line.split()) % 3 == 0
-
-
-def _count_images(model: Path) -> int:
-    """Number of images of a model; 0 if the file is missing."""
-    file = _model_file(model, "images")
-    if file is None:
-        return 0
-    if file.suffix == ".txt":
-        return len(_read_images(model))
-    with file.open("rb") as stream:
-        return int.from_bytes(stream.read(8), "little")
 
 
 def _read_points(model: Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
@@ -302,16 +257,23 @@ def _parse_point(line: str) -> tuple[float, float, float, int, int, int]:
 
 def _read_binary_points(file: Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
     """Positions and colours of points3D.bin."""
-    data, head = _BinaryReader(file), struct.calcsize("<Q3d3BdQ")
-    raw, count = data.data, len(data.records(head))
-    # Tracks make the records differ in length: a short loop finds where each begins, NumPy reads them all.
-    starts, offset, track = np.empty(count, np.int64), data.offset, struct.Struct("<Q")
-    for index in range(count):
-        if offset + head > len(raw):
-            raise data.truncated()
-        starts[index] = offset
-        offset += head + 8 * track.unpack_from(raw, offset + head - 8)[0]
-    if offset > len(raw):
-        raise data.truncated()
-    heads = np.frombuffer(raw, np.uint8)[starts[:, None] + np.arange(8, 35)]
+    with _reading(file):
+        raw, starts, offset = file.read_bytes(), [], 8
+        # Tracks make the records differ in length: a short loop finds where each begins, NumPy reads them all.
+        for _ in range(*struct.unpack_from("<Q", raw)):
+            starts.append(offset)
+            offset += 51 + 8 * struct.unpack_from("<Q", raw, offset + 43)[0]
+        if offset > len(raw):
+            raise EOFError
+        heads = np.frombuffer(raw, np.uint8)[np.array(starts, np.int64)[:, None] + np.arange(8, 35)]
     return np.ascontiguousarray(heads[:, :24]).view("<f8"), np.ascontiguousarray(heads[:, 24:])
+
+
+def _rows(*places: str) -> tuple[Reader, ...]:
+    """The readers of models in some places of a capture's folder."""
+    return tuple(Reader("COLMAP", (place + _MARK,), functools.partial(_read_colmap, places)) for place in places)
+
+
+READERS = _rows("sparse/*/", "sparse/")
+NESTED_READERS = (*_rows("colmap/sparse/*/", "colmap/sparse/"), *_rows("colmap_text/"), *_rows(""))
+"""of models in places that nerfstudio and instant-ngp use beside a transforms.json, which goes first; or no folder"""

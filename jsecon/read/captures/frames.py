@@ -6,7 +6,6 @@ import collections
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -14,7 +13,6 @@ from jaxtyping import Bool, Float, UInt8
 from jsecon.errors import InputError
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.read.captures.lens import Lens
-from jsecon.types import ImageFile
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,19 +51,6 @@ class PosedImages:
     """Whether the program that found the poses takes images as they are stored, as COLMAP does."""
 
 
-class CaptureExtent(NamedTuple):
-    """Number, size and names of a capture's frames."""
-
-    frames: int
-    """Number of frames."""
-    size: tuple[int, int]
-    """(width, height) of the frames, px."""
-    names: tuple[str, ...]
-    """Names of the frames."""
-    files: tuple[ImageFile, ...]
-    """Image of each frame."""
-
-
 @dataclasses.dataclass(frozen=True)
 class FrameOptions:
     """Which frames of a capture are loaded, and their size.
@@ -84,15 +69,16 @@ class FrameOptions:
 
     def __post_init__(self) -> None:
         """Raises InputError if no capture can be loaded with one of the options."""
-        if self.downscale is not None and not (np.isfinite(self.downscale) and self.downscale >= 1):
-            raise InputError("downscale", str(self.downscale), "a number of at least 1", "2 halves width and height.")
-        if self.long_side is not None and self.long_side < 1:
-            raise InputError("long_side", str(self.long_side), "at least 1 px", "400 is the default.")
-        if self.frames is not None and self.frames < 1:
-            raise InputError("frames", str(self.frames), "at least 1", "Leave it out to take every frame.")
-        if self.holdout is not None and (self.holdout < 0 or self.holdout == 1):
-            remedy = "8 is the custom; 1 leaves no frame to fit to."
-            raise InputError("holdout", str(self.holdout), "0 (no frame), or at least 2 (every second)", remedy)
+        every = "0 (no frame), or at least 2 (every second)"
+        for name, is_valid, expected, remedy in (
+            ("downscale", lambda v: np.isfinite(v) and v >= 1, "a number of at least 1", "2 halves width and height."),
+            ("long_side", lambda v: v >= 1, "at least 1 px", "400 is the default."),
+            ("frames", lambda v: v >= 1, "at least 1", "Leave it out to take every frame."),
+            ("holdout", lambda v: v == 0 or v > 1, every, "8 is the custom; 1 leaves no frame to fit to."),
+        ):
+            value = getattr(self, name)
+            if value is not None and not is_valid(value):
+                raise InputError(name, str(value), expected, remedy)
 
     def size(self, size: tuple[int, int]) -> tuple[int, int]:
         """Computes (width, height) of the frames of images of a size, px."""
@@ -105,6 +91,12 @@ def evenly_spaced(count: int, limit: int | None) -> np.ndarray:
     if limit is None or limit >= count:
         return np.arange(count)
     return np.unique(np.linspace(0, count - 1, limit).round().astype(int))
+
+
+def same_aspect(size: tuple[int, ...], other: tuple[int, ...]) -> bool:
+    """Whether two sizes (width, height) have one aspect, to a pixel of the coarser of the two, which was rounded."""
+    (width, height), (columns, rows) = size, other
+    return min(abs(columns * height / rows - width), abs(width * rows / height - columns)) <= 1
 
 
 def holdout_mask(count: int, every: int | None) -> Bool[np.ndarray, " t"]:

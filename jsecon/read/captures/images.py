@@ -16,15 +16,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt, UInt8
-from PIL import Image
-from PIL.BmpImagePlugin import BmpImageFile
+from PIL import BmpImagePlugin, Image, JpegImagePlugin, PngImagePlugin, TiffImagePlugin, WebPImagePlugin
 from PIL.ImageFile import ImageFile
-from PIL.JpegImagePlugin import JpegImageFile
-from PIL.PngImagePlugin import PngImageFile
-from PIL.TiffImagePlugin import TiffImageFile
-from PIL.WebPImagePlugin import WebPImageFile
 
-from jsecon.errors import InputError, describe_error
+from jsecon.errors import InputError
 from jsecon.files import atomic_write, map_npy, reading
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif")
@@ -32,59 +27,42 @@ IMAGE_SUFFIXES += tuple(suffix.upper() for suffix in IMAGE_SUFFIXES)
 """suffixes tried, in this order, if a capture names an image without one"""
 MAX_PIXELS = 1 << 27
 """pixels of an image: 134 million"""
-_TRANSPOSED = (5, 6, 7, 8)
-"""EXIF orientations that swap width and height"""
 _DECODERS: dict[bytes, type[ImageFile]] = {
-    b"\x89PNG": PngImageFile,
-    b"\xff\xd8": JpegImageFile,
-    b"RIFF": WebPImageFile,
-    b"BM": BmpImageFile,
-    b"II*\0": TiffImageFile,
-    b"MM\0*": TiffImageFile,
+    b"\x89PNG": PngImagePlugin.PngImageFile,
+    b"\xff\xd8": JpegImagePlugin.JpegImageFile,
+    b"RIFF": WebPImagePlugin.WebPImageFile,
+    b"BM": BmpImagePlugin.BmpImageFile,
+    b"II*\0": TiffImagePlugin.TiffImageFile,
+    b"MM\0*": TiffImagePlugin.TiffImageFile,
 }
 """first bytes of a file -> Pillow's decoder"""
 _ORIENTATION = 0x0112
-"""EXIF tag: 1 is upright; 6, the commonest of a phone held upright, asks for a turn clockwise by 90 degrees"""
-_MODES = {"1": "L"} | dict.fromkeys(("RGBA", "PA", "LA", "La", "RGBa"), "RGBA")
-_MODES |= {mode: mode for mode in ("L", "I;16", "I;16B", "I", "F")}
-"""Pillow's mode of a file -> mode of the returned pixels; others become RGB"""
+"""EXIF tag: 1 is upright; 6, the commonest of a phone held upright, asks for a turn clockwise by 90 degrees. From 5
+on they swap width and height."""
 
 
 @contextlib.contextmanager
 def _open(path: Path) -> Iterator[ImageFile]:
     """Opens an image; only its header is read. Errors of the decoder in the body of the `with` become InputErrors."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(12)
-            file.seek(0)
-            if not head:
-                raise ValueError("the file is empty")
-            decoder = next((kind for magic, kind in _DECODERS.items() if head.startswith(magic)), None)
-            if decoder is None and head[4:12] in (b"ftypheic", b"ftypheix", b"ftypmif1", b"ftyphevc"):
-                decoder = _heic_decoder(path)
-            if decoder is None:
-                raise ValueError("it is not an image of a known kind")
-            with decoder(file) as image:
-                if isinstance(image, JpegImageFile) and image.width * image.height > MAX_PIXELS:
-                    image.draft(None, (image.width // 2, image.height // 2))
-                if image.width * image.height > MAX_PIXELS:
-                    problem = f"the image has {image.width}x{image.height} pixels"
-                    remedy = "Shrink it, for instance to half its width and height."
-                    raise InputError(path, problem, f"at most {MAX_PIXELS // 10**6} million", remedy)
-                yield image
-    except InputError:
-        raise
-    except OSError as error:
-        if error.errno is not None:
-            raise InputError(path, describe_error(error), remedy="Check the path.") from error
-        raise _damaged(path, error) from error
-    except Exception as error:  # Pillow's errors have no other common base
-        raise _damaged(path, error) from error
-
-
-def _damaged(path: Path, error: Exception) -> InputError:
-    problem = f"the image cannot be read ({describe_error(error)})"
-    return InputError(path, problem, remedy="Copy or export the file again.")
+    again = "Copy or export the file again."
+    with reading(path, remedy=again, problem="the image cannot be read"), path.open("rb") as file:
+        head = file.read(12)
+        file.seek(0)
+        if not head:
+            raise ValueError("the file is empty")
+        decoder = next((kind for magic, kind in _DECODERS.items() if head.startswith(magic)), None)
+        if decoder is None and head[4:12] in (b"ftypheic", b"ftypheix", b"ftypmif1", b"ftyphevc"):
+            decoder = _heic_decoder(path)
+        if decoder is None:
+            raise ValueError("it is not an image of a known kind")
+        with decoder(file) as image:
+            if image.format == "JPEG" and image.width * image.height > MAX_PIXELS:
+                image.draft(None, (image.width // 2, image.height // 2))
+            if image.width * image.height > MAX_PIXELS:
+                problem = f"the image has {image.width}x{image.height} pixels"
+                remedy = "Shrink it, for instance to half its width and height."
+                raise InputError(path, problem, f"at most {MAX_PIXELS // 10**6} million", remedy)
+            yield image
 
 
 def _heic_decoder(path: Path) -> type[ImageFile]:
@@ -98,20 +76,18 @@ def _heic_decoder(path: Path) -> type[ImageFile]:
 
 
 def _orientation(image: ImageFile) -> int:
-    """EXIF's orientation of the pixels that Pillow returns, 1 to 8; 1 for HEIC, whose decoder turns them itself."""
-    if isinstance(image, TiffImageFile):
-        value = image.tag_v2.get(_ORIENTATION, 1)
-    else:
-        tags = Image.Exif()
+    """EXIF's orientation, 1 to 8, of pixels that Pillow returns as they are stored: it turns TIFF and HEIC itself."""
+    tags = Image.Exif()
+    if image.format in ("JPEG", "PNG", "WEBP"):
         with contextlib.suppress(Exception):  # damaged EXIF turns nothing
             tags.load(image.info.get("exif", b""))
-        value = tags.get(_ORIENTATION, 1) if isinstance(image, tuple(_DECODERS.values())) else 1
+    value = tags.get(_ORIENTATION, 1)
     return value if value in range(1, 9) else 1
 
 
-def _apply_orientation(image: np.ndarray, orientation: int) -> np.ndarray:
+def apply_orientation(image: np.ndarray, orientation: int) -> np.ndarray:
     """Turns stored pixels (H, W, ...) upright, by their EXIF orientation."""
-    if orientation in _TRANSPOSED:
+    if orientation > 4:
         image = image.swapaxes(0, 1)
     if orientation in (2, 3, 6, 7):
         image = image[:, ::-1]
@@ -126,19 +102,18 @@ def _decode(path: Path, *, upright: bool = True, native: bool = False) -> tuple[
     `native` keeps the indices of a palette, and colours that are declared transparent. Also returns the closed image.
     """
     with _open(path) as image:
-        if isinstance(image, PngImageFile):
-            with PngImageFile(path) as copy:
+        if image.format == "PNG":
+            with PngImagePlugin.PngImageFile(path) as copy:
                 copy.verify()  # compares the checksums, and leaves an image that cannot be decoded
         orientation = _orientation(image)
         image.load()
-        mode = image.mode if native else _MODES.get(image.mode, "RGB")
-        if mode in ("L", "RGB") and "transparency" in image.info and not native:
+        is_kept = native or image.mode in ("L", "I;16", "I;16B", "I", "F")
+        mode = image.mode if is_kept else "RGB"
+        if image.has_transparency_data and not native:
             mode = "RGBA"
         pixels = np.asarray(image if mode == image.mode else image.convert(mode))
         pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
-        if isinstance(image, TiffImageFile):  # Pillow has turned it
-            return pixels if upright else _apply_orientation(pixels, {6: 8, 8: 6}.get(orientation, orientation)), image
-        return _apply_orientation(pixels, orientation) if upright else pixels, image
+        return apply_orientation(pixels, orientation) if upright else pixels, image
 
 
 def find_image(folder: Path, name: str) -> Path | None:
@@ -156,27 +131,32 @@ def find_image(folder: Path, name: str) -> Path | None:
     return None
 
 
-class ImageHeader(NamedTuple):
-    """Size and orientation of an image file."""
+class _ImageHeader(NamedTuple):
+    """Sizes (width, height), px, and EXIF orientation of an image file."""
 
     stored: tuple[int, int]
-    """(width, height) of the stored pixels, px."""
+    upright: tuple[int, int]
+    """The size once the orientation is applied."""
     orientation: int
-    """EXIF's, 1 to 8."""
-
-    @property
-    def upright(self) -> tuple[int, int]:
-        """(width, height) once the orientation is applied, px."""
-        width, height = self.stored
-        return (height, width) if self.orientation in _TRANSPOSED else (width, height)
+    """1 to 8."""
 
 
-def image_header(path: str | Path) -> ImageHeader:
+def image_header(path: str | Path) -> _ImageHeader:
     """Reads size and orientation of an image file, from its header alone."""
     with _open(Path(path)) as image:
-        orientation, (width, height) = _orientation(image), image.size
-        is_swapped = isinstance(image, TiffImageFile) and orientation in _TRANSPOSED
-        return ImageHeader((height, width) if is_swapped else (width, height), orientation)
+        orientation = _orientation(image)
+        return _ImageHeader(image.size, image.size[::-1] if orientation > 4 else image.size, orientation)
+
+
+def size_around(path: Path, cx: object, cy: object) -> tuple[int, int]:
+    """Reads (width, height), px, of an image, stored or upright: of which a principal point lies nearer to the middle.
+
+    It is the upright size if the point is not known, that is not of numbers.
+    """
+    header = image_header(path)
+    if not isinstance(cx, int | float) or not isinstance(cy, int | float):
+        return header.upright
+    return min(header.upright, header.stored, key=lambda size: abs(2 * cx - size[0]) + abs(2 * cy - size[1]))
 
 
 def read_pixels(path: Path, *, upright: bool = True) -> np.ndarray:
@@ -222,8 +202,7 @@ def read_label_image(path: str | Path) -> Int[np.ndarray, "h w"]:
     """Reads the ids of a label image (.png or .npy).
 
     A grey PNG of 1 to 16 bits has its values as ids; a palette PNG the indices into it, never its colours; an RGB PNG
-    of 8 bits R*65536 + G*256 + B. Fully transparent pixels are 0; if all colours are black, the opaque pixels are the
-    mask. A .npy has whole numbers or booleans (H, W), negative where there is no label.
+    of 8 bits R*65536 + G*256 + B. A .npy has whole numbers or booleans (H, W), negative where there is no label.
     """
     path = Path(path)
     if path.suffix.lower() == ".npy":
@@ -231,7 +210,7 @@ def read_label_image(path: str | Path) -> Int[np.ndarray, "h w"]:
     expected = "ids as grey values (8 or 16 bits), palette indices or 8 bit colours"
     remedy = "Write one id per pixel as an 8 or 16 bit grey PNG without transparency, or as integers in a .npy."
     image, decoder = _decode(path, native=True)
-    if not isinstance(decoder, PngImageFile):
+    if decoder.format != "PNG":
         raise InputError(path, "the mask is not a PNG", expected, remedy)
     bits = path.read_bytes()[24]
     if image.ndim == 2:
@@ -242,12 +221,8 @@ def read_label_image(path: str | Path) -> Int[np.ndarray, "h w"]:
         raise InputError(path, f"the mask has {bits} bits in each of its channels", expected, remedy)
     colours = image.astype(np.int32)
     ids = colours[..., 0] if image.shape[2] == 2 else colours[..., :3] @ np.array([65536, 256, 1], np.int32)
-    if image.shape[2] in (2, 4):
-        alpha = image[..., -1]
-        opaque = alpha == 255
-        if not (opaque | (alpha == 0)).all():
-            raise InputError(path, "the mask has half transparent pixels", expected, remedy)
-        ids = np.where(opaque, ids, 0) if ids.any() else opaque.astype(np.int32)
+    if image.shape[2] in (2, 4) and (image[..., -1] < 255).any():
+        raise InputError(path, "the mask has transparent pixels", expected, remedy)
     return ids
 
 
@@ -260,11 +235,10 @@ def _read_id_array(path: Path) -> Int[np.ndarray, "h w"]:
     if image.ndim != 2 or not image.size:
         raise InputError(path, f"the array has shape {image.shape}", expected, remedy)
     with np.errstate(invalid="ignore"):
-        is_whole = image.dtype.kind in "biu" or bool((image == np.floor(image)).all())
-        is_bounded = bool((image < 1 << 62).all() and (image > -(1 << 62)).all())
-    if not (is_whole and is_bounded):
+        ids = image.astype(np.int64)
+    if (ids != image).any():
         raise InputError(path, "the array has numbers that are not ids", expected, remedy)
-    return image.astype(np.int64)
+    return ids
 
 
 def read_depth(path: str | Path, unit: float) -> Float[np.ndarray, "h w"]:

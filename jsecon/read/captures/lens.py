@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jsecon.errors import InputError
+from jsecon.numerics import is_finite_and_bounded
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +43,14 @@ class Lens:
     model: str | None = None
     """one of COLMAP's models with two focal lengths that OpenCV does not have; None: OpenCV's, see `fisheye`."""
 
+    def __post_init__(self) -> None:
+        """Raises ValueError if no image can have been taken with it."""
+        numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        has_size = 0 < self.width < 1 << 31 and 0 < self.height < 1 << 31
+        if not (has_size and is_finite_and_bounded(numbers) and min(self.fx, self.fy) >= 1e-3):
+            size = f"{self.width}x{self.height}"
+            raise ValueError(f"a camera of {size} px has focal lengths, centre and distortion {numbers}")
+
     @property
     def distorted(self) -> bool:
         """Whether its images must be resampled before they are those of a pinhole."""
@@ -60,10 +69,9 @@ def _colmap_camera(lens: Lens) -> Any:
     try:
         import pycolmap
     except ImportError as error:
+        problem = "this camera model needs pycolmap, which is not installed"
         remedy = "Run: pip install 'jsecon[sfm]' (or undistort the images: colmap image_undistorter)."
-        raise InputError(
-            lens.model, "this camera model needs pycolmap, which is not installed", remedy=remedy
-        ) from error
+        raise InputError(lens.model, problem, remedy=remedy) from error
     parameters = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
     return pycolmap.Camera(model=lens.model, width=lens.width, height=lens.height, params=parameters)
 
@@ -96,9 +104,9 @@ def _covered(lens: Lens, zoom: float) -> bool:
     Looks along rays from the principal point to the border: the distorted radius must grow all the way (a polynomial
     folds back beyond its range, which would show the same pixels twice) and end inside the image.
     """
-    across, down = np.linspace(0, lens.width, 48), np.linspace(0, lens.height, 48)
-    edges = [(across, 0 * across), (across, 0 * across + lens.height), (0 * down, down), (0 * down + lens.width, down)]
-    border = np.concatenate([np.stack(edge, -1) for edge in edges])
+    share = np.linspace(0, 1, 48)[:, None]
+    border = np.concatenate([share * [1, 0], share * [1, 0] + [0, 1], share * [0, 1], share * [0, 1] + [1, 0]])
+    border *= [lens.width, lens.height]
     ends = (border - [lens.cx, lens.cy]) / [lens.fx * zoom, lens.fy * zoom]
     rays = ends[:, None] * np.linspace(0, 1, 65)[:, None]
     pixels = _distort(lens, rays.reshape(-1, 2)).reshape(rays.shape)

@@ -18,8 +18,9 @@ from jsecon.errors import InputError
 from jsecon.files import read_json, reading
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.read.captures.frames import PosedImage, PosedImages, make_rigid
-from jsecon.read.captures.images import find_image, image_header
+from jsecon.read.captures.images import find_image, size_around
 from jsecon.read.captures.lens import Lens
+from jsecon.read.registry import Reader
 from jsecon.read.splats.ply import load_point_cloud
 
 _PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE"}
@@ -27,7 +28,7 @@ _FISHEYE = {"OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEY
 _REMEDY = "Write the file anew (ns-process-data, colmap2nerf.py)."
 
 
-def read_nerfstudio(path: Path) -> PosedImages:
+def _read_nerfstudio(path: Path) -> PosedImages:
     """Reads the posed images of a transforms.json, or of the folder that holds one, with their depth and points."""
     file = path / "transforms.json" if path.is_dir() else path
     content = read_json(file, "a transforms.json", _REMEDY)
@@ -41,13 +42,13 @@ def read_nerfstudio(path: Path) -> PosedImages:
                 image = find_image(file.parent, name)
                 # From OpenGL's axes of the camera to OpenCV's.
                 pose = make_rigid(_matrix(entry["transform_matrix"]) * [1, -1, -1, 1], file, name)
-                lens = _lens(file, {**content, **entry}, name, image)
+                lens = _lens({**content, **entry}, image)
                 depth = None if image is None else _named_file(file, entry, "depth_file_path")
                 full_name = _full_name(name, image)
                 images.append(PosedImage(full_name, image, lens, np.linalg.inv(pose), depth, unit))
         if any("mask_path" in entry for entry in content["frames"]):
             notes.append("The masks named by mask_path (pixels to ignore) were not used.")
-        source_from_poses = _source_from_poses(file, content, scale)
+        source_from_poses = _source_from_poses(content, scale)
         cloud = _named_file(file, content, "ply_file_path")
     points = () if cloud is None else load_point_cloud(cloud)
     return PosedImages(images, file, *points, source_from_poses=source_from_poses, notes=tuple(notes))
@@ -95,7 +96,7 @@ def source_from_trained(file: Path) -> Float[np.ndarray, "4 4"]:
         )
 
 
-def _source_from_poses(file: Path, content: dict[str, Any], scale: float) -> np.ndarray:
+def _source_from_poses(content: dict[str, Any], scale: float) -> np.ndarray:
     """(4, 4) inverse of world = applied_scale * (applied_transform source)."""
     matrix = _matrix(content.get("applied_transform", np.eye(4)))
     if not is_finite_and_bounded(matrix):
@@ -104,8 +105,7 @@ def _source_from_poses(file: Path, content: dict[str, Any], scale: float) -> np.
     size = np.abs(scaled[:3, :3]).max()
     turn = scaled[:3, :3] / size if size > 0 else np.zeros((3, 3))
     if not (np.linalg.det(turn) > 0 and np.allclose(turn @ turn.T, (turn @ turn.T)[0, 0] * np.eye(3), atol=1e-3)):
-        problem = "applied_transform or applied_scale cannot be inverted, or shears or mirrors"
-        raise InputError(file, problem, "a rotation, a scale and a shift", _REMEDY)
+        raise ValueError("applied_transform or applied_scale cannot be inverted, or shears or mirrors")
     return np.linalg.inv(scaled)
 
 
@@ -115,35 +115,30 @@ def _full_name(name: str, image: Path | None) -> str:
     return name if image is None or name.lower().endswith(image.suffix.lower()) else name + image.suffix
 
 
-def _lens(file: Path, keys: dict[str, Any], name: str, image: Path | None) -> Lens | None:
+def _lens(keys: dict[str, Any], image: Path | None) -> Lens | None:
     """The lens of a frame by its keys and, after them, those of the file; None if neither gives its size."""
-    undistort = "Undistort the images first."
     model = str(keys.get("camera_model", "OPENCV")).upper()
     if model not in _PERSPECTIVE | _FISHEYE:
         known = ", ".join(sorted(_PERSPECTIVE | _FISHEYE))
-        raise InputError(file, f"camera_model {model}", f"one of {known}", undistort)
+        raise ValueError(f"camera_model {model} is none of {known}: undistort the images first")
     if other := next((key for key in ("ftheta_p0", "latlong", "equirectangular") if keys.get(key)), None):
-        problem = f"the lens of {name} is one of instant-ngp's own ({other})"
-        raise InputError(file, problem, "a perspective or an OpenCV fisheye lens", undistort)
+        raise ValueError(f"its lens is one of instant-ngp's own, {other}: undistort the images first")
     is_fisheye = model in _FISHEYE or keys.get("is_fisheye") is True
     if keys.get("w") is not None and keys.get("h") is not None:
         width, height = (round(_number(keys, key, 0.0)) for key in ("w", "h"))
     elif image is not None:
-        width, height = image_header(image).upright
+        width, height = size_around(image, keys.get("cx"), keys.get("cy"))
     else:
         return None
     fx, fy = _focal(keys, "fl_x", "camera_angle_x", width), _focal(keys, "fl_y", "camera_angle_y", height)
     fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
     if fx is None or fy is None:
         raise ValueError("it has no focal length: fl_x or camera_angle_x, in the file or the frame")
-    if min(width, height, fx, fy) <= 0:
-        raise ValueError(f"it has {width}x{height} px and focal lengths {fx}, {fy}")
     order = ("k1", "k2", "k3", "k4") if is_fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
     distortion = tuple(_number(keys, key, 0.0) for key in order)
     if model == "OPENCV" and not is_fisheye and distortion[5] != 0:
         # nerfstudio's OPENCV has k1..k4 in one polynomial; OpenCV's own k4 divides. Not the same lens: refuse to guess.
-        problem = f"k4 = {keys['k4']} with camera_model OPENCV"
-        raise InputError(file, problem, "k1 k2 p1 p2 k3, or FULL_OPENCV", undistort)
+        raise ValueError(f"k4 = {keys['k4']} with camera_model OPENCV: undistort the images first, or use FULL_OPENCV")
     cx, cy = _number(keys, "cx", width / 2), _number(keys, "cy", height / 2)
     return Lens(width, height, fx, fy, cx, cy, distortion, is_fisheye)
 
@@ -158,3 +153,6 @@ def _focal(keys: dict[str, Any], direct: str, angle: str, size: int) -> float | 
             raise ValueError(f"{angle} = {value}, which is no angle between 0 and pi (radians)")
         return 0.5 * size / math.tan(0.5 * value)
     return None
+
+
+READERS = tuple(Reader("nerfstudio", (mark,), _read_nerfstudio) for mark in ("transforms.json", ".json"))

@@ -18,9 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from jsecon.errors import InputError
 from jsecon.files import parse_json, read_text, reading
-from jsecon.numerics import is_finite_and_bounded
 from jsecon.read.captures.frames import PosedImage, PosedImages, make_rigid
-from jsecon.read.captures.images import MAX_PIXELS, image_header
+from jsecon.read.captures.images import find_image, image_header, size_around
 from jsecon.read.captures.lens import Lens
 from jsecon.read.registry import Reader
 
@@ -56,12 +55,6 @@ def _list_images(folder: Path) -> list[Path]:
     return images
 
 
-def _sibling(folder: Path, stem: str, suffix: str) -> Path:
-    """The file of a frame, also with its suffix in upper case."""
-    upper = folder / f"{stem}{suffix.upper()}"
-    return upper if upper.is_file() else folder / f"{stem}{suffix}"
-
-
 def _matrix(rotation: Rotation, translation: np.ndarray) -> Float[np.ndarray, "4 4"]:
     """A pose."""
     pose = np.eye(4)
@@ -72,21 +65,18 @@ def _matrix(rotation: Rotation, translation: np.ndarray) -> Float[np.ndarray, "4
 def _lens(width: Any, height: Any, *intrinsics: Any) -> Lens:
     """A pinhole lens of fx, fy, cx, cy as a file has them.
 
-    Raises ValueError if the frame has no pixels or focal length, or its principal point lies outside: the intrinsics
-    then are those of another size.
+    Raises ValueError if the principal point lies outside: the intrinsics then are those of another size.
     """
     fx, fy, cx, cy = map(float, intrinsics)
-    has_size = 1 <= width <= MAX_PIXELS and 1 <= height <= MAX_PIXELS
-    if not (has_size and is_finite_and_bounded(intrinsics) and min(fx, fy) >= 1e-3):
-        raise ValueError(f"a frame of {width}x{height} with focal lengths {fx:g}, {fy:g}")
     if not (0 < cx < width and 0 < cy < height):
-        raise ValueError(f"a frame of {width}x{height} with its centre at {cx:g}, {cy:g}")
+        raise ValueError(
+            f"a frame of {width}x{height} with focal lengths {fx:g}, {fy:g} and its centre at {cx:g}, {cy:g}"
+        )
     return Lens(int(width), int(height), fx, fy, cx, cy)
 
 
 def _posed_image(image: Path, lens: Lens, camera_to_world: np.ndarray, depth: Path | None = None) -> PosedImage:
-    """A frame, with its depth map if that exists."""
-    depth = None if depth is None or not depth.is_file() else depth
+    """A frame."""
     world_to_camera = np.linalg.inv(make_rigid(camera_to_world, image, image.name))
     return PosedImage(image.name, image, lens, world_to_camera, depth)
 
@@ -101,10 +91,9 @@ def _posed_images(path: Path, images: list[PosedImage], count: int, *notes: str)
 def _read_scannet(path: Path) -> PosedImages:
     """Reads ScanNet's exported folders."""
     images, lenses = _list_images(path / "color"), {}
-    for kind in ("color", "depth"):
+    for kind, first in ("color", images[0]), ("depth", find_image(path / "depth", f"{images[0].stem}.png")):
         file = path / "intrinsic" / f"intrinsic_{kind}.txt"
-        first = images[0] if kind == "color" else _sibling(path / "depth", images[0].stem, ".png")
-        if file.is_file() and first.is_file():
+        if file.is_file() and first is not None:
             k = _numbers(file, 4, 4)
             with _parsing(file):
                 lenses[kind] = _lens(*image_header(first).upright, k[0, 0], k[1, 1], k[0, 2], k[1, 2])
@@ -112,7 +101,7 @@ def _read_scannet(path: Path) -> PosedImages:
     for image in images:
         pose = _numbers(path / "pose" / f"{image.stem}.txt", 4, 4)
         if np.isfinite(pose).all():  # infinite where tracking was lost
-            frame = _posed_image(image, lenses["color"], pose, _sibling(path / "depth", image.stem, ".png"))
+            frame = _posed_image(image, lenses["color"], pose, find_image(path / "depth", f"{image.stem}.png"))
             posed.append(dataclasses.replace(frame, depth_lens=lenses.get("depth")))
     return _posed_images(path, posed, len(images))
 
@@ -155,7 +144,7 @@ def _read_tum(path: Path) -> PosedImages:
         if row >= 0:
             with _parsing(path / "groundtruth.txt"):
                 pose = _matrix(Rotation.from_quat(poses[row, 4:]), poses[row, 1:4])
-            frame = _posed_image(image, lens, pose, depths[depth] if depth >= 0 else None)
+            frame = _posed_image(image, lens, pose, depths[depth] if depth >= 0 and depths[depth].is_file() else None)
             posed.append(dataclasses.replace(frame, depth_unit=1 / 5000))
     return _posed_images(path, posed, len(images))
 
@@ -174,7 +163,7 @@ def _read_arkitscenes(path: Path) -> PosedImages:
         if row >= 0 and lens >= 0:
             width, height, *intrinsics = _numbers(lens_files[lens], 6)[0]
             world_to_camera = _matrix(Rotation.from_rotvec(rows[row, 1:4]), rows[row, 4:])
-            depth = path / "lowres_depth" / image.name
+            depth = find_image(path / "lowres_depth", image.name)
             with _parsing(lens_files[lens]):
                 lens_of_frame = _lens(width, height, *intrinsics)
                 posed.append(_posed_image(image, lens_of_frame, np.linalg.inv(world_to_camera), depth))
@@ -191,17 +180,29 @@ def _read_polycam(path: Path) -> PosedImages:
         raise InputError(frames, "it has no images/ or no cameras/", remedy=remedy)
     images, posed = _list_images(frames / f"{prefix}images"), []
     for image in images:
-        file = _sibling(frames / f"{prefix}cameras", image.stem, ".json")
-        if file.is_file():
+        file = find_image(frames / f"{prefix}cameras", f"{image.stem}.json")
+        if file is not None:
             with _parsing(file):
                 camera = parse_json(file.read_bytes())
-                # Recent corrected_cameras/ have no sizes.
-                size = (camera["width"], camera["height"]) if "width" in camera else image_header(image).upright
+                size = _polycam_size(camera, find_image(frames / "cameras", f"{image.stem}.json"), image)
                 lens = _lens(*size, *(camera[name] for name in ("fx", "fy", "cx", "cy")))
                 rows = [[camera[f"t_{i}{j}"] for j in range(4)] for i in range(3)]
                 pose = np.array([*rows, [0, 0, 0, 1]], np.float64) @ _PHONE_AXES
-            posed.append(_posed_image(image, lens, pose, _sibling(frames / "depth", image.stem, ".png")))
+            posed.append(_posed_image(image, lens, pose, find_image(frames / "depth", f"{image.stem}.png")))
     return _posed_images(path, posed, len(images))
+
+
+def _polycam_size(camera: Any, uncorrected: Path | None, image: Path) -> tuple[Any, Any]:
+    """(width, height) that a camera's intrinsics are for.
+
+    Recent corrected_cameras/ have no sizes: then it is that of the uncorrected camera, if its aspect is the image's.
+    """
+    if "width" in camera:
+        return camera["width"], camera["height"]
+    size = size_around(image, camera["cx"], camera["cy"])
+    before = {} if uncorrected is None else parse_json(uncorrected.read_bytes())
+    width, height = before.get("width", size[0]), before.get("height", size[1])
+    return (width, height) if abs(width * size[1] - height * size[0]) <= max(width, height) else size
 
 
 def _read_record3d(path: Path) -> PosedImages:
@@ -214,12 +215,10 @@ def _read_record3d(path: Path) -> PosedImages:
         k = metadata["K"]  # by columns
         intrinsics = metadata.get("perFrameIntrinsicCoeffs") or [(k[0], k[4], k[6], k[7])] * len(metadata["poses"])
         poses = np.array(metadata["poses"], np.float64).reshape(-1, 7)
+        size = (metadata["w"], metadata["h"]) if "w" in metadata else image_header(images[0]).upright
         for image in images:
-            n = int(image.stem)
-            if n < len(poses):
+            if (n := int(image.stem)) < len(poses):
                 pose = _matrix(Rotation.from_quat(poses[n, :4]), poses[n, 4:]) @ _PHONE_AXES
-                has_size = "w" in metadata and "h" in metadata
-                size = (metadata["w"], metadata["h"]) if has_size else image_header(image).upright
                 posed.append(_posed_image(image, _lens(*size, *intrinsics[n]), pose))
     return _posed_images(path, posed, len(images), "Record3D's depth was not read: its compression is not supported.")
 

@@ -6,8 +6,10 @@ the runs fill the mask, and needs no compiled dependency. Polygons are [[x, y, x
 add up.
 """
 
+import functools
+from collections.abc import Callable
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -16,21 +18,22 @@ from jaxtyping import Bool
 from jsecon.errors import InputError
 from jsecon.files import read_json, reading
 from jsecon.read.captures.images import MAX_PIXELS
-from jsecon.read.masks.names import FrameNames
+from jsecon.read.registry import Reader
 
+ReadMasks: TypeAlias = Callable[[tuple[int, int]], tuple[Path, np.ndarray | list[np.ndarray]]]
+"""(width, height) of the image of a frame -> a file, and its ids (H, W), or masks (H, W), the best first"""
 _REMEDY = "Write them with SAM's scripts/amg.py --convert-to-rle, or as COCO polygons."
 _RLE = '{"size": [H, W], "counts": a text or a list}'
 _JSON = 'a list of {"segmentation": ...}, or COCO\'s {"images", "annotations"}'
 
 
-def _decode_rle(rle: Any, where: str | Path) -> Bool[np.ndarray, "h w"]:
+def _decode_rle(rle: Any, where: str) -> Bool[np.ndarray, "h w"]:
     """Decodes a run-length encoded mask; `where` names it for errors."""
-    with reading(where, _RLE, _REMEDY, problem="the mask cannot be read"):
-        height, width = rle["size"]
-        if not isinstance(height, int) or not isinstance(width, int):
-            raise ValueError("its size is not a pair of whole numbers")
-        counts = rle["counts"]
-        runs = np.asarray(_parse_runs(counts) if isinstance(counts, str) else counts, np.int64)
+    height, width = rle["size"]
+    if not isinstance(height, int) or not isinstance(width, int):
+        raise ValueError("its size is not a pair of whole numbers")
+    counts = rle["counts"]
+    runs = np.asarray(_parse_runs(counts) if isinstance(counts, str) else counts, np.int64)
     valid = runs.ndim == 1 and ((runs >= 0) & (runs <= MAX_PIXELS)).all() and min(height, width) > 0
     if not valid or height * width > MAX_PIXELS or runs.sum() != height * width:
         raise InputError(where, f"the mask's runs fill {int(runs.sum())} of {height}x{width} pixels", _RLE, _REMEDY)
@@ -62,100 +65,92 @@ def _parse_runs(text: str) -> list[int]:
     return runs
 
 
-def _fill_polygons(polygons: Any, width: int, height: int, where: str | Path) -> Bool[np.ndarray, "h w"]:
-    """Draws COCO's polygons [[x, y, x, y, ...], ...], px, as one mask, edges included."""
-    expected = "[[x, y, x, y, ...], ...] with three corners or more each"
-    nested = isinstance(polygons, list) and all(isinstance(polygon, list) for polygon in polygons)
-    with reading(where, expected, _REMEDY, problem="the mask's polygons cannot be read"):
-        corners = [np.asarray(each, np.float64).reshape(-1, 2) for each in (polygons if nested else [polygons])]
-        if not corners or not all(len(each) > 2 and np.isfinite(each).all() for each in corners):
-            raise ValueError("one has no three corners")
+def _fill_polygons(polygons: list[Any], size: tuple[int, int], where: str) -> Bool[np.ndarray, "h w"]:
+    """Draws COCO's polygons [[x, y, x, y, ...], ...], px, as one mask of `size` (width, height), edges included."""
+    nested = all(isinstance(polygon, list) for polygon in polygons)
+    corners = [np.asarray(each, np.float64).reshape(-1, 2) for each in (polygons if nested else [polygons])]
+    if not all(len(each) > 2 and np.isfinite(each).all() for each in corners):
+        raise ValueError("one of its polygons has no three corners")
     far = np.concatenate(corners)
-    if (far < -1).any() or (far > np.array([width, height]) + 1).any():  # corners may lie on the far edges
+    if (far < -1).any() or (far > np.array(size) + 1).any():  # corners may lie on the far edges
         problem = f"the mask's polygons reach from {far.min(0).tolist()} to {far.max(0).tolist()} px"
         remedy = 'Give the size of the image that they were drawn on ("images" with "width" and "height").'
-        raise InputError(where, problem, f"corners within {width}x{height}", remedy)
-    canvas = np.zeros((height, width), np.uint8)
+        raise InputError(where, problem, f"corners within {size[0]}x{size[1]}", remedy)
+    canvas = np.zeros(size[::-1], np.uint8)
     for each in corners:
         cv2.fillPoly(canvas, [np.round(each).astype(np.int32)], 1)
     return canvas.astype(bool)
 
 
-def read_json_masks(file: Path, size: tuple[int, int]) -> list[Bool[np.ndarray, "h w"]]:
-    """Reads the masks of one frame, the best first. Polygons are drawn on `size` (width, height), or on the file's."""
+def _read_json_masks(file: Path, size: tuple[int, int], level: str) -> list[Bool[np.ndarray, "h w"]]:
+    """The masks of one frame, the best first. Polygons are drawn on `size` (width, height), or on the file's."""
     content = read_json(file, _JSON, _REMEDY)
     with reading(file, _JSON, _REMEDY, problem="it holds no masks"):
-        records = _records(content)
+        records = list(content["annotations"] if isinstance(content, dict) else content)
         images = [content.get("image"), *content.get("images", [])[:1]] if isinstance(content, dict) else []
-        size = next((own for own in map(_image_size, images) if own is not None), size)
-    return _decode_records(file, records, size)
+        own = next(filter(None, map(_image_size, images)), None)
+    return _decode_records(file, records, own, size)[1]
 
 
-def _records(content: Any) -> list[Any]:
-    """The records of a file's masks: a list, or "annotations"."""
-    return list(content["annotations"] if isinstance(content, dict) else content)
+def _decode_records(
+    file: Path, records: list[Any], own: tuple[int, int] | None, size: tuple[int, int]
+) -> tuple[Path, list[np.ndarray]]:
+    """The file, and the masks of its records, those with the best scores (SAM's stability times predicted IoU) first.
 
-
-def _decode_records(file: Path, records: list[Any], size: tuple[int, int]) -> list[np.ndarray]:
-    """The masks of records, those with the best scores (SAM's stability times predicted IoU) first."""
+    `own` is the (width, height) that the file gives for the image, which goes before `size`.
+    """
     with reading(file, _JSON, _REMEDY, problem="a mask's score cannot be read"):
         scores = [float(r.get("predicted_iou", 1.0)) * float(r.get("stability_score", 1.0)) for r in records]
     masks = []
     for number in np.argsort(-np.asarray(scores), kind="stable"):
-        where = f"{file}, mask {number}"
-        with reading(where, "run lengths or polygons", _REMEDY, problem="the mask cannot be read"):
+        where, expected = (
+            f"{file}, mask {number}",
+            f"{_RLE}, or [[x, y, x, y, ...], ...] with three corners or more each",
+        )
+        with reading(where, expected, _REMEDY, problem="the mask cannot be read"):
             segmentation = records[number]["segmentation"]
             if isinstance(segmentation, dict):
                 masks.append(_decode_rle(segmentation, where))
             elif segmentation != []:
-                masks.append(_fill_polygons(segmentation, *size, where))
-    return masks
+                masks.append(_fill_polygons(list(segmentation), own or size, where))
+    return file, masks
 
 
 def _image_size(image: Any) -> tuple[int, int] | None:
     """(width, height) of an image's record, or None."""
-    try:
-        width, height = int(image["width"]), int(image["height"])
-    except (TypeError, KeyError, ValueError, OverflowError):
+    width, height = (image.get(key) if isinstance(image, dict) else None for key in ("width", "height"))
+    has_size = isinstance(width, int) and isinstance(height, int) and width > 0 and 0 < width * height <= MAX_PIXELS
+    return (width, height) if has_size else None
+
+
+def open_coco(folder: Path, frame_of: Callable[[PurePosixPath, str], str | None]) -> dict[str, ReadMasks] | None:
+    """Opens the COCO file of all frames: `folder` itself, or the only JSON in it if that lists images.
+
+    `frame_of` looks up the name of a frame by the path and the suffix of an image.
+    """
+    files = [folder] if folder.is_file() else list(folder.glob("*.json"))
+    if len(files) != 1 or files[0].suffix.lower() != ".json":
         return None
-    return (width, height) if 0 < width * height <= MAX_PIXELS and width > 0 else None
-
-
-class _CocoFile:
-    """A COCO file of all frames."""
-
-    def __init__(self, file: Path, content: Any, frame_names: FrameNames):
-        self.file = file
-        with reading(file, _JSON, _REMEDY, problem="it is not a COCO file"):
-            images = {image["id"]: image for image in content["images"]}
-            records: dict[Any, list[Any]] = {number: [] for number in images}
-            for record in _records(content):
-                records[record["image_id"]].append(record)
-            paths = {number: PurePosixPath(str(image["file_name"])) for number, image in images.items()}
-        matches = {n: frame_names.match(Path(path.name), path.parts[:-1], "") for n, path in paths.items()}
-        self._images = {match.frame: (images[n], records[n]) for n, match in matches.items() if match is not None}
-        if not self._images:
-            first = next(iter(paths.values()), "no image")
-            problem = f"none of its {len(paths)} images is called like a frame (the first: {first})"
-            raise InputError(file, problem, remedy="Name the images like those of the capture.")
-
-    def __contains__(self, name: str) -> bool:
-        """Whether a frame is among its images."""
-        return name in self._images
-
-    def read(self, name: str, size: tuple[int, int]) -> list[Bool[np.ndarray, "h w"]]:
-        """Reads the masks of a frame as `read_json_masks` does."""
-        image, records = self._images[name]
-        return _decode_records(self.file, records, _image_size(image) or size)
-
-
-def open_coco(folder: Path, frame_names: FrameNames) -> _CocoFile | None:
-    """Opens the COCO file of all frames: `folder` itself, or the only JSON in it if that lists images."""
-    files = [folder] if folder.is_file() else sorted(folder.glob("*.json")) if folder.is_dir() else []
-    if len(files) != 1 or (files[0] != folder and frame_names.match(files[0], (), ".json") is not None):
+    file = files[0]
+    if file != folder and frame_of(PurePosixPath(file.name), ".json") is not None:
         return None
-    if files[0].suffix.lower() != ".json":
+    content = read_json(file, _JSON, _REMEDY)
+    if file != folder and not (isinstance(content, dict) and "images" in content):
         return None
-    content = read_json(files[0], _JSON, _REMEDY)
-    is_coco = files[0] == folder or (isinstance(content, dict) and "images" in content)
-    return _CocoFile(files[0], content, frame_names) if is_coco else None
+    readers: dict[str, ReadMasks] = {}
+    with reading(file, _JSON, _REMEDY, problem="it is not a COCO file"):
+        records: dict[Any, list[Any]] = {image["id"]: [] for image in content["images"]}
+        for record in content["annotations"]:
+            records[record["image_id"]].append(record)
+        for image in content["images"]:
+            name, own = frame_of(PurePosixPath(str(image["file_name"])), ""), _image_size(image)
+            if name is not None:
+                readers[name] = functools.partial(_decode_records, file, records[image["id"]], own)
+    if not readers:
+        first = content["images"][0]["file_name"] if content["images"] else "no image"
+        problem = f"none of its {len(records)} images is called like a frame (the first: {first})"
+        raise InputError(file, problem, remedy="Name the images like those of the capture.")
+    return readers
+
+
+READER = Reader("SAM", (".json",), _read_json_masks)

@@ -3,7 +3,15 @@
 `READERS` is the table of formats. A reader takes a file, the (width, height) of its frame's image and LangSplat's
 level. It returns ids (H, W), the same for the same object in every frame, 0 for no region (or negative: 0 is a region
 then); or a list of masks (H, W) of this frame alone, the best first, which may overlap. Other packages add readers by
-entry points in the group jsecon.masks. `jsecon.read.masks.names` says which file belongs to which frame.
+entry points in the group jsecon.masks.
+
+A mask is named like its frame: `<frame>.png`, like the image's whole name (`<frame>.jpg.png`, as COLMAP has it), or
+with a word for what it is (`<frame>_mask.png`). It lies in the folder itself, or in subfolders named like those of the
+images (`cam0/<frame>.png`). Any other subfolders stand for objects (`<object>/<frame>.png`, black and white, as SAM 2
+writes them with --per_obj_png_file).
+
+Masks must be of the frames as the capture was loaded, undistorted. Other sizes of the same aspect are resized
+(nearest), and masks of the stored pixels of photographs are turned upright with them.
 
 LangSplat's `<frame>_s.npy` float32 (4, H, W) has ids by level, -1 = none, which are rows of `<frame>_f.npy` float32
 (M, E), unit (minghanqin/LangSplat, preprocess.py). The same thing has another row in each frame.
@@ -11,62 +19,69 @@ LangSplat's `<frame>_s.npy` float32 (4, H, W) has ids by level, -1 = none, which
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import NamedTuple
+import collections
+import functools
+import os
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Int, Int16
 
 from jsecon.errors import InputError
-from jsecon.files import map_npy, reading
+from jsecon.files import list_files, map_npy, reading
 from jsecon.numerics import is_finite_and_bounded
-from jsecon.read.captures.images import read_label_image
-from jsecon.read.masks.json_masks import open_coco, read_json_masks
-from jsecon.read.masks.names import AllFrames, FrameNames, MaskFiles, find_masks
+from jsecon.read.captures.frames import same_aspect
+from jsecon.read.captures.images import IMAGE_SUFFIXES, apply_orientation, read_label_image
+from jsecon.read.masks.json_masks import READER as JSON_READER, ReadMasks, open_coco
 from jsecon.read.registry import Reader, readers
-from jsecon.types import Progress
+from jsecon.types import ImageFile, Progress
 
 LEVELS = ("default", "s", "m", "l")
 """levels of LangSplat's `_s.npy`, in their order: all of SAM's masks, subparts, parts, whole objects"""
 _MAX_REGIONS = int(np.iinfo(np.int16).max)
+_PREPROCESS = "Run LangSplat's preprocess.py on every frame."
 
 
-def _read_level(path: Path, level: str) -> Int[np.ndarray, "h w"]:
+_WORD = r"masks?|seg|segs|segmentations?|labels?|ids?|instances?|objects?|annotations?"
+_AFFIX = re.compile(rf"(?:(?:{_WORD})[_.-])?(.+?)(?:[_.-](?:{_WORD}))?", re.IGNORECASE)
+"""a frame's name within that of its mask"""
+
+AllFrames: TypeAlias = Mapping[str, ImageFile | None]
+"""all frames of a capture in order, by name, each with its image or None"""
+
+
+def _read_level(path: Path, size: tuple[int, int], level: str) -> Int[np.ndarray, "h w"]:
     """Reads one level of LangSplat's `_s.npy`: (H, W) ids, -1 for no region."""
     if level not in LEVELS:
         raise InputError("level", f"there is no level {level!r}", f"one of {', '.join(LEVELS)}", "l is the coarsest.")
-    expected = f"a .npy of shape ({len(LEVELS)}, H, W)"
-    with reading(path, expected, "Write the masks again.", problem="the array is damaged or missing"):
+    expected = f"a .npy of shape ({len(LEVELS)}, H, W): ids of levels {', '.join(LEVELS)}, -1 for no region"
+    with (
+        reading(path, expected, "Write the masks again.", problem="the array cannot be read"),
+        np.errstate(invalid="ignore"),  # of a signalling NaN
+    ):
         image = map_npy(path)
-    if image.ndim != 3 or len(image) != len(LEVELS) or not image.size:
-        expected = f"({len(LEVELS)}, H, W): levels {', '.join(LEVELS)}"
-        remedy = "Give _s.npy files, not the _f.npy ones."
-        raise InputError(path, f"the array has shape {image.shape}", expected, remedy)
-    with np.errstate(invalid="ignore"):  # of a signalling NaN
+        if image.ndim != 3 or len(image) != len(LEVELS) or not image.size:
+            raise ValueError(f"its shape is {image.shape}")
         image = np.asarray(image[LEVELS.index(level)], np.float64)
-    # float32, LangSplat's type of ids, holds every integer below 1 << 24
-    if not ((image >= -(1 << 24)) & (image < 1 << 24) & (image == image.round())).all():
-        problem = "the array has numbers that are no integers or too large"
-        raise InputError(path, problem, "ids, -1 for no region", "Write the masks again.")
+        # float32, LangSplat's type of ids, holds every integer below 1 << 24
+        if not ((image >= -(1 << 24)) & (image < 1 << 24) & (image == image.round())).all():
+            raise ValueError("it has numbers that are no integers or too large")
     return image.astype(np.int64)
-
-
-def _read_ids(path: Path, size: tuple[int, int], level: str) -> np.ndarray:
-    """The ids of a .png or .npy."""
-    return read_label_image(path)
 
 
 def _read_langsplat(path: Path, size: tuple[int, int], level: str) -> list[np.ndarray]:
     """The masks of one level of LangSplat's `_s.npy`."""
-    ids, image = _compact_ids(path, _read_level(path, level))
+    ids, image = _compact_ids(path, _read_level(path, size, level))
     return [image == index for index in range(len(ids))]
 
 
 READERS = (
     Reader("LangSplat", ("_s.npy",), _read_langsplat),
-    Reader("ids", (".png", ".npy"), _read_ids),
-    Reader("SAM", (".json",), lambda path, size, level: read_json_masks(path, size)),
+    Reader("ids", (".png", ".npy"), lambda path, size, level: read_label_image(path)),
+    JSON_READER,
 )
 
 
@@ -76,16 +91,8 @@ class TrackedMasks(NamedTuple):
     labels: Int16[np.ndarray, "t h w"]
     """-1 = none, else 0..R-1, the same region in every frame."""
     ids: tuple[int, ...]
-    """R ids as the files have them (of a colour: R*65536 + G*256 + B), or numbers of objects or of masks in a frame."""
-    notes: tuple[str, ...]
-    """What was skipped or changed, a sentence each."""
-
-
-class Proposals(NamedTuple):
-    """Masks of single frames, read on demand."""
-
-    read: Callable[[int], Bool[np.ndarray, "m h w"]]
-    """Index of a frame -> its masks (M, H, W). Raises InputError if a file is damaged."""
+    """R ids as the files have them (of a colour: R*65536 + G*256 + B), numbers of objects from 1 on, or of masks in a
+    frame from 0 on."""
     notes: tuple[str, ...]
     """What was skipped or changed, a sentence each."""
 
@@ -101,6 +108,136 @@ class FrameMasks(NamedTuple):
     """(M,) int32 the frame of each mask."""
 
 
+class _Match(NamedTuple):
+    """A mask file that is named like a frame."""
+
+    frame: str
+    extra: str
+    """Its folders that the frame's image does not have, with "/"."""
+    rank: int
+    """The lower, the closer is the file's name to the frame's."""
+    path: PurePosixPath
+    """Path in the folder of masks."""
+
+
+_Matcher: TypeAlias = Callable[[PurePosixPath, str], _Match | None]
+
+
+def _match_frames(frames: AllFrames) -> _Matcher:
+    """Makes a function from the path of a mask file in its folder, and its suffix, to its frame.
+
+    It returns None if no frame fits, or two equally well.
+    """
+    by_key: dict[str, list[tuple[str, tuple[str, ...]]]] = collections.defaultdict(list)
+    for name, file in frames.items():
+        path = PurePosixPath(name if file is None else file.path)
+        stem = name if file is None else _without_image_suffix(path.name)
+        for key, folders in {name: (), stem: path.parts[:-1]}.items():
+            by_key[key].append((name, folders))
+
+    def match(path: PurePosixPath, suffix: str) -> _Match | None:
+        base = path.name[: len(path.name) - len(suffix)]
+        word = _AFFIX.fullmatch(base)
+        keys = [base, _without_image_suffix(base), *([word[1], _without_image_suffix(word[1])] if word else [])]
+        for rank, key in enumerate(dict.fromkeys(keys)):
+            if fits := sorted(
+                (*_extra_folders(path.parts[:-1], folders), name) for name, folders in by_key.get(key, ())
+            ):
+                is_unclear = len(fits) > 1 and fits[0][:2] == fits[1][:2]
+                return None if is_unclear else _Match(fits[0][3], "/".join(fits[0][2]), rank, path)
+        return None
+
+    return match
+
+
+def _without_image_suffix(name: str) -> str:
+    """The name without the suffix of an image."""
+    stem, suffix = os.path.splitext(name)
+    return stem if suffix.lower() in IMAGE_SUFFIXES else name
+
+
+def _extra_folders(folders: tuple[str, ...], of_image: tuple[str, ...]) -> tuple[int, int, tuple[str, ...]]:
+    """The folders of a mask that its image does not have: their number, minus the number of others, and they."""
+    others, extra = list(of_image), []
+    for folder in reversed(folders):
+        if folder in others:
+            others.remove(folder)
+        else:
+            extra.insert(0, folder)
+    return len(extra), len(extra) - len(folders), tuple(extra)
+
+
+def _find_masks(
+    folder: Path, frames: AllFrames, match: _Matcher, formats: Sequence[Reader], level: str
+) -> tuple[dict[str, ReadMasks], list[str]]:
+    """Finds the masks of frames, which must be of one format: readers by frame, and notes."""
+    if not folder.is_dir():
+        problem = "this is a file" if folder.exists() else "there is no such folder"
+        raise InputError(folder, problem, "a folder of masks", "Check the path.")
+    matched: dict[Reader, list[_Match]] = collections.defaultdict(list)
+    unmatched: dict[Reader, list[Path]] = collections.defaultdict(list)
+    unread = []
+    for path in list_files(folder):
+        reader = next((reader for reader in formats if reader.fits(path)), None)
+        marks = () if reader is None else reader.marks
+        suffix = next((mark for mark in marks if path.name.lower().endswith(mark)), path.suffix)
+        found = match(PurePosixPath(path.relative_to(folder)), suffix)
+        if reader is None:
+            unread += [] if found is None else [path]
+        elif found is None:
+            unmatched[reader].append(path)
+        else:
+            matched[reader].append(found)
+    if not matched:
+        for path in unread:
+            if path.suffix.lower() in (*IMAGE_SUFFIXES, ".npz", ".gif", ".exr"):  # may be meant as masks
+                raise _unsupported(path)
+        count = sum(map(len, unmatched.values()))
+        problem = f"it holds {count} masks{', none of which is called like a frame' if count else ''}"
+        expected = " or ".join(next(iter(frames)) + mark for reader in formats for mark in reader.marks) + " and so on"
+        raise InputError(folder, problem, expected, "Name each mask like its frame.")
+    if len(matched) > 1:
+        first, second = (reader.marks[0] for reader in list(matched)[:2])
+        problem = f"there are both {first} and {second} masks of these frames"
+        raise InputError(folder, problem, "one kind", "Put each kind into a folder of its own.")
+    ((reader, matches),) = matched.items()
+    # Folders that the images do not have stand for objects, if all files lie in several of them.
+    extras = sorted({match.extra for match in matches}, key=_natural_order)
+    objects = extras if "" not in extras and len(extras) > 1 else []
+    notes = []
+    if objects:
+        notes.append(f"The folders {_shorten(objects)} are read as objects: each has black and white masks of one.")
+    elif extras[1:]:
+        notes.append(f"Masks in other folders ({_shorten(extras[1:])}) were not used.")
+    if others := unmatched[reader]:
+        verb = "belongs" if len(others) == 1 else "belong"
+        files = f"{len(others)} of the {reader.marks[0]} files"
+        notes.append(f"{files} {verb} to no frame of this capture, first {others[0].name}.")
+    paths: dict[str, dict[str, Path]] = collections.defaultdict(dict)
+    for match in sorted(matches, key=lambda match: (match.rank, -len(match.path.parts))):
+        if match.extra in (objects or extras[:1]):
+            paths[match.frame].setdefault(match.extra, folder / match.path)
+    return {name: functools.partial(_read_files, reader, objects, some, level) for name, some in paths.items()}, notes
+
+
+def _unsupported(path: Path) -> InputError:
+    """The error of a mask in a format that is not read."""
+    if path.suffix.lower() in (".jpg", ".jpeg"):
+        remedy = "Export the masks again as PNG: one that is converted from JPEG keeps the wrong ids."
+        return InputError(path, "the mask is a JPEG, whose compression changes ids", "a PNG or .npy", remedy)
+    return InputError(path, f"masks are not read from {path.suffix.lower()} files", "a PNG or .npy", "Convert it.")
+
+
+def _natural_order(name: str) -> tuple[str, int, str]:
+    """Sort key that puts 9 before 10."""
+    return re.sub(r"\d+", lambda number: number[0].zfill(20), name), len(name), name
+
+
+def _shorten(names: Sequence[str]) -> str:
+    """Joins the first of some names."""
+    return ", ".join(names[:4]) + (f", ... ({len(names)})" if len(names) > 4 else "")
+
+
 def resize_nearest(image: np.ndarray, width: int, height: int) -> np.ndarray:
     """Resizes an image of integers (H, W): each pixel has the value at its centre."""
     rows, columns = image.shape
@@ -109,129 +246,116 @@ def resize_nearest(image: np.ndarray, width: int, height: int) -> np.ndarray:
     return image[down[:, None], across]
 
 
-def _same_aspect(rows: int, columns: int, width: int, height: int) -> bool:
-    """Whether an image has the aspect of a size, to a pixel of the coarser of the two, whose size was rounded."""
-    return min(abs(columns * height / rows - width), abs(width * rows / height - columns)) <= 1
-
-
-class _MaskFitter:
-    """Brings masks, upright like their frames' images and at any scale, to the size (H, W) of the frames."""
-
-    def __init__(self, frames: AllFrames, size: tuple[int, int]):
-        self.files = {name: file for name, file in frames.items() if file is not None}
-        self.height, self.width = size
-        self.resized = 0
-
-    def __call__(self, path: Path, image: np.ndarray, name: str) -> np.ndarray:
-        """Resizes the mask of a frame to (H, W); raises InputError, with its file, for another aspect."""
-        file = self.files.get(name)
-        width, height = (self.width, self.height) if file is None else (file.width, file.height)
-        rows, columns = image.shape
-        sizes = (width, height), (self.width, self.height)
-        if not any(_same_aspect(rows, columns, *size) for size in sizes):
-            remedy = "Make the masks from the frames as they are loaded (undistorted, upright), at any scale."
-            expected = f"{width}x{height} like its frame, or that aspect"
-            raise InputError(path, f"the mask is {image.shape[1]}x{image.shape[0]}", expected, remedy)
-        if image.shape == (self.height, self.width):
-            return image
-        self.resized += 1
-        return resize_nearest(image, self.width, self.height)
-
-    def notes(self) -> list[str]:
-        """What was changed."""
-        return [f"{self.resized} masks were resized to {self.width}x{self.height} (nearest)."] if self.resized else []
-
-
 def _compact_ids(path: Path, image: np.ndarray) -> tuple[np.ndarray, Int16[np.ndarray, "h w"]]:
     """Replaces the ids of a label image, negative for no region, by their indices: the ids, ascending, and (H, W)."""
-    if image.max(initial=0) < 1 << 20:
-        # A table instead of a sort: some ten times faster, and most masks have small ids.
-        seen = np.zeros(int(image.max(initial=0)) + 2, bool)
-        seen[np.maximum(image, -1)] = True
-        ids = np.flatnonzero(seen[:-1])
-    else:
-        ids = np.unique(image)
-        ids = ids[ids >= 0]
-    if len(ids) > _MAX_REGIONS + 1:  # and the background
+    ids, index = np.unique(image, return_inverse=True)
+    unlabelled = int((ids < 0).sum())
+    if len(ids) - unlabelled > _MAX_REGIONS + 1:  # and the background
         remedy = "Give label images, not photographs."
         raise InputError(path, f"the mask has {len(ids)} ids", f"at most {_MAX_REGIONS}", remedy)
-    if not len(ids):
-        return ids, np.full(image.shape, -1, np.int16)
-    position = np.minimum(np.searchsorted(ids, image), len(ids) - 1)
-    return ids, np.where(ids[position] == image, position, -1).astype(np.int16)
+    return ids[unlabelled:], np.maximum(index.reshape(image.shape) - unlabelled, -1).astype(np.int16)
+
+
+def _read_files(
+    reader: Reader, objects: Sequence[str], paths: dict[str, Path], level: str, size: tuple[int, int]
+) -> tuple[Path, np.ndarray | list[np.ndarray]]:
+    """A file of a frame, and its ids or masks; of objects, ids from 1 on, the first on top."""
+    path, ids = next(iter(paths.values())), np.zeros((0, 0), np.int64)
+    if not objects:
+        with reading(path, remedy="Write the masks again."):
+            return path, reader.read(path, size, level)
+    for number, name in reversed([*enumerate(objects, start=1)]):
+        if name not in paths:
+            continue
+        image = read_label_image(paths[name])
+        if len(values := np.unique(image[image > 0])) > 1:
+            folders = ", ".join(objects[:4])
+            problem = f"the mask has {len(values)} values besides 0, but the folders {folders} hold objects"
+            remedy = "Name folders of cameras like those of the images; make masks of objects black and white."
+            raise InputError(paths[name], problem, "one value for the object", remedy)
+        ids = ids if ids.size else np.zeros(image.shape, np.int64)
+        if image.shape != ids.shape:
+            problem, expected = f"the mask is {image.shape[1]}x{image.shape[0]}", f"{ids.shape[1]}x{ids.shape[0]}"
+            raise InputError(paths[name], problem, f"{expected}, as others of its frame", "Write all at one size.")
+        ids[image > 0] = number
+    return path, ids
 
 
 class _Source:
     """The masks of a folder, or of a COCO file, frame by frame at the size of the frames."""
 
-    def __init__(self, folder: Path, names: Sequence[str], size: tuple[int, int], level: str, frames: AllFrames | None):
-        self.folder, self.size, self.level = folder, size, level
-        self.frames: AllFrames = frames or dict.fromkeys(names)
-        self.coco = open_coco(folder, FrameNames(self.frames))
-        self.files: MaskFiles | None = None
-        if self.coco is None:
-            self.files = find_masks(folder, self.frames, readers("jsecon.masks", READERS))
-        self.names = [name for name in names if self._has(name)]
-        if not self.names:
+    def __init__(
+        self,
+        folder: Path,
+        names: Sequence[str],
+        size: tuple[int, int],
+        level: str,
+        frames: AllFrames | None,
+        formats: Sequence[Reader] = (),
+    ):
+        self.size, self.frames = size, frames or dict.fromkeys(names)
+        self.resized = self.turned = 0
+        self.notes: list[str] = []
+        match = _match_frames(self.frames)
+        coco = None if formats else open_coco(folder, lambda *file: (found := match(*file)) and found.frame)
+        if coco is None:
+            formats = formats or readers("jsecon.masks", READERS)
+            coco, self.notes = _find_masks(folder, self.frames, match, formats, level)
+        self.readers: dict[str, ReadMasks] = coco
+        self.missing = [name for name in names if name not in self.readers]
+        if len(self.missing) == len(names):
             problem = f"it has masks, but of none of the {len(names)} frames in use"
             raise InputError(folder, problem, f"a mask of {names[0]} and others", "Name each mask like its frame.")
-        self.missing = [name for name in names if not self._has(name)]
-        self.objects = self.files.objects if self.files else ()
-        self.fit = _MaskFitter(self.frames, size)
-
-    def _has(self, name: str) -> bool:
-        return name in self.coco if self.coco is not None else self.files is not None and name in self.files.files
+        if self.missing:
+            note = f"{len(self.missing)} of {len(names)} frames have no masks (the first: {self.missing[0]})."
+            self.notes.insert(0, note)
 
     def read(self, name: str) -> tuple[Path, np.ndarray | list[np.ndarray]]:
-        """The file of a frame, and its ids or masks at the size of the frames."""
-        file = self.frames.get(name)
-        size = (self.size[1], self.size[0]) if file is None else (file.width, file.height)
-        if self.coco is not None:
-            path, stored = self.coco.file, self.coco.read(name, size)
-        else:
-            assert self.files is not None
-            path = self.files.files[name][""]
-            with reading(path, remedy="Write the masks again."):
-                stored = self.files.reader.read(path, size, self.level)
+        """A file of a frame, and its ids or masks (those that have pixels) at the size of the frames."""
+        path, stored = self.readers[name](self._image_size(name))
         if not isinstance(stored, list):
-            return path, self.fit(path, stored, name)
-        masks = (self.fit(path, mask, name) for mask in stored)
+            return path, self._fit(path, stored, name)
+        masks = (self._fit(path, mask, name) for mask in stored)
         return path, [mask for mask in masks if mask.any()]
 
-    def masks(self, name: str) -> list[np.ndarray]:
-        """The masks (H, W) of a frame that have pixels at this size, one for each object, id or mask."""
-        if self.objects:
-            paths = self.files.files[name] if self.files else {}
-            masks = [self._object(path, name) for path in paths.values()]
-            return [mask for mask in masks if mask.any()]
-        _, stored = self.read(name)
-        return stored if isinstance(stored, list) else [stored == number for number in np.unique(stored) if number > 0]
+    def _image_size(self, name: str) -> tuple[int, int]:
+        """(width, height) of the image of a frame."""
+        file = self.frames.get(name)
+        return (self.size[1], self.size[0]) if file is None else (file.width, file.height)
 
-    def object_labels(self, name: str) -> tuple[Path, np.ndarray]:
-        """A file of a frame, and (H, W) index of the object of each pixel, the first on top, -1 for none."""
-        paths = self.files.files[name] if self.files else {}
-        labels = np.full(self.size, -1, np.int16)
-        for key, path in reversed(paths.items()):
-            labels[self._object(path, name)] = self.objects.index(key)
-        return next(iter(paths.values())), labels
+    def _fit(self, path: Path, image: np.ndarray, name: str) -> np.ndarray:
+        """Turns and resizes the mask of a frame to (H, W); raises InputError, with its file, for another aspect."""
+        file, upright, size = self.frames.get(name), self._image_size(name), image.shape[::-1]
+        fits = same_aspect(upright, size)
+        if file is not None and file.orientation > 1:
+            stored = upright[::-1] if file.orientation > 4 else upright
+            if same_aspect(stored, size) and (self._are_of_stored_pixels or not fits):
+                image, fits = apply_orientation(image, file.orientation), True
+                self.turned += 1
+        if not fits and not same_aspect(self.size[::-1], size):
+            remedy = "Make the masks from the frames as they are loaded (undistorted, upright), at any scale."
+            expected = f"{upright[0]}x{upright[1]} like its frame, or that aspect"
+            raise InputError(path, f"the mask is {size[0]}x{size[1]}", expected, remedy)
+        if image.shape == self.size:
+            return image
+        self.resized += 1
+        return resize_nearest(image, self.size[1], self.size[0])
 
-    def _object(self, path: Path, name: str) -> np.ndarray:
-        """(H, W) mask of one object."""
-        image = self.fit(path, read_label_image(path), name)
-        if len(values := np.unique(image[image > 0])) > 1:
-            objects = ", ".join(self.objects[:4])
-            problem = f"the mask has {len(values)} values besides 0, but the folders {objects} hold objects"
-            remedy = "Name folders of cameras like those of the images; make masks of objects black and white."
-            raise InputError(path, problem, "one value for the object", remedy)
-        return image > 0
+    @functools.cached_property
+    def _are_of_stored_pixels(self) -> bool:
+        """Whether masks of images that lie on their side fit the stored pixels only.
 
-    def notes(self) -> list[str]:
-        """What was skipped or changed."""
-        notes = list(self.files.notes) if self.files else []
-        if self.missing:
-            count = len(self.missing) + len(self.names)
-            notes.insert(0, f"{len(self.missing)} of {count} frames have no masks (the first: {self.missing[0]}).")
-        return notes + self.fit.notes()
+        Then those of images that stand on their head, or are square, are of the stored pixels too.
+        """
+        lying = [name for name in self.readers if (file := self.frames.get(name)) and file.orientation > 4]
+        for name in lying[:8]:
+            upright = self._image_size(name)
+            _, stored = self.readers[name](upright)
+            for image in stored[:1] if isinstance(stored, list) else [stored]:
+                size = image.shape[::-1]
+                if same_aspect(upright[::-1], size) and not same_aspect(upright, size):
+                    return True
+        return False
 
 
 def load_labels(
@@ -247,48 +371,49 @@ def load_labels(
     """Reads masks as labels (H, W) of regions over T frames called `names`.
 
     Ids mean the same object in every frame; the masks of single frames (SAM's, COCO's, LangSplat's) are regions of
-    their own. Where masks overlap, the first lies on top. Masks must be of the frames as the capture was loaded,
-    undistorted and upright; other sizes of the same aspect are resized (nearest). A frame without a mask is -1
-    everywhere.
+    their own. Where masks overlap, the first lies on top. A frame without a mask is -1 everywhere.
 
     `level` is LangSplat's, a name of LEVELS. `frames` are all frames of the capture in order, each with its image.
     `limit` is the most masks to read, for a check: other frames are left out.
     """
     source = _Source(Path(folder), names, size, level, frames)
-    names = list(names) if limit is None else source.names[:limit]
+    names = list(names) if limit is None else [name for name in names if name not in source.missing][:limit]
     labels = np.full((len(names), *size), -1, np.int16)
     frame_ids: list[np.ndarray] = []
     is_shared, has_negative = True, False
     for t, name in enumerate(names):
         ids = np.zeros(0, np.int64)
         if name not in source.missing:
-            path, stored = source.object_labels(name) if source.objects else source.read(name)
+            path, stored = source.read(name)
             if isinstance(stored, list):
-                is_shared = False
-                ids = np.arange(len(stored))
-                for number in reversed(ids):
-                    labels[t][stored[number]] = number
-            else:
-                has_negative |= not source.objects and bool(stored.min() < 0)
-                ids, labels[t] = _compact_ids(path, stored)
+                is_shared, image = False, np.full(size, -1)
+                for number in reversed(range(len(stored))):
+                    image[stored[number]] = number
+                stored = image
+            elif stored.min() < 0:
+                has_negative = True
+            ids, labels[t] = _compact_ids(path, stored)
         frame_ids.append(ids)
         if progress is not None:
             progress(t + 1, len(names))
-    has_background = is_shared and not source.objects and not has_negative
     if is_shared:
         ids = np.unique(np.concatenate(frame_ids))
-        ids = ids[ids != 0] if has_background else ids
+        ids = ids if has_negative else ids[ids != 0]
         tables = [np.where(np.isin(each, ids), np.searchsorted(ids, each), -1) for each in frame_ids]
     else:
         ids = np.concatenate(frame_ids)
         starts = np.cumsum([0, *map(len, frame_ids)])
-        tables = [each + start for each, start in zip(frame_ids, starts)]
+        tables = [np.arange(len(each)) + start for each, start in zip(frame_ids, starts)]
     if len(ids) > _MAX_REGIONS:
         remedy = "Take a coarser level or fewer frames."
         raise InputError(folder, f"there are {len(ids)} regions", f"at most {_MAX_REGIONS}", remedy)
     for frame, table in zip(labels, tables):
         frame[:] = np.append(table, -1).astype(np.int16)[frame]
-    notes = source.notes()
+    notes = list(source.notes)
+    if source.resized:
+        notes.append(f"{source.resized} masks were resized to {size[1]}x{size[0]} (nearest).")
+    if source.turned:
+        notes.append(f"{source.turned} masks were of the stored pixels, and were turned upright like their images.")
     if has_negative:
         notes.append("The masks hold negative ids: these count as unlabelled, and 0 as a region.")
     if not is_shared:
@@ -303,15 +428,20 @@ def load_proposals(
     *,
     level: str = "l",
     frames: AllFrames | None = None,
-) -> Proposals:
-    """Finds the masks of single frames, which are read on demand; arguments as of `load_labels`."""
+) -> tuple[Callable[[int], Bool[np.ndarray, "m h w"]], tuple[str, ...]]:
+    """Finds the masks of single frames: a function from a frame's index to its masks (M, H, W), and notes.
+
+    The function raises InputError if a file is damaged. Arguments as of `load_labels`.
+    """
     source = _Source(Path(folder), names, size, level, frames)
 
     def read(index: int) -> Bool[np.ndarray, "m h w"]:
-        masks = [] if names[index] in source.missing else source.masks(names[index])
-        return np.stack([np.zeros(size, bool), *masks])[1:]
+        _, stored = (None, []) if names[index] in source.missing else source.read(names[index])
+        if not isinstance(stored, list):
+            stored = [stored == number for number in np.unique(stored) if number > 0]
+        return np.stack([np.zeros(size, bool), *stored])[1:]
 
-    return Proposals(read, tuple(source.notes()))
+    return read, tuple(source.notes)
 
 
 def load_features(
@@ -322,55 +452,36 @@ def load_features(
     level: str = "l",
     frames: AllFrames | None = None,
 ) -> FrameMasks:
-    """Reads one level of the masks of frames as labels (H, W), with their embeddings.
+    """Reads one level of LangSplat's masks as labels (H, W), with their embeddings; arguments as of `load_labels`.
 
-    Masks that vanish at the size asked for are skipped. `frames` are all frames of the capture, each with its image.
+    Masks that vanish at the size asked for are skipped.
     """
-    every = frames or dict.fromkeys(names)
-    found = find_masks(folder, every, (Reader("LangSplat", ("_s.npy",), _read_level),))
-
-    fit = _MaskFitter(every, size)
+    source = _Source(folder, names, size, level, frames, (Reader("LangSplat", ("_s.npy",), _read_level),))
+    if source.missing:
+        missing = folder / f"{source.missing[0]}_s.npy"
+        raise InputError(missing, "there is no such file", remedy=_PREPROCESS)
     labels = np.full((len(names), *size), -1, np.int32)
     rows: list[np.ndarray] = []
-    frame: list[int] = []
     for t, name in enumerate(names):
-        masks = found.files.get(name, {}).get("", folder / f"{name}_s.npy")  # a missing file is an error of its reader
-        file = masks.with_name(masks.name[: -len("_s.npy")] + "_f.npy")
-        table = _read_table(file)
-        if rows and table.shape[-1] != len(rows[0]):
-            problem, expected = f"it has rows of {table.shape[-1]} numbers", f"{len(rows[0])}, as in the frames before"
-            raise InputError(file, problem, expected, "Write all frames' files with the same model.")
-        ids, indices = _compact_ids(masks, _read_level(masks, level))
-        last = max(ids.tolist(), default=-1)
-        if table.ndim != 2 or not is_finite_and_bounded(table) or last >= len(table):
-            problem = f"it is an array {table.shape} for ids up to {last}"
-            expected = "a finite row for each id of the _s.npy beside it"
-            raise InputError(file, problem, expected, "Write both files of the frame again.")
-        fitted = fit(masks, indices, name)
-        kept = np.unique(fitted[fitted >= 0])
-        row_of = np.full(len(ids) + 1, -1, np.int32)
-        row_of[kept] = len(rows) + np.arange(len(kept))
-        labels[t] = row_of[fitted]
-        rows += [table[ids[k]] for k in kept]
-        frame += [t] * len(kept)
-    width = rows[0].shape[-1] if rows else 0
-    embeddings = np.stack(rows).astype(np.float32) if rows else np.zeros((0, width), np.float32)
-    return FrameMasks(labels, embeddings, np.array(frame, np.int32))
+        path, ids = source.read(name)
+        file = path.with_name(path.name[: -len("_s.npy")] + "_f.npy")
+        kept, index = _compact_ids(path, np.asarray(ids))
+        with reading(file, "a finite row for each id of the _s.npy beside it", _PREPROCESS):
+            table, last = map_npy(file), int(kept.max(initial=-1))
+            if table.ndim != 2 or not is_finite_and_bounded(table) or last >= len(table):
+                raise ValueError(f"it is an array {table.shape} for ids up to {last}")
+            if rows and table.shape[1] != rows[0].shape[1]:
+                raise ValueError(f"it has rows of {table.shape[1]} numbers, those before {rows[0].shape[1]}")
+        labels[t] = np.where(index >= 0, index + sum(map(len, rows)), -1)
+        rows.append(table[kept])
+    frame = np.repeat(np.arange(len(rows), dtype=np.int32), [len(each) for each in rows])
+    return FrameMasks(labels, np.concatenate(rows).astype(np.float32), frame)
 
 
 def embedding_size(folder: Path) -> int:
     """Reads the size E of the embeddings in a folder, by its first file."""
-    files = sorted(folder.rglob("*_f.npy"))
-    if not files:
-        remedy = "Give the language_features folder that LangSplat's preprocess.py wrote."
-        raise InputError(folder, "it holds no _f.npy", "<frame>_f.npy beside <frame>_s.npy", remedy)
-    return int(_read_table(files[0]).shape[-1])
-
-
-def _read_table(file: Path) -> np.ndarray:
-    """Reads an array of embeddings."""
-    with reading(file, "a (M, E) array, one row per mask", "Run LangSplat's preprocess.py on every frame."):
-        table = map_npy(file)
-        if table.ndim == 0:
-            raise ValueError("a single number")
-    return table
+    for file in sorted(folder.rglob("*_f.npy")):
+        with reading(file, "a (M, E) array, one row per mask", _PREPROCESS):
+            return int(map_npy(file).shape[1])
+    remedy = "Give the language_features folder that LangSplat's preprocess.py wrote."
+    raise InputError(folder, "it holds no _f.npy", "<frame>_f.npy beside <frame>_s.npy", remedy)

@@ -28,7 +28,7 @@ from jsecon.errors import InputError, describe_error
 from jsecon.files import atomic_write, parse_json, reading
 from jsecon.read.registry import Reader, find_reader
 from jsecon.read.splats.gltf import read_glb, save_glb
-from jsecon.read.splats.ply import Header, drawable_gaussians, read_ply, read_ply_file, save_ply, usable_blocks
+from jsecon.read.splats.ply import drawable_gaussians, read_ply, read_ply_file, save_ply, usable_blocks
 from jsecon.splat.sh import C0
 from jsecon.splat.transform import float32_rounding, transform_axes, transform_gaussians
 from jsecon.types import Array, Gaussians
@@ -40,13 +40,6 @@ read."""
 _AGAIN = "Export it again, or as an uncompressed .ply."
 _SPZ_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 """from a .ply's x right, y down, z forward to .spz's x right, y up, z back; and back again"""
-_SPZ_SYSTEMS = (
-    *("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
-    *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
-)
-"""axes 1 to 16: where x, y and z point to, left or right, up or down, forward or back"""
-_DIRECTIONS = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
-"""a direction in the axes of a .ply"""
 
 
 def _import_gsply(path: Path) -> Any:
@@ -78,19 +71,14 @@ def _gaussians(path: Path, data: Any) -> Gaussians:
     rest = np.zeros((len(data.means), 0, 3)) if data.shN is None else data.shN
     if rest.shape[1] not in (0, 3, 8, 15):
         raise ValueError(f"{rest.shape[1]} harmonics above the constant")
-    arrays = {
-        "means": data.means,
-        "log_scales": data.scales,
-        "quaternions": data.quats,
-        "opacity_logits": np.reshape(data.opacities, -1),
-        "sh": np.concatenate([np.asarray(data.sh0)[:, None], rest], axis=1),
-    }
-    return drawable_gaussians(path, {name: np.ascontiguousarray(a, np.float32) for name, a in arrays.items()})
+    sh = np.concatenate([np.asarray(data.sh0)[:, None], rest], axis=1)
+    return drawable_gaussians(path, data.means, data.scales, data.quats, np.reshape(data.opacities, -1), sh)
 
 
-def _antialiasing_note(path: Path) -> tuple[str, ...]:
-    """Notes that a file was trained with antialiasing."""
-    return (f"{path.name} was trained with antialiasing (Mip-Splatting), and is drawn without it.",)
+def _antialiasing_notes(path: Path, is_antialiased: bool) -> tuple[str, ...]:
+    """Notes that a file was trained with antialiasing, if it was."""
+    note = f"{path.name} was trained with antialiasing (Mip-Splatting), and is drawn without it."
+    return (note,) if is_antialiased else ()
 
 
 def _read_spz(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
@@ -104,9 +92,9 @@ def _read_spz(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
         body = gzip.decompress(data) if is_gzip else data
         magic, version, count, degree, _, flags = struct.unpack("<4sIIBBB", body[:15])
         if magic != b"NGSP":
-            raise InputError(path, "it does not begin as a .spz does", remedy=_AGAIN)
+            raise ValueError("it does not begin as a .spz does")
         if not 2 <= version <= 4:
-            raise InputError(path, f"it is of version {version}", "a .spz of version 2 to 4", _AGAIN)
+            raise ValueError(f"it is of version {version}, expected a .spz of version 2 to 4")
         if count > 1000 * len(data):
             raise ValueError(f"it announces {count} Gaussians")
         if is_gzip:
@@ -114,13 +102,13 @@ def _read_spz(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
             records = body[16 + count * row :]
         else:
             records = data[32 : int.from_bytes(data[16:20], "little")]
-        axes = _spz_axes(path, records if flags & 2 else b"")
+        axes = _spz_axes(records if flags & 2 else b"")
         gaussians = transform_axes(_gaussians(path, gsply.read_spz(path)), axes)
     gaussians = dataclasses.replace(gaussians, means=gaussians.means.astype(np.float32))
-    return gaussians, _antialiasing_note(path) if flags & 1 else ()
+    return gaussians, _antialiasing_notes(path, bool(flags & 1))
 
 
-def _spz_axes(path: Path, records: bytes) -> np.ndarray:
+def _spz_axes(records: bytes) -> np.ndarray:
     """(4, 4) from the axes that the records of a .spz name to those of a .ply; by default from its makers' (RUB)."""
     axes, offset = _SPZ_AXES, 0
     while offset + 8 <= len(records):
@@ -128,12 +116,14 @@ def _spz_axes(path: Path, records: bytes) -> np.ndarray:
         if offset + 8 + length > len(records):
             raise EOFError
         number = int.from_bytes(records[offset + 8 : offset + 12], "little")
-        if kind == 0xADBE0003 and number > len(_SPZ_SYSTEMS):
-            remedy = "Export the scene again, in Niantic's own axes (RUB)."
-            raise InputError(path, f"its coordinate system has the unknown number {number}", "1 to 16", remedy)
+        if kind == 0xADBE0003 and number > 16:
+            raise ValueError(f"its coordinate system has the unknown number {number}, expected 1 to 16")
         if kind == 0xADBE0003 and number > 0:  # 0: unspecified
-            axes = np.eye(4)
-            axes[:3, :3] = np.array([_DIRECTIONS[letter] for letter in _SPZ_SYSTEMS[number - 1]]).T
+            # 1 to 8 are LDB, RDB, LUB, RUB, LDF, ...: x points left or right, y down or up, z back or forward.
+            # 9 to 16 are LFD, RFD, LFU, RFU, LBD, ...: y points forward or back, z down or up.
+            bits, is_z_up = number - 1, number > 8
+            signs = 1 if bits & 1 else -1, -1 if bits & 2 else 1, 1 if bool(bits & 4) != is_z_up else -1, 1
+            axes = np.diag(signs)[:, [0, 2, 1, 3] if is_z_up else [0, 1, 2, 3]].astype(float)
         offset += 8 + length
     return axes
 
@@ -145,31 +135,31 @@ def _save_spz(path: Path, gaussians: Gaussians, *, similarity: Float[Array, "4 4
         raise InputError(path, "there are no Gaussians to write", remedy="Write a .ply, which may be empty.")
     into = _SPZ_AXES if similarity is None else _SPZ_AXES @ np.asarray(similarity, np.float64)
     blocks = [block for _, block in usable_blocks(path, gaussians, into)]
-    means, log_scales, quaternions, opacity_logits, sh = (
-        np.concatenate([np.asarray(getattr(block, name)) for block in blocks])
-        for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh")
-    )
-    reach = float(np.abs(means).max(initial=0))
-    largest = log_scales.max(axis=1)
+    whole = jax.tree.map(lambda *parts: np.concatenate(parts).astype(np.float32), *blocks)
+    reach, sizes = float(np.abs(whole.means).max()), whole.log_scales.max(axis=1)
     finest = 16 if reach > 1 else 24
     bits = next((n for n in range(finest, 0, -1) if reach * 2.0**n < 1 << 23), 0)
-    if bits == 0 or (bits < finest and (np.exp(largest) < 2.0 ** (1 - bits)).mean() > 0.5):
+    if bits == 0 or (bits < finest and (np.exp(sizes) < 2.0 ** (1 - bits)).mean() > 0.5):
         problem = f"positions up to {reach:,.0f} units from the origin would be rounded to {2.0**-bits:.3g} units"
         remedy = "Write a .ply or a .glb, or bring the scene nearer to its origin."
         raise InputError(path, problem, "a rounding below the size of most Gaussians", remedy)
-    if (largest > 5.95).any() or (largest < -10.05).sum() > 0.01 * len(largest):
-        problem = f"its Gaussians are up to {np.exp(largest.max()):.3g} units large, or many are tiny"
-        remedy = "Write a .ply, or scale the scene."
-        raise InputError(path, problem, "sizes from 4.5e-5 to 379 units in a .spz", remedy)
-    columns = {"means": means, "scales": log_scales, "quats": quaternions, "opacities": opacity_logits, "sh0": sh[:, 0]}
-    arrays = {name: np.ascontiguousarray(a, np.float32) for name, a in columns.items()}
-    rest = np.ascontiguousarray(sh[:, 1:], np.float32) if sh.shape[1] > 1 else None
+    if (sizes > 5.95).any() or (sizes < -10.05).mean() > 0.01:
+        problem = f"its Gaussians are up to {np.exp(sizes.max()):.3g} units large, or many are tiny"
+        raise InputError(path, problem, "sizes from 4.5e-5 to 379 units in a .spz", "Write a .ply, or scale the scene.")
+    rest = np.ascontiguousarray(whole.sh[:, 1:]) if whole.sh.shape[1] > 1 else None
+    columns = (
+        whole.means,
+        whole.log_scales,
+        whole.quaternions,
+        whole.opacity_logits,
+        np.ascontiguousarray(whole.sh[:, 0]),
+    )
     with atomic_write(path) as temporary, np.errstate(over="ignore"):
-        data = gsply.GSData.from_arrays(**arrays, shN=rest, format="ply")
+        data = gsply.GSData.from_arrays(*columns, shN=rest, format="ply")
         gsply.write_spz(temporary, data, version=3, fractional_bits=bits)
 
 
-def _read_compressed_ply(path: Path, header: Header) -> Gaussians:
+def _read_compressed_ply(path: Path, header: Any) -> Gaussians:
     """Reads SuperSplat's compressed .ply (github.com/playcanvas/splat-transform, decompress-ply.ts)."""
     with _decoding(path) as gsply:
         chunk, vertex, *rest = header.elements
@@ -198,7 +188,7 @@ def _read_sog(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
         # gsply indexes a codebook without a check of its size
         if any(len(part.get("codebook", [0] * 256)) < 256 for part in meta.values() if isinstance(part, dict)):
             raise ValueError("a codebook of fewer than 256 numbers")
-        return _gaussians(path, gsply.sogread(path)), _antialiasing_note(path) if meta.get("antialias") is True else ()
+        return _gaussians(path, gsply.sogread(path)), _antialiasing_notes(path, meta.get("antialias") is True)
 
 
 def _read_splat(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
@@ -213,27 +203,18 @@ def _read_splat(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
     opacity = np.clip(rows["rgba"][:, 3] / 255, half_step, 1 - half_step)
     with np.errstate(divide="ignore", invalid="ignore"):
         log_scales = np.log(rows["scales"])  # a size of 0 is that of a flat Gaussian
-    arrays = {
-        "means": rows["means"],
-        "log_scales": log_scales,
-        "quaternions": (rows["rotation"].astype(np.float32) - 128) / 128,
-        "opacity_logits": np.log(opacity / (1 - opacity)),
-        "sh": (rows["rgba"][:, None, :3] / 255.0 - 0.5) / C0,
-    }
-    return drawable_gaussians(path, {name: np.ascontiguousarray(a, np.float32) for name, a in arrays.items()}), ()
+    turns, sh = (rows["rotation"].astype(np.float32) - 128) / 128, (rows["rgba"][:, None, :3] / 255.0 - 0.5) / C0
+    return drawable_gaussians(path, rows["means"], log_scales, turns, np.log(opacity / (1 - opacity)), sh), ()
 
 
 def _read_ply(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
     """Reads a .ply, compressed or not."""
     header = read_ply_file(path)[1]
-    notes = _antialiasing_note(path) if any(map(_names_antialiasing, header.comments)) else ()
+    comments = [comment.lower().replace(":", " ").split() for comment in header.comments]
+    is_antialiased = ["splatrendermode", "mip"] in comments or ["antialiased", "1"] in comments  # of Brush, Postshot
     is_compressed = any(name == "packed_position" for element in header.elements for name, _ in element.fields)
-    return (_read_compressed_ply(path, header) if is_compressed else read_ply(path)), notes
-
-
-def _names_antialiasing(comment: str) -> bool:
-    """Whether a comment of a .ply marks a training with antialiasing, as Brush and Postshot write it."""
-    return comment.lower().replace(":", " ").split() in (["splatrendermode", "mip"], ["antialiased", "1"])
+    gaussians = _read_compressed_ply(path, header) if is_compressed else read_ply(path)
+    return gaussians, _antialiasing_notes(path, is_antialiased)
 
 
 READERS = (
@@ -268,20 +249,15 @@ def load_gaussians(path: str | Path, *, similarity: Float[Array, "4 4"] | None =
     gaussians, notes = read_gaussians(path)
     for note in notes:
         warnings.warn(note, stacklevel=2)
-    return _in_float32(Path(path), gaussians, similarity)
-
-
-def _in_float32(path: Path, gaussians: Gaussians, similarity: Float[Array, "4 4"] | None) -> Gaussians:
-    """Puts the Gaussians (NumPy) of a file on jax's device, after a (4, 4) transform into another world in float64."""
     if similarity is not None:
         gaussians = transform_gaussians(gaussians, similarity)
     rounding = float32_rounding(gaussians)
     if len(rounding) and np.median(rounding) > MAX_READ_ROUNDING:
         place = ", ".join(f"{number:.10g}" for number in np.median(gaussians.means, axis=0))
+        problem = f"the Gaussians lie about ({place}), where float32 does not tell them apart"
         remedy = (
             "Give load_gaussians a similarity that brings them near 0, as numpy.linalg.inv(capture.source_from_scene)."
         )
-        problem = f"the Gaussians lie about ({place}), where float32 does not tell them apart"
         raise InputError(path, problem, remedy=remedy)
     return jax.tree.map(jnp.asarray, gaussians)
 

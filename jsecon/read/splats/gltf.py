@@ -8,13 +8,12 @@ pygltflib is not used: it checks neither sizes nor strides, and reads and writes
 """
 
 import dataclasses
-import functools
 import json
 import math
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import jax
 import numpy as np
@@ -37,7 +36,7 @@ _FLOAT, _BYTE, _VERTICES, _POINTS = 5126, 5121, 34962, 0
 """glTF's numbers for component types, a target of buffers and a mode of primitives"""
 _DTYPES = {5120: "i1", _BYTE: "u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
 _SRGB = "srgb_rec709_display"
-_REMEDY = "Export the scene again, or as a .ply."
+_REMEDY = "Export the Gaussians alone, uncompressed, in sRGB colours and with all transforms applied, or as a .ply."
 
 
 def save_glb(
@@ -62,7 +61,15 @@ def save_glb(
     if needs_float64(gaussians, into):
         origin = np.median(next(transform_blocks(gaussians, into))[1].means, axis=0)
 
-    blocks = functools.partial(_attribute_blocks, path, into, origin, object_ids)
+    def blocks(part: Gaussians) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+        """Yields the number of a block's first Gaussian, and its attributes as the file has them."""
+        for rows, block in usable_blocks(path, part, into):
+            attributes = _attributes(dataclasses.replace(block, means=block.means - origin))
+            if object_ids is not None:
+                attributes["_OBJECT_ID"] = np.asarray(object_ids[rows])[:, None]
+            kinds = {name: np.uint8 if name == "COLOR_0" else "<f4" for name in attributes}
+            yield rows.start, {name: np.ascontiguousarray(a, kinds[name]) for name, a in attributes.items()}
+
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for _, block in blocks(dataclasses.replace(gaussians, sh=gaussians.sh[:, :1])):
         low, high = np.minimum(low, block["POSITION"].min(0)), np.maximum(high, block["POSITION"].max(0))
@@ -105,21 +112,6 @@ def save_glb(
                 file.write(array.tobytes())
 
 
-def _attribute_blocks(
-    path: str | Path, into: np.ndarray, origin: np.ndarray, object_ids: Any, gaussians: Gaussians
-) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-    """Yields the attributes of Gaussians in blocks, as the file has them, after the number of the first Gaussian."""
-    for rows, block in usable_blocks(path, gaussians, into):
-        if block.log_scales.max() > 88:  # beyond, float32 does not hold the exponential
-            problem = f"a Gaussian is exp({block.log_scales.max():.4g}) units large"
-            raise InputError(path, problem, "at most exp(88) in a .glb", "Write a .ply, or scale the scene down.")
-        attributes = _attributes(dataclasses.replace(block, means=block.means - origin))
-        if object_ids is not None:
-            attributes["_OBJECT_ID"] = np.asarray(object_ids[rows])[:, None]
-        kinds = {name: np.uint8 if name == "COLOR_0" else "<f4" for name in attributes}
-        yield rows.start, {name: np.ascontiguousarray(a, kinds[name]) for name, a in attributes.items()}
-
-
 def _attributes(block: Gaussians) -> dict[str, np.ndarray]:
     """The attributes of Gaussians that are in glTF's axes, (N, components)."""
     turned = jax.tree.map(lambda a: np.asarray(a, np.float64), block)
@@ -134,10 +126,7 @@ def _attributes(block: Gaussians) -> dict[str, np.ndarray]:
         f"{_EXTENSION}:ROTATION": np.roll(unit, -1, axis=1),
         f"{_EXTENSION}:SCALE": np.exp(turned.log_scales),
         f"{_EXTENSION}:OPACITY": opacity,
-    } | {
-        f"{_EXTENSION}:SH_DEGREE_{degree}_COEF_{n}": turned.sh[:, degree**2 + n]
-        for degree in range(math.isqrt(turned.sh.shape[1]))
-        for n in range(2 * degree + 1)
+        **{name: turned.sh[:, n] for n, name in enumerate(_harmonics(turned.sh.shape[1]))},
     }
 
 
@@ -149,85 +138,65 @@ def read_glb(path: Path) -> Gaussians:
     0 to 3. Other attributes are not read. What is not supported is an error: other extensions, kernels, projections and
     colour spaces, numbers in another file, and nodes that shear, mirror or scale their axes unequally.
     """
-    parts, count = [], 0
-    problem = "its Gaussians cannot be read"
-    with reading(path, remedy=_REMEDY, problem=problem), path.open("rb") as file:
-        glb = _open(path, file)
-        for matrix, primitive in _primitives(glb):
-            arrays = _fields(glb, primitive)
-            count += len(arrays["means"])
-            if 12 * count > glb.length:
-                raise glb.error(f"{count} Gaussians do not fit into {glb.length} bytes")
-            parts.append(transform_gaussians(drawable_gaussians(path, arrays), _AXES @ matrix))
-    if not parts:
-        raise InputError(path, f"no primitive of its scene holds Gaussians ({_EXTENSION})", remedy=_REMEDY)
-    counts = {part.sh.shape[1] for part in parts}
-    if len(counts) > 1:
-        problem = f"its primitives have {' and '.join(map(str, sorted(counts)))} coefficients of harmonics"
-        raise InputError(path, problem, "one degree for all", "Export each part as a .ply of its own.")
+    with reading(path, remedy=_REMEDY, problem="its Gaussians cannot be read"):
+        document, body = _open(path)
+        parts = [
+            transform_gaussians(_gaussians(path, document, body, attributes), _AXES @ matrix)
+            for matrix, attributes in _primitives(document)
+        ]
+        if not parts:
+            raise ValueError(f"no primitive of its scene holds Gaussians ({_EXTENSION})")
+        if len({part.sh.shape[1] for part in parts}) > 1:
+            raise ValueError("its primitives have harmonics of several degrees: export each as a .ply of its own")
     return jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Glb:
-    """An open .glb: its JSON document, and its binary chunk."""
-
-    path: Path
-    file: BinaryIO
-    document: Any
-    start: int
-    """Offset of the binary chunk."""
-    length: int
-    """Bytes of the binary chunk."""
-
-    def error(self, problem: str, expected: str = "", remedy: str = _REMEDY) -> InputError:
-        """An error of this file."""
-        return InputError(self.path, problem, expected, remedy)
-
-
-def _open(path: Path, file: BinaryIO) -> _Glb:
-    """Reads the container of a .glb, and checks that it is complete."""
-    size = path.stat().st_size
-    magic, version, length = struct.unpack("<4sII", file.read(12))
+def _open(path: Path) -> tuple[Any, np.ndarray]:
+    """The JSON document of a .glb, and its binary chunk, memory-mapped."""
+    data = np.memmap(path, np.uint8, "r") if path.stat().st_size else np.zeros(0, np.uint8)
+    magic, version, length, text, kind = struct.unpack("<4sIII4s", data[:20])
     if (magic, version) != (b"glTF", 2):
-        raise InputError(path, "it does not begin as a .glb of version 2 does", remedy=_REMEDY)
-    text, kind = struct.unpack("<I4s", file.read(8))
-    document, start = parse_json(file.read(text)), 28 + text
-    body, binary = struct.unpack("<I4s", file.read(8)) if start <= size else (0, b"BIN\0")
-    if length != size or start + body > max(size, start) or (kind, binary) != (b"JSON", b"BIN\0"):
-        raise InputError(path, f"the file is cut short or damaged: {size} of {length} bytes", remedy=_REMEDY)
+        raise ValueError("it does not begin as a .glb of version 2 does")
+    document, start = parse_json(bytes(data[20 : 20 + text])), 28 + text
+    size, binary = struct.unpack("<I4s", data[start - 8 : start]) if start <= len(data) else (0, b"BIN\0")
+    if length != len(data) or start + size > max(len(data), start) or (kind, binary) != (b"JSON", b"BIN\0"):
+        raise ValueError(f"the file is cut short or damaged: {len(data)} of {length} bytes")
     if unsupported := set(document.get("extensionsRequired", ())) - {_EXTENSION, "KHR_mesh_quantization"}:
-        remedy = "Export the Gaussians alone and without compression, or as a .ply."
-        raise InputError(path, f"it requires the extension {', '.join(sorted(unsupported))}", remedy=remedy)
-    return _Glb(path, file, document, start, body)
+        raise ValueError(f"it requires the extension {', '.join(sorted(unsupported))}")
+    return document, data[start : start + size]
 
 
-def _primitives(glb: _Glb) -> Iterator[tuple[np.ndarray, Any]]:
-    """Yields each primitive with Gaussians, after the (4, 4) transform of its node into the world."""
-    scenes, nodes = glb.document["scenes"], glb.document["nodes"]
-    queue = [(index, np.eye(4)) for index in scenes[glb.document.get("scene", 0)].get("nodes", ())]
+def _primitives(document: Any) -> Iterator[tuple[np.ndarray, Any]]:
+    """Yields the attributes of each primitive with Gaussians, after the (4, 4) transform of its node into the world."""
+    nodes = document["nodes"]
+    queue = [(index, np.eye(4)) for index in document["scenes"][document.get("scene", 0)].get("nodes", ())]
     visited = set()
     while queue:
         index, parent = queue.pop(0)
         if index in visited:
-            raise glb.error(f"node {index} is in its scene twice")
+            raise ValueError(f"node {index} is in its scene twice")
         visited.add(index)
         node = nodes[index]
         matrix = parent @ _node_matrix(node)
         queue += [(child, matrix) for child in node.get("children", ())]
-        for primitive in glb.document["meshes"][node["mesh"]]["primitives"] if "mesh" in node else ():
+        for primitive in document["meshes"][node["mesh"]]["primitives"] if "mesh" in node else ():
             if (properties := primitive.get("extensions", {}).get(_EXTENSION)) is not None:
-                _require_supported(glb, properties)
-                yield matrix, primitive
+                _require_supported(properties, index, matrix)
+                yield matrix, primitive["attributes"]
 
 
-def _require_supported(glb: _Glb, properties: Any) -> None:
-    """Raises InputError if a primitive's Gaussians have a property that jsecon does not draw."""
+def _require_supported(properties: Any, index: int, matrix: np.ndarray) -> None:
+    """Raises ValueError if Gaussians have a property that jsecon does not draw, or a node that it cannot apply."""
     supported = {"kernel": "ellipse", "projection": "perspective", "colorSpace": _SRGB, "extensions": {}}
     for key, value in supported.items():
         if (found := properties.get(key, value)) != value:
-            remedy = "Export the scene uncompressed and with sRGB colours, or as a .ply."
-            raise glb.error(f"the {key} of its Gaussians is {found}", str(value or "none"), remedy)
+            raise ValueError(f"the {key} of its Gaussians is {found}, expected {value or 'none'}")
+    axes = matrix[:3, :3]
+    squares = axes.T @ axes
+    if not (np.allclose(squares, squares[0, 0] * np.eye(3), atol=2e-4 * squares[0, 0]) and np.linalg.det(axes) > 0):
+        sizes = ", ".join(f"{size:.6g}" for size in np.linalg.norm(axes, axis=0))
+        problem = f"its node {index} scales its axes by {sizes}, or shears or mirrors them"
+        raise ValueError(f"{problem}, expected a rotation, one positive scale and a shift")
 
 
 def _node_matrix(node: Any) -> np.ndarray:
@@ -240,49 +209,44 @@ def _node_matrix(node: Any) -> np.ndarray:
     return matrix
 
 
-def _fields(glb: _Glb, primitive: Any) -> dict[str, np.ndarray]:
-    """The fields of `Gaussians` of a primitive's attributes."""
-    accessors = primitive["attributes"]
-    harmonics = [f"{_EXTENSION}:SH_DEGREE_{degree}_COEF_{n}" for degree in range(4) for n in range(2 * degree + 1)]
-    present = [name in accessors for name in harmonics]
-    if (count := sum(present)) not in COEFFICIENT_COUNTS or not all(present[:count]):
-        expected = "all of degree 0, and of each higher degree up to 3 all or none of them"
-        raise glb.error(f"it has {count} coefficients of harmonics", expected)
-    names = {kind: f"{_EXTENSION}:{kind.upper()}" for kind in ("rotation", "scale", "opacity")} | {"means": "POSITION"}
-    columns = {name: _column(glb, name, accessors[name]) for name in (*names.values(), *harmonics[:count])}
-    rows = len(columns["POSITION"])
-    sizes = {names["rotation"]: 4, names["opacity"]: 1}
-    for name, column in columns.items():
-        if column.shape != (rows, sizes.get(name, 3)):
-            problem = f"its attribute {name} has {column.shape[0]} rows of {column.shape[1]} numbers"
-            raise glb.error(problem, f"{rows} of {sizes.get(name, 3)}")
+def _gaussians(path: Path, document: Any, body: np.ndarray, accessors: Any) -> Gaussians:
+    """The Gaussians of a primitive's attributes."""
+    harmonics = [name for name in _harmonics(16) if name in accessors]
+    if len(harmonics) not in COEFFICIENT_COUNTS or harmonics != _harmonics(len(harmonics)):
+        raise ValueError(f"it has {len(harmonics)} coefficients of harmonics, expected whole degrees from 0 on")
+    columns = {"POSITION": 3, f"{_EXTENSION}:SCALE": 3, f"{_EXTENSION}:ROTATION": 4, f"{_EXTENSION}:OPACITY": 1}
+    columns |= dict.fromkeys(harmonics, 3)
+    arrays = [_column(document, body, name, accessors[name]) for name in columns]
+    for array, (name, size) in zip(arrays, columns.items()):
+        if array.shape != (len(arrays[0]), size):
+            raise ValueError(f"its attribute {name} has shape {array.shape}, expected {len(arrays[0]), size}")
+    means, scales, rotations, alpha, *sh = arrays
     with np.errstate(all="ignore"):  # numbers that are not finite are refused by their name later
-        alpha = columns[names["opacity"]][:, 0].astype(np.float64)
-        fields = {
-            "means": columns["POSITION"],
-            "log_scales": np.log(columns[names["scale"]], dtype=np.float64),
-            "quaternions": np.roll(columns[names["rotation"]], 1, axis=1),
-            "opacity_logits": np.log(alpha / (1 - alpha)),
-            "sh": np.stack([columns[name] for name in harmonics[:count]], axis=1),
-        }
-    return {name: np.ascontiguousarray(array, np.float32) for name, array in fields.items()}
+        alpha = alpha[:, 0].astype(np.float64)
+        logits, log_scales = np.log(alpha / (1 - alpha)), np.log(scales, dtype=np.float64)
+    return drawable_gaussians(path, means, log_scales, np.roll(rotations, 1, axis=1), logits, np.stack(sh, axis=1))
 
 
-def _column(glb: _Glb, name: str, index: int) -> Float[np.ndarray, "n c"]:
-    """(N, components) float32 of an attribute's accessor; reads and allocates no more than the binary chunk."""
-    accessor = glb.document["accessors"][index]
-    view, count = glb.document["bufferViews"][accessor["bufferView"]], int(accessor["count"])
+def _harmonics(count: int) -> list[str]:
+    """The attributes of the first coefficients of the harmonics."""
+    degrees = range(math.isqrt(count))
+    return [f"{_EXTENSION}:SH_DEGREE_{degree}_COEF_{n}" for degree in degrees for n in range(2 * degree + 1)]
+
+
+def _column(document: Any, body: np.ndarray, name: str, index: int) -> Float[np.ndarray, "n c"]:
+    """(N, components) float32 of an attribute's accessor."""
+    accessor = document["accessors"][index]
+    view, count = document["bufferViews"][accessor["bufferView"]], int(accessor["count"])
     kind, size = np.dtype(_DTYPES[accessor["componentType"]]), _COMPONENTS[accessor["type"]]
     row = kind.itemsize * size
-    stride = int(view.get("byteStride", row))
-    offset = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
-    needed = (count - 1) * stride + row if count else 0
-    if "sparse" in accessor or view["buffer"] != 0 or "uri" in glb.document["buffers"][0]:
-        raise glb.error(f"the numbers of {name} are sparse or lie in another file")
-    if count < 0 or stride < row or offset < 0 or offset + needed > glb.length:
-        raise glb.error(f"{name} has {count} rows of {stride} bytes from {offset} on, in {glb.length} bytes")
-    glb.file.seek(glb.start + offset)
-    array = np.ndarray((count, size), kind, glb.file.read(needed), strides=(stride, kind.itemsize))
-    if kind.kind == "f" or accessor.get("normalized") is not True:
-        return array.astype(np.float32)
-    return np.maximum(array.astype(np.float32) / np.iinfo(kind).max, -1)
+    stride, offset = (
+        int(view.get("byteStride", row)),
+        int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0)),
+    )
+    if "sparse" in accessor or view["buffer"] != 0 or "uri" in document["buffers"][0]:
+        raise ValueError(f"the numbers of {name} are sparse or lie in another file")
+    if count < 0 or stride < row or offset < 0 or offset + (count - 1) * stride + row > len(body):
+        raise ValueError(f"{name} has {count} rows of {stride} bytes from {offset} on, in {len(body)} bytes")
+    array = np.ndarray((count, size), kind, body, offset, (stride, kind.itemsize)).astype(np.float32)
+    is_share = kind.kind != "f" and accessor.get("normalized") is True
+    return np.maximum(array / np.iinfo(kind).max, -1) if is_share else array

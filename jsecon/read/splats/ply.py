@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -32,12 +32,6 @@ _POSITION, _OPACITY, _RGB = ("x", "y", "z"), ("opacity",), ("red", "green", "blu
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALE = ("scale_0", "scale_1", "scale_2")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
-_SIZES = {"means": 3, "log_scales": 3, "quaternions": 4}
-
-
-def _error(path: Path, problem: str, expected: str = "", remedy: str = "Export the file again.") -> InputError:
-    """The error of a .ply that cannot be read."""
-    return InputError(path, problem, expected, remedy)
 
 
 @dataclasses.dataclass
@@ -51,18 +45,13 @@ class _Element:
     lists: dict[str, tuple[str, str]]
     """Name of a list property -> NumPy types of its length and of its items."""
 
-    @property
-    def fixed(self) -> bool:
-        """Whether all rows have one length: no property is a list."""
-        return not self.lists
-
     def dtype(self, order: str) -> np.dtype:
         """Type of a row without its lists, in a byte order of NumPy."""
         return np.dtype([(name, order + kind) for name, kind in self.fields if kind != "list"])
 
 
 @dataclasses.dataclass(frozen=True)
-class Header:
+class _Header:
     """The header of a .ply."""
 
     form: str
@@ -73,46 +62,43 @@ class Header:
     """Offset of the first byte after the header."""
 
 
-def _parse_header(path: Path, data: memoryview) -> Header:
+def _parse_header(data: memoryview) -> _Header:
     """Parses the header at the start of some bytes."""
     # The last line of a header, as Unix, Windows and old Macs end it.
     last = rb"[\r\n]end_header[ \t]*(?:\r\n|\n|\r|\Z)"
     end = re.search(last, data[: 1 << 24]) if data[:3] == b"ply" else None
     if end is None:
-        problem = "it has no .ply header" if len(data) else "the file is empty"
-        raise _error(path, problem, "a file that starts with 'ply' and a header")
+        raise ValueError("it has no .ply header" if len(data) else "the file is empty")
     form, elements, comments = "", [], []
     for line in bytes(data[: end.start()]).decode("ascii", "replace").splitlines()[1:]:
-        words = line.split()
         try:
-            if not words:
-                continue
-            if words[0] in ("comment", "obj_info"):
-                comments.append(line.strip().partition(" ")[2].strip())
-            elif words[0] == "format":
-                form = words[1]
-            elif words[0] == "element":
-                elements.append(_Element(words[1], int(words[2]), [], {}))
-                if elements[-1].count < 0:
-                    raise ValueError(words[2])
-            elif words[0] == "property" and words[1] == "list":
-                elements[-1].fields.append((words[4], "list"))
-                elements[-1].lists[words[4]] = _TYPES[words[2]], _TYPES[words[3]]
-            elif words[0] == "property":
-                elements[-1].fields.append((words[2], _TYPES[words[1]]))
-            else:
-                raise ValueError(words[0])
+            match line.split():
+                case []:
+                    pass
+                case ["comment" | "obj_info", *words]:
+                    comments.append(" ".join(words))
+                case ["format", form, *_]:
+                    pass
+                case ["element", name, count] if int(count) >= 0:
+                    elements.append(_Element(name, int(count), [], {}))
+                case ["property", "list", length, item, name]:
+                    elements[-1].fields.append((name, "list"))
+                    elements[-1].lists[name] = _TYPES[length], _TYPES[item]
+                case ["property", kind, name]:
+                    elements[-1].fields.append((name, _TYPES[kind]))
+                case _:
+                    raise ValueError(line)
         except (IndexError, KeyError, ValueError) as error:
-            raise _error(path, f"the header line {line.strip()!r} is not valid") from error
+            raise ValueError(f"the header line {line.strip()!r} is not valid") from error
     if form not in ORDERS:
-        raise _error(path, f"its format is {form!r}", f"one of {', '.join(ORDERS)}")
-    return Header(form, elements, tuple(comments), end.end())
+        raise ValueError(f"its format is {form!r}, expected one of {', '.join(ORDERS)}")
+    return _Header(form, elements, tuple(comments), end.end())
 
 
-def read_ply_file(path: Path) -> tuple[memoryview, Header]:
-    """Maps a .ply into memory: all its bytes, and its header."""
+def read_ply_file(path: Path) -> tuple[memoryview, _Header]:
+    """Maps a .ply into memory: all its bytes, and its header. Raises ValueError if it is none."""
     data = np.memmap(path, np.uint8, "r").data if path.stat().st_size else memoryview(b"")
-    return data, _parse_header(path, data)
+    return data, _parse_header(data)
 
 
 def _read_vertices(path: Path) -> np.ndarray:
@@ -120,56 +106,31 @@ def _read_vertices(path: Path) -> np.ndarray:
     data, header = read_ply_file(path)
     names = [element.name for element in header.elements]
     if "vertex" not in names:
-        raise _error(path, f"its elements are {', '.join(names) or 'missing'}", "an element vertex")
+        raise ValueError(f"its elements are {', '.join(names) or 'missing'}, expected an element vertex")
     *before, vertices = header.elements[: names.index("vertex") + 1]
-    if lists := [element.name for element in (*before, vertices) if not element.fixed]:
-        raise _error(path, f"its element {lists[0]} has lists", "lists behind the vertices only")
+    if lists := [element.name for element in (*before, vertices) if element.lists]:
+        raise ValueError(f"its element {lists[0]} has lists, expected lists behind the vertices only")
+    dtype = vertices.dtype(ORDERS[header.form])
     if header.form == "ascii":
-        lines = [line for line in bytes(data[header.start :]).splitlines() if line.strip()]
         first = sum(element.count for element in before)
-        return _parse_text(path, lines[first : first + vertices.count], vertices)
-    order = ORDERS[header.form]
-    dtype = vertices.dtype(order)
-    offset = header.start + sum(element.count * element.dtype(order).itemsize for element in before)
-    if offset + vertices.count * dtype.itemsize > len(data):
-        raise _truncated(path, (len(data) - offset) // dtype.itemsize, vertices)
-    return np.frombuffer(data, dtype, vertices.count, offset)
-
-
-def _truncated(path: Path, count: int, vertices: _Element) -> InputError:
-    """The error of a file that ends before the last vertex."""
-    return _error(path, f"the file is cut short: it holds {max(count, 0)} of {vertices.count} vertices")
-
-
-def _parse_text(path: Path, lines: list[bytes], vertices: _Element) -> np.ndarray:
-    """Parses the lines of the vertices of a text file."""
-    names = [name for name, _ in vertices.fields]
-    try:
-        numbers = np.array([line.split() for line in lines], np.float64).reshape(len(lines), len(names))
-    except ValueError as error:
-        problem = f"a vertex line does not have {len(names)} numbers, or the file is cut short"
-        raise _error(path, problem) from error
-    if len(lines) < vertices.count:
-        raise _truncated(path, len(lines), vertices)
-    result = np.empty(vertices.count, vertices.dtype("="))
-    for column, name in enumerate(names):
-        with np.errstate(over="ignore", invalid="ignore"):  # infinite numbers are refused by the caller
-            result[name] = numbers[:, column]
-    return result
+        lines = [line for line in bytes(data[header.start :]).splitlines() if line.strip()][first:]
+        rows = lines[: vertices.count]
+        count = len(rows)
+    else:
+        offset = header.start + sum(element.count * element.dtype("<").itemsize for element in before)
+        count = max(len(data) - offset, 0) // max(dtype.itemsize, 1)
+    if count < vertices.count:
+        raise ValueError(f"the file is cut short: it holds {count} of {vertices.count} vertices")
+    if header.form != "ascii":
+        return np.frombuffer(data, dtype, vertices.count, offset)
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite numbers are refused by the caller
+        return np.loadtxt(rows, dtype, comments=None, ndmin=1) if rows else np.empty(0, dtype)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # beyond float32: infinite, which every reader refuses
 def _columns(vertices: np.ndarray, names: tuple[str, ...] | list[str], dtype: type = np.float32) -> np.ndarray:
     """(N, C) some properties of the vertices."""
-    fields = vertices.dtype.names or ()
-    if len({vertices.dtype[name] for name in fields}) == 1:
-        # One type throughout, as in nearly every file: a plain table, read along its rows (twice as fast).
-        table = vertices.view(vertices.dtype[0]).reshape(len(vertices), len(fields))
-        return table[:, [fields.index(name) for name in names]].astype(dtype)
-    result = np.empty((len(vertices), len(names)), dtype)
-    for column, name in enumerate(names):
-        result[:, column] = vertices[name]
-    return result
+    return np.array([vertices[name] for name in names], dtype).T
 
 
 def read_ply(path: Path) -> Gaussians:
@@ -179,7 +140,7 @@ def read_ply(path: Path) -> Gaussians:
     The means are float64 if the file has them so. Variants are read as the program that wrote them draws them:
 
     - 2D Gaussians (no scale_2, or -inf there) are flat.
-    - Mip-Splatting's `filter_3D` is fused into sizes and opacities, as by its create_fused_ply.py.
+    - Mip-Splatting's `filter_3D`, also in small letters, is fused into sizes and opacities (its create_fused_ply.py).
     - Colours red, green, blue of 8 bits replace f_dc (nerfstudio's --ply-color-mode rgb).
 
     Other properties and elements are ignored.
@@ -190,60 +151,61 @@ def read_ply(path: Path) -> Gaussians:
     has_rgb = not set(_DC) & set(names) and all(name in names and table.dtype[name] == np.uint8 for name in _RGB)
     colours = _RGB if has_rgb else _DC
     if missing := [name for name in (*_POSITION, *colours, *_OPACITY, *scales, *_ROTATION) if name not in names]:
-        expected = "3D Gaussians in INRIA's layout (x y z, f_dc_0..2, opacity, scale_0..2, rot_0..3)"
-        remedy = "A plain point cloud is not enough: export the trained Gaussians as an uncompressed .ply."
-        raise _error(path, f"its vertices have no {', '.join(missing)}", expected, remedy)
+        layout = "3D Gaussians in INRIA's layout (x y z, f_dc_0..2, opacity, scale_0..2, rot_0..3)"
+        raise ValueError(f"its vertices have no {', '.join(missing)}, expected {layout}: a point cloud is not enough")
     rest = sum(name.startswith("f_rest_") for name in names)
     rest_names = [f"f_rest_{index}" for index in range(rest)]
     if rest not in (0, 9, 24, 45) or any(name not in names for name in rest_names):
-        expected = "0, 9, 24 or 45 of them, counted from f_rest_0 (spherical harmonics of degree 0 to 3)"
-        remedy = "Export the file again, with harmonics of degree 3 or less."
-        raise _error(path, f"its vertices have {rest} properties f_rest", expected, remedy)
+        raise ValueError(
+            f"its vertices have {rest} properties f_rest, expected 0, 9, 24 or 45 (degree 0 to 3) from 0 on"
+        )
+    filters = [name for name in names if name.lower() == "filter_3d"][:1]
     exact = all(np.can_cast(table.dtype[name], np.float32) for name in _POSITION)
-    arrays: dict[str, np.ndarray] = {name: np.empty((count, size), np.float32) for name, size in _SIZES.items()}
-    arrays["means"] = np.empty((count, 3), np.float32 if exact else np.float64)
-    arrays["opacity_logits"] = np.empty(count, np.float32)
-    arrays["sh"] = np.empty((count, 1 + rest // 3, 3), np.float32)
+    means = np.empty((count, 3), np.float32 if exact else np.float64)
+    log_scales, quaternions, logits = (np.empty((count, *shape), np.float32) for shape in ((3,), (4,), ()))
+    sh = np.empty((count, 1 + rest // 3, 3), np.float32)
     for first in range(0, count, BLOCK_ROWS):
         rows = slice(first, first + BLOCK_ROWS)
         vertices = table[rows]
-        arrays["means"][rows] = _columns(vertices, _POSITION, arrays["means"].dtype.type)
-        arrays["log_scales"][rows, 2] = -np.inf
-        arrays["log_scales"][rows, : len(scales)] = _columns(vertices, scales)
-        arrays["quaternions"][rows] = _columns(vertices, _ROTATION)
-        arrays["opacity_logits"][rows] = _columns(vertices, _OPACITY)[:, 0]
+        means[rows] = _columns(vertices, _POSITION, means.dtype.type)
+        log_scales[rows, 2] = -np.inf
+        log_scales[rows, : len(scales)] = _columns(vertices, scales)
+        quaternions[rows] = _columns(vertices, _ROTATION)
+        logits[rows] = _columns(vertices, _OPACITY)[:, 0]
         first_band = _columns(vertices, colours)
-        arrays["sh"][rows, 0] = (first_band / 255 - 0.5) / C0 if has_rgb else first_band
-        others = _columns(vertices, rest_names).reshape(len(vertices), 3, rest // 3)
-        arrays["sh"][rows, 1:] = others.transpose(0, 2, 1)
-        if "filter_3D" in names:
-            block = {name: array[rows] for name, array in arrays.items()}
-            _fuse_filter(path, block, _columns(vertices, ["filter_3D"])[:, 0])
-    return drawable_gaussians(path, arrays)
+        sh[rows, 0] = (first_band / 255 - 0.5) / C0 if has_rgb else first_band
+        sh[rows, 1:] = _columns(vertices, rest_names).reshape(len(vertices), 3, rest // 3).transpose(0, 2, 1)
+        if filters:
+            _fuse_filter(log_scales[rows], logits[rows], _columns(vertices, filters)[:, 0])
+    return drawable_gaussians(path, means, log_scales, quaternions, logits, sh)
 
 
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")
-def _fuse_filter(path: Path, arrays: dict[str, np.ndarray], deviation: np.ndarray) -> None:
+def _fuse_filter(log_scales: np.ndarray, logits: np.ndarray, deviation: np.ndarray) -> None:
     """Widens Gaussians, in place, by a filter with standard deviations (M,).
 
     Sizes become sqrt(s^2 + f^2), opacities shrink by the ratio of the volumes (Mip-Splatting,
     get_opacity_with_3D_filter).
     """
     if not (np.isfinite(deviation) & (deviation >= 0)).all():
-        problem = "numbers of filter_3D are negative or not finite"
-        raise _error(path, problem, "standard deviations", "Train again.")
-    before = arrays["log_scales"].astype(np.float64)
+        raise ValueError("numbers of filter_3D are negative or not finite")
+    before = log_scales.astype(np.float64)
     after = 0.5 * np.logaddexp(2 * before, 2 * np.log(deviation.astype(np.float64))[:, None])
     shrink = np.exp(np.where(after == before, 0.0, before - after).sum(axis=1))
-    opacity = shrink / (1 + np.exp(-arrays["opacity_logits"].astype(np.float64)))
-    arrays["log_scales"][:] = after
-    arrays["opacity_logits"][:] = np.log(opacity) - np.log1p(-opacity)
+    opacity = shrink / (1 + np.exp(-logits.astype(np.float64)))
+    log_scales[:] = after
+    logits[:] = np.log(opacity) - np.log1p(-opacity)
 
 
-def drawable_gaussians(path: Path, arrays: Mapping[str, np.ndarray]) -> Gaussians:
-    """Makes Gaussians of NumPy arrays of a file, by the names of their fields; refuses numbers that cannot be drawn."""
-    _require_drawable(path, arrays, 0, "Remove these Gaussians (SuperSplat drops them on loading), or train again.")
-    return Gaussians(**arrays)
+def drawable_gaussians(path: Path, means: np.ndarray, *others: np.ndarray) -> Gaussians:
+    """Makes Gaussians of NumPy arrays of a file, in the order of their fields; refuses numbers that cannot be drawn.
+
+    All become float32, but for means of float64.
+    """
+    kinds = (np.float64 if means.dtype == np.float64 else np.float32, *(4 * (np.float32,)))
+    gaussians = Gaussians(*(np.ascontiguousarray(array, kind) for array, kind in zip((means, *others), kinds)))
+    _require_drawable(path, gaussians, 0, "Remove these Gaussians (SuperSplat drops them on loading), or train again.")
+    return gaussians
 
 
 def usable_blocks(
@@ -255,14 +217,13 @@ def usable_blocks(
     """
     check_gaussians(gaussians)
     for rows, block in transform_blocks(gaussians, similarity):
-        columns = {name: getattr(block, name) for name in (*_SIZES, "opacity_logits", "sh")}
-        _require_drawable(path, columns, rows.start, "Remove these Gaussians first.")
+        _require_drawable(path, block, rows.start, "Remove these Gaussians first.")
         yield rows, block
 
 
-def _require_drawable(path: str | Path, arrays: Mapping[str, np.ndarray], first: int, remedy: str) -> None:
+def _require_drawable(path: str | Path, gaussians: Gaussians, first: int, remedy: str) -> None:
     """Raises InputError if a Gaussian, counted from `first`, cannot be drawn."""
-    for name, array in arrays.items():
+    for name, array in vars(gaussians).items():
         rows = unusable_rows(name, array)
         if rows.any():
             state = "not finite or zero" if name == "quaternions" else "not finite"
@@ -331,22 +292,15 @@ def _table(block: Gaussians, is_double: bool, object_ids: np.ndarray | None) -> 
 
 
 def load_point_cloud(path: str | Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
-    """Reads a plain point cloud (.ply): (P, 3) float64 points and uint8 colours, grey if the file has none.
-
-    Colours red green blue are whole numbers of 8 or 16 bits, or floats from 0 to 1.
-    """
-    path = Path(path)
+    """Reads a plain point cloud (.ply): (P, 3) float64 points, uint8 colours, grey if the file has none of 8 bits."""
     with reading(path, remedy="Export the file again."):
-        vertices = _read_vertices(path)
-    names = vertices.dtype.names or ()
-    if missing := [name for name in _POSITION if name not in names]:
-        raise _error(path, f"its vertices have no {', '.join(missing)}", "a point cloud with x y z")
-    points = _columns(vertices, _POSITION, np.float64)
-    if not is_finite_and_bounded(points):
-        raise _error(path, "its points have NaN, infinite or absurd coordinates")
-    if not all(name in names for name in _RGB):
+        vertices = _read_vertices(Path(path))
+        names = vertices.dtype.names or ()
+        if missing := [name for name in _POSITION if name not in names]:
+            raise ValueError(f"its vertices have no {', '.join(missing)}, expected a point cloud with x y z")
+        points = _columns(vertices, _POSITION, np.float64)
+        if not is_finite_and_bounded(points):
+            raise ValueError("its points have NaN, infinite or absurd coordinates")
+    if not all(name in names and vertices.dtype[name] == np.uint8 for name in _RGB):
         return points, np.full((len(points), 3), 128, np.uint8)
-    kind = vertices.dtype["red"]
-    brightest = np.iinfo(kind).max if kind.kind in "iu" else 1.0
-    colours = np.nan_to_num(_columns(vertices, _RGB, np.float64))
-    return points, np.clip(colours * (255 / brightest), 0, 255).round().astype(np.uint8)
+    return points, _columns(vertices, _RGB, np.uint8)
