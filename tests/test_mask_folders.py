@@ -167,7 +167,7 @@ def test_masks_of_no_frame_are_told(tmp_path):
 
 def test_kinds_that_are_not_read_are_named(tmp_path):
     write(tmp_path / "a.jpg", ids_image())
-    with refused("a.jpg", "JPEG", "PNG"):
+    with refused("a.jpg", ".jpg", "PNG"):
         load_labels(tmp_path, ("a",), SIZE)
     (tmp_path / "a.jpg").rename(tmp_path / "a.tif")
     with refused("a.tif", ".tif"):

@@ -128,21 +128,22 @@ def _inner_captures(path: Path) -> list[Path]:
 def _no_capture(path: Path) -> InputError:
     """The error of a path without a capture: what lies there, and what to give instead."""
     expected = "a capture of COLMAP, nerfstudio, a depth camera or a phone; or photographs, or a video"
-    if not path.exists():
-        return InputError(path, "there is no such file or folder", expected, "Check the path.")
-    if not path.is_dir():
-        remedy = "Give the folder of the capture, its transforms file (.json), or the video."
-        return InputError(path, f"a file with the suffix {path.suffix!r} is not a capture", expected, remedy)
-    if photos := unposed_photographs(path):
-        remedy = "Find their poses first: jsecon run does so (extra sfm), and keeps them in OUT/poses as a capture."
-        return InputError(path, f"{len(photos)} photographs without poses", "a capture with poses", remedy)
-    entries = sorted(child for child in path.iterdir() if not child.name.startswith("."))
-    if not entries:
-        return InputError(path, "an empty folder", expected, "Copy the capture there, or check the path.")
+    entries = sorted(child for child in path.iterdir() if not child.name.startswith(".")) if path.is_dir() else []
+    names = ", ".join(child.name for child in entries[:5]) + (", ..." if len(entries) > 5 else "")
+    problem = f"a folder without poses and photographs, but with {names}"
     remedy = "Give a folder with images/ and sparse/0, with transforms.json, or with photographs in it."
-    if captures := _inner_captures(path):
+    if not path.exists():
+        problem, remedy = "there is no such file or folder", "Check the path."
+    elif not path.is_dir():
+        problem = f"a file with the suffix {path.suffix!r} is not a capture"
+        remedy = "Give the folder of the capture, its transforms file (.json), or the video."
+    elif photos := unposed_photographs(path):
+        problem, expected = f"{len(photos)} photographs without poses", "a capture with poses"
+        remedy = "Find their poses first: jsecon run does so (extra sfm), and keeps them in OUT/poses as a capture."
+    elif not entries:
+        problem, remedy = "an empty folder", "Copy the capture there, or check the path."
+    elif captures := _inner_captures(path):
         remedy = f"Give the capture's own folder, for example {captures[0]}."
     elif files := [child for child in entries if child.suffix.lower() == ".json"]:
         remedy = f"Give the transforms file itself, for example {files[0]}."
-    names = ", ".join(child.name for child in entries[:5]) + (", ..." if len(entries) > 5 else "")
-    return InputError(path, f"a folder without poses and photographs, but with {names}", expected, remedy)
+    return InputError(path, problem, expected, remedy)

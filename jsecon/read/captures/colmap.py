@@ -119,30 +119,21 @@ def _take(stream: io.BytesIO, form: str) -> tuple:
     return struct.unpack("<" + form, stream.read(struct.calcsize("<" + form)))
 
 
-def _parse_lines(
-    file: Path, layout: str, parse: Callable[[str], Any], is_continuation: Callable[[str], bool] | None = None
-) -> list:
-    """Parses the records of a text file, a line each.
+def _parse_lines(file: Path, layout: str, parse: Callable[[str], Any]) -> list:
+    """Parses the records of a text file, a line each, but for lines of which `parse` makes None.
 
-    A line after a record is skipped if `is_continuation` holds. A ValueError of `parse` becomes an error with the
-    line's number and the `layout` that it should have.
+    A ValueError of `parse` becomes an error with the line's number and the `layout` that it should have.
     """
-    records, follows = [], False
-    for number, line in enumerate(read_text(file).split("\n"), start=1):
-        line = line.strip()
-        if line.startswith("#"):
-            continue
-        if (follows and is_continuation is not None and is_continuation(line)) or not line:
-            follows = False
-            continue
-        try:
-            records.append(parse(line))
-        except InputError:
-            raise
-        except ValueError as error:
-            raise InputError(file, f"line {number} is {line[:80]!r}", layout, _REMEDY) from error
-        follows = True
-    return records
+    records = []
+    for number, line in enumerate(map(str.strip, read_text(file).split("\n")), start=1):
+        if line and not line.startswith("#"):
+            try:
+                records.append(parse(line))
+            except InputError:
+                raise
+            except ValueError as error:
+                raise InputError(file, f"line {number} is {line[:80]!r}", layout, _REMEDY) from error
+    return [record for record in records if record is not None]
 
 
 def _lens(file: Path, model: str, width: int, height: int, parameters: tuple[float, ...]) -> Lens:
@@ -204,12 +195,14 @@ def _read_images(model: Path) -> list[tuple[str, int, np.ndarray]]:
     """(name, camera number, (4, 4) float64 world-to-camera) of each image of a model, in the order of the file."""
     file = _require_file(model, "images")
 
-    def parse(line: str) -> tuple[str, int, np.ndarray]:
+    def parse(line: str) -> tuple[str, int, np.ndarray] | None:
+        if not line.strip("0123456789+-.eE \t") and len(line.split()) % 3 == 0:
+            return None  # an image's second line, which some programs omit: X Y POINT3D_ID, any number of times
         _, qw, qx, qy, qz, tx, ty, tz, camera, name = line.split(maxsplit=9)
         return name, int(camera), _pose(file, name, tuple(map(float, (qw, qx, qy, qz, tx, ty, tz))))
 
     if file.suffix == ".txt":
-        return _parse_lines(file, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", parse, _are_observations)
+        return _parse_lines(file, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", parse)
     images = []
     with _reading(file):
         data = file.read_bytes()
@@ -222,14 +215,6 @@ def _read_images(model: Path) -> list[tuple[str, int, np.ndarray]]:
             stream.seek(len(encoded) + 1, 1)
             _take(stream, f"{24 * _take(stream, 'Q')[0]}x")
     return images
-
-
-def _are_observations(line: str) -> bool:
-    """Whether a line of images.txt is the second one of an image: X Y POINT3D_ID, any number of times.
-
-    Some programs omit these lines. An image's first line has 10 words, or more if its name has spaces.
-    """
-    return not line.strip("0123456789+-.eE \t") and len(line.split()) % 3 == 0
 
 
 def _read_points(model: Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:

@@ -188,12 +188,9 @@ def read_image(path: str | Path, *, upright: bool = True) -> tuple[UInt8[np.ndar
 def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"] | UInt[np.ndarray, "h w"]) -> None:
     """Writes RGB, or grey values of 8 or 16 bits, atomically; the suffix chooses the format."""
     path, image = Path(path), np.asarray(image)
-    try:
-        encoded, data = cv2.imencode(path.suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image)
-    except cv2.error:
-        encoded = False
-    if not encoded:
+    if not cv2.haveImageWriter(path.name):
         raise InputError(path, f"no image format has the suffix {path.suffix!r}", remedy="Use .png or .jpg.")
+    _, data = cv2.imencode(path.suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image)
     with atomic_write(path) as temporary:
         temporary.write_bytes(data.tobytes())
 

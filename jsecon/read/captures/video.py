@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from jsecon.errors import InputError
-from jsecon.files import atomic_write
+from jsecon.read.captures.images import write_image
 from jsecon.types import Progress
 
 DEFAULT_VIDEO_FRAMES = 150
@@ -50,8 +50,7 @@ def write_frames(
     for number, (image, _) in enumerate(_decode(video)):
         if number in chosen:
             written.append(folder / f"frame_{number:06d}.jpg")
-            with atomic_write(written[-1]) as temporary:  # imwrite hides a full disk
-                temporary.write_bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 97])[1].tobytes())
+            write_image(written[-1], cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
         if progress is not None:
             progress(len(sharpness) + number + 1, 2 * len(sharpness))
     return written
@@ -59,7 +58,8 @@ def write_frames(
 
 def _decode(video: Path) -> Iterator[tuple[UInt8[np.ndarray, "h w 3"], int]]:
     """Yields each frame (BGR), with the number of frames by the video's header, at least 1."""
-    reader = cv2.VideoCapture(os.fspath(video), cv2.CAP_FFMPEG)  # other backends write errors to stderr
+    # Other backends write errors to stderr; FFmpeg takes what stands before a colon for a protocol, but in a full path.
+    reader = cv2.VideoCapture(os.path.abspath(video), cv2.CAP_FFMPEG)
     try:
         total = max(1, int(reader.get(cv2.CAP_PROP_FRAME_COUNT)))
         while True:

@@ -190,8 +190,11 @@ def _find_masks(
             matched[reader].append(found)
     if not matched:
         for path in unread:
-            if path.suffix.lower() in (*IMAGE_SUFFIXES, ".npz", ".gif", ".exr"):  # may be meant as masks
-                raise _unsupported(path)
+            suffix = path.suffix.lower()
+            if suffix in (*IMAGE_SUFFIXES, ".npz", ".gif", ".exr"):  # may be meant as masks
+                because = ", and its compression changes ids" if suffix in (".jpg", ".jpeg") else ""
+                remedy = "Export the masks again: one that is converted from JPEG keeps the wrong ids."
+                raise InputError(path, f"the mask is a {suffix} file{because}", "a PNG or .npy", remedy)
         count = sum(map(len, unmatched.values()))
         problem = f"it holds {count} masks{', none of which is called like a frame' if count else ''}"
         expected = " or ".join(next(iter(frames)) + mark for reader in formats for mark in reader.marks) + " and so on"
@@ -218,14 +221,6 @@ def _find_masks(
         if match.extra in (objects or extras[:1]):
             paths[match.frame].setdefault(match.extra, folder / match.path)
     return {name: functools.partial(_read_files, reader, objects, some, level) for name, some in paths.items()}, notes
-
-
-def _unsupported(path: Path) -> InputError:
-    """The error of a mask in a format that is not read."""
-    if path.suffix.lower() in (".jpg", ".jpeg"):
-        remedy = "Export the masks again as PNG: one that is converted from JPEG keeps the wrong ids."
-        return InputError(path, "the mask is a JPEG, whose compression changes ids", "a PNG or .npy", remedy)
-    return InputError(path, f"masks are not read from {path.suffix.lower()} files", "a PNG or .npy", "Convert it.")
 
 
 def _natural_order(name: str) -> tuple[str, int, str]:
@@ -329,7 +324,7 @@ class _Source:
         fits = same_aspect(upright, size)
         if file is not None and file.orientation > 1:
             stored = upright[::-1] if file.orientation > 4 else upright
-            if same_aspect(stored, size) and (self._are_of_stored_pixels or not fits):
+            if same_aspect(stored, size) and (not fits or self._are_of_stored_pixels):
                 image, fits = apply_orientation(image, file.orientation), True
                 self.turned += 1
         if not fits and not same_aspect(self.size[::-1], size):

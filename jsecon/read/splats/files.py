@@ -24,11 +24,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jsecon.errors import InputError, describe_error
+from jsecon.errors import InputError, describe_error, require_shape
 from jsecon.files import atomic_write, parse_json, reading
 from jsecon.read.registry import Reader, find_reader
 from jsecon.read.splats.gltf import read_glb, save_glb
 from jsecon.read.splats.ply import drawable_gaussians, read_ply, read_ply_file, save_ply, usable_blocks
+from jsecon.splat.project import check_gaussians
 from jsecon.splat.sh import C0
 from jsecon.splat.transform import float32_rounding, transform_axes, transform_gaussians
 from jsecon.types import Array, Gaussians
@@ -128,11 +129,9 @@ def _spz_axes(records: bytes) -> np.ndarray:
     return axes
 
 
-def _save_spz(path: Path, gaussians: Gaussians, *, similarity: Float[Array, "4 4"] | None = None) -> None:
+def _save_spz(path: Path, gaussians: Gaussians, object_ids: Any, similarity: Float[Array, "4 4"] | None) -> None:
     """Writes a .spz of version 3, with the finest positions that hold the farthest Gaussian in 24 bits."""
     gsply = _import_gsply(path)
-    if not gaussians.count:
-        raise InputError(path, "there are no Gaussians to write", remedy="Write a .ply, which may be empty.")
     into = _SPZ_AXES if similarity is None else _SPZ_AXES @ np.asarray(similarity, np.float64)
     blocks = [block for _, block in usable_blocks(path, gaussians, into)]
     whole = jax.tree.map(lambda *parts: np.concatenate(parts).astype(np.float32), *blocks)
@@ -255,9 +254,7 @@ def load_gaussians(path: str | Path, *, similarity: Float[Array, "4 4"] | None =
     if len(rounding) and np.median(rounding) > MAX_READ_ROUNDING:
         place = ", ".join(f"{number:.10g}" for number in np.median(gaussians.means, axis=0))
         problem = f"the Gaussians lie about ({place}), where float32 does not tell them apart"
-        remedy = (
-            "Give load_gaussians a similarity that brings them near 0, as numpy.linalg.inv(capture.source_from_scene)."
-        )
+        remedy = "Give load_gaussians a similarity that brings them near 0, as inv(capture.source_from_scene)."
         raise InputError(path, problem, remedy=remedy)
     return jax.tree.map(jnp.asarray, gaussians)
 
@@ -308,18 +305,22 @@ def save_gaussians(
     """
     path = Path(path)
     require_writable_format(path)
-    suffix = path.suffix.lower()
-    if suffix == ".spz":
-        _save_spz(path, gaussians, similarity=similarity)
-    else:
-        save = save_glb if suffix == ".glb" else save_ply
-        save(path, gaussians, object_ids=object_ids, similarity=similarity)
+    check_gaussians(gaussians)
+    if object_ids is not None:
+        require_shape("object_ids", object_ids, (gaussians.count,), "Give one id per Gaussian.")
+    if not gaussians.count and path.suffix.lower() != ".ply":
+        raise InputError(path, "there are no Gaussians to write", remedy="Write a .ply, which may be empty.")
+    _WRITERS[path.suffix.lower()](path, gaussians, object_ids, similarity)
 
 
 def require_writable_format(path: Path) -> None:
     """Checks that `save_gaussians` can write a file, which need not exist."""
-    if path.suffix.lower() not in (".ply", ".spz", ".glb"):
+    if path.suffix.lower() not in _WRITERS:
         remedy = f"For example: {path.stem}.ply; npx @playcanvas/splat-transform makes other formats of it."
-        raise InputError(path, f"its name ends in {path.suffix or 'no suffix'}", ".ply or .spz or .glb", remedy)
+        raise InputError(path, f"its name ends in {path.suffix or 'no suffix'}", " or ".join(_WRITERS), remedy)
     if path.suffix.lower() == ".spz":
         _import_gsply(path)
+
+
+_WRITERS = {".ply": save_ply, ".spz": _save_spz, ".glb": save_glb}
+"""suffix -> function that writes a file from Gaussians, ids of objects or None, and a similarity or None"""

@@ -20,10 +20,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from jsecon.errors import InputError, require_shape
+from jsecon.errors import InputError
 from jsecon.files import atomic_write, parse_json, reading
 from jsecon.read.splats.ply import drawable_gaussians, needs_float64, usable_blocks
-from jsecon.splat.project import check_gaussians
 from jsecon.splat.sh import C0, COEFFICIENT_COUNTS
 from jsecon.splat.transform import transform_blocks, transform_gaussians
 from jsecon.types import Array, Gaussians
@@ -40,23 +39,14 @@ _REMEDY = "Export the Gaussians alone, uncompressed, in sRGB colours and with al
 
 
 def save_glb(
-    path: str | Path,
-    gaussians: Gaussians,
-    *,
-    object_ids: Int[Array, " n"] | None = None,
-    similarity: Float[Array, "4 4"] | None = None,
+    path: Path, gaussians: Gaussians, object_ids: Int[Array, " n"] | None, similarity: Float[Array, "4 4"] | None
 ) -> None:
     """Writes Gaussians in float32, in glTF's axes: (x, y, z) becomes (-x, -y, z), y up.
 
     If float32 would not hold the positions (coordinates of a map projection), they are relative to the translation of
     the node. Object ids are the attribute _OBJECT_ID, -1 for none.
     """
-    check_gaussians(gaussians)
-    if object_ids is not None:
-        require_shape("object_ids", object_ids, (gaussians.count,), "Give one id per Gaussian.")
     count, into = gaussians.count, _AXES if similarity is None else _AXES @ np.asarray(similarity, np.float64)
-    if not count:
-        raise InputError(path, "there are no Gaussians to write", remedy="Write a .ply, which may be empty.")
     origin = np.zeros(3)
     if needs_float64(gaussians, into):
         origin = np.median(next(transform_blocks(gaussians, into))[1].means, axis=0)

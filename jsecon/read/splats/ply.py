@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from jsecon.errors import InputError, require_shape
+from jsecon.errors import InputError
 from jsecon.files import atomic_write, reading
 from jsecon.numerics import is_finite_and_bounded
-from jsecon.splat.project import check_gaussians, unusable_rows
+from jsecon.splat.project import unusable_rows
 from jsecon.splat.sh import C0
 from jsecon.splat.transform import BLOCK_ROWS, float32_rounding, transform_blocks
 from jsecon.types import Array, Gaussians
@@ -209,13 +209,12 @@ def drawable_gaussians(path: Path, means: np.ndarray, *others: np.ndarray) -> Ga
 
 
 def usable_blocks(
-    path: str | Path, gaussians: Gaussians, similarity: Float[Array, "4 4"] | None
+    path: Path, gaussians: Gaussians, similarity: Float[Array, "4 4"] | None
 ) -> Iterator[tuple[slice, Gaussians]]:
     """Yields the rows of a block, and its Gaussians in the (4, 4) transformed world of the file that is written.
 
     The Gaussians may be memory-mapped. A Gaussian that cannot be drawn is an error: `load_gaussians` would refuse it.
     """
-    check_gaussians(gaussians)
     for rows, block in transform_blocks(gaussians, similarity):
         _require_drawable(path, block, rows.start, "Remove these Gaussians first.")
         yield rows, block
@@ -233,20 +232,13 @@ def _require_drawable(path: str | Path, gaussians: Gaussians, first: int, remedy
 
 
 def save_ply(
-    path: str | Path,
-    gaussians: Gaussians,
-    *,
-    object_ids: Int[Array, " n"] | None = None,
-    similarity: Float[Array, "4 4"] | None = None,
+    path: Path, gaussians: Gaussians, object_ids: Int[Array, " n"] | None, similarity: Float[Array, "4 4"] | None
 ) -> None:
     """Writes Gaussians in INRIA's layout: binary little endian float32, normals zero, f_rest channel-major.
 
     Float32 Gaussians come back bit by bit. Positions are written in float64 if float32 would not hold them (coordinates
     of a map projection). Object ids are a further property, int32, which other readers skip.
     """
-    check_gaussians(gaussians)
-    if object_ids is not None:
-        require_shape("object_ids", object_ids, (gaussians.count,), "Give one id per Gaussian.")
     rest_names = (f"f_rest_{index}" for index in range(3 * (gaussians.sh.shape[1] - 1)))
     names = (*_POSITION, "nx", "ny", "nz", *_DC, *rest_names, *_OPACITY, *_SCALE, *_ROTATION)
     is_double = needs_float64(gaussians, similarity)
