@@ -39,19 +39,6 @@ def test_options_are_checked(tmp_path, options):
         load_capture(tmp_path, **options)
 
 
-def test_frames_are_taken_by_name(tmp_path):
-    write_colmap(CAPTURE, tmp_path)
-    names = CAPTURE.names[3], CAPTURE.names[1]
-    loaded = load_capture(tmp_path, only=names, holdout=None)
-    assert loaded.names == names[::-1]  # in the capture's order
-    np.testing.assert_array_equal(loaded.frames, CAPTURE.frames[[1, 3]])
-    np.testing.assert_allclose(loaded.cameras.world_to_camera, CAPTURE.cameras.world_to_camera[[1, 3]], atol=1e-6)
-    with refused("no frame called nothing among the 5"):
-        load_capture(tmp_path, only=["nothing", names[0]])
-    with refused("no frame called ..."):
-        load_capture(tmp_path, only=[])
-
-
 def test_options_and_progress(tmp_path):
     write_colmap(CAPTURE, tmp_path)
     calls = []

@@ -13,7 +13,7 @@ import math
 import os
 import re
 import tempfile
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
@@ -205,19 +205,13 @@ def _read_depth(
     return cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)
 
 
-def build_capture(
-    posed: PosedImages,
-    options: FrameOptions,
-    *,
-    only: Collection[str] | None = None,
-    progress: Progress | None = None,
-) -> Capture:
+def build_capture(posed: PosedImages, options: FrameOptions, *, progress: Progress | None = None) -> Capture:
     """Reads the images of a capture: in name order, undistorted, at one size.
 
     Distorted images are resampled (bilinear) to the widest pinhole lens without empty pixels, then shrunk (area
     average). Images of other sizes than the commonest are resized to it, focal lengths with them. Large coordinates and
     units far from metres are changed in float64 (`_normalizing_transform`), by the same for any choice of frames;
-    `Capture.source_from_scene` leads back. `only` names the frames to read.
+    `Capture.source_from_scene` leads back.
     """
     frames, notes = _in_order(posed)
     deep = [frame.posed for frame in frames if frame.posed.depth is not None and not len(posed.points)]
@@ -225,13 +219,6 @@ def build_capture(
     depths = [read_depth(image.depth, image.depth_unit) for image in samples if image.depth is not None]
     poses = np.stack([frame.pose for frame in frames])
     world, world_notes = _normalizing_transform(poses, posed.points, depths)  # of all frames, whichever are taken
-    if only is not None:
-        missing = sorted(set(only) - {frame.name for frame in frames})
-        if missing or not only:
-            among = f"among the {len(frames)}, {frames[0].name} ..."
-            problem = f"there is no frame called {[*missing, '...'][0]} {among}"
-            raise InputError(posed.where, problem, remedy="Give the capture that these names are of.")
-        frames = [frame for frame in frames if frame.name in only]
     notes += [*posed.notes, *world_notes, *_camera_jumps(frames)]
     unsized = [frames[i] for i in evenly_spaced(len(frames), options.frames)]
     if len(unsized) < len(frames):

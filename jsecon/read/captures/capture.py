@@ -5,7 +5,6 @@ and poses in OpenCV axes. Other packages add readers by entry points in the grou
 """
 
 import re
-from collections.abc import Collection
 from pathlib import Path
 
 from jsecon.errors import InputError
@@ -30,7 +29,6 @@ def load_capture(
     long_side: int | None = None,
     frames: int | None = None,
     holdout: int | None = 8,
-    only: Collection[str] | None = None,
     progress: Progress | None = None,
 ) -> Capture:
     """Loads a capture.
@@ -45,7 +43,6 @@ def load_capture(
       long_side: Longest side of the frames, px, if `downscale` is None; None: no limit.
       frames: Most frames, evenly spaced; None: all.
       holdout: k holds out the frames 0, k, 2k, ...; 0 or None holds out no frame.
-      only: Names of the frames to load, as in Capture.names; None: all.
       progress: Called with (frames done, frames).
 
     Returns:
@@ -55,7 +52,7 @@ def load_capture(
       InputError: The path holds no capture, or a damaged one.
     """
     options = FrameOptions(downscale, long_side, frames, holdout)
-    return build_capture(read_posed_images(Path(path)), options, only=only, progress=progress)
+    return build_capture(read_posed_images(Path(path)), options, progress=progress)
 
 
 def read_posed_images(path: Path) -> PosedImages:

@@ -440,12 +440,7 @@ def load_proposals(
 
 
 def load_features(
-    folder: Path,
-    names: Sequence[str],
-    size: tuple[int, int],
-    *,
-    level: str = "l",
-    frames: AllFrames | None = None,
+    folder: Path, names: Sequence[str], size: tuple[int, int], *, level: str = "l", frames: AllFrames | None = None
 ) -> FrameMasks:
     """Reads one level of LangSplat's masks as labels (H, W), with their embeddings; arguments as of `load_labels`.
 
