@@ -69,16 +69,13 @@ class FrameOptions:
 
     def __post_init__(self) -> None:
         """Raises InputError if no capture can be loaded with one of the options."""
-        every = "0 (no frame), or at least 2 (every second)"
-        for name, is_valid, expected, remedy in (
-            ("downscale", lambda v: np.isfinite(v) and v >= 1, "a number of at least 1", "2 halves width and height."),
-            ("long_side", lambda v: v >= 1, "at least 1 px", "400 is the default."),
-            ("frames", lambda v: v >= 1, "at least 1", "Leave it out to take every frame."),
-            ("holdout", lambda v: v == 0 or v > 1, every, "8 is the custom; 1 leaves no frame to fit to."),
-        ):
+        for name in ("downscale", "long_side", "frames"):
             value = getattr(self, name)
-            if value is not None and not is_valid(value):
-                raise InputError(name, str(value), expected, remedy)
+            if value is not None and not 1 <= value < np.inf:
+                raise InputError(name, str(value), "a number of at least 1", "Leave it out for no limit.")
+        if self.holdout is not None and (self.holdout < 0 or self.holdout == 1):
+            remedy = "8 is the custom; 1 leaves no frame to fit to."
+            raise InputError("holdout", str(self.holdout), "0 (no frame), or at least 2 (every second)", remedy)
 
     def size(self, size: tuple[int, int]) -> tuple[int, int]:
         """Computes (width, height) of the frames of images of a size, px."""

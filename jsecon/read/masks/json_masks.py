@@ -123,16 +123,16 @@ def _image_size(image: Any) -> tuple[int, int] | None:
     return (width, height) if has_size else None
 
 
-def open_coco(folder: Path, frame_of: Callable[[PurePosixPath, str], str | None]) -> dict[str, ReadMasks] | None:
+def open_coco(folder: Path, match: Callable[[PurePosixPath, str], Any]) -> dict[str, ReadMasks] | None:
     """Opens the COCO file of all frames: `folder` itself, or the only JSON in it if that lists images.
 
-    `frame_of` looks up the name of a frame by the path and the suffix of an image.
+    `match` finds the `frame` of the path and the suffix of an image, or None.
     """
     files = [folder] if folder.is_file() else list(folder.glob("*.json"))
     if len(files) != 1 or files[0].suffix.lower() != ".json":
         return None
     file = files[0]
-    if file != folder and frame_of(PurePosixPath(file.name), ".json") is not None:
+    if file != folder and match(PurePosixPath(file.name), ".json") is not None:
         return None
     content = read_json(file, _JSON, _REMEDY)
     if file != folder and not (isinstance(content, dict) and "images" in content):
@@ -143,9 +143,9 @@ def open_coco(folder: Path, frame_of: Callable[[PurePosixPath, str], str | None]
         for record in content["annotations"]:
             records[record["image_id"]].append(record)
         for image in content["images"]:
-            name, own = frame_of(PurePosixPath(str(image["file_name"])), ""), _image_size(image)
-            if name is not None:
-                readers[name] = functools.partial(_decode_records, file, records[image["id"]], own)
+            found, own = match(PurePosixPath(str(image["file_name"])), ""), _image_size(image)
+            if found is not None:
+                readers[found.frame] = functools.partial(_decode_records, file, records[image["id"]], own)
     if not readers:
         first = content["images"][0]["file_name"] if content["images"] else "no image"
         problem = f"none of its {len(records)} images is called like a frame (the first: {first})"

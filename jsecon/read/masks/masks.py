@@ -91,8 +91,8 @@ class TrackedMasks(NamedTuple):
     labels: Int16[np.ndarray, "t h w"]
     """-1 = none, else 0..R-1, the same region in every frame."""
     ids: tuple[int, ...]
-    """R ids as the files have them (of a colour: R*65536 + G*256 + B), numbers of objects from 1 on, or of masks in a
-    frame from 0 on."""
+    """R ids as the files have them (of a colour: R*65536 + G*256 + B), or numbers of objects from 1 on; masks of single
+    frames are counted from 0 on."""
     notes: tuple[str, ...]
     """What was skipped or changed, a sentence each."""
 
@@ -140,9 +140,8 @@ def _match_frames(frames: AllFrames) -> _Matcher:
         word = _AFFIX.fullmatch(base)
         keys = [base, _without_image_suffix(base), *([word[1], _without_image_suffix(word[1])] if word else [])]
         for rank, key in enumerate(dict.fromkeys(keys)):
-            if fits := sorted(
-                (*_extra_folders(path.parts[:-1], folders), name) for name, folders in by_key.get(key, ())
-            ):
+            fits = [(*_extra_folders(path.parts[:-1], folders), name) for name, folders in by_key.get(key, ())]
+            if fits := sorted(fits):
                 is_unclear = len(fits) > 1 and fits[0][:2] == fits[1][:2]
                 return None if is_unclear else _Match(fits[0][3], "/".join(fits[0][2]), rank, path)
         return None
@@ -205,7 +204,7 @@ def _find_masks(
         raise InputError(folder, problem, "one kind", "Put each kind into a folder of its own.")
     ((reader, matches),) = matched.items()
     # Folders that the images do not have stand for objects, if all files lie in several of them.
-    extras = sorted({match.extra for match in matches}, key=_natural_order)
+    extras = sorted({found.extra for found in matches}, key=_natural_order)
     objects = extras if "" not in extras and len(extras) > 1 else []
     notes = []
     if objects:
@@ -213,13 +212,12 @@ def _find_masks(
     elif extras[1:]:
         notes.append(f"Masks in other folders ({_shorten(extras[1:])}) were not used.")
     if others := unmatched[reader]:
-        verb = "belongs" if len(others) == 1 else "belong"
-        files = f"{len(others)} of the {reader.marks[0]} files"
-        notes.append(f"{files} {verb} to no frame of this capture, first {others[0].name}.")
+        files = f"{len(others)} of the {reader.marks[0]} files, first {others[0].name}"
+        notes.append(f"There are masks of no frame of this capture: {files}.")
     paths: dict[str, dict[str, Path]] = collections.defaultdict(dict)
-    for match in sorted(matches, key=lambda match: (match.rank, -len(match.path.parts))):
-        if match.extra in (objects or extras[:1]):
-            paths[match.frame].setdefault(match.extra, folder / match.path)
+    for found in sorted(matches, key=lambda found: (found.rank, -len(found.path.parts))):
+        if found.extra in (objects or extras[:1]):
+            paths[found.frame].setdefault(found.extra, folder / found.path)
     return {name: functools.partial(_read_files, reader, objects, some, level) for name, some in paths.items()}, notes
 
 
@@ -292,7 +290,7 @@ class _Source:
         self.resized = self.turned = 0
         self.notes: list[str] = []
         match = _match_frames(self.frames)
-        coco = None if formats else open_coco(folder, lambda *file: (found := match(*file)) and found.frame)
+        coco = None if formats else open_coco(folder, match)
         if coco is None:
             formats = formats or readers("jsecon.masks", READERS)
             coco, self.notes = _find_masks(folder, self.frames, match, formats, level)
@@ -375,30 +373,25 @@ def load_labels(
     names = list(names) if limit is None else [name for name in names if name not in source.missing][:limit]
     labels = np.full((len(names), *size), -1, np.int16)
     frame_ids: list[np.ndarray] = []
-    is_shared, has_negative = True, False
+    is_shared, has_negative, count = True, False, 0
     for t, name in enumerate(names):
         ids = np.zeros(0, np.int64)
         if name not in source.missing:
             path, stored = source.read(name)
             if isinstance(stored, list):
                 is_shared, image = False, np.full(size, -1)
-                for number in reversed(range(len(stored))):
-                    image[stored[number]] = number
-                stored = image
+                for number, mask in reversed([*enumerate(stored, start=count)]):
+                    image[mask] = number
+                stored, count = image, count + len(stored)
             elif stored.min() < 0:
                 has_negative = True
             ids, labels[t] = _compact_ids(path, stored)
         frame_ids.append(ids)
         if progress is not None:
             progress(t + 1, len(names))
-    if is_shared:
-        ids = np.unique(np.concatenate(frame_ids))
-        ids = ids if has_negative else ids[ids != 0]
-        tables = [np.where(np.isin(each, ids), np.searchsorted(ids, each), -1) for each in frame_ids]
-    else:
-        ids = np.concatenate(frame_ids)
-        starts = np.cumsum([0, *map(len, frame_ids)])
-        tables = [np.arange(len(each)) + start for each, start in zip(frame_ids, starts)]
+    ids = np.unique(np.concatenate(frame_ids))
+    ids = ids[ids != 0] if is_shared and not has_negative else ids
+    tables = [np.where(np.isin(each, ids), np.searchsorted(ids, each), -1) for each in frame_ids]
     if len(ids) > _MAX_REGIONS:
         remedy = "Take a coarser level or fewer frames."
         raise InputError(folder, f"there are {len(ids)} regions", f"at most {_MAX_REGIONS}", remedy)
