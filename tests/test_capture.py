@@ -1,7 +1,5 @@
 """load_capture finds the format; options are checked."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from capture_files import refused, small_capture, transforms, write_transforms
@@ -65,28 +63,3 @@ def test_spread(count, wanted):
     assert len(chosen) == 1 or chosen[-1] == count - 1
     gaps = np.diff(chosen)
     assert len(gaps) == 0 or (gaps.min() >= 1 and gaps.max() - gaps.min() <= 1)
-
-
-def jumps(centres, folder) -> list[str]:
-    """The notes on jumps of a capture with these camera centres."""
-    capture = small_capture(len(centres))
-    poses = np.tile(np.eye(4), (len(centres), 1, 1))
-    poses[:, :3, :3] = np.linalg.qr(np.random.default_rng(1).normal(size=(len(centres), 3, 3)))[0]
-    poses[:, :3, :3] *= np.linalg.det(poses[:, :3, :3])[:, None, None]
-    poses[:, :3, 3] = -np.einsum("tij,tj->ti", poses[:, :3, :3], centres)
-    cameras = dataclasses.replace(capture.cameras, world_to_camera=poses)
-    write_transforms(dataclasses.replace(capture, cameras=cameras), folder)
-    return [note for note in load_capture(folder).notes if "jumps in" in note]
-
-
-def test_poses_that_jump_are_told_and_frames_that_do_not_move_or_have_no_order_do_not_jump(tmp_path):
-    along = np.cumsum(np.random.default_rng(0).uniform(0.1, 2.0, 40)) / 40  # steps of a tenth to twice the usual
-    centres = np.stack([np.cos(along), np.zeros(40), np.sin(along)], axis=1)
-    assert jumps(centres, tmp_path) == []
-    assert jumps(centres[np.random.default_rng(2).permutation(40)], tmp_path) == []
-    assert jumps(np.zeros((9, 3)), tmp_path) == []
-    assert jumps(centres[:1], tmp_path) == []
-    centres[12:15, 0] += 15 / 40
-    (note,) = jumps(centres, tmp_path)
-    assert "2 places" in note
-    assert "frame_011 to frame_012, frame_014 to frame_015)" in note

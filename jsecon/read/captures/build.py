@@ -219,7 +219,7 @@ def build_capture(posed: PosedImages, options: FrameOptions, *, progress: Progre
     depths = [read_depth(image.depth, image.depth_unit) for image in samples if image.depth is not None]
     poses = np.stack([frame.pose for frame in frames])
     world, world_notes = _normalizing_transform(poses, posed.points, depths)  # of all frames, whichever are taken
-    notes += [*posed.notes, *world_notes, *_camera_jumps(frames)]
+    notes += [*posed.notes, *world_notes]
     unsized = [frames[i] for i in evenly_spaced(len(frames), options.frames)]
     if len(unsized) < len(frames):
         notes.append(f"{len(unsized)} of {len(frames)} frames were taken, evenly spaced.")
@@ -282,27 +282,6 @@ def build_capture(posed: PosedImages, options: FrameOptions, *, progress: Progre
     )
 
 
-def _camera_jumps(frames: Sequence[_Frame]) -> list[str]:
-    """Reports places where neighbouring frames' cameras lie more than ten median steps apart: a note, or none.
-
-    A reconstruction of 125 photographs with five errors had steps of 11 to 20 there; when right, its largest was 2.2,
-    and that of a walk with one cut 9.9.
-    """
-    steps = np.linalg.norm(np.diff(_centres(np.stack([frame.pose for frame in frames])), axis=0), axis=1)
-    median = float(np.median(steps)) if len(steps) else 0.0
-    far = [f"{frames[t].name} to {frames[t + 1].name}" for t in np.flatnonzero(steps > 10 * median)]
-    if median == 0 or not far:
-        return []
-    places = ", ".join(far[:5]) + (" ..." if len(far) > 5 else "")
-    jump = f"The camera jumps in {len(far)} places, by up to {steps.max() / median:.0f} of its usual steps ({places})."
-    return [f"{jump} If the frames are one walk, poses there are wrong: check them before you trust the fit."]
-
-
-def _centres(poses: np.ndarray) -> np.ndarray:
-    """(T, 3) camera centres of world-to-camera poses."""
-    return -np.einsum("tji,tj->ti", poses[:, :3, :3], poses[:, :3, 3])
-
-
 def _normalizing_transform(
     poses: Float[np.ndarray, "t 4 4"], points: Float[np.ndarray, "p 3"], depths: Sequence[Float[np.ndarray, "h w"]] = ()
 ) -> tuple[Float[np.ndarray, "4 4"], tuple[str, ...]]:
@@ -312,7 +291,7 @@ def _normalizing_transform(
     scaled by a power of 1000, comes out in the same world up to a shift of its own size. Depth maps of a few views, in
     world units with 0 where unknown, stand in for missing points; without either, the spread of the cameras counts.
     """
-    centres = _centres(poses)
+    centres = -np.einsum("tji,tj->ti", poses[:, :3, :3], poses[:, :3, 3])
     middle = np.median(centres, axis=0)
     spread = float(np.median(np.linalg.norm(centres - middle, axis=1)))
     near = _near_depth(poses, np.asarray(points, np.float64), depths) or spread

@@ -63,14 +63,13 @@ def _read_colmap(places: Sequence[str], path: Path) -> PosedImages:
     """
     found = {file.parent for place in places for file in path.glob(place + _MARK)}
     found = sorted(found, key=lambda model: (not model.name.isdecimal(), len(model.name), model))
+    found = [model for model in found if _model_file(model, "images")] or found
     models, notes = {model: _read_images(model) for model in found}, []
     model, *others = sorted(models, key=lambda model: -len(models[model]))
     if others:
         largest, *rest = (f"{place.relative_to(path)} with {len(models[place])} images" for place in (model, *others))
-        notes.append(
-            f"There are {len(models)} models. The largest, {largest}, is used; left out: {', '.join(rest)}. "
-            "Join them (colmap model_merger), or take photographs between them, to use all."
-        )
+        used = f"There are {len(models)} models. The largest, {largest}, is used; left out: {', '.join(rest)}."
+        notes.append(f"{used} Join them (colmap model_merger), or take photographs between them, to use all.")
     lenses, images = _read_cameras(model), models[model]
     files = _find_images(path, [name for name, _, _ in images])
     posed = []

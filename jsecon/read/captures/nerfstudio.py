@@ -91,9 +91,8 @@ def source_from_trained(file: Path) -> Float[np.ndarray, "4 4"]:
         scale = _number(content, "scale", 1.0)
         if not scale > 0:
             raise ValueError(f"scale is {scale}")
-        return np.linalg.inv(
-            np.diag([scale, scale, scale, 1.0]) @ make_rigid(_matrix(content["transform"]), file, "the trained world")
-        )
+        transform = make_rigid(_matrix(content["transform"]), file, "the trained world")
+        return np.linalg.inv(np.diag([scale, scale, scale, 1.0]) @ transform)
 
 
 def _source_from_poses(content: dict[str, Any], scale: float) -> np.ndarray:

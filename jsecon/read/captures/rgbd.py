@@ -69,9 +69,7 @@ def _lens(width: Any, height: Any, *intrinsics: Any) -> Lens:
     """
     fx, fy, cx, cy = map(float, intrinsics)
     if not (0 < cx < width and 0 < cy < height):
-        raise ValueError(
-            f"a frame of {width}x{height} with focal lengths {fx:g}, {fy:g} and its centre at {cx:g}, {cy:g}"
-        )
+        raise ValueError(f"a frame of {width}x{height} with its centre at {cx:g}, {cy:g}")
     return Lens(int(width), int(height), fx, fy, cx, cy)
 
 
@@ -154,9 +152,8 @@ def _read_arkitscenes(path: Path) -> PosedImages:
     images, rows = _list_images(path / "lowres_wide"), _numbers(path / "lowres_wide.traj", 7)
     lens_files = sorted((path / "lowres_wide_intrinsics").glob("*.pincam"))
     with _parsing(path / "lowres_wide"):
-        times, lens_times = (
-            np.array([float(f.stem.rpartition("_")[2]) for f in each]) for each in (images, lens_files)
-        )
+        stems = [[file.stem.rpartition("_")[2] for file in files] for files in (images, lens_files)]
+        times, lens_times = (np.array(each, np.float64) for each in stems)
     posed = []
     # The name of a frame's intrinsics can be a millisecond earlier or later than that of its image.
     for image, row, lens in zip(images, _nearest_times(rows[:, 0], times), _nearest_times(lens_times, times)):

@@ -23,7 +23,7 @@ from jsecon.read.registry import Reader
 ReadMasks: TypeAlias = Callable[[tuple[int, int]], tuple[Path, np.ndarray | list[np.ndarray]]]
 """(width, height) of the image of a frame -> a file, and its ids (H, W), or masks (H, W), the best first"""
 _REMEDY = "Write them with SAM's scripts/amg.py --convert-to-rle, or as COCO polygons."
-_RLE = '{"size": [H, W], "counts": a text or a list}'
+_MASK = '{"size": [H, W], "counts": a text or a list}, or polygons of three corners or more'
 _JSON = 'a list of {"segmentation": ...}, or COCO\'s {"images", "annotations"}'
 
 
@@ -36,7 +36,7 @@ def _decode_rle(rle: Any, where: str) -> Bool[np.ndarray, "h w"]:
     runs = np.asarray(_parse_runs(counts) if isinstance(counts, str) else counts, np.int64)
     valid = runs.ndim == 1 and ((runs >= 0) & (runs <= MAX_PIXELS)).all() and min(height, width) > 0
     if not valid or height * width > MAX_PIXELS or runs.sum() != height * width:
-        raise InputError(where, f"the mask's runs fill {int(runs.sum())} of {height}x{width} pixels", _RLE, _REMEDY)
+        raise InputError(where, f"the mask's runs fill {int(runs.sum())} of {height}x{width} pixels", _MASK, _REMEDY)
     values = np.arange(len(runs)) % 2 == 1
     return np.ascontiguousarray(np.repeat(values, runs).reshape(width, height).T)
 
@@ -103,11 +103,8 @@ def _decode_records(
         scores = [float(r.get("predicted_iou", 1.0)) * float(r.get("stability_score", 1.0)) for r in records]
     masks = []
     for number in np.argsort(-np.asarray(scores), kind="stable"):
-        where, expected = (
-            f"{file}, mask {number}",
-            f"{_RLE}, or [[x, y, x, y, ...], ...] with three corners or more each",
-        )
-        with reading(where, expected, _REMEDY, problem="the mask cannot be read"):
+        where = f"{file}, mask {number}"
+        with reading(where, _MASK, _REMEDY, problem="the mask cannot be read"):
             segmentation = records[number]["segmentation"]
             if isinstance(segmentation, dict):
                 masks.append(_decode_rle(segmentation, where))
@@ -118,9 +115,9 @@ def _decode_records(
 
 def _image_size(image: Any) -> tuple[int, int] | None:
     """(width, height) of an image's record, or None."""
-    width, height = (image.get(key) if isinstance(image, dict) else None for key in ("width", "height"))
-    has_size = isinstance(width, int) and isinstance(height, int) and width > 0 and 0 < width * height <= MAX_PIXELS
-    return (width, height) if has_size else None
+    sides = [image.get(key) if isinstance(image, dict) else None for key in ("width", "height")]
+    width, height = (int(side) if isinstance(side, int | float) and 0 < side <= MAX_PIXELS else 0 for side in sides)
+    return (width, height) if 0 < width * height <= MAX_PIXELS else None
 
 
 def open_coco(folder: Path, match: Callable[[PurePosixPath, str], Any]) -> dict[str, ReadMasks] | None:

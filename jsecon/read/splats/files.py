@@ -145,16 +145,10 @@ def _save_spz(path: Path, gaussians: Gaussians, object_ids: Any, similarity: Flo
     if (sizes > 5.95).any() or (sizes < -10.05).mean() > 0.01:
         problem = f"its Gaussians are up to {np.exp(sizes.max()):.3g} units large, or many are tiny"
         raise InputError(path, problem, "sizes from 4.5e-5 to 379 units in a .spz", "Write a .ply, or scale the scene.")
-    rest = np.ascontiguousarray(whole.sh[:, 1:]) if whole.sh.shape[1] > 1 else None
-    columns = (
-        whole.means,
-        whole.log_scales,
-        whole.quaternions,
-        whole.opacity_logits,
-        np.ascontiguousarray(whole.sh[:, 0]),
-    )
+    constant, rest = np.ascontiguousarray(whole.sh[:, 0]), np.ascontiguousarray(whole.sh[:, 1:])
+    columns = whole.means, whole.log_scales, whole.quaternions, whole.opacity_logits, constant
     with atomic_write(path) as temporary, np.errstate(over="ignore"):
-        data = gsply.GSData.from_arrays(*columns, shN=rest, format="ply")
+        data = gsply.GSData.from_arrays(*columns, shN=rest if rest.size else None, format="ply")
         gsply.write_spz(temporary, data, version=3, fractional_bits=bits)
 
 

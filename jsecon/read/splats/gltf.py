@@ -229,10 +229,8 @@ def _column(document: Any, body: np.ndarray, name: str, index: int) -> Float[np.
     view, count = document["bufferViews"][accessor["bufferView"]], int(accessor["count"])
     kind, size = np.dtype(_DTYPES[accessor["componentType"]]), _COMPONENTS[accessor["type"]]
     row = kind.itemsize * size
-    stride, offset = (
-        int(view.get("byteStride", row)),
-        int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0)),
-    )
+    stride = int(view.get("byteStride", row))
+    offset = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
     if "sparse" in accessor or view["buffer"] != 0 or "uri" in document["buffers"][0]:
         raise ValueError(f"the numbers of {name} are sparse or lie in another file")
     if count < 0 or stride < row or offset < 0 or offset + (count - 1) * stride + row > len(body):
