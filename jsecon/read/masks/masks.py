@@ -53,15 +53,13 @@ AllFrames: TypeAlias = Mapping[str, ImageFile | None]
 """all frames of a capture in order, by name, each with its image or None"""
 
 
+@np.errstate(invalid="ignore")  # of a signalling NaN
 def _read_level(path: Path, size: tuple[int, int], level: str) -> Int[np.ndarray, "h w"]:
     """Reads one level of LangSplat's `_s.npy`: (H, W) ids, -1 for no region."""
     if level not in LEVELS:
         raise InputError("level", f"there is no level {level!r}", f"one of {', '.join(LEVELS)}", "l is the coarsest.")
     expected = f"a .npy of shape ({len(LEVELS)}, H, W): ids of levels {', '.join(LEVELS)}, -1 for no region"
-    with (
-        reading(path, expected, "Write the masks again.", problem="the array cannot be read"),
-        np.errstate(invalid="ignore"),  # of a signalling NaN
-    ):
+    with reading(path, expected, "Write the masks again.", problem="the array cannot be read"):
         image = map_npy(path)
         if image.ndim != 3 or len(image) != len(LEVELS) or not image.size:
             raise ValueError(f"its shape is {image.shape}")

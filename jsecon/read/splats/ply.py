@@ -156,9 +156,7 @@ def read_ply(path: Path) -> Gaussians:
     rest = sum(name.startswith("f_rest_") for name in names)
     rest_names = [f"f_rest_{index}" for index in range(rest)]
     if rest not in (0, 9, 24, 45) or any(name not in names for name in rest_names):
-        raise ValueError(
-            f"its vertices have {rest} properties f_rest, expected 0, 9, 24 or 45 (degree 0 to 3) from 0 on"
-        )
+        raise ValueError(f"its vertices have {rest} properties f_rest, expected 0, 9, 24 or 45 (degree 0 to 3)")
     filters = [name for name in names if name.lower() == "filter_3d"][:1]
     exact = all(np.can_cast(table.dtype[name], np.float32) for name in _POSITION)
     means = np.empty((count, 3), np.float32 if exact else np.float64)
