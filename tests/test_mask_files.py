@@ -130,7 +130,7 @@ def test_langsplat_levels(tmp_path, level):
 def test_langsplat_misfits(tmp_path):
     path = tmp_path / "b_s.npy"
     np.save(path, np.zeros((3, *SIZE)))
-    with refused("b_s.npy", "shape (3, 12, 18)"):
+    with refused("b_s.npy", "shape is (3, 12, 18)"):
         load_labels(tmp_path, NAMES, SIZE)
     np.save(path, np.full((4, *SIZE), 0.5))
     with refused("b_s.npy", "no integers"):

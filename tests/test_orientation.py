@@ -62,7 +62,7 @@ def test_a_file_without_a_size_means_the_pixels_that_its_centre_lies_in_the_midd
     np.testing.assert_array_equal(jsecon.load_capture(tmp_path).frames, capture.frames)
     write_turned(capture, tmp_path / "images", [6, 8, 1], upright=True)
     for n, (entry, turns) in enumerate(zip(content["frames"], (1, 3, 0))):
-        depth = np.arange(24 * 16, dtype=np.uint16).reshape(16, 24) + 1
+        depth = np.arange(24 * 16, dtype=np.uint16).reshape(16, 24) + 1000
         entry["depth_file_path"] = f"depth_{n}.npy"
         np.save(tmp_path / entry["depth_file_path"], np.rot90(depth, turns))
     (tmp_path / "transforms.json").write_text(json.dumps(content))

@@ -116,18 +116,14 @@ def test_headers_that_are_none(tmp_path, header, said):
         load_gaussians(tmp_path / "a.ply")
 
 
-@pytest.mark.parametrize(
-    ("kind", "values"),
-    [("uchar", [0, 51, 255]), ("ushort", [0, 51 * 257, 65535]), ("float", [0.0, 0.2, 1.0])],
-)
-def test_plain_points(tmp_path, kind, values):
+def test_plain_points(tmp_path):
     given = {
         "x": np.arange(3.0),
         "y": np.ones(3),
         "z": -np.arange(3.0),
-        **dict.fromkeys(("red", "green", "blue"), np.array(values)),
+        **dict.fromkeys(("red", "green", "blue"), np.array([0, 51, 255])),
     }
-    write_ply(tmp_path / "p.ply", given, types={**dict.fromkeys(("red", "green", "blue"), kind), "x": "double"})
+    write_ply(tmp_path / "p.ply", given, types={**dict.fromkeys(("red", "green", "blue"), "uchar"), "x": "double"})
     points, colours = load_point_cloud(tmp_path / "p.ply")
     np.testing.assert_array_equal(points, np.stack([given[axis] for axis in "xyz"], -1).astype(np.float32))
     np.testing.assert_array_equal(colours, np.repeat([[0], [51], [255]], 3, 1))

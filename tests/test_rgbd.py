@@ -255,7 +255,7 @@ def test_tum_names_with_spaces(tmp_path):
     ("tum", "groundtruth.txt", "1305031102.17 0 0 0 0 0 0 0\n", "zero norm"),
     ("tum", "intrinsics.txt", "500 500 12 8" + 9 * " 0.01", "9 numbers after"),
     ("arkitscenes", "lowres_wide.traj", "1 2 3\n", "lowres_wide.traj"),
-    ("polycam", "keyframes/corrected_cameras/101.json", '{"fx": 3}', "'fy'"),
+    ("polycam", "keyframes/corrected_cameras/101.json", '{"fx": 3}', "'cx'"),
     ("record3d", "metadata.json", '{"poses": [[0, 0, 0]]}', "metadata.json"),
 ])  # fmt: skip
 def test_damaged_files_are_told(tmp_path, name, file, text, says):
