@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from metrics import Metric, interleaved, show
 
-from jsecon.paper.queries import query_one_step
-from jsecon.query.answer import match_regions, query_anchored, select_by_code
+from jsecon.paper.queries import query_one_step, select_by_code
+from jsecon.query.answer import match_regions, query_anchored
 from jsecon.types import Camera, Codes, Gaussians, LanguageField, Regions, Votes
 
 REGIONS, TOP, TEXTS, SAMPLE, SIZE = 40, 8, 100, 20_000, 3

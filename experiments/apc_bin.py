@@ -27,7 +27,8 @@ from jsecon.fit.depth import points_from_depth
 from jsecon.fit.quality import measure_quality
 from jsecon.fit.start import gaussians_from_points
 from jsecon.paper.distill import distill_votes
-from jsecon.query.answer import match_region, select_by_code, select_gaussians
+from jsecon.paper.queries import select_by_code
+from jsecon.query.answer import match_region, select_gaussians
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.render import selection_mask
 from jsecon.query.rules import QueryRules
@@ -169,7 +170,9 @@ def evaluate(
             else:
                 chosen = select_gaussians(field, match, QueryRules(min_share=options.threshold)).mask
             if way.endswith("DBSCAN"):
-                chosen = jnp.asarray(remove_outliers(np.asarray(field.gaussians.means), np.asarray(chosen), keep="all"))
+                chosen = jnp.asarray(
+                    remove_outliers(np.asarray(field.gaussians.means), np.asarray(chosen), keep="all").mask
+                )
             for t in np.flatnonzero(capture.held_out):
                 camera = jax.tree.map(jnp.asarray, capture.cameras[int(t)])
                 mask = np.asarray(selection_mask(field.gaussians, camera, chosen))

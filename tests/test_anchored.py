@@ -13,14 +13,13 @@ from small_field import REGIONS, field_of, lone_votes, make_field, shares, unit_
 from jsecon.errors import InputError
 from jsecon.field.evidence import region_votes
 from jsecon.field.membership import add_visible_weight, normalise_votes, vote_shares
-from jsecon.paper.queries import CODE_THRESHOLD
+from jsecon.paper.queries import CODE_THRESHOLD, select_by_code
 from jsecon.query.answer import (
     match_region,
     match_regions,
     query_anchored,
     query_region,
     query_several,
-    select_by_code,
     select_gaussians,
 )
 from jsecon.query.classes import query_classes

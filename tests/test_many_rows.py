@@ -25,8 +25,8 @@ from jsecon.field.similarity import similarities
 from jsecon.fit.photometric import psnr
 from jsecon.paper.autoencoder import encode
 from jsecon.paper.distill import distill_votes
-from jsecon.paper.queries import query_canonical, query_one_step
-from jsecon.query.answer import match_regions, query_anchored, query_several, select_by_code
+from jsecon.paper.queries import query_canonical, query_one_step, select_by_code
+from jsecon.query.answer import match_regions, query_anchored, query_several
 from jsecon.query.classes import query_classes
 from jsecon.query.rules import QueryRules
 from jsecon.query.scores import region_similarities

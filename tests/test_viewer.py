@@ -2,14 +2,11 @@
 
 import dataclasses
 import http.client
-import io
 import itertools
 import socket
 import subprocess
 import sys
-import time
 import urllib.request
-import zipfile
 from types import SimpleNamespace
 
 import cv2
@@ -23,24 +20,26 @@ from small_field import colour_field, make_field
 
 from jsecon import Camera, InputError, load_gaussians, region_at, save_field
 from jsecon.app.catalogue import main_regions
-from jsecon.app.records import Query, Region
+from jsecon.app.pictures import palette
+from jsecon.app.records import Answer, Query, Region
 from jsecon.app.scene import Scene
-from jsecon.app.viewer.state import COLOURINGS, ViewState, answer_colours, highlight
+from jsecon.app.viewer.state import ANSWER_HUE, COLOURINGS, ViewState, highlight
 from jsecon.app.viewer.window import Viewer, open_viewer, region_along
 from jsecon.query.pointing import region_shares_seen
+from jsecon.types import Selection
 from jsecon.vision.colours import BASIC, ColourEmbedder
 
 MUG = ViewState(("red mug",))
 
 
 def test_a_click_highlights_a_region_and_a_second_click_removes_it():
-    state = MUG.toggle_region(3)
+    state = MUG.with_question(Region(3))
     assert state.questions == (Region(3),)
-    assert state.toggle_region(3).questions == ()
-    assert MUG.toggle_region(3, add=True).questions == ("red mug", Region(3))
-    both = state.toggle_region(4, add=True)
+    assert state.with_question(Region(3)).questions == ()
+    assert MUG.with_question(Region(3), add=True).questions == ("red mug", Region(3))
+    both = state.with_question(Region(4), add=True)
     assert both.questions == (Region(3), Region(4))
-    assert both.toggle_region(3, add=True).questions == (Region(4),)
+    assert both.with_question(Region(3), add=True).questions == (Region(4),)
 
 
 def test_a_text_is_one_question_with_the_options_of_the_controls():
@@ -50,30 +49,31 @@ def test_a_text_is_one_question_with_the_options_of_the_controls():
     assert MUG.with_question("  ").questions == ()
     changed = dataclasses.replace(MUG, threshold=0.7, all_of_class=True)
     assert changed.queries == (Query("red mug", threshold=0.7, all_of_class=True),)
-    kept = dataclasses.replace(changed.isolate(), threshold=0.2)
-    assert kept.isolated == changed.queries
-    assert changed.hide().hidden == changed.queries
-    assert changed.hide().questions == ()
-    assert ViewState().isolate() == ViewState().hide() == ViewState()
-    assert changed.isolate().hide().show_all() == dataclasses.replace(changed, questions=())
 
 
 def test_colours_of_answers_differ_and_do_not_depend_on_their_number():
-    assert answer_colours(0).shape == (0, 3)
-    many = answer_colours(12).astype(int)
-    np.testing.assert_array_equal(answer_colours(3), many[:3])
+    assert palette(0, ANSWER_HUE).shape == (0, 3)
+    many = palette(12, ANSWER_HUE).astype(int)
+    np.testing.assert_array_equal(palette(3, ANSWER_HUE), many[:3])
     differences = np.abs(many[:, None] - many[None]).sum(-1)
     assert differences[~np.eye(12, dtype=bool)].min() > 40
 
 
+def answer_of(mask, similarity):
+    """An answer by its mask and similarities."""
+    mask, zero = np.array(mask, bool), np.zeros((), np.float32)
+    selection = Selection(mask, np.array(similarity, np.float32), np.zeros((), np.int32), zero)
+    return Answer(Query("mug"), "votes", mask, selection, SimpleNamespace())
+
+
 def test_answers_are_tinted_and_the_rest_is_dimmed():
     base = np.array([[200, 100, 0]] * 4, np.uint8)
-    assert highlight(base, [], []) is base
-    a, b = np.array([1, 1, 0, 0], bool), np.array([0, 1, 1, 0], bool)
-    first, second = np.array([0.9, 0.6, 0.1, 0], np.float32), np.array([0, 0.8, np.nan, 0], np.float32)
-    colours = highlight(base, [a, b], [first, second]).astype(int)
-    tinted = (0.45 * base[0] + 0.55 * answer_colours(2)).astype(int)
-    np.testing.assert_allclose(colours[:3], [tinted[0], tinted[1], tinted[1]], atol=1)
+    failed, empty = InputError("query", "no words"), answer_of([0, 0, 0, 0], [0, 0, 0, 0])
+    assert highlight(base, [failed, empty]) is base
+    first, second = answer_of([1, 1, 0, 0], [0.9, 0.6, 0.1, 0]), answer_of([0, 1, 1, 0], [0, 0.8, np.nan, 0])
+    colours = highlight(base, [first, failed, second]).astype(int)
+    tinted = (0.45 * base[0] + 0.55 * palette(3, ANSWER_HUE)).astype(int)
+    np.testing.assert_allclose(colours[:3], [tinted[0], tinted[2], tinted[2]], atol=1)
     assert 0 < colours[3].max() < 0.5 * 200
     np.testing.assert_array_equal(base, [[200, 100, 0]] * 4)
 
@@ -140,7 +140,7 @@ def test_a_text_is_highlighted(viewer):
     mask, lit = mask_of(viewer, word), colours(viewer)
     assert (lit[~mask, :3].astype(int) <= base[~mask, :3]).all()
     np.testing.assert_array_equal(lit[:, 3], base[:, 3])
-    np.testing.assert_allclose(lit[mask, :3], 0.45 * base[mask, :3] + 0.55 * answer_colours(1)[0], atol=1)
+    np.testing.assert_allclose(lit[mask, :3], 0.45 * base[mask, :3] + 0.55 * palette(1, ANSWER_HUE)[0], atol=1)
     assert f"{int(mask.sum())} of 64 Gaussians" in words_of(viewer)
 
 
@@ -151,17 +151,14 @@ def test_a_relation_says_how_it_was_read(viewer):
     assert f"read as &#x27;{word}&#x27;, largest: 1 object" in words_of(viewer)
 
 
-def test_isolate_hide_and_show_all(viewer):
+def test_only_the_selection(viewer):
     word, opacity = word_of(viewer), colours(viewer)[:, 3]
     mask = mask_of(viewer, word)
     ask(viewer, word)
-    settled(viewer, lambda: viewer.then(ViewState.isolate))
+    settled(viewer, lambda: viewer.then(lambda state: dataclasses.replace(state, only_selected=True)))
     np.testing.assert_array_equal(colours(viewer)[:, 3], np.where(mask, opacity, 0))
-    settled(viewer, lambda: viewer.then(ViewState.show_all))
+    settled(viewer, lambda: viewer.then(lambda state: state.with_question("")))
     np.testing.assert_array_equal(colours(viewer)[:, 3], opacity)
-    settled(viewer, lambda: viewer.then(ViewState.hide))
-    np.testing.assert_array_equal(colours(viewer)[:, 3], np.where(mask, 0, opacity))
-    assert settled(viewer, lambda: viewer.then(ViewState.show_all)) == ViewState()
 
 
 @pytest.mark.parametrize("colouring", COLOURINGS)
@@ -187,20 +184,17 @@ def test_odd_texts_and_faults_are_reported_and_the_viewer_goes_on(viewer, capsys
     assert ask(viewer, Region(1)).questions == (Region(1),)
 
 
-def test_files_of_the_answers(viewer, tmp_path):
+def test_the_file_of_the_selection(viewer, tmp_path):
     sent = []
     client = SimpleNamespace(send_file_download=lambda name, content, **_: sent.append((name, content)))
     settled(viewer, lambda: viewer.export(client))
     assert "no Gaussian is selected" in viewer.panel._notice.content
     ask(viewer, Region(1))
     settled(viewer, lambda: viewer.export(client))
-    assert sent[0][0] == "region-1.zip"
-    with zipfile.ZipFile(io.BytesIO(sent[0][1])) as archive:
-        names = archive.namelist()
-        archive.extractall(tmp_path)
-    assert {"region-1.json", "region-1.ply"} <= set(names)
-    assert sum(name.endswith(".png") for name in names) == 3
-    assert load_gaussians(tmp_path / "region-1.ply").count == mask_of(viewer, Region(1)).sum()
+    name, content = sent[0]
+    assert name == "region-1.ply"
+    (tmp_path / name).write_bytes(content)
+    assert load_gaussians(tmp_path / name).count == mask_of(viewer, Region(1)).sum()
 
 
 def test_a_taken_port_and_a_missing_extra_are_refused(viewer, monkeypatch):
@@ -374,25 +368,13 @@ def test_in_a_browser_it_does_what_a_person_tries(viewer, tmp_path):
         until(lambda: viewer.state.questions == (Region(region),), "and away again")
 
         page.press("export")
-        packed = until(lambda: list((tmp_path / "downloads").glob("*.zip")), "the files arrive")[0]
-        assert f"region-{region}.ply" in zipfile.ZipFile(packed).namelist()
+        until(lambda: list((tmp_path / "downloads").glob(f"region-{region}.ply")), "the file arrives")
 
         clicked = scene_of(page)
-        page.press("hide")
-        until(lambda: viewer.state.hidden, "the region is hidden")
+        page.js(f"{input_of('only the selection')}.click()")
+        until(lambda: viewer.state.only_selected, "the rest is hidden")
         after_change(page, clicked)
-        page.press("show all")
-        until(lambda: not viewer.state.hidden, "and shown again")
         client = next(iter(viewer.server.get_clients().values()))
         viewer.go_to_frame(client, 2)
         centre = viewer.layer._centers[2]
         until(lambda: np.allclose(client.camera.position, centre, atol=1e-3), "at the frame")
-        viewer.layer.show_frames(True)
-        time.sleep(1)
-        near = viewer.layer._centers[0] + 0.04 * viewer.layer.scale * viewer.layer._rotations[0].as_matrix()[:, 2]
-        place = viewer.layer._rotations[2].inv().apply(near - centre)
-        focal = height / 2 / np.tan(viewer.layer.fovs[2] / 2)
-        things = viewer.state.questions
-        page.click(left + width / 2 + focal * place[0] / place[2], top + height / 2 + focal * place[1] / place[2])
-        until(lambda: viewer.panel._frame.value == "frame_0", "the camera of another frame is clicked")
-        assert viewer.state.questions == things

@@ -81,15 +81,8 @@ def test_only_the_groups_that_change_are_sent(field, server, monkeypatch):
     assert not colours(layer)[:, 3].any()
 
 
-def test_frames_stand_where_they_were_taken(field, server):
+def test_the_window_starts_at_the_first_frame(field, server):
     layer = SplatLayer(server, field)
     centres = np.asarray(field.cameras.centres) * layer.scale
-    assert list(layer.frustums) == [0, 1, 2, 3]
-    for t, frustum in layer.frustums.items():
-        np.testing.assert_allclose(frustum.position, centres[t], rtol=1e-5)
-        assert frustum.fov == pytest.approx(2 * np.arctan(20 / 43))
-        assert not frustum.visible
-    layer.show_frames(True)
-    shown = [frustum.visible for frustum in layer.frustums.values()]
-    assert shown == [False, True, True, True]  # one stands in the 0th
+    assert server.initial_camera.fov == pytest.approx(2 * np.arctan(20 / 43))
     np.testing.assert_allclose(server.initial_camera.position, centres[0], rtol=1e-5)

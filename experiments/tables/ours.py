@@ -18,8 +18,8 @@ from jsecon.field.membership import membership_probability, normalise_votes
 from jsecon.field.regions import scene_parts
 from jsecon.paper.autoencoder import train_autoencoder
 from jsecon.paper.distill import distill_l1, distill_votes
-from jsecon.paper.queries import CODE_THRESHOLD, query_canonical, query_one_step
-from jsecon.query.answer import match_regions, query_anchored, query_several, select_by_code
+from jsecon.paper.queries import CODE_THRESHOLD, query_canonical, query_one_step, select_by_code
+from jsecon.query.answer import match_regions, query_anchored, query_several
 from jsecon.query.classes import query_classes
 from jsecon.query.grouping import parts_fallback
 from jsecon.query.outliers import remove_outliers
@@ -147,7 +147,7 @@ def ask_field(
         if way == "all":
             every = dataclasses.replace(rules, all_of_class=True, fragment_score=RULES.fragment_score)
             found = query_several(field, text[None], rules=every)
-            return dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, found.mask, keep="all")))
+            return dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, found.mask, keep="all").mask))
         if way == "one_step":
             code = encode(codes.autoencoder, text)
             found = query_one_step(codes.gaussians, code, 0.9 if threshold is None else threshold)
@@ -171,7 +171,7 @@ def ask_field(
                 found = other
         mask = np.asarray(found.mask)
         return (
-            dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, mask, keep="largest")))
+            dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, mask, keep="largest").mask))
             if clean
             else found
         )

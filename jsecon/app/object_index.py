@@ -23,8 +23,8 @@ from jsecon.query.answer import match_regions
 from jsecon.query.expressions import parse_expression
 from jsecon.query.grouping import join_fragments
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
-from jsecon.query.outliers import split_outliers
-from jsecon.query.referring import evaluate, stack_shapes
+from jsecon.query.outliers import remove_outliers
+from jsecon.query.referring import evaluate
 from jsecon.query.relations import Viewpoint, order_values, viewpoint
 from jsecon.query.rules import QueryRules
 from jsecon.types import LanguageField, Selection
@@ -32,8 +32,6 @@ from jsecon.views.frame import field_up
 
 MAX_KEPT = 1024
 """number of phrases, and of objects, that are kept"""
-SEEN = ("left of", "right of", "in front of", "behind", "leftmost", "rightmost", "nearest", "farthest")
-"""relations and orders that depend on the viewpoint"""
 
 
 def choose_shades(
@@ -160,7 +158,7 @@ class ObjectIndex:
         rows, share = voters[share >= SHARE_THRESHOLD], share[share >= SHARE_THRESHOLD]
         gaussians = gaussian_rows(dataclasses.replace(self._field.gaussians, sh=None), rows)
         weight = share * self._votes.total[rows]
-        kept = split_outliers(gaussians.means, np.ones(len(rows), bool), keep="supported", weight=weight).mask
+        kept = remove_outliers(gaussians.means, np.ones(len(rows), bool), keep="supported", weight=weight).mask
         if not kept.any():
             return None
         gaussians = gaussian_rows(gaussians, kept)
@@ -222,7 +220,7 @@ class ObjectIndex:
             reason=best.reason,
             objects=tuple(best.chosen),
             reading=expression.describe(readings[place]),
-            viewpoint=words if expression.words & set(SEEN) else "",
+            viewpoint=words if expression.depends_on_view else "",
             used=tuple(best.used),
             alternatives=tuple({found.regions: found for found in [*best.alternatives, *differing]}.values()),
             question=question,
@@ -234,7 +232,7 @@ class ObjectIndex:
         centers = np.stack(
             [source_from_scene[:3, :3] @ found.shape.center[0] + source_from_scene[:3, 3] for found in objects]
         )
-        bearing = order_values(stack_shapes(objects), view)["leftmost"]
+        bearing = [order_values(found.shape, view)["leftmost"][0] for found in objects]
         places = ["the left one", *["a middle one"] * (len(objects) - 2), "the right one"]
         words = [
             f"{place} at ({', '.join(f'{x:.2f}' for x in centers[k])})" for place, k in zip(places, np.argsort(bearing))

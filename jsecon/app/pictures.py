@@ -19,9 +19,9 @@ UNKNOWN = 0.25
 """grey of Gaussians without a region, 0 to 1"""
 
 
-def palette(count: int) -> UInt8[np.ndarray, "n 3"]:
-    """Chooses RGB of regions 0 .. count-1, none of which depends on `count`: hues a golden angle apart."""
-    hues = (0.11 + 0.61803398875 * np.arange(count)) % 1.0
+def palette(count: int, hue: float = 0.11) -> UInt8[np.ndarray, "n 3"]:
+    """Chooses RGB of regions 0 .. count-1, none of which depends on `count`: golden angles apart, from a hue on."""
+    hues = (hue + 0.61803398875 * np.arange(count)) % 1.0
     colours = [colorsys.hls_to_rgb(h, (0.62, 0.42, 0.72)[i % 3], 0.85) for i, h in enumerate(hues)]
     return (np.asarray(colours, np.float64).reshape(count, 3) * 255).astype(np.uint8)
 

@@ -32,17 +32,7 @@ from jsecon.paper.queries import CODE_THRESHOLD
 from jsecon.pipeline.options import Options, is_bare_scene
 from jsecon.pipeline.progress import Console
 from jsecon.process import MEMORY, memory_budget
-from jsecon.query.answer import (
-    NO_REGIONS,
-    RegionMatch,
-    Trimmed,
-    answer_region,
-    answer_texts,
-    match_region,
-    match_regions,
-    select_by_code,
-    trim,
-)
+from jsecon.query.answer import NO_REGIONS, Trimmed, answer, trim
 from jsecon.query.expressions import is_expression, parse_query
 from jsecon.query.pointing import box_mask, lift, region_at
 from jsecon.query.render import selection_mask
@@ -292,9 +282,7 @@ class Scene:
             raise InputError(f"query {str(query)!r}", problem, remedy="Ask by votes, or for one thing.")
         embedded = embedder.embed_text(included + excluded)  # NumPy's slices need no compilation
         texts, without = jax.device_put((embedded[: len(included)], embedded[len(included) :]))
-        if query.by == "code":
-            return self._answer_by_code(query, match_regions(field, texts, rules), {})
-        found = answer_texts(field, texts, rules, excluded=without, outliers=query.outliers)
+        found = answer(field, texts, rules, excluded=without, outliers=query.outliers)
         by_parts = "no region holds the object, so the parts that match the text were selected"
         skipped = {"regions": by_parts} if found.by_parts else {}
         return self._finish(query, found, skipped)
@@ -303,9 +291,7 @@ class Scene:
         """Selects the Gaussians of a region, and of those that the query's options add to it."""
         rules = self._rules(query, ONE_REGION)
         skipped = {"text encoder": why}
-        if query.by == "code":
-            return self._answer_by_code(query, match_region(self.field, region, rules), skipped)
-        found = answer_region(self.field, region, rules, outliers=query.outliers)
+        found = answer(self.field, region, rules, outliers=query.outliers)
         last = self.field.regions.count - 1
         reason = "" if 0 <= region <= last else f"there is no region {region}: the regions are 0 to {last}"
         return self._finish(query, found, skipped, reason)
@@ -313,7 +299,9 @@ class Scene:
     def _rules(self, query: Query, rules: QueryRules) -> QueryRules:
         """Rules with the options of a query."""
         options: dict[str, Any] = {"min_rank": query.min_rank, "all_of_class": query.all_of_class}
-        if query.threshold is not None and query.by == "votes":
+        if query.by == "code":
+            options["code_threshold"] = CODE_THRESHOLD if query.threshold is None else query.threshold
+        elif query.threshold is not None:
             options["min_share"] = query.threshold
         if isinstance(query.question, str):
             # Of an embedder trained to tell whether a text is true of an image; the cosines of all others only rank.
@@ -321,13 +309,6 @@ class Scene:
         elif query.all_of_class:
             options |= {"duplicate_cosine": ALIKE_THRESHOLD, "all_of_class": False}
         return dataclasses.replace(rules, **options)
-
-    def _answer_by_code(self, query: Query, match: RegionMatch, skipped: dict[str, str]) -> Answer:
-        """Selects the Gaussians whose codes are close to that of the best region (the paper)."""
-        threshold = CODE_THRESHOLD if query.threshold is None else query.threshold
-        selection = select_by_code(self.field, match, threshold)
-        outliers = trim(self.field, selection, "supported" if query.outliers else None)
-        return self._finish(query, Trimmed(match, selection, outliers, 1), skipped)
 
     def _answer_outline(self, query: Query, question: Box | Mask) -> Answer:
         """Selects the object that a box or masks outline in frames."""

@@ -11,13 +11,15 @@ texts. The anchored query crosses the gap once, among R regions, where only the 
 region lie close together, so any high threshold does.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
 from jsecon.errors import require, require_shape
 from jsecon.field.similarity import Number, similarities
-from jsecon.types import Array, Selection
+from jsecon.types import Array, LanguageField, Selection
 
 TEMPERATURE = 10.0
 """LERF's and LangSplat's factor on the cosines; not CLIP's own 100"""
@@ -113,15 +115,26 @@ def query_gt_anchored(
     similarity, known = similarities(region_embeddings, text)
     best = jnp.argmax(jnp.where(known, similarity, -jnp.inf))
     region = jnp.where(jnp.any(known), best, -1).astype(jnp.int32)
-    near = select_near_region(codes, region_codes, region, threshold)
+    near = _select_near_region(codes, region_codes, region, threshold)
     return Selection(near.mask, near.similarity, region, jnp.where(region >= 0, similarity[best], 0.0))
 
 
+def select_by_code(field: LanguageField, match: tuple, threshold: Number = CODE_THRESHOLD) -> Selection:
+    """Selects the Gaussians whose code is close to that of the best region of a `query.answer.RegionMatch`."""
+    codes: Any = field.codes
+    require(codes is not None, "field.codes", None, "codes", "Make the field with jsecon run --paper.")
+    _, region, *scores = match
+    near = _select_near_region(jnp.asarray(codes.gaussians), jnp.asarray(codes.regions), region, threshold)
+    return Selection(near.mask, near.similarity, region, *scores)
+
+
 @jax.jit
-def select_near_region(
+def _select_near_region(
     codes: Float[Array, "n d"], region_codes: Float[Array, "r d"], region: Array, threshold: Number
 ) -> Selection:
     """Selects the Gaussians whose code is close to that of a region: the second step. Region -1 selects none."""
+    if not len(region_codes):
+        region_codes = jnp.zeros((1, codes.shape[1]), codes.dtype)
     similarity, known = similarities(codes, region_codes[jnp.maximum(region, 0)])
     near = _selection(similarity, known, threshold)
     found = region >= 0

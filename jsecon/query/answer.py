@@ -6,14 +6,14 @@
     select_gaussians   regions -> the Gaussians of which these regions hold at least half (field/membership)
     trim               Gaussians -> without those that lie apart from the rest (query/outliers)
 
-`answer_texts` does all three; thresholds are `QueryRules`. A region, as under a pixel, can stand in place of a text.
+`answer` does all three; thresholds are `QueryRules`. A region, as under a pixel, can stand in place of a text.
 The gap between a text's and an image's embedding is crossed once, among R regions, where only the order matters (the
 paper's GT-anchored query). Gaussians are then compared with regions, so almost any threshold does.
 
-All but `trim` and the two functions that call it can be traced: jit them, or vmap them over texts.
+All but `trim` and `answer` can be traced: jit them, or vmap them over texts.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,10 +25,10 @@ from jsecon.errors import require
 from jsecon.field.columns import is_mapped, vote_blocks
 from jsecon.field.membership import inside_fraction
 from jsecon.field.similarity import Number, similarities
-from jsecon.paper.queries import CODE_THRESHOLD, select_near_region
+from jsecon.paper.queries import select_by_code
 from jsecon.programs import stored_jit
 from jsecon.query.grouping import join_fragments, parts_fallback, regions_with
-from jsecon.query.outliers import OutlierResult, split_outliers
+from jsecon.query.outliers import OutlierResult, remove_outliers
 from jsecon.query.rules import ALL_OF_CLASS, ONE_REGION, RULES, QueryRules
 from jsecon.query.scores import score_text, unrelated_words, word_similarities
 from jsecon.types import Array, LanguageField, Selection, Votes
@@ -71,41 +71,35 @@ class Trimmed(NamedTuple):
     """Whether parts answer."""
 
 
-def answer_texts(
+def answer(
     field: LanguageField,
-    queries: Float[Array, "q e"],
+    query: Float[Array, "q e"] | int,
     rules: QueryRules = RULES,
     *,
     excluded: Float[Array, "u e"] | None = None,
     outliers: bool = True,
 ) -> Trimmed:
-    """Answers a question of one text or several by the path of this page. Host code.
+    """Answers a question by the path of this page. Host code.
 
+    `query` has the embeddings of one text or several, or is the id of a region that stands in place of a text.
     `outliers` drops the Gaussians that lie apart; regions of the `excluded` texts are left out.
     """
-    match = match_regions(field, queries, rules, excluded=excluded)
-    several = rules.all_of_class or len(queries) > 1 or (excluded is not None and len(excluded) > 0)
-    if field.parts is not None and not several:
-        selection = parts_fallback(field, queries[0], match.score, rules)
-        if selection is not None:
-            return Trimmed(match, selection, trim(field, selection, "supported" if outliers else None), 1, True)
-    return _answer(field, match, rules, ("all" if several else "supported") if outliers else None)
-
-
-def answer_region(
-    field: LanguageField, region: int, rules: QueryRules = ONE_REGION, *, outliers: bool = True
-) -> Trimmed:
-    """Answers a region in place of a text, as `answer_texts` does. Host code."""
-    keep = ("all" if rules.duplicate_cosine is not None else "supported") if outliers else None
-    return _answer(field, match_region(field, region, rules), rules, keep)
-
-
-def _answer(field: LanguageField, match: RegionMatch, rules: QueryRules, keep: str | None) -> Trimmed:
-    selection = select_gaussians(field, match, rules)
-    outliers = trim(field, selection, keep)
-    overlap = field.votes.overlap
-    groups = [] if overlap is None else join_fragments(np.flatnonzero(match.chosen), np.asarray(overlap))
-    return Trimmed(match, selection, outliers, max(1, min(len(groups), outliers.clusters_kept)))
+    parts = None
+    if isinstance(query, int | np.integer):
+        match = match_region(field, query, rules)
+        several = rules.duplicate_cosine is not None
+    else:
+        match = match_regions(field, query, rules, excluded=excluded)
+        several = rules.all_of_class or len(query) > 1 or (excluded is not None and len(excluded) > 0)
+        if field.parts is not None and not several and rules.code_threshold is None:
+            parts = parts_fallback(field, query[0], match.score, rules)
+    selection = select_gaussians(field, match, rules) if parts is None else parts
+    kept = trim(field, selection, ("all" if several else "supported") if outliers else None)
+    count, overlap = 1, field.votes.overlap
+    if overlap is not None and parts is None and rules.code_threshold is None:
+        groups = join_fragments(np.flatnonzero(match.chosen), np.asarray(overlap))
+        count = max(1, min(len(groups), kept.clusters_kept))
+    return Trimmed(match, selection, kept, count, parts is not None)
 
 
 def match_regions(
@@ -208,10 +202,11 @@ def select_gaussians(field: LanguageField, match: RegionMatch, rules: QueryRules
     """Selects the Gaussians in which the matched regions have a share of at least `rules.min_share`. Pure.
 
     The share (`inside_fraction`) estimates the probability that a pixel of the Gaussian belongs to the regions.
-    Gaussians that no view sees, or with votes that are not finite, stay out. Mapped votes are read in blocks.
+    Gaussians that no view sees, or with votes that are not finite, stay out. Mapped votes are read in blocks. With
+    `rules.code_threshold` the codes decide in place of the votes (`select_by_code`).
     """
-    if field.regions.count == 0:
-        return _select_none(field, match)
+    if rules.code_threshold is not None:
+        return select_by_code(field, match, rules.code_threshold)
     if not is_mapped(field.votes):
         return _select_from_votes(jax.tree.map(jnp.asarray, field.votes), match, rules.min_share)
     parts = [_select_from_votes(votes, match, rules.min_share) for votes in vote_blocks(field.votes)]
@@ -227,27 +222,12 @@ def _select_from_votes(votes: Votes, match: RegionMatch, min_share: Number) -> S
     return Selection(mask, share, *match[1:])
 
 
-def _select_none(field: LanguageField, match: RegionMatch) -> Selection:
-    none = jnp.zeros(field.gaussians.count, bool)
-    return Selection(none, none.astype(jnp.float32), *map(jnp.asarray, match[1:5]))
-
-
-def select_by_code(field: LanguageField, match: RegionMatch, threshold: Number = CODE_THRESHOLD) -> Selection:
-    """Selects the Gaussians whose code has at least a cosine with that of the best matched region (the paper). Pure."""
-    codes: Any = field.codes
-    require(codes is not None, "field.codes", None, "codes", "Make the field with jsecon run --paper.")
-    if field.regions.count == 0:
-        return _select_none(field, match)
-    near = select_near_region(jnp.asarray(codes.gaussians), jnp.asarray(codes.regions), match.region, threshold)
-    return Selection(near.mask, near.similarity, *match[1:])
-
-
 def trim(field: LanguageField, selection: Selection, keep: str | None = "supported") -> OutlierResult:
     """Drops the selected Gaussians that lie apart (`remove_outliers`); None in `keep` drops none. Host code."""
     if keep is None:
         return OutlierResult(np.asarray(selection.mask), "outliers are kept", 0, 0)
     weight = np.clip(np.asarray(selection.similarity), 0.0, 1.0) * np.asarray(field.votes.total)
-    return split_outliers(field.gaussians.means, selection.mask, keep=keep, weight=weight)
+    return remove_outliers(field.gaussians.means, selection.mask, keep=keep, weight=weight)
 
 
 def query_anchored(field: LanguageField, text_embedding: Float[Array, " e"], *, rules: QueryRules = RULES) -> Selection:

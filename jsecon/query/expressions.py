@@ -38,6 +38,8 @@ ANCHORED_ORDERS = ("nearest to", "farthest from")
 """Relations that choose one thing by its distance from another."""
 MAX_WORDS, MAX_RELATIONS = 60, 2
 """Of an expression."""
+_OF_VIEW = {"left of", "right of", "in front of", "behind", "leftmost", "rightmost", "nearest", "farthest"}
+"""Relations and orders that depend on the viewpoint."""
 _ORDINALS, _NUMBERS = _WORDS["ordinals"], _WORDS["numbers"]
 _QUOTED = re.compile(r"""(?<!\S)(?:"([^"]+)"|'(.+?)'|“([^”]+)”)(?=[\s,.?!]|$)""", re.DOTALL)
 """A text in quotes; an apostrophe within a word is not a quote."""
@@ -117,22 +119,14 @@ class Condition:
 class Expression:
     """What a text asks for."""
 
-    text: str
-    """The text."""
     thing: NounPhrase
     """The object that is looked for."""
     conditions: tuple[Condition, ...] = ()
     """Its relations, in the order of the text."""
     joined: bool = False
     """Whether all conditions belong to the object for certain."""
-    counted: bool = False
-    """Whether the text asks for the number of objects."""
-
-    @property
-    def words(self) -> set[str]:
-        """The relations and orders of the expression."""
-        things = [self.thing, *(anchor for condition in self.conditions for anchor in condition.anchors)]
-        return {c.relation for c in self.conditions} | {thing.order for thing in things if thing.order is not None}
+    depends_on_view: bool = False
+    """Whether a relation or an order depends on the viewpoint."""
 
     def readings(self) -> list[tuple[Condition, ...]]:
         """Lists the ways to attach the relations to the objects.
@@ -217,7 +211,9 @@ def parse_expression(text: str) -> Expression:
         conditions.append(Condition(relation, tuple(things)))
     if counted:
         thing = dataclasses.replace(thing, every=True)
-    return Expression(text, thing, tuple(conditions), joined, counted)
+    phrases = [thing, *(anchor for condition in conditions for anchor in condition.anchors)]
+    depends_on_view = not _OF_VIEW.isdisjoint([*relations, *(phrase.order for phrase in phrases)])
+    return Expression(thing, tuple(conditions), joined, depends_on_view)
 
 
 def _tokens(text: str) -> list[_Token]:

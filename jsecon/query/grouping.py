@@ -114,7 +114,7 @@ def parts_fallback(
     """
     require(field.parts is not None, "parts_fallback", "a field without parts", "its parts", "Run with --parts.")
     parts, text, words = cast(Parts, field.parts), jnp.asarray(text), unrelated_words(field)
-    scores = np.asarray(_compiled_part_scores(parts, text, words, retrieval=rules.retrieval))
+    scores = np.asarray(part_scores(parts, text, words, retrieval=rules.retrieval))
     on_scale, of_scores = np.array([0.0, SHARE_THRESHOLD, 1.0]), np.array([0.0, PART_SCORE, 1.0])
     least = float(np.interp(rules.min_share, on_scale, of_scores))
     mask = best_cluster(scores >= least, scores, field.gaussians.means)
@@ -136,6 +136,7 @@ def parts_fallback(
     return Selection(jnp.asarray(mask), jnp.asarray(similarity), region, similar, rank, None, presence)
 
 
+@functools.partial(jax.jit, static_argnames="retrieval")
 def part_scores(
     parts: Parts, text: Float[Array, " e"], words: Float[Array, "w e"] | None, *, retrieval: str
 ) -> Float[Array, " n"]:
@@ -148,9 +149,6 @@ def part_scores(
     reach = jnp.max(jnp.where(known, similarity, -jnp.inf), initial=-jnp.inf) - median
     scores = jnp.where(known & (reach > 0), (similarity - median) / jnp.where(reach > 0, reach, 1.0), 0.0)
     return jnp.concatenate([scores, jnp.zeros(1, scores.dtype)])[parts.part]  # part -1: the last
-
-
-_compiled_part_scores = jax.jit(part_scores, static_argnames="retrieval")
 
 
 @functools.partial(jax.jit, static_argnames="retrieval")

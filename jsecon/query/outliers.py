@@ -47,7 +47,7 @@ def remove_outliers(
     weight: Float[Array, " n"] | None = None,
     keep: str = "supported",
     eps: float | None = None,
-) -> Bool[np.ndarray, " n"]:
+) -> OutlierResult:
     """Removes the selected Gaussians that lie apart, by DBSCAN on their centres. Host code: it cannot be traced.
 
     Noise is dropped, and so are the clusters that `keep` does not name. Three kinds of selections come back as they
@@ -65,23 +65,11 @@ def remove_outliers(
       eps: Radius, world units; None takes 6 times the spacing of the selection.
 
     Returns:
-      (N,) bool.
+      The mask without outliers, and what became of the clusters.
 
     Raises:
       ValueError: An option is out of range, or `weight` has another length.
     """
-    return split_outliers(means, mask, weight=weight, keep=keep, eps=eps).mask
-
-
-def split_outliers(
-    means: Float[Array, "n 3"],
-    mask: Bool[Array, " n"],
-    *,
-    weight: Float[Array, " n"] | None = None,
-    keep: str = "supported",
-    eps: float | None = None,
-) -> OutlierResult:
-    """Removes outliers as `remove_outliers` does, and counts the clusters."""
     require_one_of("remove_outliers", keep, ("largest", "supported", "all"), "Use 'all' to keep several objects.")
     remedy = "Leave eps out to have it follow the selection's spacing."
     require(eps is None or eps > 0, "remove_outliers", f"eps={eps}", "eps > 0", remedy)
@@ -95,11 +83,8 @@ def split_outliers(
     chosen, points = chosen[finite], points[finite]
     if len(chosen) < MIN_SAMPLES:
         return OutlierResult(mask, f"fewer than {MIN_SAMPLES} Gaussians are selected", 0, 0)
-    links = _links(points) if len(points) <= _EXACT_POINTS else None
-    if eps is None:  # the links tell, unless more than half of the points coincide
-        eps = EPS_SPACINGS * float(np.median(links[0][:, min(3, len(points) - 1)])) if links else 0.0
-        eps = eps or _default_eps(points)
-    if _one_component(points, eps, links):  # then nothing lies apart, and DBSCAN is not needed
+    eps = _default_eps(points) if eps is None else eps
+    if _one_component(points, eps):  # then nothing lies apart, and DBSCAN is not needed
         return OutlierResult(mask, "the selection is one component", 1, 0)
     labels = _dbscan(points, eps)
     if labels.max() < 0:
@@ -174,19 +159,10 @@ def _dbscan(points: Float[Array, "m 3"], eps: float, min_samples: int = MIN_SAMP
     return DBSCAN(eps=eps, min_samples=min_samples).fit(places, sample_weight=weight).labels_[voxel]
 
 
-def _links(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distances and ids (M, _LINKS) of the nearest of M points, each point itself first; infinite beyond the last."""
-    distance, near = KDTree(points, balanced_tree=False).query(points, k=_LINKS)
-    return np.asarray(distance), np.asarray(near)
-
-
-def _one_component(points: np.ndarray, eps: float, links: tuple[np.ndarray, np.ndarray] | None) -> bool:
-    """Finds out whether steps of at most eps lead from each of the points (M, 3), M >= 1, to every other.
-
-    `links` are those of the points, where each is a place of its own.
-    """
+def _one_component(points: np.ndarray, eps: float) -> bool:
+    """Finds out whether steps of at most eps lead from each of the points (M, 3), M >= 1, to every other."""
     places, _, _ = _places(points, eps)
-    distance, near = _links(places) if links is None else links
+    distance, near = map(np.asarray, KDTree(places, balanced_tree=False).query(places, k=_LINKS))
     linked = distance <= eps
     ends = near[linked], np.concatenate([[0], np.cumsum(linked.sum(1))])
     graph = csr_array((np.ones(len(ends[0])), *ends), shape=(len(places), len(places)))
@@ -213,13 +189,8 @@ def _voxels(points: np.ndarray, edge: float) -> tuple[Int[np.ndarray, " m"], Int
     """The voxel of each point (M,), numbered in the order of their first points, and how many points each has (V,)."""
     # Counted from the median, so that a stray at the end of the world costs the others no digits.
     places = np.floor((points - np.median(points, axis=0)) / edge)
-    first_place = places.min(axis=0)
-    sizes = places.max(axis=0) - first_place + 1
-    if np.prod(sizes) < 2.0**62:
-        # One integer a row sorts some ten times faster than rows do.
-        keys = (places - first_place).astype(np.int64) @ np.array([sizes[1] * sizes[2], sizes[2], 1], np.int64)
-        _, first, which, count = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
-    else:
-        _, first, which, count = np.unique(places, axis=0, return_index=True, return_inverse=True, return_counts=True)
+    # One integer a row sorts some ten times faster than rows do. Strays beyond a million voxels count as at their edge.
+    keys = (np.clip(places, -(1 << 20), (1 << 20) - 1).astype(np.int64) + (1 << 20)) @ (1 << np.array([42, 21, 0]))
+    _, first, which, count = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
     order = np.argsort(first)
     return np.argsort(order)[which.reshape(-1)], count[order]

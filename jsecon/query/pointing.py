@@ -148,13 +148,11 @@ def lift(
     outside, inside, unknown = weight[:, OUTSIDE], weight[:, INSIDE], weight[:, UNKNOWN]
     within = _regions_within(field, inside + unknown, outside)
     chosen = within >= 0.5
-    known = np.asarray(inside_fraction(field.votes, jnp.asarray(chosen)).fraction) if chosen.any() else 0.0
-    share = (inside + PRIOR_PX * known) / (inside + outside + PRIOR_PX)
-    if not chosen.any():
-        share = np.where(inside + outside > 0, inside / np.maximum(inside + outside, 1e-9), 0.0)
-    best = int(within.argmax()) if len(within) else -1
-    region = best if best >= 0 and chosen[best] else -1
-    score = float(within[best]) if best >= 0 else 0.0
+    known = np.asarray(inside_fraction(field.votes, jnp.asarray(chosen)).fraction)
+    prior = PRIOR_PX if chosen.any() else 1e-9
+    share = (inside + prior * known) / (inside + outside + prior)
+    region = int(within.argmax()) if chosen.any() else -1
+    score = float(within.max(initial=0.0))
     finite = np.isfinite(share)
     mask = finite & (share >= threshold)
     similarity = np.where(finite, share, 0.0).astype(np.float32)

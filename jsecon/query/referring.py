@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 
 from jsecon.query.expressions import ANCHORED_ORDERS, Condition, NounPhrase
 from jsecon.query.object_shapes import ObjectShapes
-from jsecon.query.relations import SATISFIED, Viewpoint, between_scores, gap, order_values, pair_scores, size_of
+from jsecon.query.relations import SATISFIED, Viewpoint, between_scores, order_values, pair_scores
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +56,7 @@ class _ReferringResult:
     """Why there is no object, or not the number that the text says; else empty."""
 
 
-def stack_shapes(objects: Sequence[Object]) -> ObjectShapes:
+def _stack_shapes(objects: Sequence[Object]) -> ObjectShapes:
     """Joins the shapes of at least one object to one record."""
     return jax.tree.map(lambda *columns: np.concatenate(columns), *(found.shape for found in objects))
 
@@ -67,7 +67,7 @@ def evaluate(find: Find, thing: NounPhrase, conditions: Sequence[Condition], vie
     if not candidates:
         known = "" if np.isnan(rank) else f" ({int(100 * rank)} % of unrelated words are less like the scene)"
         return _ReferringResult([], reason=f"there is no {thing.text!r} in the scene{known}")
-    shapes = stack_shapes(candidates)
+    shapes = _stack_shapes(candidates)
     used: list[Object] = []
     orders: list[tuple[str, np.ndarray]] = []
     for condition in conditions:
@@ -123,20 +123,19 @@ def _condition_scores(
     view: Viewpoint,
 ) -> Float[np.ndarray, " k"]:
     """Score of a condition for each candidate, with the anchor that fits best; for an anchored order the value."""
-    others = stack_shapes(anchors[0])
+    others = _stack_shapes(anchors[0])
     usable = _apart(candidates, anchors[0])
     if condition.relation == "between":
-        ends = stack_shapes(anchors[-1])
+        ends = _stack_shapes(anchors[-1])
         distinct = _apart(candidates, anchors[-1])[:, None] & _apart(anchors[0], anchors[-1])
         scores = between_scores(shapes, others, ends)
         return np.where(usable[:, :, None] & distinct, scores, 0.0).max((1, 2))
     rows = max(512 // len(others), 1)  # pairs at once, whose points stay in the processor's cache
     parts = [shapes[first : first + rows] for first in range(0, len(shapes), rows)]
-    if condition.relation in ANCHORED_ORDERS:
-        gaps = np.concatenate([gap(part[:, None], others[None]) for part in parts])
-        gaps = np.where(usable, gaps, np.inf).min(1)
-        return gaps if condition.relation == "nearest to" else np.where(np.isfinite(gaps), -gaps, np.inf)
     scores = np.concatenate([pair_scores(condition.relation, part, others, view) for part in parts])
+    if condition.relation in ANCHORED_ORDERS:
+        gaps = np.where(usable, scores, np.inf).min(1)
+        return gaps if condition.relation == "nearest to" else np.where(np.isfinite(gaps), -gaps, np.inf)
     return np.where(usable, scores, 0.0).max(1)
 
 
@@ -149,8 +148,8 @@ def _ordered(
     first = thing.rank - 1 if name not in ANCHORED_ORDERS else 0
     chosen = ranked[first : first + count]
     others = [k for k in ranked if k not in chosen]
-    # Within 0.02 radians, or 0.04 of the objects' size, neither is clearly before the other.
-    tolerance = 0.02 if name in ("leftmost", "rightmost") else 0.04 * np.median(size_of(shapes)[ranked])
+    # Within 0.02 radians, or 0.08 of the mean half of the sides, neither is clearly before the other.
+    tolerance = 0.02 if name in ("leftmost", "rightmost") else 0.08 * np.median(shapes.half_size.mean(-1)[ranked])
     close = [k for k in others if chosen and min(abs(values[k] - values[c]) for c in chosen) <= tolerance]
     return chosen, close, others
 

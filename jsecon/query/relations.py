@@ -1,16 +1,13 @@
-"""Where objects stand to each other: soft predicates on boxes and points, and orders. Pure functions: jit or vmap them.
+"""Where objects stand to each other: soft predicates on boxes and points, and orders. Pure functions of NumPy arrays.
 
 A predicate takes shapes of objects (`ObjectShapes`, upright boxes) whose leading axes broadcast, and returns scores
-in [0, 1]; from SATISFIED on the relation holds. `pair_scores` and `between_scores` take all pairs and triples. NumPy
-arrays are scored by NumPy, without a program to compile, and jax arrays by jax. All distances are relative to the
-objects' sizes: a scene that is scaled, shifted, or turned about the up axis together with its viewpoint has the same
-scores. Subtract a common origin before coordinates become float32.
+in [0, 1]; from SATISFIED on the relation holds. `pair_scores` and `between_scores` take all pairs and triples. All
+distances are relative to the objects' sizes: a scene that is scaled, shifted, or turned about the up axis together with
+its viewpoint has the same scores. Subtract a common origin before coordinates become float32.
 """
 
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -37,30 +34,21 @@ class Viewpoint:
 
 def viewpoint(camera: Camera, up: Float[Array, " 3"]) -> Viewpoint:
     """Makes the viewpoint of a camera. One that looks straight up or down has its upper edge as forward."""
-    xp = _module(camera.world_to_camera)
     axes = camera.world_to_camera[:3, :3]
     forward, upper = _level(axes[2], up), _level(-axes[1], up)
     tilted = _length(forward) < 0.2
-    forward = xp.where(tilted, upper * xp.sign(-_dot(axes[2], up)), forward)
-    return Viewpoint(camera.centres, forward / xp.maximum(_length(forward), 1e-9), up)
-
-
-def _module(array: Any) -> Any:
-    """Returns the module that computes with an array: jax.numpy, or NumPy."""
-    return jnp if isinstance(array, jax.Array) else np
+    forward = np.where(tilted, upper * np.sign(-_dot(axes[2], up)), forward)
+    return Viewpoint(camera.centres, forward / np.maximum(_length(forward), 1e-9), up)
 
 
 def _dot(a: Array, b: Array) -> Any:
-    """Products of vectors (..., 3), which broadcast.
-
-    As a sum of products: a matrix times a vector, reduced under vmap, can be silently wrong (jax issue 39103).
-    """
+    """Products of vectors (..., 3), which broadcast."""
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
 
 def _length(vector: Array) -> Any:
     """Lengths of vectors (..., 3)."""
-    return _module(vector).sqrt(_dot(vector, vector))
+    return np.sqrt(_dot(vector, vector))
 
 
 def _level(vector: Array, up: Array) -> Array:
@@ -68,24 +56,24 @@ def _level(vector: Array, up: Array) -> Array:
     return vector - _dot(vector, up)[..., None] * up
 
 
-def size_of(shape: ObjectShapes) -> Float[Array, "*batch"]:
+def _size(shape: ObjectShapes) -> Float[Array, "*batch"]:
     """Measures objects: the mean of the three sides of each box."""
     return 2.0 * shape.half_size.mean(-1)
 
 
 def _rise(x: Array, steepness: float = 10.0) -> Array:
     """A soft step, 0.5 at x = 0: the logistic function."""
-    return 0.5 + 0.5 * _module(x).tanh(0.5 * steepness * x)
+    return 0.5 + 0.5 * np.tanh(0.5 * steepness * x)
 
 
 def _within(x: Array, power: float = 2.0) -> Array:
     """Falls from 1 at x = 0 over 0.5 at x = 1 to 0."""
-    return 1.0 / (1.0 + _module(x).maximum(x, 0.0) ** power)
+    return 1.0 / (1.0 + np.maximum(x, 0.0) ** power)
 
 
 def _over(x: Array, size: Array) -> Array:
     """Quotient of x and a size, which may be 0."""
-    return x / _module(size).maximum(size, 1e-12)
+    return x / np.maximum(size, 1e-12)
 
 
 def _heights(shape: ObjectShapes) -> tuple[Array, Array, Array]:
@@ -111,25 +99,24 @@ def _inside(
     return footprint, footprint & (z <= half[..., 2])
 
 
-def gap(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
+def _gap(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
     """Measures the free distance between the surfaces of two objects.
 
     It is the smallest distance of the points of one to the box of the other, of both ways the larger: a box may hold
     free space, as that of an arch does. Points of a large object may lie farther apart than a small one is wide, which
     is taken off. 0 if the surfaces touch.
     """
-    xp = _module(a.points)
 
     def to_box(own: ObjectShapes, other: ObjectShapes) -> Array:
         local = _local_points(own.points, other)
-        beyond = (xp.maximum(distance - other.half_size[..., None, k], 0.0) for k, distance in enumerate(local))
+        beyond = (np.maximum(distance - other.half_size[..., None, k], 0.0) for k, distance in enumerate(local))
         x, y, z = (own.half_size[..., k] for k in range(3))
-        spacing = xp.sqrt(8.0 * (x * y + y * z + z * x) / own.points.shape[-2])
-        missed = xp.maximum(spacing - 0.25 * size_of(other), 0.0)
+        spacing = np.sqrt(8.0 * (x * y + y * z + z * x) / own.points.shape[-2])
+        missed = np.maximum(spacing - 0.25 * _size(other), 0.0)
         dx, dy, dz = beyond
-        return xp.sqrt((dx * dx + dy * dy + dz * dz).min(-1)) - missed
+        return np.sqrt((dx * dx + dy * dy + dz * dz).min(-1)) - missed
 
-    return xp.maximum(xp.maximum(to_box(a, b), to_box(b, a)), 0.0)
+    return np.maximum(np.maximum(to_box(a, b), to_box(b, a)), 0.0)
 
 
 def _sight(a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> tuple[Array, Array]:
@@ -138,14 +125,13 @@ def _sight(a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> tuple[Array, Ar
     So left and right agree with the image of the camera. Where the eye is as near as the objects are apart, or nearly
     above them, they are those of the viewpoint.
     """
-    xp = _module(a.center)
     to = 0.5 * (a.center + b.center) - view.eye
     across = _level(to, view.up)
     distance = _length(across)
     apart = _length(_level(a.center - b.center, view.up))
-    usual = distance > xp.maximum(0.5 * apart, 0.25 * abs(_dot(to, view.up)))
-    forward = xp.where(usual[..., None], across / xp.where(usual, distance, 1.0)[..., None], view.forward)
-    return forward, xp.cross(forward, view.up)
+    usual = distance > np.maximum(0.5 * apart, 0.25 * abs(_dot(to, view.up)))
+    forward = np.where(usual[..., None], across / np.where(usual, distance, 1.0)[..., None], view.forward)
+    return forward, np.cross(forward, view.up)
 
 
 def _towards(a: ObjectShapes, b: ObjectShapes, along: Array, across: Array) -> Array:
@@ -180,18 +166,16 @@ def _overlap(a: ObjectShapes, b: ObjectShapes) -> Array:
 
     Of two that cross, as an arch and a beam beneath it, each has few points there; the middle of one counts instead.
     """
-    xp = _module(a.points)
-    shared = xp.maximum(_inside(a.points, b)[0].mean(-1), _inside(b.points, a)[0].mean(-1))
-    crossed = xp.maximum(_centred(a, b), _centred(b, a))
-    return xp.maximum(shared, _OVER * (1.0 + crossed))
+    shared = np.maximum(_inside(a.points, b)[0].mean(-1), _inside(b.points, a)[0].mean(-1))
+    crossed = np.maximum(_centred(a, b), _centred(b, a))
+    return np.maximum(shared, _OVER * (1.0 + crossed))
 
 
 def _centred(a: ObjectShapes, b: ObjectShapes) -> Array:
     """How deep the middle of a lies in the footprint of b: 1 in its middle, 0 at its edge, at least -1."""
     x, y, _ = _local_points(a.center[..., None, :], b)
-    xp = _module(x)
-    depth = 1.0 - xp.maximum(_over(x[..., 0], b.half_size[..., 0]), _over(y[..., 0], b.half_size[..., 1]))
-    return xp.maximum(depth, -1.0)
+    depth = 1.0 - np.maximum(_over(x[..., 0], b.half_size[..., 0]), _over(y[..., 0], b.half_size[..., 1]))
+    return np.maximum(depth, -1.0)
 
 
 def _local(a: ObjectShapes, b: ObjectShapes, share: float, otherwise: Array) -> Array:
@@ -200,14 +184,13 @@ def _local(a: ObjectShapes, b: ObjectShapes, share: float, otherwise: Array) -> 
     So the seat of a chair, not its back, is what a cushion lies on, and the top of a table, not its feet, what is above
     a box. The heights are taken as evenly spread around their mean: a sort would take most of the time.
     """
-    xp = _module(a.points)
     close, _ = _inside(a.points, b, 1.4)  # with the surface around it, since b hides that below
     heights = _dot(a.points, a.axes[..., None, :, 2])
-    number = xp.maximum(close.sum(-1), 1)
-    mean = xp.where(close, heights, 0.0).sum(-1) / number
-    variance = xp.where(close, (heights - mean[..., None]) ** 2, 0.0).sum(-1) / number
-    spread = xp.sqrt(12.0 * xp.maximum(variance, 1e-30))
-    return xp.where(close.any(-1), mean + (share - 0.5) * spread, otherwise)
+    number = np.maximum(close.sum(-1), 1)
+    mean = np.where(close, heights, 0.0).sum(-1) / number
+    variance = np.where(close, (heights - mean[..., None]) ** 2, 0.0).sum(-1) / number
+    spread = np.sqrt(12.0 * np.maximum(variance, 1e-30))
+    return np.where(close.any(-1), mean + (share - 0.5) * spread, otherwise)
 
 
 def _tolerance(shape: ObjectShapes) -> Array:
@@ -249,15 +232,14 @@ def _next_to(a: ObjectShapes, b: ObjectShapes) -> Float[Array, "*batch"]:
 
     They have at least 0.3 of the smaller height in common.
     """
-    xp = _module(a.points)
     (low_a, high_a, tall_a), (low_b, high_b, tall_b) = _heights(a), _heights(b)
-    common = _over(xp.minimum(high_a, high_b) - xp.maximum(low_a, low_b), xp.minimum(tall_a, tall_b))
+    common = _over(np.minimum(high_a, high_b) - np.maximum(low_a, low_b), np.minimum(tall_a, tall_b))
     return _within(_relative_gap(a, b) / 0.6) * _rise(common - 0.3) * _rise(_OVER - _overlap(a, b))
 
 
 def _relative_gap(a: ObjectShapes, b: ObjectShapes) -> Array:
     """The gap in units of the geometric mean of the sizes."""
-    return _over(gap(a, b), _module(a.points).sqrt(size_of(a) * size_of(b)))
+    return _over(_gap(a, b), np.sqrt(_size(a) * _size(b)))
 
 
 _PREDICATES = {
@@ -273,13 +255,15 @@ _PREDICATES = {
     "next to": lambda a, b, _: _next_to(a, b),
     # Gaps between surfaces in units of the objects' sizes: near falls as the gap grows, far rises with it.
     "near": lambda a, b, _: _within(_relative_gap(a, b) / 1.1),
+    "nearest to": lambda a, b, _: _gap(a, b),
+    "farthest from": lambda a, b, _: _gap(a, b),
     "far from": lambda a, b, _: 1.0 - _within(_relative_gap(a, b) / 2.0),
-    "touching": lambda a, b, _: _within(_over(gap(a, b), 0.12 * _module(a.points).minimum(size_of(a), size_of(b)))),
+    "touching": lambda a, b, _: _within(_over(_gap(a, b), 0.12 * np.minimum(_size(a), _size(b)))),
 }
 
 
 def pair_scores(relation: str, a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> Float[Array, "k l"]:
-    """Scores "object of a RELATION object of b" for all pairs; from SATISFIED on it holds."""
+    """Scores "object of a RELATION object of b" for all pairs; of "nearest to" and "farthest from" it is the gap."""
     return _PREDICATES[relation](a[:, None], b[None], view)
 
 
@@ -291,10 +275,10 @@ def between_scores(a: ObjectShapes, b: ObjectShapes, c: ObjectShapes) -> Float[A
     """
     a, b, c = a[:, None, None], b[None, :, None], c[None, None]
     line, offset = c.center - b.center, a.center - b.center
-    length = _module(line).maximum(_length(line), 1e-12)
+    length = np.maximum(_length(line), 1e-12)
     along = _dot(offset, line) / length**2
     off = _length(offset - along[..., None] * line)
-    reach = 0.5 * 0.5 * (length + size_of(a))
+    reach = 0.5 * 0.5 * (length + _size(a))
     return _rise(along - 0.1, 20.0) * _rise(0.9 - along, 20.0) * _within(_over(off, reach), 4.0)
 
 
@@ -307,8 +291,7 @@ def order_values(shapes: ObjectShapes, view: Viewpoint) -> dict[str, Float[Array
     height = 2.0 * shapes.half_size[:, 2]
     level = _dot(shapes.center, view.up)
     away = shapes.center - view.eye
-    xp = _module(away)
-    bearing = xp.arctan2(_dot(away, xp.cross(view.forward, view.up)), _dot(away, view.forward))
+    bearing = np.arctan2(_dot(away, np.cross(view.forward, view.up)), _dot(away, view.forward))
     distance = _length(away)
     pairs = {"smallest": volume, "shortest": height, "lowest": level, "leftmost": bearing, "nearest": distance}
     opposite = dict(zip(pairs, ("largest", "tallest", "highest", "rightmost", "farthest")))

@@ -43,7 +43,7 @@ def selection_mask(
     Raises:
       ValueError: Shapes disagree.
     """
-    return _rendered(gaussians, camera, mask, None, capacity).alpha > threshold
+    return render_selection(gaussians, camera, mask, capacity=capacity).alpha > threshold
 
 
 def render_selection(
@@ -56,15 +56,8 @@ def render_selection(
 ) -> Rendering:
     """Renders the selected Gaussians alone. The others become transparent, so selections share one program. Pure.
 
-    Features (H, W, 1) are sum alpha T similarity; ones by default.
+    Features (H, W, 3) are sum alpha T similarity, three times; similarities are 1 by default.
     """
-    rendering = _rendered(gaussians, camera, mask, similarity, capacity)
-    return dataclasses.replace(rendering, features=rendering.features[..., :1])
-
-
-def _rendered(
-    gaussians: Gaussians, camera: Camera, mask: Array, similarity: Array | None, capacity: int | None
-) -> Rendering:
     require_shape("mask", mask, (gaussians.count,), "Pass one truth value per Gaussian.")
     logits, features = _alone(gaussians.opacity_logits, mask, similarity)
     return render(dataclasses.replace(gaussians, opacity_logits=logits), camera, features, capacity=capacity)

@@ -49,6 +49,9 @@ class QueryRules:
     """Relative score from which a region is of that class."""
     min_share: Number = SHARE_THRESHOLD
     """Smallest share of the regions in a selected Gaussian."""
+    code_threshold: Number | None = None
+    """Smallest cosine of a selected Gaussian's code with that of the best region (the paper), in place of `min_share`;
+    None selects by votes."""
     logits: Logits | None = None
     """Scale and bias of an embedder that was trained to tell whether a text is true of an image."""
 

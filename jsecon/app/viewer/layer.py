@@ -1,4 +1,4 @@
-"""The Gaussians of a field in the viewer's window, and the cameras of its frames."""
+"""The Gaussians of a field in the viewer's window, and the places of its frames."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ to 256"""
 
 
 class SplatLayer:
-    """The Gaussians in the window, in groups that are sent one by one, and the cameras of the frames.
+    """The Gaussians in the window, in groups that are sent one by one, and the places of the frames.
 
     Args:
       server: The viser server.
@@ -31,7 +31,6 @@ class SplatLayer:
       photo: (N, 3) uint8 colours of degree 0.
       regions: (N,) main region of each Gaussian, or -1.
       fovs: (T,) vertical fields of view of the frames, radians.
-      frustums: Index of a frame -> its camera in the window.
     """
 
     def __init__(self, server: Any, field: LanguageField):
@@ -48,7 +47,6 @@ class SplatLayer:
         self.photo = (255 * np.clip(0.5 + C0 * np.asarray(gaussians.sh)[:, 0], 0, 1)).astype(np.uint8)
         self._server = server
         self._up = scene_up(field.cameras)
-        self._aspect = field.cameras.width / field.cameras.height
         self.fovs = 2 * np.arctan(field.cameras.height / 2 / np.asarray(field.cameras.fy, np.float64))
         opacity = np.nan_to_num(np.asarray(sigmoid(np.asarray(gaussians.opacity_logits))))
         self._opacity = np.rint(255 * np.where(usable, opacity, 0)).astype(np.uint8)
@@ -71,9 +69,6 @@ class SplatLayer:
         poses = np.asarray(field.cameras.world_to_camera, np.float64)
         self._rotations = Rotation.from_matrix(poses[:, :3, :3].transpose(0, 2, 1))
         self._centers = -np.einsum("tji,tj->ti", poses[:, :3, :3], poses[:, :3, 3]) * self.scale
-        self.frustums = self._add_frustums(server)
-        self._frame = 0
-        self._frames_shown = False
         self._set_start(server.initial_camera, centers)
 
     def _set_start(self, camera: Any, centers: np.ndarray) -> None:
@@ -88,28 +83,6 @@ class SplatLayer:
         camera.near = 0.01 * self.scale
         camera.far = 1e4 * self.scale
 
-    def _add_frustums(self, server: Any) -> dict[int, Any]:
-        """Adds the cameras of the frames to the window, invisible."""
-        frames = range(0, len(self._centers), -(-len(self._centers) // 150))  # more would cover the scene
-        size = 0.06 * float(np.linalg.norm(np.std(self._centers, axis=0))) or 0.1 * self.scale
-        wxyz = self._rotations.as_quat(scalar_first=True)
-        return {
-            t: server.scene.add_camera_frustum(
-                f"/frames/{t}",
-                float(self.fovs[t]),
-                aspect=self._aspect,
-                scale=size,
-                color=(150, 170, 200),
-                thickness=1.2,
-                thickness_units="screen",
-                variant="filled",
-                visible=False,
-                wxyz=wxyz[t],
-                position=self._centers[t],
-            )
-            for t in frames
-        }
-
     def paint(self, colours: np.ndarray, visible: np.ndarray) -> None:
         """Colours the Gaussians, (N, 3) uint8 RGB. Only groups that change are sent."""
         opacity = np.where(visible, self._opacity, np.uint8(0))
@@ -122,17 +95,9 @@ class SplatLayer:
                     handle.buffer = buffer
         self._server.flush()
 
-    def show_frames(self, shown: bool) -> None:
-        """Shows or hides the cameras of the frames, but for the one at the viewpoint, which would cover the view."""
-        self._frames_shown = shown
-        for frame, frustum in self.frustums.items():
-            frustum.visible = shown and frame != self._frame
-
     def go_to(self, client: Any, frame: int) -> None:
         """Moves a viser client to the camera of a frame."""
         with client.atomic():
             client.camera.position = self._centers[frame]
             client.camera.wxyz = self._rotations[frame].as_quat(scalar_first=True)
         client.camera.fov = float(self.fovs[frame])
-        self._frame = frame
-        self.show_frames(self._frames_shown)

@@ -10,10 +10,8 @@ import html
 import http
 import io
 import queue
-import shutil
 import tempfile
 import threading
-import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -26,12 +24,12 @@ from jaxtyping import Bool, Float
 
 from jsecon.app import verbs
 from jsecon.app.access import is_allowed_host, listen
-from jsecon.app.outputs import file_stem, write_answer
+from jsecon.app.outputs import file_stem
 from jsecon.app.pictures import UNKNOWN, palette
-from jsecon.app.records import Answer, Query
+from jsecon.app.records import Answer, Region
 from jsecon.app.scene import Scene, open_scene
 from jsecon.app.viewer.layer import SplatLayer
-from jsecon.app.viewer.state import COLOURINGS, ViewState, answer_colours, highlight
+from jsecon.app.viewer.state import ANSWER_HUE, COLOURINGS, ViewState, highlight
 from jsecon.app.viewer.static_page import export_page
 from jsecon.errors import InputError
 from jsecon.pipeline.progress import Console
@@ -101,11 +99,10 @@ class Viewer:
         start = np.asarray(origin) / self.layer.scale
 
         def act() -> None:
-            visible = self._visible(self.state)
-            region = region_along(self.scene.field, start, np.asarray(direction), focal=focal, visible=visible)
+            region = region_along(self.scene.field, start, np.asarray(direction), focal=focal, visible=self._visible())
             if region < 0:
                 raise InputError("", "no region is known there: it is background, or no frame shows it")
-            self.state = self.state.toggle_region(region, add=add)
+            self.state = self.state.with_question(Region(region), add=add)
 
         self._steps.put(act)
 
@@ -114,28 +111,17 @@ class Viewer:
         self._steps.put(lambda: self.layer.go_to(client, frame))
 
     def export(self, client: Any) -> None:
-        """Queues sending the highlighted answers as a .zip: .ply, .json and masks of each."""
+        """Queues sending the highlighted Gaussians as a .ply."""
 
         def act() -> None:
-            answers = [self._answer(query) for query in self.state.queries]
-            answers = [answer for answer in answers if isinstance(answer, Answer) and len(answer.rows)]
-            if not answers:
+            if not (found := self._found()):
                 raise InputError("", "no Gaussian is selected, so there is no file to export")
-            client.send_file_download(f"{file_stem(answers[0])}.zip", self._zipped(answers), save_immediately=True)
+            with tempfile.TemporaryDirectory() as folder:
+                file = Path(folder, f"{file_stem(found[0])}.ply")
+                self.scene.export(file, np.any([answer.mask for answer in found], axis=0))
+                client.send_file_download(file.name, file.read_bytes(), save_immediately=True)
 
         self._steps.put(act)
-
-    def _answer(self, query: Query) -> Answer | InputError:
-        """Answers a query, or returns why it cannot be answered."""
-        return self.scene.ask_all([query])[0]
-
-    def _zipped(self, answers: Sequence[Answer]) -> bytes:
-        with tempfile.TemporaryDirectory() as folder:
-            for answer in answers:
-                masks = {t: self.scene.mask(answer, t) for t in self.scene.best_frames(answer, 3)}
-                write_answer(answer, self.scene, Path(folder, "answers"), masks)
-            packed = shutil.make_archive(str(Path(folder, "packed")), "zip", Path(folder, "answers"))
-            return Path(packed).read_bytes()
 
     def _work(self) -> None:
         """Takes the steps in turn, and draws the last state when no step waits."""
@@ -154,30 +140,23 @@ class Viewer:
         with contextlib.suppress(InputError):  # an embedder without words: each text then has this error
             self.scene.prepare()
 
-    def _visible(self, state: ViewState) -> Bool[np.ndarray, " n"]:
-        """The visible Gaussians of a state."""
-        count = self.scene.field.gaussians.count
-        isolated, hidden = ([self._selection(q)[0] for q in queries] for queries in (state.isolated, state.hidden))
-        visible = np.any(isolated, axis=0) if isolated else np.ones(count, bool)
-        return visible & ~np.any(hidden, axis=0) if hidden else visible
+    def _found(self) -> list[Answer]:
+        """The answers of the state that select a Gaussian."""
+        answers = self.scene.ask_all(self.state.queries)
+        return [answer for answer in answers if isinstance(answer, Answer) and len(answer.rows)]
 
-    def _selection(self, query: Query) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Mask and similarities of an answer; zeros for an error."""
-        answer = self._answer(query)
-        if isinstance(answer, InputError):
-            count = self.scene.field.gaussians.count
-            return np.zeros(count, bool), np.zeros(count, np.float32)
-        return answer.mask, np.asarray(answer.selection.similarity)
+    def _visible(self) -> Bool[np.ndarray, " n"]:
+        """The Gaussians that the state shows."""
+        if self.state.only_selected and (found := self._found()):
+            return np.any([answer.mask for answer in found], axis=0)
+        return np.ones(self.scene.field.gaussians.count, bool)
 
     def _draw(self) -> None:
         """Colours the Gaussians of the window, and describes the answers."""
         state = self.state
-        selections = [self._selection(query) for query in state.queries]
-        masks, similarities = [mask for mask, _ in selections], [similarity for _, similarity in selections]
-        matched = masks if any(mask.any() for mask in masks) else []
-        colours = highlight(self._base_colours[state.colouring], matched, similarities)
-        self.layer.paint(colours, self._visible(state))
-        self.panel.show(state, [self._answer(query) for query in state.queries])
+        answers = self.scene.ask_all(state.queries)
+        self.layer.paint(highlight(self._base_colours[state.colouring], answers), self._visible())
+        self.panel.show(state, answers)
         self.drawn = state
 
 
@@ -192,8 +171,6 @@ class _Panel:
     def __init__(self, viewer: Any, server: Any):
         self._viewer = viewer
         self._names = viewer.scene.field.names
-        self._ray = np.zeros(3)
-        self._clicked_at = 0.0
         gui = server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="medium")
         gui.set_panel_label(f"jsecon · {viewer.scene.name}")
@@ -203,40 +180,34 @@ class _Panel:
         hint = "Keep what is selected when you find or click something else"
         self._add = gui.add_checkbox("add to selection", False, hint=hint)
         self._messages = gui.add_html("")
-        self._notice = gui.add_html("", visible=False)
+        self._notice = gui.add_html("")
         hint = "Select every region that matches, not only the best one"
         all_of_class = gui.add_checkbox("all of its kind", default.all_of_class, hint=hint)
         hint = "Smallest share of a Gaussian that must lie in the matching regions"
         threshold = gui.add_slider("threshold", 0.0, 1.0, 0.01, default.threshold, hint=hint)
+        only_selected = gui.add_checkbox("only the selection", default.only_selected, hint="Hide everything else")
         colouring = gui.add_dropdown("colour", COLOURINGS, initial_value=default.colouring)
-        self._controls = {"all_of_class": all_of_class, "threshold": threshold, "colouring": colouring}
-        buttons = gui.add_button_group("selection", ("isolate", "hide", "show all", "export"))
-        with gui.add_folder("frames", expand_by_default=False):
-            hint = "Go to the camera of a frame"
-            self._frame = gui.add_dropdown("frame", ("choose", *self._names), initial_value="choose", hint=hint)
-            cameras = gui.add_checkbox("show cameras", False, hint="Click a camera to go there")
+        self._controls = {
+            "all_of_class": all_of_class,
+            "threshold": threshold,
+            "only_selected": only_selected,
+            "colouring": colouring,
+        }
+        export = gui.add_button("export", hint="Download the selected Gaussians as a .ply")
+        hint = "Go to the camera of a frame"
+        frame = gui.add_dropdown("frame", ("choose", *self._names), initial_value="choose", hint=hint)
 
         text_form.on_submit(_in_order(self._find))
         for name, control in self._controls.items():
             control.on_update(_in_order(lambda event, name=name: self._set_control(name, event.target.value)))
-        buttons.on_click(_in_order(self._press))
-        self._frame.on_update(_in_order(self._choose_frame))
-        cameras.on_update(_in_order(lambda event: viewer.layer.show_frames(event.target.value)))
-        for frame, frustum in viewer.layer.frustums.items():
-            frustum.on_click(_in_order(lambda event, frame=frame: self._click_frame(event, frame)))
+        export.on_click(_in_order(lambda event: viewer.export(event.client)))
+        frame.on_update(_in_order(self._choose_frame))
         for modifier in (None, "shift"):
             server.scene.on_click(modifier=modifier)(_in_order(self._click_scene))
 
     def _find(self, event: Any) -> None:
         text, add = self._text.value, self._add.value
         self._viewer.then(lambda state: state.with_question(text, add=add))
-
-    def _press(self, event: Any) -> None:
-        if event.target.value == "export":
-            self._viewer.export(event.client)
-        else:
-            steps = {"isolate": ViewState.isolate, "hide": ViewState.hide, "show all": ViewState.show_all}
-            self._viewer.then(steps[event.target.value])
 
     def _set_control(self, name: str, value: Any) -> None:
         if getattr(self._viewer.state, name) != value:
@@ -246,18 +217,7 @@ class _Panel:
         if event.client is not None and event.target.value in self._names:
             self._viewer.go_to_frame(event.client, self._names.index(event.target.value))
 
-    def _click_frame(self, event: Any, frame: int) -> None:
-        self._ray = np.asarray(event.ray_direction)
-        self._clicked_at = time.monotonic()
-        self._frame.value = self._names[frame]
-        self._viewer.go_to_frame(event.client, frame)
-
     def _click_scene(self, event: Any) -> None:
-        """Handles a click on the scene, unless it was one on a frame's camera."""
-        # viser reports a click on a frame's camera for the scene too, by a ray that is rounded otherwise.
-        recent = time.monotonic() - self._clicked_at <= 0.5
-        if recent and np.allclose(event.ray_direction, self._ray, atol=0.02):
-            return
         camera = event.client.camera
         focal = camera.image_height / 2 / np.tan(camera.fov / 2)
         add = self._add.value or event.modifier == "shift"
@@ -274,8 +234,8 @@ class _Panel:
 
     def show_notice(self, text: str | InputError) -> None:
         """Shows a notice above the answers; "" removes it."""
-        self._notice.content = _box(_error(text) if isinstance(text, InputError) else html.escape(text))
-        self._notice.visible = text != ""
+        words = _error(text) if isinstance(text, InputError) else html.escape(text)
+        self._notice.content = _box(words) if words else ""
 
 
 def _in_order(act: Callable[[Any], Any]) -> Any:
@@ -289,7 +249,7 @@ def _in_order(act: Callable[[Any], Any]) -> Any:
 
 def _message(place: int, query: Any, answer: Answer | InputError) -> str:
     """An answer or an error behind a square in its colour."""
-    colour = "#{:02x}{:02x}{:02x}".format(*answer_colours(place + 1)[place])
+    colour = "#{:02x}{:02x}{:02x}".format(*palette(place + 1, ANSWER_HUE)[place])
     swatch = f'<span style="display:inline-block;width:.8em;height:.8em;border-radius:2px;background:{colour}"></span>'
     failed = isinstance(answer, InputError)
     words = _error(answer) if failed else html.escape(answer.describe())
@@ -347,7 +307,7 @@ def _guarded_pages() -> Iterator[None]:
 
     def serve(handler: Any, *address: Any, process_request: Callable[..., Any], **kwargs: Any) -> Any:
         def checked(connection: Any, request: Any) -> Any:
-            return _refusal(request) or process_request(connection, request)
+            return _refusal(connection, request) or process_request(connection, request)
 
         wrapped.append(True)
         return listen(handler, *address, process_request=checked, **kwargs)
@@ -361,18 +321,14 @@ def _guarded_pages() -> Iterator[None]:
         raise RuntimeError("this viser does not listen through websockets.asyncio.server.serve")
 
 
-def _refusal(request: Any) -> Any:
+def _refusal(connection: Any, request: Any) -> Any:
     """Returns the response to a request that may not see the page, None for one that may go on."""
-    from websockets.datastructures import Headers
-    from websockets.http11 import Response
-
     host = request.headers.get("Host", "")
     origin = request.headers.get("Origin")
     if is_allowed_host(host) and (origin is None or urlsplit(origin).netloc.lower() == host.lower()):
         return None
-    body = b"This page is shown to this machine alone, under the address that jsecon view printed."
-    headers = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))})
-    return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", headers, body)
+    words = "This page is shown to this machine alone, under the address that jsecon view printed."
+    return connection.respond(http.HTTPStatus.FORBIDDEN, words)
 
 
 def open_viewer(scene: Scene, *, port: int, state: ViewState) -> Viewer:
