@@ -32,7 +32,7 @@ from jsecon.paper.queries import CODE_THRESHOLD
 from jsecon.pipeline.options import Options, is_bare_scene
 from jsecon.pipeline.progress import Console
 from jsecon.process import MEMORY, memory_budget
-from jsecon.query.answer import NO_REGIONS, Trimmed, answer, trim
+from jsecon.query.answer import NO_REGIONS, Trimmed, answer_question, trim
 from jsecon.query.expressions import is_expression, parse_query
 from jsecon.query.pointing import box_mask, lift, region_at
 from jsecon.query.render import selection_mask
@@ -282,7 +282,7 @@ class Scene:
             raise InputError(f"query {str(query)!r}", problem, remedy="Ask by votes, or for one thing.")
         embedded = embedder.embed_text(included + excluded)  # NumPy's slices need no compilation
         texts, without = jax.device_put((embedded[: len(included)], embedded[len(included) :]))
-        found = answer(field, texts, rules, excluded=without, outliers=query.outliers)
+        found = answer_question(field, texts, rules, excluded=without, outliers=query.outliers)
         by_parts = "no region holds the object, so the parts that match the text were selected"
         skipped = {"regions": by_parts} if found.by_parts else {}
         return self._finish(query, found, skipped)
@@ -291,7 +291,7 @@ class Scene:
         """Selects the Gaussians of a region, and of those that the query's options add to it."""
         rules = self._rules(query, ONE_REGION)
         skipped = {"text encoder": why}
-        found = answer(self.field, region, rules, outliers=query.outliers)
+        found = answer_question(self.field, region, rules, outliers=query.outliers)
         last = self.field.regions.count - 1
         reason = "" if 0 <= region <= last else f"there is no region {region}: the regions are 0 to {last}"
         return self._finish(query, found, skipped, reason)

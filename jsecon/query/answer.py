@@ -6,11 +6,11 @@
     select_gaussians   regions -> the Gaussians of which these regions hold at least half (field/membership)
     trim               Gaussians -> without those that lie apart from the rest (query/outliers)
 
-`answer` does all three; thresholds are `QueryRules`. A region, as under a pixel, can stand in place of a text.
+`answer_question` does all three; thresholds are `QueryRules`. A region, as under a pixel, can stand in place of a text.
 The gap between a text's and an image's embedding is crossed once, among R regions, where only the order matters (the
 paper's GT-anchored query). Gaussians are then compared with regions, so almost any threshold does.
 
-All but `trim` and `answer` can be traced: jit them, or vmap them over texts.
+All but `trim` and `answer_question` can be traced: jit them, or vmap them over texts.
 """
 
 from typing import NamedTuple
@@ -71,7 +71,7 @@ class Trimmed(NamedTuple):
     """Whether parts answer."""
 
 
-def answer(
+def answer_question(
     field: LanguageField,
     query: Float[Array, "q e"] | int,
     rules: QueryRules = RULES,

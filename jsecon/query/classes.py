@@ -99,8 +99,7 @@ def _classes(embeddings, texts, pixels, votes, words, rules: QueryRules, standar
         rank = jnp.where(count > 0, below / jnp.maximum(count, 1), 1.0)
     if (logits := rules.logits) is not None:
         presence = of_best(jax.vmap(lambda text: presence_prob(embeddings, text, logits), out_axes=1)(texts))
-    accepted = rules.accept(rank, of_best(plain), presence)
-    accepted &= known & jnp.any(valid)
+    accepted = rules.accept(rank, of_best(plain), presence) & known & jnp.any(valid)
     count = votes.regions.shape[0]
 
     def sums(allowed):
@@ -113,10 +112,8 @@ def _classes(embeddings, texts, pixels, votes, words, rules: QueryRules, standar
 
     (weight, total), (weight_of_all, total_of_all) = sums(accepted), sums(known)
     # Where only refused regions vote, they decide after all: the protocols know no answer "none".
-    weight, total = (
-        jnp.where(weight > 0, weight, weight_of_all),
-        jnp.where((weight > 0)[:, None], total, total_of_all),
-    )
+    total = jnp.where((weight > 0)[:, None], total, total_of_all)
+    weight = jnp.where(weight > 0, weight, weight_of_all)
     finite = (votes.views > 0) & (weight > 0) & jnp.isfinite(weight_of_all) & jnp.any(valid)
     mean = jnp.where(finite[:, None], total / jnp.where(finite, weight, 1.0)[:, None], 0.0)
     possible = finite[:, None] & valid

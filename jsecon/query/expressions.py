@@ -164,10 +164,8 @@ _PREPOSITIONS = {words[0] for words in _RELATION_OF if len(words) == 1} - {"near
 def is_expression(text: str) -> bool:
     """Whether a text needs the grammar: it has a relation, an order or a number outside of quotes and names."""
     counted, tokens = _question(_tokens(text))
-    if counted:
-        return True
-    if not tokens:
-        return False
+    if counted or not tokens:
+        return counted
     parts, relations, _, problem = _split(tokens)
     phrase, quantified, _ = _noun_phrase(parts[0])
     return bool(relations or problem or quantified or phrase.order)

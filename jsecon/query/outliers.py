@@ -133,7 +133,6 @@ def _default_eps(points: Float[Array, "m 3"], *, spacings: float = EPS_SPACINGS)
     The median is taken over at most 20,000 points. If more than half of the points coincide the spacing is that of the
     distinct ones; the radius is 1 if there is only one place.
     """
-    points = np.asarray(points, np.float64)
     for candidates in (points, np.unique(points, axis=0)):
         if len(candidates) > 1:
             sample = candidates[:: -(-len(candidates) // 20_000)]
@@ -151,9 +150,6 @@ def _dbscan(points: Float[Array, "m 3"], eps: float, min_samples: int = MIN_SAMP
     """
     from sklearn.cluster import DBSCAN
 
-    points = np.asarray(points, np.float64)
-    if not len(points):
-        return np.full(0, -1)
     places, voxel, count = _places(points, eps)
     weight = count if len(places) < len(points) else None  # of ones it would add up each list of neighbours
     return DBSCAN(eps=eps, min_samples=min_samples).fit(places, sample_weight=weight).labels_[voxel]

@@ -134,8 +134,10 @@ def _sight(a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> tuple[Array, Ar
     return forward, np.cross(forward, view.up)
 
 
-def _towards(a: ObjectShapes, b: ObjectShapes, along: Array, across: Array) -> Array:
-    """Whether a lies in the direction `along` from b."""
+def _towards(a: ObjectShapes, b: ObjectShapes, view: Viewpoint, *, sideways: bool) -> Float[Array, "*batch"]:
+    """Whether a is left of b as the viewpoint sees it (`sideways`), or nearer to the viewpoint and not far aside."""
+    forward, right = _sight(a, b, view)
+    along, across = (-right, forward) if sideways else (-forward, right)
 
     def interval(shape: ObjectShapes, axis: Array) -> tuple[Array, Array]:
         places = _dot(shape.points, axis[..., None, :])
@@ -147,18 +149,6 @@ def _towards(a: ObjectShapes, b: ObjectShapes, along: Array, across: Array) -> A
     beside = abs(side_a - side_b) - wide_a - wide_b
     # From 0.35 of the shift at which they just part, within a cone of 68 degrees: 2.5 times as far aside as along.
     return _rise(_over(shift, half_a + half_b) - 0.35) * _within(_over(beside, 2.5 * shift))
-
-
-def _left_of(a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> Float[Array, "*batch"]:
-    """Whether a is left of b as the viewpoint sees it; b is then as much right of a."""
-    forward, right = _sight(a, b, view)
-    return _towards(a, b, -right, forward)
-
-
-def _in_front_of(a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> Float[Array, "*batch"]:
-    """Whether a is nearer to the viewpoint than b and not far aside; b is then as much behind a."""
-    forward, right = _sight(a, b, view)
-    return _towards(a, b, -forward, right)
 
 
 def _overlap(a: ObjectShapes, b: ObjectShapes) -> Array:
@@ -243,10 +233,10 @@ def _relative_gap(a: ObjectShapes, b: ObjectShapes) -> Array:
 
 
 _PREDICATES = {
-    "left of": _left_of,
-    "right of": lambda a, b, view: _left_of(b, a, view),
-    "in front of": _in_front_of,
-    "behind": lambda a, b, view: _in_front_of(b, a, view),
+    "left of": lambda a, b, view: _towards(a, b, view, sideways=True),
+    "right of": lambda a, b, view: _towards(b, a, view, sideways=True),
+    "in front of": lambda a, b, view: _towards(a, b, view, sideways=False),
+    "behind": lambda a, b, view: _towards(b, a, view, sideways=False),
     "above": lambda a, b, _: _above(a, b),
     "below": lambda a, b, _: _above(b, a),
     "on": lambda a, b, _: _on(a, b),

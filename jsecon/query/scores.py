@@ -29,9 +29,8 @@ own)."""
 
 def unrelated_words(field: LanguageField) -> Array | None:
     """Returns the unrelated words of a field (W, E), or None if it has none."""
-    return (
-        jnp.asarray(field.unrelated_words) if field.unrelated_words is not None and len(field.unrelated_words) else None
-    )
+    words = field.unrelated_words
+    return jnp.asarray(words) if words is not None and len(words) else None
 
 
 class _TextScores(NamedTuple):
