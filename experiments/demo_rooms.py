@@ -100,12 +100,12 @@ def draw(run: pipeline.Run, rows: list[Row], out: Path) -> None:
     frame, train = run.capture.names.index(pictured), np.flatnonzero(~np.asarray(run.capture.held_out))
     nearest = int(np.abs(train - frame).argmin())
     frames, t = np.asarray(run.capture.frames), int(train[nearest])
-    renderer = pictures.Renderer(run.field.gaussians, run.field.cameras)
     masks = {row.query: row.mask for row in rows if row.frame == pictured}
+    colours = pictures.region_colours(run.field)
     panels = {
         "frame": frames[frame],
         "masks of one object each": pictures.label_overlay(frames[t], run.labels[nearest]),
-        "regions of the Gaussians": renderer.colours(t, pictures.region_colours(run.field)),
+        "regions of the Gaussians": pictures.render_picture(run.field.gaussians, run.field.cameras[t], colours),
         "answers to texts": answers_overlay(frames[frame], masks),
     }
     with atomic_write(out / "demo.jpg") as temporary:

@@ -8,11 +8,8 @@ import cv2
 import numpy as np
 import pytest
 from browser import CHROMIUM, dumped
-from small_field import make_field
 
 from jsecon.app import pictures, report
-from jsecon.app.catalogue import main_regions
-from jsecon.app.pictures import Renderer
 
 
 class _Reader(HTMLParser):
@@ -145,15 +142,16 @@ def test_a_selection_is_brighter_than_what_it_leaves_and_the_truth_is_outlined()
     assert not (pictures.selection_overlay(frame, mask).reshape(-1, 3) == 255).all(1).any()
 
 
-def test_a_region_is_pictured_where_its_gaussians_are(scene, cameras):
-    field = make_field(scene, cameras)[0]
-    renderer, regions = Renderer(field.gaussians, field.cameras), main_regions(field)
-    photo = renderer.photo(1)
-    for region in range(5):
-        part = renderer.crop(1, regions == region)
-        height, width = part.shape[:2]
-        assert height <= photo.shape[0]
-        assert width <= photo.shape[1]
-        windows = np.lib.stride_tricks.sliding_window_view(photo, part.shape)[..., 0, :, :, :]
-        assert (windows == part).all((-3, -2, -1)).any(), "a part of the frame"
-    np.testing.assert_array_equal(renderer.crop(1, regions == 99), photo)
+def test_a_picture_is_cut_to_a_mask():
+    image, mask = _image(), np.zeros((24, 32), bool)
+    np.testing.assert_array_equal(pictures.crop(image, mask), image)
+    mask[10:13, 2:4] = True
+    part = pictures.crop(image, mask)
+    np.testing.assert_array_equal(part, image[: part.shape[0], : part.shape[1]])
+    assert part.shape[1] < 32
+    mask = np.zeros((240, 320), bool)
+    mask[100:150, 200:220] = True
+    rows, columns = np.mgrid[:240, :320]
+    part = pictures.crop(np.stack([rows, columns, mask], axis=-1), mask)
+    assert part[..., 2].sum() == mask.sum()
+    assert part[..., 2].mean() > 0.15

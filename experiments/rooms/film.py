@@ -4,11 +4,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
+import jax
 import numpy as np
 from PIL import Image
 
 from experiments.rooms.capture import look_at
-from jsecon.app.pictures import Renderer
+from jsecon.app.pictures import render_picture
 from jsecon.app.records import Answer
 from jsecon.files import atomic_write
 from jsecon.fit.resize import scale_cameras
@@ -45,7 +46,7 @@ def write_film(field: LanguageField, answers: Sequence[Answer], file: Path) -> i
     count = SECONDS * FRAMES_PER_SECOND
     long_side = max(field.cameras.width, field.cameras.height)
     cameras = scale_cameras(orbit(field.cameras, count), min(LONG_SIDE_PX / long_side, 2.0))
-    renderer = Renderer(field.gaussians, cameras)
+    gaussians = jax.device_put(field.gaussians)
     colours = np.clip(0.5 + C0 * np.asarray(field.gaussians.sh, np.float32)[:, 0], 0, 1)
     dark = np.repeat(DIM * colours.mean(1, keepdims=True), 3, axis=1)
     frames_per_answer = count / (len(answers) + 1)
@@ -57,7 +58,7 @@ def write_film(field: LanguageField, answers: Sequence[Answer], file: Path) -> i
             lit = min(max(2 * (lit_answers - n), 0.0), 1.0)
             bright = SHINE + (1 - SHINE) * colours[answer.mask]
             rgb[answer.mask] += lit * (bright - rgb[answer.mask])
-        image, latest = renderer.colours(t, rgb), int(np.floor(lit_answers))
+        image, latest = render_picture(gaussians, cameras[t], rgb), int(np.floor(lit_answers))
         if 0 <= latest < len(answers):
             image = _captioned(image, str(answers[latest].query))
         frames.append(Image.fromarray(image))

@@ -4,11 +4,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-from jaxtyping import UInt8
 
-from jsecon.app import report, verbs
+from jsecon.app import pictures, report, verbs
 from jsecon.app.catalogue import Catalogue
 from jsecon.app.outputs import slug
 from jsecon.app.records import decimals
@@ -133,7 +131,7 @@ def _page(scene: Scene, catalogue: Catalogue, records: list[dict[str, Any]], con
             figures = [report.figure(scene.render(name, mask), name) for name in record["frames"]]
             best = scene.frame_index(record["frames"][0]) if record["frames"] else 0
             part = "" if record["parent"] is None else f" · part of {record['parent']}"
-            picture = _fitted(scene.renderer.crop(best, mask), 150)
+            picture = pictures.crop(scene.render(best), scene.mask(mask, best))
             words = f"{record['id']} · {_size_and_center(record)[0]}{part}"
             facts = report.table(("", ""), _facts(record, records))
             card = report.card(picture, _title(record), words, report.grid(figures, 3), facts)
@@ -145,13 +143,6 @@ def _page(scene: Scene, catalogue: Catalogue, records: list[dict[str, Any]], con
         parts.append(report.section("Surroundings", words, report.cards(cards[True])))
     lead = "What jsecon found in the scene. Open an object to see it in the frames that show most of it."
     return report.page("Objects", lead, parts)
-
-
-def _fitted(image: UInt8[np.ndarray, "h w 3"], side: int) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Scales an image to a longer side, px."""
-    scale = side / max(image.shape[:2])
-    size = max(round(scale * image.shape[1]), 1), max(round(scale * image.shape[0]), 1)
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
 
 
 def _facts(record: dict[str, Any], records: list[dict[str, Any]]) -> list[tuple[str, str]]:

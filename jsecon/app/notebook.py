@@ -3,8 +3,6 @@
 jsecon.types calls `to_html` through the table of contents when a notebook asks.
 """
 
-import html
-
 import jax
 import numpy as np
 from jaxtyping import UInt8
@@ -25,7 +23,7 @@ def to_html(value: LanguageField | Capture) -> str:
       Its picture and a line of words.
     """
     image, words = _picture(value)
-    return f'<div><img alt="" src="{report.data_uri(image)}"><br>{html.escape(words)}</div>'
+    return report.figure(image, words)
 
 
 def _picture(value: LanguageField | Capture) -> tuple[UInt8[np.ndarray, "h w 3"], str]:
@@ -38,7 +36,7 @@ def _picture(value: LanguageField | Capture) -> tuple[UInt8[np.ndarray, "h w 3"]
         words = f"Capture of {len(value.names)} frames of {cameras.width}x{cameras.height}, "
         words += f"{int(np.asarray(value.held_out).sum())} held out, {len(value.points):,} sparse points"
         return image, words + ("" if value.depths is None else ", with depth")
-    renderer = pictures.Renderer(value.gaussians, small)
-    image = np.concatenate([renderer.photo(0), renderer.colours(0, pictures.region_colours(value))], axis=1)
+    views = [pictures.render_picture(value.gaussians, small[0], rgb) for rgb in (None, pictures.region_colours(value))]
+    image = np.concatenate(views, axis=1)
     words = f"LanguageField of {value.gaussians.count:,} Gaussians, {value.regions.count} regions and "
     return image, f"{words}{len(value.names)} frames, texts by {value.embedder or 'no embedder'}"

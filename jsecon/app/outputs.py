@@ -96,15 +96,15 @@ def _section(scene: Scene, answer: Answer, masks: Mapping[int, np.ndarray]) -> s
 
 def file_stem(answer: Answer) -> str:
     """Names the files of an answer without ending: the same name in every run, and not that of any other query."""
-    name, key = str(answer.query), answer.query.key
+    question, name = answer.query.question, str(answer.query)
     plain = slug(name)
     pointed = re.fullmatch(r"(at|box|region) .*\d", name, re.DOTALL)  # a text may be called like a pixel
-    by_name = bool(pointed) == (key is not None) and not isinstance(answer.query.question, Mask)
+    by_name = bool(pointed) != isinstance(question, str) and not isinstance(question, Mask)
     device = re.fullmatch(r"con|prn|aux|nul|(com|lpt)\d", plain)  # on Windows, whatever its ending
     short = len(plain.encode()) <= MAX_SLUG_BYTES and not device
     if by_name and short and plain.replace("-", " ") == name:
         return plain
-    return _hashed(plain, name if key is None else key + "\0")
+    return _hashed(plain, question if isinstance(question, str) else repr(question))
 
 
 def _frame_stem(scene: Scene, frame: int) -> str:

@@ -1,17 +1,16 @@
 """Pictures of a run: regions in colours that stay the same in every view, selections."""
 
 import colorsys
-import functools
 
 import cv2
-import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from jsecon.app.catalogue import main_regions
+from jsecon.field.columns import is_mapped
 from jsecon.splat.render import render, render_rgb
 from jsecon.splat.visible import render_in_blocks
-from jsecon.types import Array, Camera, Gaussians, LanguageField
+from jsecon.types import Camera, Gaussians, LanguageField
 
 SELECTED = (255, 64, 160)
 """RGB of a selection, which no natural object has"""
@@ -63,55 +62,24 @@ def region_colours(field: LanguageField) -> Float[np.ndarray, "n 3"]:
     return np.concatenate([palette(field.regions.count) / 255, np.full((1, 3), UNKNOWN)])[main_regions(field)]
 
 
-class Renderer:
-    """Renders one scene in its views.
-
-    Args:
-      gaussians: The scene.
-      cameras: Its T views.
-      in_blocks: Renders a scene that is larger than memory, in the colours of the scene only.
-
-    Attributes:
-      photo: Renders a view in the scene's colours, (H, W, 3) uint8. It keeps the pictures.
-    """
-
-    def __init__(self, gaussians: Gaussians, cameras: Camera, *, in_blocks: bool = False):
-        self._gaussians = gaussians if in_blocks else jax.device_put(gaussians)
-        self._in_blocks = in_blocks
-        self._cameras = jax.tree.map(np.asarray, cameras)  # whose items need no compilation
-        self.photo = functools.cache(self._photo)
-
-    def _photo(self, view: int) -> UInt8[np.ndarray, "h w 3"]:
-        """Renders a view in the scene's colours."""
-        if self._in_blocks:
-            return _to_bytes(render_in_blocks(self._gaussians, self._cameras[view]))
-        return _to_bytes(render_rgb(self._gaussians, self._cameras[view]).features)
-
-    def colours(self, view: int, rgb: Float[Array, "n 3"]) -> UInt8[np.ndarray, "h w 3"]:
-        """Renders a view in other colours than the scene's, each in [0, 1]."""
-        return _to_bytes(render(self._gaussians, self._cameras[view], np.asarray(rgb, np.float32)).features)
-
-    def crop(self, view: int, mask: Bool[np.ndarray, " n"]) -> UInt8[np.ndarray, "h2 w2 3"]:
-        """Cuts out the part of a view that shows some Gaussians; the whole view if it shows none of them.
-
-        A square with a margin around all but 3 % of their centres on each side, as far as the view reaches.
-        """
-        photo, camera = self.photo(view), self._cameras[view]
-        pose = np.asarray(camera.world_to_camera)
-        points = np.asarray(self._gaussians.means)[mask] @ pose[:3, :3].T + pose[:3, 3]
-        points = points[points[:, 2] > 1e-6]
-        u = float(camera.fx) * points[:, 0] / points[:, 2] + float(camera.cx)
-        v = float(camera.fy) * points[:, 1] / points[:, 2] + float(camera.cy)
-        inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-        if not inside.any():
-            return photo
-        (left, right), (top, bottom) = (np.quantile(a[inside], (0.03, 0.97)) for a in (u, v))
-        half = 0.8 * max(right - left, bottom - top, 16)  # px; the margin is 0.3 of the object's size
-        x, y = (left + right) / 2, (top + bottom) / 2
-        rows = slice(int(max(y - half, 0)), int(min(y + half, camera.height)) + 1)
-        return photo[rows, int(max(x - half, 0)) : int(min(x + half, camera.width)) + 1]
-
-
-def _to_bytes(image: Array) -> np.ndarray:
-    """Returns an image in [0, 1] as uint8."""
+def render_picture(
+    gaussians: Gaussians, camera: Camera, rgb: Float[np.ndarray, "n 3"] | None = None
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Renders a view in the scene's colours, or in others, each in [0, 1]; a mapped scene in its own, by blocks."""
+    if rgb is not None:
+        image = render(gaussians, camera, np.asarray(rgb, np.float32)).features
+    elif is_mapped(gaussians):
+        image = render_in_blocks(gaussians, camera)
+    else:
+        image = render_rgb(gaussians, camera).features
     return (np.clip(np.asarray(image), 0.0, 1.0) * 255 + 0.5).astype(np.uint8)
+
+
+def crop(image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """Cuts out the square around a mask, with a margin; the whole image if the mask is empty."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    if not len(rows):
+        return image
+    half = 0.8 * max(np.ptp(rows), np.ptp(columns), 16)  # px; the margin is 0.3 of the object's size
+    top, left = (int(max((ends[0] + ends[-1]) / 2 - half, 0)) for ends in (rows, columns))
+    return image[top : int(top + 2 * half) + 1, left : int(left + 2 * half) + 1]

@@ -101,18 +101,14 @@ class Query:
     def __post_init__(self) -> None:
         """Refuses numbers out of their ranges."""
         require_one_of("query", self.by, METHODS, "'votes' is the default.")
-        low = -1 if self.by == "code" else 0
-        numbers = {"threshold": self.threshold, "min_rank": self.min_rank}
-        for name, value in numbers.items():
-            least = low if name == "threshold" else 0
+        numbers = {"threshold": (self.threshold, -1 if self.by == "code" else 0), "min_rank": (self.min_rank, 0)}
+        for name, (value, least) in numbers.items():
             if value is not None and not least <= value <= 1:
-                raise InputError(
-                    name, f"{value:g}", f"a number from {least} to 1", f"Leave {name} out for the default."
-                )
+                expected = f"a number from {least} to 1"
+                raise InputError(name, f"{value:g}", expected, f"Leave {name} out for the default.")
         if isinstance(self.question, Box | Mask) and self.by != "votes":
-            raise InputError(
-                "by", "a mask or a box selects by the outline alone", remedy="Leave it out, or ask a text."
-            )
+            problem = "a mask or a box selects by the outline alone"
+            raise InputError("by", problem, remedy="Leave it out, or ask a text.")
 
     def __str__(self) -> str:
         """The text, or the name of a pixel, box, mask or region."""
@@ -123,14 +119,6 @@ class Query:
             first = next(iter(question.frames.values()), "mask")
             return Path(first).stem if isinstance(first, str | Path) else f"mask {next(iter(question.frames))}"
         return " ".join(map(str, (type(question).__name__.lower(), *vars(question).values())))
-
-    @property
-    def key(self) -> str | None:
-        """What tells it from any other query in the names of its files; None for a text, which does so itself."""
-        if isinstance(self.question, Mask):
-            parts = [str(part) for pair in self.question.frames.items() for part in pair]
-            return "\0".join(("mask", *parts))
-        return None if isinstance(self.question, str) else str(self)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

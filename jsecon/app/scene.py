@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Int, UInt8
 
+from jsecon.app import pictures
 from jsecon.app.catalogue import Catalogue, objects
 from jsecon.app.object_index import ObjectIndex, choose_shades
 from jsecon.app.records import Answer, Box, Mask, Query, Question, Region, gaussian_rows
@@ -32,8 +33,9 @@ from jsecon.paper.queries import CODE_THRESHOLD
 from jsecon.pipeline.options import Options, is_bare_scene
 from jsecon.pipeline.progress import Console
 from jsecon.process import MEMORY, memory_budget
-from jsecon.query.answer import NO_REGIONS, Trimmed, answer_question, trim
+from jsecon.query.answer import answer_question, trim
 from jsecon.query.expressions import is_expression, parse_query
+from jsecon.query.outliers import OutlierResult
 from jsecon.query.pointing import box_mask, lift, region_at
 from jsecon.query.render import selection_mask
 from jsecon.query.rules import ONE_REGION, QueryRules
@@ -41,7 +43,7 @@ from jsecon.read.captures.capture import has_depth
 from jsecon.read.captures.images import read_pixels
 from jsecon.read.masks.masks import resize_nearest
 from jsecon.read.splats.files import save_gaussians
-from jsecon.types import LanguageField
+from jsecon.types import Gaussians, LanguageField, Selection
 
 CACHED_BYTES = 1 << 28
 """bytes of the answers that a scene keeps, of five bytes a Gaussian each"""
@@ -158,6 +160,7 @@ class Scene:
         self._lock = threading.RLock()
         self._answers: OrderedDict[Query, Answer] = OrderedDict()
         self._cameras = jax.tree.map(np.asarray, field.cameras)  # whose items need no compilation
+        self._photo = functools.cache(lambda t: pictures.render_picture(self._gaussians, self._cameras[t]))
 
     @functools.cached_property
     def embedder(self) -> Any:
@@ -228,7 +231,7 @@ class Scene:
         return answer
 
     def ask_all(self, questions: Sequence[Question | Query], **options: Any) -> list[Answer | InputError]:
-        """Answers several questions. Equal ones are answered once.
+        """Answers several questions.
 
         Args:
           questions: As for `ask`.
@@ -241,13 +244,13 @@ class Scene:
           InputError: An option is out of its range.
         """
         queries = [query if isinstance(query, Query) else Query(query, **options) for query in questions]
-        results: dict[Query, Answer | InputError] = {}
-        for query in dict.fromkeys(queries):
+        results: list[Answer | InputError] = []
+        for query in queries:
             try:
-                results[query] = self.ask(query)
+                results.append(self.ask(query))
             except InputError as error:
-                results[query] = error
-        return [results[query] for query in queries]
+                results.append(error)
+        return results
 
     def _answer(self, query: Query) -> Answer:
         """Answers a query that is not among the last ones."""
@@ -284,17 +287,14 @@ class Scene:
         texts, without = jax.device_put((embedded[: len(included)], embedded[len(included) :]))
         found = answer_question(field, texts, rules, excluded=without, outliers=query.outliers)
         by_parts = "no region holds the object, so the parts that match the text were selected"
-        skipped = {"regions": by_parts} if found.by_parts else {}
-        return self._finish(query, found, skipped)
+        return self._finish(query, found[:3], {"regions": by_parts} if found.by_parts else {})
 
     def _answer_region(self, query: Query, region: int, why: str) -> Answer:
         """Selects the Gaussians of a region, and of those that the query's options add to it."""
-        rules = self._rules(query, ONE_REGION)
-        skipped = {"text encoder": why}
-        found = answer_question(self.field, region, rules, outliers=query.outliers)
+        found = answer_question(self.field, region, self._rules(query, ONE_REGION), outliers=query.outliers)
         last = self.field.regions.count - 1
         reason = "" if 0 <= region <= last else f"there is no region {region}: the regions are 0 to {last}"
-        return self._finish(query, found, skipped, reason)
+        return self._finish(query, found[:3], {"text encoder": why}, reason)
 
     def _rules(self, query: Query, rules: QueryRules) -> QueryRules:
         """Rules with the options of a query."""
@@ -313,38 +313,34 @@ class Scene:
     def _answer_outline(self, query: Query, question: Box | Mask) -> Answer:
         """Selects the object that a box or masks outline in frames."""
         self._require_memory("an outline")
-        if isinstance(question, Box):
-            frame, *ends = vars(question).values()
-            index = self.frame_index(frame)
-            masks = {index: box_mask(self.field, *ends)}
-            question = dataclasses.replace(question, frame=self.field.names[index])
-        else:
-            given = {self.frame_index(frame): mask for frame, mask in question.frames.items()}
-            if len(given) < len(question.frames):
-                raise InputError("mask", "a frame has two masks", remedy="Give one mask of an object in each frame.")
-            size = self.field.cameras.width, self.field.cameras.height
-            masks = {t: _read_mask(m, *size) if isinstance(m, str | Path) else m for t, m in given.items()}
-            question = Mask({self.field.names[index]: mask for index, mask in given.items()})
+        ends = [] if isinstance(question, Mask) else [question.x0, question.y0, question.x1, question.y1]
+        frames = question.frames if isinstance(question, Mask) else {question.frame: box_mask(self.field, *ends)}
+        given = {self.frame_index(frame): mask for frame, mask in frames.items()}
+        if len(given) < len(frames):
+            raise InputError("mask", "a frame has two masks", remedy="Give one mask of an object in each frame.")
+        size = self.field.cameras.width, self.field.cameras.height
+        masks = [_read_mask(m, *size) if isinstance(m, str | Path) else np.asarray(m) for m in given.values()]
         threshold = SHARE_THRESHOLD if query.threshold is None else query.threshold
-        stack = np.stack([np.asarray(mask).astype(int) for mask in masks.values()])
-        selection = lift(self.field, stack, list(masks), threshold=threshold)
+        selection = lift(self.field, np.stack([mask.astype(int) for mask in masks]), list(given), threshold=threshold)
         outliers = trim(self.field, selection, "supported" if query.outliers else None)
+        named = {self.field.names[index]: mask for index, mask in given.items()}
+        box = isinstance(question, Box)
+        question = dataclasses.replace(question, frame=next(iter(named))) if box else Mask(named)
         query = dataclasses.replace(query, question=question)
-        found = Trimmed(NO_REGIONS, selection, outliers, 1)
-        return self._finish(query, found, {"text encoder": "the outline is the query"}, by="outline")
+        return self._finish(query, (selection, outliers, 1), {"text encoder": "the outline is the query"})
 
     def _finish(
-        self, query: Query, found: Trimmed, skipped: dict[str, str], reason: str = "", by: str | None = None
+        self, query: Query, found: tuple[Selection, OutlierResult, int], skipped: dict[str, str], reason: str = ""
     ) -> Answer:
-        """The answer of a query whose Gaussians were selected and trimmed."""
-        outliers = found.outliers
+        """The answer of a query whose Gaussians were selected and trimmed: these, and the number of objects."""
+        selection, outliers, count = found
         return Answer(
             query,
-            by or query.by,
+            "outline" if isinstance(query.question, Box | Mask) else query.by,
             outliers.mask,
-            jax.tree.map(np.asarray, found.selection),
+            jax.tree.map(np.asarray, selection),
             self.field,
-            count=found.objects if outliers.mask.any() else 0,
+            count=count if outliers.mask.any() else 0,
             reason=reason,
             clusters=(outliers.clusters_kept, outliers.clusters_dropped),
             skipped=skipped | ({"DBSCAN": outliers.skipped} if outliers.skipped else {}),
@@ -445,14 +441,14 @@ class Scene:
             return objects(self.field, vocabulary, self.embedder, up=self._up)
 
     def prepare(self) -> None:
-        """Compiles what questions need, and measures all objects, so that the first question is as fast as later ones.
+        """Compiles what questions need, so that the first question is as fast as later ones.
 
         Raises:
           InputError: The embedder has no words.
         """
         with self._lock:
             self.mask(self.ask("red"), 0)
-            self._index.prepare()
+            self.relate("red")
             _ = self._catalogue
 
     def frame_index(self, frame: int | str) -> int:
@@ -526,19 +522,19 @@ class Scene:
           InputError: There is no such frame.
         """
         with self._lock:
-            gaussians, mask = self._device_gaussians, selected.mask if isinstance(selected, Answer) else selected
-            if gaussians is None:
+            gaussians, mask = self._gaussians, selected.mask if isinstance(selected, Answer) else selected
+            if is_mapped(gaussians):
                 chosen = np.flatnonzero(mask)
                 rows = np.zeros(_padded(len(chosen), self.field.gaussians.count), np.int64)
                 rows[: len(chosen)] = chosen
                 mask = np.arange(len(rows)) < len(chosen)
-                gaussians = jax.device_put(gaussian_rows(self.field.gaussians, rows))
+                gaussians = jax.device_put(gaussian_rows(gaussians, rows))
             return np.asarray(selection_mask(gaussians, self._cameras[self.frame_index(frame)], jnp.asarray(mask)))
 
     @functools.cached_property
-    def _device_gaussians(self) -> Any:
-        """The Gaussians on jax's device; None for a mapped field."""
-        return None if is_mapped(self.field.gaussians) else jax.device_put(self.field.gaussians)
+    def _gaussians(self) -> Gaussians:
+        """The Gaussians, on jax's device unless they are mapped."""
+        return self.field.gaussians if is_mapped(self.field.gaussians) else jax.device_put(self.field.gaussians)
 
     def render(
         self, frame: int | str, selected: Answer | Bool[np.ndarray, " n"] | None = None
@@ -555,20 +551,9 @@ class Scene:
         Raises:
           InputError: There is no such frame.
         """
-        from jsecon.app import pictures
-
         with self._lock:
-            photo = self.renderer.photo(self.frame_index(frame))
+            photo = self._photo(self.frame_index(frame))
             return photo if selected is None else pictures.selection_overlay(photo, self.mask(selected, frame))
-
-    @functools.cached_property
-    def renderer(self) -> Any:
-        """Renders frames in the scene's colours or in others (`pictures.Renderer`)."""
-        from jsecon.app.pictures import Renderer
-
-        mapped = self._device_gaussians is None
-        gaussians = self.field.gaussians if mapped else self._device_gaussians
-        return Renderer(gaussians, self._cameras, in_blocks=mapped)
 
     def export(
         self,

@@ -56,13 +56,11 @@ NO_REGIONS = RegionMatch(np.zeros(0, bool), np.asarray(-1, np.int32), np.asarray
 """The match of a field without regions."""
 
 
-class Trimmed(NamedTuple):
+class _Answered(NamedTuple):
     """The answer to a question."""
 
-    match: RegionMatch
-    """The regions."""
     selection: Selection
-    """Their Gaussians, or those of the parts that answer in place of regions (`parts_fallback`)."""
+    """The Gaussians of the regions that match, or of the parts that answer in their place (`parts_fallback`)."""
     outliers: OutlierResult
     """The mask of the selection without outliers, and what became of its clusters."""
     objects: int
@@ -78,7 +76,7 @@ def answer_question(
     *,
     excluded: Float[Array, "u e"] | None = None,
     outliers: bool = True,
-) -> Trimmed:
+) -> _Answered:
     """Answers a question by the path of this page. Host code.
 
     `query` has the embeddings of one text or several, or is the id of a region that stands in place of a text.
@@ -99,7 +97,7 @@ def answer_question(
     if overlap is not None and parts is None and rules.code_threshold is None:
         groups = join_fragments(np.flatnonzero(match.chosen), np.asarray(overlap))
         count = max(1, min(len(groups), kept.clusters_kept))
-    return Trimmed(match, selection, kept, count, parts is not None)
+    return _Answered(selection, kept, count, parts is not None)
 
 
 def match_regions(

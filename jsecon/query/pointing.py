@@ -135,9 +135,8 @@ def lift(
     index = [_frame(field, frame) for frame in frames]
     size = field.cameras.height, field.cameras.width
     masks = np.asarray(masks).astype(np.int32)
-    fit = (
-        masks.shape == (len(index), *size) and bool(np.isin(masks, (OUTSIDE, INSIDE, UNKNOWN)).all()) and len(index) > 0
-    )
+    known = bool(np.isin(masks, (OUTSIDE, INSIDE, UNKNOWN)).all())
+    fit = len(index) > 0 and masks.shape == (len(index), *size) and known
     remedy = f"Give one mask per frame, {size[1]} wide and {size[0]} high, of the frames as the run used them."
     require(fit, "masks", f"{masks.shape} with {len(index)} frames", f"({len(index)}, {size[0]}, {size[1]})", remedy)
     if not (masks != OUTSIDE).any():
@@ -156,9 +155,7 @@ def lift(
     finite = np.isfinite(share)
     mask = finite & (share >= threshold)
     similarity = np.where(finite, share, 0.0).astype(np.float32)
-    return Selection(
-        jnp.asarray(mask), jnp.asarray(similarity), jnp.asarray(region, jnp.int32), jnp.asarray(score, jnp.float32)
-    )
+    return Selection(*map(jnp.asarray, (mask, similarity, np.int32(region), np.float32(score))))
 
 
 def box_mask(field: LanguageField, x0: int, y0: int, x1: int, y1: int) -> Int[np.ndarray, "h w"]:
