@@ -45,7 +45,7 @@ def page():
                 "words",
                 report.grid([report.figure(_image(), "<b>x</b>", strong="<i>mug</i>", sharp=True)], 2),
             ),
-            report.cards(
+            report.grid(
                 report.card(_image(), name, "words", report.grid([report.figure(_image(), "view")], 3))
                 for name in ("red <mug>", "blue mug")
             ),
@@ -76,7 +76,7 @@ def test_words_from_outside_are_escaped(page):
 @pytest.mark.parametrize("sharp", [True, False])
 def test_pictures_inside_the_page_are_the_pictures_given(sharp):
     image = np.repeat(np.repeat(_image()[:6, :8], 8, 0), 8, 1)
-    kind, data = report.data_uri(image, sharp=sharp).split(",")
+    kind, data = report._data_uri(image, sharp=sharp).split(",")
     back = cv2.cvtColor(
         cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB
     )

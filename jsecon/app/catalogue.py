@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 from scipy.special import softmax
 
-from jsecon.app.records import gaussian_rows, rounded
+from jsecon.app.records import gaussian_rows, rounded, source_shapes
 from jsecon.errors import InputError
 from jsecon.field.columns import vote_blocks
 from jsecon.field.membership import SHARE_THRESHOLD, membership_probability, ratio, vote_columns, vote_shares
@@ -22,7 +22,6 @@ from jsecon.query.grouping import MIN_FRAGMENT_OVERLAP, regions_with
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.outliers import MIN_SAMPLES
 from jsecon.query.rules import QueryRules
-from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Array, LanguageField, Votes
 from jsecon.views.frame import field_up
 from jsecon.vision.unrelated_words import UNRELATED_WORDS, embed_unrelated_words
@@ -122,16 +121,6 @@ class Catalogue:
         }
 
 
-class _Names(NamedTuple):
-    """Names of a vocabulary, and what they are compared by."""
-
-    texts: tuple[str, ...]
-    embeddings: np.ndarray
-    """(V, E)"""
-    scale: float
-    """of cosines in the softmax"""
-
-
 def objects(
     field: LanguageField,
     vocabulary: Sequence[str] | None = None,
@@ -159,14 +148,14 @@ def objects(
       InputError: The vocabulary is empty, the embedder cannot represent a name, or `up` has no direction.
     """
     upright = field_up(field, up)
-    names = _vocabulary(field, vocabulary, embedder)
+    texts, embeddings, scale = _vocabulary(field, vocabulary, embedder)
     size, main = _sizes(field)
-    groups = _groups(field, main, upright)
+    groups = region_objects(field, main, upright)
     members = np.arange(groups.max(initial=-1) + 1)[:, None] == groups  # (G, R)
     pixels = np.asarray(field.regions.pixel_counts, np.float64)
     weighted = pixels.sum(1)[:, None] * np.asarray(field.regions.embeddings, np.float64)
-    order, probability = _name(members @ weighted, names)
-    text = np.asarray((*names.texts, ""), object)
+    order, probability = _name(members @ weighted, embeddings, scale)
+    text = np.asarray((*texts, ""), object)
     surroundings = np.array([bool(SURROUNDINGS & set(name.lower().split())) for name in text[order[:, 0]]], bool)
     whole = _wholes(field, groups, members, size, surroundings)
     labels, part_labels, confidence = _assign(field, groups, whole)
@@ -176,6 +165,8 @@ def objects(
     renumber = np.full(len(whole) + 1, -1, np.int32)  # the last entry is that of -1
     renumber[rows] = np.arange(len(rows))
     labels, part_labels = renumber[labels], renumber[part_labels]
+    wholes, parts = np.flatnonzero(labels >= 0), np.flatnonzero(part_labels >= 0)
+    ids = np.concatenate([labels[wholes], part_labels[parts]])
     shown = members[rows] @ pixels
     best = np.argsort(-shown, axis=1, kind="stable")[:, :3]  # those that show most of it
     best = np.where(np.take_along_axis(shown, best, axis=1) > 0, best, -1)
@@ -190,7 +181,7 @@ def objects(
         confidence=confidence[rows],
         views=(shown > 0).sum(1),
         frames=np.pad(best, ((0, 0), (0, 3 - best.shape[1])), constant_values=-1),
-        shapes=_shapes(field, labels, part_labels, renumber[whole[rows]], upright),
+        shapes=source_shapes(field, np.concatenate([wholes, parts]), ids, upright),
         labels=labels,
         part_labels=part_labels,
         regions=renumber[groups],
@@ -199,31 +190,18 @@ def objects(
     )
 
 
-def region_objects(field: LanguageField, up: np.ndarray) -> Int[np.ndarray, " r"]:
-    """Finds which regions show one object, by the rules of `objects`.
-
-    Args:
-      field: Field of R regions.
-      up: (3,) unit up axis in the field's world.
-
-    Returns:
-      (R,) a number for each region: those of one object have the same one.
-    """
-    return _groups(field, _sizes(field)[1], up)
-
-
-def _vocabulary(field: LanguageField, vocabulary: Sequence[str] | None, embedder: Any) -> _Names:
-    """Returns the names to choose from, with their embeddings."""
+def _vocabulary(
+    field: LanguageField, vocabulary: Sequence[str] | None, embedder: Any
+) -> tuple[tuple[str, ...], np.ndarray, float]:
+    """Returns the names to choose from, their embeddings (V, E), and the scale of cosines in the softmax."""
     words_known = field.unrelated_words is not None and len(field.unrelated_words) == len(UNRELATED_WORDS)
     if vocabulary is None and embedder is None and words_known and not field.embedder.startswith("colours"):
-        return _Names(
-            UNRELATED_WORDS, np.asarray(field.unrelated_words, np.float32), SOFTMAX_SCALE
-        )  # without the model
+        return UNRELATED_WORDS, np.asarray(field.unrelated_words, np.float32), SOFTMAX_SCALE  # without the model
     if embedder is None:
         from jsecon.pipeline.model_loading import external_dim, field_embedder
 
         if vocabulary is None and external_dim(field.embedder) is not None:
-            return _Names((), np.zeros((0, field.regions.embeddings.shape[1]), np.float32), SOFTMAX_SCALE)
+            return (), np.zeros((0, field.regions.embeddings.shape[1]), np.float32), SOFTMAX_SCALE
         embedder = field_embedder(field)
     logits = getattr(embedder, "logits", None)
     scale = getattr(embedder, "softmax_scale", SOFTMAX_SCALE) if logits is None else logits.scale
@@ -231,23 +209,24 @@ def _vocabulary(field: LanguageField, vocabulary: Sequence[str] | None, embedder
     if not texts:
         raise InputError("vocabulary", "it has no names", remedy="Give at least one name.")
     rows = embed_unrelated_words(embedder) if texts == UNRELATED_WORDS else np.asarray(embedder.embed_text(list(texts)))
-    return _Names(texts, rows, scale)
+    return texts, rows, scale
 
 
-def _name(embeddings: np.ndarray, names: _Names) -> tuple[Int[np.ndarray, "k m"], Float[np.ndarray, "k m"]]:
-    """Returns the most probable names of K embeddings (K, E) of any length, and their probabilities.
+def _name(
+    embeddings: np.ndarray, names: np.ndarray, scale: float
+) -> tuple[Int[np.ndarray, "k m"], Float[np.ndarray, "k m"]]:
+    """Returns the most probable of V names (V, E) of K embeddings (K, E) of any length, and their probabilities.
 
-    A name's index is the number of names where the vocabulary has fewer than `NAMES`, and its probability 0.
+    A name's index is V where the vocabulary has fewer than `NAMES`, and its probability 0.
     """
-    if not names.texts:
-        return np.zeros((len(embeddings), NAMES), int), np.zeros((len(embeddings), NAMES))
-    rows, columns = (np.asarray(table, np.float64) for table in (embeddings, names.embeddings))
+    rows, columns = np.asarray(embeddings, np.float64), np.asarray(names, np.float64)
     lengths = np.linalg.norm(rows, axis=1)[:, None] * np.linalg.norm(columns, axis=1)
-    probability = softmax(names.scale * (rows @ columns.T) / np.where(lengths > 0, lengths, 1.0), axis=1)
+    cosines = rows @ columns.T / np.where(lengths > 0, lengths, 1.0)
+    probability = softmax(scale * cosines, axis=1) if len(names) else cosines
     order = np.argsort(-probability, axis=1, kind="stable")[:, :NAMES]
     missing = ((0, 0), (0, NAMES - order.shape[1]))
     best = np.pad(np.take_along_axis(probability, order, axis=1), missing)
-    return np.pad(order, missing, constant_values=len(names.texts)), best
+    return np.pad(order, missing, constant_values=len(names)), best
 
 
 def main_regions(field: LanguageField) -> Int[np.ndarray, " n"]:
@@ -279,8 +258,6 @@ def _same_object(
     """
     count = embeddings.shape[0]
     itself = jnp.eye(count, dtype=bool)
-    if count == 0:
-        return (itself, itself)
 
     def matched(rules: QueryRules) -> Array:
         def with_region(region):
@@ -296,31 +273,25 @@ def _same_object(
     return (itself | (matched(QueryRules()) & (overlap >= MIN_FRAGMENT_OVERLAP)), alike)
 
 
-def _groups(field: LanguageField, main: np.ndarray, up: np.ndarray) -> Int[np.ndarray, " r"]:
-    """Returns the group of each region: those that show one object have the same one."""
-    joined, alike = map(
-        np.array, _same_object(*jax.tree.map(jnp.asarray, (field.regions.embeddings, field.votes.overlap)))
-    )
-    if not len(joined):
+def region_objects(field: LanguageField, main: np.ndarray, up: np.ndarray) -> Int[np.ndarray, " r"]:
+    """Returns the group of each region, by the rules of `objects`: those that show one object have the same one.
+
+    `main` are the `main_regions`, and `up` is the unit up axis in the field's world.
+    """
+    if field.regions.count == 0:
         return np.zeros(0, int)
-    pairs = np.argwhere(np.triu(alike & ~joined, 1))
-    rows = {region: np.flatnonzero(main == region) for region in np.unique(pairs)}
-    means = np.asarray(field.gaussians.means, np.float64)
-    centers = {region: means[own].mean(0) for region, own in rows.items() if len(own) >= MIN_SAMPLES}
-    reach = {region: np.linalg.norm(means[rows[region]] - c, axis=1).max() for region, c in centers.items()}
+    arrays = jax.tree.map(jnp.asarray, (field.regions.embeddings, field.votes.overlap))
+    joined, alike = map(np.array, _same_object(*arrays))
     plain = dataclasses.replace(field.gaussians, sh=None)
 
-    def shape_of(*regions: int) -> ObjectShapes:
-        taken = gaussian_rows(plain, np.concatenate([rows[region] for region in regions]))
-        return object_shapes(taken.means, np.zeros(taken.count, int), up, spreads=gaussian_spreads(taken))
+    @functools.cache
+    def shape(*regions: int) -> ObjectShapes:
+        own = gaussian_rows(plain, np.concatenate([np.flatnonzero(main == region) for region in regions]))
+        return object_shapes(own.means, np.zeros(own.count, int), up, spreads=gaussian_spreads(own))
 
-    shape = functools.cache(shape_of)
-    for first, second in pairs.tolist():
-        if first in centers and second in centers:
-            distance = np.linalg.norm(centers[first] - centers[second])
-            near = distance <= 1.5 * (reach[first] + reach[second])  # before the boxes, which cost more
-            common = functools.partial(shape_of, first, second)
-            joined[first, second] = near and _is_continued(shape(first), shape(second), common)
+    large = _counts(main, len(joined)) >= MIN_SAMPLES
+    for first, second in np.argwhere(np.triu(alike & ~joined & large & large[:, None], 1)).tolist():
+        joined[first, second] = _is_continued(shape(first), shape(second), functools.partial(shape, first, second))
     return connected_components(joined, directed=False)[1]
 
 
@@ -362,15 +333,15 @@ def _wholes(
 
 
 @stored_jit
-def _objects_of_gaussians(votes: Votes, objects: Int[Array, " r"]) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
+def _objects_of_gaussians(votes: Votes, objects: Int[Array, " r_and_1"]) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
     """Assigns each Gaussian to the object with the largest share in it: (N,) the object, and its share.
 
     The share is that of all regions of the object together (`inside_fraction`), so a query for exactly these regions
     selects the same Gaussians, and those that belong to another object even more. -1 is no object: of a region, and of
-    a Gaussian with a share below SHARE_THRESHOLD. Each row stands for itself.
+    a Gaussian with a share below SHARE_THRESHOLD. Each row stands for itself. `objects` ends with -1, for no region.
     """
     columns = list(vote_columns(votes))
-    owners = [jnp.where(region >= 0, objects[jnp.maximum(region, 0)], -1) for region, _, _ in columns]
+    owners = [objects[region] for region, _, _ in columns]
     best_share = jnp.zeros(votes.total.shape, votes.weights.dtype)
     best = jnp.full(votes.total.shape, -1, jnp.int32)
     for owner in owners:
@@ -388,22 +359,17 @@ def _objects_of_gaussians(votes: Votes, objects: Int[Array, " r"]) -> tuple[Int[
 
 def _assign(field: LanguageField, groups: np.ndarray, whole: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns the whole (N,) and the part (N,) of each Gaussian, and the confidence (G,) of each group."""
-    tops = jnp.asarray(np.where(whole < 0, np.arange(len(whole)), whole)[groups].astype(np.int32))
-    parts = jnp.asarray(np.where(whole < 0, -1, np.arange(len(whole)))[groups].astype(np.int32))
+    own, above = np.arange(len(whole)), np.append(whole, -1)  # the last entry is that of -1
+    columns = np.where(whole < 0, own, whole)[groups], np.where(whole < 0, -1, own)[groups]
+    tops, parts = (jnp.asarray(np.append(column, -1).astype(np.int32)) for column in columns)
     labels, part_labels, total = [], [], np.zeros(len(whole))
     for votes in vote_blocks(field.votes):
-        if not len(groups):
-            labels.append(np.full(len(votes.views), -1, np.int32))
-            part_labels.append(labels[-1])
-            continue
-        top, top_share = _objects_of_gaussians(votes, tops)
-        part, part_share = _objects_of_gaussians(votes, parts)
-        top, part = np.array(top), np.array(part)
-        part[(part >= 0) & (whole[part] != top)] = -1
-        for label, share in ((top, top_share), (part, part_share)):
+        (top, top_share), (part, part_share) = (_objects_of_gaussians(votes, objects) for objects in (tops, parts))
+        part = np.where(above[part] == top, part, -1)
+        for label, share in ((np.asarray(top), top_share), (part, part_share)):
             inside = np.asarray(membership_probability(share, votes))
             total += np.bincount(label[label >= 0], inside[label >= 0], len(whole))
-        labels.append(top)
+        labels.append(np.asarray(top))
         part_labels.append(part)
     labels, part_labels = np.concatenate(labels), np.concatenate(part_labels)
     counts = _counts(labels, len(whole)) + _counts(part_labels, len(whole))
@@ -424,17 +390,3 @@ def _rows(gaussians: np.ndarray, whole: np.ndarray, surroundings: np.ndarray) ->
             parts = np.flatnonzero(listed & (whole == group))
             rows += [int(group), *map(int, parts[np.argsort(-gaussians[parts], kind="stable")])]
     return np.array(rows, int)
-
-
-def _shapes(
-    field: LanguageField, labels: np.ndarray, part_labels: np.ndarray, parent: np.ndarray, up: np.ndarray
-) -> ObjectShapes:
-    """Measures the objects in the world of the capture."""
-    chosen = np.concatenate([np.flatnonzero(labels >= 0), np.flatnonzero(part_labels >= 0)])
-    own = np.concatenate([labels[labels >= 0], part_labels[part_labels >= 0]])
-    plain = dataclasses.replace(field.gaussians, sh=field.gaussians.sh[:, :1])  # the place does not need colours
-    taken = gaussian_rows(plain, chosen)
-    placed = transform_gaussians(taken, field.source_from_scene)
-    source_from_scene = np.asarray(field.source_from_scene, np.float64)
-    means = np.asarray(taken.means, np.float64) @ source_from_scene[:3, :3].T + source_from_scene[:3, 3]
-    return object_shapes(means, own, up, spreads=gaussian_spreads(placed))

@@ -130,34 +130,17 @@ def _page(scene: Scene, catalogue: Catalogue, records: list[dict[str, Any]], con
             mask = catalogue.mask(record["id"])
             figures = [report.figure(scene.render(name, mask), name) for name in record["frames"]]
             best = scene.frame_index(record["frames"][0]) if record["frames"] else 0
-            part = "" if record["parent"] is None else f" · part of {record['parent']}"
+            part = "" if record["parent"] is None else f", part of {record['parent']}"
             picture = pictures.crop(scene.render(best), scene.mask(mask, best))
-            words = f"{record['id']} · {_size_and_center(record)[0]}{part}"
-            facts = report.table(("", ""), _facts(record, records))
-            card = report.card(picture, _title(record), words, report.grid(figures, 3), facts)
+            size, center = _size_and_center(record)
+            words = f"{record['id']}{part}: {size}, at ({center}), {record['gaussians']} Gaussians"
+            card = report.card(picture, _title(record), words, report.grid(figures, 3))
             cards[record["surroundings"]].append(card)
             progress(record["id"] + 1, len(records))
-    parts = [report.cards(cards[False])]
-    if cards[True]:
-        words = "Walls, floors and the like, by their names."
-        parts.append(report.section("Surroundings", words, report.cards(cards[True])))
+    words = "Walls, floors and the like, by their names."
+    parts = [report.grid(cards[False]), report.section("Surroundings", words, report.grid(cards[True]))]
     lead = "What jsecon found in the scene. Open an object to see it in the frames that show most of it."
     return report.page("Objects", lead, parts)
-
-
-def _facts(record: dict[str, Any], records: list[dict[str, Any]]) -> list[tuple[str, str]]:
-    """Returns the lines of an object's table."""
-    size, center = _size_and_center(record)
-    parts = [f"{other['id']} {_title(other)}" for other in records if other["parent"] == record["id"]]
-    rows = [
-        ("names", ", ".join(f"{name['name']} {name['probability']:.0%}" for name in record["names"])),
-        ("size", size),
-        ("centre", center),
-        ("Gaussians", str(record["gaussians"])),
-        ("frames that show it", str(record["views"])),
-        ("confidence", f"{record['confidence']:.0%}"),
-    ]
-    return [*rows, ("parts", ", ".join(parts))] if parts else rows
 
 
 def _title(record: dict[str, Any]) -> str:

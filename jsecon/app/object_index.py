@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import KDTree
 
-from jsecon.app.catalogue import region_objects
+from jsecon.app.catalogue import main_regions, region_objects
 from jsecon.app.records import Answer, Object, Query, gaussian_rows, rounded, world_scale
 from jsecon.field.columns import votes_of_rows
 from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction_of_regions
@@ -74,12 +74,7 @@ class ObjectIndex:
       up: (3,) up axis in the capture's world; None finds it.
     """
 
-    def __init__(
-        self,
-        field: LanguageField,
-        embedder: Any,
-        up: Sequence[float | int] | None,
-    ):
+    def __init__(self, field: LanguageField, embedder: Any, up: Sequence[float | int] | None):
         """Finds the up axis; objects are measured when they are first asked for."""
         self.up = field_up(field, up)
         regions = jax.tree.map(jnp.asarray, field.regions)  # on the device once, not for each phrase
@@ -91,14 +86,6 @@ class ObjectIndex:
         self._votes = jax.tree.map(np.asarray, field.votes)
         self._object = functools.lru_cache(MAX_KEPT)(self._measure_object)
         self._objects_of = functools.lru_cache(MAX_KEPT)(self._find_objects)
-
-    def prepare(self) -> None:
-        """Measures the object of every region, so that the first questions are as fast as later ones."""
-        for group in join_fragments(range(self._field.regions.count), self._joined)[:MAX_KEPT]:
-            for regions in {(region,) for region in group} | {group}:
-                self._object(regions)
-        match_regions(self._field, self._field.regions.embeddings[:1], self._rules)  # compiles it
-        _ = self._names
 
     def _find_objects(self, phrase: str) -> tuple[list[Object], float]:
         """Finds the objects that a phrase names: regions that match it, those of one object joined.
@@ -137,7 +124,7 @@ class ObjectIndex:
     @functools.cached_property
     def _joined(self) -> np.ndarray:
         """(R, R) overlap of the regions; 1 for those of one object."""
-        groups = region_objects(self._field, self.up)
+        groups = region_objects(self._field, main_regions(self._field), self.up)
         same = (groups[:, None] == groups).astype(np.float32)
         return same if self._votes.overlap is None else np.maximum(self._votes.overlap, same)
 

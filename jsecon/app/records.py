@@ -167,9 +167,7 @@ class Answer:
     @functools.cached_property
     def points(self) -> Float[np.ndarray, "m 3"]:
         """(M, 3) float64 centres of the selected Gaussians in the capture's world."""
-        source_from_scene = np.asarray(self.field.source_from_scene, np.float64)
-        means = np.asarray(self.field.gaussians.means)[self.rows].astype(np.float64)
-        return means @ source_from_scene[:3, :3].T + source_from_scene[:3, 3]
+        return _source_points(self.field, self.rows)
 
     @functools.cached_property
     def place(self) -> ObjectShapes:
@@ -184,9 +182,7 @@ class Answer:
         if not len(self.rows):
             problem = self.reason or f"no Gaussian is selected (score {float(self.selection.score):.3f})"
             raise InputError(f"query {str(self.query)!r}", problem, remedy="Ask with other words, or by a pixel.")
-        plain = dataclasses.replace(self.field.gaussians, sh=self.field.gaussians.sh[:, :1])  # the place has no colours
-        selected = transform_gaussians(gaussian_rows(plain, self.rows), self.field.source_from_scene)
-        return object_shapes(self.points, np.zeros(len(self.rows), int), spreads=gaussian_spreads(selected))[0]
+        return source_shapes(self.field, self.rows, np.zeros(len(self.rows), int))[0]
 
     @property
     def confidence(self) -> float | None:
@@ -311,6 +307,22 @@ class Answer:
 def _known(value: Any) -> float | None:
     """A number to four digits; None for None and NaN."""
     return None if value is None or np.isnan(value) else round(float(value), 4)
+
+
+def _source_points(field: LanguageField, rows: np.ndarray) -> Float[np.ndarray, "m 3"]:
+    """Centres of Gaussians in the capture's world."""
+    source_from_scene = np.asarray(field.source_from_scene, np.float64)
+    means = np.asarray(field.gaussians.means)[rows].astype(np.float64)
+    return means @ source_from_scene[:3, :3].T + source_from_scene[:3, 3]
+
+
+def source_shapes(
+    field: LanguageField, rows: np.ndarray, labels: np.ndarray, up: np.ndarray | None = None
+) -> ObjectShapes:
+    """Measures objects in the capture's world: `labels` are those of the Gaussians `rows` (`object_shapes`)."""
+    plain = dataclasses.replace(field.gaussians, sh=field.gaussians.sh[:, :1])  # shapes have no colours
+    placed = transform_gaussians(gaussian_rows(plain, rows), field.source_from_scene)
+    return object_shapes(_source_points(field, rows), labels, up, spreads=gaussian_spreads(placed))
 
 
 def gaussian_rows(gaussians: Gaussians, rows: np.ndarray | Bool[np.ndarray, " n"]) -> Gaussians:

@@ -45,14 +45,10 @@ def figure(image: np.ndarray, caption: str, *, strong: str = "", sharp: bool = F
     return f"<figure>{picture}<figcaption>{bold}{_escaped(caption)}</figcaption></figure>"
 
 
-def grid(figures: Iterable[str], columns: int) -> str:
-    """Puts figures side by side, in so many columns on a wide screen."""
-    return f'<div class="grid" style="--columns:{columns}">{"".join(figures)}</div>'
-
-
-def cards(elements: Iterable[str]) -> str:
-    """Puts cards side by side."""
-    return f'<div class="cards">{"".join(elements)}</div>'
+def grid(elements: Iterable[str], columns: int | None = None) -> str:
+    """Puts elements side by side: figures in so many columns on a wide screen, or cards in as many as there is room."""
+    kind = 'cards"' if columns is None else f'grid" style="--columns:{columns}"'
+    return f'<div class="{kind}>{"".join(elements)}</div>'
 
 
 def card(image: np.ndarray, title: str, words: str, *parts: str) -> str:
@@ -61,7 +57,7 @@ def card(image: np.ndarray, title: str, words: str, *parts: str) -> str:
     return f'<details class="card">{summary}{"".join(parts)}</details>'
 
 
-def data_uri(image: np.ndarray, *, sharp: bool = False) -> str:
+def _data_uri(image: np.ndarray, *, sharp: bool = False) -> str:
     """Encodes an RGB image as a data URI: of a JPEG, or of a PNG if `sharp`."""
     ending, kind, options = (".png", "png", []) if sharp else (".jpg", "jpeg", [cv2.IMWRITE_JPEG_QUALITY, 88])
     _, data = cv2.imencode(ending, cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2BGR), options)
@@ -70,7 +66,7 @@ def data_uri(image: np.ndarray, *, sharp: bool = False) -> str:
 
 def _image(image: np.ndarray, words: str, sharp: bool = False, attributes: str = "") -> str:
     """Returns the tag of an image."""
-    return f'<img alt="{_escaped(words.strip())}" src="{data_uri(image, sharp=sharp)}"{attributes}>'
+    return f'<img alt="{_escaped(words.strip())}" src="{_data_uri(image, sharp=sharp)}"{attributes}>'
 
 
 def _escaped(value: object) -> str:
