@@ -1,5 +1,6 @@
 """`jsecon doctor`: checks what runs need of this machine."""
 
+import collections
 import dataclasses
 import importlib
 import importlib.metadata
@@ -7,7 +8,6 @@ import importlib.util
 import os
 import platform
 import re
-import shutil
 from pathlib import Path
 from typing import Literal
 
@@ -18,6 +18,10 @@ from jsecon.process import available_memory, cores
 
 MIN_MEMORY = 2 << 30
 """bytes that `jsecon demo` takes, rounded up"""
+REINSTALL = 'Run: pip install --force-reinstall "jsecon"'
+"""remedy of a broken package"""
+MODULES = {"opencv_contrib_python_headless": "cv2", "pillow": "PIL", "scikit_learn": "sklearn"}
+"""required package -> its module, if that has another name"""
 EXTRAS = {
     "sfm": (("pycolmap",), "poses of photographs and videos"),
     "formats": (("gsply", "pillow_heif"), ".spz, .sog, compressed .ply, HEIC photographs"),
@@ -50,34 +54,27 @@ def _doctor(verb: verbs.Doctor, console: Console) -> verbs.VerbResult:
         checks = [_Check("python", "ok", f"{platform.python_version()}, {platform.platform(terse=True)}")]
         checks += [_check_packages(), *_check_jax()]
         checks.append(_Check("cores", "ok", f"{cores()} of {os.cpu_count()} may be used"))
-        checks += [_check_memory(), _check_disk(), _check_programs(), *map(_check_extra, EXTRAS)]
+        checks += [_check_memory(), _check_programs(), *map(_check_extra, EXTRAS)]
     console.print_line("\n".join(f"{check.status:<8} {check.name:<10} {check.message}" for check in checks))
     failed = [check for check in checks if check.remedy and check.status != "ok"]
     return {"checks": checks, "errors": [InputError(c.name, c.message, remedy=c.remedy) for c in failed]}
 
 
-def _required_modules() -> list[str]:
-    """The modules of the packages that jsecon requires."""
-    needs = [
-        re.split(r"[<>=!~; \[]", need)[0] for need in importlib.metadata.requires("jsecon") or [] if "extra" not in need
-    ]
-    modules = {"opencv-contrib-python-headless": "cv2", "pillow": "PIL", "scikit-learn": "sklearn"}
-    return [modules.get(name, name.replace("-", "_")) for name in needs]
-
-
 def _check_packages() -> _Check:
     """Imports the packages that jsecon requires."""
-    broken = {}
-    for name in _required_modules():
+    needs = [need for need in importlib.metadata.requires("jsecon") or [] if "extra" not in need]
+    names = [re.split(r"[<>=!~; \[]", need)[0].replace("-", "_") for need in needs]
+    broken = []
+    for name in names:
         try:
-            importlib.import_module(name)
-            if name == "cv2":
+            importlib.import_module(MODULES.get(name, name))
+            if name.startswith("opencv"):
                 importlib.import_module("jsecon.vision.classical").require_contrib()
         except Exception as error:  # a broken wheel raises anything
-            broken[name] = f"{name} ({error})"
+            broken.append(f"{name} ({error})")
     if not broken:
-        return _Check("packages", "ok", f"all {len(_required_modules())} required packages can be imported")
-    return _Check("packages", "missing", ", ".join(broken.values()), 'Run: pip install --force-reinstall "jsecon"')
+        return _Check("packages", "ok", f"all {len(names)} required packages can be imported")
+    return _Check("packages", "missing", ", ".join(broken), REINSTALL)
 
 
 def _check_jax() -> list[_Check]:
@@ -87,11 +84,10 @@ def _check_jax() -> list[_Check]:
 
         from jsecon.backend import REMEDY, check_backend
 
-        kinds = [device.platform for device in jax.devices()]
-        devices = ", ".join(f"{kinds.count(kind)} {kind}" for kind in sorted(set(kinds)))
+        kinds = collections.Counter(device.platform for device in jax.devices())
     except Exception as error:  # whatever a driver or a wheel raises
-        remedy = 'Run: pip install --force-reinstall "jsecon"'
-        return [_Check("jax", "wrong", str(error) or describe_error(error), remedy)]
+        return [_Check("jax", "wrong", str(error) or describe_error(error), REINSTALL)]
+    devices = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
     jax_check = _Check("jax", "ok", f"{jax.__version__}, devices: {devices}")
     try:
         report = check_backend()
@@ -109,27 +105,18 @@ def _check_memory() -> _Check:
     if free is None:
         return _Check("memory", "ok", "this system does not report the free memory")
     message = f"{_size(free)} free" + ("" if limit is None else f", limit {_size(limit)} (cgroup)")
-    if free < MIN_MEMORY:
-        message += f"; jsecon demo takes {_size(MIN_MEMORY)}"
-    return _Check("memory", "ok" if free >= MIN_MEMORY else "wrong", message, "End other programs, or raise the limit.")
-
-
-def _check_disk() -> _Check:
-    """Measures the free space of the current folder."""
-    free = shutil.disk_usage(".").free
-    # jsecon demo writes less than 200 MiB.
-    writable = os.access(".", os.W_OK)
-    message = f"{_size(free)} free in {Path.cwd()}{'' if writable else ', which cannot be written: use --out'}"
-    return _Check("disk", "ok" if writable and free >= 200 << 20 else "wrong", message)
+    if free >= MIN_MEMORY:
+        return _Check("memory", "ok", message)
+    message += f"; jsecon demo takes {_size(MIN_MEMORY)}"
+    return _Check("memory", "wrong", message, "End other programs, or raise the limit.")
 
 
 def _check_programs() -> _Check:
-    """Examines the folder of compiled programs."""
+    """Finds the folder of compiled programs."""
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     if folder is None:
         return _Check("programs", "missing", "no folder can be written, so that every run compiles anew (set HOME)")
-    files = [file for file in Path(folder).rglob("*") if file.is_file()]
-    return _Check("programs", "ok", f"{len(files)} files, {_size(sum(f.stat().st_size for f in files))} in {folder}")
+    return _Check("programs", "ok", f"{sum(file.is_file() for file in Path(folder).rglob('*'))} files in {folder}")
 
 
 def _check_extra(name: str) -> _Check:
@@ -142,5 +129,5 @@ def _check_extra(name: str) -> _Check:
 
 
 def _size(count: int) -> str:
-    """Returns a number of bytes in GiB or MiB."""
-    return f"{count / 2**30:.1f} GiB" if count >= 1 << 30 else f"{count / 2**20:.0f} MiB"
+    """Returns a number of bytes in GiB."""
+    return f"{count / 2**30:.1f} GiB"

@@ -39,17 +39,14 @@ def evaluate(
             continue
 
         def select(text: str, options: dict[str, Any] = options) -> Selection | None:
-            try:
-                answer = scene.ask(text, **options)
-            except InputError:  # no words for it
+            [answer] = scene.ask_all([text], **options)
+            if isinstance(answer, InputError):  # no words for it
                 return None
             return dataclasses.replace(answer.selection, mask=answer.mask)
 
         with console.progress(f"evaluate {kind}") as progress:
-            thresholds = (ALPHA_THRESHOLD,)
-            measured = evaluate_at_thresholds(
-                field.gaussians, cameras, labels, select, alpha_thresholds=thresholds, progress=progress
-            )
+            inputs = field.gaussians, cameras, labels, select
+            measured = evaluate_at_thresholds(*inputs, alpha_thresholds=(ALPHA_THRESHOLD,), progress=progress)
             results[kind] = measured[ALPHA_THRESHOLD]
     return results
 

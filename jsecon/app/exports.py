@@ -137,8 +137,10 @@ def _page(scene: Scene, catalogue: Catalogue, records: list[dict[str, Any]], con
             card = report.card(picture, _title(record), words, report.grid(figures, 3))
             cards[record["surroundings"]].append(card)
             progress(record["id"] + 1, len(records))
-    words = "Walls, floors and the like, by their names."
-    parts = [report.grid(cards[False]), report.section("Surroundings", words, report.grid(cards[True]))]
+    parts = [report.grid(cards[False])]
+    if cards[True]:
+        words = "Walls, floors and the like, by their names."
+        parts.append(report.section("Surroundings", words, report.grid(cards[True])))
     lead = "What jsecon found in the scene. Open an object to see it in the frames that show most of it."
     return report.page("Objects", lead, parts)
 

@@ -30,14 +30,11 @@ def _list_models(console: Console) -> verbs.VerbResult:
     for row in hub.catalogue():
         cached = [each for each in row.megabytes if row.in_precision(each).cached_folder is not None]
         seconds = "-" if row.seconds is None else f"{row.seconds:.1f}"
-        here = " ".join(cached) or "-"
-        line = columns(row.name, row.role, row.megabytes["fp32"], seconds, here, row.licence, row.purpose)
-        console.print_line(line)
+        figures = row.megabytes["fp32"], seconds, " ".join(cached) or "-"
+        console.print_line(columns(row.name, row.role, *figures, row.licence, row.purpose))
         rows.append(dataclasses.asdict(row) | {"cached": cached})
     console.print_line("MB and seconds are of fp32: a frame of 400x300 on two cores, 40 regions or one object in it.")
-    console.print_line(
-        "jsecon models get NAME fetches one; hub:owner/name names any other repository of huggingface.co."
-    )
+    console.print_line("jsecon models get NAME fetches one; hub:owner/name is any other repository of huggingface.co.")
     return {"models": rows}
 
 

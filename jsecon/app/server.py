@@ -4,12 +4,11 @@ FastAPI makes /openapi.json from the models below, and answers each question in 
 time. A request reads only the fields: no name in it is a path.
 """
 
-import contextlib
 import hmac
 import json
 import re
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
@@ -132,56 +131,43 @@ def application(scenes: Mapping[str, Scene], *, token: str = "", hosts: Collecti
     )
     app.add_middleware(_Guard, token=token, hosts=hosts)
 
-    def scene_of(request: _Request) -> Scene:
-        try:
-            return find_scene(scenes, request.field)
-        except InputError as error:
-            raise HTTPException(404, f'Field "field": {error}') from error
-
     @app.post("/query", summary="Count, score and place of the answer to a text or a pixel")
     def query(request: _Question) -> Response:
-        scene = scene_of(request)
+        scene = find_scene(scenes, request.field)
         if (request.text is None) == (request.at is None):
             raise HTTPException(422, 'Field "text": give it, or "at", and not both.')
-        part = "text" if request.at is None else "at"
         question = request.text or "" if request.at is None else At(*request.at)
         options = {"by": request.by, "threshold": request.threshold, "all_of_class": request.all}
-        with _errors_of(part):
-            answer = scene.ask(Query(question, frame=request.frame, **options))
-            return _AsciiResponse({"field": scene.name} | answer.as_dict())
+        answer = scene.ask(Query(question, frame=request.frame, **options))
+        return _AsciiResponse({"field": scene.name} | answer.as_dict())
 
     @app.post("/measure", summary="Distances between two objects: surfaces, centres, free gap, angle")
     def measure(request: _Pair) -> Response:
-        scene = scene_of(request)
-        with _errors_of("a or b"):
-            distances = scene.measure(request.a, request.b, frame=request.frame)
-        return _AsciiResponse({"field": scene.name} | distances)
+        scene = find_scene(scenes, request.field)
+        return _AsciiResponse({"field": scene.name} | scene.measure(request.a, request.b, frame=request.frame))
 
     @app.get("/objects", summary="The objects of a field: names, boxes, Gaussians")
     def objects(request: Annotated[_Request, Parameters()]) -> Response:
-        scene = scene_of(request)
-        with _errors_of("field"):
-            return _AsciiResponse({"field": scene.name, "objects": scene.objects().records()})
+        scene = find_scene(scenes, request.field)
+        return _AsciiResponse({"field": scene.name, "objects": scene.objects().records()})
 
     @app.get("/selection.ply", summary="The selected Gaussians in the capture's world")
     def selection(request: Annotated[_Selection, Parameters()]) -> Response:
-        scene = scene_of(request)
-        with _errors_of("text"), tempfile.TemporaryDirectory() as folder:
-            answer = scene.ask(request.text, by=request.by)
-            if not len(answer.rows):
-                raise InputError(f"query {request.text!r}", "no Gaussian is selected", remedy="Ask with other words.")
+        scene = find_scene(scenes, request.field)
+        answer = scene.ask(request.text, by=request.by)
+        if not len(answer.rows):
+            raise InputError(f"query {request.text!r}", "no Gaussian is selected", remedy="Ask with other words.")
+        with tempfile.TemporaryDirectory() as folder:
             file = Path(folder, "selection.ply")
             scene.export(file, answer)
             return Response(file.read_bytes(), media_type="application/octet-stream")
 
     @app.get("/mask.png", summary="The selection alone in a frame, alpha above 0.7")
     def mask(request: Annotated[_MaskOf, Parameters()]) -> Response:
-        scene = scene_of(request)
-        with _errors_of("frame"):
-            frame = None if request.frame is None else scene.frame_index(request.frame)
-        with _errors_of("text"):
-            answer = scene.ask(request.text, by=request.by)
-        index = [*scene.best_frames(answer, 1), 0][0] if frame is None else frame
+        scene = find_scene(scenes, request.field)
+        answer = scene.ask(request.text, by=request.by)
+        best = [*scene.best_frames(answer, 1), 0][0]
+        index = best if request.frame is None else scene.frame_index(request.frame)
         image = cv2.imencode(".png", scene.mask(answer, index).astype(np.uint8) * 255)[1].tobytes()
         name = re.sub("[^ -~]", "?", scene.field.names[index])
         return Response(image, media_type="image/png", headers={"x-frame": name})
@@ -189,6 +175,11 @@ def application(scenes: Mapping[str, Scene], *, token: str = "", hosts: Collecti
     @app.get("/healthz", summary="The fields and their frames")
     async def health() -> Response:
         return _AsciiResponse({"status": "ok", "fields": [_describe(scene) for scene in scenes.values()]})
+
+    @app.exception_handler(InputError)
+    async def wrong(request: Request, error: Exception) -> Response:
+        message = str(error).replace("--at FRAME X Y", '"at": [frame, column, row]')
+        return _AsciiResponse({"error": re.sub(r"--([a-z]+)", r'"\1"', message)}, 422)
 
     @app.exception_handler(RequestValidationError)
     async def invalid(request: Request, error: Exception) -> Response:
@@ -207,17 +198,6 @@ def application(scenes: Mapping[str, Scene], *, token: str = "", hosts: Collecti
         return _AsciiResponse({"error": "Internal error. The server's log has it."}, 500)
 
     return app
-
-
-@contextlib.contextmanager
-def _errors_of(part: str) -> Iterator[None]:
-    """Makes an InputError one of a part of the request, in whose words --at is "at"."""
-    try:
-        yield
-    except InputError as error:
-        message = str(error).replace("--at FRAME X Y", '"at": [frame, column, row]')
-        message = re.sub(r"--([a-z]+)", r'"\1"', message)
-        raise HTTPException(422, f'Field "{part}": {message}') from error
 
 
 def _describe(scene: Scene) -> dict[str, Any]:
@@ -239,10 +219,8 @@ def prepare(
     listening = listen(host, port)
     scenes = open_scenes(files, embedder)
     app = application(scenes, token=token, hosts=(host, *hosts))
-    options: dict[str, Any] = {
-        "timeout_keep_alive": 5,
-        "limit_concurrency": 256,
-    }  # the cheap ones included; others get 503
+    # The limit counts cheap requests too; those beyond it get 503.
+    options: dict[str, Any] = {"timeout_keep_alive": 5, "limit_concurrency": 256}
     config = uvicorn.Config(app, log_level="warning", ws="none", server_header=False, **options)
     address = f"http://{bracketed(host)}:{listening.getsockname()[1]}"
     description = {"address": address, "fields": [_describe(scene) for scene in scenes.values()]}

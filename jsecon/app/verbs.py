@@ -76,7 +76,28 @@ class Demo(Verb):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Run(Verb, InputOptions):
+class _PipelineVerb(Verb):
+    """Options of the verbs that compute stages.
+
+    Attributes:
+      dry_run: Only lists the stages that would run, and checks their inputs. It writes no file.
+    """
+
+    dry_run: Option[bool] = False
+    scene: SceneOptions = dataclasses.field(default_factory=SceneOptions)
+
+    @property
+    def options(self) -> Options:
+        """Options of the run without the groups."""
+        values = dict(vars(self))
+        for group in filter(dataclasses.is_dataclass, vars(self).values()):
+            values |= vars(group)
+        names = {field.name for field in dataclasses.fields(Options)}
+        return Options(**{name: value for name, value in values.items() if name in names})
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Run(_PipelineVerb, InputOptions):
     """Builds the language field of a capture.
 
     Its stages estimate poses that the capture lacks, fit Gaussians or read them, find objects or read their masks,
@@ -85,7 +106,6 @@ class Run(Verb, InputOptions):
 
     Attributes:
       out: Output folder.
-      dry_run: Only lists the stages that would run, and checks their inputs. It writes no file.
       distributed: Shares the masks, the embeddings, the votes and the held-out frames with the other processes that
         mpirun or srun starts. The field stays the same.
     """
@@ -98,23 +118,15 @@ class Run(Verb, InputOptions):
     )
 
     out: Option[Path]
-    dry_run: Option[bool] = False
     distributed: Option[bool] = False
-    scene: SceneOptions = dataclasses.field(default_factory=SceneOptions)
     bare: BareOptions = dataclasses.field(default_factory=BareOptions)
     masks: MaskOptions = dataclasses.field(default_factory=MaskOptions)
     models: ModelOptions = dataclasses.field(default_factory=ModelOptions)
     field: FieldOptions = dataclasses.field(default_factory=FieldOptions)
 
-    @property
-    def options(self) -> Options:
-        """Options of the run without the groups."""
-        groups = self.scene, self.bare, self.masks, self.models, self.field
-        return Options(self.capture, self.gaussians, **{name: x for group in groups for name, x in vars(group).items()})
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Fit(Verb):
+class Fit(_PipelineVerb):
     """Fits Gaussians to a capture, and no more.
 
     Writes a scene of 3D Gaussians in the capture's world, with PSNR and SSIM of the held-out frames. A folder
@@ -124,20 +136,12 @@ class Fit(Verb):
     Attributes:
       capture: The same captures as for jsecon run.
       out: The .ply (INRIA's layout, which SuperSplat opens), .spz or .glb to write.
-      dry_run: Only lists the stages that would run, and checks their inputs. It writes no file.
     """
 
     examples = ("jsecon fit my_capture --out scene.ply --minutes 5",)
 
     capture: Positional[Path]
     out: Option[Path]
-    dry_run: Option[bool] = False
-    scene: SceneOptions = dataclasses.field(default_factory=SceneOptions)
-
-    @property
-    def options(self) -> Options:
-        """Options of the fit without the groups."""
-        return Options(self.capture, **vars(self.scene))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -272,7 +276,7 @@ class View(_FieldVerb):
     """Shows a field in a browser and answers queries there.
 
     A page on this machine shows the Gaussians (extra viewer). A text highlights what it selects, a click what lies
-    there. The page has a threshold, the frames, and files of the selection. With --export, jsecon writes one HTML file
+    there. The page has a threshold, the frames, and a file of the selection. With --export, jsecon writes one HTML file
     instead, which opens by double click, without a server.
 
     Attributes:
@@ -311,16 +315,27 @@ class Eval(_FieldVerb):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Serve(Verb):
+class _FieldsVerb(Verb):
+    """Options of the verbs that keep fields open.
+
+    Attributes:
+      fields: Paths of field.safetensors files. Each field is known by the name of its folder.
+      embedder: The CLIP model that the fields were made with: a name, hub:owner/name, or a folder. By default it is the
+        one that the runs used.
+    """
+
+    fields: Positional[list[Path]]
+    embedder: ModelOption = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Serve(_FieldsVerb):
     """Answers queries over HTTP, with fields that are loaded once.
 
     Answers POST /query {"text": "red mug"} with Content-Type application/json, and more: see /openapi.json (extra
     serve).
 
     Attributes:
-      fields: Paths of field.safetensors files. Each field is known by the name of its folder.
-      embedder: The CLIP model that the fields were made with: a name, hub:owner/name, or a folder. By default it is the
-        one that the runs used.
       host: Address to listen on. Beyond loopback a token is required.
       port: Port to listen on.
       token: Token that requests must carry behind "Bearer" in the header Authorization. By default it is JSECON_TOKEN
@@ -332,8 +347,6 @@ class Serve(Verb):
     examples = ("jsecon serve my_field/field.safetensors other_field/field.safetensors",)
     extra = "serve"
 
-    fields: Positional[list[Path]]
-    embedder: ModelOption = None
     host: Option[str] = "127.0.0.1"
     port: Annotated[Option[int], Range(0, 65535)] = 8765
     token: Option[str] = ""
@@ -341,23 +354,15 @@ class Serve(Verb):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Mcp(Verb):
+class Mcp(_FieldsVerb):
     """Offers fields to language models as tools.
 
     A server of the Model Context Protocol on standard input and output (extra mcp), which a model's program starts. Its
     tools find, count, locate, measure and render things and only read. The models of texts must be on this machine.
-
-    Attributes:
-      fields: Paths of field.safetensors files. Each field is known by the name of its folder.
-      embedder: The CLIP model that the fields were made with: a name, hub:owner/name, or a folder. By default it is the
-        one that the runs used.
     """
 
     examples = ("jsecon mcp my_field/field.safetensors",)
     extra = "mcp"
-
-    fields: Positional[list[Path]]
-    embedder: ModelOption = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -390,7 +395,7 @@ class Models(Verb):
 class Doctor(Verb):
     """Checks whether this machine has what runs need.
 
-    It prints a line each about the backend's numbers, jax and its devices, cores, memory, disk, the folder of compiled
+    It prints a line each about the backend's numbers, jax and its devices, cores, memory, the folder of compiled
     programs, and each extra with the command that installs it. The exit code is 2 if a check fails that every run
     depends on. `jsecon models check` examines models.
     """
