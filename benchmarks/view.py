@@ -28,8 +28,7 @@ from browser import Page, opened, until
 from serve import SHADES, WORDS, copied, free_port
 
 from jsecon.app.scene import Scene
-from jsecon.app.viewer.state import ViewState
-from jsecon.app.viewer.window import Viewer, open_viewer
+from jsecon.app.viewer.window import Viewer, ViewState, open_viewer
 from jsecon.field.field import load_field, save_field
 
 HOOK = """(undrawn => {

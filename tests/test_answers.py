@@ -10,7 +10,7 @@ from small_field import colour_field, make_field
 from test_gltf import read_glb
 
 from jsecon import Answer, Query, QueryRules, Scene, load_gaussians, objects, query_region, save_field
-from jsecon.app.outputs import write_answers
+from jsecon.app.querying import write_answers
 from jsecon.pipeline.progress import Console
 
 

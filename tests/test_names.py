@@ -24,7 +24,7 @@ from jsecon import (
     save_field,
 )
 from jsecon.app.cli import main
-from jsecon.app.outputs import file_stem, write_answer
+from jsecon.app.querying import file_stem, write_answer
 from jsecon.files import path_within
 from jsecon.query.expressions import parse_query
 from jsecon.vision.colours import ColourEmbedder

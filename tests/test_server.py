@@ -14,8 +14,7 @@ from starlette.testclient import TestClient
 from table_field import table_field
 
 from jsecon import InputError, save_field
-from jsecon.app.scene import Scene
-from jsecon.app.scenes import open_scenes
+from jsecon.app.scene import Scene, open_scenes
 from jsecon.app.server import MAX_BODY, application, prepare
 from jsecon.vision.colours import ColourEmbedder
 

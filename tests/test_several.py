@@ -9,7 +9,7 @@ from small_field import KnownTexts, make_field, rows_of_a_kind, shares, unit_row
 from table_field import table_field
 
 from jsecon import InputError, QueryRules, Regions, Scene, match_regions
-from jsecon.app.outputs import write_answer
+from jsecon.app.querying import write_answer
 from jsecon.query.answer import query_anchored, query_several
 
 

@@ -23,8 +23,15 @@ from jsecon.app.catalogue import main_regions
 from jsecon.app.pictures import palette
 from jsecon.app.records import Answer, Query, Region
 from jsecon.app.scene import Scene
-from jsecon.app.viewer.state import ANSWER_HUE, COLOURINGS, ViewState, highlight
-from jsecon.app.viewer.window import Viewer, open_viewer, region_along
+from jsecon.app.viewer.window import (
+    ANSWER_HUE,
+    COLOURINGS,
+    Viewer,
+    ViewState,
+    highlight,
+    open_viewer,
+    region_along,
+)
 from jsecon.query.pointing import region_shares_seen
 from jsecon.types import Selection
 from jsecon.vision.colours import BASIC, ColourEmbedder
@@ -187,10 +194,10 @@ def test_odd_texts_and_faults_are_reported_and_the_viewer_goes_on(viewer, capsys
 def test_the_file_of_the_selection(viewer, tmp_path):
     sent = []
     client = SimpleNamespace(send_file_download=lambda name, content, **_: sent.append((name, content)))
-    settled(viewer, lambda: viewer.export(client))
+    settled(viewer, lambda: viewer.then(lambda _: viewer._export(client)))
     assert "no Gaussian is selected" in viewer.panel._notice.content
     ask(viewer, Region(1))
-    settled(viewer, lambda: viewer.export(client))
+    settled(viewer, lambda: viewer.then(lambda _: viewer._export(client)))
     name, content = sent[0]
     assert name == "region-1.ply"
     (tmp_path / name).write_bytes(content)
@@ -375,6 +382,6 @@ def test_in_a_browser_it_does_what_a_person_tries(viewer, tmp_path):
         until(lambda: viewer.state.only_selected, "the rest is hidden")
         after_change(page, clicked)
         client = next(iter(viewer.server.get_clients().values()))
-        viewer.go_to_frame(client, 2)
+        viewer.then(lambda _: viewer.layer.go_to(client, 2))
         centre = viewer.layer._centers[2]
         until(lambda: np.allclose(client.camera.position, centre, atol=1e-3), "at the frame")

@@ -160,7 +160,9 @@ def objects(
     whole = _wholes(field, groups, members, size, surroundings)
     labels, part_labels, confidence = _assign(field, groups, whole)
     gaussians = np.where(whole < 0, _counts(labels, len(whole)), _counts(part_labels, len(whole)))
-    rows = _rows(gaussians, whole, surroundings)
+    top, listed = np.where(whole < 0, np.arange(len(whole)), whole), gaussians >= MIN_SAMPLES
+    rows = np.lexsort((-gaussians, whole >= 0, top, -gaussians[top], surroundings[top]))  # each part behind its whole
+    rows = rows[listed[rows] & listed[top[rows]]]
 
     renumber = np.full(len(whole) + 1, -1, np.int32)  # the last entry is that of -1
     renumber[rows] = np.arange(len(rows))
@@ -345,13 +347,10 @@ def _objects_of_gaussians(votes: Votes, objects: Int[Array, " r_and_1"]) -> tupl
     best_share = jnp.zeros(votes.total.shape, votes.weights.dtype)
     best = jnp.full(votes.total.shape, -1, jnp.int32)
     for owner in owners:
-
-        def of_owner(k, combine, owner=owner):
-            return functools.reduce(
-                combine, (jnp.where(other == owner, columns[j][k], 0.0) for j, other in enumerate(owners))
-            )
-
-        share = jnp.nan_to_num(ratio(of_owner(1, jnp.add), of_owner(2, jnp.maximum)))
+        weights = [jnp.where(other == owner, weight, 0.0) for other, (_, weight, _) in zip(owners, columns)]
+        seen = [jnp.where(other == owner, seen, 0.0) for other, (_, _, seen) in zip(owners, columns)]
+        share = ratio(functools.reduce(jnp.add, weights), functools.reduce(jnp.maximum, seen))
+        share = jnp.nan_to_num(share)
         better = (owner >= 0) & (votes.views > 0) & (share > best_share)
         best, best_share = jnp.where(better, owner, best), jnp.where(better, share, best_share)
     return jnp.where(best_share >= SHARE_THRESHOLD, best, -1).astype(jnp.int32), best_share
@@ -379,14 +378,3 @@ def _assign(field: LanguageField, groups: np.ndarray, whole: np.ndarray) -> tupl
 def _counts(labels: np.ndarray, count: int) -> np.ndarray:
     """Returns how many labels each of `count` groups has."""
     return np.bincount(labels[labels >= 0], minlength=count)
-
-
-def _rows(gaussians: np.ndarray, whole: np.ndarray, surroundings: np.ndarray) -> Int[np.ndarray, " k"]:
-    """Returns the groups that are listed, in the order of the catalogue."""
-    listed = gaussians >= MIN_SAMPLES
-    rows: list[int] = []
-    for group in np.lexsort((-gaussians, surroundings)):
-        if listed[group] and whole[group] < 0:
-            parts = np.flatnonzero(listed & (whole == group))
-            rows += [int(group), *map(int, parts[np.argsort(-gaussians[parts], kind="stable")])]
-    return np.array(rows, int)

@@ -4,7 +4,6 @@ import collections
 import dataclasses
 import importlib
 import importlib.metadata
-import importlib.util
 import os
 import platform
 import re
@@ -22,18 +21,6 @@ REINSTALL = 'Run: pip install --force-reinstall "jsecon"'
 """remedy of a broken package"""
 MODULES = {"opencv_contrib_python_headless": "cv2", "pillow": "PIL", "scikit_learn": "sklearn"}
 """required package -> its module, if that has another name"""
-EXTRAS = {
-    "sfm": (("pycolmap",), "poses of photographs and videos"),
-    "formats": (("gsply", "pillow_heif"), ".spz, .sog, compressed .ply, HEIC photographs"),
-    "serve": (("fastapi", "uvicorn"), "jsecon serve"),
-    "viewer": (("viser",), "jsecon view"),
-    "mcp": (("mcp",), "jsecon mcp"),
-    "docs": (("sphinx", "myst_nb", "furo"), "building the documentation"),
-    "figures": (("matplotlib",), "figures of the experiments"),
-    "words": (("ai_edge_litert",), "the experiment on real words"),
-    "export": (("torch", "open_clip", "transformers", "onnx"), "CLIP, SigLIP and SAM 2.1 from checkpoints"),
-}
-"""extra -> the modules that it installs, and what it is for"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +41,7 @@ def _doctor(verb: verbs.Doctor, console: Console) -> verbs.VerbResult:
         checks = [_Check("python", "ok", f"{platform.python_version()}, {platform.platform(terse=True)}")]
         checks += [_check_packages(), *_check_jax()]
         checks.append(_Check("cores", "ok", f"{cores()} of {os.cpu_count()} may be used"))
-        checks += [_check_memory(), _check_programs(), *map(_check_extra, EXTRAS)]
+        checks += [_check_memory(), _check_programs(), *_check_extras()]
     console.print_line("\n".join(f"{check.status:<8} {check.name:<10} {check.message}" for check in checks))
     failed = [check for check in checks if check.remedy and check.status != "ok"]
     return {"checks": checks, "errors": [InputError(c.name, c.message, remedy=c.remedy) for c in failed]}
@@ -63,7 +50,7 @@ def _doctor(verb: verbs.Doctor, console: Console) -> verbs.VerbResult:
 def _check_packages() -> _Check:
     """Imports the packages that jsecon requires."""
     needs = [need for need in importlib.metadata.requires("jsecon") or [] if "extra" not in need]
-    names = [re.split(r"[<>=!~; \[]", need)[0].replace("-", "_") for need in needs]
+    names = [_package(need).replace("-", "_") for need in needs]
     broken = []
     for name in names:
         try:
@@ -119,13 +106,22 @@ def _check_programs() -> _Check:
     return _Check("programs", "ok", f"{sum(file.is_file() for file in Path(folder).rglob('*'))} files in {folder}")
 
 
-def _check_extra(name: str) -> _Check:
-    """Checks whether the modules of an extra are installed."""
-    modules, purpose = EXTRAS[name]
-    absent = [module for module in modules if importlib.util.find_spec(module) is None]
-    if not absent:
-        return _Check(name, "ok", purpose)
-    return _Check(name, "missing", f'{purpose}: pip install "jsecon[{name}]" ({", ".join(absent)})')
+def _check_extras() -> list[_Check]:
+    """Checks whether the packages of each extra are installed."""
+    absent: dict[str, list[str]] = {}
+    for need in importlib.metadata.requires("jsecon") or []:
+        name, _, extra = need.partition("extra == ")
+        package = _package(name)
+        if (extra := extra.strip("\"'")) not in ("", "dev", "all"):
+            found = any(True for _ in importlib.metadata.distributions(name=package))
+            absent.setdefault(extra, []).extend([] if found else [package])
+    words = {name: f'pip install "jsecon[{name}]" ({", ".join(packages)})' for name, packages in absent.items()}
+    return [_Check(n, "missing" if absent[n] else "ok", words[n] if absent[n] else "installed") for n in absent]
+
+
+def _package(need: str) -> str:
+    """Returns the name in a requirement such as "numpy>=2"."""
+    return re.split(r"[<>=!~; \[]", need)[0]
 
 
 def _size(count: int) -> str:

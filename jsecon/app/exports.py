@@ -8,7 +8,7 @@ import numpy as np
 
 from jsecon.app import pictures, report, verbs
 from jsecon.app.catalogue import Catalogue
-from jsecon.app.outputs import slug
+from jsecon.app.querying import slug
 from jsecon.app.records import decimals
 from jsecon.app.scene import Scene, open_scene
 from jsecon.errors import InputError
@@ -28,7 +28,10 @@ def _objects(verb: verbs.Objects, console: Console) -> verbs.VerbResult:
         scene = open_scene(verb.field, embedder=verb.embedder)
         listed = scene.objects(names)
     records = listed.records()
-    _print_objects(records, console)
+    for record in records:
+        place = "" if record["parent"] is None else "  "
+        ending = ", surroundings" if record["surroundings"] else ""
+        console.print_line(f"{record['id']:>4}  {place}{_title(record)}: {_words(record)}{ending}")
     if hidden := int((listed.regions < 0).sum()):
         console.print_line(f"  too small to be listed, with fewer than {MIN_SAMPLES} Gaussians: {hidden} regions")
     elif not records:
@@ -98,19 +101,6 @@ def _check_export(verb: verbs.Export) -> None:
         raise InputError("--objects", problem, remedy="Leave one of them out.")
 
 
-def _print_objects(records: list[dict[str, Any]], console: Console) -> None:
-    """Prints a line for each object; parts are indented under their wholes."""
-    wide = max((len(_title(record)) for record in records), default=4) + 2
-    console.print_line(f"{'id':>4}  {'name':<{wide}}  prob.  Gaussians  views  conf.  size, centre")
-    for record in records:
-        name = ("" if record["parent"] is None else "  ") + _title(record)
-        probability = record["names"][0]["probability"] if record["names"] else 0.0
-        figures = f"{probability:5.2f}  {record['gaussians']:9d}  {record['views']:5d}  {record['confidence']:5.2f}"
-        size, center = _size_and_center(record)
-        ending = ", surroundings" if record["surroundings"] else ""
-        console.print_line(f"{record['id']:>4}  {name:<{wide}}  {figures}  {size}, at ({center}){ending}")
-
-
 def _save_objects(scene: Scene, folder: Path) -> list[Path]:
     """Writes a .ply of each object, named by its id and name; of a whole with the Gaussians of its parts."""
     files = []
@@ -130,11 +120,12 @@ def _page(scene: Scene, catalogue: Catalogue, records: list[dict[str, Any]], con
             mask = catalogue.mask(record["id"])
             figures = [report.figure(scene.render(name, mask), name) for name in record["frames"]]
             best = scene.frame_index(record["frames"][0]) if record["frames"] else 0
-            part = "" if record["parent"] is None else f", part of {record['parent']}"
+            part = "" if record["parent"] is None else f" (part of {record['parent']})"
             picture = pictures.crop(scene.render(best), scene.mask(mask, best))
-            size, center = _size_and_center(record)
-            words = f"{record['id']}{part}: {size}, at ({center}), {record['gaussians']} Gaussians"
+            words = f"{record['id']}{part}: {_words(record)}"
             card = report.card(picture, _title(record), words, report.grid(figures, 3))
+                picture, _title(record), f"{record['id']}{part}: {_words(record)}", report.grid(figures, 3)
+            )
             cards[record["surroundings"]].append(card)
             progress(record["id"] + 1, len(records))
     parts = [report.grid(cards[False])]
@@ -150,8 +141,10 @@ def _title(record: dict[str, Any]) -> str:
     return record["names"][0]["name"] if record["names"] else "object"
 
 
-def _size_and_center(record: dict[str, Any]) -> tuple[str, str]:
-    """Returns length, width and height of an object, and its centre, to a hundredth of its size."""
+def _words(record: dict[str, Any]) -> str:
+    """Returns length, width, height and centre of an object, to a hundredth of its size, and how much shows it."""
     size, center = record["box"]["size"], record["box"]["center"]
     digits = decimals(float(np.linalg.norm(size)), 0.01)
-    return " x ".join(f"{x:.{digits}f}" for x in size), ", ".join(f"{x:.{digits}f}" for x in center)
+    sides = " x ".join(f"{x:.{digits}f}" for x in size)
+    place = ", ".join(f"{x:.{digits}f}" for x in center)
+    return f"{sides}, at ({place}), {record['gaussians']} Gaussians, {record['views']} frames"

@@ -18,15 +18,12 @@ from mcp.types import ToolAnnotations
 from pydantic import Field
 
 from jsecon.app import verbs
-from jsecon.app.scene import Scene
-from jsecon.app.scenes import find_scene, open_scenes
+from jsecon.app.scene import Scene, find_scene, open_scenes
 from jsecon.errors import InputError
 from jsecon.pipeline.progress import Console
 
 Words: TypeAlias = Annotated[str, Field(description="What is asked for, in words", pattern=r"\S", max_length=500)]
-Frame: TypeAlias = Annotated[
-    str | None, Field(description="Name of the frame that it is seen from, or #3 for the fourth")
-]
+Frame: TypeAlias = Annotated[str | None, Field(description="Name of the frame that it is seen from, or its place: #3")]
 FieldName: TypeAlias = Annotated[str | None, Field(description="Name of the field; the first by default")]
 
 
@@ -107,7 +104,6 @@ def _mcp(verb: verbs.Mcp, console: Console) -> verbs.VerbResult:
     with console.progress("fields"):
         scenes = open_scenes(verb.fields, verb.embedder)
     for scene in scenes.values():
-        console.print_line(
-            f"{scene.name}: {scene.field.gaussians.count} Gaussians, {scene.field.regions.count} regions"
-        )
+        field = scene.field
+        console.print_line(f"{scene.name}: {field.gaussians.count} Gaussians, {field.regions.count} regions")
     return {"then": make_server(scenes).run}

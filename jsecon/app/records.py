@@ -189,17 +189,9 @@ class Answer:
         """Estimated probability that the answer shows what the text names; None if it is unknown."""
         return _known(self.selection.confidence)
 
-    @property
-    def _outliers(self) -> dict[str, int]:
-        """Numbers of selected Gaussians, of those that were dropped, and of clusters that were kept and dropped."""
-        selected = int(np.asarray(self.selection.mask).sum())
-        kept, dropped = self.clusters
-        counts = {"dropped": selected - len(self.rows), "selected": selected}
-        return counts | {"clusters_kept": kept, "clusters_dropped": dropped}
-
     def as_dict(self) -> dict[str, Any]:
         """The record of the answer as plain values for JSON, in the capture's world: the same at every door."""
-        region = int(self.selection.region)
+        region, selected = int(self.selection.region), int(np.asarray(self.selection.mask).sum())
         presence = _known(self.selection.presence)
         probability = {} if presence is None else {"presence": presence}
         if len(self.rows) and self.by == "votes":
@@ -217,7 +209,12 @@ class Answer:
             "confidence": self.confidence,
             "region": region if region >= 0 else None,
             "probability": probability or None,
-            "outliers": self._outliers,
+            "outliers": {
+                "dropped": selected - len(self.rows),
+                "selected": selected,
+                "clusters_kept": self.clusters[0],
+                "clusters_dropped": self.clusters[1],
+            },
             "place": self._place_record() if len(self.rows) else None,
             "reason": self.reason,
             "skipped": dict(self.skipped),
@@ -288,16 +285,6 @@ class Answer:
         digits = decimals(float(np.linalg.norm(np.ptp(self.points, axis=0))), 0.01)
         centroid = ", ".join(f"{coordinate:.{digits}f}" for coordinate in self.points.mean(0))
         return ", ".join([*parts, f"around ({centroid})"])
-
-    @property
-    def outlier_words(self) -> str:
-        """What DBSCAN dropped, in a sentence; "" if it dropped no Gaussian."""
-        counts = self._outliers
-        if not counts["dropped"]:
-            return ""
-        many = counts["clusters_dropped"]
-        clusters = f", {many} smaller cluster{'s' if many > 1 else ''} among them" if many else ""
-        return f"{counts['dropped']} of {counts['selected']} selected Gaussians stand apart and were dropped{clusters}"
 
     def __str__(self) -> str:
         """The line that the command line prints."""

@@ -5,12 +5,12 @@ Every door (command line, viewer, server, tools of language models, notebook, ev
 frames and units.
 """
 
+import contextlib
 import dataclasses
 import functools
 import re
 import threading
-from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +97,32 @@ def open_scene(
     return Scene(field, embedder, up=up, name=file.parent.name if file.name == FIELD_FILE else file.stem)
 
 
+def open_scenes(files: Sequence[Path], embedder: str | Path | None) -> "dict[str, Scene]":
+    """Opens fields, each named like its folder, and prepares them for questions.
+
+    `embedder` is the CLIP model of the fields (`open_scene`); None takes the one that each run used.
+    """
+    scenes: dict[str, Scene] = {}
+    for file in files:
+        scene = open_scene(file, embedder=embedder)
+        if scene.name in scenes:
+            raise InputError(file, f"it is a second field named {scene.name!r}", remedy="Rename one of the folders.")
+        scenes[scene.name] = scene
+        _ = scene.embedder
+        with contextlib.suppress(InputError):  # an embedder that has no word for what is asked to prepare it
+            scene.prepare()
+    return scenes
+
+
+def find_scene(scenes: "Mapping[str, Scene]", name: str | None) -> "Scene":
+    """Returns the scene of a name; the first if the name is None."""
+    if name is None:
+        return next(iter(scenes.values()))
+    if name not in scenes:
+        raise InputError(f"field {name!r}", "there is no such field", remedy=f"There are {', '.join(scenes)}.")
+    return scenes[name]
+
+
 def _field_of_gaussians(options: Options, folder: Path, console: Console) -> Path:
     """Finds the field of a file of Gaussians in a folder, or makes it there.
 
@@ -158,7 +184,8 @@ class Scene:
         self._embedder = embedder
         self._up = up
         self._lock = threading.RLock()
-        self._answers: OrderedDict[Query, Answer] = OrderedDict()
+        count = max(CACHED_BYTES // (5 * max(field.gaussians.count, 1)), 1)
+        self._answers = functools.lru_cache(count)(lambda query: self._answer(query))
         self._cameras = jax.tree.map(np.asarray, field.cameras)  # whose items need no compilation
         self._photo = functools.cache(lambda t: pictures.render_picture(self._gaussians, self._cameras[t]))
 
@@ -219,16 +246,9 @@ class Scene:
             or pixel, no region lies at a pixel, or an option is out of its range.
         """
         query = question if isinstance(question, Query) else Query(question, **options)
-        answer = self._answers.get(query)
-        if answer is not None:
-            return answer
         with self._lock:
-            answer = self._answers.get(query) or self._answer(query)
-            if not isinstance(query.question, Mask):  # an array may change
-                self._answers[query] = answer
-            while len(self._answers) > max(CACHED_BYTES // (5 * max(self.field.gaussians.count, 1)), 1):
-                self._answers.popitem(last=False)
-        return answer
+            # The arrays of a mask may change.
+            return (self._answer if isinstance(query.question, Mask) else self._answers)(query)
 
     def ask_all(self, questions: Sequence[Question | Query], **options: Any) -> list[Answer | InputError]:
         """Answers several questions.

@@ -26,8 +26,7 @@ import jsecon
 from jsecon.app import verbs
 from jsecon.app.access import bracketed, is_allowed_host, listen, token_for
 from jsecon.app.records import At, Query
-from jsecon.app.scene import Scene
-from jsecon.app.scenes import find_scene, open_scenes
+from jsecon.app.scene import Scene, find_scene, open_scenes
 from jsecon.errors import InputError
 from jsecon.pipeline.progress import Console
 

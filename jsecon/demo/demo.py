@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from jsecon.app import evaluation, pictures, report, running, verbs
-from jsecon.app.outputs import write_answer
+from jsecon.app.querying import write_answer
 from jsecon.app.scene import Scene
 from jsecon.evaluate.lerf import Row
 from jsecon.pipeline import run as pipeline

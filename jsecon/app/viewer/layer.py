@@ -19,6 +19,19 @@ MAX_STD = 200.0
 to 256"""
 
 
+def first_view(field: LanguageField) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Finds where the first frame was taken, what it looks at, and the up axis, in the field's world."""
+    pose = np.asarray(field.cameras.world_to_camera, np.float64)[0]
+    eye = -pose[:3, :3].T @ pose[:3, 3]
+    forward = pose[2, :3]
+    means = np.asarray(field.gaussians.means, np.float64)
+    offsets = means[np.isfinite(means).all(1)] - eye
+    depth = offsets @ forward
+    ahead = depth[np.linalg.norm(offsets - depth[:, None] * forward, axis=1) < 0.2 * depth]
+    distance = float(np.median(ahead)) if len(ahead) else 1.0
+    return eye, eye + distance * forward, scene_up(field.cameras)
+
+
 class SplatLayer:
     """The Gaussians in the window, in groups that are sent one by one, and the places of the frames.
 
@@ -29,7 +42,6 @@ class SplatLayer:
     Attributes:
       scale: Units of the window per unit of the field.
       photo: (N, 3) uint8 colours of degree 0.
-      regions: (N,) main region of each Gaussian, or -1.
       fovs: (T,) vertical fields of view of the frames, radians.
     """
 
@@ -46,7 +58,6 @@ class SplatLayer:
         self.scale = 1 / float(np.median(positive)) if len(positive) else 1.0
         self.photo = (255 * np.clip(0.5 + C0 * np.asarray(gaussians.sh)[:, 0], 0, 1)).astype(np.uint8)
         self._server = server
-        self._up = scene_up(field.cameras)
         self.fovs = 2 * np.arctan(field.cameras.height / 2 / np.asarray(field.cameras.fy, np.float64))
         opacity = np.nan_to_num(np.asarray(sigmoid(np.asarray(gaussians.opacity_logits))))
         self._opacity = np.rint(255 * np.where(usable, opacity, 0)).astype(np.uint8)
@@ -55,8 +66,7 @@ class SplatLayer:
         covariances = roots @ roots.transpose(0, 2, 1)
         centers = where_usable(gaussians.means) * np.float32(self.scale)
         self._groups = []
-        self.regions = main_regions(field)
-        order = np.argsort(self.regions, kind="stable")
+        order = np.argsort(main_regions(field), kind="stable")
         for k, rows in enumerate(np.array_split(order, max(min(GROUPS, len(order)), 1))):
             handle = server.scene.add_gaussian_splats(
                 f"/field/{k}",
@@ -69,16 +79,11 @@ class SplatLayer:
         poses = np.asarray(field.cameras.world_to_camera, np.float64)
         self._rotations = Rotation.from_matrix(poses[:, :3, :3].transpose(0, 2, 1))
         self._centers = -np.einsum("tji,tj->ti", poses[:, :3, :3], poses[:, :3, 3]) * self.scale
-        self._set_start(server.initial_camera, centers)
-
-    def _set_start(self, camera: Any, centers: np.ndarray) -> None:
-        """Starts the window at the first frame, upright."""
-        self._server.scene.set_up_direction(self._up)
-        forward = self._rotations[0].apply([0, 0, 1])
-        depth = (centers - self._centers[0]) @ forward
-        distance = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
-        camera.position = self._centers[0]
-        camera.look_at = self._centers[0] + distance * forward
+        eye, target, up = first_view(field)
+        server.scene.set_up_direction(up)
+        camera = server.initial_camera
+        camera.position = eye * self.scale
+        camera.look_at = target * self.scale
         camera.fov = float(self.fovs[0])
         camera.near = 0.01 * self.scale
         camera.far = 1e4 * self.scale

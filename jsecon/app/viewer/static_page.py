@@ -10,15 +10,14 @@ import json
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from jsecon.app import verbs
 from jsecon.app.catalogue import main_regions
 from jsecon.app.records import Answer
 from jsecon.app.scene import open_scene
+from jsecon.app.viewer.layer import first_view
 from jsecon.errors import InputError
 from jsecon.files import write_text
 from jsecon.numerics import sigmoid
@@ -26,7 +25,6 @@ from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console
 from jsecon.splat.sh import C0
 from jsecon.types import Gaussians, LanguageField
-from jsecon.views.frame import scene_up
 
 NO_REGION = 65535
 """code of a Gaussian without a region"""
@@ -80,31 +78,15 @@ def page(field: LanguageField, answers: Sequence[Answer], *, title: str) -> str:
         "low": low.tolist(),
         "span": (high - low).tolist(),
         "texts": texts,
-        **_camera(field, means[drawn]),
+        **{name: place.tolist() for name, place in zip(("eye", "target", "up"), first_view(field))},
+        "focal": float(np.asarray(field.cameras.fx)[0]),
+        "size": [field.cameras.width, field.cameras.height],
         **size_range,
     }
     template = resources.files("jsecon.app.viewer").joinpath("static_page.html").read_text(encoding="utf-8")
     filled = template.replace("__TITLE__", html.escape(title))
     filled = filled.replace("__SCENE__", json.dumps(scene).replace("</", "<\\/"))
     return filled.replace("__SPLATS__", base64.b64encode(splats).decode())
-
-
-def _camera(field: LanguageField, means: Float[np.ndarray, "n 3"]) -> dict[str, Any]:
-    """Returns the first view: the first frame, upright, turning about what it looks at."""
-    pose = np.asarray(field.cameras.world_to_camera, np.float64)[0]
-    eye = -pose[:3, :3].T @ pose[:3, 3]
-    forward = pose[2, :3]
-    depth = (means - eye) @ forward
-    off_axis = np.linalg.norm(means - eye - depth[:, None] * forward, axis=1)
-    ahead = depth[(depth > 0) & (off_axis < 0.2 * np.maximum(depth, 1e-9))]
-    distance = float(np.median(ahead)) if len(ahead) else max(float(np.linalg.norm(np.ptp(means, axis=0))), 1e-6)
-    return {
-        "eye": eye.tolist(),
-        "target": (eye + distance * forward).tolist(),
-        "up": scene_up(field.cameras).tolist(),
-        "focal": float(np.asarray(field.cameras.fx)[0]),
-        "size": [field.cameras.width, field.cameras.height],
-    }
 
 
 def _pack(

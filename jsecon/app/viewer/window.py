@@ -15,23 +15,23 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeAlias, get_args
 from urllib.parse import urlsplit
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
 from jsecon.app import verbs
 from jsecon.app.access import is_allowed_host, listen
-from jsecon.app.outputs import file_stem
-from jsecon.app.pictures import UNKNOWN, palette
-from jsecon.app.records import Answer, Region
+from jsecon.app.pictures import palette, region_colours
+from jsecon.app.querying import file_stem
+from jsecon.app.records import Answer, Query, Region
 from jsecon.app.scene import Scene, open_scene
 from jsecon.app.viewer.layer import SplatLayer
-from jsecon.app.viewer.state import ANSWER_HUE, COLOURINGS, ViewState, highlight
 from jsecon.app.viewer.static_page import export_page
 from jsecon.errors import InputError
+from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.pipeline.progress import Console
 from jsecon.query.pointing import MIN_SHARE, region_shares_seen
 from jsecon.query.render import HIDDEN_LOGIT
@@ -39,6 +39,59 @@ from jsecon.types import Camera, LanguageField
 
 RAY_VIEW_SIDE = 1025
 """side of the view that looks along a ray, px; the ray meets the centre of its middle pixel"""
+Colouring: TypeAlias = Literal["photo", "region"]
+COLOURINGS: tuple[Colouring, ...] = get_args(Colouring)
+"""What the colours of the Gaussians show: the photographs, or regions."""
+ANSWER_HUE = 0.91
+"""hue of the first answer in `palette`, pink: few natural objects have it"""
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewState:
+    """What the viewer shows. Two equal states look the same."""
+
+    questions: tuple[str | Region, ...] = ()
+    """Texts and clicked regions whose answers are highlighted, in the order of their colours."""
+    threshold: float = SHARE_THRESHOLD
+    """Smallest share of a selected Gaussian."""
+    all_of_class: bool = False
+    """Whether to select all regions that match instead of the best one."""
+    only_selected: bool = False
+    """Whether the selected Gaussians alone are visible, if there are any."""
+    colouring: Colouring = "photo"
+
+    @property
+    def queries(self) -> tuple[Query, ...]:
+        """The highlighted questions with their options."""
+        options = {"threshold": self.threshold, "all_of_class": self.all_of_class}
+        return tuple(Query(question, **options) for question in self.questions)
+
+    def with_question(self, question: str | Region, *, add: bool = False) -> "ViewState":
+        """Highlights a question in place of the others, or beside them.
+
+        A blank text highlights nothing. A region that is highlighted is removed.
+        """
+        others = tuple(other for other in self.questions if add and other != question)
+        removed = isinstance(question, Region) and question in self.questions
+        new = () if removed or not str(question).strip() else (question,)
+        return dataclasses.replace(self, questions=(*others, *new))
+
+
+def highlight(base: UInt8[np.ndarray, "n 3"], answers: Sequence[Answer | InputError]) -> UInt8[np.ndarray, "n 3"]:
+    """Tints the Gaussians of each answer in its colour, and dims the others; if none is selected the colours stay."""
+    tints = palette(len(answers), ANSWER_HUE)
+    found = [(tint, answer) for tint, answer in zip(tints, answers) if isinstance(answer, Answer) and len(answer.rows)]
+    if not found:
+        return base
+    grey = base.mean(1, keepdims=True, dtype=np.float32)
+    colours = (0.4 * (0.4 * base + 0.6 * grey)).astype(np.uint8)  # darker, and less of its hue
+    best = np.full(len(base), -np.inf, np.float32)
+    for tint, answer in found:
+        similarity = np.asarray(answer.selection.similarity)
+        rows = np.flatnonzero(answer.mask & (np.nan_to_num(similarity) > best))
+        best[rows] = similarity[rows]
+        colours[rows] = (0.45 * base[rows] + 0.55 * tint).astype(np.uint8)
+    return colours
 
 
 class Viewer:
@@ -62,16 +115,16 @@ class Viewer:
         self.drawn: ViewState | None = None
         self.layer = SplatLayer(server, scene.field)
         self.panel = _Panel(self, server)
-        table = np.concatenate([palette(scene.field.regions.count), np.full((1, 3), 255 * UNKNOWN, np.uint8)])
-        self._base_colours = {"photo": self.layer.photo, "region": table[self.layer.regions]}
-        self._steps: queue.SimpleQueue[Callable[[], Any] | None] = queue.SimpleQueue()
+        regions = (255 * region_colours(scene.field)).astype(np.uint8)
+        self._base_colours = {"photo": self.layer.photo, "region": regions}
+        self._steps: queue.SimpleQueue[Callable[[ViewState], ViewState | None] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, daemon=True)
 
     def _start(self, state: ViewState) -> None:
         """Draws the first state, and starts the thread, which first compiles what questions need."""
         self.state = state
         self._draw()
-        self._steps.put(self._prepare)
+        self.then(self._prepare)
         self._thread.start()
 
     def _run(self) -> None:
@@ -86,48 +139,32 @@ class Viewer:
         self._steps.put(None)
         self._thread.join()
 
-    def then(self, step: Callable[[ViewState], ViewState]) -> None:
-        """Queues a step, which makes the next state of the present one."""
+    def then(self, step: Callable[[ViewState], ViewState | None]) -> None:
+        """Queues a step: a function of the present state, which returns the next one, or None to keep it."""
+        self._steps.put(step)
 
-        def act() -> None:
-            self.state = step(self.state)
+    def _clicked(self, state: ViewState, ray: Any, focal: float, *, add: bool) -> ViewState:
+        """Highlights the region that the ray of an event in the window's world meets; focal length in px."""
+        start, direction = np.asarray(ray.ray_origin) / self.layer.scale, np.asarray(ray.ray_direction)
+        region = region_along(self.scene.field, start, direction, focal=focal, visible=self._visible())
+        if region < 0:
+            raise InputError("", "no region is known there: it is background, or no frame shows it")
+        return state.with_question(Region(region), add=add)
 
-        self._steps.put(act)
-
-    def _click(self, origin: Sequence[float], direction: Sequence[float], focal: float, *, add: bool) -> None:
-        """Queues highlighting the region that a ray in the window's world meets; focal length in px."""
-        start = np.asarray(origin) / self.layer.scale
-
-        def act() -> None:
-            region = region_along(self.scene.field, start, np.asarray(direction), focal=focal, visible=self._visible())
-            if region < 0:
-                raise InputError("", "no region is known there: it is background, or no frame shows it")
-            self.state = self.state.with_question(Region(region), add=add)
-
-        self._steps.put(act)
-
-    def go_to_frame(self, client: Any, frame: int) -> None:
-        """Queues moving a client to the camera of a frame."""
-        self._steps.put(lambda: self.layer.go_to(client, frame))
-
-    def export(self, client: Any) -> None:
-        """Queues sending the highlighted Gaussians as a .ply."""
-
-        def act() -> None:
-            if not (found := self._found()):
-                raise InputError("", "no Gaussian is selected, so there is no file to export")
-            with tempfile.TemporaryDirectory() as folder:
-                file = Path(folder, f"{file_stem(found[0])}.ply")
-                self.scene.export(file, np.any([answer.mask for answer in found], axis=0))
-                client.send_file_download(file.name, file.read_bytes(), save_immediately=True)
-
-        self._steps.put(act)
+    def _export(self, client: Any) -> None:
+        """Sends the highlighted Gaussians as a .ply."""
+        if not (found := self._found()):
+            raise InputError("", "no Gaussian is selected, so there is no file to export")
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder, f"{file_stem(found[0])}.ply")
+            self.scene.export(file, np.any([answer.mask for answer in found], axis=0))
+            client.send_file_download(file.name, file.read_bytes(), save_immediately=True)
 
     def _work(self) -> None:
         """Takes the steps in turn, and draws the last state when no step waits."""
         while (step := self._steps.get()) is not None:
             try:
-                step()
+                self.state = step(self.state) or self.state
                 if self._steps.empty() and self.state != self.drawn:
                     self._draw()
             except InputError as error:
@@ -136,7 +173,7 @@ class Viewer:
                 self.panel.show_notice("Internal error. The terminal shows its trace.")
                 traceback.print_exc()
 
-    def _prepare(self) -> None:
+    def _prepare(self, state: ViewState) -> None:
         with contextlib.suppress(InputError):  # an embedder without words: each text then has this error
             self.scene.prepare()
 
@@ -181,17 +218,13 @@ class _Panel:
         self._add = gui.add_checkbox("add to selection", False, hint=hint)
         self._messages = gui.add_html("")
         self._notice = gui.add_html("")
-        hint = "Select every region that matches, not only the best one"
-        all_of_class = gui.add_checkbox("all of its kind", default.all_of_class, hint=hint)
-        hint = "Smallest share of a Gaussian that must lie in the matching regions"
-        threshold = gui.add_slider("threshold", 0.0, 1.0, 0.01, default.threshold, hint=hint)
-        only_selected = gui.add_checkbox("only the selection", default.only_selected, hint="Hide everything else")
-        colouring = gui.add_dropdown("colour", COLOURINGS, initial_value=default.colouring)
+        every = "Select every region that matches, not only the best one"
+        share = "Smallest share of a Gaussian that must lie in the matching regions"
         self._controls = {
-            "all_of_class": all_of_class,
-            "threshold": threshold,
-            "only_selected": only_selected,
-            "colouring": colouring,
+            "all_of_class": gui.add_checkbox("all of its kind", default.all_of_class, hint=every),
+            "threshold": gui.add_slider("threshold", 0.0, 1.0, 0.01, default.threshold, hint=share),
+            "only_selected": gui.add_checkbox("only the selection", default.only_selected, hint="Hide everything else"),
+            "colouring": gui.add_dropdown("colour", COLOURINGS, initial_value=default.colouring),
         }
         export = gui.add_button("export", hint="Download the selected Gaussians as a .ply")
         hint = "Go to the camera of a frame"
@@ -200,7 +233,7 @@ class _Panel:
         text_form.on_submit(_in_order(self._find))
         for name, control in self._controls.items():
             control.on_update(_in_order(lambda event, name=name: self._set_control(name, event.target.value)))
-        export.on_click(_in_order(lambda event: viewer.export(event.client)))
+        export.on_click(_in_order(lambda event: viewer.then(lambda _: viewer._export(event.client))))
         frame.on_update(_in_order(self._choose_frame))
         for modifier in (None, "shift"):
             server.scene.on_click(modifier=modifier)(_in_order(self._click_scene))
@@ -215,13 +248,14 @@ class _Panel:
 
     def _choose_frame(self, event: Any) -> None:
         if event.client is not None and event.target.value in self._names:
-            self._viewer.go_to_frame(event.client, self._names.index(event.target.value))
+            frame = self._names.index(event.target.value)
+            self._viewer.then(lambda _: self._viewer.layer.go_to(event.client, frame))
 
     def _click_scene(self, event: Any) -> None:
         camera = event.client.camera
         focal = camera.image_height / 2 / np.tan(camera.fov / 2)
         add = self._add.value or event.modifier == "shift"
-        self._viewer._click(event.ray_origin, event.ray_direction, focal, add=add)
+        self._viewer.then(lambda state: self._viewer._clicked(state, event, focal, add=add))
 
     def show(self, state: ViewState, answers: Sequence[Answer | InputError]) -> None:
         """Sets the controls to a state, and describes the answer or the error of each of its questions."""
