@@ -124,8 +124,6 @@ def _page(scene: Scene, catalogue: Catalogue, records: list[dict[str, Any]], con
             picture = pictures.crop(scene.render(best), scene.mask(mask, best))
             words = f"{record['id']}{part}: {_words(record)}"
             card = report.card(picture, _title(record), words, report.grid(figures, 3))
-                picture, _title(record), f"{record['id']}{part}: {_words(record)}", report.grid(figures, 3)
-            )
             cards[record["surroundings"]].append(card)
             progress(record["id"] + 1, len(records))
     parts = [report.grid(cards[False])]

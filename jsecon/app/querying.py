@@ -1,4 +1,4 @@
-"""`jsecon query`: its options as questions, and its answers as files: Gaussians, a record, masks and a page of pictures.
+"""`jsecon query`: its options as questions, and its answers as files: Gaussians, a record, masks, a page of pictures.
 
 Every query has unique file names, the same in every run: an ordinary text is its name ("red mug" is red-mug), any other
 name ends in a hash of what it stands for (`file_stem`).
