@@ -67,7 +67,7 @@ def test_run_writes_field_metrics_and_report_and_tells_its_plan(room, room_run, 
         assert text in words
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count("data:image/") >= 24
-    assert "Held-out frames" in page
+    assert "Frames, masks, regions" in page
     assert (tmp_path / "out" / "field.safetensors").read_bytes() == (out / "field.safetensors").read_bytes()
 
 

@@ -8,7 +8,6 @@ A page of another site can send requests to a server on loopback under a name th
 import ipaddress
 import os
 import socket
-from collections.abc import Collection
 from urllib.parse import urlsplit
 
 from jsecon.errors import InputError, describe_error
@@ -22,19 +21,13 @@ def _is_loopback(host: str) -> bool:
         return host.rstrip(".").lower() == "localhost"
 
 
-def _host_of(header: str) -> str:
-    """Returns the host of a Host header in lower case, without port and brackets; "" if the header has no host."""
+def is_allowed_host(header: str) -> bool:
+    """Checks whether a Host header names this machine, by a name of loopback."""
     try:
-        name = urlsplit(f"//{header}").hostname
+        host = urlsplit(f"//{header}").hostname
     except ValueError:
-        return ""
-    return (name or "").rstrip(".")
-
-
-def is_allowed_host(header: str, hosts: Collection[str] = ()) -> bool:
-    """Checks whether a Host header names this machine: by loopback or one of `hosts`."""
-    host = _host_of(header)
-    return bool(host) and (_is_loopback(host) or host in {_host_of(bracketed(name)) for name in hosts})
+        return False
+    return host is not None and _is_loopback(host)
 
 
 def token_for(host: str, token: str) -> str:

@@ -86,7 +86,7 @@ def write_run(
     warnings = [note for note in run.notes if note.startswith(WARNING)]
     with console.progress("report"):
         result = report.section("Result", ". ".join([summary, *warnings]))
-        write_text(out / "report.html", report.page(title, lead, [result, *parts, *_pictures(run), *_tables(run)]))
+        write_text(out / "report.html", report.page(title, lead, [result, *parts, _pictures(run), *_tables(run)]))
     console.print_line("\n".join([*warnings, summary]))
     console.print_line(f"field   {out / 'field.safetensors'}\nreport  {out / 'report.html'}")
     return metrics
@@ -102,33 +102,23 @@ def _quality(held_out: Quality, console: Console) -> dict[str, float | None]:
     return {"held_out_psnr": round(psnr, 3), "held_out_ssim": round(ssim, 4)}
 
 
-def _pictures(run: Run) -> list[str]:
-    """Returns the parts that show frames, masks, regions and the rendered scene."""
+def _pictures(run: Run) -> str:
+    """Returns the part that shows frames, masks, regions and the rendered scene."""
     train = vision_frames(run.capture, run.options)
     gaussians, cameras = jax.device_put(run.field.gaussians), jax.tree.map(np.asarray, run.field.cameras)
     colours = pictures.region_colours(run.field)
-
-    def pair(t: int, *between: str) -> list[str]:
-        """A frame and its rendering, with other pictures between them."""
-        photo = report.figure(np.asarray(run.capture.frames[t]), run.capture.names[t])
-        return [photo, *between, report.figure(pictures.render_picture(gaussians, cameras[t]), "rendered")]
-
     cells = []
     for row in evenly_spaced(len(train), 6):
         t = int(train[row])
-        masks = pictures.label_overlay(np.asarray(run.capture.frames[t]), run.labels[row])
-        regions = pictures.render_picture(gaussians, cameras[t], colours)
-        cells += pair(t, report.figure(masks, "masks", sharp=True), report.figure(regions, "regions"))
-    words = (
-        "A region has one colour in all views, and so has each Gaussian by its strongest region; a grey one has none."
-    )
-    parts = [report.section("Frames, masks, regions", words, report.grid(cells, 4))]
-    held_out = np.flatnonzero(run.capture.held_out)
-    if len(held_out):
-        cells = [cell for row in evenly_spaced(len(held_out), 4) for cell in pair(int(held_out[row]))]
-        words = "Photographs that no step has seen, and their renderings."
-        parts.append(report.section("Held-out frames", words, report.grid(cells, 4)))
-    return parts
+        frame = np.asarray(run.capture.frames[t])
+        cells += [
+            report.figure(frame, run.capture.names[t]),
+            report.figure(pictures.label_overlay(frame, run.labels[row]), "masks", sharp=True),
+            report.figure(pictures.render_picture(gaussians, cameras[t], colours), "regions"),
+            report.figure(pictures.render_picture(gaussians, cameras[t]), "rendered"),
+        ]
+    words = "A region has one colour in all views, and so has each Gaussian by its strongest region; grey has none."
+    return report.section("Frames, masks, regions", words, report.grid(cells, 4))
 
 
 def _tables(run: Run) -> list[str]:

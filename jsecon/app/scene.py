@@ -131,10 +131,9 @@ def _field_of_gaussians(options: Options, folder: Path, console: Console) -> Pat
     from jsecon.pipeline import run as pipeline  # late: questions to a field need none of it
 
     with console.progress("plan"):
-        path = pipeline.current_field(options, folder)
-        if path is None and options.embedder is None and (folder / FIELD_FILE).is_file():
+        if options.embedder is None and (folder / FIELD_FILE).is_file():
             options = dataclasses.replace(options, embedder=_model_of(folder / FIELD_FILE))
-            path = pipeline.current_field(options, folder)
+        path = pipeline.current_field(options, folder)
     if path is None:
         pipeline.run(options, folder, console=console)
         path = folder / FIELD_FILE

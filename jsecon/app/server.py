@@ -8,7 +8,7 @@ import hmac
 import json
 import re
 import tempfile
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
@@ -78,10 +78,9 @@ class _AsciiResponse(JSONResponse):
 class _Guard:
     """Middleware that refuses requests by the rules of `jsecon.app.access`, and bodies that are too large."""
 
-    def __init__(self, app: Any, token: str, hosts: Collection[str]):
+    def __init__(self, app: Any, token: str):
         self._app = app
         self._token = token
-        self._hosts = hosts
 
     async def __call__(self, scope: dict, receive: Callable, send: Callable) -> None:
         if scope["type"] != "http":
@@ -107,18 +106,18 @@ class _Guard:
             sent = headers.get("authorization", "").encode("latin-1")
             if not hmac.compare_digest(sent, f"Bearer {self._token}".encode("utf-8", "surrogateescape")):
                 return 401, "A token is required. Send the header Authorization: Bearer TOKEN."
-        elif not is_allowed_host(headers.get("host", ""), self._hosts):
-            return 403, "The Host header does not name this server. Allow it with jsecon serve --allow-host NAME."
+        elif not is_allowed_host(headers.get("host", "")):
+            return 403, "The Host header does not name this machine. Behind a proxy, start jsecon serve with --token."
         kind = headers.get("content-type", "").partition(";")[0].strip().lower()
         if method == "POST" and kind != "application/json":  # what a page of another site can send without asking
             return 415, "The body must be JSON. Send the header Content-Type: application/json."
         return None
 
 
-def application(scenes: Mapping[str, Scene], *, token: str = "", hosts: Collection[str] = ()) -> FastAPI:
+def application(scenes: Mapping[str, Scene], *, token: str = "") -> FastAPI:
     """Makes the ASGI application of scenes by name, the first of which is the default.
 
-    Requests must carry the token, or without one name this machine: by loopback or one of `hosts`.
+    Requests must carry the token, or without one name this machine.
     """
     app = FastAPI(
         title="jsecon",
@@ -128,7 +127,7 @@ def application(scenes: Mapping[str, Scene], *, token: str = "", hosts: Collecti
         redirect_slashes=False,
         default_response_class=_AsciiResponse,
     )
-    app.add_middleware(_Guard, token=token, hosts=hosts)
+    app.add_middleware(_Guard, token=token)
 
     @app.post("/query", summary="Count, score and place of the answer to a text or a pixel")
     def query(request: _Question) -> Response:
@@ -208,16 +207,16 @@ def _describe(scene: Scene) -> dict[str, Any]:
 
 
 def prepare(
-    files: Sequence[Path], *, host: str, port: int, token: str, embedder: str | Path | None, hosts: Collection[str] = ()
+    files: Sequence[Path], *, host: str, port: int, token: str, embedder: str | Path | None
 ) -> tuple[dict[str, Any], Callable[[], None]]:
     """Opens fields and listens; returns address and fields, and the function that answers requests until it is stopped.
 
-    `port` 0 takes a free one, `token` "" that of the environment, and `hosts` are names of this machine.
+    `port` 0 takes a free one, and `token` "" that of the environment.
     """
     token = token_for(host, token)
     listening = listen(host, port)
     scenes = open_scenes(files, embedder)
-    app = application(scenes, token=token, hosts=(host, *hosts))
+    app = application(scenes, token=token)
     # The limit counts cheap requests too; those beyond it get 503.
     options: dict[str, Any] = {"timeout_keep_alive": 5, "limit_concurrency": 256}
     config = uvicorn.Config(app, log_level="warning", ws="none", server_header=False, **options)
@@ -228,9 +227,8 @@ def prepare(
 
 def _serve(verb: verbs.Serve, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon serve`; the result is as of `prepare`, with its function under "then"."""
-    access = {"host": verb.host, "port": verb.port, "token": verb.token, "hosts": verb.allow_host}
     with console.progress("fields"):
-        result, serve = prepare(verb.fields, embedder=verb.embedder, **access)
+        result, serve = prepare(verb.fields, host=verb.host, port=verb.port, token=verb.token, embedder=verb.embedder)
     for scene in result["fields"]:
         console.print_line(f"{scene['name']}: {scene['gaussians']} Gaussians, {scene['regions']} regions")
     console.print_line(result["address"])

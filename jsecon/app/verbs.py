@@ -224,7 +224,7 @@ class Query(_FieldVerb):
 class Objects(_FieldVerb):
     """Lists the objects of a field with names, boxes and sizes.
 
-    Prints a table. With --out it also writes objects.json and catalogue.html, a page with pictures of each object.
+    Prints a line for each. With --out it also writes objects.json and catalogue.html, a page with pictures of each.
     Regions that show one object are joined, and parts are listed under their whole. Boxes stand upright, in the
     capture's world. An object's id is that of jsecon export.
 
@@ -339,9 +339,8 @@ class Serve(_FieldsVerb):
       host: Address to listen on. Beyond loopback a token is required.
       port: Port to listen on.
       token: Token that requests must carry behind "Bearer" in the header Authorization. By default it is JSECON_TOKEN
-        of the environment, and without that no token is needed.
-      allow_host: Name by which clients reach this server besides localhost and --host, such as that of a proxy. Without
-        a token, requests by other names are refused.
+        of the environment, and without that no token is needed. Without a token, requests under other names than those
+        of this machine are refused: set one behind a proxy.
     """
 
     examples = ("jsecon serve my_field/field.safetensors other_field/field.safetensors",)
@@ -350,7 +349,6 @@ class Serve(_FieldsVerb):
     host: Option[str] = "127.0.0.1"
     port: Annotated[Option[int], Range(0, 65535)] = 8765
     token: Option[str] = ""
-    allow_host: Repeated[str] = dataclasses.field(default_factory=list)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
