@@ -1,16 +1,23 @@
-"""Pictures of a run: regions in colours that stay the same in every view, selections."""
+"""Pictures of a run: regions in colours that stay the same in every view, selections, what a notebook shows.
+
+jsecon.types calls `to_html` through the table of contents when a notebook asks.
+"""
 
 import colorsys
 
 import cv2
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from jsecon.app import report
 from jsecon.app.catalogue import main_regions
 from jsecon.field.columns import is_mapped
+from jsecon.fit.resize import resize_frame, scale_cameras
+from jsecon.read.captures.frames import evenly_spaced
 from jsecon.splat.render import render, render_rgb
 from jsecon.splat.visible import render_in_blocks
-from jsecon.types import Camera, Gaussians, LanguageField
+from jsecon.types import Camera, Capture, Gaussians, LanguageField
 
 SELECTED = (255, 64, 160)
 """RGB of a selection, which no natural object has"""
@@ -83,3 +90,32 @@ def crop(image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]) -> UI
     half = 0.8 * max(np.ptp(rows), np.ptp(columns), 16)  # px; the margin is 0.3 of the object's size
     top, left = (int(max((ends[0] + ends[-1]) / 2 - half, 0)) for ends in (rows, columns))
     return image[top : int(top + 2 * half) + 1, left : int(left + 2 * half) + 1]
+
+
+def to_html(value: LanguageField | Capture) -> str:
+    """Shows a value as HTML.
+
+    Args:
+      value: A LanguageField or a Capture.
+
+    Returns:
+      Its picture and a line of words.
+    """
+    image, words = _picture(value)
+    return report.figure(image, words)
+
+
+def _picture(value: LanguageField | Capture) -> tuple[UInt8[np.ndarray, "h w 3"], str]:
+    """Returns the picture and the line of a value."""
+    cameras = jax.tree.map(np.asarray, value.cameras)
+    small = scale_cameras(cameras, min(240 / max(cameras.width, cameras.height), 1.0))
+    if isinstance(value, Capture):
+        chosen = evenly_spaced(len(value.names), 4)
+        image = np.concatenate([resize_frame(np.asarray(value.frames[t]), small) for t in chosen], axis=1)
+        words = f"Capture of {len(value.names)} frames of {cameras.width}x{cameras.height}, "
+        words += f"{int(np.asarray(value.held_out).sum())} held out, {len(value.points):,} sparse points"
+        return image, words + ("" if value.depths is None else ", with depth")
+    views = [render_picture(value.gaussians, small[0], rgb) for rgb in (None, region_colours(value))]
+    image = np.concatenate(views, axis=1)
+    words = f"LanguageField of {value.gaussians.count:,} Gaussians, {value.regions.count} regions and "
+    return image, f"{words}{len(value.names)} frames, texts by {value.embedder or 'no embedder'}"
