@@ -152,6 +152,6 @@ def test_a_picture_is_cut_to_a_mask():
     mask = np.zeros((240, 320), bool)
     mask[100:150, 200:220] = True
     rows, columns = np.mgrid[:240, :320]
-    part = pictures.crop(np.stack([rows, columns, mask], axis=-1), mask)
+    part = pictures.crop(np.stack([rows, columns, mask], axis=-1).astype(np.uint8), mask)
     assert part[..., 2].sum() == mask.sum()
     assert part[..., 2].mean() > 0.15

@@ -66,18 +66,19 @@ def test_colours_of_answers_differ_and_do_not_depend_on_their_number():
     assert differences[~np.eye(12, dtype=bool)].min() > 40
 
 
-def answer_of(mask, similarity):
+def answer_of(field, mask, similarity):
     """An answer by its mask and similarities."""
     mask, zero = np.array(mask, bool), np.zeros((), np.float32)
     selection = Selection(mask, np.array(similarity, np.float32), np.zeros((), np.int32), zero)
-    return Answer(Query("mug"), "votes", mask, selection, SimpleNamespace())
+    return Answer(Query("mug"), "votes", mask, selection, field)
 
 
-def test_answers_are_tinted_and_the_rest_is_dimmed():
+def test_answers_are_tinted_and_the_rest_is_dimmed(field):
     base = np.array([[200, 100, 0]] * 4, np.uint8)
-    failed, empty = InputError("query", "no words"), answer_of([0, 0, 0, 0], [0, 0, 0, 0])
+    failed, empty = InputError("query", "no words"), answer_of(field, [0, 0, 0, 0], [0, 0, 0, 0])
     assert highlight(base, [failed, empty]) is base
-    first, second = answer_of([1, 1, 0, 0], [0.9, 0.6, 0.1, 0]), answer_of([0, 1, 1, 0], [0, 0.8, np.nan, 0])
+    first = answer_of(field, [1, 1, 0, 0], [0.9, 0.6, 0.1, 0])
+    second = answer_of(field, [0, 1, 1, 0], [0, 0.8, np.nan, 0])
     colours = highlight(base, [first, failed, second]).astype(int)
     tinted = (0.45 * base[0] + 0.55 * palette(3, ANSWER_HUE)).astype(int)
     np.testing.assert_allclose(colours[:3], [tinted[0], tinted[2], tinted[2]], atol=1)

@@ -29,7 +29,10 @@ KINDS: dict[str, dict[str, Any]] = {
 def evaluate(
     scene: Scene, labels: Sequence[LabelledFrame], console: Console, kinds: Sequence[str] = tuple(KINDS)
 ) -> Evaluation:
-    """Measures kinds of queries. A text that the scene's embedder has no words for counts as 0."""
+    """Measures kinds of queries, and prints mIoU, mAcc@0.25 and localisation accuracy of each.
+
+    A text that the scene's embedder has no words for counts as 0.
+    """
     field = scene.field
     cameras = {name: field.cameras[t] for t, name in enumerate(field.names)}
     results = {}
@@ -48,6 +51,13 @@ def evaluate(
             inputs = field.gaussians, cameras, labels, select
             measured = evaluate_at_thresholds(*inputs, alpha_thresholds=(ALPHA_THRESHOLD,), progress=progress)
             results[kind] = measured[ALPHA_THRESHOLD]
+    _, first = next(iter(results.values()))
+    counts = f"{first['pairs']} pairs of {first['queries']} queries in {first['frames']} frames"
+    console.print_line(f"{first['protocol']}\n{counts}")
+    console.print_line(f"  {'query':<14} {'mIoU':>6} {'mAcc@0.25':>10} {'Loc. acc.':>10} {'missing':>8}")
+    for kind, (_, summary) in results.items():
+        shares = f"{summary['miou']:>6.3f} {summary['macc']:>10.3f} {summary['loc_acc']:>10.3f}"
+        console.print_line(f"  {kind:<14} {shares} {summary['missing']:>8}")
     return results
 
 
@@ -59,28 +69,11 @@ def _eval(verb: verbs.Eval, console: Console) -> verbs.VerbResult:
         scene = open_scene(verb.field, embedder=verb.embedder)
         _ = scene.embedder  # else its absence would count as 0 for every text
     results = evaluate(scene, load_lerf_labels(verb.labels), console)
-    print_table(results, console)
     names = ("frame", "query", "iou", "located", "selected", "region", "score")
     pairs = {
-        kind: summary | {"rows": [{name: _rounded(getattr(row, name)) for name in names} for row in rows]}
+        kind: summary | {"rows": [{name: getattr(row, name) for name in names} for row in rows]}
         for kind, (rows, summary) in results.items()
     }
     write_text(out / "evaluation.json", json.dumps(pairs, indent=2) + "\n")
     console.print_line(f"all pairs  {out / 'evaluation.json'}")
     return {"written": {"pairs": out / "evaluation.json"}} | {kind: summary for kind, (_, summary) in results.items()}
-
-
-def _rounded(value: Any) -> Any:
-    """A float to four digits; other values as they are."""
-    return round(value, 4) if isinstance(value, float) else value
-
-
-def print_table(results: Evaluation, console: Console) -> None:
-    """Prints the protocol, and mIoU, mAcc@0.25 and localisation accuracy of each kind of query."""
-    _, first = next(iter(results.values()))
-    counts = f"{first['pairs']} pairs of {first['queries']} queries in {first['frames']} frames"
-    console.print_line(f"{first['protocol']}\n{counts}")
-    console.print_line(f"  {'query':<14} {'mIoU':>6} {'mAcc@0.25':>10} {'Loc. acc.':>10} {'missing':>8}")
-    for kind, (_, summary) in results.items():
-        shares = f"{summary['miou']:>6.3f} {summary['macc']:>10.3f} {summary['loc_acc']:>10.3f}"
-        console.print_line(f"  {kind:<14} {shares} {summary['missing']:>8}")

@@ -39,8 +39,8 @@ def run_demo(out: Path, *, console: Console, room: Path = ROOM, steps: int = 550
     options = Options(capture, holdout=holdout, steps=steps)
     run = pipeline.run(options, out, console=console)
     scene, labels = Scene(run.field), load_lerf_labels(capture / "label")
-    results = evaluation.evaluate(scene, labels, console, ("anchored",))
-    rows, summary = results["anchored"]
+    console.print_line("measured on the held-out views")
+    rows, summary = evaluation.evaluate(scene, labels, console, ("anchored",))["anchored"]
     texts = sorted({name for frame in labels for name in frame.objects})
     with console.progress("answers"):
         for text in texts:
@@ -51,8 +51,6 @@ def run_demo(out: Path, *, console: Console, room: Path = ROOM, steps: int = 550
     lead += "on a plain CPU and without any learned weights."
     parts = [_queries(run, rows, summary, labels)]
     metrics = running.write_run(run, out, console, "jsecon demo", lead, parts, anchored=summary)
-    console.print_line("measured on the held-out views")
-    evaluation.print_table(results, console)
     view = f'jsecon view {out / "field.safetensors"} "{texts[0]}"  (extra viewer; --export writes a page)'
     console.print_line(f"answers {out / 'queries'}\nview it {view}")
     return metrics

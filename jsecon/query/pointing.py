@@ -135,8 +135,8 @@ def lift(
     index = [_frame(field, frame) for frame in frames]
     size = field.cameras.height, field.cameras.width
     masks = np.asarray(masks).astype(np.int32)
-    known = bool(np.isin(masks, (OUTSIDE, INSIDE, UNKNOWN)).all())
-    fit = len(index) > 0 and masks.shape == (len(index), *size) and known
+    valid = bool(np.isin(masks, (OUTSIDE, INSIDE, UNKNOWN)).all())
+    fit = len(index) > 0 and masks.shape == (len(index), *size) and valid
     remedy = f"Give one mask per frame, {size[1]} wide and {size[0]} high, of the frames as the run used them."
     require(fit, "masks", f"{masks.shape} with {len(index)} frames", f"({len(index)}, {size[0]}, {size[1]})", remedy)
     if not (masks != OUTSIDE).any():
