@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from jsecon.app.catalogue import main_regions, region_objects
-from jsecon.app.records import Answer, Object, Query, gaussian_rows, rounded, world_scale
+from jsecon.app.records import Answer, Object, Query, gaussian_rows, rounded, source_points, world_scale
 from jsecon.field.columns import votes_of_rows
 from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction_of_regions
 from jsecon.query.answer import match_regions
@@ -194,9 +194,7 @@ class ObjectIndex:
             mask[found.rows] = True
         region = best.chosen[0].regions[0] if len(best.chosen) == 1 else -1
         score = best.chosen[0].score if best.chosen else 0.0
-        selection = Selection(
-            mask, mask.astype(np.float32), np.asarray(region, np.int32), np.asarray(score, np.float32)
-        )
+        selection = Selection(mask, mask.astype(np.float32), np.int32(region), np.float32(score))
         return Answer(
             query=query,
             by="relation",
@@ -215,10 +213,7 @@ class ObjectIndex:
 
     def _tell_apart(self, objects: Sequence[Object], view: Viewpoint) -> str:
         """Says how objects of one name could be told apart: from left to right."""
-        source_from_scene = np.asarray(self._field.source_from_scene, np.float64)
-        centers = np.stack(
-            [source_from_scene[:3, :3] @ found.shape.center[0] + source_from_scene[:3, 3] for found in objects]
-        )
+        centers = source_points(self._field, np.concatenate([found.shape.center for found in objects]))
         bearing = [order_values(found.shape, view)["leftmost"][0] for found in objects]
         places = ["the left one", *["a middle one"] * (len(objects) - 2), "the right one"]
         words = [

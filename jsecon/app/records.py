@@ -167,7 +167,7 @@ class Answer:
     @functools.cached_property
     def points(self) -> Float[np.ndarray, "m 3"]:
         """(M, 3) float64 centres of the selected Gaussians in the capture's world."""
-        return _source_points(self.field, self.rows)
+        return source_points(self.field, np.asarray(self.field.gaussians.means)[self.rows])
 
     @functools.cached_property
     def place(self) -> ObjectShapes:
@@ -221,10 +221,11 @@ class Answer:
         }
         if self.by != "relation":
             return record
-        groups = {name: [self._object_record(found) for found in getattr(self, name)]
-                  for name in ("objects", "used", "alternatives")}  # fmt: skip
-        relation = {"reading": self.reading, "viewpoint": self.viewpoint, "ambiguous": bool(self.question)}
-        return record | {"relation": relation | {"question": self.question} | groups}
+        relation: dict[str, Any] = {name: getattr(self, name) for name in ("reading", "viewpoint", "question")}
+        relation["ambiguous"] = bool(self.question)
+        for name in ("objects", "used", "alternatives"):
+            relation[name] = [self._object_record(found) for found in getattr(self, name)]
+        return record | {"relation": relation}
 
     def _place_record(self) -> dict[str, Any]:
         """The place as plain values: mean and box of the centres, and the oriented box."""
@@ -240,14 +241,13 @@ class Answer:
 
     def _object_record(self, found: Object) -> dict[str, Any]:
         """An object as plain values."""
-        source_from_scene = np.asarray(self.field.source_from_scene, np.float64)
         size = 2 * world_scale(self.field) * np.asarray(found.shape.half_size[0])
         length = float(np.linalg.norm(size))
         return {
             "phrase": found.phrase,
             "regions": list(found.regions),
             "gaussians": len(found.rows),
-            "center": rounded(source_from_scene[:3, :3] @ found.shape.center[0] + source_from_scene[:3, 3], length),
+            "center": rounded(source_points(self.field, found.shape.center)[0], length),
             "size": rounded(size, length),
             "score": round(found.score, 4),
             "conditions": found.conditions,
@@ -296,11 +296,10 @@ def _known(value: Any) -> float | None:
     return None if value is None or np.isnan(value) else round(float(value), 4)
 
 
-def _source_points(field: LanguageField, rows: np.ndarray) -> Float[np.ndarray, "m 3"]:
-    """Centres of Gaussians in the capture's world."""
+def source_points(field: LanguageField, points: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
+    """Moves points of the field's world to the capture's, in float64."""
     source_from_scene = np.asarray(field.source_from_scene, np.float64)
-    means = np.asarray(field.gaussians.means)[rows].astype(np.float64)
-    return means @ source_from_scene[:3, :3].T + source_from_scene[:3, 3]
+    return points.astype(np.float64) @ source_from_scene[:3, :3].T + source_from_scene[:3, 3]
 
 
 def source_shapes(
@@ -308,8 +307,9 @@ def source_shapes(
 ) -> ObjectShapes:
     """Measures objects in the capture's world: `labels` are those of the Gaussians `rows` (`object_shapes`)."""
     plain = dataclasses.replace(field.gaussians, sh=field.gaussians.sh[:, :1])  # shapes have no colours
-    placed = transform_gaussians(gaussian_rows(plain, rows), field.source_from_scene)
-    return object_shapes(_source_points(field, rows), labels, up, spreads=gaussian_spreads(placed))
+    taken = gaussian_rows(plain, rows)
+    spreads = gaussian_spreads(transform_gaussians(taken, field.source_from_scene))
+    return object_shapes(source_points(field, taken.means), labels, up, spreads=spreads)
 
 
 def gaussian_rows(gaussians: Gaussians, rows: np.ndarray | Bool[np.ndarray, " n"]) -> Gaussians:
