@@ -29,9 +29,7 @@ def _objects(verb: verbs.Objects, console: Console) -> verbs.VerbResult:
         listed = scene.objects(names)
     records = listed.records()
     for record in records:
-        place = "" if record["parent"] is None else "  "
-        ending = ", surroundings" if record["surroundings"] else ""
-        console.print_line(f"{record['id']:>4}  {place}{_title(record)}: {_words(record)}{ending}")
+        console.print_line(f"{record['id']:>4}  {_title(record)}: {_words(record)}")
     if hidden := int((listed.regions < 0).sum()):
         console.print_line(f"  too small to be listed, with fewer than {MIN_SAMPLES} Gaussians: {hidden} regions")
     elif not records:
@@ -114,24 +112,18 @@ def _save_objects(scene: Scene, folder: Path) -> list[Path]:
 
 def _page(scene: Scene, catalogue: Catalogue, records: list[dict[str, Any]], console: Console) -> str:
     """Returns the page: a card for each object, which opens to its views."""
-    cards: dict[bool, list[str]] = {False: [], True: []}
+    cards = []
     with console.progress("pictures") as progress:
         for record in records:
             mask = catalogue.mask(record["id"])
             figures = [report.figure(scene.render(name, mask), name) for name in record["frames"]]
             best = scene.frame_index(record["frames"][0]) if record["frames"] else 0
-            part = "" if record["parent"] is None else f" (part of {record['parent']})"
             picture = pictures.crop(scene.render(best), scene.mask(mask, best))
-            words = f"{record['id']}{part}: {_words(record)}"
-            card = report.card(picture, _title(record), words, report.grid(figures, 3))
-            cards[record["surroundings"]].append(card)
+            words = f"{record['id']}: {_words(record)}"
+            cards.append(report.card(picture, _title(record), words, report.grid(figures, 3)))
             progress(record["id"] + 1, len(records))
-    parts = [report.grid(cards[False])]
-    if cards[True]:
-        words = "Walls, floors and the like, by their names."
-        parts.append(report.section("Surroundings", words, report.grid(cards[True])))
-    lead = "What jsecon found in the scene. Open an object to see it in the frames that show most of it."
-    return report.page("Objects", lead, parts)
+    lead = "The objects of the scene. Open an object to see it in the frames that show most of it."
+    return report.page("Objects", lead, [report.grid(cards)])
 
 
 def _title(record: dict[str, Any]) -> str:
@@ -140,9 +132,11 @@ def _title(record: dict[str, Any]) -> str:
 
 
 def _words(record: dict[str, Any]) -> str:
-    """Returns length, width, height and centre of an object, to a hundredth of its size, and how much shows it."""
+    """Says how large an object is and where, to a hundredth of its size, what shows it, and what it belongs to."""
     size, center = record["box"]["size"], record["box"]["center"]
     digits = decimals(float(np.linalg.norm(size)), 0.01)
     sides = " x ".join(f"{x:.{digits}f}" for x in size)
     place = ", ".join(f"{x:.{digits}f}" for x in center)
-    return f"{sides}, at ({place}), {record['gaussians']} Gaussians, {record['views']} frames"
+    words = [sides, f"at ({place})", f"{record['gaussians']} Gaussians", f"{record['views']} frames"]
+    words += [] if record["parent"] is None else [f"part of {record['parent']}"]
+    return ", ".join([*words, "surroundings"] if record["surroundings"] else words)
