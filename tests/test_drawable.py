@@ -75,18 +75,6 @@ def test_what_can_be_drawn_comes_back_from_fields_and_files(scene, camera, field
         np.testing.assert_allclose(jsecon.render_rgb(found, camera).features, drawn, atol=0.05)
 
 
-@pytest.mark.long
-def test_a_flat_gaussian_is_one_of_no_thickness_in_value_and_gradient(scene, camera):
-    """In every run a row of test_stability has log scales of minus infinity."""
-    flat, thin = changed(scene, **FLAT), changed(scene, log_scales=[-1.5, -1.0, np.log(1e-6)])
-    loss = jax.jit(jax.value_and_grad(lambda g: (jsecon.render_rgb(g, camera).features ** 2).sum(), allow_int=True))
-    (value, gradient), (expected, slopes) = (loss(jax.tree.map(jnp.asarray, g)) for g in (flat, thin))
-    np.testing.assert_allclose(value, expected, rtol=1e-5)
-    for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
-        size = np.abs(getattr(slopes, name)).max()
-        np.testing.assert_allclose(getattr(gradient, name), getattr(slopes, name), atol=1e-4 * size)
-
-
 @pytest.mark.parametrize(("name", "value"), REFUSED)
 def test_what_load_refuses_is_not_written(scene, field, tmp_path, name, value):
     odd = changed(scene, **{name: value})
@@ -99,14 +87,10 @@ def test_what_load_refuses_is_not_written(scene, field, tmp_path, name, value):
 
 
 def test_a_batch_of_cameras_is_gone_over_and_a_single_one_is_not(cameras):
-    for batch in (cameras, jax.tree.map(jnp.asarray, cameras)):
-        assert len(batch) == 4
-        views = list(batch)
-        assert len(views) == 4
-        for t, view in enumerate(views):
-            np.testing.assert_array_equal(view.world_to_camera, cameras.world_to_camera[t])
-            assert (float(view.fx), view.width) == (float(cameras.fx[t]), cameras.width)
-        for act in (iter, len):
-            with pytest.raises(TypeError, match="single camera"):
-                act(batch[0])
-    assert [len(part) for part in jax.tree.map(lambda a: np.stack([a, a]), cameras)] == [4, 4]
+    views = list(jax.tree.map(jnp.asarray, cameras))
+    assert len(cameras) == len(views) == 4
+    for t, view in enumerate(views):
+        np.testing.assert_array_equal(view.world_to_camera, cameras.world_to_camera[t])
+    for act in (iter, len):
+        with pytest.raises(TypeError, match="single camera"):
+            act(cameras[0])

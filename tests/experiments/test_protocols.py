@@ -1,21 +1,18 @@
 """Protocols: means over the classes that occur against a confusion matrix, OpenGaussian's selections, memberships of
 all views, and all silhouettes in one walk against each group rendered alone."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from balls import ring_of_balls
 from hypothesis import given, settings, strategies as st
-from small_field import make_field, shares, unit_rows
+from small_field import unit_rows
 
 from experiments.protocols.opengaussian import most_similar_text, select_leaf, select_text, without_stragglers
 from experiments.protocols.points import evaluate_points, point_class_means
 from experiments.rivals.leaves import silhouette_overlaps
-from experiments.tables.ours import of_all_views
-from jsecon import InputError, Regions, plan_view, query_anchored, selection_mask
+from jsecon import InputError, plan_view, selection_mask
 
 
 @settings(deadline=None, max_examples=40)
@@ -97,23 +94,6 @@ def test_stragglers_and_giants_go():
     assert kept.sum() > 150
     few = np.arange(201) < 50
     np.testing.assert_array_equal(without_stragglers(means, scales, few), few)
-
-
-@pytest.fixture(scope="module")
-def field(scene, cameras):
-    """Regions 1 and 4 are alike."""
-    field, _ = make_field(scene, cameras)
-    embeddings = np.array(field.regions.embeddings)
-    embeddings[4] = embeddings[1]
-    return dataclasses.replace(field, regions=Regions(embeddings, field.regions.pixel_counts))
-
-
-def test_all_views_are_the_denominator_where_the_votes_do_not_say_which_show_a_region(field):
-    shown = np.asarray(field.votes.total)[:, None] * np.float32(0.5) * np.ones((1, 3), np.float32)
-    known = dataclasses.replace(field, votes=dataclasses.replace(field.votes, weight_where_region_visible=shown))
-    found = query_anchored(of_all_views(known), field.regions.embeddings[2])
-    np.testing.assert_allclose(found.similarity, shares(field, [2]), atol=1e-6)
-    assert not np.array_equal(found.mask, query_anchored(known, field.regions.embeddings[2]).mask)
 
 
 GROUPS, SLOTS = 8, 4

@@ -1,16 +1,12 @@
 """Every method by every reading: what a cell holds, who is compared with whom, and what a reading does to a score."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from experiments.test_tables import folder, small, with_gaussians  # noqa: F401
 
 from experiments import fair, lerf, shared_errors
 from experiments.rivals.lifting import smoothed
-from experiments.tables import fill
 from experiments.tables.readings import as_share
-from experiments.tables.rows import rows_of
 
 
 def test_a_share_is_one_half_where_the_readout_cuts():
@@ -35,16 +31,8 @@ def test_smoothing_fills_the_range_and_leaves_out_what_is_unknown():
 
 def cell(method, seed, value, lenient):
     texts = {"a": [[value, value], [lenient]], "b": [[value], [lenient]]}
-    return {
-        "scene": "s",
-        "seed": seed,
-        "level": "medium",
-        "method": method,
-        "miou": value,
-        "miou_vala": lenient,
-        "macc": 1.0,
-        "texts": texts,
-    }
+    told = {"scene": "s", "seed": seed, "level": "medium", "method": method, "texts": texts}
+    return told | {"miou": value, "miou_vala": lenient, "macc": 1.0}
 
 
 def test_each_method_is_read_as_suits_each_figure_and_ours_also_by_one_reading():
@@ -76,30 +64,6 @@ def test_ours_is_compared_with_a_method_on_the_scenes_and_seeds_that_it_has():
     assert told["ours, consensus, miou"]["mean"] == pytest.approx((0.1 + 0.8) / 2)
 
 
-def test_the_interval_is_of_pairs():
-    rng = np.random.default_rng(1)
-    other = {("s", 0, f"t{k}"): float(v) for k, v in enumerate(rng.random(200))}
-    ours = {key: value + 0.02 + 0.01 * rng.normal() for key, value in other.items()}
-    mean, low, high = fair.ahead(ours, other)
-    assert 0.015 < low < mean < high < 0.025  # though the texts differ by 0.3
-
-
-@pytest.mark.long
-def test_a_cell_holds_the_texts_that_its_figure_is_made_of(folder):  # noqa: F811
-    rows = rows_of(points=False)
-    few = ("VALA: centred, lenient silhouette, sharp", "ours, tracks: contrast, silhouette")
-    plan = with_gaussians(small(lerf.QUICK, folder, "readings", methods=few), "perfect")
-    plan = dataclasses.replace(plan, level="perfect")
-    cells = fill.fill(plan, rows, tell=lambda _: None)
-    assert [found["method"] for found in cells] == list(few)
-    for found in cells:
-        for figure, name in enumerate(("miou", "miou_vala")):
-            every = [value for texts in found["texts"].values() for value in texts[figure]]
-            assert len(every) == found["pairs"]
-            assert np.mean(every) == pytest.approx(found[name], abs=1e-4)
-    assert cells[1]["miou"] > 0.1
-
-
 def test_shared_errors_are_measured_on_a_twin(folder):  # noqa: F811
     """At full strength fewer regions have their own text as the best, and no figure moves at strength 0."""
     data = small(lerf.QUICK, folder, "shared").data
@@ -116,9 +80,3 @@ def test_shared_errors_are_measured_on_a_twin(folder):  # noqa: F811
     assert told["full"][own] < 0.8
     assert told["full"]["mask to its own text"] < told["plain"]["mask to its own text"] - 0.01
     assert told["full"]["same region, another view"] == pytest.approx(1, abs=1e-5)
-
-
-def test_readings_are_named_without_the_constants_of_methods():
-    named = {fair.reading_of(row) for points in (False, True) for row in rows_of(points)}
-    assert "centred, threshold" in named
-    assert not any("roots" in name or "codebook" in name or "0." in name for name in named)

@@ -11,11 +11,11 @@ from twin_files import evidence_of_tracks
 
 from experiments.datasets.ovs3d import box_of
 from experiments.protocols.opengaussian import most_similar_text, select_leaf, select_text
-from experiments.rivals import evidence as evidence_module, lifting
-from experiments.rivals.evidence import local_masks, with_room
+from experiments.rivals import lifting
+from experiments.rivals.evidence import local_masks
 from experiments.rivals.gaussian_grouping import query_gaussian_grouping, train_gaussian_grouping
 from experiments.rivals.langsplat import train_langsplat
-from experiments.rivals.opengaussian import Schedule, train_instances, train_opengaussian
+from experiments.rivals.opengaussian import Schedule, train_opengaussian
 from experiments.simulated_vision.embeddings import made_text_space
 from jsecon import InputError, plan_view, project
 from jsecon.evaluate.lerf import ALPHA_THRESHOLD, evaluate_at_thresholds
@@ -77,28 +77,13 @@ def test_gaussian_grouping(world):
         return query_gaussian_grouping(model, evidence, texts[query], canonical)
 
     assert miou(world, ask) >= 0.6
-    # A text that means two things finds both, or the better one where one alone is asked for.
-    first = np.flatnonzero(np.asarray(evidence.frame) == 0)
-    shown = [k for k in (1, 2, 3) if (np.asarray(evidence.masks[0]) == first[k]).sum() >= 40][:2]
-    alike = np.array(evidence.embeddings)
-    alike[first[shown[1]]] = 0.95 * alike[first[shown[0]]] + 0.3 * alike[first[shown[1]]]
-    alike = dataclasses.replace(evidence, embeddings=alike)
-    both = query_gaussian_grouping(model, alike, texts[shown[0]], canonical)
-    one = query_gaussian_grouping(model, alike, texts[shown[0]], canonical, nearly=1.0)
-    each = [np.asarray(ask(k).mask) for k in shown]
-    assert each[1].any()
-    assert (np.asarray(both.mask) >= each[0] | each[1]).all()
-    np.testing.assert_array_equal(one.mask, each[0])
     # What the first view does not show can't be found.
     hidden = np.asarray(evidence.frame) == 0
     blind = dataclasses.replace(evidence, embeddings=np.where(hidden[:, None], canonical[0], evidence.embeddings))
     nothing = query_gaussian_grouping(model, blind, texts[1], canonical)
     assert not np.asarray(nothing.mask).any()
     assert int(nothing.region) == -1
-
-
-def test_gaussian_grouping_has_eight_bits_for_ids(world):
-    many = dataclasses.replace(world[0], tracks=np.asarray(world[0].tracks) + 260)
+    many = dataclasses.replace(evidence, tracks=np.asarray(evidence.tracks) + 260)
     with pytest.raises(InputError, match="at most 255"):
         train_gaussian_grouping(many, key=jax.random.key(0), steps=1)
 
@@ -122,50 +107,6 @@ def test_opengaussian(world):
     assert leaf_of.max() < 24
     unmatched = np.asarray(model.matches) < 3
     assert not np.asarray(model.leaf_features)[unmatched].any()
-
-
-@pytest.mark.long
-def test_codebooks_share_their_first_stage(world):
-    """The model is that of all stages at once, and what is shared is left as it was."""
-    key, short = jax.random.key(0), dataclasses.replace(SCHEDULE, instance_steps=6, coarse_steps=2, fine_steps=2)
-    instances = train_instances(world[0], key=key, schedule=short)
-    other, _ = train_opengaussian(
-        world[0], key=key, schedule=dataclasses.replace(short, position_weight=1.0), instances=instances
-    )
-    shared, history = train_opengaussian(world[0], key=key, schedule=short, instances=instances)
-    alone, expected = train_opengaussian(world[0], key=key, schedule=short)
-    jax.tree.map(np.testing.assert_array_equal, (shared, history), (alone, expected))
-    assert (np.asarray(other.leaf_of) != np.asarray(shared.leaf_of)).any()
-
-
-ROOMY = {
-    "langsplat": lambda world: train_langsplat(world[0], key=jax.random.key(0), steps=8, epochs=3),
-    "grouping": lambda world: train_gaussian_grouping(world[0], key=jax.random.key(0), steps=8, classes=32),
-    "opengaussian": lambda world: train_opengaussian(
-        world[0],
-        key=jax.random.key(0),
-        schedule=dataclasses.replace(SCHEDULE, instance_steps=8, coarse_steps=4, fine_steps=4),
-    ),
-}
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("train", ROOMY.values(), ids=ROOMY)
-def test_room_behind_the_gaussians_changes_nothing(world, train, monkeypatch):
-    assert world[0].gaussians.count % 2048
-    with_it = train(world)
-    monkeypatch.setattr(evidence_module, "_ROWS", 1)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), with_it, train(world))
-
-
-def test_room_is_invisible(world):
-    gaussians, camera = world[0].gaussians, world[0].cameras[0]
-    roomy = with_room(gaussians)
-    assert roomy.count % 2048 == 0
-    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[: len(b)], b), roomy, gaussians)
-    visible = np.asarray(jax.jit(project)(roomy, camera).visible)
-    np.testing.assert_array_equal(visible[: gaussians.count], jax.jit(project)(gaussians, camera).visible)
-    assert not visible[gaussians.count :].any()
 
 
 @pytest.mark.parametrize("train", [lifting.train_occam, lifting.train_backprojection, lifting.train_vala])

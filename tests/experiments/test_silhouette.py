@@ -13,11 +13,9 @@ from experiments.tables.silhouette import (
     ascend,
     choose_views,
     fit_silhouette,
-    footprints,
 )
 from jsecon.query.render import ALPHA_THRESHOLD, VALA_THRESHOLD, render_selection
 from jsecon.splat.plan import plan_view, render_plan
-from jsecon.splat.scan import to_tiles
 
 
 @pytest.fixture(scope="module")
@@ -50,24 +48,6 @@ def test_what_is_rendered_fits_better_than_what_the_threshold_takes(world):
     views = choose_views(gaussians, cameras, before)
     assert expected(gaussians, views, share, after) > expected(gaussians, views, share, before) + 0.005
     assert not after[share <= 0.1].any()
-
-
-def test_footprints_add_up_to_what_a_rendering_absorbs(world):
-    gaussians, cameras, share = world
-    chosen = share >= 0.5
-    open_to = np.flatnonzero((share > 0.3) & (share < 0.9))
-    views = choose_views(gaussians, cameras, chosen)
-    found = footprints(gaussians, views, share, open_to, chosen)
-    level = np.array(found.base)
-    for c in np.flatnonzero(chosen[open_to]):
-        own = slice(found.starts[c], found.starts[c + 1])
-        np.add.at(level, found.tiles[own], found.absorbed[own])
-    tiles = (len(level) - 1) // len(views.fx)
-    for t in (0, len(views.fx) - 1):
-        camera = jax.tree.map(jnp.asarray, views[t])
-        alpha = np.asarray(to_tiles(render_selection(gaussians, camera, jnp.asarray(chosen)).alpha, 8))[:-1]
-        found_alpha, clear = 1 - np.exp(-level[t * tiles : (t + 1) * tiles]), alpha < 0.98  # rendering stops early
-        np.testing.assert_allclose(found_alpha[clear], alpha[clear], atol=2e-4)
 
 
 def made_up(seed, count=14, tiles=40, views=2):
@@ -118,11 +98,3 @@ def test_equals_the_slow_twin(seed):
     weights = WEIGHTS if seed else (0.0, 1.0)
     got = np.asarray(ascend(found, jnp.asarray(taken), views, len(taken), jnp.asarray(weights)))
     np.testing.assert_array_equal(got, slow_twin(found, views, taken, weights))
-
-
-def test_nothing_to_choose_from_stays_nothing(world):
-    gaussians, cameras, share = world
-    assert not np.asarray(fit_silhouette(gaussians, cameras, np.zeros_like(share))).any()
-    few = np.zeros_like(share)
-    few[2500] = 1.0
-    assert np.asarray(fit_silhouette(gaussians, cameras, few)).sum() == 1
