@@ -41,6 +41,7 @@ def expected(gaussians, views, share, mask, weights=WEIGHTS):
     return value / len(views.fx)
 
 
+@pytest.mark.long
 def test_what_is_rendered_fits_better_than_what_the_threshold_takes(world):
     gaussians, cameras, share = world
     before = share >= 0.5
