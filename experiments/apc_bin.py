@@ -170,9 +170,7 @@ def evaluate(
             else:
                 chosen = select_gaussians(field, match, QueryRules(min_share=options.threshold)).mask
             if way.endswith("DBSCAN"):
-                chosen = jnp.asarray(
-                    remove_outliers(np.asarray(field.gaussians.means), np.asarray(chosen), keep="all").mask
-                )
+                chosen = jnp.asarray(remove_outliers(np.asarray(field.gaussians.means), np.asarray(chosen), keep="all"))
             for t in np.flatnonzero(capture.held_out):
                 camera = jax.tree.map(jnp.asarray, capture.cameras[int(t)])
                 mask = np.asarray(selection_mask(field.gaussians, camera, chosen))

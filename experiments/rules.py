@@ -156,7 +156,7 @@ def measure(data: twins.Data, scene: str, seed: int, level: str) -> dict:
             for k, query in enumerate(setting.bench.queries):
                 own = truth == names.index(query)
                 if own.sum() >= LEAST:
-                    kept = remove_outliers(means, np.asarray(ROWS[row](setting, field, k).mask), keep="largest").mask
+                    kept = remove_outliers(means, np.asarray(ROWS[row](setting, field, k).mask), keep="largest")
                     told[by][row][query] = round(float((kept & own).sum() / (kept | own).sum()), 4)
         if by == "consensus":
             told["refusal"] = refusal(setting, field)

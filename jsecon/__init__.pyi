@@ -11,7 +11,7 @@ from .app.records import (
     Query as Query,
     Region as Region,
 )
-from .app.scene import Scene as Scene, open_scene as open_scene
+from .app.scene import Scene as Scene, locate as locate, open_scene as open_scene
 from .backend import check_backend as check_backend
 from .errors import InputError as InputError
 from .evaluate.metrics import (

@@ -174,7 +174,7 @@ CALLS: dict[str, tuple[str, Callable[[World], list]]] = {
     ),
     "remove_outliers": (
         "n1 n0",
-        lambda w: [(jsecon.remove_outliers(np.asarray(w.gaussians.means), np.ones(w.n, bool)).mask, (w.n,))],
+        lambda w: [(jsecon.remove_outliers(np.asarray(w.gaussians.means), np.ones(w.n, bool)), (w.n,))],
     ),
     "object_shapes": ("n1 n0 r0", shapes),
     "iou": ("n1 n0", lambda w: [(jsecon.iou(np.ones(w.n, bool), np.ones(w.n, bool)), ())]),

@@ -5,14 +5,14 @@ import time
 import numpy as np
 import pytest
 
-from jsecon.query.outliers import remove_outliers
+from jsecon.query.outliers import remove_outliers, split_outliers
 
 
 def test_one_component_is_seen_where_points_are_dense():
     sphere = np.random.default_rng(0).normal(size=(4_000, 3))
     sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
     for points, whole in ((sphere, True), (np.concatenate([sphere, [[1.5, 0, 0]]]), False), (sphere[:20], False)):
-        found = remove_outliers(points, np.ones(len(points), bool), eps=0.33)
+        found = split_outliers(points, np.ones(len(points), bool), eps=0.33)
         assert found.skipped == ("the selection is one component" if whole else "")
 
 
@@ -28,21 +28,21 @@ def two_blobs_and_strays(scale=1.0):
 def test_strays_go_and_eps_follows_the_scale(scale):
     points = two_blobs_and_strays(scale)
     everything = np.ones(len(points), bool)
-    every = remove_outliers(points, everything, keep="all").mask
+    every = remove_outliers(points, everything, keep="all")
     assert every[:400].mean() > 0.97
     assert not every[400:].any()
-    largest = remove_outliers(points, everything, keep="largest").mask
+    largest = remove_outliers(points, everything, keep="largest")
     np.testing.assert_array_equal(largest, every & (np.arange(len(points)) < 300))
-    np.testing.assert_array_equal(remove_outliers(points, everything).mask, every)  # a third of the largest has support
+    np.testing.assert_array_equal(remove_outliers(points, everything), every)  # a third of the largest has support
     weight = np.where(np.arange(len(points)) < 300, 1.0, 0.01)
-    np.testing.assert_array_equal(remove_outliers(points, everything, weight=weight).mask, largest)
+    np.testing.assert_array_equal(remove_outliers(points, everything, weight=weight), largest)
 
 
 def test_only_what_was_selected_is_looked_at():
     points = two_blobs_and_strays()
     mask = np.arange(len(points)) >= 300
     mask[:150] = False
-    kept = remove_outliers(points, mask).mask
+    kept = remove_outliers(points, mask)
     assert not kept[~mask].any()
     assert kept[300:400].mean() > 0.95
 
@@ -51,7 +51,7 @@ def test_centres_that_are_not_finite_are_never_kept():
     points = two_blobs_and_strays()
     points[3] = np.nan
     points[4, 1] = np.inf
-    kept = remove_outliers(points, np.ones(len(points), bool)).mask
+    kept = remove_outliers(points, np.ones(len(points), bool))
     assert not kept[[3, 4]].any()
     assert kept[:300].sum() > 280
 
@@ -60,18 +60,18 @@ def test_centres_that_are_not_finite_are_never_kept():
 def test_what_dbscan_cannot_tell_comes_back_as_it_is(count):
     points = np.random.default_rng(0).normal(size=(40, 3)) * 100
     mask = np.arange(40) < count
-    np.testing.assert_array_equal(remove_outliers(points, mask).mask, mask)
-    assert remove_outliers(points, np.ones(40, bool), eps=1e-3).mask.all()  # no cluster
+    np.testing.assert_array_equal(remove_outliers(points, mask), mask)
+    assert remove_outliers(points, np.ones(40, bool), eps=1e-3).all()  # no cluster
     turn = np.linspace(0, 6, 2_000)
     ring = np.stack([np.cos(turn), np.sin(turn), 0.1 * turn], axis=1)
-    assert remove_outliers(ring, np.ones(2_000, bool)).mask.all()  # one component
+    assert remove_outliers(ring, np.ones(2_000, bool)).all()  # one component
 
 
 def test_points_on_top_of_each_other():
     same = np.zeros((50, 3))
-    assert remove_outliers(same, np.ones(50, bool)).mask.all()
+    assert remove_outliers(same, np.ones(50, bool)).all()
     mostly = np.concatenate([same, np.random.default_rng(0).normal(size=(20, 3))])
-    assert remove_outliers(mostly, np.ones(70, bool)).mask[:50].all()
+    assert remove_outliers(mostly, np.ones(70, bool))[:50].all()
 
 
 @pytest.mark.long
@@ -83,7 +83,7 @@ def test_half_a_million_points_in_seconds():
     points[200_000:250_000] = 0.02 * points[200_000:250_000] - [3, 0, 0]  # thousands of neighbours each
     points[:2_000] = rng.uniform(-30, 30, (2_000, 3))
     start = time.process_time()
-    kept = remove_outliers(points, np.ones(500_000, bool), keep="largest").mask
+    kept = remove_outliers(points, np.ones(500_000, bool), keep="largest")
     assert time.process_time() - start < 15  # about 2 s; scikit-learn runs out of memory on the dense ball's lists
     assert kept[250_000:].all()
     assert not kept[:250_000].any()

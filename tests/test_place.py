@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from small_field import make_field
 from table_field import table_field
 
+import jsecon
 from jsecon import Answer, InputError, Query, Scene, Selection
 
 SIZE = np.array([0.5, 0.3, 0.1])
@@ -64,6 +65,8 @@ def test_two_objects_of_a_name_are_counted_and_have_no_place_together():
     with pytest.raises(InputError, match="names 2 objects"):
         scene.locate("red mug")
     left = scene.locate("the leftmost red mug")
+    same = jsecon.locate(scene.field, "the leftmost red mug", scene.embedder)
+    np.testing.assert_array_equal(same.center, left.place.center)
     np.testing.assert_allclose(left.place.center[:2], [-0.5, 0], atol=0.02)
     with pytest.raises(InputError, match="names 0 objects"):
         scene.locate("the red mug on the dark blue box")

@@ -100,7 +100,7 @@ def test_python_and_the_command_keep_the_same_gaussians(scene, cameras):
     for region in range(5):
         selection = jsecon.query_region(field, region)
         weight = np.asarray(selection.similarity) * np.asarray(field.votes.total)
-        mask = jsecon.remove_outliers(field.gaussians.means, selection.mask, weight=weight).mask
+        mask = jsecon.remove_outliers(field.gaussians.means, selection.mask, weight=weight)
         np.testing.assert_array_equal(asked.ask(Region(region)).mask, mask)
 
 

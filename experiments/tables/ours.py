@@ -147,7 +147,7 @@ def ask_field(
         if way == "all":
             every = dataclasses.replace(rules, all_of_class=True, fragment_score=RULES.fragment_score)
             found = query_several(field, text[None], rules=every)
-            return dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, found.mask, keep="all").mask))
+            return dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, found.mask, keep="all")))
         if way == "one_step":
             code = encode(codes.autoencoder, text)
             found = query_one_step(codes.gaussians, code, 0.9 if threshold is None else threshold)
@@ -171,7 +171,7 @@ def ask_field(
                 found = other
         mask = np.asarray(found.mask)
         return (
-            dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, mask, keep="largest").mask))
+            dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, mask, keep="largest")))
             if clean
             else found
         )

@@ -124,7 +124,7 @@ def _evened(setting: Setting, answers: Answers, *, clean: bool) -> Answers:
         share = jnp.asarray(found.similarity, jnp.float32)
         share = 0.5 * (share + jnp.mean(share[near], axis=1))
         mask = np.asarray(share >= SHARE_THRESHOLD)
-        mask = remove_outliers(means, mask, keep="largest").mask if clean else mask
+        mask = remove_outliers(means, mask, keep="largest") if clean else mask
         return dataclasses.replace(found, mask=jnp.asarray(mask), similarity=share)
 
     return dataclasses.replace(answers, select=select)

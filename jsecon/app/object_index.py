@@ -145,7 +145,7 @@ class ObjectIndex:
         rows, share = voters[share >= SHARE_THRESHOLD], share[share >= SHARE_THRESHOLD]
         gaussians = gaussian_rows(dataclasses.replace(self._field.gaussians, sh=None), rows)
         weight = share * self._votes.total[rows]
-        kept = remove_outliers(gaussians.means, np.ones(len(rows), bool), keep="supported", weight=weight).mask
+        kept = remove_outliers(gaussians.means, np.ones(len(rows), bool), keep="supported", weight=weight)
         if not kept.any():
             return None
         gaussians = gaussian_rows(gaussians, kept)

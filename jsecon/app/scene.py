@@ -35,6 +35,7 @@ from jsecon.pipeline.progress import Console
 from jsecon.process import MEMORY, memory_budget
 from jsecon.query.answer import answer_question, trim
 from jsecon.query.expressions import is_expression, parse_query
+from jsecon.query.object_shapes import ObjectShapes
 from jsecon.query.outliers import OutlierResult
 from jsecon.query.pointing import box_mask, lift, region_at
 from jsecon.query.render import selection_mask
@@ -597,6 +598,32 @@ class Scene:
             gaussians = gaussian_rows(gaussians, rows)
             object_ids = None if object_ids is None else object_ids[rows]
         save_gaussians(file, gaussians, similarity=self.field.source_from_scene, object_ids=object_ids)
+
+
+def locate(
+    field: LanguageField,
+    text: str,
+    embedder: Any = None,
+    *,
+    frame: int | str | None = None,
+    up: Sequence[float | int] | None = None,
+) -> ObjectShapes:
+    """Locates the one thing that a text names.
+
+    Args:
+      field: The field.
+      text: For example "orange ball" or "the red mug left of the bottle".
+      embedder: Embedder of the field; None opens it.
+      frame: As for `Scene.relate`.
+      up: Up axis of the capture's world; None finds it.
+
+    Returns:
+      Its boxes and points, in the capture's world and its unit.
+
+    Raises:
+      InputError: As for `Scene.locate`.
+    """
+    return Scene(field, embedder, up=up).locate(text, frame=frame).place
 
 
 def _read_mask(file: str | Path, width: int, height: int) -> Bool[np.ndarray, "h w"]:

@@ -28,7 +28,7 @@ from jsecon.field.similarity import Number, similarities
 from jsecon.paper.queries import select_by_code
 from jsecon.programs import stored_jit
 from jsecon.query.grouping import join_fragments, parts_fallback, regions_with
-from jsecon.query.outliers import OutlierResult, remove_outliers
+from jsecon.query.outliers import OutlierResult, split_outliers
 from jsecon.query.rules import ALL_OF_CLASS, ONE_REGION, RULES, QueryRules
 from jsecon.query.scores import score_text, unrelated_words, word_similarities
 from jsecon.types import Array, LanguageField, Selection, Votes
@@ -225,7 +225,7 @@ def trim(field: LanguageField, selection: Selection, keep: str | None = "support
     if keep is None:
         return OutlierResult(np.asarray(selection.mask), "outliers are kept", 0, 0)
     weight = np.clip(np.asarray(selection.similarity), 0.0, 1.0) * np.asarray(field.votes.total)
-    return remove_outliers(field.gaussians.means, selection.mask, keep=keep, weight=weight)
+    return split_outliers(field.gaussians.means, selection.mask, keep=keep, weight=weight)
 
 
 def query_anchored(field: LanguageField, text_embedding: Float[Array, " e"], *, rules: QueryRules = RULES) -> Selection:

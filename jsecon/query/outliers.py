@@ -47,7 +47,7 @@ def remove_outliers(
     weight: Float[Array, " n"] | None = None,
     keep: str = "supported",
     eps: float | None = None,
-) -> OutlierResult:
+) -> Bool[np.ndarray, " n"]:
     """Removes the selected Gaussians that lie apart, by DBSCAN on their centres. Host code: it cannot be traced.
 
     Noise is dropped, and so are the clusters that `keep` does not name. Three kinds of selections come back as they
@@ -65,11 +65,23 @@ def remove_outliers(
       eps: Radius, world units; None takes 6 times the spacing of the selection.
 
     Returns:
-      The mask without outliers, and what became of the clusters.
+      (N,) bool, the mask without outliers.
 
     Raises:
       ValueError: An option is out of range, or `weight` has another length.
     """
+    return split_outliers(means, mask, weight=weight, keep=keep, eps=eps).mask
+
+
+def split_outliers(
+    means: Float[Array, "n 3"],
+    mask: Bool[Array, " n"],
+    *,
+    weight: Float[Array, " n"] | None = None,
+    keep: str = "supported",
+    eps: float | None = None,
+) -> OutlierResult:
+    """Removes outliers as `remove_outliers` does, and reports what became of the clusters."""
     require_one_of("remove_outliers", keep, ("largest", "supported", "all"), "Use 'all' to keep several objects.")
     remedy = "Leave eps out to have it follow the selection's spacing."
     require(eps is None or eps > 0, "remove_outliers", f"eps={eps}", "eps > 0", remedy)
