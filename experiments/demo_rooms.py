@@ -61,7 +61,11 @@ def fields_of_room(folder: Path, seed: int, quick: bool) -> tuple[pipeline.Run, 
     options = RunOptions(capture, holdout=HOLDOUT, steps=60 if quick else 550, seed=seed)
     run = pipeline.run(options, folder, console=Console())
     masked = dataclasses.replace(options, masks=capture / "masks")
-    return run, pipeline.run(masked, folder / "true_masks", console=Console(), cache_folder=folder / "cache")
+    cache = folder / "true_masks" / "cache"
+    cache.parent.mkdir(exist_ok=True)
+    if not cache.exists():
+        cache.symlink_to(folder.resolve() / "cache")  # the Gaussians are the same
+    return run, pipeline.run(masked, cache.parent, console=Console())
 
 
 def one_step(run: pipeline.Run, embedder) -> Callable[[str], Selection]:

@@ -107,7 +107,7 @@ def test_pickles_are_neither_written_nor_read_and_only_records_of_jsecon_are_mad
 
 def test_keys_follow_stage_and_parts():
     def key(name, **options):
-        return Stage(name, "", lambda given: StageResult(None), key_options=options).key({}, None)
+        return Stage(name, "", lambda given: StageResult(None), key_options=options).key({}, Path())
 
     assert key("votes", a=1, b=[2, None]) == key("votes", b=[2, None], a=1)
     assert len({key("votes", a=1, b=[2, None]), key("codes", a=1, b=[2, None]), key("votes", a=1, b=[3, None])}) == 3

@@ -42,7 +42,7 @@ def load(folder, out, **options):
     """What the first stage of a run makes of a capture, and what it told."""
     given = Options(capture=folder, holdout=6, steps=2000, **options)
     work = RunContext(given, Models(ColourEmbedder()), out)
-    done = compute_stages(work, plan_capture(work), out / "cache")
+    done = compute_stages(work, plan_capture(work))
     return done.results.load, " ".join(done.notes), done.steps[0].status
 
 

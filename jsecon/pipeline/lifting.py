@@ -19,18 +19,16 @@ from jsecon.vision.protocols import Embedder
 from jsecon.vision.unrelated_words import embed_unrelated_words
 
 
-def plan_votes(context: RunContext) -> Stage:
-    """Plans the votes of the regions for each Gaussian."""
+def plan_lifting(context: RunContext) -> list[Stage]:
+    """Plans the votes of the regions for each Gaussian, and the codes of the paper if the options ask for them."""
     how, after = "the strongest regions of each Gaussian", ("load", "gaussians", "objects")
-    key_options, accumulate = context.key_options("centre_pixel_weight"), _accumulate_votes
-    return Stage("votes", how, accumulate, after=after, key_options=key_options, distributed=True)
-
-
-def plan_codes(context: RunContext) -> Stage:
-    """Plans the codes of the paper."""
+    key_options = context.key_options("centre_pixel_weight")
+    votes = Stage("votes", how, _accumulate_votes, after=after, key_options=key_options, distributed=True)
+    if not context.options.paper:
+        return [votes]
     how = "3 numbers per region by an autoencoder, distilled into the Gaussians by their votes"
     key_options = context.key_options("seed")
-    return Stage("codes", how, _compute_codes, after=("regions", "votes"), key_options=key_options)
+    return [votes, Stage("codes", how, _compute_codes, after=("regions", "votes"), key_options=key_options)]
 
 
 def _accumulate_votes(stage: StageInput) -> StageResult:

@@ -29,7 +29,13 @@ from jsecon.vision.protocols import Segmenter
 from jsecon.vision.surfaces import smooth_depth, surfaces_from_depth
 
 
-def plan_objects(context: RunContext) -> Stage:
+def plan_objects(context: RunContext) -> list[Stage]:
+    """Plans the objects, their embeddings, and small parts of the scene if the options ask for them."""
+    parts = [_plan_parts(context)] if context.options.parts else []
+    return [_plan_labels(context), _plan_regions(context), *parts]
+
+
+def _plan_labels(context: RunContext) -> Stage:
     """Plans the labels of the training frames: from mask files, or proposals associated over the frames."""
     options, models, folder = context.options, context.models, context.options.masks
     key_options = context.key_options("vision_frames")
@@ -38,7 +44,7 @@ def plan_objects(context: RunContext) -> Stage:
         skipped = {"segmenter": reason, "association": reason}
         key_options |= context.key_options("level")
         how, read = f"read from {folder.name}", _read_masks
-        return Stage("objects", how, read, after=("load",), key_options=key_options, files=folder, skipped=skipped)
+        return Stage("objects", how, read, after=("load",), key_options=key_options, files=(folder,), skipped=skipped)
     if options.proposals is not None:
         how = f"proposals read from {options.proposals.name}"
         key_options |= context.key_options("level")
@@ -58,30 +64,36 @@ def plan_objects(context: RunContext) -> Stage:
         how += f", in at most {options.vision_frames} frames"
     tracker = None if models.tracker is None else models.tracker.name
     key_options |= {"association": options.associated_by, "tracker": tracker}
-    after, files = ("load", "gaussians"), options.proposals
-    find = _find_objects
-    return Stage("objects", how, find, after=after, key_options=key_options, files=files, distributed=consensus)
+    return Stage(
+        "objects",
+        how,
+        _find_objects,
+        after=("load", "gaussians"),
+        key_options=key_options,
+        files=(options.proposals,),
+        distributed=consensus,
+    )
 
 
-def plan_regions(context: RunContext) -> Stage:
+def _plan_regions(context: RunContext) -> Stage:
     """Plans an embedding of each region: by the embedder, or from files."""
     options, embedder, after = context.options, context.models.embedder.name, ("load", "objects")
     if options.features is None:
         how, key_options = f"embedded by {embedder!r}, views weighted by pixels", {"embedder": embedder}
         return Stage("regions", how, _embed_objects, after=after, key_options=key_options, distributed=True)
     how = f"embeddings read from {options.features.name}, level {options.level}, views weighted by pixels"
-    key_options, read = context.key_options("level"), _read_embeddings
+    key_options, read, files = context.key_options("level"), _read_embeddings, (options.features,)
     skipped = {"embedder": f"embeddings are given ({options.features.name})"}
-    return Stage("regions", how, read, after=after, key_options=key_options, files=options.features, skipped=skipped)
+    return Stage("regions", how, read, after=after, key_options=key_options, files=files, skipped=skipped)
 
 
-def plan_parts(context: RunContext) -> Stage:
+def _plan_parts(context: RunContext) -> Stage:
     """Plans small parts of the scene."""
     how, after = "of the scene, by what single masks say of them", ("load", "gaussians", "objects")
     key_options = context.key_options("seed", "level", "granularity", "centre_pixel_weight")
     key_options["embedder"] = context.models.embedder.name
-    find, files = _find_parts, context.options.features
-    return Stage("parts", how, find, after=after, key_options=key_options, files=files)
+    files = (context.options.features,)
+    return Stage("parts", how, _find_parts, after=after, key_options=key_options, files=files)
 
 
 class _TrainingView:

@@ -5,9 +5,9 @@
 
 jax.distributed connects them: it reads number, index and address from what the launcher sets. The first process runs
 the stages: it alone reads and writes the cache, holds the lock of the output folder and prints. For a stage that is
-`distributed`, it sends the others the results that the stage reads. All compute the stage together, each its part of
-the views (`parallel.map_over_processes`). Then the others wait for the next one. Only
-the inputs and the models need to be on every machine.
+`distributed`, it sends the others (`run.run_worker`) the results that the stage reads. All compute the stage together,
+each its part of the views (`parallel.map_over_processes`). Then the others wait for the next one. Only the inputs and
+the models need to be on every machine.
 
 A process that fails prints why, and the launcher ends the others.
 """
@@ -16,7 +16,7 @@ import atexit
 import contextlib
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import jax
 
@@ -24,7 +24,6 @@ import jsecon
 from jsecon.errors import InputError
 from jsecon.parallel import allgather_tree
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.results import Checkpoint, Results, RunContext, Stage, StageInput
 
 
 @contextlib.contextmanager
@@ -60,28 +59,3 @@ def connection(options: Options) -> Iterator[int]:
         sys.stderr.flush()
         os._exit(2)  # gloo's threads wait for the others
     jax.distributed.shutdown()
-
-
-def broadcast(stage: Stage | None, results: Results, sent: set[str]) -> None:
-    """Lets all processes compute a stage that is distributed, or ends the work of the others if there is no stage.
-
-    `sent` holds the names of the results that the others have.
-    """
-    if jax.process_count() == 1:
-        return
-    if stage is None:
-        allgather_tree({"stage": ""})
-    elif stage.distributed:
-        new = {name: getattr(results, name) for name in stage.after if name not in sent}
-        sent |= set(new)
-        allgather_tree({"stage": stage.name, "results": new})
-
-
-def compute_called_stages(context: RunContext, stages: Sequence[Stage]) -> None:
-    """Computes each stage that the first process calls for, until it shuts down. It writes no file."""
-    by_name, results = {stage.name: stage for stage in stages}, Results()
-    while (call := allgather_tree(None)[0])["stage"]:
-        for name, value in call["results"].items():
-            setattr(results, name, value)
-        checkpoint = Checkpoint(context.out / "worker")
-        by_name[call["stage"]].compute(StageInput(context, results, lambda done, total: None, checkpoint))

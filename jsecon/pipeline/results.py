@@ -9,7 +9,7 @@ import hashlib
 import json
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -47,8 +47,8 @@ class Results:
     """weight of each region on each Gaussian"""
     codes: Codes | None = None
     """codes of the paper, if the options ask for them"""
-    held_out: Quality
-    """PSNR and SSIM of the held-out frames"""
+    held_out: Quality = Quality(np.zeros(0, int), np.zeros(0), np.zeros(0))
+    """PSNR and SSIM of the held-out frames; of no frame for a scene without photographs"""
     poses: Any
     """None: structure from motion writes its poses to OUT/poses"""
 
@@ -137,8 +137,8 @@ class Stage:
     """Stages whose results it reads."""
     key_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Options and models that the result depends on; models by their content, not by the place of files."""
-    files: Path | Callable[[], Sequence[Path]] | None = None
-    """Input file or folder, or a function that lists the input files."""
+    files: tuple[Path | None, ...] = ()
+    """Input files and folders; None for one that the options do not name."""
     skipped: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """Parts that the options make needless, each with the reason."""
     distributed: bool = False
@@ -147,23 +147,16 @@ class Stage:
     """Folder that it writes for later stages, with its key in KEY_FILE; it runs again if another run wrote that
     folder."""
 
-    def key(self, keys: Mapping[str, str], files: str | None) -> str:
-        """Hashes all that the result depends on."""
+    def key(self, keys: Mapping[str, str], out: Path) -> str:
+        """Hashes all that the result depends on; of the input files, but for those in `out`, names, sizes and times."""
         parts = {
             "source": cache.source_digest(),
             "after": [keys[other] for other in self.after],
             "options": dict(self.key_options),
-            "files": files,
+            "files": cache.files_digest(filter(None, self.files), exclude=out),
         }
         text = json.dumps([self.name, parts], sort_keys=True)
         return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
-
-    def files_digest(self, context: RunContext) -> str | None:
-        """Hashes names, sizes and times of the input files."""
-        if self.files is None:
-            return None
-        paths = [self.files] if isinstance(self.files, Path) else self.files()
-        return cache.files_digest(paths, exclude=context.out)
 
 
 def training_frames(held_out: Array) -> np.ndarray:

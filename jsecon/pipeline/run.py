@@ -17,7 +17,8 @@ import numpy as np
 from jsecon.errors import InputError
 from jsecon.field.field import FIELD_FILE, load_field, save_field
 from jsecon.files import exclusive_lock
-from jsecon.pipeline import cache, lifting, model_loading, processes, stages
+from jsecon.parallel import allgather_tree
+from jsecon.pipeline import cache, lifting, model_loading, stages
 from jsecon.pipeline.options import Options, check_ranges, is_bare_scene, require_writable
 from jsecon.pipeline.progress import Console, Step
 from jsecon.pipeline.results import (
@@ -30,6 +31,7 @@ from jsecon.pipeline.results import (
     StageResult,
     training_frames,
 )
+from jsecon.pipeline.scene import plan_scene
 from jsecon.pipeline.scene_files import read_scene
 from jsecon.pipeline.sources import provenance
 from jsecon.poses.sfm import require_pycolmap
@@ -43,56 +45,10 @@ from jsecon.vision.classical import require_contrib
 
 
 @dataclasses.dataclass(frozen=True)
-class _Computed:
-    """Output of stages."""
-
-    results: Results
-    keys: dict[str, str]
-    """Key of each stage."""
-    steps: list[Step]
-    """Stages, and what was skipped."""
-    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
-    """Wall time of each stage, also of one that was computed in an earlier run."""
-    notes: list[str] = dataclasses.field(default_factory=list)
-    """What the user should know, a sentence each."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Run(_Computed):
-    """A finished run."""
-
-    field: LanguageField
-    options: Options
-    programs: dict[str, int]
-    """Number of programs that jax compiled ("all"), and of those that it read "from_disk"."""
-
-    @property
-    def capture(self) -> Capture:
-        """The capture, corrected if the options ask for that."""
-        return self.results.load
-
-    @property
-    def labels(self) -> np.ndarray:
-        """(T, H, W) int16 labels of the training frames that vision uses."""
-        return self.results.objects
-
-    @property
-    def held_out(self) -> Quality:
-        """PSNR and SSIM of the held-out frames."""
-        return self.results.held_out
-
-    @property
-    def skipped(self) -> dict[str, str]:
-        """Parts that were not needed, each with the reason."""
-        return {step.name: step.why for step in self.steps if step.status == "skipped"}
-
-
-@dataclasses.dataclass(frozen=True)
 class _Plan:
-    """Which of the stages would run: their keys, digests of their input files, and cache files, by name."""
+    """Which of the stages would run: their keys and cache files, by name."""
 
     keys: dict[str, str]
-    files: dict[str, str | None]
     paths: dict[str, Path]
     stale: list[str]
     """Stages whose result is stored and whose output folder is another run's."""
@@ -104,22 +60,59 @@ class _Plan:
         return [step.name for step in self.steps if step.status == "run"]
 
 
-def _plan(context: RunContext, stage_list: list[Stage], folder: Path) -> _Plan:
-    """Plans stages: which of them `folder` already holds. Writes no file; raises InputError for invalid options."""
+@dataclasses.dataclass(frozen=True)
+class _Computed:
+    """Output of stages."""
+
+    keys: dict[str, str]
+    """Key of each stage."""
+    steps: list[Step]
+    """Stages, and what was skipped."""
+    results: Results = dataclasses.field(default_factory=Results)
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+    """Wall time of each stage, also of one that was computed in an earlier run."""
+    notes: list[str] = dataclasses.field(default_factory=list)
+    """What the user should know, a sentence each."""
+    sent: set[str] = dataclasses.field(default_factory=set)
+    """Results that the other processes have."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A finished run."""
+
+    field: LanguageField
+    options: Options
+    capture: Capture
+    """The capture, corrected if the options ask for that."""
+    labels: np.ndarray
+    """(T, H, W) int16 labels of the training frames that vision uses."""
+    held_out: Quality
+    """PSNR and SSIM of the held-out frames."""
+    steps: list[Step]
+    """Stages, and what was skipped."""
+    seconds: dict[str, float]
+    """Wall time of each stage, also of one that was computed in an earlier run."""
+    notes: list[str]
+    """What the user should know, a sentence each."""
+    programs: dict[str, int]
+    """Number of programs that jax compiled ("all"), and of those that it read "from_disk"."""
+
+
+def _plan(context: RunContext, stage_list: list[Stage]) -> _Plan:
+    """Plans stages: which of them the cache holds. Writes no file; raises InputError for invalid options."""
     _require_inputs(context.options)
     _require_own_folder(context.options, context.out)
     require_contrib()
     keys: dict[str, str] = {}
-    files: dict[str, str | None] = {}
     for stage in stage_list:
-        files[stage.name] = stage.files_digest(context)
-        keys[stage.name] = stage.key(keys, files[stage.name])
-    paths = {name: folder / f"{name}-{key}.safetensors" for name, key in keys.items()}
+        keys[stage.name] = stage.key(keys, context.out)
+    paths = {name: context.out / "cache" / f"{name}-{key}.safetensors" for name, key in keys.items()}
     stale = [stage.name for stage in stage_list if not _owns_output(stage, stage_list, paths)]
     cached = {name for name, path in paths.items() if path.exists() and name not in stale}
     steps = [Step(stage.name, "cached" if stage.name in cached else "run", stage.how) for stage in stage_list]
     steps += [Step(part, "skipped", why) for stage in stage_list for part, why in stage.skipped.items()]
-    return _Plan(keys, files, paths, stale, steps)
+    return _Plan(keys, paths, stale, steps)
 
 
 def _require_inputs(options: Options) -> None:
@@ -139,10 +132,8 @@ def _require_inputs(options: Options) -> None:
 
 def _require_options_apply(options: Options) -> None:
     """Raises InputError if an option is set that the input has no use for."""
-    bare, defaults = (
-        is_bare_scene(options.capture),
-        {field.name: field.default for field in dataclasses.fields(options)},
-    )
+    bare = is_bare_scene(options.capture)
+    defaults = {field.name: field.default for field in dataclasses.fields(options)}
     for name in ("frames", "holdout", "refine") if bare else ("views", "up", "cameras"):
         if getattr(options, name) != defaults[name]:
             kind = "a scene without photographs" if bare else "a capture, which has its own views"
@@ -182,45 +173,36 @@ def _checkpoint_file(path: Path) -> Path:
     return path.with_suffix(".checkpoint.safetensors")
 
 
-def compute_stages(
-    context: RunContext,
-    stage_list: list[Stage],
-    folder: Path,
-    *,
-    console: Console | None = None,
-) -> _Computed:
+def compute_stages(context: RunContext, stage_list: list[Stage], console: Console | None = None) -> _Computed:
     """Plans stages, reports the plan, then computes each or reads it from the cache."""
-    console, sent = console or Console(), set()
+    console = console or Console()
     with console.progress("plan"):
-        plan = _plan(context, stage_list, folder)
+        plan = _plan(context, stage_list)
         require_writable(context.out)
     with exclusive_lock(context.out):
-        cache.prepare(folder)
+        cache.prepare(context.out / "cache")
         for name in plan.stale:
             plan.paths[name].unlink(missing_ok=True)
         console.print_line(f"{context.options.capture} -> {context.out}")
         for step in plan.steps:
             console.step(step)
         context.models.require_ready(plan.running)
-        computed = _Computed(Results(), plan.keys, plan.steps)
+        computed = _Computed(plan.keys, plan.steps)
         for stage in stage_list:
-            _compute_stage(context, stage, plan, computed, console, sent)
-        processes.broadcast(None, computed.results, sent)
+            _compute_stage(context, stage, plan.paths[stage.name], computed, console)
+        _broadcast(None, computed)
     return computed
 
 
-def _compute_stage(
-    context: RunContext, stage: Stage, plan: _Plan, computed: _Computed, console: Console, sent: set[str]
-) -> None:
+def _compute_stage(context: RunContext, stage: Stage, path: Path, computed: _Computed, console: Console) -> None:
     """Computes one stage or reads it from the cache, and adds it to `computed`."""
-    path = plan.paths[stage.name]
     checkpoint = Checkpoint(_checkpoint_file(path))
 
     def compute(progress: Any) -> StageResult:
-        processes.broadcast(stage, computed.results, sent)
+        _broadcast(stage, computed)
         result = stage.compute(StageInput(context, computed.results, progress, checkpoint))
-        if plan.files[stage.name] != stage.files_digest(context):  # then the key does not describe the result
-            where = stage.files if isinstance(stage.files, Path) else context.options.capture
+        if stage.key(computed.keys, context.out) != computed.keys[stage.name]:  # then it does not describe the result
+            where = next(filter(None, stage.files)) if len(stage.files) == 1 else context.options.capture
             problem = f"files that changed while stage {stage.name} read them"
             remedy = "Run the same command again when no program writes there; finished stages are kept."
             raise InputError(where, problem, "files that stay as they are during a run", remedy)
@@ -247,37 +229,53 @@ def _compute_stage(
         console.note(note)
 
 
-def run(
-    options: Options,
-    out: Path,
-    *,
-    console: Console | None = None,
-    cache_folder: Path | None = None,
-) -> Run:
+def _broadcast(stage: Stage | None, computed: _Computed) -> None:
+    """Lets all processes compute a stage that is distributed, or ends the work of the others if there is no stage."""
+    if jax.process_count() == 1:
+        return
+    if stage is None:
+        allgather_tree({"stage": ""})
+    elif stage.distributed:
+        new = {name: getattr(computed.results, name) for name in stage.after if name not in computed.sent}
+        computed.sent.update(new)
+        allgather_tree({"stage": stage.name, "results": new})
+
+
+def run_worker(options: Options, out: Path) -> None:
+    """Computes each stage that the first process calls for, until it ends the work. It writes no file."""
+    context, results = _open_context(options, out), Results()
+    by_name = {stage.name: stage for stage in stages.run_stages(context)}
+    while (call := allgather_tree(None)[0])["stage"]:
+        vars(results).update(call["results"])
+        checkpoint = Checkpoint(out / "worker")
+        by_name[call["stage"]].compute(StageInput(context, results, lambda done, total: None, checkpoint))
+
+
+def run(options: Options, out: Path, *, console: Console | None = None) -> Run:
     """Builds the field of a capture and writes OUT/field.safetensors.
 
     A run that was stopped resumes where it stopped, to the same result.
     """
     console, before = console or Console(), compilation_counts()
-    folder = cache_folder or out / "cache"
-    context = _open_context(options, out, folder)
-    options = context.options
-    computed = compute_stages(context, stages.run_stages(context), folder, console=console)
-    results, embedder = computed.results, context.models.embedder
+    context = _open_context(options, out)
+    computed = compute_stages(context, stages.run_stages(context), console)
+    results, seconds, embedder = computed.results, computed.seconds, context.models.embedder
     started = time.monotonic()
     with console.progress("field"):
-        field = lifting.join_field(results, embedder, provenance(options, computed.keys, embedder.name, out), options)
+        origin = provenance(context.options, computed.keys, embedder.name, out)
+        field = lifting.join_field(results, embedder, origin, context.options)
         save_field(out / FIELD_FILE, field)
-    computed.seconds["field"] = time.monotonic() - started
-    console.done("field", computed.seconds["field"], True)
+    seconds["field"] = time.monotonic() - started
+    console.done("field", seconds["field"], True)
     programs = {name: count - before[name] for name, count in compilation_counts().items()}
-    return Run(**vars(computed), field=field, options=options, programs=programs)
+    made = results.load, results.objects, results.held_out
+    return Run(field, context.options, *made, computed.steps, seconds, computed.notes, programs)
 
 
-def _open_context(options: Options, out: Path, cache_folder: Path | None = None) -> RunContext:
+def _open_context(options: Options, out: Path) -> RunContext:
     """Opens the models of a run."""
     options = model_loading.with_folders(options)
-    return RunContext(options, model_loading.open_models(options, cache_folder or out / "cache"), out)
+    return RunContext(options, model_loading.open_models(options, out / "cache"), out)
 
 
 def current_field(options: Options, out: Path) -> Path | None:
@@ -286,7 +284,7 @@ def current_field(options: Options, out: Path) -> Path | None:
     if not path.is_file():
         return None
     context = _open_context(options, out)
-    keys = _plan(context, stages.run_stages(context), out / "cache").keys
+    keys = _plan(context, stages.run_stages(context)).keys
     try:
         origin = json.loads(load_field(path, mapped=True).provenance)
     except (InputError, ValueError):  # damaged: the run writes it anew
@@ -294,18 +292,11 @@ def current_field(options: Options, out: Path) -> Path | None:
     return path if origin.get("keys") == keys else None
 
 
-def run_worker(options: Options, out: Path) -> None:
-    """Does the part of a run of every process but the first (`processes`)."""
-    context = _open_context(options, out)
-    processes.compute_called_stages(context, stages.run_stages(context))
-
-
 def dry_run(options: Options, out: Path, *, scene_only: bool = False, console: Console) -> dict[str, Any]:
     """Lists the stages that `run` would compute, and writes no file."""
     with console.progress("plan"):
         context = _open_context(options, out)
-        stage_list = stages.fit_stages(context) if scene_only else stages.run_stages(context)
-        plan = _plan(context, stage_list, out / "cache")
+        plan = _plan(context, plan_scene(context) if scene_only else stages.run_stages(context))
         context.models.require_ready(plan.running)
         _check_inputs(context, plan)
     console.print_line(f"{options.capture} -> {out}, a dry run")
@@ -347,5 +338,5 @@ def _check_inputs(context: RunContext, plan: _Plan) -> None:
 def fit(options: Options, out: Path, *, console: Console | None = None) -> tuple[Gaussians, Capture, Quality]:
     """Computes the stages of `run` that make and measure the scene, into the same cache, so that a `run` continues."""
     context = _open_context(options, out)
-    results = compute_stages(context, stages.fit_stages(context), out / "cache", console=console).results
+    results = compute_stages(context, plan_scene(context), console).results
     return results.gaussians, results.load, results.held_out

@@ -5,7 +5,6 @@ A scene that comes without photographs is rendered from virtual views, or from g
 """
 
 import dataclasses
-import functools
 import shutil
 from pathlib import Path
 
@@ -31,7 +30,7 @@ from jsecon.read.captures.frames import FrameOptions, frame_names, make_rigid, t
 from jsecon.read.captures.nerfstudio import source_from_trained
 from jsecon.read.captures.video import DEFAULT_VIDEO_FRAMES, is_video, write_frames
 from jsecon.splat.transform import transform_gaussians
-from jsecon.types import Camera, Capture, Gaussians, Quality
+from jsecon.types import Camera, Capture, Gaussians
 from jsecon.views.capture import render_capture
 from jsecon.views.frame import scene_frame, surface_points
 from jsecon.views.plan import place_cameras
@@ -44,18 +43,17 @@ def plan_capture(context: RunContext) -> list[Stage]:
         return [_plan_rendered_views(context)]
     if is_video(capture):
         what = f"the {options.frames or DEFAULT_VIDEO_FRAMES} sharpest frames of {capture.name}, evenly spread"
-        key_options, files = context.key_options("frames"), capture
+        key_options, files = context.key_options("frames"), [capture]
     elif unposed_photographs(capture):
-        photographs = list_photographs(capture)
-        what = f"{len(photographs)} photographs, which have none"
-        key_options = {"names": [photo.relative_to(capture).as_posix() for photo in photographs]}
-        files = functools.partial(list_photographs, capture)
+        files = list_photographs(capture)
+        what = f"{len(files)} photographs, which have none"
+        key_options = {"names": [photo.relative_to(capture).as_posix() for photo in files]}
     else:
         return [_plan_load(context, capture)]
     how = f"found by structure from motion (pycolmap) for {what}"
     folder = context.out / "poses"
-    poses = Stage("poses", how, _estimate_poses, key_options=key_options, files=files, output_dir=folder)
-    return [poses, dataclasses.replace(_plan_load(context, folder), after=("poses",), files=None)]
+    poses = Stage("poses", how, _estimate_poses, key_options=key_options, files=tuple(files), output_dir=folder)
+    return [poses, dataclasses.replace(_plan_load(context, folder), after=("poses",), files=())]
 
 
 def _plan_load(context: RunContext, capture: Path) -> Stage:
@@ -70,24 +68,32 @@ def _plan_load(context: RunContext, capture: Path) -> Stage:
         key_options |= context.key_options("seed", "steps", "minutes") | {"refine": refine}
         how += ", corrected by short fits"
         how += " in about half of the fit's time where that helps" * (refine == "auto")
-    return Stage("load", how, _load_frames, key_options=key_options, files=capture)
+    return Stage("load", how, _load_frames, key_options=key_options, files=(capture,))
 
 
 def _plan_rendered_views(context: RunContext) -> Stage:
     """Plans the stage "load" of a scene without photographs."""
-    options, skipped = context.options, {"photographs": "the scene comes without any"}
-    if options.cameras is not None:
-        poses, both = options.cameras, [options.cameras, options.capture]
-        how, key_options = f"the scene rendered from the poses of {poses.name}", context.key_options("long_side")
-        skipped["planned views"] = f"the poses are given ({poses.name})"
-        render = _render_given_poses
-        return Stage("load", how, render, key_options=key_options, files=lambda: both, skipped=skipped)
-    how = f"{options.views} virtual views, planned from the Gaussians of {options.capture.name}"
-    key_options, render = context.key_options("views", "up", "long_side"), _render_planned_views
-    return Stage("load", how, render, key_options=key_options, files=options.capture, skipped=skipped)
+    options, files = context.options, (context.options.capture, context.options.cameras)
+    skipped = {"photographs": "the scene comes without any", "held_out": "no photograph to compare with"}
+    if options.cameras is None:
+        how = f"{options.views} virtual views, planned from the Gaussians of {options.capture.name}"
+        key_options, render = context.key_options("views", "up", "long_side"), _render_planned_views
+    else:
+        how = f"the scene rendered from the poses of {options.cameras.name}"
+        key_options, render = context.key_options("long_side"), _render_given_poses
+        skipped["planned views"] = f"the poses are given ({options.cameras.name})"
+    return Stage("load", how, render, key_options=key_options, files=files, skipped=skipped)
 
 
-def plan_gaussians(context: RunContext) -> Stage:
+def plan_scene(context: RunContext) -> list[Stage]:
+    """Plans the capture, the Gaussians, and the quality of the scene if there are photographs: the last."""
+    how = "PSNR and SSIM of the rendered colours"
+    held_out = Stage("held_out", how, _measure_held_out, after=("load", "gaussians"), distributed=True)
+    scene = [*plan_capture(context), _plan_gaussians(context)]
+    return scene if is_bare_scene(context.options.capture) else [*scene, held_out]
+
+
+def _plan_gaussians(context: RunContext) -> Stage:
     """Plans the scene's Gaussians: of a file, brought into the capture's world, or fitted to the training frames."""
     options = context.options
     bare = is_bare_scene(options.capture)
@@ -101,15 +107,7 @@ def plan_gaussians(context: RunContext) -> Stage:
     skipped = {"photometric fit": f"the scene's Gaussians are given ({path.name})"}
     read = _read_bare_scene if bare else _read_gaussians_of_capture
     how = f"read from {path.name}"
-    return Stage("gaussians", how, read, after=("load",), key_options=key_options, files=path, skipped=skipped)
-
-
-def plan_held_out(context: RunContext) -> Stage:
-    """Plans PSNR and SSIM of the held-out frames."""
-    if is_bare_scene(context.options.capture):
-        return Stage("held_out", "no photograph to compare with", _measure_nothing)
-    how = "PSNR and SSIM of the rendered colours"
-    return Stage("held_out", how, _measure_held_out, after=("load", "gaussians"), distributed=True)
+    return Stage("gaussians", how, read, after=("load",), key_options=key_options, files=(path,), skipped=skipped)
 
 
 def _estimate_poses(stage: StageInput) -> StageResult:
@@ -305,8 +303,3 @@ def _read_bare_scene(stage: StageInput) -> StageResult:
     """Reads a scene without photographs into the world of its rendered views."""
     source, notes = read_scene(stage.context.options.capture)
     return StageResult(_into_world(source, np.asarray(stage.results.load.source_from_scene, np.float64)), notes=notes)
-
-
-def _measure_nothing(stage: StageInput) -> StageResult:
-    """Returns the quality of no frame: renders are no photographs."""
-    return StageResult(Quality(np.zeros(0, int), np.zeros(0), np.zeros(0)))
