@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from jsecon.errors import InputError
 from jsecon.fit.quality import QUICK_LONG_SIDE
@@ -35,41 +36,15 @@ def read_scene(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
     return scene, notes
 
 
-class _PhotoSimilarity(NamedTuple):
-    """Similarity of a scene to the photographs."""
-
-    correlation: float
-    """Mean over the views, in [-1, 1]."""
-    contrast: float
-    """Standard deviations above the correlation with the photographs shuffled among the cameras."""
-    psnr: float
-    """Mean, dB."""
-    views: int
-    """Number of views compared."""
-
-    @property
-    def explained(self) -> bool:
-        """Whether the photographs show this scene from these cameras.
-
-        Fitted scenes have a correlation of 0.8 to 0.97 in their world, and -0.1 to 0.1 in others. Scenes of one
-        Gaussian per sparse point, not fitted, have 0.40 (fox) and 0.50 (bonsai) in theirs, and up to 0.40 in others;
-        but their contrast is 4.2 and 4.9, and up to 3.6 in others (4.0 if shifted by a tenth of the scene's size).
-        """
-        if self.views < 6:  # whose contrast is not significant
-            return self.correlation >= 0.5
-        return self.correlation >= 0.85 or (self.correlation >= 0.3 and self.contrast >= 4.0)
-
-
 class _Placement(NamedTuple):
     """Gaussians in a world that they may be in."""
 
-    name: str
+    world: str
     gaussians: Gaussians
-    similarity: _PhotoSimilarity
-
-    def leads(self, other: "_Placement") -> bool:
-        """Whether it is clearly more like the photographs."""
-        return self.similarity.correlation > other.similarity.correlation + 0.05
+    correlation: float
+    """With the photographs of the same cameras, the mean over the views, in [-1, 1]."""
+    explained: bool
+    """Whether the photographs show this scene from these cameras."""
 
 
 def place_in_capture(
@@ -78,62 +53,43 @@ def place_in_capture(
     """Moves a file's Gaussians into the world of the capture's cameras.
 
     A few frames are rendered in each world that the file may be in: the one that `trained` leads back from, that of the
-    capture's files, that of its poses, and those of known training programs. The one most like the frames is taken.
+    capture's files, and that of its poses; if none explains the frames, those of known training programs. The first is
+    taken, unless the frames are explained by another that is clearly more like them.
     """
     source_from_scene = np.asarray(capture.source_from_scene, np.float64)
-    poses_from_scene = (
-        np.eye(4) if capture.poses_from_scene is None else np.asarray(capture.poses_from_scene, np.float64)
-    )
-    transformed = not np.allclose(
-        poses_from_scene, source_from_scene, rtol=1e-9, atol=1e-9 * np.abs(source_from_scene).max()
-    )
-    worlds: list[tuple[str, np.ndarray]] = []
-    if trained is not None:
-        worlds.append(("dataparser_transforms.json", trained))
-        if transformed:
-            worlds.append(
-                (
-                    "dataparser_transforms.json, of the poses",
-                    source_from_scene @ np.linalg.inv(poses_from_scene) @ trained,
-                )
-            )
-    worlds.append(("the capture's files" if transformed else "the capture's poses", np.eye(4)))
+    poses = capture.poses_from_scene
+    poses_from_scene = np.eye(4) if poses is None else np.asarray(poses, np.float64)
+    scene_from_source, scene_from_poses = np.linalg.inv(source_from_scene), np.linalg.inv(poses_from_scene)
+    size = np.abs(source_from_scene).max()
+    transformed = not np.allclose(poses_from_scene, source_from_scene, rtol=1e-9, atol=1e-9 * size)
+    worlds = {"the capture's files" if transformed else "the capture's poses": scene_from_source}
     if transformed:
-        worlds.append(
-            ("the poses, without the applied_transform undone", source_from_scene @ np.linalg.inv(poses_from_scene))
-        )
-
-    def place(name: str, world: np.ndarray) -> _Placement:
-        moved = transform_gaussians(gaussians, np.linalg.inv(source_from_scene) @ world)
-        scene = jax.tree.map(jnp.asarray, moved)
-        return _Placement(name, scene, _photo_similarity(scene, capture))
-
+        worlds["the poses, without the applied_transform undone"] = scene_from_poses
+    if trained is not None:
+        told = {"dataparser_transforms.json": scene_from_source @ trained}
+        if transformed:
+            told["dataparser_transforms.json, of the poses"] = scene_from_poses @ trained
+        worlds = told | worlds
     best = None
-    for n, (name, world) in enumerate(worlds):
-        other = place(name, world)
-        best = other if best is None or other.leads(best) else best
-        progress(n + 1, len(worlds))
-    assert best is not None
-    if not best.similarity.explained:
-        cameras = np.linalg.inv(
-            transform_poses(np.asarray(capture.cameras.world_to_camera, np.float64), poses_from_scene)
-        )
-        points = np.asarray(capture.points, np.float64) @ poses_from_scene[:3, :3].T + poses_from_scene[:3, 3]
-        for name, world in _training_worlds(cameras, points):
-            other = place(
-                f"the training, normalised as by {name}", source_from_scene @ np.linalg.inv(world @ poses_from_scene)
-            )
-            if other.similarity.explained and other.leads(best):
+    for candidates in (list(worlds.items()), _training_worlds(capture, poses_from_scene)):
+        if best is not None and best.explained:
+            break
+        for n, (world, scene_from_world) in enumerate(candidates):
+            moved = jax.tree.map(jnp.asarray, transform_gaussians(gaussians, scene_from_world))
+            other = _Placement(world, moved, *_compare_with_photographs(moved, capture))
+            if best is None or (other.explained and other.correlation > best.correlation + 0.05):
                 best = other
-    figures = f"correlation with the frames {best.similarity.correlation:.2f}, {best.similarity.psnr:.1f} dB"
-    note = f"The Gaussians were read in the world of {best.name} ({figures})."
+            progress(n + 1, len(candidates))
+    assert best is not None
+    figure = f"correlation with the frames {best.correlation:.2f}"
+    note = f"The Gaussians were read in the world of {best.world} ({figure})."
     # A fitted scene has 0.97 in its world, 0.56 a tenth of a metre beside it, 0.39 when turned by 20 degrees; a crude
     # one 0.81 in its world.
-    if best.similarity.correlation < 0.6:
+    if best.correlation < 0.6:
         note += " They show the frames only roughly: the scene is crude, or its world or poses are a bit off."
-    if not best.similarity.explained:
+    if not best.explained:
         note = (
-            f"{WARNING}The Gaussians of {path.name} do not look like the frames ({figures}). They are probably in "
+            f"{WARNING}The Gaussians of {path.name} do not look like the frames ({figure}). They are probably in "
             f"another world than the poses, and answers will be wrong. Give Gaussians in the world of the capture, or "
             f"put the dataparser_transforms.json of their training beside {path.name}."
         )
@@ -151,25 +107,29 @@ def _rounding_note(gaussians: Gaussians, path: Path) -> tuple[str, ...]:
     return (f"{WARNING}{note} Export them in double precision, or nearer to the origin.",)
 
 
-def _photo_similarity(gaussians: Gaussians, capture: Capture) -> _PhotoSimilarity:
-    """Compares renderings of a scene with at most eight training frames."""
+def _compare_with_photographs(gaussians: Gaussians, capture: Capture) -> tuple[float, bool]:
+    """Renders at most eight training frames: their correlation with the photographs, and whether these explain them.
+
+    Fitted scenes have a correlation of 0.8 to 0.97 in their world, and -0.1 to 0.1 in others. Scenes of one Gaussian
+    per sparse point, not fitted, have 0.40 (fox) and 0.50 (bonsai) in theirs, and up to 0.40 in others. But with the
+    photographs shuffled among the cameras, theirs lies 4.2 and 4.9 standard deviations above the mean, and up to 3.6 in
+    others (4.0 if shifted by a tenth of the scene's size).
+    """
     train = np.flatnonzero(~np.asarray(capture.held_out))
     views = train[evenly_spaced(len(train), 8)]
     cameras = shrink_cameras(capture.cameras, QUICK_LONG_SIDE)
-    gaussians = jax.device_put(gaussians)
-    rendered, photos, psnr = [], [], []
+    rendered, photos = [], []
     for t in views.tolist():
-        image = np.clip(np.asarray(render_rgb(gaussians, cameras[t]).features), 0, 1)
-        photo = resize_frame(np.asarray(capture.frames[t]), cameras).astype(np.float32) / 255
-        psnr.append(-10 * np.log10(max(float(np.mean((image - photo) ** 2)), 1e-10)))
-        rendered.append(_pattern(image))
-        photos.append(_pattern(photo))
+        rendered.append(_pattern(np.clip(np.asarray(render_rgb(gaussians, cameras[t]).features), 0, 1)))
+        photos.append(_pattern(resize_frame(np.asarray(capture.frames[t]), cameras).astype(np.float32) / 255))
     table = np.stack(rendered) @ np.stack(photos).T
+    correlation = float(np.diag(table).mean())
+    if len(views) < 6:  # a shuffle of so few is not significant
+        return correlation, correlation >= 0.5
     draw, rows = np.random.default_rng(0), np.arange(len(views))
     shuffled = np.array([table[rows, draw.permutation(len(views))].sum() for _ in range(500)])
-    deviation = max(float(shuffled.std()), 1e-9)
-    contrast = float((np.trace(table) - shuffled.mean()) / deviation)
-    return _PhotoSimilarity(float(np.diag(table).mean()), contrast, float(np.mean(psnr)), len(views))
+    contrast = (np.trace(table) - shuffled.mean()) / max(shuffled.std(), 1e-9)
+    return correlation, bool(correlation >= 0.85 or (correlation >= 0.3 and contrast >= 4.0))
 
 
 def _pattern(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, " p"]:
@@ -184,67 +144,55 @@ def _pattern(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, " p"]:
 
 
 def _training_worlds(
-    cameras_to_world: Float[np.ndarray, "t 4 4"], points: Float[np.ndarray, "p 3"]
+    capture: Capture, poses_from_scene: Float[np.ndarray, "4 4"]
 ) -> list[tuple[str, Float[np.ndarray, "4 4"]]]:
-    """Computes the worlds that training programs normalise a capture to, from its cameras and points.
+    """Computes the worlds that training programs normalise a capture to: what they are, and the way from them.
 
     gsplat (examples/datasets/normalize.py): the cameras' up to -y by the smallest turn, the median of the points of
     their axes nearest to the origin to the origin, the median camera to distance 1; then the points' principal axes,
     whose signs are open. nerfstudio (auto_orient_and_center_poses, "up" and "poses"): the cameras' up to z, their mean
-    to the origin, the largest coordinate of one to 1. Returns for each world the program and the (4, 4) similarity from
-    the world of the poses, that of the arguments.
+    to the origin, the largest coordinate of one to 1.
     """
-    turns, centres = cameras_to_world[:, :3, :3], cameras_to_world[:, :3, 3]
+    poses = transform_poses(np.asarray(capture.cameras.world_to_camera, np.float64), poses_from_scene)
+    points = np.asarray(capture.points, np.float64) @ poses_from_scene[:3, :3].T + poses_from_scene[:3, 3]
+    cameras = np.linalg.inv(poses)
+    turns, centres = cameras[:, :3, :3], cameras[:, :3, 3]
     up = -turns[:, :, 1].mean(0)
     if not np.linalg.norm(up) > 1e-6:
         return []
     worlds = []
-    turn = _least_turn(up, np.array([0.0, -1.0, 0.0]))
+    turn = Rotation.align_vectors([0.0, -1.0, 0.0], up)[0].as_matrix()
     ahead, places = turns[:, :, 2] @ turn.T, centres @ turn.T
     middle = np.median(places - (ahead * places).sum(1, keepdims=True) * ahead, axis=0)
-    plain = _scaled(turn, middle, np.median(np.linalg.norm(places - middle, axis=1)))
-    if plain is not None:
-        if len(points) > 3:
-            there = points @ plain[:3, :3].T + plain[:3, 3]
-            centre = np.median(there, axis=0)
-            axes = np.linalg.eigh(np.cov(there - centre, rowvar=False))[1][:, ::-1].T
-            axes[0] *= np.sign(np.linalg.det(axes))
-            for signs in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)):
-                aligned = np.eye(4)
-                aligned[:3, :3] = np.diag(signs) @ axes
-                aligned[:3, 3] = -aligned[:3, :3] @ centre
-                worlds.append(("gsplat", aligned @ plain))
-        worlds.append(("gsplat", plain))
+    plain = _similarity(turn, middle, np.median(np.linalg.norm(places - middle, axis=1)))
+    if len(points) > 3:
+        there = points @ plain[:3, :3].T + plain[:3, 3]
+        centre = np.median(there, axis=0)
+        axes = np.linalg.eigh(np.cov(there - centre, rowvar=False))[1][:, ::-1].T
+        axes[0] *= np.sign(np.linalg.det(axes))
+        for signs in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)):
+            turn = np.diag(signs) @ axes
+            worlds.append(("gsplat", _similarity(turn, turn @ centre, 1.0) @ plain))
+    worlds.append(("gsplat", plain))
     # What nerfstudio applies first to a COLMAP model that it reads itself: (x, y, z) to (x, z, -y).
     from_colmap = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
     for before in (np.eye(4), from_colmap):
-        turn = _least_turn(before[:3, :3] @ up, np.array([0.0, 0.0, 1.0]))
+        turn = Rotation.align_vectors([0.0, 0.0, 1.0], before[:3, :3] @ up)[0].as_matrix()
         places = centres @ (turn @ before[:3, :3]).T
         middle = places.mean(0)
-        trained = _scaled(turn, middle, np.abs(places - middle).max())
-        if trained is not None:
-            worlds.append(("nerfstudio", trained @ before))
-    return worlds
+        worlds.append(("nerfstudio", _similarity(turn, middle, np.abs(places - middle).max()) @ before))
+    return [
+        (f"the training, normalised as by {program}", np.linalg.inv(world @ poses_from_scene))
+        for program, world in worlds
+    ]
 
 
-def _scaled(turn: np.ndarray, middle: np.ndarray, size: float) -> np.ndarray | None:
-    """Turned, `middle` to the origin, `size` to 1; None without a size."""
-    if not (np.isfinite(size) and size > 0):
-        return None
+def _similarity(turn: np.ndarray, middle: np.ndarray, size: float) -> np.ndarray:
+    """(4, 4) what turns, then brings `middle` to the origin and `size` to 1; a size of 0 stays."""
+    size = size if size > 0 else 1.0
     result = np.eye(4)
     result[:3, :3], result[:3, 3] = turn / size, -middle / size
     return result
-
-
-def _least_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(3, 3) the smallest rotation that brings the direction of a to the unit vector b."""
-    a = a / np.linalg.norm(a)
-    x, y, z = np.cross(a, b)
-    cosine = float(a @ b)
-    if cosine < -1 + 1e-8:
-        return np.diag([-1.0, 1.0, -1.0]) if abs(b[1]) < 0.5 else np.diag([-1.0, -1.0, 1.0])
-    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + skew + skew @ skew / (1 + cosine)
 
 
 def check_overlap(gaussians: Gaussians, cameras: Camera, where: str) -> None:
