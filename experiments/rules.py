@@ -25,6 +25,7 @@ import tyro
 from experiments import lerf, results
 from experiments.cells import append_cell, read_cells
 from experiments.fair import ahead
+from experiments.memory_maps import clear_programs
 from experiments.rivals.evidence import Evidence
 from experiments.tables import twins
 from experiments.tables.association import associated
@@ -32,7 +33,6 @@ from experiments.tables.ours import field_of, parts_of
 from experiments.tables.setting import Setting
 from jsecon.field.evidence import region_votes
 from jsecon.fit.start import gaussians_from_points
-from jsecon.process import clear_programs
 from jsecon.query.answer import match_regions, query_anchored, query_several
 from jsecon.query.grouping import parts_fallback
 from jsecon.query.outliers import remove_outliers

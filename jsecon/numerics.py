@@ -49,8 +49,8 @@ def safe_scale(size: Array) -> Array:
     return jax.lax.stop_gradient(factor.astype(size.dtype))
 
 
-@functools.partial(jax.jit, static_argnames="keepdims", inline=True)
-def safe_norm(x: Array, keepdims: bool = False) -> Array:
+@functools.partial(jax.jit, inline=True)
+def safe_norm(x: Array) -> Array:
     """Computes Euclidean lengths, right over the whole float range (1e-30 and 1e30 alike)."""
     x = jnp.asarray(x)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=-1, keepdims=True, initial=0.0))
@@ -59,17 +59,17 @@ def safe_norm(x: Array, keepdims: bool = False) -> Array:
     scaled = jnp.where(usable, x * factor, 0.0)
     squares = jnp.sum(scaled * scaled, axis=-1, keepdims=True)
     length = jnp.where(usable, jnp.sqrt(jnp.where(usable, squares, 1.0)) * (1 / factor), largest)
-    return length if keepdims else jnp.squeeze(length, -1)
+    return jnp.squeeze(length, -1)
 
 
-@functools.partial(jax.jit, static_argnames="axis", inline=True)
-def normalize(x: Array, axis: int = -1) -> Array:
+@functools.partial(jax.jit, inline=True)
+def normalize(x: Array) -> Array:
     """Scales vectors to unit length."""
     x = jnp.asarray(x)
-    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True, initial=0.0))
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=-1, keepdims=True, initial=0.0))
     usable = (largest > 0) & jnp.isfinite(largest)
     scaled = jnp.where(usable, x * safe_scale(largest), 0.0)
-    squares = jnp.sum(scaled * scaled, axis=axis, keepdims=True)
+    squares = jnp.sum(scaled * scaled, axis=-1, keepdims=True)
     unit = scaled / jnp.sqrt(jnp.where(usable, squares, 1.0))
     return jnp.where(usable, unit, jnp.where(largest == 0, 0.0, jnp.nan))
 

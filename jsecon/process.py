@@ -6,14 +6,11 @@ all cores and the speed of benchmarks/results.md does the same:
     from jsecon.process import prepare_process
     prepare_process()
     import jsecon
-
-A program that runs long and sees many scenes calls `clear_programs()` from time to time.
 """
 
 import _thread
 import contextlib
 import ctypes
-import gc
 import hashlib
 import os
 import re
@@ -36,11 +33,11 @@ _counts: dict[str, int] = {}
 
 
 def prepare_process(*, keep_programs: bool = True) -> None:
-    """Sets XLA's flags and the folder of compiled programs (see `settings`), silences OpenCV, keeps freed memory.
+    """Sets XLA's flags and the folder of compiled programs (see `_settings`), silences OpenCV, keeps freed memory.
 
     Call it before jax makes its first array and OpenCV is imported. Variables that the user has set stay.
     """
-    chosen = settings(os.environ, cores(), _cpu_features())
+    chosen = _settings(os.environ, cores(), _cpu_features())
     if not keep_programs:
         chosen.pop("JAX_COMPILATION_CACHE_DIR", None)
     os.environ.update({name: value for name, value in _OPENCV.items() if name not in os.environ} | chosen)
@@ -187,22 +184,7 @@ def compilation_counts() -> dict[str, int]:
     return dict(_counts)
 
 
-def clear_programs(*, above: int = 25_000) -> None:
-    """Frees jax's compiled programs if the process has more than `above` memory maps, which Linux counts.
-
-    Linux allows a process 65,530 of them and XLA takes several a program: one that sees scene after scene, each with
-    sizes of its own, ends in "Unable to allocate section memory". Programs are compiled again, or read from disk, when
-    they are next called.
-    """
-    maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_bytes().count(b"\n") > above:
-        import jax
-
-        jax.clear_caches()
-        gc.collect()
-
-
-def settings(environ: Mapping[str, str], cores: int, cpu_features: frozenset[str]) -> dict[str, str]:
+def _settings(environ: Mapping[str, str], cores: int, cpu_features: frozenset[str]) -> dict[str, str]:
     """Chooses environment variables for one host device per core, full-width vectors and stored programs.
 
     512-bit vectors are used only if the CPU has them. The folder of compiled programs is named by a digest of the CPU's

@@ -217,11 +217,6 @@ class Votes:
     overlap: Array | None = None
     """(R, R) in [0, 1]: soft IoU of the Gaussians of two regions; None: not known."""
 
-    @property
-    def weight_beyond_top_k(self) -> Array:
-        """(N,) labelled weight that lies outside the K strongest regions."""
-        return jnp.maximum(self.labelled - self.weights.sum(-1), 0.0)
-
     def dense(self) -> Array:
         """Spreads the votes over all regions."""
         n, k = self.regions.shape
@@ -292,7 +287,6 @@ class _Texts(tuple):
         return hash(_Texts)
 
 
-@jax.tree_util.register_pytree_with_keys_class
 @dataclasses.dataclass(frozen=True)
 class LanguageField(_Shown):
     """Everything a query needs, in one file: the scene, its votes, its regions, and where they came from.
@@ -324,22 +318,25 @@ class LanguageField(_Shown):
     codes: Codes | None = None
     """codes of Gaussians and regions, which only queries by code read; None if the run was not asked for them."""
 
-    def tree_flatten_with_keys(self) -> tuple[tuple, _Texts]:
-        """The arrays with their names, and the texts, for jax."""
-        parts = {part.name: getattr(self, part.name) for part in dataclasses.fields(self)}
-        texts = _Texts(parts.pop(name) for name in _TEXTS)
-        return tuple((jax.tree_util.GetAttrKey(name), part) for name, part in parts.items()), texts
-
-    @classmethod
-    def tree_unflatten(cls, texts: _Texts, arrays: Iterable) -> LanguageField:
-        """Makes a field of what `tree_flatten_with_keys` gives, for jax."""
-        parts = dict(zip((part.name for part in dataclasses.fields(cls) if part.name not in _TEXTS), arrays))
-        traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(parts))
-        return cls(**parts, **dict(zip(_TEXTS, _Texts(((), "", "{}")) if traced else texts)))
-
 
 _TEXTS = ("names", "embedder", "provenance")
 """Static fields of LanguageField."""
+_ARRAYS = tuple(part.name for part in dataclasses.fields(LanguageField) if part.name not in _TEXTS)
+
+
+def _flatten_field(field: LanguageField) -> tuple[tuple, _Texts]:
+    """The arrays of a field with their names, and its texts."""
+    arrays = tuple((jax.tree_util.GetAttrKey(name), getattr(field, name)) for name in _ARRAYS)
+    return arrays, _Texts(getattr(field, name) for name in _TEXTS)
+
+
+def _unflatten_field(texts: _Texts, arrays: Iterable) -> LanguageField:
+    parts = dict(zip(_ARRAYS, arrays))
+    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(parts))
+    return LanguageField(**parts, **dict(zip(_TEXTS, _Texts(((), "", "{}")) if traced else texts)))
+
+
+jax.tree_util.register_pytree_with_keys(LanguageField, _flatten_field, _unflatten_field)
 
 
 @record

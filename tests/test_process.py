@@ -16,7 +16,7 @@ import pytest
 
 from jsecon import InputError, process
 from jsecon.poses import sfm
-from jsecon.process import settings
+from jsecon.process import _settings as settings
 from jsecon.read.captures import build
 from jsecon.read.captures.capture import load_capture
 
@@ -91,7 +91,7 @@ def test_a_program_that_was_cut_short_on_disk_is_compiled_and_kept_anew_without_
 def test_programs_are_forgotten_where_there_are_too_many_maps(tmp_path):
     program = (
         "import jax\n"
-        "from jsecon.process import clear_programs\n"
+        "from experiments.memory_maps import clear_programs\n"
         "double = jax.jit(lambda x: 2 * x)\n"
         "for above in (10**9, 0):\n"
         "    double(1)\n"

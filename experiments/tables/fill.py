@@ -12,12 +12,13 @@ import numpy as np
 
 from experiments.cells import append_cell, exclusive_lock, read_cells, run_helpers
 from experiments.datasets.benchmark import Benchmark
+from experiments.memory_maps import clear_programs
 from experiments.protocols.points import evaluate_points
 from experiments.tables import twins
 from experiments.tables.answers import QUICK_STEPS, Answers, Method, Steps
 from experiments.tables.setting import Setting, prepare
 from jsecon.evaluate.lerf import ALPHA_THRESHOLD, VALA_THRESHOLD, evaluate_at_thresholds
-from jsecon.process import clear_programs, cores, peak_memory_mib
+from jsecon.process import cores, peak_memory_mib
 
 DIGITS = 4
 """Decimal places of the IoU of single texts and frames."""

@@ -108,7 +108,7 @@ def region_votes(
       labels: (T, H, W) integers below `num_regions`, -1 where a pixel belongs to no region; or T images (H, W), of
         which `labels[t]` reads one, in several threads. Inside a trace R and more count as -1.
       num_regions: R.
-      top: Number of strongest regions that each Gaussian keeps; `Votes.weight_beyond_top_k` counts the rest.
+      top: Number of strongest regions that each Gaussian keeps.
       by_view: Whether to keep each view's total too (`Votes.by_view`), as `normalise_votes` needs it.
       centre_pixel_weight: In [0, 1]. A weight away from the pixel that holds the Gaussian's centre counts
         1 - `centre_pixel_weight`: at 1 a Gaussian is what its centre is, at 0 what its whole footprint is.

@@ -221,7 +221,7 @@ def rendered_l1(
     known = jnp.any(region_codes != 0, axis=-1)
     mask = ((labels >= 0) & (labels < len(region_codes)) & known[ids])[..., None]
     # safe_norm has a zero gradient at zero, which leaves 1e9 times the rendering's there, as in LangSplat.
-    units = features / (safe_norm(features, keepdims=True) + 1e-9)
+    units = features / (safe_norm(features)[:, None] + 1e-9)
     rendering = render_plan(plan, units)
     return jnp.mean(jnp.where(mask, jnp.abs(rendering.features - region_codes[ids]), 0.0)), rendering.overflow
 
