@@ -126,22 +126,19 @@ def _deserialize(data: bytes) -> Any:
 
 
 def _allgather_bytes(data: bytes) -> list[bytes]:
-    """Exchanges bytes.
+    """Exchanges bytes, in pieces of one size, as jax compiles for each.
 
-    It uses all_gather in pieces of at most 64 MiB, whose lengths are powers of two, as jax compiles for each
-    length. (Gloo's psum_scatter fails if one process comes 30 s after the other: jax issue 40831.)
+    It uses all_gather: Gloo's psum_scatter fails if one process comes 30 s after the other (jax issue 40831).
     """
     if jax.process_count() == 1:
         return [data]
-    sizes = process_allgather(np.array(divmod(len(data), 1 << 31), np.int32))
-    lengths = [int(high) * (1 << 31) + int(low) for high, low in sizes]
+    size = 1 << 22
+    lengths = [
+        int(whole) * size + int(rest) for whole, rest in process_allgather(np.array(divmod(len(data), size), np.int32))
+    ]
     parts = [bytearray() for _ in lengths]
-    largest = 1 << 26
-    for begin in range(0, max(lengths), largest):
-        size = min(largest, max(1 << 16, 1 << (max(lengths) - begin - 1).bit_length()))
-        piece = np.zeros(size, np.uint8)
+    for begin in range(0, max(lengths), size):
         mine = np.frombuffer(data[begin : begin + size], np.uint8)
-        piece[: len(mine)] = mine
-        for part, row, length in zip(parts, process_allgather(piece), lengths):
-            part += row[: max(0, min(size, length - begin))].tobytes()
-    return [bytes(part) for part in parts]
+        for part, row in zip(parts, process_allgather(np.pad(mine, (0, size - len(mine))))):
+            part += row.tobytes()
+    return [bytes(part[:length]) for part, length in zip(parts, lengths)]

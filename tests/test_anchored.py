@@ -12,7 +12,7 @@ from small_field import REGIONS, field_of, lone_votes, make_field, shares, unit_
 
 from jsecon.errors import InputError
 from jsecon.field.evidence import region_votes
-from jsecon.field.membership import add_visible_weight, normalise_votes, vote_shares
+from jsecon.field.membership import _add_visible_weight, normalise_votes, vote_shares
 from jsecon.paper.queries import CODE_THRESHOLD, select_by_code
 from jsecon.query.answer import (
     match_region,
@@ -201,7 +201,7 @@ def test_a_view_that_lost_the_region_says_nothing_against_it():
     views = (by_view > 0).sum(0)
     votes = Votes(regions, weights, weights.sum(1), total, total, views, 0, 2, by_view)
     plain = field_of(votes, Regions(np.eye(2, 8, dtype=np.float32), shows))
-    known = dataclasses.replace(plain, votes=add_visible_weight(votes, plain.regions))
+    known = dataclasses.replace(plain, votes=_add_visible_weight(votes, plain.regions))
     text = jnp.eye(2, 8)[0]
     assert np.asarray(query_anchored(plain, text).mask).tolist() == [False, False, False]  # 4 of 10
     found = query_anchored(known, text)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jsecon import query_canonical, query_one_step
-from jsecon.paper.queries import query_gt_anchored
+from jsecon.paper.queries import _select_near_region
 
 
 def exact_cosines(codes, code):
@@ -92,23 +92,13 @@ def test_unknown_features_are_never_selected_and_broken_phrases_select_nothing()
     assert not query_canonical(features, jnp.zeros(3), phrases, 0.0).mask.any()
 
 
-def test_the_anchored_query_takes_the_nearest_region_then_its_code():
+def test_the_second_step_of_the_anchored_query_compares_codes_with_that_of_the_region():
     rng = np.random.default_rng(0)
-    embeddings, table = rng.normal(size=(6, 9)).astype(np.float32), rng.normal(size=(6, 3)).astype(np.float32)
+    table = rng.normal(size=(6, 3)).astype(np.float32)
     codes = table[rng.integers(0, 6, 200)] + 0.1 * rng.normal(size=(200, 3)).astype(np.float32)
     for region in range(6):
-        text = embeddings[region] + 0.1 * rng.normal(size=9).astype(np.float32)
-        got = query_gt_anchored(codes, table, embeddings, text)
-        expected = exact_cosines(codes, table[region])
+        got, expected = _select_near_region(codes, table, region, 0.9), exact_cosines(codes, table[region])
         assert int(got.region) == region
-        assert float(got.score) == pytest.approx(exact_cosines(embeddings, text)[region], abs=1e-6)
         np.testing.assert_allclose(got.similarity, expected, atol=1e-6)
         np.testing.assert_array_equal(got.mask, expected >= 0.9)
-    jitted = jax.jit(jax.vmap(lambda text: query_gt_anchored(codes, table, embeddings, text).region))(embeddings)
-    np.testing.assert_array_equal(jitted, np.arange(6))
-    for nothing in (query_gt_anchored(codes, table, embeddings, np.full(9, np.nan, np.float32)),
-                    query_gt_anchored(codes, table[:0], embeddings[:0], text),
-                    query_gt_anchored(codes[:0], table, embeddings, text)):  # fmt: skip
-        assert not nothing.mask.any()
-    unknown = query_gt_anchored(codes, table, np.where(np.arange(6)[:, None] == region, 0, embeddings), text)
-    assert int(unknown.region) != region  # a region that was never embedded answers nothing
+    assert not _select_near_region(codes, table, -1, -1.0).mask.any()

@@ -20,7 +20,7 @@ from conftest import gaussians_at, look_at
 from small_field import shares, unit_rows
 from test_direct import exact_cosines, exact_relevancy
 
-from jsecon.field.membership import add_visible_weight, inside_fraction, with_overlap
+from jsecon.field.membership import _add_visible_weight, _with_overlap, inside_fraction
 from jsecon.paper.autoencoder import encode
 from jsecon.paper.distill import distill_votes
 from jsecon.paper.queries import query_canonical, query_one_step, select_by_code
@@ -138,11 +138,11 @@ def test_shares(shown):
 
 def test_shown_and_overlap():
     votes, regions = of_shares.cast(COUNT)
-    found = add_visible_weight(votes, regions)
+    found = _add_visible_weight(votes, regions)
     np.testing.assert_allclose(
         found.weight_where_region_visible, of_shares.exact_shown(votes, regions), rtol=1e-5, atol=1e-6
     )
-    np.testing.assert_allclose(with_overlap(found).overlap, of_shares.exact_overlap(found), rtol=2e-5, atol=1e-6)
+    np.testing.assert_allclose(_with_overlap(found).overlap, of_shares.exact_overlap(found), rtol=2e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("reduce", ["median", "mean", "mode"])

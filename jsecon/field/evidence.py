@@ -149,7 +149,7 @@ def region_votes(
             return tuple(evidence if scratch is None else _on_disk(evidence, scratch / str(t)))
 
         lists = [ViewEvidence(*evidence) for evidence in map_views(views, view, progress)]
-        return sum_evidence(lists, gaussians.count, num_regions, top=top, by_view=by_view, folder=folder)
+        return _sum_evidence(lists, gaussians.count, num_regions, top=top, by_view=by_view, folder=folder)
 
 
 def view_evidence(
@@ -358,7 +358,7 @@ def _dense_view_backward(columns, centre_pixel_weight, capacity, kept, cotangent
 _dense_view.defvjp(_dense_view_forward, _dense_view_backward)
 
 
-def sum_evidence(
+def _sum_evidence(
     views: Sequence[ViewEvidence],
     count: int,
     num_regions: int,

@@ -3,7 +3,7 @@
     p_nr = w_nr / max(W_nr, LABELLED_PART L_n, SEEN_PART W_n)
 
 with w_nr the weight of region r on Gaussian n (`region_votes`), W_nr the weight with which n was seen in the views that
-show r (`add_visible_weight`), L_n that on pixels of any region, and W_n that on all pixels. A view in which the tracker
+show r (`normalise_votes`), L_n that on pixels of any region, and W_n that on all pixels. A view in which the tracker
 lost a region, or in which nothing was proposed, does not count against it. The two other terms ask for evidence: a
 Gaussian behind the fridge, in the next room, has a trace of weight in the views that show the fridge and most of its
 weight in views of its own room. Where the votes do not know which views show a region, all count: p_nr = w_nr / W_n.
@@ -65,26 +65,26 @@ def normalise_votes(votes: Votes, regions: Regions) -> Votes:
       ValueError: The votes have no `by_view`, or other views than `regions`.
     """
     if not is_mapped(votes):
-        return with_overlap(add_visible_weight(votes, regions))
+        return _with_overlap(_add_visible_weight(votes, regions))
     shows = _views_that_show(regions)
     sums = jnp.zeros((regions.count, regions.count), jnp.float32)
     visible = [np.zeros((0, votes.regions.shape[1]), np.float32)]
     for rows in row_slices(votes, len(votes.views)):
         block = dataclasses.replace(votes_of_rows(votes, rows), by_view=np.asarray(_by_view(votes, regions)[:, rows]))
-        block = _add_visible_weight(block, shows)
+        block = _sum_visible_weight(block, shows)
         sums += _overlap_sums(jnp.asarray(block.regions), vote_shares(block), regions.count)
         visible.append(np.asarray(block.weight_where_region_visible))
     visible = np.concatenate(visible)
     return dataclasses.replace(votes, by_view=None, weight_where_region_visible=visible, overlap=_soft_iou(sums))
 
 
-def add_visible_weight(votes: Votes, regions: Regions) -> Votes:
+def _add_visible_weight(votes: Votes, regions: Regions) -> Votes:
     """Replaces `by_view` by the weight with which the views that show a vote's region see the Gaussian. Pure.
 
     The share that follows is the object posterior of B3-Seg: weight inside over inside and outside, over the views that
     contain the object.
     """
-    return _add_visible_weight(dataclasses.replace(votes, by_view=_by_view(votes, regions)), _views_that_show(regions))
+    return _sum_visible_weight(dataclasses.replace(votes, by_view=_by_view(votes, regions)), _views_that_show(regions))
 
 
 def _by_view(votes: Votes, regions: Regions) -> Array:
@@ -109,7 +109,7 @@ def _views_that_show(regions: Regions) -> Bool[Array, "r t"]:
 
 
 @jax.jit
-def _add_visible_weight(votes: Votes, shows: Bool[Array, "r t"]) -> Votes:
+def _sum_visible_weight(votes: Votes, shows: Bool[Array, "r t"]) -> Votes:
     """Replaces `by_view` by `shown`, with the (R, T) views that show a region; Gaussian by Gaussian."""
     by_view, regions = jnp.asarray(votes.by_view), jnp.asarray(votes.regions)
     count = regions.shape[0]
@@ -129,7 +129,7 @@ def _add_visible_weight(votes: Votes, shows: Bool[Array, "r t"]) -> Votes:
     return dataclasses.replace(votes, by_view=None, weight_where_region_visible=shown)
 
 
-def with_overlap(votes: Votes) -> Votes:
+def _with_overlap(votes: Votes) -> Votes:
     """Adds `overlap` (R, R), the soft IoU of two regions' Gaussians. Pure.
 
         o_rs = sum_n min(p_nr, p_ns) / sum_n max(p_nr, p_ns)
@@ -158,7 +158,7 @@ def _overlap_sums(regions: Int[Array, "n k"], share: Float[Array, "n k"], count:
 
 @jax.jit
 def _soft_iou(both: Float[Array, "r r"]) -> Float[Array, "r r"]:
-    """Computes the overlap of `with_overlap` from the sums, which add up over blocks of Gaussians."""
+    """Computes the overlap of `_with_overlap` from the sums, which add up over blocks of Gaussians."""
     size = jnp.diagonal(both)
     both = jnp.where(jnp.eye(len(both), dtype=bool), both, both + both.T)
     either = size[:, None] + size - both

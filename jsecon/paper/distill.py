@@ -151,11 +151,28 @@ def distill_l1(
       ValueError: Shapes disagree, or labels are no integers; outside a trace also for a NaN and labels of R and more.
     """
     require_labels(labels, len(region_codes))
-    start = _start(gaussians, cameras, labels, region_codes, steps=steps, key=key, init=init)
+    views, shape, dtype = labels.shape[0], (gaussians.count, region_codes.shape[1]), region_codes.dtype
+    expected = (*cameras.world_to_camera.shape[:-2], cameras.height, cameras.width)
+    require_shape("labels", labels, expected, "Pass the labels and the cameras of the same views at the same size.")
+    sizes = f"{views} views, {steps} steps, {len(region_codes)} regions"
+    some = min(views, steps, len(region_codes)) > 0
+    require(some, "distill_l1", sizes, "at least one of each", "Give what is to be distilled.")
+    order_key, init_key = jax.random.split(key)
+    if isinstance(init, str):
+        require_one_of("init", init, ("zero", "random"), "Where you have votes, start from distill_votes(...).")
+        features = jnp.zeros(shape, dtype)
+        if init == "random":
+            features = 0.01 * normalize(jax.random.normal(init_key, shape, dtype))
+    else:
+        require_shape("init", init, shape, "Give one row per Gaussian, of the regions' code size.")
+        features = jnp.asarray(init, dtype)
+    rounds = jax.random.split(order_key, -(-steps // views))
+    order = jax.vmap(lambda k: jax.random.permutation(k, views))(rounds).reshape(-1)[:steps].astype(jnp.int32)
+    state = _State(features, _optimizer().init(features), order, jnp.zeros(steps, dtype), jnp.zeros((), jnp.int32))
     # Regions in multiples of 256, the last without a code: scenes share their compiled programs.
     table = jnp.pad(jnp.asarray(region_codes), ((0, -len(region_codes) % 256), (0, 0)))
     stretch = steps if progress is None else max(1, -(-steps // 100))
-    state, plans = start, prepare_views(gaussians, cameras, capacity=capacity)
+    plans = prepare_views(gaussians, cameras, capacity=capacity)
     if plans is None and capacity is None and not is_traced((gaussians, cameras)):
         capacity = plan_capacity(gaussians, cameras, margin=1.0)
     for begin in range(0, steps, stretch):
@@ -172,40 +189,8 @@ def distill_l1(
     codes = normalize(state.features)
     if isinstance(init, str) and init == "random":
         # What never moved was never seen: a random code would be a wrong answer, a zero code is "unknown".
-        codes = jnp.where(jnp.any(state.features != start.features, axis=1, keepdims=True), codes, 0.0)
+        codes = jnp.where(jnp.any(state.features != features, axis=1, keepdims=True), codes, 0.0)
     return Distillation(codes, state.history)
-
-
-def _start(
-    gaussians: Gaussians,
-    cameras: Camera,
-    labels: Shaped[Array, "t h w"],
-    region_codes: Float[Array, "r d"],
-    *,
-    steps: int,
-    key: Key,
-    init: str | Float[Array, "n d"],
-) -> _State:
-    """Makes the state before the first step, and checks the shapes."""
-    views, count, size = labels.shape[0], gaussians.count, region_codes.shape[1]
-    expected = (*cameras.world_to_camera.shape[:-2], cameras.height, cameras.width)
-    require_shape("labels", labels, expected, "Pass the labels and the cameras of the same views at the same size.")
-    sizes = f"{views} views, {steps} steps, {len(region_codes)} regions"
-    some = min(views, steps, len(region_codes)) > 0
-    require(some, "distill_l1", sizes, "at least one of each", "Give what is to be distilled.")
-    order_key, init_key = jax.random.split(key)
-    dtype = region_codes.dtype
-    if isinstance(init, str):
-        require_one_of("init", init, ("zero", "random"), "Where you have votes, start from distill_votes(...).")
-        features = jnp.zeros((count, size), dtype)
-        if init == "random":
-            features = 0.01 * normalize(jax.random.normal(init_key, (count, size), dtype))
-    else:
-        require_shape("init", init, (count, size), "Give one row per Gaussian, of the regions' code size.")
-        features = jnp.asarray(init, dtype)
-    rounds = jax.random.split(order_key, -(-steps // views))
-    order = jax.vmap(lambda k: jax.random.permutation(k, views))(rounds).reshape(-1)[:steps].astype(jnp.int32)
-    return _State(features, _optimizer().init(features), order, jnp.zeros(steps, dtype), jnp.zeros((), jnp.int32))
 
 
 def rendered_l1(

@@ -1,4 +1,4 @@
-"""Queries on codes: one-step, canonical, and the paper's GT-anchored one. Pure functions.
+"""Queries on codes: one-step, canonical, and the second step of the paper's GT-anchored one. Pure functions.
 
 With l_i the code of Gaussian i, l_r that of region r, tau the embedding of a text and E the encoder:
 
@@ -8,7 +8,7 @@ With l_i the code of Gaussian i, l_r that of region r, tau the embedding of a te
 
 One-step compares a Gaussian with the text itself, across the gap between texts and images, so no threshold suits all
 texts. The anchored query crosses the gap once, among R regions, where only the order matters; codes distilled from one
-region lie close together, so any high threshold does.
+region lie close together, so any high threshold does. Its first step is `query/answer.match_regions`.
 """
 
 from typing import Any
@@ -95,28 +95,6 @@ def relevancies(
     # The softmax of two is a sigmoid of their difference, and it is smallest against the closest phrase.
     share = jax.nn.sigmoid(TEMPERATURE * (positive - jnp.max(negative, axis=0)))
     return jnp.where(known, share, 0.0), known
-
-
-@jax.jit
-def query_gt_anchored(
-    codes: Float[Array, "n d"],
-    region_codes: Float[Array, "r d"],
-    region_embeddings: Float[Array, "r e"],
-    text: Float[Array, " e"],
-    threshold: Number = CODE_THRESHOLD,
-) -> Selection:
-    """Selects the Gaussians whose code is close to that of the region most similar to the text: both steps.
-
-    `region` is -1 and the mask is empty without regions, or for a broken text.
-    """
-    if len(region_codes) == 0:
-        none = jnp.zeros(len(codes), codes.dtype)
-        return Selection(none > 0, none, jnp.asarray(-1, jnp.int32), jnp.zeros((), codes.dtype))
-    similarity, known = similarities(region_embeddings, text)
-    best = jnp.argmax(jnp.where(known, similarity, -jnp.inf))
-    region = jnp.where(jnp.any(known), best, -1).astype(jnp.int32)
-    near = _select_near_region(codes, region_codes, region, threshold)
-    return Selection(near.mask, near.similarity, region, jnp.where(region >= 0, similarity[best], 0.0))
 
 
 def select_by_code(field: LanguageField, match: tuple, threshold: Number = CODE_THRESHOLD) -> Selection:
