@@ -22,7 +22,7 @@ from experiments.datasets.depth_points import confirmed_depths
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import accuracy_at, iou, mean_iou
 from jsecon.field.evidence import region_votes
-from jsecon.field.membership import add_visible_weight
+from jsecon.field.membership import normalise_votes
 from jsecon.fit.depth import points_from_depth
 from jsecon.fit.quality import measure_quality
 from jsecon.fit.start import gaussians_from_points
@@ -136,9 +136,7 @@ def build_field(gaussians: Gaussians, capture: Capture, labels: np.ndarray) -> L
     count = len(OBJECTS) + 1
     pixels = np.stack([(labels[used] == r).sum((1, 2)) for r in range(count)]).astype(np.int32)
     regions = Regions(jnp.eye(count), jnp.asarray(pixels))
-    votes = add_visible_weight(
-        region_votes(gaussians, cameras, jnp.asarray(labels[used]), count, by_view=True), regions
-    )
+    votes = normalise_votes(region_votes(gaussians, cameras, jnp.asarray(labels[used]), count, by_view=True), regions)
     return LanguageField(
         gaussians=gaussians,
         votes=votes,
