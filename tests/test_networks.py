@@ -223,7 +223,7 @@ def test_texts_need_the_model_of_embeddings_from_files(seen, models, tmp_path, c
     assert cli.main([*ask, "--embedder", str(models[1]), "--min-rank", "0"]) == 0
     assert 0 < json.loads((tmp_path / "answers" / "red.json").read_text())["score"] < 1
     with pytest.raises(InputError, match="5, as those from files have"):
-        model_loading.open_embedder("given-5", folder=models[1])
+        model_loading._open_embedder("given-5", folder=models[1])
 
 
 def test_two_sources_of_masks_are_refused(room, models, tmp_path):

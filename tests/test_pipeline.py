@@ -261,7 +261,7 @@ def test_peak_memory_is_in_mebibytes():
 
 def test_embedders_of_other_versions_are_refused():
     with pytest.raises(InputError, match="Run the capture again"):
-        model_loading.open_embedder("colours-of-the-future")
+        model_loading._open_embedder("colours-of-the-future")
 
 
 class Killed(Exception):

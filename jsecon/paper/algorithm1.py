@@ -24,8 +24,8 @@ class MaskletState:
     """State of `masklets` between two frames, to resume from."""
 
     done: int  # number of frames whose proposals were tracked
-    proposals: dict[str, np.ndarray]  # of every frame: `rows` (T,) masks, and `counts`, `starts`, `stops` of their runs
-    layers: dict[str, np.ndarray]  # the tracked masks of every frame, in the same layout
+    proposals: list[RunLengthMasks]  # the proposed masks of each frame
+    layers: list[RunLengthMasks]  # the tracked masks of each frame
 
 
 def masklets(
@@ -74,11 +74,10 @@ def masklets(
     count, height, width = frames.shape[:3]
     proposals, layers = _Layers(count, height, width), _Layers(count, height, width)
     if state is not None:
-        done, known = state.done, len(state.layers["rows"])
+        done, known = state.done, len(state.layers)
         fits, remedy = known == count and 0 <= done <= count, "Pass the state of this sequence, or no state."
         require(fits, "state", f"{done} of {known} frames", f"a state of {count} frames", remedy)
-        proposals.restore(state.proposals)
-        layers.restore(state.layers)
+        proposals.runs, layers.runs = list(state.proposals), list(state.layers)
     for t in range(0 if state is None else state.done, count):
         masks = np.asarray(segment(frames[t], t), bool)
         require_shape("segment", masks, ("M", height, width), "A segmenter returns masks of the size of the frame.")
@@ -91,7 +90,7 @@ def masklets(
             for other, image in enumerate(labels):
                 layers.add_labels(other, image, len(prompts))
         if on_checkpoint is not None:
-            on_checkpoint(lambda done=t + 1: MaskletState(done, proposals.record(), layers.record()))
+            on_checkpoint(lambda done=t + 1: MaskletState(done, list(proposals.runs), list(layers.runs)))
         if progress is not None:
             progress(t + 1, count)
     if not count or not layers.size(0):
@@ -170,39 +169,25 @@ class _Layers:
     def __init__(self, count: int, height: int, width: int):
         self.count, self.shape = count, (height, width)
         empty = np.zeros(0, np.int32)
-        self._runs = [RunLengthMasks(empty, empty, empty, height * width) for _ in range(count)]
+        self.runs = [RunLengthMasks(empty, empty, empty, height * width) for _ in range(count)]
 
     def size(self, t: int) -> int:
-        return len(self._runs[t].counts)
+        return len(self.runs[t].counts)
 
     def at(self, t: int) -> Sparse:
         """(R, H W) ones at frame t."""
-        return self._runs[t].rows()
+        return self.runs[t].rows()
 
     def add_masks(self, t: int, masks: np.ndarray) -> None:
         """Appends masks (M, H, W) bool to frame t."""
-        self._runs[t] = self._runs[t].concatenate(encode_masks(masks))
+        self.runs[t] = self.runs[t].concatenate(encode_masks(masks))
 
     def add_labels(self, t: int, labels: np.ndarray, number: int) -> None:
         """Appends `number` masks to frame t: the pixels (H, W) labelled 0, 1, ..."""
         pixels = np.flatnonzero((labels >= 0) & (labels < number))
         ones = np.ones(len(pixels), np.float32)
         rows = sparse.csr_matrix((ones, (labels.reshape(-1)[pixels], pixels)), shape=(number, labels.size))
-        self._runs[t] = self._runs[t].concatenate(encode_rows(rows))
-
-    def record(self) -> dict[str, np.ndarray]:
-        """All masks as plain arrays (see MaskletState)."""
-        return {"rows": np.array([len(runs.counts) for runs in self._runs], np.int64)} | {
-            name: np.concatenate([getattr(runs, name) for runs in self._runs]) for name in ("counts", "starts", "stops")
-        }
-
-    def restore(self, record: dict[str, np.ndarray]) -> None:
-        """Restores the masks from the result of `record`."""
-        counts = np.split(record["counts"], np.cumsum(record["rows"])[:-1])
-        places = np.cumsum([part.sum() for part in counts])[:-1]
-        starts, stops = (np.split(record[name], places) for name in ("starts", "stops"))
-        pixels = self.shape[0] * self.shape[1]
-        self._runs = [RunLengthMasks(*frame, pixels) for frame in zip(starts, stops, counts)]
+        self.runs[t] = self.runs[t].concatenate(encode_rows(rows))
 
     def grouped(self, groups: np.ndarray) -> "_Layers":
         """Unites the masks of each group (R,), in the order of the groups."""
@@ -212,7 +197,7 @@ class _Layers:
         for t in range(self.count):
             united = unite @ self.at(t)
             united.sort_indices()
-            result._runs[t] = encode_rows(united)
+            result.runs[t] = encode_rows(united)
         return result
 
     def flatten(self, best_first: np.ndarray) -> np.ndarray:

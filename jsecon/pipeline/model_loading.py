@@ -101,11 +101,11 @@ def open_models(options: Options, store: Path) -> Models:
         if options.embedder is None:
             return Models(external, segmenter, tracker)
         name = external.name
-    embedder = open_embedder(name, folder=options.embedder, precision=precision, store=store / "embeddings")
+    embedder = _open_embedder(name, folder=options.embedder, precision=precision, store=store / "embeddings")
     return Models(embedder, segmenter, tracker)
 
 
-def open_embedder(
+def _open_embedder(
     name: str | None = None,
     *,
     folder: str | Path | None = None,
@@ -163,7 +163,7 @@ def field_embedder(field: LanguageField, folder: str | Path | None = None) -> Em
             raise InputError("field", problem, "", f"Fetch it with: {model.get_command}.")
         if model is not None:
             return _of_space(model, field.embedder, "")
-    return open_embedder(field.embedder, folder=folder)
+    return _open_embedder(field.embedder, folder=folder)
 
 
 def _find_model(field: LanguageField) -> "ClipEmbedder | HubModel | None":

@@ -64,15 +64,8 @@ def _plan_labels(context: RunContext) -> Stage:
         how += f", in at most {options.vision_frames} frames"
     tracker = None if models.tracker is None else models.tracker.name
     key_options |= {"association": options.associated_by, "tracker": tracker}
-    return Stage(
-        "objects",
-        how,
-        _find_objects,
-        after=("load", "gaussians"),
-        key_options=key_options,
-        files=(options.proposals,),
-        distributed=consensus,
-    )
+    after, files = ("load", "gaussians"), (options.proposals,)
+    return Stage("objects", how, _find_objects, after, key_options, files, distributed=consensus)
 
 
 def _plan_regions(context: RunContext) -> Stage:

@@ -73,16 +73,17 @@ def _plan_load(context: RunContext, capture: Path) -> Stage:
 
 def _plan_rendered_views(context: RunContext) -> Stage:
     """Plans the stage "load" of a scene without photographs."""
-    options, files = context.options, (context.options.capture, context.options.cameras)
+    options = context.options
+    files = (options.capture, options.cameras)
     skipped = {"photographs": "the scene comes without any", "held_out": "no photograph to compare with"}
     if options.cameras is None:
         how = f"{options.views} virtual views, planned from the Gaussians of {options.capture.name}"
-        key_options, render = context.key_options("views", "up", "long_side"), _render_planned_views
+        key_options = context.key_options("views", "up", "long_side")
     else:
         how = f"the scene rendered from the poses of {options.cameras.name}"
-        key_options, render = context.key_options("long_side"), _render_given_poses
+        key_options = context.key_options("long_side")
         skipped["planned views"] = f"the poses are given ({options.cameras.name})"
-    return Stage("load", how, render, key_options=key_options, files=files, skipped=skipped)
+    return Stage("load", how, _render_views, key_options=key_options, files=files, skipped=skipped)
 
 
 def plan_scene(context: RunContext) -> list[Stage]:
@@ -223,37 +224,27 @@ def _measure_held_out(stage: StageInput) -> StageResult:
     return StageResult(measure_quality(scene, capture, progress=stage.progress), notes=notes)
 
 
-def _render_planned_views(stage: StageInput) -> StageResult:
-    """Plans virtual views of a scene without photographs, and renders them."""
-    options = stage.context.options
+def _render_views(stage: StageInput) -> StageResult:
+    """Renders a scene without photographs from planned views, or from the poses of a file."""
+    options, notes = stage.context.options, ()
     source, _ = read_scene(options.capture)
     source_from_scene = _world_of_scene(source)
     scene = _into_world(source, source_from_scene)
-    planned = place_cameras(
-        scene,
-        views=options.views,
-        width=options.long_side,
-        height=options.long_side * 3 // 4,
-        up=None if options.up is None else np.array(options.up, np.float64),
-        progress=stage.progress,
-    )
-    names = tuple(f"view_{index:03d}" for index in range(len(planned.cameras)))
-    capture = render_capture(scene, planned.cameras, names, source_from_scene, notes=(f"{planned}.",))
-    return StageResult(capture, notes=capture.notes)
-
-
-def _render_given_poses(stage: StageInput) -> StageResult:
-    """Renders a scene without photographs from the poses of a file."""
-    options = stage.context.options
-    assert options.cameras is not None
-    source, _ = read_scene(options.capture)
-    source_from_scene = _world_of_scene(source)
-    cameras, names = _load_poses(options.cameras, options.long_side)
-    poses = transform_poses(np.asarray(cameras.world_to_camera), np.linalg.inv(source_from_scene)).astype(np.float32)
-    cameras = dataclasses.replace(cameras, world_to_camera=poses)
-    scene = _into_world(source, source_from_scene)
-    check_overlap(scene, cameras, str(options.cameras))
-    return StageResult(render_capture(scene, cameras, names, source_from_scene))
+    if options.cameras is None:
+        planned = place_cameras(
+            scene,
+            views=options.views,
+            width=options.long_side,
+            height=options.long_side * 3 // 4,
+            up=None if options.up is None else np.array(options.up, np.float64),
+            progress=stage.progress,
+        )
+        cameras, notes = planned.cameras, (f"{planned}.",)
+        names = tuple(f"view_{index:03d}" for index in range(len(cameras)))
+    else:
+        cameras, names = _load_poses(options.cameras, options.long_side, source_from_scene)
+        check_overlap(scene, cameras, str(options.cameras))
+    return StageResult(render_capture(scene, cameras, names, source_from_scene, notes=notes), notes=notes)
 
 
 def _world_of_scene(gaussians: Gaussians) -> np.ndarray:
@@ -277,8 +268,8 @@ def _into_world(gaussians: Gaussians, source_from_scene: np.ndarray) -> Gaussian
     return dataclasses.replace(moved, means=np.asarray(moved.means, np.float32))
 
 
-def _load_poses(path: Path, long_side: int) -> tuple[Camera, tuple[str, ...]]:
-    """Returns T cameras to render from, poses in float64 in the world of their file, and their names.
+def _load_poses(path: Path, long_side: int, source_from_scene: np.ndarray) -> tuple[Camera, tuple[str, ...]]:
+    """Returns T cameras to render from, and their names.
 
     `path` is a capture, whose images need not be there, such as the folder of a COLMAP model or a transforms.json. All
     cameras get the size of the first lens, shrunk to `long_side`, each with its field of view and without distortion.
@@ -290,13 +281,10 @@ def _load_poses(path: Path, long_side: int) -> tuple[Camera, tuple[str, ...]]:
         raise InputError(path, problem, "at least one pose, each with w and h", "Estimate the poses again.")
     width, height = FrameOptions(long_side=long_side).size((lenses[0].width, lenses[0].height))
     sized = [lens.resized(width, height) for lens in lenses]
-
-    def column(name):
-        return np.array([getattr(lens, name) for lens in sized], np.float32)
-
+    intrinsics = np.array([[lens.fx, lens.fy, lens.cx, lens.cy] for lens in sized], np.float32)
     poses = np.stack([make_rigid(image.world_to_camera, path, image.name) for image in images])
-    cameras = Camera(poses, column("fx"), column("fy"), column("cx"), column("cy"), width, height)
-    return cameras, frame_names([image.name for image in images], path)
+    poses = transform_poses(poses, np.linalg.inv(source_from_scene)).astype(np.float32)
+    return Camera(poses, *intrinsics.T, width, height), frame_names([image.name for image in images], path)
 
 
 def _read_bare_scene(stage: StageInput) -> StageResult:
