@@ -44,10 +44,6 @@ _DTYPES = {"BOOL": np.dtype(bool)} | {
 _CODES = {dtype: code for code, dtype in _DTYPES.items()}
 
 
-class ForeignFileError(ValueError):
-    """Raised for a safetensors file that `write_arrays` did not write."""
-
-
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
     """Opens a temporary path beside a file, which gets the file's name at the end, or is removed if the body raised."""
@@ -212,7 +208,8 @@ def read_arrays(
         layout = parse_json(file.read(length))
         metadata = layout.pop("__metadata__", {})
         if "jsecon" not in metadata:
-            raise ForeignFileError("it is a safetensors file of another program")
+            problem, remedy = "it is a safetensors file of another program", "Give a file that jsecon wrote."
+            raise InputError(path, problem, "a file of jsecon", remedy)
         if metadata.get("crc32") != str(zlib.crc32(metadata["jsecon"].encode())):
             raise ValueError("its description does not match its checksum")
         contents = parse_json(metadata["jsecon"])

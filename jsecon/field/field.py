@@ -20,7 +20,6 @@ from jsecon.errors import InputError, describe_error, require
 from jsecon.field.columns import ROWS
 from jsecon.files import (
     READ_ERRORS,
-    ForeignFileError,
     atomic_write,
     pack_tree,
     parse_json,
@@ -146,8 +145,6 @@ def _read(path: Path, mapped: int, checked: bool) -> LanguageField:
         field = jax.tree.map(_on_device, field)
     except InputError:
         raise
-    except ForeignFileError as error:
-        raise InputError(path, str(error), "a field file", _REMEDY) from error
     except READ_ERRORS as error:
         problem = f"the field file is damaged ({describe_error(error)})"
         raise InputError(path, problem, "a whole one", changed) from error
