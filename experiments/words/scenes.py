@@ -141,7 +141,11 @@ def _default_masks(capture: Capture, gaussians: Gaussians) -> np.ndarray:
     """labels (T, H, W) of the views that vote, by the vision without weights as `jsecon run` has it."""
     work, loaded = RunContext(RunOptions(Path()), Models(ColourEmbedder()), Path()), Results(load=capture)
     loaded.gaussians = _on_device(gaussians)
-    return plan_objects(work)[0].compute(StageInput(work, loaded, lambda done, total: None, Checkpoint(Path()))).value
+    return (
+        plan_objects(work)[0]
+        .compute(StageInput(work, loaded, lambda done, total: None, Checkpoint(Path("objects"))))
+        .value
+    )
 
 
 def _on_device(tree):

@@ -85,10 +85,10 @@ class RunContext:
 
 
 class Checkpoint:
-    """State of a stage in progress on disk, so that it resumes there after a stop."""
+    """State of a stage in progress, on disk beside the file of its result, so that it resumes there after a stop."""
 
-    def __init__(self, path: Path):
-        self._path = path
+    def __init__(self, result: Path):
+        self._path = result.with_suffix(".checkpoint.safetensors")
         self._last = time.monotonic()
 
     @property

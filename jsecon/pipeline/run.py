@@ -45,27 +45,15 @@ from jsecon.vision.classical import require_contrib
 
 
 @dataclasses.dataclass(frozen=True)
-class _Plan:
-    """Which of the stages would run: their keys and cache files, by name."""
-
-    keys: dict[str, str]
-    paths: dict[str, Path]
-    stale: list[str]
-    """Stages whose result is stored and whose output folder is another run's."""
-    steps: list[Step]
-
-    @property
-    def running(self) -> list[str]:
-        """Stages that would run."""
-        return [step.name for step in self.steps if step.status == "run"]
-
-
-@dataclasses.dataclass(frozen=True)
-class _Computed:
-    """Output of stages."""
+class _RunState:
+    """The plan of stages, and what is computed of it."""
 
     keys: dict[str, str]
     """Key of each stage."""
+    paths: dict[str, Path]
+    """Cache file of each stage."""
+    stale: list[str]
+    """Stages whose result is stored and whose output folder is another run's."""
     steps: list[Step]
     """Stages, and what was skipped."""
     results: Results = dataclasses.field(default_factory=Results)
@@ -75,6 +63,11 @@ class _Computed:
     """What the user should know, a sentence each."""
     sent: set[str] = dataclasses.field(default_factory=set)
     """Results that the other processes have."""
+
+    @property
+    def running(self) -> list[str]:
+        """Stages that would run."""
+        return [step.name for step in self.steps if step.status == "run"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,7 +92,7 @@ class Run:
     """Number of programs that jax compiled ("all"), and of those that it read "from_disk"."""
 
 
-def _plan(context: RunContext, stage_list: list[Stage]) -> _Plan:
+def _plan(context: RunContext, stage_list: list[Stage]) -> _RunState:
     """Plans stages: which of them the cache holds. Writes no file; raises InputError for invalid options."""
     _require_inputs(context.options)
     _require_own_folder(context.options, context.out)
@@ -112,7 +105,7 @@ def _plan(context: RunContext, stage_list: list[Stage]) -> _Plan:
     cached = {name for name, path in paths.items() if path.exists() and name not in stale}
     steps = [Step(stage.name, "cached" if stage.name in cached else "run", stage.how) for stage in stage_list]
     steps += [Step(part, "skipped", why) for stage in stage_list for part, why in stage.skipped.items()]
-    return _Plan(keys, paths, stale, steps)
+    return _RunState(keys, paths, stale, steps)
 
 
 def _require_inputs(options: Options) -> None:
@@ -163,45 +156,40 @@ def _owns_output(stage: Stage, stage_list: list[Stage], paths: dict[str, Path]) 
     if stage.output_dir is None:
         return True
     file = stage.output_dir / KEY_FILE
-    if file.is_file() and file.read_text() == _checkpoint_file(paths[stage.name]).stem:
+    if file.is_file() and file.read_text() == Checkpoint(paths[stage.name]).folder.name:
         return True
     return all(paths[other.name].exists() for other in stage_list if stage.name in other.after)
 
 
-def _checkpoint_file(path: Path) -> Path:
-    """The file of the checkpoint that a stage writes while it computes the result at `path`."""
-    return path.with_suffix(".checkpoint.safetensors")
-
-
-def compute_stages(context: RunContext, stage_list: list[Stage], console: Console | None = None) -> _Computed:
+def compute_stages(context: RunContext, stage_list: list[Stage], console: Console | None = None) -> _RunState:
     """Plans stages, reports the plan, then computes each or reads it from the cache."""
     console = console or Console()
     with console.progress("plan"):
-        plan = _plan(context, stage_list)
+        state = _plan(context, stage_list)
         require_writable(context.out)
     with exclusive_lock(context.out):
         cache.prepare(context.out / "cache")
-        for name in plan.stale:
-            plan.paths[name].unlink(missing_ok=True)
+        for name in state.stale:
+            state.paths[name].unlink(missing_ok=True)
         console.print_line(f"{context.options.capture} -> {context.out}")
-        for step in plan.steps:
+        for step in state.steps:
             console.step(step)
-        context.models.require_ready(plan.running)
-        computed = _Computed(plan.keys, plan.steps)
+        context.models.require_ready(state.running)
         for stage in stage_list:
-            _compute_stage(context, stage, plan.paths[stage.name], computed, console)
-        _broadcast(None, computed)
-    return computed
+            _compute_stage(context, stage, state, console)
+        _broadcast(None, state)
+    return state
 
 
-def _compute_stage(context: RunContext, stage: Stage, path: Path, computed: _Computed, console: Console) -> None:
-    """Computes one stage or reads it from the cache, and adds it to `computed`."""
-    checkpoint = Checkpoint(_checkpoint_file(path))
+def _compute_stage(context: RunContext, stage: Stage, state: _RunState, console: Console) -> None:
+    """Computes one stage or reads it from the cache, and adds it to the state."""
+    path = state.paths[stage.name]
+    checkpoint = Checkpoint(path)
 
     def compute(progress: Any) -> StageResult:
-        _broadcast(stage, computed)
-        result = stage.compute(StageInput(context, computed.results, progress, checkpoint))
-        if stage.key(computed.keys, context.out) != computed.keys[stage.name]:  # then it does not describe the result
+        _broadcast(stage, state)
+        result = stage.compute(StageInput(context, state.results, progress, checkpoint))
+        if stage.key(state.keys, context.out) != state.keys[stage.name]:  # then it does not describe the result
             where = next(filter(None, stage.files)) if len(stage.files) == 1 else context.options.capture
             problem = f"files that changed while stage {stage.name} read them"
             remedy = "Run the same command again when no program writes there; finished stages are kept."
@@ -217,27 +205,27 @@ def _compute_stage(context: RunContext, stage: Stage, path: Path, computed: _Com
                 remedy = "Take smaller frames (--long-side), or fewer (--frames). Finished stages are kept."
                 raise InputError(f"stage {stage.name}", problem, "more memory", remedy) from error
             raise
-    setattr(computed.results, stage.name, result.value)
-    computed.seconds[stage.name] = seconds
+    setattr(state.results, stage.name, result.value)
+    state.seconds[stage.name] = seconds
     checkpoint.remove()
     console.done(stage.name, seconds, fresh)
     for part, why in result.skipped.items():
-        computed.steps.append(Step(part, "skipped", why))
-        console.step(computed.steps[-1])
+        state.steps.append(Step(part, "skipped", why))
+        console.step(state.steps[-1])
     for note in result.notes:
-        computed.notes.append(note)
+        state.notes.append(note)
         console.note(note)
 
 
-def _broadcast(stage: Stage | None, computed: _Computed) -> None:
+def _broadcast(stage: Stage | None, state: _RunState) -> None:
     """Lets all processes compute a stage that is distributed, or ends the work of the others if there is no stage."""
     if jax.process_count() == 1:
         return
     if stage is None:
         allgather_tree({"stage": ""})
     elif stage.distributed:
-        new = {name: getattr(computed.results, name) for name in stage.after if name not in computed.sent}
-        computed.sent.update(new)
+        new = {name: getattr(state.results, name) for name in stage.after if name not in state.sent}
+        state.sent.update(new)
         allgather_tree({"stage": stage.name, "results": new})
 
 
@@ -258,18 +246,18 @@ def run(options: Options, out: Path, *, console: Console | None = None) -> Run:
     """
     console, before = console or Console(), compilation_counts()
     context = _open_context(options, out)
-    computed = compute_stages(context, stages.run_stages(context), console)
-    results, seconds, embedder = computed.results, computed.seconds, context.models.embedder
+    state = compute_stages(context, stages.run_stages(context), console)
+    results, seconds, embedder = state.results, state.seconds, context.models.embedder
     started = time.monotonic()
     with console.progress("field"):
-        origin = provenance(context.options, computed.keys, embedder.name, out)
+        origin = provenance(context.options, state.keys, embedder.name, out)
         field = lifting.join_field(results, embedder, origin, context.options)
         save_field(out / FIELD_FILE, field)
     seconds["field"] = time.monotonic() - started
     console.done("field", seconds["field"], True)
     programs = {name: count - before[name] for name, count in compilation_counts().items()}
     made = results.load, results.objects, results.held_out
-    return Run(field, context.options, *made, computed.steps, seconds, computed.notes, programs)
+    return Run(field, context.options, *made, state.steps, seconds, state.notes, programs)
 
 
 def _open_context(options: Options, out: Path) -> RunContext:
@@ -306,7 +294,7 @@ def dry_run(options: Options, out: Path, *, scene_only: bool = False, console: C
     return {"stages": plan.steps}
 
 
-def _check_inputs(context: RunContext, plan: _Plan) -> None:
+def _check_inputs(context: RunContext, plan: _RunState) -> None:
     """Raises InputError for inputs that a run would refuse, as its stages check them before their long work.
 
     Those of stages that would run are checked, by headers and a few files; masks only if the frames have poses.
