@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from jsecon.errors import InputError
-from jsecon.field.columns import is_mapped, vote_blocks
+from jsecon.field.columns import vote_blocks
 from jsecon.field.evidence import region_votes, votes_memory
 from jsecon.field.membership import normalise_votes
 from jsecon.paper.autoencoder import encode, train_autoencoder
@@ -59,8 +59,7 @@ def _compute_codes(stage: StageInput) -> StageResult:
     key = jax.random.key(options.seed)
     autoencoder = train_autoencoder(embeddings, latent=3, key=key, progress=stage.progress)
     table = encode(autoencoder, embeddings)
-    blocks = vote_blocks(cast) if is_mapped(cast) else [cast]
-    codes = np.concatenate([np.asarray(distill_votes(block, table)) for block in blocks])
+    codes = np.concatenate([np.asarray(distill_votes(block, table)) for block in vote_blocks(cast)])
     return StageResult(Codes(codes, table, autoencoder))
 
 
