@@ -47,8 +47,9 @@ def _accumulate_votes(stage: StageInput) -> StageResult:
         notes = (f"votes are kept on disk: {sizes}",)
     accumulated = region_votes(scene, cameras, labels, count, folder=folder if on_disk else None, **settings)
     unseen = int((np.asarray(accumulated.views) == 0).sum())
-    skipped = {"unseen Gaussians": f"{unseen} of {scene.count}, which no frame sees"} if unseen else {}
-    return StageResult(accumulated, skipped, notes)
+    if unseen:
+        notes = (*notes, f"no frame sees {unseen} of {scene.count} Gaussians, which answer no query")
+    return StageResult(accumulated, notes)
 
 
 def _compute_codes(stage: StageInput) -> StageResult:

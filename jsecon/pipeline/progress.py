@@ -41,7 +41,7 @@ class Console:
                 print(text, file=self._out, flush=True)
 
     def step(self, step: Step) -> None:
-        """Prints a step: first all that are planned, later also parts that only the data could settle."""
+        """Prints a step that is planned."""
         self.print_line(f"  {step.name:<16} {step.status:<9} {step.why}".rstrip())
 
     def done(self, name: str, seconds: float, fresh: bool) -> None:

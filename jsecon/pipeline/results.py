@@ -62,8 +62,6 @@ class StageResult:
 
     value: Any
     """The result, a tree of arrays and records."""
-    skipped: dict[str, str] = dataclasses.field(default_factory=dict)
-    """Parts that were not needed, each with the reason."""
     notes: tuple[str, ...] = ()
     """What the user should know, a sentence each."""
 

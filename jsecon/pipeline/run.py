@@ -209,9 +209,6 @@ def _compute_stage(context: RunContext, stage: Stage, state: _RunState, console:
     state.seconds[stage.name] = seconds
     checkpoint.remove()
     console.done(stage.name, seconds, fresh)
-    for part, why in result.skipped.items():
-        state.steps.append(Step(part, "skipped", why))
-        console.step(state.steps[-1])
     for note in result.notes:
         state.notes.append(note)
         console.note(note)

@@ -128,7 +128,7 @@ def _estimate_poses(stage: StageInput) -> StageResult:
     shutil.rmtree(out, ignore_errors=True)
     shutil.move(posed, out)
     write_text(out / KEY_FILE, folder.name)
-    return StageResult(None, notes=(*notes, f"The poses are in {out}: COLMAP opens them."))
+    return StageResult(None, (*notes, f"The poses are in {out}: COLMAP opens them."))
 
 
 def _refinement(options: Options, capture: Path) -> str:
