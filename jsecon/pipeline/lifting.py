@@ -48,7 +48,7 @@ def _accumulate_votes(stage: StageInput) -> StageResult:
     accumulated = region_votes(scene, cameras, labels, count, folder=folder if on_disk else None, **settings)
     unseen = int((np.asarray(accumulated.views) == 0).sum())
     if unseen:
-        notes = (*notes, f"no frame sees {unseen} of {scene.count} Gaussians, which answer no query")
+        notes = (*notes, f"no frame sees {unseen} of {scene.count} Gaussians")
     return StageResult(accumulated, notes)
 
 
