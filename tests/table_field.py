@@ -3,11 +3,14 @@
 World: z up; the cameras look along y, x is to the right.
 """
 
+import dataclasses
+
 import numpy as np
 from conftest import gaussians_at
+from small_field import lone_votes
 
 from experiments.rooms.capture import look_at
-from jsecon.types import Camera, LanguageField, Regions, Votes
+from jsecon.types import Camera, LanguageField, Regions
 from jsecon.vision.colours import ColourEmbedder
 
 THINGS = (
@@ -26,33 +29,17 @@ def table_field(things=THINGS, *, source_from_scene=None, directions=((0.0, -2.0
     draw = np.random.default_rng(3)
     embedder = ColourEmbedder()
     points = [np.array(center) + np.array(half) * draw.uniform(-1, 1, (120, 3)) for _, center, half in things]
-    count = 120 * len(things)
-    means = np.concatenate(points).astype(np.float32)
-    gaussians = gaussians_at(means, 2e-3)
-    member = np.repeat(np.arange(len(things), dtype=np.int32), 120)[:, None]
-    ones = np.ones(count, np.float32)
-    views = np.full(count, len(directions), np.int32)
-    overlap = np.eye(len(things), dtype=np.float32)
-    weights = np.ones((count, 1), np.float32)
-    votes = Votes(
-        member,
-        weights,
-        ones,
-        ones,
-        ones,
-        views,
-        np.int32(0),
-        len(things),
-        weight_where_region_visible=weights,
-        overlap=overlap,
-    )
+    gaussians = gaussians_at(np.concatenate(points).astype(np.float32), 2e-3)
+    votes = lone_votes(np.repeat(np.arange(len(things)), 120), len(things))
+    overlap, views = np.eye(len(things), dtype=np.float32), np.full(gaussians.count, len(directions), np.int32)
+    shown = {"weight_where_region_visible": votes.weights, "overlap": overlap, "views": views}
     embeddings = np.asarray(embedder.embed_text([name for name, _, _ in things]), np.float32)
     pixels = np.full((len(things), len(directions)), 900, np.int32)
     poses = np.stack([look_at(np.array(eye), np.zeros(3)) for eye in directions])
     flat = np.full(len(directions), 50.0, np.float32)
     field = LanguageField(
         gaussians=gaussians,
-        votes=votes,
+        votes=dataclasses.replace(votes, **shown),
         regions=Regions(embeddings, pixels),
         cameras=Camera(poses, flat, flat, flat, flat * 0.8, 100, 80),
         canonical_phrases=np.asarray(embedder.canonical_phrases, np.float32),

@@ -27,9 +27,8 @@ def made_field(count, *, regions=REGIONS, seed=0):
     labelled = weights.sum(1)
     views, peak = np.full(count, 3, np.int32), np.full(count, 0.5, np.float32)
     shown = np.where(ids >= 0, weights * rng.uniform(1, 3, weights.shape), 0).astype(np.float32)
-    votes = Votes(
-        ids, weights, labelled, labelled + 1, peak, views, np.int32(0), regions, weight_where_region_visible=shown
-    )
+    columns = ids, weights, labelled, labelled + 1, peak, views, np.int32(0), regions
+    votes = Votes(*columns, weight_where_region_visible=shown)
     known = Regions(unit_rows(rng, regions, SIZE), rng.integers(1, 900, (regions, 2)).astype(np.int32))
     return field_of(votes, known, canonical_phrases=unit_rows(rng, 4, SIZE))
 
@@ -96,97 +95,42 @@ def test_gradient_equals_central_differences(x64):
     assert slope == pytest.approx(float(total(texts + step) - total(texts - step)) / 2, rel=1e-5)
 
 
-def test_what_is_not_known_has_no_class():
-    field, texts = made_field(8), unit_rows(np.random.default_rng(1), 3, SIZE)
-    expected, _ = query_classes(field, texts, every=True)
+def test_what_is_not_known_has_no_class_and_is_nobodys():
+    """A view that nobody has, votes that are not finite, a region and texts without a direction; no regions."""
+    field, texts = made_field(60), unit_rows(np.random.default_rng(1), 3, SIZE)
+    lost = np.array(field.regions.embeddings)
+    lost[4] = 0
     regions, weights, views = (np.array(a) for a in (field.votes.regions, field.votes.weights, field.votes.views))
     views[0] = 0
     regions[1], weights[2, 0], weights[3, 0] = -1, np.nan, np.inf
+    known = Regions(lost, field.regions.pixel_counts)
     votes = dataclasses.replace(field.votes, regions=regions, weights=weights, views=views)
-    labels, found = query_classes(dataclasses.replace(field, votes=votes), texts, every=True)
+    ask = {"rules": QueryRules(retrieval="cosine", min_score=-1.0), "every": True}
+    labels, found = query_classes(dataclasses.replace(field, regions=known, votes=votes), texts, **ask)
     np.testing.assert_array_equal(labels[:4], -1)
     np.testing.assert_array_equal(found[:4], 0)
-    np.testing.assert_array_equal(labels[4:], expected[4:])
-
-
-def test_regions_and_texts_without_a_direction_are_nobodys():
-    field, texts = made_field(60), unit_rows(np.random.default_rng(1), 3, SIZE)
-    lost = np.array(field.regions.embeddings)
-    lost[2] = 0
-    known = Regions(lost, field.regions.pixel_counts)
-    ask = {"rules": QueryRules(retrieval="cosine", min_score=-1.0)}
-    labels, found = query_classes(dataclasses.replace(field, regions=known), texts, **ask)
-    ids, weights, shown = (
-        np.array(a) for a in (field.votes.regions, field.votes.weights, field.votes.weight_where_region_visible)
-    )
-    ids[ids == 2] = -1
-    without = dataclasses.replace(
-        field.votes, regions=ids, weights=np.where(ids >= 0, weights, 0), weight_where_region_visible=shown
-    )
+    ids = np.where(field.votes.regions == 4, -1, field.votes.regions)
+    without = dataclasses.replace(field.votes, regions=ids, weights=np.where(ids >= 0, field.votes.weights, 0))
     expected, same = query_classes(dataclasses.replace(field, votes=without), texts, **ask)
-    np.testing.assert_array_equal(labels, expected)
-    np.testing.assert_allclose(found, same, atol=1e-6)
-    assert 0.5 < (np.asarray(labels) >= 0).mean() < 1
+    np.testing.assert_array_equal(labels[4:], expected[4:])
+    np.testing.assert_allclose(found[4:], same[4:], atol=1e-6)
     opposite = np.concatenate([-lost.sum(0, keepdims=True), np.zeros((1, SIZE), np.float32)]).astype(np.float32)
     labels, _ = query_classes(field, opposite, rules=QueryRules(retrieval="cosine"), every=True)
     assert not np.asarray(labels).any()  # the worst of texts is nearer than none
-    labels, _ = query_classes(field, opposite[1:])
-    assert (np.asarray(labels) == -1).all()
-    empty = dataclasses.replace(made_field(5), regions=Regions(lost[:0], field.regions.pixel_counts[:0]))
-    labels, found = query_classes(empty, texts)
-    assert (np.asarray(labels) == -1).all()
-    assert found.shape == (5, 3)
-
-
-def test_a_region_that_is_none_of_the_classes_speaks_where_no_other_does():
-    field = made_field(3, regions=3)
-    known = Regions(np.eye(3, SIZE, dtype=np.float32), field.regions.pixel_counts)
-    ids = np.int32([[2, 0, -1], [2, -1, -1], [1, 2, -1]])
-    weights = np.float32([[8, 4, 0], [8, 0, 0], [8, 1, 0]])
-    seen = {
-        "weight_where_region_visible": np.float32([[8, 8, 0]] * 3),
-        "labelled": weights.sum(1),
-        "total": weights.sum(1),
-    }
-    votes = dataclasses.replace(field.votes, regions=ids, weights=weights, **seen)
-    field = dataclasses.replace(field, regions=known, votes=votes)
-    texts = np.float32(np.stack([known.embeddings[0], known.embeddings[1] + 0.05 * known.embeddings[2]]))
-    rules = QueryRules(retrieval="cosine")
-    labels, found = query_classes(field, texts, rules=rules, every=True)
-    np.testing.assert_array_equal(labels, [0, 1, 1])  # the second was seen in the region of no class alone
-    np.testing.assert_array_equal(query_classes(field, texts, rules=rules)[0], [0, -1, 1])
-    np.testing.assert_allclose(found[0], [1, 0], atol=1e-6)
-    without = dataclasses.replace(field, votes=dataclasses.replace(votes, weight_where_region_visible=None))
-    np.testing.assert_array_equal(query_classes(without, texts, rules=rules, every=True)[0], [0, 1, 1])
-
-
-def test_a_probability_refuses_classes_as_it_refuses_texts():
-    field, texts, rows = made_field(600), unit_rows(np.random.default_rng(1), 5, SIZE), np.arange(REGIONS)
-    known = field.regions
-    cosines = np.asarray(known.embeddings, np.float64) @ texts.T
-    best = cosines.argmax(1)
-    own = np.sort(cosines[rows, best])  # a region is of its best class, or of none
-    logits = Logits(40.0, float(np.log(0.01 / 0.99) - 40 * (own[2] + own[3]) / 2))
-    there = 1 / (1 + np.exp(-40 * cosines[rows, best] - logits.bias)) >= 0.01
-    assert there.sum() == 3
-    ids, weights, shown = (np.asarray(a) for a in (field.votes.regions, field.votes.weights, seen_of(field.votes)))
-    part = np.zeros((600, 5))
-    for q in range(5):
-        inside = (ids >= 0) & np.isin(ids, rows[there & (best == q)])
-        part[:, q] = np.where(inside, weights, 0).sum(1) / np.maximum(np.where(inside, shown, 0).max(1), 1e-9)
-    labels, _ = query_classes(field, texts, rules=QueryRules(logits=logits))
-    sure = (np.abs(part - 0.5) > 1e-5).all(1)
-    np.testing.assert_array_equal((np.asarray(labels) >= 0)[sure], (part >= 0.5).any(1)[sure])
-    assert 0.1 < (np.asarray(labels) < 0).mean() < 0.9
-    assert (np.asarray(query_classes(field, texts, rules=QueryRules(logits=Logits(40.0, -1000.0)))[0]) == -1).all()
-    every, _ = query_classes(field, texts, rules=QueryRules(logits=logits, min_score=0.0))
-    np.testing.assert_array_equal(every, query_classes(field, texts, rules=QueryRules(min_score=-2.0))[0])
-
-
-def test_refuses_what_it_cannot_ask():
-    field, texts = made_field(4), unit_rows(np.random.default_rng(1), 3, SIZE)
+    assert (np.asarray(query_classes(field, opposite[1:])[0]) == -1).all()
+    empty = dataclasses.replace(field, regions=Regions(lost[:0], field.regions.pixel_counts[:0]))
+    assert (np.asarray(query_classes(empty, texts)[0]) == -1).all()
     for wrong in (texts[:, :5], texts[:0]):
         with pytest.raises(ValueError, match="query_classes"):
             query_classes(field, wrong)
-    with pytest.raises(ValueError, match="contrast"):
-        query_classes(field, texts, rules=QueryRules(retrieval="nearest"))
+
+
+def test_a_probability_refuses_regions_as_a_similarity_does():
+    field, texts = made_field(600), unit_rows(np.random.default_rng(1), 5, SIZE)
+    best = np.sort((field.regions.embeddings @ texts.T).max(1))
+    least = float(best[2] + best[3]) / 2  # three of six regions are none of the classes
+    logits = Logits(40.0, float(np.log(0.01 / 0.99) - 40 * least))
+    labels, _ = query_classes(field, texts, rules=QueryRules(logits=logits))
+    expected, _ = query_classes(field, texts, rules=QueryRules(min_score=least))
+    np.testing.assert_array_equal(labels, expected)
+    assert 0.1 < (np.asarray(labels) < 0).mean() < 0.9

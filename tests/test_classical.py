@@ -48,20 +48,13 @@ def test_each_thing_is_one_region_in_spite_of_shading_shadow_and_noise(seed):
     assert best_ious(table[None], masks)[0] > 0.9
 
 
-def test_best_first_and_no_specks():
-    frame, _ = desk()
-    segmenter = ClassicalSegmenter(max_regions=5)
-    masks = segmenter(frame, 0)
-    assert len(masks) == 5
-    assert (masks.sum((1, 2)) >= segmenter.min_area * frame[..., 0].size).all()
-    full = ClassicalSegmenter()(frame, 0)
-    np.testing.assert_array_equal(masks, full[:5])
-
-
 def test_the_same_frame_gives_the_same_masks_and_its_mirror_image_nearly_the_mirrored():
     frame, things = desk()
     segmenter = ClassicalSegmenter()
     assert isinstance(segmenter, Segmenter)
+    best = ClassicalSegmenter(max_regions=5)(frame, 0)
+    np.testing.assert_array_equal(best, segmenter(frame, 0)[:5])
+    assert (best.sum((1, 2)) >= segmenter.min_area * frame[..., 0].size).all()
     np.testing.assert_array_equal(segmenter(frame, 0), segmenter(frame, 7))
     mirrored = segmenter(np.ascontiguousarray(frame[:, ::-1]), 0)
     assert (best_ious(things[:, :, ::-1], mirrored) > 0.85).all()
@@ -95,10 +88,6 @@ def test_dark_and_bright_frames_are_seen_by_adapted_eyes():
         exposed = (255 * (gain * linear / (1 + (gain - 1) * linear)) ** (1 / 2.2)).round().astype(np.uint8)
         assert not low <= median(exposed) <= high
         assert low <= median(_adapt_exposure(exposed)) <= high
-        exposed[0, :40], exposed[0, 40:80] = 0, 255
-        np.testing.assert_array_equal(_adapt_exposure(exposed)[0, :80], exposed[0, :80])  # black and white stay
-    between = np.full((4, 5, 3), 140, np.uint8)  # 0.27
-    np.testing.assert_array_equal(_adapt_exposure(between), between)
 
 
 @pytest.mark.parametrize("frame", [
@@ -109,18 +98,13 @@ def test_flat_tiny_and_noisy_frames(frame):
     labels = ClassicalSegmenter().partition(frame, 0)
     assert labels.shape == frame.shape[:2]
     np.testing.assert_array_equal(np.unique(labels), np.arange(labels.max() + 1))
-    masks = ClassicalSegmenter()(frame, 0)
-    assert masks.dtype == bool
-    assert masks.shape[1:] == frame.shape[:2]
-    assert len(masks) >= (frame.std() < 1)
+    assert len(ClassicalSegmenter()(frame, 0)) >= (frame.std() < 1)
 
 
 @pytest.mark.parametrize("path", ["captures/bonsai/images/DSCF5605.JPG", "captures/fox/images/0001.jpg"])
 def test_real_photographs_come_apart_into_tens_of_regions(shared, path):
     picture = cv2.imread(str(shared / path))[..., ::-1]
-    frame = cv2.resize(
-        picture, None, fx=400 / picture.shape[1], fy=400 / picture.shape[1], interpolation=cv2.INTER_AREA
-    )
+    frame = cv2.resize(picture, (400, 400 * len(picture) // picture.shape[1]), interpolation=cv2.INTER_AREA)
     masks = ClassicalSegmenter()(frame, 0)
     assert 8 <= len(masks) <= 64
     assert masks.any(0).mean() > 0.9

@@ -61,21 +61,6 @@ def test_a_shaded_thing_is_nearest_to_its_own_name(embedder, name):
     assert similarity[order[0]] > 0.75
 
 
-@pytest.mark.parametrize("hue", ["green", "blue", "red", "purple"])
-def test_dark_and_light_of_one_hue_are_kept_apart(embedder, hue):
-    texts = embedder.embed_text([f"dark {hue} bottle", f"light {hue} bottle"])
-    regions = np.stack([of_ball(embedder, PALETTE[f"dark {hue}"]), of_ball(embedder, PALETTE[f"light {hue}"])])
-    similarity = texts @ regions.T
-    assert (np.diagonal(similarity) > similarity[[0, 1], [1, 0]] + 0.4).all()
-
-
-def test_likeness_falls_with_the_distance_of_colours(embedder):
-    likeness = embedder.embed_text(["red"]) @ embedder.embed_text(["crimson", "orange", "yellow", "blue"]).T
-    assert (np.diff(likeness[0]) < 0).all()
-    likeness = embedder.embed_text(["teal"]) @ embedder.embed_text(["turquoise", "light blue", "orange"]).T
-    assert (np.diff(likeness[0]) < 0).all()
-
-
 @pytest.mark.parametrize(("one", "other"), [
     ("gray cat", "grey cat"), ("light-blue cup", "the light blue mug"), ("GREENISH", "greenish"),
     ("lighter green", "pale green"),
@@ -87,14 +72,15 @@ def test_texts_that_say_the_same(embedder, one, other):
     np.testing.assert_allclose(*embedder.embed_text([one, other]), atol=1e-6)
 
 
-def test_ish_and_compounds_lie_between(embedder):
-    greenish, green, grey, bluish_green, blue, navy, navy_blue = embedder.embed_text(
-        ["greenish", "green", "grey", "bluish-green", "blue", "navy", "navy blue"]
-    )
-    assert greenish @ grey > green @ grey
-    assert greenish @ green > greenish @ blue
-    assert green @ blue < bluish_green @ blue < bluish_green @ green
-    assert navy_blue @ navy > navy_blue @ blue
+@pytest.mark.parametrize("order", [
+    ("red", "crimson", "orange", "yellow", "blue"), ("teal", "turquoise", "light blue", "orange"),
+    ("greenish", "green", "blue"), ("grey", "greenish", "green"), ("bluish-green", "green", "blue"),
+    ("blue", "bluish-green", "green"), ("navy blue", "navy", "blue"),
+])  # fmt: skip
+def test_likeness_falls_with_the_distance_of_colours(embedder, order):
+    """ "-ish" and compounds lie between."""
+    first, *others = embedder.embed_text(list(order))
+    assert (np.diff(np.stack(others) @ first) < 0).all()
 
 
 def test_two_colours_want_both(embedder):
@@ -125,15 +111,6 @@ def test_a_text_without_colour_is_refused_plainly(embedder, text):
         embedder.embed_text(["the cup that isn't red"])
 
 
-@pytest.mark.parametrize(("text", "narrower"), [
-    ("Green mug", ["dark green mug", "light green mug"]), ("a gray box", ["a dark grey box", "a light grey box"]),
-    ("the blue one", ["the dark blue one", "the light blue one", "the navy one"]), ("white wall", []),
-    ("dark blue mug", []), ("bright red mug", []), ("teal mug", []), ("reddish mug", []), ("red and white box", []),
-])  # fmt: skip
-def test_only_a_bare_basic_term_has_narrower_texts(embedder, text, narrower):
-    assert embedder.narrower(text) == narrower
-
-
 def test_canonical_phrases_lose_to_the_right_colour_and_win_over_wrong_ones(embedder):
     names = [name for name in BASIC if name != "grey"]
     regions = np.stack([of_ball(embedder, PALETTE[name]) for name in names])
@@ -146,14 +123,12 @@ def test_canonical_phrases_lose_to_the_right_colour_and_win_over_wrong_ones(embe
 @settings(deadline=None, max_examples=10)
 @given(st.integers(0, 2**32 - 1))
 def test_equivariance_and_exposure(seed):
-    """Rows follow the masks; mirroring the frame changes nothing; a little less light keeps a colour's vector near."""
+    """Mirroring the frame changes nothing; a little less light keeps a colour's vector near."""
     embedder = ColourEmbedder()
     rng = np.random.default_rng(seed)
     frame = cv2.resize(rng.integers(0, 256, (3, 4, 3), np.uint8), (40, 30), interpolation=cv2.INTER_NEAREST)
     masks = rng.random((4, 30, 40)) < 0.3
     rows = embedder.embed_regions(frame, masks)
-    order = rng.permutation(4)
-    np.testing.assert_array_equal(embedder.embed_regions(frame, masks[order]), rows[order])
     np.testing.assert_allclose(embedder.embed_regions(frame[:, ::-1], masks[:, :, ::-1]), rows, atol=1e-5)
     dimmer = np.round(frame * 0.95).astype(np.uint8)
     assert ((embedder.embed_regions(dimmer, masks) * rows).sum(1) > 0.8).all()

@@ -42,9 +42,7 @@ def test_what_is_unknown_is_never_selected(threshold):
 
 def test_nan_threshold_and_no_gaussians_select_nothing_and_sizes_that_disagree_are_told():
     assert not query_one_step(jnp.eye(3), jnp.ones(3), np.nan).mask.any()
-    empty = query_one_step(jnp.zeros((0, 3)), jnp.ones(3), 0.5)
-    assert empty.mask.shape == (0,)
-    assert float(empty.score) == 0
+    assert float(query_one_step(jnp.zeros((0, 3)), jnp.ones(3), 0.5).score) == 0
     with pytest.raises(ValueError, match=r"got \(4,\), expected \(3,\)"):
         query_one_step(jnp.eye(3), jnp.ones(4), 0.5)
     with pytest.raises(ValueError, match="C >= 1"):
@@ -75,12 +73,6 @@ def test_relevancy_equals_the_softmax_in_float64():
         assert (np.asarray(got.mask[row]) == (expected >= 0.5))[clear].all()
     alone = query_canonical(features, texts[1], canonical, 0.5)
     np.testing.assert_allclose(alone.similarity, got.similarity[1], atol=1e-6)
-
-
-def test_above_a_half_means_closer_than_every_phrase():
-    features = jnp.asarray([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
-    got = query_canonical(features, jnp.asarray([1.0, 0.2, 0]), jnp.asarray([[0, 1.0, 0], [0, 0, 1.0]]), 0.5)
-    assert got.mask.tolist() == [True, False, False]
 
 
 def test_unknown_features_are_never_selected_and_broken_phrases_select_nothing():

@@ -65,12 +65,6 @@ def test_reductions_equal_float64(reduce):
     np.testing.assert_allclose(jitted, got, atol=1e-6)
 
 
-def test_a_tie_of_two_regions_gives_the_first_of_them_whole():
-    codes = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
-    votes = make_votes([[2, 0, -1]], [[3.0, 3.0, 0]], 3)
-    np.testing.assert_allclose(distill_votes(votes, codes, "median"), [[0, 0, 1]], atol=1e-6)
-
-
 @pytest.mark.parametrize("reduce", ["mean", "median", "mode"])
 def test_extremes(reduce):
     codes = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 0], [np.nan, 0, 0]], np.float32)
@@ -84,20 +78,18 @@ def test_extremes(reduce):
     assert not np.isfinite(got[6]).all() or (got[6] == 0).all()  # a NaN code never passes for a code
 
 
-def test_what_is_mostly_unlabelled_is_unknown():
+def test_ties_what_is_mostly_unlabelled_no_regions_and_wrong_tables():
+    codes = np.eye(3, dtype=np.float32)
+    tied = make_votes([[2, 0, -1]], [[3.0, 3.0, 0]], 3)
+    np.testing.assert_allclose(distill_votes(tied, codes, "median"), [[0, 0, 1]], atol=1e-6)  # the first, whole
     votes = dataclasses.replace(make_votes([[0, 1]] * 3, [[2.0, 1.0]] * 3, 2), total=jnp.asarray([3.0, 6.0, 7.0]))
-    codes = jnp.eye(2)
-    np.testing.assert_array_equal(distill_votes(votes, codes), [[1, 0], [1, 0], [0, 0]])
-
-
-def test_no_regions_and_wrong_options_and_tables():
+    np.testing.assert_array_equal(distill_votes(votes, codes[:2, :2]), [[1, 0], [1, 0], [0, 0]])
     nothing = make_votes(np.zeros((7, 0)), np.zeros((7, 0)), 0)
-    np.testing.assert_array_equal(distill_votes(nothing, np.zeros((0, 3), np.float32)), np.zeros((7, 3)))
-    votes = make_votes([[0, 1]], [[1, 1]], 2)
+    np.testing.assert_array_equal(distill_votes(nothing, codes[:0]), np.zeros((7, 3)))
     with pytest.raises(ValueError, match="expected 'mean' or"):
-        distill_votes(votes, np.eye(2, dtype=np.float32), "sum")
+        distill_votes(votes, codes[:2], "sum")
     with pytest.raises(ValueError, match=r"got \(3, 3\)"):
-        distill_votes(votes, np.eye(3, dtype=np.float32))
+        distill_votes(votes, codes)
 
 
 @pytest.fixture(scope="module")
@@ -160,50 +152,14 @@ def test_the_gradient_of_the_rendered_l1_is_that_of_finite_differences(task, sca
         check_grads(jax.jit(loss), (start,), order=1, modes=["rev"], eps=1e-7 * scale, rtol=1e-4)
 
 
-def test_random_and_given_starts_learn_and_zero_is_the_trap(task):
-    scene, cameras, labels, codes, members, capacity = task
-    options, calls = {"steps": 240, "key": KEY, "capacity": capacity}, []
-    told = {"progress": lambda *count: calls.append(count)}
-    at_random, history = distill_l1(scene, cameras, labels, codes, init="random", **told, **options)
-    assert calls[-1] == (240, 240)
-    assert float(history[-20:].mean()) < 0.6 * float(history[:4].mean())
-    right = np.argmax(np.asarray(at_random) @ np.asarray(codes).T, axis=1) == members
-    from_zero, zero_history = distill_l1(scene, cameras, labels, codes, init="zero", **options)
-    seen = np.asarray(from_zero).any(axis=1)
-    # The trap: the codes stay at the corners of the cube, (+-1, +-1, +-1) / sqrt 3, whatever the target.
-    corner = np.abs(np.asarray(from_zero)[seen]) * np.sqrt(3)
-    assert np.quantile(np.abs(corner - 1), 0.9) < 0.05
-    assert right.mean() > 0.6
-    assert float(zero_history[-20:].mean()) > float(history[-20:].mean())
-    again, _ = distill_l1(scene, cameras, labels, codes, init="random", **options)
-    np.testing.assert_array_equal(again, at_random)  # in one stretch or in a hundred
-
-
 def test_unseen_gaussians_get_no_code_and_unlabelled_pixels_count_in_the_denominator_alone(task):
     scene, cameras, labels, codes, _, capacity = task
     behind = dataclasses.replace(scene, means=scene.means.at[0].set(jnp.asarray([0.0, 50.0, 0.0])))
     options = {"steps": 3, "key": KEY, "capacity": capacity}
     got, _ = distill_l1(behind, cameras, labels, codes, init="random", **options)
     assert (np.asarray(got[0]) == 0).all()
-    start = jnp.asarray(unit_rows(np.random.default_rng(0), 64, 3))
-    kept, _ = distill_l1(behind, cameras, labels, codes, init=start, **options)
-    assert np.linalg.norm(kept[0]) == pytest.approx(1, abs=1e-5)
     _, history = distill_l1(scene, cameras, jnp.full_like(labels, -1), codes, init="random", **options)
     assert (np.asarray(history) == 0).all()
-
-
-@pytest.mark.long
-def test_under_jit_too_small_a_capacity_is_data_and_outside_an_error(task):
-    """In every run test_capacity has what exceeds a capacity."""
-    scene, cameras, labels, codes, _, enough = task
-    assert enough > 64
-
-    def losses(key):
-        return distill_l1(scene, cameras, labels, codes, steps=2, key=key, init="random", capacity=64)[1]
-
-    with pytest.raises(ValueError, match="capacity=64"):
-        losses(KEY)
-    assert np.isnan(jax.jit(losses)(KEY)).all()
 
 
 def test_shapes_that_disagree_are_told(task):

@@ -1,21 +1,19 @@
-"""The schedule of a fit; and growth: halves keep what the whole was, rows stay in place, the draw follows the votes."""
+"""Growth of a fit: halves keep what the whole was, and rows stay in place; its rates, and smaller frames."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import gaussians_at
 from scipy.spatial.transform import Rotation
 
 from jsecon.fit.growth import (
     MIN_OPACITY,
     _in_use,
-    _sample_rows,
     _split_in_two,
-    drop_free_rows,
     grow,
     pad_with_free_rows,
 )
-from jsecon.fit.optimise import Schedule
 from jsecon.fit.resize import resize_frame, scale_cameras
 from jsecon.fit.step import LearningRates, _rates_at
 from jsecon.splat.capacity import round_capacity
@@ -24,13 +22,9 @@ from jsecon.types import Camera, Gaussians
 
 def scene(count=30, seed=0):
     rng = np.random.default_rng(seed)
-    return Gaussians(
-        rng.normal(size=(count, 3)).astype(np.float32),
-        rng.normal(-2, 0.5, (count, 3)).astype(np.float32),
-        rng.normal(size=(count, 4)).astype(np.float32),
-        rng.uniform(-2, 3, count).astype(np.float32),
-        rng.normal(size=(count, 4, 3)).astype(np.float32),
-    )
+    means, sizes = rng.normal(size=(count, 3)), np.exp(rng.normal(-2, 0.5, (count, 3)))
+    turns, logit = rng.normal(size=(count, 4)), rng.uniform(-2, 3, count)
+    return gaussians_at(means, sizes, turns=turns, logit=logit, sh=rng.normal(size=(count, 4, 3)))
 
 
 def covariance(gaussians):
@@ -38,47 +32,20 @@ def covariance(gaussians):
     return np.einsum("nij,nj,nkj->nik", rotation, np.exp(2 * gaussians.log_scales), rotation)
 
 
-def test_halves_have_the_mean_and_covariance_of_the_whole():
+def test_halves_have_the_mean_the_covariance_and_the_alpha_at_the_centre_of_the_whole():
     whole = scene()
     one, other = _split_in_two(whole)
     np.testing.assert_allclose((one.means + other.means) / 2, whole.means, atol=1e-6)
     offset = (one.means - whole.means)[:, :, None]
     both = covariance(one) + offset @ offset.transpose(0, 2, 1)
     np.testing.assert_allclose(both, covariance(whole), rtol=1e-4, atol=1e-6)
-
-
-def test_halves_give_the_centre_the_alpha_it_had():
-    whole = scene()
-    one, other = _split_in_two(whole)
-
-    def alpha(g):
-        return 1 / (1 + np.exp(-g.opacity_logits))
-
+    alpha_one, alpha_other, alpha = (1 / (1 + np.exp(-g.opacity_logits)) for g in (one, other, whole))
     near = np.exp(-((0.6 / 0.8) ** 2) / 2)
-    at_centre = 1 - (1 - near * alpha(one)) * (1 - near * alpha(other))
-    free = alpha(one) < alpha(whole) - 1e-6  # where it would have to be more opaque than the whole, it is as opaque
-    np.testing.assert_allclose(at_centre[free], alpha(whole)[free], rtol=1e-4)
+    at_centre = 1 - (1 - near * alpha_one) * (1 - near * alpha_other)
+    free = alpha_one < alpha - 1e-6  # where it would have to be more opaque than the whole, it is as opaque
+    np.testing.assert_allclose(at_centre[free], alpha[free], rtol=1e-4)
     assert free.sum() > 5
-    assert (alpha(one) <= alpha(whole) + 1e-6).all()
-
-
-def test_free_rows_are_not_in_use_and_go_when_compacted():
-    whole = scene()
-    longer = pad_with_free_rows(whole, 64)
-    assert longer.count == 64
-    np.testing.assert_array_equal(_in_use(longer), np.arange(64) < 30)
-    jax.tree.map(np.testing.assert_array_equal, drop_free_rows(longer), whole)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(longer))
-
-
-def test_draws_follow_the_votes_and_never_repeat():
-    votes = np.array([0.0, 1.0, 2.0, 4.0, 0.0, 8.0])
-    counts = np.zeros(6)
-    for seed in range(2000):
-        counts[_sample_rows(votes, 1, np.random.default_rng(seed))] += 1
-    np.testing.assert_allclose(counts / 2000, votes / votes.sum(), atol=0.04)
-    all_of_them = _sample_rows(votes, 100, np.random.default_rng(0))
-    assert sorted(all_of_them) == [1, 2, 3, 5]
+    assert (alpha_one <= alpha + 1e-6).all()
 
 
 @pytest.mark.parametrize("target", [36, 80, 2000])
@@ -101,29 +68,12 @@ def test_grown_scenes_have_as_many_as_wanted_and_their_moments_begin_anew(target
 def test_faint_gaussians_make_room_and_nothing_is_added_where_nothing_is_wrong():
     whole = scene()
     whole.opacity_logits[:5] = np.log(MIN_OPACITY / 2)
-    moments = jax.tree.map(np.zeros_like, whole), jax.tree.map(np.zeros_like, whole)
-    after, _ = grow(whole, moments, np.ones(30, np.float32), 30, 30, [0])
+    after, _ = grow(whole, (whole, whole), np.ones(30, np.float32), 30, 30, [0])
     assert after.count == 30
     assert _in_use(after).all()
     whole = pad_with_free_rows(scene(), 64)
-    moments = jax.tree.map(np.zeros_like, whole), jax.tree.map(np.zeros_like, whole)
-    after, _ = grow(whole, moments, np.zeros(64, np.float32), 60, 60, [0])
+    after, _ = grow(whole, (whole, whole), np.zeros(64, np.float32), 60, 60, [0])
     jax.tree.map(np.testing.assert_array_equal, after, whole)
-
-
-def test_sizes_follow_each_other_the_number_rises_evenly_and_degrees_open_one_after_another():
-    schedule = Schedule(sizes=((0.25, 0.2), (0.5, 0.5), (1.0, 1.0)), max_gaussians=280)
-    assert [schedule._size(done) for done in (0.0, 0.19, 0.2, 0.49, 0.5, 1.0)] == [0.25, 0.25, 0.5, 0.5, 1.0, 1.0]
-    assert [schedule._next_size(done) for done in (0.0, 0.2, 0.5)] == [0.5, 1.0, None]
-    assert [schedule._count(done, 100) for done in (0.04, 0.05, 0.3, 0.5, 0.51)] == [None, 100, 200, 280, None]
-    assert schedule._count(0.3, 400) is None
-    assert [schedule._degree(done) for done in (0.0, 0.09, 0.11, 0.35)] == [0, 0, 1, 3]
-
-
-@pytest.mark.parametrize("wrong", [{"sizes": ((0.5, 0.5),)}, {"sizes": ((0.0, 1.0),)}])
-def test_wrong_schedules_are_refused(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        Schedule(**wrong)
 
 
 def test_rates_decay_log_linearly_and_frozen_positions_stay():

@@ -29,9 +29,6 @@ def test_an_upright_box_is_that_of_a_brick_that_was_turned_about_the_up_axis(shi
     np.testing.assert_allclose(shapes.axes[:, :, 2], [[0, 0, 1]] * 2)
     assert np.abs(shapes.axes[:, :, 0] @ turn.apply([1, 0, 0])).min() > 0.99
     np.testing.assert_allclose(np.linalg.det(shapes.axes), 1)
-    local = (shapes.points[0] - shapes.center[0]) @ shapes.axes[0]
-    assert (np.abs(local) <= shapes.half_size[0] + 1e-6).all()
-    assert (np.ptp(local, axis=0) > 0.8 * SIZE).all()
 
 
 def test_without_an_up_axis_the_box_follows_the_points():
@@ -48,7 +45,6 @@ def test_spreads_make_boxes_larger_and_few_points_are_repeated():
     np.testing.assert_allclose(shapes.half_size[0], [0.6, 0.1, 0.1], atol=0.02)
     assert shapes.points.shape == (1, 256, 3)
     assert {tuple(point) for point in shapes.points[0]} == {(0, 0, 0), (1, 0, 0)}
-    assert len(object_shapes(points, np.full(2, -1))) == 0
     with pytest.raises(ValueError, match="no Gaussian"):
         object_shapes(points, np.array([0, 2]))
 
@@ -62,12 +58,8 @@ def test_up_is_across_the_x_axes_of_cameras_that_look_down():
         ones = np.ones(7)
         up = scene_up(Camera(pose, ones, ones, ones, ones, 4, 4)[chosen])
         assert up[2] > (0.999 if chosen == slice(None) else 0.8)
-
-
-@pytest.mark.parametrize("pose", [np.eye(4), np.diag([-1.0, -1, 1, 1])], ids=["alike", "turned round"])
-def test_cameras_whose_upper_edges_cancel_have_an_up_axis(pose):
-    poses = np.stack([pose, pose @ np.diag([1.0, -1, -1, 1])])  # the second stands on its head
-    ones = np.ones(2)
-    up = scene_up(Camera(poses, ones, ones, ones, ones, 4, 4))
-    np.testing.assert_allclose(np.linalg.norm(up), 1)
-    assert abs(up[0]) < 1e-6  # level: across the x axes
+    for first in (np.eye(4), np.diag([-1.0, -1, 1, 1])):
+        poses = np.stack([first, first @ np.diag([1.0, -1, -1, 1])])  # the second stands on its head
+        up = scene_up(Camera(poses, *(np.ones(2),) * 4, 4, 4))
+        np.testing.assert_allclose(np.linalg.norm(up), 1)
+        assert abs(up[0]) < 1e-6  # level: across the x axes

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from small_field import KnownTexts, field_of, lone_votes, unit_rows
 
-from jsecon import QueryRules, Scene, load_field, query_anchored, save_field
-from jsecon.field import field as field_file
+from jsecon import QueryRules, Scene, query_anchored
 from jsecon.query.grouping import MIN_REGION_RATIO, PART_SCORE, part_scores, parts_fallback
 from jsecon.query.outliers import best_cluster
 from jsecon.types import Parts, Regions
@@ -45,15 +44,9 @@ def test_part_scores_are_the_stated_ones_compiled_and_over_many_texts():
     assert float(np.max(many)) == pytest.approx(1)
     plain = part_scores(parts, texts[0], None, retrieval="contrast")
     np.testing.assert_allclose(plain, scores_in_numpy(parts, texts[0], np.zeros((1, 16))), atol=1e-4)
-
-
-def test_parts_that_are_all_equally_near_answer_nothing():
-    parts = Parts(np.zeros(4, np.int32), np.ones((1, 3), np.float32) / 3**0.5, np.ones(1, np.float32))
-    np.testing.assert_array_equal(
-        part_scores(parts, np.array([1, 0, 0], np.float32), None, retrieval="contrast"), np.zeros(4)
-    )
-    bare = Parts(np.zeros(5, np.int32), np.zeros((1, 2), np.float32), np.zeros(1, np.float32))
-    np.testing.assert_array_equal(part_scores(bare, np.ones(2, np.float32), None, retrieval="contrast"), np.zeros(5))
+    for same in (np.ones((1, 16), np.float32) / 4, np.zeros((1, 16), np.float32)):  # all parts are equally near
+        none = Parts(np.zeros(5, np.int32), same, np.ones(1, np.float32))
+        np.testing.assert_array_equal(part_scores(none, texts[0], None, retrieval="contrast"), np.zeros(5))
 
 
 def test_the_best_cluster_stays_and_specks_do_not_rule():
@@ -82,24 +75,14 @@ def unheld():
     part = thing.astype(np.int32)
     part[-20:] = 5
     weight = np.array([30, 30, 30, 30, 20, 10], np.float32)
-    embeddings = unit_rows_near(directions[[0, 1, 2, 3, 4, 4]], rng)
-    field = dataclasses.replace(
-        field_of_rows_of(means, thing, directions[:4]), canonical_phrases=across(directions)[:1]
-    )
-    return dataclasses.replace(field, parts=Parts(part, embeddings, weight)), directions, thing
-
-
-def unit_rows_near(rows, rng):
-    rows = rows + 0.05 * rng.normal(size=rows.shape)
-    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
-
-
-def field_of_rows_of(means, thing, embeddings):
-    """Votes give each Gaussian the region of its thing, and the fifth thing to the fourth region."""
-    regions = len(embeddings)
-    votes = lone_votes(np.minimum(thing, regions - 1), regions)
-    field = field_of(votes, Regions(embeddings, np.full((regions, 2), 500, np.int32)))
-    return dataclasses.replace(field, gaussians=dataclasses.replace(field.gaussians, means=means))
+    embeddings = directions[[0, 1, 2, 3, 4, 4]] + 0.05 * rng.normal(size=(6, 12))
+    embeddings /= np.linalg.norm(embeddings, axis=1, keepdims=True)
+    parts = Parts(part, embeddings.astype(np.float32), weight)
+    votes = lone_votes(np.minimum(thing, 3), 4)  # the fifth thing is of the fourth region
+    regions = Regions(directions[:4], np.full((4, 2), 500, np.int32))
+    field = field_of(votes, regions, parts=parts, canonical_phrases=across(directions)[:1])
+    gaussians = dataclasses.replace(field.gaussians, means=means)
+    return dataclasses.replace(field, gaussians=gaussians), directions, thing
 
 
 def across(directions):
@@ -119,45 +102,36 @@ def pooled_in_numpy(field, mask, text):
 def test_the_parts_answer_what_no_region_holds(unheld):
     field, directions, thing = unheld
     text, score = directions[4], query_anchored(field, directions[4]).score
-    found = parts_fallback(field, text, score, QueryRules())
-    selection = found
+    selection = parts_fallback(field, text, score, QueryRules())
     np.testing.assert_array_equal(selection.mask, thing == 4)
     assert int(selection.region) == -1
-    assert found.presence is None
+    assert selection.presence is None
     expected = pooled_in_numpy(field, thing == 4, text.astype(np.float64))
     assert float(selection.score) == pytest.approx(expected, abs=1e-5)
     near = np.asarray(part_scores(field.parts, text, None, retrieval="contrast"))
     on_scale = np.interp(near, [0, PART_SCORE, 1], [0, 0.5, 1])
     np.testing.assert_allclose(selection.similarity, on_scale, atol=1e-6)
     assert on_scale[thing != 4].max() < 0.5
-    assert (
-        parts_fallback(field, text, MIN_REGION_RATIO * expected + 1e-4, QueryRules()) is None
-    )  # a region that good holds it
-    assert parts_fallback(field, text, MIN_REGION_RATIO * expected - 1e-4, QueryRules()) is not None
-
-
-def test_they_are_silent_where_a_region_answers_or_nothing_does(unheld):
-    field, directions, _ = unheld
-    for text in directions[:4]:
-        assert parts_fallback(field, text, query_anchored(field, text).score, QueryRules()) is None
-    assert parts_fallback(field, across(directions)[1], 0.0, QueryRules()) is None
-    never = dataclasses.replace(field, parts=dataclasses.replace(field.parts, part=np.full(200, -1, np.int32)))
-    assert parts_fallback(never, directions[4], 0.0, QueryRules()) is None
-    with pytest.raises(ValueError, match="--parts"):
-        parts_fallback(dataclasses.replace(field, parts=None), directions[4], 0.0, QueryRules())
-
-
-def test_a_higher_threshold_takes_fewer_and_a_probability_decides_where_there_is_one(unheld):
-    field, directions, thing = unheld
-    text = directions[4]
     strict = parts_fallback(field, text, 0.0, QueryRules(min_share=0.999))
     assert 0 < np.asarray(strict.mask).sum() < (thing == 4).sum()  # the nearer of its two parts
-    likely, unlikely = Logits(20.0, -10.0), Logits(20.0, -40.0)
-    assert parts_fallback(field, text, 0.0, QueryRules(logits=likely)).presence > 0.9
-    assert parts_fallback(field, text, 0.0, QueryRules(logits=unlikely)) is None
+    likely, unlikely = (QueryRules(logits=Logits(20.0, bias)) for bias in (-10.0, -40.0))
+    assert parts_fallback(field, text, 0.0, likely).presence > 0.9
+    good, never = MIN_REGION_RATIO * expected, np.full(200, -1, np.int32)
+    assert parts_fallback(field, text, good - 1e-4, QueryRules()) is not None
+    nowhere = dataclasses.replace(field, parts=dataclasses.replace(field.parts, part=never))
+    for where, asked, least, rules in (
+        (field, text, good + 1e-4, QueryRules()),  # a region that good holds it
+        *((field, other, query_anchored(field, other).score, QueryRules()) for other in directions[:4]),
+        (field, across(directions)[1], 0.0, QueryRules()),
+        (nowhere, text, 0.0, QueryRules()),
+        (field, text, 0.0, unlikely),
+    ):
+        assert parts_fallback(where, asked, least, rules) is None
+    with pytest.raises(ValueError, match="--parts"):
+        parts_fallback(dataclasses.replace(field, parts=None), text, 0.0, QueryRules())
 
 
-def test_a_text_that_no_region_answers_is_answered_by_parts_in_memory_and_in_blocks(unheld, tmp_path, monkeypatch):
+def test_a_text_that_no_region_answers_is_answered_by_parts(unheld):
     field, directions, thing = unheld
     embedder = KnownTexts({"fifth": directions[4], "first": directions[0]})
     answer = Scene(field, embedder).ask("fifth")
@@ -168,11 +142,3 @@ def test_a_text_that_no_region_answers_is_answered_by_parts_in_memory_and_in_blo
     assert "regions" not in plain.skipped
     alone = Scene(dataclasses.replace(field, parts=None), embedder).ask("fifth")  # the region that it went to, whole
     np.testing.assert_array_equal(alone.mask, thing >= 3)
-    save_field(tmp_path / "field.safetensors", field)
-    monkeypatch.setattr(field_file, "MAPPED", 0)
-    mapped = load_field(tmp_path / "field.safetensors", mapped=True)
-    found, first = Scene(mapped, embedder).ask_all(["fifth", "first"])
-    np.testing.assert_array_equal(found.mask, thing == 4)
-    assert found.skipped == answer.skipped
-    assert float(found.selection.score) == float(answer.selection.score)
-    np.testing.assert_array_equal(first.mask, thing == 0)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from small_field import make_field, rows_of_a_kind, shares
 
-from jsecon import QueryRules, Regions, query_anchored, query_region, query_several
+from jsecon import QueryRules, Regions, query_anchored, query_region
 from jsecon.query.grouping import MIN_FRAGMENT_OVERLAP, regions_with
 
 EMBEDDINGS = np.eye(9, dtype=np.float32)
@@ -46,47 +46,20 @@ def with_other(field, overlap, **changes):
 
 
 @pytest.mark.parametrize("retrieval", ["cosine", "contrast"])
-def test_a_text_finds_a_thing_with_its_pieces_but_no_other_of_its_kind(broken, retrieval):
-    text = broken.regions.embeddings[0]
-    found = query_anchored(broken, text, rules=QueryRules(retrieval=retrieval))
-    np.testing.assert_allclose(found.similarity, shares(broken, [0, 1]), atol=1e-6)
-    np.testing.assert_array_equal(found.mask, shares(broken, [0, 1]) >= 0.5)
+@pytest.mark.parametrize(("overlaps", "options", "regions"), [
+    ("known", {}, [0, 1]), ("known", {"fragment_score": None}, [0]), ("known", {"fragment_score": 1.0}, [0]),
+    ("apart", {}, [0]), ("unknown", {}, [0]),
+    ("apart", {"all_of_class": True, "same_class_score": 0.8}, [0, 1]),
+    ("known", {"all_of_class": True, "same_class_score": 0.99}, [0, 1]),
+    ("apart", {"all_of_class": True, "same_class_score": 0.99}, [0]),
+])  # fmt: skip
+def test_a_text_finds_a_thing_with_its_pieces_but_no_other_of_its_kind(broken, retrieval, overlaps, options, regions):
+    overlap = {"known": broken.votes.overlap, "apart": np.eye(5, dtype=np.float32), "unknown": None}[overlaps]
+    field = with_other(broken, overlap)
+    found = query_anchored(field, field.regions.embeddings[0], rules=QueryRules(retrieval=retrieval, **options))
+    np.testing.assert_allclose(found.similarity, shares(field, regions), atol=1e-6)
+    np.testing.assert_array_equal(found.mask, shares(field, regions) >= 0.5)
     assert int(found.region) == 0
-    alone = query_anchored(broken, text, rules=QueryRules(retrieval=retrieval, fragment_score=None))
-    np.testing.assert_allclose(alone.similarity, shares(broken, [0]), atol=1e-6)
-    for other in (with_other(broken, np.eye(5, dtype=np.float32)), with_other(broken, None)):  # apart; not known
-        got = query_anchored(other, text, rules=QueryRules(retrieval=retrieval))
-        np.testing.assert_array_equal(got.similarity, alone.similarity)
-    none = query_anchored(broken, text, rules=QueryRules(retrieval=retrieval, min_score=2.0))
-    assert int(none.region) == -1
-    assert not np.asarray(none.mask).any()
-
-
-def test_several_regions_take_their_pieces_with_them(broken):
-    text = broken.regions.embeddings[:1]
-    apart = with_other(broken, np.eye(5, dtype=np.float32))
-    for field, options, regions in (
-        (broken, {"all_of_class": False}, [0, 1]),
-        (broken, {"all_of_class": False, "fragment_score": 1.0}, [0]),
-        (apart, {"all_of_class": False}, [0]),
-        (apart, {"same_class_score": 0.8}, [0, 1]),
-        (broken, {"same_class_score": 0.99}, [0, 1]),
-        (apart, {"same_class_score": 0.99}, [0]),
-    ):
-        found = query_several(field, text, rules=QueryRules(**{"all_of_class": True} | options))
-        np.testing.assert_allclose(found.similarity, shares(field, regions), atol=1e-6, err_msg=str(options))
-
-
-def test_a_region_takes_its_pieces_with_it_where_that_is_asked_for(broken):
-    """As a text would whose embedding is the region's own."""
-    unknown = with_other(broken, None)
-    for field, nearness, regions in (
-        (broken, None, [0]),
-        (broken, 1.0, [0]),
-        (broken, 0.5, [0, 1]),
-        (unknown, 0.5, [0]),
-    ):
-        found = query_region(field, 0, rules=QueryRules(fragment_score=nearness, duplicate_cosine=None))
-        np.testing.assert_allclose(found.similarity, shares(broken, regions), atol=1e-6)
-        assert int(found.region) == 0
-    assert int(query_region(broken, 99, rules=QueryRules(fragment_score=0.5, duplicate_cosine=None)).region) == -1
+    if "all_of_class" not in options:  # a region that stands for a text takes its pieces with it
+        found = query_region(field, 0, rules=QueryRules(duplicate_cosine=None, **options))
+        np.testing.assert_allclose(found.similarity, shares(field, regions), atol=1e-6)

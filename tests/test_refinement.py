@@ -1,10 +1,9 @@
-"""`--refine` of a run: which captures it looks at by default, what it decides, and what a dry run tells of it."""
+"""`--refine` of a run: which captures it looks at by default, what it decides, and what the plan tells of it."""
 
 import dataclasses
 import json
 
 import cv2
-import jax
 import numpy as np
 import pytest
 from capture_files import transforms, write_images
@@ -14,8 +13,8 @@ from test_corrections import (
     rough,
     truth as truth,
 )
+from test_fit import same
 
-from jsecon.app import cli
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import RunContext
 from jsecon.pipeline.run import compute_stages
@@ -46,41 +45,23 @@ def load(folder, out, **options):
     return done.results.load, " ".join(done.notes), done.steps[0].status
 
 
-def alike(a, b):
-    a, b = (dataclasses.replace(c, notes=()) for c in (a, b))
-    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
-
-
-@pytest.fixture
-def _small(monkeypatch, truth):
-    """Frames of one size, and a start of the probes that few views can correct."""
+@pytest.mark.long
+@pytest.mark.parametrize(("exact", "says"), [(False, "are corrected"), (True, "stay as they are")])
+def test_by_default_a_rough_capture_with_depth_is_corrected_once(capture, truth, tmp_path, monkeypatch, exact, says):
+    """With frames of one size, and a start of the probes that few views can correct."""
     monkeypatch.setattr(refine, "FINE_SIZE", 1.0)
     monkeypatch.setattr(refine, "MIN_ASIDE", 1)
     monkeypatch.setattr(refine, "starting_gaussians", lambda capture, **_: (truth, ""))
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("_small")
-def test_by_default_a_rough_capture_with_depth_is_corrected_once(capture, tmp_path):
-    told = write(rough(capture, **errors()), tmp_path / "rough")
+    told = write(capture if exact else rough(capture, **errors()), tmp_path / "told")
     as_it_is, _, _ = load(told, tmp_path / "none", refine="never")
-    better, notes, status = load(told, tmp_path / "out")
-    assert status == "run"
-    assert "are corrected" in notes
-    assert not alike(better, as_it_is)
-    again, notes, status = load(told, tmp_path / "out")
-    assert status == "cached"
-    assert "are corrected" in notes
-    assert alike(again, better)
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("_small")
-def test_by_default_an_exact_capture_stays_as_its_files_say(capture, tmp_path):
-    exact = write(capture, tmp_path / "exact")
-    kept, notes, _ = load(exact, tmp_path / "out")
-    assert "stay as they are" in notes
-    assert alike(kept, load(exact, tmp_path / "none", refine="never")[0])
+    found = []
+    for status in ("run", "cached"):
+        better, notes, how = load(told, tmp_path / "out")
+        assert how == status
+        assert says in notes
+        found.append(dataclasses.replace(better, notes=as_it_is.notes))
+    assert same(*found)
+    assert same(found[0], as_it_is) == exact
 
 
 def test_without_depth_or_with_gaussians_nothing_is_tried(capture, tmp_path):
@@ -96,18 +77,6 @@ def test_without_depth_or_with_gaussians_nothing_is_tried(capture, tmp_path):
         assert one.how == other.how
         assert one.key_options == other.key_options
     assert how(deep).key_options != how(deep, steps=300).key_options
-    _, notes, _ = load(plain, tmp_path / "none")
-    assert "stay as they are" not in notes
-
-
-def test_a_dry_run_lists_the_refinement(capture, tmp_path, capsys):
-    folder = write(capture, tmp_path / "deep")
-
-    def load_stage(*options):
-        line = ["fit", str(folder), "--out", str(tmp_path / "out.ply"), *options, "--dry-run", "--json"]
-        assert cli.main(line) == 0
-        return next(stage for stage in json.loads(capsys.readouterr().out)["stages"] if stage["name"] == "load")
-
-    assert "corrected by short fits in about half" in load_stage()["why"]
-    assert load_stage("--refine", "always")["why"].endswith("corrected by short fits")
-    assert "corrected" not in load_stage("--refine", "never")["why"]
+    assert "corrected by short fits in about half" in how(deep).how
+    assert how(deep, refine="always").how.endswith("corrected by short fits")
+    assert "corrected" not in how(deep, refine="never").how

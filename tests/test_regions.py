@@ -39,8 +39,6 @@ def sequence(seed, count=5, frames=4):
 def test_equals_the_definition(seed):
     frames, labels = sequence(seed)
     regions = region_embeddings(frames, labels, embed, num_regions=7)
-    assert regions.embeddings.shape == (7, 4)
-    assert regions.embeddings.dtype == np.float32
     np.testing.assert_allclose(regions.embeddings, slow(frames, labels, 7), atol=1e-6)
     np.testing.assert_array_equal(regions.pixel_counts, [[(image == r).sum() for image in labels] for r in range(7)])
 
@@ -67,27 +65,18 @@ def test_given_embeddings_equal_the_definition(seed):
         embeddings_of_masks(labels, masks[:2], rows)
 
 
-def test_a_large_view_outweighs_a_small_one():
-    frames = np.zeros((2, 8, 8, 3), np.uint8)
-    frames[0, ..., 0] = 200
-    frames[1, ..., 2] = 200
-    labels = np.full((2, 8, 8), -1, np.int16)
-    labels[0] = 0
-    labels[1, 0, :2] = 0
-    by_pixels = region_embeddings(frames, labels, embed).embeddings[0]
-    assert by_pixels[0] > 10 * by_pixels[2]
-
-
-def test_invariant_to_the_order_of_frames_and_equivariant_to_renaming():
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int64])
+def test_invariant_to_the_order_of_frames_and_to_the_type_of_labels_and_equivariant_to_renaming(dtype):
     frames, labels = sequence(3)
-    told = []
+    labels, told = np.maximum(labels, 0), []
     plain = region_embeddings(frames, labels, embed, progress=lambda done, total: told.append((done, total)))
     assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
-    turned = region_embeddings(frames[::-1], labels[::-1], embed)
+    turned = region_embeddings(frames[::-1], labels[::-1].astype(dtype), embed)
     np.testing.assert_allclose(turned.embeddings, plain.embeddings, atol=1e-6)
-    name = np.append(np.random.default_rng(0).permutation(5), -1).astype(np.int16)
-    renamed = region_embeddings(frames, name[labels], embed)
-    np.testing.assert_allclose(renamed.embeddings[name[:5]], plain.embeddings, atol=1e-6)
+    np.testing.assert_array_equal(turned.pixel_counts[:, ::-1], plain.pixel_counts)
+    name = np.random.default_rng(0).permutation(5)
+    renamed = region_embeddings(frames, name[labels].astype(np.int16), embed)
+    np.testing.assert_allclose(renamed.embeddings[name], plain.embeddings, atol=1e-6)
 
 
 def test_what_is_never_seen_is_zero_and_counts_nowhere():
@@ -95,27 +84,11 @@ def test_what_is_never_seen_is_zero_and_counts_nowhere():
     labels[labels == 2] = -1
     regions = region_embeddings(frames, labels, embed)
     assert not regions.embeddings[2].any()
-    assert not regions.pixel_counts[2].any()
     nothing = region_embeddings(frames, np.full_like(labels, -1), embed, num_regions=3)
-    assert nothing.embeddings.shape == (3, 4)
-    assert not nothing.embeddings.any()
+    np.testing.assert_array_equal(nothing.embeddings, np.zeros((3, 4)))
     assert region_embeddings(frames, np.full_like(labels, -1), embed).embeddings.shape == (0, 4)
-
-
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int64])
-def test_labels_of_any_integer_type_and_no_frames(dtype):
-    frames, labels = sequence(2)
-    labels = np.maximum(labels, 0)
-    found, same = (region_embeddings(frames, images, embed) for images in (labels.astype(dtype), labels))
-    np.testing.assert_array_equal(found.embeddings, same.embeddings)
-    np.testing.assert_array_equal(found.pixel_counts, same.pixel_counts)
-    for count, options in ((0, {}), (3, {"num_regions": 3})):
-        none = region_embeddings(frames[:0], labels[:0].astype(dtype), embed, **options)
-        assert (none.embeddings.shape, none.pixel_counts.shape) == ((count, 0), (count, 0))
-
-
-def test_bad_options_are_refused():
-    frames, labels = sequence(0)
+    none = region_embeddings(frames[:0], labels[:0], embed)
+    assert (none.embeddings.shape, none.pixel_counts.shape) == ((0, 0), (0, 0))
     with pytest.raises(ValueError, match="num_regions"):
         region_embeddings(frames, labels, embed, num_regions=2)
     with pytest.raises(ValueError, match="labels"):

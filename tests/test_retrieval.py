@@ -1,19 +1,16 @@
 """Which region matches a text: similarities against NumPy in float64, evidence, and refusal."""
 
 import dataclasses
-import json
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.test_util import check_grads
-from small_field import KnownTexts, field_of, lone_votes, make_field, unit_rows
+from small_field import KnownTexts, make_field, unit_rows
 
-from jsecon import Regions, load_field, query_anchored, query_classes, query_several, save_field
-from jsecon.app import cli
+from jsecon import Regions, Scene, load_field, query_anchored, query_classes, query_region, query_several, save_field
 from jsecon.field.similarity import similarities
-from jsecon.pipeline import model_loading
 from jsecon.query.rules import MIN_COSINE, MIN_RANK, QueryRules
 from jsecon.query.scores import region_similarities, view_count_weight, word_similarities
 
@@ -37,19 +34,12 @@ def rows():
     return unit_rows(rng, 7, SIZE), unit_rows(rng, 1, SIZE)[0], unit_rows(rng, 5, SIZE)
 
 
-def test_equals_the_formula(rows):
+def test_equals_the_formula_and_rows_without_a_direction_are_unknown(rows):
     embeddings, text, words = rows
-    got, known = region_similarities(*rows, "contrast")
-    np.testing.assert_allclose(got, exact(*rows), atol=1e-6)
-    assert np.asarray(known).all()
     plain = similarities(jnp.asarray(embeddings), jnp.asarray(text))[0]
     np.testing.assert_array_equal(region_similarities(*rows, "cosine")[0], plain)
     np.testing.assert_array_equal(region_similarities(embeddings, text, None, "contrast")[0], plain)
     np.testing.assert_allclose(word_similarities(embeddings, words, "cosine"), words @ embeddings.T, atol=1e-6)
-
-
-def test_rows_without_a_direction_are_unknown(rows):
-    embeddings, text, words = rows
     more = np.concatenate([embeddings, np.zeros((1, SIZE), np.float32), np.full((1, SIZE), np.nan, np.float32)])
     got, known = region_similarities(more, text, words, "contrast")
     np.testing.assert_array_equal(known, [True] * 7 + [False] * 2)
@@ -86,12 +76,6 @@ def test_a_query_finds_its_region_by_the_one_or_the_other(worded):
             assert float(got.score) == pytest.approx(score[best], abs=1e-5)
         differ += ranked["cosine"].argmax() != ranked["contrast"].argmax()
     assert differ
-    bare, text = dataclasses.replace(field, unrelated_words=None), texts[0]
-    against = -embeddings.sum(0)
-    low = query_anchored(bare, against, rules=QueryRules(min_score=-1.0)).region
-    high = query_anchored(bare, against).region
-    assert int(low) >= 0 > int(high)  # without words and threshold it is MIN_COSINE
-    assert (embeddings @ unit(against)).max() < MIN_COSINE
     with pytest.raises(ValueError, match="contrast"):
         QueryRules(retrieval="nearest")
 
@@ -102,38 +86,7 @@ def test_evidence_is_of_views_and_counts_against_the_best_known_region():
     expected = looks / (looks + 2) / (3 / 5)
     np.testing.assert_allclose(view_count_weight(jnp.asarray(pixels)), expected, rtol=1e-6)
     np.testing.assert_array_equal(view_count_weight(jnp.zeros((3, 4), jnp.int32)), 1)
-    np.testing.assert_array_equal(
-        view_count_weight(jnp.asarray([[7], [7]])), 1
-    )  # one view: nothing to tell them apart by
-
-
-def test_a_thing_that_fills_a_third_of_all_views_is_found_before_slivers_of_its_colour():
-    """Kitchen fronts in light and shade, their embedding mixed; slivers that are purer; a wall and a floor."""
-    rng = np.random.default_rng(2)
-    red, dark, wall, floor = unit_rows(rng, 4, 64)
-    fronts = unit(red + 0.5 * dark + 0.3 * wall)
-    slivers = [unit(red + 0.12 * row) for row in unit_rows(rng, 3, 64)]
-    embeddings = np.stack([fronts, wall, floor, *slivers]).astype(np.float32)
-    views = 20
-    pixels = np.zeros((6, views), np.int32)
-    pixels[:3] = np.array([40_000, 50_000, 30_000])[:, None]
-    for row, count in zip(pixels[3:], (2, 3, 4), strict=True):
-        row[:count] = 700
-    text = red.astype(np.float32)
-    words = unit_rows(rng, 40, 64)
-    plain, _ = region_similarities(embeddings, text, words, "contrast")
-    assert int(jnp.argmax(plain)) > 2  # by the similarity alone a sliver wins
-    field = field_of(lone_votes(np.arange(6), 6), Regions(embeddings, pixels))
-    field = dataclasses.replace(field, unrelated_words=words)
-    one = query_anchored(field, jnp.asarray(text))
-    assert int(one.region) == 0
-    assert np.asarray(one.mask)[0]
-    everything = np.asarray(
-        query_several(field, jnp.asarray(text[None]), rules=QueryRules(all_of_class=True, min_score=0.2)).mask
-    )
-    assert everything[0]
-    assert everything[3:].any()
-    assert not everything[1:3].any()
+    np.testing.assert_array_equal(view_count_weight(jnp.asarray([[7], [7]])), 1)  # one view: no difference
 
 
 def exact_quantile(embeddings, text, words):
@@ -195,18 +148,10 @@ def test_unrelated_words_that_tell_nothing_refuse_nothing_and_no_words_fall_back
     nan = query_anchored(field, np.full(SIZE, np.nan, np.float32))
     assert int(nan.region) == -1
     assert np.isnan(float(nan.rank))
-    known = field.unrelated_words[7]
-    assert float(query_anchored(field, known).rank) == pytest.approx(
-        exact_quantile(field.regions.embeddings, known, field.unrelated_words), abs=1e-6
-    )
-    one = dataclasses.replace(
-        field_of(lone_votes(np.zeros(4), 1), Regions(field.unrelated_words[:1] * 0.5, np.full((1, 1), 900))),
-        canonical_phrases=np.zeros((0, SIZE), np.float32),
-        unrelated_words=field.unrelated_words,
-    )
-    assert float(query_anchored(one, field.unrelated_words[0]).rank) == 1  # nothing is nearer to it than itself
-    none = dataclasses.replace(one, regions=Regions(np.zeros((0, SIZE), np.float32), np.zeros((0, 1), np.int32)))
-    assert int(query_anchored(none, texts[0]).region) == -1
+    none = dataclasses.replace(field, regions=Regions(np.zeros((0, SIZE), np.float32), np.zeros((0, 1), np.int32)))
+    for nothing in (query_anchored(none, texts[0]), query_region(none, 0)):
+        assert not nothing.mask.any()
+        assert int(nothing.region) == -1
 
 
 def test_a_list_of_classes_is_compared_in_deviations_of_each_text(worded):
@@ -231,39 +176,23 @@ def test_a_list_of_classes_is_compared_in_deviations_of_each_text(worded):
     assert (np.asarray(nothing[0]) == -1).all()
 
 
-def test_the_command_line_says_the_quantile_and_what_an_old_field_lacks(worded, tmp_path, monkeypatch, capsys):
+def test_an_answer_has_its_rank_and_confidence_and_that_of_an_old_field_has_none(worded, tmp_path):
     field, texts = worded
-    shares = [exact_quantile(field.regions.embeddings, text, field.unrelated_words) for text in texts]
-    rows = {"seen": texts[int(np.argmax(shares))], "unseen": texts[int(np.argmin(shares))]}
-    words = KnownTexts(rows, canonical_phrases=field.canonical_phrases)
-    monkeypatch.setattr(model_loading, "field_embedder", lambda *a, **k: words)
+    ranks = [exact_quantile(field.regions.embeddings, text, field.unrelated_words) for text in texts]
+    rows = {"seen": texts[int(np.argmax(ranks))], "unseen": texts[int(np.argmin(ranks))]}
 
-    def asked(name, *options):
-        line = ["query", str(tmp_path / name), "seen", "unseen", "--views", "0", "--out", str(tmp_path), *options]
-        assert cli.main(line) == 0
-        told = [json.loads((tmp_path / f"{text}.json").read_text()) for text in ("seen", "unseen")]
-        return told, capsys.readouterr().out
+    def answers(words):
+        save_field(tmp_path / "field.safetensors", dataclasses.replace(field, unrelated_words=words))
+        scene = Scene(load_field(tmp_path / "field.safetensors"), KnownTexts(rows))
+        return [scene.ask(text).as_dict() for text in rows]
 
-    save_field(
-        tmp_path / "new.safetensors",
-        dataclasses.replace(field, unrelated_words=field.unrelated_words.astype(np.float16)),
-    )
-    assert np.asarray(load_field(tmp_path / "new.safetensors").unrelated_words).dtype == np.float16
-    (seen, unseen), out = asked("new.safetensors")
-    assert seen["rank"] == pytest.approx(max(shares), abs=0.02)  # of words in float16
-    assert unseen["rank"] == pytest.approx(min(shares), abs=0.02)
+    seen, unseen = answers(field.unrelated_words.astype(np.float16))
+    assert seen["rank"] == pytest.approx(max(ranks), abs=0.02)  # of words in float16
+    assert unseen["rank"] == pytest.approx(min(ranks), abs=0.02)
+    assert 0 < seen["confidence"] <= 1
     assert seen["region"] is not None
     assert unseen["region"] is None
-    assert f"more similar than {int(100 * seen['rank'])} % of unrelated words" in out
-    assert f"confidence {int(100 * seen['confidence'])} %" in out
-    assert asked("new.safetensors", "--min-rank", "0")[0][1]["region"] is not None
-    beyond = ["query", str(tmp_path / "new.safetensors"), "seen", "--out", str(tmp_path), "--min-rank", "1.5"]
-    assert cli.main(beyond) == 2
-    assert "--min-rank" in capsys.readouterr().err
-
-    save_field(tmp_path / "old.safetensors", dataclasses.replace(field, unrelated_words=None))
-    (seen, unseen), out = asked("old.safetensors")
-    assert seen["rank"] is unseen["rank"] is None
-    assert seen["confidence"] is unseen["confidence"] is None
+    for answer in answers(None):
+        assert answer["rank"] is answer["confidence"] is None
     cosine = query_anchored(dataclasses.replace(field, unrelated_words=None), rows["seen"])
-    assert seen["score"] == pytest.approx(float(cosine.score), abs=1e-5)
+    assert answers(None)[0]["score"] == pytest.approx(float(cosine.score), abs=1e-5)

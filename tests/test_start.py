@@ -9,7 +9,7 @@ from hypothesis import given, settings, strategies as st
 from experiments.datasets.depth_points import labels_of_points
 from jsecon import Camera, Capture, InputError
 from jsecon.fit.depth import points_from_depth
-from jsecon.fit.start import _neighbour_distances, gaussians_from_points, starting_gaussians
+from jsecon.fit.start import gaussians_from_points, starting_gaussians
 from jsecon.splat.sh import C0
 
 
@@ -22,49 +22,22 @@ def brute_distances(points, neighbours=3):
 
 @settings(deadline=None, max_examples=20)
 @given(st.integers(2, 40), st.integers(0, 1000))
-def test__neighbour_distances_equal_brute_force(count, seed):
-    points = np.random.default_rng(seed).standard_normal((count, 3))
+def test_gaussians_from_points_hold_the_colour_opacity_and_scale(count, seed):
+    rng = np.random.default_rng(seed)
+    points, colors = rng.standard_normal((count, 3)), rng.integers(0, 256, (count, 3)).astype(np.uint8)
     points[: count // 3] = points[0]  # duplicates
-    np.testing.assert_allclose(_neighbour_distances(points), brute_distances(points), rtol=1e-9)
-
-
-def test__neighbour_distances_of_many_points_and_of_one():
-    points = np.random.default_rng(0).standard_normal((40_000, 3))
-    found = _neighbour_distances(points)
-    assert found.shape == (40_000,)
-    some = slice(0, 3)
-    distance = np.linalg.norm(points[some, None] - points[None], axis=-1)
-    np.testing.assert_allclose(found[some], np.sqrt((np.sort(distance, axis=1)[:, 1:4] ** 2).mean(axis=1)), rtol=1e-9)
-    assert _neighbour_distances(points[:1])[0] == pytest.approx(np.sqrt(1e-7))
-
-
-def test_gaussians_from_points_hold_the_colour_opacity_and_scale():
-    rng = np.random.default_rng(0)
-    points, colors = rng.standard_normal((30, 3)), rng.integers(0, 256, (30, 3)).astype(np.uint8)
     gaussians = gaussians_from_points(points, colors, opacity=0.3, sh_degree=2)
-    assert gaussians.sh.shape == (30, 9, 3)
+    assert gaussians.sh.shape == (count, 9, 3)
     np.testing.assert_allclose(0.5 + C0 * gaussians.sh[:, 0], colors / 255, atol=1e-6)
     assert not gaussians.sh[:, 1:].any()
     np.testing.assert_allclose(1 / (1 + np.exp(-gaussians.opacity_logits)), 0.3, rtol=1e-6)
-    np.testing.assert_allclose(
-        np.exp(gaussians.log_scales), np.repeat(brute_distances(points)[:, None], 3, 1), rtol=1e-5
-    )
-    np.testing.assert_array_equal(gaussians.quaternions, np.tile([1, 0, 0, 0], (30, 1)))
+    distances = brute_distances(points)
+    np.testing.assert_allclose(np.exp(gaussians.log_scales), np.repeat(distances[:, None], 3, 1), rtol=1e-5)
+    np.testing.assert_array_equal(gaussians.quaternions, np.tile([1, 0, 0, 0], (count, 1)))
     capped = gaussians_from_points(points, colors, max_scale=0.2, scale=0.5)
-    np.testing.assert_allclose(
-        np.exp(capped.log_scales[:, 0]), np.minimum(0.5 * brute_distances(points), 0.2), rtol=1e-5
-    )
-
-
-@pytest.mark.parametrize("wrong", [
-    {"points": np.zeros((0, 3)), "colors": np.zeros((0, 3), np.uint8)},
-    {"points": np.full((1, 3), np.nan), "colors": np.zeros((1, 3), np.uint8)},
-    {"opacity": 1.0}, {"opacity": 0.0}, {"scale": 0.0}, {"sh_degree": 4},
-])  # fmt: skip
-def test_wrong_starts_are_refused(wrong):
-    options = {"points": np.eye(3), "colors": np.zeros((3, 3), np.uint8), **wrong}
-    with pytest.raises(ValueError, match="expected"):
-        gaussians_from_points(options.pop("points"), options.pop("colors"), **options)
+    np.testing.assert_allclose(np.exp(capped.log_scales[:, 0]), np.minimum(0.5 * distances, 0.2), rtol=1e-5)
+    alone = gaussians_from_points(points[:1], colors[:1])
+    np.testing.assert_allclose(np.exp(alone.log_scales), np.sqrt(1e-7), rtol=1e-5)
 
 
 def wall_capture(height=24, width=32, views=3):
@@ -103,20 +76,14 @@ def test_points_from_depth_lie_on_the_wall_and_agree_between_views():
     assert (found.colors[inside].max(axis=1) == 200).all()
 
 
-def test_points_from_depth_project_back_onto_their_pixels():
+def test_depth_points_are_at_most_so_many_and_need_depth():
     capture = wall_capture()
-    found = points_from_depth(capture, voxel=1e-4, stride=3, frames=np.array([2]))
-    assert (found.counts == 1).all()
-    frame, row, column = found.sample_pixels.T
-    assert set(frame) == {2}
-    pose = capture.cameras.world_to_camera[2]
-    seen = found.points[found.sample_points] @ pose[:3, :3].T + pose[:3, 3]
-    np.testing.assert_allclose(30 * seen[:, 0] / seen[:, 2] + 16, column + 0.5, atol=1e-3)
-    np.testing.assert_allclose(30 * seen[:, 1] / seen[:, 2] + 12, row + 0.5, atol=1e-3)
-
-
-def test_max_points_is_kept_and_nearly_reached():
-    assert 40 <= len(points_from_depth(wall_capture(), max_points=50).points) <= 50
+    assert 40 <= len(points_from_depth(capture, max_points=50).points) <= 50
+    for match, depths in (("no depth", None), ("no pixel", np.zeros_like(capture.depths))):
+        with pytest.raises(InputError, match=match):
+            points_from_depth(dataclasses.replace(capture, depths=depths), voxel=0.1)
+    with pytest.raises(ValueError, match="exactly one"):
+        points_from_depth(capture)
 
 
 def test_labels_of_points_take_the_majority():
@@ -132,23 +99,11 @@ def test_labels_of_points_take_the_majority():
         assert result[n] == expected
 
 
-def test_depth_points_need_depth():
-    capture = wall_capture()
-    with pytest.raises(InputError, match="no depth"):
-        points_from_depth(dataclasses.replace(capture, depths=None), voxel=0.1)
-    with pytest.raises(InputError, match="no pixel"):
-        points_from_depth(dataclasses.replace(capture, depths=np.zeros_like(capture.depths)), voxel=0.1)
-    with pytest.raises(ValueError, match="exactly one"):
-        points_from_depth(capture)
-
-
 def test_a_start_takes_depth_before_sparse_points_and_says_so():
     capture = wall_capture()
     points = np.random.default_rng(0).standard_normal((60, 3)).astype(np.float32)
     sparse = dataclasses.replace(capture, points=points, point_colors=np.zeros((60, 3), np.uint8))
-    gaussians, origin = starting_gaussians(sparse, sh_degree=1)
-    assert "depth frames" in origin
-    assert gaussians.sh.shape[1:] == (4, 3)
+    assert "depth frames" in starting_gaussians(sparse)[1]
     gaussians, origin = starting_gaussians(dataclasses.replace(sparse, depths=None))
     assert origin == "60 sparse points of the capture"
     np.testing.assert_array_equal(gaussians.means, points)

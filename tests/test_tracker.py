@@ -1,14 +1,9 @@
 import numpy as np
 import pytest
 from balls import HEIGHT, WIDTH, ious, ring_of_balls
-from conftest import look_at
-from mask_overlaps import iou_matrix
 
-from jsecon.association.consensus import clean_tracks
 from jsecon.association.scene import superpixels
-from jsecon.paper.algorithm1 import masklets
 from jsecon.paper.tracker import GeometricTracker
-from jsecon.types import Camera
 from jsecon.vision.protocols import Tracker
 
 
@@ -27,40 +22,17 @@ def prompts_at(truth, t):
     return truth[t][None] == np.arange(1, 4)[:, None, None]
 
 
-@pytest.mark.parametrize("start", [10, 12])
-def test_follows_each_ball_around_the_ring(world, tracker, start):
-    _, _, frames, truth, _ = world
+def test_follows_each_ball_around_the_ring(world, tracker):
+    (_, _, frames, truth, _), start = world, 10
     assert isinstance(tracker, Tracker)
     labels = tracker(frames, start, prompts_at(truth, start))
-    assert labels.shape == truth.shape
-    assert labels.dtype == np.int16
     np.testing.assert_array_equal(labels[start], truth[start] - 1)
     assert np.nanmin(ious(labels, truth, 3)) > 0.9
-
-
-def test_order_of_prompts_only_renames(world, tracker):
-    _, _, frames, truth, _ = world
-    prompts = prompts_at(truth, 12)
-    order = np.asarray([2, 0, 1])
-    plain, turned = tracker(frames, 12, prompts), tracker(frames, 12, prompts[order])
-    np.testing.assert_array_equal(np.append(order, -1)[turned], plain)
-
-
-def test_each_prompt_alone_and_no_prompt(world, tracker):
-    _, _, frames, truth, _ = world
-    for b in range(3):
-        labels = tracker(frames, 12, prompts_at(truth, 12)[b : b + 1])
-        alone = ious(np.where(labels == 0, b, -1), truth, 3)[:, b]
-        assert np.nanmin(alone) > 0.9
-    assert (tracker(frames, 1, np.zeros((0, HEIGHT, WIDTH), bool)) == -1).all()
-    assert (tracker(frames, 1, np.zeros((1, HEIGHT, WIDTH), bool)) == -1).all()
-
-
-def test_prompts_that_overlap_go_to_the_first(world, tracker):
-    _, _, frames, truth, _ = world
-    ball = truth[0] == 1
-    labels = tracker(frames, 0, np.stack([ball, ball | (truth[0] == 2)]))
-    np.testing.assert_array_equal(labels[0], np.where(ball, 0, np.where(truth[0] == 2, 1, -1)))
+    order = np.asarray([2, 0, 1])  # of the prompts: it only renames
+    turned = tracker(frames, start, prompts_at(truth, start)[order])
+    np.testing.assert_array_equal(np.append(order, -1)[turned], labels)
+    for none in (np.zeros((0, HEIGHT, WIDTH), bool), np.zeros((1, HEIGHT, WIDTH), bool)):
+        assert (tracker(frames, start, none) == -1).all()
 
 
 def test_where_a_frame_proposes_nothing_or_a_merger_the_gaussians_find_the_ball(world):
@@ -74,28 +46,6 @@ def test_where_a_frame_proposes_nothing_or_a_merger_the_gaussians_find_the_ball(
     assert np.nanmean(np.delete(scores, [13, 14], axis=0)) > 0.9  # and the track goes on behind them
 
 
-def test_a_frame_that_looks_away_stays_empty(world):
-    gaussians, cameras, frames, truth, proposals = world
-    poses = np.array(cameras.world_to_camera)
-    poses[4] = look_at((0.0, -1.0, -2.2), (0.0, -1.0, -9.0))
-    away = Camera(poses, cameras.fx, cameras.fy, cameras.cx, cameras.cy, width=WIDTH, height=HEIGHT)
-    tracker = GeometricTracker(gaussians, away, proposals, superpixels_per_frame=60)
-    labels = tracker(frames, 12, prompts_at(truth, 12))
-    assert (labels[4] == -1).all()
-    assert np.nanmin(np.delete(ious(labels, truth, 3), 4, axis=0)) > 0.85
-
-
-def test_masklets_over_the_tracker_find_the_three_balls_and_the_floor(world, tracker):
-    _, _, frames, truth, proposals = world
-    labels = masklets(frames, lambda frame, t: proposals[t], tracker)
-    settled = tracker.consistent(frames, labels)
-    np.testing.assert_array_equal(tracker.consistent(frames, settled), settled)
-    assert settled.max() == 3
-    for label in range(4):
-        best = max(iou_matrix((truth == label).reshape(1, -1), (settled == r).reshape(1, -1))[0, 0] for r in range(4))
-        assert best > 0.9
-
-
 def test_consistent_gives_a_rare_part_to_its_owner_and_keeps_the_rest(world, tracker):
     _, _, frames, truth, _ = world
     labels = truth.copy()
@@ -103,9 +53,7 @@ def test_consistent_gives_a_rare_part_to_its_owner_and_keeps_the_rest(world, tra
     settled = tracker.consistent(frames, labels)
     np.testing.assert_array_equal(settled, truth)
     np.testing.assert_array_equal(tracker.consistent(frames, truth), truth)
-    assert clean_tracks(settled).max() == 3
-    unsigned = labels.astype(np.uint8)
-    np.testing.assert_array_equal(tracker.consistent(frames, unsigned), tracker.consistent(frames, labels * 1))
+    np.testing.assert_array_equal(tracker.consistent(frames, labels.astype(np.uint8)), settled)
     nothing = np.full_like(truth, -1)
     np.testing.assert_array_equal(tracker.consistent(frames, nothing), nothing)
 

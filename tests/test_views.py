@@ -89,49 +89,10 @@ def moved(gaussians, seed, scale=None):
     return transform_gaussians(gaussians, similarity), similarity
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_the_frame_turns_scales_and_moves_with_the_scene(room, seed):
-    there, similarity = moved(room, seed)
-    size = np.cbrt(np.linalg.det(similarity[:3, :3]))
-    first, second = (scene_frame(surface_points(scene)) for scene in (room, there))
-    np.testing.assert_allclose(first.axes[2], [0, 0, 1], atol=0.01)
-    np.testing.assert_allclose(second.axes[2], similarity[:3, :3] @ first.axes[2] / size, atol=0.01)
-    np.testing.assert_allclose(second.centre, similarity[:3, :3] @ first.centre + similarity[:3, 3], atol=0.02 * size)
-    np.testing.assert_allclose(np.sort(second.half), np.sort(first.half) * size, rtol=0.03)
-    assert first.sure
-    assert second.sure
-
-
 def walls_of(length, width, height):
     """Points of a floor and four walls of a room."""
     x, y, z = np.diag([length, width, height])
     return [sheet(np.zeros(3), *sides) for sides in ((x, y), (x, z), (y, z))] + [sheet(y, x, z), sheet(x, y, z)]
-
-
-PLACES = {
-    "wall larger than the floor": (walls_of(6.0, 2.0, 4.0)[:2], 0.3),
-    "room higher than wide": (walls_of(3.0, 3.0, 5.0), 0.3),
-    "ceiling": ([*walls_of(4.0, 3.0, 2.5), sheet([0.0, 0.0, 2.5], [4.0, 0.0, 0.0], [0.0, 3.0, 0.0])], 0.3),
-    "no floor": ([sheet([-2.0, 0.0, -1.0], [6.0, 0.0, 0.0], [0.0, 0.0, 3.0])], 0.0),
-}
-"""points of planes, and the height of what lies before them"""
-
-
-@pytest.mark.parametrize("place", PLACES)
-@pytest.mark.parametrize("seed", range(2))
-def test_up_is_right_where_the_largest_plane_is_no_floor(place, seed):
-    planes, height = PLACES[place]
-    things = [ball_points([x, y, height]) for x, y in ((0.8, 0.6), (2.2, 1.2), (1.4, 1.0))]
-    if place == "no floor":  # a board on the wall, and things to both sides of it
-        board = sheet([1.0, -0.2, -0.5], [0.5, -1.0, 0.0], [0.0, 0.0, 1.5])
-        things = [board, ball_points([1.0, -0.6, 0.2]), ball_points([1.2, 0.8, -0.2])]
-    points = np.concatenate([*planes, *things])
-    turn = Rotation.random(random_state=seed).as_matrix()
-    for scale, rotation in ((1.0, np.eye(3)), (7.0, turn)):
-        frame = scene_frame(scale * points @ rotation.T + scale)
-        up = rotation.T @ frame.axes[2]
-        assert up[2] > 0.98 or (place == "no floor" and up[2] < -0.98)
-        assert not (frame.sure and place == "no floor")
 
 
 def block(draw, low, high, count=500):
@@ -139,98 +100,73 @@ def block(draw, low, high, count=500):
     return draw.uniform(low, high, (count, 3))
 
 
+def floor_things(height):
+    return [ball_points([x, y, height]) for x, y in ((0.8, 0.6), (2.2, 1.2), (1.4, 1.0))]
+
+
 def table(draw, tops):
-    """Points of a table without a floor, twelve times as large as tables are: a board, legs, and things on it."""
-    x, y, z = np.diag([18.0, 10.0, 8.0])
-    legs = [block(draw, [a, b, 0], [a + 0.6, b + 0.6, 8], 300) for a in (0.4, 17) for b in (0.4, 9)]
-    things = [block(draw, [3 + 3.5 * k, 4, 8], [5 + 3.5 * k, 6, 8 + top]) for k, top in enumerate(tops)]
-    return np.concatenate([sheet(z, x, y), sheet(z - [0.0, 0.0, 0.3], x, y), *legs, *things])
+    """A table with things of the heights `tops`, and legs."""
+    things = [block(draw, [x, 0.4, 0], [x + 0.4, 0.8, top]) for x, top in zip((0.3, 1.0, 1.7, 2.4), tops)]
+    legs = [block(draw, [x, y, -1.2], [x + 0.1, y + 0.1, 0], 150) for x in (0.1, 2.8) for y in (0.1, 1.3)]
+    return [sheet([0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 1.5, 0.0]), *things, *legs]
 
 
 def corridor(draw, tops):
-    """Points of a corridor whose walls are three times as large as its floor, and of things on the floor."""
+    """A corridor, whose walls are three times as large as its floor, and things on the floor."""
     things = [block(draw, [2 + 3 * k, 0.6, 0], [2.8 + 3 * k, 1.4, top]) for k, top in enumerate(tops)]
-    return np.concatenate([*walls_of(14.0, 2.0, 6.0), *things])
+    return [*walls_of(14.0, 2.0, 6.0), *things]
 
 
-@pytest.mark.parametrize("make", [table, corridor])
-@pytest.mark.parametrize("seed", range(3))
-def test_up_is_right_where_gravity_alone_tells(make, seed):
-    """A table has things on one side and legs on the other; a corridor's floor is the smallest of its planes."""
-    draw = np.random.default_rng(seed)
-    points = make(draw, draw.uniform(0.8, 3.0, 4))
-    turn = Rotation.random(random_state=seed).as_matrix()
-    frame = scene_frame(points @ turn.T)
-    np.testing.assert_allclose(frame.axes[2], turn[:, 2], atol=0.03)
-    assert frame.sure
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_up_is_right_in_a_room_whose_floaters_rest_on_nothing(seed):
+def room_with_floaters(draw, _):
     """As in a fitted scene: most things are pieces of walls and what a fit leaves in the air."""
-    draw = np.random.default_rng(seed)
     things = [block(draw, [0.6 + k, 1, 0], [1 + k, 1.4, 0.4]) for k in range(3)]
     corners = [draw.uniform([0.3, 0.3, 0.5], [3.5, 2.5, 1.4]) for _ in range(7)]
-    floaters = [block(draw, corner, corner + 0.1, 60) for corner in corners]
+    return [*walls_of(4.0, 3.0, 2.0), *things, *(block(draw, corner, corner + 0.1, 60) for corner in corners)]
+
+
+UPRIGHT = {
+    "wall larger than the floor": lambda *_: walls_of(6.0, 2.0, 4.0)[:2] + floor_things(0.3),
+    "room higher than wide": lambda *_: walls_of(3.0, 3.0, 5.0) + floor_things(0.3),
+    "ceiling": lambda *_: [*walls_of(4.0, 3.0, 2.5), sheet([0, 0, 2.5], [4.0, 0, 0], [0, 3.0, 0]), *floor_things(0.3)],
+    "table": table,
+    "corridor": corridor,
+    "room with floaters": room_with_floaters,
+}
+"""points of places, of a generator and heights"""
+
+
+@pytest.mark.parametrize("place", UPRIGHT)
+@pytest.mark.parametrize("seed", range(2))
+def test_up_is_right_whatever_the_largest_plane_is(place, seed):
+    draw = np.random.default_rng(seed)
+    points = np.concatenate(UPRIGHT[place](draw, draw.uniform(0.8, 3.0, 4)))
     turn = Rotation.random(random_state=seed).as_matrix()
-    frame = scene_frame(np.concatenate([*walls_of(4.0, 3.0, 2.0), *things, *floaters]) @ turn.T)
-    np.testing.assert_allclose(frame.axes[2], turn[:, 2], atol=0.03)
+    for scale, rotation in ((1.0, np.eye(3)), (7.0, turn)):
+        frame = scene_frame(scale * points @ rotation.T + scale)
+        np.testing.assert_allclose(frame.axes[2], rotation[:, 2], atol=0.03)
+        assert frame.sure or place not in ("table", "corridor")
 
 
-def test_a_wrong_up_axis_is_never_sure():
-    """A crate has six sides, and things that float have none."""
+def test_a_wrong_up_axis_is_never_sure_and_one_can_be_given(room):
+    """A crate has six sides, things that float have none, and a wall with a board has no floor."""
     draw = np.random.default_rng(0)
     crate = draw.uniform(-1, 1, (4000, 3))
     crate[np.arange(4000), np.arange(4000) % 3] = np.where(np.arange(4000) % 2 == 0, -1, 1)
     floating = np.concatenate([ball_points(centre) for centre in draw.uniform(-1, 1, (6, 3))])
-    for points in (crate, floating):
+    wall, board = sheet([-2, 0, -1], [6, 0, 0], [0, 0, 3]), sheet([1, -0.2, -0.5], [0.5, -1, 0], [0, 0, 1.5])
+    before_wall = np.concatenate([wall, board, ball_points([1.0, -0.6, 0.2]), ball_points([1.2, 0.8, -0.2])])
+    for points in (crate, floating, before_wall):
         assert not scene_frame(points).sure
-
-
-def test_the_up_axis_can_be_given(room):
-    frame = scene_frame(surface_points(room), np.array([0.0, 2.0, 0.0]))
-    np.testing.assert_allclose(frame.axes[2], [0, 1, 0])
+    np.testing.assert_allclose(scene_frame(surface_points(room), np.array([0.0, 2.0, 0.0])).axes[2], [0, 1, 0])
     with pytest.raises(jsecon.InputError, match="direction"):
         scene_frame(surface_points(room), np.zeros(3))
-
-
-def test_free_places_lie_in_the_room_away_from_its_things(room):
-    points = surface_points(room)
-    frame = scene_frame(points)
-    places = plan._free_places(points, frame)
-    assert len(places) == plan.PLACES
-    assert (np.abs(places[:, 0]) < 3).all()
-    assert (np.abs(places[:, 1]) < 2.5).all()
-    distance = np.linalg.norm(places[:, None] - np.asarray(room.means), axis=2).min(1)
-    assert (distance > 0.05 * frame.diagonal).all()
-
-
-def test_greedy_cover_gains_at_each_step_the_most_that_any_view_would():
-    rng = np.random.default_rng(0)
-    weights = rng.exponential(0.2, (12, 40)) * (rng.random((12, 40)) < 0.3)
-    importance = rng.random(40)
-    chosen, share = plan._greedy_cover(weights, importance, 5)
-    shown = weights / 0.3
-
-    def value(rows):
-        return importance @ np.log1p(shown[rows].sum(0))
-
-    picked = []
-    for view in chosen:
-        assert value([*picked, view]) == pytest.approx(
-            max(value([*picked, other]) for other in set(range(12)) - {*picked}), rel=1e-5
-        )
-        picked.append(int(view))
-    assert share == pytest.approx(importance @ np.minimum(shown[picked].sum(0), 1) / importance.sum(), rel=1e-5)
-    assert len(set(picked)) == 5
 
 
 def test_a_room_is_seen_from_inside_and_an_object_from_around(room, object_alone, around):
     inside = place_cameras(room, views=8, width=160, height=120)
     assert inside.kind == "room"
     centres = np.asarray(inside.cameras.centres)
-    assert (np.abs(centres[:, 0]) < 3).all()
-    assert (np.abs(centres[:, 1]) < 2.5).all()
+    assert (np.abs(centres[:, :2]) < [3, 2.5]).all()
     assert around.kind == "object"
     assert (np.linalg.norm(np.asarray(around.cameras.centres) - around.frame.centre, axis=1) > 1).all()
     for scene, planned in ((room, inside), (object_alone, around)):
@@ -243,20 +179,13 @@ def test_no_view_looks_through_fog():
     """Wide Gaussians beside the balls fill the views from there, as floaters do in fitted scenes."""
     fog = np.random.default_rng(0).uniform([2.0, -1.5, 0], [3.2, 1.5, 2.5], (600, 3))
     scene = scene_of([*balls(), (fog, (0.5, 0.5, 0.5), 0.3)])
-
-    def most_fog():
-        cameras = place_cameras(scene, views=16, width=80, height=60, up=np.array([0, 0, 1.0])).cameras
-        cameras, labels = cameras[np.arange(48) % 16], np.full((48, 60, 80), -1, np.int32)
-        weights = np.asarray(jsecon.region_votes(scene, cameras, labels, 1, top=1, by_view=True).by_view)
-        poses = np.asarray(cameras.world_to_camera)
-        depth = poses[:, 2, :3] @ scene.means.T + poses[:, 2, 3:]
-        wide = np.exp(scene.log_scales[:, 0]) * cameras.fx[:, None] > 0.1 * 80 * depth
-        return ((weights * wide).sum(1) / weights.sum(1)).max()
-
-    assert most_fog() < 0.45
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plan, "FOG_SHARE", 2)
-        assert most_fog() > 0.9
+    cameras = place_cameras(scene, views=16, width=80, height=60, up=np.array([0, 0, 1.0])).cameras
+    cameras, labels = cameras[np.arange(48) % 16], np.full((48, 60, 80), -1, np.int32)
+    weights = np.asarray(jsecon.region_votes(scene, cameras, labels, 1, top=1, by_view=True).by_view)
+    poses = np.asarray(cameras.world_to_camera)
+    depth = poses[:, 2, :3] @ scene.means.T + poses[:, 2, 3:]
+    wide = np.exp(scene.log_scales[:, 0]) * cameras.fx[:, None] > 0.1 * 80 * depth
+    assert ((weights * wide).sum(1) / weights.sum(1)).max() < 0.45  # 0.9 where views through fog are not left out
 
 
 @pytest.mark.parametrize(("change", "clause"), [
@@ -282,27 +211,31 @@ def test_a_splat_without_photographs_answers_a_text(room, tmp_path, capsys):
     selected = {tuple(mean) for mean in np.round(np.asarray(jsecon.load_gaussians(answer).means), 3)}
     truth = {tuple(mean) for mean in np.round(np.asarray(there.means, np.float32)[-1200:-800], 3)}
     assert len(selected & truth) / len(selected | truth) > 0.8
-    assert json.loads(next(out.glob("*.json")).read_text())["count"] == len(selected)
 
 
-@pytest.mark.parametrize("kind", ["transforms", "colmap"])
-def test_given_cameras_take_the_place_of_planned_views(object_alone, around, tmp_path, kind):
+@pytest.mark.parametrize("kind", ["transforms", "colmap", "elsewhere"])
+def test_given_cameras_take_the_place_of_planned_views(object_alone, around, tmp_path, capsys, kind):
     """In the world of the scene's file, which is moved and 200 times larger; no image is needed."""
     there, similarity = moved(object_alone, 3, scale=200.0)
     jsecon.save_gaussians(tmp_path / "scene.ply", there)
     planned = around.cameras[:4]
     poses = np.array(planned.world_to_camera, np.float64) @ np.linalg.inv(similarity)
     poses[:, :3] /= np.linalg.norm(poses[:, :1, :3], axis=2, keepdims=True)
-    given = dataclasses.replace(
-        small_capture(4), cameras=dataclasses.replace(planned, world_to_camera=poses), names=("a0", "a1", "a2", "a3")
-    )
-    cameras = tmp_path / ("transforms.json" if kind == "transforms" else "sparse")
-    if kind == "transforms":
-        cameras.write_text(json.dumps(transforms(given)))
-    else:
+    if kind == "elsewhere":  # cameras that do not see the scene
+        poses = np.diag([-1.0, 1.0, -1.0, 1.0]) @ poses
+    planned_there = dataclasses.replace(planned, world_to_camera=poses)
+    given = dataclasses.replace(small_capture(4), cameras=planned_there, names=("a0", "a1", "a2", "a3"))
+    cameras, out = tmp_path / ("sparse" if kind == "colmap" else "poses.json"), tmp_path / "field"
+    if kind == "colmap":
         write_text_model(given, cameras)
-    out = tmp_path / "field"
-    assert main(["run", str(tmp_path / "scene.ply"), "--cameras", str(cameras), "--out", str(out)]) == 0
+    else:
+        cameras.write_text(json.dumps(transforms(given)))
+    code = main(["run", str(tmp_path / "scene.ply"), "--cameras", str(cameras), "--out", str(out)])
+    if kind == "elsewhere":
+        assert code == 2
+        assert "poses.json" in capsys.readouterr().err
+        return
+    assert code == 0
     field = jsecon.load_field(out / "field.safetensors")
     assert field.names == ("a0", "a1", "a2", "a3")
     mine = jsecon.render_rgb(field.gaussians, field.cameras[1]).alpha
@@ -325,15 +258,3 @@ def test_an_up_axis_of_length_0_is_refused(room, tmp_path, capsys):
     line = ["run", str(tmp_path / "scene.ply"), "--up", "0", "0", "0", "--out", str(tmp_path / "field")]
     assert main(line) == 2
     assert "--up: [0.0, 0.0, 0.0] is no direction" in capsys.readouterr().err
-
-
-def test_poses_that_look_elsewhere_are_refused(object_alone, tmp_path, capsys):
-    jsecon.save_gaussians(tmp_path / "scene.ply", object_alone)
-    pose = np.eye(4)
-    pose[:3, 3] = 1000
-    frames = [{"file_path": f"{k}.png", "transform_matrix": pose.tolist()} for k in range(2)]
-    cameras = tmp_path / "poses.json"
-    cameras.write_text(json.dumps({"w": 80, "h": 60, "fl_x": 60, "frames": frames}))
-    asked = ["run", str(tmp_path / "scene.ply"), "--cameras", str(cameras), "--out", str(tmp_path / "field")]
-    assert main(asked) == 2
-    assert "poses.json" in capsys.readouterr().err
