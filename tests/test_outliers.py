@@ -1,5 +1,7 @@
 """DBSCAN with scikit-learn's labels, and the outliers it removes from a selection."""
 
+import time
+
 import numpy as np
 import pytest
 
@@ -59,6 +61,21 @@ def test_what_dbscan_cannot_tell_comes_back_as_it_is(count):
     same = np.concatenate([np.zeros((50, 3)), points[:20]])  # points on top of each other
     assert remove_outliers(same[:50], np.ones(50, bool)).all()
     assert remove_outliers(same, np.ones(70, bool))[:50].all()
+
+
+@pytest.mark.long
+def test_half_a_million_points_in_seconds():
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(500_000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    points[:200_000] = 0.3 * points[:200_000] + [3, 0, 0]
+    points[200_000:250_000] = 0.02 * points[200_000:250_000] - [3, 0, 0]  # thousands of neighbours each
+    points[:2_000] = rng.uniform(-30, 30, (2_000, 3))
+    start = time.process_time()
+    kept = remove_outliers(points, np.ones(500_000, bool), keep="largest")
+    assert time.process_time() - start < 15  # about 2 s; scikit-learn runs out of memory on the dense ball's lists
+    assert kept[250_000:].all()
+    assert not kept[:250_000].any()
 
 
 def test_options_out_of_range_are_told():
