@@ -52,7 +52,7 @@ class Box:
 class Mask:
     """One object, outlined in one frame or several."""
 
-    frames: Mapping[int | str, np.ndarray | str | Path]
+    frames: Mapping[Any, np.ndarray | str | Path]
     """frame -> (H, W) bool at the size of the field's frames, or an image file in which black is outside"""
 
 
@@ -309,7 +309,7 @@ def source_shapes(
     plain = dataclasses.replace(field.gaussians, sh=field.gaussians.sh[:, :1])  # shapes have no colours
     taken = gaussian_rows(plain, rows)
     spreads = gaussian_spreads(transform_gaussians(taken, field.source_from_scene))
-    return object_shapes(source_points(field, taken.means), labels, up, spreads=spreads)
+    return object_shapes(source_points(field, np.asarray(taken.means)), labels, up, spreads=spreads)
 
 
 def gaussian_rows(gaussians: Gaussians, rows: np.ndarray | Bool[np.ndarray, " n"]) -> Gaussians:

@@ -284,7 +284,8 @@ def _load_poses(path: Path, long_side: int, source_from_scene: np.ndarray) -> tu
     intrinsics = np.array([[lens.fx, lens.fy, lens.cx, lens.cy] for lens in sized], np.float32)
     poses = np.stack([make_rigid(image.world_to_camera, path, image.name) for image in images])
     poses = transform_poses(poses, np.linalg.inv(source_from_scene)).astype(np.float32)
-    return Camera(poses, *intrinsics.T, width, height), frame_names([image.name for image in images], path)
+    fx, fy, cx, cy = intrinsics.T
+    return Camera(poses, fx, fy, cx, cy, width, height), frame_names([image.name for image in images], path)
 
 
 def _read_bare_scene(stage: StageInput) -> StageResult:

@@ -155,7 +155,7 @@ def _default_eps(points: Float[Array, "m 3"], *, spacings: float = EPS_SPACINGS)
     return 1.0
 
 
-def _dbscan(points: Float[Array, "m 3"], eps: float, min_samples: int = MIN_SAMPLES) -> Int[np.ndarray, " m"]:
+def _dbscan(points: Float[np.ndarray, "m 3"], eps: float, min_samples: int = MIN_SAMPLES) -> Int[np.ndarray, " m"]:
     """Clusters points by scikit-learn's DBSCAN: counted from 0 in the order of their first core point, -1 for noise.
 
     Above 5,000 points those of one voxel have one label.

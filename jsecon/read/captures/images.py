@@ -145,7 +145,9 @@ def image_header(path: str | Path) -> _ImageHeader:
     """Reads size and orientation of an image file, from its header alone."""
     with _open(Path(path)) as image:
         orientation = _orientation(image)
-        return _ImageHeader(image.size, image.size[::-1] if orientation > 4 else image.size, orientation)
+        width, height = image.size
+        upright = (height, width) if orientation > 4 else (width, height)
+        return _ImageHeader((width, height), upright, orientation)
 
 
 def size_around(path: Path, cx: object, cy: object) -> tuple[int, int]:

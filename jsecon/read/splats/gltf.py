@@ -144,11 +144,11 @@ def read_glb(path: Path) -> Gaussians:
 def _open(path: Path) -> tuple[Any, np.ndarray]:
     """The JSON document of a .glb, and its binary chunk, memory-mapped."""
     data = np.memmap(path, np.uint8, "r") if path.stat().st_size else np.zeros(0, np.uint8)
-    magic, version, length, text, kind = struct.unpack("<4sIII4s", data[:20])
+    magic, version, length, text, kind = struct.unpack("<4sIII4s", bytes(data[:20]))
     if (magic, version) != (b"glTF", 2):
         raise ValueError("it does not begin as a .glb of version 2 does")
     document, start = parse_json(bytes(data[20 : 20 + text])), 28 + text
-    size, binary = struct.unpack("<I4s", data[start - 8 : start]) if start <= len(data) else (0, b"BIN\0")
+    size, binary = struct.unpack("<I4s", bytes(data[start - 8 : start])) if start <= len(data) else (0, b"BIN\0")
     if length != len(data) or start + size > max(len(data), start) or (kind, binary) != (b"JSON", b"BIN\0"):
         raise ValueError(f"the file is cut short or damaged: {len(data)} of {length} bytes")
     if unsupported := set(document.get("extensionsRequired", ())) - {_EXTENSION, "KHR_mesh_quantization"}:
