@@ -194,7 +194,9 @@ class ObjectIndex:
             mask[found.rows] = True
         region = best.chosen[0].regions[0] if len(best.chosen) == 1 else -1
         score = best.chosen[0].score if best.chosen else 0.0
-        selection = Selection(mask, mask.astype(np.float32), np.asarray(region, np.int32), np.asarray(score, np.float32))
+        selection = Selection(
+            mask, mask.astype(np.float32), np.asarray(region, np.int32), np.asarray(score, np.float32)
+        )
         return Answer(
             query=query,
             by="relation",
