@@ -8,6 +8,7 @@ import zlib
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jsecon import Camera, Capture, InputError
 from jsecon.app import cli
@@ -36,12 +37,9 @@ ROOM_FIT = {"holdout": 4, "steps": 110}
 def ring_poses(count: int, radius: float = 3.0) -> np.ndarray:
     """(count, 4, 4) float64 world-to-camera around the origin, looking at it, each with a roll of its own."""
     poses = np.tile(np.eye(4), (count, 1, 1))
-    for index, angle in enumerate(np.linspace(0, 2 * np.pi, count, endpoint=False)):
-        turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-        cosine, sine = np.cos(0.3 * index), np.sin(0.3 * index)
-        roll = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
-        poses[index, :3, :3] = roll @ turn
-        poses[index, :3, 3] = 0, 0, radius
+    angles = np.stack([0.3 * np.arange(count), np.linspace(0, 2 * np.pi, count, endpoint=False)], 1)
+    poses[:, :3, :3] = Rotation.from_euler("ZY", angles).as_matrix()
+    poses[:, 2, 3] = radius
     return poses
 
 
@@ -49,15 +47,9 @@ def small_capture(count: int = 5, width: int = 24, height: int = 16, points: int
     """Random images of a ring of cameras, two intrinsics among them."""
     rng = np.random.default_rng(7)
     half = np.arange(count) % 2
-    cameras = Camera(
-        world_to_camera=ring_poses(count).astype(np.float32),
-        fx=(20.25 + half).astype(np.float32),
-        fy=(21.5 + half).astype(np.float32),
-        cx=np.full(count, 11.75, np.float32),
-        cy=np.full(count, 8.5, np.float32),
-        width=width,
-        height=height,
-    )
+    lenses = ((value + half).astype(np.float32) for value in (20.25, 21.5))
+    centre = (np.full(count, value, np.float32) for value in (11.75, 8.5))
+    cameras = Camera(ring_poses(count).astype(np.float32), *lenses, *centre, width=width, height=height)
     return Capture(
         frames=rng.integers(0, 256, (count, height, width, 3), np.uint8),
         cameras=cameras,
@@ -70,12 +62,14 @@ def small_capture(count: int = 5, width: int = 24, height: int = 16, points: int
     )
 
 
-def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """wxyz by way of OpenCV's rotation vector."""
-    vector = cv2.Rodrigues(rotation)[0].ravel()
-    angle = np.linalg.norm(vector)
-    axis = vector / angle if angle > 0 else vector
-    return np.array([np.cos(angle / 2), *(np.sin(angle / 2) * axis)])
+def assert_same(loaded, expected):
+    np.testing.assert_array_equal(loaded.frames, expected.frames)
+    np.testing.assert_array_equal(loaded.points, expected.points)
+    np.testing.assert_array_equal(loaded.point_colors, expected.point_colors)
+    assert loaded.names == expected.names
+    assert (loaded.cameras.width, loaded.cameras.height) == (expected.cameras.width, expected.cameras.height)
+    for field in ("world_to_camera", "fx", "fy", "cx", "cy"):
+        np.testing.assert_allclose(getattr(loaded.cameras, field), getattr(expected.cameras, field), atol=1e-6)
 
 
 def write_images(capture: Capture, folder, ending: str = ".png") -> None:
@@ -87,37 +81,34 @@ def write_images(capture: Capture, folder, ending: str = ".png") -> None:
 def write_text_model(capture: Capture, folder, cameras: list[str] | None = None) -> None:
     """The capture as a COLMAP text model; `cameras` replaces the lines of cameras.txt (camera 1 takes them all)."""
     folder.mkdir(parents=True, exist_ok=True)
+
+    def words(numbers):
+        return " ".join(repr(float(number)) for number in numbers)
+
     lenses = np.stack([capture.cameras.fx, capture.cameras.fy, capture.cameras.cx, capture.cameras.cy], -1)
     size = f"{capture.cameras.width} {capture.cameras.height}"
-    lines = [f"{n} PINHOLE {size} " + " ".join(map(repr, map(float, lens))) for n, lens in enumerate(lenses, start=1)]
-    (folder / "cameras.txt").write_text("# CAMERA_ID, MODEL, ...\n" + "\n".join(cameras or lines) + "\n")
+    lines = cameras or [f"{n} PINHOLE {size} {words(lens)}" for n, lens in enumerate(lenses, start=1)]
+    (folder / "cameras.txt").write_text("\n".join(["# CAMERA_ID, MODEL, ...", *lines, ""]))
     lines = ["# two lines an image"]
     for n, (name, pose) in enumerate(zip(capture.names, capture.cameras.world_to_camera.astype(np.float64)), start=1):
-        numbers = " ".join(map(repr, map(float, (*quaternion(pose[:3, :3]), *pose[:3, 3]))))
+        turn = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
         # One image has observations, the next an empty line, as COLMAP writes them.
-        lines += [f"{n} {numbers} {1 if cameras else n} {name}.png", "1.5 2.5 -1 3 4 17" if n % 2 else ""]
+        lines += [f"{n} {words((*turn, *pose[:3, 3]))} {1 if cameras else n} {name}.png"]
+        lines += ["1.5 2.5 -1 3 4 17" if n % 2 else ""]
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
-    rows = [
-        f"{n} {' '.join(map(repr, map(float, point)))} {' '.join(map(str, map(int, colour)))} 0.5 1 2 2 3"
-        for n, (point, colour) in enumerate(zip(capture.points, capture.point_colors), start=1)
-    ]
-    (folder / "points3D.txt").write_text("# POINT3D_ID ...\n" + "\n".join(rows) + "\n")
+    lines = ["# POINT3D_ID ..."]
+    for n, (point, (red, green, blue)) in enumerate(zip(capture.points, capture.point_colors), start=1):
+        lines.append(f"{n} {words(point)} {red} {green} {blue} 0.5 1 2 2 3")
+    (folder / "points3D.txt").write_text("\n".join(lines) + "\n")
 
 
 def transforms(capture: Capture, ending: str = ".png", **more) -> dict:
     """The capture as a transforms.json with intrinsics a frame."""
-    frames = []
-    cameras = capture.cameras
+    cameras, frames = capture.cameras, []
     for index, name in enumerate(capture.names):
-        camera_to_world = np.linalg.inv(cameras.world_to_camera[index].astype(np.float64)) @ np.diag([1, -1, -1, 1])
-        frames.append(
-            {
-                "file_path": f"images/{name}{ending}",
-                "transform_matrix": camera_to_world.tolist(),
-                "fl_x": float(cameras.fx[index]),
-                "fl_y": float(cameras.fy[index]),
-            }
-        )
+        pose = np.linalg.inv(cameras.world_to_camera[index].astype(np.float64)) @ np.diag([1, -1, -1, 1])
+        lens = {"fl_x": float(cameras.fx[index]), "fl_y": float(cameras.fy[index])}
+        frames.append({"file_path": f"images/{name}{ending}", "transform_matrix": pose.tolist(), **lens})
     shared = {"w": cameras.width, "h": cameras.height, "cx": float(cameras.cx[0]), "cy": float(cameras.cy[0])}
     return {**shared, "aabb_scale": 4, **more, "frames": frames}
 

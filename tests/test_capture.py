@@ -1,12 +1,19 @@
-"""load_capture finds the format; options are checked."""
+"""load_capture: formats, options, EXIF, and the same scene in other units and places."""
 
+import dataclasses
+import json
+
+import cv2
 import numpy as np
 import pytest
-from capture_files import refused, small_capture, transforms, write_transforms
+from capture_files import refused, small_capture, transforms, write_images, write_text_model, write_transforms
+from scipy.spatial.transform import Rotation
+from test_images import stored_as, with_orientation
 
 from experiments.rooms.writers import write_colmap
 from jsecon.read.captures.capture import load_capture
 from jsecon.read.captures.frames import evenly_spaced
+from jsecon.read.splats.files import save_gaussians
 
 CAPTURE = small_capture()
 
@@ -16,8 +23,7 @@ def test_formats_are_detected(tmp_path):
     write_transforms(CAPTURE, tmp_path / "nerfstudio")
     (tmp_path / "nerfstudio/transforms.json").rename(tmp_path / "nerfstudio/transforms_train.json")
     for path in ("colmap", "nerfstudio/transforms_train.json"):
-        loaded = load_capture(tmp_path / path)
-        np.testing.assert_array_equal(loaded.frames, CAPTURE.frames)
+        np.testing.assert_array_equal(load_capture(tmp_path / path).frames, CAPTURE.frames)
     (tmp_path / "nerfstudio/images").rename(tmp_path / "elsewhere")
     with refused("nerfstudio", "without poses", "transforms_train.json"):
         load_capture(tmp_path / "nerfstudio")
@@ -27,10 +33,9 @@ def test_formats_are_detected(tmp_path):
     assert len(load_capture(tmp_path / "colmap").points) == len(CAPTURE.points)
 
 
-@pytest.mark.parametrize("options", [
-    {"downscale": 0.5}, {"downscale": float("nan")}, {"long_side": 0}, {"frames": 0}, {"holdout": 1},
-    {"holdout": -8},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "options", [{"downscale": 0.5}, {"downscale": np.nan}, {"long_side": 0}, {"frames": 0}, {"holdout": 1}]
+)
 def test_options_are_checked(tmp_path, options):
     write_colmap(CAPTURE, tmp_path)
     with refused(*options):
@@ -46,12 +51,8 @@ def test_options_and_progress(tmp_path):
     np.testing.assert_allclose(loaded.cameras.fy, CAPTURE.cameras.fy[[0, 1, 3, 4]] * 11 / 16)
     assert not loaded.held_out.any()
     assert calls == [(1, 4), (2, 4), (3, 4), (4, 4)]
-    same = load_capture(tmp_path, long_side=16, frames=4)
-    np.testing.assert_array_equal(same.frames, loaded.frames)
-    assert load_capture(tmp_path, long_side=100).frames.shape == CAPTURE.frames.shape
-    single = load_capture(tmp_path, frames=1)
-    assert not single.held_out.any()
-    assert any("only one" in note for note in single.notes)
+    np.testing.assert_array_equal(load_capture(tmp_path, long_side=16, frames=4).frames, loaded.frames)
+    assert not load_capture(tmp_path, frames=1).held_out.any()
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 50])
@@ -63,3 +64,126 @@ def test_spread(count, wanted):
     assert len(chosen) == 1 or chosen[-1] == count - 1
     gaps = np.diff(chosen)
     assert len(gaps) == 0 or (gaps.min() >= 1 and gaps.max() - gaps.min() <= 1)
+
+
+def write_turned(capture, folder, orientations, *, upright):
+    """The capture's images with EXIF orientations; the frames are what is upright, or else what is stored."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, frame, orientation in zip(capture.names, capture.frames, orientations):
+        stored_as(frame if upright else with_orientation(frame, orientation), orientation, folder / f"{name}.png")
+
+
+def test_mixed_exif_orientations_come_upright(tmp_path):
+    capture = small_capture(8)
+    write_turned(capture, tmp_path / "images", range(1, 9), upright=True)
+    (tmp_path / "transforms.json").write_text(json.dumps(transforms(capture)))
+    read = load_capture(tmp_path)
+    np.testing.assert_array_equal(read.frames, capture.frames)
+    assert {(file.width, file.height) for file in read.files} == {(24, 16)}
+    assert any("7 images were turned upright" in note for note in read.notes)
+
+
+def test_other_images_tell_that_a_program_ignored_exif(tmp_path):
+    """The camera model of the first, on its side, leaves EXIF out: so does that of the second, upside down."""
+    capture = small_capture(3, points=0)
+    write_text_model(capture, tmp_path / "sparse/0")
+    write_turned(capture, tmp_path / "images", [6, 3, 1], upright=False)
+    np.testing.assert_array_equal(load_capture(tmp_path).frames[1], capture.frames[1])
+
+
+@pytest.mark.parametrize(("orientation", "upright"), [(3, False), (6, False), (6, True)])
+def test_poses_of_stored_pixels_keep_them(tmp_path, orientation, upright):
+    """By the size of the camera model; where that cannot tell, because COLMAP ignores EXIF."""
+    capture = small_capture(3)
+    write_text_model(capture, tmp_path / "sparse/0")
+    write_turned(capture, tmp_path / "images", [orientation, 1, 1], upright=upright)
+    read = load_capture(tmp_path)
+    np.testing.assert_array_equal(read.frames, capture.frames)
+    assert any(("turned upright" if upright else "as they are stored") in note for note in read.notes)
+
+
+def test_a_file_without_a_size_means_the_pixels_that_its_centre_lies_in_the_middle_of(tmp_path):
+    """Of photographs that lie on their side, stored and upright; depth is measured like the stored pixels."""
+    capture = small_capture(3)
+    write_turned(capture, tmp_path / "images", [6, 8, 1], upright=False)
+    content = transforms(capture)
+    del content["w"], content["h"]
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    np.testing.assert_array_equal(load_capture(tmp_path).frames, capture.frames)
+    write_turned(capture, tmp_path / "images", [6, 8, 1], upright=True)
+    depth = np.arange(24 * 16, dtype=np.uint16).reshape(16, 24) + 1000
+    for n, (entry, turns) in enumerate(zip(content["frames"], (1, 3, 0))):
+        entry["depth_file_path"] = f"depth_{n}.npy"
+        np.save(tmp_path / entry["depth_file_path"], np.rot90(depth, turns))
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    read = load_capture(tmp_path)
+    np.testing.assert_array_equal(read.frames, capture.frames)
+    np.testing.assert_allclose(read.depths, np.broadcast_to(0.001 * depth, (3, 16, 24)), rtol=1e-5)
+
+
+SHIFT = np.array([1e7, -5411876.6, 312.25])
+
+
+def moved(capture, scale, shift):
+    """The capture with poses and points in float64, `scale` times as large and shifted."""
+    poses = capture.cameras.world_to_camera.astype(np.float64)
+    poses[:, :3, :3] = Rotation.from_matrix(poses[:, :3, :3]).as_matrix()
+    poses[:, :3, 3] = scale * poses[:, :3, 3] - poses[:, :3, :3] @ shift
+    cameras = dataclasses.replace(capture.cameras, world_to_camera=poses)
+    return dataclasses.replace(capture, cameras=cameras, points=scale * capture.points.astype(np.float64) + shift)
+
+
+def written(kind, capture, folder, scale, shift):
+    """A capture folder of the kind: COLMAP, nerfstudio with depth, and nerfstudio with nothing but poses."""
+    there = moved(capture, scale, shift)
+    write_images(capture, folder / "images")
+    if kind == "colmap":
+        write_text_model(there, folder / "sparse" / "0")
+        return folder
+    told = transforms(there, depth_unit_scale_factor=0.001 * scale)
+    (folder / "depth").mkdir()
+    for frame, name in zip(told["frames"] if kind == "depth" else (), capture.names):
+        frame["depth_file_path"] = f"depth/{name}.png"
+        cv2.imwrite(str(folder / frame["depth_file_path"]), np.full(capture.frames.shape[1:3], 2500, np.uint16))
+    (folder / "transforms.json").write_text(json.dumps(told))
+    return folder
+
+
+@pytest.mark.parametrize("kind", ["colmap", "depth"])
+@pytest.mark.parametrize(("scale", "shift"), [(1, SHIFT), (1e-3, 0 * SHIFT), (1e-3, SHIFT), (1e3, SHIFT), (1e6, SHIFT)])
+def test_a_capture_comes_out_the_same_in_any_place_and_unit(tmp_path, kind, scale, shift):
+    plain = load_capture(written(kind, small_capture(), tmp_path / "plain", 1, 0 * SHIFT))
+    there = load_capture(written(kind, small_capture(), tmp_path / "there", scale, shift))
+    np.testing.assert_array_equal(plain.source_from_scene, np.eye(4))
+    offset = there.cameras.centres[0] - plain.cameras.centres[0]
+    assert np.abs(offset).max() < 11
+    np.testing.assert_allclose(there.cameras.centres, plain.cameras.centres + offset, atol=2e-5)
+    if kind == "colmap":
+        np.testing.assert_allclose(there.points, plain.points + offset, atol=2e-5)
+    if kind == "depth":
+        np.testing.assert_allclose(np.asarray(there.depths), np.asarray(plain.depths), rtol=1e-6)
+    back = there.cameras.centres.astype(np.float64) @ there.source_from_scene[:3, :3].T + there.source_from_scene[:3, 3]
+    np.testing.assert_allclose(back, scale * plain.cameras.centres.astype(np.float64) + shift, atol=3e-6 * scale)
+
+
+def test_a_capture_from_one_place_keeps_its_unit(tmp_path):
+    """A tripod's poses, which differ by rounding, tell no size; large coordinates are centred all the same."""
+    capture = small_capture()
+    capture.cameras.world_to_camera[:, :3, 3] = 1e-9 * np.arange(15).reshape(5, 3)
+    found = load_capture(written("poses", capture, tmp_path, 1, SHIFT))
+    np.testing.assert_allclose(found.source_from_scene[:3, :3], np.eye(3))
+    assert np.abs(found.cameras.centres).max() < 1
+    np.testing.assert_allclose(found.source_from_scene[:3, 3] + found.cameras.centres[0], SHIFT, atol=1e-3)
+
+
+def test_the_world_of_a_capture_is_that_of_all_its_frames(tmp_path):
+    """However many are loaded: a field of some of them goes with the capture of others."""
+    folder = written("colmap", small_capture(), tmp_path, 1e-3, SHIFT)
+    whole, some = load_capture(folder), load_capture(folder, frames=3)
+    np.testing.assert_array_equal(some.source_from_scene, whole.source_from_scene)
+
+
+def test_an_ordinary_scene_is_written_in_single_precision(tmp_path, scene):
+    """As INRIA's readers expect it, whatever turns and moves it a little."""
+    save_gaussians(tmp_path / "a.ply", scene, similarity=np.diag([2.0, 2.0, 2.0, 1.0]) + np.eye(4, k=3))
+    assert b"property double" not in (tmp_path / "a.ply").read_bytes()

@@ -5,10 +5,10 @@ import struct
 
 import numpy as np
 import pytest
-from capture_files import refused, ring_poses, small_capture, write_images, write_text_model
+from capture_files import assert_same, refused, small_capture, write_images, write_text_model
 
 from experiments.rooms.writers import write_colmap
-from jsecon import Camera, load_capture
+from jsecon import load_capture
 from jsecon.read.captures.capture import read_posed_images
 from jsecon.read.captures.images import write_image
 
@@ -21,77 +21,40 @@ def folder(tmp_path):
     return tmp_path / "scene"
 
 
-def assert_same(loaded, expected, tolerance=1e-6):
-    np.testing.assert_array_equal(loaded.frames, expected.frames)
-    np.testing.assert_array_equal(loaded.points, expected.points)
-    np.testing.assert_array_equal(loaded.point_colors, expected.point_colors)
-    assert loaded.names == expected.names
-    assert (loaded.cameras.width, loaded.cameras.height) == (expected.cameras.width, expected.cameras.height)
-    for field in ("world_to_camera", "fx", "fy", "cx", "cy"):
-        np.testing.assert_allclose(getattr(loaded.cameras, field), getattr(expected.cameras, field), atol=tolerance)
-
-
-def test_binary_round_trip(folder):
-    loaded = load_capture(folder, holdout=0)
-    assert_same(loaded, CAPTURE)
-    assert loaded.notes == ()
-    assert not loaded.held_out.any()
-    np.testing.assert_array_equal(loaded.source_from_scene, np.eye(4))
-
-
 def test_quaternions_in_every_quadrant(tmp_path):
     """Half turns about each axis are where the common formulas divide by zero."""
-    poses = ring_poses(4)
-    for pose, signs in zip(poses, [(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]):
-        pose[:3, :3] = np.diag(signs)
-    cameras = Camera(poses.astype(np.float32), *([np.full(4, 20.0, np.float32)] * 4), width=24, height=16)
     capture = small_capture(4)
-    write_colmap(type(capture)(**{**vars(capture), "cameras": cameras}), tmp_path)
-    np.testing.assert_array_equal(load_capture(tmp_path).cameras.world_to_camera, poses.astype(np.float32))
-
-
-def binary_with_tracks(path, points, colours, lengths):
-    records = [
-        struct.pack("<Q3d3BdQ", n, *point, *map(int, colour), 0.5, length) + bytes(8 * length)
-        for n, (point, colour, length) in enumerate(zip(points, colours, lengths), start=1)
-    ]
-    path.write_bytes(struct.pack("<Q", len(records)) + b"".join(records))
+    poses = capture.cameras.world_to_camera
+    poses[:, :3, :3] = [np.diag(signs) for signs in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))]
+    write_colmap(capture, tmp_path)
+    np.testing.assert_array_equal(load_capture(tmp_path).cameras.world_to_camera, poses)
 
 
 def test_tracks_of_all_lengths_and_observations(folder):
-    lengths = np.random.default_rng(0).integers(0, 9, len(CAPTURE.points))
-    binary_with_tracks(folder / "sparse/0/points3D.bin", CAPTURE.points, CAPTURE.point_colors, lengths)
+    records = []
+    for n, (point, colour) in enumerate(zip(CAPTURE.points, CAPTURE.point_colors)):
+        records.append(struct.pack("<Q3d3BdQ", n, *point, *map(int, colour), 0.5, n % 9) + bytes(8 * (n % 9)))
+    (folder / "sparse/0/points3D.bin").write_bytes(struct.pack("<Q", len(records)) + b"".join(records))
     images = (folder / "sparse/0/images.bin").read_bytes()
     size = len(CAPTURE.names[0]) + 5 + 64
     heads = [images[8 + n * (size + 8) : 8 + n * (size + 8) + size] for n in range(5)]
-    bodies = b"".join(head + struct.pack("<Q", n) + bytes(24 * n) for n, head in enumerate(heads))
-    (folder / "sparse/0/images.bin").write_bytes(images[:8] + bodies)
+    bodies = [head + struct.pack("<Q", n) + bytes(24 * n) for n, head in enumerate(heads)]
+    bodies = bodies[3:] + bodies[:3]  # frames come by name
+    (folder / "sparse/0/images.bin").write_bytes(images[:8] + b"".join(bodies))
     (folder / "sparse/0/rigs.bin").write_bytes(b"of a newer COLMAP")
     assert_same(load_capture(folder, holdout=0), CAPTURE)
-
-
-def test_name_order_holdout_and_subset(folder):
-    images = folder / "sparse/0/images.bin"
-    data = images.read_bytes()
-    size = (len(data) - 8) // 5
-    records = [data[8 + n * size : 8 + (n + 1) * size] for n in range(5)]
-    images.write_bytes(data[:8] + b"".join(records[n] for n in (3, 0, 4, 2, 1)))
-    loaded = load_capture(folder, holdout=2)
-    assert_same(loaded, CAPTURE)
-    np.testing.assert_array_equal(loaded.held_out, [True, False, True, False, True])
-    some = load_capture(folder, frames=3, holdout=3)
-    assert some.names == tuple(CAPTURE.names[n] for n in (0, 2, 4))
-    np.testing.assert_array_equal(some.held_out, [True, False, False])
-    assert "3 of 5 frames" in some.notes[0]
+    loaded = load_capture(folder, frames=3, holdout=3)
+    assert loaded.names == tuple(CAPTURE.names[n] for n in (0, 2, 4))
+    np.testing.assert_array_equal(loaded.held_out, [True, False, False])
+    (folder / "sparse/0/points3D.bin").unlink()
+    assert load_capture(folder).points.shape == (0, 3)
 
 
 def test_downscale_is_an_area_mean(folder):
     loaded = load_capture(folder, downscale=2)
     means = CAPTURE.frames.reshape(5, 8, 2, 12, 2, 3).mean((2, 4))
     assert np.abs(loaded.frames - means).max() <= 1
-    np.testing.assert_allclose(loaded.cameras.fx, CAPTURE.cameras.fx / 2)
     np.testing.assert_allclose(loaded.cameras.cy, CAPTURE.cameras.cy / 2)
-    assert (loaded.cameras.width, loaded.cameras.height) == (12, 8)
 
 
 def test_smaller_images_than_the_model_says(tmp_path):
@@ -127,30 +90,20 @@ def picture(x, y):
     return 128 + 60 * np.sin(7 * x + 1) + 60 * np.cos(6 * y)
 
 
-@pytest.mark.parametrize(
-    ("model", "parameters"),
-    [
-        ("SIMPLE_PINHOLE", (90.0, 59.0, 46.0)),
-        ("SIMPLE_RADIAL", (108.0, 59.0, 46.0, -0.12)),
-        ("RADIAL", (108.0, 59.0, 46.0, 0.1, 0.05)),
-        ("OPENCV", (108.0, 105.0, 59.0, 46.0, -0.1, 0.03, 0.004, -0.003)),
-        ("FULL_OPENCV", (108.0, 105.0, 59.0, 46.0, 0.2, 0.05, 0.001, 0.002, 0.01, 0.25, 0.02, 0.005)),
-        ("OPENCV_FISHEYE", (90.0, 88.0, 59.0, 46.0, 0.03, -0.01, 0.002, 0.001)),
-        ("SIMPLE_RADIAL_FISHEYE", (90.0, 59.0, 46.0, 0.05)),
-        ("RADIAL_FISHEYE", (90.0, 59.0, 46.0, 0.04, -0.02)),
-        ("FOV", (90.0, 88.0, 59.0, 46.0, 0.9)),
-        ("THIN_PRISM_FISHEYE", (90.0, 88.0, 59.0, 46.0, 0.03, -0.01, 0.004, -0.003, 0.002, 0.001, 0.01, -0.02)),
-        (
-            "RAD_TAN_THIN_PRISM_FISHEYE",
-            (90.0, 88.0, 59.0, 46.0, 0.03, -0.01, 2e-3, 1e-3, -5e-4, 2e-4, 4e-3, -3e-3, 0.01, -2e-3, 5e-3, 3e-3),
-        ),
-        ("SIMPLE_DIVISION", (90.0, 59.0, 46.0, -0.1)),
-        ("DIVISION", (90.0, 88.0, 59.0, 46.0, 0.05)),
-        ("SIMPLE_FISHEYE", (90.0, 59.0, 46.0)),
-        ("FISHEYE", (90.0, 88.0, 59.0, 46.0)),
-        ("EUCM", (90.0, 88.0, 59.0, 46.0, 0.6, 1.1)),
-    ],
-)
+@pytest.mark.parametrize(("model", "parameters"), [
+    ("SIMPLE_PINHOLE", (90.0, 59.0, 46.0)), ("SIMPLE_RADIAL", (108.0, 59.0, 46.0, -0.12)),
+    ("RADIAL", (108.0, 59.0, 46.0, 0.1, 0.05)), ("OPENCV", (108.0, 105.0, 59.0, 46.0, -0.1, 0.03, 0.004, -0.003)),
+    ("FULL_OPENCV", (108.0, 105.0, 59.0, 46.0, 0.2, 0.05, 0.001, 0.002, 0.01, 0.25, 0.02, 0.005)),
+    ("OPENCV_FISHEYE", (90.0, 88.0, 59.0, 46.0, 0.03, -0.01, 0.002, 0.001)),
+    ("SIMPLE_RADIAL_FISHEYE", (90.0, 59.0, 46.0, 0.05)), ("RADIAL_FISHEYE", (90.0, 59.0, 46.0, 0.04, -0.02)),
+    ("FOV", (90.0, 88.0, 59.0, 46.0, 0.9)),
+    ("THIN_PRISM_FISHEYE", (90.0, 88.0, 59.0, 46.0, 0.03, -0.01, 0.004, -0.003, 0.002, 0.001, 0.01, -0.02)),
+    ("RAD_TAN_THIN_PRISM_FISHEYE",
+     (90.0, 88.0, 59.0, 46.0, 0.03, -0.01, 2e-3, 1e-3, -5e-4, 2e-4, 4e-3, -3e-3, 0.01, -2e-3, 5e-3, 3e-3)),
+    ("SIMPLE_DIVISION", (90.0, 59.0, 46.0, -0.1)), ("DIVISION", (90.0, 88.0, 59.0, 46.0, 0.05)),
+    ("SIMPLE_FISHEYE", (90.0, 59.0, 46.0)), ("FISHEYE", (90.0, 88.0, 59.0, 46.0)),
+    ("EUCM", (90.0, 88.0, 59.0, 46.0, 0.6, 1.1)),
+])  # fmt: skip
 def test_every_model_is_undistorted_as_colmap_projects_it(tmp_path, model, parameters):
     """A binary model that pycolmap writes, and images as pycolmap's camera sees the plane z = 1."""
     colmap = pytest.importorskip("pycolmap")
@@ -160,13 +113,10 @@ def test_every_model_is_undistorted_as_colmap_projects_it(tmp_path, model, param
     seen = camera.cam_from_img(np.stack([u, v], -1).reshape(-1, 2)).reshape(height, width, 2)
     image = np.repeat(picture(seen[..., 0], seen[..., 1]).round().astype(np.uint8)[..., None], 3, -1)
     capture = small_capture(2, width, height)
-    write_colmap(capture, tmp_path)
-    number = getattr(colmap.CameraModelId, model).value
-    numbers = np.array(parameters, "<f8").tobytes()
-    cameras = struct.pack("<Q", 2) + b"".join(struct.pack("<iiQQ", n, number, width, height) + numbers for n in (1, 2))
-    (tmp_path / "sparse/0/cameras.bin").write_bytes(cameras)
-    for name in capture.names:
-        write_image(tmp_path / "images" / f"{name}.png", image)
+    write_colmap(dataclasses.replace(capture, frames=np.stack([image, image])), tmp_path)
+    head = struct.pack("<iQQ", getattr(colmap.CameraModelId, model).value, width, height)
+    cameras = (struct.pack("<i", n) + head + np.array(parameters, "<f8").tobytes() for n in (1, 2))
+    (tmp_path / "sparse/0/cameras.bin").write_bytes(struct.pack("<Q", 2) + b"".join(cameras))
     loaded = load_capture(tmp_path, holdout=0)
     pinhole = loaded.cameras[0]
     expected = picture((u - pinhole.cx) / pinhole.fx, (v - pinhole.cy) / pinhole.fy)
@@ -180,23 +130,6 @@ def test_every_model_is_undistorted_as_colmap_projects_it(tmp_path, model, param
     assert 0.8 < pinhole.fx / parameters[0] < 1.2
 
 
-def test_models_that_no_pinhole_stands_in_for(tmp_path):
-    write_images(CAPTURE, tmp_path / "images")
-    write_text_model(CAPTURE, tmp_path / "sparse", ["1 EQUIRECTANGULAR 24 16 24 16"])
-    with refused("cameras.txt", "EQUIRECTANGULAR", "perspective views"):
-        load_capture(tmp_path)
-    write_text_model(CAPTURE, tmp_path / "sparse", ["1 NEW_FISHEYE 24 16 24 16"])
-    with refused("cameras.txt", "NEW_FISHEYE", "image_undistorter"):
-        load_capture(tmp_path)
-    write_colmap(CAPTURE, tmp_path / "binary")
-    path = tmp_path / "binary/sparse/0/cameras.bin"
-    data = bytearray(path.read_bytes())
-    struct.pack_into("<i", data, 12, 99)
-    path.write_bytes(data)
-    with refused("cameras.bin", "99", "image_undistorter"):
-        load_capture(tmp_path / "binary")
-
-
 def test_the_largest_of_several_models_is_taken_and_the_others_are_named(tmp_path):
     write_colmap(CAPTURE, tmp_path)
     (tmp_path / "sparse/0").rename(tmp_path / "sparse/10")
@@ -208,7 +141,6 @@ def test_the_largest_of_several_models_is_taken_and_the_others_are_named(tmp_pat
     write_text_model(small, tmp_path / "sparse/2")
     loaded = load_capture(tmp_path, holdout=0)
     assert_same(loaded, CAPTURE)
-    assert len(loaded.notes) == 1
     for words in ("3 models", "sparse/10 with 5", "sparse/0 with 2", "sparse/2 with 2"):
         assert words in loaded.notes[0]
 
@@ -217,77 +149,35 @@ def test_the_largest_of_several_models_is_taken_and_the_others_are_named(tmp_pat
 def test_places_where_programs_put_a_model(tmp_path, place):
     write_text_model(CAPTURE, tmp_path / place)
     write_images(CAPTURE, tmp_path if place == "" else tmp_path / "images")
-    loaded = load_capture(tmp_path, holdout=0)
-    assert_same(loaded, CAPTURE)
-    assert loaded.notes == ()
+    assert_same(load_capture(tmp_path, holdout=0), CAPTURE)
 
 
-NAMES = ["p 1.png", "1 2 3.png", "0001.png", "cam a/p.JPG", "cam b/p.JPG"]
+NAMES = ["p 1.png", "1 2 3.png", "0001.png", "cam a/p.png", "cam b/p.png"]
+SECONDS = {
+    "none": 5 * [[]],
+    "empty": 5 * [[""]],
+    "observations": 5 * [["1.5 2.5 -1 3 4 17 1e2 2 3 4 5 6"]],
+    "mixed": [[], [""], ["12 13 14"], [], ["1.5 2.5 -1"]],
+}
 
 
-@pytest.mark.parametrize("second", ["none", "empty", "observations", "mixed"])
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+@pytest.mark.parametrize(("second", "encoding"), [*zip(SECONDS, ("utf-8", "utf-8-sig", "utf-16", "utf-8"))])
 def test_images_txt_with_and_without_its_second_lines(tmp_path, second, encoding):
     """What follows a first line is a second one only where it is a list of triples."""
     write_text_model(CAPTURE, tmp_path / "sparse")
     lines = [line for line in (tmp_path / "sparse/images.txt").read_text().split("\n") if ".png" in line]
     lines = [line.rpartition(" ")[0] + " " + name for line, name in zip(lines, NAMES)]
-    seconds = {
-        "none": 5 * [[]],
-        "empty": 5 * [[""]],
-        "observations": 5 * [["1.5 2.5 -1 3 4 17 1e2 2 3 4 5 6"]],
-        "mixed": [[], [""], ["12 13 14"], [], ["1.5 2.5 -1"]],
-    }[second]
-    text = "# a comment\r\n" + "\r\n".join(line for own, more in zip(lines, seconds) for line in (own, *more))
-    (tmp_path / "sparse/images.txt").write_bytes(text.encode(encoding))
-    for file in ("cameras.txt", "points3D.txt"):
-        content = (tmp_path / "sparse" / file).read_text()
-        (tmp_path / "sparse" / file).write_bytes(content.replace("\n", "\r\n").encode(encoding))
+    lines = ["# a comment", *(line for own, more in zip(lines, SECONDS[second]) for line in (own, *more))]
+    (tmp_path / "sparse/images.txt").write_text("\n".join(lines))
+    for file in (tmp_path / "sparse").iterdir():
+        file.write_bytes(file.read_text().replace("\n", "\r\n").encode(encoding))
     for name, frame in zip(NAMES, CAPTURE.frames):
-        write_image(tmp_path / "images" / name.replace(".JPG", ".png"), frame)
-        if name.endswith(".JPG"):
-            (tmp_path / "images" / name).with_suffix(".png").rename(tmp_path / "images" / name.replace(".JPG", ".jpg"))
+        write_image(tmp_path / "images" / name, frame)
     loaded = load_capture(tmp_path, holdout=0)
-    names = "p 1", "1 2 3", "0001", "cam a_p", "cam b_p"
-    assert sorted(loaded.names) == sorted(names)
-    place = [loaded.names.index(name) for name in names]
+    place = [loaded.names.index(name) for name in ("p 1", "1 2 3", "0001", "cam a_p", "cam b_p")]
     np.testing.assert_array_equal(loaded.frames[place], CAPTURE.frames)
     np.testing.assert_allclose(loaded.cameras.world_to_camera[place], CAPTURE.cameras.world_to_camera, atol=1e-6)
     assert len(loaded.points) == len(CAPTURE.points)
-
-
-def test_missing_images_are_counted(folder):
-    (folder / "images/frame_001.png").unlink()
-    (folder / "images/frame_004.png").unlink()
-    loaded = load_capture(folder)
-    assert loaded.names == ("frame_000", "frame_002", "frame_003")
-    assert "2 of 5 frames" in loaded.notes[0]
-    assert "frame_001.png" in loaded.notes[0]
-
-
-@pytest.mark.parametrize("numbers", [(np.nan, 0, 0, 0, 0, 0, 0), (1, 0, 0, 0, 0, np.inf, 0), (0, 0, 0, 0, 0, 0, 0)])
-def test_poses_that_are_none(folder, numbers):
-    path = folder / "sparse/0/images.bin"
-    data = bytearray(path.read_bytes())
-    struct.pack_into("<7d", data, 12, *numbers)
-    path.write_bytes(data)
-    with refused("images.bin", "frame_000.png", "NaN"):
-        load_capture(folder)
-
-
-def test_no_points_file_and_nan_points(folder):
-    (folder / "sparse/0/points3D.bin").unlink()
-    loaded = load_capture(folder)
-    assert loaded.points.shape == (0, 3)
-    assert "no sparse points" in loaded.notes[0]
-    points = CAPTURE.points.astype(float)
-    points[3] = np.nan
-    binary_with_tracks(folder / "sparse/0/points3D.bin", points, CAPTURE.point_colors, [0] * len(points))
-    with refused("points3D.bin", "NaN"):
-        load_capture(folder)
-    (folder / "sparse/0/images.bin").unlink()
-    with refused("no images.bin"):
-        load_capture(folder)
 
 
 def test_names_that_clash(tmp_path):
@@ -295,10 +185,9 @@ def test_names_that_clash(tmp_path):
     write_text_model(CAPTURE, tmp_path / "sparse")
     path = tmp_path / "sparse/images.txt"
     path.write_text(path.read_text().replace("frame_001.png", "left/a.png").replace("frame_003.png", "right/a.png"))
-    write_images(CAPTURE, tmp_path / "images")
-    for side, name in (("left", "frame_001"), ("right", "frame_003")):
-        (tmp_path / "images" / side).mkdir()
-        (tmp_path / f"images/{name}.png").rename(tmp_path / f"images/{side}/a.png")
+    names = "frame_000", "left/a", "frame_002", "right/a", "frame_004"
+    for name, frame in zip(names, CAPTURE.frames):
+        write_image(tmp_path / "images" / f"{name}.png", frame)
     assert load_capture(tmp_path).names == ("frame_000", "frame_002", "frame_004", "left_a", "right_a")
     path.write_text(path.read_text().replace("right/a.png", "left/a.jpg"))
     (tmp_path / "images/right/a.png").rename(tmp_path / "images/left/a.jpg")
@@ -313,6 +202,5 @@ def test_bonsai(shared):
     assert loaded.points.shape == (35058, 3)
     assert len(read_posed_images(shared / "captures/bonsai/").images) == 125
     np.testing.assert_allclose(loaded.cameras.fx, 205.4657, atol=0.01)
-    pose = loaded.cameras.world_to_camera.astype(np.float64)
-    seen = np.einsum("tij,pj->tpi", pose[:, :3, :3], loaded.points) + pose[:, None, :3, 3]
-    assert ((seen[..., 2] > 0).mean(1) > 0.5).all()
+    seen = np.einsum("tij,pj->tpi", loaded.cameras.world_to_camera[:, :3, :3], loaded.points)
+    assert ((seen + loaded.cameras.world_to_camera[:, None, :3, 3])[..., 2] > 0).mean(1).min() > 0.5

@@ -14,7 +14,6 @@ ARRAYS = {
     "number": np.array(7),
     "nothing": np.zeros((0, 3), np.int16),
     "flags": np.array([True, False]),
-    "half": np.ones(3, np.float16),
 }
 
 

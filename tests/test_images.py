@@ -12,13 +12,7 @@ import pytest
 from capture_files import png, png_chunk, refused
 
 from jsecon.errors import InputError
-from jsecon.read.captures.images import (
-    image_header,
-    read_depth,
-    read_image,
-    read_label_image,
-    write_image,
-)
+from jsecon.read.captures.images import image_header, read_depth, read_image, read_label_image, write_image
 from jsecon.read.captures.lens import Lens, undistorted_pinhole, undistortion_maps
 
 RNG = np.random.default_rng(3)
@@ -27,27 +21,12 @@ FRAME = RNG.integers(0, 256, (13, 17, 3), np.uint8)
 
 def test_what_is_written_comes_back(tmp_path):
     write_image(tmp_path / "a.png", FRAME)
-    image, transparent = read_image(tmp_path / "a.png")
-    np.testing.assert_array_equal(image, FRAME)
-    assert not transparent
-    assert image_header(tmp_path / "a.png").upright == (17, 13)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png")[0], FRAME)
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
-    smooth = cv2.resize(FRAME, (170, 130), interpolation=cv2.INTER_CUBIC)
-    write_image(tmp_path / "a.jpg", smooth)
-    image, _ = read_image(tmp_path / "a.jpg")
-    assert np.abs(image.astype(int) - smooth).mean() < 4
+    write_image(tmp_path / "a.jpg", corners())
+    assert np.abs(read_image(tmp_path / "a.jpg")[0].astype(int) - corners()).mean() < 6
     with refused("a.xyz", "'.xyz'"):
         write_image(tmp_path / "a.xyz", FRAME)
-
-
-def test_grey_and_transparency(tmp_path):
-    cv2.imwrite(str(tmp_path / "grey.png"), FRAME[..., 0])
-    np.testing.assert_array_equal(read_image(tmp_path / "grey.png")[0], np.repeat(FRAME[..., :1], 3, -1))
-    alpha = np.where(np.arange(17) < 5, 0, 255).astype(np.uint8) * np.ones((13, 1), np.uint8)
-    cv2.imwrite(str(tmp_path / "clear.png"), np.dstack([FRAME[..., ::-1], alpha]))
-    image, transparent = read_image(tmp_path / "clear.png")
-    assert transparent
-    np.testing.assert_array_equal(image, FRAME * (alpha > 0)[..., None])
 
 
 def deep_png(rows, *, woven=0, behind=b""):
@@ -119,25 +98,14 @@ def test_a_heic_is_turned_once_and_damage_and_absence_are_told(tmp_path, monkeyp
     photo = pillow_heif.from_pillow(PIL.Image.fromarray(np.ascontiguousarray(stored)))
     photo.save(tmp_path / "a.heic", quality=95, exif=tags.tobytes())
     assert image_header(tmp_path / "a.heic").upright == (96, 64)
-    image, transparent = read_image(tmp_path / "a.heic")
-    assert np.abs(image.astype(int) - corners(96, 64)).mean() < 6
-    assert not transparent
-    photo.save(tmp_path / "cut.heic", quality=95)
-    data = (tmp_path / "cut.heic").read_bytes()
+    assert np.abs(read_image(tmp_path / "a.heic")[0].astype(int) - corners(96, 64)).mean() < 6
+    data = (tmp_path / "a.heic").read_bytes()
     (tmp_path / "cut.heic").write_bytes(data[: len(data) // 2])
     with refused("cut.heic", "cannot be read"):
         read_image(tmp_path / "cut.heic")
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
     with refused("a.heic", "pip install 'jsecon[formats]'"):
         read_image(tmp_path / "a.heic")
-
-
-@pytest.mark.parametrize("cut", [0, 3, 8, 9, 14, 20])
-def test_damaged_exif_turns_nothing(tmp_path, cut):
-    stored = cv2.imencode(".jpg", FRAME)[1].tobytes()
-    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x09\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"[: 6 + cut]
-    (tmp_path / "a.jpg").write_bytes(stored[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + stored[2:])
-    assert read_image(tmp_path / "a.jpg")[0].shape == (13, 17, 3)
 
 
 def test_too_large_images_are_shrunk_or_say_the_limit(tmp_path, monkeypatch):
@@ -156,7 +124,9 @@ def test_too_large_images_are_shrunk_or_say_the_limit(tmp_path, monkeypatch):
 
 
 def test_odd_kinds_of_images_are_read_right(tmp_path):
-    """CMYK, 16 bit grey of a TIFF, grey with alpha, an animation (its first frame)."""
+    """Grey, CMYK, 16 bit grey of a TIFF, colours and grey with alpha, an animation (its first frame)."""
+    cv2.imwrite(str(tmp_path / "a.bmp"), corners()[..., 0])
+    np.testing.assert_array_equal(read_image(tmp_path / "a.bmp")[0], np.repeat(corners()[..., :1], 3, -1))
     image = PIL.Image.fromarray(corners())
     image.convert("CMYK").save(tmp_path / "a.jpg", quality=95)
     assert np.abs(read_image(tmp_path / "a.jpg")[0].astype(int) - corners()).mean() < 6
@@ -165,39 +135,14 @@ def test_odd_kinds_of_images_are_read_right(tmp_path):
     np.testing.assert_array_equal(read_image(tmp_path / "a.tif")[0], np.repeat(grey[..., None], 3, -1))
     alpha = np.where(np.arange(48) < 20, 0, 255).astype(np.uint8) * np.ones((32, 1), np.uint8)
     PIL.Image.fromarray(np.stack([grey, alpha], -1), "LA").save(tmp_path / "a.png")
-    shown, transparent = read_image(tmp_path / "a.png")
-    assert transparent
-    np.testing.assert_array_equal(shown[..., 1], np.where(alpha > 0, grey, 0))
+    PIL.Image.fromarray(np.dstack([corners(), alpha])).save(tmp_path / "c.png")
+    for name, expected in (("a.png", np.repeat(grey[..., None], 3, -1)), ("c.png", corners())):
+        shown, transparent = read_image(tmp_path / name)
+        assert transparent
+        np.testing.assert_array_equal(shown, expected * (alpha > 0)[..., None])
     for ending in (".webp", ".png"):
         image.save(tmp_path / f"b{ending}", save_all=True, append_images=[image.rotate(180)], lossless=True)
         np.testing.assert_array_equal(read_image(tmp_path / f"b{ending}")[0], corners())
-    for ending in (".webp", ".tif", ".bmp", ".heic"):
-        (tmp_path / f"cut{ending}").write_bytes(b"")
-        with refused(f"cut{ending}", "empty"):
-            read_image(tmp_path / f"cut{ending}")
-
-
-def test_cut_jpeg_with_a_thumbnail(tmp_path):
-    """The thumbnail in the header ends like a whole JPEG does."""
-    stored = cv2.imencode(".jpg", FRAME)[1].tobytes()
-    header = b"\xff\xe1" + (len(stored) + 2).to_bytes(2, "big") + stored
-    (tmp_path / "a.jpg").write_bytes((stored[:2] + header + stored[2:])[:-40])
-    with refused("a.jpg", "truncated"):
-        read_image(tmp_path / "a.jpg")
-
-
-def test_damaged_png_missing_file_and_no_image(tmp_path):
-    write_image(tmp_path / "a.png", FRAME)
-    data = bytearray((tmp_path / "a.png").read_bytes())
-    data[len(data) // 2] ^= 0x10
-    (tmp_path / "a.png").write_bytes(data)
-    with refused("a.png", "checksum"):
-        read_image(tmp_path / "a.png")
-    with refused("none.png", "No such file"):
-        read_image(tmp_path / "none.png")
-    (tmp_path / "text.png").write_text("no image at all, but long enough to look at")
-    with refused("text.png", "known kind"):
-        image_header(tmp_path / "text.png")
 
 
 @pytest.mark.parametrize("bits", [1, 2, 4, 8, 16])
@@ -211,18 +156,9 @@ def test_label_bits(tmp_path, bits):
         np.testing.assert_array_equal(read_label_image(tmp_path / "palette.png"), ids)
 
 
-def test_label_colours_and_refusals(tmp_path):
+def test_label_colours(tmp_path):
     write_image(tmp_path / "a.png", FRAME)
     np.testing.assert_array_equal(read_label_image(tmp_path / "a.png"), FRAME.astype(int) @ [65536, 256, 1])
-    cv2.imwrite(str(tmp_path / "four.png"), np.dstack([FRAME, FRAME[..., 0]]))
-    with refused("four.png", "transparent pixels"):
-        read_label_image(tmp_path / "four.png")
-    cv2.imwrite(str(tmp_path / "deep.png"), FRAME.astype(np.uint16) * 257)
-    with refused("deep.png", "16 bits"):
-        read_label_image(tmp_path / "deep.png")
-    write_image(tmp_path / "a.jpg", FRAME)
-    with refused("a.jpg", "not a PNG"):
-        read_label_image(tmp_path / "a.jpg")
 
 
 @pytest.mark.parametrize("dtype", [bool, np.uint8, np.int32, np.int64, np.float32])
@@ -243,9 +179,6 @@ def test_depth(tmp_path):
     np.testing.assert_allclose(read_depth(tmp_path / "d.png", 0.001), counts / 1000, rtol=1e-6)
     np.save(tmp_path / "d.npy", np.array([[1.0, np.nan, -2.0]]))
     np.testing.assert_array_equal(read_depth(tmp_path / "d.npy", 2.0), [[2, 0, 0]])
-    write_image(tmp_path / "rgb.png", FRAME)
-    with refused("rgb.png", "uint8"):
-        read_depth(tmp_path / "rgb.png", 0.001)
 
 
 BROWN = Lens(160, 120, 130.0, 128.0, 83.0, 58.0, (-0.21, 0.06, 0.002, -0.001))

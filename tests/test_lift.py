@@ -9,7 +9,7 @@ import pytest
 from small_field import REGIONS, make_field, true_regions
 
 from jsecon import InputError, region_votes
-from jsecon.query.pointing import INSIDE, OUTSIDE, PRIOR_PX, UNKNOWN, box_mask, lift
+from jsecon.query.pointing import OUTSIDE, PRIOR_PX, UNKNOWN, box_mask, lift
 
 
 @pytest.fixture(scope="module")
@@ -35,8 +35,7 @@ def test_a_mask_finds_its_region_and_what_the_frame_does_not_see_of_it(field):
         assert share[own == region].mean() > share[own != region].mean() + 0.2
         if (hidden & (own == region)).any():
             assert share[hidden & (own == region)].max() > 0.3
-    several = lift(made, np.where(labels[:3] < 0, UNKNOWN, labels[:3] == 2), [made.names[0], 1, 2])
-    assert int(several.region) == 2
+    assert int(lift(made, np.where(labels[:3] < 0, UNKNOWN, labels[:3] == 2), [made.names[0], 1, 2]).region) == 2
 
 
 def test_the_share_is_that_of_the_weights_and_the_regions_word(field):
@@ -57,9 +56,10 @@ def test_without_a_region_there_the_outline_alone_decides(field):
     made, labels = field
     half = (labels[:1] == 0) & (np.arange(labels.shape[2]) < 20)  # part of a region
     found = lift(made, half, [0])
+    share = np.asarray(found.similarity)
     assert int(found.region) == -1
-    assert np.asarray(found.similarity).max() > 0.3
-    assert not np.asarray(found.similarity)[seen(made, 0) == 0].any()
+    assert share.max() > 0.3
+    assert not share[seen(made, 0) == 0].any()
 
 
 def test_of_a_box_only_the_outside_is_known(field):
@@ -70,8 +70,6 @@ def test_of_a_box_only_the_outside_is_known(field):
     assert (box[labels[0] == 1] == UNKNOWN).all()
     found = lift(made, box[None], [0])
     assert np.asarray(found.mask).any()
-    inside = lift(made, np.where(box == UNKNOWN, INSIDE, OUTSIDE)[None], [0])
-    assert np.asarray(inside.mask).sum() >= np.asarray(found.mask).sum()
 
 
 def test_odd_input_is_refused(field):

@@ -1,16 +1,16 @@
-"""Masks from disk: matched by name, compacted over the frames, every change said, every misfit told."""
+"""Masks from disk: matched by name, compacted over the frames, every change said; which folders are cameras and which
+objects."""
 
 import json
 
 import cv2
 import numpy as np
 import pytest
-from capture_files import png, refused
+from capture_files import refused
 
-from experiments.datasets.feature_files import load_text_features, write_features, write_text_features
-from jsecon.read.captures.images import write_image
-from jsecon.read.masks.masks import LEVELS, embedding_size, load_features, load_labels
-from jsecon.vision.protocols import CANONICAL
+from experiments.datasets.feature_files import write_features
+from jsecon.read.masks.masks import LEVELS, embedding_size, load_features, load_labels, load_proposals
+from jsecon.types import ImageFile
 
 NAMES = ("b", "a", "c")
 SIZE = (12, 18)
@@ -40,45 +40,22 @@ def test_integers(tmp_path, dtype):
     labels, ids, notes = load_labels(tmp_path, NAMES, SIZE, progress=lambda *call: calls.append(call))
     expected, expected_ids = slow(images)
     np.testing.assert_array_equal(labels, expected)
-    assert labels.dtype == np.int16
-    assert ids == expected_ids
-    assert notes == ()
+    assert (labels.dtype, ids, notes) == (np.int16, expected_ids, ())
     assert calls == [(1, 3), (2, 3), (3, 3)]
 
 
-def test_colours_are_ids_and_indices_of_a_palette_are_too(tmp_path):
-    """Palettes as DAVIS and its trackers write them; this one repeats colours on purpose."""
-    indices = RNG.integers(0, 4, (3, *SIZE))
-    for name, image in zip(NAMES, indices):
-        (tmp_path / f"{name}.png").write_bytes(png(image, bits=2, colour_type=3, palette=bytes([0, 0, 0, 9, 9, 9] * 2)))
-    labels, ids, _ = load_labels(tmp_path, NAMES, SIZE)
-    np.testing.assert_array_equal(labels, slow(indices)[0])
-    assert ids == (1, 2, 3)
-    palette = np.array([[0, 0, 0], [255, 0, 0], [0, 0, 255], [1, 2, 3]], np.uint8)
-    for name, image in zip(NAMES, indices):
-        write_image(tmp_path / f"{name}.png", palette[image])
-    labels, ids, _ = load_labels(tmp_path, NAMES, SIZE)
-    np.testing.assert_array_equal(labels, slow(palette[indices].astype(int) @ [65536, 256, 1])[0])
-    assert ids == (255, 66051, 16711680)
-
-
-def test_colmap_names_and_precedence(tmp_path):
+def test_colmap_names_precede_and_missing_masks_leave_their_frames_unlabelled(tmp_path):
     write_masks(tmp_path, IDS, ("b.jpg", "a.JPG", "c"))
     write_masks(tmp_path, IDS[:1] * 0 + 5, ("c.jpg",))
-    labels, _, _ = load_labels(tmp_path, NAMES, SIZE)
-    np.testing.assert_array_equal(labels, slow(IDS)[0])
-
-
-def test_missing_masks_leave_their_frames_unlabelled(tmp_path):
-    write_masks(tmp_path, IDS[[0, 2]], ("b", "c"))
+    np.testing.assert_array_equal(load_labels(tmp_path, NAMES, SIZE).labels, slow(IDS)[0])
+    (tmp_path / "a.JPG.png").unlink()
     labels, _, notes = load_labels(tmp_path, NAMES, SIZE)
     assert (labels[1] == -1).all()
     np.testing.assert_array_equal(labels[[0, 2]], slow(IDS[[0, 2]])[0])
-    assert len(notes) == 1
     assert "1 of 3 frames have no masks (the first: a)" in notes[0]
 
 
-def test_no_mask_at_all_and_a_damaged_one(tmp_path):
+def test_folders_without_masks_of_the_frames(tmp_path):
     with refused(tmp_path, "0 masks", "b.png"):
         load_labels(tmp_path, NAMES, SIZE)
     write_masks(tmp_path, IDS, ("0000", "0001", "0002"))
@@ -86,25 +63,16 @@ def test_no_mask_at_all_and_a_damaged_one(tmp_path):
         load_labels(tmp_path, NAMES, SIZE)
     with refused("nowhere", "no such folder"):
         load_labels(tmp_path / "nowhere", NAMES, SIZE)
-    write_masks(tmp_path, IDS)
-    (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:-20])
-    with refused("a.png", "cannot be read"):
-        load_labels(tmp_path, NAMES, SIZE)
+    with refused(tmp_path, "no _f.npy"):
+        embedding_size(tmp_path)
 
 
 def test_other_sizes(tmp_path):
-    """The same aspect is resized by nearest; another one is told."""
-    large = np.kron(IDS, np.ones((1, 4, 4), int))
-    write_masks(tmp_path, large)
+    """They are resized; 1000x667 shrunk to a tenth is 100x67: off by a pixel of the smaller, by five of the larger."""
+    write_masks(tmp_path, np.kron(IDS, np.ones((1, 4, 4), int)))
     labels, _, notes = load_labels(tmp_path, NAMES, SIZE)
     np.testing.assert_array_equal(labels, slow(IDS)[0])
     assert "3 masks were resized to 18x12" in notes[0]
-    enlarged, _, _ = load_labels(tmp_path, NAMES, (96, 144))
-    np.testing.assert_array_equal(enlarged, np.kron(slow(IDS)[0], np.ones((1, 8, 8), int)))
-    write_masks(tmp_path, IDS.transpose(0, 2, 1))
-    with refused("b.png", "12x18", "18x12"):
-        load_labels(tmp_path, NAMES, SIZE)
-    # 1000x667 shrunk to a tenth is 100x67: off by a pixel of the smaller, by five of the larger.
     write_masks(tmp_path, np.ones((1, 67, 100)), ("b",))
     assert (load_labels(tmp_path, ("b",), (667, 1000)).labels == 0).all()
 
@@ -123,28 +91,9 @@ def test_langsplat_levels(tmp_path, level):
         expected, expected_ids = slow(image[None], -1)
         np.testing.assert_array_equal(found, np.where(expected[0] >= 0, expected[0] + first, -1))
         first += len(expected_ids)
-    assert ids == tuple(range(first))
-    assert len(notes) == 1
-
-
-def test_langsplat_misfits(tmp_path):
-    path = tmp_path / "b_s.npy"
-    np.save(path, np.zeros((3, *SIZE)))
-    with refused("b_s.npy", "shape is (3, 12, 18)"):
-        load_labels(tmp_path, NAMES, SIZE)
-    np.save(path, np.full((4, *SIZE), 0.5))
-    with refused("b_s.npy", "no integers"):
-        load_labels(tmp_path, NAMES, SIZE)
-    np.save(path, np.zeros((4, *SIZE)))
+    assert (ids, len(notes)) == (tuple(range(first)), 1)
     with refused("level", "'xl'"):
         load_labels(tmp_path, NAMES, SIZE, level="xl")
-    for length in (300, 0):
-        path.write_bytes(path.read_bytes()[:length])
-        with refused("b_s.npy", "cannot be read"):
-            load_labels(tmp_path, NAMES, SIZE)
-    write_masks(tmp_path, IDS)
-    with refused("there are both"):
-        load_labels(tmp_path, NAMES, SIZE)
 
 
 def test_too_many_regions(tmp_path):
@@ -157,60 +106,218 @@ def test_too_many_regions(tmp_path):
         load_labels(tmp_path, NAMES, (100, 120))
 
 
-@pytest.fixture
-def written(tmp_path):
+def test_masks_come_back_with_their_own_rows(tmp_path):
     rng = np.random.default_rng(0)
     labels = rng.integers(-1, 3, (2, 12, 16)).astype(np.int16)
     labels[1][labels[1] == 1] = 0  # mask 1 of the second frame is nowhere
     rows = rng.normal(size=(2, 3, 5)).astype(np.float32)
     for t in range(2):
         write_features(tmp_path, f"frame_{t}", labels[t], rows[t])
-    return tmp_path, labels, rows
-
-
-def test_masks_come_back_with_their_own_rows(written):
-    folder, labels, rows = written
+    assert embedding_size(tmp_path) == 5
     for level in ("default", "l"):
-        found = load_features(folder, ["frame_0", "frame_1"], (12, 16), level=level)
+        found = load_features(tmp_path, ["frame_0", "frame_1"], (12, 16), level=level)
         np.testing.assert_array_equal(found.frame, [0, 0, 0, 1, 1])
-        np.testing.assert_array_equal(found.labels >= 0, labels >= 0)
         for t in range(2):
-            given = rows[t][labels[t]]
             shown = labels[t] >= 0
-            np.testing.assert_array_equal(found.embeddings[found.labels[t]][shown], given[shown])
+            np.testing.assert_array_equal(found.labels[t] >= 0, shown)
+            np.testing.assert_array_equal(found.embeddings[found.labels[t]][shown], rows[t][labels[t]][shown])
     assert not set(np.unique(found.labels[0])) & set(np.unique(found.labels[1])) - {-1}
 
 
-def test_what_is_missing_or_disagrees_is_told(written):
-    folder, _, rows = written
-    with refused("frame_2_s.npy", "no such file"):
-        load_features(folder, ["frame_0", "frame_2"], (12, 16))
-    assert embedding_size(folder) == 5
-    for wrong, said in ((rows[1][:2], "(2, 5) for ids up to 2"), (rows[1][:, :4], "rows of 4 numbers")):
-        np.save(folder / "frame_1_f.npy", wrong)
-        with refused("frame_1_f.npy", said):
-            load_features(folder, ["frame_0", "frame_1"], (12, 16))
+FRAME = (12, 16)
 
 
-def test_a_folder_without_embeddings_is_refused(tmp_path):
-    with refused(tmp_path, "no _f.npy"):
-        embedding_size(tmp_path)
-    (tmp_path / "a_f.npy").write_bytes(b"no array")
-    with refused("a_f.npy", "cannot be read"):
-        embedding_size(tmp_path)
+def write(path, image):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), np.asarray(image, np.uint8 if np.max(image) < 256 else np.uint16))
 
 
-def test_texts(tmp_path):
-    vectors = np.random.default_rng(1).normal(size=(6, 4)).astype(np.float32)
-    file = tmp_path / "text_features.json"
-    write_text_features(file, ["mug", "ball", *CANONICAL], vectors)
-    queries, canonical = load_text_features(file, ["ball", "mug"])
-    np.testing.assert_allclose(queries, vectors[[1, 0]], atol=1e-6)
-    np.testing.assert_allclose(canonical, vectors[2:], atol=1e-6)
-    with refused(file, "no vector of spoon"):
-        load_text_features(file, ["mug", "spoon"])
-    table = json.loads(file.read_text())
-    del table["texture"]
-    file.write_text(json.dumps(table))
-    with refused("texture"):
-        load_text_features(file, ["mug"])
+def ids_image():
+    return RNG.choice([0, 1, 2, 3, 4], FRAME)
+
+
+def photographs(*paths, size=(16, 12)):
+    """Frames of a capture, named as `load_capture` names them."""
+    names = [path.removesuffix(".jpg") for path in paths]
+    stems = [name.rpartition("/")[2] for name in names]
+    names = stems if len(set(stems)) == len(stems) else [name.replace("/", "_") for name in names]
+    return {name: ImageFile(path, *size) for name, path in zip(names, paths)}
+
+
+@pytest.mark.parametrize("folders", [("0", "1"), ("cam0", "cam1"), ("rig/left", "rig/right")])
+@pytest.mark.parametrize("alike", [False, True])
+@pytest.mark.parametrize("prefix", ["", "images/"])
+def test_folders_like_those_of_the_images_are_cameras(tmp_path, folders, alike, prefix):
+    paths = [f"{folders[n % 2]}/v{n // 2 if alike else n}" for n in range(4)]
+    images = [ids_image() for _ in paths]
+    for path, image in zip(paths, images):
+        write(tmp_path / f"{path}.png", image)
+    files = photographs(*(f"{prefix}{path}.jpg" for path in paths))
+    labels, ids, notes = load_labels(tmp_path, tuple(files), FRAME, frames=files)
+    np.testing.assert_array_equal(labels, np.stack(images) - 1)
+    assert (ids, notes) == ((1, 2, 3, 4), ())
+    read, _ = load_proposals(tmp_path, tuple(files), FRAME, frames=files)
+    np.testing.assert_array_equal(read(3), [images[3] == id for id in range(1, 5)])
+    images = [255 * (RNG.random(FRAME) < 0.5) for _ in paths]  # one object
+    for path, image in zip(paths, images):
+        write(tmp_path / f"{path}.png", image)
+    labels, ids, _ = load_labels(tmp_path, tuple(files), FRAME, frames=files)
+    np.testing.assert_array_equal(labels, np.stack(images) // 255 - 1)
+    assert ids == (255,)
+
+
+@pytest.mark.parametrize(("paths", "pattern"), [
+    (("a.jpg", "b.jpg"), "{object}/{name}"), (("cam0/a.jpg", "cam1/a.jpg"), "{object}/{camera}/{name}"),
+    (("cam0/a.jpg", "cam1/a.jpg"), "{camera}/{object}/{name}"),
+])  # fmt: skip
+def test_other_folders_of_black_and_white_masks_are_objects(tmp_path, paths, pattern):
+    files = photographs(*paths)
+    masks = np.array([[255 * (RNG.random(FRAME) < 0.5) for _ in files] for _ in range(2)])
+    for number, frames in enumerate(masks):
+        for file, mask in zip(files.values(), frames):
+            camera, _, name = file.path.removesuffix(".jpg").rpartition("/")
+            write(tmp_path / (pattern.format(object=number, camera=camera, name=name) + ".png"), mask)
+    labels, ids, notes = load_labels(tmp_path, tuple(files), FRAME, frames=files)
+    assert ids == (1, 2)
+    np.testing.assert_array_equal(labels, np.where(masks[0] > 0, 0, np.where(masks[1] > 0, 1, -1)))
+    assert any("objects" in note for note in notes)
+    read, _ = load_proposals(tmp_path, tuple(files), FRAME, frames=files)
+    np.testing.assert_array_equal(read(1), [masks[0, 1] > 0, (masks[1, 1] > 0) & (masks[0, 1] == 0)])
+
+
+def test_objects_are_in_some_of_the_frames_in_their_order_and_the_lower_id_lies_on_top(tmp_path):
+    low, high = np.zeros((2, *FRAME), bool)
+    low[1:8, 2:9] = high[5:11, 6:14] = True
+    for frame, folder, mask in (("b", "obj_10", high), ("c", "obj_9", low), ("c", "obj_10", high)):
+        write(tmp_path / folder / f"{frame}.png", 255 * mask)
+    (tmp_path / "other").mkdir()
+    labels, ids, notes = load_labels(tmp_path, tuple("bcf"), FRAME)
+    assert ids == (1, 2)
+    np.testing.assert_array_equal(labels[0] == 1, high)
+    np.testing.assert_array_equal(labels[1], np.where(low, 0, np.where(high, 1, -1)))
+    assert (labels[2] == -1).all()
+    assert "1 of 3 frames" in notes[0]
+    assert any("obj_9, obj_10" in note for note in notes)
+
+
+@pytest.mark.parametrize("width", [5, 16, 23, 31, 32, 47, 80])
+def test_resizing_takes_the_value_at_each_centre(tmp_path, width):
+    image = RNG.integers(1, 9, (12 * width // 16 or 1, width))
+    write(tmp_path / "a.png", image)
+    labels, ids, _ = load_labels(tmp_path, ("a",), FRAME)
+    rows = np.floor((np.arange(12) + 0.5) * len(image) / 12).astype(int)
+    columns = np.floor((np.arange(16) + 0.5) * width / 16).astype(int)
+    np.testing.assert_array_equal(np.array(ids)[labels[0]], image[rows[:, None], columns])
+
+
+@pytest.mark.parametrize(("frame", "file"), [
+    ("a", "a.PNG"), ("frame.0001", "frame.0001.png"), ("frame.0001", "frame.0001.jpg.png"), ("a", "a.JPG.Png"),
+    ("a", "a_mask.png"), ("frame.0001", "frame.0001_masks.png"), ("0001", "mask_0001.png"), ("a", "a.jpg_mask.png"),
+    ("cam0_a", "cam0/a.png"), ("cam0_a", "cam0_a.png"),
+])  # fmt: skip
+def test_what_a_mask_may_be_called(tmp_path, frame, file):
+    image = ids_image()
+    write(tmp_path / file, image)
+    write(tmp_path / "b.png", image)
+    files = photographs("cam0/a.jpg", "cam1/a.jpg", "b.jpg") if frame == "cam0_a" else {}
+    labels, _, notes = load_labels(tmp_path, (frame, "b"), FRAME, frames=files or None)
+    np.testing.assert_array_equal(labels, np.stack([image, image]) - 1)
+    assert not notes
+
+
+def test_masks_of_no_frame_and_kinds_that_are_not_read_are_named(tmp_path):
+    for name in "abc":
+        write(tmp_path / f"{name}.png", ids_image())
+    _, _, notes = load_labels(tmp_path, ("b",), FRAME, frames=dict.fromkeys("ab"))
+    assert "1 of the .png files" in notes[0]
+    assert "c.png" in notes[0]
+    with refused(tmp_path, "none of the 1 frames"):
+        load_labels(tmp_path, ("d",), FRAME, frames=dict.fromkeys("abd"))
+    for name, words in (("d.jpg", ("d.jpg", ".jpg", "PNG")), ("d.tif", ("d.tif", ".tif"))):
+        write(tmp_path / name[2:] / name, ids_image())
+        with refused(*words):
+            load_labels(tmp_path / name[2:], ("d",), FRAME)
+
+
+def test_arrays_with_negative_numbers(tmp_path):
+    """-1 = none: then 0 is an id, in all."""
+    image = ids_image()
+    np.save(tmp_path / "a.npy", image)
+    np.save(tmp_path / "b.npy", image - 1)
+    labels, ids, notes = load_labels(tmp_path, ("a", "b"), FRAME)
+    np.testing.assert_array_equal(labels, [image, image - 1])
+    assert ids == (0, 1, 2, 3, 4)
+    assert "negative" in notes[0]
+
+
+def test_masks_of_stored_pixels_are_turned_like_their_photographs(tmp_path):
+    """A lies on its side (6: its stored pixels are turned clockwise), b stands on its head, c is upright."""
+    upright = [ids_image() for _ in range(3)]
+    files = {name: ImageFile(f"{name}.jpg", 16, 12, turn) for name, turn in zip("abc", (6, 3, 1))}
+    stored = [np.rot90(upright[0]), upright[1][::-1, ::-1], upright[2]]
+    for images, note in ((upright, ""), ([image.repeat(2, 0).repeat(2, 1) for image in stored], "2 masks were of the")):
+        for name, image in zip("abc", images):
+            write(tmp_path / f"{name}.png", image)
+        labels, _, notes = load_labels(tmp_path, tuple("abc"), FRAME, frames=files)
+        np.testing.assert_array_equal(labels, np.stack(upright) - 1)
+        assert note in "".join(notes)
+    read, _ = load_proposals(tmp_path, tuple("abc"), FRAME, frames=files)
+    np.testing.assert_array_equal(read(1), [upright[1] == id for id in range(1, 5)])
+
+
+def test_masks_of_photographs_of_another_aspect_follow_them(tmp_path):
+    """Frames have one size: a portrait photograph is squeezed into it, and so is its mask."""
+    image = ids_image().T
+    write(tmp_path / "a.png", image)
+    labels, _, _ = load_labels(tmp_path, ("a",), FRAME, frames={"a": ImageFile("a.jpg", 12, 16)})
+    rows, columns = ((2 * np.arange(12) + 1) * 16 // 24), ((2 * np.arange(16) + 1) * 12 // 32)
+    np.testing.assert_array_equal(labels[0], image[rows[:, None], columns] - 1)
+
+
+SQUARE = [1, 1, 9, 1, 9, 9, 1, 9]
+HOLE = [3, 3, 7, 3, 7, 7, 3, 7]
+APART = [11, 2, 14, 2, 14, 6, 11, 6]
+OVER = [8, 4, 12, 4, 12, 5, 8, 5]
+
+
+@pytest.mark.parametrize("polygons", [[SQUARE], [SQUARE, APART, OVER], [SQUARE, SQUARE], [HOLE, SQUARE]])
+def test_polygons_are_filled_and_add_up(tmp_path, polygons):
+    """As in COCO's own tools: a hole within is none."""
+    (tmp_path / "a.json").write_text(json.dumps([{"segmentation": polygons}, {"segmentation": [APART]}]))
+    read, _ = load_proposals(tmp_path, ("a",), FRAME)
+    expected = np.zeros((2, *FRAME), bool)
+    for mask, boxes in zip(expected, (polygons, [APART])):
+        for x, y, _, _, right, below, *_ in boxes:
+            mask[y : below + 1, x : right + 1] = True
+    np.testing.assert_array_equal(read(0), expected)
+
+
+def test_one_coco_file_of_all_frames(tmp_path):
+    names, shapes = ("a", "b", "other"), ((7, SQUARE), (7, APART), (9, SQUARE))
+    images = [{"id": 7 + n, "file_name": f"{name}.jpg", "height": 24, "width": 32} for n, name in enumerate(names)]
+    annotations = [{"image_id": image, "segmentation": [shape], "category_id": 1} for image, shape in shapes]
+    content = {"images": images, "annotations": annotations, "categories": [{"id": 1, "name": "thing"}]}
+    (tmp_path / "instances.json").write_text(json.dumps(content))
+    mask = np.zeros((24, 32), np.uint8)
+    cv2.fillPoly(mask, [np.array(SQUARE).reshape(-1, 2)], 1)
+    for place in (tmp_path, tmp_path / "instances.json"):
+        read, notes = load_proposals(place, ("a", "b", "c"), FRAME)
+        assert read(0).shape == (2, *FRAME)
+        np.testing.assert_array_equal(read(0)[0], mask[1::2, 1::2])
+        assert read(1).shape == read(2).shape == (0, *FRAME)
+        assert notes == ("1 of 3 frames have no masks (the first: c).",)
+    with refused("instances.json", "none of its 3 images"):
+        load_proposals(tmp_path, ("x",), FRAME)
+
+
+def test_embeddings_lie_in_the_cameras_folders(tmp_path):
+    files = photographs("cam0/a.jpg", "cam1/a.jpg")
+    rows = RNG.normal(size=(2, 2, 3)).astype(np.float32)
+    for n, camera in enumerate(("cam0", "cam1")):
+        (tmp_path / camera).mkdir()
+        np.save(tmp_path / camera / "a_s.npy", np.tile(np.arange(16) // 8, (4, 12, 1)).astype(np.float32))
+        np.save(tmp_path / camera / "a_f.npy", rows[n])
+    found = load_features(tmp_path, tuple(files), FRAME, frames=files)
+    np.testing.assert_array_equal(found.frame, [0, 0, 1, 1])
+    np.testing.assert_array_equal(found.embeddings, rows.reshape(4, 3))
+    np.testing.assert_array_equal(found.labels[1, 0], np.arange(16) // 8 + 2)

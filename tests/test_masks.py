@@ -32,13 +32,6 @@ def test_equals_rendering_the_subset_cut_out(scene, cameras):
     assert not mask.all()
 
 
-def test_what_is_not_selected_hides_nothing(scene, camera):
-    wall = jax.tree.map(np.array, scene)
-    wall.means[63], wall.log_scales[63], wall.opacity_logits[63] = (0.0, -0.6, -2.0), 0.0, 9.0
-    chosen = np.arange(64) < 20
-    np.testing.assert_array_equal(selection_mask(wall, camera, chosen), selection_mask(scene, camera, chosen))
-
-
 def test_nothing_and_everything_and_a_mask_of_another_length(scene, camera):
     assert not np.asarray(selection_mask(scene, camera, np.zeros(64, bool))).any()
     everything = render(jax.tree.map(jnp.asarray, scene), camera, jnp.ones((64, 1))).alpha

@@ -1,11 +1,11 @@
 """transforms.json: axes, intrinsics in every spelling, missing images, depth, points; damage is told."""
 
+import dataclasses
 import json
 
 import cv2
 import numpy as np
-import pytest
-from capture_files import refused, small_capture, transforms, write_images, write_transforms
+from capture_files import assert_same, small_capture, transforms, write_images, write_transforms
 from splat_files import write_ply
 
 from jsecon.read.captures.capture import load_capture
@@ -23,14 +23,9 @@ def load_changed(tmp_path, change, **options):
 
 def test_round_trip(tmp_path):
     loaded = load_changed(tmp_path, lambda content: None, holdout=0)
-    np.testing.assert_array_equal(loaded.frames, CAPTURE.frames)
-    for field in ("world_to_camera", "fx", "fy", "cx", "cy"):
-        np.testing.assert_allclose(getattr(loaded.cameras, field), getattr(CAPTURE.cameras, field), atol=1e-6)
-    assert (loaded.cameras.width, loaded.cameras.height) == (24, 16)
-    assert loaded.points.shape == (0, 3)
+    assert_same(loaded, dataclasses.replace(CAPTURE, points=CAPTURE.points[:0], point_colors=CAPTURE.point_colors[:0]))
     assert loaded.notes == ()
     np.testing.assert_array_equal(loaded.source_from_scene, np.eye(4))
-    assert json.loads((tmp_path / "transforms.json").read_text()) == transforms(CAPTURE)  # it is only read
 
 
 def test_opengl_axes(tmp_path):
@@ -41,16 +36,6 @@ def test_opengl_axes(tmp_path):
 
     pose = load_changed(tmp_path, change).cameras.world_to_camera[0]
     np.testing.assert_allclose(pose @ [1.0, 2.0, -5.0, 1.0], [1.0, -2.0, 5.0, 1.0])
-
-
-@pytest.mark.parametrize("ending", ["", ".JPG"])
-def test_paths_without_ending_and_with_windows_separators(tmp_path, ending):
-    write_images(CAPTURE, tmp_path / "images", ".JPG")
-    content = transforms(CAPTURE, ending)
-    for entry in content["frames"]:
-        entry["file_path"] = ".\\" + entry["file_path"].replace("/", "\\")
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
-    assert load_capture(tmp_path).names == CAPTURE.names
 
 
 def test_camera_angle_and_sizes_from_the_images(tmp_path):
@@ -66,7 +51,7 @@ def test_camera_angle_and_sizes_from_the_images(tmp_path):
     np.testing.assert_array_equal(cameras.cy, 8)
 
 
-def test_missing_images_are_said_and_left_out(tmp_path):
+def test_missing_images_and_unused_masks_are_said(tmp_path):
     write_transforms(CAPTURE, tmp_path)
     (tmp_path / "images/frame_001.png").unlink()
     (tmp_path / "images/frame_002.png").unlink()
@@ -74,13 +59,10 @@ def test_missing_images_are_said_and_left_out(tmp_path):
     assert loaded.names == ("frame_000", "frame_003", "frame_004")
     np.testing.assert_array_equal(loaded.frames, CAPTURE.frames[[0, 3, 4]])
     np.testing.assert_array_equal(loaded.held_out, [True, False, True])
-    assert len(loaded.notes) == 1
     assert "2 of 5" in loaded.notes[0]
     assert "frame_001" in loaded.notes[0]
-    for name in loaded.names:
-        (tmp_path / f"images/{name}.png").unlink()
-    with refused("transforms.json", "none of which"):
-        load_capture(tmp_path)
+    masked = load_changed(tmp_path, lambda content: content["frames"][0].update(mask_path="m.png"))
+    assert "mask_path" in masked.notes[0]
 
 
 def test_applied_transform_and_scale_are_undone(tmp_path):
@@ -106,12 +88,6 @@ def test_depth_maps(tmp_path):
     assert not loaded.depths[[0, 2, 3, 4]].any()
     small = load_capture(tmp_path, downscale=2).depths[1]
     assert np.isin(small, loaded.depths[1]).all()
-    assert cv2.imwrite(str(tmp_path / "d.png"), counts.T)
-    with refused("d.png", "16x24"):
-        load_capture(tmp_path)
-    (tmp_path / "d.png").unlink()
-    with refused("d.png", "no such file"):
-        load_capture(tmp_path)
 
 
 def test_points_from_a_ply(tmp_path):
@@ -129,80 +105,19 @@ def test_distortion_keys(tmp_path):
     assert "5 images were undistorted" in loaded.notes[0]
     fisheye = load_changed(tmp_path, lambda content: content.update(camera_model="OPENCV_FISHEYE", k1=0.1))
     assert not np.allclose(fisheye.cameras.fx, loaded.cameras.fx)
-    with refused("transforms.json", "k4"):
-        load_changed(tmp_path, lambda content: content.update(camera_model="OPENCV", k4=0.1))
-    with refused("transforms.json", "EQUIRECTANGULAR"):
-        load_changed(tmp_path, lambda content: content.update(camera_model="EQUIRECTANGULAR"))
-    with refused("transforms.json", "ftheta_p0"):
-        load_changed(tmp_path, lambda content: content.update(ftheta_p0=0.1))
 
 
-def test_names_with_dots_and_without_ending(tmp_path):
+def test_names_with_dots_with_windows_separators_and_without_ending(tmp_path):
     """The ending is that of the file; what follows another dot belongs to the name."""
     write_images(CAPTURE, tmp_path / "images", ".PNG")
     content = transforms(CAPTURE, "")
     for n, entry in enumerate(content["frames"]):
         (tmp_path / f"images/frame_{n:03d}.PNG").rename(tmp_path / f"images/render.{n:04d}.PNG")
-        entry["file_path"] = f"./images/render.{n:04d}" + (".png" if n == 3 else "")
+        entry["file_path"] = f".\\images\\render.{n:04d}" + (".png" if n == 3 else "")
     (tmp_path / "scene.JSON").write_text(json.dumps(content))
     loaded = load_capture(tmp_path / "scene.JSON", holdout=0)
     assert loaded.names == tuple(f"render.{n:04d}" for n in range(5))
     np.testing.assert_array_equal(loaded.frames, CAPTURE.frames)
-
-
-def test_masks_are_said_to_be_unused(tmp_path):
-    loaded = load_changed(tmp_path, lambda content: content["frames"][0].update(mask_path="m.png"))
-    assert "mask_path" in loaded.notes[0]
-
-
-def _drop(*path):
-    def change(content):
-        for key in path[:-1]:
-            content = content[key]
-        del content[path[-1]]
-
-    return change
-
-
-def _put(value, *path):
-    def change(content):
-        for key in path[:-1]:
-            content = content[key]
-        content[path[-1]] = value
-
-    return change
-
-
-NAN_POSE = [[1.0, 0, 0, float("nan")], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-MIRROR = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
-SCALED = np.diag([2.0, 2.0, 2.0, 1.0]).tolist()
-
-
-@pytest.mark.parametrize(("change", "said"), [
-    (_drop("frames", 2, "transform_matrix"), "frame_002.png) cannot be read ('transform_matrix' is"),
-    (_put([], "frames"), "no frame"), (_put("wide", "w"), "wide"),
-    (_put([[1, 2], [3, 4]], "frames", 0, "transform_matrix"), "shape (2, 2)"),
-    (_put(NAN_POSE, "frames", 3, "transform_matrix"), "pose of images/frame_003.png has NaN"),
-    (_put(MIRROR, "frames", 3, "transform_matrix"), "not rigid"),
-    (_put(SCALED, "frames", 3, "transform_matrix"), "not rigid"),
-    (_put(0.0, "applied_scale"), "cannot be inverted"), (_put("gone.ply", "ply_file_path"), "gone.ply"),
-    (_put("spar\0se.ply", "ply_file_path"), "no such file"),
-    (_put(["sparse.ply"], "ply_file_path"), "another kind"),
-])  # fmt: skip
-def test_damage_is_told(tmp_path, change, said):
-    with refused(said):
-        load_changed(tmp_path, change)
-
-
-def test_no_focal_length(tmp_path):
-    def change(content):
-        for entry in content["frames"]:
-            del entry["fl_x"], entry["fl_y"]
-
-    with refused("no focal length", "camera_angle_x"):
-        load_changed(tmp_path, change)
-    with refused("camera_angle_x = 4.0"):
-        load_changed(tmp_path, lambda content: (change(content), content.update(camera_angle_x=4.0)))
 
 
 def test_rounded_rotations_are_made_exact(tmp_path):
@@ -215,29 +130,7 @@ def test_rounded_rotations_are_made_exact(tmp_path):
 
 
 def test_fox(shared):
-    """67 entries, 17 of which have no image; matches between two views meet in front of both, within a pixel."""
+    """67 entries, 17 of which have no image."""
     loaded = load_capture(shared / "captures/fox", downscale=2)
     assert loaded.frames.shape == (50, 960, 540, 3)
     assert "17 of 67" in loaded.notes[0]
-    assert loaded.held_out.sum() == 7
-    sift = cv2.SIFT_create(2000)
-    (points_a, found_a), (points_b, found_b) = (
-        sift.detectAndCompute(cv2.cvtColor(loaded.frames[t], cv2.COLOR_RGB2GRAY), None) for t in (0, 2)
-    )
-    pairs = cv2.BFMatcher().knnMatch(found_a, found_b, k=2)
-    kept = [first for first, second in pairs if first.distance < 0.7 * second.distance]
-    pixels = [
-        np.array([points_a[match.queryIdx].pt for match in kept]) + 0.5,
-        np.array([points_b[match.trainIdx].pt for match in kept]) + 0.5,
-    ]
-    projections = []
-    for t in (0, 2):
-        camera = loaded.cameras[t]
-        matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], np.float64)
-        projections.append(matrix @ camera.world_to_camera[:3].astype(np.float64))
-    lifted = cv2.triangulatePoints(*projections, *(p.T for p in pixels))
-    for projection, seen in zip(projections, pixels):
-        x, y, z = projection @ (lifted / lifted[3])
-        assert (z > 0).mean() > 0.95
-        assert np.median(np.hypot(x / z - seen[:, 0], y / z - seen[:, 1])) < 0.5
-    assert len(kept) > 100

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from conftest import gaussians_at
 from scipy.spatial.transform import Rotation
 from small_field import make_field
 from table_field import table_field
@@ -24,12 +25,9 @@ def answer(scene, cameras):
     inside[32:] = -inside[:32]
     turn = Rotation.from_euler("zyx", [40, 25, 10], degrees=True)
     means = turn.apply(inside * SIZE) + np.array([1.0, 2.0, 3.0])
-    gaussians = dataclasses.replace(
-        field.gaussians, means=means.astype(np.float32), log_scales=np.full((64, 3), np.log(1e-3), np.float32)
-    )
     every, share = np.ones(64, bool), np.ones(64, np.float32)
     selection = Selection(every, share, np.int32(0), np.float32(0.7))
-    field = dataclasses.replace(field, gaussians=gaussians)
+    field = dataclasses.replace(field, gaussians=gaussians_at(means, 1e-3))
     return Answer(Query("brick"), "votes", every, selection, field), turn, means
 
 
@@ -43,35 +41,17 @@ def test_the_oriented_box_is_that_of_the_brick(answer):
     assert np.abs(np.diagonal(place.axes.T @ turn.as_matrix())).min() > 0.9
     assert (place.low >= means.min(0) - 0.01).all()
     assert (place.high <= means.max(0) + 0.01).all()
-    record = asked.as_dict()
-    assert record["count"] == 64
-    assert record["place"]["extent"] == pytest.approx(list(2 * place.half_size), abs=1e-5)
-
-
-def test_it_is_in_the_world_of_the_capture(answer):
-    asked, *_ = answer
-    source_from_scene = np.diag([2.0, 2.0, 2.0, 1.0])
-    source_from_scene[:3, 3] = [5, 0, 0]
-    there = dataclasses.replace(asked, field=dataclasses.replace(asked.field, source_from_scene=source_from_scene))
-    np.testing.assert_allclose(there.place.center, 2 * asked.place.center + [5, 0, 0], rtol=1e-4)
-    np.testing.assert_allclose(there.place.half_size, 2 * asked.place.half_size, rtol=1e-3)
+    assert asked.as_dict()["place"]["extent"] == pytest.approx(list(2 * place.half_size), abs=1e-5)
 
 
 def test_two_objects_of_a_name_are_counted_and_have_no_place_together():
     scene = Scene(*table_field())
-    mugs, box = (scene.ask(text) for text in ("red mug", "dark blue box"))
-    assert (mugs.count, box.count) == (2, 1)
-    assert mugs.as_dict()["objects"] == 2
-    with pytest.raises(InputError, match="names 2 objects"):
-        scene.locate("red mug")
+    assert scene.ask("red mug").as_dict()["objects"] == 2
     left = scene.locate("the leftmost red mug")
     same = jsecon.locate(scene.field, "the leftmost red mug", scene.embedder)
     np.testing.assert_array_equal(same.center, left.place.center)
     np.testing.assert_allclose(left.place.center[:2], [-0.5, 0], atol=0.02)
-    with pytest.raises(InputError, match="names 0 objects"):
-        scene.locate("the red mug on the dark blue box")
     nothing = scene.ask("the red mug on the dark blue box")
     assert nothing.as_dict()["place"] is None
     with pytest.raises(InputError, match="none on dark blue box"):
         _ = nothing.place
-    np.testing.assert_array_equal(scene.locate("dark blue box").place.center, box.place.center)

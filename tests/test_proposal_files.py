@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from jsecon.errors import InputError
 from jsecon.read.masks.masks import load_labels, load_proposals
 
 SIZE = (20, 30)
@@ -25,10 +24,10 @@ def masks():
 
 def records(masks, scores=None):
     """As scripts/amg.py of segment-anything writes them."""
-    found = [
-        {"segmentation": {"size": list(mask.shape), "counts": text_of(runs_of(mask))}, "area": int(mask.sum())}
-        for mask in masks
-    ]
+    found = []
+    for mask in masks:
+        rle = {"size": list(mask.shape), "counts": text_of(runs_of(mask))}
+        found.append({"segmentation": rle, "area": int(mask.sum())})
     for record, score in zip(found, scores or []):
         record |= {"predicted_iou": score, "stability_score": 0.9}
     return found
@@ -72,24 +71,10 @@ def test_masks_of_single_frames_are_regions_of_their_own(tmp_path, masks):
     assert any("regions of their own" in note for note in notes)
 
 
-@pytest.mark.parametrize(("content", "words"), [
-    ("[{", "not JSON"), ('[{"bbox": [1, 2, 3, 4]}]', "'segmentation' is missing"),
-    ('{"info": 1}', "'annotations' is missing"), ('[{"segmentation": [[1, 2, 3, 4]]}]', "mask 0"),
-    ('[{"segmentation": {"size": [20, 30], "counts": [5]}}]', "5 of 20x30"),
-])  # fmt: skip
-def test_damaged_json_is_named(tmp_path, content, words):
-    (tmp_path / "a.json").write_text(content)
-    read, _ = load_proposals(tmp_path, ("a",), SIZE)
-    with pytest.raises(InputError, match=words) as caught:
-        read(0)
-    assert caught.value.where.startswith(str(tmp_path / "a.json"))
-
-
 def runs_of(mask) -> list[int]:
     """Lengths of runs down the columns, of 0 first."""
     flat = np.concatenate([[False], mask.T.ravel()])
-    edges = np.flatnonzero(np.diff(flat)) + 0
-    return np.diff([0, *edges, mask.size]).tolist()
+    return np.diff([0, *np.flatnonzero(np.diff(flat)), mask.size]).tolist()
 
 
 def text_of(runs) -> str:
@@ -114,30 +99,16 @@ def decoded(rle) -> np.ndarray:
 
 
 def test_the_example_of_cocos_own_tests():
-    counts = [6, 1, 40, 4, 5, 4, 5, 4, 21]
-    mask = decoded({"size": [9, 10], "counts": "61X13mN000`0"})
-    np.testing.assert_array_equal(mask, decoded({"size": [9, 10], "counts": counts}))
-    assert mask.sum() == 1 + 4 + 4 + 4
-    assert np.argwhere(mask.T.ravel())[0] == 6
+    mask = np.zeros(90, bool)
+    mask[[6, *range(47, 51), *range(56, 60), *range(65, 69)]] = True
+    for counts in ("61X13mN000`0", [6, 1, 40, 4, 5, 4, 5, 4, 21]):
+        np.testing.assert_array_equal(decoded({"size": [9, 10], "counts": counts}).T.ravel(), mask)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.integers(1, 70), st.floats(0, 1))
 def test_every_mask_comes_back(seed, height, width, density):
     rng = np.random.default_rng(seed)
     mask = np.kron(rng.random((height, width)) < density, np.ones((1, rng.integers(1, 9)), bool)) > 0
     for counts in (runs_of(mask), text_of(runs_of(mask))):
         np.testing.assert_array_equal(decoded({"size": list(mask.shape), "counts": counts}), mask)
-
-
-@pytest.mark.parametrize(("rle", "words"), [
-    ({"size": [9, 10], "counts": "61X13mN000"}, "69 of 9x10"),
-    ({"size": [9, 10], "counts": "61X13mN000`"}, "breaks off"),
-    ({"size": [9, 10], "counts": "61 X"}, "is not a digit"),
-    ({"size": [9, 10], "counts": [-10, 100]}, "90 of 9x10"), ({"size": [0, 10], "counts": []}, "0 of 0x10"),
-    ({"size": [9, 10]}, "'counts' is missing"), ({"size": [2, 2], "counts": "abc\u00e9"}, "is not a digit"),
-])  # fmt: skip
-def test_runs_that_are_no_mask_are_refused_where_they_lie(rle, words):
-    with pytest.raises(InputError, match=words) as caught:
-        decoded(rle)
-    assert caught.value.where.endswith("a.json, mask 0")

@@ -11,13 +11,8 @@ from capture_files import refused, small_capture
 from scipy.spatial.transform import Rotation
 
 from jsecon import load_capture
-from jsecon.pipeline.options import Options
-from jsecon.pipeline.results import RunContext
-from jsecon.pipeline.scene import plan_capture
-from jsecon.read.captures.images import read_depth
+from jsecon.read.captures.images import write_image
 from jsecon.read.captures.lens import Lens, resample_depth
-from jsecon.vision.colours import ColourEmbedder
-from jsecon.vision.protocols import Models
 
 _RANDOM = small_capture(count=12)
 _ONE = {name: np.full(12, getattr(_RANDOM.cameras, name)[0]) for name in ("fx", "fy", "cx", "cy")}
@@ -35,11 +30,6 @@ def poses(axes=(1, 1, 1)) -> np.ndarray:
     return np.linalg.inv(CAPTURE.cameras.world_to_camera.astype(np.float64)) @ np.diag([*axes, 1])
 
 
-def image(path, n: int) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), CAPTURE.frames[n][..., ::-1])
-
-
 def depth(path, n: int, unit: float = 0.001) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), np.round(CAPTURE.depths[n] / unit).astype(np.uint16))
@@ -54,26 +44,26 @@ def write_scannet(folder) -> None:
     for kind in ("color", "depth"):
         np.savetxt(folder / "intrinsic" / f"intrinsic_{kind}.txt", matrix)
     for n, pose in enumerate(poses()):
-        image(folder / "color" / f"{n}.png", n)
+        write_image(folder / "color" / f"{n}.png", CAPTURE.frames[n])
         depth(folder / "depth" / f"{n}.png", n)
         np.savetxt(folder / "pose" / f"{n}.txt", np.full((4, 4), -np.inf) if n == 4 else pose)
 
 
 def write_tum(folder) -> None:
-    """Poses come more often than images, at other times; image 4 has none near."""
+    """Poses come more often than images, at other times; image 4 has none near. Names may have spaces."""
     times = 1305031102.17 + 0.1 * np.arange(12)
     lines = {"rgb": ["# color images"], "depth": ["# depth maps"], "groundtruth": ["# timestamp tx ty tz qx qy qz qw"]}
     for n, pose in enumerate(poses()):
-        image(folder / "rgb" / f"{times[n]:.6f}.png", n)
+        write_image(folder / "rgb images" / f"{times[n]:.6f}.png", CAPTURE.frames[n])
         depth(folder / "depth" / f"{times[n] + 0.007:.6f}.png", n, 1 / 5000)
-        lines["rgb"].append(f"{times[n]:.6f} rgb/{times[n]:.6f}.png")
+        lines["rgb"].append(f"{times[n]:.6f} rgb images/{times[n]:.6f}.png")
         lines["depth"].append(f"{times[n] + 0.007:.6f} depth/{times[n] + 0.007:.6f}.png")
         numbers = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
-        for late, numbers_then in ((0.004, numbers), (0.05, [9, 9, 9, 0, 0, 0, 1])):
+        for late, pose_then in ((0.004, numbers), (0.05, [9, 9, 9, 0, 0, 0, 1])):
             if n != 4 or late > 0.01:
-                lines["groundtruth"].append(" ".join(map(str, [times[n] + late, *numbers_then])))
+                lines["groundtruth"].append(" ".join(map(str, [times[n] + late, *pose_then])))
     for name, text in lines.items():
-        (folder / f"{name}.txt").write_text("\n".join(text) + "\n")
+        (folder / f"{name}.txt").write_text("\n".join(text) + "\n", encoding="utf-8-sig")
     (folder / "intrinsics.txt").write_text(" ".join(map(str, [K[0], K[1], K[2] - 0.5, K[3] - 0.5])))
 
 
@@ -81,9 +71,10 @@ def write_arkitscenes(folder) -> None:
     lines = []
     for n, pose in enumerate(np.linalg.inv(poses())):
         name = f"41069021_{100 + n / 10:.3f}"
-        image(folder / "lowres_wide" / f"{name}.png", n)
+        write_image(folder / "lowres_wide" / f"{name}.png", CAPTURE.frames[n])
         depth(folder / "lowres_depth" / f"{name}.png", n)
-        file = folder / "lowres_wide_intrinsics" / f"{name}.pincam"
+        near = f"41069021_{100 + n / 10 + 0.001 * (n % 3 - 1):.3f}"  # of intrinsics: up to a millisecond off
+        file = folder / "lowres_wide_intrinsics" / f"{near}.pincam"
         file.parent.mkdir(exist_ok=True)
         file.write_text(" ".join(map(str, [*SIZE, *K])))
         if n != 4:
@@ -96,7 +87,7 @@ def write_polycam(folder) -> None:
     frames = folder / "keyframes"
     (frames / "corrected_cameras").mkdir(parents=True)
     for n, pose in enumerate(poses((1, -1, -1))):
-        image(frames / "corrected_images" / f"{100 + n}.png", n)
+        write_image(frames / "corrected_images" / f"{100 + n}.png", CAPTURE.frames[n])
         depth(frames / "depth" / f"{100 + n}.png", n)
         told = {f"t_{i}{j}": pose[i, j] for i in range(3) for j in range(4)}
         told |= dict(zip(("fx", "fy", "cx", "cy", "width", "height"), [*K, *SIZE])) | {"blur_score": 90.1}
@@ -107,19 +98,14 @@ def write_polycam(folder) -> None:
 def write_record3d(folder) -> None:
     rows = [[*Rotation.from_matrix(pose[:3, :3]).as_quat(), *pose[:3, 3]] for pose in poses((1, -1, -1))]
     for n in range(13):
-        image(folder / "rgb" / f"{n}.png", min(n, 11))
+        write_image(folder / "rgb" / f"{n}.png", CAPTURE.frames[min(n, 11)])
     fx, fy, cx, cy = K
     told = {"w": 24, "h": 16, "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1], "poses": rows}
     (folder / "metadata.json").write_text(json.dumps(told))
 
 
-FORMATS = {
-    "scannet": write_scannet,
-    "tum": write_tum,
-    "arkitscenes": write_arkitscenes,
-    "polycam": write_polycam,
-    "record3d": write_record3d,
-}
+WRITERS = write_scannet, write_tum, write_arkitscenes, write_polycam, write_record3d
+FORMATS = {write.__name__.removeprefix("write_"): write for write in WRITERS}
 
 
 def expected(name: str) -> list[int]:
@@ -142,8 +128,6 @@ def test_the_capture_comes_back(tmp_path, name):
     assert any("1 of 1" in note and "no pose" in note for note in found.notes)
     if name == "scannet":
         assert found.names == tuple(map(str, kept))
-    work = RunContext(Options(tmp_path / name), Models(ColourEmbedder()), tmp_path / "out")
-    assert [stage.name for stage in plan_capture(work)] == ["load"]  # a run looks for no poses
 
 
 def test_a_depth_camera_of_its_own_is_seen_through_the_colour_camera(tmp_path):
@@ -169,7 +153,7 @@ def test_the_benchmarks_own_cameras_are_known_by_name(tmp_path, camera, fx, bent
     folder = tmp_path / f"rgbd_dataset_{camera}_desk"
     write_tum(folder)
     (folder / "intrinsics.txt").unlink()
-    for file in (folder / "rgb").iterdir():
+    for file in (folder / "rgb images").iterdir():
         cv2.imwrite(str(file), np.zeros((480, 640, 3), np.uint8))
     for file in (folder / "depth").iterdir():
         cv2.imwrite(str(file), np.full((480, 640), 5000, np.uint16))
@@ -177,38 +161,32 @@ def test_the_benchmarks_own_cameras_are_known_by_name(tmp_path, camera, fx, bent
     assert any("undistorted" in note for note in found.notes) == bent
     if not bent:
         np.testing.assert_allclose([found.cameras.fx[0], found.cameras.cx[0]], [fx, 320.6], rtol=1e-6)
-    assert read_depth(next((folder / "depth").iterdir()), 1 / 5000).max() == 1
-    shutil.move(folder, tmp_path / "mine")
-    with refused("intrinsics.txt", "fx fy cx cy"):
-        load_capture(tmp_path / "mine")
 
 
-@pytest.mark.parametrize("before", [None, SIZE])
-@pytest.mark.parametrize("smaller", [False, True])
+@pytest.mark.parametrize(("before", "smaller"), [(False, False), (True, False), (True, True)])
 def test_polycam_without_sizes(tmp_path, before, smaller):
-    """Recent corrected_cameras/ name none: cameras/ has them, or the images themselves."""
+    """Recent corrected_cameras/ name none: cameras/ has them, or the images themselves, which the numbers must fit."""
     write_polycam(tmp_path)
-    frames = tmp_path / "keyframes"
+    frames, step = tmp_path / "keyframes", 2 if smaller else 1
     (frames / "cameras").mkdir()
     for file in (frames / "corrected_cameras").iterdir():
         told = json.loads(file.read_text())
-        told = {name: value for name, value in told.items() if name not in ("width", "height")}
-        file.rename(file.with_suffix(".JSON"))
+        del told["width"], told["height"]
+        file.unlink()
         file.with_suffix(".JSON").write_text(json.dumps(told))
-        if before is not None:
+        if before:
             (frames / "cameras" / file.name).write_text(json.dumps({"width": SIZE[0], "height": SIZE[1]}))
+    for n in range(12):
+        cv2.imwrite(str(frames / "corrected_images" / f"{100 + n}.png"), CAPTURE.frames[n, ::step, ::step])
+    found = load_capture(tmp_path, holdout=0)
+    assert (found.cameras.width, found.cameras.height) == (24 // step, 16 // step)
+    np.testing.assert_allclose(found.cameras.fx, K[0] / step, rtol=1e-6)
+    np.testing.assert_allclose(found.cameras.cy, K[3] / step, rtol=1e-6)
+    assert len(found.names) == 11
     if smaller:
-        for file in (frames / "corrected_images").iterdir():
-            cv2.imwrite(str(file), cv2.imread(str(file))[::2, ::2])
-    if smaller and before is None:  # nothing says what size the numbers are for: they don't fit the images
+        shutil.rmtree(frames / "cameras")
         with refused("cameras", "12x8", "centre"):
             load_capture(tmp_path)
-        return
-    found = load_capture(tmp_path, holdout=0)
-    assert (found.cameras.width, found.cameras.height) == ((12, 8) if smaller else SIZE)
-    np.testing.assert_allclose(found.cameras.fx, K[0] / (2 if smaller else 1), rtol=1e-6)
-    np.testing.assert_allclose(found.cameras.cy, K[3] / (2 if smaller else 1), rtol=1e-6)
-    assert len(found.names) == 11
 
 
 def test_polycam_without_corrected_cameras(tmp_path):
@@ -231,35 +209,3 @@ def test_record3d_as_its_archive_unpacks(tmp_path):
     found = load_capture(tmp_path, holdout=0)
     np.testing.assert_array_equal(found.frames, CAPTURE.frames)
     np.testing.assert_allclose(found.cameras.cx, K[2], rtol=1e-6)
-
-
-def test_arkitscenes_intrinsics_a_millisecond_off(tmp_path):
-    write_arkitscenes(tmp_path)
-    for n, file in enumerate(sorted((tmp_path / "lowres_wide_intrinsics").iterdir())):
-        file.rename(file.with_name(f"41069021_{100 + n / 10 + 0.001 * (n % 3 - 1):.3f}.pincam"))
-    found = load_capture(tmp_path, holdout=0)
-    np.testing.assert_array_equal(found.frames, CAPTURE.frames[expected("arkitscenes")])
-
-
-def test_tum_names_with_spaces(tmp_path):
-    write_tum(tmp_path)
-    (tmp_path / "rgb").rename(tmp_path / "rgb images")
-    text = (tmp_path / "rgb.txt").read_text().replace(" rgb/", " rgb images/")
-    (tmp_path / "rgb.txt").write_bytes(text.encode("utf-8-sig"))
-    assert len(load_capture(tmp_path, holdout=0).names) == 11
-
-
-@pytest.mark.parametrize(("name", "file", "text", "says"), [
-    ("scannet", "pose/3.txt", "1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n", "not rigid"),
-    ("scannet", "intrinsic/intrinsic_color.txt", "", "intrinsic_color.txt"),
-    ("tum", "groundtruth.txt", "1305031102.17 0 0 0 0 0 0 0\n", "zero norm"),
-    ("tum", "intrinsics.txt", "500 500 12 8" + 9 * " 0.01", "9 numbers after"),
-    ("arkitscenes", "lowres_wide.traj", "1 2 3\n", "lowres_wide.traj"),
-    ("polycam", "keyframes/corrected_cameras/101.json", '{"fx": 3}', "'cx'"),
-    ("record3d", "metadata.json", '{"poses": [[0, 0, 0]]}', "metadata.json"),
-])  # fmt: skip
-def test_damaged_files_are_told(tmp_path, name, file, text, says):
-    FORMATS[name](tmp_path)
-    (tmp_path / file).write_text(text)
-    with refused(says):
-        load_capture(tmp_path)

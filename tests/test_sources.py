@@ -3,12 +3,10 @@
 import dataclasses
 import json
 
-import numpy as np
 import pytest
 from small_field import make_field
 
 from jsecon import InputError, load_field, save_field
-from jsecon.app.cli import main
 from jsecon.pipeline.model_loading import field_embedder
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.sources import locate_sources, provenance
@@ -39,12 +37,10 @@ def test_hints_are_relative_to_the_field_and_are_followed_from_its_file(field, t
     assert locate_sources(own)[:3] == (CLIP, None, None)  # of a field that no file was read of
 
 
-@pytest.mark.parametrize(
-    "hint", ["/etc", "//host/share", "C:\\models", "C:models", "\\\\host\\share", "a\0b", "x" * 9000]
-)
-def test_absolute_and_impossible_hints_lead_nowhere(field, tmp_path, hint):
-    own = told(field, folders={"capture": hint, "embedder": hint}, embedder=CLIP, options={"embedder": hint})
-    assert locate_sources(own, tmp_path)[:3] == (CLIP, None, None)
+def test_absolute_and_impossible_hints_lead_nowhere(field, tmp_path):
+    for hint in ("/etc", "//host/share", "C:\\models", "C:models", "\\\\host\\share", "a\0b", "x" * 9000):
+        own = told(field, folders={"capture": hint, "embedder": hint}, embedder=CLIP, options={"embedder": hint})
+        assert locate_sources(own, tmp_path)[:3] == (CLIP, None, None)
 
 
 def test_a_model_of_another_name_is_not_opened(field, tmp_path):
@@ -56,16 +52,11 @@ def test_a_model_of_another_name_is_not_opened(field, tmp_path):
         field_embedder(load_field(tmp_path / "field.safetensors"))
 
 
-@pytest.mark.parametrize(
-    "provenance",
-    ["[]", '{"options": []}', '{"folders": 3}', '{"folders": {"embedder": 7}}', '{"embedder": {}}', "{", "[" * 5000],
-)
-def test_a_malformed_provenance_is_refused_in_words(field, tmp_path, provenance, capsys):
+MALFORMED = "[]", '{"options": []}', '{"folders": 3}', '{"folders": {"embedder": 7}}', '{"embedder": {}}', "{"
+
+
+@pytest.mark.parametrize("provenance", MALFORMED)
+def test_a_malformed_provenance_is_refused_in_words(field, provenance):
     own = dataclasses.replace(field, provenance=provenance, embedder=ColourEmbedder().name)
     with pytest.raises(InputError, match="provenance is not what jsecon run writes"):
         field_embedder(own)
-    if provenance.startswith('{"'):  # others load_field refuses
-        save_field(tmp_path / "field.safetensors", own)
-        assert main(["query", str(tmp_path / "field.safetensors"), "red", "--out", str(tmp_path / "a")]) == 2
-        assert "provenance" in capsys.readouterr().err
-        assert not np.any([file.name.startswith("red") for file in (tmp_path / "a").iterdir()])

@@ -29,7 +29,8 @@ _TUM_INTRINSICS = {
     "3": (535.4, 539.2, 320.1, 247.6),
 }
 """fx fy cx cy k1 k2 p1 p2 k3 of the benchmark's cameras freiburg1 to 3, the centre of the first pixel at (0, 0)"""
-_PHONE_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
+_PHONE_AXES = np.array([1.0, -1.0, -1.0, 1.0])
+"""signs of the columns of a pose, from the axes of phones: a product of matrices would warn of infinite numbers"""
 _EXPORT = "Export the capture again."
 _parsing = functools.partial(reading, remedy=_EXPORT)
 """makes errors in parsing a file InputErrors"""
@@ -184,7 +185,7 @@ def _read_polycam(path: Path) -> PosedImages:
                 size = _polycam_size(camera, find_image(frames / "cameras", f"{image.stem}.json"), image)
                 lens = _lens(*size, *(camera[name] for name in ("fx", "fy", "cx", "cy")))
                 rows = [[camera[f"t_{i}{j}"] for j in range(4)] for i in range(3)]
-                pose = np.array([*rows, [0, 0, 0, 1]], np.float64) @ _PHONE_AXES
+                pose = np.array([*rows, [0, 0, 0, 1]], np.float64) * _PHONE_AXES
             posed.append(_posed_image(image, lens, pose, find_image(frames / "depth", f"{image.stem}.png")))
     return _posed_images(path, posed, len(images))
 
@@ -215,7 +216,7 @@ def _read_record3d(path: Path) -> PosedImages:
         size = (metadata["w"], metadata["h"]) if "w" in metadata else image_header(images[0]).upright
         for image in images:
             if (n := int(image.stem)) < len(poses):
-                pose = _matrix(Rotation.from_quat(poses[n, :4]), poses[n, 4:]) @ _PHONE_AXES
+                pose = _matrix(Rotation.from_quat(poses[n, :4]), poses[n, 4:]) * _PHONE_AXES
                 posed.append(_posed_image(image, _lens(*size, *intrinsics[n]), pose))
     return _posed_images(path, posed, len(images), "Record3D's depth was not read: its compression is not supported.")
 
