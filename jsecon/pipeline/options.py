@@ -37,14 +37,20 @@ class Range:
     high: int | float
     above: bool = False
     """`low` itself is too small"""
+    direction: bool = False
+    """the numbers are a direction, so that at least one of them must not be 0"""
 
     def __contains__(self, numbers: Any) -> bool:
         """Whether all numbers of a tree of tuples and lists lie in the range."""
         leaves = [x for x in _leaves(numbers) if isinstance(x, int | float) and not isinstance(x, bool)]
+        if self.direction and leaves and not any(leaves):
+            return False
         return all(self.low <= x <= self.high and not (self.above and x == self.low) for x in leaves)
 
     def __str__(self) -> str:
         """The range in words."""
+        if self.direction:
+            return "a direction, three numbers that are not all 0"
         return f"{'above' if self.above else 'at least'} {self.low:g} and at most {self.high:g}"
 
 
@@ -59,7 +65,7 @@ def _leaves(tree: Any) -> Iterator[Any]:
 Count: TypeAlias = Annotated[T, Range(1, 1_000_000)]
 Seed: TypeAlias = Annotated[T, Range(0, 2**31 - 1)]
 """what jax and NumPy both take"""
-Direction: TypeAlias = Annotated[T, Range(-1e6, 1e6)]
+Direction: TypeAlias = Annotated[T, Range(-1e6, 1e6, direction=True)]
 
 
 def check_ranges(options: Any) -> None:
