@@ -57,6 +57,10 @@ class Repository:
         return entry
 
 
+def _refusal(status: int, code: str) -> Response:
+    return JSONResponse({"error": code}, status, {"X-Error-Code": code})
+
+
 class Hub:
     """The server: `repositories` by name, `requests` as "METHOD path"."""
 
@@ -65,24 +69,19 @@ class Hub:
         self.requests: list[str] = []
         self.endpoint = ""
 
-    def _find(self, request: Request) -> Repository | Response:
-        self.requests.append(f"{request.method} {request.url.path}")
-        repository = self.repositories.get(f"{request.path_params['owner']}/{request.path_params['name']}")
-        if repository is None:
-            return JSONResponse({"error": "Repository not found"}, 404, {"X-Error-Code": "RepoNotFound"})
-        if repository.gated:
-            return JSONResponse({"error": "gated"}, repository.gated, {"X-Error-Code": "GatedRepo"})
-        revision = request.path_params.get("revision", "main")
-        if revision not in ("main", repository.commit):
-            return JSONResponse({"error": "Revision not found"}, 404, {"X-Error-Code": "RevisionNotFound"})
-        return repository
-
     def answer(self, handler: Callable) -> Callable:
         """A route's function: `handler` of a request and its repository, or why there is none."""
 
         async def answer(request: Request) -> Response:
-            repository = self._find(request)
-            return repository if isinstance(repository, Response) else handler(request, repository)
+            self.requests.append(f"{request.method} {request.url.path}")
+            repository = self.repositories.get(f"{request.path_params['owner']}/{request.path_params['name']}")
+            if repository is None:
+                return _refusal(404, "RepoNotFound")
+            if repository.gated:
+                return _refusal(repository.gated, "GatedRepo")
+            if request.path_params.get("revision", "main") not in ("main", repository.commit):
+                return _refusal(404, "RevisionNotFound")
+            return handler(request, repository)
 
         return answer
 
@@ -91,11 +90,6 @@ class Hub:
         name = f"{request.path_params['owner']}/{request.path_params['name']}"
         entries = [repository.entry(path) for path in sorted(repository.files)]
         siblings = [{"rfilename": e["path"], "size": e["size"], "blobId": e["oid"]} for e in entries]
-        for sibling, entry in zip(siblings, entries):
-            if "blobs" not in request.query_params:
-                del sibling["size"], sibling["blobId"]
-            elif "lfs" in entry:
-                sibling["lfs"] = {"sha256": entry["lfs"]["oid"], "size": entry["size"], "pointerSize": 130}
         tags = [f"license:{repository.licence}"]
         return JSONResponse({"id": name, "sha": repository.commit, "siblings": siblings, "tags": tags})
 
@@ -107,7 +101,7 @@ class Hub:
         """HEAD and GET /OWNER/NAME/resolve/REVISION/PATH."""
         path = request.path_params["path"]
         if path not in repository.files:
-            return Response(status_code=404, headers={"X-Error-Code": "EntryNotFound"})
+            return _refusal(404, "EntryNotFound")
         content, entry = repository.files[path], repository.entry(path)
         etag = entry["lfs"]["oid"] if "lfs" in entry else entry["oid"]
         headers = {"X-Repo-Commit": repository.commit, "ETag": f'"{etag}"'}

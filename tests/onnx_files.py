@@ -7,13 +7,9 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 KINDS = {
-    "float32": TensorProto.FLOAT,
-    "float16": TensorProto.FLOAT16,
-    "int64": TensorProto.INT64,
-    "int32": TensorProto.INT32,
-    "uint8": TensorProto.UINT8,
-    "bool": TensorProto.BOOL,
-}
+    "float32": TensorProto.FLOAT, "float16": TensorProto.FLOAT16, "int64": TensorProto.INT64,
+    "int32": TensorProto.INT32, "uint8": TensorProto.UINT8, "bool": TensorProto.BOOL,
+}  # fmt: skip
 
 
 def node(op: str, inputs: list[str], outputs: list[str], **attributes) -> onnx.NodeProto:
@@ -44,15 +40,10 @@ class Sketch:
         return write_graph(path, self.nodes, inputs, outputs, self.constants)
 
 
-def write_graph(
-    path: Path,
-    nodes: list[onnx.NodeProto],
-    inputs: dict[str, tuple[str, list]],
-    outputs: dict[str, tuple[str, list]],
-    constants: dict[str, np.ndarray] | None = None,
-    *,
-    external: str | None = None,
-) -> Path:
+Side = dict[str, tuple[str, list]]
+
+
+def write_graph(path: Path, nodes: list, inputs: Side, outputs: Side, constants=None, *, external=None) -> Path:
     """Writes a graph of opset 17. Inputs and outputs: name -> (dtype, shape), a text for a free axis. `external` is the
     name of the file beside it that takes the constants."""
     values = [
@@ -60,9 +51,8 @@ def write_graph(
         for side in (inputs, outputs)
     ]
     stored = [numpy_helper.from_array(np.asarray(array), name) for name, array in (constants or {}).items()]
-    model = helper.make_model(
-        helper.make_graph(nodes, path.stem, *values, stored), opset_imports=[helper.make_opsetid("", 17)], ir_version=8
-    )
+    graph = helper.make_graph(nodes, path.stem, *values, stored)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     onnx.checker.check_model(model)
     path.parent.mkdir(parents=True, exist_ok=True)
     if external is None:

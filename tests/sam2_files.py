@@ -58,9 +58,8 @@ def write_sam2(folder: Path, *, seed: int = 1, memory: int = MEMORY) -> Path:
     prompt = g("ReduceMean", prompt, axes=[1, 2], keepdims=0)  # (1, C)
     seen = g("ReduceMean", "feats2_cond", axes=[2, 3], keepdims=0)
     both = g("Tanh", g("Add", prompt, seen))
-    coarse = g(
-        "ConvTranspose", "feats2_cond", g.weight(CHANNELS, 1, 4, 4, scale=0.3), kernel_shape=[4] * 2, strides=[4] * 2
-    )
+    weight = g.weight(CHANNELS, 1, 4, 4, scale=0.3)
+    coarse = g("ConvTranspose", "feats2_cond", weight, kernel_shape=[4] * 2, strides=[4] * 2)
     middle = g("ConvTranspose", "feats1", g.weight(2, 1, 2, 2), kernel_shape=[2, 2], strides=[2, 2])
     turned = g("Reshape", g("MatMul", both, g.weight(CHANNELS, 1)), [1, 1, 1, 1])
     mask = g("Add", g("Add", g("Add", coarse, middle), turned), "feats0")
@@ -74,17 +73,10 @@ def write_sam2(folder: Path, *, seed: int = 1, memory: int = MEMORY) -> Path:
     pointer = g("Where", present, g("MatMul", both, g.weight(CHANNELS, CHANNELS)), g.weight(1, CHANNELS))
     g("Reshape", pointer, [1, 1, CHANNELS], into="object_pointer")
     g("Tanh", g("MatMul", both, g.weight(CHANNELS, 1)), into="iou")
-    g.save(
-        folder / "onnx" / "mask_decoder.onnx",
-        fine | {"feats2_cond": image, "input_points": (1, 1, "points", 2), "input_labels": (1, 1, "points")},
-        {
-            "low_res_mask": (1, 1, LOW, LOW),
-            "high_res_mask": (1, 1, SIZE, SIZE),
-            "iou": (1, 1),
-            "object_score_logits": (1, 1, 1),
-            "object_pointer": (1, 1, CHANNELS),
-        },
-    )
+    inputs = fine | {"feats2_cond": image, "input_points": (1, 1, "points", 2), "input_labels": (1, 1, "points")}
+    outputs = {"low_res_mask": (1, 1, LOW, LOW), "high_res_mask": (1, 1, SIZE, SIZE), "iou": (1, 1)}
+    outputs |= {"object_score_logits": (1, 1, 1), "object_pointer": (1, 1, CHANNELS)}
+    g.save(folder / "onnx" / "mask_decoder.onnx", inputs, outputs)
 
     g = RandomSketch(rng)
     hard = g("Cast", g("Greater", "high_res_mask", 0.0), to=1)
@@ -99,12 +91,9 @@ def write_sam2(folder: Path, *, seed: int = 1, memory: int = MEMORY) -> Path:
     flat = g("Reshape", features, [memory, TOKENS, 1])
     g("Transpose", flat, perm=[1, 2, 0], into="memory_tokens")
     g("Identity", g.weight(TOKENS, 1, memory, scale=0.5), into="memory_pos")
-    tokens = (TOKENS, 1, memory)
-    g.save(
-        folder / "onnx" / "memory_encoder.onnx",
-        {"feats2": image, "high_res_mask": (1, 1, SIZE, SIZE), "object_score_logits": (1, 1), "binarize": ()},
-        {"memory_tokens": tokens, "memory_pos": tokens},
-    )
+    inputs = {"feats2": image, "high_res_mask": (1, 1, SIZE, SIZE), "object_score_logits": (1, 1), "binarize": ()}
+    outputs = dict.fromkeys(("memory_tokens", "memory_pos"), (TOKENS, 1, memory))
+    g.save(folder / "onnx" / "memory_encoder.onnx", inputs, outputs)
 
     g = RandomSketch(rng)
     keys = g("MatMul", g("Add", "memory", "memory_pos"), g.weight(MEMORY, CHANNELS, scale=0.7))
@@ -116,21 +105,16 @@ def write_sam2(folder: Path, *, seed: int = 1, memory: int = MEMORY) -> Path:
     current = g("Transpose", "current_vision_features", perm=[1, 2, 0])
     g("Reshape", g("Add", current, read), image, into="conditioned_feats")
     rows = SLOTS * TOKENS + POINTERS * (CHANNELS // MEMORY)
-    current = {
-        name: (TOKENS, 1, CHANNELS) for name in ("current_vision_features", "current_vision_position_embeddings")
-    }
-    memories = {name: (rows, 1, MEMORY) for name in ("memory", "memory_pos")}
-    g.save(folder / "onnx" / "memory_attention.onnx", current | memories, {"conditioned_feats": image})
+    names = "current_vision_features", "current_vision_position_embeddings"
+    inputs = dict.fromkeys(names, (TOKENS, 1, CHANNELS)) | dict.fromkeys(("memory", "memory_pos"), (rows, 1, MEMORY))
+    g.save(folder / "onnx" / "memory_attention.onnx", inputs, {"conditioned_feats": image})
 
     g = RandomSketch(rng)
     column = g("Unsqueeze", "normalized_diffs", [1])
     waves = g("Sin", g("MatMul", column, g.weight(1, CHANNELS, scale=5.0)))
     g("MatMul", waves, g.weight(CHANNELS, MEMORY, scale=0.6), into="pointer_pos")
-    g.save(
-        folder / "onnx" / "pointer_tpos.onnx",
-        {"normalized_diffs": ("pointers",)},
-        {"pointer_pos": ("pointers", MEMORY)},
-    )
+    inputs, outputs = {"normalized_diffs": ("pointers",)}, {"pointer_pos": ("pointers", MEMORY)}
+    g.save(folder / "onnx" / "pointer_tpos.onnx", inputs, outputs)
 
     codes = (0.7 * rng.normal(size=(SLOTS, MEMORY))).tolist()
     constants = {"image_size": SIZE, "image_mean": MEAN, "image_std": STD, "memory_temporal_positional_encoding": codes}

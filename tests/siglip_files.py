@@ -3,24 +3,15 @@ padding too, which shifts every colour a little towards grey: another padding, o
 
 import json
 from pathlib import Path
+from string import ascii_lowercase
 
 import numpy as np
-from clip_files import COLOURS, SIZE, write_visual
-from onnx_files import Sketch
+from clip_files import COLOURS, SIZE, write_textual, write_visual
 
 LENGTH = 12
 HALF = (0.5, 0.5, 0.5)
 SCALE, BIAS = 110.0, -40.0
-TOKENS = [
-    "<pad>",
-    "</s>",
-    "<unk>",
-    *(f"▁{name}" for name in COLOURS),
-    "▁a",
-    "▁thing",
-    "▁",
-    *"abcdefghijklmnopqrstuvwxyz",
-]
+TOKENS = ["<pad>", "</s>", "<unk>", *(f"▁{word}" for word in (*COLOURS, "a", "thing", "")), *ascii_lowercase]
 PADDING, UNKNOWN = 0.01, 0.002
 """grey that a filled place adds, and a token that is no colour"""
 
@@ -60,18 +51,6 @@ def embedded(texts: list[str], length: int = LENGTH) -> np.ndarray:
     return np.asarray(found) / np.linalg.norm(found, axis=1, keepdims=True)
 
 
-def write_textual(
-    path: Path, name: str, outputs: tuple[str, ...], batch: int | str, length: int | str, kind: str
-) -> Path:
-    """Texts -> the sum of their tokens' colours; the last of `outputs` is it, one before it the tokens'."""
-    g = Sketch()
-    rows = g("Gather", table(), name, into=outputs[0] if len(outputs) > 1 else None)
-    g("ReduceSum", rows, [1], keepdims=0, into=outputs[-1])
-    declared = {outputs[-1]: ("float32", [batch, 3])}
-    declared |= {rows: ("float32", [batch, length, 3])} if len(outputs) > 1 else {}
-    return g.save(path, {name: (kind, [batch, length])}, declared)
-
-
 def write_siglip(folder: Path, layout: str, *, logits: bool = True) -> Path:
     """A SigLIP folder of immich's layout or of that of transformers.js, with logits.json."""
     if logits:
@@ -79,15 +58,15 @@ def write_siglip(folder: Path, layout: str, *, logits: bool = True) -> Path:
         write_json(folder / "logits.json", {"scale": SCALE, "bias": BIAS})
     if layout == "immich":
         write_visual(folder / "visual" / "model.onnx", ("image", "image_embedding"), 1, HALF, HALF)
-        write_textual(folder / "textual" / "model.onnx", "text", ("text_embedding",), 1, LENGTH, "int32")
+        write_textual(folder / "textual" / "model.onnx", ("text", "text_embedding"), table(), [1, LENGTH], "int32")
         write_unigram(folder / "textual", tokenizer_class="T5TokenizerFast")
         text = {"context_length": LENGTH, "hf_tokenizer_name": "x", "tokenizer_kwargs": {"clean": "canonicalize"}}
         write_json(folder / "config.json", {"init_logit_bias": -10, "text_cfg": text})
         write_json(folder / "visual" / "preprocess_cfg.json", {"size": [SIZE, SIZE], "mean": HALF, "std": HALF})
         return folder
-    outputs, onnx = ("last_hidden_state", "pooler_output"), folder / "onnx"
+    names, onnx = ("input_ids", "last_hidden_state", "pooler_output"), folder / "onnx"
     write_visual(onnx / "vision_model.onnx", ("pixel_values", "pooler_output"), "batch", HALF, HALF)
-    write_textual(onnx / "text_model.onnx", "input_ids", outputs, "batch", "length", "int64")
+    write_textual(onnx / "text_model.onnx", names, table(), ["batch", "length"], "int64")
     write_unigram(folder)
     write_json(folder / "config.json", {"model_type": "siglip", "text_config": {"max_position_embeddings": LENGTH}})
     images = {"do_rescale": True, "rescale_factor": 1 / 255, "image_mean": HALF, "image_std": HALF}

@@ -1,67 +1,140 @@
-"""`jsecon models check`: what a folder holds, what of it can be used, and what is missing."""
+"""Folders of models: what they are good for, and one sentence that names the file for each kind of damage."""
 
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
 import pytest
-from clip_files import write_clip
+from capture_files import refused, run_cli
+from clip_files import token_colours, write_clip, write_textual
+from onnx_files import node, write_graph
 from sam2_files import write_sam2
-from sam_files import write_sam
+from sam_files import write_decoder, write_encoder, write_sam
+from siglip_files import LENGTH, write_siglip
 
-from jsecon.app import cli
-from jsecon.errors import InputError
+from jsecon.networks.clip import ClipEmbedder
+from jsecon.networks.sam import SamSegmenter
+from jsecon.networks.sam2 import Sam2Tracker
 from jsecon.pipeline.model_loading import inspect_models
 
+MODELS = {
+    "clip": (ClipEmbedder, lambda folder: write_clip(folder, "immich")),
+    "clip.js": (ClipEmbedder, lambda folder: write_clip(folder, "transformers.js")),
+    "siglip": (ClipEmbedder, lambda folder: write_siglip(folder, "immich")),
+    "siglip.js": (ClipEmbedder, lambda folder: write_siglip(folder, "transformers.js")),
+    "sam": (SamSegmenter, write_sam),
+    "sam2": (Sam2Tracker, write_sam2),
+}
+IMAGES, TEXTS, TOKENS = "visual/model.onnx", "textual/model.onnx", "textual/tokenizer.json"
+ENCODER, DECODER = "onnx/vision_encoder.onnx", "onnx/prompt_encoder_mask_decoder.onnx"
+RULES = {"context_length": LENGTH, "hf_tokenizer_name": "x"}
+"""of open_clip's configuration"""
 
-@pytest.fixture(scope="module")
-def folders(tmp_path_factory):
-    base = tmp_path_factory.mktemp("models")
-    return {
-        "CLIP": write_clip(base / "clip", "immich"),
-        "SAM": write_sam(base / "sam"),
-        "SAM 2": write_sam2(base / "sam2"),
-    }
+
+def casts(output):
+    """Writes a graph of texts that only casts its tokens."""
+    given, result = {"text": ("int64", [1, 77])}, {output: ("float32", [1, 77])}
+    return lambda path: write_graph(path, [node("Cast", ["text"], [output], to=1)], given, result)
 
 
-@pytest.mark.parametrize(("model", "words"), [
-    ("CLIP", ["images of 32x32 px", "3 numbers", "--embedder"]),
-    ("SAM", ["decoder of SAM, 4 prompts per run", "images of 256 px", "--segmenter"]),
-    ("SAM 2", ["images of 64 px", "--tracker"]),
+def flat(path):
+    kind = "float32", [1, 5]
+    write_graph(path, [node("Identity", ["pixel_values"], ["y"])], {"pixel_values": kind}, {"y": kind})
+
+
+def not_finite(path):
+    write_textual(path, ("text", "embedding"), np.nan * token_colours(), [1, 77], "int32")
+
+
+def wider_memory(path):
+    shutil.copy(write_sam2(path.parents[2] / "other", memory=6) / "onnx" / path.name, path)
+
+
+def damage(path, change):
+    """Removes a file (None), cuts it (a number), replaces it (bytes, a list, the name of another file), changes entries
+    (a dictionary) or writes it anew (a function)."""
+    if change is None:
+        path.unlink()
+    elif isinstance(change, int):
+        path.write_bytes(path.read_bytes()[:change])
+    elif isinstance(change, bytes):
+        path.write_bytes(change)
+    elif isinstance(change, str):
+        shutil.copy(path.parents[change.count("/")] / change, path)
+    elif callable(change):
+        change(path)
+    else:
+        content = json.loads(path.read_text()) | change if isinstance(change, dict) else change
+        path.write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize(("model", "name", "change", "words"), [
+    ("clip", TEXTS, None, (f"lacks {TEXTS}", "huggingface.co")), ("clip", TOKENS, None, f"lacks {TOKENS}"),
+    ("clip.js", "onnx/vision_model.onnx", None, "lacks onnx/vision_model.onnx"),
+    ("clip.js", "preprocessor_config.json", None, "lacks preprocessor_config.json"),
+    ("clip", IMAGES, TEXTS, "input 'image': no such input; the graph has text int32[1, 77]"),
+    ("clip", TEXTS, IMAGES, f"{TEXTS}, input 'image'"),
+    ("clip", TEXTS, casts("pooler_output"), "output 'embedding': no such output; the graph has pooler_output"),
+    ("clip", TEXTS, casts("embedding"), "texts of 77 numbers, expected 3"),
+    ("clip", TEXTS, not_finite, "model.onnx: an embedding that is zero or not finite"),
+    ("clip", "visual/preprocess_cfg.json", {"size": 48}, ("image float32[1, 3, 48, 48]", "Expected: 32")),
+    ("clip", TOKENS, b"{", (TOKENS, "no tokenizer of this model")), ("clip", TOKENS, [], "no tokenizer of this model"),
+    ("clip", TOKENS, {"model": {"type": "BPE", "vocab": {"a": "b"}, "merges": []}}, "no tokenizer of this model"),
+    ("clip", TOKENS, {"model": {"type": "Unigram", "unk_id": 0, "vocab": [["a", 0.0]]}}, "no tokenizer of this model"),
+    ("clip", TOKENS, {"post_processor": None}, "a start and an end around a word"),
+    ("siglip", "visual/preprocess_cfg.json", {"mean": None}, ("preprocess_cfg.json", "cannot be read")),
+    ("siglip", "textual/tokenizer_config.json", None, "tokenizer_config.json: No such file"),
+    ("siglip", "textual/tokenizer_config.json", {"pad_token": None}, ("pad_token None", "pads short texts")),
+    ("siglip", "textual/tokenizer_config.json", {"pad_token": "<none>"}, "without '<none>'"),
+    ("siglip", "config.json", [], "JSON of list"), ("siglip", "config.json", {"text_cfg": {}}, "no tokenizer of this"),
+    ("siglip", "config.json", {"text_cfg": RULES | {"context_length": 0}}, "texts of 0 tokens"),
+    ("siglip", "config.json", {"text_cfg": RULES | {"tokenizer_kwargs": {"clean": "upper"}}}, "cleaned by 'upper'"),
+    ("siglip", "config.json", {"text_cfg": RULES | {"tokenizer_kwargs": {"strip": True}}}, "tokenizer_kwargs"),
+    ("siglip", "logits.json", [], ("logits.json", "logit_bias")), ("siglip", "logits.json", {"scale": 0}, "logit_bias"),
+    ("siglip", "logits.json", {"scale": "x"}, "logit_bias"), ("siglip", "logits.json", {"scale": 1e9}, "logit_bias"),
+    ("siglip.js", "config.json", {"text_config": {"max_position_embeddings": "x"}}, "texts of 'x' tokens"),
+    ("siglip.js", "preprocessor_config.json", {"rescale_factor": 1}, "pixels times 1, not 1/255"),
+    ("siglip.js", "tokenizer_config.json", {"tokenizer_class": "BertTokenizer"}, ("'BertTokenizer'", "Siglip")),
+    ("sam", ENCODER, None, ("no segmenter, since it lacks onnx/vision_encoder.onnx", "huggingface.co")),
+    ("sam", "preprocessor_config.json", None, "lacks preprocessor_config.json"),
+    ("sam", "preprocessor_config.json", {"image_mean": None}, ("preprocessor_config.json", "cannot be read")),
+    ("sam", ENCODER, DECODER, ("vision_encoder.onnx, input 'pixel_values'", "input_points")),
+    ("sam", DECODER, ENCODER, "decoder.onnx, input 'input_points': no such input"),
+    ("sam", ENCODER, lambda path: write_encoder(path, 128, ("image_embeddings", "image_positional_embeddings")),
+     ("vision_encoder.onnx, output 'image_embeddings'", "8, 8], expected ", "16, 16]")),
+    ("sam", ENCODER, lambda path: write_encoder(path, 256), "output 'image_positional_embeddings': no such output"),
+    ("sam", ENCODER, flat, "input 'pixel_values': pixel_values float32[1, 5], expected"),
+    ("sam", DECODER, lambda path: write_decoder(path, 256, "sam", "batch", masks=1), ("'pred_masks'", "3 or 4 masks")),
+    ("sam2", "onnx/memory_encoder.onnx", None, "memory_encoder"), ("sam2", "constants.json", None, "constants.json"),
+    ("sam2", "constants.json", b"PK\x03\x04 cut", "not JSON"),
+    ("sam2", "constants.json", {"memory_temporal_positional_encoding": [[0.0] * 4] * 3}, "(3, 4)"),
+    ("sam2", "constants.json", {"image_mean": ["a"] * 3}, "cannot be read"),
+    ("sam2", "onnx/mask_decoder.onnx", "onnx/pointer_tpos.onnx", "feats2_cond"),
+    ("sam2", "onnx/memory_encoder.onnx", wider_memory, "tokens"), ("sam2", ENCODER, 999, "vision_encoder.onnx"),
 ])  # fmt: skip
-def test_what_a_folder_is_good_for(folders, model, words):
-    findings = inspect_models(folders[model])
-    assert list(findings["usable"]) == [model]
-    for word in words:
-        assert word in findings["usable"][model]
-    for problem in findings["unusable"].values():
-        assert "since it lacks onnx/" in problem
-        assert "huggingface.co" in problem
+def test_a_damaged_folder_is_named(tmp_path, model, name, change, words):
+    open_model, write = MODELS[model]
+    folder = write(tmp_path / "model")
+    damage(folder / name, change)
+    with refused(*([words] if isinstance(words, str) else words)):
+        open_model(folder).check()
 
 
-def test_every_graph_is_told_with_its_tensors(folders, capsys):
-    assert cli.main(["models", "check", str(folders["CLIP"])]) == 0
-    told = capsys.readouterr().out
-    for line in (
-        "  textual/model.onnx",
-        "    in   text int32[1, 77]",
-        "    out  embedding float32[1, 3]",
-        "    in   image float32[1, 3, 32, 32]",
-        "CLIP: usable",
-        "SAM: not usable",
-    ):
-        assert line in told.splitlines()
-    findings = inspect_models(folders["SAM"])
-    assert len(findings["graphs"]) == 2
-    assert any("input_points float32[1, batch, points, 2]" in graph for graph in findings["graphs"].values())
-
-
-def test_damage_and_emptiness_end_in_exit_code_2(tmp_path, capsys):
+def test_every_graph_is_told_with_its_tensors_and_damage_ends_in_exit_code_2(tmp_path, capsys):
     folder = write_clip(tmp_path / "clip", "immich")
-    graph = folder / "visual" / "model.onnx"
-    graph.write_bytes(graph.read_bytes()[:100])
-    assert cli.main(["models", "check", str(folder)]) == 2
+    assert run_cli("models", "check", folder) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert {"  textual/model.onnx", "    in   text int32[1, 77]", "    out  embedding float32[1, 3]"} <= set(told)
+    assert {"CLIP: usable", "SAM: not usable"} <= set(told)
+    assert list(inspect_models(write_sam(tmp_path / "sam"))["usable"]) == ["SAM"]
+    assert list(inspect_models(write_sam2(tmp_path / "sam2"))["usable"]) == ["SAM 2"]
+    damage(folder / IMAGES, 100)
+    assert run_cli("models", "check", folder) == 2
     told = capsys.readouterr()
     assert "cannot be opened: ONNX Runtime" in told.out
     assert "no model that can be used" in told.err
     (tmp_path / "empty").mkdir()
-    assert cli.main(["models", "check", str(tmp_path / "empty")]) == 2
-    assert "0 graphs" in capsys.readouterr().out
-    with pytest.raises(InputError, match="no such folder"):
-        inspect_models(tmp_path / "nowhere")
+    assert run_cli("models", "check", tmp_path / "empty") == 2
+    with refused("no such folder"):
+        inspect_models(Path("nowhere"))

@@ -1,19 +1,15 @@
 """SAM 2 as a tracker: against a slow twin that keeps everything, on small graphs of the public export's signatures."""
 
 import json
-import shutil
-import tracemalloc
 
 import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
 from PIL import Image
 from sam2_files import CHANNELS, MEAN, MEMORY, POINTERS, SIZE, SLOTS, STD, write_sam2
 
-from jsecon.errors import InputError
-from jsecon.networks.sam2 import HOLE_AREA, Sam2Tracker, _Bank, _fill_holes, _Memory, follow, open_sam2
+from jsecon.networks.sam2 import HOLE_AREA, Sam2Tracker, _fill_holes, follow, open_sam2
 from jsecon.networks.session import Graph
 from jsecon.vision.protocols import Tracker
 
@@ -120,7 +116,7 @@ class Twin:
 
 
 def test_frames_forward_and_backward_equal_the_twin(folder):
-    frames, start = a_clip(24), 9
+    frames, start = a_clip(24), 5  # more after it than are remembered
     prompts = [
         a_mask(3, 4, 15, 13),
         (np.array([[12, 6], [25, 18]], np.float32), np.array([2, 3], np.int32)),
@@ -135,21 +131,11 @@ def test_frames_forward_and_backward_equal_the_twin(folder):
         ours = np.stack([found[t][number] for t in range(24)])
         np.testing.assert_allclose(ours, wanted, atol=TOLERANCE)
         signs |= {out["score"] > 0 for out in twin.outputs.values()}
+        assert all((wanted[t] == -1024).all() for t, out in twin.outputs.items() if out["score"] <= 0)
         twin.code = twin.code[::-1]
         changed = max(changed, np.abs(twin(prompt, start) - wanted).max())
     assert changed > 20 * TOLERANCE  # a wrong code would show
     assert signs == {True, False}  # objects present, and absent
-
-
-def test_absent_objects_leave_no_pixel_and_their_own_memory(folder):
-    frames = a_clip(24)
-    twin = Twin(folder, frames)
-    wanted = twin(a_mask(3, 4, 15, 13), 0)
-    absent = [t for t, out in twin.outputs.items() if out["score"] <= 0]
-    assert absent
-    labels = Sam2Tracker(folder)(frames, 0, a_mask(3, 4, 15, 13)[None])
-    assert (labels[absent] == -1).all()
-    assert all((wanted[t] == -1024).all() for t in absent)
 
 
 def test_tracker_gives_each_pixel_to_the_highest_logit(folder):
@@ -168,37 +154,14 @@ def test_tracker_gives_each_pixel_to_the_highest_logit(folder):
     assert (tracker(frames, 2, prompts[1:2]) == -1).all()
 
 
-def test_the_name_follows_the_content_and_the_graphs_can_be_dropped(tmp_path):
-    one, same = write_sam2(tmp_path / "one"), write_sam2(tmp_path / "same")
-    other = write_sam2(tmp_path / "other", seed=5)
-    tracker = Sam2Tracker(one)
-    assert tracker.name == Sam2Tracker(same).name
-    assert tracker.name != Sam2Tracker(other).name
+def test_the_name_follows_the_content_and_the_graphs_can_be_dropped(folder, tmp_path):
+    tracker = Sam2Tracker(folder)
+    assert tracker.name == Sam2Tracker(write_sam2(tmp_path / "same")).name
+    assert tracker.name != Sam2Tracker(write_sam2(tmp_path / "other", seed=5)).name
     frames, prompts = a_clip(3), a_mask(3, 4, 15, 13)[None]
     before = tracker(frames, 1, prompts)
     tracker.close()
     np.testing.assert_array_equal(tracker(frames, 1, prompts), before)
-    tracker.check()
-    (one / "onnx" / "pointer_tpos.onnx").write_bytes((one / "onnx" / "mask_decoder.onnx").read_bytes())
-    with pytest.raises(InputError, match="pointer_tpos"):
-        tracker.check()
-
-
-@pytest.mark.long
-def test_four_hundred_frames_hold_no_more_than_a_hundred(folder, tmp_path):
-    sam2, peaks = open_sam2(folder), []
-    for count in (100, 400):
-        path = tmp_path / f"{count}.npy"
-        np.save(path, np.broadcast_to(a_clip(1), (count, HEIGHT, WIDTH, 3)))
-        frames = np.load(path, mmap_mode="r")
-        prompts = [a_mask(3, 4, 15, 13)]
-        for t, _ in follow(sam2, frames[:3], 1, prompts):  # what is made once
-            assert t < 3
-        tracemalloc.start()
-        assert sum(len(logits) for _, logits in follow(sam2, frames, count // 2, prompts)) == count
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-    assert peaks[1] < 1.2 * peaks[0] + 100_000
 
 
 def test_holes_are_filled_up_to_their_area():
@@ -208,86 +171,4 @@ def test_holes_are_filled_up_to_their_area():
     filled = _fill_holes(logits, 2)
     assert (filled[[1, 2], [1, 2]] == np.float32(0.1)).all()
     assert (filled[5:8, 5:8] == -2).all()
-    np.testing.assert_array_equal(_fill_holes(logits, 0), logits)
     np.testing.assert_array_equal(_fill_holes(logits, 1), logits)
-    assert (_fill_holes(np.full((2, 2), -1.0, np.float32), 4) == np.float32(0.1)).all()
-
-
-def test_prompts_outside_the_sequence_are_refused(folder):
-    with pytest.raises(ValueError, match="a frame below 3"):
-        next(follow(open_sam2(folder), a_clip(3), 3, [a_mask(0, 0, 4, 4)]))
-    with pytest.raises(ValueError, match="frames' size"):
-        Sam2Tracker(folder)(a_clip(3), 0, np.zeros((1, 4, 4), bool))
-    with pytest.raises(ValueError, match="an empty mask"):
-        next(follow(open_sam2(folder), a_clip(3), 0, [a_mask(0, 0, 0, 0)]))
-
-
-def change_constants(folder, **changes):
-    """Changes entries of constants.json; None removes one."""
-    content = json.loads((folder / "constants.json").read_text()) | changes
-    content = {name: value for name, value in content.items() if value is not None}
-    (folder / "constants.json").write_text(json.dumps(content))
-
-
-@pytest.mark.parametrize(("damage", "said"), [
-    (lambda f: (f / "onnx" / "memory_encoder.onnx").unlink(), "memory_encoder"),
-    (lambda f: (f / "constants.json").unlink(), r"constants\.json"),
-    (lambda f: (f / "constants.json").write_bytes(b"PK\x03\x04 cut"), "not JSON"),
-    (lambda f: change_constants(f, image_std=None), "image_std"),
-    (lambda f: change_constants(f, memory_temporal_positional_encoding=[[0.0] * 4] * 3), r"\(3, 4\)"),
-    (lambda f: change_constants(f, image_mean=["a"] * 3), "cannot be read"),
-    (lambda f: shutil.copy(f / "onnx" / "pointer_tpos.onnx", f / "onnx" / "mask_decoder.onnx"), "feats2_cond"),
-    (lambda f: shutil.copy(write_sam2(f / "o", memory=6) / "onnx" / "memory_encoder.onnx", f / "onnx"), "tokens"),
-    (
-        lambda f: (f / "onnx" / "vision_encoder.onnx").write_bytes(
-            (f / "onnx" / "vision_encoder.onnx").read_bytes()[:999]
-        ),
-        r"vision_encoder\.onnx",
-    ),
-])  # fmt: skip
-def test_a_wrong_folder_is_named(damage, said, tmp_path):
-    model = write_sam2(tmp_path / "model")
-    damage(model)
-    with pytest.raises(InputError, match=said):
-        open_sam2(model)
-
-
-def memory(t):
-    return _Memory(np.full((2, 3), t, np.float32), np.full(4, t, np.float32))
-
-
-def attended(bank, t, step, count=100):
-    """Rows with their memories, and distances with their pointers, by the frames that they are of."""
-    memories, pointers = bank.attended(t, step, count)
-    return [(row, int(m[0, 0])) for row, m in memories], [(d, int(p[0])) for d, p in pointers]
-
-
-def test_the_prompted_frame_and_the_six_before_are_attended_to():
-    bank = _Bank(0, memory(0), {t: memory(t) for t in range(1, 20)})
-    memories, pointers = attended(bank, 20, 1)
-    assert memories == [(6, 0), (0, 19), (1, 18), (2, 17), (3, 16), (4, 15), (5, 14)]
-    assert pointers == [(20, 0), *[(d, 20 - d) for d in range(1, POINTERS)]]
-    just_turned = _Bank(10, memory(10), {t: memory(t) for t in range(11, 14)})  # what the forward pass left beyond
-    assert attended(just_turned, 9, -1)[0] == [(6, 10), (1, 11), (2, 12), (3, 13), (1, 11), (1, 11), (1, 11)]
-    assert attended(just_turned, 9, -1, count=3)[1] == [(1, 10), (2, 11), *[(2, 11)] * 14]
-    assert attended(_Bank(3, memory(3)), 4, 1) == ([(6, 3)] * SLOTS, [(1, 3)] * POINTERS)
-
-
-@settings(max_examples=30, deadline=None)
-@given(count=st.integers(2, 60), start=st.integers(0, 59))
-def test_what_is_dropped_was_never_to_be_read(count, start):
-    start = min(start, count - 1)
-    bank, whole = _Bank(start, memory(start)), _Bank(start, memory(start))
-    for step, order in ((1, range(start + 1, count)), (-1, range(start - 1, -1, -1))):
-        for t in order:
-            assert attended(bank, t, step, count) == attended(whole, t, step, count)
-            whole = _Bank(start, memory(start), {**whole.tracked, t: memory(t)})
-            bank = bank.with_tracked(t, memory(t), step)
-            assert sum(m.tokens is not None for m in bank.tracked.values()) <= 2 * (SLOTS - 1)
-            assert len(bank.tracked) <= 2 * (POINTERS - 1)
-
-
-def test_reading_what_was_dropped_is_an_error():
-    bank = _Bank(0, memory(0), {1: memory(1), 2: memory(2)._replace(tokens=None)})
-    with pytest.raises(ValueError, match="dropped"):
-        bank.attended(4, 1, 100)
