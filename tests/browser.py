@@ -40,18 +40,12 @@ class Page:
         self._socket.send(json.dumps({"id": own, "method": method, "params": given}))
         while True:
             told = json.loads(self._socket.recv(timeout=600))
-            self._note(told)
+            if told.get("method") in ("Network.requestWillBeSent", "Network.webSocketCreated"):
+                self.asked.append(told["params"].get("url") or told["params"]["request"]["url"])
             if told.get("id") == own:
                 if "error" in told:
                     raise RuntimeError(f"{method}: {told['error']}")
                 return told["result"]
-
-    def _note(self, told: dict) -> None:
-        given = told.get("params", {})
-        if told.get("method") == "Network.requestWillBeSent":
-            self.asked.append(given["request"]["url"])
-        elif told.get("method") == "Network.webSocketCreated":
-            self.asked.append(given["url"])
 
     def js(self, code: str) -> Any:
         """The value of an expression, awaited."""
@@ -64,24 +58,22 @@ class Page:
         """The value of an expression as soon as it is true."""
         return until(lambda: self.js(code), code, seconds)
 
-    def click(self, x: float, y: float, *, shift: bool = False) -> None:
-        given = {"x": x, "y": y, "modifiers": 8 * shift}
-        self.send("Input.dispatchMouseEvent", type="mouseMoved", **given)
+    def click(self, x: float, y: float) -> None:
+        self.send("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
         for kind in ("mousePressed", "mouseReleased"):
-            self.send("Input.dispatchMouseEvent", type=kind, button="left", clickCount=1, **given)
+            self.send("Input.dispatchMouseEvent", type=kind, button="left", clickCount=1, x=x, y=y)
 
     def key(self, name: str, code: int, text: str = "") -> None:
         given: dict[str, Any] = {"key": name, "windowsVirtualKeyCode": code}
         self.send("Input.dispatchKeyEvent", type="keyDown", text=text, **given)
         self.send("Input.dispatchKeyEvent", type="keyUp", **given)
 
-    def type(self, element: str, text: str, *, enter: bool = True) -> None:
+    def type(self, element: str, text: str) -> None:
         """Replaces what stands in an input (an expression for it), and presses enter."""
         self.js(f"(() => {{ const e = {element}; e.focus(); e.select(); }})()")
         self.send("Input.insertText", text=text)
         time.sleep(0.12)  # the page tells the server of a text at most every 50 ms
-        if enter:
-            self.key("Enter", 13, "\r")
+        self.key("Enter", 13, "\r")
 
     def press(self, label: str) -> None:
         """Clicks the button of that label."""
@@ -103,21 +95,26 @@ def until(found: Callable[[], Any], told: str, seconds: float = 20.0) -> Any:
     return value
 
 
-def dumped(address: str, folder: Path, *options: str) -> dict:
-    """What a page wrote as JSON into its element `found`, without a person; `options` are Chromium's."""
+def driven(text: str, script: str, folder: Path, *options: str) -> dict:
+    """What a script notes of a page, in its object `found`; `options` are Chromium's."""
     assert CHROMIUM is not None
+    written = "out.id = 'found', out.textContent = JSON.stringify(found), document.body.append(out)"
+    guarded = f"try {{ {script} }} catch (error) {{ found.error = String(error); }}"
+    whole = f"const found = {{}}, out = document.createElement('pre'); (async () => {{ {guarded} {written}; }})();"
+    file = folder / "page.html"
+    file.write_text(text.replace("</body>", f"<script>{whole}</script></body>"))
     given = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder / 'browser'}", "--dump-dom"]
-    done = subprocess.run([CHROMIUM, *given, *options, address], capture_output=True, text=True, timeout=120)
+    command = [CHROMIUM, *given, *options, f"file://{file}"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     return json.loads(html.unescape(re.search(r'<pre id="found">(.*?)</pre>', done.stdout, re.DOTALL).group(1)))
 
 
 @contextlib.contextmanager
 def opened(address: str, folder: Path, *, width: int = 960, height: int = 640) -> Iterator[Page]:
-    """A page at an address; downloads go to FOLDER/downloads."""
+    """A page at an address; `folder` keeps what the browser writes."""
     from websockets.sync.client import connect
 
     assert CHROMIUM is not None
-    (folder / "downloads").mkdir(parents=True, exist_ok=True)
     command = [CHROMIUM, *OPTIONS, f"--user-data-dir={folder / 'browser'}", f"--window-size={width},{height}"]
     with subprocess.Popen([*command, "about:blank"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         try:
@@ -129,8 +126,6 @@ def opened(address: str, folder: Path, *, width: int = 960, height: int = 640) -
             with connect(target["webSocketDebuggerUrl"], **patient) as socket:
                 page = Page(socket)
                 page.send("Network.enable")
-                where = str(folder / "downloads")
-                page.send("Browser.setDownloadBehavior", behavior="allow", downloadPath=where)
                 page.send("Page.navigate", url=address)
                 yield page
         finally:

@@ -1,15 +1,20 @@
 """The page and its pictures: self-contained, escaped, colours that stay the same from view to view."""
 
 import base64
+import html
 import re
 from html.parser import HTMLParser
 
 import cv2
 import numpy as np
 import pytest
-from browser import CHROMIUM, dumped
+from browser import CHROMIUM, driven
+from capture_files import small_capture
+from small_field import make_field
 
 from jsecon.app import pictures, report
+from jsecon.app.catalogue import main_regions
+from jsecon.app.pictures import Renderer
 
 
 class _Reader(HTMLParser):
@@ -17,10 +22,9 @@ class _Reader(HTMLParser):
 
     def __init__(self):
         super().__init__()
-        self.open, self.images, self.seen = [], [], []
+        self.open, self.images = [], []
 
     def handle_starttag(self, tag, attrs):
-        self.seen.append(tag)
         if tag not in self.VOID:
             self.open.append(tag)
         if tag == "img":
@@ -36,79 +40,50 @@ def _image(seed=0):
 
 @pytest.fixture(scope="module")
 def page():
-    return report.page(
-        "A <title> & more",
-        "lead",
-        [
-            report.section(
-                "Frames",
-                "words",
-                report.grid([report.figure(_image(), "<b>x</b>", strong="<i>mug</i>", sharp=True)], 2),
-            ),
-            report.grid(
-                report.card(_image(), name, "words", report.grid([report.figure(_image(), "view")], 3))
-                for name in ("red <mug>", "blue mug")
-            ),
-            report.table(["a", "<b>fit</b>"], [[1, "<script>"]]),
-        ],
-    )
+    figures = report.grid([report.figure(_image(), "<b>x</b>", strong="<i>mug</i>", sharp=True)], 2)
+    view = report.grid([report.figure(_image(), "view")], 3)
+    cards = report.cards(report.card(_image(), name, "words", view) for name in ("red <mug>", "blue mug"))
+    table = report.table(["a", "<b>fit</b>"], [[1, "<script>"]])
+    return report.page("A <title> & more", "lead", [report.section("Frames", "words", figures), cards, table])
 
 
-def test_the_page_is_well_formed_and_holds_all_it_shows(page):
+def test_the_page_is_well_formed_and_holds_all_it_shows_and_words_from_outside_are_escaped(page):
     reader = _Reader()
     reader.feed(page)
     assert reader.open == []
     assert not re.search(r"href|url\(|@import|https?:", re.sub(r"base64,[^\"]*", "", page))
-    assert reader.seen.count("script") == 1
     assert all(image["src"].startswith("data:image/") and image["alt"] for image in reader.images)
-
-
-def test_words_from_outside_are_escaped(page):
-    assert "A &lt;title&gt; &amp; more" in page
     assert page.count("<script>") == 1
-    assert "&lt;script&gt;" in page
-    assert "red &lt;mug&gt;" in page
-    assert "&lt;i&gt;mug&lt;/i&gt;" in page
-    assert "&lt;b&gt;fit&lt;/b&gt;" in page
-    assert "&lt;b&gt;x&lt;/b&gt;" in page
+    for text in ("A <title> & more", "<script>", "red <mug>", "<i>mug</i>", "<b>fit</b>", "<b>x</b>"):
+        assert html.escape(text) in page
 
 
 @pytest.mark.parametrize("sharp", [True, False])
 def test_pictures_inside_the_page_are_the_pictures_given(sharp):
     image = np.repeat(np.repeat(_image()[:6, :8], 8, 0), 8, 1)
-    kind, data = report._data_uri(image, sharp=sharp).split(",")
-    back = cv2.cvtColor(
-        cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB
-    )
+    kind, data = report.data_uri(image, sharp=sharp).split(",")
+    back = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
     assert kind == ("data:image/png;base64" if sharp else "data:image/jpeg;base64")
     assert np.abs(back.astype(int) - image).mean() <= (0 if sharp else 25)
 
 
 PILOT = """
-<script>
-const found = {};
 const side = selector => document.querySelector(selector).getBoundingClientRect();
 const wait = ms => new Promise(done => setTimeout(done, ms));
-(async () => {
-  await wait(100);
-  document.querySelector(".grid figure > img").click();
-  found.enlarged = [large.open, large.firstChild.src === document.querySelector(".grid figure > img").src];
-  large.firstChild.click(); found.closed = large.open;
-  document.querySelectorAll(".card")[1].querySelector("summary").click(); await wait(50);
-  found.opened = side(".card[open] .grid").height > 0;
-  found.overflow = document.documentElement.scrollWidth - document.documentElement.clientWidth;
-  found.requests = performance.getEntriesByType("resource").filter(e => !e.name.startsWith("data:")).length;
-  const out = document.createElement("pre"); out.id = "found"; out.textContent = JSON.stringify(found);
-  document.body.append(out);
-})();
-</script></body>"""
+await wait(100);
+document.querySelector(".grid figure > img").click();
+found.enlarged = [large.open, large.firstChild.src === document.querySelector(".grid figure > img").src];
+large.firstChild.click(); found.closed = large.open;
+document.querySelectorAll(".card")[1].querySelector("summary").click(); await wait(50);
+found.opened = side(".card[open] .grid").height > 0;
+found.overflow = document.documentElement.scrollWidth - document.documentElement.clientWidth;
+found.requests = performance.getEntriesByType("resource").filter(e => !e.name.startsWith("data:")).length;
+"""
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
 def test_in_a_browser_pictures_are_enlarged_and_cards_open(page, tmp_path):
-    file = tmp_path / "page.html"
-    file.write_text(page.replace("</body>", PILOT))
-    found = dumped(f"file://{file}", tmp_path, "--window-size=500,800", "--virtual-time-budget=5000")
+    found = driven(page, PILOT, tmp_path, "--window-size=500,800", "--virtual-time-budget=5000")
     assert found["enlarged"] == [True, True]
     assert found["closed"] is False
     assert found["opened"]
@@ -133,25 +108,42 @@ def test_labels_are_drawn_in_their_colours_and_unlabelled_pixels_stay_grey():
 
 
 def test_a_selection_is_brighter_than_what_it_leaves_and_the_truth_is_outlined():
-    mask, truth = np.zeros((24, 32), bool), np.zeros((24, 32), bool)
+    mask, truth = np.zeros((2, 24, 32), bool)
     mask[6:18, 6:18] = truth[6:18, 12:26] = True
     frame = np.full((24, 32, 3), 100, np.uint8)
     image = pictures.selection_overlay(frame, mask, truth)
     assert image[9, 9, 0] > image[2, 2, 0]
-    assert (image.reshape(-1, 3) == 255).all(1).any()
-    assert not (pictures.selection_overlay(frame, mask).reshape(-1, 3) == 255).all(1).any()
+    assert (image == 255).all(2).any()
+    assert not (pictures.selection_overlay(frame, mask) == 255).all(2).any()
 
 
-def test_a_picture_is_cut_to_a_mask():
-    image, mask = _image(), np.zeros((24, 32), bool)
-    np.testing.assert_array_equal(pictures.crop(image, mask), image)
-    mask[10:13, 2:4] = True
-    part = pictures.crop(image, mask)
-    np.testing.assert_array_equal(part, image[: part.shape[0], : part.shape[1]])
-    assert part.shape[1] < 32
-    mask = np.zeros((240, 320), bool)
-    mask[100:150, 200:220] = True
-    rows, columns = np.mgrid[:240, :320]
-    part = pictures.crop(np.stack([rows, columns, mask], axis=-1).astype(np.uint8), mask)
-    assert part[..., 2].sum() == mask.sum()
-    assert part[..., 2].mean() > 0.15
+def test_a_region_is_pictured_where_its_gaussians_are(scene, cameras):
+    field = make_field(scene, cameras)[0]
+    renderer, regions = Renderer(field.gaussians, field.cameras), main_regions(field)
+    photo = renderer.photo(1)
+    for region in range(5):
+        part = renderer.crop(1, regions == region)
+        windows = np.lib.stride_tricks.sliding_window_view(photo, part.shape)[..., 0, :, :, :]
+        assert (windows == part).all((-3, -2, -1)).any(), "a part of the frame"
+    np.testing.assert_array_equal(renderer.crop(1, regions == 99), photo)
+
+
+# What a notebook shows
+
+
+def picture(page):
+    data = re.search(r'src="data:image/jpeg;base64,([^"]+)"', page).group(1)
+    return cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
+
+
+def test_a_field_shows_its_first_view_and_its_regions(scene, cameras):
+    image = picture(make_field(scene, cameras)[0]._repr_html_())
+    assert image.shape == (40, 96, 3)
+    assert image[:, :48].std() > 3
+    assert np.abs(image[:, :48].astype(int) - image[:, 48:]).mean() > 3  # colours and regions are not the same picture
+
+
+def test_a_capture_shows_a_few_small_frames():
+    page = small_capture(4, 480, 400)._repr_html_()
+    assert "Capture of 4 frames of 480x400, 0 held out, 50 sparse points<" in page
+    assert picture(page).shape == (200, 4 * 240, 3)
