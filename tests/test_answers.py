@@ -2,16 +2,17 @@
 
 import dataclasses
 import json
+import os
 
+import cv2
 import numpy as np
 import pytest
-from capture_files import run_cli
-from small_field import colour_field, make_field
+from capture_files import refused, run_cli
+from small_field import colour_field
 from test_gltf import read_glb
 
-from jsecon import Answer, Query, QueryRules, Scene, load_gaussians, objects, query_region, save_field
-from jsecon.app.querying import write_answers
-from jsecon.pipeline.progress import Console
+from jsecon import Scene, load_gaussians, objects, save_field
+from jsecon.vision.colours import ColourEmbedder
 
 
 @pytest.fixture(scope="module")
@@ -25,21 +26,21 @@ def saved(scene, cameras, tmp_path_factory):
     return field, file
 
 
-def test_a_field_is_exported_in_every_format(saved, tmp_path, capsys):
+@pytest.mark.parametrize("ending", ["ply", "spz", "glb"])
+def test_a_field_is_exported_in_every_format(saved, tmp_path, ending):
     field, file = saved
-    means = np.add(field.gaussians.means, [2, 0, 0])
-    for ending in ("ply", "spz"):
-        assert run_cli("export", file, "--out", tmp_path / f"scene.{ending}") == 0
-        np.testing.assert_allclose(load_gaussians(tmp_path / f"scene.{ending}").means, means, atol=2**-16)
-    assert run_cli("export", file, "--out", tmp_path / "scene.glb", "--with-labels") == 0
-    assert f"{len(means)} Gaussians" in capsys.readouterr().out
-    _, found = read_glb(tmp_path / "scene.glb")
-    np.testing.assert_allclose(found["POSITION"], means * [-1, -1, 1], atol=1e-6)
-    np.testing.assert_array_equal(found["_OBJECT_ID"][:, 0], objects(field).labels)
+    means, out = np.add(field.gaussians.means, [2, 0, 0]), tmp_path / f"scene.{ending}"
+    assert run_cli("export", file, "--out", out, *(["--with-labels"] if ending == "glb" else [])) == 0
+    if ending == "glb":
+        found = read_glb(out)[1]
+        np.testing.assert_allclose(found["POSITION"], means * [-1, -1, 1], atol=1e-6)
+        np.testing.assert_array_equal(found["_OBJECT_ID"][:, 0], objects(field).labels)
+    else:
+        np.testing.assert_allclose(load_gaussians(out).means, means, atol=2**-16)
 
 
 @pytest.mark.parametrize("ending", ["ply", "spz", "glb"])
-def test_a_selection_is_written_in_every_format(saved, tmp_path, ending):
+def test_a_selection_is_written_in_every_format_with_its_masks(saved, tmp_path, ending):
     field, file = saved
     size = field.cameras.width, field.cameras.height
     asked = "query", file, "--box", "#0", 0, 0, *size, "--out", tmp_path, "--format", ending, "--views", 1
@@ -52,6 +53,9 @@ def test_a_selection_is_written_in_every_format(saved, tmp_path, ending):
     else:
         means = np.asarray(load_gaussians(chosen).means, np.float64)
         np.testing.assert_allclose(means.mean(0), told["place"]["centroid"], atol=1e-4)
+    (mask,) = (cv2.imread(str(tmp_path / name), cv2.IMREAD_UNCHANGED) for name in told["masks"].values())
+    assert mask.shape == size[::-1]
+    assert set(np.unique(mask)) == {0, 255}
     assert {path.suffix for path in tmp_path.iterdir()} == {f".{ending}", ".json", ".png", ".html"}
 
 
@@ -63,28 +67,19 @@ def test_an_ending_that_cannot_be_written_is_refused_before_anything_is_read(tmp
     assert "npx @playcanvas/splat-transform" in told
 
 
-class Told(Console):
-    def __init__(self):
-        super().__init__()
-        self.lines = []
-
-    def print_line(self, text):
-        self.lines.append(text)
-
-
-def test_an_answer_without_a_region_says_so_and_one_without_gaussians_differs(scene, cameras, tmp_path):
-    field, _ = make_field(scene, cameras)
-    nothing = np.zeros(field.gaussians.count, bool)
-    none = Answer(Query("unicorn"), "votes", nothing, query_region(field, -1), field, count=0)
-    faint = query_region(field, 1, rules=QueryRules(min_share=2.0))
-    empty = Answer(Query("faint"), "votes", nothing, faint, field, count=0)
-    told = Told()
-    write_answers(Scene(field), [none, empty], tmp_path, told, views=1)
-    first, second, pictures = told.lines
-    assert first.startswith("'unicorn': 0 of 64 Gaussians")
-    assert first.endswith("no region matches it, no Gaussian is selected")
-    assert second.endswith("region 1, no Gaussian is selected")
-    assert pictures.endswith("answers.html")
+def test_answers_without_a_region_or_gaussians_and_a_text_that_is_not_utf8(saved, tmp_path, capsys):
+    field, file = saved
+    odd = os.fsdecode(b"caf\xe9 red")
+    asked = "query", file, "red but not red", odd, "red", "--out", tmp_path, "--views", 0
+    assert run_cli(*asked, "--json") == 2
+    told = json.loads(capsys.readouterr().out)
+    assert "is not UTF-8" in told["error"]["message"]
+    assert [answer["region"] is None for answer in told["answers"]] == [True, False]
+    assert run_cli(*asked) == 2
+    out, err = capsys.readouterr()
+    assert next(line for line in err.splitlines() if line.startswith("jsecon: ")).isascii()
+    assert "0 of 64 Gaussians" in out
     assert "no region matches it" in (tmp_path / "answers.html").read_text()
-    written = [json.loads(file.read_text()) for file in sorted(tmp_path.rglob("*.json"))]
-    assert sorted((w["query"], w["region"]) for w in written) == [("faint", 1), ("unicorn", None)]
+    for by in ("votes", "code"):
+        with refused("not UTF-8"):
+            Scene(field, ColourEmbedder()).ask(odd, by=by)

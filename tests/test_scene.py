@@ -1,14 +1,15 @@
 """A scene that is asked: what it refuses, what it keeps, threads, and the field of a splat without photographs."""
 
 import dataclasses
-import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 from balls import sphere
 from capture_files import run_cli
 from clip_files import write_clip
-from small_field import colour_field, field_of, lone_votes
+from conftest import gaussians_at
+from small_field import field_of, lone_votes
 from table_field import table_field
 
 import jsecon
@@ -27,15 +28,9 @@ def table():
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 5, -3])
 @pytest.mark.parametrize("option", ["threshold", "min_rank"])
-def test_a_number_out_of_its_range_is_refused_at_once(table, tmp_path, capsys, option, value):
+def test_a_number_out_of_its_range_is_refused_at_once(table, option, value):
     with pytest.raises(InputError, match=f"{option}: .*expected a number from 0 to 1"):
         table.ask("red mug", **{option: value})
-    line = "query", tmp_path / "nowhere.safetensors", "red", "--out", tmp_path / "out"
-    assert run_cli(*line, f"--{option.replace('_', '-')}", value) == 2
-    assert option.replace("_", "-") in capsys.readouterr().err
-    assert run_cli(*line, "--views", -1) == 2
-    assert "--views" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
 
 
 def test_the_region_of_another_field_selects_nothing_with_a_word(table):
@@ -74,13 +69,8 @@ def test_many_texts_in_many_threads_are_answered_alike_within_bounds(monkeypatch
     texts = ["red mug", "dark blue box", "white plate", "the leftmost red mug"]
     expected = {text: Scene(field, embedder).ask(text).rows for text in texts}
     embedded.clear()
-    found = []
-    work = [threading.Thread(target=lambda text=text: found.append(scene.ask(text))) for text in texts * 6]
-    for thread in work:
-        thread.start()
-    for thread in work:
-        thread.join()
-    assert len(found) == 24
+    with ThreadPoolExecutor(24) as pool:
+        found = list(pool.map(scene.ask, texts * 6))
     for answer in found:
         np.testing.assert_array_equal(answer.rows, expected[str(answer.query)])
     assert len({id(answer) for answer in found}) == 4
@@ -96,17 +86,6 @@ def test_many_texts_in_many_threads_are_answered_alike_within_bounds(monkeypatch
     assert texts[0] in embedded
 
 
-def test_python_and_the_command_keep_the_same_gaussians(scene, cameras):
-    """The outliers of an answer, by the functions below the scene with their defaults."""
-    field = colour_field(scene, cameras)
-    asked = Scene(field)
-    for region in range(5):
-        selection = jsecon.query_region(field, region)
-        weight = np.asarray(selection.similarity) * np.asarray(field.votes.total)
-        mask = jsecon.remove_outliers(field.gaussians.means, selection.mask, weight=weight)
-        np.testing.assert_array_equal(asked.ask(Region(region)).mask, mask)
-
-
 def test_regions_of_few_gaussians_are_called_too_small(tmp_path, capsys):
     regions = Regions(np.eye(2, 8, dtype=np.float32), np.full((2, 1), 50, np.int32))
     field = dataclasses.replace(field_of(lone_votes([0] * 9 + [1] * 4, 2), regions), embedder="given-8")
@@ -115,17 +94,13 @@ def test_regions_of_few_gaussians_are_called_too_small(tmp_path, capsys):
     assert "too small to be listed, with fewer than 10 Gaussians: 2 regions" in capsys.readouterr().out
 
 
+@pytest.mark.long  # a whole run
 def test_the_field_of_a_splat_is_kept_with_its_model(tmp_path):
     """Asked with a model first and then without, it is the field that is there; another model makes it anew."""
     draw = np.random.default_rng(0)
     means = np.concatenate([sphere(draw, centre, 0.3, 300) for centre in ((0, 0, 0), (1, 0, 0), (0, 1, 0))])
-    splat = jsecon.Gaussians(
-        means.astype(np.float32),
-        np.full((900, 3), -3.5, np.float32),
-        np.tile(np.float32([1, 0, 0, 0]), (900, 1)),
-        np.full(900, 4, np.float32),
-        np.repeat(np.float32([[1, -1, -1], [-1, 1, -1], [-1, -1, 1]]), 300, axis=0)[:, None],
-    )
+    colours = np.repeat(np.float32([[1, -1, -1], [-1, 1, -1], [-1, -1, 1]]), 300, axis=0)[:, None]
+    splat = gaussians_at(means, 0.03, logit=4, sh=colours)
     jsecon.save_gaussians(tmp_path / "scene.ply", splat)
     options = Options(tmp_path / "scene.ply", views=4, long_side=64, up=(0.0, 0.0, 1.0))
     model, folder = write_clip(tmp_path / "clip", "transformers.js"), tmp_path / "scene_field"
