@@ -1,4 +1,4 @@
-"""Checks built pages of the documentation: `python -m tests.built_pages FOLDER`.
+"""Checks built pages of the documentation: `python docs/check_pages.py FOLDER`.
 
 No page may ask another host for anything, and every link inside the pages must lead to an element that exists.
 """
@@ -9,15 +9,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
-LOADED = {
-    "img": "src",
-    "script": "src",
-    "link": "href",
-    "iframe": "src",
-    "source": "src",
-    "video": "src",
-    "embed": "src",
-}
+LOADED = {"link": "href"} | dict.fromkeys(("img", "script", "iframe", "source", "video", "embed"), "src")
 """elements whose target a browser loads by itself"""
 REMOTE = re.compile(r"(?:https?:)?//", re.IGNORECASE)
 
@@ -33,6 +25,7 @@ class Page(HTMLParser):
         self.feed(path.read_text())
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Notes the target and the anchors of an element."""
         values = {name: value or "" for name, value in attrs}
         self.anchors |= {values[name] for name in ("id", "name") if name in values}
         target = values.get(LOADED.get(tag, ""), "")
@@ -45,7 +38,10 @@ class Page(HTMLParser):
 def faults(folder: Path) -> list[str]:
     """A sentence for each fault of the pages that sphinx-build wrote to a folder."""
     pages = {path.resolve(): Page(path) for path in folder.rglob("*.html")}
-    found = [f"{style} loads {url}" for style in folder.rglob("*.css") for url in _remote_urls(style.read_text())]
+    found = []
+    for style in folder.rglob("*.css"):
+        urls = re.findall(r"""(?:url\(|@import)\s*["']?([^"')]+)""", style.read_text())
+        found += [f"{style} loads {url}" for url in urls if REMOTE.match(url)]
     for path, page in pages.items():
         name = path.relative_to(folder.resolve())
         found += [f"{name} loads {target}" for target in page.loaded if REMOTE.match(target)]
@@ -59,12 +55,6 @@ def faults(folder: Path) -> list[str]:
             elif parts.fragment and file in pages and unquote(parts.fragment) not in pages[file].anchors:
                 found.append(f"{name} links to {target}, which has no such element")
     return found
-
-
-def _remote_urls(style: str) -> list[str]:
-    """Addresses of other hosts that a style sheet loads."""
-    targets = re.findall(r"""url\(\s*["']?([^"')]+)""", style) + re.findall(r"""@import\s+["']([^"']+)""", style)
-    return [target for target in targets if REMOTE.match(target)]
 
 
 if __name__ == "__main__":
