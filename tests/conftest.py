@@ -12,7 +12,6 @@ import os
 import pickle
 import shutil
 import tempfile
-from collections import Counter
 from pathlib import Path
 
 import compiling
@@ -69,23 +68,17 @@ settings.load_profile("jsecon")
 
 import numpy as np  # noqa: E402
 
-from experiments.memory_maps import clear_programs  # noqa: E402
-from jsecon.process import compilation_counts  # noqa: E402
+from jsecon.process import clear_programs  # noqa: E402
 from jsecon.types import Camera, Gaussians  # noqa: E402
 
 # Tracing makes many objects and few cycles: ten times fewer collections save a tenth of a test's time.
 gc.freeze()
 gc.set_threshold(20_000, 20, 20)
 
-# fmt: off
 LONGEST = (
     "compiling", "pipeline", "corrections", "fit", "views", "render", "blocks", "cores", "cli", "readme", "networks",
-    "capacity", "relations", "retrieval", "votes", "tiles", "anchored", "silhouette", "distill", "motion",
-    "photometric", "evidence", "several", "rivals", "classes", "codes", "autoencoder", "asking", "tracker", "consensus",
-    "scene_stages", "traced", "parts", "gaussian_files", "processes", "paths", "names", "window", "viewer", "direct",
-    "shares", "field",
-)
-# fmt: on
+    "capacity", "relations", "retrieval", "votes", "tiles", "anchored", "distill", "motion", "photometric", "evidence",
+)  # fmt: skip
 """files, without test_, that start first; files that use `room_run` come after test_pipeline, which makes it"""
 
 
@@ -105,27 +98,6 @@ def pytest_runtest_protocol(item, nextitem):
     if nextitem is None or nextitem.path != item.path:
         clear_programs(above=40_000)
     return done
-
-
-def pytest_sessionstart(session):
-    session.config.programs = Counter()
-    compilation_counts()
-
-
-def pytest_sessionfinish(session):
-    """Passes a worker's number of compiled programs to the process that prints the sum."""
-    session.config.programs.update(compilation_counts())
-    if hasattr(session.config, "workeroutput"):
-        session.config.workeroutput["programs"] = dict(session.config.programs)
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_testnodedown(node):
-    node.config.programs.update(getattr(node, "workeroutput", {}).get("programs", {}))
-
-
-def pytest_terminal_summary(terminalreporter, config):
-    terminalreporter.write_line(f"{config.programs['all']} programs compiled")
 
 
 @pytest.fixture

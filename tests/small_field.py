@@ -74,19 +74,10 @@ def _make_field(scene, cameras, dim):
     left, sizes, _ = np.linalg.svd(embeddings, full_matrices=False)
     table = left * sizes  # unit rows with the cosines of the embeddings
     pixels = np.stack([(labels == r).sum((1, 2)) for r in range(REGIONS)]).astype(np.int32)
-    field = LanguageField(
-        gaussians=scene,
-        votes=votes,
-        regions=Regions(embeddings, pixels),
-        cameras=cameras,
-        canonical_phrases=unit_rows(rng, 4, dim),
-        source_from_scene=np.eye(4),
-        names=tuple(f"frame_{t}" for t in range(len(labels))),
-        embedder="random",
-        provenance='{"made by": "a test"}',
-        unrelated_words=np.zeros((0, dim), np.float32),
-        codes=Codes(distill_votes(votes, table), table, None),
-    )
+    names = tuple(f"frame_{t}" for t in range(len(labels)))
+    given = scene, votes, Regions(embeddings, pixels), cameras, unit_rows(rng, 4, dim), np.eye(4), names
+    words, codes = np.zeros((0, dim), np.float32), Codes(distill_votes(votes, table), table, None)
+    field = LanguageField(*given, "random", '{"made by": "a test"}', unrelated_words=words, codes=codes)
     return field, labels
 
 

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from capture_files import refused, small_capture, write_images, write_text_model, write_transforms
-from fuzz_readers import tiny_field
+from fuzz_readers import _field
+from test_pipeline import Recorder
 
 from jsecon import load_capture, save_field, save_gaussians
 from jsecon.files import exclusive_lock, write_text
 from jsecon.pipeline import cache, run as pipeline, scene
-from jsecon.pipeline.progress import Console
 from jsecon.pipeline.results import RunContext
 from jsecon.pipeline.scene import plan_capture
 from jsecon.read.captures import build
@@ -37,9 +37,9 @@ def no_room():
 
 
 @pytest.mark.parametrize(("name", "write"), [
-    ("a.safetensors", lambda path: save_field(path, tiny_field())),
+    ("a.safetensors", lambda path: save_field(path, _field())),
     ("a.safetensors", lambda path: cache.save(path, np.zeros(9999))),
-    ("a.ply", lambda path: save_gaussians(path, tiny_field().gaussians)),
+    ("a.ply", lambda path: save_gaussians(path, _field().gaussians)),
     ("a.png", lambda path: write_image(path, np.random.default_rng(0).integers(0, 255, (99, 99, 3), np.uint8))),
     ("a.txt", lambda path: write_text(path, "x" * 5000)),
 ])  # fmt: skip
@@ -76,12 +76,12 @@ def test_frames_that_lie_on_a_full_disk_are_told(capture, no_room, monkeypatch):
         load_capture(capture)
 
 
-class Meddler(Console):
-    """Writes to a file while a stage runs."""
+class Meddler(Recorder):
+    """Writes to a file while the captures are loaded."""
 
     def __init__(self, file):
         super().__init__()
-        self.file, self.fresh = file, {}
+        self.file = file
 
     @contextlib.contextmanager
     def progress(self, name):
@@ -91,9 +91,6 @@ class Meddler(Console):
                     file.write(b"more")
 
         yield meddle
-
-    def done(self, name, seconds, fresh):
-        self.fresh[name] = fresh
 
 
 def test_a_file_that_changes_while_it_is_read_is_told_and_nothing_of_it_is_kept(capture, tmp_path):

@@ -84,20 +84,8 @@ def test_wrong_input_and_other_options_are_reported_once(small_run, tmp_path):
     (tmp_path / "empty").mkdir()
     _, error = start([str(tmp_path / "empty")], tmp_path / "out").communicate(timeout=120)
     assert error.count(f"jsecon: {tmp_path / 'empty'}") == 1
-    other = [
-        "-n",
-        "1",
-        *JSECON,
-        *small_run,
-        "--out",
-        str(tmp_path / "out"),
-        "--distributed",
-        "--parts",
-        ":",
-        "-n",
-        "1",
-    ]
-    running = start(small_run, tmp_path / "out", other)
+    rank = [*JSECON, *small_run, "--out", str(tmp_path / "out"), "--distributed", "--parts"]
+    running = start(small_run, tmp_path / "out", ["-n", "1", *rank, ":", "-n", "1"])
     _, error = running.communicate(timeout=120)
     assert running.returncode != 0
     assert error.count("Give all processes the same options and version.") == 1

@@ -1,14 +1,12 @@
 """Traces on disk: a new process runs the stored program, to the same bits, and nothing else is taken for it."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.sharding import NamedSharding, PartitionSpec
 
-from jsecon import host_mesh, plan_view
+from jsecon import host_mesh
 from jsecon.programs import stored_jit
 
 
@@ -47,11 +45,10 @@ def test_other_types_and_options_are_other_programs(folder):
     x = jnp.ones(4, jnp.bfloat16)
     assert run(x, 2.0, 2)["y"].dtype == jnp.bfloat16  # 2.0 has no type of its own
     assert run(x, np.float32(2), 2)["y"].dtype == jnp.float32
-    run(x, 2.0, 3)
     run(jnp.ones(5), 2.0, 3)
     with jax.enable_x64(True):
         assert run(np.ones(5), 2.0, 3)["y"].dtype == np.float64
-    assert traces == [2, 2, 3, 3, 3]
+    assert traces == [2, 2, 3, 3]
 
 
 def test_inside_of_a_trace_it_is_an_ordinary_function(folder):
@@ -61,7 +58,7 @@ def test_inside_of_a_trace_it_is_an_ordinary_function(folder):
     assert not list(folder.glob("*.trace"))
 
 
-@pytest.mark.parametrize("cut", [0, 1, 20, -1])
+@pytest.mark.parametrize("cut", [0, 20, -1])
 def test_a_damaged_trace_is_made_again(folder, cut):
     x = np.ones(3, np.float32)
     run, _ = counted()
@@ -78,21 +75,9 @@ def test_a_folder_that_cannot_be_written_costs_only_time(folder):
     jax.config.update("jax_compilation_cache_dir", str(folder / "file"))
     (folder / "file").write_text("in the way")
     run, traces = counted()
-    run(np.ones(3, np.float32), 2.0, 2)
-    run(np.ones(3, np.float32), 2.0, 2)
-    assert traces == [2]
-
-
-def test_plans_of_views_are_the_same_bits(folder, scene, camera):
-    def plan_with(gaussians, camera, capacity):
-        return plan_view(gaussians, camera, capacity=capacity)
-
-    arguments = dataclasses.replace(scene, sh=None), camera, 4096
-    expected = jax.jit(plan_with, static_argnums=2)(*arguments)
     for _ in range(2):
-        plan = stored_jit(plan_with, static_argnums=(2,))(*arguments)
-        assert (plan.width, plan.height, plan.mesh, plan.lists.tile) == (48, 40, None, expected.lists.tile)
-        jax.tree.map(np.testing.assert_array_equal, plan, expected)
+        run(np.ones(3, np.float32), 2.0, 2)
+    assert traces == [2]
 
 
 def test_a_result_goes_on_to_several_devices_and_a_placed_array_stays_where_it_is(folder):
