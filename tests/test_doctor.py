@@ -2,19 +2,16 @@
 
 import json
 import re
-import tomllib
-from pathlib import Path
 
 import jax
 
 from jsecon import backend, process
 from jsecon.app import cli, doctor
 
-PROJECT = tomllib.loads((Path(__file__).resolve().parent.parent / "pyproject.toml").read_text())["project"]
-
 
 def test_it_prints_what_is_here_and_what_is_not(capsys, monkeypatch):
-    monkeypatch.setitem(doctor.EXTRAS, "sfm", (("no_such_module",), "poses"))
+    needs = ["numpy>=2", 'no-such-package>=1; extra == "sfm"', "numpy; extra == 'formats'"]
+    monkeypatch.setattr(doctor.importlib.metadata, "requires", lambda name: needs)
     assert cli.main(["doctor"]) == 0
     printed = capsys.readouterr().out
     lines = {line[9:19].strip(): (line[:8].strip(), line[20:]) for line in printed.splitlines()}
@@ -23,7 +20,8 @@ def test_it_prints_what_is_here_and_what_is_not(capsys, monkeypatch):
     assert lines["jax"][1].endswith(f"{len(jax.devices())} cpu")
     assert lines["backend"][0] == "ok"
     assert re.match(r"all \d+ required packages can be imported", lines["packages"][1])
-    assert lines["sfm"] == ("missing", 'poses: pip install "jsecon[sfm]" (no_such_module)')
+    assert lines["sfm"] == ("missing", 'pip install "jsecon[sfm]" (no-such-package)')
+    assert lines["formats"] == ("ok", "installed")
     assert re.match(r"\d+(\.\d)? [GM]iB free", lines["memory"][1])
 
 
@@ -43,7 +41,3 @@ def test_what_every_run_needs_and_is_wrong_is_exit_code_2(capsys, monkeypatch):
     assert "without ximgproc" in checks["packages"][1]
     assert {error["where"] for error in printed["errors"]} == {"packages", "backend", "memory"}
     assert all(error["remedy"] for error in printed["errors"])
-
-
-def test_it_knows_the_extras_of_the_project():
-    assert set(doctor.EXTRAS) == set(PROJECT["optional-dependencies"]) - {"dev", "all"}

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from capture_files import run_cli
 
-from jsecon.read.captures.capture import capture_extent, load_capture
-from jsecon.read.captures.frames import CaptureExtent, FrameOptions
+from jsecon.read.captures.build import plan_frames
+from jsecon.read.captures.capture import load_capture, read_posed_images
+from jsecon.read.captures.frames import FrameOptions
 
 STAGES = ["load", "gaussians", "objects", "regions", "votes", "held_out"]
 
@@ -36,10 +37,10 @@ def test_a_dry_run_lists_every_stage_writes_nothing_and_refuses_bad_options(room
 
 
 @pytest.mark.parametrize("given", [{}, {"downscale": 2.0}, {"long_side": 50, "frames": 3}])
-def test_the_extent_is_that_of_the_loaded_capture(room, given):
-    capture, extent = load_capture(room, **given), capture_extent(room, FrameOptions(**given))
-    size = capture.cameras.width, capture.cameras.height
-    assert extent == CaptureExtent(len(capture.names), size, capture.names, capture.files)
+def test_planned_frames_are_those_of_the_loaded_capture(room, given):
+    capture, (frames, size) = load_capture(room, **given), plan_frames(read_posed_images(room), FrameOptions(**given))
+    assert size == (capture.cameras.width, capture.cameras.height)
+    assert frames == dict(zip(capture.names, capture.files))
 
 
 def _wrong_masks(room, folder):

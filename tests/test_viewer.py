@@ -2,11 +2,9 @@
 
 import dataclasses
 import http.client
-import io
 import subprocess
 import sys
 import urllib.request
-import zipfile
 from types import SimpleNamespace
 
 import cv2
@@ -21,50 +19,51 @@ from small_field import colour_field
 
 from jsecon import Camera, InputError, load_gaussians, region_at, save_field
 from jsecon.app.catalogue import main_regions
-from jsecon.app.records import Query, Region
+from jsecon.app.pictures import palette
+from jsecon.app.records import Answer, Query, Region
 from jsecon.app.scene import Scene
 from jsecon.app.viewer.layer import MAX_STD, SplatLayer
-from jsecon.app.viewer.state import COLOURINGS, ViewState, answer_colours, highlight
-from jsecon.app.viewer.window import Viewer, open_viewer, region_along
+from jsecon.app.viewer.window import ANSWER_HUE, COLOURINGS, Viewer, ViewState, highlight, open_viewer, region_along
 from jsecon.query.pointing import region_shares_seen
+from jsecon.types import Selection
 from jsecon.vision.colours import BASIC, ColourEmbedder
 
 MUG = ViewState(("red mug",))
 
 
 def test_clicks_and_texts_change_the_questions_and_the_controls_their_options():
-    state = MUG.toggle_region(3)
+    state = MUG.with_question(Region(3))
     assert state.questions == (Region(3),)
-    assert state.toggle_region(3).questions == ()
-    assert MUG.toggle_region(3, add=True).questions == ("red mug", Region(3))
-    assert state.toggle_region(4, add=True).toggle_region(3, add=True).questions == (Region(4),)
+    assert state.with_question(Region(3)).questions == ()
+    assert MUG.with_question(Region(3), add=True).questions == ("red mug", Region(3))
+    assert state.with_question(Region(4), add=True).with_question(Region(3), add=True).questions == (Region(4),)
     assert ViewState().with_question("mug; bowl").queries == (Query("mug; bowl", threshold=0.5),)
     assert MUG.with_question("bowl", add=True).with_question("red mug", add=True).questions == ("bowl", "red mug")
     assert MUG.with_question("  ").questions == ()
     changed = dataclasses.replace(MUG, threshold=0.7, all_of_class=True)
     assert changed.queries == (Query("red mug", threshold=0.7, all_of_class=True),)
-    kept = dataclasses.replace(changed.isolate(), threshold=0.2)
-    assert kept.isolated == changed.hide().hidden == changed.queries
-    assert changed.hide().questions == ()
-    assert ViewState().isolate() == ViewState().hide() == ViewState()
-    assert changed.isolate().hide().show_all() == dataclasses.replace(changed, questions=())
 
 
 def test_colours_of_answers_differ_and_do_not_depend_on_their_number():
-    many = answer_colours(12).astype(int)
-    np.testing.assert_array_equal(answer_colours(3), many[:3])
+    many = palette(12, ANSWER_HUE).astype(int)
+    np.testing.assert_array_equal(palette(3, ANSWER_HUE), many[:3])
     differences = np.abs(many[:, None] - many[None]).sum(-1)
     assert differences[~np.eye(12, dtype=bool)].min() > 40
 
 
-def test_a_gaussian_of_two_answers_has_the_colour_of_the_better_one():
+def test_a_gaussian_of_two_answers_has_the_colour_of_the_better_one(field):
+    def answer_of(mask, similarity):
+        mask, zero = np.array(mask, bool), np.zeros((), np.float32)
+        selection = Selection(mask, np.array(similarity, np.float32), np.zeros((), np.int32), zero)
+        return Answer(Query("mug"), "votes", mask, selection, field)
+
     base = np.array([[200, 100, 0]] * 4, np.uint8)
-    assert highlight(base, [], []) is base
-    a, b = np.array([1, 1, 0, 0], bool), np.array([0, 1, 1, 0], bool)
-    first, second = np.array([0.9, 0.6, 0.1, 0], np.float32), np.array([0, 0.8, np.nan, 0], np.float32)
-    colours = highlight(base, [a, b], [first, second]).astype(int)
-    tinted = (0.45 * base[0] + 0.55 * answer_colours(2)).astype(int)
-    np.testing.assert_allclose(colours[:3], [tinted[0], tinted[1], tinted[1]], atol=1)
+    failed = InputError("query", "no words")
+    assert highlight(base, [failed, answer_of([0, 0, 0, 0], [0, 0, 0, 0])]) is base
+    first, second = answer_of([1, 1, 0, 0], [0.9, 0.6, 0.1, 0]), answer_of([0, 1, 1, 0], [0, 0.8, np.nan, 0])
+    colours = highlight(base, [first, failed, second]).astype(int)
+    tinted = (0.45 * base[0] + 0.55 * palette(3, ANSWER_HUE)).astype(int)
+    np.testing.assert_allclose(colours[:3], [tinted[0], tinted[2], tinted[2]], atol=1)
     assert 0 < colours[3].max() < 0.5 * 200
 
 
@@ -129,21 +128,18 @@ def test_a_text_is_highlighted(viewer):
     mask, lit = mask_of(viewer, word), colours(viewer.layer)
     assert (lit[~mask, :3].astype(int) <= base[~mask, :3]).all()
     np.testing.assert_array_equal(lit[:, 3], base[:, 3])
-    np.testing.assert_allclose(lit[mask, :3], 0.45 * base[mask, :3] + 0.55 * answer_colours(1)[0], atol=1)
+    np.testing.assert_allclose(lit[mask, :3], 0.45 * base[mask, :3] + 0.55 * palette(1, ANSWER_HUE)[0], atol=1)
     assert f"{int(mask.sum())} of 64 Gaussians" in words_of(viewer)
 
 
-def test_isolate_hide_and_show_all(viewer):
+def test_only_the_selection(viewer):
     word, opacity = word_of(viewer), colours(viewer.layer)[:, 3]
     mask = mask_of(viewer, word)
     ask(viewer, word)
-    show(viewer, ViewState.isolate)
+    show(viewer, lambda state: dataclasses.replace(state, only_selected=True))
     np.testing.assert_array_equal(colours(viewer.layer)[:, 3], np.where(mask, opacity, 0))
-    show(viewer, ViewState.show_all)
+    show(viewer, lambda state: state.with_question(""))
     np.testing.assert_array_equal(colours(viewer.layer)[:, 3], opacity)
-    show(viewer, ViewState.hide)
-    np.testing.assert_array_equal(colours(viewer.layer)[:, 3], np.where(mask, 0, opacity))
-    assert show(viewer, ViewState.show_all) == ViewState()
 
 
 @pytest.mark.parametrize("colouring", COLOURINGS)
@@ -169,20 +165,17 @@ def test_odd_texts_and_faults_are_reported_and_the_viewer_goes_on(viewer, capsys
     assert ask(viewer, Region(1)).questions == (Region(1),)
 
 
-def test_files_of_the_answers(viewer, tmp_path):
+def test_the_file_of_the_selection(viewer, tmp_path):
     sent = []
     client = SimpleNamespace(send_file_download=lambda name, content, **_: sent.append((name, content)))
-    settled(viewer, lambda: viewer.export(client))
+    settled(viewer, lambda: viewer.then(lambda _: viewer._export(client)))
     assert "no Gaussian is selected" in viewer.panel._notice.content
     ask(viewer, Region(1))
-    settled(viewer, lambda: viewer.export(client))
-    assert sent[0][0] == "region-1.zip"
-    with zipfile.ZipFile(io.BytesIO(sent[0][1])) as archive:
-        names = archive.namelist()
-        archive.extractall(tmp_path)
-    assert {"region-1.json", "region-1.ply"} <= set(names)
-    assert sum(name.endswith(".png") for name in names) == 3
-    assert load_gaussians(tmp_path / "region-1.ply").count == mask_of(viewer, Region(1)).sum()
+    settled(viewer, lambda: viewer.then(lambda _: viewer._export(client)))
+    ((name, content),) = sent
+    assert name == "region-1.ply"
+    (tmp_path / name).write_bytes(content)
+    assert load_gaussians(tmp_path / name).count == mask_of(viewer, Region(1)).sum()
 
 
 def test_a_taken_port_and_a_missing_extra_are_refused(viewer, monkeypatch):
@@ -272,15 +265,11 @@ def test_huge_and_tiny_gaussians_stay_within_what_viser_holds_and_those_not_fini
     np.testing.assert_array_equal(np.flatnonzero(colours(layer)[:, 3] == 0), [3])
 
 
-def test_frames_stand_where_they_were_taken(field, server):
+def test_the_window_starts_at_the_first_frame(field, server):
     layer = SplatLayer(server, field)
-    centres = np.asarray(field.cameras.centres) * layer.scale
-    layer.show_frames(True)
-    assert {t: frustum.visible for t, frustum in layer.frustums.items()} == {0: False, 1: True, 2: True, 3: True}
-    for t, frustum in layer.frustums.items():  # one stands in the 0th
-        np.testing.assert_allclose(frustum.position, centres[t], rtol=1e-5)
-        assert frustum.fov == pytest.approx(2 * np.arctan(20 / 43))
-    np.testing.assert_allclose(server.initial_camera.position, centres[0], rtol=1e-5)
+    centre = np.asarray(field.cameras.centres)[0] * layer.scale
+    assert server.initial_camera.fov == pytest.approx(2 * np.arctan(20 / 43))
+    np.testing.assert_allclose(server.initial_camera.position, centre, rtol=1e-5)
 
 
 @pytest.mark.long
@@ -319,7 +308,7 @@ def input_of(label: str) -> str:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
-def test_in_a_browser_a_text_lights_up_a_click_selects_and_buttons_act(viewer, tmp_path):
+def test_in_a_browser_a_text_lights_up_a_click_selects_and_controls_act(viewer, tmp_path):
     word, address = word_of(viewer), f"http://127.0.0.1:{viewer.server.get_port()}/"
     with opened(address, tmp_path, width=640, height=360) as page:
         first = begun(page)
@@ -329,10 +318,8 @@ def test_in_a_browser_a_text_lights_up_a_click_selects_and_buttons_act(viewer, t
         count = int(mask_of(viewer, word).sum())
         page.until(f"document.body.innerText.includes('{word}: {count} of 64 Gaussians')")
         click_a_region(viewer, page)
-        page.press("hide")
-        until(lambda: viewer.state.hidden, "the region is hidden")
-        page.press("show all")
-        until(lambda: not viewer.state.hidden, "and shown again")
+        page.js(f"{input_of('only the selection')}.click()")
+        until(lambda: viewer.state.only_selected, "the rest is hidden")
         page.js("document.querySelectorAll('[role=slider]')[0].focus()")
         page.key("ArrowRight", 39)
         until(lambda: viewer.state.threshold == 0.51, "the threshold moves")
