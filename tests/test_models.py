@@ -81,7 +81,7 @@ def damage(path, change):
     ("clip", "visual/preprocess_cfg.json", {"size": 48}, ("image float32[1, 3, 48, 48]", "Expected: 32")),
     ("clip", TOKENS, b"{", (TOKENS, "no tokenizer of this model")), ("clip", TOKENS, [], "no tokenizer of this model"),
     ("clip", TOKENS, {"model": {"type": "BPE", "vocab": {"a": "b"}, "merges": []}}, "no tokenizer of this model"),
-    ("clip", TOKENS, {"model": {"type": "Unigram", "unk_id": 0, "vocab": [["a", 0.0]]}}, "no tokenizer of this model"),
+    ("clip", TOKENS, b'{"model": {"type": "Unigram", "unk_id": 0, "vocab": [["a", 0.0]]}}', "no tokenizer of this"),
     ("clip", TOKENS, {"post_processor": None}, "a start and an end around a word"),
     ("siglip", "visual/preprocess_cfg.json", {"mean": None}, ("preprocess_cfg.json", "cannot be read")),
     ("siglip", "textual/tokenizer_config.json", None, "tokenizer_config.json: No such file"),
