@@ -68,7 +68,7 @@ settings.load_profile("jsecon")
 
 import numpy as np  # noqa: E402
 
-from jsecon.process import clear_programs  # noqa: E402
+from experiments.memory_maps import clear_programs  # noqa: E402
 from jsecon.types import Camera, Gaussians  # noqa: E402
 
 # Tracing makes many objects and few cycles: ten times fewer collections save a tenth of a test's time.

@@ -22,7 +22,7 @@ def _tree(scene, cameras):
         "coder": Autoencoder({"params": {"Dense_0": {"kernel": np.ones((4, 2), np.float32)}}}, {}),
         "nan": float("nan"),
         "empty": np.zeros((0, 3)),
-        "outcome": StageResult(np.ones(2, bool), {"part": "why"}, ("a note",)),
+        "outcome": StageResult(np.ones(2, bool), ("a note",)),
     }
 
 

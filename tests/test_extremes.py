@@ -134,7 +134,7 @@ def lifted(w: World) -> list:
 
 
 def outside(w: World) -> list:
-    return [(jsecon.remove_outliers(np.asarray(w.gaussians.means), np.ones(w.n, bool)).mask, (w.n,))]
+    return [(jsecon.remove_outliers(np.asarray(w.gaussians.means), np.ones(w.n, bool)), (w.n,))]
 
 
 def one_step(w: World) -> list:

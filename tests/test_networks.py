@@ -168,9 +168,9 @@ def test_texts_need_the_model_of_embeddings_from_files(seen, models, tmp_path, c
     assert run_cli(*ask, "--embedder", models[1], "--min-rank", "0") == 0
     assert 0 < json.loads((tmp_path / "answers" / "red.json").read_text())["score"] < 1
     with refused("5, as those from files have"):
-        model_loading.open_embedder("given-5", folder=models[1])
+        model_loading._open_embedder("given-5", folder=models[1])
     with refused("Run the capture again"):
-        model_loading.open_embedder("colours-of-the-future")
+        model_loading._open_embedder("colours-of-the-future")
 
 
 def test_proposals_are_kept_by_content(models, tmp_path):

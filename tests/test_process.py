@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from jsecon import InputError, process
-from jsecon.process import settings
+from jsecon.process import _settings as settings
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -56,7 +56,7 @@ def test_a_prepared_process_has_a_device_a_core(tmp_path):
 def test_programs_are_forgotten_where_there_are_too_many_maps(tmp_path):
     program = (
         "import jax\n"
-        "from jsecon.process import clear_programs\n"
+        "from experiments.memory_maps import clear_programs\n"
         "double = jax.jit(lambda x: 2 * x)\n"
         "for above in (10**9, 0):\n"
         "    double(1)\n"
