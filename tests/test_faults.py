@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from capture_files import refused, small_capture, write_images, write_text_model, write_transforms
-from fuzz_readers import _field
+from fuzz_readers import tiny_field
 from test_pipeline import Recorder
 
 from jsecon import load_capture, save_field, save_gaussians
@@ -37,9 +37,9 @@ def no_room():
 
 
 @pytest.mark.parametrize(("name", "write"), [
-    ("a.safetensors", lambda path: save_field(path, _field())),
+    ("a.safetensors", lambda path: save_field(path, tiny_field())),
     ("a.safetensors", lambda path: cache.save(path, np.zeros(9999))),
-    ("a.ply", lambda path: save_gaussians(path, _field().gaussians)),
+    ("a.ply", lambda path: save_gaussians(path, tiny_field().gaussians)),
     ("a.png", lambda path: write_image(path, np.random.default_rng(0).integers(0, 255, (99, 99, 3), np.uint8))),
     ("a.txt", lambda path: write_text(path, "x" * 5000)),
 ])  # fmt: skip

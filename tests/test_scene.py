@@ -76,10 +76,14 @@ def test_many_texts_in_many_threads_are_answered_alike_within_bounds(monkeypatch
     assert len({id(answer) for answer in found}) == 4
     assert embedded.count("white plate") == 1
     monkeypatch.setattr(scenes, "CACHED_BYTES", 3 * 5 * field.gaussians.count)
-    bounded = Scene(field, embedder)
-    for number in range(5):
-        bounded.ask(f"red mug {number}")
-    assert bounded._answers.cache_info().currsize == 3
+    small = Scene(field, Counting())
+    for text in texts:
+        small.ask(text)
+    embedded.clear()
+    small.ask(texts[-1])
+    assert not embedded
+    small.ask(texts[0])
+    assert texts[0] in embedded
 
 
 def test_regions_of_few_gaussians_are_called_too_small(tmp_path, capsys):
