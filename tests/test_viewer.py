@@ -303,7 +303,7 @@ def after_change(page, before: np.ndarray) -> np.ndarray:
 def input_of(label: str) -> str:
     """The input beside a label."""
     return f"""[...document.querySelectorAll('input')].find(e => {{
-        for (let p = e, k = 0; k < 6 && p; k++, p = p.parentElement) if (p.innerText?.trim() === '{label}') return true;
+        for (let p = e, k = 0; k < 9 && p; k++, p = p.parentElement) if (p.innerText?.trim() === '{label}') return true;
         }})"""
 
 
