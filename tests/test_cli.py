@@ -201,7 +201,7 @@ def test_a_number_out_of_range_is_refused_at_once(verb, flag, kinds, allowed, ca
 
 
 def test_ranges_hold_for_options_in_python_too(room):
-    for changes in ({"seed": -1}, {"minutes": math.inf}, {"agreement": 0.0}):
+    for changes in ({"seed": -1}, {"minutes": math.inf}, {"agreement": 0.0}, {"up": (0.0, 0.0, 0.0)}):
         with refused("expected"):
             check_ranges(Options(room, **changes))
 
