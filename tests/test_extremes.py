@@ -190,3 +190,14 @@ def test_a_function_takes_the_ends_of_its_input(name, end):
     for array, shape in CALLS[name][1](World(**ENDS[end])):
         assert np.shape(array) == shape
         assert np.isfinite(np.asarray(array, np.float64)).all()
+
+
+def test_the_table_has_every_pure_function():
+    """Those that are left out read or write files, print, or take a record that a row's function makes."""
+    others = {
+        *("objects", "locate", "to_html", "open_scene", "check_backend", "host_mesh", "match_regions", "render_plan"),
+        *("check_field", "load_field", "save_field", "load_capture", "load_gaussians", "save_gaussians", "encode"),
+        *("mean_iou", "accuracy_at", "localization_accuracy", "select_gaussians", "membership_probability"),
+    }
+    functions = {name for name in jsecon.__all__ if not isinstance(getattr(jsecon, name), type)}
+    assert functions <= CALLS.keys() | others

@@ -1,6 +1,7 @@
 """SAM 2 as a tracker: against a slow twin that keeps everything, on small graphs of the public export's signatures."""
 
 import json
+import tracemalloc
 
 import cv2
 import jax.numpy as jnp
@@ -162,6 +163,23 @@ def test_the_name_follows_the_content_and_the_graphs_can_be_dropped(folder, tmp_
     before = tracker(frames, 1, prompts)
     tracker.close()
     np.testing.assert_array_equal(tracker(frames, 1, prompts), before)
+
+
+@pytest.mark.long
+def test_four_hundred_frames_hold_no_more_than_a_hundred(folder, tmp_path):
+    sam2, peaks = open_sam2(folder), []
+    for count in (100, 400):
+        path = tmp_path / f"{count}.npy"
+        np.save(path, np.broadcast_to(a_clip(1), (count, HEIGHT, WIDTH, 3)))
+        frames = np.load(path, mmap_mode="r")
+        prompts = [a_mask(3, 4, 15, 13)]
+        for t, _ in follow(sam2, frames[:3], 1, prompts):  # what is made once
+            assert t < 3
+        tracemalloc.start()
+        assert sum(len(logits) for _, logits in follow(sam2, frames, count // 2, prompts)) == count
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.2 * peaks[0] + 100_000
 
 
 def test_holes_are_filled_up_to_their_area():
