@@ -30,10 +30,14 @@ FULL_PRECISION = jax.lax.Precision.HIGHEST
 5e-4 on an H100). A CPU computes the same digits either way"""
 
 
+MAX_COORDINATE = 1e18
+"""largest coordinate: float32 holds its square"""
+
+
 @np.errstate(invalid="ignore")  # a signalling NaN
 def is_finite_and_bounded(*numbers: Any) -> bool:
-    """Whether all numbers are finite and at most 1e18 in size: float32 holds the square of such a coordinate."""
-    return all(bool((np.abs(np.asarray(values, np.float64)) <= 1e18).all()) for values in numbers)
+    """Whether all numbers are finite and at most `MAX_COORDINATE` in size."""
+    return all(bool((np.abs(np.asarray(values, np.float64)) <= MAX_COORDINATE).all()) for values in numbers)
 
 
 def safe_scale(size: Array) -> Array:

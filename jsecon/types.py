@@ -133,6 +133,22 @@ class ImageFile:
     """EXIF's that was applied; 1 if none."""
 
 
+@dataclasses.dataclass(frozen=True)
+class UpAxis:
+    """Which way is up, and how that is known."""
+
+    axis: tuple[float, float, float]
+    """Unit vector, in the world of what it belongs to."""
+    evidence: str
+    """What it was taken from, in words."""
+    sure: bool = True
+    """Whether it is trusted."""
+
+    def __str__(self) -> str:
+        """Its evidence, and whether that is sure."""
+        return f"{self.evidence}{'' if self.sure else ' (not sure: --up X Y Z sets it)'}"
+
+
 @record
 class Capture(_Shown):
     """A posed set of frames, as every loader returns it. Arrays are NumPy on the host."""
@@ -162,6 +178,10 @@ class Capture(_Shown):
     poses_from_scene: Array | None = None
     """(4, 4) similarity from this world to that of the poses in the files, before any transform that they name
     (applied_transform) is undone; None: it is the same."""
+    up: UpAxis | None = static(default=None)
+    """Which way is up in this world, where the capture's format or the planner of its views knows it."""
+    metres_per_unit: float | None = static(default=None)
+    """Metres of one unit of the files' world, where the format guarantees them."""
 
 
 @record
@@ -317,10 +337,14 @@ class LanguageField(_Shown):
     measured against (jsecon.query.scores). None: a field of an earlier version."""
     codes: Codes | None = None
     """codes of Gaussians and regions, which only queries by code read; None if the run was not asked for them."""
+    up: UpAxis | None = None
+    """which way is up in the field's world; None: a field of an earlier version."""
+    metres_per_unit: float | None = None
+    """metres of one unit of the capture files' world; None: not known."""
 
 
-_TEXTS = ("names", "embedder", "provenance")
-"""Static fields of LanguageField."""
+_TEXTS = {"names": (), "embedder": "", "provenance": "{}", "up": None, "metres_per_unit": None}
+"""Static fields of LanguageField, and their values inside of a trace."""
 _ARRAYS = tuple(part.name for part in dataclasses.fields(LanguageField) if part.name not in _TEXTS)
 
 
@@ -333,7 +357,7 @@ def _flatten_field(field: LanguageField) -> tuple[tuple, _Texts]:
 def _unflatten_field(texts: _Texts, arrays: Iterable) -> LanguageField:
     parts = dict(zip(_ARRAYS, arrays))
     traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(parts))
-    return LanguageField(**parts, **dict(zip(_TEXTS, _Texts(((), "", "{}")) if traced else texts)))
+    return LanguageField(**parts, **dict(zip(_TEXTS, _TEXTS.values() if traced else texts)))
 
 
 jax.tree_util.register_pytree_with_keys(LanguageField, _flatten_field, _unflatten_field)

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 from scipy.special import softmax
 
-from jsecon.app.records import gaussian_rows, rounded, source_shapes
+from jsecon.app.records import gaussian_rows, rounded, source_shapes, source_up
 from jsecon.errors import InputError
 from jsecon.field.columns import vote_blocks
 from jsecon.field.membership import SHARE_THRESHOLD, membership_probability, ratio, vote_columns, vote_shares
@@ -75,6 +75,8 @@ class Catalogue:
     """(R,) int32 id of the object that each region belongs to, or -1."""
     up: np.ndarray
     """(3,) up axis in the world of the capture."""
+    up_evidence: str
+    """what the up axis was taken from, and whether that is sure."""
     frame_names: tuple[str, ...]
     """names of the field's frames."""
 
@@ -139,7 +141,7 @@ def objects(
       vocabulary: Names to choose from. None takes those of the embedder: of colours their names, of things and of the
         background; of others common nouns.
       embedder: Embedder of the field; None opens it if names need it.
-      up: Up axis in the capture's world; None finds it (`field_up`).
+      up: Up axis in the capture's world; None takes the field's own.
 
     Returns:
       The catalogue. It is empty if the field has no regions.
@@ -147,7 +149,8 @@ def objects(
     Raises:
       InputError: The vocabulary is empty, the embedder cannot represent a name, or `up` has no direction.
     """
-    upright = field_up(field, up)
+    axis = field_up(field, up)
+    upright = np.array(axis.axis)
     texts, embeddings, scale = _vocabulary(field, vocabulary, embedder)
     size, main = _sizes(field)
     groups = region_objects(field, main, upright)
@@ -172,9 +175,7 @@ def objects(
     shown = members[rows] @ pixels
     best = np.argsort(-shown, axis=1, kind="stable")[:, :3]  # those that show most of it
     best = np.where(np.take_along_axis(shown, best, axis=1) > 0, best, -1)
-    source_from_scene = np.asarray(field.source_from_scene, np.float64)
-    upright = source_from_scene[:3, :3] @ upright
-    upright /= np.linalg.norm(upright)
+    source_axis = np.array(source_up(field, axis).axis)
     return Catalogue(
         names=text[order[rows]],
         probability=probability[rows],
@@ -183,11 +184,12 @@ def objects(
         confidence=confidence[rows],
         views=(shown > 0).sum(1),
         frames=np.pad(best, ((0, 0), (0, 3 - best.shape[1])), constant_values=-1),
-        shapes=source_shapes(field, np.concatenate([wholes, parts]), ids, upright),
+        shapes=source_shapes(field, np.concatenate([wholes, parts]), ids, source_axis),
         labels=labels,
         part_labels=part_labels,
         regions=renumber[groups],
-        up=upright,
+        up=source_axis,
+        up_evidence=str(axis),
         frame_names=field.names,
     )
 

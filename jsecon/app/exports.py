@@ -9,7 +9,7 @@ import numpy as np
 from jsecon.app import pictures, report, verbs
 from jsecon.app.catalogue import Catalogue
 from jsecon.app.querying import slug
-from jsecon.app.records import decimals
+from jsecon.app.records import decimals, unit_of
 from jsecon.app.scene import Scene, open_scene
 from jsecon.errors import InputError
 from jsecon.files import write_text
@@ -37,7 +37,8 @@ def _objects(verb: verbs.Objects, console: Console) -> verbs.VerbResult:
     if verb.out is None:
         return {"objects": records}
     files = {"objects": verb.out / "objects.json", "catalogue": verb.out / "catalogue.html"}
-    content = {"frame": "the capture's world", "up": listed.up.round(6).tolist(), "objects": records}
+    up = {"up": listed.up.round(6).tolist(), "up_evidence": listed.up_evidence}
+    content = {"frame": "the capture's world", "unit": unit_of(scene.field)} | up | {"objects": records}
     write_text(files["objects"], json.dumps(content, indent=2) + "\n")
     write_text(files["catalogue"], _page(scene, listed, records, console))
     console.print_line(f"pictures  {files['catalogue']}")

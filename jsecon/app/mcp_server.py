@@ -18,6 +18,7 @@ from mcp.types import ToolAnnotations
 from pydantic import Field
 
 from jsecon.app import verbs
+from jsecon.app.records import unit_of
 from jsecon.app.scene import Scene, find_scene, open_scenes
 from jsecon.errors import InputError
 from jsecon.pipeline.progress import Console
@@ -44,16 +45,19 @@ class _Tools:
 
     def objects(self, field: FieldName = None) -> dict[str, Any]:
         """Lists the objects of a scene with names, sizes and places, the largest first; at most 100."""
-        rows = find_scene(self._scenes, field).objects().records()
-        return {"count": len(rows), "objects": rows[:100]}
+        scene = find_scene(self._scenes, field)
+        listed = scene.objects()
+        world = {"unit": unit_of(scene.field), "up": listed.up.tolist(), "up_evidence": listed.up_evidence}
+        return {"count": len(listed)} | world | {"objects": listed.records()[:100]}
 
     def locate(self, text: Words, frame: Frame = None, field: FieldName = None) -> dict[str, Any]:
         """Locates one thing: oriented box, and the middle of its top, where a gripper from above would close."""
         scene = find_scene(self._scenes, field)
         answer = scene.locate(text, frame=frame)
-        center, up = answer.place.center, scene.objects().up
+        listed = scene.objects()
+        center, up = answer.place.center, listed.up
         top = center + (np.quantile(answer.points @ up, 0.98) - center @ up) * up
-        return answer.as_dict() | {"top": np.round(top, 6).tolist()}
+        return answer.as_dict() | {"top": np.round(top, 6).tolist(), "up_evidence": listed.up_evidence}
 
     def measure(self, a: Words, b: Words, frame: Frame = None, field: FieldName = None) -> dict[str, Any]:
         """Measures the distance of two things: between surfaces, between centres, free gap, angle above horizontal."""
@@ -71,7 +75,7 @@ class _Tools:
 def make_server(scenes: Mapping[str, Scene]) -> MCPServer:
     """Makes the server of scenes by name, the first of which is the default."""
     instructions = (
-        "Finds things in 3D scenes. Coordinates are in the scene's own world, in metres where the capture has metres. "
+        "Finds things in 3D scenes. Coordinates are in the scene's own world and in the answer's unit. "
         'A text names a thing, or tells it apart by place, order or number: "the second red mug from the left", "the '
         'ball on the plate next to the bowl", "how many bottles".'
     )

@@ -76,7 +76,8 @@ class ObjectIndex:
 
     def __init__(self, field: LanguageField, embedder: Any, up: Sequence[float | int] | None):
         """Finds the up axis; objects are measured when they are first asked for."""
-        self.up = field_up(field, up)
+        self._up_axis = field_up(field, up)
+        self.up = np.array(self._up_axis.axis)
         regions = jax.tree.map(jnp.asarray, field.regions)  # on the device once, not for each phrase
         reference = None if field.unrelated_words is None else jnp.asarray(field.unrelated_words)
         cameras = jax.tree.map(np.asarray, field.cameras)  # on which jax would compile each step of a viewpoint
@@ -208,6 +209,7 @@ class ObjectIndex:
             objects=tuple(best.chosen),
             reading=expression.describe(readings[place]),
             viewpoint=words if expression.depends_on_view else "",
+            up=self._up_axis if expression.conditions or expression.thing.order else None,
             used=tuple(best.used),
             alternatives=tuple({found.regions: found for found in [*best.alternatives, *differing]}.values()),
             question=question,
@@ -223,8 +225,8 @@ class ObjectIndex:
         ]
         return f"{', '.join(words[:-1])} or {words[-1]}"
 
-    def distances(self, first: Object, second: Object) -> dict[str, float]:
-        """Distances of two objects in the capture's world; angle of the second above the horizontal, degrees."""
+    def distances(self, first: Object, second: Object) -> dict[str, Any]:
+        """Distances of two objects, in metres if they are known; angle of the second above the horizontal, degrees."""
         means = np.asarray(self._field.gaussians.means, np.float64)
         surfaces = float(KDTree(means[first.rows]).query(means[second.rows])[0].min())
         line = second.shape.center[0] - first.shape.center[0]
@@ -235,6 +237,9 @@ class ObjectIndex:
             for shape in (first.shape, second.shape)
         ]
         angle = float(np.degrees(np.arcsin(np.clip(way @ self.up, -1, 1))))
-        scale = world_scale(self._field)
+        metres = self._field.metres_per_unit
+        scale = world_scale(self._field) * (metres or 1.0)
         lengths = scale * np.array([surfaces, centers, max(centers - sum(reach), 0.0)])
-        return dict(zip(("surfaces", "centers", "gap"), rounded(lengths, scale * centers))) | {"angle": round(angle, 2)}
+        result: dict[str, Any] = dict(zip(("surfaces", "centers", "gap"), rounded(lengths, scale * centers)))
+        unit = "capture units" if metres is None else "metres"
+        return result | {"angle": round(angle, 2), "unit": unit, "up": str(self._up_axis)}

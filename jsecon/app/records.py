@@ -21,7 +21,7 @@ from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_sh
 from jsecon.query.referring import Object
 from jsecon.query.rules import MIN_RANK
 from jsecon.splat.transform import transform_gaussians
-from jsecon.types import Gaussians, LanguageField, Selection
+from jsecon.types import Gaussians, LanguageField, Selection, UpAxis
 
 METHODS = ("votes", "code")
 """how a region selects Gaussians: by their votes, or by their codes (the paper)"""
@@ -33,8 +33,16 @@ class At:
 
     frame: int | str
     """name, the end of a name, or index of the frame; "#10" is an index too"""
-    x: int
-    y: int
+    x: int | float
+    """column, px; or if x and y are from 0 to 1 and not both integers, a share of the width"""
+    y: int | float
+
+    def pixel(self, width: int, height: int) -> tuple[int, int]:
+        """Column and row in frames of a size, px."""
+        is_share = 0 <= self.x <= 1 and 0 <= self.y <= 1 and any(number % 1 for number in (self.x, self.y))
+        scale = (width, height) if is_share else (1, 1)
+        column, row = (int(number * size) for number, size in zip((self.x, self.y), scale))
+        return (min(column, width - 1), min(row, height - 1)) if is_share else (column, row)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,6 +149,7 @@ class Answer:
       used: The objects that `objects` were compared with.
       alternatives: Other objects of the name, best first.
       question: What would settle which object is meant; "" if nothing has to be.
+      up: Which way was up in the field's world, if the text has a relation or an order.
     """
 
     query: Query
@@ -158,6 +167,7 @@ class Answer:
     used: tuple[Object, ...] = ()
     alternatives: tuple[Object, ...] = ()
     question: str = ""
+    up: UpAxis | None = None
 
     @functools.cached_property
     def rows(self) -> np.ndarray:
@@ -218,11 +228,14 @@ class Answer:
             "place": self._place_record() if len(self.rows) else None,
             "reason": self.reason,
             "skipped": dict(self.skipped),
+            "unit": unit_of(self.field),
+            "frame_size": [self.field.cameras.width, self.field.cameras.height],
         }
         if self.by != "relation":
             return record
         relation: dict[str, Any] = {name: getattr(self, name) for name in ("reading", "viewpoint", "question")}
         relation["ambiguous"] = bool(self.question)
+        relation["up"] = None if self.up is None else dataclasses.asdict(source_up(self.field, self.up))
         for name in ("objects", "used", "alternatives"):
             relation[name] = [self._object_record(found) for found in getattr(self, name)]
         return record | {"relation": relation}
@@ -259,7 +272,8 @@ class Answer:
             names = sorted({found.phrase for found in self.objects})
             number = f"{self.count} object{'s' * (self.count != 1)}{f' ({names[0]})' if names else ''}"
             seen = f", {self.viewpoint}" if self.viewpoint else ""
-            sentences = [f"read as {self.reading}{seen}: {number}", self.reason.rstrip("."), self.question]
+            up = "" if self.up is None else f"up is from {self.up}"
+            sentences = [f"read as {self.reading}{seen}: {number}", self.reason.rstrip("."), self.question, up]
             return ". ".join(filter(None, [*sentences, self._counts()]))
         return self._counts()
 
@@ -280,6 +294,8 @@ class Answer:
             parts.append("parts in place of a region")
         elif self.by in METHODS:
             parts.append(self.reason or "no region matches it")
+        if isinstance(self.query.question, At | Box):
+            parts.append(f"in frames of {self.field.cameras.width}x{self.field.cameras.height} px")
         if not len(self.rows):
             return ", ".join([*parts, "no Gaussian is selected"])
         digits = decimals(float(np.linalg.norm(np.ptp(self.points, axis=0))), 0.01)
@@ -300,6 +316,18 @@ def source_points(field: LanguageField, points: Float[np.ndarray, "m 3"]) -> Flo
     """Moves points of the field's world to the capture's, in float64."""
     source_from_scene = np.asarray(field.source_from_scene, np.float64)
     return points.astype(np.float64) @ source_from_scene[:3, :3].T + source_from_scene[:3, 3]
+
+
+def source_up(field: LanguageField, up: UpAxis) -> UpAxis:
+    """Turns an up axis of the field's world into the capture's."""
+    axis = np.asarray(field.source_from_scene, np.float64)[:3, :3] @ np.array(up.axis) / world_scale(field)
+    return dataclasses.replace(up, axis=tuple(axis.round(6).tolist()))
+
+
+def unit_of(field: LanguageField) -> str:
+    """Names the unit of coordinates in the capture's world."""
+    scale = field.metres_per_unit
+    return "capture units" if scale is None else "metres" if scale == 1 else f"capture units of {scale:g} metres"
 
 
 def source_shapes(

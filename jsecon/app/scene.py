@@ -22,7 +22,7 @@ from jaxtyping import Bool, Int, UInt8
 from jsecon.app import pictures
 from jsecon.app.catalogue import Catalogue, objects
 from jsecon.app.object_index import ObjectIndex, choose_shades
-from jsecon.app.records import Answer, Box, Mask, Query, Question, Region, gaussian_rows
+from jsecon.app.records import Answer, At, Box, Mask, Query, Question, Region, gaussian_rows
 from jsecon.errors import InputError
 from jsecon.field.columns import is_mapped
 from jsecon.field.field import FIELD_FILE, check_field, load_field
@@ -40,7 +40,6 @@ from jsecon.query.outliers import OutlierResult
 from jsecon.query.pointing import box_mask, lift, region_at
 from jsecon.query.render import selection_mask
 from jsecon.query.rules import ONE_REGION, QueryRules
-from jsecon.read.captures.capture import has_depth
 from jsecon.read.captures.images import read_pixels
 from jsecon.read.masks.masks import resize_nearest
 from jsecon.read.splats.files import save_gaussians
@@ -66,7 +65,7 @@ def open_scene(
       embedder: What embeds texts: an embedder, a folder or a name of a CLIP model that is on this machine and is opened
         when a text needs it, or a function that returns an embedder for a field. None takes the model that the field
         was made with.
-      up: Up axis of the capture's world, three numbers. None takes that of the cameras, or the normal of the ground.
+      up: Up axis of the capture's world, three numbers. None takes the field's own.
       out: Folder for the field of a file of Gaussians; by default NAME_field beside NAME.ply.
       console: Receives the progress where a field is made.
 
@@ -95,17 +94,21 @@ def open_scene(
         parse_model(model, "embedder")
         embedder = functools.partial(field_embedder, folder=model)
     file = file.resolve()
-    return Scene(field, embedder, up=up, name=file.parent.name if file.name == FIELD_FILE else file.stem)
+    name = file.parent.name if file.name == FIELD_FILE else file.stem
+    return Scene(field, embedder, up=up, name=Path(path).stem if is_bare_scene(Path(path)) else name)
 
 
 def open_scenes(files: Sequence[Path], embedder: str | Path | None) -> "dict[str, Scene]":
-    """Opens fields, each named like its folder, and prepares them for questions.
+    """Opens fields, each named like its folder, or its file of Gaussians, and prepares them for questions.
 
-    `embedder` is the CLIP model of the fields (`open_scene`); None takes the one that each run used.
+    Files of Gaussians of one name, such as point_cloud.ply, are told apart by their folders. `embedder` is the CLIP
+    model of the fields (`open_scene`); None takes the one that each run used.
     """
     scenes: dict[str, Scene] = {}
     for file in files:
         scene = open_scene(file, embedder=embedder)
+        for folder in Path(file).resolve().parents if is_bare_scene(file) else ():
+            scene.name = f"{folder.name}_{scene.name}" if scene.name in scenes else scene.name
         if scene.name in scenes:
             raise InputError(file, f"it is a second field named {scene.name!r}", remedy="Rename one of the folders.")
         scenes[scene.name] = scene
@@ -285,12 +288,14 @@ class Scene:
             return self._answer_region(query, question.id, "the region is the query")
         index = self.frame_index(question.frame)
         name = self.field.names[index]
-        region = region_at(self.field, index, question.x, question.y)
+        cameras = self.field.cameras
+        x, y = question.pixel(cameras.width, cameras.height)
+        region = region_at(self.field, index, x, y)
         if region < 0:
-            problem = f"no region lies under column {question.x}, row {question.y}"
+            problem = f"no region lies under column {x}, row {y} of {cameras.width}x{cameras.height} px"
             remedy = "Choose another pixel or frame: report.html of the run shows the regions."
             raise InputError(f"frame {name}", problem, remedy=remedy)
-        query = dataclasses.replace(query, question=dataclasses.replace(question, frame=name))
+        query = dataclasses.replace(query, question=At(name, x, y))
         return self._answer_region(query, region, "the region under the pixel is the query")
 
     def _answer_text(self, query: Query) -> Answer:
@@ -420,23 +425,16 @@ class Scene:
         Returns:
           Plain values: the texts "a" and "b"; "surfaces", the smallest distance between Gaussians of the two;
           "centers", that of the middles of their boxes; "gap", the free way between their boxes on the line between the
-          middles, 0 where they meet; "angle", degrees of the second above the horizontal as seen from the first; and
-          the "unit" of the lengths (metres where the capture has depth).
+          middles, 0 where they meet; "angle", degrees of the second above the horizontal as seen from the first; the
+          "unit" of the lengths (metres if the capture's format guarantees them or the run was given a scale, else
+          capture units); and "up", what the up axis was taken from.
 
         Raises:
           InputError: As for `relate`; or a text names no object, or several.
         """
         with self._lock:
             first, second = (self.locate(text, frame=frame, relate=True).objects[0] for text in (a, b))
-            return {"a": a, "b": b} | self._index.distances(first, second) | {"unit": self._unit}
-
-    @functools.cached_property
-    def _unit(self) -> str:
-        """Unit of the capture's world: "metres", or "capture units" where its scale is not known to be metres."""
-        from jsecon.pipeline.sources import locate_sources
-
-        capture = locate_sources(self.field).capture
-        return "metres" if capture is not None and has_depth(Path(capture)) else "capture units"
+            return {"a": a, "b": b} | self._index.distances(first, second)
 
     @functools.cached_property
     def _catalogue(self) -> Catalogue:

@@ -25,7 +25,7 @@ from starlette.exceptions import HTTPException as AnyHTTPException
 import jsecon
 from jsecon.app import verbs
 from jsecon.app.access import bracketed, is_allowed_host, listen, token_for
-from jsecon.app.records import At, Query
+from jsecon.app.records import At, Query, unit_of
 from jsecon.app.scene import Scene, find_scene, open_scenes
 from jsecon.errors import InputError
 from jsecon.pipeline.progress import Console
@@ -44,9 +44,12 @@ class _Request(BaseModel):
     field: Name = None
 
 
+Place: TypeAlias = Annotated[StrictInt | StrictFloat, Field(ge=-1e6, le=1e6)]
+
+
 class _Question(_Request):
     text: Text | None = None
-    at: tuple[Frame, StrictInt, StrictInt] | None = Field(None, description="[frame, column, row]")
+    at: tuple[Frame, Place, Place] | None = Field(None, description="[frame, column, row], px or shares of the frame")
     by: verbs.By = "votes"
     threshold: Annotated[StrictFloat | StrictInt, Field(ge=-1, le=1)] | None = None
     all: StrictBool = False
@@ -147,7 +150,9 @@ def application(scenes: Mapping[str, Scene], *, token: str = "") -> FastAPI:
     @app.get("/objects", summary="The objects of a field: names, boxes, Gaussians")
     def objects(request: Annotated[_Request, Parameters()]) -> Response:
         scene = find_scene(scenes, request.field)
-        return _AsciiResponse({"field": scene.name, "objects": scene.objects().records()})
+        listed = scene.objects()
+        world = {"unit": unit_of(scene.field), "up": listed.up.tolist(), "up_evidence": listed.up_evidence}
+        return _AsciiResponse({"field": scene.name} | world | {"objects": listed.records()})
 
     @app.get("/selection.ply", summary="The selected Gaussians in the capture's world")
     def selection(request: Annotated[_Selection, Parameters()]) -> Response:

@@ -176,9 +176,10 @@ class Query(_FieldVerb):
       from_frame: Frame from which left, right, front and behind are seen. By default it is the mean camera, or the
         frame that shows most objects where the cameras look in all directions.
       up: Up axis of the capture's world, three numbers, for relations, and for the views of a file of Gaussians. By
-        default it is that of the cameras, or the normal of the ground.
-      at: Selects what lies under the pixel in column X and row Y of a frame, in the frames as the run used them. A
-        frame is named by its name, the end of its name, or its place such as #10.
+        default it is the field's own, and an answer says what that was taken from.
+      at: Selects what lies under the pixel in column X and row Y of a frame, in the frames as the run used them, or at
+        shares of their width and height such as 0.25 0.5. A frame is named by its name, the end of its name, or its
+        place such as #10.
       mask: Selects the object that a mask outlines in a frame, or masks in several frames. Black is outside.
       box: Selects the regions that are seen by more than half in a box of a frame.
       out: Output folder.
@@ -201,7 +202,7 @@ class Query(_FieldVerb):
     )
 
     texts: Positional[list[str]]
-    at: Annotated[Repeated[tuple[str, int, int]], arg(metavar="FRAME X Y"), Range(0, 100_000)] = dataclasses.field(
+    at: Annotated[Repeated[tuple[str, float, float]], arg(metavar="FRAME X Y"), Range(0, 100_000)] = dataclasses.field(
         default_factory=list
     )
     mask: Annotated[Repeated[list[str]], arg(metavar="FRAME PNG ...")] = dataclasses.field(default_factory=list)

@@ -30,12 +30,14 @@ from jsecon.files import (
 from jsecon.read.captures.images import MAX_PIXELS
 from jsecon.splat.project import unusable_rows
 from jsecon.splat.sh import COEFFICIENT_COUNTS
-from jsecon.types import Autoencoder, Camera, Codes, Gaussians, LanguageField, Parts, Regions, Votes
+from jsecon.types import Autoencoder, Camera, Codes, Gaussians, LanguageField, Parts, Regions, UpAxis, Votes
 
 FIELD_FILE = "field.safetensors"
 """name of a field in its folder"""
 VERSION = 3
-_RECORDS = {cls.__name__: cls for cls in (LanguageField, Gaussians, Votes, Regions, Parts, Camera, Codes, Autoencoder)}
+_RECORDS = {
+    cls.__name__: cls for cls in (LanguageField, Gaussians, Votes, Regions, Parts, Camera, Codes, Autoencoder, UpAxis)
+}
 MAPPED = 1 << 20
 """bytes of a column from which a mapped field leaves it on disk"""
 _REMEDY = "Make the field again with `jsecon run`."
@@ -215,6 +217,11 @@ def _oddity(field: LanguageField, checked: bool = True) -> str | None:
     texts = (*field.names, field.embedder, field.provenance)
     if not all(isinstance(text, str) for text in texts) or not isinstance(parse_json(field.provenance), dict):
         return "names, embedder or provenance that are no texts, or no JSON object"
+    if field.up is not None and not _is_up_axis(field.up):
+        return "an up axis that is no unit vector with its evidence"
+    scale = field.metres_per_unit
+    if scale is not None and not (isinstance(scale, int | float) and 0 < scale < np.inf):
+        return f"a unit of {scale!r} metres"
     if not 0 < field.cameras.width * field.cameras.height <= MAX_PIXELS:
         return f"views of {field.cameras.width}x{field.cameras.height} px"
     codes, dim = field.codes, field.regions.embeddings.shape[1]
@@ -222,6 +229,14 @@ def _oddity(field: LanguageField, checked: bool = True) -> str | None:
     if isinstance(coder, Autoencoder) and not _layers_fit(coder, dim, latent):
         return "an autoencoder whose layers do not lead from embeddings to codes and back"
     return None
+
+
+def _is_up_axis(up: Any) -> bool:
+    """Whether an up axis of a file is one."""
+    if not (isinstance(up, UpAxis) and isinstance(up.evidence, str) and isinstance(up.sure, bool)):
+        return False
+    numbers = isinstance(up.axis, tuple) and all(isinstance(number, float) for number in up.axis)
+    return numbers and len(up.axis) == 3 and bool(abs(np.linalg.norm(up.axis) - 1) < 1e-3)
 
 
 def _layers_fit(autoencoder: Autoencoder, dim: int, latent: int) -> bool:

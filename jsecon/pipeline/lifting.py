@@ -15,6 +15,7 @@ from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import Results, RunContext, Stage, StageInput, StageResult, vision_frames
 from jsecon.process import memory_budget
 from jsecon.types import Codes, LanguageField, Regions
+from jsecon.views.frame import find_up_axis, given_up
 from jsecon.vision.protocols import Embedder
 from jsecon.vision.unrelated_words import embed_unrelated_words
 
@@ -69,6 +70,8 @@ def join_field(results: Results, embedder: Embedder, provenance: str, options: O
     capture, embedded = results.load, results.regions
     pixels = np.zeros((embedded.count, len(capture.names)), np.int32)
     pixels[:, vision_frames(capture, options)] = embedded.pixel_counts
+    given = None if options.up is None else given_up(options.up, capture.source_from_scene)
+    scale = capture.metres_per_unit if options.metres_per_unit is None else options.metres_per_unit
     return LanguageField(
         gaussians=results.gaussians,
         votes=normalise_votes(results.votes, embedded),
@@ -82,4 +85,6 @@ def join_field(results: Results, embedder: Embedder, provenance: str, options: O
         parts=results.parts,
         unrelated_words=embed_unrelated_words(embedder).astype(np.float16),
         codes=results.codes,
+        up=given or capture.up or find_up_axis(results.gaussians, capture.cameras),
+        metres_per_unit=scale,
     )

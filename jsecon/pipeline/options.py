@@ -134,13 +134,11 @@ class BareOptions:
 
     Attributes:
       views: Number of virtual views that are planned and rendered, at least 2.
-      up: Up axis of the scene, three numbers. By default it is the normal of the ground, a large plane.
       cameras: Renders the scene from these poses instead of planned ones: a COLMAP model, or a transforms.json. Their
         images are not needed.
     """
 
     views: Annotated[Option[int], Range(2, 1000)] = 24
-    up: Direction[Option[tuple[float, float, float] | None]] = None
     cameras: Option[Path | None] = None
 
 
@@ -210,11 +208,17 @@ class FieldOptions:
       paper: Also computes the paper's codes, three numbers per Gaussian, which query --by code compares.
       centre_pixel_weight: Weight of the pixel at a Gaussian's centre against all pixels that it covers, 0 to 1. Use 1
         if the answer is evaluated on points.
+      up: Up axis of the files' world, three numbers. By default it is that of gravity if the format of the capture has
+        it, else it follows from what rests on what, else from the cameras without their roll.
+      metres_per_unit: Metres of one unit of the files' world, if you measured it. Captures of depth cameras and phones
+        have metres; lengths in all others are in units of the capture without it.
     """
 
     parts: Option[bool] = False
     paper: Option[bool] = False
     centre_pixel_weight: Annotated[Option[float], Range(0, 1)] = 0.0
+    up: Direction[Option[tuple[float, float, float] | None]] = None
+    metres_per_unit: Annotated[Option[float | None], Range(0, 1e9, above=True)] = None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -26,11 +26,11 @@ from jsecon.read.captures.capture import (
     read_posed_images,
     unposed_photographs,
 )
-from jsecon.read.captures.frames import FrameOptions, frame_names, make_rigid, transform_poses
+from jsecon.read.captures.frames import FrameOptions, frame_names, make_rigid, transform_poses, usable_images
 from jsecon.read.captures.nerfstudio import source_from_trained
 from jsecon.read.captures.video import DEFAULT_VIDEO_FRAMES, is_video, write_frames
 from jsecon.splat.transform import transform_gaussians
-from jsecon.types import Camera, Capture, Gaussians
+from jsecon.types import Camera, Capture, Gaussians, UpAxis
 from jsecon.views.capture import render_capture
 from jsecon.views.frame import scene_frame, surface_points
 from jsecon.views.plan import place_cameras
@@ -226,7 +226,7 @@ def _measure_held_out(stage: StageInput) -> StageResult:
 
 def _render_views(stage: StageInput) -> StageResult:
     """Renders a scene without photographs from planned views, or from the poses of a file."""
-    options, notes = stage.context.options, ()
+    options, notes, up = stage.context.options, (), None
     source, _ = read_scene(options.capture)
     source_from_scene = _world_of_scene(source)
     scene = _into_world(source, source_from_scene)
@@ -239,12 +239,15 @@ def _render_views(stage: StageInput) -> StageResult:
             up=None if options.up is None else np.array(options.up, np.float64),
             progress=stage.progress,
         )
+        frame = planned.frame
+        up = UpAxis(tuple(frame.axes[2].tolist()), f"the scene, {frame.evidence}", frame.sure)
         cameras, notes = planned.cameras, (f"{planned}.",)
         names = tuple(f"view_{index:03d}" for index in range(len(cameras)))
     else:
         cameras, names = _load_poses(options.cameras, options.long_side, source_from_scene)
         check_overlap(scene, cameras, str(options.cameras))
-    return StageResult(render_capture(scene, cameras, names, source_from_scene, notes=notes), notes=notes)
+    capture = render_capture(scene, cameras, names, source_from_scene, notes=notes, up=up)
+    return StageResult(capture, notes=notes)
 
 
 def _world_of_scene(gaussians: Gaussians) -> np.ndarray:
@@ -274,7 +277,7 @@ def _load_poses(path: Path, long_side: int, source_from_scene: np.ndarray) -> tu
     `path` is a capture, whose images need not be there, such as the folder of a COLMAP model or a transforms.json. All
     cameras get the size of the first lens, shrunk to `long_side`, each with its field of view and without distortion.
     """
-    images = read_posed_images(path).images
+    images, _ = usable_images(read_posed_images(path))
     lenses = [image.lens for image in images if image.lens is not None]
     if not images or len(lenses) < len(images):
         problem = "one of its frames has no size" if images else "it has no frame"

@@ -6,7 +6,7 @@ import numpy as np
 
 from jsecon.splat.render import render_rgb
 from jsecon.splat.sh import colours_from_sh
-from jsecon.types import Camera, Capture, Gaussians
+from jsecon.types import Camera, Capture, Gaussians, UpAxis
 
 
 def render_capture(
@@ -16,6 +16,7 @@ def render_capture(
     source_from_scene: np.ndarray,
     *,
     notes: tuple[str, ...] = (),
+    up: UpAxis | None = None,
 ) -> Capture:
     """Renders a bare scene as the frames of a capture, none of them held out.
 
@@ -25,6 +26,7 @@ def render_capture(
       names: T names of the frames.
       source_from_scene: (4, 4) similarity from that world to the file's.
       notes: What the user should know, a sentence each.
+      up: Which way is up in the capture's world, if the planner of the views knows.
     """
     scene = jax.tree.map(jnp.asarray, gaussians)
     background = _background(scene, cameras[0])
@@ -42,6 +44,7 @@ def render_capture(
         source_from_scene=source_from_scene,
         names=names,
         notes=notes,
+        up=up,
     )
 
 

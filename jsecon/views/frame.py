@@ -14,8 +14,15 @@ import numpy as np
 from jaxtyping import Float
 
 from jsecon.errors import InputError
-from jsecon.types import Camera, Gaussians, LanguageField
+from jsecon.types import Camera, Gaussians, LanguageField, UpAxis
 from jsecon.views.upright import TRIM, find_up
+
+_DIRECTIONS = 1500
+"""directions that `up_of_cameras` judges, 5 degrees apart"""
+_ROLL_BINS = 45
+_ROLL_SPREAD = 2 * np.pi / _ROLL_BINS
+"""radians, of the rolls of cameras that are held alike"""
+_QUARTERS = np.radians([0.0, 90.0, 180.0, 270.0])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,45 +111,122 @@ def _direction(up: Any) -> np.ndarray:
     return up
 
 
-def scene_up(cameras: Camera) -> Float[np.ndarray, " 3"]:
-    """Finds the up axis (unit, world) of a scene from its cameras, which people and planners hold level.
+def up_of_cameras(cameras: Camera) -> UpAxis:
+    """Finds the up axis of a scene from its cameras, whatever their roll.
 
-    It is the direction that is most nearly perpendicular to the x axes of all cameras, on the side of their upper
-    edges. If all cameras have nearly the same x axis, it is the mean direction of their upper edges, unless these
-    cancel.
+    People hold cameras level or turned by a quarter, all alike or some of them, turn around more than they look up and
+    down, and look down more than up. Each direction is judged by that. The best one is then made exact: it is across
+    the x axes of the cameras without their roll, or the mean of their upper edges if they all look one way.
+
+    It is sure if the cameras are level or turned by quarters, many of them level, and no other direction fits as well.
     """
-    up = _perpendicular_up(cameras)[0]
-    return up / np.linalg.norm(up)
-
-
-def _perpendicular_up(cameras: Camera) -> tuple[np.ndarray, bool]:
-    """Returns the direction of `scene_up`, and whether all cameras have nearly the same x axis."""
     pose = np.asarray(cameras.world_to_camera, np.float64)
-    right = pose[:, 0, :3]
-    mean_up = -pose[:, 1, :3].mean(0)
-    values, vectors = np.linalg.eigh(right.T @ right / len(right))
-    up = vectors[:, 0] * (np.sign(vectors[:, 0] @ mean_up) or 1.0)
-    is_parallel = bool(values[1] < 0.01)  # the x axes tell the up axis only up to the cameras' tilt
-    return mean_up if is_parallel and np.linalg.norm(mean_up) > 1e-6 else up, is_parallel
+    pose = pose[np.linspace(0, len(pose) - 1, min(len(pose), 64)).astype(int), :3, :3]
+    right, down, ahead = pose.transpose(1, 0, 2)
+    steps = np.arange(_DIRECTIONS) + 0.5
+    height, turn = 1 - 2 * steps / _DIRECTIONS, steps * np.pi * (3 - np.sqrt(5))
+    flat = np.sqrt(1 - height**2)
+    directions = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
+
+    scores, shared = _judge_cameras(directions, right, down, ahead)
+    best = int(scores.argmax())
+    others = np.abs(directions @ directions[best]) < np.cos(np.radians(30))
+    up, roll = directions[best], shared[best]
+    offsets = np.append(_QUARTERS, roll if np.cos(4 * roll) < np.cos(np.radians(40)) else 0.0)  # else it is a quarter
+    for _ in range(3):
+        rolls = _rolls(up[None], right, down)[0]
+        nearest = offsets[np.cos(rolls[:, None] - offsets).argmax(1)]
+        kept = np.cos(rolls - nearest) >= np.cos(np.radians(20))
+        if not kept.any():
+            break
+        cosine, sine = np.cos(nearest[kept, None]), np.sin(nearest[kept, None])
+        level = cosine * right[kept] + sine * down[kept]
+        edge = (sine * right[kept] - cosine * down[kept]).mean(0)
+        values, vectors = np.linalg.eigh(level.T @ level / len(level))
+        across = vectors[:, 0] * (np.sign(vectors[:, 0] @ edge) or 1.0)
+        up = edge if values[1] < 0.01 and np.linalg.norm(edge) > 1e-6 else across
+        up = up / np.linalg.norm(up)
+    ends, _ = _judge_cameras(np.stack([up, -up]), right, down, ahead)
+    up = up if ends[0] >= ends[1] else -up
+    from_quarters = np.cos(_rolls(up[None], right, down)[0][:, None] - _QUARTERS) >= np.cos(np.radians(20))  # (T, 4)
+    is_clear = from_quarters.any(1).mean() >= 0.85 and scores[best] - scores[others].max() >= 0.8
+    level = from_quarters[:, 0].mean()
+    evidence = "the cameras, which are level" if level >= 0.85 else "the cameras, with their roll taken out"
+    return UpAxis(tuple(up.tolist()), evidence, bool(is_clear and level >= 0.4))
 
 
-def field_up(field: LanguageField, up: Sequence[Any] | np.ndarray | None = None) -> Float[np.ndarray, " 3"]:
-    """Finds the up axis of a field (unit, the field's world).
+def _judge_cameras(
+    directions: np.ndarray, right: np.ndarray, down: np.ndarray, ahead: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Judges directions (D, 3): how usual the cameras' rolls and pitches are if it is up, and their commonest roll.
 
-    It is that of its cameras, or of cameras that all look one way the ground's if it is sure.
+    `right`, `down` and `ahead` are the axes (T, 3) of the cameras.
+    """
+    rolls, pitches = _rolls(directions, right, down), directions @ ahead.T
+    shared = _commonest_roll(rolls)
+    usual = _usual_roll(rolls, _ROLL_SPREAD)
+    likely = np.log(0.5 * _peak(rolls - shared[:, None], _ROLL_SPREAD) + usual + 0.02).mean(1)
+    prior = np.log(_usual_roll(shared, 1.5 * _ROLL_SPREAD) + 1e-3) - 0.5 * ((pitches.mean(1) + 0.3) / 0.45) ** 2
+    return likely - np.log(pitches.std(1) + 0.1) + prior / len(right), shared
+
+
+def _rolls(directions: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """(D, T) angle of each direction in the image plane of each camera, from its upper edge."""
+    return np.arctan2(directions @ right.T, -directions @ down.T)
+
+
+def _peak(angles: np.ndarray, width: float) -> np.ndarray:
+    """A bell of height 1 around an angle of 0, that repeats."""
+    return np.exp((np.cos(angles) - 1) / width**2)
+
+
+def _usual_roll(rolls: np.ndarray, width: float) -> np.ndarray:
+    """How usual a roll is: level, then a quarter turn, then upside down."""
+    shares = (0.4, 0.2, 0.05, 0.2)
+    return sum((share * _peak(rolls - quarter, width) for share, quarter in zip(shares, _QUARTERS)), np.zeros(()))
+
+
+def _commonest_roll(rolls: np.ndarray) -> np.ndarray:
+    """(D,) roll near which most of the T rolls (D, T) are."""
+    bins = np.round(rolls / _ROLL_SPREAD).astype(int) % _ROLL_BINS
+    counts = np.stack([(bins == bin).sum(1) for bin in range(_ROLL_BINS)], axis=1)
+    centre = (counts + 0.7 * (np.roll(counts, 1, 1) + np.roll(counts, -1, 1))).argmax(1) * _ROLL_SPREAD
+    offset = rolls - centre[:, None]
+    near = np.cos(offset) >= np.cos(2 * _ROLL_SPREAD)
+    return centre + np.arctan2((near * np.sin(offset)).sum(1), (near * np.cos(offset)).sum(1))
+
+
+def find_up_axis(gaussians: Gaussians, cameras: Camera) -> UpAxis:
+    """Finds the up axis of a scene: from what rests on what if that is sure, else from the cameras.
+
+    It is not sure where cameras that are surely level tell otherwise. Where the cameras only tell an axis, not which
+    end of it is up, the scene does.
+    """
+    from_cameras = up_of_cameras(cameras)
+    axis = np.array(from_cameras.axis)
+    with contextlib.suppress(InputError):  # a scene without a surface
+        up, sure, evidence = find_up(surface_points(gaussians))
+        if sure:
+            agree = not from_cameras.sure or up @ axis >= 0.9
+            return UpAxis(tuple(up.tolist()), f"the scene, {evidence}", bool(agree))
+        if not from_cameras.sure and up @ axis < -0.9:
+            return UpAxis(tuple((-axis).tolist()), f"{from_cameras.evidence}, and the scene", False)
+    return from_cameras
+
+
+def field_up(field: LanguageField, up: Sequence[Any] | np.ndarray | None = None) -> UpAxis:
+    """Finds the up axis of a field in its world: the one in its file, else `find_up_axis`.
 
     Args:
       field: The field.
       up: (3,) the up axis in the capture's world where it is known.
     """
     if up is not None:
-        turned = np.asarray(field.source_from_scene, np.float64)[:3, :3].T @ _direction(up)
-        return turned / np.linalg.norm(turned)
-    axis, is_parallel = _perpendicular_up(field.cameras)
-    axis = axis / np.linalg.norm(axis)
-    if is_parallel:
-        with contextlib.suppress(InputError):  # a scene without a surface has no ground
-            ground = scene_frame(surface_points(field.gaussians))
-            if ground.sure and ground.axes[2] @ axis >= 0.7:  # the same way up
-                return ground.axes[2]
-    return axis
+        return given_up(up, field.source_from_scene)
+    return field.up or find_up_axis(field.gaussians, field.cameras)
+
+
+def given_up(up: Any, source_from_scene: Any) -> UpAxis:
+    """Brings an up axis (3,) that the user gave in the capture's world into that of the scene."""
+    turned = np.asarray(source_from_scene, np.float64)[:3, :3].T @ _direction(up)
+    return UpAxis(tuple((turned / np.linalg.norm(turned)).tolist()), "what was given")

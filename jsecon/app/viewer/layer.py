@@ -10,7 +10,7 @@ from jsecon.numerics import sigmoid
 from jsecon.splat.project import is_usable
 from jsecon.splat.sh import C0
 from jsecon.types import LanguageField
-from jsecon.views.frame import scene_up
+from jsecon.views.frame import field_up
 
 GROUPS = 16
 """number of groups of Gaussians; only groups whose colours change are sent again, since viser sends all of a group"""
@@ -29,7 +29,7 @@ def first_view(field: LanguageField) -> tuple[np.ndarray, np.ndarray, np.ndarray
     depth = offsets @ forward
     ahead = depth[np.linalg.norm(offsets - depth[:, None] * forward, axis=1) < 0.2 * depth]
     distance = float(np.median(ahead)) if len(ahead) else 1.0
-    return eye, eye + distance * forward, scene_up(field.cameras)
+    return eye, eye + distance * forward, np.array(field_up(field).axis)
 
 
 class SplatLayer:

@@ -8,6 +8,7 @@ cut off a scene in kilometres.
 from __future__ import annotations
 
 import collections
+import dataclasses
 import functools
 import math
 import os
@@ -23,6 +24,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jsecon.errors import InputError
+from jsecon.numerics import MAX_COORDINATE
 from jsecon.process import cores
 from jsecon.read.captures.frames import (
     FrameOptions,
@@ -34,6 +36,7 @@ from jsecon.read.captures.frames import (
     make_rigid,
     same_aspect,
     transform_poses,
+    usable_images,
 )
 from jsecon.read.captures.images import apply_orientation, image_header, read_depth, read_image
 from jsecon.read.captures.lens import Lens, resample_depth, undistorted_pinhole, undistortion_maps
@@ -150,21 +153,24 @@ def _file(frame: _Frame) -> ImageFile:
 
 def _in_order(posed: PosedImages) -> tuple[list[_Frame], list[str]]:
     """The frames whose images are there in name order, and notes."""
-    images = [image for image in posed.images if image.image is not None]
-    missing = [image.name for image in posed.images if image.image is None]
+    placed, notes = usable_images(posed)
+    images = [image for image in placed if image.image is not None]
+    missing = [image.name for image in placed if image.image is None]
     first = f"(the first: {missing[0]})" if missing else ""
     if not images:
         problem = f"it has {len(missing)} frames, none of which has its image {first}" if missing else "it has no frame"
+        problem = f"{problem}; {notes[0]}" if notes else problem
         remedy = "Copy the images to where it names them." if missing else "Estimate the poses again."
         raise InputError(posed.where, problem, remedy=remedy)
-    notes = [f"{len(missing)} of {len(posed.images)} frames were left out: their images are missing {first}."]
+    if missing:
+        notes.append(f"{len(missing)} of {len(placed)} frames were left out: their images are missing {first}.")
     images.sort(key=lambda image: re.sub(r"\d+", lambda number: number[0].zfill(20), image.name))
     frames = [
         _Frame(name, image, image.image, make_rigid(image.world_to_camera, posed.where, image.name), image.lens)
         for name, image in zip(frame_names([image.name for image in images], posed.where), images)
         if image.image and image.lens
     ]
-    return frames, notes if missing else []
+    return frames, notes
 
 
 def _commonest_size(frames: Sequence[_Frame]) -> tuple[int, int]:
@@ -214,6 +220,10 @@ def build_capture(posed: PosedImages, options: FrameOptions, *, progress: Progre
     `Capture.source_from_scene` leads back.
     """
     frames, notes = _in_order(posed)
+    known = (np.abs(np.asarray(posed.points, np.float64)) <= MAX_COORDINATE).all(1)
+    if not known.all():
+        notes.append(f"{int((~known).sum())} sparse points were left out: their coordinates are no ordinary numbers.")
+        posed = dataclasses.replace(posed, points=posed.points[known], colours=posed.colours[known])
     deep = [frame.posed for frame in frames if frame.posed.depth is not None and not len(posed.points)]
     samples = [deep[index] for index in evenly_spaced(len(deep), 8)] if deep else []
     depths = [read_depth(image.depth, image.depth_unit) for image in samples if image.depth is not None]
@@ -279,6 +289,8 @@ def build_capture(posed: PosedImages, options: FrameOptions, *, progress: Progre
         notes=tuple(notes),
         files=tuple(map(_file, frames)),
         poses_from_scene=from_world,
+        up=posed.up,
+        metres_per_unit=posed.metres_per_unit,
     )
 
 

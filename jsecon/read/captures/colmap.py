@@ -178,11 +178,12 @@ def _read_cameras(model: Path) -> dict[int, Lens]:
 
 
 def _pose(file: Path, name: str, numbers: tuple[float, ...]) -> np.ndarray:
-    """(4, 4) world-to-camera from qw qx qy qz tx ty tz."""
+    """(4, 4) world-to-camera from qw qx qy qz tx ty tz; NaN for a pose that is lost."""
     quaternion = np.array(numbers[:4], np.float64)
-    length = np.linalg.norm(quaternion) if is_finite_and_bounded(numbers) else 0.0
-    if not length > 1e-6:
-        problem = f"the pose of {name} has NaN, infinite or absurd numbers, or no rotation: {numbers}"
+    if not is_finite_and_bounded(numbers):
+        return np.full((4, 4), np.nan)
+    if not np.linalg.norm(quaternion) > 1e-6:
+        problem = f"the pose of {name} has no rotation: {numbers}"
         raise InputError(file, problem, remedy="Estimate the poses again, or delete this image from the model.")
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
@@ -225,8 +226,6 @@ def _read_points(model: Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarra
         points, colours = table[:, :3], table[:, 3:].astype(np.uint8)
     else:
         points, colours = _read_binary_points(file)
-    if not is_finite_and_bounded(points):
-        raise InputError(file, "points have NaN, infinite or absurd coordinates", remedy="Estimate the model again.")
     return points, colours
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 from jsecon.errors import InputError
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.read.captures.lens import Lens
+from jsecon.types import UpAxis
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +50,10 @@ class PosedImages:
     notes: tuple[str, ...] = ()
     ignores_exif: bool = False
     """Whether the program that found the poses takes images as they are stored, as COLMAP does."""
+    up: UpAxis | None = None
+    """Which way is up in the world of the poses, where the format knows gravity."""
+    metres_per_unit: float | None = None
+    """Metres of one unit of the world of the source files, where the format guarantees them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,6 +122,20 @@ def frame_names(files: Sequence[str], where: object) -> tuple[str, ...]:
     first, second = [file for file, name in zip(files, names) if name == twice][:2]
     remedy = "Rename the images, or take one of the two out."
     raise InputError(where, f"two frames, {first} and {second}, differ in their suffixes only", remedy=remedy)
+
+
+def usable_images(posed: PosedImages) -> tuple[list[PosedImage], list[str]]:
+    """Chooses the images of a capture with a pose of ordinary numbers, each once, and says what was left out."""
+    placed = [image for image in posed.images if is_finite_and_bounded(image.world_to_camera)]
+    once = list({image.name: image for image in reversed(placed)}.values())[::-1]
+    lost, twice = len(posed.images) - len(placed), len(placed) - len(once)
+    notes = [f"{lost} frames were left out: their poses have NaN, infinite or absurd numbers."] if lost else []
+    return once, [*notes, f"{twice} frames are listed twice; the first of each was taken."] if twice else notes
+
+
+def rigid_or_nan(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Float[np.ndarray, "4 4"]:
+    """`make_rigid`, or NaN for a pose that is lost, which `usable_images` leaves out."""
+    return make_rigid(pose, where, name) if is_finite_and_bounded(pose) else np.full((4, 4), np.nan)
 
 
 def make_rigid(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Float[np.ndarray, "4 4"]:

@@ -17,11 +17,12 @@ from jaxtyping import Float
 from jsecon.errors import InputError
 from jsecon.files import read_json, reading
 from jsecon.numerics import is_finite_and_bounded
-from jsecon.read.captures.frames import PosedImage, PosedImages, make_rigid
+from jsecon.read.captures.frames import PosedImage, PosedImages, make_rigid, rigid_or_nan
 from jsecon.read.captures.images import find_image, size_around
 from jsecon.read.captures.lens import Lens
 from jsecon.read.registry import Reader
 from jsecon.read.splats.ply import load_point_cloud
+from jsecon.types import UpAxis
 
 _PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE"}
 _FISHEYE = {"OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
@@ -32,7 +33,7 @@ def _read_nerfstudio(path: Path) -> PosedImages:
     """Reads the posed images of a transforms.json, or of the folder that holds one, with their depth and points."""
     file = path / "transforms.json" if path.is_dir() else path
     content = read_json(file, "a transforms.json", _REMEDY)
-    images, notes = [], []
+    images, notes, scaled = [], [], 0
     with reading(file, remedy=_REMEDY):
         scale = _number(content, "applied_scale", 1.0)
         unit = _number(content, "depth_unit_scale_factor", 0.001) * scale  # millimetres are nerfstudio's default
@@ -41,17 +42,21 @@ def _read_nerfstudio(path: Path) -> PosedImages:
             with reading(file, remedy=_REMEDY, problem=f"frame {index} ({name}) cannot be read"):
                 image = find_image(file.parent, name)
                 # From OpenGL's axes of the camera to OpenCV's.
-                pose = make_rigid(_matrix(entry["transform_matrix"]) * [1, -1, -1, 1], file, name)
-                lens = _lens({**content, **entry}, image)
+                pose = rigid_or_nan(_matrix(entry["transform_matrix"]) * [1, -1, -1, 1], file, name)
+                lens, is_scaled = _lens({**content, **entry}, image)
+                scaled += is_scaled
                 depth = None if image is None else _named_file(file, entry, "depth_file_path")
                 full_name = _full_name(name, image)
                 images.append(PosedImage(full_name, image, lens, np.linalg.inv(pose), depth, unit))
         if any("mask_path" in entry for entry in content["frames"]):
             notes.append("The masks named by mask_path (pixels to ignore) were not used.")
+        if scaled:
+            notes.append(f"The intrinsics of {scaled} frames are shares of the image size; they were scaled to pixels.")
+        up = _stated_up(content)
         source_from_poses = _source_from_poses(content, scale)
         cloud = _named_file(file, content, "ply_file_path")
     points = () if cloud is None else load_point_cloud(cloud)
-    return PosedImages(images, file, *points, source_from_poses=source_from_poses, notes=tuple(notes))
+    return PosedImages(images, file, *points, source_from_poses=source_from_poses, notes=tuple(notes), up=up)
 
 
 def _number(record: dict[str, Any], key: str, default: float) -> float:
@@ -114,8 +119,26 @@ def _full_name(name: str, image: Path | None) -> str:
     return name if image is None or name.lower().endswith(image.suffix.lower()) else name + image.suffix
 
 
-def _lens(keys: dict[str, Any], image: Path | None) -> Lens | None:
-    """The lens of a frame by its keys and, after them, those of the file; None if neither gives its size."""
+def _stated_up(content: dict[str, Any]) -> UpAxis | None:
+    """Which way is up in the file's world, if it says so: instant-ngp's "up", or nerfstudio's "orientation_override".
+
+    "none" marks a world that phones (Polycam) aligned with gravity, z up, which a training must not turn.
+    """
+    if "up" in content:
+        axis = np.array(content["up"], np.float64)
+        if axis.shape != (3,) or not is_finite_and_bounded(axis) or not np.linalg.norm(axis) > 0:
+            raise ValueError(f"up is {content['up']}, expected three numbers that are not all 0")
+        return UpAxis(tuple((axis / np.linalg.norm(axis)).tolist()), 'the capture ("up" of its transforms)')
+    if content.get("orientation_override") == "none":
+        return UpAxis((0.0, 0.0, 1.0), 'gravity in the capture ("orientation_override" of its transforms)')
+    return None
+
+
+def _lens(keys: dict[str, Any], image: Path | None) -> tuple[Lens | None, bool]:
+    """The lens of a frame by its keys and, after them, those of the file, and whether they are shares of its size.
+
+    The lens is None if neither gives its size.
+    """
     model = str(keys.get("camera_model", "OPENCV")).upper()
     if model not in _PERSPECTIVE | _FISHEYE:
         known = ", ".join(sorted(_PERSPECTIVE | _FISHEYE))
@@ -128,7 +151,7 @@ def _lens(keys: dict[str, Any], image: Path | None) -> Lens | None:
     elif image is not None:
         width, height = size_around(image, keys.get("cx"), keys.get("cy"))
     else:
-        return None
+        return None, False
     fx, fy = _focal(keys, "fl_x", "camera_angle_x", width), _focal(keys, "fl_y", "camera_angle_y", height)
     fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
     if fx is None or fy is None:
@@ -139,7 +162,13 @@ def _lens(keys: dict[str, Any], image: Path | None) -> Lens | None:
         # nerfstudio's OPENCV has k1..k4 in one polynomial; OpenCV's own k4 divides. Not the same lens: refuse to guess.
         raise ValueError(f"k4 = {keys['k4']} with camera_model OPENCV: undistort the images first, or use FULL_OPENCV")
     cx, cy = _number(keys, "cx", width / 2), _number(keys, "cy", height / 2)
-    return Lens(width, height, fx, fy, cx, cy, distortion, is_fisheye)
+    # Nobody has a lens of 160 degrees or more with its focal length in pixels, or its centre in the first pixel.
+    is_scaled = min(width, height) > 16 and (max(fx, fy) < 10 and 12 * max(fx, fy) < width, max(cx, cy) <= 1)
+    if is_scaled and is_scaled[0]:
+        fx, fy = fx * width, fy * height
+    if is_scaled and is_scaled[1]:
+        cx, cy = cx * width, cy * height
+    return Lens(width, height, fx, fy, cx, cy, distortion, is_fisheye), bool(is_scaled and any(is_scaled))
 
 
 def _focal(keys: dict[str, Any], direct: str, angle: str, size: int) -> float | None:

@@ -1,7 +1,8 @@
 """Captures of depth cameras and phones, on the host: ScanNet, TUM, ARKitScenes, Polycam and Record3D.
 
 Formats: ScanNet SensReader/python; TUM's RGB-D benchmark (file_formats); ARKitScenes DATA.md; nerfstudio process_data
-polycam_utils.py and record3d_utils.py. Each keeps its world; phones look along -z with y up. Frames without a pose are
+polycam_utils.py and record3d_utils.py. Each keeps its world. Phones look along -z of their own axes, and gravity is
+along an axis of their worlds: y of Polycam and Record3D, z of ARKitScenes. Frames without a pose are
 left out, and counted in a note.
 """
 
@@ -18,10 +19,11 @@ from scipy.spatial.transform import Rotation
 
 from jsecon.errors import InputError
 from jsecon.files import parse_json, read_text, reading
-from jsecon.read.captures.frames import PosedImage, PosedImages, make_rigid
+from jsecon.read.captures.frames import PosedImage, PosedImages, rigid_or_nan
 from jsecon.read.captures.images import find_image, image_header, size_around
 from jsecon.read.captures.lens import Lens
 from jsecon.read.registry import Reader
+from jsecon.types import UpAxis
 
 _TUM_INTRINSICS = {
     "1": (517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
@@ -31,6 +33,7 @@ _TUM_INTRINSICS = {
 """fx fy cx cy k1 k2 p1 p2 k3 of the benchmark's cameras freiburg1 to 3, the centre of the first pixel at (0, 0)"""
 _PHONE_AXES = np.array([1.0, -1.0, -1.0, 1.0])
 """signs of the columns of a pose, from the axes of phones: a product of matrices would warn of infinite numbers"""
+_Y_UP, _Z_UP = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 _EXPORT = "Export the capture again."
 _parsing = functools.partial(reading, remedy=_EXPORT)
 """makes errors in parsing a file InputErrors"""
@@ -76,15 +79,17 @@ def _lens(width: Any, height: Any, *intrinsics: Any) -> Lens:
 
 def _posed_image(image: Path, lens: Lens, camera_to_world: np.ndarray, depth: Path | None = None) -> PosedImage:
     """A frame."""
-    world_to_camera = np.linalg.inv(make_rigid(camera_to_world, image, image.name))
+    world_to_camera = np.linalg.inv(rigid_or_nan(camera_to_world, image, image.name))
     return PosedImage(image.name, image, lens, world_to_camera, depth)
 
 
-def _posed_images(path: Path, images: list[PosedImage], count: int, *notes: str) -> PosedImages:
-    """The frames with a pose, of `count` images."""
+def _posed_images(
+    path: Path, images: list[PosedImage], count: int, *notes: str, up: UpAxis | None = None
+) -> PosedImages:
+    """The frames with a pose, of `count` images, in metres: all of these sensors measure them."""
     lost = count - len(images)
     lost_note = (f"{lost} of {count} frames were left out, since they have no pose.",) if lost else ()
-    return PosedImages(images, path, notes=(*lost_note, *notes))
+    return PosedImages(images, path, notes=(*lost_note, *notes), up=up, metres_per_unit=1.0)
 
 
 def _read_scannet(path: Path) -> PosedImages:
@@ -165,7 +170,7 @@ def _read_arkitscenes(path: Path) -> PosedImages:
             with _parsing(lens_files[lens]):
                 lens_of_frame = _lens(width, height, *intrinsics)
                 posed.append(_posed_image(image, lens_of_frame, np.linalg.inv(world_to_camera), depth))
-    return _posed_images(path, posed, len(images))
+    return _posed_images(path, posed, len(images), up=UpAxis(_Z_UP, "gravity in the capture (ARKitScenes)"))
 
 
 def _read_polycam(path: Path) -> PosedImages:
@@ -187,7 +192,7 @@ def _read_polycam(path: Path) -> PosedImages:
                 rows = [[camera[f"t_{i}{j}"] for j in range(4)] for i in range(3)]
                 pose = np.array([*rows, [0, 0, 0, 1]], np.float64) * _PHONE_AXES
             posed.append(_posed_image(image, lens, pose, find_image(frames / "depth", f"{image.stem}.png")))
-    return _posed_images(path, posed, len(images))
+    return _posed_images(path, posed, len(images), up=UpAxis(_Y_UP, "gravity in the capture (Polycam)"))
 
 
 def _polycam_size(camera: Any, uncorrected: Path | None, image: Path) -> tuple[Any, Any]:
@@ -218,7 +223,8 @@ def _read_record3d(path: Path) -> PosedImages:
             if (n := int(image.stem)) < len(poses):
                 pose = _matrix(Rotation.from_quat(poses[n, :4]), poses[n, 4:]) * _PHONE_AXES
                 posed.append(_posed_image(image, _lens(*size, *intrinsics[n]), pose))
-    return _posed_images(path, posed, len(images), "Record3D's depth was not read: its compression is not supported.")
+    note = "Record3D's depth was not read: its compression is not supported."
+    return _posed_images(path, posed, len(images), note, up=UpAxis(_Y_UP, "gravity in the capture (Record3D)"))
 
 
 READERS = (

@@ -17,7 +17,6 @@ from jaxtyping import Float, Int, UInt8
 
 from jsecon.errors import InputError
 from jsecon.files import atomic_write, reading
-from jsecon.numerics import is_finite_and_bounded
 from jsecon.splat.project import unusable_rows
 from jsecon.splat.sh import C0
 from jsecon.splat.transform import BLOCK_ROWS, float32_rounding, transform_blocks
@@ -289,8 +288,6 @@ def load_point_cloud(path: str | Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[
         if missing := [name for name in _POSITION if name not in names]:
             raise ValueError(f"its vertices have no {', '.join(missing)}, expected a point cloud with x y z")
         points = _columns(vertices, _POSITION, np.float64)
-        if not is_finite_and_bounded(points):
-            raise ValueError("its points have NaN, infinite or absurd coordinates")
     if not all(name in names and vertices.dtype[name] == np.uint8 for name in _RGB):
         return points, np.full((len(points), 3), 128, np.uint8)
     return points, _columns(vertices, _RGB, np.uint8)
