@@ -204,3 +204,29 @@ def test_bonsai(shared):
     np.testing.assert_allclose(loaded.cameras.fx, 205.4657, atol=0.01)
     seen = np.einsum("tij,pj->tpi", loaded.cameras.world_to_camera[:, :3, :3], loaded.points)
     assert ((seen + loaded.cameras.world_to_camera[:, None, :3, 3])[..., 2] > 0).mean(1).min() > 0.5
+
+
+@pytest.mark.parametrize("value", [np.nan, -np.inf])
+def test_lost_poses_and_points_are_left_out_and_counted(folder, value):
+    path = folder / "sparse/0/images.bin"
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<d", data, 44, value)
+    path.write_bytes(data)
+    path = folder / "sparse/0/points3D.bin"
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<d", data, 8 + 3 * 51 + 16, value)  # y of the point 3
+    path.write_bytes(data)
+    loaded = load_capture(folder)
+    assert len(loaded.names) == len(CAPTURE.names) - 1
+    assert len(loaded.points) == len(CAPTURE.points) - 1
+    assert "1 frames were left out: their poses" in loaded.notes[0]
+    assert any("1 sparse points were left out" in note for note in loaded.notes)
+
+
+def test_intrinsics_in_shares_of_the_image_are_refused(folder):
+    path = folder / "sparse/0/cameras.bin"
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<4d", data, 32, 0.9, 0.9, 0.5, 0.5)
+    path.write_bytes(data)
+    with refused("cameras.bin", "give it in pixels"):
+        load_capture(folder)

@@ -5,6 +5,7 @@ import json
 
 import cv2
 import numpy as np
+import pytest
 from capture_files import assert_same, small_capture, transforms, write_images, write_transforms
 from splat_files import write_ply
 
@@ -134,3 +135,53 @@ def test_fox(shared):
     loaded = load_capture(shared / "captures/fox", downscale=2)
     assert loaded.frames.shape == (50, 960, 540, 3)
     assert "17 of 67" in loaded.notes[0]
+
+
+@pytest.mark.parametrize("change", [{"frames": 1}, {"frames": 2, "shift": 1.0}], ids=["again", "elsewhere"])
+def test_a_frame_that_is_listed_twice_is_taken_once(tmp_path, change):
+    def twice(content):
+        again = json.loads(json.dumps(content["frames"][change["frames"]]))
+        again["file_path"] = f"./{again['file_path']}"
+        again["transform_matrix"][0][3] += change.get("shift", 0.0)
+        content["frames"].append(again)
+
+    loaded = load_changed(tmp_path, twice, holdout=0)
+    assert loaded.names == CAPTURE.names
+    np.testing.assert_allclose(loaded.cameras.world_to_camera, CAPTURE.cameras.world_to_camera, atol=1e-6)
+    assert "1 frames are listed twice" in loaded.notes[0]
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e30])
+def test_a_lost_pose_is_left_out_and_counted(tmp_path, value):
+    def lose(content):
+        content["frames"][1]["transform_matrix"][2][3] = value
+
+    loaded = load_changed(tmp_path, lose, holdout=0)
+    assert loaded.names == (CAPTURE.names[0], *CAPTURE.names[2:])
+    assert "1 frames were left out: their poses" in loaded.notes[0]
+
+
+@pytest.mark.parametrize("both", [True, False])
+def test_intrinsics_in_shares_of_the_image_are_pixels_again(tmp_path, both):
+    width, height = CAPTURE.cameras.width, CAPTURE.cameras.height
+
+    def shares(content):
+        content["cx"], content["cy"] = content["cx"] / width, content["cy"] / height
+        for entry in content["frames"]:
+            if both:
+                entry["fl_x"], entry["fl_y"] = entry["fl_x"] / width, entry["fl_y"] / height
+
+    loaded = load_changed(tmp_path, shares, holdout=0)
+    for name in ("fx", "fy"):
+        np.testing.assert_allclose(getattr(loaded.cameras, name), getattr(CAPTURE.cameras, name), rtol=1e-5)
+    np.testing.assert_allclose(loaded.cameras.cx, CAPTURE.cameras.cx[0], rtol=1e-5)
+    assert "shares of the image size" in loaded.notes[0]
+
+
+@pytest.mark.parametrize(("key", "value", "axis"), [
+    ("orientation_override", "none", (0, 0, 1)), ("up", [0, -3.0, 0], (0, -1, 0)), ("orientation_override", "up", None),
+])  # fmt: skip
+def test_up_is_what_the_file_says(tmp_path, key, value, axis):
+    loaded = load_changed(tmp_path, lambda content: content.update({key: value, "depth_unit_scale_factor": 0.001}))
+    assert (loaded.up and loaded.up.axis) == axis
+    assert loaded.metres_per_unit is None  # depth in any unit is no promise

@@ -126,6 +126,9 @@ def test_the_capture_comes_back(tmp_path, name):
     else:
         np.testing.assert_allclose(found.depths, CAPTURE.depths[kept], atol=1e-4)
     assert any("1 of 1" in note and "no pose" in note for note in found.notes)
+    gravity = {"arkitscenes": (0, 0, 1), "polycam": (0, 1, 0), "record3d": (0, 1, 0)}.get(name)
+    assert (found.up and found.up.axis) == gravity  # the others know none
+    assert found.metres_per_unit == 1
     if name == "scannet":
         assert found.names == tuple(map(str, kept))
 

@@ -144,3 +144,10 @@ def test_fields_are_opened_by_their_folders_names_and_the_address_is_told(scenes
     assert [scene["name"] for scene in told["fields"]] == ["a", "b"]
     with refused("a token that clients must have"):
         prepare(files, host="0.0.0.0", port=0, token="", embedder=None)
+
+
+def test_splats_of_one_name_are_told_apart_by_their_folders(scenes, tmp_path, monkeypatch):
+    save_field(tmp_path / "field.safetensors", scenes["desk"].field)
+    monkeypatch.setattr("jsecon.app.scene._field_of_gaussians", lambda *_: tmp_path / "field.safetensors")
+    files = [tmp_path / name for name in ("a/cloud.ply", "b/cloud.ply", "b/room.spz")]
+    assert list(open_scenes(files, None)) == ["cloud", "b_cloud", "room"]

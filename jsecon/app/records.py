@@ -273,7 +273,7 @@ class Answer:
             number = f"{self.count} object{'s' * (self.count != 1)}{f' ({names[0]})' if names else ''}"
             seen = f", {self.viewpoint}" if self.viewpoint else ""
             up = "" if self.up is None else f"up is from {self.up}"
-            sentences = [f"read as {self.reading}{seen}: {number}", self.reason.rstrip("."), self.question, up]
+            sentences = [f"read as {self.reading}{seen}: {number}", self.reason.rstrip("."), up, self.question]
             return ". ".join(filter(None, [*sentences, self._counts()]))
         return self._counts()
 

@@ -50,7 +50,7 @@ class Lens:
         if not (has_size and is_finite_and_bounded(numbers) and min(self.fx, self.fy) >= 1e-3):
             size = f"{self.width}x{self.height}"
             raise ValueError(f"a camera of {size} px has focal lengths, centre and distortion {numbers}")
-        if max(self.cx, self.cy) <= 1 and min(self.width, self.height) > 16:
+        if max(self.cx, self.cy) <= 1 and min(self.width, self.height) >= 8:
             size = f"{self.width}x{self.height}"
             raise ValueError(f"a camera of {size} px has its centre at {self.cx:g}, {self.cy:g}: give it in pixels")
 

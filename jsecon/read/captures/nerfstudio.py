@@ -163,7 +163,7 @@ def _lens(keys: dict[str, Any], image: Path | None) -> tuple[Lens | None, bool]:
         raise ValueError(f"k4 = {keys['k4']} with camera_model OPENCV: undistort the images first, or use FULL_OPENCV")
     cx, cy = _number(keys, "cx", width / 2), _number(keys, "cy", height / 2)
     # Nobody has a lens of 160 degrees or more with its focal length in pixels, or its centre in the first pixel.
-    is_scaled = min(width, height) > 16 and (max(fx, fy) < 10 and 12 * max(fx, fy) < width, max(cx, cy) <= 1)
+    is_scaled = min(width, height) >= 8 and (max(fx, fy) < 10 and 12 * max(fx, fy) < width, max(cx, cy) <= 1)
     if is_scaled and is_scaled[0]:
         fx, fy = fx * width, fy * height
     if is_scaled and is_scaled[1]:
