@@ -137,8 +137,8 @@ class ImageFile:
 class UpAxis:
     """Which way is up, and how that is known."""
 
-    axis: tuple[float, float, float]
-    """Unit vector, in the world of what it belongs to."""
+    axis: tuple[float, ...]
+    """(3,) unit vector, in the world of what it belongs to."""
     evidence: str
     """What it was taken from, in words."""
     sure: bool = True

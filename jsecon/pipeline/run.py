@@ -252,6 +252,9 @@ def run(options: Options, out: Path, *, console: Console | None = None) -> Run:
         save_field(out / FIELD_FILE, field)
     seconds["field"] = time.monotonic() - started
     console.done("field", seconds["field"], True)
+    if field.up is not None and not field.up.sure:
+        state.notes.append(f"up is from {field.up}")
+        console.note(state.notes[-1])
     programs = {name: count - before[name] for name, count in compilation_counts().items()}
     made = results.load, results.objects, results.held_out
     return Run(field, context.options, *made, state.steps, seconds, state.notes, programs)

@@ -163,12 +163,15 @@ def _lens(keys: dict[str, Any], image: Path | None) -> tuple[Lens | None, bool]:
         raise ValueError(f"k4 = {keys['k4']} with camera_model OPENCV: undistort the images first, or use FULL_OPENCV")
     cx, cy = _number(keys, "cx", width / 2), _number(keys, "cy", height / 2)
     # Nobody has a lens of 160 degrees or more with its focal length in pixels, or its centre in the first pixel.
-    is_scaled = min(width, height) >= 8 and (max(fx, fy) < 10 and 12 * max(fx, fy) < width, max(cx, cy) <= 1)
-    if is_scaled and is_scaled[0]:
+    is_image = min(width, height) >= 8
+    focal_shares = is_image and max(fx, fy) < min(10, width / 12)
+    centre_shares = is_image and max(cx, cy) <= 1
+    if focal_shares:
         fx, fy = fx * width, fy * height
-    if is_scaled and is_scaled[1]:
+    if centre_shares:
         cx, cy = cx * width, cy * height
-    return Lens(width, height, fx, fy, cx, cy, distortion, is_fisheye), bool(is_scaled and any(is_scaled))
+    lens = Lens(width, height, fx, fy, cx, cy, distortion, is_fisheye)
+    return lens, focal_shares or centre_shares
 
 
 def _focal(keys: dict[str, Any], direct: str, angle: str, size: int) -> float | None:
