@@ -53,8 +53,8 @@ def test_the_scene_tells_up_where_all_cameras_are_rolled_and_look_one_way(roll):
     """A table with things on it: what they rest on is below."""
     draw = np.random.default_rng(0)
     top = draw.uniform([-1, -1, 0], [1, 1, 0.004], (3000, 3))
-    middles = [(-0.6, -0.5), (0.5, 0.4), (0.6, -0.6), (-0.4, 0.6), (0.0, -0.1)]
-    things = [draw.uniform([x - 0.1, y - 0.1, 0], [x + 0.1, y + 0.1, 0.3], (500, 3)) for x, y in middles]
+    corners = [(-0.7, -0.6, 0.2), (0.4, 0.3, 0.45), (0.5, -0.7, 0.3), (-0.5, 0.5, 0.6), (-0.1, -0.2, 0.15)]
+    things = [draw.uniform([x, y, 0], [x + 0.2, y + 0.2, height], (500, 3)) for x, y, height in corners]
     cameras = cameras_around(lambda k: roll, around=20.0)
     up = find_up_axis(gaussians_at(np.concatenate([top, *things]).astype(np.float32), 0.02), cameras)
     np.testing.assert_allclose(up.axis, [0, 0, 1], atol=0.05)
