@@ -4,7 +4,7 @@
 
 Twins of LERF, regions of the simulated tracker. Every name of a thing in the room is asked, and 200 names that nothing
 in it has; the first weigh as much as the second in all. An answer is right if its region shows the thing. Answers that
-the default quantile refuses do not count. `OFFSET` and `SLOPE` of jsecon.query.scores are fitted on the seeds
+the default rules judge absent do not count. `OFFSET` and `SLOPE` of jsecon.query.scores are fitted on the seeds
 `--fitted` by the likelihood. The expected calibration error has ten bins of equal width.
 """
 
@@ -23,7 +23,7 @@ from experiments import lerf, results
 from experiments.cells import append_cell, read_cells
 from experiments.shared_errors import pooled
 from experiments.tables import twins
-from jsecon.query.rules import MIN_RANK, RULES
+from jsecon.query.rules import ABSENT, RULES
 from jsecon.query.scores import OFFSET, SLOPE, score_text, word_similarities
 
 BINS = 10
@@ -85,7 +85,7 @@ def _ask(embeddings, texts, pixels, words):
 
     def ask(text):
         scores = score_text(embeddings, text, pixels, words, similar, RULES)
-        return scores.best, scores.rank, scores.confidence
+        return scores.best, scores.state, scores.confidence
 
     return jax.vmap(ask)(texts)
 
@@ -102,8 +102,8 @@ def answered(options: Options, scene: str, seed: int, level: str, vision: int) -
     rows = []
     for texts, objects in ((found.texts, np.arange(len(found.texts))), (found.absent, np.full(len(found.absent), -1))):
         given = (jnp.asarray(own, jnp.float32) for own in (embeddings, texts, pixels, words))
-        for region, rank, confidence, thing in zip(*map(np.asarray, _ask(*given)), objects):
-            if rank >= MIN_RANK:
+        for region, state, confidence, thing in zip(*map(np.asarray, _ask(*given)), objects):
+            if state > ABSENT:
                 right = thing >= 0 and found.objects[region] == thing
                 rows.append((float(confidence), float(right), 1 / len(texts)))
     return rows

@@ -38,7 +38,7 @@ from experiments.words.scenes import DEFAULT, GIVEN, RIVALS, WordScene, load_sce
 from jsecon.field.membership import normalise_votes
 from jsecon.query.answer import match_regions, query_anchored, query_several
 from jsecon.query.classes import query_classes
-from jsecon.query.rules import MIN_COSINE, MIN_RANK, QueryRules
+from jsecon.query.rules import MIN_COSINE, STATES, QueryRules
 from jsecon.query.scores import view_count_weight
 from jsecon.types import LanguageField, Regions, Selection
 from jsecon.vision.unrelated_words import embed_unrelated_words
@@ -227,17 +227,17 @@ def lifting(name: str, masks: str) -> list[float]:
 
 
 def refusal(case: Case, embedder: Conse) -> dict[str, Any]:
-    """Which names `query_anchored` answers: of the scene's the share that is kept, of absent ones the share that is
-    refused. Beside them the quantiles of both, how often those of the scene have the larger one, and the confidence of
-    each answer with whether its region has the name."""
+    """Shares of the states of the scene's names and of absent ones, how often the former have the larger rank, and the
+    confidence of each answer with whether its region has the name."""
     scene = case.scene
     absent = absent_names(embedder.texts, scene.name, scene.names)
     found: dict[str, Any] = {"asked": [len(scene.texts), len(absent)]}
-    quantiles, answers = [], []
+    quantiles = []
     for names, wanted in ((scene.texts, scene.asked), (absent, np.full(len(absent), -1))):
         told = [match_regions(case.field, jnp.asarray(text)[None]) for text in embedder.embed_text(list(names))]
         quantiles.append(np.array([float(answer.rank) for answer in told]))
-        answers.append([int(answer.region) for answer in told])
+        states = [STATES[int(answer.state)] for answer in told]
+        found.setdefault("states", []).append({state: states.count(state) / len(states) for state in STATES})
         found.setdefault("confidence", []).append(
             [
                 (round(float(answer.confidence), 4), bool(scene.region_names[int(answer.region)] == name))
@@ -246,8 +246,6 @@ def refusal(case: Case, embedder: Conse) -> dict[str, Any]:
             ]
         )
     found["auc"] = rules.auc(*quantiles)
-    found["kept"] = float(np.mean(np.array(answers[0]) >= 0))
-    found["refused"] = float(np.mean(np.array(answers[1]) < 0))
     return found
 
 
@@ -339,12 +337,14 @@ def tables(metrics: dict) -> list[str]:
     text.append(results.table(tuple(metrics["lifting"]), [tuple(map(_mean, metrics["lifting"].values()))]))
     for k, figures in cases.items():
         own = figures["refusal"]
-        rows.append((k, own["asked"][1], *(own[key] for key in ("auc", "kept", "refused", "calibration error"))))
+        shares = (f"{kind[state]:.3f}" for kind in own["states"] for state in reversed(STATES))
+        rows.append((k, own["asked"][1], own["auc"], *shares, own["calibration error"]))
     text.append(
-        f"Present and absent names by `query_anchored`, which answers above the quantile {MIN_RANK}; the calibration "
-        "error of its confidence, both kinds weighing the same in all."
+        "States of present and absent names by `query_anchored`; the calibration error of its confidence, both kinds "
+        "weighing the same in all."
     )
-    header = ("scene, masks, embedder", "absent", "AUC", "kept", "refused", "calibration error")
+    states = (f"{kind} {state}" for kind in ("present:", "absent:") for state in reversed(STATES))
+    header = ("scene, masks, embedder", "absent", "AUC", *states, "calibration error")
     return [*text, results.table(header, rows)]
 
 

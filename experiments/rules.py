@@ -36,7 +36,7 @@ from jsecon.fit.start import gaussians_from_points
 from jsecon.query.answer import match_regions, query_anchored, query_several
 from jsecon.query.grouping import parts_fallback
 from jsecon.query.outliers import remove_outliers
-from jsecon.query.rules import MIN_COSINE, MIN_RANK, QueryRules
+from jsecon.query.rules import MIN_COSINE, STATES, QueryRules
 from jsecon.types import LanguageField
 
 AS_IT_IS = "as it is"
@@ -165,14 +165,18 @@ def measure(data: twins.Data, scene: str, seed: int, level: str) -> dict:
 
 
 def default_refusal(setting: Setting, field: LanguageField, by: str) -> dict[str, float]:
-    """Shares of the present texts that `jsecon query` answers by default, and of the absent ones that it refuses."""
+    """Shares of the present texts that `jsecon query` answers by default, and of the absent ones that it refuses: those
+    that are absent, and those that are not found."""
     absent = twins.words_of(setting.bench, setting.folder.parent, setting.level, setting.seed).absent
 
-    def share(texts):
-        return float(np.mean([bool(match_regions(field, jnp.asarray(text)[None]).chosen.any()) for text in texts]))
+    def states(texts):
+        return np.array([int(match_regions(field, jnp.asarray(text)[None]).state) for text in texts])
 
-    name = f"jsecon query, {by}, quantile {MIN_RANK:g}"
-    return {f"{name}: kept": share(setting.texts), f"{name}: refused": 1 - share(absent)}
+    kept, refused, told = states(setting.texts), states(absent), {}
+    for least in (1, 2):
+        name = f"jsecon query, {by}, {' or '.join(STATES[least:])}"
+        told |= {f"{name}: kept": float(np.mean(kept >= least)), f"{name}: refused": float(np.mean(refused < least))}
+    return told
 
 
 def best_scores(field: LanguageField, texts: np.ndarray, retrieval: str) -> np.ndarray:

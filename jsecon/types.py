@@ -383,3 +383,5 @@ class Selection:
     not known."""
     presence: Array | None = None
     """() float: probability that the text is true of the region; None unless the embedder was trained to tell that."""
+    state: Array | None = None
+    """() int: index of `jsecon.query.rules.STATES`, whether the scene has what the text names; None without a text."""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from capture_files import refused, run_cli
 from small_field import REGIONS, make_field, shares, true_regions
+from table_field import table_field
 
 import jsecon
 from jsecon import Regions, Votes, load_gaussians, save_field
@@ -113,6 +114,39 @@ def test_names_come_from_the_vocabulary_that_is_given(field):
     for names, words in (([], "no names"), (["mug"], "no colour word")):
         with refused(words):
             jsecon.objects(field, names)
+
+
+@pytest.mark.parametrize("things", [
+    ("red", "green", "orange", "yellow", "blue"), ("dark blue", "light blue", "white"),
+    ("purple", "dark purple", "light pink", "grey", "brown", "turquoise", "light green", "black"),
+])  # fmt: skip
+def test_a_query_selects_what_the_catalogue_names(things):
+    """The things' colours are off, as those of masks that reach over the edges are."""
+    field, embedder = table_field([(f"{name} box", (0.5 * k, 0, 0.1), (0.1,) * 3) for k, name in enumerate(things)])
+    mixed = np.asarray(field.regions.embeddings) + 0.5 * embedder.embed_text(["light grey background"])
+    for part in (0.0, 0.3, 0.6):  # of a neighbour's colour
+        rows = mixed + part * np.roll(mixed, 1, axis=0)
+        regions = Regions(rows / np.linalg.norm(rows, axis=1, keepdims=True), field.regions.pixel_counts)
+        scene = jsecon.Scene(dataclasses.replace(field, regions=regions), embedder)
+        states = {name: scene.ask(name).state for name in embedder.vocabulary}
+        catalogue = scene.objects()
+        names = [str(name) for name, sure in zip(catalogue.names[:, 0], catalogue.probability[:, 0]) if sure >= 0.5]
+        assert len(names) >= (len(things) - 1 if part < 0.5 else 1)
+        assert "absent" not in [states[name] for name in names]
+        assert list(states.values()).count("absent") >= 10
+        answers = {name: scene.ask(name) for name in states}
+        assert all((answer.state == "absent") == (not answer.mask.any()) for answer in answers.values())
+        assert all(answer.as_dict()["state"] == answer.state for answer in answers.values())
+        assert all(("it may be absent" in str(answer)) == (answer.state == "unsure") for answer in answers.values())
+
+
+def test_a_name_that_a_query_finds_absent_is_no_name(field):
+    """The one thing among them is nothing like any of the names, so the nearest of them is none of its own."""
+    catalogue = jsecon.objects(field, ["black", "dark brown"], EMBEDDER)
+    states = [jsecon.Scene(field, EMBEDDER).ask(text).state for text in ("black", "dark brown")]
+    assert states == ["absent", "absent"]
+    assert (catalogue.probability == 0).all()
+    assert set(catalogue.names[:, 0]) <= {"black", "dark brown"}
 
 
 def test_a_field_without_regions_has_an_empty_catalogue(field):

@@ -11,7 +11,7 @@ from small_field import KnownTexts, make_field, unit_rows
 
 from jsecon import Regions, Scene, load_field, query_anchored, query_classes, query_region, query_several, save_field
 from jsecon.field.similarity import similarities
-from jsecon.query.rules import MIN_COSINE, MIN_RANK, QueryRules
+from jsecon.query.rules import ABSENT, FOUND, FOUND_MARGIN, MIN_COSINE, MIN_MARGIN, UNSURE, QueryRules
 from jsecon.query.scores import region_similarities, view_count_weight, word_similarities
 
 SIZE = 12
@@ -91,11 +91,22 @@ def test_evidence_is_of_views_and_counts_against_the_best_known_region():
 
 def exact_quantile(embeddings, text, words):
     """The share of words, without the tenth that is nearest to the text, that are less similar to their best region."""
+    return exact_standing(embeddings, text, words, np.ones(len(embeddings)))[0]
+
+
+def exact_standing(embeddings, text, words, weight):
+    """That share, and the margin of the text among the words by regions of some weights."""
     rows, words, text = (unit(np.asarray(a, np.float64)) for a in (embeddings, words, text))
     mean = words.mean(0)
     order = np.argsort(-(unit(words - mean) @ unit(text - mean)), kind="stable")[int(0.1 * len(words)) :]
-    scores = (unit(words - mean) @ rows.T).max(1)[order]
-    return np.mean(scores < (rows @ unit(text - mean)).max())
+    table = np.concatenate([unit(text - mean)[None], unit(words - mean)[order]]) @ rows.T
+    best = np.where(table > 0, table * weight, table).argmax(1)
+    heights = table[np.arange(len(table)), best] - table @ weight / weight.sum()
+    largest = table.max(1)
+    margin = sum(
+        share * (of_all[0] - of_all[1:].mean()) / of_all[1:].std() for share, of_all in ((1, largest), (0.4, heights))
+    )
+    return np.mean(largest[1:] < largest[0]), margin
 
 
 @pytest.fixture
@@ -106,26 +117,33 @@ def worded(scene, cameras):
     return dataclasses.replace(field, unrelated_words=unit_rows(rng, 61, SIZE)), unit_rows(rng, 200, SIZE)
 
 
-def test_a_text_is_refused_by_its_rank_among_words_unrelated_words(worded):
+def test_a_text_is_found_unsure_or_absent_by_its_margin_among_unrelated_words(worded):
     field, texts = worded
+    weight = np.asarray(view_count_weight(field.regions.pixel_counts), np.float64)
 
     def ask(text):
         return query_anchored(field, text)
 
-    together = jax.jit(jax.vmap(ask))(texts[:15])
-    for k, text in enumerate(texts[:15]):
-        expected = exact_quantile(field.regions.embeddings, text, field.unrelated_words)
+    seen = set()
+    together = jax.jit(jax.vmap(ask))(texts[:40])
+    for k, text in enumerate(texts[:40]):
+        expected, margin = exact_standing(field.regions.embeddings, text, field.unrelated_words, weight)
+        state = int(margin >= MIN_MARGIN) + int(margin >= FOUND_MARGIN)
+        seen.add(state)
         found = ask(text)
         assert float(found.rank) == pytest.approx(expected, abs=1e-6)
-        assert (int(found.region) >= 0) == (expected >= MIN_RANK)
-        assert bool(found.mask.any()) <= (expected >= MIN_RANK)
+        assert int(found.state) == int(together.state[k]) == state
+        assert (int(found.region) >= 0) == (state > ABSENT)
+        assert bool(found.mask.any()) <= (state > ABSENT)
         assert float(together.rank[k]) == pytest.approx(expected, abs=1e-6)
         np.testing.assert_array_equal(together.mask[k], found.mask)
         loose, strict = (
             query_anchored(field, text, rules=QueryRules(min_rank=q)) for q in (expected - 1e-3, expected + 1e-3)
         )
         assert int(loose.region) >= 0 > int(strict.region)
+        assert int(loose.state) == max(state, UNSURE)
         assert float(query_several(field, text[None]).rank) == pytest.approx(expected, abs=1e-6)
+    assert seen == {ABSENT, UNSURE, FOUND}
     assert int(query_anchored(field, texts[0], rules=QueryRules(min_rank=0.0)).region) >= 0
     by_threshold = query_anchored(field, texts[0], rules=QueryRules(min_score=-1.0, min_rank=1.0))
     assert int(by_threshold.region) >= 0  # a threshold that is given decides

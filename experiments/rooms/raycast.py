@@ -151,11 +151,12 @@ def texture_pattern(texture: Texture, points: Float[np.ndarray, "3 n"]) -> Float
     return np.zeros(points.shape[1], np.float32)
 
 
-def bake_room(room: Room) -> LitRoom:
+def bake_room(room: Room, *, coarser: int = 1) -> LitRoom:
     """Paints and lights the flat surfaces of a room, in colours that no object has.
 
     Args:
       room: The room.
+      coarser: Factor on the texels of their paint and shadows.
 
     Returns:
       The room with its walls, floor, ceiling and table top.
@@ -171,12 +172,18 @@ def bake_room(room: Room) -> LitRoom:
         ((-x, -y, floor), right, 2 * x, back),
         ((-x, y, floor), right, 2 * x, -back),
     ]
-    walls = [_wall(room, draw, tall, *side) for side in sides]
-    ground = _flat(room, draw, np.array([-x, -y, floor], np.float32), 2 * x, 2 * y, up, 0.006, 0.05, _tiles)
-    above = _flat(room, draw, np.array([-x, -y, ceiling], np.float32), 2 * x, 2 * y, -up, 0.02, None, _plaster)
+    walls = [_wall(room, draw, tall, *side, 0.008 * coarser) for side in sides]
+    ground = _flat(
+        room, draw, np.array([-x, -y, floor], np.float32), 2 * x, 2 * y, up, 0.006 * coarser, 0.05 * coarser, _tiles
+    )
+    above = _flat(
+        room, draw, np.array([-x, -y, ceiling], np.float32), 2 * x, 2 * y, -up, 0.02 * coarser, None, _plaster
+    )
     tx, ty = TABLE_HALF
     top = _cloth if room.cloth else _planks
-    table = _flat(room, draw, np.array([-tx, -ty, 0], np.float32), 2 * tx, 2 * ty, up, 0.0025, 0.005, top)
+    table = _flat(
+        room, draw, np.array([-tx, -ty, 0], np.float32), 2 * tx, 2 * ty, up, 0.0025 * coarser, 0.005 * coarser, top
+    )
     return LitRoom(room, (*walls, ground, above), table)
 
 
@@ -259,9 +266,9 @@ def _under_table(points):
     return np.clip(0.75 + 0.4 * beyond.max(0), 0.6, 1)
 
 
-def _wall(room, draw, tall, corner, first, span, normal):
+def _wall(room, draw, tall, corner, first, span, normal, texel):
     origin, up = np.array(corner, np.float32), np.array([0, 0, 1], np.float32)
-    points, u, v = _grid(origin, first, up, span, tall, 0.008)
+    points, u, v = _grid(origin, first, up, span, tall, texel)
     tone = 0.05 * _noise(draw, u.shape, 36) + 0.035 * np.sign(np.sin(2 * np.pi * u / 0.24))
     low = v < 0.95
     tone -= 0.28 * low + 0.15 * ((v > 0.95) & (v < 0.99)) + 0.2 * (v < 0.1)
@@ -274,7 +281,7 @@ def _wall(room, draw, tall, corner, first, span, normal):
     light = SKY_RADIANCE * (0.82 + 0.18 * np.clip(v / 0.5, 0, 1)) + 0.6 * LAMP_RADIANCE * _lamp_cosine(
         room, points, turn
     ).reshape(u.shape)
-    return _Plane(origin, first, up, 0.008, (paint * light[..., None]).astype(np.float32))
+    return _Plane(origin, first, up, texel, (paint * light[..., None]).astype(np.float32))
 
 
 def _hang_picture(draw, paint, blot, u, v, middle):
@@ -406,19 +413,20 @@ def _linear_to_srgb(rgb: Float[np.ndarray, "... 3"]) -> UInt8[np.ndarray, "... 3
 
 
 def render_views(
-    room: Room, cameras: Camera, *, progress: Progress | None = None
+    room: Room, cameras: Camera, *, coarser: int = 1, progress: Progress | None = None
 ) -> tuple[UInt8[np.ndarray, "t h w 3"], Int16[np.ndarray, "t h w"], Float32[np.ndarray, "t h w"]]:
     """Renders a room.
 
     Args:
       room: The room.
       cameras: T cameras inside the room (leading batch axis).
+      coarser: Factor on the texels of walls, floor and table (`bake_room`).
       progress: Called with the number of finished views and T.
 
     Returns:
       Frames, instances (index of the object, -1 = background) and z-depths (m).
     """
-    baked = bake_room(room)
+    baked = bake_room(room, coarser=coarser)
     lamps = room.lamp_points
     owners = np.array([part.owner for part in room.parts] + [-1], np.int16)
     count = int(np.asarray(cameras.fx).shape[0])

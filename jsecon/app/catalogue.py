@@ -21,7 +21,8 @@ from jsecon.programs import stored_jit
 from jsecon.query.grouping import MIN_FRAGMENT_OVERLAP, regions_with
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.outliers import MIN_SAMPLES
-from jsecon.query.rules import QueryRules
+from jsecon.query.rules import ABSENT, QueryRules
+from jsecon.query.scores import judge_texts, unrelated_words
 from jsecon.types import Array, LanguageField, Votes
 from jsecon.views.frame import field_up
 from jsecon.vision.unrelated_words import UNRELATED_WORDS, embed_unrelated_words
@@ -54,7 +55,7 @@ class Catalogue:
     """(K, 3) str: names of the vocabulary, the most probable first; "" beyond its end, and where a field of
     embeddings from files has no model for texts."""
     probability: np.ndarray
-    """(K, 3) probability of each name, if exactly one of the vocabulary is right."""
+    """(K, 3) probability of each name if exactly one of the vocabulary is right; 0 of one that a query finds absent."""
     surroundings: np.ndarray
     """(K,) bool: the best name is one of walls, floors and the like."""
     parent: np.ndarray
@@ -151,13 +152,17 @@ def objects(
     """
     axis = field_up(field, up)
     upright = np.array(axis.axis)
-    texts, embeddings, scale = _vocabulary(field, vocabulary, embedder)
+    texts, embeddings, scale, rules = _vocabulary(field, vocabulary, embedder)
     size, main = _sizes(field)
     groups = region_objects(field, main, upright)
     members = np.arange(groups.max(initial=-1) + 1)[:, None] == groups  # (G, R)
     pixels = np.asarray(field.regions.pixel_counts, np.float64)
     weighted = pixels.sum(1)[:, None] * np.asarray(field.regions.embeddings, np.float64)
-    order, probability = _name(members @ weighted, embeddings, scale)
+    arrays = field.regions.embeddings, embeddings, field.regions.pixel_counts
+    present = np.zeros(len(texts), bool)
+    if len(members) and len(texts):
+        present = np.asarray(judge_texts(*map(jnp.asarray, arrays), unrelated_words(field), rules)) > ABSENT
+    order, probability = _name(members @ weighted, embeddings, scale, present)
     text = np.asarray((*texts, ""), object)
     surroundings = np.array([bool(SURROUNDINGS & set(name.lower().split())) for name in text[order[:, 0]]], bool)
     whole = _wholes(field, groups, members, size, surroundings)
@@ -196,16 +201,17 @@ def objects(
 
 def _vocabulary(
     field: LanguageField, vocabulary: Sequence[str] | None, embedder: Any
-) -> tuple[tuple[str, ...], np.ndarray, float]:
-    """Returns the names to choose from, their embeddings (V, E), and the scale of cosines in the softmax."""
+) -> tuple[tuple[str, ...], np.ndarray, float, QueryRules]:
+    """Returns the names to choose from, their embeddings (V, E), the scale of cosines in the softmax, and the rules."""
     words_known = field.unrelated_words is not None and len(field.unrelated_words) == len(UNRELATED_WORDS)
     if vocabulary is None and embedder is None and words_known and not field.embedder.startswith("colours"):
-        return UNRELATED_WORDS, np.asarray(field.unrelated_words, np.float32), SOFTMAX_SCALE  # without the model
+        # Without the model.
+        return UNRELATED_WORDS, np.asarray(field.unrelated_words, np.float32), SOFTMAX_SCALE, QueryRules()
     if embedder is None:
         from jsecon.pipeline.model_loading import external_dim, field_embedder
 
         if vocabulary is None and external_dim(field.embedder) is not None:
-            return (), np.zeros((0, field.regions.embeddings.shape[1]), np.float32), SOFTMAX_SCALE
+            return (), np.zeros((0, field.regions.embeddings.shape[1]), np.float32), SOFTMAX_SCALE, QueryRules()
         embedder = field_embedder(field)
     logits = getattr(embedder, "logits", None)
     scale = getattr(embedder, "softmax_scale", SOFTMAX_SCALE) if logits is None else logits.scale
@@ -213,21 +219,23 @@ def _vocabulary(
     if not texts:
         raise InputError("vocabulary", "it has no names", remedy="Give at least one name.")
     rows = embed_unrelated_words(embedder) if texts == UNRELATED_WORDS else np.asarray(embedder.embed_text(list(texts)))
-    return texts, rows, scale
+    return texts, rows, scale, QueryRules(logits=logits)
 
 
 def _name(
-    embeddings: np.ndarray, names: np.ndarray, scale: float
+    embeddings: np.ndarray, names: np.ndarray, scale: float, present: Bool[np.ndarray, " v"]
 ) -> tuple[Int[np.ndarray, "k m"], Float[np.ndarray, "k m"]]:
     """Returns the most probable of V names (V, E) of K embeddings (K, E) of any length, and their probabilities.
 
-    A name's index is V where the vocabulary has fewer than `NAMES`, and its probability 0.
+    A name that is not `present`, because a query finds it absent, has probability 0: the catalogue and queries have one
+    judgement. A name's index is V where the vocabulary has fewer than `NAMES`, and its probability 0.
     """
     rows, columns = np.asarray(embeddings, np.float64), np.asarray(names, np.float64)
     lengths = np.linalg.norm(rows, axis=1)[:, None] * np.linalg.norm(columns, axis=1)
     cosines = rows @ columns.T / np.where(lengths > 0, lengths, 1.0)
     probability = softmax(scale * cosines, axis=1) if len(names) else cosines
-    order = np.argsort(-probability, axis=1, kind="stable")[:, :NAMES]
+    raw, probability = probability, np.where(present, probability, 0.0)
+    order = np.lexsort((-raw, -probability), axis=1)[:, :NAMES]  # stable
     missing = ((0, 0), (0, NAMES - order.shape[1]))
     best = np.pad(np.take_along_axis(probability, order, axis=1), missing)
     return np.pad(order, missing, constant_values=len(names)), best

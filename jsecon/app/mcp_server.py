@@ -37,6 +37,7 @@ class _Tools:
     def find(self, text: Words, frame: Frame = None, field: FieldName = None) -> dict[str, Any]:
         """Finds or counts what a text names: number of Gaussians and objects, score, centre and box, or why not.
 
+        "state" is "found", "unsure" (the best match is given, and what the text names may be absent) or "absent".
         Of a text with a relation, an order or a number, "relation" has the objects, how the text was read, and a
         question where it leaves open which object is meant.
         """

@@ -26,7 +26,7 @@ from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_sh
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.referring import evaluate
 from jsecon.query.relations import Viewpoint, order_values, viewpoint
-from jsecon.query.rules import QueryRules
+from jsecon.query.rules import ABSENT, FOUND, MIN_RANK, QueryRules
 from jsecon.types import LanguageField, Selection
 from jsecon.views.frame import field_up
 
@@ -37,7 +37,7 @@ MAX_KEPT = 1024
 def choose_shades(
     field: LanguageField, embedder: Any, texts: Sequence[str], rules: QueryRules, *, every: bool
 ) -> list[str]:
-    """Replaces texts that no region matches by narrower ones that some region does.
+    """Replaces texts that are not found by narrower ones that are.
 
     Among colours "blue" is a family, and a room may have nothing of its typical colour but a dark and a light blue
     thing. Each is far from the word and near to its own shade.
@@ -50,7 +50,7 @@ def choose_shades(
 
     def score(text: str, rules: QueryRules) -> float:
         match = match_regions(field, jnp.asarray(embedder.embed_text([text])), rules)
-        return float(match.score) if int(match.region) >= 0 else -np.inf
+        return float(match.score) if int(match.state) == FOUND else -np.inf
 
     replaced: list[str] = []
     for text in texts:
@@ -58,7 +58,8 @@ def choose_shades(
         best: list[str] = []
         if narrower and np.isinf(score(text, rules)):
             # Of n attempts one succeeds by chance as often as one attempt that is n times as strict.
-            strict = dataclasses.replace(rules, min_rank=1 - (1 - rules.min_rank) / len(narrower))
+            least = MIN_RANK if rules.min_rank is None else rules.min_rank
+            strict = dataclasses.replace(rules, min_rank=1 - (1 - least) / len(narrower))
             scores = {option: score(option, strict) for option in narrower}
             best = [option for option in sorted(narrower, key=scores.__getitem__) if scores[option] > -np.inf]
         replaced.extend(best[0 if every else -1 :] or [text])
@@ -101,7 +102,8 @@ class ObjectIndex:
         regions = np.flatnonzero(np.asarray(match.chosen)) if int(match.region) >= 0 else np.zeros(0, int)
         groups = self._best_named(texts, join_fragments(regions, self._joined))
         made = [(group, self._object(group)) for group in groups]
-        return [Object(phrase, group, *parts) for group, parts in made if parts is not None], float(match.rank)
+        state = int(match.state)
+        return [Object(phrase, group, *parts, state) for group, parts in made if parts is not None], float(match.rank)
 
     def _best_named(self, texts: Sequence[str], groups: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
         """Keeps the objects that no other name of the vocabulary fits better than the text, if there are any.
@@ -195,9 +197,9 @@ class ObjectIndex:
             mask[found.rows] = True
         region = best.chosen[0].regions[0] if len(best.chosen) == 1 else -1
         score = best.chosen[0].score if best.chosen else 0.0
-        selection = Selection(
-            mask, mask.astype(np.float32), np.asarray(region, np.int32), np.asarray(score, np.float32)
-        )
+        state = np.asarray(min((found.state for found in [*best.chosen, *best.used]), default=ABSENT), np.int32)
+        score = np.asarray(score, np.float32)
+        selection = Selection(mask, mask.astype(np.float32), np.asarray(region, np.int32), score, state=state)
         return Answer(
             query=query,
             by="relation",

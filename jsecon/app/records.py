@@ -19,7 +19,7 @@ from jsecon.errors import InputError, require_one_of
 from jsecon.field.membership import probability_inside
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.referring import Object
-from jsecon.query.rules import MIN_RANK
+from jsecon.query.rules import ABSENT, FOUND, STATES, UNSURE
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Gaussians, LanguageField, Selection, UpAxis
 
@@ -87,7 +87,8 @@ class Query:
         are searched for as they stand.
       by: How a region selects Gaussians, "votes" or "code".
       threshold: Smallest similarity of a selected Gaussian; None takes 0.5 for votes and 0.9 for codes.
-      min_rank: Share of unrelated words that must be less similar to the scene than a text, else it has no match.
+      min_rank: Share of unrelated words that must be less similar to the scene than a text, else it is absent; 0
+        selects the best match of every text. None judges by its margin among these words (`jsecon.query.rules`).
       all_of_class: Whether to select all regions of the class, such as all chairs, instead of the best one.
       outliers: Whether to drop the Gaussians that stand apart from the rest.
       frame: Frame from which left, right, front and behind are seen. None takes the mean camera, or the frame that
@@ -101,7 +102,7 @@ class Query:
     question: Question
     by: str = "votes"
     threshold: float | int | None = None
-    min_rank: float | int = MIN_RANK
+    min_rank: float | int | None = None
     all_of_class: bool = False
     outliers: bool = True
     frame: int | str | None = None
@@ -195,6 +196,16 @@ class Answer:
         return source_shapes(self.field, self.rows, np.zeros(len(self.rows), int))[0]
 
     @property
+    def state(self) -> str:
+        """Whether the scene has what the query names.
+
+        "found"; "unsure", where the best match is selected and what the text names may be absent; or "absent", where no
+        Gaussian is selected.
+        """
+        state = FOUND if self.selection.state is None else int(self.selection.state)
+        return STATES[state if len(self.rows) else ABSENT]
+
+    @property
     def confidence(self) -> float | None:
         """Estimated probability that the answer shows what the text names; None if it is unknown."""
         return _known(self.selection.confidence)
@@ -210,6 +221,7 @@ class Answer:
             probability["percentile_10"] = round(float(np.quantile(inside, 0.1)), 4)
         record = {
             "query": str(self.query),
+            "state": self.state,
             "by": self.by,
             "count": len(self.rows),
             "gaussians": self.field.gaussians.count,
@@ -288,6 +300,8 @@ class Answer:
                 parts.append(f"more similar than {int(100 * rank + 1e-6)} % of unrelated words")
             if self.confidence is not None and region >= 0:
                 parts.append(f"confidence {int(100 * self.confidence)} %")
+        if self.state == STATES[UNSURE]:
+            parts.append("unsure: it may be absent")
         if region >= 0:
             parts.append(f"region {region}")
         elif "regions" in self.skipped:

@@ -185,8 +185,8 @@ class Query(_FieldVerb):
       out: Output folder.
       by: How a matching region selects Gaussians: by its votes, or by its code in a field of jsecon run --paper.
       threshold: Smallest similarity of a selected Gaussian. By default it is 0.5 for votes and 0.9 for code.
-      min_rank: Share of unrelated words that must be less similar to the scene than a text, else the text has no match.
-        About 1 - min_rank of the texts of absent objects are answered. With 0 every text is answered.
+      min_rank: Share of unrelated words that must be less similar to the scene than a text, else the text is absent.
+        With 0 every text is answered. By default it is found, unsure or absent by how its match compares with theirs.
       all: Selects every region of the kind that a text names, such as all chairs, instead of the best one: those whose
         similarity lies at least 0.75 of the way from the median region to the best one (by votes).
       keep_outliers: Keeps the Gaussians that stand apart from the rest of an answer. By default DBSCAN drops them, and
@@ -214,7 +214,7 @@ class Query(_FieldVerb):
     up: Direction[Option[tuple[float, float, float] | None]] = None
     by: Option[By] = "votes"
     threshold: Annotated[Option[float | None], Range(-1, 1)] = None
-    min_rank: Annotated[Option[float], Range(0, 1)] = 0.82
+    min_rank: Annotated[Option[float | None], Range(0, 1)] = None
     all: Option[bool] = False
     keep_outliers: Option[bool] = False
     views: Annotated[Option[int], Range(0, 1000)] = 3

@@ -29,7 +29,7 @@ from jsecon.paper.queries import select_by_code
 from jsecon.programs import stored_jit
 from jsecon.query.grouping import join_fragments, parts_fallback, regions_with
 from jsecon.query.outliers import OutlierResult, split_outliers
-from jsecon.query.rules import ALL_OF_CLASS, ONE_REGION, RULES, QueryRules
+from jsecon.query.rules import ABSENT, ALL_OF_CLASS, ONE_REGION, RULES, QueryRules
 from jsecon.query.scores import score_text, unrelated_words, word_similarities
 from jsecon.types import Array, LanguageField, Selection, Votes
 
@@ -49,10 +49,14 @@ class RegionMatch(NamedTuple):
     """Probability that the best region shows what the text names (`answer_confidence`); NaN without such words."""
     presence: Float[Array, ""] | None = None
     """Probability that the text is true of the best region; None without `QueryRules.logits`."""
+    state: Int[Array, ""] | np.ndarray | None = None
+    """Index of `rules.STATES`: whether the scene has what the text names; None of a region in place of a text."""
 
 
 export.register_namedtuple_serialization(RegionMatch, serialized_name="jsecon.RegionMatch")  # for `stored_jit`
-NO_REGIONS = RegionMatch(np.zeros(0, bool), np.asarray(-1, np.int32), np.asarray(0.0, np.float32))
+NO_REGIONS = RegionMatch(
+    np.zeros(0, bool), np.asarray(-1, np.int32), np.asarray(0.0, np.float32), state=np.asarray(ABSENT)
+)
 """The match of a field without regions."""
 
 
@@ -145,7 +149,7 @@ def _match(embeddings, pixels, overlap, queries, excluded, words, rules: QueryRu
         def match_text(text):
             scores = score_text(embeddings, text, pixels, words, word_scores, rules)
             chosen = regions_with(scores.best, scores.similarity, scores.known, embeddings, overlap, rules)
-            return scores, chosen & scores.known & scores.accepted
+            return scores, chosen & scores.known & (scores.state > ABSENT)
 
         scores, chosen = jax.vmap(match_text)(texts)
         return scores, chosen.any(0), jnp.max(jnp.where(chosen, scores.similarity, -jnp.inf), axis=0)
@@ -156,7 +160,7 @@ def _match(embeddings, pixels, overlap, queries, excluded, words, rules: QueryRu
         # Equal up to rounding: a text that is both included and excluded matches nothing.
         chosen &= ~(rejected & (against >= similarity - 1e-5))
     # The best region of a text is before those that join it, whose similarity may be larger: similarities span 2.
-    is_best = jnp.any((jnp.arange(len(embeddings)) == scores.best[:, None]) & scores.accepted[:, None], axis=0)
+    is_best = jnp.any((jnp.arange(len(embeddings)) == scores.best[:, None]) & (scores.state > ABSENT)[:, None], axis=0)
     best = jnp.argmax(jnp.where(chosen, similarity + 4.0 * is_best, -jnp.inf))
     matches = jnp.any(chosen)
 
@@ -173,6 +177,7 @@ def _match(embeddings, pixels, overlap, queries, excluded, words, rules: QueryRu
         jnp.nanmax(jnp.where(known, scores.rank, jnp.nan)),
         jnp.nanmax(jnp.where(known, scores.confidence, jnp.nan)),
         None if presence is None else jnp.where(matches, presence[best], jnp.max(presence)),
+        jnp.where(matches, jnp.max(scores.state), ABSENT),
     )
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from jsecon.errors import require
 from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction, ratio, vote_columns
-from jsecon.query.rules import RULES, QueryRules
+from jsecon.query.rules import ABSENT, RULES, QueryRules
 from jsecon.query.scores import (
     presence_prob,
     region_similarities,
@@ -91,15 +91,15 @@ def _classes(embeddings, texts, pixels, votes, words, rules: QueryRules, standar
     def of_best(table):
         return jnp.take_along_axis(table, best[:, None], axis=1)[:, 0]
 
-    rank = presence = None
+    standing = presence = None
     if words is not None:
         scores = word_similarities(embeddings, words, rules.retrieval)
         count = jnp.sum(jnp.isfinite(scores), axis=0)
         below = jnp.sum(scores < of_best(plain), axis=0, dtype=plain.dtype)
-        rank = jnp.where(count > 0, below / jnp.maximum(count, 1), 1.0)
+        standing = (jnp.where(count > 0, below / jnp.maximum(count, 1), 1.0), None)
     if (logits := rules.logits) is not None:
         presence = of_best(jax.vmap(lambda text: presence_prob(embeddings, text, logits), out_axes=1)(texts))
-    accepted = rules.accept(rank, of_best(plain), presence) & known & jnp.any(valid)
+    accepted = (rules.judge(standing, of_best(plain), presence) > ABSENT) & known & jnp.any(valid)
     count = votes.regions.shape[0]
 
     def sums(allowed):

@@ -28,11 +28,11 @@ from jsecon.field.regions import mean_residuals
 from jsecon.field.similarity import Number, similarities
 from jsecon.numerics import normalize
 from jsecon.query.outliers import best_cluster
-from jsecon.query.rules import QueryRules
+from jsecon.query.rules import ABSENT, QueryRules
 from jsecon.query.scores import (
     presence_prob,
-    rank_among_words,
     region_similarities,
+    standing_among_words,
     unrelated_words,
     word_similarities,
 )
@@ -101,7 +101,7 @@ def parts_fallback(
 
     The parts whose relative score reaches PART_SCORE are clustered. The cluster with the best upper scores is pooled
     into one embedding. It answers if the best region has less than MIN_REGION_RATIO of its similarity with the text,
-    and the rules accept it, measured against the parts that match unrelated words best.
+    and the rules do not judge it absent, measured against the parts that match unrelated words best.
 
     Args:
       field: Field with parts.
@@ -127,13 +127,13 @@ def parts_fallback(
         return np.bincount(rows[rows >= 0], minlength=len(parts.weight)).astype(np.float32)
 
     inside = count(part[mask]) / np.maximum(count(part), 1.0)
-    pooled, similar, rank = _pooled(parts.embeddings, parts.weight, inside, text, words, retrieval=rules.retrieval)
+    pooled, similar, standing = _pooled(parts.embeddings, parts.weight, inside, text, words, retrieval=rules.retrieval)
     presence = None if rules.logits is None else presence_prob(pooled[None], text, rules.logits)[0]
-    accepted = rules.accept(None if words is None else rank, similar, presence)
-    if not mask.any() or float(region_score) >= MIN_REGION_RATIO * float(similar) or not bool(accepted):
+    state = rules.judge(standing, similar, presence)
+    if not mask.any() or float(region_score) >= MIN_REGION_RATIO * float(similar) or int(state) == ABSENT:
         return None
-    region = jnp.asarray(-1, jnp.int32)
-    return Selection(jnp.asarray(mask), jnp.asarray(similarity), region, similar, rank, None, presence)
+    region, rank = jnp.asarray(-1, jnp.int32), jnp.asarray(jnp.nan) if standing is None else standing[0]
+    return Selection(jnp.asarray(mask), jnp.asarray(similarity), region, similar, rank, None, presence, state)
 
 
 @functools.partial(jax.jit, static_argnames="retrieval")
@@ -154,10 +154,19 @@ def part_scores(
 @functools.partial(jax.jit, static_argnames="retrieval")
 def _pooled(
     embeddings: Array, weight: Array, inside: Array, text: Array, words: Array | None, *, retrieval: str
-) -> tuple[Array, Array, Array]:
-    """Embedding (E,) of P parts, of each the share `inside` (P,), its similarity, and its rank among the words."""
+) -> tuple[Array, Array, tuple[Array, Array] | None]:
+    """Embedding (E,) of P parts, of each the share `inside` (P,), its similarity, and its standing among the words."""
     pooled = normalize(jnp.sum((weight * inside)[:, None] * embeddings, axis=0))
     similar = region_similarities(pooled[None], text, words, retrieval)[0][0]
     if words is None:
-        return pooled, similar, jnp.asarray(jnp.nan)
-    return pooled, similar, rank_among_words(similar, text, words, word_similarities(embeddings, words, retrieval))
+        return pooled, similar, None
+    of_parts, known = region_similarities(embeddings, text, words, retrieval)
+    share = known / jnp.maximum(jnp.sum(known), 1)
+    reach = similar, similar - jnp.sum(share * of_parts)
+    return (
+        pooled,
+        similar,
+        standing_among_words(
+            reach, text, words, word_similarities(embeddings, words, retrieval), known.astype(text.dtype)
+        ),
+    )

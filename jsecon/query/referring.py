@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from jsecon.query.expressions import ANCHORED_ORDERS, Condition, NounPhrase
 from jsecon.query.object_shapes import ObjectShapes
 from jsecon.query.relations import SATISFIED, Viewpoint, between_scores, order_values, pair_scores
+from jsecon.query.rules import FOUND
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,6 +28,8 @@ class Object:
     """(M,) its Gaussians."""
     shape: ObjectShapes
     """Its box and points, in the field's world."""
+    state: int = FOUND
+    """Whether the scene has what the phrase names, an index of `rules.STATES`."""
     conditions: dict[str, float] = dataclasses.field(default_factory=dict)
     """Score of each condition that was put to it, by the condition in words."""
 

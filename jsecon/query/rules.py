@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 
 from jsecon.errors import require_one_of
 from jsecon.field.membership import SHARE_THRESHOLD
@@ -13,11 +14,14 @@ from jsecon.vision.protocols import Logits
 
 RETRIEVALS = ("contrast", "cosine")
 """Ways to compare a text with regions: what sets it apart from unrelated words, or the plain cosine (the paper)."""
+STATES = ("absent", "unsure", "found")
+"""Whether the scene has what a text names. If "unsure", the best match is selected, and may be something else."""
+ABSENT, UNSURE, FOUND = range(3)
+MIN_MARGIN, FOUND_MARGIN = 1.1, 2.1
+"""Margins among unrelated words (`standing_among_words`) from which a text is unsure, and from which it is found."""
 MIN_RANK = 0.82
-"""Smallest share of unrelated words (`LanguageField.unrelated_words`) that must match the scene less than the text
-does. It is the least that refuses 0.8 of the absent texts with simulated CLIP at medium noise. Refused of these, and
-kept of the others: there 0.81 and 0.95, with errors that views share 0.78 and 0.49; on real words (ConSE, 15 classes of
-replica_apartment_0) 0.95 and 0.93, with jsecon's own masks 0.94 and 0.73."""
+"""Smallest share of unrelated words (`LanguageField.unrelated_words`) that must match a region less than its class of
+a list does. Of whole scenes it is the least that refuses 0.8 of absent texts with simulated CLIP at medium noise."""
 MIN_COSINE = 0.2
 """Smallest cosine of the best region, for fields without unrelated words. The paper has such a threshold and does not
 state it. In CLIP ViT-B/16 an image has a cosine of 0.25 to 0.35 with a text that fits and 0.1 to 0.2 with another."""
@@ -34,10 +38,12 @@ class QueryRules:
 
     retrieval: str = static(default="contrast")
     """One of RETRIEVALS. A field without unrelated words is always searched by "cosine"."""
-    min_rank: Number = MIN_RANK
-    """Smallest share of unrelated words that must match the scene less than the text does; 0 refuses no text."""
+    min_rank: Number | None = None
+    """Smallest share of unrelated words that must match the scene less than the text does, else it is absent; 0 refuses
+    no text. None judges by the margin among these words."""
     min_score: Number | None = None
-    """Smallest similarity of the best region, in place of `min_rank`; a probability where there are `logits`."""
+    """Smallest similarity of the best region, in place of a comparison with words; a probability where there are
+    `logits`."""
     duplicate_cosine: Number | None = ALIKE_THRESHOLD
     """Cosine from which two regions are one object seen twice, and both answer; None disables it."""
     fragment_score: Number | None = 0.5
@@ -59,15 +65,23 @@ class QueryRules:
         """Raises ValueError for an unknown retrieval."""
         require_one_of("QueryRules", self.retrieval, RETRIEVALS, f"{RETRIEVALS[0]!r} is the default.")
 
-    def accept(self, rank, similarity, presence):
-        """Decides whether the scene answers a text: the one refusal of texts, of regions and of parts.
+    def judge(self, standing, similarity, presence):
+        """Decides whether the scene has what a text names: the one judgement of texts, of regions and of parts.
 
-        `rank` is None without unrelated words, and `presence`, the probability that the text is true, without `logits`.
+        `standing` is the text's rank and margin among unrelated words (`standing_among_words`), None without such
+        words; the margin is None where a region is compared with a list of classes. `presence`, the probability that
+        the text is true, is None without `logits`. Returns an index of STATES.
         """
-        if self.min_score is None and rank is not None:
-            return rank >= self.min_rank
-        value, default = (similarity, MIN_COSINE) if presence is None else (presence, MIN_PRESENCE)
-        return value >= (default if self.min_score is None else self.min_score)
+        if self.min_score is not None or standing is None:
+            value, default = (similarity, MIN_COSINE) if presence is None else (presence, MIN_PRESENCE)
+            return FOUND * (value >= (default if self.min_score is None else self.min_score))
+        rank, margin = standing
+        if margin is None:
+            return FOUND * (rank >= (MIN_RANK if self.min_rank is None else self.min_rank))
+        state = UNSURE * (margin >= MIN_MARGIN) + (FOUND - UNSURE) * (margin >= FOUND_MARGIN)
+        if self.min_rank is None:
+            return state
+        return jnp.where(rank >= self.min_rank, jnp.maximum(state, UNSURE), ABSENT)
 
 
 RULES = QueryRules()

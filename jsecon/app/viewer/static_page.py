@@ -71,7 +71,8 @@ def page(field: LanguageField, answers: Sequence[Answer], *, title: str) -> str:
     for answer in answers:
         mask = np.packbits(np.asarray(answer.mask)[drawn], bitorder="little").tobytes()
         score = float(answer.selection.score)
-        texts.append({"text": str(answer.query), "score": score, "mask": base64.b64encode(mask).decode()})
+        packed = base64.b64encode(mask).decode()
+        texts.append({"text": str(answer.query), "state": answer.state, "score": score, "mask": packed})
     scene = {
         "count": int(drawn.sum()),
         "regions": field.regions.count,
