@@ -19,7 +19,7 @@ from jsecon.app.catalogue import main_regions, region_objects
 from jsecon.app.records import Answer, Object, Query, gaussian_rows, rounded, source_points, world_scale
 from jsecon.field.columns import votes_of_rows
 from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction_of_regions
-from jsecon.query.answer import match_regions
+from jsecon.query.answer import RegionMatch, match_regions
 from jsecon.query.expressions import parse_expression
 from jsecon.query.grouping import join_fragments
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
@@ -43,25 +43,28 @@ def choose_shades(
     thing. Each is far from the word and near to its own shade.
 
     The embedder's `narrower(text)`, if it has one, lists texts that name a part of what the text names. With `every`,
-    all of these that match replace the text, instead of the best of them.
+    all of these that match replace the text, instead of the best of them. A text whose own match no shade finds stays.
     """
     if not hasattr(embedder, "narrower"):
         return list(texts)
 
-    def score(text: str, rules: QueryRules) -> float:
-        match = match_regions(field, jnp.asarray(embedder.embed_text([text])), rules)
-        return float(match.score) if int(match.state) == FOUND else -np.inf
+    def match(text: str, rules: QueryRules) -> RegionMatch:
+        return match_regions(field, jnp.asarray(embedder.embed_text([text])), rules)
 
     replaced: list[str] = []
     for text in texts:
         narrower = embedder.narrower(text)
         best: list[str] = []
-        if narrower and np.isinf(score(text, rules)):
+        if narrower and int((own := match(text, rules)).state) < FOUND:
             # Of n attempts one succeeds by chance as often as one attempt that is n times as strict.
             least = MIN_RANK if rules.min_rank is None else rules.min_rank
             strict = dataclasses.replace(rules, min_rank=1 - (1 - least) / len(narrower))
-            scores = {option: score(option, strict) for option in narrower}
-            best = [option for option in sorted(narrower, key=scores.__getitem__) if scores[option] > -np.inf]
+            matches = {option: match(option, strict) for option in narrower}
+            best = sorted(
+                (o for o, m in matches.items() if int(m.state) == FOUND), key=lambda o: float(matches[o].score)
+            )
+            if int(own.state) > ABSENT and int(own.region) not in [int(matches[option].region) for option in best]:
+                best = []  # the match is another thing, which no shade fits
         replaced.extend(best[0 if every else -1 :] or [text])
     return replaced
 

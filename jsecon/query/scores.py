@@ -26,9 +26,9 @@ of 9 cases, at 1.6 times its height in half of them. Fitted to answers on simula
 something that is there, by regions of a tracker and by consensus (experiments/calibration.py). Expected calibration
 error in other such rooms: 0.04 (tracks) and 0.07 (consensus); on real words about 0.24 (given masks) and 0.43 (jsecon's
 own)."""
-HEIGHT_WEIGHT = 0.4
-"""Weight of the heights in the margin of a text among unrelated words. At 0.3 to 0.5 both the colours of ray-traced
-rooms (experiments/colour_refusal.py) and simulated CLIP at high noise are judged well; at 0 the latter is not."""
+HEIGHT_WEIGHT = 0.5
+"""Weight of the heights in the margin of a text among unrelated words: so many deviations of heights as of similarities
+are reached by absent colours in ray-traced rooms, and more by what is present with simulated CLIP at high noise."""
 
 
 def unrelated_words(field: LanguageField) -> Array | None:
@@ -138,10 +138,10 @@ def standing_among_words(
     The rank is the share of the words whose largest similarity with a region is smaller; 1 if no word is left. The
     margin is in standard deviations d of the words, with s their largest similarities and h their heights (`_height`):
 
-        (s - mean_w s_w) / d(s_w) + HEIGHT_WEIGHT (h - mean_w h_w) / d(h_w)
+        max((s - mean_w s_w) / d(s_w), HEIGHT_WEIGHT (h - mean_w h_w) / d(h_w))
 
-    The first part suits colours, whose similarities mean the same in all scenes. The second part suits CLIP, where some
-    texts are more similar to all regions than others are. In a scene of few things the words differ more.
+    The first suits colours, whose similarities mean the same in all scenes. The second suits CLIP, where some texts are
+    more similar to all regions than others are. In a scene of few things the words differ more.
 
     The tenth of the words that is nearest to the text is left out: the scene often has what is like it. `reach` has the
     largest similarity of the text and its height, and `scores` are the similarities of the words.
@@ -160,8 +160,8 @@ def standing_among_words(
         spread = jnp.sqrt(jnp.sum(jnp.where(known, of_words - level, 0.0) ** 2) / count)
         return (value - level) / jnp.maximum(spread, 1e-6)
 
-    margin = deviations(reach[0], largest)
-    margin += HEIGHT_WEIGHT * deviations(reach[1], jax.vmap(_height, in_axes=(0, None))(scores, weight))
+    heights = jax.vmap(_height, in_axes=(0, None))(scores, weight)
+    margin = jnp.maximum(deviations(reach[0], largest), HEIGHT_WEIGHT * deviations(reach[1], heights))
     below = jnp.sum(known & (largest[others] < reach[0]), dtype=text.dtype) / count
     return jnp.where(jnp.any(known), below, 1.0), jnp.where(jnp.any(known), margin, jnp.inf)
 
