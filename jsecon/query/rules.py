@@ -17,7 +17,7 @@ RETRIEVALS = ("contrast", "cosine")
 STATES = ("absent", "unsure", "found")
 """Whether the scene has what a text names. If "unsure", the best match is selected, and may be something else."""
 ABSENT, UNSURE, FOUND = range(3)
-MIN_MARGIN, FOUND_MARGIN = 0.75, 1.45
+MIN_MARGIN, FOUND_MARGIN = 0.7, 1.45
 """Margins among unrelated words (`standing_among_words`) from which a text is unsure, and from which it is found."""
 MIN_RANK = 0.82
 """Smallest share of unrelated words (`LanguageField.unrelated_words`) that must match a region less than its class of
