@@ -29,7 +29,7 @@ from jsecon.paper.queries import select_by_code
 from jsecon.programs import stored_jit
 from jsecon.query.grouping import join_fragments, parts_fallback, regions_with
 from jsecon.query.outliers import OutlierResult, split_outliers
-from jsecon.query.rules import ABSENT, ALL_OF_CLASS, ONE_REGION, RULES, QueryRules
+from jsecon.query.rules import ABSENT, ALL_OF_CLASS, FOUND, ONE_REGION, RULES, QueryRules
 from jsecon.query.scores import score_text, unrelated_words, word_similarities
 from jsecon.types import Array, LanguageField, Selection, Votes
 
@@ -49,8 +49,8 @@ class RegionMatch(NamedTuple):
     """Probability that the best region shows what the text names (`answer_confidence`); NaN without such words."""
     presence: Float[Array, ""] | None = None
     """Probability that the text is true of the best region; None without `QueryRules.logits`."""
-    state: Int[Array, ""] | np.ndarray | None = None
-    """Index of `rules.STATES`: whether the scene has what the text names; None of a region in place of a text."""
+    state: Int[Array, ""] | np.ndarray = np.asarray(FOUND, np.int32)
+    """Index of `rules.STATES`: whether the scene has what the text names."""
 
 
 export.register_namedtuple_serialization(RegionMatch, serialized_name="jsecon.RegionMatch")  # for `stored_jit`

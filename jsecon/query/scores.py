@@ -72,7 +72,8 @@ def score_text(
     if rules.retrieval != "cosine" and words is not None:  # the plain cosine is the paper's, without weights
         weighted = jnp.where(similarity > 0, similarity * weight, similarity)
     best = jnp.argmax(jnp.where(known, weighted, -jnp.inf))
-    standing, rank, confidence = None, *[jnp.asarray(jnp.nan, similarity.dtype)] * 2
+    standing = None
+    rank = confidence = jnp.asarray(jnp.nan, similarity.dtype)
     if words is not None and word_scores is not None:
         weight = jnp.where(known, weight, 0.0)
         reach = jnp.max(jnp.where(known, similarity, -jnp.inf)), _height(similarity, weight)
