@@ -115,8 +115,8 @@ def load_replica(folder: str | Path, *, voting_every: int) -> tuple[Capture, np.
 
 def points_as_gaussians(capture: Capture, options: Options) -> tuple[DepthPoints, Gaussians]:
     """The back-projected depths of all views, one per voxel, and a Gaussian for each."""
-    everything = np.arange(len(capture.names))
-    points = points_from_depth(capture, voxel=options.voxel_m, stride=options.stride, frames=everything)
+    every_view = dataclasses.replace(capture, held_out=np.zeros_like(capture.held_out))
+    points = points_from_depth(every_view, voxel=options.voxel_m, stride=options.stride)
     gaussians = gaussians_from_points(
         points.points, points.colors, opacity=options.opacity, scale=options.scale, max_scale=2 * options.voxel_m
     )

@@ -4,8 +4,7 @@
     python -m experiments.vision_speed --graphs models      seconds: graphs of true size by experiments.export_models
 
 `masks` counts the true masks of rooms that guided prompts and the grid find, at two levels of SAM. `seconds` times
-every graph in a folder of models, adds up a frame, and compares lower precisions (written by `--prepare`) with full
-precision; the machine should do nothing else.
+every graph in a folder of models and adds up a frame; the machine should do nothing else.
 """
 
 import dataclasses
@@ -17,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.distance import cosine, pdist
 
 from experiments import results
 from experiments.datasets.plain_room import make_room
@@ -26,7 +24,7 @@ from experiments.rooms.raycast import render_views
 from experiments.rooms.room import crowded_room
 from experiments.simulated_vision.exact_sam import ExactGridSam, ExactSam, found_shares, level_labels, masks_of
 from jsecon.networks.clip import ClipEmbedder
-from jsecon.networks.hub import SUFFIXES, Precision, Role, find_files
+from jsecon.networks.hub import Role, find_files
 from jsecon.networks.sam import Level, SamGraphs
 from jsecon.networks.sam2 import follow, open_sam2
 from jsecon.process import cores
@@ -40,7 +38,7 @@ GUIDED = 70
 """guided prompts of a frame"""
 REGIONS = 40
 """regions of a frame that are embedded"""
-TEXTS = ("a red mug", "grey sofa", "the small green plant on the window sill", "keyboard", "tea", "wooden table")
+TEXT = "a red mug"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,8 +49,6 @@ class Options:
     """Folder with models of true size; empty: masks are counted instead."""
     roles: tuple[Role, ...] = ("segmenter", "embedder", "tracker")
     """Which of them are timed."""
-    prepare: bool = False
-    """Writes the graphs in lower precisions first, and times nothing."""
     rooms: tuple[int, ...] = (0, 1, 2)
     """Seeds, of crowded and of plain rooms each."""
     views: int = 3
@@ -68,9 +64,6 @@ def main(options: Options) -> dict:
     metrics = json.loads(kept.read_text()) if kept.exists() else {}
     if not options.graphs:
         metrics["masks"] = count_masks(options)
-    elif options.prepare:
-        write_precisions(Path(options.graphs))
-        return {}
     else:
         metrics["seconds"] = metrics.get("seconds", {}) | time_models(Path(options.graphs), options)
     results.save(folder, options, metrics, table(metrics))
@@ -117,22 +110,21 @@ def _count_frame(row: dict[str, Any], frame: np.ndarray, labels: dict[str, np.nd
 
 
 def time_models(folder: Path, options: Options) -> dict[str, Any]:
-    """Times the graphs of each model in a folder, and compares lower precisions with full precision."""
+    """Times the graphs of each model in a folder."""
     room = make_room(options.rooms[0])
     cameras = room_cameras(room, views=1, width=options.width, height=options.height)
     frame, masks = render_views(room, cameras)[0][0], masks_of(level_labels(room, cameras[0])["l"], LEAST_PX)
     kinds = {
         "segmenter": _time_segmenter,
-        "embedder": lambda model, precision, frame: _time_embedder(model, precision, frame, masks[:8]),
+        "embedder": lambda model, frame: _time_embedder(model, frame, masks[:8]),
         "tracker": _time_tracker,
     }
     measured: dict[str, Any] = {}
     for model in sorted(path for path in folder.iterdir() if path.is_dir()):
         role = role_of(model)
         if role in options.roles:
-            for precision in precisions_of(model):
-                measured.setdefault(model.name, {"role": role})[precision] = kinds[role](model, precision, frame)
-                print(model.name, precision, measured[model.name][precision], flush=True)
+            measured[model.name] = {"role": role} | kinds[role](model, frame)
+            print(model.name, measured[model.name], flush=True)
     return measured
 
 
@@ -141,31 +133,6 @@ def role_of(model: Path) -> Role:
     if (model / "onnx" / "memory_encoder.onnx").is_file():
         return "tracker"
     return "segmenter" if (model / "onnx" / "vision_encoder.onnx").is_file() else "embedder"
-
-
-def precisions_of(model: Path) -> list[Precision]:
-    """Returns the precisions of the graphs in a folder."""
-    first = "model" if role_of(model) == "embedder" else "vision_encoder"
-    return [p for p, suffix in SUFFIXES.items() if any(model.rglob(f"{first}{suffix}.onnx"))]
-
-
-def write_precisions(folder: Path) -> None:
-    """Writes the graphs of every model in half and in 8-bit precision beside the full ones, as public exports do."""
-    import onnx
-    from onnxruntime.quantization import QuantType, quantize_dynamic
-    from onnxruntime.transformers.float16 import convert_float_to_float16
-
-    full = [path for path in sorted(folder.rglob("*.onnx")) if not path.stem.endswith(("_fp16", "_quantized"))]
-    for path in full:
-        if role_of(path.parents[1]) == "tracker":
-            continue
-        half = path.with_name(f"{path.stem}_fp16.onnx")
-        eight = path.with_name(f"{path.stem}_quantized.onnx")
-        if not half.exists():
-            onnx.save(convert_float_to_float16(onnx.load(str(path)), keep_io_types=True), str(half))
-        if not eight.exists():
-            quantize_dynamic(path, eight, weight_type=QuantType.QUInt8)
-        print(path, flush=True)
 
 
 def _seconds(call: Callable[[], Any]) -> float:
@@ -180,44 +147,24 @@ def _seconds(call: Callable[[], Any]) -> float:
     return (time.process_time() - started) / cores()
 
 
-def _time_segmenter(model: Path, precision: Precision, frame: np.ndarray) -> dict[str, Any]:
-    graphs = SamGraphs(*find_files(model, "segmenter", precision))
+def _time_segmenter(model: Path, frame: np.ndarray) -> dict[str, Any]:
+    graphs = SamGraphs(*find_files(model, "segmenter"))
     encoder = _seconds(lambda: graphs.encode(frame))
     encoded = graphs.encode(frame)
     points = np.random.default_rng(0).uniform(0, 300, (8, 2)).astype(np.float32)
-    list(graphs.decode(encoded, points[:2]))  # tries several prompts a run
-    decoder = {}
-    for batch in (1, 8) if graphs.batch > 1 else (1,):
-        graphs.batch = batch
-        decoder[batch] = _seconds(lambda: list(graphs.decode(encoded, points))) / len(points)
-    reference = encoded.features
-    if precision != "fp32":
-        reference = SamGraphs(*find_files(model, "segmenter", "fp32")).encode(frame).features
-    pairs = ([own[name].astype(np.float64).ravel() for own in (encoded.features, reference)] for name in reference)
-    cosines = [1 - cosine(*pair) for pair in pairs]
-    prompt = min(decoder.values())
+    prompt = _seconds(lambda: [graphs.decode(encoded, point) for point in points]) / len(points)
     frames = {"guided": encoder + GUIDED * prompt, "grid": encoder + GRID * prompt}
-    return {"encoder": encoder, "prompt": decoder, "frame": frames, "least_cosine": float(min(cosines))}
+    return {"encoder": encoder, "prompt": {1: prompt}, "frame": frames}
 
 
-def _time_embedder(model: Path, precision: Precision, frame: np.ndarray, masks: np.ndarray) -> dict[str, Any]:
-    def embed(embedder: ClipEmbedder) -> tuple[np.ndarray, np.ndarray]:
-        return embedder.embed_regions(frame, masks), embedder.embed_text(list(TEXTS))
-
-    embedder = ClipEmbedder(model, precision=precision)
-    regions, texts = embed(embedder)
+def _time_embedder(model: Path, frame: np.ndarray, masks: np.ndarray) -> dict[str, Any]:
+    embedder = ClipEmbedder(model)
     crop = {n: _seconds(lambda n=n: embedder.embed_regions(frame, masks[:n])) / n for n in (1, len(masks))}
-    text = _seconds(lambda: embedder.embed_text([TEXTS[0]]))
-    embedder.close()
-    exact = (regions, texts) if precision == "fp32" else embed(ClipEmbedder(model, precision="fp32"))
-    cosines = [float((one * other).sum(1).min()) for one, other in zip((regions, texts), exact)]
-    others = [float(1 - pdist(rows, "cosine").mean()) for rows in exact]
-    frame_seconds = REGIONS * min(crop.values())
-    figures = {"crop": crop, "frame": frame_seconds, "text": text}
-    return figures | {"least_cosine": cosines[0], "least_cosine_texts": cosines[1], "others": others}
+    text = _seconds(lambda: embedder.embed_text([TEXT]))
+    return {"crop": crop, "frame": REGIONS * min(crop.values()), "text": text}
 
 
-def _time_tracker(model: Path, precision: Precision, frame: np.ndarray) -> dict[str, Any]:
+def _time_tracker(model: Path, frame: np.ndarray) -> dict[str, Any]:
     graphs = open_sam2(model)
     frames = np.stack([np.roll(frame, 3 * t, 1) for t in range(3)])
     prompt = np.array([[200.0, 150.0]], np.float32), np.array([1], np.int32)
@@ -245,24 +192,18 @@ def table(metrics: dict) -> str:
                     count = mine["prompts"] / row["frames"]
                     rows.append((kind, level, prompts, f"{count:.0f}", row["true"], *mine["found"]))
         parts.append(results.table(header, rows))
-    header = ("model", "precision", "encoder, s", "prompt or crop, s", "frame, s", "by the grid, s", "least cosine")
-    texts_header = ("model", "precision", "text, s", "least cosine of texts", "mean of two crops", "of two texts")
-    rows, texts = [], []
-    for model, figures in metrics.get("seconds", {}).items():
-        for precision, row in figures.items():
-            if precision != "role":
-                each = row.get("prompt", row.get("crop", {"": row.get("object")}))
-                batch = min(each, key=each.get)
-                single = f"{each[batch]:.3f}{f' (batch {batch})' if batch else ''}"
-                frame = row["frame"] if isinstance(row["frame"], dict) else {"guided": row["frame"]}
-                grid = f"{frame['grid']:.0f}" if "grid" in frame else "-"
-                encoder = f"{row['encoder']:.2f}" if "encoder" in row else "-"
-                cosine = f"{row['least_cosine']:.5f}" if "least_cosine" in row else "-"
-                rows.append((model, precision, encoder, single, f"{frame['guided']:.1f}", grid, cosine))
-                if "text" in row:
-                    cosines = (f"{value:.5f}" for value in (row["least_cosine_texts"], *row["others"]))
-                    texts.append((model, precision, f"{row['text']:.3f}", *cosines))
-    parts += [results.table(*given) for given in ((header, rows), (texts_header, texts)) if given[1]]
+    header = ("model", "encoder, s", "prompt or crop, s", "text, s", "frame, s", "by the grid, s")
+    rows = []
+    for model, row in metrics.get("seconds", {}).items():
+        each = row.get("prompt", row.get("crop", {"": row.get("object")}))
+        batch = min(each, key=each.get)
+        single = f"{each[batch]:.3f}{f' (batch {batch})' if batch else ''}"
+        frame = row["frame"] if isinstance(row["frame"], dict) else {"guided": row["frame"]}
+        grid = f"{frame['grid']:.0f}" if "grid" in frame else "-"
+        encoder, text = (f"{row[name]:.2f}" if name in row else "-" for name in ("encoder", "text"))
+        rows.append((model, encoder, single, text, f"{frame['guided']:.1f}", grid))
+    if rows:
+        parts.append(results.table(header, rows))
     return "\n\n".join(parts)
 
 

@@ -10,7 +10,7 @@ from clip_files import COLOURS, END, START, fixture, vocabulary, write_clip, wri
 from hypothesis import given, settings, strategies as st
 from tokenizers import decoders
 
-from jsecon.networks.clip import ClipEmbedder, masked_crop, read_preprocessing
+from jsecon.networks.clip import ClipEmbedder, _masked_crop, read_preprocessing
 from jsecon.networks.tokenizer import CLIP_LENGTH, TextTokenizer
 from jsecon.vision.protocols import CANONICAL, Embedder
 from jsecon.vision.unrelated_words import UNRELATED_WORDS, cached_unrelated_words
@@ -69,12 +69,12 @@ def test_crops_are_those_of_langsplat(frame):
     inside = zeroed[5 : 5 + (32 - 5), 20 : 20 + (30 - 20)]  # width and height are differences: the last are lost
     square = np.zeros((27, 27, 3), np.uint8)
     square[:, (27 - 10) // 2 : (27 - 10) // 2 + 10] = inside
-    np.testing.assert_array_equal(masked_crop(frame, mask, 64), cv2.resize(square, (64, 64)))
+    np.testing.assert_array_equal(_masked_crop(frame, mask, 64), cv2.resize(square, (64, 64)))
     dot = np.zeros_like(mask)
     dot[3, 4] = True
-    assert (masked_crop(frame, dot, 8) == frame[3, 4]).all()
+    assert (_masked_crop(frame, dot, 8) == frame[3, 4]).all()
     with pytest.raises(ValueError, match="at least one pixel"):
-        masked_crop(frame, np.zeros_like(mask), 8)
+        _masked_crop(frame, np.zeros_like(mask), 8)
 
 
 def test_embeddings_are_kept_by_content(folders, frame, masks, tmp_path, monkeypatch):

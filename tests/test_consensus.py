@@ -5,8 +5,8 @@ from hypothesis import given, settings, strategies as st
 from scipy import sparse
 
 from jsecon.association.consensus import (
-    average_linkage,
-    group_by_consensus,
+    _average_linkage,
+    _group_by_consensus,
     pieces_on_masks,
     track_masks,
 )
@@ -110,7 +110,7 @@ def test_average_linkage_joins_what_the_slow_twin_joins(seed, count, least):
     both = rng.uniform(0.1, 2.0, (count, count))
     ratio = rng.uniform(0.0, 1.0, (count, count))
     both, ratio = both + both.T, (ratio + ratio.T) / 2
-    got = average_linkage(both * ratio, both, least_ratio=least)
+    got = _average_linkage(both * ratio, both, least_ratio=least)
     assert same_partition(got, joined_pair_by_pair(both * ratio, both, least))
     np.testing.assert_array_equal(np.unique(got), np.arange(got.max() + 1))
 
@@ -118,15 +118,15 @@ def test_average_linkage_joins_what_the_slow_twin_joins(seed, count, least):
 def test_average_linkage_of_ties_large_sums_and_pairs_that_are_hardly_seen_together():
     for scale in (1e-20, 1.0, 1e20):
         both = np.full((40, 40), scale)
-        assert average_linkage(both, both, least_ratio=1.0).max() == 0  # all pairs alike
-        assert average_linkage(0.5 * both, both, least_ratio=0.6).max() == 39
+        assert _average_linkage(both, both, least_ratio=1.0).max() == 0  # all pairs alike
+        assert _average_linkage(0.5 * both, both, least_ratio=0.6).max() == 39
     rng = np.random.default_rng(0)
     rows = rng.random((300, 30)).astype(np.float32) * 1e-3
     both = rows @ rows.T  # as float32 products come: not exactly symmetric sums
-    assert average_linkage(0.9 * both, both, least_ratio=0.5).max() == 0
+    assert _average_linkage(0.9 * both, both, least_ratio=0.5).max() == 0
     both = np.asarray([[1.0, 0.01], [0.01, 1.0]])  # hardly seen together
-    assert average_linkage(both, both, least_ratio=0.5, least_shared=0.0).max() == 0
-    assert average_linkage(both, both, least_ratio=0.5, least_shared=0.02).max() == 1
+    assert _average_linkage(both, both, least_ratio=0.5, least_shared=0.0).max() == 0
+    assert _average_linkage(both, both, least_ratio=0.5, least_shared=0.02).max() == 1
 
 
 def made_scene(views=12, wrong=0, seed=0):
@@ -146,20 +146,20 @@ def made_scene(views=12, wrong=0, seed=0):
 @pytest.mark.parametrize("wrong", [0, 4])
 def test_views_that_merge_everything_are_outvoted_in_any_order_of_frames_and_masks(wrong):
     membership, visible, weights, means, truth = made_scene(wrong=wrong)
-    assert same_partition(group_by_consensus(membership, visible, weights, means, pieces=24), truth)
-    cells = group_by_consensus(membership, visible, weights, means, pieces=24, agreement=2.0)  # joins no two pieces
+    assert same_partition(_group_by_consensus(membership, visible, weights, means, pieces=24), truth)
+    cells = _group_by_consensus(membership, visible, weights, means, pieces=24, agreement=2.0)  # joins no two pieces
     assert all(len(np.unique(truth[cells == cell])) == 1 for cell in np.unique(cells))
     order = np.random.default_rng(1).permutation(membership.shape[1])
-    got = group_by_consensus(membership[:, order], visible[:, ::-1], weights, means, pieces=24)
+    got = _group_by_consensus(membership[:, order], visible[:, ::-1], weights, means, pieces=24)
     assert same_partition(got, truth)
 
 
 def test_most_views_decide_and_rows_and_frames_that_disagree_are_refused(world, scene):
     membership, visible, weights, means, _ = made_scene(wrong=8)  # of 12
-    assert group_by_consensus(membership, visible, weights, means, pieces=24).max() == 0
-    assert group_by_consensus(membership, visible, weights, means, pieces=24, agreement=0.7).max() == 2
+    assert _group_by_consensus(membership, visible, weights, means, pieces=24).max() == 0
+    assert _group_by_consensus(membership, visible, weights, means, pieces=24, agreement=0.7).max() == 2
     with pytest.raises(ValueError, match="N rows"):
-        group_by_consensus(membership[1:], visible, weights, means)
+        _group_by_consensus(membership[1:], visible, weights, means)
     with pytest.raises(ValueError, match="frames"):
         track_masks(world[2][1:], scene)
     for work in (track_masks, pieces_on_masks):
@@ -171,9 +171,9 @@ def test_few_points_and_points_that_are_never_seen():
     membership, visible, weights, means, truth = made_scene()
     for count in (1, 2, 5):
         few = (part[:count] for part in (membership, visible, weights, means))
-        assert group_by_consensus(*few).max() == 0  # all of one clump
+        assert _group_by_consensus(*few).max() == 0  # all of one clump
     weights[::7] = 0.0
-    got = group_by_consensus(membership, visible, weights, means, pieces=24)
+    got = _group_by_consensus(membership, visible, weights, means, pieces=24)
     assert (got[::7] == -1).all()
     assert same_partition(got[weights > 0], truth[weights > 0])
-    assert (group_by_consensus(membership, visible, 0 * weights, means) == -1).all()
+    assert (_group_by_consensus(membership, visible, 0 * weights, means) == -1).all()

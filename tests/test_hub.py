@@ -39,8 +39,8 @@ def local(server: Hub, tmp_path, monkeypatch) -> Hub:
     return server
 
 
-def slimsam(precision=None) -> hub.HubModel:
-    model = hub.parse_model("slimsam", "segmenter", precision)
+def slimsam() -> hub.HubModel:
+    model = hub.parse_model("slimsam", "segmenter")
     assert isinstance(model, hub.HubModel)
     return model
 
@@ -64,8 +64,8 @@ def test_a_name_brings_its_files_and_no_others(local, capsys):
     assert run_cli("models", "list", "--json") == 0
     rows = json.loads(capsys.readouterr().out)["models"]
     cached = {(row["name"], row["role"]): row["cached"] for row in rows}
-    assert cached["slimsam", "segmenter"] == ["fp32"]
-    assert cached["sam2", "tracker"] == []
+    assert cached["slimsam", "segmenter"] is True
+    assert cached["sam2", "tracker"] is False
 
 
 def test_an_address_is_fetched_for_a_role(local, capsys):
@@ -82,7 +82,6 @@ def test_a_model_in_the_cache_is_used_without_a_request(local, monkeypatch):
         folder = slimsam().cached_folder
         assert folder is not None
         assert hub.parse_model(hub.cached_address(folder), "segmenter").cached_folder == folder
-        assert slimsam("fp16").cached_folder is None
     assert local.requests == []
 
 
@@ -125,17 +124,28 @@ def test_a_branch_that_moved_keeps_the_cached_commit_until_it_is_fetched(local):
     assert hub.parse_model(hub.cached_address(first), "segmenter").cached_folder == first
 
 
-@pytest.mark.parametrize(("text", "role", "precision", "clause"), [
-    ("hub:owner", "embedder", None, "hub:owner/name"), ("clap", "embedder", None, "clip, siglip2, mobileclip"),
-    ("siglp2", "embedder", None, "Did you mean siglip2"), ("a/b", "embedder", None, "Did you mean hub:a/b"),
-    ("clip", "segmenter", None, "Did you mean the embedder clip"), ("./nowhere", "tracker", None, "no folder and"),
-    ("mobileclip", "embedder", "int8", "Use fp32 or fp16"),
-    ("hub:Xenova/mobileclip_s0", "embedder", "int8", "not offered in int8"),
-    ("", "embedder", None, "no folder and no known embedder"), (" ", "segmenter", None, "no folder and no known"),
+def test_graphs_of_lower_precision_are_taken_where_there_are_no_others(local):
+    files = local.repositories[NAME].files
+    files["onnx/prompt_encoder_mask_decoder_fp16.onnx"] = GRAPH[:9]
+    assert "3 files, 1 MB, fp32" in str(hub.plan_download(slimsam()))
+    del files["onnx/vision_encoder.onnx"]
+    plan = hub.plan_download(slimsam())
+    assert "3 files, 1 MB, fp16" in str(plan)
+    folder = hub.fetch(plan)
+    assert slimsam().cached_folder == folder
+    names = [path.name for path in hub.find_files(folder, "segmenter")[:2]]
+    assert names == ["vision_encoder_fp16.onnx", "prompt_encoder_mask_decoder_fp16.onnx"]
+
+
+@pytest.mark.parametrize(("text", "role", "clause"), [
+    ("hub:owner", "embedder", "hub:owner/name"), ("clap", "embedder", "clip, siglip2, mobileclip"),
+    ("a/b", "embedder", "or hub:owner/name"), ("clip", "segmenter", "Known names: edgetam, slimsam, sam2"),
+    ("./nowhere", "tracker", "no folder and"), ("auto", "tracker", "no folder and no known tracker"),
+    ("", "embedder", "no folder and no known embedder"), (" ", "segmenter", "no folder and no known"),
 ])  # fmt: skip
-def test_what_is_no_model_is_refused(text, role, precision, clause):
+def test_what_is_no_model_is_refused(text, role, clause):
     with refused(clause):
-        hub.parse_model(text, role, precision)
+        hub.parse_model(text, role)
 
 
 def test_a_name_comes_before_a_folder_that_is_called_so(tmp_path, monkeypatch):

@@ -52,7 +52,7 @@ def test_ssim_and_loss_equal_their_definitions_one_image_at_a_time_and_together(
     batch = np.stack([images(seed=s)[0] for s in range(3)])
     together = jax.jit(jax.vmap(photometric_loss, in_axes=(0, None)))(batch, target)
     np.testing.assert_allclose(together, [photometric_loss(b, target) for b in batch], rtol=1e-5)
-    with pytest.raises(ValueError, match="same"):
+    with pytest.raises(ValueError, match="target"):
         photometric_loss(image, target[:, 1:])
     with jax.enable_x64(True):
         image, target = images(dtype=np.float64)

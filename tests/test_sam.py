@@ -59,15 +59,14 @@ def graphs_of(folder) -> SamGraphs:
 def by_definition(folder, frame, token_of_level):
     """SAM's automatic mask generator with LangSplat's levels, one point a call: masks and scores of one level."""
     graphs = graphs_of(folder)
-    graphs.batch = 1
     found, encoded = [], graphs.encode(frame)
     for point in GridPrompts(frame, 1).points:
-        ((logits, ious),) = graphs.decode(encoded, point[None])
+        logits, ious = graphs.decode(encoded, point)
         for token in token_of_level:
-            full = graphs.to_frame(logits[0, token], encoded)
+            full = graphs.to_frame(logits[token], encoded)
             stable = (full > 1).sum() / max((full > -1).sum(), 1)
-            if ious[0, token] > 0.7 and stable >= 0.85:
-                found.append((full > 0, ious[0, token], stable))
+            if ious[token] > 0.7 and stable >= 0.85:
+                found.append((full > 0, ious[token], stable))
     boxes = np.asarray([_box_of(mask) for mask, *_ in found], float)
     found = [found[i] for i in _box_nms(boxes, np.asarray([iou for _, iou, _ in found]), 0.7)]
     clean = []
@@ -133,15 +132,15 @@ def test_guided_prompts_find_the_things_of_the_grid_with_fewer_points(folders, f
         assert max((mask & other).sum() / (mask | other).sum() for other in guided) > 0.9
 
 
-def test_sam_2_takes_a_frame_stretched_to_a_square_and_one_prompt_a_run(folders, frame, tmp_path):
+def test_sam_2_takes_a_frame_stretched_to_a_square(folders, frame, tmp_path):
     graphs = graphs_of(folders["sam2", "batch"])
-    assert (graphs.batch, graphs.side, graphs.stretched) == (1, 256, True)
+    assert (graphs.side, graphs.stretched) == (256, True)
     encoded = graphs.encode(frame)
     assert encoded.scaled == (256, 256)
     cell = encoded.features["image_embeddings.2"][0, :3, 5, 5]
     np.testing.assert_allclose(255 * (cell * STD + MEAN), frame[40, 50], atol=1)  # (5.5 / 16) of height and width
-    found = list(graphs.decode(encoded, np.float32([[40, 40], [120, 80], [5, 5]])))
-    assert [masks.shape for masks, _ in found] == [(1, 3, 64, 64)] * 3
+    masks, scores = graphs.decode(encoded, np.float32([40, 40]))
+    assert (masks.shape, scores.shape) == ((3, 64, 64), (3,))
     folder = shutil.copytree(folders["sam2", "batch"], tmp_path / "other")
     config = folder / "preprocessor_config.json"
     config.write_text(json.dumps(json.loads(config.read_text()) | {"image_mean": [0.5] * 3, "image_std": [0.5] * 3}))
@@ -152,7 +151,12 @@ def test_sam_2_takes_a_frame_stretched_to_a_square_and_one_prompt_a_run(folders,
 
 def test_a_frame_without_anything_good_gives_no_masks(folders, frame, monkeypatch):
     decode = SamGraphs.decode
-    monkeypatch.setattr(SamGraphs, "decode", lambda *given: ((masks, 0.7 * ious) for masks, ious in decode(*given)))
+
+    def decode_poorly(*given):
+        masks, ious = decode(*given)
+        return masks, 0.7 * ious
+
+    monkeypatch.setattr(SamGraphs, "decode", decode_poorly)
     assert SamSegmenter(folders["sam", "batch"])(frame, 0).shape == (0, 120, 160)
 
 

@@ -13,7 +13,7 @@ from small_field import KnownTexts, make_field, unit_rows
 from experiments.export.vocabulary import write_vocabulary
 from jsecon import Scene, query_anchored, query_several
 from jsecon.networks.clip import ClipEmbedder, read_preprocessing
-from jsecon.networks.tokenizer import TextRules, TextTokenizer, read_text_rules
+from jsecon.networks.tokenizer import TextTokenizer, _TextRules, read_text_rules
 from jsecon.query.rules import MIN_COSINE, MIN_PRESENCE, QueryRules
 from jsecon.query.scores import presence_prob
 from jsecon.vision.protocols import Embedder, Logits
@@ -50,7 +50,7 @@ def test_texts_are_cleaned_as_the_configurations_say(folders):
         "whitespace": "Tea & MILK, d\u00e9j\u00e0_vu!",
     }
     for clean, text in expected.items():
-        assert TextTokenizer(path, TextRules(LENGTH, "</s>", clean))._clean(said) == text
+        assert TextTokenizer(path, _TextRules(LENGTH, "</s>", clean))._clean(said) == text
 
 
 def test_siglip_2_has_another_vocabulary_padding_and_case(tmp_path):
@@ -59,7 +59,7 @@ def test_siglip_2_has_another_vocabulary_padding_and_case(tmp_path):
     for name in ("tokenizer.json", "tokenizer_config.json"):
         (tmp_path / "model" / name).write_bytes((tmp_path / name).read_bytes())
     rules = read_text_rules(tmp_path / "model", tmp_path / "model" / "tokenizer.json")
-    assert rules == TextRules(LENGTH, "<pad>", "lower")
+    assert rules == _TextRules(LENGTH, "<pad>", "lower")
     tokenizer = TextTokenizer(path, rules)
     (short, long, foreign), mask = tokenizer(["Red Mug,", "mug " * 40, "\u8336"], 8)
     numbers = json.loads(path.read_text())["model"]["vocab"]
@@ -96,7 +96,7 @@ def test_mobileclip_s_images_are_not_normalised(tmp_path):
 def test_a_length_that_is_left_out_is_transformers_own(tmp_path):
     folder = write_siglip(tmp_path / "model", "transformers.js")
     write_json(folder / "config.json", {"model_type": "siglip"})
-    assert read_text_rules(folder, folder / "tokenizer.json") == TextRules(64, "</s>", "canonicalize")
+    assert read_text_rules(folder, folder / "tokenizer.json") == _TextRules(64, "</s>", "canonicalize")
 
 
 def test_scale_and_bias_are_read_in_every_layout_and_a_folder_without_them_says_so(folders, tmp_path):

@@ -52,7 +52,7 @@ def test_a_model_of_another_name_is_not_opened(field, tmp_path):
         field_embedder(load_field(tmp_path / "field.safetensors"))
 
 
-MALFORMED = "[]", '{"options": []}', '{"folders": 3}', '{"folders": {"embedder": 7}}', '{"embedder": {}}', "{"
+MALFORMED = "[]", '{"folders": 3}', '{"folders": {"embedder": 7}}', '{"embedder": {}}', "{"
 
 
 @pytest.mark.parametrize("provenance", MALFORMED)

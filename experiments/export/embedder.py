@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from experiments.export.graph import Agreement
-from jsecon.networks.clip import ClipEmbedder, masked_crop
+from jsecon.networks.clip import ClipEmbedder, _masked_crop
 
 TEXTS = [
     "a photo of a red mug",
@@ -47,7 +47,7 @@ def compared(
     embedder = ClipEmbedder(folder)
     with torch.inference_mode():
         frame, masks = regions()
-        crops = np.stack([masked_crop(frame, mask, numbers["size"][0]) for mask in masks])
+        crops = np.stack([_masked_crop(frame, mask, numbers["size"][0]) for mask in masks])
         pixels = torch.from_numpy(crops).permute(0, 3, 1, 2).float() / 255
         mean, std = (torch.tensor(numbers[key]).reshape(1, 3, 1, 1) for key in ("mean", "std"))
         seen = encode((pixels - mean) / std).numpy()

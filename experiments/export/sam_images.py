@@ -107,7 +107,8 @@ def _asked(model: Any, folder: Path, side: int) -> Agreement:
     """Points of a frame put to the folder as SAM's proposals put them, and to the model."""
     frame = regions()[0]
     graphs = SamGraphs(*find_files(folder, "segmenter"))
-    found = list(graphs.decode(graphs.encode(frame), POINTS))
+    encoded = graphs.encode(frame)
+    found = [graphs.decode(encoded, point) for point in POINTS]
     pixels = np.asarray(Image.fromarray(frame).resize((side, side), Image.Resampling.BILINEAR), np.float64) / 255
     image = torch.from_numpy(((pixels - MEAN) / STD).astype(np.float32)).permute(2, 0, 1)[None]
     scale = torch.tensor([side / frame.shape[1], side / frame.shape[0]])
@@ -115,8 +116,8 @@ def _asked(model: Any, folder: Path, side: int) -> Agreement:
     with torch.inference_mode():
         wanted = model(pixel_values=image, input_points=points, multimask_output=True)
     pairs = {
-        "pred_masks": (np.concatenate([masks for masks, _ in found]), wanted.pred_masks[0].numpy()),
-        "iou_scores": (np.concatenate([scores for _, scores in found]), wanted.iou_scores[0].numpy()),
+        "pred_masks": (np.stack([masks for masks, _ in found]), wanted.pred_masks[0].numpy()),
+        "iou_scores": (np.stack([scores for _, scores in found]), wanted.iou_scores[0].numpy()),
     }
     return Agreement(
         f"{len(POINTS)} points by SamGraphs",

@@ -1,6 +1,6 @@
 """SAM whose decoder answers with the true masks under a point, of a made-up room: subpart, part and whole."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -8,7 +8,7 @@ from jaxtyping import Bool, Int, Int32
 
 from experiments.rooms.raycast import trace_rays
 from experiments.rooms.room import Room
-from jsecon.networks.sam import EncodedFrame, Level, SamSegmenter
+from jsecon.networks.sam import Level, SamSegmenter
 from jsecon.types import Camera
 
 LOGIT = 8.0
@@ -76,19 +76,17 @@ class ExactGraphs:
         self._labels = [labels[level] for level in LEVELS]
         self.prompts = 0
 
-    def encode(self, frame: np.ndarray) -> EncodedFrame:
+    def encode(self, frame: np.ndarray) -> None:
         """Takes a frame (H, W, 3), which must be the whole one."""
-        size = int(frame.shape[0]), int(frame.shape[1])
-        return EncodedFrame({}, size, size)
 
-    def decode(self, encoded: EncodedFrame, points: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yields the masks of each point (P, 2) in px of the frame."""
-        for column, row in points.astype(int):
-            self.prompts += 1
-            masks = np.stack([labels == labels[row, column] for labels in self._labels])
-            yield np.where(masks, LOGIT, -LOGIT).astype(np.float32)[None], np.full((1, 3), PREDICTED_IOU, np.float32)
+    def decode(self, encoded: None, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the masks of a point (2,) in px of the frame."""
+        column, row = point.astype(int)
+        self.prompts += 1
+        masks = np.stack([labels == labels[row, column] for labels in self._labels])
+        return np.where(masks, LOGIT, -LOGIT).astype(np.float32), np.full(3, PREDICTED_IOU, np.float32)
 
-    def to_frame(self, logits: np.ndarray, encoded: EncodedFrame) -> np.ndarray:
+    def to_frame(self, logits: np.ndarray, encoded: None) -> np.ndarray:
         """Masks are of the frame's size already."""
         return logits
 

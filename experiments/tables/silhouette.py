@@ -18,10 +18,11 @@ from jaxtyping import Bool, Float
 from jsecon.errors import require_shape
 from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.fit.resize import scale_cameras
+from jsecon.numerics import MAX_ALPHA, MIN_ALPHA
 from jsecon.process import cores
 from jsecon.query.render import ALPHA_THRESHOLD, HIDDEN_LOGIT, VALA_THRESHOLD
 from jsecon.splat.plan import plan_view, render_plan
-from jsecon.splat.scan import pixel_alphas, to_tiles
+from jsecon.splat.scan import pixel_centres, to_tiles
 from jsecon.types import Array, Camera, Gaussians
 
 SILHOUETTE_WEIGHTS = {"silhouette": (2.0, 1.0), "strict_silhouette": (1.0, 0.0), "lenient_silhouette": (0.0, 1.0)}
@@ -219,8 +220,11 @@ def _rows(gaussians: Gaussians, chosen: np.ndarray, rows: int) -> Gaussians:
 
 @functools.partial(jax.jit, static_argnums=(3, 4))
 def _absorbed(splats: Array, ids: Array, tiles: Array, across: int, edge: int) -> Array:
-    corners = (tiles % across * edge).astype(splats.dtype), (tiles // across * edge).astype(splats.dtype)
-    return -jnp.log1p(-pixel_alphas(splats[ids], corners, edge))
+    x, y, l11, l21, l22, opacity = (column[:, None] for column in splats[ids].T)
+    columns, rows = pixel_centres(edge, splats.dtype)
+    across_px, down_px = (tiles % across * edge)[:, None] + columns - x, (tiles // across * edge)[:, None] + rows - y
+    alpha = opacity * jnp.exp(-((l11 * across_px + l21 * down_px) ** 2) - (l22 * down_px) ** 2)
+    return -jnp.log1p(-jnp.where(alpha >= MIN_ALPHA, jnp.minimum(alpha, MAX_ALPHA), 0.0))
 
 
 @functools.partial(jax.jit, static_argnums=2)

@@ -3,12 +3,10 @@
 import dataclasses
 import textwrap
 from pathlib import Path
-from typing import get_args
 
 from jsecon.app import verbs
 from jsecon.errors import InputError
 from jsecon.networks import hub
-from jsecon.networks.hub import HubModel, Precision, Role
 from jsecon.pipeline.progress import Console
 
 
@@ -25,15 +23,15 @@ def _models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
 def _list_models(console: Console) -> verbs.VerbResult:
     """Prints the catalogue: name, role, size, licence, whether it is on this machine, and what it is good for."""
     rows = []
-    columns = "{:<11} {:<10} {:>5} {:>7}  {:<10} {:<25} {}".format
+    columns = "{:<11} {:<10} {:>5} {:>7}  {:<5} {:<25} {}".format
     console.print_line(columns("name", "role", "MB", "s/frame", "here", "licence", "adds"))
     for row in hub.catalogue():
-        cached = [each for each in row.megabytes if row.in_precision(each).cached_folder is not None]
+        cached = row.cached_folder is not None
         seconds = "-" if row.seconds is None else f"{row.seconds:.1f}"
-        figures = row.megabytes["fp32"], seconds, " ".join(cached) or "-"
-        console.print_line(columns(row.name, row.role, *figures, row.licence, row.purpose))
+        here = "yes" if cached else "-"
+        console.print_line(columns(row.name, row.role, row.megabytes, seconds, here, row.licence, row.purpose))
         rows.append(dataclasses.asdict(row) | {"cached": cached})
-    console.print_line("MB and seconds are of fp32: a frame of 400x300 on two cores, 40 regions or one object in it.")
+    console.print_line("Seconds are of a frame of 400x300 on two cores, 40 regions or one object in it.")
     console.print_line("jsecon models get NAME fetches one; hub:owner/name is any other repository of huggingface.co.")
     return {"models": rows}
 
@@ -45,7 +43,7 @@ def _get_models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
         if name.startswith(hub.PREFIX) and verb.role is None:
             errors.append(InputError(name, "an address does not tell what the model is for", remedy="Give --role."))
             continue
-        for model in _candidates(name, verb.role, verb.precision):
+        for model in hub.models_of_name(name, verb.role):
             try:
                 with console.progress("hub"):
                     download = hub.plan_download(model)
@@ -86,18 +84,7 @@ def _cached_model(name: str) -> Path:
     """Returns the folder of a model that is on this machine, by its name, address or folder."""
     if Path(name).exists() and not any(row.name == name for row in hub.catalogue()):
         return Path(name)
-    for model in _candidates(name, None, None):
-        for precision in get_args(Precision):
-            if (folder := dataclasses.replace(model, precision=precision).cached_folder) is not None:
-                return folder
+    for model in hub.models_of_name(name, None):
+        if (folder := model.cached_folder) is not None:
+            return folder
     raise InputError(name, "this model is not on this machine", "", f"Fetch it with: jsecon models get {name}")
-
-
-def _candidates(name: str, role: Role | None, precision: Precision | None) -> list[HubModel]:
-    """Returns the models of a name, one for each of its roles; of an address one for each role that it may have."""
-    if name.startswith(hub.PREFIX):
-        return [hub.parse_address(name, each, precision) for each in get_args(Role) if role in (None, each)]
-    if name != "auto":
-        return [row.in_precision(precision) for row in hub.models_of_name(name, role)]
-    rows = [hub.models_of_name(each, of)[0] for of, each in hub.RECOMMENDED.items() if role in (None, of)]
-    return [row.in_precision(precision) for row in rows]

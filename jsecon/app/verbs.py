@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeAlias, TypeVar
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from jsecon.networks.hub import Precision, Role
+from jsecon.networks.hub import Role
 from jsecon.pipeline.options import (
     BareOptions,
     Direction,
@@ -379,7 +379,6 @@ class Models(Verb):
       names: Names, addresses (hub:owner/name or hub:owner/name@revision), and for check also folders. auto stands for
         the models of `jsecon run --models auto`.
       role: What the models are for: for get an address needs it, and a name has by default every role of its models.
-      precision: Precision of the graphs. By default it is the one that jsecon uses.
     """
 
     examples = ("jsecon models list", "jsecon models get auto", "jsecon models check my_models")
@@ -387,7 +386,6 @@ class Models(Verb):
     action: Positional[Literal["list", "get", "check"]]
     names: Positional[list[str]] = dataclasses.field(default_factory=list)
     role: Option[Role | None] = None
-    precision: Option[Precision | None] = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

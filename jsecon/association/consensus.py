@@ -26,7 +26,7 @@ MAX_PIECES = 3000
 """Maximum number of pieces of a scene."""
 
 
-def group_by_consensus(
+def _group_by_consensus(
     membership: Sparse,
     visible: Sparse,
     weights: Float[np.ndarray, " n"],
@@ -38,7 +38,7 @@ def group_by_consensus(
 ) -> Int[np.ndarray, " n"]:
     """Groups Gaussians into objects by the consensus of the views: (N,) object 0 .. R-1, -1 if it is never seen.
 
-    The Gaussians are first gathered into small pieces (`_scene_pieces`). Then `average_linkage` joins pieces while the
+    The Gaussians are first gathered into small pieces (`_scene_pieces`). Then `_average_linkage` joins pieces while the
     views that see two groups put both into one mask with a probability of at least `agreement`. Groups that have
     less than 0.02 of their visibility in common stay separate.
 
@@ -64,7 +64,7 @@ def group_by_consensus(
     in_masks, in_view = gather @ membership, gather @ visible
     together = (in_masks @ in_masks.T).toarray()
     both = (in_view @ in_view.T).toarray()
-    owner[live] = average_linkage(together, both, least_ratio=agreement, least_shared=0.02)[piece[live]]
+    owner[live] = _average_linkage(together, both, least_ratio=agreement, least_shared=0.02)[piece[live]]
     return owner
 
 
@@ -82,7 +82,7 @@ def _scene_pieces(
     It runs k-means over the centres (compressed outside of the middle half of the scene, so that distant objects get
     few pieces) and a random projection of the masks, initialised by `_split_cells`. Two rounds end within 6 % of the
     sum of squares of k-means++ and mini-batches (bonsai, replica_apartment_0), in a tenth to a third of the time.
-    Arguments as for `group_by_consensus`.
+    Arguments as for `_group_by_consensus`.
     """
     piece = np.full(len(means), -1, np.int64)
     live = np.flatnonzero(weights > 0)
@@ -132,7 +132,7 @@ def _cell_means(points: Float[np.ndarray, "n d"], cell: Int[np.ndarray, " n"]) -
     return np.stack([np.bincount(cell, column) for column in points.T], axis=1) / np.bincount(cell)[:, None]
 
 
-def average_linkage(
+def _average_linkage(
     together: Float[np.ndarray, "k k"], both: Float[np.ndarray, "k k"], *, least_ratio: float, least_shared: float = 0.0
 ) -> Int[np.ndarray, " k"]:
     """Clusters K items by weighted average linkage: (K,) group 0 .. R-1.
@@ -198,7 +198,7 @@ def track_masks(
 ) -> Int16[np.ndarray, "t h w"]:
     """Follows objects through the frames by consensus, independent of the order of the frames.
 
-    The Gaussians are grouped by `group_by_consensus`, and the groups are assigned the superpixels of each frame.
+    The Gaussians are grouped by `_group_by_consensus`, and the groups are assigned the superpixels of each frame.
 
     Args:
       frames: (T, H, W, 3) uint8.
@@ -209,7 +209,7 @@ def track_masks(
     """
     require(seed >= 0, "seed", seed, "at least 0", "Give another seed.")
     views, means = scene.all(frames, progress), np.asarray(scene.gaussians.means, np.float32)
-    owner = group_by_consensus(*mask_signatures(views, scene.count), means, agreement=agreement, seed=seed)
+    owner = _group_by_consensus(*_mask_signatures(views, scene.count), means, agreement=agreement, seed=seed)
     count = int(owner.max(initial=-1)) + 1
     labels = np.full(frames.shape[:3], -1, np.int16)
     for image, view in zip(labels, views):
@@ -257,17 +257,17 @@ def pieces_on_masks(
     """
     require(seed >= 0, "seed", seed, "at least 0", "Give another seed.")
     views, means = scene.all(frames, progress), np.asarray(scene.gaussians.means, np.float32)
-    piece = _scene_pieces(*mask_signatures(views, scene.count), means, pieces=MAX_PIECES, seed=seed)
+    piece = _scene_pieces(*_mask_signatures(views, scene.count), means, pieces=MAX_PIECES, seed=seed)
     entries, start = [], 0
     for view in views:
-        cast = view.on_masks.tocoo()
+        cast = _weights_on_masks(view)
         entries.append((cast.data, view.seen[cast.row], start + cast.col))
         start += len(view.proposals)
     return piece, sum_entries(entries, (scene.count, start))
 
 
-def mask_signatures(views: list[FrameSuperpixels], count: int) -> tuple[Sparse, Sparse, Float[np.ndarray, " n"]]:
-    """Computes the input of `group_by_consensus`: membership (N, M), visible (N, T) and weights (N,).
+def _mask_signatures(views: list[FrameSuperpixels], count: int) -> tuple[Sparse, Sparse, Float[np.ndarray, " n"]]:
+    """Computes the input of `_group_by_consensus`: membership (N, M), visible (N, T) and weights (N,).
 
     The visibility of a Gaussian in a frame is its clarity, relative to the frame that sees it best: on an outline it
     overlaps its neighbours. A frame abstains on a Gaussian by the share that lies in no mask of it. The shares in the
@@ -280,7 +280,7 @@ def mask_signatures(views: list[FrameSuperpixels], count: int) -> tuple[Sparse, 
         weights[view.seen] += totals
         # Two Gaussians are together with the mean, over the layers of masks, of the product of their shares.
         layers = np.maximum(view.proposals.sum(0).max(initial=1.0), 1.0)
-        cast = view.on_masks.tocoo()
+        cast = _weights_on_masks(view)
         outside = np.maximum(1.0 - np.asarray(cast.sum(1)).ravel() / np.maximum(totals * layers, 1e-12), 0.0)
         share = cast.data / np.maximum(totals[cast.row] * layers, 1e-12)
         norm = np.bincount(cast.row, share**2, len(totals)) + outside**2 / layers
@@ -293,3 +293,8 @@ def mask_signatures(views: list[FrameSuperpixels], count: int) -> tuple[Sparse, 
         start += len(view.proposals)
     membership, visible = sum_entries(shares, (count, start)), sum_entries(looks, (count, len(views)))
     return membership, visible, (weights / max(len(views), 1)).astype(np.float32)
+
+
+def _weights_on_masks(view: FrameSuperpixels) -> Sparse:
+    """Returns the weight of each Gaussian on each proposal, a sparse matrix (n, M) of coordinates."""
+    return (view.votes @ sparse.csr_matrix(view.proposals.T)).tocoo()

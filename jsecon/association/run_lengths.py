@@ -33,10 +33,6 @@ class RunLengthMasks:
         shape = (len(self.counts), self.pixels)
         return sparse.csr_matrix((np.ones(len(columns), np.float32), columns.astype(np.int32), ends), shape=shape)
 
-    def masks(self, height: int, width: int) -> Bool[np.ndarray, "r h w"]:
-        """Decodes the masks into images (R, H, W); P = H W."""
-        return self.rows().astype(bool).toarray().reshape(len(self.counts), height, width)
-
     def concatenate(self, others: "RunLengthMasks") -> "RunLengthMasks":
         """Appends masks over the same pixels."""
         starts, stops = (np.concatenate(pair) for pair in zip((self.starts, self.stops), (others.starts, others.stops)))
@@ -66,12 +62,12 @@ def cache_masks_as_rle(
     """Caches a function from the index of a frame to its masks, which it then calls once per index, in run lengths."""
 
     @functools.cache
-    def encoded(index: int) -> tuple[RunLengthMasks, tuple[int, int]]:
+    def encoded(index: int) -> tuple[RunLengthMasks, tuple[int, int, int]]:
         masks = propose(index)
-        return encode_masks(masks), masks.shape[1:]
+        return encode_masks(masks), masks.shape
 
     def masks_of(index: int) -> Bool[np.ndarray, "m h w"]:
-        runs, size = encoded(index)
-        return runs.masks(*size)
+        runs, shape = encoded(index)
+        return runs.rows().astype(bool).toarray().reshape(shape)
 
     return masks_of

@@ -49,11 +49,6 @@ class FrameSuperpixels:
         """(n,) total weight of each Gaussian in the frame."""
         return np.asarray(self.votes.sum(1)).ravel()
 
-    @property
-    def on_masks(self) -> Sparse:
-        """(n, M) weight of each Gaussian on each proposal."""
-        return self.votes @ sparse.csr_matrix(self.proposals.T)
-
 
 class SceneSuperpixels:
     """The superpixels of all frames of one scene, computed once.

@@ -6,14 +6,17 @@ offset). Each view has a row, which Adam moves when that view is drawn, with sep
 """
 
 import dataclasses
-import math
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jsecon.types import Array, Camera, record
+
+_TERMS = 24
+"""Terms of the power series of a rigid motion: exact to float64 for rotations of up to 3 radians."""
 
 
 @record
@@ -53,35 +56,17 @@ def identity_corrections(views: int) -> Corrections:
     return Corrections(np.zeros((views, 6), np.float32), np.tile(np.eye(3, 4, dtype=np.float32), (views, 1, 1)))
 
 
-def _series(squared: Array, first: int) -> Array:
-    """The sum over k of (-squared)^k / (2 k + first)!; nine terms are exact to float64 for squared angles up to 1."""
-    total = jnp.zeros_like(squared)
-    for k in reversed(range(9)):
-        total = total * -squared + 1 / math.factorial(2 * k + first)
-    return total
-
-
 def se3_exp(twist: Float[Array, "6"]) -> Float[Array, "4 4"]:
-    """Computes the rigid motion of a twist (Lynch and Park 2017, eq. 3.88), smooth everywhere, zero included."""
-    x, y, z = twist[0], twist[1], twist[2]
-    squared = x * x + y * y + z * z
-    small = squared < 1
-    # Each branch gets only numbers that it can handle: sqrt has no gradient at 0, and the series ends.
-    near = jnp.where(small, squared, 0.0)
-    far = jnp.where(small, 1.0, squared)
-    angle = jnp.sqrt(far)
-    sine = jnp.sin(angle) / angle
-    versine = 2 * jnp.sin(angle / 2) ** 2 / far
-    closed_forms = sine, versine, (1 - sine) / far
-    a, b, c = (jnp.where(small, _series(near, n), closed) for n, closed in zip((1, 2, 3), closed_forms))
+    """Computes the rigid motion of a twist of up to 3 radians: the exponential of its matrix, by its power series."""
+    x, y, z, a, b, c = twist
     zero = jnp.zeros_like(x)
-    cross = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
-    identity = jnp.eye(3, dtype=twist.dtype)
-    cross_squared = twist[:3, None] * twist[None, :3] - squared * identity
-    rotation = identity + a * cross + b * cross_squared
-    translation = ((identity + b * cross + c * cross_squared) * twist[3:]).sum(1)
-    last_row = jnp.eye(4, dtype=twist.dtype)[3:]
-    return jnp.concatenate([jnp.concatenate([rotation, translation[:, None]], axis=1), last_row])
+    matrix = jnp.stack([zero, -z, y, a, z, zero, -x, b, -y, x, zero, c, zero, zero, zero, zero]).reshape(4, 4)
+    identity = jnp.eye(4, dtype=twist.dtype)
+
+    def next_power(n, motion):  # Horner's rule, from the last term
+        return identity + (matrix[:, :, None] * motion[None]).sum(1) / (_TERMS - n)
+
+    return jax.lax.fori_loop(0, _TERMS, next_power, identity)
 
 
 def corrected_camera(camera: Camera, twist: Float[Array, "6"]) -> Camera:

@@ -4,7 +4,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from jsecon.errors import InputError, require
 from jsecon.types import Array, Capture
@@ -17,8 +17,6 @@ class DepthPoints(NamedTuple):
     """(P, 3) float32 mean of the voxel's samples, world."""
     colors: np.ndarray
     """(P, 3) uint8 mean colour of the voxel's samples."""
-    counts: np.ndarray
-    """(P,) int32 samples in the voxel."""
     voxel: float
     """edge of a voxel, world units."""
     sample_pixels: np.ndarray
@@ -67,32 +65,24 @@ def _voxel_for(points: Float[Array, "s 3"], max_points: int) -> float:
 
 
 def points_from_depth(
-    capture: Capture,
-    *,
-    voxel: float | None = None,
-    max_points: int | None = None,
-    stride: int = 1,
-    frames: Int[np.ndarray, " f"] | None = None,
+    capture: Capture, *, voxel: float = 0.0, max_points: int | None = None, stride: int = 1
 ) -> DepthPoints:
-    """Back-projects the known depths and averages them in voxels.
+    """Back-projects the known depths of the training frames and averages them in voxels.
 
     Args:
       capture: Capture with depth; without one, an InputError says what to do.
       voxel: Edge of a voxel, world units.
-      max_points: Maximum number of points, in place of `voxel`: the smallest edge that gives so few is used.
+      max_points: Maximum number of points. If `voxel` is 0 or gives more, the smallest edge that gives so few is used.
       stride: Uses every so many pixels in each direction.
-      frames: Indices of the frames to use; by default the training frames.
     """
-    exclusive = (voxel is None) != (max_points is None)
-    require(exclusive, "voxel, max_points", (voxel, max_points), "exactly one of the two", "voxel is in world units.")
-    chosen = np.flatnonzero(~np.asarray(capture.held_out)) if frames is None else np.asarray(frames)
+    require(voxel > 0 or max_points is not None, "voxel", voxel, "above 0", "Give it, or max_points.")
+    chosen = np.flatnonzero(~np.asarray(capture.held_out))
     parts = [back_project_frame(capture, int(t), stride) for t in chosen]
     if not any(len(world) for world, _, _ in parts):
         raise InputError("capture", "no pixel with a known depth", "depths above 0", "Check their encoding and unit.")
     points, colors, pixels = (np.concatenate(columns) for columns in zip(*parts))
     frame = np.repeat(chosen, [len(world) for world, _, _ in parts])
-    if voxel is None:
-        assert max_points is not None
+    if max_points is not None and (not voxel or _voxel_ids(points, voxel).max() >= max_points):
         voxel = _voxel_for(points, max_points)
     ids = _voxel_ids(points, voxel)
     counts = np.bincount(ids)
@@ -100,7 +90,6 @@ def points_from_depth(
     return DepthPoints(
         mean.astype(np.float32),
         np.rint(color).astype(np.uint8),
-        counts.astype(np.int32),
         float(voxel),
         np.column_stack([frame, pixels]).astype(np.int32),
         ids.astype(np.int32),

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
 
 from jsecon.splat.capacity import round_capacity
 from jsecon.types import Gaussians
@@ -67,16 +68,8 @@ def _split_in_two(gaussians: Gaussians) -> tuple[Gaussians, Gaussians]:
     """
     scales = np.asarray(gaussians.log_scales)
     rows, axis = np.arange(len(scales)), scales.argmax(axis=1)
-    w, x, y, z = (np.asarray(gaussians.quaternions) / np.linalg.norm(gaussians.quaternions, axis=1, keepdims=True)).T
-    # The longest axis is a column of the rotation.
-    columns = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
-            [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
-            [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    offset = _OFFSET * np.exp(scales[rows, axis])[:, None] * columns[axis, :, rows]
+    rotations = Rotation.from_quat(gaussians.quaternions, scalar_first=True).as_matrix()
+    offset = _OFFSET * np.exp(scales[rows, axis])[:, None] * rotations[rows, :, axis]
     log_scales = scales.copy()
     log_scales[rows, axis] += math.log(_SHRINKAGE)
     opacity = 1 / (1 + np.exp(-np.clip(np.asarray(gaussians.opacity_logits, np.float64), -30, 30)))

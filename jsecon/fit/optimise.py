@@ -57,10 +57,6 @@ class Schedule:
         """Returns the size of the frames that follows, or None if the present size is the last."""
         return next((later for (_, end), (later, _) in pairwise(self.sizes) if done < end), None)
 
-    def _degree(self, done: float) -> int:
-        """Returns the highest degree of the spherical harmonics that learns; it may exceed the scene's."""
-        return int(done / 0.1)
-
     def _count(self, done: float, start: int) -> int | None:
         """Returns the number of Gaussians to grow to from `start`, or None outside of the growth phase."""
         if not GROWTH_START <= done <= GROWTH_END or self.max_gaussians <= start:
@@ -127,8 +123,7 @@ def fit_gaussians(
     key: PRNGKeyArray,
     steps: int | None = None,
     seconds: float | None = None,
-    start: Gaussians | None = None,
-    state: FitState | None = None,
+    start: Gaussians | FitState,
     schedule: Schedule = _SCHEDULE,
     rates: LearningRates = _RATES,
     refine: CorrectionRates | None = None,
@@ -147,8 +142,7 @@ def fit_gaussians(
       key: Key of the order of the views and of growth.
       steps: Number of steps; the same steps on the same devices give the same result.
       seconds: Time limit in place of `steps`, without compilation.
-      start: Initial scene.
-      state: State of a stopped fit, in place of `start`.
+      start: Initial scene, or the state of a stopped fit.
       schedule: Sizes of the frames and number of Gaussians over time.
       rates: Learning rates.
       refine: Rates at which poses and exposures are corrected too (`TrainState.corrections`), or None.
@@ -160,26 +154,22 @@ def fit_gaussians(
       The fitted Gaussians, and the loss of the view of each step, before the step.
 
     Raises:
-      ValueError: Not exactly one of `steps` and `seconds`, or of `start` and `state`; a limit that is not above 0 and
-        finite; or a state of another fit.
+      ValueError: Not exactly one of `steps` and `seconds`, or a limit that is not above 0 and finite.
       InputError: Every frame is held out, or the fit diverges.
     """
     limits = steps, seconds
     require(limits.count(None) == 1, "steps, seconds", limits, "exactly one of the two", "Choose one limit.")
     limit = cast(float, seconds if steps is None else steps)
     require(0 < limit < math.inf, "steps, seconds", limits, "a finite number above 0", "Choose a longer fit.")
-    exclusive = (start is None) != (state is None)
-    got = start is not None, state is not None
-    require(exclusive, "start, state", got, "exactly one of the two", "Pass state to resume a fit.")
     mesh = host_mesh(-(-capture.cameras.height // (BLOCK * TILE)))  # no strip is empty
     runner = StepRunner(capture, mesh)
-    if start is not None:
+    if isinstance(start, FitState):
+        state = start
+    else:
         # Each doubling costs a compilation, as long as hundreds of steps over free rows: larger fits allocate half.
         divisor = 1 if schedule.max_gaussians <= 1 << 16 else 2
         min_rows = schedule.max_gaussians // divisor if schedule.max_gaussians > start.count else 0
         state = _init_fit_state(start, None if refine is None else len(capture.names), min_rows=min_rows)
-    assert state is not None
-    _check_resumable(state, steps, refine)
     seed = int(jax.random.bits(key))
     train = put_on_devices(state.train, mesh)
     while float(state.done) < 1:
@@ -188,7 +178,7 @@ def fit_gaussians(
         # A resumed fit has the same chunks.
         count = max(1, min(chunk - first % chunk, math.ceil((1 - done) / pace - 1e-6)))
         size, order = schedule._size(done), _view_order(key, runner.frames, first, first + count)
-        config = StepConfig(schedule._degree(done), rates, refine)
+        config = StepConfig(int(done / 0.1), rates, refine)
         program, later = runner.compile(train, size, config), schedule._next_size(done)
         has_all_rows = train.gaussians.count >= schedule.max_gaussians
         if later is not None and has_all_rows and steps is not None:  # a fit with a time limit would lose steps
@@ -207,7 +197,11 @@ def fit_gaussians(
             raise InputError("", problem, remedy=remedy)
         target = schedule._count(done, int(state.started))
         if target is not None and len(losses) % chunk == 0:
-            host = _densify(host, schedule, target, [seed, len(losses)])
+            moments = host.first_moment, host.second_moment
+            most, draw = schedule.max_gaussians, [seed, len(losses)]
+            gaussians, moments = grow(host.gaussians, moments, host.votes, target, most, draw)
+            no_votes = np.zeros(gaussians.count, host.votes.dtype)
+            host = TrainState(gaussians, *moments, no_votes, host.corrections)
             train = put_on_devices(host, mesh)
         elapsed += time.monotonic() - began
         now = len(losses) / steps if steps is not None else min(elapsed / limit, 1.0)
@@ -218,17 +212,6 @@ def fit_gaussians(
         if progress:
             progress(len(losses) if steps is not None else round(elapsed), round(limit))
     return drop_free_rows(state.train.gaussians), np.asarray(state.losses)
-
-
-def _check_resumable(state: FitState, steps: int | None, refine: CorrectionRates | None) -> None:
-    """Raises ValueError if a state was made with other options."""
-    remedy = "Resume with the options of the first run."
-    got = state.train.corrections is not None
-    require(got == (refine is not None), "state with corrections", got, f"{refine is not None}", remedy)
-    if steps is not None:
-        same = abs(float(state.done) * steps - len(state.losses)) < 1e-6
-        got = f"{len(state.losses)} steps, {float(state.done):.1%} of its fit"
-        require(same, "state", got, f"a fit of {steps} steps", remedy)
 
 
 def _to_host(state: TrainState, rows: int) -> TrainState:
@@ -260,10 +243,3 @@ def _run_chunk(
         if not most:
             return after, jax.device_get(losses)
         runner.widen(state, size, most)
-
-
-def _densify(state: TrainState, schedule: Schedule, target: int, seed: list[int]) -> TrainState:
-    """Adds Gaussians up to `target` on the host and resets the votes."""
-    moments = state.first_moment, state.second_moment
-    gaussians, moments = grow(state.gaussians, moments, state.votes, target, schedule.max_gaussians, seed)
-    return TrainState(gaussians, *moments, np.zeros_like(state.votes, shape=gaussians.count), state.corrections)

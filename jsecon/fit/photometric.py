@@ -16,7 +16,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Float
 
-from jsecon.errors import require
+from jsecon.errors import require_shape
 from jsecon.parallel import map_over_devices
 from jsecon.splat.fusion import compute_once, opaque_true
 from jsecon.types import Array
@@ -63,14 +63,8 @@ def _gaussian_blur(image: Float[Array, "h w c"]) -> Float[Array, "h w c"]:
 _gaussian_blur.defvjp(lambda image: (_gaussian_blur(image), None), lambda _, cotangent: (_gaussian_blur(cotangent),))
 
 
-def _same_shape(image, target) -> None:
-    got = f"{image.shape} and {target.shape}"
-    require(image.shape == target.shape, "image and target", got, "the same (H, W, C)", "Render at the photo's size.")
-
-
 def ssim_map(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[Array, "h w c"]:
     """Computes the structural similarity of each pixel and channel, in [-1, 1] (Wang 2004, eq. 13)."""
-    _same_shape(image, target)
     # Five blurs instead of one of a stack: slicing the gradient of the stack costs XLA four times the blurs.
     mean_i, mean_t = _gaussian_blur(image), _gaussian_blur(target)
     square_i, square_t = _gaussian_blur(image * image), _gaussian_blur(target * target)
@@ -91,7 +85,7 @@ def photometric_loss(
       target: Photograph of the same shape.
       mesh: Devices to divide the rows among. With a mesh only `image` is differentiable, in reverse mode.
     """
-    _same_shape(image, target)
+    require_shape("target", target, image.shape, "Render at the photo's size.")
     if mesh is None:
         absolute = jnp.mean(jnp.abs(image - target))
         return (1 - SSIM_SHARE) * absolute + SSIM_SHARE * (1 - jnp.mean(ssim_map(image, target)))
@@ -168,6 +162,5 @@ def _loss_of_rows(x: Array, y: Array, inside: Array, channels: int) -> tuple[Arr
 
 def psnr(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[Array, ""]:
     """Computes the peak signal-to-noise ratio in dB, infinite for equal images; clamp a rendering to [0, 1] first."""
-    _same_shape(image, target)
     difference = image - target
     return -10.0 * jnp.log10(jnp.mean(difference * difference))

@@ -95,9 +95,6 @@ def gaussians_from_points(
     require(len(points) > 0, "points", 0, "at least one", "Triangulate points from the frames (fit.triangulate).")
     bad = int((~np.isfinite(points).all(axis=1)).sum())
     require(not bad, "points", f"{bad} with a coordinate that is not finite", "finite coordinates", "Drop them first.")
-    require(0 < opacity < 1, "opacity", opacity, "between 0 and 1", "0.1 is usual, 0.9 on depth.")
-    require(scale > 0, "scale", scale, "positive", "1 is usual.")
-    require(sh_degree in (0, 1, 2, 3), "sh_degree", sh_degree, "0 to 3", "0 is colour alone.")
     deviations = scale * _neighbour_distances(points)
     if max_scale is not None:
         deviations = np.minimum(deviations, max_scale)

@@ -203,7 +203,7 @@ class StepConfig(NamedTuple):
     """Settings of a step."""
 
     degree: int
-    """Highest degree of the spherical harmonics that learns."""
+    """Highest degree of the spherical harmonics that learns; it may exceed the scene's."""
     rates: LearningRates
     refine: CorrectionRates | None
 

@@ -9,7 +9,7 @@ it is.
 
 import functools
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -18,8 +18,8 @@ from jaxtyping import Bool, Float32, UInt8
 
 from jsecon.errors import InputError, require
 from jsecon.files import read_json, reading
-from jsecon.networks.hub import Precision, find_files
-from jsecon.networks.session import Graph, Tensor, batches, content_digest
+from jsecon.networks.hub import find_files
+from jsecon.networks.session import Graph, Tensor, content_digest
 from jsecon.networks.tokenizer import CLIP_LENGTH, TextTokenizer, read_text_rules
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.vision.protocols import CANONICAL, Logits
@@ -62,27 +62,19 @@ def read_preprocessing(path: Path) -> tuple[tuple[float, ...], tuple[float, ...]
         rescale = float(content.get("rescale_factor", 1 / 255)) if content.get("do_rescale", True) else 1.0
         if abs(255 * rescale - 1) > 1e-3:
             raise ValueError(f"pixels times {rescale:g}, not 1/255")
-        size = _square_side(content.get("crop_size", content.get("size")))
+        size = content.get("crop_size", content.get("size"))  # 224, [224, 224] or {"height": 224, "width": 224}
+        sides = set(size.values() if isinstance(size, dict) else size if isinstance(size, list) else [size])
+        if len(sides) != 1:
+            raise ValueError(f"a size of {size}, not of a square")
+        side = None if size is None else int(sides.pop())
         mean, std = tuple(map(float, mean)), tuple(map(float, std))
     is_valid = len(mean) == len(std) == 3 and is_finite_and_bounded(mean, std) and min(std) >= 1e-6
-    if not is_valid or not 1 <= (size or 1) <= 4096:
-        raise InputError(path, f"mean {mean}, std {std}, size {size}", expected, remedy)
-    return mean, std, size
+    if not is_valid or not 1 <= (side or 1) <= 4096:
+        raise InputError(path, f"mean {mean}, std {std}, size {side}", expected, remedy)
+    return mean, std, side
 
 
-def _square_side(size: object) -> int | None:
-    """The side of a square image, which files write as 224, [224, 224] or {"height": 224, "width": 224}."""
-    if isinstance(size, dict):
-        size = list(size.values())
-    if isinstance(size, Sequence):
-        sides = set(map(int, size))
-        if len(sides) != 1:
-            raise ValueError(f"a size of {sorted(sides)}, not of a square")
-        return sides.pop()
-    return None if size is None else int(str(size))
-
-
-def masked_crop(
+def _masked_crop(
     frame: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], size: int
 ) -> UInt8[np.ndarray, "size size 3"]:
     """Crops a region: black outside of its mask, centred in a black square, resized bilinearly to `size` px.
@@ -111,7 +103,6 @@ class ClipEmbedder:
 
     Args:
       folder: The model folder.
-      precision: Precision of its graphs; None takes the highest that is there.
       store: Folder that caches embeddings of regions by content; or None.
 
     Attributes:
@@ -119,15 +110,14 @@ class ClipEmbedder:
       logits: Scale and bias of a model trained with a sigmoid if the folder has them, else None.
     """
 
-    def __init__(self, folder: str | Path, *, precision: Precision | None = None, store: Path | None = None):
-        visual, textual, config, tokenizer = find_files(folder, "embedder", precision)
-        mean, std, size = read_preprocessing(config)
-        rules = read_text_rules(Path(folder), tokenizer)
-        extra = repr((mean, std, size, *(rules or ())))
-        self.name = f"clip-{content_digest([visual, textual], [tokenizer], extra=extra)}"
-        self.logits = _read_logits(Path(folder)) if rules is not None else None
-        self._visual_path, self._textual_path, self._tokenizer_path = visual, textual, tokenizer
-        self._mean, self._std, self._size, self._rules = mean, std, size, rules
+    def __init__(self, folder: str | Path, *, store: Path | None = None):
+        self._visual_path, self._textual_path, config, self._tokenizer_path = find_files(folder, "embedder")
+        self._mean, self._std, self._size = read_preprocessing(config)
+        self._rules = read_text_rules(Path(folder), self._tokenizer_path)
+        extra = repr((self._mean, self._std, self._size, *(self._rules or ())))
+        digest = content_digest([self._visual_path, self._textual_path], [self._tokenizer_path], extra=extra)
+        self.name = f"clip-{digest}"
+        self.logits = _read_logits(Path(folder)) if self._rules is not None else None
         self._store = None if store is None else EmbeddingStore(store, self.name)
 
     @functools.cached_property
@@ -163,10 +153,9 @@ class ClipEmbedder:
                 rows[index] = known[key]
             elif masks[index].any():
                 missing.append(index)
-        for start in range(0, len(missing), _BATCH):
-            chunk = missing[start : start + _BATCH]
-            crops = np.stack([masked_crop(frame, masks[index], self._side) for index in chunk])
-            rows[chunk] = _normalize(self._run_visual(crops), self._visual_path)
+        if missing:
+            crops = np.stack([_masked_crop(frame, masks[index], self._side) for index in missing])
+            rows[missing] = _normalize(self._run_visual(crops), self._visual_path)
         if self._store is not None and missing:
             self._store.write(frame, known | {keys[index]: rows[index] for index in missing})
         return rows
@@ -176,7 +165,7 @@ class ClipEmbedder:
         for text in texts:
             if not text.strip():
                 raise InputError("text", repr(text), "a text", 'Say what to find, for example "red mug".')
-        return _normalize(self._embed_phrases(texts), self._textual_path)
+        return self._embed_phrases(texts)
 
     def check(self) -> str:
         """Runs the graphs on a black image and a word, closes them, and describes the model in a sentence."""
@@ -184,14 +173,9 @@ class ClipEmbedder:
         self._embed_phrases(["word"])
         summary = f"images of {self._side}x{self._side} px and texts to {self.dim} numbers"
         self.close()
-        if self._rules is None:
-            return summary
-        length, pad, clean = self._rules
-        summary = f"{summary}; texts of {length} tokens, padded with {pad!r}, cleaned by {clean!r}"
-        if self.logits is None:
-            return f"{summary}; no scale and bias, so that a text is refused by its cosine. {_LOGITS_REMEDY}"
-        scale, bias = self.logits
-        return f"{summary}; how likely a text is there: sigmoid({scale:.4f} cosine {bias:+.4f})"
+        if self._rules is not None and self.logits is None:
+            summary += f"; no scale and bias, so that a text is refused by its cosine. {_LOGITS_REMEDY}"
+        return summary
 
     def close(self) -> None:
         """Closes the graphs and frees their memory; they are opened again when needed."""
@@ -230,13 +214,12 @@ class ClipEmbedder:
     def _run_visual(self, crops: UInt8[np.ndarray, "b s s 3"]) -> np.ndarray:
         """(B, S, S, 3) RGB to (B, E), not normalised."""
         mean, std = np.asarray(self._mean, np.float32), np.asarray(self._std, np.float32)
-        images = np.ascontiguousarray(((crops.astype(np.float32) / 255.0 - mean) / std).transpose(0, 3, 1, 2))
-        tensor, output = self._visual_input, self._output(self._visual, "image").name
-        parts = [
-            _run_rows(self._visual, {tensor.name: part}, output, count)
-            for part, count in batches(images, tensor.fixed(0), _BATCH)
-        ]
-        return np.concatenate(parts)
+        tensor, output = self._visual_input, self._output(self._visual, "image")
+
+        def feed(part):
+            return {tensor.name: ((part.astype(np.float32) / 255.0 - mean) / std).transpose(0, 3, 1, 2)}
+
+        return _run_in_batches(self._visual, crops, tensor.fixed(0), feed, output.name)
 
     def _embed_phrases(self, phrases: list[str]) -> Float32[np.ndarray, "p e"]:
         """(P, E) unit embeddings of phrases as they are."""
@@ -246,11 +229,12 @@ class ClipEmbedder:
         names = [name for name in graph.inputs if name not in masks]
         tensor = graph.require("input", names[0] if len(names) == 1 else "input_ids", (None, None), what)
         length = tensor.fixed(1) or (CLIP_LENGTH if self._rules is None else self._rules.length)
-        parts = []
-        for part, count in batches(np.stack(self._tokenizer(phrases, length), 1), tensor.fixed(0), _BATCH):
-            feeds = {tensor.name: part[:, 0]} | dict.fromkeys(masks, part[:, 1])
-            parts.append(_run_rows(graph, feeds, output.name, count))
-        rows = np.concatenate(parts)
+
+        def feed(part):
+            return {tensor.name: part[:, 0]} | dict.fromkeys(masks, part[:, 1])
+
+        tokens = np.stack(self._tokenizer(phrases, length), axis=1)
+        rows = _run_in_batches(graph, tokens, tensor.fixed(0), feed, output.name)
         if rows.shape[1] != self.dim:
             expected = f"{self.dim}, like the images of {self._visual_path.name}"
             remedy = "Take both graphs from one model, with their projections."
@@ -271,18 +255,34 @@ def _read_logits(folder: Path) -> Logits | None:
     content = read_json(path, expected, _LOGITS_REMEDY)
     with reading(path, expected, _LOGITS_REMEDY):
         logits = Logits(float(content["scale"]), float(content["bias"]))
-    if not (is_finite_and_bounded(*logits) and 0 < logits.scale <= 1e4 and abs(logits.bias) <= 1e3):
+    if not (0 < logits.scale <= 1e4 and abs(logits.bias) <= 1e3):
         raise InputError(path, f"scale {logits.scale:g}, bias {logits.bias:g}", expected, _LOGITS_REMEDY)
     return logits
 
 
-def _run_rows(graph: Graph, feeds: dict[str, np.ndarray], output: str, count: int) -> np.ndarray:
-    """Returns the first `count` rows (count, E) of an output."""
-    rows = graph.run(feeds, [output])[output]
-    if rows.ndim != 2 or len(rows) < count:
-        where = f"{graph.path}, output {output!r}"
-        raise InputError(where, f"shape {rows.shape}", f"{count} embeddings", "Export the graph again.")
-    return rows[:count]
+def _run_in_batches(
+    graph: Graph, rows: np.ndarray, fixed: int | None, feed: Callable[[np.ndarray], dict[str, np.ndarray]], output: str
+) -> np.ndarray:
+    """Runs a graph on rows (N, ...) and returns an output (N, E).
+
+    Args:
+      graph: The graph.
+      rows: Rows, each for one embedding.
+      fixed: Size of a batch if the graph fixes it; the last batch is then padded with zeros.
+      feed: Makes the inputs of a batch of rows.
+      output: Name of the output.
+    """
+    size = fixed or _BATCH
+    padding = np.zeros((-len(rows) % size if fixed else 0, *rows.shape[1:]), rows.dtype)
+    padded = np.concatenate([rows, padding])
+    parts = []
+    for start in range(0, len(padded), size):
+        part = padded[start : start + size]
+        parts.append(graph.run(feed(part), [output])[output])
+        if parts[-1].ndim != 2 or len(parts[-1]) != len(part):
+            where = f"{graph.path}, output {output!r}"
+            raise InputError(where, f"shape {parts[-1].shape}", f"{len(part)} embeddings", "Export the graph again.")
+    return np.concatenate(parts)[: len(rows)]
 
 
 def _normalize(rows: np.ndarray, path: Path) -> Float32[np.ndarray, "b e"]:

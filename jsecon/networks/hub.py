@@ -8,38 +8,33 @@ so that the user can be asked. Afterwards huggingface_hub compares each file wit
 
 import contextlib
 import dataclasses
-import difflib
 import functools
 import re
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 from jsecon.errors import InputError, describe_error
 
 Role = Literal["embedder", "segmenter", "tracker"]
 
-Precision = Literal["fp32", "fp16", "int8"]
-"""numbers that a graph computes with"""
-SUFFIXES: Mapping[Precision, str] = {"fp32": "", "fp16": "_fp16", "int8": "_quantized"}
-"""precision -> what public exports append to the name of a graph"""
+_SUFFIXES = {"fp32": "", "fp16": "_fp16", "int8": "_quantized"}
+"""precision of graphs -> what public exports append to their names; the first that is there is taken"""
 PREFIX = "hub:"
 RECOMMENDED: Mapping[Role, str] = {"segmenter": "edgetam", "embedder": "siglip2"}
 """what `--models auto` takes"""
 
 
 class _Layout(NamedTuple):
-    """The files of one public layout of a model. `{p}` stands for the suffix of the precision."""
+    """The files of one public layout of a model."""
 
     required: tuple[str, ...]
     """files without which the model does not work"""
     optional: tuple[str, ...] = ()
     """files that are fetched where the repository has them"""
-
-    def in_precision(self, precision: Precision) -> "_Layout":
-        """Writes the names of the files in one precision."""
-        return _Layout(*(tuple(name.format(p=SUFFIXES[precision]) for name in names) for names in self))
+    precision: str = "fp32"
+    """precision of the graphs"""
 
 
 _TRACKER = tuple(
@@ -64,7 +59,8 @@ _LAYOUTS: Mapping[Role, tuple[_Layout, ...]] = {
     ),
     "tracker": (_Layout((*_TRACKER, "constants.json")), _Layout((*_TRACKER, "onnx/constants.json"))),
 }
-"""role -> the layouts that its public exports have. A graph's external data (`.onnx_data`) comes with the graph."""
+"""role -> the layouts that its public exports have; `{p}` stands for the suffix of the precision. A graph's external
+data (`.onnx_data`) comes with the graph."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,18 +73,16 @@ class HubModel:
     """"owner/name"."""
     revision: str = "main"
     """Commit, branch or tag."""
-    precision: Precision = "fp32"
-    """Precision of its graphs."""
     name: str = ""
     """Its name in the catalogue; empty for any other model."""
-    megabytes: Mapping[Precision, int] = dataclasses.field(default_factory=dict)
-    """Size of the files by precision. A repository of the catalogue is offered in these precisions alone."""
+    megabytes: int | None = None
+    """Size of the files."""
     licence: str = ""
     """Licence of the weights."""
     purpose: str = ""
     """What it is good for, in one sentence."""
     seconds: float | None = None
-    """Seconds of a frame in fp32 on two cores of a Xeon with AVX-512: of a segmenter with 70 guided prompts, of an
+    """Seconds of a frame on two cores of a Xeon with AVX-512: of a segmenter with 70 guided prompts, of an
     embedder for 40 regions, of a tracker for one object. None if they were not measured."""
 
     @property
@@ -99,8 +93,7 @@ class HubModel:
     @property
     def get_command(self) -> str:
         """The command that fetches the model."""
-        precision = "" if self.precision == "fp32" else f" --precision {self.precision}"
-        return f"jsecon models get {self.name or self.address} --role {self.role}{precision}"
+        return f"jsecon models get {self.name or self.address} --role {self.role}"
 
     @property
     def cached_folder(self) -> Path | None:
@@ -108,8 +101,7 @@ class HubModel:
         from huggingface_hub import snapshot_download
         from huggingface_hub.errors import LocalEntryNotFoundError
 
-        for layout in _LAYOUTS[self.role]:
-            required, optional = layout.in_precision(self.precision)
+        for required, optional, _ in _layouts(self.role):
             patterns = [*required, *optional, *(f"{name}_data*" for name in required)]
             with contextlib.suppress(LocalEntryNotFoundError, ValueError):  # ValueError: no name of a repository
                 folder = snapshot_download(
@@ -119,18 +111,14 @@ class HubModel:
                     return Path(folder)
         return None
 
-    def in_precision(self, precision: Precision | None) -> "HubModel":
-        """Returns the model with graphs in a precision, by default fp32, or raises InputError if it is not offered.
 
-        Models of masks stay in fp32 if they have no other precision.
-        """
-        precision = precision or "fp32"
-        if self.megabytes and precision not in self.megabytes:
-            if self.role == "embedder":
-                problem = f"{self.name or self.repository} is not offered in {precision}"
-                raise InputError("--precision", problem, "", f"Use {' or '.join(self.megabytes)}.")
-            precision = "fp32"
-        return dataclasses.replace(self, precision=precision)
+def _layouts(role: Role) -> list[_Layout]:
+    """Lists the layouts of a role in each precision, the highest first."""
+    return [
+        _Layout(*(tuple(name.format(p=suffix) for name in names) for names in layout[:2]), precision)
+        for precision, suffix in _SUFFIXES.items()
+        for layout in _LAYOUTS[role]
+    ]
 
 
 @functools.cache
@@ -140,13 +128,7 @@ def catalogue() -> tuple[HubModel, ...]:
     return tuple(HubModel(**row) for row in rows)
 
 
-def _published(role: Role) -> str:
-    """Says in a sentence where models of a role are published."""
-    names = ", ".join(row.repository for row in catalogue() if row.role == role)
-    return f"Such models are published on huggingface.co: {names}, and others of the same layout."
-
-
-def parse_model(choice: str | Path, role: Role, precision: Precision | None = None) -> HubModel | Path:
+def parse_model(choice: str | Path, role: Role) -> HubModel | Path:
     """Reads what a user gave for a model, or raises InputError.
 
     A name of the catalogue comes before a folder of that name here, which "./clip" or a `Path` means.
@@ -154,44 +136,39 @@ def parse_model(choice: str | Path, role: Role, precision: Precision | None = No
     Args:
       choice: A name, "hub:owner/name", "hub:owner/name@revision", or a folder.
       role: What the model is for.
-      precision: Precision of a model of the hub; None takes fp32.
     """
     if isinstance(choice, Path):
         return choice
-    if choice.startswith(PREFIX):
-        return parse_address(choice, role, precision)
-    is_name = any((row.name, row.role) == (choice, role) for row in catalogue())
-    if choice.strip() and not is_name and Path(choice).exists():
+    is_known = choice.startswith(PREFIX) or any((row.name, row.role) == (choice, role) for row in catalogue())
+    if choice.strip() and not is_known and Path(choice).exists():
         return Path(choice)
-    return models_of_name(choice, role)[0].in_precision(precision)
+    return models_of_name(choice, role)[0]
 
 
-def parse_address(text: str, role: Role, precision: Precision | None = None) -> HubModel:
+def _parse_address(text: str, role: Role) -> HubModel:
     """Reads "hub:owner/name" or "hub:owner/name@revision", or raises InputError."""
     address = re.fullmatch(rf"{PREFIX}([\w.-]+/[\w.-]+?)(?:@([\w./-]+))?", text)
     if address is None:
         raise InputError(text, "not the address of a model", "", "Write hub:owner/name or hub:owner/name@revision.")
-    repository, revision = address[1], address[2] or "main"
-    row = _row_of_repository(role, repository)
-    if row is None:
-        return HubModel(role, repository, revision, precision or "fp32")
-    if revision != row.revision:
-        row = dataclasses.replace(row, revision=revision, name="")
-    return row.in_precision(precision)
+    model = _row_of_repository(role, address[1]) or HubModel(role, address[1])
+    revision = address[2] or "main"
+    return model if revision == model.revision else dataclasses.replace(model, revision=revision, name="")
 
 
 def models_of_name(name: str, role: Role | None) -> list[HubModel]:
-    """Looks up the models of a name in the catalogue, at least one, for a role or for any; else raises InputError."""
-    rows = [row for row in catalogue() if role in (None, row.role)]
-    if matches := [row for row in rows if row.name == name]:
+    """Looks up the models of a name or an address, at least one, for a role or for any; else raises InputError.
+
+    The name "auto" stands for RECOMMENDED. An address may be a model of every role.
+    """
+    roles = get_args(Role) if role is None else (role,)
+    if name.startswith(PREFIX):
+        return [_parse_address(name, each) for each in roles]
+    names_of_roles = RECOMMENDED if name == "auto" else dict.fromkeys(roles, name)
+    rows = [row for row in catalogue() if row.role in roles]
+    if matches := [row for row in rows if row.name == names_of_roles.get(row.role)]:
         return matches
-    names = list(dict.fromkeys(row.name for row in rows))
-    similar = [f"the {row.role} {name}" for row in catalogue() if row.name == name]
-    similar += difflib.get_close_matches(name, names, 1)
-    if re.fullmatch(r"[\w-][\w.-]*/[\w.-]+(@[\w./-]+)?", name):
-        similar = [f"{PREFIX}{name}"]
-    suggestion = f"Did you mean {similar[0]}? " if similar else ""
-    remedy = f"{suggestion}Known names: {', '.join(names)}. Or give a folder, or hub:owner/name."
+    names = ", ".join(dict.fromkeys(row.name for row in rows))
+    remedy = f"Known names: {names}. Or give a folder, or hub:owner/name."
     raise InputError(repr(name), f"no folder and no known {role or 'model'}", "", remedy)
 
 
@@ -216,40 +193,31 @@ def cached_address(folder: Path) -> str | None:
     return f"{PREFIX}{parts[-3].removeprefix('models--').replace('--', '/')}@{parts[-1]}"
 
 
-def find_files(folder: str | Path, role: Role, precision: Precision | None = None) -> list[Path]:
+def find_files(folder: str | Path, role: Role) -> list[Path]:
     """Finds the required files of a model in a folder, in the order of its layout, or raises InputError.
 
-    Args:
-      folder: The folder.
-      role: What the model is for.
-      precision: Precision of its graphs. None takes the highest that is there, as models of masks do that lack it.
+    The graphs are those of the highest precision that is there.
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(folder, "no such folder", "", _published(role))
-    precisions: list[Precision] = [precision] if precision is not None else []
-    if precision is None or role != "embedder":
-        precisions += SUFFIXES
-    layout = _present_layout(role, precisions, lambda name: (folder / name).is_file(), folder, _published(role))
+        raise InputError(folder, "no such folder", "", "Check the path of the model.")
+    layout = _present_layout(role, lambda name: (folder / name).is_file(), folder)
     return [folder / name for name in layout.required]
 
 
-def _present_layout(
-    role: Role, precisions: list[Precision], exists: Callable[[str], object], where: object, remedy: str
-) -> _Layout:
-    """Returns the first layout whose required files exist, in the first precision in which they do."""
+def _present_layout(role: Role, exists: Callable[[str], object], where: object) -> _Layout:
+    """Returns the first layout whose required files exist, or raises InputError."""
     missing = []
-    for precision in precisions:
-        for layout in _LAYOUTS[role]:
-            named = layout.in_precision(precision)
-            missing.append([name for name in named.required if not exists(name)])
-            if not missing[-1]:
-                return named
+    for layout in _layouts(role):
+        missing.append([name for name in layout.required if not exists(name)])
+        if not missing[-1]:
+            return layout
+    remedy = f"`jsecon models list` names models of huggingface.co that work as {role}."
     raise InputError(where, f"no {role}, since it lacks {', '.join(min(missing, key=len))}", "", remedy)
 
 
 @dataclasses.dataclass(frozen=True)
-class Download:
+class _Download:
     """What has to be fetched for a model."""
 
     model: HubModel
@@ -257,22 +225,24 @@ class Download:
     """Files that the model needs, with their bytes."""
     licence: str
     """Licence by the repository's own card, or "not stated"."""
+    precision: str
+    """Precision of the graphs."""
 
     def __str__(self) -> str:
         """Describes it on one line."""
         megabytes = max(round(sum(self.sizes.values()) / 1e6), 1)
-        return f"{self.model.address} ({len(self.sizes)} files, {megabytes:,} MB, licence: {self.licence})"
+        files = f"{len(self.sizes)} files, {megabytes:,} MB, {self.precision}"
+        return f"{self.model.address} ({files}, licence: {self.licence})"
 
 
-def plan_download(model: HubModel) -> Download:
+def plan_download(model: HubModel) -> _Download:
     """Asks the hub which files a model needs, or raises InputError."""
     from huggingface_hub import HfApi
 
     with _hub_errors(model):
         info = HfApi().model_info(model.repository, revision=model.revision, files_metadata=True)
     sizes = {file.rfilename: file.size or 0 for file in info.siblings or ()}
-    remedy = f"Choose another repository or --precision. `jsecon models list` has {model.role} models that work."
-    layout = _present_layout(model.role, [model.precision], sizes.__contains__, model.address, remedy)
+    layout = _present_layout(model.role, sizes.__contains__, model.address)
     data = tuple(f"{name}_data" for name in layout.required)
     needed = {
         path: size
@@ -280,10 +250,10 @@ def plan_download(model: HubModel) -> Download:
         if path in (*layout.required, *layout.optional) or path.startswith(data)
     }
     licences = [tag.removeprefix("license:") for tag in info.tags or () if tag.startswith("license:")]
-    return Download(model, needed, ", ".join(licences) or "not stated")
+    return _Download(model, needed, ", ".join(licences) or "not stated", layout.precision)
 
 
-def fetch(download: Download) -> Path:
+def fetch(download: _Download) -> Path:
     """Brings the files of a model into the hub's cache, or raises InputError; returns their folder.
 
     What is there already stays, and a transfer that broke goes on. A file that differs from its hash is removed.
@@ -308,31 +278,29 @@ def fetch(download: Download) -> Path:
 @contextlib.contextmanager
 def _hub_errors(model: HubModel) -> Iterator[None]:
     """Turns the errors of requests into an InputError: those of the network have no base in common."""
+    from huggingface_hub import constants, errors
+
     try:
         yield
     except Exception as error:
         cause: BaseException = error
         while isinstance(cause, FileNotFoundError) and cause.__cause__ is not None:  # LocalEntryNotFoundError
             cause = cause.__cause__
-        problem, remedy = _explain(model, cause)
+        page, get = f"{constants.ENDPOINT}/{model.repository}", model.get_command
+        match cause:  # in this order: GatedRepoError is a RepositoryNotFoundError
+            case errors.OfflineModeIsEnabled():
+                problem = "not in the cache, and HF_HUB_OFFLINE forbids requests"
+                remedy = f"Unset HF_HUB_OFFLINE, then {get}"
+            case errors.GatedRepoError():
+                problem = "its owner grants access to accounts only"
+                remedy = f"Accept its licence on {page}, set HF_TOKEN to a token of your account, then {get}"
+            case errors.RevisionNotFoundError():
+                problem = f"the repository has no revision {model.revision}"
+                remedy = f"See {page}/commits/main for those it has."
+            case errors.RepositoryNotFoundError():
+                problem = "the hub has no such repository, or it is private"
+                remedy = "Check the name; for a private one set HF_TOKEN."
+            case _:
+                problem = f"not fetched from {constants.ENDPOINT} ({describe_error(cause)})"
+                remedy = f"Check the network and the disk. Run it again: {get}"
         raise InputError(model.address, problem, "", remedy) from error
-
-
-def _explain(model: HubModel, error: BaseException) -> tuple[str, str]:
-    """Returns what is wrong and what to do, for an error during a request."""
-    from huggingface_hub import constants, errors
-
-    page, get = f"{constants.ENDPOINT}/{model.repository}", model.get_command
-    match error:  # in this order: GatedRepoError is a RepositoryNotFoundError
-        case errors.OfflineModeIsEnabled():
-            return "not in the cache, and HF_HUB_OFFLINE forbids requests", f"Unset HF_HUB_OFFLINE, then {get}"
-        case errors.GatedRepoError():
-            remedy = f"Accept its licence on {page}, set HF_TOKEN to a token of your account, then {get}"
-            return "its owner grants access to accounts only", remedy
-        case errors.RevisionNotFoundError():
-            return f"the repository has no revision {model.revision}", f"See {page}/commits/main for those it has."
-        case errors.RepositoryNotFoundError():
-            remedy = "Check the name; for a private one set HF_TOKEN."
-            return "the hub has no such repository, or it is private", remedy
-    remedy = f"Check the network and the disk. Run it again: {get}"
-    return f"not fetched from {constants.ENDPOINT} ({describe_error(error)})", remedy

@@ -9,14 +9,14 @@ These steps are those of facebookresearch/segment-anything (automatic_mask_gener
 
 A model folder has onnx/vision_encoder.onnx and onnx/prompt_encoder_mask_decoder.onnx, as exported for transformers.js,
 and preprocessor_config.json, which states how colours are scaled. The decoder takes input_points (1, B, P, 2) and
-input_labels (1, B, P) and gives iou_scores and pred_masks. There are two kinds, which differ in its other inputs:
-    SAM      image_embeddings of a frame that is scaled by its longer side and padded; a batch of prompts in one run
+input_labels (1, B, P) and gives iou_scores and pred_masks. Each run has one point: 8 prompts in one run of EdgeTAM's
+decoder take 42 ms each on two cores, one alone 34 ms. There are two kinds, which differ in its other inputs:
+    SAM      image_embeddings of a frame that is scaled by its longer side and padded
     SAM 2    image_embeddings.0, .1 and .2 of a frame that is stretched to a square, as EdgeTAM and SAM 2.1 have;
-             input_boxes (1, 0, 4), so one prompt a run
+             input_boxes (1, 0, 4)
 """
 
 import functools
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -28,8 +28,8 @@ from scipy import sparse
 
 from jsecon.errors import InputError, require
 from jsecon.networks.clip import read_preprocessing
-from jsecon.networks.hub import Precision, find_files
-from jsecon.networks.session import Graph, batches, content_digest
+from jsecon.networks.hub import find_files
+from jsecon.networks.session import Graph, content_digest
 from jsecon.vision.classical import ClassicalSegmenter
 
 _BOX_IOU = 0.7
@@ -42,7 +42,7 @@ TOKENS: dict[str, tuple[int, ...]] = {"default": (0, 1, 2), "s": (0,), "m": (1,)
 """level -> which of a point's three masks it takes"""
 
 
-class EncodedFrame(NamedTuple):
+class _EncodedFrame(NamedTuple):
     """A frame as the decoder needs it."""
 
     features: dict[str, np.ndarray]
@@ -62,7 +62,6 @@ class SamGraphs:
       config: preprocessor_config.json.
 
     Attributes:
-      batch: Number of prompts of one run.
       side: Side of the encoder's square image in px.
       stretched: Whether frames are stretched to a square (SAM 2), else scaled and padded (SAM).
     """
@@ -81,10 +80,7 @@ class SamGraphs:
         masks = self._decoder.require("output", "pred_masks", (1, None, None, None, None), what)
         if masks.fixed(2) not in (None, 3, 4):
             raise self._not_three_masks(str(masks))
-        self._fixed_batch = 1 if "input_boxes" in inputs else points.fixed(1)
-        # Of EdgeTAM's decoder on two cores, 8 prompts a run take 42 ms each, one alone 34 ms. 64 of SAM's take more
-        # than 1 GiB.
-        self.batch = self._fixed_batch or 4
+        self._prompts = points.fixed(1) or 1  # of a run; the same one if the graph fixes more
         self.side = image.fixed(3) or side or 1024
         self._links = [name for name in inputs if name not in ("input_points", "input_labels", "input_boxes")]
         for name in self._links:
@@ -97,7 +93,7 @@ class SamGraphs:
         where = f"{self._decoder.path}, output 'pred_masks'"
         return InputError(where, problem, expected, "Export the decoder with all of its masks.")
 
-    def encode(self, frame: UInt8[np.ndarray, "h w 3"]) -> EncodedFrame:
+    def encode(self, frame: UInt8[np.ndarray, "h w 3"]) -> _EncodedFrame:
         """Encodes an RGB frame for `decode`.
 
         It is resized by Pillow, as in SAM's training: its kernel widens if an image shrinks, OpenCV's does not.
@@ -109,28 +105,28 @@ class SamGraphs:
         square = np.zeros((self.side, self.side, 3), np.float32)
         square[: size[0], : size[1]] = (image - self._mean) / self._std
         features = self._encoder.run({"pixel_values": square.transpose(2, 0, 1)[None]}, self._links)
-        return EncodedFrame(features, (height, width), size)
+        return _EncodedFrame(features, (height, width), size)
 
     def decode(
-        self, encoded: EncodedFrame, points: Float32[np.ndarray, "p 2"]
-    ) -> Iterator[tuple[Float32[np.ndarray, "b 3 l l"], Float32[np.ndarray, "b 3"]]]:
-        """Yields mask logits from part to whole, and predicted IoUs, of points x, y in px of the frame, by batches.
+        self, encoded: _EncodedFrame, point: Float32[np.ndarray, " 2"]
+    ) -> tuple[Float32[np.ndarray, "3 l l"], Float32[np.ndarray, " 3"]]:
+        """Predicts mask logits from part to whole, and their IoUs, at a point x, y in px of the frame.
 
         Of four masks the first is left out: it is SAM's one mask for several points.
         """
-        scaled = points * np.divide(encoded.scaled[::-1], encoded.size[::-1], dtype=np.float32)
+        scaled = point * np.divide(encoded.scaled[::-1], encoded.size[::-1], dtype=np.float32)
         feeds = dict(encoded.features)
+        feeds["input_points"] = np.broadcast_to(scaled, (1, self._prompts, 1, 2))
+        feeds["input_labels"] = np.ones((1, self._prompts, 1), np.int64)
         if "input_boxes" in self._decoder.inputs:
             feeds["input_boxes"] = np.zeros((1, 0, 4), np.float32)
-        for part, count in batches(scaled, self._fixed_batch, self.batch):
-            prompts = {"input_points": part[None, :, None], "input_labels": np.ones((1, len(part), 1), np.int64)}
-            outputs = self._decoder.run(feeds | prompts, ["pred_masks", "iou_scores"])
-            masks, scores = outputs["pred_masks"][0], outputs["iou_scores"][0]
-            if masks.shape[:2] != scores.shape or masks.shape[1] not in (3, 4):
-                raise self._not_three_masks(f"{list(masks.shape)} with scores {list(scores.shape)}")
-            yield masks[:count, -3:].astype(np.float32), scores[:count, -3:].astype(np.float32)
+        outputs = self._decoder.run(feeds, ["pred_masks", "iou_scores"])
+        masks, scores = outputs["pred_masks"][0, 0], outputs["iou_scores"][0, 0]
+        if len(masks) != len(scores) or len(masks) not in (3, 4):
+            raise self._not_three_masks(f"{list(masks.shape)} with scores {list(scores.shape)}")
+        return masks[-3:].astype(np.float32), scores[-3:].astype(np.float32)
 
-    def to_frame(self, logits: Float32[np.ndarray, "l l"], encoded: EncodedFrame) -> Float32[np.ndarray, "h w"]:
+    def to_frame(self, logits: Float32[np.ndarray, "l l"], encoded: _EncodedFrame) -> Float32[np.ndarray, "h w"]:
         """Resizes the logits of a mask to the frame, bilinearly, through the encoder's square as SAM does."""
         size = encoded.size[::-1]
         if self.stretched:
@@ -209,9 +205,6 @@ class _Candidate(NamedTuple):
     iou: float
     """as the model predicts it"""
     stability: float
-    token: int
-    prompt: int
-    """index of its point"""
 
 
 class SamSegmenter:
@@ -222,7 +215,6 @@ class SamSegmenter:
     Args:
       folder: The model folder.
       level: Level of the masks.
-      precision: Precision of its graphs, if the folder has such ones; else the highest that is there.
 
     Attributes:
       name: Follows from the content of the files and the level.
@@ -231,8 +223,8 @@ class SamSegmenter:
     prompts: Any = _GuidedPrompts
     """chooses the points: made from a frame and the number of levels, it has `next_points` and `explain`"""
 
-    def __init__(self, folder: str | Path, *, level: Level = "l", precision: Precision | None = None):
-        self._files = find_files(folder, "segmenter", precision)
+    def __init__(self, folder: str | Path, *, level: Level = "l"):
+        self._files = find_files(folder, "segmenter")
         encoder, decoder, config = self._files
         self._level = level
         extra = f"{level} {read_preprocessing(config)}"
@@ -252,9 +244,13 @@ class SamSegmenter:
         prompts = self.prompts(frame, len(tokens))
         candidates: list[_Candidate] = []
         while len(points := prompts.next_points()):
-            for candidate in self._predict(encoded, points):
-                prompts.explain(tokens.index(candidate.token), points[candidate.prompt], candidate.mask)
-                candidates.append(candidate)
+            for point in points:
+                logits, ious = self._graphs.decode(encoded, point)
+                for number, token in enumerate(tokens):
+                    candidate = self._candidate(encoded, logits[token], float(ious[token]))
+                    if candidate is not None:
+                        prompts.explain(number, point, candidate.mask)
+                        candidates.append(candidate)
         boxes = np.asarray([_box_of(candidate.mask) for candidate in candidates], np.float64).reshape(-1, 4)
         distinct = [candidates[i] for i in _box_nms(boxes, np.asarray([c.iou for c in candidates]), _BOX_IOU)]
         masks, changed = np.zeros((len(distinct), *frame.shape[:2]), bool), np.zeros(len(distinct), bool)
@@ -267,27 +263,22 @@ class SamSegmenter:
         kept = _langsplat_nms(masks, scores)
         return masks[kept], scores[kept]
 
-    def _predict(self, encoded: EncodedFrame, points: np.ndarray) -> Iterator[_Candidate]:
-        """Yields the masks of points (P, 2) in px that are good and stable, in the order of the points."""
-        start = 0
-        for logits, ious in self._graphs.decode(encoded, points):
-            for row, token in zip(*np.nonzero(ious > 0.7)):
-                if token not in TOKENS[self._level]:
-                    continue
-                mask_logits = self._graphs.to_frame(logits[row, token], encoded)
-                steady = _stability(mask_logits, 1.0)
-                mask = mask_logits > 0
-                if steady >= 0.85 and mask.any():
-                    yield _Candidate(mask, float(ious[row, token]), steady, int(token), start + int(row))
-            start += len(ious)
+    def _candidate(self, encoded: _EncodedFrame, logits: np.ndarray, iou: float) -> _Candidate | None:
+        """Returns the mask of logits (L, L) if it is good and stable."""
+        if iou <= 0.7:
+            return None
+        logits = self._graphs.to_frame(logits, encoded)
+        # the IoU of the masks at +1 and -1
+        stability = np.count_nonzero(logits > 1.0) / max(np.count_nonzero(logits > -1.0), 1)
+        mask = logits > 0
+        return _Candidate(mask, iou, stability) if stability >= 0.85 and mask.any() else None
 
     def check(self) -> str:
         """Opens and closes the graphs, and describes the model in a sentence."""
         graphs = self._graphs
         self.close()
-        many = "one prompt per run" if graphs.batch == 1 else f"{graphs.batch} prompts per run"
         kind = "SAM 2" if graphs.stretched else "SAM"
-        return f"masks of every frame; decoder of {kind}, {many}, images of {graphs.side} px"
+        return f"masks of every frame; decoder of {kind}, images of {graphs.side} px"
 
     def close(self) -> None:
         """Closes the graphs and frees their memory; they are opened again when needed."""
@@ -296,12 +287,6 @@ class SamSegmenter:
     @functools.cached_property
     def _graphs(self) -> SamGraphs:
         return SamGraphs(*self._files)
-
-
-def _stability(logits: Float[np.ndarray, "h w"], offset: float) -> float:
-    """Returns the IoU of the masks of logits at +offset and -offset; 0 if the wider one is empty."""
-    wide_area = int(np.count_nonzero(logits > -offset))
-    return int(np.count_nonzero(logits > offset)) / wide_area if wide_area else 0.0
 
 
 def _box_of(mask: Bool[np.ndarray, "h w"]) -> tuple[int, int, int, int]:

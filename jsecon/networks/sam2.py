@@ -28,7 +28,7 @@ from PIL import Image
 from jsecon.errors import InputError, require
 from jsecon.files import read_json, reading
 from jsecon.networks.hub import find_files
-from jsecon.networks.session import Graph, Shape, content_digest
+from jsecon.networks.session import Graph, content_digest
 from jsecon.numerics import is_finite_and_bounded
 
 SLOTS = 7
@@ -41,32 +41,14 @@ _FETCH = "Fetch the folder again, all of it from one repository."
 _MASK_LOGIT = 10.0
 """logit of a pixel of a mask prompt; its negative outside"""
 
-# Letters are sizes that must agree across the files: S image, G grid of the coarsest features, T = G^2, C channels, M
-# numbers of a memory token; None is free.
-_FINE, _COARSE = (1, None, None, None), (1, "C", "G", "G")
-_SIGNATURES: Mapping[str, tuple[Mapping[str, Shape], Mapping[str, Shape]]] = {
-    "vision_encoder": (
-        {"pixel_values": (1, 3, "S", "S")},
-        {"feats0": _FINE, "feats1": _FINE}
-        | {name: _COARSE for name in ("feats2", "feats2_no_mem", "vision_pos_embed")},
-    ),
-    "mask_decoder": (
-        {"feats0": _FINE, "feats1": _FINE, "feats2_cond": _COARSE}
-        | {"input_points": (1, 1, None, 2), "input_labels": (1, 1, None)},
-        {"low_res_mask": (1, 1, None, None), "high_res_mask": (1, 1, "S", "S"), "object_pointer": (1, 1, "C")},
-    ),
-    "memory_encoder": (
-        {"feats2": _COARSE, "high_res_mask": (1, 1, "S", "S"), "object_score_logits": (1, 1), "binarize": ()},
-        {"memory_tokens": (None, 1, "M"), "memory_pos": (None, 1, "M")},
-    ),
-    "memory_attention": (
-        {"current_vision_features": ("T", 1, "C"), "current_vision_position_embeddings": ("T", 1, "C")}
-        | {"memory": (None, 1, "M"), "memory_pos": (None, 1, "M")},
-        {"conditioned_feats": _COARSE},
-    ),
-    "pointer_tpos": ({"normalized_diffs": (None,)}, {"pointer_pos": (None, "M")}),
+_OUTPUTS: Mapping[str, tuple[str, ...]] = {
+    "vision_encoder": ("feats0", "feats1", "feats2", "feats2_no_mem", "vision_pos_embed"),
+    "mask_decoder": ("low_res_mask", "high_res_mask", "object_pointer", "object_score_logits"),
+    "memory_encoder": ("memory_tokens", "memory_pos"),
+    "memory_attention": ("conditioned_feats",),
+    "pointer_tpos": ("pointer_pos",),
 }
-"""graph -> inputs and outputs that are used, with their shapes"""
+"""graph -> outputs that are used"""
 
 Features = Mapping[str, np.ndarray]
 """output of the vision encoder for a frame, by name, shared by all objects"""
@@ -114,7 +96,8 @@ class Sam2Graphs:
     Args:
       graphs: By name, as in the module's docstring.
       constants: Content of constants.json.
-      sizes: Sizes S of the image, G of the grid of the coarsest features, C of their channels, T = G^2 and M.
+      sizes: Sizes S of the image, G of the grid of the coarsest features, C of their channels, M of a
+        memory token.
     """
 
     def __init__(self, graphs: Mapping[str, Any], constants: _Constants, sizes: Mapping[str, int]):
@@ -131,7 +114,7 @@ class Sam2Graphs:
         small = np.asarray(frame.resize((side, side), Image.Resampling.BICUBIC))
         image = ((small / 255.0).astype(np.float32) - self.constants.mean) / self.constants.std
         outputs = self._run("vision_encoder", pixel_values=image.transpose(2, 0, 1)[None])
-        return {name: outputs[name] for name in _SIGNATURES["vision_encoder"][1]}
+        return {name: outputs[name] for name in _OUTPUTS["vision_encoder"]}
 
     def _run(self, name: str, **feeds: np.ndarray) -> dict[str, np.ndarray]:
         """Runs a graph by name."""
@@ -218,7 +201,7 @@ def open_sam2(folder: Path) -> Sam2Graphs:
     """Opens the model in a folder, or raises InputError if its files do not make one model."""
     files = _sam2_files(folder)
     constants = _read_constants(files["constants"])
-    graphs = {name: Graph(files[name]) for name in _SIGNATURES}
+    graphs = {name: Graph(files[name]) for name in _OUTPUTS}
     encoder, decoder = graphs["vision_encoder"], graphs["mask_decoder"]
     image = encoder.require("input", "pixel_values", (1, 3, None, None), "SAM 2's vision encoder")
     # Sizes are those of inputs: PyTorch's exporter leaves some sizes of the encoder's outputs open.
@@ -227,13 +210,12 @@ def open_sam2(folder: Path) -> Sam2Graphs:
     if side is None or channels is None or grid is None:
         expected = "an image and features of fixed sizes"
         raise InputError(decoder.path, f"{image} and {features}", expected, _FETCH)
-    sizes = {"S": side, "C": channels, "G": grid, "T": grid * grid, "M": constants.temporal_code.shape[1]}
-    for name, graph in graphs.items():
-        for tensors, kind in zip(_SIGNATURES[name], ("input", "output")):
-            for tensor, shape in tensors.items():
-                fixed = tuple(sizes[size] if isinstance(size, str) else size for size in shape)
-                graph.require(kind, tensor, fixed, f"SAM 2's {name.replace('_', ' ')}")
-    return Sam2Graphs(graphs, constants, sizes)
+    for name, outputs in _OUTPUTS.items():
+        for output in outputs:
+            graphs[name].require("output", output, None, f"SAM 2's {name.replace('_', ' ')}")
+    width = constants.temporal_code.shape[1]
+    graphs["memory_encoder"].require("output", "memory_tokens", (None, 1, width), "the encoder of these constants")
+    return Sam2Graphs(graphs, constants, {"S": side, "C": channels, "G": grid, "M": width})
 
 
 def _read_constants(path: Path) -> _Constants:
@@ -349,7 +331,7 @@ class Sam2Tracker:
 
     def __init__(self, folder: Path):
         files = _sam2_files(folder)
-        graphs = [files[name] for name in _SIGNATURES]
+        graphs = [files[name] for name in _OUTPUTS]
         self.name = f"sam2-{content_digest(graphs, [files['constants']], extra=repr(HOLE_AREA))}"
         self._folder = folder
 
@@ -377,9 +359,6 @@ class Sam2Tracker:
           (T, H, W) int16 index of the object, or -1. A pixel of several objects goes to the highest logit.
         """
         height, width = frames.shape[1:3]
-        fits = prompts.ndim == 3 and prompts.shape[1:] == (height, width) and 0 <= index < len(frames)
-        expected = f"(B, {height}, {width}) and a frame below {len(frames)}"
-        require(fits, "Sam2Tracker", (prompts.shape, index), expected, "Give masks of the frames' size.")
         labels = np.full(frames.shape[:3], -1, np.int16)
         objects = [b for b, mask in enumerate(prompts) if mask.any()]
         if not objects:

@@ -10,7 +10,7 @@ import hashlib
 import math
 import mmap
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -20,15 +20,8 @@ import onnxruntime
 from jsecon.errors import InputError
 from jsecon.process import cores
 
-_DTYPES = {
-    "tensor(float)": "float32",
-    "tensor(float16)": "float16",
-    "tensor(double)": "float64",
-    "tensor(int64)": "int64",
-    "tensor(int32)": "int32",
-    "tensor(uint8)": "uint8",
-    "tensor(int8)": "int8",
-    "tensor(bool)": "bool",
+_DTYPES = {"tensor(float)": "float32", "tensor(double)": "float64"} | {
+    f"tensor({name})": name for name in ("float16", "int64", "int32", "uint8", "int8", "bool")
 }
 _MAX_INPUT_NUMBERS = 1 << 26
 """size of an input; an image of 4096 x 4096 px has 2^25.6 numbers"""
@@ -58,7 +51,7 @@ class Tensor:
     def __str__(self) -> str:
         """Returns the name and shape for messages."""
         if self.shape is None:
-            return f"{self.name} {self.dtype}"
+            return f"{self.name} {self.dtype}".rstrip()
         return f"{self.name} {self.dtype}[{', '.join('?' if size is None else str(size) for size in self.shape)}]"
 
     def fixed(self, axis: int) -> int | None:
@@ -68,9 +61,9 @@ class Tensor:
         size = self.shape[axis]
         return size if isinstance(size, int) and size > 0 else None
 
-    def fits(self, shape: Shape) -> bool:
+    def _fits(self, shape: Shape | None) -> bool:
         """Whether an array of a shape could be the tensor; None and symbols fit every size."""
-        if self.shape is None:
+        if self.shape is None or shape is None:
             return True
         return len(self.shape) == len(shape) and all(
             not (isinstance(mine, int) and mine > 0 and isinstance(size, int)) or mine == size
@@ -109,6 +102,10 @@ class Graph:
         self._run_options = onnxruntime.RunOptions()
         self._run_options.log_severity_level = 4
 
+    def __str__(self) -> str:
+        """Lists the inputs on one line and the outputs on another."""
+        return f"in   {_describe(self.inputs.values())}\nout  {_describe(self.outputs.values())}"
+
     def _open(self, *, optimise: bool) -> onnxruntime.InferenceSession:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = cores()
@@ -132,20 +129,20 @@ class Graph:
             expected = "a whole ONNX graph, with its external data files beside it"
             raise InputError(self.path, problem, expected, "Fetch or export the file again.") from error
 
-    def require(self, side: Literal["input", "output"], name: str, shape: Shape, what: str) -> Tensor:
+    def require(self, side: Literal["input", "output"], name: str, shape: Shape | None, what: str) -> Tensor:
         """Returns a tensor of the graph, or raises InputError if it is missing or has another shape.
 
         Args:
           side: Whether it is an input or an output.
           name: Its name.
-          shape: Its shape; None fits any size.
+          shape: Its shape; None fits any size, and in place of the sizes any shape.
           what: What the graph should be, for the message.
         """
         tensors = self.inputs if side == "input" else self.outputs
-        if name not in tensors or not tensors[name].fits(shape):
-            missing = f"no such {side}; the graph has {describe(tensors.values())}"
+        if name not in tensors or not tensors[name]._fits(shape):
+            missing = f"no such {side}; the graph has {_describe(tensors.values())}"
             problem = str(tensors[name]) if name in tensors else missing
-            expected = f"{Tensor(name, '', tuple(shape))}, as {what} has".replace(" [", "[")
+            expected = f"{Tensor(name, '', shape and tuple(shape))}, as {what} has".replace(" [", "[")
             remedy = "Give the right file; `jsecon models check DIR` lists what each one is."
             raise InputError(f"{self.path}, {side} {name!r}", problem, expected, remedy)
         return tensors[name]
@@ -174,26 +171,9 @@ class Graph:
         return np.asarray(array, dtype if is_same_kind else None, order="C")
 
 
-def describe(tensors: Iterable[Tensor]) -> str:
+def _describe(tensors: Iterable[Tensor]) -> str:
     """Lists name, type and shape of tensors on one line."""
     return ", ".join(map(str, tensors)) or "no tensor"
-
-
-def batches(rows: np.ndarray, fixed: int | None, free: int) -> Iterator[tuple[np.ndarray, int]]:
-    """Yields batches of rows, each with the number of its rows that are not padding.
-
-    Args:
-      rows: Array with any leading axis.
-      fixed: Batch size that a graph fixes, or None; the last batch is then padded with zeros.
-      free: Largest batch size if none is fixed.
-    """
-    size = fixed or free
-    for start in range(0, len(rows), size):
-        part = rows[start : start + size]
-        count = len(part)
-        if fixed and count < fixed:
-            part = np.concatenate([part, np.zeros((fixed - count, *rows.shape[1:]), rows.dtype)])
-        yield part, count
 
 
 def _graph_files(path: Path) -> tuple[Path, ...]:

@@ -26,7 +26,7 @@ _CLEANING_OF_CLASS = {"SiglipTokenizer": "canonicalize", "GemmaTokenizer": "lowe
 _FETCH = "Fetch the file again, from the folder that the graphs come from."
 
 
-class TextRules(NamedTuple):
+class _TextRules(NamedTuple):
     """How a SigLIP takes its texts."""
 
     length: int
@@ -45,7 +45,7 @@ class TextTokenizer:
       rules: How the model takes its texts; None for CLIP, which reads up to the first end of a text, padded with 0.
     """
 
-    def __init__(self, path: Path, rules: TextRules | None):
+    def __init__(self, path: Path, rules: _TextRules | None):
         from tokenizers import Tokenizer
 
         self._path = path
@@ -100,7 +100,7 @@ class TextTokenizer:
             raise InputError(self._path, problem, expected, remedy) from error
 
 
-def read_text_rules(folder: Path, tokenizer: Path) -> TextRules | None:
+def read_text_rules(folder: Path, tokenizer: Path) -> _TextRules | None:
     """Reads how a model takes its texts; None if it does so as CLIP does, or there is no config.json.
 
     config.json of open_clip (immich's layout) has `text_cfg` with `context_length` and, for another vocabulary than
@@ -134,7 +134,7 @@ def read_text_rules(folder: Path, tokenizer: Path) -> TextRules | None:
     if type(length) is not int or not 2 <= length <= 4096 or clean not in ("canonicalize", "lower", "whitespace"):
         expected = "2 to 4096 tokens, cleaned by canonicalize, lower or whitespace"
         raise InputError(path, f"texts of {length!r} tokens, cleaned by {clean!r}", expected, _FETCH)
-    return TextRules(length, pad, clean)
+    return _TextRules(length, pad, clean)
 
 
 def _read_padding(tokenizer: Path) -> tuple[str, str]:

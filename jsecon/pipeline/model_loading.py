@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, get_args
 import numpy as np
 
 from jsecon.errors import InputError
-from jsecon.networks.hub import RECOMMENDED, HubModel, Precision, Role, parse_model
+from jsecon.networks.hub import RECOMMENDED, HubModel, Role, parse_model
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.sources import locate_sources
 from jsecon.types import LanguageField
@@ -76,18 +76,17 @@ def with_folders(options: Options) -> Options:
         choice = getattr(options, role)
         choice = recommended.get(role) if choice is None else choice
         if choice is not None:
-            models[role] = parse_model(choice, role, options.precision)
+            models[role] = parse_model(choice, role)
     return dataclasses.replace(options, **_local_folders(models))
 
 
 def open_models(options: Options, store: Path) -> Models:
     """Opens the models of a run by their folders; `store` is the folder that caches proposals and embeddings."""
-    precision = options.precision
     segmenter = tracker = None
     if options.segmenter is not None:
         from jsecon.networks.sam import SamSegmenter
 
-        sam = SamSegmenter(Path(options.segmenter), level=options.level, precision=precision)
+        sam = SamSegmenter(Path(options.segmenter), level=options.level)
         segmenter = StoredSegmenter(sam, store / "proposals")
     if options.tracker is not None:
         from jsecon.networks.sam2 import Sam2Tracker
@@ -101,30 +100,23 @@ def open_models(options: Options, store: Path) -> Models:
         if options.embedder is None:
             return Models(external, segmenter, tracker)
         name = external.name
-    embedder = _open_embedder(name, folder=options.embedder, precision=precision, store=store / "embeddings")
+    embedder = _open_embedder(name, folder=options.embedder, store=store / "embeddings")
     return Models(embedder, segmenter, tracker)
 
 
-def _open_embedder(
-    name: str | None = None,
-    *,
-    folder: str | Path | None = None,
-    precision: Precision | None = None,
-    store: Path | None = None,
-) -> Embedder:
+def _open_embedder(name: str | None = None, *, folder: str | Path | None = None, store: Path | None = None) -> Embedder:
     """Opens an embedder: CLIP if one is named, else colours. InputError is raised if it is of another space.
 
     Args:
       name: Name of the space, or None for any. In an external space any CLIP with embeddings of that length is taken.
       folder: Folder, name or address of a CLIP model.
-      precision: Precision of its graphs.
       store: Folder that caches embeddings.
     """
     if folder is not None:
         from jsecon.networks.clip import ClipEmbedder
 
-        folder = _local_folders({"embedder": parse_model(folder, "embedder", precision)})["embedder"]
-        clip = ClipEmbedder(folder, precision=precision, store=store)
+        folder = _local_folders({"embedder": parse_model(folder, "embedder")})["embedder"]
+        clip = ClipEmbedder(folder, store=store)
         return _of_space(clip, name, "Give the model that the field was made with: --embedder DIR.")
     if (dim := external_dim(name)) is not None:
         raise _missing_model(dim)
@@ -177,12 +169,12 @@ def _find_model(field: LanguageField) -> "ClipEmbedder | HubModel | None":
         return None
     from jsecon.networks.clip import ClipEmbedder
 
-    model = None if sources.address is None else parse_model(sources.address, "embedder", sources.precision)
+    model = None if sources.address is None else parse_model(sources.address, "embedder")
     on_hub = model if isinstance(model, HubModel) else None
     for folder in (sources.model, None if on_hub is None else on_hub.cached_folder):
         if folder is not None:
             with contextlib.suppress(InputError):  # another model is there now
-                embedder = ClipEmbedder(folder, precision=sources.precision)
+                embedder = ClipEmbedder(folder)
                 if embedder.name == sources.embedder:
                     return embedder
     return on_hub
@@ -217,10 +209,9 @@ def inspect_models(folder: Path) -> dict[str, Any]:
 
 def _signature(path: Path) -> str:
     """Writes the inputs and outputs of a graph, or why it cannot be opened."""
-    from jsecon.networks.session import Graph, describe
+    from jsecon.networks.session import Graph
 
     try:
-        graph = Graph(path, optimise=False)
+        return str(Graph(path, optimise=False))
     except InputError as error:
         return f"cannot be opened: {error.sentence}"
-    return f"in   {describe(graph.inputs.values())}\nout  {describe(graph.outputs.values())}"

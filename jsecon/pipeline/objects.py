@@ -163,9 +163,7 @@ def _classical_segmenter(options: Options, view: _TrainingView, gaussians: Gauss
         known = depths[:, ::4, ::4]
         spacing = 0.02 * float(np.median(known[known > 0]))  # closer points show a sensor's noise, not the surface
         most = 100_000  # points whose normals are estimated
-        cloud = points_from_depth(capture, voxel=spacing, stride=4)
-        if len(cloud.points) > most:
-            cloud = points_from_depth(capture, max_points=most, stride=4)
+        cloud = points_from_depth(capture, voxel=spacing, max_points=most, stride=4)
         surfaces = surfaces_from_depth(depths, cameras, cloud.points)
         return ClassicalSegmenter(**setting, surfaces=surfaces)
     if options.granularity != "coarse":

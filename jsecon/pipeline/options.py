@@ -13,7 +13,6 @@ from typing import Annotated, Any, Literal, TypeAlias, TypeVar, get_type_hints
 import tyro
 
 from jsecon.errors import InputError, describe_error
-from jsecon.networks.hub import Precision
 
 T = TypeVar("T")
 
@@ -182,8 +181,6 @@ class ModelOptions:
         hub:owner/name, or a folder.
       vision_frames: Maximum number of training frames, evenly spaced, in which masks are found and embedded. The fit
         uses all of them. By default vision does too.
-      precision: Precision of the models' graphs. By default it is the one that is fastest on a CPU, fp32, in which
-        models of masks stay if they have no other.
       features: Folder language_features of LangSplat. Regions take their embeddings from <frame>_s.npy and _f.npy, and
         texts then need the CLIP model that made them (--embedder, here or of query).
     """
@@ -194,7 +191,6 @@ class ModelOptions:
     tracker: ModelOption = None
     embedder: ModelOption = None
     vision_frames: Annotated[Option[int | None], Range(2, 1_000_000)] = None
-    precision: Option[Precision | None] = None
     features: Option[Path | None] = None
 
 

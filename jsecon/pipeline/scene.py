@@ -186,9 +186,9 @@ def _fit_scene(stage: StageInput) -> StageResult:
     """Fits Gaussians to the training frames. A long fit may have one for each pixel of a frame, a short one half."""
     from jsecon.fit.optimise import Schedule, fit_gaussians
 
-    options, capture, state = stage.context.options, stage.results.load, stage.checkpoint.read()
-    start, notes = None, ()
-    if state is None:
+    options, capture, start = stage.context.options, stage.results.load, stage.checkpoint.read()
+    notes = ()
+    if start is None:
         start, origin = starting_gaussians(capture, sh_degree=2, progress=stage.progress)
         check_overlap(start, capture.cameras[training_frames(capture.held_out)], str(options.capture))
         notes = (f"start of the fit: {origin}",)
@@ -201,7 +201,6 @@ def _fit_scene(stage: StageInput) -> StageResult:
         steps=options.steps if minutes is None else None,
         seconds=None if minutes is None else 60 * minutes,
         start=start,
-        state=state,
         schedule=Schedule(max_gaussians=most),
         on_checkpoint=lambda current: stage.checkpoint.keep(lambda: current),
         progress=stage.progress,

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jsecon
 from jsecon.errors import InputError
 from jsecon.files import parse_json
-from jsecon.networks.hub import SUFFIXES, Precision, cached_address
+from jsecon.networks.hub import cached_address
 from jsecon.pipeline.options import Options
 from jsecon.types import LanguageField
 
@@ -28,8 +28,6 @@ class Sources(NamedTuple):
     """folder of the capture, if that still exists"""
     address: str | None = None
     """where the model is on the hub ("hub:owner/name@commit"), if the run took it from there"""
-    precision: Precision | None = None
-    """of its graphs; None for the default"""
 
 
 def provenance(options: Options, keys: dict[str, str], embedder: str, out: Path) -> str:
@@ -60,16 +58,15 @@ def locate_sources(field: LanguageField, beside: Path | None = None) -> Sources:
     beside = getattr(field.provenance, "folder", None) if beside is None else beside
     try:
         provenance = parse_json(field.provenance or "{}")
-        folders, models, options = (provenance.get(name, {}) for name in ("folders", "models", "options"))
+        folders, models = (provenance.get(name, {}) for name in ("folders", "models"))
         name = provenance.get("embedder", "")
-        precisions: list[Precision] = [each for each in SUFFIXES if each == options.get("precision")]
         if not all(isinstance(hint, str) for hint in (name, *folders.values(), *models.values())):
             raise ValueError("a hint is not a text")
     except (ValueError, TypeError, AttributeError) as error:
         remedy = "Give the folders yourself, with --embedder and --images, or run the capture again."
         raise InputError("field", "its provenance is not what jsecon run writes", remedy=remedy) from error
     model, capture = (_resolve(beside, folders.get(kind)) for kind in ("embedder", "capture"))
-    return Sources(name or None, model, capture, models.get("embedder"), next(iter(precisions), None))
+    return Sources(name or None, model, capture, models.get("embedder"))
 
 
 def _resolve(beside: Path | None, hint: str | None) -> Path | None:

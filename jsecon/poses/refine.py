@@ -26,7 +26,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, PRNGKeyArray
 
-from jsecon.errors import require
 from jsecon.fit.corrections import (
     CorrectionRates,
     Corrections,
@@ -191,8 +190,6 @@ def refine_capture(
       probes: Maximum number of probes, at least 1.
       progress: Called with the number of steps done and of all.
     """
-    require(visits > 0, "visits", visits, "at least 1", f"{VISITS} are usual.")
-    require(probes > 0, "probes", probes, "at least 1", f"{PROBES} are usual.")
     original, train, decide = capture, ~np.asarray(capture.held_out), max_fit_steps is not None
     aligned = None if capture.depths is None else _align_by_depth(capture, train, ~train)
     by_depth, refine = aligned is not None, CorrectionRates()
@@ -214,12 +211,13 @@ def refine_capture(
         if remaining > 1:
             capture, remaining = _move_cameras(capture, corrections), remaining - 1
     capture = capture if aligned is None else aligned
+    extent = max(cameras_extent(capture.cameras[train]), 1e-6)
     while remaining > 1:
-        scene, corrections = prober.fit(capture, prober.initial(capture), refine, plan.coarse_size, steps)
+        _, corrections = prober.fit(capture, prober.initial(capture), refine, plan.coarse_size, steps)
         before, capture = capture, _move_cameras(capture, corrections)
-        # px at full size, below which the poses are stable
-        stable = _median_shift_px(scene, before.cameras[train], capture.cameras[train]) < 0.25
-        remaining = 1 if stable else remaining - 1
+        shift, turn = _pose_changes(before.cameras[train], capture.cameras[train])
+        pixels = np.asarray(capture.cameras.fx)[train] * np.hypot(shift / extent, turn)
+        remaining = 1 if np.median(pixels) < 0.25 else remaining - 1  # px at full size: the poses are stable
     scene, corrections = prober.fit(capture, prober.initial(capture), refine, FINE_SIZE, steps)
     if held_out:
         corrections = prober.align(capture, scene, corrections, ~train, refine, FINE_SIZE, ALIGN_VISITS)
@@ -315,23 +313,12 @@ def _mean_psnr(
     return float(np.mean(values)) if values else math.nan
 
 
-def _median_shift_px(scene: Gaussians, before: Camera, after: Camera) -> float:
-    """Median over the cameras of the median distance, px, by which their move shifts the Gaussians in view."""
-    points, shifts = np.asarray(scene.means, np.float64), []
-    for t in range(len(before.fx)):
-        (u, v), (moved_u, moved_v) = (_project_points(points, cameras, t) for cameras in (before, after))
-        inside = (u >= 0) & (u <= before.width) & (v >= 0) & (v <= before.height)
-        distances = np.hypot(moved_u - u, moved_v - v)[inside]
-        shifts.append(np.nanmedian(distances) if np.isfinite(distances).any() else 0.0)
-    return float(np.median(shifts))
-
-
-def _project_points(points: Float[np.ndarray, "n 3"], cameras: Camera, t: int) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and rows (px) of points in camera t; NaN behind it."""
-    pose = np.asarray(cameras.world_to_camera[t], np.float64)
-    x, y, z = pose[:3, :3] @ points.T + pose[:3, 3:]
-    z = np.where(z > 0, z, np.nan)
-    return cameras.fx[t] * x / z + cameras.cx[t], cameras.fy[t] * y / z + cameras.cy[t]
+def _pose_changes(before: Camera, after: Camera) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, " t"]]:
+    """Shifts (world units) and turns (radians) between the poses of cameras."""
+    a, b = (np.asarray(cameras.world_to_camera, np.float64) for cameras in (before, after))
+    shift = np.linalg.norm(np.asarray(after.centres) - np.asarray(before.centres), axis=1)
+    difference = np.linalg.norm(a[:, :3, :3] - b[:, :3, :3], axis=(1, 2))
+    return shift, 2 * np.arcsin(np.minimum(difference / math.sqrt(8), 1))
 
 
 def _move_cameras(capture: Capture, corrections: Corrections) -> Capture:
@@ -379,10 +366,8 @@ def _rigid_drift(moved: Float[Array, "t 4 4"], poses: Float[Array, "t 4 4"], ext
 
 def _describe(before: Capture, after: Capture, corrections: Corrections, *, by_depth: bool) -> list[str]:
     """How far the frames were off, a sentence each."""
-    a, b = (np.asarray(c.cameras.world_to_camera, np.float64) for c in (before, after))
-    shift = np.linalg.norm(np.asarray(after.cameras.centres) - np.asarray(before.cameras.centres), axis=1)
-    cosine = (np.einsum("tij,tij->t", a[:, :3, :3], b[:, :3, :3]) - 1) / 2
-    turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    shift, turn = _pose_changes(before.cameras, after.cameras)
+    turn = np.degrees(turn)
     median = f"{np.median(shift):.3g} world units and {np.median(turn):.2g} degrees in the median"
     by = "by colour and depth of their frames, then by a probe fit" if by_depth else "by probe fits"
     gains = np.asarray(corrections.colours).sum(axis=(1, 2)) / 3  # of white: an affine map may spread a gain

@@ -259,7 +259,7 @@ def _attribute_gradient(moments: Array, attributes: Array, corners: tuple[Array,
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4, 5))
 def _rasterize(
-    splats: Array, features: Array, lists: TileLists, width: int, height: int, mesh: Mesh | None = None
+    splats: Array, features: Array, lists: TileLists, width: int, height: int, mesh: Mesh | None
 ) -> tuple[Array, Array]:
     """Composites finite features; arguments and results as for `rasterize_nan_contained`."""
     return _forward(splats, features, lists, width, height, mesh)[:2]
@@ -339,14 +339,9 @@ def _unmerge(array: Array, sets: int) -> Array:
 
 
 def rasterize_nan_contained(
-    splats: Float[Array, "n 6"],
-    features: Float[Array, "n d"],
-    lists: TileLists,
-    width: int,
-    height: int,
-    mesh: Mesh | None = None,
-) -> tuple[Float[Array, "h w d"], Float[Array, "h w"]]:
-    """Composites features of which some may be NaN or infinite.
+    splats: Array, features: Array, lists: TileLists, width: int, height: int, mesh: Mesh | None
+) -> tuple[Array, Array]:
+    """Composites features (N, D) of which some may be NaN or infinite.
 
     Returns:
       Image (H, W, D), NaN in exactly the pixels that a Gaussian with a non-finite feature touches, and final

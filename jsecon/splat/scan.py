@@ -158,12 +158,6 @@ def _coefficients(rows: Array, corner_x: Array, corner_y: Array, exponent: Array
     return jnp.stack([l11, l21, -(l11 * x + l21 * y), l22, -(l22 * y), exponent], axis=-1)
 
 
-def pixel_alphas(splats: Float[Array, "p 6"], corners: tuple[Array, Array], tile: int) -> Float[Array, "p pixels"]:
-    """Computes the alpha (P, pixels) of splats (P, 6) in one tile each, whose upper left corners are given (px)."""
-    exponent = make_table(splats)[:, ATTRIBUTES]
-    return _alphas(_coefficients(splats, *corners, exponent)[:, None], tile)[:, 0]
-
-
 def cumulative(combine: Callable, start: Array, values: Array) -> tuple[Array, Array]:
     """Computes an exclusive scan along the second axis with an associative operation.
 

@@ -11,7 +11,7 @@ import math
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Int, Int32, Int64
+from jaxtyping import Float, Float32, Int, Int32, Int64
 
 from jsecon.vision.surfaces import Surface
 
@@ -64,7 +64,7 @@ def _region_borders(
         if shape is None:
             shapes.append(np.zeros(len(colours[-1])))
         elif isinstance(shape, Surface):
-            shapes.append(np.minimum(steepness * shape.off_plane(axis, inner, outer)[cut], _MAX_STEP))
+            shapes.append(np.minimum(steepness * _off_plane(shape, axis, inner, outer)[cut], _MAX_STEP))
         else:
             shapes.append(np.minimum(step(shape), _MAX_STEP))
     count = int(superpixels.max()) + 1
@@ -76,6 +76,19 @@ def _region_borders(
         np.bincount(inverse, np.concatenate(colours), len(pairs)),
         np.bincount(inverse, np.concatenate(shapes), len(pairs)),
     )
+
+
+def _off_plane(
+    surface: Surface, axis: int, near: Int[np.ndarray, " n"], far: Int[np.ndarray, " n"]
+) -> Float[np.ndarray, "_ _"]:
+    """Computes the distance of pixels from each other's planes, 0 along any plane however steeply it is seen.
+
+    The pixels are those of two indices along an image axis. The distance is the smaller one, as a share of the
+    smaller z.
+    """
+    a, b = np.take(surface.points, near, axis), np.take(surface.points, far, axis)
+    off = [np.abs(np.einsum("...k,...k", b - a, np.take(surface.normals, which, axis))) for which in (near, far)]
+    return np.minimum(*off) / np.maximum(np.minimum(a[..., 2], b[..., 2]), 1e-6)
 
 
 def merge_regions(

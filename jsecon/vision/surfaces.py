@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Int, Shaped
+from jaxtyping import Bool, Float, Float32, Float64, Shaped
 from scipy.spatial import KDTree
 
 from jsecon.types import Camera
@@ -54,16 +54,6 @@ class Surface(NamedTuple):
     """(H, W, 3) float32 in camera axes, world units."""
     normals: np.ndarray
     """(H, W, 3) float32 unit, towards the camera."""
-
-    def off_plane(self, axis: int, near: Int[np.ndarray, " n"], far: Int[np.ndarray, " n"]) -> Float[np.ndarray, "_ _"]:
-        """Computes the distance of pixels from each other's planes, 0 along any plane however steeply it is seen.
-
-        The pixels are those of two indices along an image axis. The distance is the smaller one, as a share of the
-        smaller z.
-        """
-        a, b = np.take(self.points, near, axis), np.take(self.points, far, axis)
-        off = [np.abs(np.einsum("...k,...k", b - a, np.take(self.normals, which, axis))) for which in (near, far)]
-        return np.minimum(*off) / np.maximum(np.minimum(a[..., 2], b[..., 2]), 1e-6)
 
 
 def _cloud_normals(points: Float[np.ndarray, "p 3"]) -> Float64[np.ndarray, "p 3"]:
