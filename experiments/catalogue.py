@@ -27,7 +27,7 @@ from experiments.rooms.room import Room, RoomObject, crowded_room
 from experiments.rooms.shapes import contains
 from jsecon.app.catalogue import Catalogue
 from jsecon.errors import InputError
-from jsecon.field.field import FIELD_FILE
+from jsecon.files import FIELD_FILE
 from jsecon.pipeline import run as pipeline
 from jsecon.pipeline.options import Options as RunOptions
 from jsecon.pipeline.progress import Console

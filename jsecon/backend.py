@@ -1,11 +1,14 @@
-"""Checks that jax computes right numbers on this backend: some releases do not (jax issue 39103)."""
+"""Starts jax's devices, and checks that jax computes right numbers on them: some releases do not (jax issue 39103)."""
 
-from typing import NamedTuple
+import contextlib
+from typing import Any, NamedTuple
 
 import jax
+import jax.extend.backend
 import jax.numpy as jnp
 import numpy as np
 
+from jsecon.errors import InputError, describe_error
 from jsecon.numerics import cosine, cosine_matrix, normalize
 
 REMEDY = (
@@ -26,6 +29,31 @@ class BackendReport(NamedTuple):
     matvec_error: float
     """the same for `max(T @ normalised row)` under jit and vmap: above 1e-3 if jax has issue 39103. jsecon never uses
     that form; code that is composed with it may."""
+
+
+def start_backend() -> None:
+    """Starts jax's devices, or raises InputError with the variable that asks for devices which this jax lacks."""
+    try:
+        jax.devices()
+    except Exception as error:  # jax raises RuntimeError, and AssertionError for a platform whose plugin is missing
+        config: Any = jax.config
+        asked = {name: config.values[name] for name in ("jax_platforms", "jax_platform_name")}
+        present: set[str] = set()
+        try:
+            for name in asked:
+                config.update(name, "")
+            with contextlib.suppress(Exception):  # it has none
+                present.update(jax.extend.backend.backends())
+        finally:
+            for name, value in asked.items():
+                config.update(name, value)
+            jax.extend.backend.clear_backends()
+        known = present | ({"gpu"} if present & {"cuda", "rocm"} else set())
+        for name, value in asked.items():
+            if value and not known.issuperset(value.split(",")):
+                problem = f"it asks for {value!r}, which this jax does not have (it has {', '.join(sorted(present))})"
+                raise InputError(name.upper(), problem, remedy=f"Unset it, or set {name.upper()}=cpu.") from error
+        raise InputError("jax", f"it cannot start ({describe_error(error)})", remedy="Run jsecon doctor.") from error
 
 
 def check_backend() -> BackendReport:

@@ -1,5 +1,6 @@
 """The error for bad input, and checks of arguments. Each message says what is wrong, where, and what to do."""
 
+import errno
 from collections.abc import Iterable
 from typing import Any
 
@@ -28,6 +29,30 @@ class InputError(ValueError):
     def sentence(self) -> str:
         """The problem as a sentence, without the place and the remedy."""
         return f"{self.problem.rstrip('.')}{f', expected {self.expected}' if self.expected else ''}."
+
+
+_MACHINE = {
+    errno.EACCES: "Mend the permissions of the file and of its folders.",
+    errno.EPERM: "Mend the permissions of the file and of its folders.",
+    errno.EMFILE: "Raise the limit of open files, for example: ulimit -n 4096",
+    errno.ENFILE: "Close other programs: the machine has no file handle left.",
+    errno.EIO: "Check the disk, or the connection to it.",
+    errno.ENOMEM: "End other programs, or take a machine with more memory.",
+}
+_MACHINE |= dict.fromkeys((errno.ESTALE, errno.ETIMEDOUT, errno.ENODEV, errno.ENXIO), _MACHINE[errno.EIO])
+"""errors of the machine, which say nothing about the content of a file, and what to do about them"""
+
+
+def machine_error(error: BaseException, path: object) -> InputError | None:
+    """Returns the error to raise where reading a file fails by the machine and not by the file's content, else None."""
+    if not isinstance(error, OSError) or error.errno not in _MACHINE:
+        return None
+    return InputError(error.filename or path, describe_error(error), remedy=_MACHINE[error.errno])
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether NumPy or jax found no memory for an array."""
+    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" in str(error))
 
 
 def describe_error(error: BaseException) -> str:

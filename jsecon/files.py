@@ -19,7 +19,7 @@ import tokenize
 import uuid
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 from safetensors import SafetensorError, safe_open
 
-from jsecon.errors import InputError, describe_error, require
+from jsecon.errors import InputError, describe_error, is_out_of_memory, machine_error, require
 
 READ_ERRORS = (
     *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ImportError, RuntimeError),
@@ -41,7 +41,23 @@ _DTYPES = {"BOOL": np.dtype(bool)} | {
     for size in sizes
 }
 """NumPy's types by safetensors' names"""
+FIELD_FILE = "field.safetensors"
+"""name of a field in its folder"""
 _CODES = {dtype: code for code, dtype in _DTYPES.items()}
+_UNPACK, _DOWNLOAD = "Unpack it, and give what is in it.", "Download the file again."
+_SUBSTITUTES = (
+    (b"version https://git-lfs", "a Git LFS pointer", "Run: git lfs pull", ()),
+    (b"PK\3\4", "a zip archive", _UNPACK, (".sog", ".npz")),
+    (b"\x1f\x8b", "a gzip archive", _UNPACK, (".spz",)),
+    *((head, "a compressed archive", _UNPACK, (".spz",)) for head in (b"BZh", b"\xfd7zXZ", b"7z\xbc\xaf", b"Rar!")),
+    (b"\x28\xb5\x2f\xfd", "a compressed archive", _UNPACK, (".spz",)),
+    *(
+        (head, "a page of HTML", "Download the file again.", ())
+        for head in (b"<!doctype", b"<html", b"<head", b"<body")
+    ),
+    *((head, "a page of XML", _DOWNLOAD, (".xml",)) for head in (b"<?xml", b"<error")),
+)
+"""first bytes in small letters, what begins so, what to do about it, and the suffixes of files that may begin so"""
 
 
 @contextlib.contextmanager
@@ -116,6 +132,16 @@ def list_files(root: Path, *, exclude: Path | None = None) -> Iterator[Path]:
     yield from (file for file in sorted(files) if file.is_file())
 
 
+def remove_files(folder: Path, names: Iterable[str]) -> None:
+    """Removes files that an earlier command wrote directly into a folder; those that are gone are no error."""
+    for file in (folder / name for name in names if Path(name).name == name):
+        try:
+            file.unlink(missing_ok=True)
+        except OSError as error:
+            problem = f"the file of an earlier answer cannot be removed ({describe_error(error)})"
+            raise InputError(file, problem, remedy="Remove it yourself, or choose another folder.") from error
+
+
 def write_text(path: str | os.PathLike, text: str) -> None:
     r"""Writes a text (UTF-8) atomically."""
     with atomic_write(path) as temporary:
@@ -140,24 +166,45 @@ def parse_json(text: str | bytes) -> Any:
 
 def read_json(path: Path, expected: str, remedy: str) -> Any:
     """Reads a JSON file."""
-    try:
-        return parse_json(path.read_bytes())
-    except OSError as error:
-        raise InputError(path, describe_error(error), expected, remedy) from error
-    except ValueError as error:
-        raise InputError(path, f"it is not JSON ({describe_error(error)})", expected, remedy) from error
+    with reading(path, expected, remedy, problem="it is not JSON"):
+        try:
+            return parse_json(path.read_bytes())
+        except OSError as error:
+            raise InputError(path, describe_error(error), expected, remedy) from error
+
+
+def describe_substitute(path: object, *, in_place: bool = True) -> tuple[str, str] | None:
+    """Recognises what stands in place of a file by its first bytes: what it is, and a remedy; else None.
+
+    Without `in_place`, archives that are the content of the file's own format count too.
+    """
+    if not os.path.isfile(str(path)):
+        return None
+    with contextlib.suppress(OSError), open(str(path), "rb") as file:
+        head = file.read(64).removeprefix(codecs.BOM_UTF8).lstrip().lower()
+        for start, what, remedy, suffixes in _SUBSTITUTES:
+            if head.startswith(start.lower()) and not (in_place and str(path).lower().endswith(suffixes)):
+                return f"{what} in place of the file" if in_place else what, remedy
+    return None
 
 
 @contextlib.contextmanager
 def reading(
     path: object, expected: str = "", remedy: str = "", *, problem: str = "it cannot be read"
 ) -> Iterator[None]:
-    """Turns what the reading of a damaged file raises (READ_ERRORS) into an InputError."""
+    """Turns what the reading of a damaged file raises (READ_ERRORS) into an InputError, which says what is there."""
     try:
         yield
-    except InputError:
-        raise
     except READ_ERRORS as error:
+        if is_out_of_memory(error):
+            raise
+        if (fault := machine_error(error, path)) is not None:
+            raise fault from error
+        where = error.where if isinstance(error, InputError) else path
+        if (substitute := describe_substitute(where)) is not None:
+            raise InputError(where, substitute[0], remedy=substitute[1]) from error
+        if isinstance(error, InputError):
+            raise
         raise InputError(path, f"{problem} ({describe_error(error)})", expected, remedy) from error
 
 
@@ -200,10 +247,10 @@ def read_arrays(
     path: str | os.PathLike, *, memory_map_above: int = sys.maxsize, verify: bool = True
 ) -> tuple[Any, dict[str, np.ndarray]]:
     """Reads what `write_arrays` wrote."""
-    with safe_open(path, framework="numpy"):  # checks sizes and places: no gap, no overlap, no bytes behind the end
-        pass
     arrays = {}
-    with open(path, "rb") as file:
+    with open(path, "rb") as file:  # first: safetensors calls a file that it may not open a missing one
+        with safe_open(path, framework="numpy"):  # checks sizes and places: no gap, no overlap, no bytes behind the end
+            pass
         length = int.from_bytes(file.read(8), "little")
         layout = parse_json(file.read(length))
         metadata = layout.pop("__metadata__", {})

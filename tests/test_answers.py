@@ -11,7 +11,9 @@ from capture_files import refused, run_cli
 from small_field import colour_field
 from test_gltf import read_glb
 
-from jsecon import Scene, load_gaussians, objects, save_field
+from jsecon import Answer, Query, Scene, load_gaussians, objects, save_field
+from jsecon.app.querying import write_answers
+from jsecon.pipeline.progress import Console
 from jsecon.vision.colours import ColourEmbedder
 
 
@@ -83,3 +85,41 @@ def test_answers_without_a_region_or_gaussians_and_a_text_that_is_not_utf8(saved
     for by in ("votes", "code"):
         with refused("not UTF-8"):
             Scene(field, ColourEmbedder()).ask(odd, by=by)
+
+
+@pytest.mark.parametrize(("first", "second"), [
+    (["--format", "glb", "--views", 4], ["--views", 1]),
+    (["--format", "spz", "--views", 2], ["--format", "glb", "--views", 0]),
+])  # fmt: skip
+def test_an_answer_replaces_the_files_of_the_last_one_to_the_same_text(saved, tmp_path, first, second):
+    """Fewer masks, another format, and no match: what stays is what the record lists, and what others wrote."""
+    field, file = saved
+    others = ["pink-frame_0-notes.png", "pink.txt", "blue.ply"]
+    for name in others:
+        (tmp_path / name).write_text("mine")
+    for options in (["--views", 2], first):
+        assert run_cli("query", file, "pink", "pink or red", "--out", tmp_path, *options) == 0
+    beside = {path.name for path in tmp_path.glob("pink-or-red*")}
+    assert run_cli("query", file, "pink", "--out", tmp_path, *second) == 0
+    told = json.loads((tmp_path / "pink.json").read_text())
+    own = {"pink.json", *told["masks"].values(), *(told[ending] for ending in ("ply", "glb") if told.get(ending))}
+    assert {path.name for path in tmp_path.iterdir()} == {"answers.html", *others, *beside, *own}
+    found = Scene(field).ask("pink")
+    nothing = Answer(Query("pink"), "votes", np.zeros_like(found.mask), found.selection, field, count=0)
+    write_answers(Scene(field), [nothing], tmp_path, Console())
+    assert {path.name for path in tmp_path.iterdir()} == {"answers.html", *others, *beside, "pink.json"}
+
+
+def test_a_text_that_fails_leaves_no_answer_of_an_earlier_field(saved, tmp_path):
+    _, file = saved
+    assert run_cli("query", file, "pink", "--out", tmp_path) == 0
+    words = {"query": "mug", "ply": "mug.ply", "masks": {"a": "mug-a.png", "b": "../mug-b.png", "c": "pink.json"}}
+    (tmp_path / "mug.json").write_text(json.dumps(words))
+    for name in ("mug.ply", "mug-a.png", "../mug-b.png"):
+        (tmp_path / "x" / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("of a field with a model")
+    assert run_cli("query", file, "mug", "--out", tmp_path) == 2
+    assert not list(tmp_path.glob("mug*"))
+    assert not (tmp_path / "answers.html").exists()
+    assert (tmp_path / "pink.json").exists()
+    assert (tmp_path.parent / "mug-b.png").exists()

@@ -194,6 +194,22 @@ def test_exported_objects_and_labels_are_those_of_the_catalogue(field, file, tmp
         np.testing.assert_array_equal(load_gaussians(path).means, np.asarray(whole.means)[labels == n])
 
 
+def test_an_export_of_objects_replaces_those_of_the_last_one_and_nothing_else(field, file, tmp_path):
+    folder = tmp_path / "objects"
+    assert run_cli("export", file, "--objects", folder) == 0
+    assert len(list(folder.iterdir())) == REGIONS
+    first = sorted(folder.iterdir())[0]
+    mine = {"001-scan.ply": b"ply\n", "copy of it.ply": first.read_bytes(), "notes.txt": b"mine"}
+    for name, content in mine.items():
+        (folder / name).write_bytes(content)
+    votes = dataclasses.replace(field.votes, regions=np.where(field.votes.regions > 1, -1, field.votes.regions))
+    save_field(file, dataclasses.replace(field, votes=votes))
+    assert run_cli("export", file, "--objects", folder) == 0
+    written = {path.name for path in folder.iterdir()} - set(mine)
+    assert len(written) == 2
+    assert set(mine) <= {path.name for path in folder.iterdir()}
+
+
 def test_only_and_without_part_the_scene_bit_for_bit(field, file, tmp_path, capsys):
     paths = {name: tmp_path / f"{name}.ply" for name in ("scene", "only", "without")}
     assert run_cli("export", file, "--out", paths["scene"]) == 0

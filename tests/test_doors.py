@@ -5,6 +5,7 @@ import asyncio
 import base64
 import json
 import re
+from concurrent.futures import Future
 
 import cv2
 import numpy as np
@@ -108,10 +109,11 @@ def test_tools_of_language_models(door):
 
     from jsecon.app.mcp_server import make_server
 
-    scene = door[0]
+    scene, opened = door[0], Future()
+    opened.set_result(scene)
 
     async def ask():
-        async with Client(make_server({"table": scene})) as client:
+        async with Client(make_server({"table": opened})) as client:
             return [(await client.call_tool("find", {"text": text})).structured_content for text in TEXTS]
 
     for text, record in zip(TEXTS, asyncio.run(ask()), strict=True):

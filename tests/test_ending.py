@@ -62,7 +62,7 @@ def test_debug_shows_where_an_error_came_from(tmp_path, capsys, monkeypatch):
             monkeypatch.setenv("JAX_TRACEBACK_FILTERING", user)
         assert cli.main([*line, "--debug"]) == 2
         err = capsys.readouterr().err
-        assert "in load_field" in err
+        assert "in locate_field" in err
         assert err.splitlines()[-1].startswith("jsecon: ")
         assert os.environ["JAX_TRACEBACK_FILTERING"] == value
 
@@ -97,3 +97,11 @@ def test_a_stop_and_a_bug_are_error_objects_with_their_own_codes(end, capsys):
     with pytest.raises(ZeroDivisionError):
         end(ZeroDivisionError("a bug"), "--json")
     assert json.loads(capsys.readouterr().out)["error"]["problem"] == "internal error: a bug"
+
+
+@pytest.mark.parametrize("error", [MemoryError("Unable to allocate 8 PiB"), RuntimeError("RESOURCE_EXHAUSTED: 9 TB")])
+def test_faults_of_the_machine_are_one_sentence(end, capsys, error):
+    assert end(OSError(24, "Too many open files", "a.ply")) == 2
+    assert capsys.readouterr().err.startswith("jsecon: a.ply: Too many open files. Raise the limit")
+    assert end(error) == 2
+    assert capsys.readouterr().err.startswith(f"jsecon: memory has no room left ({error}). End other")

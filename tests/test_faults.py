@@ -1,6 +1,7 @@
 """Faults of the machine end in one message: no room, no memory, another run in the same folder, a request to stop."""
 
 import contextlib
+import errno
 import os
 import resource
 import signal
@@ -14,8 +15,8 @@ from capture_files import refused, small_capture, write_images, write_text_model
 from fuzz_readers import tiny_field
 from test_pipeline import Recorder
 
-from jsecon import load_capture, save_field, save_gaussians
-from jsecon.files import exclusive_lock, write_text
+from jsecon import load_capture, load_field, load_gaussians, save_field, save_gaussians
+from jsecon.files import exclusive_lock, reading, write_text
 from jsecon.pipeline import cache, run as pipeline, scene
 from jsecon.pipeline.results import RunContext
 from jsecon.pipeline.scene import plan_capture
@@ -156,3 +157,48 @@ def test_a_stop_is_exit_code_130_wherever_it_falls(tmp_path):
     environ = {**os.environ, "PYTHONPATH": f"{tmp_path}:{ROOT}"}
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environ)
     assert (done.returncode, done.stderr) == (130, "\njsecon: interrupted.\n")
+
+
+@pytest.mark.parametrize(("variable", "value"), [
+    ("JAX_PLATFORMS", "gpu"), ("JAX_PLATFORMS", "cuda"), ("JAX_PLATFORMS", "cpu,tpu"), ("JAX_PLATFORM_NAME", "rocm"),
+])  # fmt: skip
+def test_a_platform_that_jax_lacks_is_named_by_every_verb(tmp_path, variable, value):
+    """And no file is called damaged; twice in one process, as a server that opens two fields."""
+    save_field(tmp_path / "field.safetensors", tiny_field())
+    save_gaussians(tmp_path / "scene.ply", tiny_field().gaussians)
+    program = (
+        "from jsecon.app import cli\n"
+        "cli.main(['query', 'field.safetensors', 'red', '--out', 'a'])\n"
+        "cli.main(['objects', 'field.safetensors'])\n"
+        "cli.main(['run', 'scene.ply', '--out', 'b', '--dry-run'])\n"
+        "cli.main(['doctor'])"
+    )
+    environ = {key: text for key, text in os.environ.items() if not key.startswith("JAX_PLATFORM")}
+    environ |= {variable: value, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=tmp_path, env=environ)
+    expected = f"{variable}: it asks for '{value}', which this jax does not have (it has cpu). Unset it, or set"
+    errors = [line for line in done.stderr.splitlines() if line.startswith("jsecon: ")]
+    assert len(errors) == 4, done.stderr
+    assert all(expected in line for line in errors)
+    assert "Traceback" not in done.stderr
+
+
+def test_faults_of_the_machine_are_no_damage_of_a_file(tmp_path):
+    save_field(tmp_path / "field.safetensors", tiny_field())
+    save_gaussians(tmp_path / "scene.ply", tiny_field().gaussians)
+    own = resource.getrlimit(resource.RLIMIT_NOFILE)
+    lowest = os.open(os.devnull, os.O_RDONLY)
+    os.close(lowest)
+    for read, name in ((load_field, "field.safetensors"), (load_gaussians, "scene.ply")):
+        read(tmp_path / name)  # with the modules that it imports
+        try:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (lowest, own[1]))
+            with refused(tmp_path / name, "Too many open files", "ulimit -n"):
+                read(tmp_path / name)
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, own)
+    for code, words in ((errno.EACCES, "permissions"), (errno.EIO, "disk"), (errno.ENOMEM, "more memory")):
+        with refused("a.ply", os.strerror(code), words), reading("a.ply", remedy="Export it again."):
+            raise OSError(code, os.strerror(code))
+    with pytest.raises(MemoryError), reading("a.ply"):
+        raise MemoryError

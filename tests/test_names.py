@@ -54,7 +54,7 @@ TEXTS = [
 
 
 def test_texts_have_names_of_their_own_also_without_case(field):
-    names = {text: file_stem(answer(field, text)) for text in TEXTS}
+    names = {text: file_stem(answer(field, text).query) for text in TEXTS}
     assert (names["red mug"], names["c"], names["café"]) == ("red-mug", "c", "café")
     assert len({name.casefold() for name in names.values()}) == len(TEXTS)
     for name in names.values():
@@ -68,9 +68,10 @@ def test_a_text_and_a_pixel_of_one_name_do_not_share_files(field):
     scene = Scene(field)
     pixel, region = scene.ask(At(1, 24, 20)), scene.ask(Region(1))
     assert str(pixel.query) == at
-    assert file_stem(pixel) != file_stem(answer(field, at))
-    assert file_stem(region) != file_stem(answer(field, "region 1"))
-    assert file_stem(pixel) == file_stem(scene.ask(At("frame_1", 24, 20))) != file_stem(scene.ask(At(1, 24, 21)))
+    assert file_stem(pixel.query) != file_stem(Query(at))
+    assert file_stem(region.query) != file_stem(Query("region 1"))
+    same, other = scene.ask(At("frame_1", 24, 20)), scene.ask(At(1, 24, 21))
+    assert file_stem(pixel.query) == file_stem(same.query) != file_stem(other.query)
 
 
 def test_frames_of_hostile_names_are_written_beneath_the_folder(field, tmp_path):

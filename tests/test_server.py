@@ -137,8 +137,8 @@ def test_fields_are_opened_by_their_folders_names_and_the_address_is_told(scenes
         file.parent.mkdir()
         save_field(file, scenes["desk"].field)
     assert list(open_scenes(files, None)) == ["a", "b"]
-    with refused("a second field named 'a'"):
-        open_scenes([files[0], files[0]], None)
+    with refused("given twice"):
+        open_scenes([files[0], files[0].parent], None)
     told, _ = prepare(files, host="127.0.0.1", port=0, token="", embedder=None)
     assert int(told["address"].removeprefix("http://127.0.0.1:")) > 0
     assert [scene["name"] for scene in told["fields"]] == ["a", "b"]
@@ -150,4 +150,8 @@ def test_splats_of_one_name_are_told_apart_by_their_folders(scenes, tmp_path, mo
     save_field(tmp_path / "field.safetensors", scenes["desk"].field)
     monkeypatch.setattr("jsecon.app.scene._field_of_gaussians", lambda *_: tmp_path / "field.safetensors")
     files = [tmp_path / name for name in ("a/cloud.ply", "b/cloud.ply", "b/room.spz")]
-    assert list(open_scenes(files, None)) == ["cloud", "b_cloud", "room"]
+    for file in files:
+        file.parent.mkdir(exist_ok=True)
+        file.write_bytes(b"of Gaussians")
+    scenes = open_scenes(files, None)
+    assert list(scenes) == [scene.name for scene in scenes.values()] == ["a/cloud", "b/cloud", "room"]

@@ -7,6 +7,8 @@ import importlib.metadata
 import os
 import platform
 import re
+import shutil
+import tempfile
 from pathlib import Path
 from typing import Literal
 
@@ -17,6 +19,8 @@ from jsecon.process import available_memory, cores
 
 MIN_MEMORY = 2 << 30
 """bytes that `jsecon demo` takes, rounded up"""
+MIN_DISK = 200 << 20
+"""bytes of the compiled programs of some runs"""
 REINSTALL = 'Run: pip install --force-reinstall "jsecon"'
 """remedy of a broken package"""
 MODULES = {"opencv_contrib_python_headless": "cv2", "pillow": "PIL", "scikit_learn": "sklearn"}
@@ -69,9 +73,12 @@ def _check_jax() -> list[_Check]:
     try:
         import jax
 
-        from jsecon.backend import REMEDY, check_backend
+        from jsecon.backend import REMEDY, check_backend, start_backend
 
+        start_backend()
         kinds = collections.Counter(device.platform for device in jax.devices())
+    except InputError as error:
+        return [_Check("jax", "wrong", f"{error.where}: {error.sentence}", error.remedy)]
     except Exception as error:  # whatever a driver or a wheel raises
         return [_Check("jax", "wrong", str(error) or describe_error(error), REINSTALL)]
     devices = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
@@ -99,11 +106,21 @@ def _check_memory() -> _Check:
 
 
 def _check_programs() -> _Check:
-    """Finds the folder of compiled programs."""
+    """Finds the folder of compiled programs, and whether there is room for more."""
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     if folder is None:
         return _Check("programs", "missing", "no folder can be written, so that every run compiles anew (set HOME)")
-    return _Check("programs", "ok", f"{sum(file.is_file() for file in Path(folder).rglob('*'))} files in {folder}")
+    message = f"{sum(file.is_file() for file in Path(folder).rglob('*'))} files in {folder}"
+    try:
+        existing = next(place for place in (Path(folder), *Path(folder).absolute().parents) if place.exists())
+        free = shutil.disk_usage(existing).free
+        tempfile.TemporaryFile(dir=existing).close()
+    except OSError as error:
+        return _Check("programs", "wrong", f"{folder}: {describe_error(error)}, so that every run compiles anew")
+    if free >= MIN_DISK:
+        return _Check("programs", "ok", message)
+    message += f", where {free >> 20} MiB are free: free {MIN_DISK >> 20} MiB, else every run compiles anew"
+    return _Check("programs", "wrong", message)
 
 
 def _check_extras() -> list[_Check]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 from jsecon.app import verbs
+from jsecon.app.opening import locate_field
 from jsecon.app.scene import Scene, open_scene
 from jsecon.errors import InputError
 from jsecon.evaluate.lerf import Row, evaluate_at_thresholds
@@ -63,10 +64,10 @@ def evaluate(
 
 def _eval(verb: verbs.Eval, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon eval`: prints the table, and writes OUT/evaluation.json with every pair."""
-    out = verb.out or verb.field.parent
+    out = verb.out or locate_field(verb.field).file.parent
     require_writable(out)
-    with console.progress("field"):
-        scene = open_scene(verb.field, embedder=verb.embedder)
+    scene = open_scene(verb.field, embedder=verb.embedder, console=console)
+    with console.progress("model"):
         _ = scene.embedder  # else its absence would count as 0 for every text
     results = evaluate(scene, load_lerf_labels(verb.labels), console)
     names = ("frame", "query", "iou", "located", "selected", "region", "score")

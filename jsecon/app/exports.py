@@ -1,8 +1,10 @@
 """`jsecon objects` and `jsecon export`: a catalogue as a page and JSON; a scene, or objects of it, as files."""
 
+import contextlib
 import json
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 
@@ -12,7 +14,7 @@ from jsecon.app.querying import slug
 from jsecon.app.records import decimals, unit_of
 from jsecon.app.scene import Scene, open_scene
 from jsecon.errors import InputError
-from jsecon.files import write_text
+from jsecon.files import remove_files, write_text
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console
 from jsecon.query.outliers import MIN_SAMPLES
@@ -23,9 +25,9 @@ def _objects(verb: verbs.Objects, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon objects`; the result has the records of the objects."""
     if verb.out is not None:
         require_writable(verb.out)
-    with console.progress("field"):
-        names = None if verb.vocabulary is None else _read_vocabulary(verb.vocabulary)
-        scene = open_scene(verb.field, embedder=verb.embedder)
+    names = None if verb.vocabulary is None else _read_vocabulary(verb.vocabulary)
+    scene = open_scene(verb.field, embedder=verb.embedder, console=console)
+    with console.progress("objects"):
         listed = scene.objects(names)
     records = listed.records()
     for record in records:
@@ -61,10 +63,9 @@ def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon export`; the result has the number of exported Gaussians and the bytes of the scene."""
     _check_export(verb)
     text = verb.only if verb.only is not None else verb.without
-    with console.progress("field"):
-        if verb.out is not None:
-            require_writable_format(verb.out)
-        scene = open_scene(verb.field, embedder=verb.embedder)
+    if verb.out is not None:
+        require_writable_format(verb.out)
+    scene = open_scene(verb.field, embedder=verb.embedder, console=console)
     answer = None if text is None else scene.ask(text)
     if answer is not None and not len(answer.rows):
         option = "--only" if verb.only is not None else "--without"
@@ -101,14 +102,30 @@ def _check_export(verb: verbs.Export) -> None:
 
 
 def _save_objects(scene: Scene, folder: Path) -> list[Path]:
-    """Writes a .ply of each object, named by its id and name; of a whole with the Gaussians of its parts."""
+    """Writes a .ply of each object, named by its id and name; of a whole with the Gaussians of its parts.
+
+    They replace those that an earlier export wrote to the folder.
+    """
     files = []
     catalogue = scene.objects()
+    remove_files(folder, [file.name for file in folder.glob("*.ply") if _is_exported_object(file)])
     for record in catalogue.records():
         name = slug(_title(record)).encode()[:60].decode("utf-8", "ignore")
         files.append(folder / f"{record['id']:03d}-{name}.ply")
-        scene.export(files[-1], catalogue.mask(record["id"]))
+        scene.export(files[-1], catalogue.mask(record["id"]), comment=_object_comment(files[-1]))
     return files
+
+
+def _object_comment(file: Path) -> str:
+    """Returns the comment in the file of an object, which tells it from a file that has another origin or name."""
+    return f"jsecon object {quote(file.name)}"
+
+
+def _is_exported_object(file: Path) -> bool:
+    """Whether an earlier export of objects wrote this file under this name."""
+    with contextlib.suppress(OSError), file.open("rb") as opened:
+        return f"comment {_object_comment(file)}\n".encode() in opened.read(2000)
+    return False
 
 
 def _page(scene: Scene, catalogue: Catalogue, records: list[dict[str, Any]], console: Console) -> str:

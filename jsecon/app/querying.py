@@ -19,13 +19,17 @@ from jsecon.app import pictures, report, verbs
 from jsecon.app.records import Answer, At, Box, Mask, Query, Question
 from jsecon.app.scene import Scene, open_scene
 from jsecon.errors import InputError
-from jsecon.files import write_text
+from jsecon.files import parse_json, remove_files, write_text
 from jsecon.pipeline.options import is_bare_scene, require_writable
 from jsecon.pipeline.progress import Console
 from jsecon.query.expressions import is_expression
 from jsecon.read.captures.images import write_image
 from jsecon.read.splats.files import require_writable_format
 
+PAGE = "answers.html"
+"""page of a command's answers in its folder"""
+FORMATS = ("ply", "spz", "glb")
+"""formats of the Gaussians of an answer, keys of its record"""
 MAX_SLUG_BYTES = 80
 """bytes of a slug; a file name may have 255 bytes, two slugs and their hashes among them"""
 
@@ -44,6 +48,11 @@ def _query(verb: verbs.Query, console: Console) -> verbs.VerbResult:
     if any(answer.by == "relation" for answer in answers):
         console.note("Words in quotes are searched for as they stand, without relations.")
     files: dict[str, Any] = {"views": verb.views, "ending": verb.format}
+    for query, result in zip(queries, results):
+        if isinstance(result, InputError) and isinstance(query.question, str):
+            _remove_answer(verb.out, file_stem(query))
+    if not answers:
+        remove_files(verb.out, [PAGE])
     result = write_answers(scene, answers, verb.out, console, **files) if answers else {"answers": []}
     return result | {"errors": [error for error in results if isinstance(error, InputError)]}
 
@@ -86,6 +95,8 @@ def write_answer(
 ) -> dict[str, Any]:
     """Writes the files of an answer, of an empty one its record alone, and returns the record of the .json.
 
+    They replace those of an earlier answer to the same question.
+
     Args:
       answer: The answer.
       scene: The scene that gave it.
@@ -93,7 +104,8 @@ def write_answer(
       masks: Index of a frame -> mask to write (`Scene.mask`).
       ending: Format of the Gaussians: ply, spz or glb.
     """
-    stem = file_stem(answer)
+    stem = file_stem(answer.query)
+    _remove_answer(out, stem)
     record = answer.as_dict() | {ending: None, "masks": {}}
     if len(answer.rows):
         record[ending] = f"{stem}.{ending}"
@@ -125,7 +137,7 @@ def write_answers(
     records: dict[str, dict[str, Any]] = {}
     with console.progress("pictures") as progress:
         for n, answer in enumerate(answers):
-            stem = file_stem(answer)
+            stem = file_stem(answer.query)
             console.print_line(str(answer))
             if stem not in records:  # else the question stands there twice
                 masks = {t: scene.mask(answer, t) for t in scene.best_frames(answer, max(views, 1))}
@@ -140,15 +152,26 @@ def write_answers(
                 sections[stem] = report.section(str(answer.query), words, report.grid(figures, 3))
             progress(n + 1, len(answers))
     lead = "The mask of each selection over the rendered scene."
-    write_text(out / "answers.html", report.page("Answers", lead, list(sections.values())))
-    console.print_line(f"pictures  {out / 'answers.html'}")
-    written = {"folder": out, "pictures": out / "answers.html"}
-    return {"written": written, "answers": [records[file_stem(answer)] for answer in answers]}
+    write_text(out / PAGE, report.page("Answers", lead, list(sections.values())))
+    console.print_line(f"pictures  {out / PAGE}")
+    written = {"folder": out, "pictures": out / PAGE}
+    return {"written": written, "answers": [records[file_stem(answer.query)] for answer in answers]}
 
 
-def file_stem(answer: Answer) -> str:
+def _remove_answer(out: Path, stem: str) -> None:
+    """Removes the files of an earlier answer: its record, and the Gaussians and masks that the record lists."""
+    try:
+        earlier = parse_json((out / f"{stem}.json").read_bytes())
+        names = [*(earlier.get(ending) for ending in FORMATS), *earlier.get("masks", {}).values()]
+    except (OSError, ValueError, AttributeError):  # there is none, or another program wrote it
+        return
+    texts = [name for name in names if isinstance(name, str) and name.isprintable()]
+    remove_files(out, [*(name for name in texts if name.startswith((f"{stem}.", f"{stem}-"))), f"{stem}.json"])
+
+
+def file_stem(query: Query) -> str:
     """Names the files of an answer without ending: the same name in every run, and not that of any other query."""
-    question, name = answer.query.question, str(answer.query)
+    question, name = query.question, str(query)
     plain = slug(name)
     pointed = re.fullmatch(r"(at|box|region) .*\d", name, re.DOTALL)  # a text may be called like a pixel
     by_name = bool(pointed) != isinstance(question, str) and not isinstance(question, Mask)

@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import re
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +22,17 @@ from jaxtyping import Bool, Int, UInt8
 from jsecon.app import pictures
 from jsecon.app.catalogue import Catalogue, objects
 from jsecon.app.object_index import ObjectIndex, choose_shades
+from jsecon.app.opening import locate_field, name_fields
 from jsecon.app.records import Answer, At, Box, Mask, Query, Question, Region, gaussian_rows
 from jsecon.errors import InputError
 from jsecon.field.columns import is_mapped
-from jsecon.field.field import FIELD_FILE, check_field, load_field
+from jsecon.field.field import check_field, load_field
 from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.field.regions import ALIKE_THRESHOLD
+from jsecon.files import FIELD_FILE
 from jsecon.networks.hub import parse_model
 from jsecon.paper.queries import CODE_THRESHOLD
-from jsecon.pipeline.options import Options, is_bare_scene
+from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Console
 from jsecon.process import MEMORY, memory_budget
 from jsecon.query.answer import answer_question, trim
@@ -61,7 +63,7 @@ def open_scene(
 
     Args:
       path: A field file, a folder with field.safetensors, or a file of Gaussians without photographs (.ply, .spz ...),
-        of which a field is made once, as `jsecon query scene.ply` does.
+        of which a field is made once, as the verbs of the command line do.
       embedder: What embeds texts: an embedder, a folder or a name of a CLIP model that is on this machine and is opened
         when a text needs it, or a function that returns an embedder for a field. None takes the model that the field
         was made with.
@@ -76,55 +78,44 @@ def open_scene(
     Raises:
       InputError: The file cannot be read, or no model has such a name.
     """
-    file = Path(path)
+    console = console or Console()
+    named, file, splat = locate_field(Path(path), None if out is None else Path(out))
     model = embedder if isinstance(embedder, str | Path) else None
-    if is_bare_scene(file):
-        folder = file.with_name(f"{file.stem}_field") if out is None else Path(out)
+    if splat is not None:
         axis: Any = None if up is None else tuple(map(float, up))
-        file = _field_of_gaussians(Options(file, embedder=model, up=axis), folder, console or Console())
-    elif file.is_dir():
-        file = file / FIELD_FILE
+        file = _field_of_gaussians(Options(splat, embedder=model, up=axis), file.parent, console)
     large = file.is_file() and file.stat().st_size > memory_budget()
-    if large:
-        check_field(file)
-    field = load_field(file, mapped=large)
+    with console.progress("field"):
+        if large:
+            check_field(file)
+        field = load_field(file, mapped=large)
     if model is not None:
         from jsecon.pipeline.model_loading import field_embedder
 
         parse_model(model, "embedder")
         embedder = functools.partial(field_embedder, folder=model)
-    file = file.resolve()
-    name = file.parent.name if file.name == FIELD_FILE else file.stem
-    return Scene(field, embedder, up=up, name=Path(path).stem if is_bare_scene(Path(path)) else name)
+    return Scene(field, embedder, up=up, name=named.name)
 
 
-def open_scenes(files: Sequence[Path], embedder: str | Path | None) -> "dict[str, Scene]":
-    """Opens fields, each named like its folder, or its file of Gaussians, and prepares them for questions.
+def open_scenes(
+    paths: Sequence[Path], embedder: str | Path | None, console: Console | None = None
+) -> "dict[str, Scene]":
+    """Opens fields by their names (`name_fields`), and prepares them for questions."""
+    options = embedder, console or Console()
+    return {name: open_prepared(name, path, *options) for name, path in name_fields(paths).items()}
 
-    Files of Gaussians of one name, such as point_cloud.ply, are told apart by their folders. `embedder` is the CLIP
-    model of the fields (`open_scene`); None takes the one that each run used.
+
+def open_prepared(name: str, path: Path, embedder: str | Path | None, console: Console) -> "Scene":
+    """Opens a field under a name, and prepares it for questions.
+
+    `embedder` is the CLIP model of the field (`open_scene`); None takes the one that its run used.
     """
-    scenes: dict[str, Scene] = {}
-    for file in files:
-        scene = open_scene(file, embedder=embedder)
-        for folder in Path(file).resolve().parents if is_bare_scene(file) else ():
-            scene.name = f"{folder.name}_{scene.name}" if scene.name in scenes else scene.name
-        if scene.name in scenes:
-            raise InputError(file, f"it is a second field named {scene.name!r}", remedy="Rename one of the folders.")
-        scenes[scene.name] = scene
-        _ = scene.embedder
-        with contextlib.suppress(InputError):  # an embedder that has no word for what is asked to prepare it
-            scene.prepare()
-    return scenes
-
-
-def find_scene(scenes: "Mapping[str, Scene]", name: str | None) -> "Scene":
-    """Returns the scene of a name; the first if the name is None."""
-    if name is None:
-        return next(iter(scenes.values()))
-    if name not in scenes:
-        raise InputError(f"field {name!r}", "there is no such field", remedy=f"There are {', '.join(scenes)}.")
-    return scenes[name]
+    scene = open_scene(path, embedder=embedder, console=console)
+    scene.name = name
+    _ = scene.embedder
+    with contextlib.suppress(InputError):  # an embedder that has no word for what is asked to prepare it
+        scene.prepare()
+    return scene
 
 
 def _field_of_gaussians(options: Options, folder: Path, console: Console) -> Path:
@@ -579,6 +570,7 @@ class Scene:
         selected: Answer | Bool[np.ndarray, " n"] | None = None,
         *,
         object_ids: Int[np.ndarray, " n"] | None = None,
+        comment: str = "",
     ) -> None:
         """Writes Gaussians in the world of the capture's files, in blocks, so that a mapped field need not fit memory.
 
@@ -586,6 +578,7 @@ class Scene:
           file: The .ply, .spz or .glb to write.
           selected: Answer or mask whose Gaussians are written; None writes the whole scene.
           object_ids: (N,) ids of the Gaussians' objects (`Catalogue.labels`), which a .ply and a .glb can hold.
+          comment: As for `save_gaussians`.
 
         Raises:
           InputError: The file cannot be written.
@@ -595,7 +588,8 @@ class Scene:
             rows = np.flatnonzero(selected.mask if isinstance(selected, Answer) else selected)
             gaussians = gaussian_rows(gaussians, rows)
             object_ids = None if object_ids is None else object_ids[rows]
-        save_gaussians(file, gaussians, similarity=self.field.source_from_scene, object_ids=object_ids)
+        world = self.field.source_from_scene
+        save_gaussians(file, gaussians, similarity=world, object_ids=object_ids, comment=comment)
 
 
 def locate(

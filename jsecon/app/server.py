@@ -25,8 +25,9 @@ from starlette.exceptions import HTTPException as AnyHTTPException
 import jsecon
 from jsecon.app import verbs
 from jsecon.app.access import bracketed, is_allowed_host, listen, token_for
+from jsecon.app.opening import find_scene
 from jsecon.app.records import At, Query, unit_of
-from jsecon.app.scene import Scene, find_scene, open_scenes
+from jsecon.app.scene import Scene, open_scenes
 from jsecon.errors import InputError
 from jsecon.pipeline.progress import Console
 
@@ -212,7 +213,13 @@ def _describe(scene: Scene) -> dict[str, Any]:
 
 
 def prepare(
-    files: Sequence[Path], *, host: str, port: int, token: str, embedder: str | Path | None
+    files: Sequence[Path],
+    *,
+    host: str,
+    port: int,
+    token: str,
+    embedder: str | Path | None,
+    console: Console | None = None,
 ) -> tuple[dict[str, Any], Callable[[], None]]:
     """Opens fields and listens; returns address and fields, and the function that answers requests until it is stopped.
 
@@ -220,7 +227,7 @@ def prepare(
     """
     token = token_for(host, token)
     listening = listen(host, port)
-    scenes = open_scenes(files, embedder)
+    scenes = open_scenes(files, embedder, console)
     app = application(scenes, token=token)
     # The limit counts cheap requests too; those beyond it get 503.
     options: dict[str, Any] = {"timeout_keep_alive": 5, "limit_concurrency": 256}
@@ -232,8 +239,8 @@ def prepare(
 
 def _serve(verb: verbs.Serve, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon serve`; the result is as of `prepare`, with its function under "then"."""
-    with console.progress("fields"):
-        result, serve = prepare(verb.fields, host=verb.host, port=verb.port, token=verb.token, embedder=verb.embedder)
+    options: dict[str, Any] = {"host": verb.host, "port": verb.port, "token": verb.token, "embedder": verb.embedder}
+    result, serve = prepare(verb.fields, **options, console=console)
     for scene in result["fields"]:
         console.print_line(f"{scene['name']}: {scene['gaussians']} Gaussians, {scene['regions']} regions")
     console.print_line(result["address"])

@@ -149,7 +149,8 @@ class _FieldVerb(Verb):
     """Options of the verbs that read a field and understand texts.
 
     Attributes:
-      field: Path of field.safetensors, written by jsecon run.
+      field: Path of field.safetensors, the folder that jsecon run wrote it to, or a file of Gaussians without
+        photographs, of which the field is made once, to NAME_field beside NAME.ply.
       embedder: The CLIP model that the field was made with: a name, hub:owner/name, or a folder. By default it is the
         one that the run used.
     """
@@ -164,12 +165,14 @@ class Query(_FieldVerb):
 
     For each text, pixel or outline, writes to the output folder: the selected Gaussians as a .ply (INRIA's layout, in
     the capture's world; SuperSplat opens it), a .json with count, score, region, centroid and bounding box, masks
-    of the frames that show it best, and answers.html with the pictures. A field of more than half of the free memory,
+    of the frames that show it best, and answers.html with the pictures. They replace the files of an earlier answer to
+    the same text. A field of more than half of the free memory,
     or than JSECON_MEMORY (GiB) of the environment, stays on disk and is read in blocks, with the same answers: texts
     and --at.
 
     Attributes:
-      field: Path of field.safetensors, written by jsecon run, or a file of Gaussians without photographs.
+      field: Path of field.safetensors, the folder that jsecon run wrote it to, or a file of Gaussians without
+        photographs, of which the field is made once, to OUT/field.
       texts: What to find, such as "red mug" "dark green bottle" "mug or bowl but not handle", or with a relation, an
         order or a number: "the red mug left of the bottle", "the second largest box". Quotes in a text make its words
         an object as they stand.
@@ -254,7 +257,8 @@ class Export(_FieldVerb):
     Attributes:
       out: The .ply (INRIA's layout), .spz or .glb to write.
       with_labels: Adds object_id, the id of each Gaussian's object in jsecon objects or -1, to the .ply or .glb.
-      objects: Folder to write a .ply of each object to, named by its id and name.
+      objects: Folder to write a .ply of each object to, named by its id and name. They replace those of an earlier
+        export to that folder.
       only: Exports only the Gaussians that jsecon query selects for this text.
       without: Exports all other Gaussians than those. Both exports together hold each Gaussian of the scene once.
     """
@@ -320,7 +324,8 @@ class _FieldsVerb(Verb):
     """Options of the verbs that keep fields open.
 
     Attributes:
-      fields: Paths of field.safetensors files. Each field is known by the name of its folder.
+      fields: Paths of field.safetensors files, their folders, or files of Gaussians without photographs, of which the
+        fields are made once. Each field is known by the name of its folder or scene.
       embedder: The CLIP model that the fields were made with: a name, hub:owner/name, or a folder. By default it is the
         one that the runs used.
     """
@@ -356,8 +361,9 @@ class Serve(_FieldsVerb):
 class Mcp(_FieldsVerb):
     """Offers fields to language models as tools.
 
-    A server of the Model Context Protocol on standard input and output (extra mcp), which a model's program starts. Its
-    tools find, count, locate, measure and render things and only read. The models of texts must be on this machine.
+    A server of the Model Context Protocol on standard input and output (extra mcp), which a model's program starts. It
+    answers at once and opens the fields in the background; a call waits for its field. Its tools find, count, locate,
+    measure and render things and only read. The models of texts must be on this machine.
     """
 
     examples = ("jsecon mcp my_field/field.safetensors",)
@@ -393,8 +399,8 @@ class Doctor(Verb):
     """Checks whether this machine has what runs need.
 
     It prints a line each about the backend's numbers, jax and its devices, cores, memory, the folder of compiled
-    programs, and each extra with the command that installs it. The exit code is 2 if a check fails that every run
-    depends on. `jsecon models check` examines models.
+    programs and its room, and each extra with the command that installs it. The exit code is 2 if a check fails that
+    every run depends on. `jsecon models check` examines models.
     """
 
     examples = ("jsecon doctor",)

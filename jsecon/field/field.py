@@ -16,24 +16,15 @@ from typing import Any
 import jax
 import numpy as np
 
-from jsecon.errors import InputError, describe_error, require
+from jsecon.backend import start_backend
+from jsecon.errors import InputError, require
 from jsecon.field.columns import ROWS
-from jsecon.files import (
-    READ_ERRORS,
-    atomic_write,
-    pack_tree,
-    parse_json,
-    read_arrays,
-    unpack_tree,
-    write_arrays,
-)
+from jsecon.files import atomic_write, pack_tree, parse_json, read_arrays, reading, unpack_tree, write_arrays
 from jsecon.read.captures.images import MAX_PIXELS
 from jsecon.splat.project import unusable_rows
 from jsecon.splat.sh import COEFFICIENT_COUNTS
 from jsecon.types import Autoencoder, Camera, Codes, Gaussians, LanguageField, Parts, Regions, UpAxis, Votes
 
-FIELD_FILE = "field.safetensors"
-"""name of a field in its folder"""
 VERSION = 3
 _RECORDS = {
     cls.__name__: cls for cls in (LanguageField, Gaussians, Votes, Regions, Parts, Camera, Codes, Autoencoder, UpAxis)
@@ -134,8 +125,9 @@ def check_field(path: str | os.PathLike) -> None:
 def _read(path: Path, mapped: int, checked: bool) -> LanguageField:
     if not path.is_file():
         raise InputError(path, "a folder" if path.is_dir() else "no such file", "a field file", _REMEDY)
+    start_backend()
     changed = f"It may have been changed or cut short in copying. {_REMEDY}"
-    try:
+    with reading(path, "a whole one", changed, problem="the field file is damaged"):
         header, members = read_arrays(path, memory_map_above=mapped, verify=checked)
         if not isinstance(header, dict) or header.get("format") != "jsecon-field":
             raise InputError(path, "it is a file of jsecon, but no field", "a field file", _REMEDY)
@@ -145,11 +137,6 @@ def _read(path: Path, mapped: int, checked: bool) -> LanguageField:
         whole = isinstance(field, LanguageField)
         problem = _disagreement(field) or _oddity(field, checked) if whole else "no field at its root"
         field = jax.tree.map(_on_device, field)
-    except InputError:
-        raise
-    except READ_ERRORS as error:
-        problem = f"the field file is damaged ({describe_error(error)})"
-        raise InputError(path, problem, "a whole one", changed) from error
     if problem is not None:
         raise InputError(path, problem, "arrays of one N, R, d, E and T", _REMEDY)
     provenance = _Provenance(field.provenance)

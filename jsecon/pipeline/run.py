@@ -14,9 +14,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from jsecon.errors import InputError
-from jsecon.field.field import FIELD_FILE, load_field, save_field
-from jsecon.files import exclusive_lock
+from jsecon.backend import start_backend
+from jsecon.errors import InputError, is_out_of_memory
+from jsecon.field.field import load_field, save_field
+from jsecon.files import FIELD_FILE, exclusive_lock
 from jsecon.parallel import allgather_tree
 from jsecon.pipeline import cache, lifting, model_loading, stages
 from jsecon.pipeline.options import Options, check_ranges, is_bare_scene, require_writable
@@ -200,7 +201,7 @@ def _compute_stage(context: RunContext, stage: Stage, state: _RunState, console:
         try:
             result, seconds, fresh = cache.fetch(path, functools.partial(compute, progress), note=console.note)
         except (MemoryError, jax.errors.JaxRuntimeError) as error:
-            if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
+            if is_out_of_memory(error):
                 problem = f"no memory left ({str(error)[:200]})"
                 remedy = "Take smaller frames (--long-side), or fewer (--frames). Finished stages are kept."
                 raise InputError(f"stage {stage.name}", problem, "more memory", remedy) from error
@@ -261,7 +262,8 @@ def run(options: Options, out: Path, *, console: Console | None = None) -> Run:
 
 
 def _open_context(options: Options, out: Path) -> RunContext:
-    """Opens the models of a run."""
+    """Starts jax's devices, and opens the models of a run."""
+    start_backend()
     options = model_loading.with_folders(options)
     return RunContext(options, model_loading.open_models(options, out / "cache"), out)
 

@@ -35,8 +35,8 @@ def export_page(verb: verbs.View, file: Path, console: Console) -> verbs.VerbRes
     if file.suffix != ".html":
         raise InputError("--export", f"{file} does not end in .html", remedy="For example: --export page.html")
     require_writable(file.parent)
+    scene = open_scene(verb.field, embedder=verb.embedder, console=console)
     with console.progress("page"):
-        scene = open_scene(verb.field, embedder=verb.embedder)
         if verb.texts:
             _ = scene.embedder  # without it one error stands for all texts
         results = scene.ask_all(verb.texts)

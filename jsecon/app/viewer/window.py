@@ -156,7 +156,7 @@ class Viewer:
         if not (found := self._found()):
             raise InputError("", "no Gaussian is selected, so there is no file to export")
         with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder, f"{file_stem(found[0])}.ply")
+            file = Path(folder, f"{file_stem(found[0].query)}.ply")
             self.scene.export(file, np.any([answer.mask for answer in found], axis=0))
             client.send_file_download(file.name, file.read_bytes(), save_immediately=True)
 
@@ -387,7 +387,7 @@ def _view(verb: verbs.View, console: Console) -> verbs.VerbResult:
     if verb.export is not None:
         return export_page(verb, verb.export, console)
     # Without its model a field can be clicked, so the model is opened when the first text is asked.
-    scene = open_scene(verb.field, embedder=verb.embedder)
+    scene = open_scene(verb.field, embedder=verb.embedder, console=console)
     if verb.texts:
         _ = scene.embedder
     state = ViewState(tuple(dict.fromkeys(verb.texts)))

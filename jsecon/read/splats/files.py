@@ -15,7 +15,7 @@ import gzip
 import struct
 import warnings
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -280,6 +280,7 @@ def save_gaussians(
     *,
     object_ids: Int[Array, " n"] | None = None,
     similarity: Float[Array, "4 4"] | None = None,
+    comment: str = "",
 ) -> None:
     """Writes Gaussians as a .ply (INRIA's layout, exact), a .glb, or a .spz (version 3, by gsply).
 
@@ -291,6 +292,7 @@ def save_gaussians(
       gaussians: N Gaussians.
       object_ids: (N,) ids of objects, -1 for none: a property of a .ply, an attribute of a .glb. A .spz has no place.
       similarity: (4, 4) transform into the world of the file.
+      comment: ASCII line for the header of a .ply; the other formats have no place.
 
     Raises:
       ValueError: Shapes disagree.
@@ -304,7 +306,8 @@ def save_gaussians(
         require_shape("object_ids", object_ids, (gaussians.count,), "Give one id per Gaussian.")
     if not gaussians.count and path.suffix.lower() != ".ply":
         raise InputError(path, "there are no Gaussians to write", remedy="Write a .ply, which may be empty.")
-    _WRITERS[path.suffix.lower()](path, gaussians, object_ids, similarity)
+    options = {"comment": comment} if path.suffix.lower() == ".ply" else {}
+    _WRITERS[path.suffix.lower()](path, gaussians, object_ids, similarity, **options)
 
 
 def require_writable_format(path: Path) -> None:
@@ -316,5 +319,5 @@ def require_writable_format(path: Path) -> None:
         _import_gsply(path)
 
 
-_WRITERS = {".ply": save_ply, ".spz": _save_spz, ".glb": save_glb}
+_WRITERS: dict[str, Callable[..., None]] = {".ply": save_ply, ".spz": _save_spz, ".glb": save_glb}
 """suffix -> function that writes a file from Gaussians, ids of objects or None, and a similarity or None"""

@@ -229,7 +229,11 @@ def _require_drawable(path: str | Path, gaussians: Gaussians, first: int, remedy
 
 
 def save_ply(
-    path: Path, gaussians: Gaussians, object_ids: Int[Array, " n"] | None, similarity: Float[Array, "4 4"] | None
+    path: Path,
+    gaussians: Gaussians,
+    object_ids: Int[Array, " n"] | None,
+    similarity: Float[Array, "4 4"] | None,
+    comment: str = "",
 ) -> None:
     """Writes Gaussians in INRIA's layout: binary little endian float32, normals zero, f_rest channel-major.
 
@@ -243,7 +247,8 @@ def save_ply(
     properties = [f"property {kind} {name}" for kind, name in zip(kinds, names)]
     properties += [] if object_ids is None else ["property int object_id"]
     vertices = f"element vertex {gaussians.count}"
-    header = ["ply", "format binary_little_endian 1.0", vertices, *properties, "end_header\n"]
+    comments = [f"comment {comment}"] if comment else []
+    header = ["ply", "format binary_little_endian 1.0", *comments, vertices, *properties, "end_header\n"]
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         file.write("\n".join(header).encode())
         for rows, block in usable_blocks(path, gaussians, similarity):

@@ -1,0 +1,113 @@
+"""What is given for a field: its file, its folder, or a splat; anything else is named by what it is."""
+
+import zipfile
+
+import numpy as np
+import pytest
+from capture_files import refused, run_cli
+from small_field import colour_field
+
+import jsecon
+from jsecon import InputError, save_field
+from jsecon.app.opening import locate_field, name_fields
+from jsecon.pipeline import run as pipeline
+
+
+@pytest.fixture(scope="module")
+def folder(scene, cameras, tmp_path_factory):
+    """A run's folder with its field."""
+    folder = tmp_path_factory.mktemp("desk")
+    save_field(folder / "field.safetensors", colour_field(scene, cameras))
+    return folder
+
+
+def zipped(file):
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("a", "b")
+
+
+@pytest.mark.parametrize(("name", "content", "words"), [
+    ("report.html", b"<!DOCTYPE html><html>", "a page of HTML"), ("a.json", b' {"frames": []}', "a JSON file"),
+    ("field.zip", zipped, "a zip archive"), ("field.npz", zipped, "a zip archive"), ("a.png", b"\x89PNG", "an image"),
+    ("scene.txt", b"ply\nformat", "a file of Gaussians under another suffix"), ("a.bin", b"", "an empty file"),
+    ("a.xyz", b"1 2 3", "a file of another kind"), ("a.npy", b"\x93NUMPY", "an array of NumPy"),
+    ("field.safetensors", b"version https://git-lfs.github.com/spec/v1\noid", "a Git LFS pointer"),
+    ("scene.ply", b"version https://git-lfs.github.com/spec/v1\noid", "a Git LFS pointer"),
+    ("scene.spz", b"<html>Not found</html>", "a page of HTML"),
+])  # fmt: skip
+def test_what_is_no_field_is_named_by_what_it_is(tmp_path, capsys, name, content, words):
+    if callable(content):
+        content(tmp_path / name)
+    else:
+        (tmp_path / name).write_bytes(content)
+    with refused(tmp_path / name, words):
+        locate_field(tmp_path / name)
+    assert run_cli("objects", tmp_path / name) == 2
+    told = capsys.readouterr().err
+    assert words in told
+    assert "damaged" not in told
+
+
+def test_what_is_missing_is_told(tmp_path):
+    (tmp_path / "capture" / "images").mkdir(parents=True)
+    with refused(tmp_path / "capture", "a folder without field.safetensors", "jsecon run"):
+        locate_field(tmp_path / "capture")
+    for name in ("nowhere.safetensors", "nowhere.ply"):
+        with refused(tmp_path / name, "no such file"):
+            jsecon.open_scene(tmp_path / name)
+
+
+def test_fields_of_one_name_have_names_that_tell_them_apart(folder, tmp_path):
+    paths = []
+    for name in ("a/field", "b/field", "c"):
+        (tmp_path / name).mkdir(parents=True)
+        save_field(tmp_path / name / "field.safetensors", jsecon.load_field(folder / "field.safetensors"))
+        paths.append(tmp_path / name)
+    for name in ("d/point_cloud.ply", "e/point_cloud.ply", "f/garden.splat"):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).write_bytes(b"ply")
+        paths.append(tmp_path / name)
+    named = name_fields(paths)
+    assert list(named) == ["a/field", "b/field", "c", "d/point_cloud", "e/point_cloud", "garden"]
+    assert list(named.values()) == paths
+    with pytest.raises(InputError, match="given twice"):
+        name_fields([paths[0], paths[0] / "field.safetensors"])
+
+
+@pytest.mark.parametrize("given", ["folder", "splat"])
+def test_every_verb_takes_a_folder_or_a_splat(folder, tmp_path, capsys, monkeypatch, given):
+    """The field of a splat is made once, beside it, as query makes it."""
+    field = jsecon.load_field(folder / "field.safetensors")
+    jsecon.save_gaussians(tmp_path / "desk.ply", field.gaussians)
+    made = []
+
+    def run(options, out, console):
+        made.append(options.capture)
+        save_field(out / "field.safetensors", field)
+
+    monkeypatch.setattr(pipeline, "run", run)
+    monkeypatch.setattr(pipeline, "current_field", lambda options, out: out / "field.safetensors" if made else None)
+    path, home = (folder, folder) if given == "folder" else (tmp_path / "desk.ply", tmp_path / "desk_field")
+    (tmp_path / "labels").mkdir()
+    assert run_cli("objects", path) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert run_cli("export", path, "--objects", tmp_path / "objects") == 0
+    assert len(list((tmp_path / "objects").iterdir())) == sum("Gaussians" in line for line in lines if " at (" in line)
+    assert run_cli("view", path, "--export", tmp_path / "page.html") == 0
+    assert run_cli("eval", path, "--labels", tmp_path / "labels") == 2
+    assert "labels" in capsys.readouterr().err
+    assert (home / "field.safetensors").is_file()
+    assert made == ([] if given == "folder" else [path])
+    assert jsecon.open_scene(path).name == (folder.name if given == "folder" else "desk")
+
+
+def test_servers_take_folders_and_splats(folder, tmp_path, capsys):
+    pytest.importorskip("fastapi", reason="the extra serve is not installed")
+    from jsecon.app.server import prepare
+
+    told, _ = prepare([folder], host="127.0.0.1", port=0, token="", embedder=None)
+    assert [field["name"] for field in told["fields"]] == [folder.name]
+    np.testing.assert_equal(told["fields"][0]["gaussians"], 64)
+    (tmp_path / "page.html").write_text("<html>")
+    assert run_cli("serve", tmp_path / "page.html", "--port", 0) == 2
+    assert "a page of HTML" in capsys.readouterr().err
