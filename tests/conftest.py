@@ -185,10 +185,10 @@ def _bake_once():
     bake, kept = raycast.bake_room, {}
 
     @functools.wraps(bake)
-    def once(room):
-        key = pickle.dumps(room)
+    def once(room, **options):
+        key = pickle.dumps((room, options))
         if key not in kept:
-            kept[key] = bake(room)
+            kept[key] = bake(room, **options)
         return kept[key]
 
     with pytest.MonkeyPatch.context() as patch:
