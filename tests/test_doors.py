@@ -26,8 +26,18 @@ TEXTS = (
     *("the orange ball on the white plate", "the white plate under the orange ball"),
     *("the second red mug from the left", "two red mugs", "how many red mugs", "the red mug near the dark blue box"),
     *("the dark green bottle between the red mugs", "the dark blue box behind the dark green bottle"),
+    *("the left red mug", "the right red mug", "the red mug closer to the white plate", "the smaller of the red mugs"),
+    *(
+        "the red mug within 60 units of the dark blue box",
+        "what is on the white plate?",
+        "what is left of the dark green bottle",
+    ),
+    *("the orange ball directly above the white plate", "where is the white plate", "is there a red mug"),
     *("the orange ball on the dark blue box", "'red mug left of green'", "all red mugs"),
 )
+REFUSED = {"the second red mug": "'second'", "the red mug opposite the white plate": "'opposite'",
+           "the red mug 5 m left of the white plate": "'5 m left of'", "the other red mug": "'other'"}  # fmt: skip
+"""text -> the word that its refusal names"""
 OUTLINE = np.pad(np.ones((30, 40), bool), ((20, 30), (30, 30)))
 POINTED = (At("frame_0", 36, 36), At(0, 45, 33), Mask({"#0": OUTLINE}), Box("#0", 30, 20, 70, 60), Region(4))
 
@@ -80,6 +90,39 @@ def test_the_export_of_one_thing(door, tmp_path):
         assert code == (0 if len(rows[text]) else 2), text
         if code == 0:
             np.testing.assert_array_equal(rows_of(scene, tmp_path / "only.ply"), rows[text])
+    text = "the left red mug"
+    assert run_cli("export", file, "--without", text, "--out", tmp_path / "rest.ply") == 0
+    rest = np.setdiff1d(np.arange(scene.field.gaussians.count), rows[text])
+    np.testing.assert_array_equal(rows_of(scene, tmp_path / "rest.ply"), rest)
+
+
+def test_every_door_names_the_word_that_it_does_not_understand(door, tmp_path, capsys):
+    pytest.importorskip("fastapi", reason="the extra serve is not installed")
+    pytest.importorskip("mcp", reason="the extra mcp is not installed")
+    from mcp import Client
+    from starlette.testclient import TestClient
+
+    from jsecon.app.mcp_server import make_server
+    from jsecon.app.server import application
+
+    scene, file, _ = door
+    client = TestClient(application({"table": scene}), "http://127.0.0.1:8765")
+
+    async def find(text):
+        async with Client(make_server({"table": scene})) as tools:
+            return await tools.call_tool("find", {"text": text})
+
+    for text, word in REFUSED.items():
+        for verb in (["query", file, text], ["export", file, "--only", text], ["export", file, "--without", text]):
+            assert run_cli(*verb, "--out", tmp_path / "out.ply") == 2
+            assert word in capsys.readouterr().err
+        replies = [client.post("/query", json={"text": text}), client.get("/selection.ply", params={"text": text})]
+        replies.append(client.get("/mask.png", params={"text": text, "frame": "#0"}))
+        assert [(reply.status_code, word in reply.text) for reply in replies] == [(422, True)] * 3
+        told = asyncio.run(find(text))
+        assert told.is_error
+        assert word in told.content[0].text
+    assert not (tmp_path / "out.ply").is_file()
 
 
 def test_http(door, tmp_path):

@@ -41,6 +41,35 @@ EXPRESSIONS = [
     ("the carry on bag under the table", "carry on bag", ["under table"], None, None, False),
     ("the under cabinet light above the sink", "under cabinet light", ["above sink"], None, None, False),
     ("two way radio next to the 2 liter bottle", "two way radio", ["next to 2 liter bottle"], None, None, False),
+    ("the left bag", "bag", [], ("leftmost", 1), None, False),
+    ("right boot", "boot", [], ("rightmost", 1), None, False),
+    ("the left-hand door", "door", [], ("leftmost", 1), None, False),
+    ("the upper cabinet", "cabinet", [], ("highest", 1), None, False),
+    ("the bottom drawer", "drawer", [], ("lowest", 1), None, False),
+    ("the front chair", "chair", [], ("nearest", 1), None, False),
+    ("the rear chair", "chair", [], ("farthest", 1), None, False),
+    ("the smaller jar", "jar", [], ("smallest", 1), None, False),
+    ("the larger of the two jars", "jars", [], ("largest", 1), None, False),
+    ("the two taller lamps", "lamps", [], ("tallest", 1), 2, True),
+    ("the far left stool", "stool", [], ("leftmost", 1), None, False),
+    ("the stool on the far right", "stool", [], ("rightmost", 1), None, False),
+    ("the jar on the left hand side", "jar", [], ("leftmost", 1), None, False),
+    ("the jar on the left shelf", "jar", ["on shelf"], None, None, False),
+    ("the jar closer to the lamp", "jar", ["nearest to lamp"], None, None, False),
+    ("the jar further away from the lamp", "jar", ["farthest from lamp"], None, None, False),
+    ("the jar smaller than the lamp", "jar", ["smaller than lamp"], None, None, False),
+    ("the jar within 40 cm of the lamp", "jar", ["within 0.4 m from lamp"], None, None, False),
+    ("jars at least two metres away from the lamp", "jars", ["at least 2 m from lamp"], None, None, True),
+    ("the jar less than 1.5 units from the lamp", "jar", ["within 1.5 units from lamp"], None, None, False),
+    ("the jar directly behind the lamp", "jar", ["behind lamp"], None, None, False),
+    ("the jar right next to the lamp", "jar", ["next to lamp"], None, None, False),
+    ("the jar immediately to the left of the lamp", "jar", ["left of lamp"], None, None, False),
+    ("what is under the lamp?", "any object", ["under lamp"], None, None, True),
+    ("what's left of the lamp", "any object", ["left of lamp"], None, None, True),
+    ("which jar is behind the lamp", "jar", ["behind lamp"], None, None, False),
+    ("is there a jar on the shelf?", "jar", ["on shelf"], None, None, True),
+    ("who is near the door", "people", ["near door"], None, None, True),
+    ("everything in the box", "any object", ["in box"], None, None, True),
     ("the armrest nearest to the one way sign", "armrest", ["nearest to one way sign"], None, None, False),
 ]  # fmt: skip
 
@@ -84,16 +113,41 @@ def test_every_spelling_is_understood_and_quotes_protect():
 
 @pytest.mark.parametrize(("text", "problem"), [
     ("", "is empty"), ("  ", "is empty"), ("word " * 5000, "5000 words"), ("mug across from the plate", "'across'"),
-    ("the widest mug", "'widest'"), ("mug near the left plate", "'left'"), ("the middle mug on the plate", "'middle'"),
+    ("the widest mug", "'widest'"), ("mug near the same plate", "'same'"), ("the middle mug on the plate", "'middle'"),
     ("the opposite mug", "'opposite'"), ("mug by the plate", "'by'"), ("lamp hanging over the table", "'hanging'"),
     ("left of the plate", "no object stands before 'left of'"), ("mug left of", "an object is missing"),
     ("behind the mug", "no object stands before 'behind'"), ("mug on", "an object is missing"),
     ("mug between the plate and", "an object is missing"), ("mug in box on plate near bowl", "3 relations"),
+    ("the third jar", "'third'"), ("second green jar", "'second'"), ("the other jar", "'other'"),
+    ("another jar", "'another'"), ("the next jar", "'next'"), ("the centre jar", "'centre'"),
+    ("the jar facing the lamp", "'facing'"), ("the jar away from the lamp", "'away'"),
+    ("the jar 3 m right of the lamp", "'3 m right of'"), ("the jar two feet from the lamp", "'two feet'"),
+    ("all jars except the green one", "'except'"), ("everything other than the jar", "'other'"),
+    ("the jar that is not on the shelf", "'not'"), ("the jar next to it", "'it'"), ("the one on the shelf", "'one'"),
+    ("the jar on the side of the box", "'side'"), ("the jar and the left lamp", "'left'"),
+    ("the jar closer to the lamp than to the door", "'than'"), ("the longer jar", "'longer'"),
+    ("the left jar or the lamp", '"or"'), ("the jar but not the jar on the shelf", '"but not"'),
     ("red mug or bowl on the plate", '"or"'), ("caf\udce9 on the plate", "not UTF-8"),
 ])  # fmt: skip
 def test_what_is_not_understood_is_named(text, problem):
+    assert is_expression(text) or not text.strip() or text.startswith("word")
     with pytest.raises(InputError, match=problem):
         parse_expression(text)
+
+
+@pytest.mark.parametrize("text", [
+    "the front door", "the second hand clock", "my first aid kit", "the back pack", "the top hat", "left hand glove",
+    "upper case letter", "night stand", "door closer", "top shelf", "2 m tape measure", "the last supper painting",
+    "'the left jar'", '"the jar opposite the lamp"', "wishing well", "lighter",
+])  # fmt: skip
+def test_names_and_quotes_with_words_of_place_stay_names(text):
+    assert not is_expression(text)
+    assert parse_query(text) == ([text.strip("'\"")], [])
+
+
+def test_a_question_without_words_of_place_asks_for_its_object():
+    assert parse_query("where is the jar?") == (["the jar"], [])
+    assert parse_query("find the lamp or the jar but not the lid") == (["the lamp", "the jar"], ["the lid"])
 
 
 def test_questions_come_apart():

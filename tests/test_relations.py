@@ -113,6 +113,42 @@ def scene():
 
 
 @pytest.mark.parametrize(("text", "regions"), [
+    ("the left red mug", [0]), ("the right red mug", [1]), ("the front red mug", [0]), ("the back red mug", [1]),
+    ("the red mug closer to the dark blue box", [1]), ("the red mug farther from the dark blue box", [0]),
+    ("the orange ball smaller than the dark blue box", [4]), ("the orange ball larger than the dark blue box", []),
+    ("the orange ball higher than the white plate", [4]), ("the white plate lower than the orange ball", [3]),
+    ("the left of the two red mugs", [0]), ("the red mug within 0.47 units of the dark blue box", [1]),
+    ("the red mug at least 0.47 units from the dark blue box", [0]), ("red mugs within 2 units of the bottle", [0, 1]),
+])  # fmt: skip
+def test_words_of_place_choose(scene, text, regions):
+    text = text.replace("the bottle", "the dark green bottle")
+    assert sorted(found.regions[0] for found in scene.ask(text).objects) == regions
+
+
+def test_any_object_has_its_name_in_the_answer(scene):
+    answer = scene.ask("what is on the white plate?")
+    assert [found.regions for found in answer.objects] == [(4,)]
+    assert "orange" in answer.objects[0].phrase
+    assert f"1 object ({answer.objects[0].phrase})" in str(answer)
+    assert scene.ask("is there anything on the orange ball?").count == 0
+
+
+def test_an_order_counts_what_it_chooses_from(scene):
+    assert scene.ask("the left of the two red mugs").reason == ""
+    assert "says 3 and 2 match" in scene.ask("the left one of the three red mugs").reason
+
+
+def test_metres_need_a_scene_in_metres(scene):
+    for text in ("the red mug within 1 m of the dark blue box", "red mugs at least 30 cm from the orange ball"):
+        with pytest.raises(InputError, match="scale of this scene is not known"):
+            scene.ask(text)
+    known = Scene(*table_field(source_from_scene=np.diag([2.0, 2.0, 2.0, 1.0])), up=(0, 0, 1))
+    known._unit = "metres"
+    near = {cm: known.ask(f"red mugs within {cm} cm of the dark blue box").count for cm in (20, 95, 400)}
+    assert near == {20: 0, 95: 1, 400: 2}
+
+
+@pytest.mark.parametrize(("text", "regions"), [
     ("the red mug right of the dark green bottle", [1]),
     ("the orange ball on the white plate", [4]),
     ("the white plate under the orange ball", [3]), ("the dark green bottle between the red mugs", [2]),

@@ -7,7 +7,7 @@ several objects, with what came nearest or what would settle which is meant.
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -15,12 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import KDTree
 
-from jsecon.app.catalogue import main_regions, region_objects
+from jsecon.app.catalogue import Catalogue, main_regions, region_objects
 from jsecon.app.records import Answer, Object, Query, gaussian_rows, rounded, source_points, world_scale
+from jsecon.errors import InputError
 from jsecon.field.columns import votes_of_rows
 from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction_of_regions
 from jsecon.query.answer import RegionMatch, match_regions
-from jsecon.query.expressions import parse_expression
+from jsecon.query.expressions import ANY_OBJECT, parse_expression
 from jsecon.query.grouping import join_fragments
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.outliers import remove_outliers
@@ -76,9 +77,16 @@ class ObjectIndex:
       field: The field, with what texts are compared with.
       embedder: Its embedder.
       up: (3,) up axis in the capture's world; None finds it.
+      catalogue: Returns all objects, for texts that name none.
     """
 
-    def __init__(self, field: LanguageField, embedder: Any, up: Sequence[float | int] | None):
+    def __init__(
+        self,
+        field: LanguageField,
+        embedder: Any,
+        up: Sequence[float | int] | None,
+        catalogue: Callable[[], Catalogue],
+    ):
         """Finds the up axis; objects are measured when they are first asked for."""
         self._up_axis = field_up(field, up)
         self.up = np.array(self._up_axis.axis)
@@ -87,6 +95,7 @@ class ObjectIndex:
         cameras = jax.tree.map(np.asarray, field.cameras)  # on which jax would compile each step of a viewpoint
         self._field = dataclasses.replace(field, regions=regions, unrelated_words=reference, cameras=cameras)
         self._embedder = embedder
+        self._catalogue = catalogue
         self._rules = QueryRules(all_of_class=True, logits=getattr(embedder, "logits", None))
         self._votes = jax.tree.map(np.asarray, field.votes)
         self._object = functools.lru_cache(MAX_KEPT)(self._measure_object)
@@ -99,6 +108,8 @@ class ObjectIndex:
         the best name of some of the objects, the others do not count. The second value is the share of unrelated words
         that are less similar to the scene than the phrase.
         """
+        if phrase == ANY_OBJECT:
+            return self._all_objects(), np.nan
         texts = choose_shades(self._field, self._embedder, [phrase], self._rules, every=True)
         embedded = jax.device_put(self._embedder.embed_text(texts))
         match = match_regions(self._field, embedded, self._rules)
@@ -107,6 +118,15 @@ class ObjectIndex:
         made = [(group, self._object(group)) for group in groups]
         state = int(match.state)
         return [Object(phrase, group, *parts, state) for group, parts in made if parts is not None], float(match.rank)
+
+    def _all_objects(self) -> list[Object]:
+        """Lists the things of the catalogue, without their parts and without surroundings, by their best names."""
+        catalogue = self._catalogue()
+        things = np.flatnonzero((catalogue.parent < 0) & ~catalogue.surroundings)
+        groups = [tuple(int(region) for region in np.flatnonzero(catalogue.regions == thing)) for thing in things]
+        named = [(str(catalogue.names[thing, 0]) or f"object {thing}", group) for thing, group in zip(things, groups)]
+        made = [(name, group, self._object(group)) for name, group in named if group]
+        return [Object(name, group, *parts) for name, group, parts in made if parts is not None]
 
     def _best_named(self, texts: Sequence[str], groups: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
         """Keeps the objects that no other name of the vocabulary fits better than the text, if there are any.
@@ -178,12 +198,20 @@ class ObjectIndex:
         camera = jax.tree.map(np.asarray, cameras[frame])
         return viewpoint(camera, self.up), f"as seen from {self._field.names[frame]}"
 
-    def answer(self, query: Query, frame: int | None) -> Answer:
-        """Finds the objects that a referring expression names, with directions as seen from a frame."""
+    def answer(self, query: Query, frame: int | None, *, metres: bool) -> Answer:
+        """Finds the objects that a referring expression names, with directions as seen from a frame.
+
+        `metres` says whether the unit of the capture's world is the metre.
+        """
         expression = parse_expression(str(query))
+        if not metres and any(condition.in_metres for condition in expression.conditions):
+            problem = "the scale of this scene is not known, so a distance in metres cannot be measured"
+            remedy = 'Ask in units of the capture ("within 2 units of the box"), or say "near" or "closest to".'
+            raise InputError(f"expression {str(query)!r}", problem, remedy=remedy)
+        unit = 1.0 / world_scale(self._field)
         view, words = self._view(frame)
         readings = expression.readings()
-        outcomes = [evaluate(self._objects_of, expression.thing, reading, view) for reading in readings]
+        outcomes = [evaluate(self._objects_of, expression.thing, reading, view, unit) for reading in readings]
         place = next((n for n, outcome in enumerate(outcomes) if outcome.chosen), 0)
         best, others = outcomes[place], outcomes[place + 1 :]
         chosen = {found.regions for found in best.chosen}

@@ -281,8 +281,8 @@ class Answer:
     def describe(self) -> str:
         """The answer in words, without the query's name: what was read, counts, score and place."""
         if self.by == "relation":
-            names = sorted({found.phrase for found in self.objects})
-            number = f"{self.count} object{'s' * (self.count != 1)}{f' ({names[0]})' if names else ''}"
+            names = ", ".join(sorted({found.phrase for found in self.objects}))
+            number = f"{self.count} object{'s' * (self.count != 1)}{f' ({names})' if names else ''}"
             seen = f", {self.viewpoint}" if self.viewpoint else ""
             up = "" if self.up is None else f"up is from {self.up}"
             sentences = [f"read as {self.reading}{seen}: {number}", self.reason.rstrip("."), up, self.question]

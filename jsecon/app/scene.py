@@ -214,7 +214,7 @@ class Scene:
         self._require_memory("a relation, an order or a number")
         if self.field.regions.count == 0:
             raise InputError("field", "it has no regions, so no objects", remedy="Make it again with other --masks.")
-        return ObjectIndex(self._text_field, self.embedder, self._up)
+        return ObjectIndex(self._text_field, self.embedder, self._up, lambda: self._catalogue)
 
     def _require_memory(self, what: str) -> None:
         """Raises InputError if the field is mapped, which `what` needs in memory."""
@@ -379,7 +379,8 @@ class Scene:
             words for an object.
         """
         with self._lock:
-            return self._index.answer(Query(text, frame=frame), None if frame is None else self.frame_index(frame))
+            place = None if frame is None else self.frame_index(frame)
+            return self._index.answer(Query(text, frame=frame), place, metres=self._unit == "metres")
 
     def locate(self, text: str, *, frame: int | str | None = None, relate: bool = False) -> Answer:
         """Finds the one thing that a text names.

@@ -40,7 +40,7 @@ class Object:
 
 
 Find = Callable[[str], tuple[list[Object], float]]
-"""the objects that a phrase names, and the share of unrelated words that are less similar to the scene than it"""
+"""The objects that a phrase names (all for ANY_OBJECT), and the share of unrelated words less similar to the scene."""
 
 
 @dataclasses.dataclass
@@ -64,8 +64,13 @@ def _stack_shapes(objects: Sequence[Object]) -> ObjectShapes:
     return jax.tree.map(lambda *columns: np.concatenate(columns), *(found.shape for found in objects))
 
 
-def evaluate(find: Find, thing: NounPhrase, conditions: Sequence[Condition], view: Viewpoint) -> _ReferringResult:
-    """Finds the objects of a name that meet conditions, one reading of a text, and chooses among them by the order."""
+def evaluate(
+    find: Find, thing: NounPhrase, conditions: Sequence[Condition], view: Viewpoint, unit: float = 1.0
+) -> _ReferringResult:
+    """Finds the objects of a name that meet conditions, one reading of a text, and chooses among them by the order.
+
+    `unit` is the unit of the conditions' lengths in the world of the shapes.
+    """
     candidates, rank = find(thing.text)
     if not candidates:
         known = "" if np.isnan(rank) else f" ({int(100 * rank)} % of unrelated words are less like the scene)"
@@ -76,12 +81,13 @@ def evaluate(find: Find, thing: NounPhrase, conditions: Sequence[Condition], vie
     for condition in conditions:
         anchors = []
         for anchor in condition.anchors:
-            result = evaluate(find, anchor, condition.conditions if anchor is condition.anchors[-1] else (), view)
+            nested = condition.conditions if anchor is condition.anchors[-1] else ()
+            result = evaluate(find, anchor, nested, view, unit)
             if not result.chosen:
                 return _ReferringResult([], used=used, reason=f"nothing to compare with: {result.reason}")
             anchors.append(result.chosen)
             used += [found for found in result.chosen if found not in used]
-        scores = _condition_scores(candidates, shapes, condition, anchors, view)
+        scores = _condition_scores(candidates, shapes, condition, anchors, view, unit)
         if condition.relation in ANCHORED_ORDERS:
             orders.append((condition.relation, scores))
             continue
@@ -92,6 +98,7 @@ def evaluate(find: Find, thing: NounPhrase, conditions: Sequence[Condition], vie
     rest = [k for k in range(len(candidates)) if k not in valid and candidates[k].score >= 0.2]
     if not valid:
         return _ReferringResult([], [candidates[k] for k in rest], used, reason=_nearest_miss(candidates))
+    matches = len(valid)
     valid.sort(key=lambda k: -candidates[k].score)
     if thing.order is not None:
         orders.append((thing.order, np.asarray(order_values(shapes, view)[thing.order])))
@@ -108,8 +115,9 @@ def evaluate(find: Find, thing: NounPhrase, conditions: Sequence[Condition], vie
     undecided = [chosen[-1], *(candidates[k] for k in close)] if close else []
     if len(chosen) > 1 and not thing.every and not orders and thing.number is None:
         undecided = chosen
-    wrong = thing.number is not None and len(chosen) != thing.number
-    reason = f"the text says {thing.number} and {len(chosen)} match" if wrong else ""
+    counts = [(thing.number, len(chosen)), (thing.among, matches)]
+    wrong = [f"the text says {said} and {count} match" for said, count in counts if said not in (None, count)]
+    reason = "; ".join(wrong)
     return _ReferringResult(chosen, alternatives, used, undecided, reason)
 
 
@@ -124,6 +132,7 @@ def _condition_scores(
     condition: Condition,
     anchors: Sequence[Sequence[Object]],
     view: Viewpoint,
+    unit: float,
 ) -> Float[np.ndarray, " k"]:
     """Score of a condition for each candidate, with the anchor that fits best; for an anchored order the value."""
     others = _stack_shapes(anchors[0])
@@ -135,7 +144,8 @@ def _condition_scores(
         return np.where(usable[:, :, None] & distinct, scores, 0.0).max((1, 2))
     rows = max(512 // len(others), 1)  # pairs at once, whose points stay in the processor's cache
     parts = [shapes[first : first + rows] for first in range(0, len(shapes), rows)]
-    scores = np.concatenate([pair_scores(condition.relation, part, others, view) for part in parts])
+    length = condition.length * unit
+    scores = np.concatenate([pair_scores(condition.relation, part, others, view, length) for part in parts])
     if condition.relation in ANCHORED_ORDERS:
         gaps = np.where(usable, scores, np.inf).min(1)
         return gaps if condition.relation == "nearest to" else np.where(np.isfinite(gaps), -gaps, np.inf)

@@ -232,6 +232,21 @@ def _relative_gap(a: ObjectShapes, b: ObjectShapes) -> Array:
     return _over(_gap(a, b), np.sqrt(_size(a) * _size(b)))
 
 
+def _volume(shape: ObjectShapes) -> Array:
+    """Side of a cube with the volume of a box."""
+    return (2.0 * shape.half_size).prod(-1) ** (1 / 3)
+
+
+def _exceeds(x: Array, y: Array, size: Array) -> Array:
+    """Whether x is larger than y, of objects of a size: from 0.05 of it on."""
+    return _rise(_over(x - y, size) - 0.05)
+
+
+def _higher(a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> Array:
+    """Whether the middle of a is above that of b, wherever they stand."""
+    return _exceeds(_dot(a.center, view.up), _dot(b.center, view.up), 0.5 * (_heights(a)[2] + _heights(b)[2]))
+
+
 _PREDICATES = {
     "left of": lambda a, b, view: _towards(a, b, view, sideways=True),
     "right of": lambda a, b, view: _towards(b, a, view, sideways=True),
@@ -243,6 +258,12 @@ _PREDICATES = {
     "under": lambda a, b, _: _above(b, a),
     "in": lambda a, b, _: _in_box(a, b),
     "next to": lambda a, b, _: _next_to(a, b),
+    "larger than": lambda a, b, _: _exceeds(_volume(a), _volume(b), _volume(b)),
+    "smaller than": lambda a, b, _: _exceeds(_volume(b), _volume(a), _volume(a)),
+    "taller than": lambda a, b, _: _exceeds(_heights(a)[2], _heights(b)[2], _heights(b)[2]),
+    "shorter than": lambda a, b, _: _exceeds(_heights(b)[2], _heights(a)[2], _heights(a)[2]),
+    "higher than": lambda a, b, view: _higher(a, b, view),
+    "lower than": lambda a, b, view: _higher(b, a, view),
     # Gaps between surfaces in units of the objects' sizes: near falls as the gap grows, far rises with it.
     "near": lambda a, b, _: _within(_relative_gap(a, b) / 1.1),
     "nearest to": lambda a, b, _: _gap(a, b),
@@ -252,8 +273,16 @@ _PREDICATES = {
 }
 
 
-def pair_scores(relation: str, a: ObjectShapes, b: ObjectShapes, view: Viewpoint) -> Float[Array, "k l"]:
-    """Scores "object of a RELATION object of b" for all pairs; of "nearest to" and "farthest from" it is the gap."""
+def pair_scores(
+    relation: str, a: ObjectShapes, b: ObjectShapes, view: Viewpoint, length: float = 0.0
+) -> Float[Array, "k l"]:
+    """Scores "object of a RELATION object of b" for all pairs; of "nearest to" and "farthest from" it is the gap.
+
+    "within" and "at least" compare the gap with a length, in units of the shapes' world.
+    """
+    if relation in ("within", "at least"):
+        near = _within(_over(_gap(a[:, None], b[None]), np.asarray(length)), 8.0)
+        return near if relation == "within" else 1.0 - near
     return _PREDICATES[relation](a[:, None], b[None], view)
 
 
@@ -277,7 +306,7 @@ def order_values(shapes: ObjectShapes, view: Viewpoint) -> dict[str, Float[Array
 
     "largest" compares the volumes of boxes, "leftmost" the directions from the viewpoint, "nearest" the distances.
     """
-    volume = (2.0 * shapes.half_size).prod(1) ** (1 / 3)
+    volume = _volume(shapes)
     height = 2.0 * shapes.half_size[:, 2]
     level = _dot(shapes.center, view.up)
     away = shapes.center - view.eye
