@@ -365,7 +365,7 @@ class Scene:
     def relate(self, text: str, *, frame: int | str | None = None) -> Answer:
         """Finds the objects that a text names and tells apart, such as "the red mug left of the bottle".
 
-        `ask` does so for texts with a relation, an order or a number; this reads any text so, as "red mugs".
+        `ask` does so for texts with a word of place, an order or a number; this reads any text so, as "red mugs".
 
         Args:
           text: The text.

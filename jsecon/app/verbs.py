@@ -174,8 +174,8 @@ class Query(_FieldVerb):
       field: Path of field.safetensors, the folder that jsecon run wrote it to, or a file of Gaussians without
         photographs, of which the field is made once, to OUT/field.
       texts: What to find, such as "red mug" "dark green bottle" "mug or bowl but not handle", or with a relation, an
-        order or a number: "the red mug left of the bottle", "the second largest box". Quotes in a text make its words
-        an object as they stand.
+        order or a number: "the red mug left of the bottle", "the second largest box", "what is on the table". Quotes
+        in a text make its words an object as they stand.
       from_frame: Frame from which left, right, front and behind are seen. By default it is the mean camera, or the
         frame that shows most objects where the cameras look in all directions.
       up: Up axis of the capture's world, three numbers, for relations, and for the views of a file of Gaussians. By
