@@ -125,6 +125,7 @@ def test_every_spelling_is_understood_and_quotes_protect():
     ("all jars except the green one", "'except'"), ("everything other than the jar", "'other'"),
     ("the jar that is not on the shelf", "'not'"), ("the jar next to it", "'it'"), ("the one on the shelf", "'one'"),
     ("the jar on the side of the box", "'side'"), ("the jar and the left lamp", "'left'"),
+    ("the top of the jar", "'top'"), ("the left side of the jar", "'left'"),
     ("the jar closer to the lamp than to the door", "'than'"), ("the longer jar", "'longer'"),
     ("the left jar or the lamp", '"or"'), ("the jar but not the jar on the shelf", '"but not"'),
     ("red mug or bowl on the plate", '"or"'), ("caf\udce9 on the plate", "not UTF-8"),

@@ -288,7 +288,7 @@ def _with_names(tokens: list[_Token]) -> list[_Token]:
 
 def _longest(tokens: Sequence[_Token], start: int, table: Container[tuple[str, ...]]) -> tuple[str, ...] | None:
     """Returns the longest spelling of a table that begins at a token, or None."""
-    for length in range(min(5, len(tokens) - start), 0, -1):
+    for length in range(min(6, len(tokens) - start), 0, -1):
         words = tuple(token.key for token in tokens[start : start + length])
         if words in table:
             return words
@@ -430,6 +430,8 @@ def _length_in_name(tokens: Sequence[_Token], place: int, named: bool) -> int:
     phrasal = named and tokens[place - 1].key in _WORDS["phrasal"] and key in ("in", "on", "over")
     if phrasal or key in ("nearer", "closer"):
         return int(not following or following[0] not in _QUANTIFIERS)
+    if key == "near" and place and not named and tokens[place - 1].key in _WORDS["determiners"]:
+        return 1  # the near mug
     if named or len(following) < 2:
         return 0
     if following[0] not in _WORDS["determiners"]:
@@ -489,6 +491,8 @@ def _noun_phrase(tokens: Sequence[_Token], related: bool = False, anchor: bool =
         binds = rest[0].key
         ordered = order is not None or any((t.key,) in _ORDER_OF or t.key in _ADJECTIVES for t in rest[:2])
         adjective = order is None and key in _ADJECTIVES and _tells_apart([t.key for t in tokens], 0, definite)
+        if not key.endswith("er") and "of" in [t.key for t in rest[:2]] and not any(_number(t.key) for t in rest[:3]):
+            adjective = False  # the top of the box, the left side of the box
         if key in _WORDS["every"]:
             several = key in ("every", "each") or binds in _WORDS["determiners"] or _is_plural(rest, counted=True)
             if binds in _WORDS["after_numbers"] or not several:
@@ -570,7 +574,7 @@ def _unknown_word(keys: Sequence[str], definite: bool, related: bool, anchor: bo
             or (key,) in _ORDER_OF
             or (key in _WORDS["prepositions"] and place > 0 and not phrasal)
             or (key.endswith("n't") and place > 0)
-            or (key in _WORDS["participles"] and place > 0 and ends)
+            or (key in _WORDS["participles"] and place > 0 and ends and not phrasal)
             or (key == "not" and before in _WORDS["fillers"])
             or (key in _WORDS["sides"] and place == 0 and anchor and after in (None, "of"))
         ):
