@@ -42,6 +42,7 @@ EXPRESSIONS = [
     ("the under cabinet light above the sink", "under cabinet light", ["above sink"], None, None, False),
     ("two way radio next to the 2 liter bottle", "two way radio", ["next to 2 liter bottle"], None, None, False),
     ("the left bag", "bag", [], ("leftmost", 1), None, False),
+    ("the left bottle of wine", "bottle of wine", [], ("leftmost", 1), None, False),
     ("right boot", "boot", [], ("rightmost", 1), None, False),
     ("the left-hand door", "door", [], ("leftmost", 1), None, False),
     ("the upper cabinet", "cabinet", [], ("highest", 1), None, False),

@@ -78,8 +78,8 @@ Question: TypeAlias = str | At | Box | Mask | Region
 class Query:
     """A question and how it is answered. Equal queries of one scene have equal answers.
 
-    A text with a word of place, an order or a number is read by its own words: `frame` is for these texts alone, and the
-    other options are for all other questions.
+    A text with a word of place, an order or a number is read by its own words: `frame` is for these texts alone, and
+    the other options are for all other questions.
 
     Attributes:
       question: A text, `At`, `Box`, `Mask` or `Region`. A text may be composite: `"red mug" or "bowl" but not

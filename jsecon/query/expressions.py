@@ -491,8 +491,9 @@ def _noun_phrase(tokens: Sequence[_Token], related: bool = False, anchor: bool =
         binds = rest[0].key
         ordered = order is not None or any((t.key,) in _ORDER_OF or t.key in _ADJECTIVES for t in rest[:2])
         adjective = order is None and key in _ADJECTIVES and _tells_apart([t.key for t in tokens], 0, definite)
-        if not key.endswith("er") and "of" in [t.key for t in rest[:2]] and not any(_number(t.key) for t in rest[:3]):
-            adjective = False  # the top of the box, the left side of the box
+        side = rest[1:] if binds in _WORDS["sides"] else rest  # the top of the box, the left side of the box
+        if side and side[0].key == "of" and not key.endswith("er") and not any(_number(t.key) for t in side[1:3]):
+            adjective = False
         if key in _WORDS["every"]:
             several = key in ("every", "each") or binds in _WORDS["determiners"] or _is_plural(rest, counted=True)
             if binds in _WORDS["after_numbers"] or not several:
