@@ -198,13 +198,13 @@ class ObjectIndex:
         camera = jax.tree.map(np.asarray, cameras[frame])
         return viewpoint(camera, self.up), f"as seen from {self._field.names[frame]}"
 
-    def answer(self, query: Query, frame: int | None, *, metres: bool) -> Answer:
+    def answer(self, query: Query, frame: int | None, in_metres: Callable[[], bool]) -> Answer:
         """Finds the objects that a referring expression names, with directions as seen from a frame.
 
-        `metres` says whether the unit of the capture's world is the metre.
+        `in_metres` tells whether the unit of the capture's world is the metre.
         """
         expression = parse_expression(str(query))
-        if not metres and any(condition.in_metres for condition in expression.conditions):
+        if any(condition.in_metres for condition in expression.conditions) and not in_metres():
             problem = "the scale of this scene is not known, so a distance in metres cannot be measured"
             remedy = 'Ask in units of the capture ("within 2 units of the box"), or say "near" or "closest to".'
             raise InputError(f"expression {str(query)!r}", problem, remedy=remedy)
