@@ -140,10 +140,10 @@ def test_an_order_counts_what_it_chooses_from(scene):
 
 def test_metres_need_a_scene_in_metres(scene):
     for text in ("the red mug within 1 m of the dark blue box", "red mugs at least 30 cm from the orange ball"):
-        with pytest.raises(InputError, match="scale of this scene is not known"):
+        with pytest.raises(InputError, match="in metres is not known"):
             scene.ask(text)
-    known = Scene(*table_field(source_from_scene=np.diag([2.0, 2.0, 2.0, 1.0])), up=(0, 0, 1))
-    known._unit = "metres"
+    field, embedder = table_field(source_from_scene=np.diag([4.0, 4.0, 4.0, 1.0]))
+    known = Scene(dataclasses.replace(field, metres_per_unit=0.5), embedder, up=(0, 0, 1))
     near = {cm: known.ask(f"red mugs within {cm} cm of the dark blue box").count for cm in (20, 95, 400)}
     assert near == {20: 0, 95: 1, 400: 2}
 

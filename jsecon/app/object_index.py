@@ -198,20 +198,19 @@ class ObjectIndex:
         camera = jax.tree.map(np.asarray, cameras[frame])
         return viewpoint(camera, self.up), f"as seen from {self._field.names[frame]}"
 
-    def answer(self, query: Query, frame: int | None, in_metres: Callable[[], bool]) -> Answer:
-        """Finds the objects that a referring expression names, with directions as seen from a frame.
-
-        `in_metres` tells whether the unit of the capture's world is the metre.
-        """
+    def answer(self, query: Query, frame: int | None) -> Answer:
+        """Finds the objects that a referring expression names, with directions as seen from a frame."""
         expression = parse_expression(str(query))
-        if any(condition.in_metres for condition in expression.conditions) and not in_metres():
-            problem = "the scale of this scene is not known, so a distance in metres cannot be measured"
-            remedy = 'Ask in units of the capture ("within 2 units of the box"), or say "near" or "closest to".'
+        metres = self._field.metres_per_unit
+        if any(condition.in_metres for condition in expression.conditions) and metres is None:
+            problem = "the size of this scene in metres is not known, so no distance in metres can be compared"
+            remedy = 'Ask in units of the capture ("within 2 units of"), or run with --metres-per-unit.'
             raise InputError(f"expression {str(query)!r}", problem, remedy=remedy)
         unit = 1.0 / world_scale(self._field)
+        units = unit, unit / (metres or 1.0)
         view, words = self._view(frame)
         readings = expression.readings()
-        outcomes = [evaluate(self._objects_of, expression.thing, reading, view, unit) for reading in readings]
+        outcomes = [evaluate(self._objects_of, expression.thing, reading, view, units) for reading in readings]
         place = next((n for n, outcome in enumerate(outcomes) if outcome.chosen), 0)
         best, others = outcomes[place], outcomes[place + 1 :]
         chosen = {found.regions for found in best.chosen}

@@ -379,8 +379,7 @@ class Scene:
             words for an object.
         """
         with self._lock:
-            place = None if frame is None else self.frame_index(frame)
-            return self._index.answer(Query(text, frame=frame), place, lambda: self._unit == "metres")
+            return self._index.answer(Query(text, frame=frame), None if frame is None else self.frame_index(frame))
 
     def locate(self, text: str, *, frame: int | str | None = None, relate: bool = False) -> Answer:
         """Finds the one thing that a text names.

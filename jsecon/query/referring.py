@@ -65,11 +65,15 @@ def _stack_shapes(objects: Sequence[Object]) -> ObjectShapes:
 
 
 def evaluate(
-    find: Find, thing: NounPhrase, conditions: Sequence[Condition], view: Viewpoint, unit: float = 1.0
+    find: Find,
+    thing: NounPhrase,
+    conditions: Sequence[Condition],
+    view: Viewpoint,
+    units: tuple[float, float] = (1.0, 1.0),
 ) -> _ReferringResult:
     """Finds the objects of a name that meet conditions, one reading of a text, and chooses among them by the order.
 
-    `unit` is the unit of the conditions' lengths in the world of the shapes.
+    `units` are the capture's unit and the metre, in the world of the shapes.
     """
     candidates, rank = find(thing.text)
     if not candidates:
@@ -82,12 +86,12 @@ def evaluate(
         anchors = []
         for anchor in condition.anchors:
             nested = condition.conditions if anchor is condition.anchors[-1] else ()
-            result = evaluate(find, anchor, nested, view, unit)
+            result = evaluate(find, anchor, nested, view, units)
             if not result.chosen:
                 return _ReferringResult([], used=used, reason=f"nothing to compare with: {result.reason}")
             anchors.append(result.chosen)
             used += [found for found in result.chosen if found not in used]
-        scores = _condition_scores(candidates, shapes, condition, anchors, view, unit)
+        scores = _condition_scores(candidates, shapes, condition, anchors, view, units)
         if condition.relation in ANCHORED_ORDERS:
             orders.append((condition.relation, scores))
             continue
@@ -132,7 +136,7 @@ def _condition_scores(
     condition: Condition,
     anchors: Sequence[Sequence[Object]],
     view: Viewpoint,
-    unit: float,
+    units: tuple[float, float],
 ) -> Float[np.ndarray, " k"]:
     """Score of a condition for each candidate, with the anchor that fits best; for an anchored order the value."""
     others = _stack_shapes(anchors[0])
@@ -144,7 +148,7 @@ def _condition_scores(
         return np.where(usable[:, :, None] & distinct, scores, 0.0).max((1, 2))
     rows = max(512 // len(others), 1)  # pairs at once, whose points stay in the processor's cache
     parts = [shapes[first : first + rows] for first in range(0, len(shapes), rows)]
-    length = condition.length * unit
+    length = condition.length * units[condition.in_metres]
     scores = np.concatenate([pair_scores(condition.relation, part, others, view, length) for part in parts])
     if condition.relation in ANCHORED_ORDERS:
         gaps = np.where(usable, scores, np.inf).min(1)
