@@ -18,6 +18,7 @@ import numpy as np
 import onnxruntime
 
 from jsecon.errors import InputError
+from jsecon.files import describe_substitute
 from jsecon.process import cores
 
 _DTYPES = {"tensor(float)": "float32", "tensor(double)": "float64"} | {
@@ -232,16 +233,16 @@ def _has_half_precision(path: Path) -> bool:
 
 
 def _check_bytes(path: Path) -> None:
-    """Checks that a file exists and is neither empty nor a Git LFS pointer."""
+    """Checks that a file exists, is not empty, and that nothing else stands in its place."""
     try:
         with open(path, "rb") as stream:
-            head = stream.read(64)
+            is_empty = not stream.read(1)
     except OSError as error:
         raise _unreadable(path, error.strerror or "an error on reading") from error
-    if not head:
+    if is_empty:
         raise _unreadable(path, "an empty file")
-    if head.startswith(b"version https://git-lfs"):
-        raise _unreadable(path, "a Git LFS pointer in place of the file", "Fetch the content: git lfs pull.")
+    if (substitute := describe_substitute(path)) is not None:
+        raise _unreadable(path, *substitute)
 
 
 def _unreadable(path: Path, problem: str, remedy: str = "Check the path, or fetch the file again.") -> InputError:

@@ -21,7 +21,6 @@ from jsecon.pipeline.scene_files import check_overlap, place_in_capture, read_sc
 from jsecon.poses.sfm import find_poses
 from jsecon.read.captures.capture import (
     has_depth,
-    list_photographs,
     load_capture,
     read_posed_images,
     unposed_photographs,
@@ -44,12 +43,12 @@ def plan_capture(context: RunContext) -> list[Stage]:
     if is_video(capture):
         what = f"the {options.frames or DEFAULT_VIDEO_FRAMES} sharpest frames of {capture.name}, evenly spread"
         key_options, files = context.key_options("frames"), [capture]
-    elif unposed_photographs(capture):
-        files = list_photographs(capture)
-        what = f"{len(files)} photographs, which have none"
-        key_options = {"names": [photo.relative_to(capture).as_posix() for photo in files]}
     else:
-        return [_plan_load(context, capture)]
+        files, notes = unposed_photographs(capture)
+        if not files:
+            return [_plan_load(context, capture)]
+        what = " ".join([f"{len(files)} photographs, which have none{'.' * bool(notes)}", *notes])
+        key_options = {"names": [photo.relative_to(capture).as_posix() for photo in files]}
     how = f"found by structure from motion (pycolmap) for {what}"
     folder = context.out / "poses"
     poses = Stage("poses", how, _estimate_poses, key_options=key_options, files=tuple(files), output_dir=folder)
@@ -118,9 +117,9 @@ def _estimate_poses(stage: StageInput) -> StageResult:
     video = is_video(capture)
     if video:
         frames = context.options.frames
-        photos = write_frames(capture, folder / "frames", frames=frames, progress=stage.progress)
+        photos, found = write_frames(capture, folder / "frames", frames=frames, progress=stage.progress)
     else:
-        photos = list_photographs(capture)
+        photos, found = unposed_photographs(capture)
     posed, notes = find_poses(photos, folder, where=capture, progress=stage.progress)
     if video:
         shutil.rmtree(posed / "images")
@@ -128,7 +127,7 @@ def _estimate_poses(stage: StageInput) -> StageResult:
     shutil.rmtree(out, ignore_errors=True)
     shutil.move(posed, out)
     write_text(out / KEY_FILE, folder.name)
-    return StageResult(None, (*notes, f"The poses are in {out}: COLMAP opens them."))
+    return StageResult(None, (*found, *notes, f"The poses are in {out}: COLMAP opens them."))
 
 
 def _refinement(options: Options, capture: Path) -> str:

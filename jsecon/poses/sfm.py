@@ -106,8 +106,8 @@ def find_poses(
         sizes = [image.shape[1::-1] for image, _ in pool.map(read_image, photos)]
     links: list[str] = []
     for number, photo in enumerate(photos):
-        # COLMAP ignores EXIF orientations and reads no HEIC: it gets a copy of the upright pixels.
-        copied = image_header(photo).orientation != 1 or photo.suffix.lower() in (".heic", ".heif")
+        # COLMAP ignores EXIF orientations and reads no HEIC and AVIF: it gets a copy of the upright pixels.
+        copied = image_header(photo).orientation != 1 or photo.suffix.lower() in (".heic", ".heif", ".avif")
         links.append(f"{number:06d}{'.png' if copied else photo.suffix.lower()}")  # COLMAP's lists split at spaces
         _link(photo, work / "links" / links[-1], upright_copy=copied)
     lenses = [[links[n] for n in group] for group in _lens_groups(photos, sizes)]

@@ -4,15 +4,19 @@
 and poses in OpenCV axes. Other packages add readers by entry points in the group jsecon.captures.
 """
 
+import collections
+import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 from jsecon.errors import InputError
-from jsecon.files import is_output_folder, list_files, reading
+from jsecon.files import describe_substitute, is_output_folder, list_files, reading
 from jsecon.read.captures import colmap, nerfstudio, rgbd
 from jsecon.read.captures.build import build_capture
 from jsecon.read.captures.frames import FrameOptions, PosedImages
-from jsecon.read.captures.images import IMAGE_SUFFIXES
+from jsecon.read.captures.images import IMAGE_SUFFIXES, convert_remedy, is_photograph, unread_format
+from jsecon.read.captures.video import is_video
 from jsecon.read.registry import Reader, find_reader
 from jsecon.types import Capture, Progress
 
@@ -20,6 +24,14 @@ READERS = (*colmap.READERS, *nerfstudio.READERS, *colmap.NESTED_READERS, *rgbd.R
 """The formats, the preferred first: a folder of both COLMAP and nerfstudio is read as COLMAP, which has the points."""
 _OTHER_IMAGES = re.compile(r"mask|depth|segmentation|proposal|label|confidence|normal|thumb")
 """in the name of a folder whose images are not photographs"""
+_OTHER_WORD = re.compile(
+    r"(?<![a-z])(mask(?:s|ed)?|depths?|disparity|seg|semantics?|instances?|labels?|normals?|alpha)(?![a-z])"
+)
+_IMAGE_WORD = re.compile(r"(?<![a-z])(colou?r|rgba?|images?|img|frame|photo)(?![a-z])")
+"""words in names of images, beside each other: frame0001.jpg and depth0001.png, a.color.png and a.depth.png"""
+_POSE_FILE = re.compile(
+    r".*(pose|traj|extrinsic|odometry|ground_?truth|camera).*\.(txt|json|npy|npz|csv|log|xml|ya?ml)"
+)
 
 
 def load_capture(
@@ -84,22 +96,47 @@ def list_photographs(path: Path) -> list[Path]:
     """Lists the photographs of a folder, or of its images/, in name order.
 
     If none lies directly in the folder, those of its subfolders are listed (cam0/, cam1/), except in folders of masks
-    or depth, masks named like the photograph beside them (a.jpg.png), and output of jsecon.
+    or depth, and output of jsecon. Depth maps, masks, and images with another's name and a word more (a_mask.png,
+    a.jpg.png) are no photographs.
     """
+    return _sort_images(path)[0]
+
+
+def _sort_images(path: Path) -> tuple[list[Path], list[Path]]:
+    """The photographs of a folder as `list_photographs` lists them, and the images beside them that are none."""
     folder = path / "images" if (path / "images").is_dir() else path
     if not folder.is_dir():
-        return []
-    direct = sorted(file for file in folder.iterdir() if _is_image(file) and file.is_file())
-    if direct:
-        return direct
-    images = [file for file in list_files(folder) if _is_image(file)]
-    masked = {image.with_suffix("") for image in images}.intersection(images)
-    return [
-        file
-        for file in images
-        if file.with_suffix("") not in masked
-        and not any(_OTHER_IMAGES.search(part.lower()) for part in file.relative_to(folder).parts[:-1])
-    ]
+        return [], []
+    images = sorted(file for file in folder.iterdir() if _is_image(file) and file.is_file())
+    if not images:
+        inner = [file for file in list_files(folder) if _is_image(file)]
+        parts = {file: file.relative_to(folder).parts[:-1] for file in inner}
+        images = [file for file in inner if not any(_OTHER_IMAGES.search(part.lower()) for part in parts[file])]
+    derived = _derived_images(images)
+    photos = [file for file in images if file not in derived and is_photograph(file)]
+    return photos, sorted({*images}.difference(photos))
+
+
+def _derived_images(images: Sequence[Path]) -> set[Path]:
+    """Images whose names are those of others with a word added or changed: masks, depth maps, masked copies.
+
+    A word that is not known counts if at least two images, and half of those without it, have such a copy.
+    """
+
+    def base(file: Path) -> tuple[Path, str]:
+        plain = _IMAGE_WORD.sub("", _OTHER_WORD.sub("", file.stem.lower()))
+        return file.parent, re.sub("[^a-z0-9]", "", plain)
+
+    bases = {base(file) for file in images if not _OTHER_WORD.search(file.stem.lower())}
+    derived = {file for file in images if _OTHER_WORD.search(file.stem.lower()) and base(file) in bases}
+    derived |= {file for file in images if file.with_suffix("") in images}
+    stems, copies = {(file.parent, file.stem) for file in images}, collections.defaultdict(set)
+    for file in images:
+        first, last = re.match("([A-Za-z]+)[_. -](.+)", file.stem), re.match("(.+)[_. -]([A-Za-z]+)$", file.stem)
+        for word, stem in ((first[1], first[2]) if first else ("", ""), (last[2], last[1]) if last else ("", "")):
+            if (file.parent, stem) in stems:
+                copies[word].add(file)
+    return derived.union(*(some for some in copies.values() if len(some) > 1 and 3 * len(some) >= len(images)))
 
 
 def _is_image(file: Path) -> bool:
@@ -107,13 +144,66 @@ def _is_image(file: Path) -> bool:
     return file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".")
 
 
-def unposed_photographs(path: Path) -> list[Path]:
-    """Lists the photographs of a folder without poses; those of subfolders only if none of these is a capture."""
+def unposed_photographs(path: Path) -> tuple[list[Path], tuple[str, ...]]:
+    """Lists the photographs of a folder without poses, and notes; those of subfolders if none of these is a capture.
+
+    Raises InputError if they are those of a capture whose folder lies above.
+    """
     if not path.is_dir() or _find_reader(path) is not None:
-        return []
-    photos = list_photographs(path)
+        return [], ()
+    photos, others = _sort_images(path)
     is_nested = bool(photos) and photos[0].parent not in (path, path / "images")
-    return [] if is_nested and _inner_captures(path) else photos
+    if is_nested and _inner_captures(path):
+        return [], ()
+    if photos and (above := _capture_above(path)) is not None:
+        folder, name = above
+        raise InputError(path, f"its photographs are part of a {name} capture", remedy=f"Give that: {folder}")
+    return photos, _notes_beside(path, photos, others) if photos else ()
+
+
+def _capture_above(path: Path) -> tuple[Path, str] | None:
+    """The folder of a capture, up to three above, whose images lie in a folder, and its format."""
+    place = Path(os.path.abspath(path))
+    for folder in place.parents[:3]:
+        reader = _find_reader(folder)
+        if reader is not None:
+            try:
+                images = [image.image for image in read_posed_images(folder).images]
+            except InputError:  # then its photographs are no capture
+                continue
+            if any(image is not None and place in Path(os.path.abspath(image)).parents for image in images):
+                return folder, reader.name
+    return None
+
+
+def _notes_beside(path: Path, photos: Sequence[Path], others: Sequence[Path]) -> tuple[str, ...]:
+    """Says what lies beside the photographs of a folder and is not used."""
+    folders = {path, photos[0].parent, photos[0].parent.parent} if path in photos[0].parents else {path}
+    folders = {folder for folder in folders if folder == path or path in folder.parents}
+    files = sorted(f for folder in folders for f in folder.iterdir() if f.is_file() and not f.name.startswith("."))
+    stems = {photo.stem for photo in photos} | {re.sub(r"[_.-]\w+$", "", photo.stem) for photo in photos}
+    numbers = [f for f in files if f.suffix.lower() in (".txt", ".json", ".npy", ".xml") and f.stem in stems]
+    poses = [file for file in files if _POSE_FILE.fullmatch(file.name.lower())]
+    poses += [f for f in numbers if f not in poses] if 2 * len(numbers) >= len(photos) else []
+    unread = [file for file in files if unread_format(file) or is_video(file)]
+    notes = []
+    if others:
+        left_out = "are left out as depth maps, masks or copies of the photographs"
+        notes.append(f"{len(others)} images {left_out} ({_shorten(others)}).")
+    if poses:
+        remedy = "Write them as a COLMAP model or a transforms.json to use them."
+        notes.append(f"What may be poses is of a layout that jsecon does not read ({_shorten(poses)}). {remedy}")
+    if unread:
+        remedy = "Convert images to JPEG or PNG; give a video by itself."
+        notes.append(
+            f"{len(unread)} files are left out, whose formats are not read here ({_shorten(unread)}). {remedy}"
+        )
+    return tuple(notes)
+
+
+def _shorten(files: Sequence[Path]) -> str:
+    """The first names of some files."""
+    return ", ".join(file.name for file in files[:3]) + (", ..." if len(files) > 3 else "")
 
 
 def _inner_captures(path: Path) -> list[Path]:
@@ -129,18 +219,41 @@ def _no_capture(path: Path) -> InputError:
     names = ", ".join(child.name for child in entries[:5]) + (", ..." if len(entries) > 5 else "")
     problem = f"a folder without poses and photographs, but with {names}"
     remedy = "Give a folder with images/ and sparse/0, with transforms.json, or with photographs in it."
+    videos = [child for child in entries if is_video(child)]
+    unread = [child for child in (*entries, *path.glob("images/*")) if unread_format(child)] if path.is_dir() else []
+    archives = [child for child in entries if _is_archive(child)]
     if not path.exists():
         problem, remedy = "there is no such file or folder", "Check the path."
+    elif _is_archive(path):
+        problem = "an archive" + " of Record3D" * (path.suffix.lower() == ".r3d")
+        remedy = f"Unpack it and give the folder: unzip {path.name} -d {path.stem}"
+    elif unread_format(path) or _is_image(path):
+        problem, remedy = "one image", "Give the folder of the photographs, in JPEG or PNG."
     elif not path.is_dir():
         problem = f"a file with the suffix {path.suffix!r} is not a capture"
         remedy = "Give the folder of the capture, its transforms file (.json), or the video."
-    elif photos := unposed_photographs(path):
+    elif photos := unposed_photographs(path)[0]:
         problem, expected = f"{len(photos)} photographs without poses", "a capture with poses"
         remedy = "Find their poses first: jsecon run does so (extra sfm), and keeps them in OUT/poses as a capture."
     elif not entries:
         problem, remedy = "an empty folder", "Copy the capture there, or check the path."
     elif captures := _inner_captures(path):
         remedy = f"Give the capture's own folder, for example {captures[0]}."
+    elif unread:
+        kinds = ", ".join(sorted({str(unread_format(child)) for child in unread}))
+        problem, remedy = f"{len(unread)} images in {kinds}, which is not read", convert_remedy(unread[0])
+    elif others := _sort_images(path)[1]:
+        problem = f"{len(others)} depth maps or masks ({_shorten(others)}), but no photographs"
+    elif videos:
+        problem = f"a folder with {'a video' if len(videos) == 1 else f'{len(videos)} videos'}, but no photographs"
+        remedy = f"Give one video: jsecon run {videos[0]}"
+    elif archives:
+        problem, remedy = f"a folder with an archive ({archives[0].name})", "Unpack it, and give what is in it."
     elif files := [child for child in entries if child.suffix.lower() == ".json"]:
         remedy = f"Give the transforms file itself, for example {files[0]}."
     return InputError(path, problem, expected, remedy)
+
+
+def _is_archive(path: Path) -> bool:
+    """Whether a file is a compressed archive, such as a .zip or a .r3d."""
+    return "archive" in (describe_substitute(path, in_place=False) or ("",))[0]

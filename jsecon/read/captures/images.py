@@ -22,7 +22,7 @@ from PIL.ImageFile import ImageFile
 from jsecon.errors import InputError
 from jsecon.files import atomic_write, map_npy, reading
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".avif")
 IMAGE_SUFFIXES += tuple(suffix.upper() for suffix in IMAGE_SUFFIXES)
 """suffixes tried, in this order, if a capture names an image without one"""
 MAX_PIXELS = 1 << 27
@@ -36,6 +36,12 @@ _DECODERS: dict[bytes, type[ImageFile]] = {
     b"MM\0*": TiffImagePlugin.TiffImageFile,
 }
 """first bytes of a file -> Pillow's decoder"""
+_RAW = dict.fromkeys((".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2"), "a camera's raw format")
+_UNREAD = {".gif": "GIF", ".exr": "OpenEXR", ".jxl": "JPEG XL", ".jp2": "JPEG 2000", ".psd": "Photoshop's format"}
+_UNREAD |= {".hdr": "Radiance's HDR", ".tga": "Targa", ".ppm": "PPM", ".pgm": "PGM", ".svg": "SVG"} | _RAW
+"""suffixes of images that are not read, and their names"""
+_UNREAD_HEADS = {b"GIF8": ".gif", b"v/1\1": ".exr", b"\xff\x0a": ".jxl", b"\0\0\0\x0cJXL": ".jxl"}
+_UNREAD_HEADS |= {b"\0\0\0\x0cjP": ".jp2", b"8BPS": ".psd", b"#?": ".hdr"}
 _ORIENTATION = 0x0112
 """EXIF tag: 1 is upright; 6, the commonest of a phone held upright, asks for a turn clockwise by 90 degrees. From 5
 on they swap width and height."""
@@ -46,13 +52,17 @@ def _open(path: Path) -> Iterator[ImageFile]:
     """Opens an image; only its header is read. Errors of the decoder in the body of the `with` become InputErrors."""
     again = "Copy or export the file again."
     with reading(path, remedy=again, problem="the image cannot be read"), path.open("rb") as file:
-        head = file.read(12)
+        head = file.read(32)
         file.seek(0)
         if not head:
             raise ValueError("the file is empty")
         decoder = next((kind for magic, kind in _DECODERS.items() if head.startswith(magic)), None)
+        if decoder is None and head[4:8] == b"ftyp" and b"avi" in head[8:]:
+            decoder = _avif_decoder(path)
         if decoder is None and head[4:12] in (b"ftypheic", b"ftypheix", b"ftypmif1", b"ftyphevc"):
             decoder = _heic_decoder(path)
+        if (decoder is None or path.suffix.lower() in _RAW) and (kind := unread_format(path, head)) is not None:
+            raise InputError(path, f"the image is in {kind}, which is not read", remedy=convert_remedy(path))
         if decoder is None:
             raise ValueError("it is not an image of a known kind")
         with decoder(file) as image:
@@ -63,6 +73,29 @@ def _open(path: Path) -> Iterator[ImageFile]:
                 remedy = "Shrink it, for instance to half its width and height."
                 raise InputError(path, problem, f"at most {MAX_PIXELS // 10**6} million", remedy)
             yield image
+
+
+def unread_format(path: Path, head: bytes = b"") -> str | None:
+    """Names the format of an image that is not read, by its first bytes or its suffix; None for other files."""
+    by_head = next((suffix for start, suffix in _UNREAD_HEADS.items() if head.startswith(start)), None)
+    return _UNREAD.get(by_head or path.suffix.lower())
+
+
+def convert_remedy(path: Path) -> str:
+    """Says how to convert an image and those beside it."""
+    return f"Convert it to JPEG or PNG, for example: magick mogrify -format jpg '{path.parent}/*{path.suffix}'"
+
+
+def _avif_decoder(path: Path) -> type[ImageFile]:
+    """Pillow's decoder of AVIF, if this Pillow has it."""
+    try:
+        from PIL.AvifImagePlugin import SUPPORTED, AvifImageFile
+    except ImportError:
+        SUPPORTED = False
+    if not SUPPORTED:
+        remedy = f"Run: pip install 'pillow>=11.3'. {convert_remedy(path)}"
+        raise InputError(path, "an AVIF photograph needs a later Pillow", remedy=remedy)
+    return AvifImageFile
 
 
 def _heic_decoder(path: Path) -> type[ImageFile]:
@@ -78,7 +111,7 @@ def _heic_decoder(path: Path) -> type[ImageFile]:
 def _orientation(image: ImageFile) -> int:
     """EXIF's orientation, 1 to 8, of pixels that Pillow returns as they are stored: it turns TIFF and HEIC itself."""
     tags = Image.Exif()
-    if image.format in ("JPEG", "PNG", "WEBP"):
+    if image.format in ("JPEG", "PNG", "WEBP", "AVIF"):
         with contextlib.suppress(Exception):  # damaged EXIF turns nothing
             tags.load(image.info.get("exif", b""))
     value = tags.get(_ORIENTATION, 1)
@@ -150,6 +183,20 @@ def image_header(path: str | Path) -> _ImageHeader:
         return _ImageHeader((width, height), upright, orientation)
 
 
+def is_photograph(path: Path) -> bool:
+    """Whether the header of an image may be a photograph's: grey of 16 bits is depth, and 1 bit a mask.
+
+    True for files that cannot be read: whoever reads them says why.
+    """
+    if path.suffix.lower() not in (".png", ".tif", ".tiff", ".bmp"):
+        return True
+    try:
+        with _open(path) as image:
+            return image.mode not in ("1", "I", "F", "I;16", "I;16B", "I;16L")
+    except InputError:
+        return True
+
+
 def size_around(path: Path, cx: object, cy: object) -> tuple[int, int]:
     """Reads (width, height), px, of an image, stored or upright: of which a principal point lies nearer to the middle.
 
@@ -201,13 +248,14 @@ def read_label_image(path: str | Path) -> Int[np.ndarray, "h w"]:
     """Reads the ids of a label image (.png or .npy).
 
     A grey PNG of 1 to 16 bits has its values as ids; a palette PNG the indices into it, never its colours; an RGB PNG
-    of 8 bits R*65536 + G*256 + B. A .npy has whole numbers or booleans (H, W), negative where there is no label.
+    of 8 bits R*65536 + G*256 + B. Transparent pixels are 0; if all colours are black, the opaque pixels are the mask. A
+    .npy has whole numbers or booleans (H, W), negative where there is no label.
     """
     path = Path(path)
     if path.suffix.lower() == ".npy":
         return _read_id_array(path)
     expected = "ids as grey values (8 or 16 bits), palette indices or 8 bit colours"
-    remedy = "Write one id per pixel as an 8 or 16 bit grey PNG without transparency, or as integers in a .npy."
+    remedy = "Write one id per pixel as an 8 or 16 bit grey PNG, or as integers in a .npy."
     image, decoder = _decode(path, native=True)
     if decoder.format != "PNG":
         raise InputError(path, "the mask is not a PNG", expected, remedy)
@@ -220,8 +268,11 @@ def read_label_image(path: str | Path) -> Int[np.ndarray, "h w"]:
         raise InputError(path, f"the mask has {bits} bits in each of its channels", expected, remedy)
     colours = image.astype(np.int32)
     ids = colours[..., 0] if image.shape[2] == 2 else colours[..., :3] @ np.array([65536, 256, 1], np.int32)
-    if image.shape[2] in (2, 4) and (image[..., -1] < 255).any():
-        raise InputError(path, "the mask has transparent pixels", expected, remedy)
+    if image.shape[2] in (2, 4):
+        opaque = image[..., -1] == 255
+        if not (opaque | (image[..., -1] == 0)).all():
+            raise InputError(path, "the mask has half transparent pixels", expected, remedy)
+        ids = np.where(opaque, ids, 0) if ids.any() else opaque.astype(np.int32)
     return ids
 
 
@@ -256,6 +307,7 @@ def read_depth(path: str | Path, unit: float) -> Float[np.ndarray, "h w"]:
     else:
         depth = read_pixels(path)
         is_depth = depth.ndim == 2 and depth.dtype == np.uint16
+        depth = np.where(depth == 65535, depth.dtype.type(0), depth)  # RGB-D cameras write it where they see nothing
     if not is_depth:
         raise InputError(path, f"the depth map has shape {depth.shape} of {depth.dtype}", expected, remedy)
     with np.errstate(over="ignore", invalid="ignore"):  # infinite: unknown

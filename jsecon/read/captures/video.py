@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,11 +13,16 @@ import numpy as np
 from jaxtyping import UInt8
 
 from jsecon.errors import InputError
+from jsecon.files import reading
 from jsecon.read.captures.images import write_image
 from jsecon.types import Progress
 
 DEFAULT_VIDEO_FRAMES = 150
 """frames taken by default: two or three rounds about a table top"""
+_MAX_FAILURES = 1000
+"""frames in a row that cannot be decoded after which the file is taken to end: a header may promise any number"""
+_COUNTED = (".mp4", ".mov", ".m4v", ".avi", ".3gp")
+"""containers whose headers count frames; others have a duration, of which the count is an estimate"""
 
 
 def is_video(path: Path) -> bool:
@@ -27,45 +33,88 @@ def is_video(path: Path) -> bool:
 
 def write_frames(
     video: Path, folder: Path, *, frames: int | None = None, progress: Progress | None = None
-) -> list[Path]:
-    """Writes the sharpest frame of each stretch of a video as a JPEG, named by its number in the video.
+) -> tuple[list[Path], tuple[str, ...]]:
+    """Writes the sharpest frame of each stretch of a video as a JPEG, named by its number in the video; adds notes.
 
-    Sharpness is the variance of the Laplacian of the grey values (Pech-Pacheco et al., "Diatom autofocusing in
-    brightfield microscopy", ICPR 2000). The video is decoded twice, a frame at a time. `frames` is the most to write.
+    Frames that cannot be decoded are passed over and counted. Sharpness is the variance of the Laplacian of the grey
+    values (Pech-Pacheco et al., "Diatom autofocusing in brightfield microscopy", ICPR 2000). The video is decoded
+    twice, a frame at a time. `frames` is the most to write.
     """
-    sharpness = []
-    for image, total in _decode(video):
+    sharpness: dict[int, float] = {}
+    total = 1
+    for number, image, total in _decode(video):
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         shrink = min(1.0, 640 / max(grey.shape))  # at that size motion still blurs, and noise counts less
         small = cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-        sharpness.append(cv2.Laplacian(small, cv2.CV_32F).var())
+        sharpness[number] = float(cv2.Laplacian(small, cv2.CV_32F).var())
         if progress is not None:
-            progress(min(len(sharpness), total), 2 * total)
+            progress(min(number + 1, total), 2 * total)
     if not sharpness:
         remedy = "Copy it again, or convert it (ffmpeg -i VIDEO walk.mp4)."
-        raise InputError(video, "OpenCV can read no frame of it", "a video", remedy)
-    count = min(frames or DEFAULT_VIDEO_FRAMES, len(sharpness))
-    edges = np.linspace(0, len(sharpness), count + 1).round().astype(int)
-    chosen, written = {int(a + np.argmax(sharpness[a:b])) for a, b in itertools.pairwise(edges)}, []
-    for number, (image, _) in enumerate(_decode(video)):
+        with reading(video):
+            raise InputError(video, "OpenCV can read no frame of it", "a video", remedy)
+    numbers, values = np.array([*sharpness]), np.array([*sharpness.values()])
+    end = int(numbers[-1]) + 1
+    edges = np.linspace(0, end, min(frames or DEFAULT_VIDEO_FRAMES, len(numbers)) + 1).round().astype(int)
+    places = np.searchsorted(numbers, edges)
+    chosen = {int(numbers[a + np.argmax(values[a:b])]) for a, b in itertools.pairwise(places) if b > a}
+    written = []
+    for number, image, _ in _decode(video):
         if number in chosen:
             written.append(folder / f"frame_{number:06d}.jpg")
             write_image(written[-1], cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
         if progress is not None:
-            progress(len(sharpness) + number + 1, 2 * len(sharpness))
-    return written
+            progress(end + number + 1, 2 * end)
+    return written, (*_missing_notes(video, len(numbers), end, total), *_colour_notes(video))
 
 
-def _decode(video: Path) -> Iterator[tuple[UInt8[np.ndarray, "h w 3"], int]]:
-    """Yields each frame (BGR), with the number of frames by the video's header, at least 1."""
+def _missing_notes(video: Path, count: int, end: int, total: int) -> tuple[str, ...]:
+    """Says how many of `total` frames by the header cannot be decoded, `end` is the number behind the last of them."""
+    is_cut = total - end > (0 if video.suffix.lower() in _COUNTED else max(2, total // 50))
+    failed = (total if is_cut else end) - count
+    if not failed:
+        return ()
+    place = f", {total - end} of them at its end: it may be cut short" if is_cut else ""
+    note = f"{failed} of {count + failed} frames of {video.name} cannot be decoded{place}."
+    return (f"{note} The others are used; copy the video again to have all.",)
+
+
+def _colour_notes(video: Path) -> tuple[str, ...]:
+    """Says that colours are off if a video is HDR, which OpenCV decodes as if it were not."""
+    with video.open("rb") as file:
+        head = file.read(1 << 16)
+        if head[4:8] in (b"ftyp", b"moov", b"wide", b"mdat", b"free"):  # boxes: moov, far behind the pixels, tells
+            place, size = 0, os.path.getsize(video)
+            while place < size:
+                file.seek(place)
+                box = file.read(16)
+                length, kind = int.from_bytes(box[:4], "big"), box[4:8]
+                length = int.from_bytes(box[8:], "big") if length == 1 else length or size - place
+                if kind == b"moov":
+                    file.seek(place)
+                    head = file.read(min(length, 1 << 26))
+                place += max(length, 8)
+    # Of ISO/IEC 23091-2's transfer characteristics, 16 is PQ (HDR10, Dolby Vision) and 18 is HLG.
+    found = re.search(rb"colr(?:nclx|nclc)..\0([\x10\x12])|\x55\xba\x81([\x10\x12])", head, re.DOTALL)
+    if found is None:
+        return ()
+    sdr = "zscale=t=linear:npl=100,tonemap=hable,zscale=p=bt709:t=bt709:m=bt709,format=yuv420p"
+    remedy = f"Convert it first: ffmpeg -i {video.name} -vf {sdr} walk.mp4"
+    return (f"{video.name} is an HDR video, which is decoded without tone mapping: colours are off. {remedy}",)
+
+
+def _decode(video: Path) -> Iterator[tuple[int, UInt8[np.ndarray, "h w 3"], int]]:
+    """Yields each frame that can be decoded: its number, BGR, and the number of frames by the header, at least 1."""
     # Other backends write errors to stderr; FFmpeg takes what stands before a colon for a protocol, but in a full path.
     reader = cv2.VideoCapture(os.path.abspath(video), cv2.CAP_FFMPEG)
     try:
         total = max(1, int(reader.get(cv2.CAP_PROP_FRAME_COUNT)))
-        while True:
+        number = failures = 0
+        while failures == 0 or (number < total and failures < _MAX_FAILURES):
             read, image = reader.read()
-            if not read:
-                return
-            yield image, total
+            failures = 0 if read else failures + 1
+            if read:
+                yield number, image, total
+            number += 1
     finally:
         reader.release()
