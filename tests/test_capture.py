@@ -45,7 +45,7 @@ def test_options_are_checked(tmp_path, options):
 def test_options_and_progress(tmp_path):
     write_colmap(CAPTURE, tmp_path)
     calls = []
-    loaded = load_capture(tmp_path, downscale=1.5, frames=4, holdout=None, progress=lambda *call: calls.append(call))
+    loaded = load_capture(tmp_path, downscale=1.5, frames=4, holdout=0, progress=lambda *call: calls.append(call))
     assert loaded.frames.shape == (4, 11, 16, 3)
     np.testing.assert_allclose(loaded.cameras.fx, CAPTURE.cameras.fx[[0, 1, 3, 4]] / 1.5)
     np.testing.assert_allclose(loaded.cameras.fy, CAPTURE.cameras.fy[[0, 1, 3, 4]] * 11 / 16)

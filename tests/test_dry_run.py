@@ -38,7 +38,9 @@ def test_a_dry_run_lists_every_stage_writes_nothing_and_refuses_bad_options(room
 
 @pytest.mark.parametrize("given", [{}, {"downscale": 2.0}, {"long_side": 50, "frames": 3}])
 def test_planned_frames_are_those_of_the_loaded_capture(room, given):
-    capture, (frames, size) = load_capture(room, **given), plan_frames(read_posed_images(room), FrameOptions(**given))
+    capture = load_capture(room, **given)
+    frames, size, held_out = plan_frames(read_posed_images(room), FrameOptions(**given))
+    np.testing.assert_array_equal(held_out, capture.held_out)
     assert size == (capture.cameras.width, capture.cameras.height)
     assert frames == dict(zip(capture.names, capture.files))
 

@@ -107,7 +107,8 @@ class SceneOptions:
     Attributes:
       long_side: Longest side of the frames in pixels, at least 16. Smaller frames keep their size.
       frames: Maximum number of frames, evenly spaced, at least 2. By default all frames are used, of a video 150.
-      holdout: Every how many frames one is held out for measuring; 0 holds out no frame.
+      holdout: Every how many frames one is held out for measuring; 0 holds out no frame. By default those that the
+        capture's own split sets aside are held out, or else every eighth.
       refine: When to correct camera poses and exposures by short fits before anything else. With auto, captures with
         depth are corrected if that lowers the error of training frames kept aside, within half of the fit's time;
         captures without depth, and runs with --gaussians, stay as they are. Held-out frames are aligned to the last of
@@ -120,7 +121,7 @@ class SceneOptions:
 
     long_side: Annotated[Option[int], Range(16, 16384)] = 400
     frames: Annotated[Option[int | None], Range(2, 1_000_000)] = None
-    holdout: Annotated[Option[int], Range(0, 1_000_000)] = 8
+    holdout: Annotated[Option[int | None], Range(0, 1_000_000)] = None
     refine: Option[Literal["never", "auto", "always"]] = "auto"
     steps: Count[Option[int]] = 2000
     minutes: Annotated[Option[float | None], Range(0.05, 10_000)] = None

@@ -39,7 +39,7 @@ from jsecon.poses.sfm import require_pycolmap
 from jsecon.process import compilation_counts
 from jsecon.read.captures.build import plan_frames
 from jsecon.read.captures.capture import read_posed_images
-from jsecon.read.captures.frames import FrameOptions, evenly_spaced, holdout_mask
+from jsecon.read.captures.frames import FrameOptions, evenly_spaced
 from jsecon.read.masks.masks import load_features, load_labels, load_proposals
 from jsecon.types import Capture, Gaussians, LanguageField, Quality
 from jsecon.vision.classical import require_contrib
@@ -312,9 +312,9 @@ def _check_inputs(context: RunContext, plan: _RunState) -> None:
         require_pycolmap(options.capture)
         return
     folder = context.out / "poses" if "poses" in plan.paths else options.capture
-    of_frames = FrameOptions(long_side=options.long_side, frames=options.frames)
-    frames, (width, height) = plan_frames(read_posed_images(folder), of_frames)
-    train = training_frames(holdout_mask(len(frames), options.holdout))
+    of_frames = FrameOptions(long_side=options.long_side, frames=options.frames, holdout=options.holdout)
+    frames, (width, height), held_out = plan_frames(read_posed_images(folder), of_frames)
+    train = training_frames(held_out)
     names = [list(frames)[t] for t in train[evenly_spaced(len(train), options.vision_frames)]]
     size, layout = (height, width), {"level": options.level, "frames": frames}
     if options.masks is not None and "objects" in running:

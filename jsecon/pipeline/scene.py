@@ -61,6 +61,7 @@ def _plan_load(context: RunContext, capture: Path) -> Stage:
     key_options = context.key_options("long_side", "frames", "holdout")
     count = "all frames" if options.frames is None else f"at most {options.frames} frames"
     held_out = f"1 in {options.holdout} held out" if options.holdout else "none held out"
+    held_out = "the capture's own split or 1 in 8 held out" if options.holdout is None else held_out
     how = f"{count}, long side at most {options.long_side} px, {held_out}"
     refine = _refinement(options, capture)
     if refine != "never":

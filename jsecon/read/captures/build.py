@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from jsecon.errors import InputError
 from jsecon.numerics import MAX_COORDINATE
@@ -134,8 +134,10 @@ def _allocate_frames(shape: tuple[int, ...]) -> np.ndarray:
             raise InputError(tempfile.gettempdir(), problem, remedy=remedy) from error
 
 
-def plan_frames(posed: PosedImages, options: FrameOptions) -> tuple[dict[str, ImageFile], tuple[int, int]]:
-    """Plans `build_capture`'s result: its frames by name, and their (width, height), px.
+def plan_frames(
+    posed: PosedImages, options: FrameOptions
+) -> tuple[dict[str, ImageFile], tuple[int, int], Bool[np.ndarray, " t"]]:
+    """Plans `build_capture`'s result: its frames by name, their (width, height), px, and which are held out.
 
     Of the images, only headers are read.
     """
@@ -143,7 +145,25 @@ def plan_frames(posed: PosedImages, options: FrameOptions) -> tuple[dict[str, Im
     frames, _ = _resolve_orientations([frames[i] for i in evenly_spaced(len(frames), options.frames)], posed)
     for lens in {frame.lens for frame in frames}:
         undistorted_pinhole(lens, posed.where)
-    return {frame.name: _file(frame) for frame in frames}, options.size(_commonest_size(frames))
+    files = {frame.name: _file(frame) for frame in frames}
+    return files, options.size(_commonest_size(frames)), _hold_out(frames, options)[0]
+
+
+def _hold_out(frames: Sequence[_Frame], options: FrameOptions) -> tuple[Bool[np.ndarray, " t"], list[str]]:
+    """Chooses the held-out frames: by the options, by the capture's own split, or every eighth; adds notes."""
+    own, notes = np.array([bool(frame.posed.held_out) for frame in frames]), []
+    has_split = any(frame.posed.held_out is not None for frame in frames)
+    if has_split and options.holdout is None:
+        held_out = own
+        notes.append(f"{own.sum()} of {len(own)} frames are held out, those that the capture's own split sets aside.")
+    else:
+        held_out = holdout_mask(len(frames), 8 if options.holdout is None else options.holdout)
+    if has_split and options.holdout is not None:
+        notes.append(f"The capture's own split, {own.sum()} frames for testing, is not used: a holdout is given.")
+    if held_out.all():
+        held_out[:] = False
+        notes.append("No frame was held out, since none would be left to fit to.")
+    return held_out, notes
 
 
 def _file(frame: _Frame) -> ImageFile:
@@ -229,7 +249,7 @@ def build_capture(posed: PosedImages, options: FrameOptions, *, progress: Progre
     depths = [read_depth(image.depth, image.depth_unit) for image in samples if image.depth is not None]
     poses = np.stack([frame.pose for frame in frames])
     world, world_notes = _normalizing_transform(poses, posed.points, depths)  # of all frames, whichever are taken
-    notes += [*posed.notes, *world_notes]
+    notes += [*posed.notes, *world_notes, *_camera_jumps(frames)]
     unsized = [frames[i] for i in evenly_spaced(len(frames), options.frames)]
     if len(unsized) < len(frames):
         notes.append(f"{len(unsized)} of {len(frames)} frames were taken, evenly spaced.")
@@ -270,10 +290,8 @@ def build_capture(posed: PosedImages, options: FrameOptions, *, progress: Progre
             raise
     if transparent:
         notes.append(f"{transparent} images have transparent pixels; they were laid over black.")
-    held_out = holdout_mask(len(frames), options.holdout)
-    if held_out.all():
-        held_out[:] = False
-        notes.append("No frame was held out, since there is only one.")
+    held_out, split_notes = _hold_out(frames, options)
+    notes += split_notes
     final = [pinholes[frame.lens].resized(width, height) for frame in frames]
     fx, fy, cx, cy = np.array([(lens.fx, lens.fy, lens.cx, lens.cy) for lens in final], np.float32).T
     poses, from_world = transform_poses(np.stack([frame.pose for frame in frames]), world), np.linalg.inv(world)
@@ -294,6 +312,27 @@ def build_capture(posed: PosedImages, options: FrameOptions, *, progress: Progre
     )
 
 
+def _camera_jumps(frames: Sequence[_Frame]) -> list[str]:
+    """Reports places where neighbouring frames' cameras lie more than ten median steps apart: a note, or none.
+
+    A reconstruction of 125 photographs with five errors had steps of 11 to 20 there; when right, its largest was 2.2,
+    and that of a walk with one cut 9.9.
+    """
+    steps = np.linalg.norm(np.diff(_centres(np.stack([frame.pose for frame in frames])), axis=0), axis=1)
+    median = float(np.median(steps)) if len(steps) else 0.0
+    far = [f"{frames[t].name} to {frames[t + 1].name}" for t in np.flatnonzero(steps > 10 * median)]
+    if median == 0 or not far:
+        return []
+    places = ", ".join(far[:5]) + (" ..." if len(far) > 5 else "")
+    jump = f"The camera jumps in {len(far)} places, by up to {steps.max() / median:.0f} of its usual steps ({places})."
+    return [f"{jump} If the frames are one walk, poses there are wrong: check them before you trust the fit."]
+
+
+def _centres(poses: np.ndarray) -> np.ndarray:
+    """(T, 3) camera centres of world-to-camera poses."""
+    return -np.einsum("tji,tj->ti", poses[:, :3, :3], poses[:, :3, 3])
+
+
 def _normalizing_transform(
     poses: Float[np.ndarray, "t 4 4"], points: Float[np.ndarray, "p 3"], depths: Sequence[Float[np.ndarray, "h w"]] = ()
 ) -> tuple[Float[np.ndarray, "4 4"], tuple[str, ...]]:
@@ -303,7 +342,7 @@ def _normalizing_transform(
     scaled by a power of 1000, comes out in the same world up to a shift of its own size. Depth maps of a few views, in
     world units with 0 where unknown, stand in for missing points; without either, the spread of the cameras counts.
     """
-    centres = -np.einsum("tji,tj->ti", poses[:, :3, :3], poses[:, :3, 3])
+    centres = _centres(poses)
     middle = np.median(centres, axis=0)
     spread = float(np.median(np.linalg.norm(centres - middle, axis=1)))
     near = _near_depth(poses, np.asarray(points, np.float64), depths) or spread

@@ -40,7 +40,7 @@ def load_capture(
     downscale: float | int | None = None,
     long_side: int | None = None,
     frames: int | None = None,
-    holdout: int | None = 8,
+    holdout: int | None = None,
     progress: Progress | None = None,
 ) -> Capture:
     """Loads a capture.
@@ -54,7 +54,8 @@ def load_capture(
       downscale: Divides width and height, at least 1.
       long_side: Longest side of the frames, px, if `downscale` is None; None: no limit.
       frames: Most frames, evenly spaced; None: all.
-      holdout: k holds out the frames 0, k, 2k, ...; 0 or None holds out no frame.
+      holdout: k holds out the frames 0, k, 2k, ..., and 0 no frame. None holds out those that the capture's own split
+        sets aside (train_filenames, test_filenames, test_frames), or else every eighth.
       progress: Called with (frames done, frames).
 
     Returns:

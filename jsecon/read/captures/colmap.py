@@ -72,11 +72,14 @@ def _read_colmap(places: Sequence[str], path: Path) -> PosedImages:
         notes.append(f"{used} Join them (colmap model_merger), or take photographs between them, to use all.")
     lenses, images = _read_cameras(model), models[model]
     files = _find_images(path, [name for name, _, _ in images])
+    split = model / "test.txt"  # the split of INRIA's training: names of images
+    tested = {line.strip() for line in read_text(split).splitlines()} if split.is_file() else None
     posed = []
     for name, camera, pose in images:
         if camera not in lenses:
             raise InputError(model, f"image {name} has camera {camera}, which the cameras file lacks", remedy=_REMEDY)
-        posed.append(PosedImage(name, files.get(name), lenses[camera], pose))
+        held_out = None if tested is None else name in tested
+        posed.append(PosedImage(name, files.get(name), lenses[camera], pose, held_out=held_out))
     if _model_file(model, "points3D") is None:
         notes.append("The model has no points3D file: there are no sparse points.")
         return PosedImages(posed, model, notes=tuple(notes), ignores_exif=True)

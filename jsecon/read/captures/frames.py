@@ -33,6 +33,8 @@ class PosedImage:
     """World units of one count in the depth file."""
     depth_lens: Lens | None = None
     """Pinhole lens of the depth map, at the same place; None: the image's, at the map's size."""
+    held_out: bool | None = None
+    """Whether the capture's own split keeps it from training; None if it has no split."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +66,7 @@ class FrameOptions:
       downscale: Divides width and height, at least 1.
       long_side: Longest side of the frames, px, if `downscale` is None; None: no limit.
       frames: Most frames, evenly spaced; None: all.
-      holdout: k holds out the frames 0, k, 2k, ...; 0 or None holds out no frame, and 1 would leave none to fit to.
+      holdout: k holds out the frames 0, k, 2k, ..., and 0 no frame; None: the capture's own split, or else 8.
     """
 
     downscale: float | int | None = None
@@ -101,8 +103,8 @@ def same_aspect(size: tuple[int, ...], other: tuple[int, ...]) -> bool:
     return min(abs(columns * height / rows - width), abs(width * rows / height - columns)) <= 1
 
 
-def holdout_mask(count: int, every: int | None) -> Bool[np.ndarray, " t"]:
-    """Marks the held-out frames 0, k, 2k, ..., as in Mip-NeRF 360 and INRIA's split; 0 or None holds out no frame."""
+def holdout_mask(count: int, every: int) -> Bool[np.ndarray, " t"]:
+    """Marks the held-out frames 0, k, 2k, ..., as in Mip-NeRF 360 and INRIA's split; 0 holds out no frame."""
     return np.arange(count) % every == 0 if every else np.zeros(count, bool)
 
 

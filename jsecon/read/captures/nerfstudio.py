@@ -18,7 +18,7 @@ from jsecon.errors import InputError
 from jsecon.files import read_json, reading
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.read.captures.frames import PosedImage, PosedImages, make_rigid, rigid_or_nan
-from jsecon.read.captures.images import find_image, size_around
+from jsecon.read.captures.images import IMAGE_SUFFIXES, find_image, size_around
 from jsecon.read.captures.lens import Lens
 from jsecon.read.registry import Reader
 from jsecon.read.splats.ply import load_point_cloud
@@ -26,6 +26,13 @@ from jsecon.types import UpAxis
 
 _PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE"}
 _FISHEYE = {"OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+_OF_LENS = {"camera_model", "is_fisheye", "w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y"}
+_OF_LENS |= {"k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "ftheta_p0", "latlong", "equirectangular"}
+_SPLITS = ("train_filenames", "val_filenames", "test_filenames")
+_KNOWN = {*_OF_LENS, *_SPLITS, "frames", "val_frames", "test_frames", "applied_transform", "applied_scale"}
+_KNOWN |= {"depth_unit_scale_factor", "ply_file_path", "file_path", "transform_matrix", "depth_file_path", "mask_path"}
+_KNOWN |= {"aabb_scale", "scale", "offset", "colmap_im_id", "camera_id", "sharpness", "timestamp"}
+"""keys that are used, or that change no number"""
 _REMEDY = "Write the file anew (ns-process-data, colmap2nerf.py)."
 
 
@@ -33,11 +40,12 @@ def _read_nerfstudio(path: Path) -> PosedImages:
     """Reads the posed images of a transforms.json, or of the folder that holds one, with their depth and points."""
     file = path / "transforms.json" if path.is_dir() else path
     content = read_json(file, "a transforms.json", _REMEDY)
-    images, notes, scaled = [], [], 0
+    images, scaled = [], 0
     with reading(file, remedy=_REMEDY):
         scale = _number(content, "applied_scale", 1.0)
         unit = _number(content, "depth_unit_scale_factor", 0.001) * scale  # millimetres are nerfstudio's default
-        for index, entry in enumerate(content["frames"]):
+        entries, notes = _split_frames(file, content)
+        for index, (entry, held_out) in enumerate(entries):
             name = entry["file_path"]
             with reading(file, remedy=_REMEDY, problem=f"frame {index} ({name}) cannot be read"):
                 image = find_image(file.parent, name)
@@ -47,8 +55,8 @@ def _read_nerfstudio(path: Path) -> PosedImages:
                 scaled += is_scaled
                 depth = None if image is None else _named_file(file, entry, "depth_file_path")
                 full_name = _full_name(name, image)
-                images.append(PosedImage(full_name, image, lens, np.linalg.inv(pose), depth, unit))
-        if any("mask_path" in entry for entry in content["frames"]):
+                images.append(PosedImage(full_name, image, lens, np.linalg.inv(pose), depth, unit, held_out=held_out))
+        if any("mask_path" in entry for entry, _ in entries):
             notes.append("The masks named by mask_path (pixels to ignore) were not used.")
         if scaled:
             notes.append(f"The intrinsics of {scaled} frames are shares of the image size; they were scaled to pixels.")
@@ -57,6 +65,48 @@ def _read_nerfstudio(path: Path) -> PosedImages:
         cloud = _named_file(file, content, "ply_file_path")
     points = () if cloud is None else load_point_cloud(cloud)
     return PosedImages(images, file, *points, source_from_poses=source_from_poses, notes=tuple(notes), up=up)
+
+
+def _split_frames(file: Path, content: dict[str, Any]) -> tuple[list[tuple[dict[str, Any], bool | None]], list[str]]:
+    """The frames of a file, each with whether its own split holds it out (None without a split), and notes.
+
+    As nerfstudio does, frames that no list names are left out if the training frames and others are listed.
+    """
+    notes, aside = [], [entry for key in ("val_frames", "test_frames") for entry in content.get(key) or []]
+    apart = {_plain_name(entry["file_path"]): entry for entry in aside}
+    lists = {key: {_plain_name(name) for name in content[key]} for key in _SPLITS if content.get(key)}
+    train = lists.get("train_filenames")
+    tested = {*apart}.union(*(names for key, names in lists.items() if key != "train_filenames")).difference(
+        train or ()
+    )
+    entries: list[tuple[dict[str, Any], bool | None]] = []
+    for entry in content["frames"]:
+        name = entry.get("file_path") if isinstance(entry, dict) else None
+        name = _plain_name(name) if isinstance(name, str) else ""
+        if name in apart:
+            continue
+        if train is not None and tested and name not in train | tested:
+            notes.append(name)
+            continue
+        is_test = name in tested if train is None or tested else name not in train
+        entries.append((entry, is_test if lists or apart else None))
+    entries += [(entry, True) for entry in apart.values()]
+    if notes:
+        notes = [f"{len(notes)} frames that no list of the split names were left out (the first: {notes[0]})."]
+    named = {_plain_name(str(entry["file_path"])) for entry, _ in entries if "file_path" in entry}
+    if unknown := sorted(set().union(*lists.values()) - named):
+        notes.append(f"The split of {file.name} names {len(unknown)} images of no frame (the first: {unknown[0]}).")
+    records = [content, *(entry for entry, _ in entries)]
+    keys = {key for record in records for key, value in record.items() if value not in (None, False, "", [])}
+    if unused := sorted(keys - _KNOWN):
+        notes.append(f"Keys of {file.name} that are not used: {', '.join(unused)}.")
+    return entries, notes
+
+
+def _plain_name(name: str) -> str:
+    """A frame's path with "/", without "./" and the suffix of an image."""
+    stem, suffix = os.path.splitext(name.replace("\\", "/").removeprefix("./"))
+    return stem if suffix.lower() in IMAGE_SUFFIXES else stem + suffix
 
 
 def _number(record: dict[str, Any], key: str, default: float) -> float:

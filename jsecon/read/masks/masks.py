@@ -27,6 +27,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple, TypeAlias
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Int, Int16
 
@@ -43,6 +44,9 @@ LEVELS = ("default", "s", "m", "l")
 """levels of LangSplat's `_s.npy`, in their order: all of SAM's masks, subparts, parts, whole objects"""
 _MAX_REGIONS = int(np.iinfo(np.int16).max)
 _PREPROCESS = "Run LangSplat's preprocess.py on every frame."
+_WHITE = 0xFFFFFF
+_LARGEST = (255, 65535, _WHITE, 2**31 - 1, 2**32 - 1)
+"""largest numbers of the types of ids, white among them: masks have them on pixels to ignore"""
 
 
 _WORD = r"masks?|seg|segs|segmentations?|labels?|ids?|instances?|objects?|annotations?"
@@ -219,6 +223,71 @@ def _find_masks(
     return {name: functools.partial(_read_files, reader, objects, some, level) for name, some in paths.items()}, notes
 
 
+class _FrameIds(NamedTuple):
+    """What the ids of a frame look like."""
+
+    ids: set[int]
+    """All that are above 0."""
+    whole: set[int]
+    """Those with a pixel amid its own, 0 among them; all, but in an image of colours."""
+    blended: set[int]
+    """Those of the others that lie between the colours around them."""
+    largest: int
+    """The largest, if it may be the largest number of a type, else 0."""
+    neighbours: set[int]
+    """Those that touch the largest."""
+    thin: float
+    """Share of the largest's pixels with another id within two pixels."""
+
+
+def _inspect_ids(image: Int[np.ndarray, "h w"]) -> _FrameIds:
+    """Looks for ids of one frame that may stand for no object."""
+    ids = {number for number in np.unique(image).tolist() if number > 0}
+    largest = max(ids, default=0)
+    whole, blended = {*ids, 0}, set()
+    if 65535 < largest <= _WHITE:
+        colours = np.stack([image >> 16, image >> 8 & 255, image & 255], axis=-1).clip(0, 255).astype(np.uint8)
+        inner = (cv2.dilate(colours, np.ones((3, 3))) == cv2.erode(colours, np.ones((3, 3)))).all(-1)
+        whole = {*np.unique(image[inner]).tolist()}
+        is_whole, slack = np.isin(image, [*whole]), 32  # sharpened edges overshoot
+        low = cv2.erode(np.where(is_whole[..., None], colours, 255).astype(np.uint8), np.ones((9, 9)))
+        high = cv2.dilate(np.where(is_whole[..., None], colours, 0).astype(np.uint8), np.ones((9, 9)))
+        is_between = (colours + slack >= low.astype(int)) & (colours <= high.astype(int) + slack)
+        blended = ids - whole - {*np.unique(image[~is_whole & ~is_between.all(-1)]).tolist()}
+    if largest not in _LARGEST:
+        return _FrameIds(ids, whole, blended, 0, set(), 0.0)
+    place = (image == largest).astype(np.uint8)
+    around = (cv2.dilate(place, np.ones((3, 3))) > 0) & (image > 0)
+    thin = 1 - float(cv2.erode(place, np.ones((5, 5)))[place > 0].mean())
+    return _FrameIds(ids, whole, blended, largest, {*np.unique(image[around]).tolist()}, thin)
+
+
+def _find_no_objects(frames: Sequence[_FrameIds]) -> tuple[set[int], int | None]:
+    """The ids that blend the colours beside them in all frames, and the id that stands for pixels to ignore, or None.
+
+    The latter is the largest number of a type and touches the other ids wherever they are. It lies on outlines, or
+    stands apart: further above the others than these from each other.
+    """
+    blended = set().union(*(frame.blended for frame in frames)) - set().union(*(frame.whole for frame in frames))
+    largest = max((frame.largest for frame in frames), default=0)
+    others = sorted(set().union(*(frame.ids for frame in frames)) - blended - {largest})
+    if not largest or not others or others[-1] > largest:
+        return blended, None
+    marked = [frame for frame in frames if frame.largest == largest]
+    places = sum(len(frame.ids - blended - {largest}) for frame in frames)
+    touched = sum(len(frame.neighbours - blended - {largest}) for frame in marked)
+    is_thin = np.mean([frame.thin for frame in marked]) > 0.9
+    is_apart = largest - others[-1] > 2 * max(np.diff([0, *others])) and len(others) > 1 and largest != _WHITE
+    return blended, largest if touched >= 0.8 * places and (is_thin or is_apart) else None
+
+
+def _count_things(labels: Int16[np.ndarray, "h w"]) -> int:
+    """Counts the connected regions of a frame that are more than a few pixels wide."""
+    inner = (cv2.dilate(labels, np.ones((3, 3))) == cv2.erode(labels, np.ones((3, 3)))) & (labels >= 0)
+    areas = cv2.connectedComponentsWithStats(inner.astype(np.uint8))[2][1:, cv2.CC_STAT_AREA]
+    return int((areas >= 9).sum())
+
+
 def _natural_order(name: str) -> tuple[str, int, str]:
     """Sort key that puts 9 before 10."""
     return re.sub(r"\d+", lambda number: number[0].zfill(20), name), len(name), name
@@ -371,6 +440,7 @@ def load_labels(
     names = list(names) if limit is None else [name for name in names if name not in source.missing][:limit]
     labels = np.full((len(names), *size), -1, np.int16)
     frame_ids: list[np.ndarray] = []
+    inspected: list[_FrameIds] = []
     is_shared, has_negative, count = True, False, 0
     for t, name in enumerate(names):
         ids = np.zeros(0, np.int64)
@@ -381,13 +451,15 @@ def load_labels(
                 for number, mask in reversed([*enumerate(stored, start=count)]):
                     image[mask] = number
                 stored, count = image, count + len(stored)
-            elif stored.min() < 0:
-                has_negative = True
+            else:
+                inspected.append(_inspect_ids(stored))
+                has_negative |= bool(stored.min() < 0)
             ids, labels[t] = _compact_ids(path, stored)
         frame_ids.append(ids)
         if progress is not None:
             progress(t + 1, len(names))
-    ids = np.unique(np.concatenate(frame_ids))
+    blended, ignored = _find_no_objects(inspected)
+    ids = np.setdiff1d(np.concatenate(frame_ids), [*blended, *(() if ignored is None else (ignored,))])
     ids = ids[ids != 0] if is_shared and not has_negative else ids
     tables = [np.where(np.isin(each, ids), np.searchsorted(ids, each), -1) for each in frame_ids]
     if len(ids) > _MAX_REGIONS:
@@ -395,7 +467,12 @@ def load_labels(
         raise InputError(folder, f"there are {len(ids)} regions", f"at most {_MAX_REGIONS}", remedy)
     for frame, table in zip(labels, tables):
         frame[:] = np.append(table, -1).astype(np.int16)[frame]
-    notes = list(source.notes)
+    notes = [*source.notes, *_no_object_notes(blended, ignored)]
+    things = np.median([_count_things(frame) for frame in labels]) if is_shared else np.inf
+    if len(ids) > 10 * max(things, 1):
+        hint = f"There are {len(ids)} ids, but a frame shows some {things:.0f} connected things."
+        reasons = "If each frame numbers its masks anew, give them as --proposals"
+        notes.append(f"{hint} {reasons}; if colours were smoothed or compressed, export the masks again.")
     if source.resized:
         notes.append(f"{source.resized} masks were resized to {size[1]}x{size[0]} (nearest).")
     if source.turned:
@@ -405,6 +482,17 @@ def load_labels(
     if not is_shared:
         notes.append("Each frame's masks count as regions of their own, since their ids are not shared.")
     return TrackedMasks(labels, tuple(map(int, ids)), tuple(notes))
+
+
+def _no_object_notes(blended: set[int], ignored: int | None) -> list[str]:
+    """Says which ids were taken as unlabelled."""
+    notes = []
+    if blended:
+        notes.append(f"{len(blended)} colours that blend those beside them (smoothed edges) count as unlabelled.")
+    if ignored is not None:
+        borders = "it lies along the borders of the others and is the largest number of its type"
+        notes.append(f"The id {ignored} counts as unlabelled (pixels to ignore): {borders}.")
+    return notes
 
 
 def load_proposals(
@@ -420,14 +508,18 @@ def load_proposals(
     The function raises InputError if a file is damaged. Arguments as of `load_labels`.
     """
     source = _Source(Path(folder), names, size, level, frames)
+    present = [name for name in names if name not in source.missing]
+    some = [stored for name in present[:3] if not isinstance(stored := source.read(name)[1], list)]
+    blended, ignored = _find_no_objects([_inspect_ids(stored) for stored in some])
 
     def read(index: int) -> Bool[np.ndarray, "m h w"]:
         _, stored = (None, []) if names[index] in source.missing else source.read(names[index])
         if not isinstance(stored, list):
-            stored = [stored == number for number in np.unique(stored) if number > 0]
+            frame = _inspect_ids(stored)
+            stored = [stored == number for number in sorted(frame.ids - frame.blended - {ignored})]
         return np.stack([np.zeros(size, bool), *stored])[1:]
 
-    return read, tuple(source.notes)
+    return read, (*source.notes, *_no_object_notes(blended, ignored))
 
 
 def load_features(

@@ -12,6 +12,8 @@ opacities.
 import contextlib
 import dataclasses
 import gzip
+import io
+import json
 import struct
 import warnings
 import zipfile
@@ -29,7 +31,7 @@ from jsecon.files import atomic_write, parse_json, reading
 from jsecon.read.registry import Reader, find_reader
 from jsecon.read.splats.gltf import read_glb, save_glb
 from jsecon.read.splats.ply import drawable_gaussians, read_ply, read_ply_file, save_ply, usable_blocks
-from jsecon.splat.project import check_gaussians
+from jsecon.splat.project import check_gaussians, unusable_rows
 from jsecon.splat.sh import C0
 from jsecon.splat.transform import float32_rounding, transform_axes, transform_gaussians
 from jsecon.types import Array, Gaussians
@@ -67,13 +69,28 @@ def _decoding(path: Path) -> Iterator[Any]:
         raise InputError(path, problem, remedy=_AGAIN) from error
 
 
-def _gaussians(path: Path, data: Any) -> Gaussians:
-    """Makes Gaussians of gsply's arrays."""
+def _usable_gaussians(path: Path, *columns: np.ndarray) -> tuple[Gaussians, tuple[str, ...]]:
+    """Makes Gaussians of the arrays of a compressed file without those that cannot be drawn, as viewers do, and notes.
+
+    A file in which more than a tenth cannot be drawn is refused: it is damaged.
+    """
+    names = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
+    wrong = np.any([unusable_rows(name, np.asarray(column)) for name, column in zip(names, columns)], axis=0)
+    if not wrong.any() or wrong.mean() > 0.1:
+        return drawable_gaussians(path, *columns), ()
+    note = (
+        f"{wrong.sum()} of {len(wrong)} Gaussians of {path.name} have numbers that cannot be drawn, and are left out."
+    )
+    return drawable_gaussians(path, *(np.asarray(column)[~wrong] for column in columns)), (note,)
+
+
+def _gaussians(path: Path, data: Any) -> tuple[Gaussians, tuple[str, ...]]:
+    """Makes Gaussians of gsply's arrays, and notes."""
     rest = np.zeros((len(data.means), 0, 3)) if data.shN is None else data.shN
     if rest.shape[1] not in (0, 3, 8, 15):
         raise ValueError(f"{rest.shape[1]} harmonics above the constant")
     sh = np.concatenate([np.asarray(data.sh0)[:, None], rest], axis=1)
-    return drawable_gaussians(path, data.means, data.scales, data.quats, np.reshape(data.opacities, -1), sh)
+    return _usable_gaussians(path, data.means, data.scales, data.quats, np.reshape(data.opacities, -1), sh)
 
 
 def _antialiasing_notes(path: Path, is_antialiased: bool) -> tuple[str, ...]:
@@ -104,9 +121,10 @@ def _read_spz(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
         else:
             records = data[32 : int.from_bytes(data[16:20], "little")]
         axes = _spz_axes(records if flags & 2 else b"")
-        gaussians = transform_axes(_gaussians(path, gsply.read_spz(path)), axes)
+        stored, notes = _gaussians(path, gsply.read_spz(path))
+        gaussians = transform_axes(stored, axes)
     gaussians = dataclasses.replace(gaussians, means=gaussians.means.astype(np.float32))
-    return gaussians, _antialiasing_notes(path, bool(flags & 1))
+    return gaussians, (*notes, *_antialiasing_notes(path, bool(flags & 1)))
 
 
 def _spz_axes(records: bytes) -> np.ndarray:
@@ -152,7 +170,7 @@ def _save_spz(path: Path, gaussians: Gaussians, object_ids: Any, similarity: Flo
         gsply.write_spz(temporary, data, version=3, fractional_bits=bits)
 
 
-def _read_compressed_ply(path: Path, header: Any) -> Gaussians:
+def _read_compressed_ply(path: Path, header: Any) -> tuple[Gaussians, tuple[str, ...]]:
     """Reads SuperSplat's compressed .ply (github.com/playcanvas/splat-transform, decompress-ply.ts)."""
     with _decoding(path) as gsply:
         chunk, vertex, *rest = header.elements
@@ -178,10 +196,29 @@ def _read_sog(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
     with _decoding(path) as gsply:
         with zipfile.ZipFile(path) as archive:
             meta = parse_json(archive.read("meta.json"))
-        # gsply indexes a codebook without a check of its size
-        if any(len(part.get("codebook", [0] * 256)) < 256 for part in meta.values() if isinstance(part, dict)):
-            raise ValueError("a codebook of fewer than 256 numbers")
-        return _gaussians(path, gsply.sogread(path)), _antialiasing_notes(path, meta.get("antialias") is True)
+            codebooks = {name: part["codebook"] for name, part in meta.items() if "codebook" in (part or ())}
+            # gsply indexes a codebook without a check of its size
+            if any(len(codebook) < 256 for codebook in codebooks.values()):
+                raise ValueError("a codebook of fewer than 256 numbers")
+            # Converters write null for an infinite first number; PlayCanvas' viewers go on from the others.
+            repaired = [
+                name for name, book in codebooks.items() if book[0] is None and None not in (book[1], book[255])
+            ]
+            for name in repaired:
+                book = codebooks[name]
+                book[0] = book[1] + (book[1] - book[255]) / 255
+            data = path.read_bytes()
+            if repaired:
+                with io.BytesIO() as whole, zipfile.ZipFile(whole, "w") as copy:
+                    for name in archive.namelist():
+                        copy.writestr(name, json.dumps(meta) if name == "meta.json" else archive.read(name))
+                    copy.close()
+                    data = whole.getvalue()
+        gaussians, notes = _gaussians(path, gsply.sogread(data))
+        notes += _antialiasing_notes(path, meta.get("antialias") is True)
+        if repaired:
+            notes += (f"{path.name}: the codebook of {', '.join(repaired)} begins with null, which was extrapolated.",)
+        return gaussians, notes
 
 
 def _read_splat(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
@@ -197,7 +234,7 @@ def _read_splat(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
     with np.errstate(divide="ignore", invalid="ignore"):
         log_scales = np.log(rows["scales"])  # a size of 0 is that of a flat Gaussian
     turns, sh = (rows["rotation"].astype(np.float32) - 128) / 128, (rows["rgba"][:, None, :3] / 255.0 - 0.5) / C0
-    return drawable_gaussians(path, rows["means"], log_scales, turns, np.log(opacity / (1 - opacity)), sh), ()
+    return _usable_gaussians(path, rows["means"], log_scales, turns, np.log(opacity / (1 - opacity)), sh)
 
 
 def _read_ply(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
@@ -206,8 +243,8 @@ def _read_ply(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
     comments = [comment.lower().replace(":", " ").split() for comment in header.comments]
     is_antialiased = ["splatrendermode", "mip"] in comments or ["antialiased", "1"] in comments  # of Brush, Postshot
     is_compressed = any(name == "packed_position" for element in header.elements for name, _ in element.fields)
-    gaussians = _read_compressed_ply(path, header) if is_compressed else read_ply(path)
-    return gaussians, _antialiasing_notes(path, is_antialiased)
+    gaussians, notes = _read_compressed_ply(path, header) if is_compressed else (read_ply(path), ())
+    return gaussians, (*notes, *_antialiasing_notes(path, is_antialiased))
 
 
 READERS = (
