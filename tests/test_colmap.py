@@ -50,6 +50,12 @@ def test_tracks_of_all_lengths_and_observations(folder):
     assert load_capture(folder).points.shape == (0, 3)
 
 
+def test_the_split_of_inrias_training_is_kept(folder):
+    (folder / "sparse/0/test.txt").write_text("frame_001.png\nframe_003.png\n")
+    np.testing.assert_array_equal(load_capture(folder).held_out, [False, True, False, True, False])
+    np.testing.assert_array_equal(load_capture(folder, holdout=4).held_out, [True, False, False, False, True])
+
+
 def test_downscale_is_an_area_mean(folder):
     loaded = load_capture(folder, downscale=2)
     means = CAPTURE.frames.reshape(5, 8, 2, 12, 2, 3).mean((2, 4))

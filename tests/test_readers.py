@@ -241,6 +241,33 @@ def test_damage_is_named(tmp_path, row):
         read(tmp_path / name)
 
 
+SUBSTITUTES = {
+    "Git LFS pointer": b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345678\n",
+    "page of HTML": b"\n<!DOCTYPE html><html><body>404 Not Found</body></html>",
+    "compressed archive": b"\xfd7zXZ\0\0\4" + bytes(99),
+}
+
+
+@pytest.mark.parametrize("name", FILE_READERS)
+def test_what_stands_in_place_of_a_file_is_named(tmp_path, name):
+    """If a file may be missing or holds anything, reading goes on."""
+    named = 0
+    for case in cases(name, tmp_path / "plain"):
+        for number, file in enumerate(dict.fromkeys(case.files)):
+            intact = file.read_bytes()
+            what, head = [*SUBSTITUTES.items()][number % 3]
+            file.write_bytes(head)
+            try:
+                case.whole(case.read())
+            except InputError as error:
+                assert f"{what} in place of the file" in str(error), file  # noqa: PT017
+                named += 1
+            except AssertionError:
+                pass
+            file.write_bytes(intact)
+    assert named
+
+
 PLUGIN = """
 import json
 import numpy as np

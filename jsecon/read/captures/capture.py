@@ -128,9 +128,10 @@ def _derived_images(images: Sequence[Path]) -> set[Path]:
         plain = _IMAGE_WORD.sub("", _OTHER_WORD.sub("", file.stem.lower()))
         return file.parent, re.sub("[^a-z0-9]", "", plain)
 
+    names = {*images}
     bases = {base(file) for file in images if not _OTHER_WORD.search(file.stem.lower())}
     derived = {file for file in images if _OTHER_WORD.search(file.stem.lower()) and base(file) in bases}
-    derived |= {file for file in images if file.with_suffix("") in images}
+    derived |= {file for file in images if file.with_suffix("") in names}
     stems, copies = {(file.parent, file.stem) for file in images}, collections.defaultdict(set)
     for file in images:
         first, last = re.match("([A-Za-z]+)[_. -](.+)", file.stem), re.match("(.+)[_. -]([A-Za-z]+)$", file.stem)

@@ -252,7 +252,7 @@ def _inspect_ids(image: Int[np.ndarray, "h w"]) -> _FrameIds:
         is_whole, slack = np.isin(image, [*whole]), 32  # sharpened edges overshoot
         low = cv2.erode(np.where(is_whole[..., None], colours, 255).astype(np.uint8), np.ones((9, 9)))
         high = cv2.dilate(np.where(is_whole[..., None], colours, 0).astype(np.uint8), np.ones((9, 9)))
-        is_between = (colours + slack >= low.astype(int)) & (colours <= high.astype(int) + slack)
+        is_between = (colours.astype(int) >= low.astype(int) - slack) & (colours <= high.astype(int) + slack)
         blended = ids - whole - {*np.unique(image[~is_whole & ~is_between.all(-1)]).tolist()}
     if largest not in _LARGEST:
         return _FrameIds(ids, whole, blended, 0, set(), 0.0)
