@@ -51,10 +51,7 @@ _SUBSTITUTES = (
     (b"\x1f\x8b", "a gzip archive", _UNPACK, (".spz",)),
     *((head, "a compressed archive", _UNPACK, (".spz",)) for head in (b"BZh", b"\xfd7zXZ", b"7z\xbc\xaf", b"Rar!")),
     (b"\x28\xb5\x2f\xfd", "a compressed archive", _UNPACK, (".spz",)),
-    *(
-        (head, "a page of HTML", "Download the file again.", ())
-        for head in (b"<!doctype", b"<html", b"<head", b"<body")
-    ),
+    *((head, "a page of HTML", _DOWNLOAD, ()) for head in (b"<!doctype", b"<html", b"<head", b"<body")),
     *((head, "a page of XML", _DOWNLOAD, (".xml",)) for head in (b"<?xml", b"<error")),
 )
 """first bytes in small letters, what begins so, what to do about it, and the suffixes of files that may begin so"""

@@ -196,7 +196,9 @@ def _read_sog(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
     with _decoding(path) as gsply:
         with zipfile.ZipFile(path) as archive:
             meta = parse_json(archive.read("meta.json"))
-            codebooks = {name: part["codebook"] for name, part in meta.items() if "codebook" in (part or ())}
+            codebooks = {
+                name: part["codebook"] for name, part in meta.items() if isinstance(part, dict) and "codebook" in part
+            }
             # gsply indexes a codebook without a check of its size
             if any(len(codebook) < 256 for codebook in codebooks.values()):
                 raise ValueError("a codebook of fewer than 256 numbers")
