@@ -114,7 +114,7 @@ def _read_scannet(path: Path) -> PosedImages:
 def _read_seven_scenes(path: Path) -> PosedImages:
     """Reads a sequence of 7-Scenes, or one in its layout (12-Scenes, BundleFusion)."""
     images = [file for file in _list_images(path) if file.stem.endswith(".color")]
-    lens, depth_lens, scale, notes = _stated_lenses(path, images[0], (640, 480), (585, 585, 320, 240), 1000)
+    lens, depth_lens, scale, notes = _stated_lenses(path, images[0], (640, 480), (585.0, 585.0, 320.0, 240.0), 1000.0)
     posed = []
     for image in images:
         stem = image.stem.removesuffix(".color")
@@ -134,13 +134,17 @@ def _read_replica(path: Path) -> PosedImages:
         numbers = [int(re.sub(r"\D", "", file.stem)) for file in images]
     if len(poses) == len(images):
         numbers = [*range(len(images))]
-    lens, _, scale, notes = _stated_lenses(path, images[0], (1200, 680), (600, 600, 600, 340), 6553.5)
+    size = 1200, 680
+    known = 6553.5 if image_header(images[0]).upright == size else 0.0
+    lens, _, scale, notes = _stated_lenses(path, images[0], size, (600.0, 600.0, 600.0, 340.0), known)
+    if not scale:
+        notes += ("The depth maps are not used, since no cam_params.json states their scale.",)
     posed = []
     for image, number in zip(images, numbers):
         if number < len(poses) and np.isfinite(poses[number]).all():
             depth = find_image(path / "results", image.stem.replace("frame", "depth") + ".png")
-            frame = _posed_image(image, lens, poses[number], None if depth == image else depth)
-            posed.append(dataclasses.replace(frame, depth_unit=1 / scale))
+            frame = _posed_image(image, lens, poses[number], depth if scale and depth != image else None)
+            posed.append(dataclasses.replace(frame, depth_unit=1 / (scale or 1.0)))
     return _posed_images(path, posed, len(images), *notes)
 
 

@@ -55,7 +55,7 @@ def write_frames(
             raise InputError(video, "OpenCV can read no frame of it", "a video", remedy)
     numbers, values = np.array([*sharpness]), np.array([*sharpness.values()])
     end = int(numbers[-1]) + 1
-    edges = np.linspace(0, end, min(frames or DEFAULT_VIDEO_FRAMES, len(numbers)) + 1).round().astype(int)
+    edges = np.linspace(0, end, min(frames or DEFAULT_VIDEO_FRAMES, end) + 1).round().astype(int)
     places = np.searchsorted(numbers, edges)
     chosen = {int(numbers[a + np.argmax(values[a:b])]) for a, b in itertools.pairwise(places) if b > a}
     written = []

@@ -20,6 +20,7 @@ LangSplat's `<frame>_s.npy` float32 (4, H, W) has ids by level, -1 = none, which
 from __future__ import annotations
 
 import collections
+import contextlib
 import functools
 import os
 import re
@@ -509,7 +510,11 @@ def load_proposals(
     """
     source = _Source(Path(folder), names, size, level, frames)
     present = [name for name in names if name not in source.missing]
-    some = [stored for name in present[:3] if not isinstance(stored := source.read(name)[1], list)]
+    some = []
+    for name in present[:3]:
+        with contextlib.suppress(InputError):  # which comes when the frame is asked for
+            stored = source.read(name)[1]
+            some += [] if isinstance(stored, list) else [stored]
     blended, ignored = _find_no_objects([_inspect_ids(stored) for stored in some])
 
     def read(index: int) -> Bool[np.ndarray, "m h w"]:
