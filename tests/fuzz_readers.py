@@ -269,7 +269,7 @@ def _videos(folder: Path) -> None:
 def _read_video(file: Path) -> list[np.ndarray]:
     frames = file.with_suffix("")
     shutil.rmtree(frames, ignore_errors=True)
-    found = [cv2.imread(str(frame)) for frame in video.write_frames(file, frames, frames=3)]
+    found = [cv2.imread(str(frame)) for frame in video.write_frames(file, frames, frames=3)[0]]
     assert 1 <= len(found) <= 3
     return found
 

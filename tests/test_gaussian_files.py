@@ -1,8 +1,10 @@
 """Gaussians of other programs' files, against files packed byte by byte here: each number within its format's step."""
 
 import dataclasses
+import json
 import struct
 import sys
+import zipfile
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from splat_files import RUB, gaussians, opacity, scene, spz_record
 
 from jsecon import Gaussians, load_gaussians, save_gaussians
+from jsecon.read.splats.files import read_gaussians
 from jsecon.splat import transform
 
 SCENE = scene(600, 4)
@@ -173,3 +176,53 @@ def test_missing_files_endings_and_packages(tmp_path, monkeypatch):
             load_gaussians(tmp_path / name)
     with refused("b.spz", "pip install 'jsecon[formats]'"):
         save_gaussians(tmp_path / "b.spz", gaussians(SCENE))
+
+
+def write_sog(folder, change):
+    """PLAIN as whole.sog, and as a.sog after `change(meta)`."""
+    (folder / "whole.sog").write_bytes(splat_files.sog(PLAIN))
+    with zipfile.ZipFile(folder / "whole.sog") as whole, zipfile.ZipFile(folder / "a.sog", "w") as other:
+        for name in whole.namelist():
+            data = whole.read(name)
+            if name == "meta.json":
+                told = json.loads(data)
+                change(told)
+                data = json.dumps(told)
+            other.writestr(name, data)
+    return folder / "a.sog"
+
+
+@pytest.mark.parametrize("part", ["scales", "sh0"])
+def test_a_codebook_that_begins_with_null_is_repaired_as_viewers_do(tmp_path, part):
+    read, notes = read_gaussians(write_sog(tmp_path, lambda meta: meta[part]["codebook"].__setitem__(0, None)))
+    whole = load_gaussians(tmp_path / "whole.sog")
+    assert part in notes[0]
+    assert read.count == whole.count
+    name = {"scales": "log_scales", "sh0": "sh"}[part]
+    changed = getattr(read, name) != np.asarray(getattr(whole, name))
+    assert changed.mean() < 0.05
+    book = np.unique(np.asarray(getattr(whole, name)))
+    np.testing.assert_allclose(getattr(read, name), getattr(whole, name), atol=0.1 * np.ptp(book))
+
+
+@pytest.mark.parametrize("kind", ["null in a .sog", "NaN in a .splat"])
+def test_gaussians_that_cannot_be_drawn_are_left_out_of_compressed_files(tmp_path, kind):
+    if kind == "NaN in a .splat":
+        data = bytearray(splat_files.splat(PLAIN))
+        data[32 * 7 : 32 * 7 + 4] = np.float32(np.nan).tobytes()
+        data[32 * 9 + 12 : 32 * 9 + 16] = np.float32(-1).tobytes()  # a size
+        data[32 * 11 + 28 : 32 * 11 + 32] = bytes([128] * 4)  # a rotation of length 0
+        (tmp_path / "a.splat").write_bytes(data)
+        read, notes = read_gaussians(tmp_path / "a.splat")
+        assert (read.count, "3 of 600 Gaussians" in notes[0]) == (597, True)
+        data[: 32 * 300 : 32] = data[3 : 32 * 300 : 32] = b"\xff" * 300  # half of the file
+        data[2 : 32 * 300 : 32] = b"\xff" * 300
+        (tmp_path / "a.splat").write_bytes(data)
+        with refused("a.splat", "not finite"):
+            read_gaussians(tmp_path / "a.splat")
+    else:
+        read, notes = read_gaussians(
+            write_sog(tmp_path, lambda meta: meta["scales"]["codebook"].__setitem__(100, None))
+        )
+        assert 540 < read.count < 600
+        assert f"{600 - read.count} of 600 Gaussians" in notes[0]

@@ -6,11 +6,13 @@ import zlib
 
 import cv2
 import numpy as np
+import PIL.features
 import PIL.Image
 import PIL.ImageOps
 import pytest
 from capture_files import png, png_chunk, refused
 
+from jsecon import load_capture
 from jsecon.errors import InputError
 from jsecon.read.captures.images import image_header, read_depth, read_image, read_label_image, write_image
 from jsecon.read.captures.lens import Lens, undistorted_pinhole, undistortion_maps
@@ -219,3 +221,38 @@ def test_lenses_that_cannot_be_undone():
         undistorted_pinhole(Lens(160, 120, 1.0, 1.0, 80.0, 60.0, (-5000.0,)), "here")
     plain = Lens(160, 120, 130.0, 130.0, 80.0, 60.0, (0.0, 0.0, 0.0, 0.0))
     assert undistorted_pinhole(plain, "here") == Lens(160, 120, 130.0, 130.0, 80.0, 60.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"), [("a.gif", "GIF"), ("b.png", "JPEG XL"), ("c.dng", "raw"), ("d.exr", "OpenEXR")]
+)
+def test_a_format_that_is_not_read_is_named(tmp_path, name, kind):
+    """By its first bytes, or its suffix: a raw file is a TIFF whose first image is a thumbnail."""
+    heads = {"a.gif": b"GIF89a", "b.png": b"\xff\x0a", "c.dng": b"II*\0", "d.exr": b"v/1\1"}
+    (tmp_path / name).write_bytes(heads[name] + bytes(200))
+    with refused(name, kind, "magick"):
+        image_header(tmp_path / name)
+    with refused(tmp_path.name, kind, "magick"):
+        if name.endswith(".png"):
+            (tmp_path / name).rename(tmp_path / "b.jxl")
+        load_capture(tmp_path)
+
+
+@pytest.mark.parametrize("turn", [1, 6])
+def test_avif_is_read_if_pillow_has_it(tmp_path, turn):
+    if not PIL.features.check("avif"):
+        pytest.skip("this Pillow has no AVIF")
+    tags = PIL.Image.Exif()
+    tags[0x0112] = turn
+    stored = corners(96, 64) if turn == 1 else np.ascontiguousarray(np.rot90(corners(96, 64)))
+    PIL.Image.fromarray(stored).save(tmp_path / "a.avif", quality=95, exif=tags.tobytes())
+    assert image_header(tmp_path / "a.avif").upright == (96, 64)
+    assert np.abs(read_image(tmp_path / "a.avif")[0].astype(int) - corners(96, 64)).mean() < 6
+
+
+def test_a_transparent_label_image_is_its_opaque_part(tmp_path):
+    opaque = FRAME[..., 0] > 99
+    for colours in (FRAME, FRAME * 0):  # black is the mask itself where it is opaque
+        cv2.imwrite(str(tmp_path / "cut.png"), np.dstack([colours[..., ::-1], np.uint8(255 * opaque)]))
+        ids = colours.astype(int) @ [65536, 256, 1] if colours.any() else 1
+        np.testing.assert_array_equal(read_label_image(tmp_path / "cut.png"), np.where(opaque, ids, 0))

@@ -9,6 +9,7 @@ import pytest
 from capture_files import refused
 
 from experiments.datasets.feature_files import write_features
+from jsecon.read.captures.images import write_image
 from jsecon.read.masks.masks import LEVELS, embedding_size, load_features, load_labels, load_proposals
 from jsecon.types import ImageFile
 
@@ -321,3 +322,94 @@ def test_embeddings_lie_in_the_cameras_folders(tmp_path):
     np.testing.assert_array_equal(found.frame, [0, 0, 1, 1])
     np.testing.assert_array_equal(found.embeddings, rows.reshape(4, 3))
     np.testing.assert_array_equal(found.labels[1, 0], np.arange(16) // 8 + 2)
+
+
+def things(shift=0):
+    """(60, 80) ids 0 to 4: three discs and a bar on a background."""
+    image = np.zeros((60, 80), np.int32)
+    for number, centre in enumerate([(15, 20), (40, 18), (62, 22)], start=1):
+        cv2.circle(image, (centre[0] + shift, centre[1]), 9, number, -1)
+    image[40:52, 10:70] = 4
+    return image
+
+
+def outlined(image):
+    """Where neighbours differ."""
+    small = image.astype(np.uint8)
+    return cv2.dilate(small, np.ones((3, 3))) != cv2.erode(small, np.ones((3, 3)))
+
+
+@pytest.mark.parametrize("kind", ["8 bits", "16 bits", "int64", "around", "white"])
+def test_an_id_to_ignore_is_no_region(tmp_path, kind):
+    """The largest of its type: on outlines, or on all that is no thing."""
+    names, plain = ("a", "b", "c"), [things(shift) for shift in range(3)]
+    for name, ids in zip(names, plain):
+        if kind == "white":
+            colours = np.array([[0, 0, 0], [200, 30, 0], [0, 90, 200], [7, 200, 90], [90, 90, 90]], np.uint8)[ids]
+            colours[outlined(ids)] = 255
+            write_image(tmp_path / f"{name}.png", colours)
+            continue
+        void = {"16 bits": 65535, "int64": 2**32 - 1}.get(kind, 255)
+        marked = np.where(ids == 0 if kind == "around" else outlined(ids), void, ids.astype(np.int64))
+        if kind == "int64":
+            np.save(tmp_path / f"{name}.npy", marked)
+        else:
+            cv2.imwrite(str(tmp_path / f"{name}.png"), marked.astype(np.uint16 if void > 255 else np.uint8))
+    labels, ids, notes = load_labels(tmp_path, names, (60, 80))
+    assert len(ids) == 4
+    assert len(notes) == 1
+    assert "counts as unlabelled" in notes[0]
+    inner = ~np.stack([outlined(image) for image in plain])
+    assert ((labels >= 0) == (np.stack(plain) > 0))[inner].all()
+    read, notes = load_proposals(tmp_path, names, (60, 80))
+    assert len(read(2)) == 4
+    assert "counts as unlabelled" in notes[0]
+
+
+@pytest.mark.parametrize("kind", ["alone", "far", "even steps", "a thing"])
+def test_the_largest_number_may_be_a_thing(tmp_path, kind):
+    tables = {"alone": [0, 0, 0, 0, 255], "even steps": [0, 64, 128, 192, 255], "far": [0, 1, 2, 3, 255]}
+    for name in "ab":
+        image = things()
+        ids = np.array(tables.get(kind, [0, 1, 2, 3, 255]))[image]
+        if kind == "a thing":
+            ids[26:41, 38:44] = 255  # touches one of three
+        cv2.imwrite(str(tmp_path / f"{name}.png"), ids.astype(np.uint8))
+    _, ids, notes = load_labels(tmp_path, ("a", "b"), (60, 80))
+    assert ids[-1] == 255
+    assert notes == ()
+
+
+@pytest.mark.parametrize("kind", ["half size", "blurred", "sharpened"])
+def test_colours_of_smoothed_edges_are_no_regions(tmp_path, kind):
+    table = np.array([[0, 0, 0], [230, 25, 75], [60, 180, 75], [255, 225, 25], [0, 130, 200]], np.uint8)
+    for shift, name in enumerate("abc"):
+        colours = table[things(shift)]
+        if kind == "half size":
+            large = cv2.resize(colours, None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST)
+            colours = cv2.resize(large, (60, 45), interpolation=cv2.INTER_AREA)
+        elif kind == "blurred":
+            colours = cv2.GaussianBlur(colours, (0, 0), 0.8)
+        else:
+            colours = cv2.resize(cv2.resize(colours, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), (80, 60))
+        write_image(tmp_path / f"{name}.png", colours)
+    labels, ids, notes = load_labels(tmp_path, ("a", "b", "c"), colours.shape[:2])
+    assert set(ids) == {int(each @ [65536, 256, 1]) for each in table[1:].astype(int)}
+    assert labels.max() == 3
+    assert "smoothed edges" in notes[0]
+    read, _ = load_proposals(tmp_path, ("a", "b", "c"), colours.shape[:2])
+    assert len(read(0)) == 4
+
+
+def test_many_more_ids_than_things_are_hinted_at(tmp_path):
+    """Ids that are numbered anew in each frame."""
+    names = tuple(f"f{n:02d}" for n in range(14))
+    for number, name in enumerate(names):
+        ids = things()
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.where(ids, ids + 4 * number, 0).astype(np.uint8))
+    _, ids, notes = load_labels(tmp_path, names, (60, 80))
+    assert len(ids) == 56
+    assert "--proposals" in notes[0]
+    assert load_labels(tmp_path, names[:5], (60, 80)).notes == (
+        "There are masks of no frame of this capture: 9 of the .png files, first f05.png.",
+    )

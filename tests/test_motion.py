@@ -7,9 +7,10 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
-from capture_files import refused
+from capture_files import png, refused
 from photo_files import FOCAL, HEIGHT, WIDTH, apart, write_photos
 from PIL import Image
 
@@ -20,7 +21,7 @@ from jsecon.pipeline.run import compute_stages
 from jsecon.pipeline.scene import plan_capture
 from jsecon.poses import sfm
 from jsecon.poses.sfm import find_poses
-from jsecon.read.captures.capture import list_photographs, load_capture
+from jsecon.read.captures.capture import list_photographs, load_capture, unposed_photographs
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Models
 
@@ -198,3 +199,68 @@ def test_the_bonsai_is_found_as_its_poses_are_given(shared, tmp_path):
     assert np.median(distances) < 0.005
     assert np.median(degrees) < 0.5
     assert np.max(distances) < 0.01
+
+
+def _touch(folder, *names):
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+
+
+@pytest.mark.parametrize("others", [
+    ["0001_mask.png", "0002_mask.png"], ["0001_masked.jpg"], ["depth0001.png", "depth0002.png"], ["0001.jpg.png"],
+    ["0001_overlay.png", "0002_overlay.png", "0003_overlay.png"], ["mask-0003.png"],
+])  # fmt: skip
+def test_images_named_like_others_with_a_word_more_are_no_photographs(tmp_path, others):
+    names = ["0001.jpg", "0002.jpg", "0003.jpg", "mask of zorro.jpg", "0003_b.jpg"]
+    _touch(tmp_path, *names, *others)
+    photographs, notes = unposed_photographs(tmp_path)
+    assert [path.name for path in photographs] == sorted(names)
+    assert f"{len(others)} images are left out" in notes[0]
+    assert others[0] in notes[0]
+
+
+@pytest.mark.parametrize("kind", ["16 bits", "1 bit"])
+def test_depth_maps_and_masks_of_any_name_are_told_by_their_bits(tmp_path, kind):
+    _touch(tmp_path, "a.jpg", "b.jpg")
+    numbers = np.arange(12).reshape(3, 4)
+    if kind == "16 bits":
+        cv2.imwrite(str(tmp_path / "c.png"), numbers.astype(np.uint16))
+    else:
+        (tmp_path / "c.png").write_bytes(png(numbers % 2, bits=1, colour_type=0))
+    assert [path.name for path in list_photographs(tmp_path)] == ["a.jpg", "b.jpg"]
+    for name in "ab":
+        (tmp_path / f"{name}.jpg").unlink()
+    with refused(tmp_path.name, "no photographs", "c.png"):
+        load_capture(tmp_path)
+
+
+@pytest.mark.parametrize(("others", "says"), [
+    (["poses_bounds.npy"], "may be poses"), (["a.txt", "b.txt"], "may be poses"), (["notes.txt"], ""),
+    (["IMG_1.dng", "walk.mov"], "2 files"),
+])  # fmt: skip
+def test_what_lies_beside_photographs_and_is_not_used_is_named_in_the_plan(tmp_path, others, says):
+    _touch(tmp_path, "a.jpg", "b.jpg", "c.jpg", *others)
+    stage = plan_capture(RunContext(Options(tmp_path), Models(ColourEmbedder()), tmp_path / "f"))[0]
+    assert "3 photographs" in stage.how
+    assert (others[0] in stage.how) == bool(says)
+    assert says in stage.how
+
+
+@pytest.mark.parametrize(("names", "says"), [
+    (["a.mp4"], "jsecon run {}/a.mp4"), (["a.mov", "b.mov"], "2 videos"), (["images/a.gif", "images/b.gif"], "in GIF"),
+])  # fmt: skip
+def test_a_folder_without_photographs_says_what_is_there(tmp_path, names, says):
+    _touch(tmp_path, *names)
+    with refused(says.format(tmp_path)):
+        load_capture(tmp_path)
+
+
+@pytest.mark.parametrize(("name", "head", "says"), [
+    ("a.r3d", b"PK\3\4", "of Record3D"), ("a.zip", b"PK\3\4", "unzip a.zip"), ("a.tgz", b"\x1f\x8b", "an archive"),
+    ("a.jpg", b"\xff\xd8", "one image"), ("a.nef", b"II*\0", "one image"),
+])  # fmt: skip
+def test_a_file_that_is_no_capture_is_named(tmp_path, name, head, says):
+    (tmp_path / name).write_bytes(head + bytes(99))
+    with refused(name, says):
+        load_capture(tmp_path / name)

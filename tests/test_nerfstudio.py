@@ -185,3 +185,42 @@ def test_up_is_what_the_file_says(tmp_path, key, value, axis):
     loaded = load_changed(tmp_path, lambda content: content.update({key: value, "depth_unit_scale_factor": 0.001}))
     assert (loaded.up and loaded.up.axis) == axis
     assert loaded.metres_per_unit is None  # depth in any unit is no promise
+
+
+NAMES = [f"images/{name}.png" for name in CAPTURE.names]
+
+
+def _by_lists(content):
+    """Without suffix and with Windows' separators too; validation frames are kept from training like test frames."""
+    content["train_filenames"] = ["./" + NAMES[0], NAMES[2].replace("/", "\\")]
+    content["val_filenames"], content["test_filenames"] = [NAMES[1]], [NAMES[4].removesuffix(".png")]
+
+
+def _by_training_list(content):
+    content["train_filenames"] = [NAMES[0], NAMES[2], NAMES[3]]
+
+
+def _by_frames(content):
+    content["test_frames"] = [content["frames"].pop(4), content["frames"].pop(1)]
+
+
+@pytest.mark.parametrize(("change", "left"), [(_by_lists, [0, 1, 2, 4]), (_by_training_list, 5), (_by_frames, 5)])
+def test_the_captures_own_split_is_kept_unless_a_holdout_is_given(tmp_path, change, left):
+    loaded = load_changed(tmp_path, change)
+    kept = [*range(left)] if isinstance(left, int) else left
+    assert loaded.names == tuple(CAPTURE.names[n] for n in kept)  # frame 3 is in none of the lists
+    np.testing.assert_array_equal(loaded.held_out, [n in (1, 4) for n in kept])
+    assert any("own split" in note for note in loaded.notes)
+    other = load_capture(tmp_path, holdout=2)
+    np.testing.assert_array_equal(other.held_out, np.arange(len(kept)) % 2 == 0)
+    assert any("not used: a holdout is given" in note for note in other.notes)
+
+
+def test_keys_that_change_what_numbers_mean_are_named(tmp_path):
+    def change(content):
+        content["frames"][1] |= {"is_bad": True, "depth_path": "depth/1.png"}
+        content["test_filenames"] = ["images/gone.png", NAMES[0]]
+
+    notes = " ".join(load_changed(tmp_path, change).notes)
+    assert "depth_path, is_bad" in notes
+    assert "1 images of no frame" in notes

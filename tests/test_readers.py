@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 from capture_files import refused, small_capture, transforms, write_images
-from fuzz_readers import MASK_SIZE, READERS
+from fuzz_readers import MASK_SIZE, READERS, cases
 from splat_files import GLTF, ply_columns, rewrite_glb, scene, sog, spz, spz_record, write_ply
 
-from jsecon import load_capture, load_gaussians
+from jsecon import InputError, load_capture, load_gaussians
 from jsecon.read.captures.images import image_header
 from jsecon.read.masks.masks import load_labels, load_proposals
 
@@ -147,7 +147,7 @@ DAMAGE = {
     "rgbd/polycam": [(put("keyframes/corrected_cameras/101.json", '{"fx": 3}'), "'cx'")],
     "rgbd/record3d": [(put("metadata.json", '{"poses": [[0, 0, 0]]}'), "metadata.json")],
     "ply/9.ply": [
-        (put("", POINTER), "header"), (columns(opacity=None), "no opacity"), (columns(x=None), "no x"),
+        (put("", POINTER), "git lfs pull"), (columns(opacity=None), "no opacity"), (columns(x=None), "no x"),
         (columns(y=(4, np.nan)), "means of 1 of 6 Gaussians", "the first: 4"),
         (columns(opacity=(4, np.nan)), "opacity_logits of 1 of 6"), (columns(f_dc_2=(4, -np.inf)), "sh of 1 of 6"),
         (columns(**{f"rot_{n}": (3, 0) for n in range(4)}), "quaternions of 1 of 6", "zero", "the first: 3"),
@@ -167,10 +167,6 @@ DAMAGE = {
         (swap("", b"element sh 300", b"element sh 299"), "299 rows of harmonics for 300 Gaussians"),
     ],
     "splats/s.sog": [(put("", sog(scene(40, 1), codebook=9)), "fewer than 256")],
-    "splats/s.splat": [
-        (numbers("", 12, "<f", -1), "log_scales of 1 of 300"),
-        (numbers("", 28, "4B", 128, 128, 128, 128), "quaternions of 1 of 300", "zero"),
-    ],
     "splats/v4.spz": [
         (put("", spz(scene(30), 4, degree=4)), "degree 4"), (put("", spz(scene(30), 5)), "version 5"),
         (put("", spz(scene(30), 4, records=spz_record(0xADBE0003, b"\x11\0\0\0"))), "unknown number 17"),
@@ -194,7 +190,7 @@ DAMAGE = {
     "depths/depth.png": [(put("", np.ones((4, 5, 3), np.uint8)), "uint8")],
     "masks/grey": [
         (edit("a.png", lambda data: data[:-20]), "a.png", "cannot be read"),
-        (put("a.png", IDS.T), "a.png", "24x36", "36x24"), (put("a.png", np.dstack([IDS] * 4)), "transparent pixels"),
+        (put("a.png", IDS.T), "a.png", "24x36", "36x24"), (put("a.png", np.dstack([IDS] * 4)), "half transparent"),
         (put("a.png", np.dstack([IDS.astype(np.uint16)] * 3)), "16 bits"),
     ],
     "masks/levels": [
@@ -248,22 +244,23 @@ SUBSTITUTES = {
 }
 
 
-@pytest.mark.parametrize("name", FILE_READERS)
+@pytest.mark.parametrize("name", [
+    *("ply", "splats", "clouds", "colmap", "nerfstudio", "rgbd", "images", "depths"),
+    *("masks", "features", "proposals", "labels", "field", "videos"),
+])  # fmt: skip
 def test_what_stands_in_place_of_a_file_is_named(tmp_path, name):
-    """If a file may be missing or holds anything, reading goes on."""
+    """Where a file may be missing or hold anything, reading goes on."""
     named = 0
     for case in cases(name, tmp_path / "plain"):
-        for number, file in enumerate(dict.fromkeys(case.files)):
+        for number, file in enumerate(case.files):
             intact = file.read_bytes()
             what, head = [*SUBSTITUTES.items()][number % 3]
             file.write_bytes(head)
             try:
-                case.whole(case.read())
+                case.read()
             except InputError as error:
                 assert f"{what} in place of the file" in str(error), file  # noqa: PT017
                 named += 1
-            except AssertionError:
-                pass
             file.write_bytes(intact)
     assert named
 

@@ -11,8 +11,13 @@ from capture_files import refused, small_capture
 from scipy.spatial.transform import Rotation
 
 from jsecon import load_capture
-from jsecon.read.captures.images import write_image
+from jsecon.pipeline.options import Options
+from jsecon.pipeline.results import RunContext
+from jsecon.pipeline.scene import plan_capture
+from jsecon.read.captures.images import read_depth, write_image
 from jsecon.read.captures.lens import Lens, resample_depth
+from jsecon.vision.colours import ColourEmbedder
+from jsecon.vision.protocols import Models
 
 _RANDOM = small_capture(count=12)
 _ONE = {name: np.full(12, getattr(_RANDOM.cameras, name)[0]) for name in ("fx", "fy", "cx", "cy")}
@@ -104,7 +109,39 @@ def write_record3d(folder) -> None:
     (folder / "metadata.json").write_text(json.dumps(told))
 
 
-WRITERS = write_scannet, write_tum, write_arkitscenes, write_polycam, write_record3d
+def write_seven_scenes(folder) -> None:
+    """Frame 4 was lost by the tracker. The depth camera writes 65535 where it sees nothing."""
+    folder.mkdir(parents=True)
+    for n, pose in enumerate(poses()):
+        write_image(folder / f"frame-{n:06d}.color.png", CAPTURE.frames[n])
+        depth(folder / f"frame-{n:06d}.depth.png", n)
+        np.savetxt(folder / f"frame-{n:06d}.pose.txt", np.full((4, 4), np.nan) if n == 4 else pose)
+    (folder / "intrinsics.txt").write_text(" ".join(map(str, K)))
+
+
+def write_bundle_fusion(folder) -> None:
+    """The layout of 7-Scenes with an info.txt."""
+    write_seven_scenes(folder)
+    (folder / "intrinsics.txt").unlink()
+    matrix = f"{K[0]} 0 {K[2]} 0 0 {K[1]} {K[3]} 0 0 0 1 0 0 0 0 1"
+    lines = ["m_sensorName = Structure", "m_colorWidth = 24", "m_depthWidth = 24", "m_depthHeight = 16"]
+    lines += [f"m_calibration{kind}Intrinsic = {matrix}" for kind in ("Color", "Depth")] + ["m_depthShift = 1000"]
+    (folder / "info.txt").write_text("\n".join(lines))
+
+
+def write_replica(folder) -> None:
+    """With the parameters of the camera in the scene; the downloads have them one folder up."""
+    rows = [np.full(16, np.inf) if n == 4 else pose.ravel() for n, pose in enumerate(poses())]
+    for n in range(12):
+        write_image(folder / "results" / f"frame{n:06d}.png", CAPTURE.frames[n])
+        depth(folder / "results" / f"depth{n:06d}.png", n, 1 / 6553.5)
+    np.savetxt(folder / "traj.txt", rows)
+    camera = {"w": 24, "h": 16, "fx": K[0], "fy": K[1], "cx": K[2] - 0.5, "cy": K[3] - 0.5, "scale": 6553.5}
+    (folder / "cam_params.json").write_text(json.dumps({"camera": camera}))
+
+
+WRITERS = write_seven_scenes, write_bundle_fusion, write_replica
+WRITERS += write_scannet, write_tum, write_arkitscenes, write_polycam, write_record3d
 FORMATS = {write.__name__.removeprefix("write_"): write for write in WRITERS}
 
 
@@ -212,3 +249,36 @@ def test_record3d_as_its_archive_unpacks(tmp_path):
     found = load_capture(tmp_path, holdout=0)
     np.testing.assert_array_equal(found.frames, CAPTURE.frames)
     np.testing.assert_allclose(found.cameras.cx, K[2], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("write", "size"), [(write_seven_scenes, (640, 480)), (write_replica, (1200, 680))])
+def test_poses_without_intrinsics_take_the_benchmarks_at_its_size_only(tmp_path, write, size):
+    folder = tmp_path / "inner" / "scene"
+    write(folder)
+    for file in (folder / "intrinsics.txt", folder / "cam_params.json"):
+        file.unlink(missing_ok=True)
+    with refused("scene", "24x16", "intrinsics.txt", "photographs alone"):
+        load_capture(folder)
+    for file in folder.rglob("*.png"):
+        if "depth" in file.name:
+            file.unlink()
+        else:
+            cv2.imwrite(str(file), np.zeros((*size[::-1], 3), np.uint8))
+    found = load_capture(folder, frames=2)
+    np.testing.assert_allclose(found.cameras.cx[0], size[0] / 2)
+    assert any("benchmark" in note for note in found.notes)
+
+
+def test_depth_of_the_largest_number_is_unknown(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), np.array([[65535, 1500]], np.uint16))
+    np.testing.assert_allclose(read_depth(tmp_path / "a.png", 0.001), [[0, 1.5]])
+
+
+@pytest.mark.parametrize(("write", "inner"), [
+    (write_polycam, "keyframes"), (write_scannet, "color"), (write_replica, "results"), (write_tum, "rgb images"),
+])  # fmt: skip
+def test_a_part_of_a_capture_names_the_whole(tmp_path, write, inner):
+    write(tmp_path / "scan")
+    work = RunContext(Options(tmp_path / "scan" / inner), Models(ColourEmbedder()), tmp_path / "out")
+    with refused(inner, "part of a", tmp_path / "scan"):
+        plan_capture(work)

@@ -1,5 +1,7 @@
 """Frames of a video: the sharpest of each stretch of time."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -31,13 +33,14 @@ def video(tmp_path_factory):
 
 def test_the_sharpest_frame_of_each_stretch_is_taken(video, tmp_path):
     told = []
-    written = write_frames(video, tmp_path / "frames", frames=6, progress=lambda *at: told.append(at))
+    written, notes = write_frames(video, tmp_path / "frames", frames=6, progress=lambda *at: told.append(at))
+    assert notes == ()
     assert [path.name for path in written] == [f"frame_{number:06d}.jpg" for number in SHARP]
     assert sorted((tmp_path / "frames").iterdir()) == written
     assert cv2.imread(str(written[0])).shape == (96, 128, 3)
     assert told[-1] == (60, 60)
     assert sorted(told) == told
-    assert len(write_frames(video, tmp_path / "all")) == 30  # a short one gives each of its frames
+    assert len(write_frames(video, tmp_path / "all")[0]) == 30  # a short one gives each of its frames
 
 
 def test_a_run_on_a_video_takes_as_many_frames_as_it_is_told(video, tmp_path):
@@ -49,3 +52,54 @@ def test_a_run_on_a_video_takes_as_many_frames_as_it_is_told(video, tmp_path):
         assert load.after == ("poses",)
         keys.append(poses.key({}, work.out))
     assert len(set(keys)) == 3
+
+
+def moving(path, code, count=30):
+    """A video of noise that moves."""
+    noise, writer = np.random.default_rng(0), cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*code), 10, (128, 96))
+    assert writer.isOpened()
+    for _ in range(count):
+        writer.write(cv2.resize(noise.integers(0, 255, (24, 32, 3), np.uint8), (128, 96)))
+    writer.release()
+    return path
+
+
+@pytest.mark.parametrize(("name", "code"), [("a.mp4", "mp4v"), ("b.avi", "MJPG"), ("c.avi", "XVID")])
+def test_a_damaged_stretch_does_not_end_a_video(tmp_path, name, code):
+    path = moving(tmp_path / name, code)
+    whole = len(write_frames(path, tmp_path / "whole")[0])
+    data = bytearray(path.read_bytes())
+    start = len(data) // 2
+    data[start : start + 3000] = bytes(3000)
+    path.write_bytes(data)
+    written, notes = write_frames(path, tmp_path / "frames")
+    assert 20 <= len(written) <= whole == 30
+    assert written[-1].name >= "frame_000025.jpg"
+    assert len(written) == 30 or f"{30 - len(written)} of 30 frames of {name} cannot be decoded" in notes[0]
+
+
+@pytest.mark.parametrize("code", ["MJPG", "XVID"])
+def test_a_video_that_is_cut_short_says_so(tmp_path, code):
+    path = moving(tmp_path / "a.avi", code)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    written, notes = write_frames(path, tmp_path / "frames")
+    assert 8 <= len(written) <= 22
+    assert f"{30 - len(written)} of 30 frames" in notes[0]
+    assert "cut short" in notes[0]
+
+
+@pytest.mark.parametrize("name", ["walk 12:30:15.avi", "http:walk.avi"])
+def test_a_name_may_have_colons(tmp_path, monkeypatch, name):
+    moving(tmp_path / "a.avi", "MJPG", 4).rename(tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    assert len(write_frames(Path(name), tmp_path / "frames")[0]) == 4
+
+
+@pytest.mark.parametrize(("name", "mark"), [
+    ("a.mp4", b"\0\0\0\x1bmoov\0\0\0\x13colrnclx\0\x09\0\x12\0\x09\0"), ("b.mkv", b"\x55\xb0\x84\x55\xba\x81\x10"),
+])  # fmt: skip
+def test_high_dynamic_range_is_noted(tmp_path, name, mark):
+    path = moving(tmp_path / name, "mp4v", 4)
+    assert write_frames(path, tmp_path / "frames")[1] == ()
+    path.write_bytes(path.read_bytes() + mark)
+    assert "HDR" in write_frames(path, tmp_path / "frames")[1][-1]

@@ -334,7 +334,7 @@ def _centres(poses: np.ndarray) -> np.ndarray:
 
 
 def _normalizing_transform(
-    poses: Float[np.ndarray, "t 4 4"], points: Float[np.ndarray, "p 3"], depths: Sequence[Float[np.ndarray, "h w"]] = ()
+    poses: Float[np.ndarray, "t 4 4"], points: Float[np.ndarray, "p 3"], depths: Sequence[np.ndarray] = ()
 ) -> tuple[Float[np.ndarray, "4 4"], tuple[str, ...]]:
     """Finds the similarity (shift and scale, no rotation) from a capture's world to one of ordinary numbers, and notes.
 
