@@ -63,7 +63,7 @@ def calls(field, labels):
 
 HOST = {
     *("to_html", "masklets", "check_backend", "load_capture", "load_gaussians"),
-    *("save_gaussians", "load_gaussians", "save_gaussians", "check_field"),
+    *("save_gaussians", "check_field", "locate"),
     *("load_field", "save_field", "region_embeddings", "host_mesh", "lift", "remove_outliers"),
     *("region_at", "plan_capacity", "objects", "object_shapes", "open_scene"),
 }

@@ -251,10 +251,3 @@ def test_options_of_photographs_are_refused_for_a_scene_alone(room, tmp_path, ca
     assert main(["run", "scene.ply", *option, "--out", "field"]) == 2
     assert option[0] in capsys.readouterr().err
     assert not (tmp_path / "field").exists()
-
-
-def test_an_up_axis_of_length_0_is_refused(room, tmp_path, capsys):
-    jsecon.save_gaussians(tmp_path / "scene.ply", room)
-    line = ["run", str(tmp_path / "scene.ply"), "--up", "0", "0", "0", "--out", str(tmp_path / "field")]
-    assert main(line) == 2
-    assert "--up: [0.0, 0.0, 0.0] is no direction" in capsys.readouterr().err

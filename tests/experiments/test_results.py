@@ -50,7 +50,7 @@ def test_committed_configs_are_portable(file):
 
 EXPERIMENTS = Path(__file__).parent.parent.parent / "experiments"
 TEXT = (EXPERIMENTS / "README.md").read_text()
-SHARED = {"cells", "results"}
+SHARED = {"cells", "memory_maps", "results"}
 """modules at the root that are no experiments"""
 
 
