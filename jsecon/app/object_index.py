@@ -120,9 +120,9 @@ class ObjectIndex:
         return [Object(phrase, group, *parts, state) for group, parts in made if parts is not None], float(match.rank)
 
     def _all_objects(self) -> list[Object]:
-        """Lists the things of the catalogue, without their parts and without surroundings, by their best names."""
+        """Lists the objects of the catalogue without surroundings, by their best names."""
         catalogue = self._catalogue()
-        things = np.flatnonzero((catalogue.parent < 0) & ~catalogue.surroundings)
+        things = np.flatnonzero(~catalogue.surroundings)
         groups = [tuple(int(region) for region in np.flatnonzero(catalogue.regions == thing)) for thing in things]
         named = [(str(catalogue.names[thing, 0]) or f"object {thing}", group) for thing, group in zip(things, groups)]
         made = [(name, group, self._object(group)) for name, group in named if group]

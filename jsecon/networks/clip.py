@@ -230,8 +230,8 @@ class ClipEmbedder:
         tensor = graph.require("input", names[0] if len(names) == 1 else "input_ids", (None, None), what)
         length = tensor.fixed(1) or (CLIP_LENGTH if self._rules is None else self._rules.length)
 
-        def feed(part):
-            return {tensor.name: part[:, 0]} | dict.fromkeys(masks, part[:, 1])
+        def feed(part: np.ndarray) -> dict[str, np.ndarray]:
+            return {tensor.name: part[:, 0]} | {name: part[:, 1] for name in masks}
 
         tokens = np.stack(self._tokenizer(phrases, length), axis=1)
         rows = _run_in_batches(graph, tokens, tensor.fixed(0), feed, output.name)

@@ -114,8 +114,12 @@ class HubModel:
 
 def _layouts(role: Role) -> list[_Layout]:
     """Lists the layouts of a role in each precision, the highest first."""
+
+    def filled(names: tuple[str, ...], suffix: str) -> tuple[str, ...]:
+        return tuple(name.format(p=suffix) for name in names)
+
     return [
-        _Layout(*(tuple(name.format(p=suffix) for name in names) for names in layout[:2]), precision)
+        _Layout(filled(layout.required, suffix), filled(layout.optional, suffix), precision)
         for precision, suffix in _SUFFIXES.items()
         for layout in _LAYOUTS[role]
     ]

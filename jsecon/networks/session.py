@@ -143,7 +143,7 @@ class Graph:
         if name not in tensors or not tensors[name]._fits(shape):
             missing = f"no such {side}; the graph has {_describe(tensors.values())}"
             problem = str(tensors[name]) if name in tensors else missing
-            expected = f"{Tensor(name, '', shape and tuple(shape))}, as {what} has".replace(" [", "[")
+            expected = f"{Tensor(name, '', None if shape is None else tuple(shape))}, as {what} has".replace(" [", "[")
             remedy = "Give the right file; `jsecon models check DIR` lists what each one is."
             raise InputError(f"{self.path}, {side} {name!r}", problem, expected, remedy)
         return tensors[name]
