@@ -1,7 +1,8 @@
 """Camera poses of photographs by structure from motion with pycolmap (extra sfm), on the CPU.
 
-The steps are COLMAP's own: SIFT features, matches of image pairs, and a model that grows photograph by photograph. Up
-to ALL_PAIRS photographs, every pair is matched. Above, each photograph is matched with its neighbours in name order and
+The steps are COLMAP's own: SIFT features, matches of image pairs, a global model (GLOMAP, Pan et al., arXiv
+2407.20219), and an incremental model if the global one leaves photographs out or contradicts the matches. Up to
+ALL_PAIRS photographs, every pair is matched. Above, each photograph is matched with its neighbours in name order and
 with those that look most alike, by a vocabulary of visual words made of the photographs themselves.
 
 COLMAP writes to the standard streams, ends its process when an internal check fails, and cannot be stopped within a
@@ -38,6 +39,10 @@ ALL_PAIRS = 40
 """Number of photographs up to which every pair is matched."""
 NEIGHBOURS, ALIKE = 10, 20
 """Neighbours in name order, and most similar photographs, that a photograph is matched with."""
+MIN_EXPLAINED, MIN_EXPLAINED_OF_MEDIAN = 0.6, 0.3
+"""Share of a photograph's matches that became common points: the least in the median photograph, and the least of any
+photograph relative to the median. In a right model of 125 photographs the median was 0.87 and the least 0.59; two
+wrongly placed ones had 0.08 and 0.12."""
 
 
 class _Job(NamedTuple):
@@ -285,27 +290,71 @@ def _pairs_that_look_alike(colmap: Any, opened: Any, images: list[int], file: Pa
 
 
 def _map(colmap: Any, total: int, work: Path, progress: Progress) -> tuple[Any, int]:
-    """Returns the model with the most photographs, or None, and the number of models of the mapper.
+    """Returns the best model, or None, and the number of models of its mapper.
 
     Focal lengths that EXIF does not name are estimated from the pairs first (Sweeney et al., "Optimizing the viewing
     graph for structure-from-motion", ICCV 2015).
     """
-    database = work / "database.db"
+    database, links = work / "database.db", work / "links"
     with colmap.Database.open(database) as opened:
         if opened.num_verified_image_pairs() == 0:
             return None, 0
     colmap.calibrate_view_graph(database, colmap.ViewGraphCalibrationOptions(random_seed=0))
-    count = 0
+    progress(0, total)
+    options = colmap.GlobalPipelineOptions(random_seed=0, min_model_size=MIN_PHOTOS, num_threads=cores())
+    options.mapper.random_seed = 0
+    (work / "global").mkdir(exist_ok=True)
+    models = list(colmap.global_mapping(database, links, work / "global", options).values())
+    candidates = [(_largest(models), len(models))]
+    if not _is_consistent(colmap, database, candidates[0][0], total):
+        count = 1
 
-    def registered() -> None:
-        nonlocal count
-        count = min(count + 1, total)
-        progress(count, total)
+        def registered() -> None:
+            nonlocal count
+            count = min(count + 1, total)
+            progress(count, total)
 
-    options = colmap.IncrementalPipelineOptions(random_seed=0, min_model_size=MIN_PHOTOS, num_threads=cores())
-    (work / "models").mkdir(exist_ok=True)
-    callbacks = {"initial_image_pair_callback": registered, "next_image_callback": registered}
-    found = colmap.incremental_mapping(database, work / "links", work / "models", options, **callbacks)
+        options = colmap.IncrementalPipelineOptions(random_seed=0, min_model_size=MIN_PHOTOS, num_threads=cores())
+        (work / "incremental").mkdir(exist_ok=True)
+        callbacks = {"initial_image_pair_callback": registered, "next_image_callback": registered}
+        models = colmap.incremental_mapping(database, links, work / "incremental", options, **callbacks).values()
+        candidates.append((_largest(list(models)), len(models)))
     progress(total, total)
-    models = list(found.values())
-    return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None), len(models)
+    candidates = [(model, count) for model, count in candidates if model is not None]
+    explained = [sum(_explained_matches(colmap, database, model)[0].values()) for model, _ in candidates]
+    return candidates[int(np.argmax(explained))] if candidates else (None, 0)
+
+
+def _largest(models: list[Any]) -> Any:
+    """Returns the model with the most photographs, or None."""
+    return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+
+
+def _is_consistent(colmap: Any, database: Path, model: Any, total: int) -> bool:
+    """Whether a model has all photographs, and each where most of its matches became common points."""
+    if model is None or model.num_reg_images() < total:
+        return False
+    explained, matches = _explained_matches(colmap, database, model)
+    shares = [explained[image] / count for image, count in matches.items()]
+    median = float(np.median(shares))
+    return median >= MIN_EXPLAINED and min(shares) >= MIN_EXPLAINED_OF_MEDIAN * median
+
+
+def _explained_matches(colmap: Any, database: Path, model: Any) -> tuple[dict[int, int], dict[int, int]]:
+    """Counts by image the verified matches whose two features became one point, and all its verified matches."""
+    points = {}
+    for number, image in model.images.items():
+        if image.has_pose:
+            points[number] = np.array([p.point3D_id if p.has_point3D() else -1 for p in image.points2D], np.int64)
+    explained: collections.Counter[int] = collections.Counter()
+    matches: collections.Counter[int] = collections.Counter()
+    with colmap.Database.open(database) as opened:
+        pairs, geometries = opened.read_two_view_geometries()
+    for pair, geometry in zip(pairs, geometries):
+        a, b = colmap.pair_id_to_image_pair(pair)
+        if a in points and b in points and len(geometry.inlier_matches):
+            of_a, of_b = points[a][geometry.inlier_matches[:, 0]], points[b][geometry.inlier_matches[:, 1]]
+            for image in (a, b):
+                matches[image] += len(of_a)
+                explained[image] += int(((of_a == of_b) & (of_a >= 0)).sum())
+    return explained, matches
