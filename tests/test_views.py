@@ -3,6 +3,7 @@
 import dataclasses
 import json
 
+import jax
 import numpy as np
 import pytest
 from capture_files import small_capture, transforms, write_text_model
@@ -13,7 +14,7 @@ import jsecon
 from jsecon.app.cli import main
 from jsecon.splat.transform import transform_gaussians
 from jsecon.views import plan
-from jsecon.views.frame import scene_frame, surface_points
+from jsecon.views.frame import inner_scene, scene_frame, surface_points
 from jsecon.views.plan import place_cameras
 
 BALLS = {"red": (0.8, 0.1, 0.1), "blue": (0.1, 0.2, 0.8), "green": (0.1, 0.6, 0.15)}
@@ -173,6 +174,66 @@ def test_a_room_is_seen_from_inside_and_an_object_from_around(room, object_alone
         alphas = [np.asarray(jsecon.render_rgb(scene, camera).alpha).mean() for camera in planned.cameras]
         assert min(alphas) > 0.03
         assert planned.coverage > 0.7
+
+
+def directions(draw, count):
+    """Unit vectors above the horizon."""
+    vectors = draw.normal(size=(count, 3))
+    vectors[:, 2] = np.abs(vectors[:, 2])
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def far_houses(draw, count):
+    """Eleven boxes around the scene."""
+    house = draw.integers(0, 11, count)
+    place = 28 * np.stack([np.cos(house), np.sin(house), 0 * house], axis=1)
+    return place + draw.uniform([-1.5, -1.5, 0], [1.5, 1.5, 4], (count, 3))
+
+
+SURROUNDINGS = {
+    "half a shell": lambda draw, count: 55 * directions(draw, count),
+    "far houses": far_houses,
+    "haze at several distances": lambda draw, count: (
+        directions(draw, count) * draw.choice([14, 25, 44], (count, 1)) * draw.uniform(0.8, 1.2, (count, 1))
+    ),
+}
+"""points around a scene of 4 units, of a generator and a count"""
+
+
+@pytest.mark.parametrize("place", SURROUNDINGS)
+@pytest.mark.parametrize("share", [0.02, 0.13, 0.4, 0.6])
+@pytest.mark.parametrize("seed", range(2))
+def test_far_surroundings_of_any_share_leave_the_frame_as_it_is(object_alone, place, share, seed):
+    count = round(object_alone.count * share / (1 - share))
+    points = SURROUNDINGS[place](np.random.default_rng(seed), count)
+    far = gaussians_at(points, np.full((count, 1), (0.1, 3.0)[seed]), sh=object_alone.sh[:1])
+    scene = jax.tree.map(lambda *parts: np.concatenate(parts), object_alone, far)
+    there, similarity = moved(scene, seed)
+    inner = inner_scene(there)
+    assert inner[: object_alone.count].all()
+    assert not inner[object_alone.count :].any()
+    expected = scene_frame(surface_points(transform_gaussians(object_alone, similarity)))
+    frame = scene_frame(surface_points(there))
+    np.testing.assert_allclose(frame.axes, expected.axes, atol=1e-9)
+    np.testing.assert_allclose(np.append(frame.centre, frame.half), np.append(expected.centre, expected.half))
+
+
+@pytest.mark.parametrize("hall", [6.0, 9.0])
+def test_walls_far_from_a_dense_table_belong_to_the_scene(hall):
+    """They are four to six times as far as its edge; a floor joins them."""
+    draw = np.random.default_rng(0)
+    corner, (x, y, z) = np.array([-hall, -hall, -1.0]), np.diag([2 * hall, 2 * hall, 6.0])
+    ends = [(corner, x, y), (corner, x, z), (corner, y, z), (corner + x, y, z), (corner + y, x, z)]
+    walls = np.concatenate([sheet(*rectangle) for rectangle in ends])
+    table = draw.uniform([-1.5, -1.5, 0], [1.5, 1.5, 0.3], (len(walls) // 4, 3))
+    assert inner_scene(gaussians_at(np.concatenate([walls, table]), 0.05)).all()
+
+
+def test_views_through_fog_alone_are_said_to_show_hardly_any_detail(around):
+    draw = np.random.default_rng(0)
+    scene = scene_of([(draw.uniform(-1, 1, (400, 3)), (0.5, 0.5, 0.5), 0.33)])
+    assert "hardly any detail" in str(place_cameras(scene, views=6, width=80, height=60))
+    assert "hardly any detail" not in str(around)
 
 
 def test_no_view_looks_through_fog():

@@ -11,7 +11,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
 
 from jsecon.errors import InputError
 from jsecon.types import Camera, Gaussians, LanguageField, UpAxis
@@ -22,6 +23,14 @@ _DIRECTIONS = 1500
 _ROLL_BINS = 45
 _ROLL_SPREAD = 2 * np.pi / _ROLL_BINS
 """radians, of the rolls of cameras that are held alike"""
+_SAMPLE = 4000
+"""Gaussians from which the inner scene is told from its surroundings: their spacing is the same for any number"""
+_LINK = 0.35
+"""distance, in radii of the inner scene, from which points are not connected to it"""
+_FAR = 3.0
+"""radii from the centre beyond which surroundings lie"""
+_FAR_SHARE, _FAR_MASS = 0.01, 0.05
+"""surroundings are at least this share of the Gaussians, and at most this share of number times density"""
 _QUARTERS = np.radians([0.0, 90.0, 180.0, 270.0])
 
 
@@ -46,10 +55,51 @@ class SceneFrame:
         return 2 * float(np.linalg.norm(self.half))
 
 
+def inner_scene(gaussians: Gaussians) -> Bool[np.ndarray, " n"]:
+    """Tells which Gaussians belong to the scene and not to its far surroundings, such as a sky or distant houses.
+
+    The inner scene starts as the ball with most number times density per radius, and grows over what is dense and near
+    it. What is left are surroundings if they are far and sparse, and what is sparse near the scene then goes with them.
+    Otherwise all Gaussians belong to the scene.
+    """
+    means = np.asarray(gaussians.means, np.float64)
+    visible = np.isfinite(means).all(1) & (np.asarray(gaussians.opacity_logits, np.float64) >= np.log(0.1 / 0.9))
+    everything = np.ones(len(means), bool)
+    if visible.sum() < 16:
+        return everything
+    points = means[visible]
+    points = points[np.unique(np.linspace(0, len(points) - 1, min(len(points), _SAMPLE)).astype(int))]
+    spacing = KDTree(points).query(points, 9)[0][:, -1]
+    spacing = np.maximum(spacing, np.quantile(spacing, 0.05))
+    if not spacing.min() > 0:
+        return everything
+    mass = (spacing.min() / spacing) ** 2
+    order = points.argsort(axis=0)
+    middle = [np.searchsorted(running, running[-1] / 2) for running in mass[order].cumsum(axis=0).T]
+    centre = np.take_along_axis(points, order, axis=0)[middle, np.arange(3)]
+    distance = np.linalg.norm(points - centre, axis=1)
+    outwards = distance.argsort()
+    held = mass[outwards].cumsum()
+    per_radius = np.where(held >= held[-1] / 2, held / np.maximum(distance[outwards], spacing.min()), 0)
+    radius = distance[outwards[per_radius.argmax()]]
+    inside, count = distance <= radius, 0
+    while count < inside.sum():
+        count = inside.sum()
+        reach = KDTree(points[inside]).query(points, distance_upper_bound=_LINK * radius)[0]
+        inside |= (np.isfinite(reach) | (distance <= _FAR * radius)) & (spacing <= _LINK * radius)
+        radius = max(radius, np.quantile(distance[inside], 1 - TRIM))
+    far = distance > _FAR * radius
+    if far.mean() < _FAR_SHARE or mass[far].sum() > _FAR_MASS * mass.sum():
+        return everything
+    reach = KDTree(points[inside]).query(np.nan_to_num(means), distance_upper_bound=_LINK * radius)[0]
+    return np.isfinite(reach)
+
+
 def surface_points(gaussians: Gaussians) -> Float[np.ndarray, "p 3"]:
     """Draws up to 20,000 points of a scene's surface: centres of Gaussians, by opacity times area.
 
-    They are the same ones however the scene is turned. InputError is raised if the scene has no visible surface.
+    They are the same ones however the scene is turned, and its surroundings have none (`inner_scene`). InputError is
+    raised if the scene has no visible surface.
     """
     means = np.asarray(gaussians.means, np.float64)
     scales = np.sort(np.exp(np.asarray(gaussians.log_scales, np.float64)), axis=1)
@@ -59,6 +109,7 @@ def surface_points(gaussians: Gaussians) -> Float[np.ndarray, "p 3"]:
     if visible.sum() < 4:
         remedy = "Open it in a viewer to check it. A scene needs visible Gaussians, and more than a few."
         raise InputError("scene", f"{int(visible.sum())} of its {len(means)} Gaussians are visible", "", remedy)
+    visible &= inner_scene(gaussians)
     low, high = np.quantile(means[visible], [TRIM, 1 - TRIM], axis=0)
     size = float(np.linalg.norm(high - low))
     if not size > 0:

@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 from jsecon.errors import InputError, require
 from jsecon.field.evidence import region_votes
 from jsecon.types import Camera, Gaussians, Progress
-from jsecon.views.frame import SceneFrame, scene_frame, surface_points
+from jsecon.views.frame import SceneFrame, inner_scene, scene_frame, surface_points
 
 FIELD_OF_VIEW = 60.0
 """degrees, horizontal"""
@@ -43,12 +43,17 @@ class _PlannedViews:
     """The scene's box and up axis."""
     kind: Literal["room", "object"]
     coverage: float
-    """Share of the scene, by opacity, that the views show."""
+    """Share of the scene without its surroundings, by opacity, that the views show."""
+    foggy: int
+    """Number of views that are fog (`FOG_SHARE`)."""
 
     def __str__(self) -> str:
-        """Describes the plan on one line: number of views, kind of scene, coverage and up axis."""
+        """Describes the plan on one line: number of views, kind of scene, coverage, up axis, and a lack of detail."""
         up = ", ".join(f"{number:.2f}" for number in self.frame.axes[2])
         trust = "" if self.frame.sure else "; not sure, --up X Y Z sets it"
+        if 2 * self.foggy > len(self.cameras):
+            trust += f"; {self.foggy} views show hardly any detail, so that texts may match nothing in them: "
+            trust += "wide Gaussians fill them, --cameras FILE gives views of your own"
         return (
             f"{len(self.cameras)} virtual views of {'a room' if self.kind == 'room' else 'an object'}, "
             f"{self.coverage:.0%} of it seen; up is ({up}), from {self.frame.evidence}{trust}"
@@ -80,18 +85,19 @@ def place_cameras(
     places = _free_places(points, frame)
     inside = _interior_cameras(frame, places)
     orbits = _orbit_cameras(frame)
-    counted = np.unique(np.linspace(0, gaussians.count - 1, min(gaussians.count, 100_000)).astype(int))
+    inner = np.flatnonzero(inner_scene(gaussians))
+    counted = inner[np.unique(np.linspace(0, len(inner) - 1, min(len(inner), 100_000)).astype(int))]
     total = len(inside) + len(orbits)
 
     def report(start: int) -> Callable[[int], None]:
         return lambda done: None if progress is None else progress(start + done, total)
 
-    seen, alpha, fog = _weights_by_view(gaussians, inside, counted, frame.diagonal, report(0))
+    seen, alpha, fog = _weights_by_view(gaussians, inside, inner, counted, frame.diagonal, report(0))
     kind: Literal["room", "object"] = "room" if _is_room(alpha, len(places)) else "object"
     candidates = inside
     if kind == "object":
         candidates = orbits
-        seen, alpha, fog = _weights_by_view(gaussians, orbits, counted, frame.diagonal, report(len(inside)))
+        seen, alpha, fog = _weights_by_view(gaussians, orbits, inner, counted, frame.diagonal, report(len(inside)))
     usable = np.flatnonzero(alpha >= 0.03)  # those that show some of the scene
     clear = usable[fog[usable] < FOG_SHARE]
     usable = clear if len(clear) >= views else usable  # a scene of few large Gaussians has no clear view
@@ -102,7 +108,7 @@ def place_cameras(
     chosen, coverage = _greedy_cover(seen[usable], opacity, views)
     chosen = usable[chosen]
     cameras = _cameras(candidates[chosen], width, height)
-    return _PlannedViews(cameras, frame, kind, coverage)
+    return _PlannedViews(cameras, frame, kind, coverage, int((fog[chosen] >= FOG_SHARE).sum()))
 
 
 def _free_places(points: Float[np.ndarray, "p 3"], frame: SceneFrame) -> Float[np.ndarray, "k 3"]:
@@ -232,9 +238,17 @@ def _cameras(poses: np.ndarray, width: int, height: int) -> Camera:
 
 
 def _weights_by_view(
-    gaussians: Gaussians, poses: np.ndarray, counted: np.ndarray, diagonal: float, report: Callable[[int], None]
+    gaussians: Gaussians,
+    poses: np.ndarray,
+    inner: np.ndarray,
+    counted: np.ndarray,
+    diagonal: float,
+    report: Callable[[int], None],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the weight of some Gaussians in each small view (V, M), and the mean alpha and the fog of each (V,)."""
+    """Returns the weight of `counted` Gaussians in each small view (V, M), and the mean alpha and the fog of each (V,).
+
+    The alpha is that of the inner scene: a sky encloses no place.
+    """
     seen = np.zeros((len(poses), len(counted)), np.float32)
     alpha, fog = np.zeros((2, len(poses)))
     cameras = _cameras(poses, CANDIDATE_WIDTH, CANDIDATE_HEIGHT)
@@ -247,7 +261,7 @@ def _weights_by_view(
         by_view = np.asarray(votes.by_view)[: len(poses) - start]
         for view, weights in enumerate(by_view, start):
             seen[view] = weights[counted]
-            alpha[view] = weights.sum() / (CANDIDATE_WIDTH * CANDIDATE_HEIGHT)
+            alpha[view] = weights[inner].sum() / (CANDIDATE_WIDTH * CANDIDATE_HEIGHT)
             with np.errstate(invalid="ignore"):  # centres that are not finite have no weight
                 depth = means @ poses[view, 2, :3] + poses[view, 2, 3]
             wide = widest * cameras.fx[view] > 0.1 * CANDIDATE_WIDTH * depth
