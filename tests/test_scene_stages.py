@@ -24,11 +24,11 @@ TRAINED = np.diag([0.4, 0.4, 0.4, 1]) @ TURN
 """from the source's world to nerfstudio's: turned and shifted, then made smaller"""
 
 
-def read(capture, file):
-    """The outcome of the stage that reads `file`, and the stage."""
+def read(capture, file, name="gaussians", **results):
+    """The outcome of the stage that reads `file` (or another, given the results before it), and the stage."""
     work = RunContext(Options(capture=file.parent, gaussians=file), Models(ColourEmbedder()), file.parent / "out")
-    stage = next(stage for stage in run_stages(work) if stage.name == "gaussians")
-    stage_input = StageInput(work, Results(load=capture), lambda done, total: None, Checkpoint(work.out))
+    stage = next(stage for stage in run_stages(work) if stage.name == name)
+    stage_input = StageInput(work, Results(load=capture, **results), lambda done, total: None, Checkpoint(work.out))
     return stage.compute(stage_input), stage
 
 
@@ -39,10 +39,10 @@ def near():
     return gaussians(arrays | {"means": arrays["means"] / 10})
 
 
-def photographed(scene, capture=None):
-    """The capture (by default the small one) with frames that show the scene."""
-    capture = capture or small_capture(8)
-    frames = [render_rgb(scene, capture.cameras[t]).features for t in range(len(capture.names))]
+def photographed(scene, capture=None, background=(0, 0, 0)):
+    """The capture (by default the small one) with frames that show the scene over a colour."""
+    capture, colour = capture or small_capture(8), np.array(background, np.float32)
+    frames = [render_rgb(scene, capture.cameras[t], background=colour).features for t in range(len(capture.names))]
     return dataclasses.replace(capture, frames=(255 * np.clip(np.stack(frames), 0, 1)).astype(np.uint8))
 
 
@@ -115,6 +115,56 @@ def nerfstudio_world(capture):
     world[:3, :3] = turn / np.abs(places).max()
     world[:3, 3] = -world[:3, :3] @ c2w[:, :3, 3].mean(0)
     return world
+
+
+BLACK, WHITE, BLUE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.2, 0.4, 0.8)
+
+
+def crude(scene):
+    """The scene with places and colours that are a bit off."""
+    rng = np.random.default_rng(3)
+    means = scene.means + rng.normal(0, 0.01, scene.means.shape).astype(np.float32)
+    return dataclasses.replace(scene, means=means, sh=scene.sh + rng.normal(0, 0.2, scene.sh.shape).astype(np.float32))
+
+
+@pytest.mark.parametrize("frames", [4, 8])
+@pytest.mark.parametrize(("background", "over"), [(BLACK, None), (WHITE, "white"), (BLUE, "the colour (")])
+def test_a_scene_may_be_trained_over_any_colour(tmp_path, near, background, over, frames):
+    """It is read in its world, and its held-out frames are compared over the colour; turned, it gets a warning."""
+    capture, file = photographed(near, small_capture(frames), background), tmp_path / "scene.ply"
+    capture = dataclasses.replace(capture, held_out=np.arange(frames) == 1)
+    save_gaussians(file, crude(near))
+    found, _ = read(capture, file)
+    np.testing.assert_allclose(found.value.means, crude(near).means, atol=1e-5)
+    assert "WARNING" not in found.notes[0]
+    assert ("over" in found.notes[0]) == (over is not None)
+    assert f"show them over {over}" in found.notes[0] or over is None
+    quality, _ = read(capture, file, "held_out", gaussians=found.value)
+    image = render_rgb(crude(near), capture.cameras[1], background=np.array(background, np.float32)).features
+    error = np.mean((np.clip(image, 0, 1) - capture.frames[1] / 255) ** 2)
+    np.testing.assert_allclose(quality.value.psnr, -10 * np.log10(error), atol=1)
+    if frames == 8 or over:
+        save_gaussians(file, transform_gaussians(near, TURN @ np.diag([3.0, 3, 3, 1])))
+        assert read(capture, file)[0].notes[0].startswith("WARNING")
+
+
+@pytest.mark.parametrize("background", [WHITE, BLUE])
+@pytest.mark.parametrize("world", [gsplat_world, nerfstudio_world])
+def test_a_normalised_world_is_found_over_any_colour(tmp_path, near, world, background):
+    capture = photographed(near, background=background)
+    save_gaussians(tmp_path / "scene.ply", near, similarity=world(capture))
+    found, _ = read(capture, tmp_path / "scene.ply")
+    np.testing.assert_allclose(found.value.means, near.means, atol=1e-5)
+    assert world.__name__.split("_")[0] in found.notes[0]
+    assert "WARNING" not in found.notes[0]
+
+
+def test_a_thing_of_one_colour_is_recognised_by_its_outline(tmp_path, near):
+    """Its colours within the outline tell nothing."""
+    red = dataclasses.replace(near, sh=np.tile(np.array([1.0, -1.5, -1.5], np.float32), (near.count, 1, 1)))
+    save_gaussians(tmp_path / "scene.ply", red)
+    found, _ = read(photographed(red, background=WHITE), tmp_path / "scene.ply")
+    assert "over white" in found.notes[0]
 
 
 def test_a_file_whose_float32_has_rounded_the_places_is_told(tmp_path, near):

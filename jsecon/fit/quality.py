@@ -37,6 +37,7 @@ def measure_quality(
     *,
     frames: Int[np.ndarray, " f"] | None = None,
     long_side: int | None = None,
+    background: Float[np.ndarray, " 3"] | None = None,
     progress: Progress | None = None,
 ) -> Quality:
     """Compares renderings, clamped to [0, 1], with photographs. Ignored pixels do not count.
@@ -48,6 +49,7 @@ def measure_quality(
       capture: Photographs and their cameras.
       frames: Indices of the frames to compare; by default the held-out frames.
       long_side: Longer side in px to which larger frames are shrunk first.
+      background: (3,) colour in [0, 1] behind the scene; by default black.
       progress: Called with the number of frames done and of all.
 
     Returns:
@@ -66,7 +68,7 @@ def measure_quality(
     chosen = np.array([t for t in chosen.tolist() if counted_pixels(t).mean() >= MIN_COUNTED_SHARE], int)
 
     def compare(t: int) -> list[float]:
-        image = render_rgb(gaussians, cameras[t]).features
+        image = render_rgb(gaussians, cameras[t], background=background).features
         frame = resize_frame(np.asarray(capture.frames[t]), cameras)
         return [float(value) for value in _compare(image, frame, counted_pixels(t))]
 

@@ -6,6 +6,7 @@ A scene that comes without photographs is rendered from virtual views, or from g
 
 import dataclasses
 import shutil
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -17,7 +18,7 @@ from jsecon.fit.quality import QUICK_LONG_SIDE, is_weak, measure_quality
 from jsecon.fit.start import starting_gaussians
 from jsecon.pipeline.options import Options, is_bare_scene
 from jsecon.pipeline.results import KEY_FILE, RunContext, Stage, StageInput, StageResult, training_frames
-from jsecon.pipeline.scene_files import check_overlap, place_in_capture, read_scene
+from jsecon.pipeline.scene_files import check_overlap, fit_background, place_in_capture, read_scene
 from jsecon.poses.sfm import find_poses
 from jsecon.read.captures.capture import (
     has_depth,
@@ -211,8 +212,10 @@ def _fit_scene(stage: StageInput) -> StageResult:
 def _measure_held_out(stage: StageInput) -> StageResult:
     """Measures the held-out frames, and names training frames that the scene does not explain."""
     capture, scene = stage.results.load, stage.results.gaussians
+    background = None if stage.context.options.gaussians is None else fit_background(scene, capture)
     train = np.flatnonzero(~np.asarray(capture.held_out))
-    fitted = measure_quality(scene, capture, frames=train, long_side=QUICK_LONG_SIDE, progress=stage.progress)
+    measure = partial(measure_quality, scene, capture, background=background, progress=stage.progress)
+    fitted = measure(frames=train, long_side=QUICK_LONG_SIDE)
     weak = np.flatnonzero(is_weak(np.asarray(fitted.psnr)))
     notes = ()
     if len(weak):
@@ -220,7 +223,7 @@ def _measure_held_out(stage: StageInput) -> StageResult:
         more = f" and {len(weak) - 5} more" if len(weak) > 5 else ""
         note = f"far below the median frame ({np.median(fitted.psnr):.1f} dB): {names}{more}; a wrong pose, or "
         notes = (note + "something moved: leave them out if the scene is blurred there",)
-    return StageResult(measure_quality(scene, capture, progress=stage.progress), notes=notes)
+    return StageResult(measure(), notes=notes)
 
 
 def _render_views(stage: StageInput) -> StageResult:
