@@ -55,8 +55,8 @@ def place_in_capture(
     """Moves a file's Gaussians into the world of the capture's cameras.
 
     A few frames are rendered in each world that the file may be in: the one that `trained` leads back from, that of the
-    capture's files, and that of its poses; if none shows the frames well, those of known training programs. The first is
-    taken, unless the frames are explained by another that is clearly more like them.
+    capture's files, and that of its poses; if none shows the frames well, those of known training programs. The first
+    is taken, unless the frames are explained by another that is clearly more like them.
     """
     source_from_scene = np.asarray(capture.source_from_scene, np.float64)
     poses = capture.poses_from_scene
@@ -126,8 +126,8 @@ def _compare_with_photographs(
 
     The background is the colour b that fits photograph = image + (1 - alpha) b best. It replaces black where it makes
     the scene clearly more like the photographs. Over it, outlines alone correlate in other worlds too, by up to 0.67;
-    in its world a crude scene has 0.85. The colours within the outlines have 0.7 to 0.9 there, and up to 0.25 in others.
-    A thing of one colour has nothing within: its outline decides.
+    in its world a crude scene has 0.85. The colours within the outlines have 0.7 to 0.9 there, and up to 0.25 in
+    others. A thing of one colour has nothing within: its outline decides.
     """
     train = np.flatnonzero(~np.asarray(capture.held_out))
     cameras = shrink_cameras(capture.cameras, QUICK_LONG_SIDE)
