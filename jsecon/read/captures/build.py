@@ -320,7 +320,7 @@ def _camera_jumps(frames: Sequence[_Frame]) -> list[str]:
     """
     steps = np.linalg.norm(np.diff(_centres(np.stack([frame.pose for frame in frames])), axis=0), axis=1)
     median = float(np.median(steps)) if len(steps) else 0.0
-    far = [f"{frames[t].name} to {frames[t + 1].name}" for t in np.flatnonzero(steps > 10 * median)]
+    far = [f"{frames[t].name} to {frames[t + 1].name}" for t in np.flatnonzero(steps > 10 * median).tolist()]
     if median == 0 or not far:
         return []
     places = ", ".join(far[:5]) + (" ..." if len(far) > 5 else "")
