@@ -106,10 +106,12 @@ def test_every_door_names_the_word_that_it_does_not_understand(door, tmp_path, c
     from jsecon.app.server import application
 
     scene, file, _ = door
+    opened = Future()
+    opened.set_result(scene)
     client = TestClient(application({"table": scene}), "http://127.0.0.1:8765")
 
     async def find(text):
-        async with Client(make_server({"table": scene})) as tools:
+        async with Client(make_server({"table": opened})) as tools:
             return await tools.call_tool("find", {"text": text})
 
     for text, word in REFUSED.items():

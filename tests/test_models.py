@@ -107,7 +107,7 @@ def damage(path, change):
     ("sam", ENCODER, flat, "input 'pixel_values': pixel_values float32[1, 5], expected"),
     ("sam", DECODER, lambda path: write_decoder(path, 256, "sam", "batch", masks=1), ("'pred_masks'", "3 or 4 masks")),
     ("sam2", "onnx/memory_encoder.onnx", None, "memory_encoder"), ("sam2", "constants.json", None, "constants.json"),
-    ("sam2", "constants.json", b"PK\x03\x04 cut", "not JSON"),
+    ("sam2", "constants.json", b"PK\x03\x04 cut", "a zip archive"),
     ("sam2", "constants.json", {"memory_temporal_positional_encoding": [[0.0] * 4] * 3}, "(3, 4)"),
     ("sam2", "constants.json", {"image_mean": ["a"] * 3}, "cannot be read"),
     ("sam2", "onnx/mask_decoder.onnx", "onnx/pointer_tpos.onnx", "feats2_cond"),

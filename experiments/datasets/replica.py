@@ -101,7 +101,7 @@ def load_frames(root: Path, scene: str, *, every: int, downscale: float | int | 
         if not number.isdigit() or int(number) >= len(poses) or not depth.is_file():
             raise InputError(image, f"no {depth.name} beside it, or no pose", remedy="Copy the rendering again.")
         shots.append(PosedImage(image.name, image, lens, poses[int(number)], depth, 1.0 / camera["scale"]))
-    return build_capture(PosedImages(shots, root / scene), FrameOptions(downscale))
+    return build_capture(PosedImages(shots, root / scene), FrameOptions(downscale, holdout=0))
 
 
 def load_semantics(
