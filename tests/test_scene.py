@@ -46,7 +46,7 @@ def test_the_region_of_another_field_selects_nothing_with_a_word(table):
     (At(0, 0, 0), {}, "no region lies under"), (Box(0, 1, 1, 5, 5), {"by": "code"}, "by the outline alone"),
     (Box(0, -9, -9, -2, -2), {}, "no pixels of a frame"), (Mask({0: np.zeros((80, 100), bool)}), {}, "no pixel inside"),
     (Mask({0: np.ones((80, 100), bool), "frame_0": np.ones((80, 100), bool)}), {}, "two masks"),
-    ("red mug", {"by": "code"}, "has no codes"), (" ", {}, "without words"), ("a text without a name", {}, "colour"),
+    ("red mug", {"by": "code"}, "has no codes"), (" ", {}, "without words"), ("a text of nothing", {}, "colour"),
 ])  # fmt: skip
 def test_what_cannot_be_answered_ends_in_a_sentence(table, question, options, problem):
     with pytest.raises(InputError, match=problem):
