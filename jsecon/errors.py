@@ -1,7 +1,7 @@
 """The error for bad input, and checks of arguments. Each message says what is wrong, where, and what to do."""
 
 import errno
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 
@@ -48,6 +48,11 @@ def machine_error(error: BaseException, path: object) -> InputError | None:
     if not isinstance(error, OSError) or error.errno not in _MACHINE:
         return None
     return InputError(error.filename or path, describe_error(error), remedy=_MACHINE[error.errno])
+
+
+def join_first(names: Sequence[str]) -> str:
+    """Joins the first four of some names, and their number if there are more."""
+    return ", ".join(names[:4]) + (f", ... ({len(names)})" if len(names) > 4 else "")
 
 
 def is_out_of_memory(error: BaseException) -> bool:

@@ -167,7 +167,7 @@ def read_json(path: Path, expected: str, remedy: str) -> Any:
         try:
             return parse_json(path.read_bytes())
         except OSError as error:
-            raise InputError(path, describe_error(error), expected, remedy) from error
+            raise machine_error(error, path) or InputError(path, describe_error(error), expected, remedy) from error
 
 
 def describe_substitute(path: object, *, in_place: bool = True) -> tuple[str, str] | None:

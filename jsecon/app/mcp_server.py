@@ -52,7 +52,7 @@ class _Tools:
         return find_scene(self._scenes, field).result()
 
     async def wait(self, field: str | None, context: Context) -> None:
-        """Waits until a field is open or has failed; the client hears of it, so that it waits too."""
+        """Waits until a field is open or has failed, and reports progress so that the client does not give up."""
         opening, began = find_scene(self._scenes, field), time.monotonic()
         while not opening.done():
             seconds = time.monotonic() - began

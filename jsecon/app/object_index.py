@@ -76,7 +76,7 @@ class ObjectIndex:
     Args:
       field: The field, with what texts are compared with.
       embedder: Its embedder.
-      up: (3,) up axis in the capture's world; None finds it.
+      up: (3,) up axis in the capture's world; None takes the field's own.
       catalogue: Returns all objects, for texts that name none.
     """
 

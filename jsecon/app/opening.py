@@ -1,4 +1,4 @@
-"""What a path that stands for a field is: a field's file, the folder of a run, or a splat of which a field is made.
+"""Finds the field that a path names: a field's file, the folder of a run, or a splat of which a field is made.
 
 Only names and first bytes are read, without jax, so that a server can answer before its fields are open.
 """
@@ -36,7 +36,7 @@ class FieldPath(NamedTuple):
 
 
 def locate_field(path: Path, out: Path | None = None) -> FieldPath:
-    """Finds the field that a path stands for, or raises InputError that says what the path is.
+    """Finds the field that a path names, or raises an InputError that describes the file.
 
     `out` is the folder for the field of a splat, by default NAME_field beside NAME.ply.
     """

@@ -157,7 +157,7 @@ class Scene:
       field: The field. One from `load_field(mapped=True)` is read in blocks; boxes, masks and relations need all of it
         in memory.
       embedder: Its embedder, or a function that makes one of the field; None opens it when a text needs it.
-      up: Up axis of the capture's world; None finds it.
+      up: Up axis of the capture's world; None takes the field's own.
       name: Name of the scene.
 
     Attributes:
@@ -607,7 +607,7 @@ def locate(
       text: For example "orange ball" or "the red mug left of the bottle".
       embedder: Embedder of the field; None opens it.
       frame: As for `Scene.relate`.
-      up: Up axis of the capture's world; None finds it.
+      up: Up axis of the capture's world; None takes the field's own.
 
     Returns:
       Its boxes and points, in the capture's world and its unit.

@@ -10,7 +10,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from jsecon.errors import InputError
+from jsecon.errors import InputError, join_first
 from jsecon.files import describe_substitute, is_output_folder, list_files, reading
 from jsecon.read.captures import colmap, nerfstudio, rgbd
 from jsecon.read.captures.build import build_capture
@@ -191,21 +191,16 @@ def _notes_beside(path: Path, photos: Sequence[Path], others: Sequence[Path]) ->
     notes = []
     if others:
         left_out = "are left out as depth maps, masks or copies of the photographs"
-        notes.append(f"{len(others)} images {left_out} ({_shorten(others)}).")
+        notes.append(f"{len(others)} images {left_out} ({join_first([file.name for file in others])}).")
     if poses:
+        names = join_first([file.name for file in poses])
         remedy = "Write them as a COLMAP model or a transforms.json to use them."
-        notes.append(f"What may be poses is of a layout that jsecon does not read ({_shorten(poses)}). {remedy}")
+        notes.append(f"What may be poses is of a layout that jsecon does not read ({names}). {remedy}")
     if unread:
+        names = join_first([file.name for file in unread])
         remedy = "Convert images to JPEG or PNG; give a video by itself."
-        notes.append(
-            f"{len(unread)} files are left out, whose formats are not read here ({_shorten(unread)}). {remedy}"
-        )
+        notes.append(f"{len(unread)} files are left out, whose formats are not read here ({names}). {remedy}")
     return tuple(notes)
-
-
-def _shorten(files: Sequence[Path]) -> str:
-    """The first names of some files."""
-    return ", ".join(file.name for file in files[:3]) + (", ..." if len(files) > 3 else "")
 
 
 def _inner_captures(path: Path) -> list[Path]:
@@ -245,7 +240,9 @@ def _no_capture(path: Path) -> InputError:
         kinds = ", ".join(sorted({str(unread_format(child)) for child in unread}))
         problem, remedy = f"{len(unread)} images in {kinds}, which is not read", convert_remedy(unread[0])
     elif others := _sort_images(path)[1]:
-        problem = f"{len(others)} depth maps or masks ({_shorten(others)}), but no photographs"
+        problem = (
+            f"{len(others)} depth maps or masks ({join_first([file.name for file in others])}), but no photographs"
+        )
     elif videos:
         problem = f"a folder with {'a video' if len(videos) == 1 else f'{len(videos)} videos'}, but no photographs"
         remedy = f"Give one video: jsecon run {videos[0]}"

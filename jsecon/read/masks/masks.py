@@ -32,7 +32,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Int, Int16
 
-from jsecon.errors import InputError
+from jsecon.errors import InputError, join_first
 from jsecon.files import list_files, map_npy, reading
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.read.captures.frames import same_aspect
@@ -211,9 +211,9 @@ def _find_masks(
     objects = extras if "" not in extras and len(extras) > 1 else []
     notes = []
     if objects:
-        notes.append(f"The folders {_shorten(objects)} are read as objects: each has black and white masks of one.")
+        notes.append(f"The folders {join_first(objects)} are read as objects: each has black and white masks of one.")
     elif extras[1:]:
-        notes.append(f"Masks in other folders ({_shorten(extras[1:])}) were not used.")
+        notes.append(f"Masks in other folders ({join_first(extras[1:])}) were not used.")
     if others := unmatched[reader]:
         files = f"{len(others)} of the {reader.marks[0]} files, first {others[0].name}"
         notes.append(f"There are masks of no frame of this capture: {files}.")
@@ -292,11 +292,6 @@ def _count_things(labels: Int16[np.ndarray, "h w"]) -> int:
 def _natural_order(name: str) -> tuple[str, int, str]:
     """Sort key that puts 9 before 10."""
     return re.sub(r"\d+", lambda number: number[0].zfill(20), name), len(name), name
-
-
-def _shorten(names: Sequence[str]) -> str:
-    """Joins the first of some names."""
-    return ", ".join(names[:4]) + (f", ... ({len(names)})" if len(names) > 4 else "")
 
 
 def resize_nearest(image: np.ndarray, width: int, height: int) -> np.ndarray:
