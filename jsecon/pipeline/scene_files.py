@@ -144,7 +144,8 @@ def _compare_with_photographs(
     with_background, explained_with = _judge(images + gaps * background, photos)
     within = np.diag(_correlations(images / np.maximum(alpha, 1e-3), photos, alpha)).mean()
     shown = with_background >= 0.9 or (explained_with and with_background >= 0.65 and within >= 0.3)
-    if shown and (not explained or with_background >= correlation + 0.1):
+    empty = (gaps > 0.95).mean() >= 0.02  # else these are the holes of a scene that is not fitted to its end
+    if empty and shown and (not explained or with_background >= correlation + 0.1):
         return with_background, True, background
     return correlation, explained, None
 
