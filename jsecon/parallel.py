@@ -96,13 +96,15 @@ def map_over_processes(
 def map_views(count: int, view: Callable[[int], Any], progress: Progress | None = None) -> list[Any]:
     """Maps a host function over the indices of views, on the cores of all processes; see `map_over_processes`.
 
-    Threads call it, so that one view's work on the host runs beside the compiled program of another.
+    Threads call it, so that one view's work on the host runs beside the compiled program of another. The first view is
+    computed alone: threads that start together would each compile the same programs.
     """
 
     def on_cores(indices: Sequence[int]) -> Iterator[Any]:
+        yield from map(view, indices[:1])
         pool = ThreadPoolExecutor(min(cores(), 8))  # each view at work holds its plan in memory
         try:
-            yield from pool.map(view, indices)
+            yield from pool.map(view, indices[1:])
         finally:
             pool.shutdown(cancel_futures=True)
 

@@ -41,7 +41,8 @@ def _object(capsys, *arguments):
     return json.loads(out), err
 
 
-def test_run_writes_field_metrics_and_report_and_tells_its_plan(room, room_run, tmp_path, capsys):
+def test_run_writes_field_metrics_and_report_and_tells_its_plan(room, room_run, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(progress, "QUIET_SECONDS", 60.0)  # a loaded machine is no reason for other lines
     run, out = room_run
     shutil.copytree(out / "cache", tmp_path / "out" / "cache")  # the stages are cached: only the verb itself is tested
     line = "run", room, "--out", tmp_path / "out", "--masks", room / "masks", *FITTED
@@ -57,6 +58,9 @@ def test_run_writes_field_metrics_and_report_and_tells_its_plan(room, room_run, 
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert metrics["regions"] >= 10
     assert metrics["held_out_psnr"] > 10
+    photo, scene = np.split(cv2.imread(str(tmp_path / "out" / "first_view.png"))[..., ::-1], 2, axis=1)
+    np.testing.assert_array_equal(photo, run.capture.frames[np.argmax(run.capture.held_out)])
+    assert np.abs(scene.astype(float) - photo).mean() < np.abs(scene.astype(float) - photo[:, ::-1]).mean()
     assert 0.5 < metrics["peak_memory_mib"] / peak_memory_mib() < 1.001  # tests before it may have taken more
     assert (tmp_path / "out" / "report.html").read_text().count("data:image/") >= 24
     assert (tmp_path / "out" / "field.safetensors").read_bytes() == (out / "field.safetensors").read_bytes()

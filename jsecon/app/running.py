@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import json
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +14,20 @@ import numpy as np
 from jsecon.app import pictures, report, verbs
 from jsecon.files import write_text
 from jsecon.pipeline import processes, run as pipeline
+from jsecon.pipeline.options import is_bare_scene
 from jsecon.pipeline.progress import Console
 from jsecon.pipeline.results import WARNING, vision_frames
 from jsecon.pipeline.run import Run
 from jsecon.process import peak_memory_mib
 from jsecon.read.captures.frames import evenly_spaced
+from jsecon.read.captures.images import write_image
 from jsecon.read.splats.files import require_writable_format, save_gaussians
-from jsecon.types import Quality
+from jsecon.types import Capture, Gaussians, Quality
 
 FILES = ("field.safetensors", "report.html", "metrics.json")
 """files of a run"""
+FIRST_VIEW = "first_view.png"
+"""file of a run of photographs: the picture that is there as soon as there is a scene"""
 
 
 def _run(verb: verbs.Run, console: Console) -> verbs.VerbResult:
@@ -32,7 +37,8 @@ def _run(verb: verbs.Run, console: Console) -> verbs.VerbResult:
         return pipeline.dry_run(options, verb.out, console=console)
     with processes.connection(options) if verb.distributed else contextlib.nullcontext(0) as index:
         if index == 0:
-            run = pipeline.run(options, verb.out, console=console)
+            show = None if is_bare_scene(options.capture) else partial(show_scene, verb.out, console)
+            run = pipeline.run(options, verb.out, console=console, on_scene=show)
         else:
             pipeline.run_worker(options, verb.out)
     if index > 0:
@@ -55,6 +61,14 @@ def _fit(verb: verbs.Fit, console: Console) -> verbs.VerbResult:
     quality = _quality(held_out, console)
     console.print_line(f"{gaussians.count} Gaussians  {verb.out}")
     return {"written": {"scene": verb.out}, "gaussians": gaussians.count} | quality
+
+
+def show_scene(out: Path, console: Console, capture: Capture, gaussians: Gaussians) -> None:
+    """Writes OUT/first_view.png, a photograph beside the scene from the same place, held out from the fit if any is."""
+    t = int(np.argmax(np.asarray(capture.held_out)))
+    rendered = pictures.render_picture(gaussians, jax.tree.map(np.asarray, capture.cameras)[t])
+    write_image(out / FIRST_VIEW, np.concatenate([np.asarray(capture.frames[t]), rendered], axis=1))
+    console.print_line(f"first view, photograph and scene: {out / FIRST_VIEW}")
 
 
 def write_run(

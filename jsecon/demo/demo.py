@@ -5,6 +5,7 @@ The room is ray-traced by experiments/rooms, so its labels are exact. Everything
 
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ def run_demo(out: Path, *, console: Console, room: Path = ROOM, steps: int = 550
     capture = _copy_capture(room, out)
     holdout = json.loads((capture / "scene.json").read_text())["holdout"]
     options = Options(capture, holdout=holdout, steps=steps)
-    run = pipeline.run(options, out, console=console)
+    run = pipeline.run(options, out, console=console, on_scene=partial(running.show_scene, out, console))
     scene, labels = Scene(run.field), load_lerf_labels(capture / "label")
     console.print_line("measured on the held-out views")
     rows, summary = evaluation.evaluate(scene, labels, console, ("anchored",))["anchored"]

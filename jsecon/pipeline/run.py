@@ -8,6 +8,7 @@ import dataclasses
 import functools
 import json
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -162,8 +163,16 @@ def _owns_output(stage: Stage, stage_list: list[Stage], paths: dict[str, Path]) 
     return all(paths[other.name].exists() for other in stage_list if stage.name in other.after)
 
 
-def compute_stages(context: RunContext, stage_list: list[Stage], console: Console | None = None) -> _RunState:
-    """Plans stages, reports the plan, then computes each or reads it from the cache."""
+def compute_stages(
+    context: RunContext,
+    stage_list: list[Stage],
+    console: Console | None = None,
+    on_scene: Callable[[Capture, Gaussians], None] | None = None,
+) -> _RunState:
+    """Plans stages, reports the plan, then computes each or reads it from the cache.
+
+    `on_scene` is called with the capture and the scene as soon as both are known.
+    """
     console = console or Console()
     with console.progress("plan"):
         state = _plan(context, stage_list)
@@ -178,6 +187,8 @@ def compute_stages(context: RunContext, stage_list: list[Stage], console: Consol
         context.models.require_ready(state.running)
         for stage in stage_list:
             _compute_stage(context, stage, state, console)
+            if stage.name == "gaussians" and on_scene is not None:
+                on_scene(state.results.load, state.results.gaussians)
         _broadcast(None, state)
     return state
 
@@ -237,14 +248,21 @@ def run_worker(options: Options, out: Path) -> None:
         by_name[call["stage"]].compute(StageInput(context, results, lambda done, total: None, checkpoint))
 
 
-def run(options: Options, out: Path, *, console: Console | None = None) -> Run:
+def run(
+    options: Options,
+    out: Path,
+    *,
+    console: Console | None = None,
+    on_scene: Callable[[Capture, Gaussians], None] | None = None,
+) -> Run:
     """Builds the field of a capture and writes OUT/field.safetensors.
 
-    A run that was stopped resumes where it stopped, to the same result.
+    A run that was stopped resumes where it stopped, to the same result. `on_scene` is called with the capture and the
+    scene as soon as both are known.
     """
     console, before = console or Console(), compilation_counts()
     context = _open_context(options, out)
-    state = compute_stages(context, stages.run_stages(context), console)
+    state = compute_stages(context, stages.run_stages(context), console, on_scene)
     results, seconds, embedder = state.results, state.seconds, context.models.embedder
     started = time.monotonic()
     with console.progress("field"):

@@ -196,13 +196,16 @@ def _fit_scene(stage: StageInput) -> StageResult:
     pixels, minutes = capture.cameras.width * capture.cameras.height, options.minutes
     is_long = options.steps >= 3000 if minutes is None else minutes >= 3
     most = min(pixels if is_long else pixels // 2, Schedule.max_gaussians)
+    # Half of the frames' size in the first half costs a program of its own. It pays in long fits: the demo's room has
+    # 32.4 dB after 550 steps with it and 32.9 without, in the same time.
+    sizes = ((1.0, 1.0),) if minutes is None and options.steps < 1000 else Schedule.sizes
     fitted, losses = fit_gaussians(
         capture,
         key=jax.random.key(options.seed),
         steps=options.steps if minutes is None else None,
         seconds=None if minutes is None else 60 * minutes,
         start=start,
-        schedule=Schedule(max_gaussians=most),
+        schedule=Schedule(sizes, most),
         on_checkpoint=lambda current: stage.checkpoint.keep(lambda: current),
         progress=stage.progress,
     )
