@@ -36,6 +36,7 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
+import beartype
 import jax
 import pytest
 from filelock import FileLock
@@ -47,19 +48,20 @@ from jaxtyping import install_import_hook
 jax.config.update("jax_compilation_cache_dir", None)
 
 HOME = Path(__file__).resolve().parent.parent
-_UNCHECKED = {"types", "__init__", "__main__"}
 
-# jsecon.types is left out: pytrees are also built from tracers, shapes and None while jax transforms them.
-install_import_hook(
-    sorted(
-        {
-            f"jsecon.{path.stem}"
-            for path in (HOME / "jsecon").iterdir()
-            if path.stem not in _UNCHECKED and (path.suffix == ".py" or (path / "__init__.py").exists())
-        }
-    ),
-    "beartype.beartype",
-)
+
+def checked(function):
+    """beartype's checks of a module's function; one inside another would get them anew at each call of that."""
+    return function if "<locals>" in function.__qualname__ else beartype.beartype(function)
+
+
+# The modules whose signatures have shapes: a check of any other costs more than its call. jsecon.types is left out, as
+# pytrees are also built from tracers, shapes and None while jax transforms them. A process that compiles as a user's
+# does runs the modules as they are.
+if not compiling.is_shipped():
+    files = [path for path in (HOME / "jsecon").rglob("*.py") if path.stem != "types"]
+    shaped = [path.relative_to(HOME).with_suffix("") for path in files if "from jaxtyping" in path.read_text()]
+    install_import_hook([".".join(path.parts) for path in shaped], "conftest.checked")
 
 # A loaded machine, or hypothesis' first table of Unicode, is no fault of a test. CI draws the same examples each time.
 _SLOW = [HealthCheck.too_slow]
