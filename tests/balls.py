@@ -1,5 +1,7 @@
 """A small world that several test files look at: three balls on a disc, seen from a ring of cameras."""
 
+import functools
+
 import numpy as np
 from conftest import gaussians_at, look_at
 
@@ -14,6 +16,7 @@ def sphere(rng, centre, radius, count):
     return np.asarray(centre) + radius * points / np.linalg.norm(points, axis=1, keepdims=True)
 
 
+@functools.cache
 def ring_of_balls():
     """Three balls on a disc (their Gaussians lie inside, so that what is rendered ends at the outline), seen
     from a ring of 24 cameras; one hides another in some views. Labels by ray casting.

@@ -159,9 +159,7 @@ def test_a_stop_is_exit_code_130_wherever_it_falls(tmp_path):
     assert (done.returncode, done.stderr) == (130, "\njsecon: interrupted.\n")
 
 
-@pytest.mark.parametrize(("variable", "value"), [
-    ("JAX_PLATFORMS", "gpu"), ("JAX_PLATFORMS", "cuda"), ("JAX_PLATFORMS", "cpu,tpu"), ("JAX_PLATFORM_NAME", "rocm"),
-])  # fmt: skip
+@pytest.mark.parametrize(("variable", "value"), [("JAX_PLATFORMS", "cpu,tpu"), ("JAX_PLATFORM_NAME", "rocm")])
 def test_a_platform_that_jax_lacks_is_named_by_every_verb(tmp_path, variable, value):
     """And no file is called damaged; twice in one process, as a server that opens two fields."""
     save_field(tmp_path / "field.safetensors", tiny_field())

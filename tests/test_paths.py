@@ -19,6 +19,13 @@ HOME = Path(__file__).resolve().parent.parent
 PLACE = "Büro für Köln 日本 #1 %20 'é'"
 
 
+def command(base) -> list:
+    """Words of a run on given Gaussians, beneath a folder."""
+    capture = base / "Aufnahme 撮影"
+    given = ["--gaussians", base / "Szene ö.ply", "--masks", capture / "masks", "--holdout", 4]
+    return ["run", capture, "--out", base / "Ausgabe ß 出力", *given]
+
+
 @pytest.fixture(scope="module")
 def ran(room, room_run, tmp_path_factory):
     """(the base folder, the field) of a run in which every path and every frame's name is odd."""
@@ -33,19 +40,25 @@ def ran(room, room_run, tmp_path_factory):
         model = model.replace(f"{old}.png".encode() + b"\0", f"{new}.png".encode() + b"\0")
     (capture / "sparse" / "0" / "images.bin").write_bytes(model)
     save_gaussians(base / "Szene ö.ply", room_run[0].field.gaussians)
-    given = "--gaussians", base / "Szene ö.ply", "--masks", capture / "masks", "--holdout", 4
-    assert run_cli("run", capture, "--out", base / "Ausgabe ß 出力", *given) == 0
+    assert run_cli(*command(base)) == 0
     return base, base / "Ausgabe ß 出力" / "field.safetensors", sorted(names.values())
 
 
-def test_a_run_in_odd_folders_makes_the_field_of_plain_ones(ran, room_run):
+def test_a_run_in_odd_folders_makes_the_field_of_plain_ones_and_leaves_out_the_fit(ran, room_run, capsys):
     base, file, names = ran
     field, plain = load_field(file), room_run[0].field
     assert field.names == tuple(names)
+    np.testing.assert_array_equal(field.gaussians.means, plain.gaussians.means)
     np.testing.assert_array_equal(field.votes.weights, plain.votes.weights)
     assert json.loads(field.provenance)["options"]["capture"] == str(base / "Aufnahme 撮影")
     assert {"field.safetensors", "metrics.json", "report.html"} < {path.name for path in file.parent.iterdir()}
     assert "Bild ä" in (file.parent / "report.html").read_text(encoding="utf-8")
+    metrics = json.loads((file.parent / "metrics.json").read_text())
+    assert metrics["held_out_psnr"] == pytest.approx(room_run[0].held_out.psnr.mean(), abs=0.1)
+    assert run_cli(*command(base), "--dry-run", "--json") == 0
+    stages = {stage["name"]: stage for stage in json.loads(capsys.readouterr().out)["stages"]}
+    assert (stages["photometric fit"]["status"], stages["gaussians"]["status"]) == ("skipped", "cached")
+    assert "Szene ö.ply" in stages["photometric fit"]["why"]
 
 
 def test_what_is_asked_is_answered_there(ran, capsys):

@@ -58,6 +58,7 @@ def test_a_run_ends_in_a_field_that_can_be_read_and_asked(room_run):
     assert (pixels[:, ~run.capture.held_out].sum(1) > 0).all()
     assert set(run.seconds) == {*STAGES, "field"}
     assert run.labels.shape == (6, 120, 160)
+    assert {"segmenter", "association"} <= set(skipped(run))  # its masks are given
 
 
 def test_a_second_run_reads_every_stage_and_writes_the_same_bytes(room_run, tmp_path):
@@ -97,18 +98,6 @@ def test_votes_of_a_scene_larger_than_memory_are_cast_in_blocks_to_the_same_fiel
         own, other = (np.asarray(getattr(votes, name), np.float64) for votes in (blocks, memory))
         assert np.linalg.norm(own - other) <= 1e-4 * np.linalg.norm(other)
     assert (np.asarray(blocks.regions) != np.asarray(memory.regions)).mean() < 1e-3
-
-
-def test_a_run_on_given_gaussians_leaves_out_the_fit_and_says_so(room_run, tmp_path):
-    run, console = room_run[0], Recorder()
-    save_gaussians(tmp_path / "scene.ply", run.field.gaussians)
-    options = dataclasses.replace(run.options, gaussians=tmp_path / "scene.ply")
-    given = pipeline.run(options, tmp_path / "out", console=console)
-    assert {"segmenter", "association"} <= set(skipped(run))
-    assert "scene.ply" in skipped(given)["photometric fit"]
-    assert (console.planned["photometric fit"].status, console.planned["gaussians"].status) == ("skipped", "run")
-    np.testing.assert_array_equal(given.field.gaussians.means, run.field.gaussians.means)
-    np.testing.assert_allclose(given.held_out.psnr, run.held_out.psnr, atol=0.1)
 
 
 def test_what_is_held_out_never_reaches_the_field(room_run, room, tmp_path):

@@ -35,38 +35,7 @@ def test_settings_give_way_to_the_user_and_to_a_home_that_cannot_be_written(tmp_
     assert "JAX_COMPILATION_CACHE_DIR" not in settings({"XDG_CACHE_HOME": str(tmp_path / "file" / "x")}, 1, frozenset())
 
 
-def run(program, home):
-    """A program in a process of its own, whose compiled programs are kept in `home`."""
-    environ = {key: value for key, value in os.environ.items() if key not in ("XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR")}
-    environ |= {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(home)}
-    return subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True, env=environ)
-
-
-def test_a_prepared_process_has_a_device_a_core(tmp_path):
-    program = (
-        "from jsecon.process import prepare_process\n"
-        "prepare_process()\n"
-        "import os, jax\n"
-        "print(jax.local_device_count(), 'JAX_COMPILATION_CACHE_DIR' in os.environ)"
-    )
-    assert run(program, tmp_path).stdout.split() == [str(len(os.sched_getaffinity(0))), "True"]
-
-
-@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="counts memory maps, which Linux tells")
-def test_programs_are_forgotten_where_there_are_too_many_maps(tmp_path):
-    program = (
-        "import jax\n"
-        "from experiments.memory_maps import clear_programs\n"
-        "double = jax.jit(lambda x: 2 * x)\n"
-        "for above in (10**9, 0):\n"
-        "    double(1)\n"
-        "    clear_programs(above=above)\n"
-        "    print(double._cache_size())"
-    )
-    assert run(program, tmp_path).stdout.split() == ["1", "0"]
-
-
-def test_programs_that_nothing_has_read_for_months_are_deleted(tmp_path):
+def test_a_prepared_process_has_a_device_a_core_and_deletes_programs_that_nothing_has_read_for_months(tmp_path):
     """Those of any machine that shares the folder, and no other file."""
     names = ("xla-old/a-cache", "xla-old/b-cache", "xla-old/c.trace", "models/d")
     paths = [tmp_path / "jsecon" / name for name in names]
@@ -74,7 +43,16 @@ def test_programs_that_nothing_has_read_for_months_are_deleted(tmp_path):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("kept")
         os.utime(path, (time.time() - 86400 * days,) * 2)
-    run("from jsecon.process import prepare_process\nprepare_process()", tmp_path)
+    program = (
+        "from jsecon.process import prepare_process\n"
+        "prepare_process()\n"
+        "import os, jax\n"
+        "print(jax.local_device_count(), 'JAX_COMPILATION_CACHE_DIR' in os.environ)"
+    )
+    environ = {key: value for key, value in os.environ.items() if key not in ("XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR")}
+    environ |= {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True, env=environ)
+    assert done.stdout.split() == [str(len(os.sched_getaffinity(0))), "True"]
     assert [path.exists() for path in paths] == [False, True, False, True]
 
 

@@ -97,18 +97,6 @@ def test_labels_that_are_no_regions_are_refused(made):
             call(labels.astype(np.float32), REGIONS)
 
 
-def test_votes_inside_a_trace_are_those_outside_and_other_labels_count_as_none(made):
-    field, labels = made
-    most = REGIONS - 1
-    assert labels.max() == most
-    inside = jax.jit(lambda: jsecon.region_votes(field.gaussians, field.cameras, labels, most, by_view=True))()
-    labels = np.where(labels < most, labels, -1)
-    outside = jsecon.region_votes(field.gaussians, field.cameras, labels, most, by_view=True)
-    for name in ("weights", "labelled", "total", "by_view"):
-        np.testing.assert_allclose(getattr(inside, name), getattr(outside, name), rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(inside.dense(), outside.dense(), rtol=1e-4, atol=1e-4)
-
-
 def test_a_background_of_another_size_is_refused(made):
     field, _ = made
     scene, camera = field.gaussians, field.cameras[0]
