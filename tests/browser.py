@@ -75,12 +75,6 @@ class Page:
         time.sleep(0.12)  # the page tells the server of a text at most every 50 ms
         self.key("Enter", 13, "\r")
 
-    def press(self, label: str) -> None:
-        """Clicks the button of that label."""
-        found = f"[...document.querySelectorAll('button')].find(b => b.textContent.trim() === '{label}')"
-        self.until(f"!!{found}")
-        self.js(f"{found}.click()")
-
     def png(self) -> bytes:
         return base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"])
 

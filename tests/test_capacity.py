@@ -10,7 +10,7 @@ from jsecon.field.evidence import region_votes
 from jsecon.parallel import host_mesh
 from jsecon.process import compilation_counts
 from jsecon.query.render import selection_mask
-from jsecon.splat.capacity import default_capacity, enough_capacity
+from jsecon.splat.capacity import default_capacity
 from jsecon.splat.plan import prepare_views, render_plan
 from jsecon.splat.render import render, render_depth
 from jsecon.types import Gaussians
@@ -98,13 +98,3 @@ def test_it_follows_the_sizes_alone():
     assert sizes == sorted(sizes)
     # A million Gaussians at 1600x1200: 110 bytes for each pair stay far below what their gradients take.
     assert 2_000_000 <= default_capacity(1_000_000, 1600, 1200) <= 3_000_000
-
-
-@pytest.mark.parametrize("strips", [1, 2, 3])
-def test_enough_is_enough(strips):
-    rng = np.random.default_rng(strips)
-    for capacity in (4096, 9000, 100):
-        room = 32 * int(np.ceil(np.ceil(capacity / strips) / 32))  # of a strip, in whole words
-        needs = room + rng.integers(-50, 20_000, strips)
-        overflow = np.maximum(needs - room, 0)
-        assert enough_capacity(capacity, overflow) // strips >= needs.max()

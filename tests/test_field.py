@@ -208,9 +208,3 @@ def test_numbers_that_are_not_finite_are_found_a_piece_at_a_time(path, monkeypat
     rewritten(path, lambda header, arrays: arrays["gaussians.means"].__setitem__((63, 2), np.nan))
     with pytest.raises(InputError, match=r"gaussians\.means with numbers that are not finite"):
         check_field(path)
-
-
-def test_a_folder_that_cannot_be_written(field, tmp_path):
-    (tmp_path / "file").write_text("in the way")
-    with pytest.raises(InputError, match="folder that can be written"):
-        save_field(tmp_path / "file" / "a.field", field)

@@ -158,11 +158,6 @@ def test_label_bits(tmp_path, bits):
         np.testing.assert_array_equal(read_label_image(tmp_path / "palette.png"), ids)
 
 
-def test_label_colours(tmp_path):
-    write_image(tmp_path / "a.png", FRAME)
-    np.testing.assert_array_equal(read_label_image(tmp_path / "a.png"), FRAME.astype(int) @ [65536, 256, 1])
-
-
 @pytest.mark.parametrize("dtype", [bool, np.uint8, np.int32, np.int64, np.float32])
 def test_label_arrays(tmp_path, dtype):
     ids = RNG.integers(0, 2 if dtype is bool else 200, (9, 11)).astype(dtype)

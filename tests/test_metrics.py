@@ -5,9 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from sklearn.metrics import jaccard_score, recall_score
 
-from experiments.protocols.points import point_accuracy, point_class_means
 from jsecon.evaluate.metrics import accuracy_at, iou, localization_accuracy, mean_iou
 
 
@@ -42,14 +40,3 @@ def test_localisation_counts_edges_and_any_box():
     assert localization_accuracy([(0, 0)], [np.zeros((0, 4))]) == 0
     with pytest.raises(ValueError, match="zip"):
         localization_accuracy([(0, 0)], [])
-
-
-def test_point_means_equal_scikit_learn():
-    rng = np.random.default_rng(1)
-    true = rng.integers(-1, 5, 4_000)
-    predicted = np.where(rng.random(4_000) < 0.6, true, rng.integers(-1, 7, 4_000))
-    counted, classes = true >= 0, np.arange(5)
-    miou, macc = point_class_means(predicted, true)
-    assert miou == pytest.approx(jaccard_score(true[counted], predicted[counted], labels=classes, average="macro"))
-    assert macc == pytest.approx(recall_score(true[counted], predicted[counted], labels=classes, average="macro"))
-    assert point_accuracy(predicted, true) == pytest.approx((predicted == true)[counted].mean())

@@ -2,7 +2,6 @@
 
 import zipfile
 
-import numpy as np
 import pytest
 from capture_files import refused, run_cli
 from small_field import colour_field
@@ -99,15 +98,3 @@ def test_every_verb_takes_a_folder_or_a_splat(folder, tmp_path, capsys, monkeypa
     assert (home / "field.safetensors").is_file()
     assert made == ([] if given == "folder" else [path])
     assert jsecon.open_scene(path).name == (folder.name if given == "folder" else "desk")
-
-
-def test_servers_take_folders_and_splats(folder, tmp_path, capsys):
-    pytest.importorskip("fastapi", reason="the extra serve is not installed")
-    from jsecon.app.server import prepare
-
-    told, _ = prepare([folder], host="127.0.0.1", port=0, token="", embedder=None)
-    assert [field["name"] for field in told["fields"]] == [folder.name]
-    np.testing.assert_equal(told["fields"][0]["gaussians"], 64)
-    (tmp_path / "page.html").write_text("<html>")
-    assert run_cli("serve", tmp_path / "page.html", "--port", 0) == 2
-    assert "a page of HTML" in capsys.readouterr().err

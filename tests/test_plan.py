@@ -7,7 +7,6 @@ import pytest
 from reference import project_reference, weights_reference
 
 from jsecon import host_mesh, plan_view, render, render_depth, render_plan
-from jsecon.splat.scan import cumulative
 
 
 def features_of(count: int, channels: int) -> jax.Array:
@@ -72,16 +71,6 @@ def test_several_devices_give_the_gradients_of_one(scene, camera, channels):
     by_one, by_two = gradients(scene, features, None), gradients(scene, features, mesh)
     for a, b in zip(jax.tree.leaves(by_one), jax.tree.leaves(by_two), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
-
-
-def test_running_products_and_sums():
-    values = np.random.default_rng(0).uniform(0.5, 1.5, (3, 16, 5)).astype(np.float32)
-    start = np.float32([[1.0], [2.0], [3.0]]) * np.ones(5, np.float32)
-    for combine, cumulate in ((jnp.multiply, np.cumprod), (jnp.add, np.cumsum)):
-        before, after = cumulative(combine, jnp.asarray(start), jnp.asarray(values))
-        expected = cumulate(np.concatenate([start[:, None], values], axis=1).astype(np.float64), axis=1)
-        np.testing.assert_allclose(before, expected[:, :-1], rtol=1e-5)
-        np.testing.assert_allclose(after, expected[:, -1], rtol=1e-5)
 
 
 def test_depth_in_the_same_pass_is_the_depth_of_its_own(scene, camera):

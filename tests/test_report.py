@@ -89,13 +89,6 @@ def test_in_a_browser_pictures_are_enlarged_and_cards_open(page, tmp_path):
     assert found["requests"] == 0
 
 
-def test_a_regions_colour_does_not_depend_on_how_many_there_are():
-    np.testing.assert_array_equal(pictures.palette(5), pictures.palette(40)[:5])
-    few = pictures.palette(12).astype(float)
-    apart = np.linalg.norm(few[:, None] - few[None], axis=-1) + 1e3 * np.eye(12)
-    assert apart.min() > 30
-
-
 def test_labels_are_drawn_in_their_colours_and_unlabelled_pixels_stay_grey():
     labels = np.full((24, 32), -1)
     labels[4:20, 4:20] = 3

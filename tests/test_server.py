@@ -1,7 +1,5 @@
 """The server: that odd input has an error of its own kind and nothing crashes. test_doors.py has its answers."""
 
-import random
-
 import cv2
 import numpy as np
 import pytest
@@ -17,7 +15,6 @@ from jsecon.app.scene import Scene, open_scenes
 from jsecon.app.server import MAX_BODY, application, prepare
 from jsecon.vision.colours import ColourEmbedder
 
-KINDS = {200, 400, 404, 413, 422}
 HERE, JSON = "http://127.0.0.1:8765", {"content-type": "application/json"}
 
 
@@ -112,19 +109,6 @@ def test_paths_lead_nowhere(client):
         assert error.json()["error"]
 
 
-def test_mutated_requests_never_crash_it(client):
-    """Seeded; a second in the suite, 10,000 by hand (`benchmarks/serve.py`)."""
-    draw = random.Random(0)
-    seeds = [b'{"text": "red mug", "by": "votes", "all": true}', b'{"at": ["frame_1", 3, 4], "threshold": 0.5}']
-    for _ in range(300):
-        body = bytearray(draw.choice(seeds))
-        for _ in range(draw.randint(1, 6)):
-            place = draw.randrange(len(body))
-            body[place : place + draw.randint(0, 3)] = bytes(draw.randrange(256) for _ in range(draw.randint(0, 3)))
-        answer = client.post("/query", content=bytes(body), headers=JSON)
-        assert answer.status_code in KINDS, (bytes(body), answer.text)
-
-
 def test_a_token_is_asked_for_where_one_is_set(scenes):
     guarded = TestClient(application(scenes, token="secret"), "http://any.name")
     for key, status in (("", 401), ("Bearer wrong", 401), ("Bearer secret", 200)):
@@ -139,7 +123,7 @@ def test_fields_are_opened_by_their_folders_names_and_the_address_is_told(scenes
     assert list(open_scenes(files, None)) == ["a", "b"]
     with refused("given twice"):
         open_scenes([files[0], files[0].parent], None)
-    told, _ = prepare(files, host="127.0.0.1", port=0, token="", embedder=None)
+    told, _ = prepare([files[0].parent, files[1]], host="127.0.0.1", port=0, token="", embedder=None)
     assert int(told["address"].removeprefix("http://127.0.0.1:")) > 0
     assert [scene["name"] for scene in told["fields"]] == ["a", "b"]
     with refused("a token that clients must have"):

@@ -9,7 +9,7 @@ from small_field import KnownTexts, make_field, rows_of_a_kind, shares, unit_row
 from table_field import table_field
 
 from jsecon import InputError, QueryRules, Regions, Scene, match_regions
-from jsecon.query.answer import query_anchored, query_several
+from jsecon.query.answer import query_several
 
 
 @pytest.fixture(scope="module")
@@ -35,17 +35,6 @@ def test_the_rule_is_the_stated_one(field):
             expected = ((similarity >= middle + kind * (best - middle)) | alike) & known & (best >= 0.2)
             got = match_regions(made, text[None], QueryRules(all_of_class=True, same_class_score=kind))
             np.testing.assert_array_equal(got.chosen, expected)
-
-
-def test_selection_is_the_share_of_the_chosen_regions(field):
-    text = field.regions.embeddings[:1]
-    got = query_several(field, text)
-    np.testing.assert_allclose(got.similarity, shares(field, [0, 1]), atol=1e-6)
-    np.testing.assert_array_equal(got.mask, shares(field, [0, 1]) >= 0.5)
-    assert int(got.region) == 0
-    assert float(got.score) == float(query_anchored(field, text[0]).score)
-    one = query_several(field, text, rules=QueryRules())
-    np.testing.assert_array_equal(one.mask, query_anchored(field, text[0]).mask)
 
 
 def test_unwanted_regions_are_left_out_unless_the_wanted_text_fits_them_better(field):

@@ -12,8 +12,7 @@ from reference import project_reference
 
 from jsecon import Gaussians, project
 from jsecon.splat.capacity import plan_capacity, round_capacity
-from jsecon.splat.composite import _join_strips, _split_into_strips
-from jsecon.splat.strips import FULL_IMAGE, Strip, tile_rows
+from jsecon.splat.strips import FULL_IMAGE, Strip
 from jsecon.splat.tiles import (
     WORD,
     _compact_tile_lists,
@@ -139,17 +138,6 @@ def test_lists_are_those_of_a_loop(words, density, filled):
     counted = np.concatenate([[0], bits.T.reshape(16, words, WORD).sum(2).reshape(-1).cumsum()[:-1]])
     np.testing.assert_array_equal(np.asarray(before).T.reshape(-1), counted)
     assert int(np.bitwise_count(np.asarray(members)).sum()) == bits.sum()
-
-
-@pytest.mark.parametrize(("height", "count", "tile"), [(1, 1, 4), (40, 3, 8), (235, 4, 8), (300, 2, 4)])
-def test_what_is_split_is_joined_again_and_every_row_of_blocks_is_in_one_strip(height, count, tile):
-    image = np.random.default_rng(height).normal(size=(height, 3, 2)).astype(np.float32)
-    strips = _split_into_strips(image, tile, count)
-    assert strips.shape == (count, tile_rows(height, tile, count) * tile, 3, 2)
-    np.testing.assert_array_equal(_join_strips(strips, tile, height), image)
-    parts = [Strip(k, count) for k in range(count)]
-    rows = [part.block_row(np.arange(*part.first_row(np.array([2, height])))) for part in parts]
-    np.testing.assert_array_equal(np.sort(np.concatenate(rows)), np.arange(2, max(height, 2)))
 
 
 @pytest.mark.parametrize("count", [2, 3])

@@ -68,16 +68,6 @@ def test_apc_scene_is_read_as_documented(apc_folder):
     assert (labels == 4).sum() == 2 * (48 * 64 - 40)
 
 
-def test_apc_scene_without_cameras_or_images_is_refused(apc_folder):
-    with pytest.raises(InputError, match="intrinsic"):
-        apc_bin.parse_cameras("# Color camera intrinsic matrix\n 1 0 0\n")
-    (apc_folder / "frame-000001.depth.png").unlink()
-    with pytest.raises(InputError, match="depth"):
-        apc_bin.load_apc(apc_folder, held_out_every=2, nearest_m=0.2)
-    with pytest.raises(InputError, match=r"cam\.info"):
-        apc_bin.load_apc(apc_folder / "nowhere", held_out_every=2, nearest_m=0.2)
-
-
 def test_palette_is_forty_colours_read_back_exactly():
     assert len(set(replica.PALETTE)) == 40
     ids = np.random.default_rng(0).integers(0, 40, (30, 40))

@@ -14,7 +14,6 @@ from experiments.tables.codes import (
     region_codes,
     spread_codes,
 )
-from jsecon.paper.autoencoder import Autoencoder
 
 KEY = jax.random.key(0)
 
@@ -44,19 +43,6 @@ def test_a_rotation_keeps_every_cosine(regions, latent):
     assert codes.shape == (regions, latent)
     np.testing.assert_allclose(np.asarray(codes) @ np.asarray(codes).T, embeddings @ embeddings.T, atol=2e-6)
     np.testing.assert_allclose(encode(coder, embeddings), codes, atol=1e-6)
-
-
-def test_an_autoencoder_where_regions_do_not_fit_and_what_is_refused():
-    embeddings = unit_rows(np.random.default_rng(0), 12, 40)
-    codes, coder, reason = region_codes(embeddings, latent=3, key=KEY, epochs=50)
-    assert isinstance(coder, Autoencoder)
-    assert reason.startswith("run")
-    np.testing.assert_allclose(encode(coder, embeddings), codes, atol=1e-6)
-    with pytest.raises(ValueError, match="not finite"):
-        region_codes(np.full((3, 40), np.inf, np.float32), latent=3, key=KEY)
-    for latent in (0, "some"):
-        with pytest.raises(ValueError, match="region_codes"):
-            region_codes(np.eye(4, dtype=np.float32), latent=latent, key=KEY)
 
 
 @pytest.mark.parametrize(("count", "latent"), [(40, 3), pytest.param(300, 6, marks=pytest.mark.long)])

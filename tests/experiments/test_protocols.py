@@ -33,6 +33,7 @@ def test_against_a_confusion_matrix(seed, count, classes):
     assert ious == pytest.approx({f"class {k}": iou for k, iou in zip(present, both / union)})
     assert told["miou"] == pytest.approx((both / union).mean())
     assert told["macc"] == pytest.approx(recall.mean())
+    assert told["accuracy"] == pytest.approx((found == truth)[truth >= 0].mean())
     assert (told["miou"], told["macc"]) == pytest.approx(point_class_means(found, truth))
     assert told["missing"] == table[:-1, -1].sum()
 

@@ -8,8 +8,7 @@ from small_field import unit_rows
 
 from experiments.words import rules
 from experiments.words.absent import absent_names
-from experiments.words.conse import Conse, Crop, Labeller, TextVectors, class_weights, conse, cut_out
-from jsecon.errors import InputError
+from experiments.words.conse import Conse, Crop, TextVectors, class_weights, conse, cut_out
 from jsecon.paper.queries import relevancies
 from jsecon.query.scores import region_similarities
 from jsecon.vision.protocols import CANONICAL, Embedder
@@ -102,21 +101,6 @@ def test_it_is_an_embedder_of_regions_and_texts(embedder):
     np.testing.assert_allclose(texts, [[1, 0, 0, 0], [0, 0, 0.5**0.5, 0.5**0.5]], atol=1e-6)
     assert absent_names(embedder.texts, "", ("red",)) == ("green", "blue", "dark ink")
     assert absent_names(embedder.texts, "", ("blue",)) == ("red", "green")  # dark ink is near to blue
-
-
-def test_what_is_missing_is_named(embedder, tmp_path):
-    (tmp_path / "broken.tflite").write_bytes(b"none")
-    np.savez(tmp_path / "short.npz", names=["red"], vectors=np.ones((1, 4)))
-    for attempt, named in (
-        (lambda: embedder.embed_text(["red", "mauve"]), "no vector for 'mauve'"),
-        (lambda: Labeller(tmp_path / "labeller.tflite"), r"labeller\.tflite"),
-        (lambda: Labeller(tmp_path / "broken.tflite"), r"broken\.tflite"),
-        (lambda: TextVectors(tmp_path / "vectors.npz"), r"vectors\.npz"),
-        (lambda: TextVectors(embedder.texts.file, tmp_path / "model"), "model"),
-        (lambda: Conse(embedder.labeller, TextVectors(tmp_path / "short.npz")), "no vector for 'green'"),
-    ):
-        with pytest.raises(InputError, match=named):
-            attempt()
 
 
 def test_rules_on_a_table():

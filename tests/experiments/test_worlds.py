@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from experiments.test_simulated import NONE, frames, space  # noqa: F401
 
-from experiments import worlds
 from experiments.datasets.plain_room import make_room
 from experiments.datasets.twins import by_kind, camouflaged
 from experiments.rooms.room import TABLE_WOOD, srgb_to_linear
@@ -192,15 +191,3 @@ def test_things_of_a_kind_are_one_answer_and_camouflage_takes_their_colours():
     for item in camouflaged(room, 1.0).objects:
         for part in item.parts:
             np.testing.assert_allclose(part.albedo, srgb_to_linear(TABLE_WOOD), rtol=1e-6)
-
-
-def test_methods_are_read_as_suits_them_on_the_choosing_seeds():
-    found = worlds.worlds(worlds.FAULTS, (1.0, 0.5))
-    assert {fault for fault, _ in found} == {"none", "together", *worlds.FAULTS}
-    assert all(world_of(level)[0] == "medium" for level, _ in found.values())
-    own, cells = {"VALA: as published": 0.5, "VALA: centred, threshold": 0.4, "ours, consensus: x": 0.6}, []
-    for seed, value in ((0, 0.1), (10, 0.3)):
-        cell = {"seed": seed, "scene": "ramen"}
-        cells += [cell | {"method": m, "miou": at + value, "miou_vala": at - value} for m, at in own.items()]
-    told = worlds.of_world(cells, (0,), (10,))
-    assert told["VALA"] == {"miou": pytest.approx(0.8), "miou_vala": pytest.approx(0.2)}
