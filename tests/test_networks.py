@@ -81,6 +81,18 @@ def fresh_of(console):
     return {name for name, fresh in console.fresh.items() if fresh} - {"field"}
 
 
+def test_regions_are_embedded_in_few_views_and_their_pixels_count_in_all(seen, tmp_path):
+    run, folder, console = seen
+    assert "in at most 5 views each" in console.planned["regions"].why
+    shutil.copytree(folder / "cache", tmp_path / "out" / "cache")
+    single, console = again(run, tmp_path / "out", crops=1)
+    assert fresh_of(console) == {"regions"}
+    pixels = np.asarray(run.field.regions.pixel_counts)
+    np.testing.assert_array_equal(single.field.regions.pixel_counts, pixels)
+    assert f"{len(pixels)} of {np.count_nonzero(pixels)} crops embedded" in " ".join(single.notes)
+    assert not np.array_equal(single.field.regions.embeddings, run.field.regions.embeddings)
+
+
 def test_the_same_models_elsewhere_are_cached_and_others_are_not(seen, models, tmp_path):
     run, folder, _ = seen
     shutil.copytree(folder, tmp_path / "out")

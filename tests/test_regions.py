@@ -79,6 +79,24 @@ def test_invariant_to_the_order_of_frames_and_to_the_type_of_labels_and_equivari
     np.testing.assert_allclose(renamed.embeddings[name], plain.embeddings, atol=1e-6)
 
 
+def test_views_that_are_not_chosen_are_not_embedded_and_their_pixels_still_count():
+    frames, labels = sequence(5)
+    views = np.random.default_rng(5).random((7, 4)) < 0.5
+    views[3] = False
+    crops = []
+    found = region_embeddings(
+        frames, labels, lambda f, m: crops.append(len(m)) or embed(f, m), num_regions=7, views=views
+    )
+    left = np.where(views[np.maximum(labels, 0), np.arange(4)[:, None, None]], labels, -1)
+    np.testing.assert_allclose(found.embeddings, slow(frames, left, 7), atol=1e-6)
+    np.testing.assert_array_equal(
+        found.pixel_counts, region_embeddings(frames, labels, embed, num_regions=7).pixel_counts
+    )
+    assert sum(crops) == (views & (found.pixel_counts > 0)).sum()
+    with pytest.raises(ValueError, match="views"):
+        region_embeddings(frames, labels, embed, views=views)
+
+
 def test_what_is_never_seen_is_zero_and_counts_nowhere():
     frames, labels = sequence(1)
     labels[labels == 2] = -1

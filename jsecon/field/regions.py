@@ -31,21 +31,24 @@ def region_embeddings(
     embed: Callable[[np.ndarray, np.ndarray], np.ndarray],
     *,
     num_regions: int | None = None,
+    views: Bool[np.ndarray, "r t"] | None = None,
     progress: Progress | None = None,
 ) -> Regions:
     """Embeds the regions of a labelled sequence: the mean over the views, scaled to unit length. Host code.
 
-        phi_r = sum_t omega_t phi_rt,  omega_t = pixels of r in t / pixels of r in all views
+        phi_r = sum_t omega_t phi_rt,  omega_t = pixels of r in t / pixels of r in all views that are embedded
 
     Args:
       frames: (T, H, W, 3) uint8.
       labels: (T, H, W) integer region ids, -1 where a pixel belongs to no region.
       embed: `Embedder.embed_regions`: (H, W, 3) and masks (M, H, W) -> (M, E) unit embeddings.
       num_regions: R; None takes the largest label + 1.
+      views: (R, T) views of each region that are embedded (`field.crops.choose_crops`); None embeds all.
       progress: Called as progress(done, total), in frames.
 
     Returns:
-      Regions. A view whose embedding is zero does not count; a region without any view has a zero embedding.
+      Regions, with the pixels in all views. A view whose embedding is zero does not count; a region without any view
+      has a zero embedding.
 
     Raises:
       ValueError: Shapes disagree, or a label is out of range.
@@ -55,7 +58,7 @@ def region_embeddings(
     def of_frame(t, masks):
         return embed(frames[t], masks)
 
-    return _pool_embeddings(labels, of_frame, num_regions=num_regions, progress=progress)
+    return _pool_embeddings(labels, of_frame, num_regions=num_regions, views=views, progress=progress)
 
 
 def embeddings_of_masks(
@@ -94,6 +97,7 @@ def _pool_embeddings(
     embed: Embed,
     *,
     num_regions: int | None = None,
+    views: Bool[np.ndarray, "r t"] | None = None,
     progress: Progress | None = None,
 ) -> Regions:
     """`region_embeddings` for an `embed` that takes the index of a frame. Several processes share the frames."""
@@ -102,16 +106,20 @@ def _pool_embeddings(
     require_labels(labels, count)
     areas = [np.bincount(image[image >= 0].reshape(-1), minlength=count)[:count] for image in labels]
     pixels = np.stack(areas, axis=1).astype(np.int32) if len(areas) else np.zeros((count, 0), np.int32)
+    embedded = pixels > 0
+    if views is not None:
+        require_shape("views", views, pixels.shape, "Give a row per region and a column per frame.")
+        embedded &= views
 
     def embed_frames(frames: Sequence[int]) -> Iterator[np.ndarray | None]:
         for t in frames:
-            seen = np.flatnonzero(pixels[:, t])
+            seen = np.flatnonzero(embedded[:, t])
             yield np.asarray(embed(t, labels[t][None] == seen[:, None, None]), np.float64) if len(seen) else None
 
     total: np.ndarray | None = None
     for t, rows in enumerate(map_over_processes(len(labels), embed_frames, progress)):
         if rows is not None:
-            seen = np.flatnonzero(pixels[:, t])
+            seen = np.flatnonzero(embedded[:, t])
             require_shape("embed", rows, (len(seen), "E"), "An embedder returns one row per mask.")
             total = np.zeros((count, rows.shape[1])) if total is None else total
             total[seen] += pixels[seen, t, None] * rows

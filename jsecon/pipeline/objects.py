@@ -14,6 +14,7 @@ from jsecon.association.consensus import clean_tracks, pieces_on_masks, track_ma
 from jsecon.association.run_lengths import cache_masks_as_rle
 from jsecon.association.scene import SceneSuperpixels
 from jsecon.errors import InputError
+from jsecon.field.crops import choose_crops, crop_geometry
 from jsecon.field.regions import Embed, embeddings_of_masks, region_embeddings, scene_parts
 from jsecon.fit.depth import points_from_depth
 from jsecon.networks.hub import model_name
@@ -72,7 +73,8 @@ def _plan_regions(context: RunContext) -> Stage:
     """Plans an embedding of each region: by the embedder, or from files."""
     options, embedder, after = context.options, context.models.embedder.name, ("load", "objects")
     if options.features is None:
-        how, key_options = f"embedded by {embedder!r}, views weighted by pixels", {"embedder": embedder}
+        how = f"embedded by {embedder!r} in at most {options.crops} views each, weighted by pixels"
+        key_options = {"embedder": embedder} | context.key_options("crops")
         return Stage("regions", how, _embed_objects, after=after, key_options=key_options, distributed=True)
     how = f"embeddings read from {options.features.name}, level {options.level}, views weighted by pixels"
     key_options, read, files = context.key_options("level"), _read_embeddings, (options.features,)
@@ -211,12 +213,18 @@ def _require_regions(labels: np.ndarray, where: str) -> None:
 
 
 def _embed_objects(stage: StageInput) -> StageResult:
-    """Embeds each region by the embedder of the run."""
-    context = stage.context
-    frames, embed = _TrainingView(stage.results.load, context.options).frames, context.models.embedder.embed_regions
-    embedded = region_embeddings(frames, stage.results.objects, embed, progress=stage.progress)
+    """Embeds each region by the embedder of the run, in few views."""
+    context, labels = stage.context, stage.results.objects
+    view, embed = _TrainingView(stage.results.load, context.options), context.models.embedder.embed_regions
+    pixels, cut, directions = crop_geometry(labels, view.cameras, int(labels.max()) + 1)
+    chosen = choose_crops(pixels, cut, directions, context.options.crops)
+    embedded = region_embeddings(view.frames, labels, embed, views=chosen, progress=stage.progress)
     context.models.close()
-    return StageResult(embedded)
+    kept, total = np.count_nonzero(chosen), np.count_nonzero(pixels)
+    if kept == total:
+        return StageResult(embedded)
+    why = f"{context.options.crops} views of a region tell as much as all (--crops)"
+    return StageResult(embedded, notes=(f"{kept} of {total} crops embedded: {why}",))
 
 
 def _read_embeddings(stage: StageInput) -> StageResult:

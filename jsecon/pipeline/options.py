@@ -180,6 +180,8 @@ class ModelOptions:
         edgetam), hub:owner/name, or a folder.
       embedder: CLIP model for regions and texts, instead of colours: a name (clip, siglip2, mobileclip),
         hub:owner/name, or a folder.
+      crops: Maximum number of views in which a region is embedded: those that show most of it, not cut off by the
+        frame's border, from different directions.
       vision_frames: Maximum number of training frames, evenly spaced, in which masks are found and embedded. The fit
         uses all of them. By default vision does too.
       features: Folder language_features of LangSplat. Regions take their embeddings from <frame>_s.npy and _f.npy, and
@@ -191,6 +193,7 @@ class ModelOptions:
     level: Option[Literal["default", "s", "m", "l"]] = "l"
     tracker: ModelOption = None
     embedder: ModelOption = None
+    crops: Count[Option[int]] = 5
     vision_frames: Annotated[Option[int | None], Range(2, 1_000_000)] = None
     features: Option[Path | None] = None
 

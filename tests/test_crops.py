@@ -1,0 +1,82 @@
+"""Views of regions that are embedded: the choice against loops, and what it is chosen by against single pixels."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from jsecon.field.crops import choose_crops, crop_geometry
+from jsecon.types import Camera
+
+
+def chosen_by_loops(pixels, cut, directions, most):
+    chosen = []
+    while len(chosen) < most:
+        best, largest = None, 0.0
+        for view in range(len(pixels)):
+            cosines = [max(sum(a * b for a, b in zip(directions[view], directions[c])), 0.0) for c in chosen]
+            gain = pixels[view] * (1 - cut[view] / 2) * (1 - max((c**8 for c in cosines), default=0.0) / 2)
+            if view not in chosen and gain > largest:
+                best, largest = view, gain
+        if best is None:
+            break
+        chosen.append(best)
+    return chosen
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 7))
+def test_the_choice_equals_loops_and_grows_by_one_view_at_a_time(seed, most):
+    rng = np.random.default_rng(seed)
+    pixels = rng.integers(0, 900, (4, 6)) * (rng.random((4, 6)) < 0.7)
+    cut, directions = rng.random((4, 6)), rng.normal((0, 0, 2), size=(4, 6, 3))
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    found = choose_crops(pixels, cut, directions, most)
+    for row, *region in zip(found, pixels, cut, directions):
+        assert set(np.flatnonzero(row)) == set(chosen_by_loops(*region, most))
+    assert (found <= choose_crops(pixels, cut, directions, most + 1)).all()
+    np.testing.assert_array_equal(choose_crops(pixels, cut, directions, 6), pixels > 0)
+
+
+def test_whole_views_and_other_directions_come_first():
+    ahead, aside = [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]
+
+    def first_two(pixels, cut, directions):
+        return np.flatnonzero(
+            choose_crops(np.array([pixels]), np.array([cut], float), np.array([directions]), 2)[0]
+        ).tolist()
+
+    assert first_two([900, 800, 500], [0, 0, 0], [ahead, ahead, aside]) == [0, 2]
+    assert first_two([900, 800, 300], [0, 0, 0], [ahead, ahead, aside]) == [0, 1]
+    assert first_two([900, 800, 500], [0, 1, 0], [ahead, aside, aside]) == [0, 2]
+
+
+def test_geometry_of_regions_by_their_pixels():
+    rng = np.random.default_rng(0)
+    labels = rng.integers(-1, 4, (2, 6, 9)).astype(np.int16)
+    labels[labels == 2] = -1
+    labels[1][labels[1] == 3] = -1
+    angle = 0.3
+    pose = np.eye(4)
+    pose[:3, :3] = [[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]]
+    focal = np.array([7.0, 8.0])
+    cameras = Camera(np.stack([np.eye(4), pose]), focal, focal + 1, focal - 3, focal - 4, width=9, height=6)
+    pixels, cut, directions = crop_geometry(labels, cameras, 4)
+    for t, image in enumerate(labels):
+        for r in range(4):
+            places = [(i, j) for i in range(6) for j in range(9) if image[i, j] == r]
+            assert pixels[r, t] == len(places)
+            if not places:
+                assert cut[r, t] == 0
+                assert not directions[r, t].any()
+                continue
+            border = sum(i in (0, 5) or j in (0, 8) for i, j in places)
+            assert cut[r, t] == pytest.approx(min(border / math.sqrt(len(places)), 1))
+            v, u = np.mean(places, axis=0) + 0.5
+            towards = cameras.world_to_camera[t][:3, :3] @ directions[r, t]
+            expected = [(u - cameras.cx[t]) / cameras.fx[t], (v - cameras.cy[t]) / cameras.fy[t], 1.0]
+            np.testing.assert_allclose(towards / towards[2], expected, atol=1e-6)
+            assert np.linalg.norm(directions[r, t]) == pytest.approx(1)
+    with pytest.raises(ValueError, match="labels"):
+        crop_geometry(labels[:1], cameras, 4)
