@@ -16,7 +16,7 @@ def chosen_by_loops(pixels, cut, directions, most):
         best, largest = None, 0.0
         for view in range(len(pixels)):
             cosines = [max(sum(a * b for a, b in zip(directions[view], directions[c])), 0.0) for c in chosen]
-            gain = pixels[view] * (1 - cut[view] / 2) * (1 - max((c**8 for c in cosines), default=0.0) / 2)
+            gain = math.sqrt(pixels[view]) * (1 - cut[view] / 2) * (1 - max((c**8 for c in cosines), default=0.0) / 2)
             if view not in chosen and gain > largest:
                 best, largest = view, gain
         if best is None:
@@ -47,9 +47,9 @@ def test_whole_views_and_other_directions_come_first():
             choose_crops(np.array([pixels]), np.array([cut], float), np.array([directions]), 2)[0]
         ).tolist()
 
-    assert first_two([900, 800, 500], [0, 0, 0], [ahead, ahead, aside]) == [0, 2]
-    assert first_two([900, 800, 300], [0, 0, 0], [ahead, ahead, aside]) == [0, 1]
-    assert first_two([900, 800, 500], [0, 1, 0], [ahead, aside, aside]) == [0, 2]
+    assert first_two([900, 800, 250], [0, 0, 0], [ahead, ahead, aside]) == [0, 2]
+    assert first_two([900, 800, 150], [0, 0, 0], [ahead, ahead, aside]) == [0, 1]
+    assert first_two([900, 800, 250], [0, 1, 0], [ahead, aside, aside]) == [0, 2]
 
 
 def test_geometry_of_regions_by_their_pixels():
