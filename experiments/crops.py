@@ -40,7 +40,7 @@ class Options:
     limits: tuple[int, ...] = (3, 5, 8, ALL)
     seeds: tuple[int, ...] = (70,)
     """Of the twins."""
-    twins: tuple[str, ...] = ("figurines", "waldo_kitchen")
+    twins: tuple[str, ...] = ("figurines",)
     """Scenes of Table 1."""
     out: str = ""
 
