@@ -1,7 +1,7 @@
 """Which views of each region are embedded: a few that show most of it, uncut, from different directions. Pure.
 
-Embeddings of one object err alike in all views, so a few views are as good as all, and a network needs seconds for
-each.
+Embeddings of one object err alike in all views, so a few views do nearly as well as all. A network needs
+seconds for each.
 """
 
 import numpy as np

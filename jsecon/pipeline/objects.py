@@ -223,7 +223,7 @@ def _embed_objects(stage: StageInput) -> StageResult:
     kept, total = np.count_nonzero(chosen), np.count_nonzero(pixels)
     if kept == total:
         return StageResult(embedded)
-    why = f"{context.options.crops} views of a region tell as much as all (--crops)"
+    why = f"more than {context.options.crops} views of a region err alike (--crops)"
     return StageResult(embedded, notes=(f"{kept} of {total} crops embedded: {why}",))
 
 

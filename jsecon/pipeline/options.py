@@ -204,7 +204,7 @@ class FieldOptions:
 
     Attributes:
       parts: Embeds each frame's own masks too, so that query finds things that no region holds, and query --all leaves
-        out what most views took for one with its neighbour. Takes twice as many embeddings.
+        out what most views took for one with its neighbour. Embeds all masks of all frames, whatever --crops says.
       paper: Also computes the paper's codes, three numbers per Gaussian, which query --by code compares.
       centre_pixel_weight: Weight of the pixel at a Gaussian's centre against all pixels that it covers, 0 to 1. Use 1
         if the answer is evaluated on points.
