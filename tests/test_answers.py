@@ -13,7 +13,9 @@ from test_gltf import read_glb
 
 from jsecon import Answer, Query, Scene, load_gaussians, objects, save_field
 from jsecon.app.querying import write_answers
+from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Console
+from jsecon.pipeline.sources import provenance
 from jsecon.vision.colours import ColourEmbedder
 
 
@@ -85,6 +87,17 @@ def test_answers_without_a_region_or_gaussians_and_a_text_that_is_not_utf8(saved
     for by in ("votes", "code"):
         with refused("not UTF-8"):
             Scene(field, ColourEmbedder()).ask(odd, by=by)
+
+
+@pytest.mark.parametrize("warning", ["9 of 12 views show hardly any detail.", "The Gaussians look like no frame."])
+def test_an_answer_of_nothing_repeats_what_the_run_warned_of(saved, tmp_path, warning):
+    told = provenance(Options(tmp_path), {}, "", tmp_path, [f"{warning} Give others."])
+    scene = Scene(dataclasses.replace(saved[0], provenance=told), ColourEmbedder())
+    absent, present = scene.ask("red but not red"), scene.ask("red", min_rank=0)
+    assert f"no region matches it; the run warned: {warning[:-1]}, no Gaussian is selected" in str(absent)
+    assert absent.as_dict()["reason"].endswith(warning[:-1])
+    assert "warned" not in str(present)
+    assert present.as_dict()["reason"] == ""
 
 
 @pytest.mark.parametrize(("first", "second"), [

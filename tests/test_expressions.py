@@ -131,6 +131,8 @@ def test_every_spelling_is_understood_and_quotes_protect():
     ("the jar closer to the lamp than to the door", "'than'"), ("the longer jar", "'longer'"),
     ("the left jar or the lamp", '"or"'), ("the jar but not the jar on the shelf", '"but not"'),
     ("red mug or bowl on the plate", '"or"'), ("caf\udce9 on the plate", "not UTF-8"),
+    ("what colour is the jar?", "'what colour is' asks for a property"), ("why is the jar on the shelf", "'why is'"),
+    ("How far is the jar from the lamp", "'how far is'"), ("which size are the jars", "'which size are'"),
 ])  # fmt: skip
 def test_what_is_not_understood_is_named(text, problem):
     assert is_expression(text) or not text.strip() or text.startswith("word")
@@ -141,7 +143,8 @@ def test_what_is_not_understood_is_named(text, problem):
 @pytest.mark.parametrize("text", [
     "the front door", "the second hand clock", "my first aid kit", "the back pack", "the top hat", "left hand glove",
     "upper case letter", "night stand", "door closer", "top shelf", "2 m tape measure", "the last supper painting",
-    "'the left jar'", '"the jar opposite the lamp"', "wishing well", "lighter",
+    "'the left jar'", '"the jar opposite the lamp"', "wishing well", "lighter", "what is love poster", "who's who book",
+    "'what colour is your parachute'",
 ])  # fmt: skip
 def test_names_and_quotes_with_words_of_place_stay_names(text):
     assert not is_expression(text)
@@ -149,7 +152,7 @@ def test_names_and_quotes_with_words_of_place_stay_names(text):
 
 
 def test_a_question_without_words_of_place_asks_for_its_object():
-    assert parse_query("where is the jar?") == (["the jar"], [])
+    assert parse_query("where is the jar?") == parse_query("what is the jar") == (["the jar"], [])
     assert parse_query("find the lamp or the jar but not the lid") == (["the lamp", "the jar"], ["the lid"])
 
 

@@ -48,6 +48,14 @@ def test_the_cameras_tell_up_however_they_are_rolled(name):
         assert ("level" in up.evidence) == (name == "level")
 
 
+@pytest.mark.parametrize("around", [360.0, 150.0])
+def test_cameras_that_may_stand_on_their_heads_are_not_sure(around):
+    """They look as level ones that look up; without the scene nothing tells the two apart."""
+    blank = gaussians_at(np.random.default_rng(0).normal(size=(400, 3)).astype(np.float32), 0.02)
+    assert not find_up_axis(blank, cameras_around(lambda k: 180, around=around)).sure
+    assert find_up_axis(blank, cameras_around(lambda k: 0, around=around)).sure
+
+
 @pytest.mark.parametrize("roll", [-90, 180, 65])
 def test_the_scene_tells_up_where_all_cameras_are_rolled_and_look_one_way(roll):
     """A table with things on it: what they rest on is below."""

@@ -34,6 +34,7 @@ from jsecon.networks.hub import parse_model
 from jsecon.paper.queries import CODE_THRESHOLD
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Console
+from jsecon.pipeline.sources import locate_sources, run_warnings
 from jsecon.process import MEMORY, memory_budget
 from jsecon.query.answer import answer_question, trim
 from jsecon.query.expressions import is_expression, parse_query
@@ -138,8 +139,6 @@ def _field_of_gaussians(options: Options, folder: Path, console: Console) -> Pat
 
 def _model_of(file: Path) -> str | Path | None:
     """The folder or address of the model that a field was made with; None if it had none."""
-    from jsecon.pipeline.sources import locate_sources
-
     try:
         sources = locate_sources(load_field(file, mapped=True))
     except InputError:  # damaged: it is made anew
@@ -303,7 +302,9 @@ class Scene:
         texts, without = jax.device_put((embedded[: len(included)], embedded[len(included) :]))
         found = answer_question(field, texts, rules, excluded=without, outliers=query.outliers)
         by_parts = "no region holds the object, so the parts that match the text were selected"
-        return self._finish(query, found[:3], {"regions": by_parts} if found.by_parts else {})
+        warnings = [] if found[1].mask.any() else run_warnings(field)
+        reason = " ".join(["no region matches it; the run warned:", *warnings]).rstrip(".") if warnings else ""
+        return self._finish(query, found[:3], {"regions": by_parts} if found.by_parts else {}, reason)
 
     def _answer_region(self, query: Query, region: int, why: str) -> Answer:
         """Selects the Gaussians of a region, and of those that the query's options add to it."""

@@ -25,6 +25,7 @@ from jsecon.pipeline.options import Options, check_ranges, is_bare_scene, requir
 from jsecon.pipeline.progress import Console, Step
 from jsecon.pipeline.results import (
     KEY_FILE,
+    WARNING,
     Checkpoint,
     Results,
     RunContext,
@@ -266,7 +267,8 @@ def run(
     results, seconds, embedder = state.results, state.seconds, context.models.embedder
     started = time.monotonic()
     with console.progress("field"):
-        origin = provenance(context.options, state.keys, embedder.name, out)
+        warnings = [note.removeprefix(WARNING) for note in state.notes if note.startswith(WARNING)]
+        origin = provenance(context.options, state.keys, embedder.name, out, warnings)
         field = lifting.join_field(results, embedder, origin, context.options)
         save_field(out / FIELD_FILE, field)
     seconds["field"] = time.monotonic() - started

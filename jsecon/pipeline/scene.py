@@ -17,7 +17,7 @@ from jsecon.files import write_text
 from jsecon.fit.quality import QUICK_LONG_SIDE, is_weak, measure_quality
 from jsecon.fit.start import starting_gaussians
 from jsecon.pipeline.options import Options, is_bare_scene
-from jsecon.pipeline.results import KEY_FILE, RunContext, Stage, StageInput, StageResult, training_frames
+from jsecon.pipeline.results import KEY_FILE, WARNING, RunContext, Stage, StageInput, StageResult, training_frames
 from jsecon.pipeline.scene_files import check_overlap, fit_background, place_in_capture, read_scene
 from jsecon.poses.sfm import find_poses
 from jsecon.read.captures.capture import (
@@ -246,7 +246,7 @@ def _render_views(stage: StageInput) -> StageResult:
         )
         frame = planned.frame
         up = UpAxis(tuple(frame.axes[2].tolist()), f"the scene, {frame.evidence}", frame.sure)
-        cameras, notes = planned.cameras, (f"{planned}.",)
+        cameras, notes = planned.cameras, (f"{planned}.", *(WARNING + note for note in planned.lack_of_detail()))
         names = tuple(f"view_{index:03d}" for index in range(len(cameras)))
     else:
         cameras, names = _load_poses(options.cameras, options.long_side, source_from_scene)

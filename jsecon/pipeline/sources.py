@@ -6,6 +6,8 @@ is used only if the name that follows from its content is the one that the run u
 
 import json
 import os
+import re
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import NamedTuple
 
@@ -30,14 +32,24 @@ class Sources(NamedTuple):
     """where the model is on the hub ("hub:owner/name@commit"), if the run took it from there"""
 
 
-def provenance(options: Options, keys: dict[str, str], embedder: str, out: Path) -> str:
-    """Writes where the field of a run comes from."""
+def provenance(options: Options, keys: dict[str, str], embedder: str, out: Path, warnings: Sequence[str] = ()) -> str:
+    """Writes where the field of a run comes from, and what the run warned of."""
     values = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
     folders = {name: getattr(options, name) for name in ("segmenter", "tracker", "embedder")}
     addresses = {name: cached_address(folder) for name, folder in folders.items() if folder is not None}
     models = {name: address for name, address in addresses.items() if address is not None}
     origin = {"jsecon": jsecon.__version__, "options": values | models, "keys": keys, "embedder": embedder}
-    return json.dumps(origin | {"folders": _relative_folders(options, out), "models": models}, sort_keys=True)
+    origin |= {"folders": _relative_folders(options, out), "models": models, "warnings": list(warnings)}
+    return json.dumps(origin, sort_keys=True)
+
+
+def run_warnings(field: LanguageField) -> list[str]:
+    """What the run that made a field warned of: the first sentence of each warning."""
+    try:
+        warnings = parse_json(field.provenance or "{}").get("warnings", [])
+        return [re.split(r"(?<=\.) ", warning)[0] for warning in warnings]
+    except (ValueError, TypeError, AttributeError):  # not written by jsecon
+        return []
 
 
 def _relative_folders(options: Options, out: Path) -> dict[str, str]:

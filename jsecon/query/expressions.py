@@ -190,6 +190,8 @@ _LENGTH_AT_END = re.compile(rf"(?<!\S){_LENGTH}$")
 _FIXED_NAMES = {tuple(words.split()): "" for words in re.split(r"[|\n]", _LEXICON["names"]["fixed"])}
 _FITTED = frozenset(_LEXICON["names"]["fitted"].split())
 _QUANTIFIERS = {*_WORDS["determiners"], *_WORDS["every"], *_ORDINALS, *_NUMBERS}
+_DESCRIBING = {*_QUANTIFIERS, *_WORDS["adjectives"], *_WORDS["anything"]}
+_ABOUT_PROPERTY = re.compile(_LEXICON["about_property"])
 _INDEFINITE = ("a", "an", "any", "some", "of")
 _PREPOSITIONS = {words[0] for words in _RELATION_OF if len(words) == 1} - {"nearest", "closest"}
 
@@ -202,8 +204,8 @@ def is_expression(text: str) -> bool:
 def _needs_grammar(text: str) -> bool:
     """Whether a text without "or" and "but not" needs the grammar."""
     counted, tokens = _question(_tokens(text))
-    if counted or not tokens:
-        return counted
+    if counted or not tokens or _asks_for_property(text):
+        return bool(tokens)
     parts, relations, _, problem = _split(tokens)
     phrase, quantified, unknown = _noun_phrase(parts[0])
     return bool(relations or problem or quantified or phrase.order or unknown) or tokens[0].key in _WORDS["everything"]
@@ -220,6 +222,9 @@ def parse_expression(text: str) -> Expression:
     where = f"expression {text!r}"
     if not tokens:
         raise InputError("expression", "the text is empty", remedy=_REMEDY)
+    if asked := _asks_for_property(text):
+        remedy = "Ask for the thing alone, or put words that are its name in quotes; the catalogue has names and sizes."
+        raise InputError(where, f"{asked!r} asks for a property of a thing, and a text selects things", remedy=remedy)
     if len(tokens) > MAX_WORDS:
         problem = f"the text has {len(tokens)} words, and an expression at most {MAX_WORDS}"
         raise InputError("expression", problem, remedy="Ask for one object and its relations to others.")
@@ -314,13 +319,21 @@ def _question(tokens: list[_Token]) -> tuple[bool, list[_Token]]:
             asked = "people" if asked == "who" else "things"
             return True, [_Token(asked, asked), *rest]
         if words in ("what", "who") and rest[0].key not in _WORDS["anything"]:
-            continue  # what colour is the mug
+            continue
         if words in ("is", "are") and rest[0].key not in _WORDS["determiners"]:
             continue
+        if words in ("what is", "what are", "what's", "who is", "who are", "who's") and rest[0].key not in _DESCRIBING:
+            continue  # a "what is love" poster
         if words in ("count", "show", "list", "locate") and rest[0].key not in _QUANTIFIERS and not _is_plural(rest):
             continue  # a count down timer, a show case
         return asked in ("how", "count", "is", "are") or words in ("what", "who", "list"), rest
     return False, tokens
+
+
+def _asks_for_property(text: str) -> str:
+    """Returns the words of a question for more than which things there are, such as "what colour is", or ""."""
+    asked = _ABOUT_PROPERTY.match(" ".join(token.key for token in _tokens(text)))
+    return asked[0] if asked else ""
 
 
 def _number(key: str) -> int | None:

@@ -32,6 +32,8 @@ _FAR = 3.0
 _FAR_SHARE, _FAR_MASS = 0.01, 0.05
 """surroundings are at least this share of the Gaussians, and at most this share of number times density"""
 _QUARTERS = np.radians([0.0, 90.0, 180.0, 270.0])
+_UPWARDS = 0.05
+"""mean sine of the cameras' pitch above which they may stand on their heads instead of looking up"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,7 +171,8 @@ def up_of_cameras(cameras: Camera) -> UpAxis:
     down, and look down more than up. Each direction is judged by that. The best one is then made exact: it is across
     the x axes of the cameras without their roll, or the mean of their upper edges if they all look one way.
 
-    It is sure if the cameras are level or turned by quarters, many of them level, and no other direction fits as well.
+    It is sure if the cameras are level or turned by quarters, many of them level, and no other direction fits as well;
+    and if they do not look up in the mean, as those that are turned by 180 degrees would.
     """
     pose = np.asarray(cameras.world_to_camera, np.float64)
     pose = pose[np.linspace(0, len(pose) - 1, min(len(pose), 64)).astype(int), :3, :3]
@@ -201,6 +204,7 @@ def up_of_cameras(cameras: Camera) -> UpAxis:
     up = up if ends[0] >= ends[1] else -up
     from_quarters = np.cos(_rolls(up[None], right, down)[0][:, None] - _QUARTERS) >= np.cos(np.radians(20))  # (T, 4)
     is_clear = from_quarters.any(1).mean() >= 0.85 and scores[best] - scores[others].max() >= 0.8
+    is_clear &= (ahead @ up).mean() <= _UPWARDS
     level = from_quarters[:, 0].mean()
     evidence = "the cameras, which are level" if level >= 0.85 else "the cameras, with their roll taken out"
     return UpAxis(tuple(up.tolist()), evidence, bool(is_clear and level >= 0.4))

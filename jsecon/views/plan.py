@@ -48,16 +48,20 @@ class _PlannedViews:
     """Number of views that are fog (`FOG_SHARE`)."""
 
     def __str__(self) -> str:
-        """Describes the plan on one line: number of views, kind of scene, coverage, up axis, and a lack of detail."""
+        """Describes the plan on one line: number of views, kind of scene, coverage and up axis."""
         up = ", ".join(f"{number:.2f}" for number in self.frame.axes[2])
         trust = "" if self.frame.sure else "; not sure, --up X Y Z sets it"
-        if 2 * self.foggy > len(self.cameras):
-            trust += f"; {self.foggy} views show hardly any detail, so that texts may match nothing in them: "
-            trust += "wide Gaussians fill them, --cameras FILE gives views of your own"
         return (
             f"{len(self.cameras)} virtual views of {'a room' if self.kind == 'room' else 'an object'}, "
             f"{self.coverage:.0%} of it seen; up is ({up}), from {self.frame.evidence}{trust}"
         )
+
+    def lack_of_detail(self) -> tuple[str, ...]:
+        """Says that most views show hardly any detail, if they do."""
+        if 2 * self.foggy <= len(self.cameras):
+            return ()
+        problem = f"{self.foggy} of {len(self.cameras)} views show hardly any detail, so that texts may match nothing."
+        return (f"{problem} Wide Gaussians fill them; --cameras FILE gives views of your own.",)
 
 
 def place_cameras(
