@@ -188,6 +188,9 @@ def _run_in_own_process(work: Path, job: _Job, progress: Progress | None) -> _Mo
         child.join()
     if model is None:
         log = work / "log.txt"
+        if not log.is_file():  # a script without that line begins anew in the process
+            remedy = 'A script that starts a run needs `if __name__ == "__main__":` before it.'
+            raise InputError("pycolmap", f"its process did not start (code {child.exitcode})", remedy=remedy)
         last = (log.read_text(errors="replace").strip().splitlines() or ["no message"])[-1]
         problem = f"it ended with code {child.exitcode} ({last})"
         raise InputError("pycolmap", problem, remedy=f"The whole log is {log}.")
