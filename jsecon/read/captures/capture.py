@@ -29,6 +29,9 @@ _OTHER_WORD = re.compile(
 )
 _IMAGE_WORD = re.compile(r"(?<![a-z])(colou?r|rgba?|images?|img|frame|photo)(?![a-z])")
 """words in names of images, beside each other: frame0001.jpg and depth0001.png, a.color.png and a.depth.png"""
+_JPEG = (".jpg", ".JPG", ".jpeg", ".JPEG")
+"""suffixes of photographs, whose masks may be a .png of the same name"""
+_POSE_FOLDER = re.compile(r"(camera_?)?poses?|cams?|cameras|extrinsics?|traj(ectory)?")
 _POSE_FILE = re.compile(
     r".*(pose|traj|extrinsic|odometry|ground_?truth|camera).*\.(txt|json|npy|npz|csv|log|xml|ya?ml)"
 )
@@ -132,6 +135,7 @@ def _derived_images(images: Sequence[Path]) -> set[Path]:
     bases = {base(file) for file in images if not _OTHER_WORD.search(file.stem.lower())}
     derived = {file for file in images if _OTHER_WORD.search(file.stem.lower()) and base(file) in bases}
     derived |= {file for file in images if file.with_suffix("") in names}
+    derived |= {f for f in images if f.suffix.lower() == ".png" and any(f.with_suffix(end) in names for end in _JPEG)}
     stems, copies = {(file.parent, file.stem) for file in images}, collections.defaultdict(set)
     for file in images:
         first, last = re.match("([A-Za-z]+)[_. -](.+)", file.stem), re.match("(.+)[_. -]([A-Za-z]+)$", file.stem)
@@ -182,6 +186,7 @@ def _notes_beside(path: Path, photos: Sequence[Path], others: Sequence[Path]) ->
     """Says what lies beside the photographs of a folder and is not used."""
     folders = {path, photos[0].parent, photos[0].parent.parent} if path in photos[0].parents else {path}
     folders = {folder for folder in folders if folder == path or path in folder.parents}
+    folders |= {child for child in path.iterdir() if child.is_dir() and _POSE_FOLDER.fullmatch(child.name.lower())}
     files = sorted(f for folder in folders for f in folder.iterdir() if f.is_file() and not f.name.startswith("."))
     stems = {photo.stem for photo in photos} | {re.sub(r"[_.-]\w+$", "", photo.stem) for photo in photos}
     numbers = [f for f in files if f.suffix.lower() in (".txt", ".json", ".npy", ".xml") and f.stem in stems]

@@ -59,7 +59,7 @@ _UNDISTORT = "Run colmap image_undistorter and load its output."
 def _read_colmap(places: Sequence[str], path: Path) -> PosedImages:
     """Reads the posed images and sparse points of the largest COLMAP model of a capture's folder, in some places.
 
-    The images lie in images/, in the folder itself or in input/.
+    The images lie in images/, in the folder itself or in input/; of sparse/ or sparse/0 alone, in the images/ beside it.
     """
     found = {file.parent for place in places for file in path.glob(place + _MARK)}
     found = sorted(found, key=lambda model: (not model.name.isdecimal(), len(model.name), model))
@@ -104,7 +104,7 @@ def _find_images(path: Path, names: Sequence[str]) -> dict[str, Path]:
     for name in names:
         path_within(path / "images", name)  # a name must not lead elsewhere
     some: dict[str, Path] = {}
-    for folder in (path / "images", path, path / "input"):
+    for folder in (path / "images", path, path / "input", path.parent / "images", path.parent.parent / "images"):
         files = {name: file for name in names if (file := find_image(folder, name)) is not None}
         if len(files) == len(set(names)):
             return files
@@ -183,11 +183,8 @@ def _read_cameras(model: Path) -> dict[int, Lens]:
 def _pose(file: Path, name: str, numbers: tuple[float, ...]) -> np.ndarray:
     """(4, 4) world-to-camera from qw qx qy qz tx ty tz; NaN for a pose that is lost."""
     quaternion = np.array(numbers[:4], np.float64)
-    if not is_finite_and_bounded(numbers):
+    if not is_finite_and_bounded(numbers) or not np.linalg.norm(quaternion) > 1e-6:
         return np.full((4, 4), np.nan)
-    if not np.linalg.norm(quaternion) > 1e-6:
-        problem = f"the pose of {name} has no rotation: {numbers}"
-        raise InputError(file, problem, remedy="Estimate the poses again, or delete this image from the model.")
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
     pose[:3, 3] = numbers[4:7]
@@ -199,7 +196,7 @@ def _read_images(model: Path) -> list[tuple[str, int, np.ndarray]]:
     file = _require_file(model, "images")
 
     def parse(line: str) -> tuple[str, int, np.ndarray] | None:
-        if not line.strip("0123456789+-.eE \t") and len(line.split()) % 3 == 0:
+        if not line.strip("0123456789+-.eEnaifNAIF \t") and len(line.split()) % 3 == 0:  # with nan and inf
             return None  # an image's second line, which some programs omit: X Y POINT3D_ID, any number of times
         _, qw, qx, qy, qz, tx, ty, tz, camera, name = line.split(maxsplit=9)
         return name, int(camera), _pose(file, name, tuple(map(float, (qw, qx, qy, qz, tx, ty, tz))))

@@ -131,13 +131,14 @@ def usable_images(posed: PosedImages) -> tuple[list[PosedImage], list[str]]:
     placed = [image for image in posed.images if is_finite_and_bounded(image.world_to_camera)]
     once = list({image.name: image for image in reversed(placed)}.values())[::-1]
     lost, twice = len(posed.images) - len(placed), len(placed) - len(once)
-    notes = [f"{lost} frames were left out: their poses have NaN, infinite or absurd numbers."] if lost else []
+    notes = [f"{lost} frames were left out: their poses are zero, or have NaN, infinite or absurd numbers."] if lost else []
     return once, [*notes, f"{twice} frames are listed twice; the first of each was taken."] if twice else notes
 
 
 def rigid_or_nan(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Float[np.ndarray, "4 4"]:
     """`make_rigid`, or NaN for a pose that is lost, which `usable_images` leaves out."""
-    return make_rigid(pose, where, name) if is_finite_and_bounded(pose) else np.full((4, 4), np.nan)
+    is_known = is_finite_and_bounded(pose) and pose[:3, :3].any()  # some programs write zeros for a lost pose
+    return make_rigid(pose, where, name) if is_known else np.full((4, 4), np.nan)
 
 
 def make_rigid(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Float[np.ndarray, "4 4"]:

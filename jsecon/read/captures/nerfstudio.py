@@ -47,11 +47,18 @@ _REMEDY = "Write the file anew (ns-process-data, colmap2nerf.py)."
 
 
 def _read_nerfstudio(path: Path) -> PosedImages:
-    """Reads the posed images of a transforms.json, or of the folder that holds one, with their depth and points."""
+    """Reads the posed images of a transforms.json, or of the folder that holds one, with their depth and points.
+
+    Of a folder in NeRF's layout, transforms_train.json has the images, and those of transforms_test.json are held out.
+    """
     file = path / "transforms.json" if path.is_dir() else path
+    file = file if file.is_file() else path / "transforms_train.json"
     content = read_json(file, "a transforms.json", _REMEDY)
     images, scaled = [], 0
     with reading(file, remedy=_REMEDY):
+        tested = path / "transforms_test.json"
+        if file.name == "transforms_train.json" and tested.is_file():
+            content["test_frames"] = read_json(tested, "a transforms.json", _REMEDY)["frames"]
         scale = _number(content, "applied_scale", 1.0)
         unit = _number(content, "depth_unit_scale_factor", 0.001) * scale  # millimetres are nerfstudio's default
         entries, notes = _split_frames(file, content)
@@ -128,8 +135,8 @@ def _number(record: dict[str, Any], key: str, default: float) -> float:
 
 
 def _matrix(rows: Any) -> Float[np.ndarray, "4 4"]:
-    """A matrix of 4 or 3 rows of 4 numbers."""
-    matrix = np.array(rows, np.float64)
+    """A matrix of 4 or 3 rows of 4 numbers; NaN for null, a pose that is lost."""
+    matrix = np.full((4, 4), np.nan) if rows is None else np.array(rows, np.float64)
     if matrix.shape not in ((4, 4), (3, 4)):
         raise ValueError(f"its matrix has shape {matrix.shape}")
     return matrix if len(matrix) == 4 else np.concatenate([matrix, [[0, 0, 0, 1]]])
@@ -246,4 +253,4 @@ def _focal(keys: dict[str, Any], direct: str, angle: str, size: int) -> float | 
     return None
 
 
-READERS = tuple(Reader("nerfstudio", (mark,), _read_nerfstudio) for mark in ("transforms.json", ".json"))
+READERS = tuple(Reader("nerfstudio", (mark,), _read_nerfstudio) for mark in ("transforms.json", "transforms_train.json", ".json"))

@@ -46,8 +46,8 @@ LEVELS = ("default", "s", "m", "l")
 _MAX_REGIONS = int(np.iinfo(np.int16).max)
 _PREPROCESS = "Run LangSplat's preprocess.py on every frame."
 _WHITE = 0xFFFFFF
-_LARGEST = (255, 65535, _WHITE, 2**31 - 1, 2**32 - 1)
-"""largest numbers of the types of ids, white among them: masks have them on pixels to ignore"""
+_LARGEST = (254, 255, 65534, 65535, _WHITE, 2**31 - 1, 2**32 - 1)
+"""largest numbers of the types of ids and those before, white among them: masks have them on pixels to ignore"""
 
 
 _WORD = r"masks?|seg|segs|segmentations?|labels?|ids?|instances?|objects?|annotations?"
@@ -230,7 +230,7 @@ class _FrameIds(NamedTuple):
     ids: set[int]
     """All that are above 0."""
     whole: set[int]
-    """Those with a pixel amid its own, 0 among them; all, but in an image of colours."""
+    """Those with a pixel amid its own, 0 among them; all, where no colours or greys are blended."""
     blended: set[int]
     """Those of the others that lie between the colours around them."""
     largest: int
@@ -246,15 +246,19 @@ def _inspect_ids(image: Int[np.ndarray, "h w"]) -> _FrameIds:
     ids = {number for number in np.unique(image).tolist() if number > 0}
     largest = max(ids, default=0)
     whole, blended = {*ids, 0}, set()
-    if 65535 < largest <= _WHITE:
-        colours = np.stack([image >> 16, image >> 8 & 255, image & 255], axis=-1).clip(0, 255).astype(np.uint8)
+    if 1 < largest <= 255 or 65535 < largest <= _WHITE:
+        is_grey = largest <= 255
+        channels = [image] * 3 if is_grey else [image >> 16, image >> 8 & 255, image & 255]
+        colours = np.stack(channels, axis=-1).clip(0, 255).astype(np.uint8)
         inner = (cv2.dilate(colours, np.ones((3, 3))) == cv2.erode(colours, np.ones((3, 3)))).all(-1)
         whole = {*np.unique(image[inner]).tolist()}
-        is_whole, slack = np.isin(image, [*whole]), 32  # sharpened edges overshoot
+        is_whole, slack = np.isin(image, [*whole]), 0 if is_grey else 40  # sharpened edges overshoot
         low = cv2.erode(np.where(is_whole[..., None], colours, 255).astype(np.uint8), np.ones((9, 9)))
         high = cv2.dilate(np.where(is_whole[..., None], colours, 0).astype(np.uint8), np.ones((9, 9)))
         is_between = (colours.astype(int) >= low.astype(int) - slack) & (colours <= high.astype(int) + slack)
         blended = ids - whole - {*np.unique(image[~is_whole & ~is_between.all(-1)]).tolist()}
+        if is_grey and len(blended) <= 3 * len(whole):  # a few narrow things, of ids between those beside them
+            whole, blended = {*ids, 0}, set()
     if largest not in _LARGEST:
         return _FrameIds(ids, whole, blended, 0, set(), 0.0)
     place = (image == largest).astype(np.uint8)
@@ -266,8 +270,8 @@ def _inspect_ids(image: Int[np.ndarray, "h w"]) -> _FrameIds:
 def _find_no_objects(frames: Sequence[_FrameIds]) -> tuple[set[int], int | None]:
     """The ids that blend the colours beside them in all frames, and the id that stands for pixels to ignore, or None.
 
-    The latter is the largest number of a type and touches the other ids wherever they are. It lies on outlines, or
-    stands apart: further above the others than these from each other.
+    The latter is the largest number of a type and touches the other ids, in the frames that have it if it lies on
+    outlines; or in all, and stands apart: further above the others than these from each other.
     """
     blended = set().union(*(frame.blended for frame in frames)) - set().union(*(frame.whole for frame in frames))
     largest = max((frame.largest for frame in frames), default=0)
@@ -275,9 +279,9 @@ def _find_no_objects(frames: Sequence[_FrameIds]) -> tuple[set[int], int | None]
     if not largest or not others or others[-1] > largest:
         return blended, None
     marked = [frame for frame in frames if frame.largest == largest]
-    places = sum(len(frame.ids - blended - {largest}) for frame in frames)
-    touched = sum(len(frame.neighbours - blended - {largest}) for frame in marked)
     is_thin = np.mean([frame.thin for frame in marked]) > 0.9
+    places = sum(len(frame.ids - blended - {largest}) for frame in (marked if is_thin else frames))
+    touched = sum(len(frame.neighbours - blended - {largest}) for frame in marked)
     is_apart = largest - others[-1] > 2 * max(np.diff([0, *others])) and len(others) > 1 and largest != _WHITE
     return blended, largest if touched >= 0.8 * places and (is_thin or is_apart) else None
 
@@ -486,7 +490,7 @@ def _no_object_notes(blended: set[int], ignored: int | None) -> list[str]:
     if blended:
         notes.append(f"{len(blended)} colours that blend those beside them (smoothed edges) count as unlabelled.")
     if ignored is not None:
-        borders = "it lies along the borders of the others and is the largest number of its type"
+        borders = "it lies along the borders of the others and is one of the largest numbers of its type"
         notes.append(f"The id {ignored} counts as unlabelled (pixels to ignore): {borders}.")
     return notes
 
