@@ -266,14 +266,25 @@ def _tokens(text: str) -> list[_Token]:
     for match in [*_QUOTED.finditer(text), None]:
         end = len(text) if match is None else match.start()
         words = (word.strip(",;:.?!") for word in text[start:end].split())
-        keys = ((word, word.lower().replace("\N{RIGHT SINGLE QUOTATION MARK}", "'")) for word in words if word)
-        tokens += _with_names([_Token(*pair) for pair in keys])
+        tokens += _with_names([token for word in words if word for token in _of_word(word)])
         if match is not None:
             tokens.append(_Token(next(filter(None, match.groups())).strip(), ""))
             start = match.end()
     following = [*(token.key for token in tokens[1:]), ""]
     weak = [t.key in _WORDS["intensifiers"] and after in _SIDES for t, after in zip(tokens, following)]
     return [token for token, dropped in zip(tokens, weak) if token.text and not dropped]
+
+
+def _of_word(word: str) -> list[_Token]:
+    """The tokens of a word: parts that hyphens join where all are orders, as in "second-largest" and "top-left"."""
+    key = word.lower().replace("\N{RIGHT SINGLE QUOTATION MARK}", "'")
+    parts = key.split("-")
+    if len(parts) == 1 or key in _SIDES:
+        return [_Token(word, key)]
+    if ("".join(parts),) in _ORDER_OF:  # left-most
+        return [_Token(word, "".join(parts))]
+    is_order = all(part in (*_ORDINALS, *_ADJECTIVES) or (part,) in _ORDER_OF for part in parts)
+    return [_Token(part, part) for part in parts] if is_order else [_Token(word, key)]
 
 
 def _with_names(tokens: list[_Token]) -> list[_Token]:
@@ -320,7 +331,7 @@ def _question(tokens: list[_Token]) -> tuple[bool, list[_Token]]:
             return True, [_Token(asked, asked), *rest]
         if words in ("what", "who") and rest[0].key not in _WORDS["anything"]:
             continue
-        if words in ("is", "are") and rest[0].key not in _WORDS["determiners"]:
+        if words in ("is", "are") and rest[0].key not in (*_WORDS["determiners"], *_WORDS["anything"]):
             continue
         if words in ("what is", "what are", "what's", "who is", "who are", "who's") and rest[0].key not in _DESCRIBING:
             continue  # a "what is love" poster
@@ -456,8 +467,13 @@ def _without_fillers(tokens: Sequence[_Token], *more: str, adverbs: bool = True)
     """Returns words without those at their end that add nothing, `more` among them."""
     tokens = list(tokens)
     fillers = {*_WORDS["fillers"], *(_WORDS["adverbs"] if adverbs else ()), *more}
-    while tokens and tokens[-1].key in fillers and not (tokens[-1].key == "right" and tokens[-2:][0].key == "the"):
-        tokens.pop()
+    while tokens:
+        if adverbs and [token.key for token in tokens[-2:]] in (["a", "bit"], ["a", "little"]):
+            del tokens[-2:]
+        elif tokens[-1].key in fillers and not (tokens[-1].key == "right" and tokens[-2:][0].key == "the"):
+            tokens.pop()
+        else:
+            break
     return tokens
 
 
@@ -589,7 +605,11 @@ def _unknown_word(keys: Sequence[str], definite: bool, related: bool, anchor: bo
             or (key in _WORDS["prepositions"] and place > 0 and not phrasal)
             or (key.endswith("n't") and place > 0)
             or (key in _WORDS["participles"] and place > 0 and ends and not phrasal)
-            or (key == "not" and before in _WORDS["fillers"])
+            or (key == "not" and (before in _WORDS["fillers"] or (place == 0 and after in _DESCRIBING)))
+            or (key == "as" and place > 0 and keys[place + 2 : place + 3] == ["as"])
+            or (placed and after is None and before in _WORDS["fillers"])
+            or (key in _SIDES[:2] and after is None and place > 0 and not phrasal)
+            or (key in _WORDS["ranges"] and anchor and place > 0 and after in (None, "of"))
             or (key in _WORDS["sides"] and place == 0 and anchor and after in (None, "of"))
         ):
             return key

@@ -59,7 +59,7 @@ _UNDISTORT = "Run colmap image_undistorter and load its output."
 def _read_colmap(places: Sequence[str], path: Path) -> PosedImages:
     """Reads the posed images and sparse points of the largest COLMAP model of a capture's folder, in some places.
 
-    The images lie in images/, in the folder itself or in input/; of sparse/ or sparse/0 alone, in the images/ beside it.
+    The images lie in images/, in the folder itself or in input/; of a folder such as sparse/0, in the images/ above it.
     """
     found = {file.parent for place in places for file in path.glob(place + _MARK)}
     found = sorted(found, key=lambda model: (not model.name.isdecimal(), len(model.name), model))

@@ -131,7 +131,7 @@ def usable_images(posed: PosedImages) -> tuple[list[PosedImage], list[str]]:
     placed = [image for image in posed.images if is_finite_and_bounded(image.world_to_camera)]
     once = list({image.name: image for image in reversed(placed)}.values())[::-1]
     lost, twice = len(posed.images) - len(placed), len(placed) - len(once)
-    notes = [f"{lost} frames were left out: their poses are zero, or have NaN, infinite or absurd numbers."] if lost else []
+    notes = [f"{lost} frames were left out: their poses are 0, NaN, infinite or absurd numbers."] if lost else []
     return once, [*notes, f"{twice} frames are listed twice; the first of each was taken."] if twice else notes
 
 
