@@ -212,11 +212,12 @@ def test_bonsai(shared):
     assert ((seen + loaded.cameras.world_to_camera[:, None, :3, 3])[..., 2] > 0).mean(1).min() > 0.5
 
 
-@pytest.mark.parametrize("value", [np.nan, -np.inf])
-def test_lost_poses_and_points_are_left_out_and_counted(folder, value):
+@pytest.mark.parametrize(("place", "pose", "value"), [(44, [np.nan], np.nan), (12, [0.0] * 4, -np.inf)])
+def test_lost_poses_and_points_are_left_out_and_counted(folder, place, pose, value):
+    """A pose with a number that is not finite, and one whose quaternion is 0."""
     path = folder / "sparse/0/images.bin"
     data = bytearray(path.read_bytes())
-    struct.pack_into("<d", data, 44, value)
+    struct.pack_into(f"<{len(pose)}d", data, place, *pose)
     path.write_bytes(data)
     path = folder / "sparse/0/points3D.bin"
     data = bytearray(path.read_bytes())
@@ -227,6 +228,23 @@ def test_lost_poses_and_points_are_left_out_and_counted(folder, value):
     assert len(loaded.points) == len(CAPTURE.points) - 1
     assert "1 frames were left out: their poses" in loaded.notes[0]
     assert any("1 sparse points were left out" in note for note in loaded.notes)
+
+
+@pytest.mark.parametrize("inner", ["sparse/0", "sparse"])
+def test_a_model_given_without_its_capture_has_the_images_above_it(folder, inner):
+    if inner == "sparse":
+        for file in (folder / "sparse/0").iterdir():
+            file.rename(folder / "sparse" / file.name)
+    assert load_capture(folder / inner).names == CAPTURE.names
+
+
+def test_features_of_a_text_model_may_be_not_finite(tmp_path):
+    write_text_model(CAPTURE, tmp_path)
+    write_images(CAPTURE, tmp_path / "images")
+    path = tmp_path / "sparse/0/images.txt"
+    names = [line for line in path.read_text().splitlines() if line.endswith(".png")]
+    path.write_text("".join(f"{name}\n1 2 -1 nan -inf 3\n" for name in names))
+    assert load_capture(tmp_path).names == CAPTURE.names
 
 
 def test_intrinsics_in_shares_of_the_image_are_refused(folder):

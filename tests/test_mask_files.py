@@ -339,7 +339,7 @@ def outlined(image):
     return cv2.dilate(small, np.ones((3, 3))) != cv2.erode(small, np.ones((3, 3)))
 
 
-@pytest.mark.parametrize("kind", ["8 bits", "16 bits", "int64", "around", "white"])
+@pytest.mark.parametrize("kind", ["8 bits", "16 bits", "int64", "around", "white", "254", "in one frame"])
 def test_an_id_to_ignore_is_no_region(tmp_path, kind):
     """The largest of its type: on outlines, or on all that is no thing."""
     names, plain = ("a", "b", "c"), [things(shift) for shift in range(3)]
@@ -349,8 +349,9 @@ def test_an_id_to_ignore_is_no_region(tmp_path, kind):
             colours[outlined(ids)] = 255
             write_image(tmp_path / f"{name}.png", colours)
             continue
-        void = {"16 bits": 65535, "int64": 2**32 - 1}.get(kind, 255)
+        void = {"16 bits": 65535, "int64": 2**32 - 1, "254": 254}.get(kind, 255)
         marked = np.where(ids == 0 if kind == "around" else outlined(ids), void, ids.astype(np.int64))
+        marked = ids if kind == "in one frame" and name != "b" else marked
         if kind == "int64":
             np.save(tmp_path / f"{name}.npy", marked)
         else:
@@ -399,6 +400,22 @@ def test_colours_of_smoothed_edges_are_no_regions(tmp_path, kind):
     assert "smoothed edges" in notes[0]
     read, _ = load_proposals(tmp_path, ("a", "b", "c"), colours.shape[:2])
     assert len(read(0)) == 4
+
+
+@pytest.mark.parametrize("steps", [60, 200])
+def test_greys_of_smoothed_edges_are_no_regions_and_narrow_things_are(tmp_path, steps):
+    """Four things, or one, smoothed; and ids of three narrow things between those beside them."""
+    for shift, name in enumerate("abc"):
+        greys = np.minimum(steps * things(shift), 240 if steps == 60 else 200).astype(np.uint8)
+        cv2.imwrite(str(tmp_path / f"{name}.png"), cv2.GaussianBlur(greys, (0, 0), 0.8))
+        narrow = greys.copy()
+        narrow[::20, 5:60], narrow[:, 2], narrow[:, 77] = 90, 30, 20
+        cv2.imwrite(str(tmp_path / f"narrow_{name}.png"), narrow)
+    _, ids, notes = load_labels(tmp_path, ("a", "b", "c"), (60, 80))
+    assert ids == ((60, 120, 180, 240) if steps == 60 else (200,))
+    assert "smoothed edges" in notes[0]
+    _, ids, _ = load_labels(tmp_path, ("narrow_a", "narrow_b", "narrow_c"), (60, 80))
+    assert {20, 30, 90} < {*ids}
 
 
 def test_many_more_ids_than_things_are_hinted_at(tmp_path):

@@ -10,6 +10,7 @@ from capture_files import assert_same, small_capture, transforms, write_images, 
 from splat_files import write_ply
 
 from jsecon.read.captures.capture import load_capture
+from jsecon.read.captures.images import write_image
 
 CAPTURE = small_capture()
 
@@ -151,10 +152,12 @@ def test_a_frame_that_is_listed_twice_is_taken_once(tmp_path, change):
     assert "1 frames are listed twice" in loaded.notes[0]
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e30])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e30, None, "zeros", "null"])
 def test_a_lost_pose_is_left_out_and_counted(tmp_path, value):
     def lose(content):
         content["frames"][1]["transform_matrix"][2][3] = value
+        if isinstance(value, str):
+            content["frames"][1]["transform_matrix"] = None if value == "null" else np.zeros((4, 4)).tolist()
 
     loaded = load_changed(tmp_path, lose, holdout=0)
     assert loaded.names == (CAPTURE.names[0], *CAPTURE.names[2:])
@@ -185,6 +188,23 @@ def test_up_is_what_the_file_says(tmp_path, key, value, axis):
     loaded = load_changed(tmp_path, lambda content: content.update({key: value, "depth_unit_scale_factor": 0.001}))
     assert (loaded.up and loaded.up.axis) == axis
     assert loaded.metres_per_unit is None  # depth in any unit is no promise
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_the_layout_of_nerf_is_read_and_its_test_images_are_held_out(tmp_path, count):
+    """A file of poses for each part, with images of the same names in a folder of each."""
+    content = transforms(CAPTURE)
+    names = [f"./train/r_{n}" for n in range(5 - count)] + [f"./test/r_{n}" for n in range(count)]
+    for name, entry, image in zip(names, content["frames"], CAPTURE.frames):
+        write_image(tmp_path / f"{name}.png", image)
+        entry["file_path"] = name
+    for part, frames in (("train", content["frames"][:-count]), ("test", content["frames"][-count:])):
+        (tmp_path / f"transforms_{part}.json").write_text(json.dumps(content | {"frames": frames}))
+    loaded = load_capture(tmp_path)
+    assert len(loaded.names) == 5
+    assert [name for name, tested in zip(loaded.names, loaded.held_out) if tested] == [
+        f"test_r_{n}" for n in range(count)
+    ]
 
 
 NAMES = [f"images/{name}.png" for name in CAPTURE.names]

@@ -113,7 +113,6 @@ DAMAGE = {
     ],
     "colmap/binary": [
         (numbers("sparse/0/cameras.bin", 12, "<i", 99), "cameras.bin", "99", "image_undistorter"),
-        (numbers(IMAGES, 12, "<4d", 0, 0, 0, 0), "images.bin", "frame_000.png", "no rotation"),
         (put(IMAGES, None), "no images.bin"),
         (swap(IMAGES, b"frame_000.png\0", b"../me_000.png\0"), "leads out"),
         (put("images/frame_000.png", POINTER), "frame_000.png"),
