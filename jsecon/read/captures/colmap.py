@@ -71,7 +71,8 @@ def _read_colmap(places: Sequence[str], path: Path) -> PosedImages:
         used = f"There are {len(models)} models. The largest, {largest}, is used; left out: {', '.join(rest)}."
         notes.append(f"{used} Join them (colmap model_merger), or take photographs between them, to use all.")
     lenses, images = _read_cameras(model), models[model]
-    files = _find_images(path, [name for name, _, _ in images])
+    above = (path.parent / "images", path.parent.parent / "images") if model == path else ()
+    files = _find_images(path, [name for name, _, _ in images], above)
     split = model / "test.txt"  # the split of INRIA's training: names of images
     tested = {line.strip() for line in read_text(split).splitlines()} if split.is_file() else None
     posed = []
@@ -99,12 +100,12 @@ def _require_file(model: Path, kind: str) -> Path:
     return file
 
 
-def _find_images(path: Path, names: Sequence[str]) -> dict[str, Path]:
+def _find_images(path: Path, names: Sequence[str], more: Sequence[Path]) -> dict[str, Path]:
     """The image files of a model by name: all in one folder, else those in the first that has any."""
     for name in names:
         path_within(path / "images", name)  # a name must not lead elsewhere
     some: dict[str, Path] = {}
-    for folder in (path / "images", path, path / "input", path.parent / "images", path.parent.parent / "images"):
+    for folder in (path / "images", path, path / "input", *more):
         files = {name: file for name in names if (file := find_image(folder, name)) is not None}
         if len(files) == len(set(names)):
             return files
