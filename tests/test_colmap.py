@@ -239,7 +239,7 @@ def test_a_model_given_without_its_capture_has_the_images_above_it(folder, inner
 
 
 def test_features_of_a_text_model_may_be_not_finite(tmp_path):
-    write_text_model(CAPTURE, tmp_path)
+    write_text_model(CAPTURE, tmp_path / "sparse/0")
     write_images(CAPTURE, tmp_path / "images")
     path = tmp_path / "sparse/0/images.txt"
     names = [line for line in path.read_text().splitlines() if line.endswith(".png")]

@@ -253,8 +253,8 @@ def _inspect_ids(image: Int[np.ndarray, "h w"]) -> _FrameIds:
         inner = (cv2.dilate(colours, np.ones((3, 3))) == cv2.erode(colours, np.ones((3, 3)))).all(-1)
         whole = {*np.unique(image[inner]).tolist()}
         is_whole, slack = np.isin(image, [*whole]), 0 if is_grey else 40  # sharpened edges overshoot
-        low = cv2.erode(np.where(is_whole[..., None], colours, 255).astype(np.uint8), np.ones((9, 9)))
-        high = cv2.dilate(np.where(is_whole[..., None], colours, 0).astype(np.uint8), np.ones((9, 9)))
+        low = cv2.erode(np.where(is_whole[..., None], colours, 255).astype(np.uint8), np.ones((13, 13)))
+        high = cv2.dilate(np.where(is_whole[..., None], colours, 0).astype(np.uint8), np.ones((13, 13)))
         is_between = (colours.astype(int) >= low.astype(int) - slack) & (colours <= high.astype(int) + slack)
         blended = ids - whole - {*np.unique(image[~is_whole & ~is_between.all(-1)]).tolist()}
         if is_grey and len(blended) <= 3 * len(whole):  # a few narrow things, of ids between those beside them
