@@ -269,6 +269,8 @@ def test_what_lies_beside_photographs_and_is_not_used_is_named_in_the_plan(tmp_p
 
 @pytest.mark.parametrize(("names", "says"), [
     (["a.mp4"], "jsecon run {}/a.mp4"), (["a.mov", "b.mov"], "2 videos"), (["images/a.gif", "images/b.gif"], "in GIF"),
+    (["cameras.json", "point_cloud/iteration_7/point_cloud.ply"], "run {}/point_cloud/iteration_7/point_cloud.ply"),
+    (["a.spz", "notes.txt"], "jsecon run {}/a.spz"),
 ])  # fmt: skip
 def test_a_folder_without_photographs_says_what_is_there(tmp_path, names, says):
     _touch(tmp_path, *names)

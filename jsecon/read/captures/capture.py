@@ -224,6 +224,8 @@ def _no_capture(path: Path) -> InputError:
     videos = [child for child in entries if is_video(child)]
     unread = [child for child in (*entries, *path.glob("images/*")) if unread_format(child)] if path.is_dir() else []
     archives = [child for child in entries if _is_archive(child)]
+    scenes = [child for child in entries if child.suffix.lower() in (".ply", ".spz", ".sog", ".splat", ".glb")]
+    scenes = sorted(path.glob("point_cloud/*/*.ply"), key=lambda file: file.stat().st_mtime) or scenes  # INRIA's
     if not path.exists():
         problem, remedy = "there is no such file or folder", "Check the path."
     elif _is_archive(path):
@@ -251,6 +253,8 @@ def _no_capture(path: Path) -> InputError:
     elif videos:
         problem = f"a folder with {'a video' if len(videos) == 1 else f'{len(videos)} videos'}, but no photographs"
         remedy = f"Give one video: jsecon run {videos[0]}"
+    elif scenes:
+        problem, remedy = "a folder with a scene of Gaussians, but no photographs", f"Give that: jsecon run {scenes[-1]}"
     elif archives:
         problem, remedy = f"a folder with an archive ({archives[0].name})", "Unpack it, and give what is in it."
     elif files := [child for child in entries if child.suffix.lower() == ".json"]:
