@@ -254,7 +254,8 @@ def _no_capture(path: Path) -> InputError:
         problem = f"a folder with {'a video' if len(videos) == 1 else f'{len(videos)} videos'}, but no photographs"
         remedy = f"Give one video: jsecon run {videos[0]}"
     elif scenes:
-        problem, remedy = "a folder with a scene of Gaussians, but no photographs", f"Give that: jsecon run {scenes[-1]}"
+        problem = "a folder with a scene of Gaussians, but no photographs"
+        remedy = f"Give the scene: jsecon run {scenes[-1]}"
     elif archives:
         problem, remedy = f"a folder with an archive ({archives[0].name})", "Unpack it, and give what is in it."
     elif files := [child for child in entries if child.suffix.lower() == ".json"]:
