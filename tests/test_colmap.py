@@ -247,7 +247,10 @@ def test_features_of_a_text_model_may_be_not_finite(tmp_path):
     assert load_capture(tmp_path).names == CAPTURE.names
 
 
-def test_intrinsics_in_shares_of_the_image_are_refused(folder):
+def test_intrinsics_in_shares_of_the_image_are_refused(folder, tmp_path):
+    write_text_model(CAPTURE, tmp_path, ["1 PINHOLE 24 16 0.9 0.9 0.5 0.5"])
+    with refused("cameras.txt", "give it in pixels"):
+        load_capture(tmp_path)
     path = folder / "sparse/0/cameras.bin"
     data = bytearray(path.read_bytes())
     struct.pack_into("<4d", data, 32, 0.9, 0.9, 0.5, 0.5)

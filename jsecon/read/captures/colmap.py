@@ -155,7 +155,8 @@ def _lens(file: Path, model: str, width: int, height: int, parameters: tuple[flo
     model = model.removeprefix("SIMPLE_")
     projection = model if model in _PYCOLMAP else None
     is_fisheye = "FISHEYE" in model and projection is None
-    return Lens(width, height, fx, fy, cx, cy, tuple(distortion), is_fisheye, projection)
+    with reading(file, remedy=_REMEDY, problem="a camera cannot be read"):
+        return Lens(width, height, fx, fy, cx, cy, tuple(distortion), is_fisheye, projection)
 
 
 def _read_cameras(model: Path) -> dict[int, Lens]:
