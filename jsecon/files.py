@@ -153,6 +153,15 @@ def read_text(path: Path) -> str:
     return data.removeprefix(codecs.BOM_UTF8).decode("utf-8", "surrogateescape")
 
 
+def read_lines(path: Path) -> Iterator[str]:
+    """Reads a text file line by line, as `read_text` reads it."""
+    with path.open("rb") as file:
+        is_wide = file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    encoding, errors = ("utf-16", "replace") if is_wide else ("utf-8-sig", "surrogateescape")
+    with path.open(encoding=encoding, errors=errors, newline="\n") as file:
+        yield from file
+
+
 def parse_json(text: str | bytes) -> Any:
     """Parses JSON."""
     try:

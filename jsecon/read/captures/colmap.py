@@ -13,14 +13,14 @@ import io
 import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from jsecon.errors import InputError
-from jsecon.files import path_within, read_text, reading
+from jsecon.files import path_within, read_lines, read_text, reading
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.read.captures.frames import PosedImage, PosedImages
 from jsecon.read.captures.images import find_image
@@ -117,7 +117,7 @@ _reading = functools.partial(reading, remedy=_REMEDY, problem="the file is damag
 """makes errors in reading a binary file InputErrors"""
 
 
-def _take(stream: io.BytesIO, form: str) -> tuple:
+def _take(stream: BinaryIO, form: str) -> tuple:
     """The next values of a struct format; raises struct.error at the end of the file."""
     return struct.unpack("<" + form, stream.read(struct.calcsize("<" + form)))
 
@@ -128,7 +128,7 @@ def _parse_lines(file: Path, layout: str, parse: Callable[[str], Any]) -> list:
     A ValueError of `parse` becomes an error with the line's number and the `layout` that it should have.
     """
     records = []
-    for number, line in enumerate(map(str.strip, read_text(file).split("\n")), start=1):
+    for number, line in enumerate(map(str.strip, read_lines(file)), start=1):
         if line and not line.startswith("#"):
             try:
                 records.append(parse(line))
@@ -182,7 +182,7 @@ def _read_cameras(model: Path) -> dict[int, Lens]:
     return lenses
 
 
-def _pose(file: Path, name: str, numbers: tuple[float, ...]) -> np.ndarray:
+def _pose(numbers: tuple[float, ...]) -> np.ndarray:
     """(4, 4) world-to-camera from qw qx qy qz tx ty tz; NaN for a pose that is lost."""
     quaternion = np.array(numbers[:4], np.float64)
     if not is_finite_and_bounded(numbers) or not np.linalg.norm(quaternion) > 1e-6:
@@ -198,24 +198,26 @@ def _read_images(model: Path) -> list[tuple[str, int, np.ndarray]]:
     file = _require_file(model, "images")
 
     def parse(line: str) -> tuple[str, int, np.ndarray] | None:
-        if not line.strip("0123456789+-.eEnaifNAIF \t") and len(line.split()) % 3 == 0:  # with nan and inf
+        numeric = not line.strip("0123456789+-.eEnaifNAIF \t")  # with nan and inf
+        if numeric and (len(line) > 1000 or len(line.split()) % 3 == 0):
             return None  # an image's second line, which some programs omit: X Y POINT3D_ID, any number of times
         _, qw, qx, qy, qz, tx, ty, tz, camera, name = line.split(maxsplit=9)
-        return name, int(camera), _pose(file, name, tuple(map(float, (qw, qx, qy, qz, tx, ty, tz))))
+        return name, int(camera), _pose(tuple(map(float, (qw, qx, qy, qz, tx, ty, tz))))
 
     if file.suffix == ".txt":
         return _parse_lines(file, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", parse)
     images = []
-    with _reading(file):
-        data = file.read_bytes()
-        stream = io.BytesIO(data)
+    with _reading(file), file.open("rb") as stream:  # features of many photographs are larger than memory may be
         for _ in range(*_take(stream, "Q")):
             _, *numbers, camera = _take(stream, "i7di")
-            encoded = data[stream.tell() : data.index(0, stream.tell())]
+            start, ahead = stream.tell(), stream.read(1 << 12)
+            encoded = ahead[: ahead.index(0)]
             name = encoded.decode("utf-8", "surrogateescape")
-            images.append((name, camera, _pose(file, name, tuple(numbers))))
-            stream.seek(len(encoded) + 1, 1)
-            _take(stream, f"{24 * _take(stream, 'Q')[0]}x")
+            images.append((name, camera, _pose(tuple(numbers))))
+            stream.seek(start + len(encoded) + 1)
+            stream.seek(24 * _take(stream, "Q")[0], 1)
+            if stream.tell() > file.stat().st_size:
+                raise EOFError
     return images
 
 
@@ -250,7 +252,9 @@ def _read_binary_points(file: Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.
             offset += 51 + 8 * struct.unpack_from("<Q", raw, offset + 43)[0]
         if offset > len(raw):
             raise EOFError
-        heads = np.frombuffer(raw, np.uint8)[np.array(starts, np.int64)[:, None] + np.arange(8, 35)]
+        places, count = np.array(starts, np.int64)[:, None], 1 << 16  # at a time: indices are larger than the points
+        blocks = [places[start : start + count] for start in range(0, max(len(places), 1), count)]
+        heads = np.concatenate([np.frombuffer(raw, np.uint8)[block + np.arange(8, 35)] for block in blocks])
     return np.ascontiguousarray(heads[:, :24]).view("<f8"), np.ascontiguousarray(heads[:, 24:])
 
 
