@@ -13,7 +13,7 @@ import io
 import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -117,7 +117,7 @@ _reading = functools.partial(reading, remedy=_REMEDY, problem="the file is damag
 """makes errors in reading a binary file InputErrors"""
 
 
-def _take(stream: BinaryIO, form: str) -> tuple:
+def _take(stream: io.BufferedIOBase, form: str) -> tuple:
     """The next values of a struct format; raises struct.error at the end of the file."""
     return struct.unpack("<" + form, stream.read(struct.calcsize("<" + form)))
 
