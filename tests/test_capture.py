@@ -21,11 +21,11 @@ CAPTURE = small_capture()
 def test_formats_are_detected(tmp_path):
     write_colmap(CAPTURE, tmp_path / "colmap")
     write_transforms(CAPTURE, tmp_path / "nerfstudio")
-    (tmp_path / "nerfstudio/transforms.json").rename(tmp_path / "nerfstudio/transforms_train.json")
-    for path in ("colmap", "nerfstudio/transforms_train.json"):
+    (tmp_path / "nerfstudio/transforms.json").rename(tmp_path / "nerfstudio/poses_left.json")
+    for path in ("colmap", "nerfstudio/poses_left.json"):
         np.testing.assert_array_equal(load_capture(tmp_path / path).frames, CAPTURE.frames)
     (tmp_path / "nerfstudio/images").rename(tmp_path / "elsewhere")
-    with refused("nerfstudio", "without poses", "transforms_train.json"):
+    with refused("nerfstudio", "without poses", "poses_left.json"):
         load_capture(tmp_path / "nerfstudio")
     with refused("nowhere", "no such file or folder"):
         load_capture(tmp_path / "nowhere")
