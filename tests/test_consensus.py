@@ -6,7 +6,9 @@ from scipy import sparse
 
 from jsecon.association.consensus import (
     _average_linkage,
+    _coplanarity,
     _group_by_consensus,
+    _piece_planes,
     pieces_on_masks,
     track_masks,
 )
@@ -129,6 +131,47 @@ def test_average_linkage_of_ties_large_sums_and_pairs_that_are_hardly_seen_toget
     assert _average_linkage(both, both, least_ratio=0.5, least_shared=0.02).max() == 1
 
 
+def turned(rng):
+    return np.linalg.qr(rng.standard_normal((3, 3)))[0]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_planes_and_coplanarity_of_pieces_equal_the_slow_twins(seed):
+    rng = np.random.default_rng(seed)
+    points = (rng.standard_normal((60, 3)) * [3.0, 2.0, 0.3]) @ turned(rng) + 1e3
+    piece, weights = np.repeat(np.arange(6), 10), rng.uniform(0.1, 1.0, 60)
+    gather = sparse.csr_matrix((weights, (piece, np.arange(60))), shape=(6, 60))
+    centres, normals = _piece_planes(gather, points)
+    for k in range(6):
+        own, share = points[piece == k], weights[piece == k] / weights[piece == k].sum()
+        middle = (share[:, None] * own).sum(0)
+        spread = sum(w * np.outer(x - middle, x - middle) for w, x in zip(share, own))
+        np.testing.assert_allclose(centres[k] + points.mean(0), middle, rtol=1e-9)  # relative to the mean of all
+        assert abs(np.linalg.eigh(spread)[1][:, 0] @ normals[k]) > 1.0 - 1e-6
+    got = _coplanarity(centres, normals, 0.7)
+    for i in range(6):
+        for j in range(6):
+            off = min(abs((centres[j] - centres[i]) @ normals[i]), abs((centres[j] - centres[i]) @ normals[j]))
+            assert abs(got[i, j] - np.exp(-((off / 0.7) ** 2))) < 1e-5
+    rotation, signs = turned(rng), rng.choice([-1.0, 1.0], (6, 1))
+    np.testing.assert_allclose(_coplanarity(centres @ rotation, signs * normals @ rotation, 0.7), got, atol=1e-5)
+    np.testing.assert_array_equal(_coplanarity(centres, normals, np.inf), 1.0)
+
+
+def test_what_rises_out_of_a_plane_leaves_it_and_the_plane_stays_whole():
+    """A box on a floor, in one mask with it in half of the views: the surfaces decide, up to the size of the box."""
+    rng = np.random.default_rng(0)
+    floor = rng.uniform(-5.0, 5.0, (600, 3)) * [1.0, 1.0, 0.001]
+    box = np.asarray([2.0, 2.0, 1.2]) + rng.uniform(-0.5, 0.5, (200, 3))
+    means, truth = np.concatenate([floor, box]).astype(np.float32), np.repeat([0, 1], [600, 200])
+    names = [np.zeros(800, int) if t % 2 else truth for t in range(12)]
+    masks = [sparse.csr_matrix((np.ones(800, np.float32), (np.arange(800), name)), shape=(800, 2)) for name in names]
+    given = sparse.hstack(masks, format="csr"), sparse.csr_matrix(np.ones((800, 12), np.float32)), np.ones(800), means
+    assert _group_by_consensus(*given, pieces=80).max() == 0
+    assert _group_by_consensus(*given, pieces=80, surface_width=5.0).max() == 0
+    assert same_partition(_group_by_consensus(*given, pieces=80, surface_width=0.8), truth)
+
+
 def made_scene(views=12, wrong=0, seed=0):
     """Three clumps of points; each view has one mask a clump, but `wrong` views have one mask over all of them."""
     rng = np.random.default_rng(seed)
@@ -172,7 +215,7 @@ def test_few_points_and_points_that_are_never_seen():
     for count in (1, 2, 5):
         few = (part[:count] for part in (membership, visible, weights, means))
         assert _group_by_consensus(*few).max() == 0  # all of one clump
-    weights[::7] = 0.0
+    weights[::7], means[::7] = 0.0, np.nan
     got = _group_by_consensus(membership, visible, weights, means, pieces=24)
     assert (got[::7] == -1).all()
     assert same_partition(got[weights > 0], truth[weights > 0])

@@ -4,6 +4,9 @@ Two Gaussians belong together if most views that see both put both into one mask
 PAMI 2005) with views as the ensemble and rendering weights as the evidence. A mask that merges two objects or cuts one
 is outvoted by the other views. Frames have no order and there is no tracking, so errors do not propagate. The idea is
 mask clustering by view consensus (Yan et al., CVPR 2024), between pieces of the scene instead of masks.
+
+Pieces off each other's plane need more views to join. So a chair that many masks merge with the floor leaves it, and
+the floor stays whole from wall to wall.
 """
 
 import numpy as np
@@ -24,6 +27,8 @@ from jsecon.vision.region_graph import relabel_sequential
 
 MAX_PIECES = 3000
 """Maximum number of pieces of a scene."""
+SURFACE_WIDTH = 0.08
+"""Distance from a plane at which pieces count as off it, as a share of the median depth: 12 cm in a small room."""
 
 
 def _group_by_consensus(
@@ -32,6 +37,7 @@ def _group_by_consensus(
     weights: Float[np.ndarray, " n"],
     means: Float[np.ndarray, "n 3"],
     *,
+    surface_width: float = np.inf,
     agreement: float = 0.4,
     pieces: int = MAX_PIECES,
     seed: int = 0,
@@ -39,14 +45,15 @@ def _group_by_consensus(
     """Groups Gaussians into objects by the consensus of the views: (N,) object 0 .. R-1, -1 if it is never seen.
 
     The Gaussians are first gathered into small pieces (`_scene_pieces`). Then `_average_linkage` joins pieces while the
-    views that see two groups put both into one mask with a probability of at least `agreement`. Groups that have
-    less than 0.02 of their visibility in common stay separate.
+    views that see two groups put both into one mask with a probability of at least `agreement`, or of 1 if they lie off
+    each other's plane (`_coplanarity`). Groups that have less than 0.02 of their visibility in common stay separate.
 
     Args:
       membership: (N, M) share of each Gaussian in each of the M masks of all frames, times its visibility there.
       visible: (N, T) visibility of each Gaussian in each frame, in [0, 1].
       weights: (N,) total rendering weight of each Gaussian.
       means: (N, 3) centres, world units.
+      surface_width: Distance from a plane at which pieces count as off it, world units; inf ignores surfaces.
       agreement: Probability of a common mask above which groups are joined.
       pieces: Maximum number of pieces.
       seed: Seed of the random projection.
@@ -62,10 +69,40 @@ def _group_by_consensus(
     shape = (int(piece.max()) + 1, len(piece))
     gather = sparse.csr_matrix((weights[live], (piece[live], live)), shape=shape)
     in_masks, in_view = gather @ membership, gather @ visible
-    together = (in_masks @ in_masks.T).toarray()
+    off_plane = min(agreement, 1.0)  # then a probability of 1 equals `agreement` in the plane
+    coplanarity = _coplanarity(*_piece_planes(gather[:, live], means[live]), surface_width)
+    together = (in_masks @ in_masks.T).toarray() * (off_plane + (1.0 - off_plane) * coplanarity)
     both = (in_view @ in_view.T).toarray()
     owner[live] = _average_linkage(together, both, least_ratio=agreement, least_shared=0.02)[piece[live]]
     return owner
+
+
+def _piece_planes(
+    gather: Sparse, means: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
+    """Computes centres and unit normals of pieces: the direction of least spread of their means, of either sign.
+
+    `gather` (K, N) has the weight of each Gaussian in its piece.
+    """
+    means = np.asarray(means, np.float64)
+    shares = sparse.diags(1.0 / np.asarray(gather.sum(1)).ravel()) @ gather
+    local = means - means.mean(0)
+    centres = shares @ local
+    moments = shares @ np.einsum("ni,nj->nij", local, local).reshape(-1, 9)
+    spread = moments.reshape(-1, 3, 3) - np.einsum("ki,kj->kij", centres, centres)
+    return centres, np.linalg.eigh(spread)[1][:, :, 0]
+
+
+def _coplanarity(
+    centres: Float[np.ndarray, "k 3"], normals: Float[np.ndarray, "k 3"], width: float
+) -> Float[np.ndarray, "k k"]:
+    """Computes how well pairs of pieces lie in one plane: exp(-(d / width)^2), 1 if they do.
+
+    With c the centres and n the normals, d is the smaller of |(c_j - c_i) . n_i| and |(c_j - c_i) . n_j|.
+    """
+    along = centres @ normals.T
+    off = np.abs(along - np.diagonal(along)).astype(np.float32)
+    return np.exp(-np.square(np.minimum(off, off.T) / width))
 
 
 def _scene_pieces(
@@ -209,7 +246,9 @@ def track_masks(
     """
     require(seed >= 0, "seed", seed, "at least 0", "Give another seed.")
     views, means = scene.all(frames, progress), np.asarray(scene.gaussians.means, np.float32)
-    owner = _group_by_consensus(*_mask_signatures(views, scene.count), means, agreement=agreement, seed=seed)
+    width = SURFACE_WIDTH * scene.median_depth
+    signatures = _mask_signatures(views, scene.count)
+    owner = _group_by_consensus(*signatures, means, surface_width=width, agreement=agreement, seed=seed)
     count = int(owner.max(initial=-1)) + 1
     labels = np.full(frames.shape[:3], -1, np.int16)
     for image, view in zip(labels, views):

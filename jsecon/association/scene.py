@@ -79,6 +79,8 @@ class SceneSuperpixels:
         self._views: list[FrameSuperpixels] = []
         self.shared = np.zeros((0, 0), np.float32)
         """(T, T) overlap of two frames: the cosine of their visible cross-sections of all Gaussians. Set by `all`."""
+        self.median_depth = 0.0
+        """Median depth of what the frames show, by rendering weight, world units. Set by `all`."""
 
     def _view(self, frame: UInt8[np.ndarray, "h w 3"], t: int) -> tuple:
         """Superpixels, visible Gaussians, arrays and shape of their weights, and proposals of a frame."""
@@ -115,12 +117,16 @@ class SceneSuperpixels:
                     len(frames), lambda t: self._view(frames[t], t), progress
                 )
             ]
-            cross_sections = np.zeros((len(views), self.count), np.float32)
+            cross_sections, all_depths = np.zeros((len(views), self.count), np.float32), []
             for t, view in enumerate(views):
                 camera = self.cameras[t]
                 pose = np.asarray(camera.world_to_camera)
                 depths = np.asarray(self.gaussians.means)[view.seen] @ pose[2, :3] + pose[2, 3]
                 cross_sections[t, view.seen] = view.totals * depths**2 / float(camera.fx * camera.fy)
+                all_depths.append(depths)
+            self.median_depth = _weighted_median(
+                np.concatenate(all_depths), np.concatenate([view.totals for view in views])
+            )
             highest = np.maximum(cross_sections.max(0), 1e-30)
             self._views = [
                 dataclasses.replace(view, clarity=area[view.seen] / highest[view.seen])
@@ -129,6 +135,13 @@ class SceneSuperpixels:
             cross_sections /= np.maximum(np.linalg.norm(cross_sections, axis=1, keepdims=True), 1e-30)
             self.shared = cross_sections @ cross_sections.T
         return self._views
+
+
+def _weighted_median(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"]) -> float:
+    """Returns the least value with at least half of the weight at or below it; 0 if there are none."""
+    order = np.argsort(values)
+    total = np.cumsum(weights[order], dtype=np.float64)
+    return float(values[order[np.searchsorted(total, 0.5 * total[-1])]]) if len(values) else 0.0
 
 
 def assign_superpixels(
