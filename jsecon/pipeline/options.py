@@ -156,7 +156,8 @@ class MaskOptions:
         things. Coarse joins the colours of a thing, and separates things by the depth that the Gaussians render.
       association: How the proposals of the frames are brought together: what most views agree on (consensus), or
         Algorithm 1 of the paper with a tracker through the Gaussians (tracking).
-      agreement: For consensus, share of the views that must put two things into one proposal. A lower share joins more.
+      agreement: For consensus, share of the views that must put two things into one proposal, or all of them if one
+        leaves the other's surface. A lower share joins more.
     """
 
     masks: Option[Path | None] = None
