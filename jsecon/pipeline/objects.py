@@ -223,7 +223,7 @@ def _embed_objects(stage: StageInput) -> StageResult:
     kept, total = np.count_nonzero(chosen), np.count_nonzero(pixels)
     if kept == total:
         return StageResult(embedded)
-    why = f"more than {context.options.crops} views of a region err alike (--crops)"
+    why = f"a region is embedded in at most {context.options.crops} views (--crops)"
     return StageResult(embedded, notes=(f"{kept} of {total} crops embedded: {why}",))
 
 
