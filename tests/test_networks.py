@@ -69,7 +69,7 @@ def test_a_run_with_sam_and_clip_finds_things_by_their_names(seen):
     assert field.embedder.startswith("clip-")
     assert field.regions.count >= 4
     texts = model_loading.field_embedder(field).embed_text([f"a {name} thing" for name in COLOURS])
-    frames = np.asarray(run.capture.frames)[~run.capture.held_out]
+    frames = np.asarray(run.capture.frames)[run.vision_frames]
     for text, (name, colour) in zip(texts, COLOURS.items()):
         best = int((np.asarray(field.regions.embeddings) @ text).argmax())
         means = [frames[run.labels == r].mean(0) for r in range(field.regions.count)]
@@ -116,6 +116,22 @@ def test_a_damaged_model_and_two_sources_of_masks_are_refused_before_any_work(se
         with refused(*words):
             again(seen[0], tmp_path / "out", **changes)
     assert not list(tmp_path.glob("out/cache/*.safetensors"))
+
+
+def test_a_segmenter_takes_the_frames_that_number_and_time_allow(seen, tmp_path):
+    run, _, _ = seen
+    results = Results(load=run.capture, gaussians=run.field.gaussians)
+    for limit, count in (({"vision_frames": 3}, 3), ({"vision_minutes": 1e-6}, 2)):
+        options = dataclasses.replace(run.options, **limit)
+        context = RunContext(options, model_loading.open_models(options, tmp_path), tmp_path)
+        stage = next(stage for stage in run_stages(context) if stage.name == "objects")
+        none = Checkpoint(tmp_path / "none.safetensors")
+        found = stage.compute(StageInput(context, results, lambda done, total: None, none))
+        assert len(found.value.labels) == len(found.value.frames) == count
+        assert not run.capture.held_out[found.value.frames].any()
+        assert f"{count} of 6 training frames: --{next(iter(limit)).replace('_', '-')} allows no more" in found.notes[0]
+    with refused("--vision-minutes", "name a --segmenter"):
+        again(run, tmp_path / "out", segmenter=None, vision_minutes=1.0)
 
 
 def test_sam_2_follows_what_sam_proposes(seen, tmp_path):
@@ -219,7 +235,7 @@ def test_models_by_name_are_fetched_once_and_found_again_for_a_moved_field(
     query = ["query", field, "a red thing", "--out", tmp_path / "answers", "--min-rank", "0"]
     assert run_cli(*query) == 0
     assert len(hub.requests) == asked
-    assert (np.asarray(load_field(field).regions.pixel_counts).sum(0) > 0).sum() == 5
+    assert 2 <= (np.asarray(load_field(field).regions.pixel_counts).sum(0) > 0).sum() <= 5
     use_hub(hub, tmp_path / "empty", monkeypatch)
     assert run_cli(*query) == 2
     commit = hub.repositories["onnx-community/siglip2-base-patch16-224-ONNX"].commit

@@ -14,6 +14,7 @@ import jsecon
 from jsecon.app.cli import main
 from jsecon.splat.transform import transform_gaussians
 from jsecon.views import plan
+from jsecon.views.cover import LOOKS, frames_by_need
 from jsecon.views.frame import inner_scene, scene_frame, surface_points
 from jsecon.views.plan import place_cameras
 
@@ -203,6 +204,17 @@ SURROUNDINGS = {
 @pytest.mark.parametrize("place", SURROUNDINGS)
 @pytest.mark.parametrize("share", [0.02, 0.13, 0.4, 0.6])
 @pytest.mark.parametrize("seed", range(2))
+def test_frames_for_masks_are_those_that_show_what_others_do_not():
+    outward, up = CENTRES * (1, 1, 0) / np.linalg.norm(CENTRES[:, :2], axis=1, keepdims=True), np.array([0, 0, 1.0])
+    poses = [plan._look(centre - 1.5 * way, way, up) for centre, way in zip(CENTRES, outward)]  # each shows one ball
+    away = plan._look(CENTRES[0] + (0, 0, 9), outward[0], up)
+    cameras = plan._cameras(np.stack([*[poses[0]] * 12, poses[1], poses[2], away]), 40, 30)
+    chosen = frames_by_need(scene_of(balls()), cameras)
+    assert sorted(chosen[:3]) == [0, 12, 13]
+    assert sorted(chosen[3:]) == [*range(1, LOOKS)]
+    np.testing.assert_array_equal(frames_by_need(scene_of(balls()), cameras, limit=2), chosen[:2])
+
+
 def test_far_surroundings_of_any_share_leave_the_frame_as_it_is(object_alone, place, share, seed):
     count = round(object_alone.count * share / (1 - share))
     points = SURROUNDINGS[place](np.random.default_rng(seed), count)

@@ -144,7 +144,7 @@ def _default_masks(capture: Capture, gaussians: Gaussians) -> np.ndarray:
     return (
         plan_objects(work)[0]
         .compute(StageInput(work, loaded, lambda done, total: None, Checkpoint(Path("objects"))))
-        .value
+        .value.labels
     )
 
 

@@ -16,7 +16,7 @@ from jsecon.files import write_text
 from jsecon.pipeline import processes, run as pipeline
 from jsecon.pipeline.options import is_bare_scene
 from jsecon.pipeline.progress import Console
-from jsecon.pipeline.results import WARNING, vision_frames
+from jsecon.pipeline.results import WARNING
 from jsecon.pipeline.run import Run
 from jsecon.process import peak_memory_mib
 from jsecon.read.captures.frames import evenly_spaced
@@ -118,12 +118,11 @@ def _quality(held_out: Quality, console: Console) -> dict[str, float | None]:
 
 def _pictures(run: Run) -> str:
     """Returns the part that shows frames, masks, regions and the rendered scene."""
-    train = vision_frames(run.capture, run.options)
     gaussians, cameras = jax.device_put(run.field.gaussians), jax.tree.map(np.asarray, run.field.cameras)
     colours = pictures.region_colours(run.field)
     cells = []
-    for row in evenly_spaced(len(train), 6):
-        t = int(train[row])
+    for row in evenly_spaced(len(run.labels), 6):
+        t = int(run.vision_frames[row])
         frame = np.asarray(run.capture.frames[t])
         cells += [
             report.figure(frame, run.capture.names[t]),

@@ -12,7 +12,7 @@ from jsecon.field.membership import normalise_votes
 from jsecon.paper.autoencoder import encode, train_autoencoder
 from jsecon.paper.distill import distill_votes
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.results import Results, RunContext, Stage, StageInput, StageResult, vision_frames
+from jsecon.pipeline.results import Results, RunContext, Stage, StageInput, StageResult
 from jsecon.process import memory_budget
 from jsecon.types import Codes, LanguageField, Regions
 from jsecon.views.frame import find_up_axis, given_up
@@ -35,8 +35,8 @@ def plan_lifting(context: RunContext) -> list[Stage]:
 def _accumulate_votes(stage: StageInput) -> StageResult:
     """Accumulates votes, on disk if they do not fit into memory; the votes are the same."""
     options, capture, scene = stage.context.options, stage.results.load, stage.results.gaussians
-    labels, folder = stage.results.objects, stage.checkpoint.folder
-    cameras = capture.cameras[vision_frames(capture, options)]
+    labels, folder = stage.results.objects.labels, stage.checkpoint.folder
+    cameras = capture.cameras[stage.results.objects.frames]
     count = int(labels.max()) + 1
     settings = {"centre_pixel_weight": options.centre_pixel_weight, "by_view": True, "progress": stage.progress}
     needed, budget = votes_memory(scene.count, len(labels)), memory_budget()
@@ -69,7 +69,7 @@ def join_field(results: Results, embedder: Embedder, provenance: str, options: O
     """Joins the results of a run to a field."""
     capture, embedded = results.load, results.regions
     pixels = np.zeros((embedded.count, len(capture.names)), np.int32)
-    pixels[:, vision_frames(capture, options)] = embedded.pixel_counts
+    pixels[:, results.objects.frames] = embedded.pixel_counts
     given = None if options.up is None else given_up(options.up, capture.source_from_scene)
     scale = capture.metres_per_unit if options.metres_per_unit is None else options.metres_per_unit
     return LanguageField(

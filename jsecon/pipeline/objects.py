@@ -3,7 +3,8 @@
 import functools
 import itertools
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -20,11 +21,23 @@ from jsecon.fit.depth import points_from_depth
 from jsecon.networks.hub import model_name
 from jsecon.paper.algorithm1 import masklets
 from jsecon.paper.tracker import GeometricTracker
+from jsecon.parallel import map_over_processes
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.results import Checkpoint, Results, RunContext, Stage, StageInput, StageResult, vision_frames
+from jsecon.pipeline.results import (
+    Checkpoint,
+    ObjectLabels,
+    Results,
+    RunContext,
+    Stage,
+    StageInput,
+    StageResult,
+    training_frames,
+)
+from jsecon.read.captures.frames import evenly_spaced
 from jsecon.read.masks.masks import load_features, load_labels, load_proposals
 from jsecon.splat.render import render_depth
 from jsecon.types import Camera, Capture, Gaussians, Progress
+from jsecon.views.cover import LEAST_GAIN, frames_by_need
 from jsecon.vision.classical import GRANULARITIES, ClassicalSegmenter
 from jsecon.vision.protocols import Segmenter
 from jsecon.vision.surfaces import smooth_depth, surfaces_from_depth
@@ -39,7 +52,10 @@ def plan_objects(context: RunContext) -> list[Stage]:
 def _plan_labels(context: RunContext) -> Stage:
     """Plans the labels of the training frames: from mask files, or proposals associated over the frames."""
     options, models, folder = context.options, context.models, context.options.masks
-    key_options = context.key_options("vision_frames")
+    key_options = context.key_options("vision_frames", "vision_minutes")
+    if options.vision_minutes is not None and not _chooses_frames(context):
+        problem = "no segmenter finds masks that consensus associates, and other masks have no time limit"
+        raise InputError("--vision-minutes", problem, remedy="Leave it out, or name a --segmenter.")
     if folder is not None:
         reason = f"masks are given ({folder.name})"
         skipped = {"segmenter": reason, "association": reason}
@@ -61,8 +77,12 @@ def _plan_labels(context: RunContext) -> Stage:
     else:
         by = "through the Gaussians" if options.tracker is None else f"by {model_name(options.tracker, 'tracker')}"
         how += f", followed {by}"
+    if _chooses_frames(context):
+        how += ", in the frames that show most of the scene"
     if options.vision_frames is not None:
         how += f", in at most {options.vision_frames} frames"
+    if options.vision_minutes is not None:
+        how += f", for {options.vision_minutes:g} minutes"
     tracker = None if models.tracker is None else models.tracker.name
     key_options |= {"association": options.associated_by, "tracker": tracker}
     after, files = ("load", "gaussians"), (options.proposals,)
@@ -91,11 +111,42 @@ def _plan_parts(context: RunContext) -> Stage:
     return Stage("parts", how, _find_parts, after=after, key_options=key_options, files=files)
 
 
+def _chooses_frames(context: RunContext) -> bool:
+    """Whether a network finds masks in frames that are chosen by need: a tracker needs them evenly spaced."""
+    return context.models.segmenter is not None and context.options.associated_by == "consensus"
+
+
+def _frames_of_vision(stage: StageInput) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Chooses the training frames in which masks are found, and notes why others are left out."""
+    context, capture = stage.context, stage.results.load
+    limit, minutes = context.options.vision_frames, context.options.vision_minutes
+    train = training_frames(capture.held_out)
+    if not _chooses_frames(context):
+        return train[evenly_spaced(len(train), limit)], ()
+    order = frames_by_need(stage.results.gaussians, capture.cameras[train], limit=limit, progress=stage.progress)
+    why = "--vision-frames allows no more" if len(order) == limit else f"others add less than {LEAST_GAIN:.0%} each"
+    if minutes is not None:
+        began, segmenter = time.monotonic(), context.models.segmenter
+
+        def segment(rows: Sequence[int]) -> Iterator[bool]:
+            for row in rows:
+                is_early = row < 2 or time.monotonic() - began < 60 * minutes
+                if is_early:  # the masks are stored on disk
+                    segmenter(capture.frames[train[order[row]]], row)
+                yield is_early
+
+        is_early = np.array(map_over_processes(len(order), segment, stage.progress))
+        why = why if is_early.all() else "--vision-minutes allows no more"
+        order = order[is_early]
+    notes = (f"masks in {len(order)} of {len(train)} training frames: {why}",) if len(order) < len(train) else ()
+    return train[np.sort(order)], notes
+
+
 class _TrainingView:
     """The training frames in which masks are found and embedded."""
 
-    def __init__(self, capture: Capture, options: Options):
-        self.capture, self.train = capture, vision_frames(capture, options)
+    def __init__(self, capture: Capture, options: Options, train: np.ndarray):
+        self.capture, self.train = capture, train
         self.names = [capture.names[t] for t in self.train]
         self.size = capture.cameras.height, capture.cameras.width
         frames = dict(itertools.zip_longest(capture.names, capture.files))
@@ -116,22 +167,25 @@ class _TrainingView:
 
 def _read_masks(stage: StageInput) -> StageResult:
     """Reads the labels of the training frames from mask files."""
-    folder, view = stage.context.options.masks, _TrainingView(stage.results.load, stage.context.options)
+    frames, _ = _frames_of_vision(stage)
+    folder, view = stage.context.options.masks, _TrainingView(stage.results.load, stage.context.options, frames)
     assert folder is not None
     loaded = load_labels(folder, view.names, view.size, **view.mask_layout, progress=stage.progress)
     _require_regions(loaded.labels, str(folder))
-    return StageResult(loaded.labels, notes=(f"{len(loaded.ids)} regions in the masks", *loaded.notes))
+    notes = (f"{len(loaded.ids)} regions in the masks", *loaded.notes)
+    return StageResult(ObjectLabels(loaded.labels, frames), notes)
 
 
 def _find_objects(stage: StageInput) -> StageResult:
     """Finds proposals in the training frames, and associates them over the frames to labels of objects."""
     context, scene = stage.context, stage.results.gaussians
-    view = _TrainingView(stage.results.load, context.options)
+    frames, why_fewer = _frames_of_vision(stage)
+    view = _TrainingView(stage.results.load, context.options, frames)
     proposals, notes = _frame_proposals(context, view, scene)
     labels = _associate_masks(context, view, scene, proposals, stage.progress, stage.checkpoint)
     context.models.close()
     _require_regions(labels, str(context.options.capture))
-    return StageResult(labels, notes=notes)
+    return StageResult(ObjectLabels(labels, frames), notes=(*why_fewer, *notes))
 
 
 def _frame_proposals(
@@ -214,8 +268,9 @@ def _require_regions(labels: np.ndarray, where: str) -> None:
 
 def _embed_objects(stage: StageInput) -> StageResult:
     """Embeds each region by the embedder of the run, in few views."""
-    context, labels = stage.context, stage.results.objects
-    view, embed = _TrainingView(stage.results.load, context.options), context.models.embedder.embed_regions
+    context, labels = stage.context, stage.results.objects.labels
+    view = _TrainingView(stage.results.load, context.options, stage.results.objects.frames)
+    embed = context.models.embedder.embed_regions
     pixels, cut, directions = crop_geometry(labels, view.cameras, int(labels.max()) + 1)
     chosen = choose_crops(pixels, cut, directions, context.options.crops)
     embedded = region_embeddings(view.frames, labels, embed, views=chosen, progress=stage.progress)
@@ -229,8 +284,8 @@ def _embed_objects(stage: StageInput) -> StageResult:
 
 def _read_embeddings(stage: StageInput) -> StageResult:
     """Reads the embeddings of masks from files, and pools them to those of the regions."""
-    options, labels = stage.context.options, stage.results.objects
-    view = _TrainingView(stage.results.load, options)
+    options, labels = stage.context.options, stage.results.objects.labels
+    view = _TrainingView(stage.results.load, options, stage.results.objects.frames)
     assert options.features is not None
     features = load_features(options.features, view.names, view.size, **view.mask_layout)
     if not len(features.embeddings):
@@ -248,7 +303,7 @@ def _read_embeddings(stage: StageInput) -> StageResult:
 def _find_parts(stage: StageInput) -> StageResult:
     """Finds small parts of the scene, each with the embeddings of all single-frame masks that contain it."""
     context, options = stage.context, stage.context.options
-    view = _TrainingView(stage.results.load, options)
+    view = _TrainingView(stage.results.load, options, stage.results.objects.frames)
     frames = view.frames
     masks, embed = _masks_with_embeddings(context, view, stage.results)
     views = SceneSuperpixels(
@@ -280,6 +335,6 @@ def _masks_with_embeddings(
 
         return masks, lambda t, masks: features.embeddings[rows(t)]
     if options.masks is not None:
-        labels = results.objects
+        labels = results.objects.labels
         return lambda t: labels[t][None] == np.unique(labels[t][labels[t] >= 0])[:, None, None], by_model
     return _frame_proposals(context, view, results.gaussians)[0], by_model

@@ -183,8 +183,10 @@ class ModelOptions:
         hub:owner/name, or a folder.
       crops: Maximum number of views in which a region is embedded: those that show most of it, not cut off by the
         frame's border, from different directions.
-      vision_frames: Maximum number of training frames, evenly spaced, in which masks are found and embedded. The fit
-        uses all of them. By default vision does too.
+      vision_frames: Maximum number of training frames in which masks are found and embedded; the fit uses all. A
+        segmenter takes those that show most of the scene first, and ends where a further one adds less than 1 %. Other
+        masks, and a tracker, take evenly spaced frames, by default all.
+      vision_minutes: Time limit of a segmenter in minutes, at least 0.05. It takes at least two frames.
       features: Folder language_features of LangSplat. Regions take their embeddings from <frame>_s.npy and _f.npy, and
         texts then need the CLIP model that made them (--embedder, here or of query).
     """
@@ -196,6 +198,7 @@ class ModelOptions:
     embedder: ModelOption = None
     crops: Count[Option[int]] = 5
     vision_frames: Annotated[Option[int | None], Range(2, 1_000_000)] = None
+    vision_minutes: Annotated[Option[float | None], Range(0.05, 10_000)] = None
     features: Option[Path | None] = None
 
 

@@ -18,7 +18,6 @@ import numpy as np
 from jsecon.errors import InputError
 from jsecon.pipeline import cache
 from jsecon.pipeline.options import Options
-from jsecon.read.captures.frames import evenly_spaced
 from jsecon.types import Array, Capture, Codes, Gaussians, Parts, Progress, Quality, Regions, Votes
 from jsecon.vision.protocols import Models
 
@@ -30,6 +29,16 @@ KEY_FILE = "made_by.txt"
 """file with the name and key of a stage, in the folder that the stage writes beside its result"""
 
 
+@dataclasses.dataclass(frozen=True)
+class ObjectLabels:
+    """Labels of objects in the training frames that vision uses."""
+
+    labels: np.ndarray
+    """(T, H, W) int16, -1 for no region."""
+    frames: np.ndarray
+    """(T,) which frames of the capture these are, ascending."""
+
+
 class Results:
     """Results of the finished stages, by the names of the stages. Reading one that is missing raises AttributeError."""
 
@@ -37,8 +46,8 @@ class Results:
     """the capture, corrected if the options ask for that"""
     gaussians: Gaussians
     """N Gaussians, read or fitted"""
-    objects: np.ndarray
-    """(T, H, W) int16 labels of the training frames, -1 for no region"""
+    objects: ObjectLabels
+    """labels of the training frames that vision uses"""
     regions: Regions
     """R regions of the training frames"""
     parts: Parts | None = None
@@ -164,9 +173,3 @@ def training_frames(held_out: Array) -> np.ndarray:
         problem = f"{len(train)} of {len(held_out)} frames to work with"
         raise InputError("frames", problem, "at least 2", "Hold out fewer frames (--holdout), or use more (--frames).")
     return train
-
-
-def vision_frames(capture: Capture, options: Options) -> np.ndarray:
-    """Lists the training frames in which masks are found and embedded."""
-    train = training_frames(capture.held_out)
-    return train[evenly_spaced(len(train), options.vision_frames)]

@@ -83,6 +83,8 @@ class Run:
     """The capture, corrected if the options ask for that."""
     labels: np.ndarray
     """(T, H, W) int16 labels of the training frames that vision uses."""
+    vision_frames: np.ndarray
+    """(T,) which frames of the capture these are."""
     held_out: Quality
     """PSNR and SSIM of the held-out frames."""
     steps: list[Step]
@@ -277,7 +279,7 @@ def run(
         state.notes.append(f"up is from {field.up}")
         console.note(state.notes[-1])
     programs = {name: count - before[name] for name, count in compilation_counts().items()}
-    made = results.load, results.objects, results.held_out
+    made = results.load, results.objects.labels, results.objects.frames, results.held_out
     return Run(field, context.options, *made, state.steps, seconds, state.notes, programs)
 
 

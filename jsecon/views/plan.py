@@ -15,6 +15,7 @@ from scipy.spatial import KDTree
 from jsecon.errors import InputError, require
 from jsecon.field.evidence import region_votes
 from jsecon.types import Camera, Gaussians, Progress
+from jsecon.views.cover import SEEN_PX, greedy_cover
 from jsecon.views.frame import SceneFrame, inner_scene, scene_frame, surface_points
 
 FIELD_OF_VIEW = 60.0
@@ -109,7 +110,10 @@ def place_cameras(
         remedy = "Open it in a viewer to check it, or give cameras of your own with --cameras FILE."
         raise InputError("scene", "no virtual view shows it", "", remedy)
     opacity = 1 / (1 + np.exp(-np.asarray(gaussians.opacity_logits, np.float64)[counted]))
-    chosen, coverage = _greedy_cover(seen[usable], opacity, views)
+    shown = seen[usable] / SEEN_PX
+    chosen = greedy_cover(shown, opacity, views)
+    once = np.minimum(shown[chosen].sum(0), 1)
+    coverage = float(opacity @ once / max(opacity.sum(), 1e-30))
     chosen = usable[chosen]
     cameras = _cameras(candidates[chosen], width, height)
     return _PlannedViews(cameras, frame, kind, coverage, int((fog[chosen] >= FOG_SHARE).sum()))
@@ -136,43 +140,6 @@ def _free_places(points: Float[np.ndarray, "p 3"], frame: SceneFrame) -> Float[n
 def _in_world(frame: SceneFrame, local: np.ndarray) -> Float[np.ndarray, "... 3"]:
     """Maps points in the box, -1 to 1 along each axis, into the world."""
     return (local * frame.half) @ frame.axes + frame.centre
-
-
-def _greedy_cover(
-    weights: Float[np.ndarray, "v n"], importance: Float[np.ndarray, " n"], views: int
-) -> tuple[np.ndarray, float]:
-    """Chooses views that show the scene, one after the other, each time the one that adds most.
-
-    What a Gaussian adds grows with the logarithm of its rendering weight in all chosen views, so that a near view of a
-    small thing still counts when others have shown it. This value is submodular: the choice is within 1 - 1/e of the
-    best one.
-
-    Args:
-      weights: Rendering weight of each Gaussian in each candidate, px; from 0.3 px on a Gaussian counts as seen.
-      importance: Weight of each Gaussian in the gain.
-      views: Number of views to choose.
-
-    Returns:
-      Indices of the chosen candidates; and the share of the importance that they show at least once.
-    """
-    shown = (weights / 0.3).astype(np.float32)
-    importance = importance.astype(np.float32)
-    covered = np.zeros(weights.shape[1], np.float32)
-    chosen: list[int] = []
-    bound = np.full(len(shown), np.inf)
-    for _ in range(min(views, len(shown))):
-        bound[chosen] = -np.inf
-        best, gain = -1, -np.inf
-        for index in np.argsort(-bound, kind="stable"):  # lazy: a gain never grows
-            if bound[index] <= gain:
-                break
-            bound[index] = float(importance @ np.log1p(shown[index] / (1 + covered)))
-            if bound[index] > gain:
-                best, gain = int(index), bound[index]
-        chosen.append(best)
-        covered += shown[best]
-    once = np.minimum(covered, 1)
-    return np.array(chosen), float(importance @ once / max(importance.sum(), 1e-30))
 
 
 def _is_room(alpha: np.ndarray, places: int) -> bool:
