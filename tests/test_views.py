@@ -201,9 +201,6 @@ SURROUNDINGS = {
 """points around a scene of 4 units, of a generator and a count"""
 
 
-@pytest.mark.parametrize("place", SURROUNDINGS)
-@pytest.mark.parametrize("share", [0.02, 0.13, 0.4, 0.6])
-@pytest.mark.parametrize("seed", range(2))
 def test_frames_for_masks_are_those_that_show_what_others_do_not():
     outward, up = CENTRES * (1, 1, 0) / np.linalg.norm(CENTRES[:, :2], axis=1, keepdims=True), np.array([0, 0, 1.0])
     poses = [plan._look(centre - 1.5 * way, way, up) for centre, way in zip(CENTRES, outward)]  # each shows one ball
@@ -215,6 +212,9 @@ def test_frames_for_masks_are_those_that_show_what_others_do_not():
     np.testing.assert_array_equal(frames_by_need(scene_of(balls()), cameras, limit=2), chosen[:2])
 
 
+@pytest.mark.parametrize("place", SURROUNDINGS)
+@pytest.mark.parametrize("share", [0.02, 0.13, 0.4, 0.6])
+@pytest.mark.parametrize("seed", range(2))
 def test_far_surroundings_of_any_share_leave_the_frame_as_it_is(object_alone, place, share, seed):
     count = round(object_alone.count * share / (1 - share))
     points = SURROUNDINGS[place](np.random.default_rng(seed), count)

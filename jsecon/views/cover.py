@@ -24,7 +24,7 @@ def greedy_cover(
     importance: Shaped[np.ndarray, " n"],
     views: int,
     *,
-    enough: float = np.inf,
+    enough: float | int = np.inf,
     least_gain: float = 0.0,
 ) -> Int[np.ndarray, " k"]:
     """Chooses views that show the scene, one after the other, each time the one that adds most.
