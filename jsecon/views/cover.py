@@ -81,6 +81,6 @@ def frames_by_need(
     views = len(cameras) if limit is None else limit
 
     def choose(rows: Sequence[int]) -> list[np.ndarray]:
-        return [greedy_cover(looks, looks.any(0), views, enough=LOOKS, least_gain=LEAST_GAIN) for _ in rows]
+        return [greedy_cover(looks, looks.max(0) > 0, views, enough=LOOKS, least_gain=LEAST_GAIN) for _ in rows]
 
     return map_over_processes(1, choose)[0]  # one process chooses: others may round otherwise
