@@ -102,6 +102,13 @@ def _clouds(folder: Path) -> None:
             write_ply(folder / f"{form}-{kind}.ply", xyz | colours, form, dict.fromkeys(colours, kind))
 
 
+def _placed_points(file: Path) -> tuple[np.ndarray, ...]:
+    """Points and colours of a cloud, but for places that are no numbers: a capture leaves these out, and counts them."""
+    points, colours = load_point_cloud(file)
+    placed = np.isfinite(points).all(1)
+    return points[placed], colours[placed]
+
+
 def _colmap(folder: Path) -> None:
     capture = small_capture(3, points=12)
     write_colmap(capture, folder / "binary")
@@ -280,7 +287,7 @@ FRAMES = np.zeros((2, 16, 16, 3), np.uint8)
 READERS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any], tuple[str, ...]]] = {
     "ply": (_plys, lambda file: read_gaussians(file)[0], ()),
     "splats": (_splats, lambda file: read_gaussians(file)[0], ()),
-    "clouds": (_clouds, load_point_cloud, ()),
+    "clouds": (_clouds, _placed_points, ()),
     "colmap": (_colmap, lambda folder: load_capture(folder, holdout=2), (".bin", ".txt")),
     "nerfstudio": (_nerfstudio, load_capture, (".json", "h0.png", "d.ply")),
     "rgbd": (lambda folder: [write(folder / name) for name, write in RGBD.items()], load_capture,

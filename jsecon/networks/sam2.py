@@ -221,7 +221,7 @@ def open_sam2(folder: Path) -> Sam2Graphs:
 def _read_constants(path: Path) -> _Constants:
     expected = f"image_mean, image_std and memory_temporal_positional_encoding of {SLOTS} rows"
     content = read_json(path, expected, _FETCH)
-    with reading(path, expected, _FETCH):
+    with reading(path, expected, _FETCH), np.errstate(over="ignore"):  # what overflows is refused below
         names = ("image_mean", "image_std", "memory_temporal_positional_encoding")
         constants = _Constants(*(np.asarray(content[name], np.float32) for name in names))
     shapes = [array.shape for array in constants]

@@ -48,10 +48,19 @@ on they swap width and height."""
 
 
 @contextlib.contextmanager
+def _size_limit() -> Iterator[None]:
+    """Makes Pillow's error for a size that no image has one of those that `reading` knows."""
+    try:
+        yield
+    except Image.DecompressionBombError as error:
+        raise ValueError(str(error)) from error
+
+
+@contextlib.contextmanager
 def _open(path: Path) -> Iterator[ImageFile]:
     """Opens an image; only its header is read. Errors of the decoder in the body of the `with` become InputErrors."""
     again = "Copy or export the file again."
-    with reading(path, remedy=again, problem="the image cannot be read"), path.open("rb") as file:
+    with reading(path, remedy=again, problem="the image cannot be read"), _size_limit(), path.open("rb") as file:
         head = file.read(32)
         file.seek(0)
         if not head:
