@@ -103,7 +103,7 @@ def _clouds(folder: Path) -> None:
 
 
 def _placed_points(file: Path) -> tuple[np.ndarray, ...]:
-    """Points and colours of a cloud, but for places that are no numbers: a capture leaves these out, and counts them."""
+    """Points and colours of a cloud, but for places that are no numbers: a capture leaves these out, with a note."""
     points, colours = load_point_cloud(file)
     placed = np.isfinite(points).all(1)
     return points[placed], colours[placed]
