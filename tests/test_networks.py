@@ -222,8 +222,7 @@ def test_models_by_name_are_fetched_once_and_found_again_for_a_moved_field(
     assert run_cli(*command) == 2  # a run fetches nothing
     assert "jsecon models get edgetam" in (said := capsys.readouterr().err)
     assert "jsecon models get siglip2" in said
-    assert run_cli("models", "get", "auto") == run_cli("models", "check", "siglip2") == 0
-    assert "CLIP: usable" in capsys.readouterr().out
+    assert run_cli("models", "get", "auto") == 0
     assert run_cli(*command) == 0
     assert "by edgetam, what the views agree on" in capsys.readouterr().out
     asked = len(hub.requests)
@@ -243,3 +242,19 @@ def test_models_by_name_are_fetched_once_and_found_again_for_a_moved_field(
     assert f"jsecon models get {address} --role embedder" in capsys.readouterr().err
     assert run_cli("models", "get", address, "--role", "embedder") == 0
     assert run_cli(*query) == 0
+
+
+def test_models_are_fetched_and_checked_by_name(hub, tmp_path, monkeypatch, capsys):
+    use_hub(hub, tmp_path / "cache", monkeypatch)
+    assert run_cli("models", "get", "edgetam", "siglip2") == 2  # this hub has no tracker of the first name
+    assert run_cli("models", "check", "siglip2") == 0
+    assert "CLIP: usable" in capsys.readouterr().out
+    assert run_cli("models", "check", "clip") == run_cli("models", "get", "clap") == run_cli("models", "get") == 2
+    assert "jsecon models get clip" in capsys.readouterr().err
+    files = hub.repositories["onnx-community/siglip2-base-patch16-224-ONNX"].files
+    for name in ("onnx/vision_model.onnx", "onnx/text_model.onnx"):
+        files[name.replace(".onnx", "_quantized.onnx")] = files.pop(name)
+    use_hub(hub, tmp_path / "other", monkeypatch)
+    assert run_cli("models", "get", "auto") == 0
+    fetched = {path.name for path in (tmp_path / "other").rglob("*.onnx")}
+    assert {"vision_model_quantized.onnx", "vision_encoder.onnx"} <= fetched

@@ -35,9 +35,9 @@ def _run(verb: verbs.Run, console: Console) -> verbs.VerbResult:
     options = verb.options
     if verb.dry_run:
         return pipeline.dry_run(options, verb.out, console=console)
+    show = None if is_bare_scene(options.capture) else partial(show_scene, verb.out, console)
     with processes.connection(options) if verb.distributed else contextlib.nullcontext(0) as index:
         if index == 0:
-            show = None if is_bare_scene(options.capture) else partial(show_scene, verb.out, console)
             run = pipeline.run(options, verb.out, console=console, on_scene=show)
         else:
             pipeline.run_worker(options, verb.out)
@@ -47,7 +47,8 @@ def _run(verb: verbs.Run, console: Console) -> verbs.VerbResult:
     metrics = write_run(run, verb.out, console, title, "Made by jsecon from posed frames.")
     query = f'jsecon query {verb.out / "field.safetensors"} "dark green bottle" --out {verb.out / "answers"}'
     console.print_line(f"next    {query}")
-    return {"written": [verb.out / name for name in FILES]} | metrics
+    names = FILES if show is None else (*FILES, FIRST_VIEW)
+    return {"written": [verb.out / name for name in names]} | metrics
 
 
 def _fit(verb: verbs.Fit, console: Console) -> verbs.VerbResult:

@@ -60,7 +60,7 @@ def run_demo(out: Path, *, console: Console, room: Path = ROOM, steps: int = 550
 def _demo(verb: verbs.Demo, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon demo`."""
     result = run_demo(verb.out, console=console)
-    return {"written": [verb.out / name for name in (*running.FILES, "queries")]} | result
+    return {"written": [verb.out / name for name in (*running.FILES, running.FIRST_VIEW, "queries")]} | result
 
 
 def _copy_capture(room: Path, out: Path) -> Path:

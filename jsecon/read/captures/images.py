@@ -49,7 +49,7 @@ on they swap width and height."""
 
 @contextlib.contextmanager
 def _size_limit() -> Iterator[None]:
-    """Makes Pillow's error for a size that no image has one of those that `reading` knows."""
+    """Turns Pillow's error for an image of impossible size into a ValueError, which `reading` reports."""
     try:
         yield
     except Image.DecompressionBombError as error:
