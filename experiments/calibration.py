@@ -4,7 +4,7 @@
 
 Twins of LERF, regions of the simulated tracker. Every name of a thing in the room is asked, and 200 names that nothing
 in it has; the first weigh as much as the second in all. An answer is right if its region shows the thing. Answers that
-the default rules judge absent do not count. `OFFSET` and `SLOPE` of jsecon.query.scores are fitted on the seeds
+the default rules judge absent do not count. `OFFSET` and `SLOPE` of jsecon.query.match are fitted on the seeds
 `--fitted` by the likelihood. The expected calibration error has ten bins of equal width.
 """
 
@@ -23,8 +23,8 @@ from experiments import lerf, results
 from experiments.cells import append_cell, read_cells
 from experiments.shared_errors import pooled
 from experiments.tables import twins
+from jsecon.query.match import OFFSET, SLOPE, score_text, word_similarities
 from jsecon.query.rules import ABSENT, RULES
-from jsecon.query.scores import OFFSET, SLOPE, score_text, word_similarities
 
 BINS = 10
 FITTED_VISION = 100

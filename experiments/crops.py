@@ -2,8 +2,8 @@
 
     python -m experiments.crops [--model FOLDER]
 
-The views are those that `jsecon.field.crops` chooses. Real words are those of `experiments.real_words` on given masks,
-twins those of Table 1 with consensus, under simulated vision of medium noise. A crop costs what
+The views are those that `jsecon.field.regions` chooses. Real words are those of `experiments.real_words` on given
+masks, twins those of Table 1 with consensus, under simulated vision of medium noise. A crop costs what
 `experiments.vision_speed` measured for SigLIP 2 on two cores. Intervals are the middle 95 % of the mean difference to
 all views, under resampling of the texts.
 """
@@ -23,7 +23,7 @@ from experiments.tables.ours import ask_field, association, field_of
 from experiments.tables.setting import Setting
 from experiments.words import rules
 from experiments.words.scenes import GIVEN, load_scene
-from jsecon.field.crops import choose_crops, crop_geometry
+from jsecon.field.regions import choose_crops, crop_geometry
 
 ALL = 0
 """of the limits: every view is embedded"""

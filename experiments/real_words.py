@@ -38,8 +38,8 @@ from experiments.words.scenes import DEFAULT, GIVEN, RIVALS, WordScene, load_sce
 from jsecon.field.membership import normalise_votes
 from jsecon.query.answer import match_regions, query_anchored, query_several
 from jsecon.query.classes import query_classes
+from jsecon.query.match import view_count_weight
 from jsecon.query.rules import MIN_COSINE, STATES, QueryRules
-from jsecon.query.scores import view_count_weight
 from jsecon.types import LanguageField, Regions, Selection
 from jsecon.vision.unrelated_words import embed_unrelated_words
 

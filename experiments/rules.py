@@ -34,7 +34,7 @@ from experiments.tables.setting import Setting
 from jsecon.field.evidence import region_votes
 from jsecon.fit.start import gaussians_from_points
 from jsecon.query.answer import match_regions, query_anchored, query_several
-from jsecon.query.grouping import parts_fallback
+from jsecon.query.match import parts_fallback
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.rules import MIN_COSINE, STATES, QueryRules
 from jsecon.types import LanguageField

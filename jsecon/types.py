@@ -334,7 +334,7 @@ class LanguageField(_Shown):
     """what single masks say of small parts of the scene, where the run was asked for it."""
     unrelated_words: Array | None = None
     """(W, E) embeddings of words unrelated to the scene, W may be 0: what a text's similarity is
-    measured against (jsecon.query.scores). None: a field of an earlier version."""
+    measured against (jsecon.query.match). None: a field of an earlier version."""
     codes: Codes | None = None
     """codes of Gaussians and regions, which only queries by code read; None if the run was not asked for them."""
     up: UpAxis | None = None
@@ -379,7 +379,7 @@ class Selection:
     """() float: share of unrelated words that are less similar to the scene than the text is; NaN or None where that is
     not known."""
     confidence: Array | None = None
-    """() float: probability that the region shows what the text names (jsecon.query.scores); NaN or None where that is
+    """() float: probability that the region shows what the text names (jsecon.query.match); NaN or None where that is
     not known."""
     presence: Array | None = None
     """() float: probability that the text is true of the region; None unless the embedder was trained to tell that."""

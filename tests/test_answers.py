@@ -12,7 +12,7 @@ from small_field import colour_field
 from test_gltf import read_glb
 
 from jsecon import Answer, Query, Scene, load_gaussians, objects, save_field
-from jsecon.app.querying import write_answers
+from jsecon.app.querying import _write_answers
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Console
 from jsecon.pipeline.sources import provenance
@@ -119,7 +119,7 @@ def test_an_answer_replaces_the_files_of_the_last_one_to_the_same_text(saved, tm
     assert {path.name for path in tmp_path.iterdir()} == {"answers.html", *others, *beside, *own}
     found = Scene(field).ask("pink")
     nothing = Answer(Query("pink"), "votes", np.zeros_like(found.mask), found.selection, field, count=0)
-    write_answers(Scene(field), [nothing], tmp_path, Console())
+    _write_answers(Scene(field), [nothing], tmp_path, Console())
     assert {path.name for path in tmp_path.iterdir()} == {"answers.html", *others, *beside, "pink.json"}
 
 

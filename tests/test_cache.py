@@ -10,7 +10,7 @@ import pytest
 from jsecon import Autoencoder
 from jsecon.files import unpack_tree
 from jsecon.pipeline import cache
-from jsecon.pipeline.results import StageResult
+from jsecon.pipeline.stages import StageResult
 
 
 def _tree(scene, cameras):

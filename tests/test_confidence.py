@@ -4,10 +4,10 @@ import jax
 import numpy as np
 
 from experiments.calibration import Bin, calibration_error
-from jsecon.query import scores
-from jsecon.query.scores import OFFSET, SLOPE
+from jsecon.query import match
+from jsecon.query.match import OFFSET, SLOPE
 
-answer_confidence = jax.jit(scores.answer_confidence)
+answer_confidence = jax.jit(match.answer_confidence)
 
 
 def case(seed: int = 0, regions: int = 7, words: int = 20):
@@ -28,7 +28,7 @@ def test_it_is_a_logistic_curve_of_how_far_the_answer_stands_out():
     expected = 1 / (1 + np.exp(-(OFFSET + SLOPE * ratio)))
     found = answer_confidence(similarity, known, evidence, words)
     np.testing.assert_allclose(found, expected, rtol=1e-4)
-    np.testing.assert_allclose(scores.answer_confidence(similarity, known, evidence, words), found, rtol=1e-5)
+    np.testing.assert_allclose(match.answer_confidence(similarity, known, evidence, words), found, rtol=1e-5)
     np.testing.assert_allclose(answer_confidence(3 * similarity, known, evidence, 3 * words), expected, rtol=1e-4)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from jsecon.field.crops import choose_crops, crop_geometry
+from jsecon.field.regions import choose_crops, crop_geometry
 from jsecon.types import Camera
 
 

@@ -18,8 +18,8 @@ from test_pipeline import Recorder
 from jsecon import load_capture, load_field, load_gaussians, save_field, save_gaussians
 from jsecon.files import exclusive_lock, reading, write_text
 from jsecon.pipeline import cache, run as pipeline, scene
-from jsecon.pipeline.results import RunContext
 from jsecon.pipeline.scene import plan_capture
+from jsecon.pipeline.stages import RunContext
 from jsecon.read.captures import build
 from jsecon.read.captures.images import write_image
 from jsecon.vision.colours import ColourEmbedder

@@ -22,8 +22,8 @@ FREQUENT = """
 from jsecon.process import prepare_process
 prepare_process()
 from jsecon.__main__ import main
-from jsecon.pipeline import results
-results.CHECKPOINT_SECONDS = 0.5
+from jsecon.pipeline import stages
+stages.CHECKPOINT_SECONDS = 0.5
 raise SystemExit(main())
 """
 """`jsecon` with frequent checkpoints"""

@@ -26,8 +26,8 @@ from jsecon.paper.distill import distill_votes
 from jsecon.paper.queries import query_canonical, query_one_step, select_by_code
 from jsecon.query.answer import match_regions, query_anchored
 from jsecon.query.classes import query_classes
+from jsecon.query.match import region_similarities
 from jsecon.query.rules import QueryRules
-from jsecon.query.scores import region_similarities
 from jsecon.splat.project import project
 from jsecon.splat.sh import colours_from_sh
 from jsecon.types import Camera, Codes

@@ -16,16 +16,20 @@ from PIL import Image
 
 from jsecon.app import cli
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.results import KEY_FILE, RunContext
 from jsecon.pipeline.run import compute_stages
 from jsecon.pipeline.scene import plan_capture
+from jsecon.pipeline.stages import KEY_FILE, RunContext
 from jsecon.poses import sfm
 from jsecon.poses.sfm import find_poses
-from jsecon.read.captures.capture import list_photographs, load_capture, read_posed_images, unposed_photographs
+from jsecon.read.captures.capture import load_capture, read_posed_images, unposed_photographs
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Models
 
 COUNT = 8
+
+
+def photographs_of(folder) -> list[Path]:
+    return unposed_photographs(folder)[0]
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +44,7 @@ def found(photos, tmp_path_factory):
     if importlib.util.find_spec("pycolmap") is None:
         pytest.skip("no pycolmap")
     work, told = tmp_path_factory.mktemp("work"), []
-    capture, notes = find_poses(list_photographs(photos[0]), work, progress=lambda *at: told.append(at))
+    capture, notes = find_poses(photographs_of(photos[0]), work, progress=lambda *at: told.append(at))
     return capture, notes, work, told
 
 
@@ -87,15 +91,15 @@ def test_one_lens_for_the_photographs_of_one_camera_and_focal_length(photos, tmp
         if focal is not None:
             exif[0x0110], exif.get_ifd(0x8769)[0x920A] = "camera", float(focal)
         Image.new("RGB", (32, 24)).save(tmp_path / f"{number}.jpg", exif=exif)
-    assert sfm._lens_groups(list_photographs(tmp_path), 4 * [(32, 24)]) == [[0, 1], [2], [3]]
-    assert sfm._lens_groups(list_photographs(tmp_path), [(32, 24), *(3 * [(24, 32)])]) == [[0], [1], [2], [3]]
-    assert sfm._lens_groups(list_photographs(photos[0]), COUNT * [(WIDTH, HEIGHT)]) == [list(range(COUNT))]
+    assert sfm._lens_groups(photographs_of(tmp_path), 4 * [(32, 24)]) == [[0, 1], [2], [3]]
+    assert sfm._lens_groups(photographs_of(tmp_path), [(32, 24), *(3 * [(24, 32)])]) == [[0], [1], [2], [3]]
+    assert sfm._lens_groups(photographs_of(photos[0]), COUNT * [(WIDTH, HEIGHT)]) == [list(range(COUNT))]
 
 
 def test_without_pycolmap_the_message_has_the_line_to_run(photos, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with refused("pip install 'jsecon[sfm]'", "walk"):
-        find_poses(list_photographs(photos[0]), tmp_path, where=photos[0])
+        find_poses(photographs_of(photos[0]), tmp_path, where=photos[0])
     assert cli.main(["run", str(photos[0]), "--out", str(tmp_path / "out")]) == 2
     assert "pip install 'jsecon[sfm]'" in capsys.readouterr().err
 
@@ -107,7 +111,7 @@ def test_without_pycolmap_the_message_has_the_line_to_run(photos, tmp_path, monk
 ])  # fmt: skip
 def test_photographs_without_a_model_are_refused(photos, tmp_path, spoil, says):
     folder = shutil.copytree(photos[0], tmp_path / "walk")
-    photographs, work = list_photographs(folder), tmp_path / "work"
+    photographs, work = photographs_of(folder), tmp_path / "work"
     if spoil == "one damaged":
         photographs[3].write_bytes(photographs[3].read_bytes()[:2000])
     elif spoil == "two endings":
@@ -128,13 +132,13 @@ def test_what_was_stopped_goes_on_with_what_was_found_though_the_photographs_hav
     """Into two folders, with the same names in each, one folder's name in Latin-1. Features and pairs of a process that
     was killed are not looked for again; nothing is left of what it half did."""
     folders = [tmp_path / "walk" / name for name in ("cam 0", os.fsdecode(b"c\xe9 #1"))]
-    for number, photo in enumerate(list_photographs(photos[0])):
+    for number, photo in enumerate(photographs_of(photos[0])):
         folder = folders[number // 4]
         folder.mkdir(parents=True, exist_ok=True)
         shutil.copy(photo, folder / f"{number % 4}.png")
     shutil.copytree(found[2], tmp_path / "work", symlinks=True)
     told = []
-    photographs = list_photographs(tmp_path / "walk")
+    photographs = photographs_of(tmp_path / "walk")
     capture, _ = find_poses(photographs, tmp_path / "work", progress=lambda *at: told.append((*at, time.monotonic())))
     matched = max(at for done, total, at in told if total == COUNT * (COUNT - 1) // 2)
     assert matched - told[0][2] < 2  # no features and no pairs
@@ -151,13 +155,13 @@ def test_photographs_in_subfolders_are_told_from_masks_and_from_output(photos, t
     ):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
-    assert [str(p.relative_to(tmp_path)) for p in list_photographs(tmp_path)] == [
+    assert [str(p.relative_to(tmp_path)) for p in photographs_of(tmp_path)] == [
         *("cam0/i0.jpg", "cam0/i1.JPG", "cam1/deep/i0.HEIC")
     ]
     (tmp_path / "inside" / "images").mkdir(parents=True)
     for name in ("a.png", "images/b.webp"):  # photographs in images/ are those of the capture
         (tmp_path / "inside" / name).touch()
-    assert list_photographs(tmp_path / "inside") == [tmp_path / "inside" / "images" / "b.webp"]
+    assert photographs_of(tmp_path / "inside") == [tmp_path / "inside" / "images" / "b.webp"]
     shutil.rmtree(tmp_path / "inside")
     with refused("3 photographs without poses", "jsecon run"):
         load_capture(tmp_path)
@@ -210,7 +214,7 @@ def test_a_run_finds_the_poses_first_and_keeps_them_with_its_output_among_the_ph
 @pytest.mark.long
 def test_the_bonsai_is_found_as_its_poses_are_given(shared, tmp_path):
     capture = shared / "captures" / "bonsai"
-    folder, notes = find_poses(list_photographs(capture), tmp_path)
+    folder, notes = find_poses(sorted((capture / "images").iterdir()), tmp_path)
     assert "125 of 125 photographs" in notes[0]
     assert float(notes[0].split("error ")[1].split()[0]) < 0.4
     ours, theirs = (load_capture(path, holdout=0, long_side=32).cameras.world_to_camera for path in (folder, capture))
@@ -247,7 +251,7 @@ def test_depth_maps_and_masks_of_any_name_are_told_by_their_bits(tmp_path, kind)
         cv2.imwrite(str(tmp_path / "c.png"), numbers.astype(np.uint16))
     else:
         (tmp_path / "c.png").write_bytes(png(numbers % 2, bits=1, colour_type=0))
-    assert [path.name for path in list_photographs(tmp_path)] == ["a.jpg", "b.jpg"]
+    assert [path.name for path in photographs_of(tmp_path)] == ["a.jpg", "b.jpg"]
     for name in "ab":
         (tmp_path / f"{name}.jpg").unlink()
     with refused(tmp_path.name, "no photographs", "c.png"):

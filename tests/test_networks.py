@@ -22,8 +22,8 @@ from jsecon.fit.start import starting_gaussians
 from jsecon.networks.sam import SamSegmenter
 from jsecon.pipeline import model_loading, run as pipeline
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.results import Checkpoint, Results, RunContext, StageInput
-from jsecon.pipeline.stages import run_stages
+from jsecon.pipeline.run import run_stages
+from jsecon.pipeline.stages import Checkpoint, Results, RunContext, StageInput
 from jsecon.vision.stores import StoredSegmenter
 
 

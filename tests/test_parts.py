@@ -9,7 +9,7 @@ import pytest
 from small_field import KnownTexts, field_of, lone_votes, unit_rows
 
 from jsecon import QueryRules, Scene, query_anchored
-from jsecon.query.grouping import MIN_REGION_RATIO, PART_SCORE, part_scores, parts_fallback
+from jsecon.query.match import MIN_REGION_RATIO, PART_SCORE, _part_scores, parts_fallback
 from jsecon.query.outliers import best_cluster
 from jsecon.types import Parts, Regions
 from jsecon.vision.protocols import Logits
@@ -36,17 +36,17 @@ def test_part_scores_are_the_stated_ones_compiled_and_over_many_texts():
     parts = made_parts()
     rng = np.random.default_rng(1)
     texts, words = unit_rows(rng, 3, 16), unit_rows(rng, 4, 16)
-    many = jax.vmap(functools.partial(part_scores, retrieval="contrast"), (None, 0, None))(parts, texts, words)
+    many = jax.vmap(functools.partial(_part_scores, retrieval="contrast"), (None, 0, None))(parts, texts, words)
     for text, row in zip(texts, many):
         expected = scores_in_numpy(parts, text.astype(np.float64), words)
         np.testing.assert_allclose(row, expected, atol=1e-4)
-        np.testing.assert_allclose(part_scores(parts, text, words, retrieval="contrast"), row, atol=1e-5)
+        np.testing.assert_allclose(_part_scores(parts, text, words, retrieval="contrast"), row, atol=1e-5)
     assert float(np.max(many)) == pytest.approx(1)
-    plain = part_scores(parts, texts[0], None, retrieval="contrast")
+    plain = _part_scores(parts, texts[0], None, retrieval="contrast")
     np.testing.assert_allclose(plain, scores_in_numpy(parts, texts[0], np.zeros((1, 16))), atol=1e-4)
     for same in (np.ones((1, 16), np.float32) / 4, np.zeros((1, 16), np.float32)):  # all parts are equally near
         none = Parts(np.zeros(5, np.int32), same, np.ones(1, np.float32))
-        np.testing.assert_array_equal(part_scores(none, texts[0], None, retrieval="contrast"), np.zeros(5))
+        np.testing.assert_array_equal(_part_scores(none, texts[0], None, retrieval="contrast"), np.zeros(5))
 
 
 def test_the_best_cluster_stays_and_specks_do_not_rule():
@@ -108,7 +108,7 @@ def test_the_parts_answer_what_no_region_holds(unheld):
     assert selection.presence is None
     expected = pooled_in_numpy(field, thing == 4, text.astype(np.float64))
     assert float(selection.score) == pytest.approx(expected, abs=1e-5)
-    near = np.asarray(part_scores(field.parts, text, None, retrieval="contrast"))
+    near = np.asarray(_part_scores(field.parts, text, None, retrieval="contrast"))
     on_scale = np.interp(near, [0, PART_SCORE, 1], [0, 0.5, 1])
     np.testing.assert_allclose(selection.similarity, on_scale, atol=1e-6)
     assert on_scale[thing != 4].max() < 0.5

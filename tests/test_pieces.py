@@ -8,7 +8,7 @@ import pytest
 from small_field import make_field, rows_of_a_kind, shares
 
 from jsecon import QueryRules, Regions, query_anchored, query_region
-from jsecon.query.grouping import MIN_FRAGMENT_OVERLAP, regions_with
+from jsecon.query.match import MIN_FRAGMENT_OVERLAP, regions_with
 
 EMBEDDINGS = np.eye(9, dtype=np.float32)
 

@@ -16,9 +16,9 @@ from test_corrections import (
 from test_fit import same
 
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.results import RunContext
 from jsecon.pipeline.run import compute_stages
 from jsecon.pipeline.scene import plan_capture
+from jsecon.pipeline.stages import RunContext
 from jsecon.poses import refine
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Models

@@ -11,8 +11,8 @@ from small_field import KnownTexts, make_field, unit_rows
 
 from jsecon import Regions, Scene, load_field, query_anchored, query_classes, query_region, query_several, save_field
 from jsecon.field.similarity import similarities
+from jsecon.query.match import region_similarities, view_count_weight, word_similarities
 from jsecon.query.rules import ABSENT, FOUND, FOUND_MARGIN, MIN_COSINE, MIN_MARGIN, UNSURE, QueryRules
-from jsecon.query.scores import region_similarities, view_count_weight, word_similarities
 
 SIZE = 12
 

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from jsecon import load_capture
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.results import RunContext
 from jsecon.pipeline.scene import plan_capture
+from jsecon.pipeline.stages import RunContext
 from jsecon.read.captures.images import read_depth, write_image
 from jsecon.read.captures.lens import Lens, resample_depth
 from jsecon.vision.colours import ColourEmbedder

@@ -12,8 +12,8 @@ from test_gaussian_files import gaussians
 
 from jsecon import load_gaussians, render_rgb, save_gaussians
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.results import Checkpoint, Results, RunContext, StageInput
-from jsecon.pipeline.stages import run_stages
+from jsecon.pipeline.run import run_stages
+from jsecon.pipeline.stages import Checkpoint, Results, RunContext, StageInput
 from jsecon.read.captures.nerfstudio import source_from_trained
 from jsecon.splat.transform import transform_gaussians
 from jsecon.vision.colours import ColourEmbedder

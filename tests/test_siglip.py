@@ -14,8 +14,8 @@ from experiments.export.vocabulary import write_vocabulary
 from jsecon import Scene, query_anchored, query_several
 from jsecon.networks.clip import ClipEmbedder, read_preprocessing
 from jsecon.networks.tokenizer import TextTokenizer, _TextRules, read_text_rules
+from jsecon.query.match import presence_prob
 from jsecon.query.rules import MIN_COSINE, MIN_PRESENCE, QueryRules
-from jsecon.query.scores import presence_prob
 from jsecon.vision.protocols import Embedder, Logits
 
 LAYOUTS = ("immich", "transformers.js")

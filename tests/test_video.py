@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.results import RunContext
 from jsecon.pipeline.scene import plan_capture
+from jsecon.pipeline.stages import RunContext
 from jsecon.read.captures.video import write_frames
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Models

@@ -23,7 +23,7 @@ from jsecon.app.pictures import palette
 from jsecon.app.records import Answer, Query, Region
 from jsecon.app.scene import Scene
 from jsecon.app.viewer.layer import MAX_STD, SplatLayer
-from jsecon.app.viewer.window import ANSWER_HUE, COLOURINGS, Viewer, ViewState, highlight, open_viewer, region_along
+from jsecon.app.viewer.window import ANSWER_HUE, COLOURINGS, Viewer, ViewState, _highlight, _region_along, open_viewer
 from jsecon.query.pointing import region_shares_seen
 from jsecon.types import Selection
 from jsecon.vision.colours import BASIC, ColourEmbedder
@@ -59,9 +59,9 @@ def test_a_gaussian_of_two_answers_has_the_colour_of_the_better_one(field):
 
     base = np.array([[200, 100, 0]] * 4, np.uint8)
     failed = InputError("query", "no words")
-    assert highlight(base, [failed, answer_of([0, 0, 0, 0], [0, 0, 0, 0])]) is base
+    assert _highlight(base, [failed, answer_of([0, 0, 0, 0], [0, 0, 0, 0])]) is base
     first, second = answer_of([1, 1, 0, 0], [0.9, 0.6, 0.1, 0]), answer_of([0, 1, 1, 0], [0, 0.8, np.nan, 0])
-    colours = highlight(base, [first, failed, second]).astype(int)
+    colours = _highlight(base, [first, failed, second]).astype(int)
     tinted = (0.45 * base[0] + 0.55 * palette(3, ANSWER_HUE)).astype(int)
     np.testing.assert_allclose(colours[:3], [tinted[0], tinted[2], tinted[2]], atol=1)
     assert 0 < colours[3].max() < 0.5 * 200
@@ -217,16 +217,16 @@ def test_a_ray_meets_the_region_of_its_pixel_and_passes_what_is_hidden(field):
     agree = []
     for x, y in ((24, 20), (18, 14), (30, 26), (20, 28), (28, 12), (24, 30)):
         ray = turn.T @ [(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, 1]
-        found = region_along(field, centre, ray, focal=float(camera.fx), visible=everything)
+        found = _region_along(field, centre, ray, focal=float(camera.fx), visible=everything)
         agree.append(found == region_at(field, 0, x, y))
     assert sum(agree) >= 5, agree  # the frame's own Jacobian differs off its axis
     first, *others = (
-        region_along(field, centre, ray, focal=45.0, visible=visible)
+        _region_along(field, centre, ray, focal=45.0, visible=visible)
         for ray, visible in ((turn[2], everything), (turn[2], ~everything), (-turn[2], everything))
     )
     assert first >= 0
     assert others == [-1, -1]
-    assert region_along(field, centre, turn[2], focal=45.0, visible=main_regions(field) != first) != first
+    assert _region_along(field, centre, turn[2], focal=45.0, visible=main_regions(field) != first) != first
 
 
 @pytest.fixture(scope="module")

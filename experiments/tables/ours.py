@@ -21,7 +21,7 @@ from jsecon.paper.distill import distill_l1, distill_votes
 from jsecon.paper.queries import CODE_THRESHOLD, query_canonical, query_one_step, select_by_code
 from jsecon.query.answer import match_regions, query_anchored, query_several
 from jsecon.query.classes import query_classes
-from jsecon.query.grouping import parts_fallback
+from jsecon.query.match import parts_fallback
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.rules import RULES, QueryRules
 from jsecon.types import Codes, LanguageField, Parts, Regions, Selection, Votes

@@ -35,7 +35,7 @@ from jsecon.field.evidence import region_votes
 from jsecon.fit.start import starting_gaussians
 from jsecon.pipeline.objects import plan_objects
 from jsecon.pipeline.options import Options as RunOptions
-from jsecon.pipeline.results import Checkpoint, Results, RunContext, StageInput
+from jsecon.pipeline.stages import Checkpoint, Results, RunContext, StageInput
 from jsecon.read.captures.capture import load_capture
 from jsecon.types import Camera, Capture, Gaussians, Regions, Votes
 from jsecon.vision.colours import ColourEmbedder

@@ -18,11 +18,10 @@ from jsecon.field.columns import vote_blocks
 from jsecon.field.membership import SHARE_THRESHOLD, membership_probability, ratio, vote_columns, vote_shares
 from jsecon.field.similarity import similarities
 from jsecon.programs import stored_jit
-from jsecon.query.grouping import MIN_FRAGMENT_OVERLAP, regions_with
+from jsecon.query.match import MIN_FRAGMENT_OVERLAP, judge_texts, regions_with, unrelated_words
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.outliers import MIN_SAMPLES
 from jsecon.query.rules import ABSENT, QueryRules
-from jsecon.query.scores import judge_texts, unrelated_words
 from jsecon.types import Array, LanguageField, Votes
 from jsecon.views.frame import field_up
 from jsecon.vision.unrelated_words import UNRELATED_WORDS, embed_unrelated_words

@@ -137,7 +137,7 @@ def _tool(method: Callable[..., Any], tools: _Tools) -> Callable[..., Awaitable[
     return call
 
 
-def open_fields(
+def _open_fields(
     fields: Mapping[str, Path], scenes: Mapping[str, Future[Any]], embedder: str | Path | None, console: Console
 ) -> None:
     """Opens fields one after the other. One that fails is an error of its calls, and is printed."""
@@ -166,7 +166,7 @@ def _mcp(verb: verbs.Mcp, console: Console) -> verbs.VerbResult:
     server = make_server(scenes)
 
     def serve() -> None:
-        opening = threading.Timer(HANDSHAKE_SECONDS, open_fields, (fields, scenes, verb.embedder, console))
+        opening = threading.Timer(HANDSHAKE_SECONDS, _open_fields, (fields, scenes, verb.embedder, console))
         opening.daemon = True
         opening.start()
         try:

@@ -22,7 +22,7 @@ from jsecon.field.columns import votes_of_rows
 from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction_of_regions
 from jsecon.query.answer import RegionMatch, match_regions
 from jsecon.query.expressions import ANY_OBJECT, parse_expression
-from jsecon.query.grouping import join_fragments
+from jsecon.query.match import join_fragments
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.referring import evaluate

@@ -53,7 +53,7 @@ def _query(verb: verbs.Query, console: Console) -> verbs.VerbResult:
             _remove_answer(verb.out, file_stem(query))
     if not answers:
         remove_files(verb.out, [PAGE])
-    result = write_answers(scene, answers, verb.out, console, **files) if answers else {"answers": []}
+    result = _write_answers(scene, answers, verb.out, console, **files) if answers else {"answers": []}
     return result | {"errors": [error for error in results if isinstance(error, InputError)]}
 
 
@@ -117,7 +117,7 @@ def write_answer(
     return record
 
 
-def write_answers(
+def _write_answers(
     scene: Scene, answers: Sequence[Answer], out: Path, console: Console, *, views: int = 3, ending: str = "ply"
 ) -> dict[str, Any]:
     """Writes the files of answers and OUT/answers.html, and prints a line for each.

@@ -16,8 +16,8 @@ from jsecon.files import write_text
 from jsecon.pipeline import processes, run as pipeline
 from jsecon.pipeline.options import is_bare_scene
 from jsecon.pipeline.progress import Console
-from jsecon.pipeline.results import WARNING
 from jsecon.pipeline.run import Run
+from jsecon.pipeline.stages import WARNING
 from jsecon.process import peak_memory_mib
 from jsecon.read.captures.frames import evenly_spaced
 from jsecon.read.captures.images import write_image

@@ -25,19 +25,13 @@ ROOM = Path(__file__).with_name("room")
 """The capture: COLMAP, images, masks of the objects, LERF labels of the held-out frames."""
 
 
-def run_demo(out: Path, *, console: Console, room: Path = ROOM, steps: int = 550) -> dict[str, Any]:
-    """Builds the field of the room, answers the texts of its labels, and writes answers, report.html and metrics.json.
-
-    Args:
-      out: Folder to write to.
-      console: Receives messages and progress.
-      room: The capture to copy.
-      steps: Number of optimisation steps of the photometric fit.
-    """
+def _demo(verb: verbs.Demo, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon demo`: builds the field of the room, answers its texts, and measures the answers."""
+    out = verb.out
     require_writable(out)
-    capture = _copy_capture(room, out)
+    capture = _copy_capture(out)
     holdout = json.loads((capture / "scene.json").read_text())["holdout"]
-    options = Options(capture, holdout=holdout, steps=steps)
+    options = Options(capture, holdout=holdout, steps=550)
     run = pipeline.run(options, out, console=console, on_scene=partial(running.show_scene, out, console))
     scene, labels = Scene(run.field), load_lerf_labels(capture / "label")
     console.print_line("measured on the held-out views")
@@ -54,21 +48,15 @@ def run_demo(out: Path, *, console: Console, room: Path = ROOM, steps: int = 550
     metrics = running.write_run(run, out, console, "jsecon demo", lead, parts, anchored=summary)
     view = f'jsecon view {out / "field.safetensors"} "{texts[0]}"  (extra viewer; --export writes a page)'
     console.print_line(f"answers {out / 'queries'}\nview it {view}")
-    return metrics
+    return {"written": [out / name for name in (*running.FILES, running.FIRST_VIEW, "queries")]} | metrics
 
 
-def _demo(verb: verbs.Demo, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon demo`."""
-    result = run_demo(verb.out, console=console)
-    return {"written": [verb.out / name for name in (*running.FILES, running.FIRST_VIEW, "queries")]} | result
-
-
-def _copy_capture(room: Path, out: Path) -> Path:
+def _copy_capture(out: Path) -> Path:
     """Copies the room to OUT/capture, whole or not at all, unless it is there."""
     capture, unfinished = out / "capture", out / "capture.part"
     if not capture.is_dir():
         shutil.rmtree(unfinished, ignore_errors=True)
-        shutil.copytree(room, unfinished)
+        shutil.copytree(ROOM, unfinished)
         unfinished.rename(capture)
     return capture
 

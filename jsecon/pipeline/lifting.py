@@ -12,7 +12,7 @@ from jsecon.field.membership import normalise_votes
 from jsecon.paper.autoencoder import encode, train_autoencoder
 from jsecon.paper.distill import distill_votes
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.results import Results, RunContext, Stage, StageInput, StageResult
+from jsecon.pipeline.stages import Results, RunContext, Stage, StageInput, StageResult
 from jsecon.process import memory_budget
 from jsecon.types import Codes, LanguageField, Regions
 from jsecon.views.frame import find_up_axis, given_up

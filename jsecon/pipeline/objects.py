@@ -15,15 +15,14 @@ from jsecon.association.consensus import clean_tracks, pieces_on_masks, track_ma
 from jsecon.association.run_lengths import cache_masks_as_rle
 from jsecon.association.scene import SceneSuperpixels
 from jsecon.errors import InputError
-from jsecon.field.crops import choose_crops, crop_geometry
-from jsecon.field.regions import Embed, embeddings_of_masks, region_embeddings, scene_parts
+from jsecon.field.regions import Embed, choose_crops, crop_geometry, embeddings_of_masks, region_embeddings, scene_parts
 from jsecon.fit.depth import points_from_depth
 from jsecon.networks.hub import model_name
 from jsecon.paper.algorithm1 import masklets
 from jsecon.paper.tracker import GeometricTracker
 from jsecon.parallel import map_over_processes
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.results import (
+from jsecon.pipeline.stages import (
     Checkpoint,
     ObjectLabels,
     Results,

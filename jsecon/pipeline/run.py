@@ -1,7 +1,7 @@
 """A run: from a capture to a language field, stage by stage, each stored as it is finished.
 
 The keys of all stages are known before any runs, so the plan is printed first: which stages run, which are cached, what
-is skipped and why. `stages` is the table of the stages.
+is skipped and why. `stages` has the table of the stages.
 """
 
 import dataclasses
@@ -20,10 +20,14 @@ from jsecon.errors import InputError, is_out_of_memory
 from jsecon.field.field import load_field, save_field
 from jsecon.files import FIELD_FILE, exclusive_lock
 from jsecon.parallel import allgather_tree
-from jsecon.pipeline import cache, lifting, model_loading, stages
+from jsecon.pipeline import cache, lifting, model_loading
+from jsecon.pipeline.objects import plan_objects
 from jsecon.pipeline.options import Options, check_ranges, is_bare_scene, require_writable
 from jsecon.pipeline.progress import Console, Step
-from jsecon.pipeline.results import (
+from jsecon.pipeline.scene import plan_scene
+from jsecon.pipeline.scene_files import read_scene
+from jsecon.pipeline.sources import provenance
+from jsecon.pipeline.stages import (
     KEY_FILE,
     WARNING,
     Checkpoint,
@@ -34,9 +38,6 @@ from jsecon.pipeline.results import (
     StageResult,
     training_frames,
 )
-from jsecon.pipeline.scene import plan_scene
-from jsecon.pipeline.scene_files import read_scene
-from jsecon.pipeline.sources import provenance
 from jsecon.poses.sfm import require_pycolmap
 from jsecon.process import compilation_counts
 from jsecon.read.captures.build import plan_frames
@@ -95,6 +96,16 @@ class Run:
     """What the user should know, a sentence each."""
     programs: dict[str, int]
     """Number of programs that jax compiled ("all"), and of those that it read "from_disk"."""
+
+
+def run_stages(context: RunContext) -> list[Stage]:
+    """Plans the stages of a run. Mask files come before the long fit, so that their errors are found early."""
+    by_name = {
+        stage.name: stage for stage in [*plan_scene(context), *plan_objects(context), *lifting.plan_lifting(context)]
+    }
+    early = ("objects", "gaussians") if context.options.masks is not None else ("gaussians", "objects")
+    order = ("poses", "load", *early, "regions", "parts", "votes", "codes", "held_out")
+    return [by_name[name] for name in order if name in by_name]
 
 
 def _plan(context: RunContext, stage_list: list[Stage]) -> _RunState:
@@ -244,7 +255,7 @@ def _broadcast(stage: Stage | None, state: _RunState) -> None:
 def run_worker(options: Options, out: Path) -> None:
     """Computes each stage that the first process calls for, until it ends the work. It writes no file."""
     context, results = _open_context(options, out), Results()
-    by_name = {stage.name: stage for stage in stages.run_stages(context)}
+    by_name = {stage.name: stage for stage in run_stages(context)}
     while (call := allgather_tree(None)[0])["stage"]:
         vars(results).update(call["results"])
         checkpoint = Checkpoint(out / "worker")
@@ -265,7 +276,7 @@ def run(
     """
     console, before = console or Console(), compilation_counts()
     context = _open_context(options, out)
-    state = compute_stages(context, stages.run_stages(context), console, on_scene)
+    state = compute_stages(context, run_stages(context), console, on_scene)
     results, seconds, embedder = state.results, state.seconds, context.models.embedder
     started = time.monotonic()
     with console.progress("field"):
@@ -296,7 +307,7 @@ def current_field(options: Options, out: Path) -> Path | None:
     if not path.is_file():
         return None
     context = _open_context(options, out)
-    keys = _plan(context, stages.run_stages(context)).keys
+    keys = _plan(context, run_stages(context)).keys
     try:
         origin = json.loads(load_field(path, mapped=True).provenance)
     except (InputError, ValueError):  # damaged: the run writes it anew
@@ -308,7 +319,7 @@ def dry_run(options: Options, out: Path, *, scene_only: bool = False, console: C
     """Lists the stages that `run` would compute, and writes no file."""
     with console.progress("plan"):
         context = _open_context(options, out)
-        plan = _plan(context, plan_scene(context) if scene_only else stages.run_stages(context))
+        plan = _plan(context, plan_scene(context) if scene_only else run_stages(context))
         context.models.require_ready(plan.running)
         _check_inputs(context, plan)
     console.print_line(f"{options.capture} -> {out}, a dry run")

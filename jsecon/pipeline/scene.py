@@ -17,8 +17,8 @@ from jsecon.files import write_text
 from jsecon.fit.quality import QUICK_LONG_SIDE, is_weak, measure_quality
 from jsecon.fit.start import starting_gaussians
 from jsecon.pipeline.options import Options, is_bare_scene
-from jsecon.pipeline.results import KEY_FILE, WARNING, RunContext, Stage, StageInput, StageResult, training_frames
 from jsecon.pipeline.scene_files import check_overlap, fit_background, place_in_capture, read_scene
+from jsecon.pipeline.stages import KEY_FILE, WARNING, RunContext, Stage, StageInput, StageResult, training_frames
 from jsecon.poses.sfm import find_poses
 from jsecon.read.captures.capture import (
     has_depth,

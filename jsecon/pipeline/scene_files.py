@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from jsecon.errors import InputError
 from jsecon.fit.quality import QUICK_LONG_SIDE
 from jsecon.fit.resize import resize_frame, shrink_cameras
-from jsecon.pipeline.results import WARNING
+from jsecon.pipeline.stages import WARNING
 from jsecon.read.captures.frames import evenly_spaced, transform_poses
 from jsecon.read.splats.files import MAX_READ_ROUNDING, read_gaussians
 from jsecon.splat.project import project

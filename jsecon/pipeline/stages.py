@@ -14,17 +14,177 @@
 Each plan states how the stage works, for what a run prints first; the stages that it reads (`after`); and the options,
 models and files on which its result depends. The function that computes it stands beside the plan. `run` computes the
 rows, or reads them from the cache. `jsecon fit` computes those of `scene.plan_scene`.
+
+Here is what they share: their results, what a stage is, and how it resumes after a stop.
 """
 
-from jsecon.pipeline.lifting import plan_lifting
-from jsecon.pipeline.objects import plan_objects
-from jsecon.pipeline.results import RunContext, Stage
-from jsecon.pipeline.scene import plan_scene
+import contextlib
+import dataclasses
+import hashlib
+import json
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jsecon.errors import InputError
+from jsecon.pipeline import cache
+from jsecon.pipeline.options import Options
+from jsecon.types import Array, Capture, Codes, Gaussians, Parts, Progress, Quality, Regions, Votes
+from jsecon.vision.protocols import Models
+
+CHECKPOINT_SECONDS = 20.0
+"""s between two checkpoints of a stage; a stop loses at most this and one chunk of steps, or one tracked frame"""
+WARNING = "WARNING: "
+"""begins a note on what makes answers wrong"""
+KEY_FILE = "made_by.txt"
+"""file with the name and key of a stage, in the folder that the stage writes beside its result"""
 
 
-def run_stages(context: RunContext) -> list[Stage]:
-    """Plans the stages of a run. Mask files come before the long fit, so that their errors are found early."""
-    by_name = {stage.name: stage for stage in [*plan_scene(context), *plan_objects(context), *plan_lifting(context)]}
-    early = ("objects", "gaussians") if context.options.masks is not None else ("gaussians", "objects")
-    order = ("poses", "load", *early, "regions", "parts", "votes", "codes", "held_out")
-    return [by_name[name] for name in order if name in by_name]
+@dataclasses.dataclass(frozen=True)
+class ObjectLabels:
+    """Labels of objects in the training frames that vision uses."""
+
+    labels: np.ndarray
+    """(T, H, W) int16, -1 for no region."""
+    frames: np.ndarray
+    """(T,) which frames of the capture these are, ascending."""
+
+
+class Results:
+    """Results of the finished stages, by the names of the stages. Reading one that is missing raises AttributeError."""
+
+    load: Capture
+    """the capture, corrected if the options ask for that"""
+    gaussians: Gaussians
+    """N Gaussians, read or fitted"""
+    objects: ObjectLabels
+    """labels of the training frames that vision uses"""
+    regions: Regions
+    """R regions of the training frames"""
+    parts: Parts | None = None
+    """parts of the scene, if the options ask for them"""
+    votes: Votes
+    """weight of each region on each Gaussian"""
+    codes: Codes | None = None
+    """codes of the paper, if the options ask for them"""
+    held_out: Quality = Quality(np.zeros(0, int), np.zeros(0), np.zeros(0))
+    """PSNR and SSIM of the held-out frames; of no frame for a scene without photographs"""
+    poses: Any
+    """None: structure from motion writes its poses to OUT/poses"""
+
+    def __init__(self, **results: Any):
+        vars(self).update(results)
+
+
+@dataclasses.dataclass(frozen=True)
+class StageResult:
+    """Output of a stage."""
+
+    value: Any
+    """The result, a tree of arrays and records."""
+    notes: tuple[str, ...] = ()
+    """What the user should know, a sentence each."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RunContext:
+    """What the stages of one run share."""
+
+    options: Options
+    """Options of the run."""
+    models: Models
+    """Models of the run."""
+    out: Path
+    """Output folder. It does not count as input if it lies inside of an input folder."""
+
+    def key_options(self, *names: str) -> dict[str, Any]:
+        """Picks options for the key of a stage."""
+        return {name: getattr(self.options, name) for name in names}
+
+
+class Checkpoint:
+    """State of a stage in progress, on disk beside the file of its result, so that it resumes there after a stop."""
+
+    def __init__(self, result: Path):
+        self._path = result.with_suffix(".checkpoint.safetensors")
+        self._last = time.monotonic()
+
+    @property
+    def folder(self) -> Path:
+        """Folder for a stage that works on files; its name is the stage's and its key's."""
+        return self._path.with_suffix("")
+
+    def read(self) -> Any | None:
+        """Reads the last state."""
+        with contextlib.suppress(cache.CorruptCacheError):
+            return cache.load(self._path)[0] if self._path.exists() else None
+        return None
+
+    def keep(self, state: Callable[[], Any]) -> None:
+        """Writes the state, at most every CHECKPOINT_SECONDS."""
+        if time.monotonic() - self._last >= CHECKPOINT_SECONDS:
+            cache.save(self._path, state())
+            self._last = time.monotonic()
+
+    def remove(self) -> None:
+        """Removes the state once the result of the stage is stored."""
+        self._path.unlink(missing_ok=True)
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+class StageInput(NamedTuple):
+    """What a stage computes from."""
+
+    context: RunContext
+    results: Results
+    progress: Progress
+    checkpoint: Checkpoint
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """One stage of a run, as it is planned."""
+
+    name: str
+    """Name of the stage, and of its result in `Results`."""
+    how: str
+    """What it will do, for the plan that a run prints first."""
+    compute: Callable[[StageInput], StageResult]
+    """Computes the result."""
+    after: tuple[str, ...] = ()
+    """Stages whose results it reads."""
+    key_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Options and models that the result depends on; models by their content, not by the place of files."""
+    files: tuple[Path | None, ...] = ()
+    """Input files and folders; None for one that the options do not name."""
+    skipped: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """Parts that the options make needless, each with the reason."""
+    distributed: bool = False
+    """Whether several processes compute it together, each a part of the views."""
+    output_dir: Path | None = None
+    """Folder that it writes for later stages, with its key in KEY_FILE; it runs again if another run wrote that
+    folder."""
+
+    def key(self, keys: Mapping[str, str], out: Path) -> str:
+        """Hashes all that the result depends on; of the input files, but for those in `out`, names, sizes and times."""
+        parts = {
+            "source": cache.source_digest(),
+            "after": [keys[other] for other in self.after],
+            "options": dict(self.key_options),
+            "files": cache.files_digest(filter(None, self.files), exclude=out),
+        }
+        text = json.dumps([self.name, parts], sort_keys=True)
+        return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+
+
+def training_frames(held_out: Array) -> np.ndarray:
+    """Lists the frames that may be fitted to."""
+    train = np.flatnonzero(~np.asarray(held_out))
+    if len(train) < 2:
+        problem = f"{len(train)} of {len(held_out)} frames to work with"
+        raise InputError("frames", problem, "at least 2", "Hold out fewer frames (--holdout), or use more (--frames).")
+    return train

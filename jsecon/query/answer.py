@@ -1,8 +1,7 @@
 """From the embedding of a text to Gaussians: the whole path of a question, on one page.
 
     match_regions      embedding of the text -> the region that matches best, unless the rules refuse the text, with the
-                       regions that belong to it. Each region is scored (query/scores), and one rule says which belong
-                       together (query/grouping)
+                       regions that belong to it: scores of regions, and the rule of what belongs together (query/match)
     select_gaussians   regions -> the Gaussians of which these regions hold at least half (field/membership)
     trim               Gaussians -> without those that lie apart from the rest (query/outliers)
 
@@ -27,10 +26,16 @@ from jsecon.field.membership import inside_fraction
 from jsecon.field.similarity import Number, similarities
 from jsecon.paper.queries import select_by_code
 from jsecon.programs import stored_jit
-from jsecon.query.grouping import join_fragments, parts_fallback, regions_with
+from jsecon.query.match import (
+    join_fragments,
+    parts_fallback,
+    regions_with,
+    score_text,
+    unrelated_words,
+    word_similarities,
+)
 from jsecon.query.outliers import OutlierResult, split_outliers
 from jsecon.query.rules import ABSENT, ALL_OF_CLASS, FOUND, ONE_REGION, RULES, QueryRules
-from jsecon.query.scores import score_text, unrelated_words, word_similarities
 from jsecon.types import Array, LanguageField, Selection, Votes
 
 

@@ -12,14 +12,14 @@ from jaxtyping import Float, Int
 
 from jsecon.errors import require
 from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction, ratio, vote_columns
-from jsecon.query.rules import ABSENT, RULES, QueryRules
-from jsecon.query.scores import (
+from jsecon.query.match import (
     presence_prob,
     region_similarities,
     unrelated_words,
     view_count_weight,
     word_similarities,
 )
+from jsecon.query.rules import ABSENT, RULES, QueryRules
 from jsecon.types import Array, LanguageField
 
 

@@ -1,7 +1,7 @@
 """Common nouns of all kinds: what the similarity of a text with a scene is measured against.
 
 Few of them are in any one scene. So their best regions say how similar a text is to a scene that does not hold what
-it names (jsecon.query.scores). The list was written before anything was measured with it.
+it names (jsecon.query.match). The list was written before anything was measured with it.
 """
 
 import contextlib

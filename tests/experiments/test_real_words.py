@@ -10,7 +10,7 @@ from experiments.words import rules
 from experiments.words.absent import absent_names
 from experiments.words.conse import Conse, Crop, TextVectors, class_weights, conse, cut_out
 from jsecon.paper.queries import relevancies
-from jsecon.query.scores import region_similarities
+from jsecon.query.match import region_similarities
 from jsecon.vision.protocols import CANONICAL, Embedder
 
 NAMES = ("red", "green", "blue")

@@ -77,7 +77,7 @@ class ViewState:
         return dataclasses.replace(self, questions=(*others, *new))
 
 
-def highlight(base: UInt8[np.ndarray, "n 3"], answers: Sequence[Answer | InputError]) -> UInt8[np.ndarray, "n 3"]:
+def _highlight(base: UInt8[np.ndarray, "n 3"], answers: Sequence[Answer | InputError]) -> UInt8[np.ndarray, "n 3"]:
     """Tints the Gaussians of each answer in its colour, and dims the others; if none is selected the colours stay."""
     tints = palette(len(answers), ANSWER_HUE)
     found = [(tint, answer) for tint, answer in zip(tints, answers) if isinstance(answer, Answer) and len(answer.rows)]
@@ -146,7 +146,7 @@ class Viewer:
     def _clicked(self, state: ViewState, ray: Any, focal: float, *, add: bool) -> ViewState:
         """Highlights the region that the ray of an event in the window's world meets; focal length in px."""
         start, direction = np.asarray(ray.ray_origin) / self.layer.scale, np.asarray(ray.ray_direction)
-        region = region_along(self.scene.field, start, direction, focal=focal, visible=self._visible())
+        region = _region_along(self.scene.field, start, direction, focal=focal, visible=self._visible())
         if region < 0:
             raise InputError("", "no region is known there: it is background, or no frame shows it")
         return state.with_question(Region(region), add=add)
@@ -192,7 +192,7 @@ class Viewer:
         """Colours the Gaussians of the window, and describes the answers."""
         state = self.state
         answers = self.scene.ask_all(state.queries)
-        self.layer.paint(highlight(self._base_colours[state.colouring], answers), self._visible())
+        self.layer.paint(_highlight(self._base_colours[state.colouring], answers), self._visible())
         self.panel.show(state, answers)
         self.drawn = state
 
@@ -300,7 +300,7 @@ def _box(text: str, colour: str = "#fa0") -> str:
     return f'<div style="{style}">{text}</div>'
 
 
-def region_along(
+def _region_along(
     field: LanguageField,
     origin: Float[np.ndarray, "3"],
     direction: Float[np.ndarray, "3"],

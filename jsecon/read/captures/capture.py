@@ -96,18 +96,13 @@ def has_depth(path: Path) -> bool:
         return False
 
 
-def list_photographs(path: Path) -> list[Path]:
-    """Lists the photographs of a folder, or of its images/, in name order.
+def _sort_images(path: Path) -> tuple[list[Path], list[Path]]:
+    """The photographs of a folder, or of its images/, in name order, and the images beside them that are none.
 
-    If none lies directly in the folder, those of its subfolders are listed (cam0/, cam1/), except in folders of masks
-    or depth, and output of jsecon. Depth maps, masks, and images with another's name and a word more (a_mask.png,
+    If no image lies directly there, those of the subfolders are listed (cam0/, cam1/), except in folders of masks or
+    depth, and output of jsecon. Depth maps, masks, and images with another's name and a word more (a_mask.png,
     a.jpg.png) are no photographs.
     """
-    return _sort_images(path)[0]
-
-
-def _sort_images(path: Path) -> tuple[list[Path], list[Path]]:
-    """The photographs of a folder as `list_photographs` lists them, and the images beside them that are none."""
     folder = path / "images" if (path / "images").is_dir() else path
     if not folder.is_dir():
         return [], []
