@@ -27,7 +27,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import results
-from experiments.calibration import Bin, calibration_error
 from experiments.cells import append_cell, read_cells
 from experiments.rivals.evidence import unit
 from experiments.rivals.lifting import READOUT, smoothed
@@ -227,24 +226,16 @@ def lifting(name: str, masks: str) -> list[float]:
 
 
 def refusal(case: Case, embedder: Conse) -> dict[str, Any]:
-    """Shares of the states of the scene's names and of absent ones, how often the former have the larger rank, and the
-    confidence of each answer with whether its region has the name."""
+    """Shares of the states of the scene's names and of absent ones, and how often the former have the larger rank."""
     scene = case.scene
     absent = absent_names(embedder.texts, scene.name, scene.names)
     found: dict[str, Any] = {"asked": [len(scene.texts), len(absent)]}
     quantiles = []
-    for names, wanted in ((scene.texts, scene.asked), (absent, np.full(len(absent), -1))):
+    for names in (scene.texts, absent):
         told = [match_regions(case.field, jnp.asarray(text)[None]) for text in embedder.embed_text(list(names))]
         quantiles.append(np.array([float(answer.rank) for answer in told]))
         states = [STATES[int(answer.state)] for answer in told]
         found.setdefault("states", []).append({state: states.count(state) / len(states) for state in STATES})
-        found.setdefault("confidence", []).append(
-            [
-                (round(float(answer.confidence), 4), bool(scene.region_names[int(answer.region)] == name))
-                for answer, name in zip(told, wanted, strict=True)
-                if int(answer.region) >= 0
-            ]
-        )
     found["auc"] = rules.auc(*quantiles)
     return found
 
@@ -276,9 +267,6 @@ def main(options: Options) -> dict:
     for k, (name, masks) in CASES.items():
         for variant in VARIANTS:
             figures = kept(f"{k}, {variant}", measure_case, name, masks, embedder, variant)
-            error, curve = calibration(figures["refusal"])
-            figures["refusal"] = {k: v for k, v in figures["refusal"].items() if k != "confidence"}
-            figures["refusal"] |= {"calibration error": error, "reliability": curve}
             metrics["cases"][f"{k}, {variant}"] = figures | {"alone": {}}
         for method in RIVALS:
             key = f"{k}, {VARIANTS[0]}"
@@ -338,22 +326,11 @@ def tables(metrics: dict) -> list[str]:
     for k, figures in cases.items():
         own = figures["refusal"]
         shares = (f"{kind[state]:.3f}" for kind in own["states"] for state in reversed(STATES))
-        rows.append((k, own["asked"][1], own["auc"], *shares, own["calibration error"]))
-    text.append(
-        "States of present and absent names by `query_anchored`; the calibration error of its confidence, both kinds "
-        "weighing the same in all."
-    )
+        rows.append((k, own["asked"][1], own["auc"], *shares))
+    text.append("States of present and absent names by `query_anchored`.")
     states = (f"{kind} {state}" for kind in ("present:", "absent:") for state in reversed(STATES))
-    header = ("scene, masks, embedder", "absent", "AUC", *states, "calibration error")
+    header = ("scene, masks, embedder", "absent", "AUC", *states)
     return [*text, results.table(header, rows)]
-
-
-def calibration(refused: dict[str, Any]) -> tuple[float, list[Bin]]:
-    """Expected calibration error and reliability curve of `refusal`, names of the scene and absent ones weighing the
-    same in all."""
-    rows = [(*own, 1 / count) for kind, count in zip(refused["confidence"], refused["asked"]) for own in kind]
-    said, right, weight = np.array(rows, float).reshape(-1, 3).T
-    return calibration_error(said, right, weight)
 
 
 if __name__ == "__main__":

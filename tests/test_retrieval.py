@@ -194,7 +194,7 @@ def test_a_list_of_classes_is_compared_in_deviations_of_each_text(worded):
     assert (np.asarray(nothing[0]) == -1).all()
 
 
-def test_an_answer_has_its_rank_and_confidence_and_that_of_an_old_field_has_none(worded, tmp_path):
+def test_an_answer_has_its_rank_and_that_of_an_old_field_has_none(worded, tmp_path):
     field, texts = worded
     ranks = [exact_quantile(field.regions.embeddings, text, field.unrelated_words) for text in texts]
     rows = {"seen": texts[int(np.argmax(ranks))], "unseen": texts[int(np.argmin(ranks))]}
@@ -207,10 +207,9 @@ def test_an_answer_has_its_rank_and_confidence_and_that_of_an_old_field_has_none
     seen, unseen = answers(field.unrelated_words.astype(np.float16))
     assert seen["rank"] == pytest.approx(max(ranks), abs=0.02)  # of words in float16
     assert unseen["rank"] == pytest.approx(min(ranks), abs=0.02)
-    assert 0 < seen["confidence"] <= 1
     assert seen["region"] is not None
     assert unseen["region"] is None
     for answer in answers(None):
-        assert answer["rank"] is answer["confidence"] is None
+        assert answer["rank"] is None
     cosine = query_anchored(dataclasses.replace(field, unrelated_words=None), rows["seen"])
     assert answers(None)[0]["score"] == pytest.approx(float(cosine.score), abs=1e-5)

@@ -205,11 +205,6 @@ class Answer:
         state = FOUND if self.selection.state is None else int(self.selection.state)
         return STATES[state if len(self.rows) else ABSENT]
 
-    @property
-    def confidence(self) -> float | None:
-        """Estimated probability that the answer shows what the text names; None if it is unknown."""
-        return _known(self.selection.confidence)
-
     def as_dict(self) -> dict[str, Any]:
         """The record of the answer as plain values for JSON, in the capture's world: the same at every door."""
         region, selected = int(self.selection.region), int(np.asarray(self.selection.mask).sum())
@@ -228,7 +223,6 @@ class Answer:
             "objects": self.count,
             "score": round(float(self.selection.score), 6),
             "rank": _known(self.selection.rank),
-            "confidence": self.confidence,
             "region": region if region >= 0 else None,
             "probability": probability or None,
             "outliers": {
@@ -298,8 +292,6 @@ class Answer:
             parts.append(f"score {float(self.selection.score):.3f}")
             if (rank := _known(self.selection.rank)) is not None:
                 parts.append(f"more similar than {int(100 * rank + 1e-6)} % of unrelated words")
-            if self.confidence is not None and region >= 0:
-                parts.append(f"confidence {int(100 * self.confidence)} %")
         if self.state == STATES[UNSURE]:
             parts.append("unsure: it may be absent")
         if region >= 0:

@@ -50,8 +50,6 @@ class RegionMatch(NamedTuple):
     """Similarity of the best region, whether it is chosen or not; 0 without regions."""
     rank: Float[Array, ""] | np.ndarray = np.asarray(np.nan, np.float32)
     """Share of unrelated words that match the scene less than the text does; NaN without such words."""
-    confidence: Float[Array, ""] | np.ndarray = np.asarray(np.nan, np.float32)
-    """Probability that the best region shows what the text names (`answer_confidence`); NaN without such words."""
     presence: Float[Array, ""] | None = None
     """Probability that the text is true of the best region; None without `QueryRules.logits`."""
     state: Int[Array, ""] | np.ndarray = np.asarray(FOUND, np.int32)
@@ -180,7 +178,6 @@ def _match(embeddings, pixels, overlap, queries, excluded, words, rules: QueryRu
         jnp.where(matches, best, -1).astype(jnp.int32),
         jnp.where(matches, similarity[best], nearest),
         jnp.nanmax(jnp.where(known, scores.rank, jnp.nan)),
-        jnp.nanmax(jnp.where(known, scores.confidence, jnp.nan)),
         None if presence is None else jnp.where(matches, presence[best], jnp.max(presence)),
         jnp.where(matches, jnp.max(scores.state), ABSENT),
     )

@@ -40,12 +40,6 @@ from jsecon.query.rules import ABSENT, QueryRules
 from jsecon.types import Array, LanguageField, Parts, Selection
 from jsecon.vision.protocols import Logits
 
-OFFSET, SLOPE = -5.6, 3.5
-"""Of the logistic curve of `answer_confidence`: an answer that stands out like that of an unrelated word is right in 1
-of 9 cases, at 1.6 times its height in half of them. Fitted to answers on simulated rooms where half of the texts name
-something that is there, by regions of a tracker and by consensus (experiments/calibration.py). Expected calibration
-error in other such rooms: 0.04 (tracks) and 0.07 (consensus); on real words about 0.24 (given masks) and 0.43 (jsecon's
-own)."""
 HEIGHT_WEIGHT = 0.5
 """Weight of the heights in the margin of a text among unrelated words: so many deviations of heights as of similarities
 are reached by absent colours in ray-traced rooms, and more by what is present with simulated CLIP at high noise."""
@@ -81,8 +75,6 @@ class _TextScores(NamedTuple):
     """Whether the scene has what the text names, an index of `rules.STATES`."""
     rank: Float[Array, ""]
     """Share of unrelated words that match the scene less than the text does; NaN without such words."""
-    confidence: Float[Array, ""]
-    """Probability that the best region shows what the text names (`answer_confidence`); NaN without such words."""
 
 
 def score_text(
@@ -102,14 +94,14 @@ def score_text(
         weighted = jnp.where(similarity > 0, similarity * weight, similarity)
     best = jnp.argmax(jnp.where(known, weighted, -jnp.inf))
     standing = None
-    rank = confidence = jnp.asarray(jnp.nan, similarity.dtype)
+    rank = jnp.asarray(jnp.nan, similarity.dtype)
     if words is not None and word_scores is not None:
         weight = jnp.where(known, weight, 0.0)
         reach = jnp.max(jnp.where(known, similarity, -jnp.inf)), _height(similarity, weight)
         standing = standing_among_words(reach, text, words, word_scores, weight)
-        rank, confidence = standing[0], answer_confidence(similarity, known, weight, word_scores)
+        rank = standing[0]
     state = rules.judge(standing, similarity[best], None if presence is None else presence[best])
-    return _TextScores(similarity, known, presence, best, state, rank, confidence)
+    return _TextScores(similarity, known, presence, best, state, rank)
 
 
 @stored_jit
@@ -217,31 +209,6 @@ def view_count_weight(pixels: Shaped[Array, "r t"]) -> Float[Array, " r"]:
     return jnp.where(largest > 0, weight / jnp.where(largest > 0, largest, 1.0), 1.0)
 
 
-def answer_confidence(
-    similarity: Float[Array, " r"],
-    known: Bool[Array, " r"],
-    weight: Float[Array, " r"],
-    word_scores: Float[Array, "w r"],
-) -> Float[Array, ""]:
-    """Estimates the probability that the best region for a text shows what the text names.
-
-        sigmoid(OFFSET + SLOPE h / mean_w h_w),  h = s_a - sum_r v_r s_r / sum_r v_r
-
-    Every unrelated word has a best region too. The height h of an answer is how far its region is above the mean region
-    in similarity s, with v the `view_count_weight` and a the region with the largest s v. Its ratio to the heights h_w
-    of unrelated words says how far the answer stands out, in any space of texts and images.
-
-    It holds for texts of which half name something in the scene, before any is refused. NaN without a region or a word.
-    """
-    weight = jnp.where(known, weight, 0.0)
-    usable = jnp.any(jnp.isfinite(word_scores), axis=1)
-    heights = jax.vmap(_height, in_axes=(0, None))(word_scores, weight)
-    count = jnp.sum(usable)
-    typical = jnp.sum(jnp.where(usable, heights, 0.0)) / jnp.where(count > 0, count, 1)
-    ratio = _height(similarity, weight) / jnp.where(typical > 0, typical, jnp.inf)
-    return jnp.where(jnp.any(known) & (count > 0), jax.nn.sigmoid(OFFSET + SLOPE * ratio), jnp.nan)
-
-
 def _height(similarity: Float[Array, " r"], weight: Float[Array, " r"]) -> Float[Array, ""]:
     """How far the best region's similarity is above the weighted mean; regions of no weight do not count."""
     counted = (weight > 0) & jnp.isfinite(similarity)
@@ -337,7 +304,7 @@ def parts_fallback(
     if not mask.any() or float(region_score) >= MIN_REGION_RATIO * float(similar) or int(state) == ABSENT:
         return None
     region, rank = jnp.asarray(-1, jnp.int32), jnp.asarray(jnp.nan) if standing is None else standing[0]
-    return Selection(jnp.asarray(mask), jnp.asarray(similarity), region, similar, rank, None, presence, state)
+    return Selection(jnp.asarray(mask), jnp.asarray(similarity), region, similar, rank, presence, state)
 
 
 @functools.partial(jax.jit, static_argnames="retrieval")
