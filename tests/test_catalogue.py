@@ -104,6 +104,27 @@ def test_a_region_inside_another_is_a_part_and_its_gaussians_are_those_of_the_wh
     np.testing.assert_array_equal(found.mask(whole), np.isin(plain.labels, plain.regions[:2]))
 
 
+def test_what_most_frames_show_whole_comes_first_and_what_few_show_last():
+    things = (
+        ("red box", (-0.3, 0, 0.1)),
+        ("green box", (0.3, 0, 0.1)),
+        ("blue box", (1.95, 0, 0.1)),
+        ("red box", (0, 0, 0.5)),
+    )
+    directions = ((0, -2, 0.8), (0.1, -2, 0.8), (-0.1, -2, 0.8), (0, -2.1, 0.8))
+    field, embedder = table_field([(*thing, (0.1,) * 3) for thing in things], directions=directions)
+    pixels = np.array(field.regions.pixel_counts)
+    pixels[1, :2], pixels[3, 1:] = 0, 0  # the fourth is shown by one of four frames that see it
+    field = dataclasses.replace(field, regions=Regions(field.regions.embeddings, pixels))
+    scene = jsecon.Scene(field, embedder, up=(0, 0, 1))
+    catalogue = scene.objects()
+    assert catalogue.regions.tolist() == [0, 1, 2, 3]  # the frames' border cuts the third
+    assert catalogue.sure.tolist() == [True, True, True, False]
+    answer = scene.relate("how many red boxes are there?")
+    assert "1 object, perhaps 2" in str(answer)
+    assert sorted(found["sure"] for found in answer.as_dict()["relation"]["objects"]) == [False, True]
+
+
 def test_names_come_from_the_vocabulary_that_is_given(field):
     catalogue = jsecon.objects(field, ["red floor", "green mug"])
     floor = catalogue.regions[0]
@@ -167,6 +188,7 @@ def test_the_command_line_writes_a_table_records_and_a_page(field, file, tmp_pat
     assert listed == json.loads(json.dumps(catalogue.records()))
     assert listed[-1]["surroundings"]
     assert page.count('class="card"') == len(catalogue)
+    assert page.index("<summary>1 more") < page.index(listed[-1]["names"][0]["name"])  # the wall is folded
     assert all(row["names"][0]["name"] in printed and row["frames"][0] in page for row in listed)
     names.write_text("#\n")
     assert run_cli("objects", file, "--vocabulary", names) == 2

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from scipy.sparse.csgraph import connected_components
 from scipy.special import softmax
 
@@ -28,6 +28,9 @@ from jsecon.vision.unrelated_words import UNRELATED_WORDS, embed_unrelated_words
 
 NAMES = 3
 """names of each object"""
+SURE_SHARE = 0.4
+"""Share of the frames which see an object that must show it, or it is unsure. On replica_apartment_0, 4 of 78 regions
+below it have an IoU of 0.4 with an instance, and 61 of 163 others."""
 PART_CONTAINMENT = 0.4
 """Share of a region inside another one from which it is a part of it. A handle that half of the views take for a part
 of its mug lies in the mug by one half."""
@@ -46,8 +49,8 @@ SURROUNDINGS = frozenset((
 class Catalogue:
     """K objects of a field of N Gaussians and R regions, in the world of the capture and its unit.
 
-    An object's id is its row. Things come first, the one with most Gaussians first, each followed by its parts;
-    surroundings come last.
+    An object's id is its row. What most frames show whole comes first, each followed by its parts; then what is unsure,
+    then surroundings.
     """
 
     names: np.ndarray
@@ -57,6 +60,8 @@ class Catalogue:
     """(K, 3) probability of each name if exactly one of the vocabulary is right; 0 of one that a query finds absent."""
     surroundings: np.ndarray
     """(K,) bool: the best name is one of walls, floors and the like."""
+    sure: np.ndarray
+    """(K,) bool: enough of the frames that see it show it (`is_sure`); what is unsure may be a fragment."""
     parent: np.ndarray
     """(K,) int id of the object that this one is a part of, or -1. A parent has none."""
     confidence: np.ndarray
@@ -112,6 +117,7 @@ class Catalogue:
             "id": n,
             "names": [{"name": name, "probability": round(float(p), 4)} for name, p in names if name],
             "surroundings": bool(self.surroundings[n]),
+            "sure": bool(self.sure[n]),
             "parent": int(self.parent[n]) if self.parent[n] >= 0 else None,
             "gaussians": int(shape.count),
             "confidence": round(float(self.confidence[n]), 4),
@@ -166,9 +172,15 @@ def objects(
     surroundings = np.array([bool(SURROUNDINGS & set(name.lower().split())) for name in text[order[:, 0]]], bool)
     whole = _wholes(field, groups, members, size, surroundings)
     labels, part_labels, confidence = _assign(field, groups, whole)
-    gaussians = np.where(whole < 0, _counts(labels, len(whole)), _counts(part_labels, len(whole)))
+    own = [np.flatnonzero((labels if whole[k] < 0 else part_labels) == k) for k in range(len(whole))]
+    gaussians = np.array([len(rows) for rows in own], int)
+    shown = members @ pixels
+    views = np.asarray(field.votes.views)
+    sure = np.array([is_sure(pixels, views[rows]) for pixels, rows in zip(shown, own)], bool)
+    complete = np.array([_frames_around(field, rows)[pixels > 0].sum() for pixels, rows in zip(shown, own)], int)
     top, listed = np.where(whole < 0, np.arange(len(whole)), whole), gaussians >= MIN_SAMPLES
-    rows = np.lexsort((-gaussians, whole >= 0, top, -gaussians[top], surroundings[top]))  # each part behind its whole
+    order_of_wholes = (top, -gaussians[top], -complete[top], ~sure[top], surroundings[top])
+    rows = np.lexsort((-gaussians, whole >= 0, *order_of_wholes))  # each part behind its whole
     rows = rows[listed[rows] & listed[top[rows]]]
 
     renumber = np.full(len(whole) + 1, -1, np.int32)  # the last entry is that of -1
@@ -176,7 +188,7 @@ def objects(
     labels, part_labels = renumber[labels], renumber[part_labels]
     wholes, parts = np.flatnonzero(labels >= 0), np.flatnonzero(part_labels >= 0)
     ids = np.concatenate([labels[wholes], part_labels[parts]])
-    shown = members[rows] @ pixels
+    shown = shown[rows]
     best = np.argsort(-shown, axis=1, kind="stable")[:, :3]  # those that show most of it
     best = np.where(np.take_along_axis(shown, best, axis=1) > 0, best, -1)
     source_axis = np.array(source_up(field, axis).axis)
@@ -184,6 +196,7 @@ def objects(
         names=text[order[rows]],
         probability=probability[rows],
         surroundings=surroundings[rows],
+        sure=sure[rows],
         parent=renumber[whole[rows]],
         confidence=confidence[rows],
         views=(shown > 0).sum(1),
@@ -196,6 +209,29 @@ def objects(
         up_evidence=str(axis),
         frame_names=field.names,
     )
+
+
+def is_sure(pixels: Shaped[np.ndarray, " t"], views: Shaped[np.ndarray, " m"]) -> bool:
+    """Whether enough of the frames that see an object show it, by its pixels in each and the views of its Gaussians."""
+    return bool(len(views) and np.count_nonzero(pixels) >= SURE_SHARE * np.median(views))
+
+
+def _frames_around(field: LanguageField, rows: Int[np.ndarray, " m"]) -> Bool[np.ndarray, " t"]:
+    """Finds the frames in which the box of some Gaussians lies whole."""
+    if not len(rows):
+        return np.zeros(len(field.names), bool)
+    cameras = jax.tree.map(np.asarray, field.cameras)
+    means = np.asarray(field.gaussians.means)[rows]
+    ends = np.stack([means.min(0), means.max(0)])
+    corners = np.stack(np.meshgrid(*ends.T), -1).reshape(-1, 3)
+    x, y, z = np.moveaxis(
+        corners @ cameras.world_to_camera[:, :3, :3].mT + cameras.world_to_camera[:, None, :3, 3], -1, 0
+    )
+    depth = np.maximum(z, 1e-9)
+    column = x / depth * cameras.fx[:, None] + cameras.cx[:, None]
+    row = y / depth * cameras.fy[:, None] + cameras.cy[:, None]
+    inside = (z > 0) & (column >= 0) & (column < cameras.width) & (row >= 0) & (row < cameras.height)
+    return inside.all(1)
 
 
 def _vocabulary(

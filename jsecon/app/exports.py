@@ -9,7 +9,7 @@ from urllib.parse import quote
 import numpy as np
 
 from jsecon.app import pictures, report, verbs
-from jsecon.app.catalogue import Catalogue
+from jsecon.app.catalogue import SURE_SHARE, Catalogue
 from jsecon.app.querying import slug
 from jsecon.app.records import decimals, unit_of
 from jsecon.app.scene import Scene, open_scene
@@ -30,8 +30,13 @@ def _objects(verb: verbs.Objects, console: Console) -> verbs.VerbResult:
     with console.progress("objects"):
         listed = scene.objects(names)
     records = listed.records()
+    unsure = [record["id"] for record in records if _is_unsure(records, record)]
     for record in records:
-        console.print_line(f"{record['id']:>4}  {_title(record)}: {_words(record)}")
+        if record["id"] not in unsure:
+            console.print_line(f"{record['id']:>4}  {_title(record)}: {_words(record)}")
+    if unsure:
+        few = f"fewer than {SURE_SHARE:.0%} of the frames that see them show them, so they may be fragments"
+        console.print_line(f"  {unsure[0]} to {unsure[-1]} are unsure: {few}")
     if hidden := int((listed.regions < 0).sum()):
         console.print_line(f"  too small to be listed, with fewer than {MIN_SAMPLES} Gaussians: {hidden} regions")
     elif not records:
@@ -130,18 +135,28 @@ def _is_exported_object(file: Path) -> bool:
 
 def _page(scene: Scene, catalogue: Catalogue, records: list[dict[str, Any]], console: Console) -> str:
     """Returns the page: a card for each object, which opens to its views."""
-    cards = []
+    cards: dict[bool, list[str]] = {False: [], True: []}  # folded or not
     with console.progress("pictures") as progress:
         for record in records:
             mask = catalogue.mask(record["id"])
             figures = [report.figure(scene.render(name, mask), name) for name in record["frames"]]
             best = scene.frame_index(record["frames"][0]) if record["frames"] else 0
-            picture = pictures.crop(scene.render(best), scene.mask(mask, best))
+            outline = scene.mask(mask, best)
+            picture = pictures.crop(pictures.selection_overlay(scene.render(best), outline, tint=0.0), outline)
             words = f"{record['id']}: {_words(record)}"
-            cards.append(report.card(picture, _title(record), words, report.grid(figures, 3)))
+            card = report.card(picture, _title(record), words, report.grid(figures, 3))
+            cards[_is_unsure(records, record) or record["surroundings"]].append(card)
             progress(record["id"] + 1, len(records))
     lead = "The objects of the scene. Open an object to see it in the frames that show most of it."
-    return report.page("Objects", lead, [report.grid(cards)])
+    more = f"{len(cards[True])} more: surroundings, and what few of the frames that see it show"
+    folded = [report.fold(more, report.grid(cards[True]))] if cards[True] else []
+    return report.page("Objects", lead, [report.grid(cards[False]), *folded])
+
+
+def _is_unsure(records: list[dict[str, Any]], record: dict[str, Any]) -> bool:
+    """Whether an object, or the one that it is a part of, is unsure."""
+    whole = record if record["parent"] is None else records[record["parent"]]
+    return not whole["sure"] and not whole["surroundings"]
 
 
 def _title(record: dict[str, Any]) -> str:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import KDTree
 
-from jsecon.app.catalogue import Catalogue, main_regions, region_objects
+from jsecon.app.catalogue import Catalogue, is_sure, main_regions, region_objects
 from jsecon.app.records import Answer, Object, Query, gaussian_rows, rounded, source_points, world_scale
 from jsecon.errors import InputError
 from jsecon.field.columns import votes_of_rows
@@ -117,7 +117,9 @@ class ObjectIndex:
         groups = self._best_named(texts, join_fragments(regions, self._joined))
         made = [(group, self._object(group)) for group in groups]
         state = int(match.state)
-        return [Object(phrase, group, *parts, state) for group, parts in made if parts is not None], float(match.rank)
+        return [Object(phrase, group, *parts, state=state) for group, parts in made if parts is not None], float(
+            match.rank
+        )
 
     def _all_objects(self) -> list[Object]:
         """Lists the objects of the catalogue without surroundings, by their best names."""
@@ -164,8 +166,8 @@ class ObjectIndex:
         ends = np.cumsum(np.bincount(owners, minlength=count + 1))[:count]
         return np.split(order // regions.shape[1], ends)[:count]
 
-    def _measure_object(self, regions: tuple[int, ...]) -> tuple[np.ndarray, ObjectShapes] | None:
-        """Returns Gaussians and shape of the object of some regions; None if it has no Gaussian."""
+    def _measure_object(self, regions: tuple[int, ...]) -> tuple[np.ndarray, ObjectShapes, bool] | None:
+        """Returns Gaussians and shape of the object of some regions, and `is_sure`; None if it has no Gaussian."""
         voters = np.unique(np.concatenate([self._voters[region] for region in regions]))
         share = inside_fraction_of_regions(votes_of_rows(self._votes, voters), regions)
         rows, share = voters[share >= SHARE_THRESHOLD], share[share >= SHARE_THRESHOLD]
@@ -176,7 +178,9 @@ class ObjectIndex:
             return None
         gaussians = gaussian_rows(gaussians, kept)
         spreads = gaussian_spreads(gaussians)
-        return rows[kept], object_shapes(gaussians.means, np.zeros(gaussians.count, int), self.up, spreads=spreads)
+        shape = object_shapes(gaussians.means, np.zeros(gaussians.count, int), self.up, spreads=spreads)
+        pixels = np.asarray(self._field.regions.pixel_counts)[list(regions)].sum(0)
+        return rows[kept], shape, is_sure(pixels, self._votes.views[rows[kept]])
 
     def _view(self, frame: int | None) -> tuple[Viewpoint, str]:
         """From where directions are seen, and what that is in words.

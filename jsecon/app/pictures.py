@@ -45,11 +45,15 @@ def label_overlay(frame: UInt8[np.ndarray, "h w 3"], labels: Int[np.ndarray, "h 
 
 
 def selection_overlay(
-    frame: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], truth: Bool[np.ndarray, "h w"] | None = None
+    frame: UInt8[np.ndarray, "h w 3"],
+    mask: Bool[np.ndarray, "h w"],
+    truth: Bool[np.ndarray, "h w"] | None = None,
+    *,
+    tint: float = 0.45,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Shows a selection in a frame: dark outside, tinted inside, with the outline of the ground truth, if any."""
+    """Shows a selection in a frame: outlined, dark outside, tinted inside; with the outline of the truth, if any."""
     image = frame.astype(np.float32)
-    image = np.where(mask[..., None], 0.55 * image + 0.45 * np.array(SELECTED, np.float32), 0.5 * image)
+    image = np.where(mask[..., None], (1 - tint) * image + tint * np.array(SELECTED, np.float32), 0.5 * image)
     image = _outlined(image.astype(np.uint8), mask, SELECTED, 1)
     if truth is not None:
         image = _outlined(_outlined(image, truth, (0, 0, 0), 3), truth, (255, 255, 255), 1)

@@ -269,6 +269,7 @@ class Answer:
             "center": rounded(source_points(self.field, found.shape.center)[0], length),
             "size": rounded(size, length),
             "score": round(found.score, 4),
+            "sure": found.sure,
             "conditions": found.conditions,
         }
 
@@ -276,7 +277,7 @@ class Answer:
         """The answer in words, without the query's name: what was read, counts, score and place."""
         if self.by == "relation":
             names = ", ".join(sorted({found.phrase for found in self.objects}))
-            number = f"{self.count} object{'s' * (self.count != 1)}{f' ({names})' if names else ''}"
+            number = _number(sum(found.sure for found in self.objects), self.count) + (f" ({names})" if names else "")
             seen = f", {self.viewpoint}" if self.viewpoint else ""
             up = "" if self.up is None else f"up is from {self.up}"
             sentences = [f"read as {self.reading}{seen}: {number}", self.reason.rstrip("."), up, self.question]
@@ -311,6 +312,14 @@ class Answer:
     def __str__(self) -> str:
         """The line that the command line prints."""
         return f"{str(self.query)!r}: {self.describe()}"
+
+
+def _number(sure: int, count: int) -> str:
+    """Says how many objects there are, of which some are sure: "3 objects, perhaps 4"."""
+    words = [f"{n} object{'s' * (n != 1)}" for n in (sure, count)]
+    if sure == count:
+        return words[0]
+    return f"{words[0]}, perhaps {count}" if sure else f"perhaps {words[1]}"
 
 
 def _known(value: Any) -> float | None:

@@ -57,6 +57,11 @@ def card(image: np.ndarray, title: str, words: str, *parts: str) -> str:
     return f'<details class="card">{summary}{"".join(parts)}</details>'
 
 
+def fold(title: str, *parts: str) -> str:
+    """Makes elements that a click on their title opens."""
+    return f"<details><summary>{_escaped(title)}</summary>{''.join(parts)}</details>"
+
+
 def _data_uri(image: np.ndarray, *, sharp: bool = False) -> str:
     """Encodes an RGB image as a data URI: of a JPEG, or of a PNG if `sharp`."""
     ending, kind, options = (".png", "png", []) if sharp else (".jpg", "jpeg", [cv2.IMWRITE_JPEG_QUALITY, 88])

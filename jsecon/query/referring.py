@@ -28,6 +28,8 @@ class Object:
     """(M,) its Gaussians."""
     shape: ObjectShapes
     """Its box and points, in the field's world."""
+    sure: bool = True
+    """Whether enough of the frames that see it show it; else it may be a fragment."""
     state: int = FOUND
     """Whether the scene has what the phrase names, an index of `rules.STATES`."""
     conditions: dict[str, float] = dataclasses.field(default_factory=dict)
