@@ -12,6 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from jsecon import Camera, Capture, InputError
 from jsecon.app import cli
+from jsecon.pipeline.options import Options
+from jsecon.pipeline.stages import RunContext
+from jsecon.vision.colours import ColourEmbedder
+from jsecon.vision.protocols import Models
 
 
 def run_cli(*arguments) -> int:
@@ -28,6 +32,11 @@ def refused(*parts):
         assert str(part) in str(info.value)
     assert info.value.problem
     assert info.value.remedy
+
+
+def context_of(capture, out, **options) -> RunContext:
+    """What the stages of a run without models share."""
+    return RunContext(Options(capture, **options), Models(ColourEmbedder()), out)
 
 
 ROOM_FIT = {"holdout": 4, "steps": 110}

@@ -22,6 +22,7 @@ from small_field import field_of, lone_votes, unit_rows
 from splat_files import compressed_ply, gaussians, ply_columns, scene, sog, splat, spz, write_ply
 from test_proposal_files import records
 from test_rgbd import FORMATS as RGBD
+from test_video import moving
 
 from experiments.datasets.feature_files import write_features
 from experiments.rooms.writers import write_colmap
@@ -264,13 +265,8 @@ def _checked(model: Any) -> Any:
 
 
 def _videos(folder: Path) -> None:
-    rng = np.random.default_rng(0)
     for name, code in {"a.avi": "MJPG", "b.mp4": "mp4v", "c.mkv": "mp4v"}.items():
-        writer = cv2.VideoWriter(str(folder / name), cv2.VideoWriter.fourcc(*code), 10, (64, 48))
-        assert writer.isOpened(), name
-        for _ in range(6):
-            writer.write(cv2.resize(rng.integers(0, 255, (6, 8, 3), np.uint8), (64, 48)))
-        writer.release()
+        moving(folder / name, code, count=6)
 
 
 def _read_video(file: Path) -> list[np.ndarray]:

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 from conftest import look_at
+from scipy.spatial.transform import Rotation
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 290.0
 # corner, edge, edge of each board, from the farthest to the nearest
@@ -56,14 +57,12 @@ def write_photos(folder, count: int, name: str = "photo {:02d}.png") -> np.ndarr
 
 
 def apart(found: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of poses (t, 4, 4) and the true ones, once a similarity has brought the camera centres together (Umeyama, PAMI
-    1991): distances as shares of the cameras' extent, and angles in degrees."""
+    """Of poses (t, 4, 4) and the true ones, once a similarity has brought the camera centres together:
+    distances as shares of the cameras' extent, and angles in degrees."""
     ours, theirs = (-np.einsum("tji,tj->ti", poses[:, :3, :3], poses[:, :3, 3]) for poses in (found, true))
     a, b = ours - ours.mean(0), theirs - theirs.mean(0)
-    left, stretch, right = np.linalg.svd(b.T @ a / len(a))
-    mirror = np.diag([1, 1, np.sign(np.linalg.det(left @ right))])
-    turn = left @ mirror @ right
-    scale = np.trace(np.diag(stretch) @ mirror) / a.var(0).sum()
+    turn = Rotation.align_vectors(b, a)[0].as_matrix()
+    scale = (b * (a @ turn.T)).sum() / (a**2).sum()
     distances = np.linalg.norm(scale * a @ turn.T - b, axis=1) / np.linalg.norm(np.ptp(theirs, axis=0))
     between = np.einsum("tij,jk,tlk->til", found[:, :3, :3], turn.T, true[:, :3, :3])
     cosines = (np.trace(between, axis1=1, axis2=2) - 1) / 2

@@ -1,6 +1,7 @@
 """Slow, readable reference: brute force over all Gaussians in NumPy float64. It defines the image."""
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from jsecon.numerics import BLUR_PX2, FRUSTUM_MARGIN, MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, NEAR
 from jsecon.types import Camera, Gaussians
@@ -34,25 +35,14 @@ def project_reference(gaussians: Gaussians, camera: Camera) -> dict[str, np.ndar
         tx = z * np.clip(x / z, -cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
         ty = z * np.clip(y / z, -cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
         jacobian = np.array([[fx / z, 0, -fx * tx / z**2], [0, fy / z, -fy * ty / z**2]])
-        scaled = jacobian @ w2c[:3, :3] @ _rotation(quaternions[i]) @ np.diag(np.exp(log_scales[i]))
+        turned = quaternions[i] if quaternions[i].any() else (1, 0, 0, 0)  # zero turns nothing
+        rotation = Rotation.from_quat(turned, scalar_first=True).as_matrix()
+        scaled = jacobian @ w2c[:3, :3] @ rotation @ np.diag(np.exp(log_scales[i]))
         covariance = out["covariances"][i] = scaled @ scaled.T + BLUR_PX2 * np.eye(2)
         # det(M M^T + e I) as a sum of positive terms: the width of a needle would cancel, even in float64.
         squares = (np.cross(*scaled) ** 2).sum() + BLUR_PX2 * (scaled**2).sum() + BLUR_PX2**2
         out["conics"][i] = covariance[1, 1] / squares, -covariance[0, 1] / squares, covariance[0, 0] / squares
     return out
-
-
-def _rotation(quaternion: np.ndarray) -> np.ndarray:
-    """Returns the rotation matrix (3, 3) of a quaternion wxyz; the identity for zero."""
-    length = np.linalg.norm(quaternion)
-    w, x, y, z = quaternion / length if length > 0 else (1.0, 0.0, 0.0, 0.0)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def weights_reference(gaussians: Gaussians, camera: Camera) -> np.ndarray:

@@ -104,13 +104,16 @@ def seen_of(votes):
     return np.maximum(np.asarray(votes.weight_where_region_visible, np.float64), least)
 
 
-def shares(field, regions):
+def shares_of(votes, regions):
     """(N,) float64: the part that lies on the regions of the weight in the views that show them, or of all weight."""
-    votes = field.votes
     inside = np.isin(np.asarray(votes.regions), regions)
     weight = np.where(inside, np.asarray(votes.weights, np.float64), 0).sum(1)
-    seen = np.where(inside, seen_of(votes), 0).max(1)
-    return np.divide(weight, seen, out=np.zeros_like(weight), where=seen > 0)
+    seen = np.where(inside & (np.asarray(votes.views) > 0)[:, None], seen_of(votes), 0).max(1, initial=0)
+    return np.divide(weight, seen, out=np.zeros_like(weight), where=seen > 0).clip(max=1)
+
+
+def shares(field, regions):
+    return shares_of(field.votes, regions)
 
 
 def lone_votes(regions, count: int) -> Votes:

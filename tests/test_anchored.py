@@ -2,10 +2,13 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import MANY
 from small_field import REGIONS, make_field, shares, unit_rows
+from test_classes import made_field
 from test_direct import exact_cosines
 
 from jsecon.errors import InputError
@@ -14,6 +17,7 @@ from jsecon.field.membership import normalise_votes, vote_shares
 from jsecon.paper.queries import CODE_THRESHOLD, select_by_code
 from jsecon.query.answer import (
     match_region,
+    match_regions,
     query_anchored,
     query_region,
     query_several,
@@ -22,7 +26,7 @@ from jsecon.query.classes import query_classes
 from jsecon.query.pointing import region_at, region_shares_seen
 from jsecon.query.rules import QueryRules
 from jsecon.splat.render import render
-from jsecon.types import Regions
+from jsecon.types import Codes, Regions
 
 
 def by_code(field, region, threshold=CODE_THRESHOLD):
@@ -78,6 +82,25 @@ def test_a_region_has_the_same_members_however_it_is_asked_for(made):
         alone = votes_for.sum(0) <= 1  # what two regions have is of the class that it answers better
         np.testing.assert_array_equal((np.asarray(classes) == region)[alone], expected[alone])
         assert alone.mean() > 0.9
+
+
+@pytest.mark.parametrize("count", [600, MANY])
+def test_texts_together_select_by_votes_and_by_codes_as_float64(count):
+    made, rng = made_field(count), np.random.default_rng(1)
+    field = dataclasses.replace(
+        made, codes=Codes(unit_rows(rng, count, 4), unit_rows(rng, made.regions.count, 4), None)
+    )
+    rules, asked = QueryRules(retrieval="cosine", duplicate_cosine=None, fragment_score=None), np.array([0, 3])
+
+    @jax.jit
+    @jax.vmap
+    def similarities(text):
+        coded = select_by_code(field, match_regions(field, text[None], rules), CODE_THRESHOLD)
+        return query_anchored(field, text, rules=rules).similarity, coded.similarity
+
+    for region, by_votes, coded in zip(asked, *similarities(field.regions.embeddings[asked])):
+        np.testing.assert_allclose(by_votes, shares(field, [region]), atol=1e-6)
+        np.testing.assert_allclose(coded, exact_cosines(field.codes.gaussians, field.codes.regions[region]), atol=1e-6)
 
 
 def test_a_region_that_is_not_there_has_no_gaussians(field):

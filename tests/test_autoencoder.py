@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import MANY
 from jax.test_util import check_grads
 from small_field import unit_rows
 
@@ -91,11 +92,13 @@ def test_forward_pass_equals_numpy_float64(trained):
     np.testing.assert_allclose(decode(coder, codes.astype(np.float32)), x, atol=1e-5)
 
 
-def test_one_vector_a_batch_a_vmap_and_a_jit_agree(trained):
+@pytest.mark.parametrize("count", [400, MANY])
+def test_one_vector_a_batch_a_vmap_and_a_jit_agree(trained, count):
     embeddings, coder, _ = trained
-    many = np.resize(embeddings[:40], (400, 48))
+    many = np.resize(embeddings[:40], (count, 48))
     codes = encode(coder, many)
-    np.testing.assert_allclose(codes[:40], codes[360:], atol=1e-6)
+    np.testing.assert_allclose(codes, np.resize(codes[:40], codes.shape), atol=1e-6)
+    np.testing.assert_allclose(codes[:40], encoded(coder, embeddings[:40]), atol=2e-4)
     np.testing.assert_allclose(jax.jit(jax.vmap(lambda row: encode(coder, row)))(many), codes, atol=1e-5)
     np.testing.assert_allclose(encode(coder, embeddings[7]), codes[7], atol=1e-5)
     np.testing.assert_allclose(decode(coder, codes[7]), decode(coder, codes)[7], atol=1e-5)

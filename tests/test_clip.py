@@ -111,6 +111,7 @@ TRANSFORMERS = {"image_mean": [0, 0, 0], "image_std": [1, 1, 1]}
     (OPEN_CLIP | {"size": 16}, 16), (OPEN_CLIP | {"size": [16, 16]}, 16), (OPEN_CLIP, None),
     (TRANSFORMERS | {"size": {"shortest_edge": 24}, "crop_size": 16}, 16),
     (TRANSFORMERS | {"size": {"shortest_edge": 24}}, 24), (TRANSFORMERS | {"size": {"height": 16, "width": 16}}, 16),
+    ({"do_normalize": False, "do_rescale": True, "rescale_factor": 1 / 255, "crop_size": 16}, 16),  # MobileCLIP's
     (OPEN_CLIP | {"size": [16, 24]}, "not of a square"), (OPEN_CLIP | {"mean": [0, 0]}, "mean"),
     (OPEN_CLIP | {"std": [0, 1, 1]}, "std"), (OPEN_CLIP | {"std": "abc"}, "cannot be read"),
     ({"size": 16}, "cannot be read"), ([], "cannot be read"),
@@ -124,7 +125,7 @@ def test_preprocessing_in_all_its_spellings(tmp_path, content, expected):
     else:
         mean, std, size = read_preprocessing(path)
         assert size == expected
-        assert len(mean) == len(std) == 3
+        assert (mean, std) == ((0.0,) * 3, (1.0,) * 3)
 
 
 def test_unrelated_words_are_embedded_once_for_a_model(tmp_path, monkeypatch):

@@ -1,18 +1,30 @@
-"""Queries on codes: query_one_step at the ends of the floats (in test_many_rows.py where jax was silently wrong);
-query_canonical against LERF's definition, written as the softmax it is, in float64."""
+"""Queries on codes: query_one_step against NumPy and at the ends of the floats; query_canonical against LERF's
+definition, written as the softmax it is, in float64."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import MANY
 
 from jsecon import query_canonical, query_one_step
-from jsecon.paper.queries import _select_near_region
 
 
 def exact_cosines(codes, code):
     codes, code = np.asarray(codes, np.float64), np.asarray(code, np.float64)
     return codes @ code / np.linalg.norm(codes, axis=1) / np.linalg.norm(code)
+
+
+@pytest.mark.parametrize("count", [300, MANY])
+def test_cosines_are_those_of_float64(count):
+    rng = np.random.default_rng(0)
+    codes, texts = (rng.normal(size=(rows, 3)).astype(np.float32) for rows in (count, 2))
+    found = jax.jit(jax.vmap(lambda text: query_one_step(codes, text, 0.5)))(texts)
+    expected = np.stack([exact_cosines(codes, text) for text in texts])
+    np.testing.assert_allclose(found.similarity, expected, atol=1e-6)
+    np.testing.assert_allclose(found.score, expected.max(axis=1), atol=1e-6)
+    clear = np.abs(expected - 0.5) > 1e-5
+    assert (np.asarray(found.mask) == (expected >= 0.5))[clear].all()
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e-12, 1.0, 1e12, 1e30, 3e38])
@@ -62,9 +74,10 @@ def exact_relevancy(features, text, canonical):
     return np.min(shares, axis=0)
 
 
-def test_relevancy_equals_the_softmax_in_float64():
+@pytest.mark.parametrize("count", [300, MANY])
+def test_relevancy_equals_the_softmax_in_float64(count):
     rng = np.random.default_rng(0)
-    features, texts, canonical = (rng.normal(size=s).astype(np.float32) for s in ((300, 8), (2, 8), (4, 8)))
+    features, texts, canonical = (rng.normal(size=(rows, 8)).astype(np.float32) for rows in (count, 2, 4))
     got = jax.jit(jax.vmap(lambda text: query_canonical(features, text, canonical, 0.5)))(texts)
     for row, text in enumerate(texts):
         expected = exact_relevancy(features, text, canonical)
@@ -82,15 +95,3 @@ def test_unknown_features_are_never_selected_and_broken_phrases_select_nothing()
     for broken in (jnp.zeros((1, 3)), jnp.full((1, 3), jnp.nan)):
         assert not query_canonical(features, text, broken, 0.0).mask.any()
     assert not query_canonical(features, jnp.zeros(3), phrases, 0.0).mask.any()
-
-
-def test_the_second_step_of_the_anchored_query_compares_codes_with_that_of_the_region():
-    rng = np.random.default_rng(0)
-    table = rng.normal(size=(6, 3)).astype(np.float32)
-    codes = table[rng.integers(0, 6, 200)] + 0.1 * rng.normal(size=(200, 3)).astype(np.float32)
-    for region in range(6):
-        got, expected = _select_near_region(codes, table, region, 0.9), exact_cosines(codes, table[region])
-        assert int(got.region) == region
-        np.testing.assert_allclose(got.similarity, expected, atol=1e-6)
-        np.testing.assert_array_equal(got.mask, expected >= 0.9)
-    assert not _select_near_region(codes, table, -1, -1.0).mask.any()

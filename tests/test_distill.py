@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import MANY
 from jax.test_util import check_grads
 from small_field import REGIONS, labels_of, true_regions, unit_rows
 
@@ -55,14 +56,16 @@ def exact(votes, codes, reduce):
     return np.array(result)
 
 
+@pytest.mark.parametrize("count", [9_000, MANY])
 @pytest.mark.parametrize("reduce", ["mean", "median", "mode"])
-def test_reductions_equal_float64(reduce):
+def test_reductions_equal_float64(reduce, count):
     rng = np.random.default_rng(0)
-    votes, codes = random_votes(rng, 9_000, 6, 20), unit_rows(rng, 20, 4)
-    got = distill_votes(votes, codes, reduce)
-    np.testing.assert_allclose(got, exact(votes, codes, reduce), atol=3e-5)
-    jitted = jax.jit(lambda v, c: distill_votes(v, c, reduce))(votes, codes)
-    np.testing.assert_allclose(jitted, got, atol=1e-6)
+    few, tables, rows = random_votes(rng, 1000, 6, 20), unit_rows(rng, 40, 4).reshape(2, 20, 4), np.arange(count) % 1000
+    votes = jax.tree.map(lambda a: a[rows] if np.ndim(a) else a, few)
+    got = jax.jit(jax.vmap(lambda table, votes: distill_votes(votes, table, reduce), (0, None)))(tables, votes)
+    for found, table in zip(got, tables):
+        np.testing.assert_allclose(found, exact(few, table, reduce)[rows], atol=3e-5)
+    np.testing.assert_allclose(distill_votes(votes, tables[0], reduce), got[0], atol=1e-6)
 
 
 @pytest.mark.parametrize("reduce", ["mean", "median", "mode"])

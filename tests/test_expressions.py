@@ -165,10 +165,21 @@ def test_a_question_without_words_of_place_asks_for_its_object():
     assert parse_query("find the lamp or the jar but not the lid") == (["the lamp", "the jar"], ["the lid"])
 
 
-def test_questions_come_apart():
-    assert parse_query("red mug") == (["red mug"], [])
-    assert parse_query("mug or 'bowl' But Not handle or lid") == (["mug", "bowl"], ["handle", "lid"])
-    assert parse_query("doorknob") == (["doorknob"], [])
-    for bad in ("", "but not handle", "mug but not ''"):
-        with pytest.raises(InputError, match="part"):
-            parse_query(bad)
+@pytest.mark.parametrize(("question", "wanted", "unwanted"), [
+    ('"tea or coffee"', ["tea or coffee"], []), ('"red mug"', ["red mug"], []),
+    ("'tea or coffee' or mug", ["tea or coffee", "mug"], []),
+    ("“tea or coffee” but not “a cup but not full”", ["tea or coffee"], ["a cup but not full"]),
+    ("mug or 'bowl' But Not \"handle\" or lid", ["mug", "bowl"], ["handle", "lid"]), ("doorknob", ["doorknob"], []),
+    ("kid's toy or dog's bone", ["kid's toy", "dog's bone"], []),
+    ("kids' toys or dogs' bones", ["kids' toys", "dogs' bones"], []),
+    ("'kid's cup or mug'", ["kid's cup or mug"], []), ('the "tea or coffee" pot', ['the "tea or coffee" pot'], []),
+    ('"red', ["red"], []),
+])  # fmt: skip
+def test_questions_come_apart_but_within_quotes_which_are_removed(question, wanted, unwanted):
+    assert parse_query(question) == (wanted, unwanted)
+
+
+@pytest.mark.parametrize("question", ["", "but not handle", "mug but not ''"])
+def test_a_question_without_a_part_is_refused(question):
+    with pytest.raises(InputError, match="part"):
+        parse_query(question)

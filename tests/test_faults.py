@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_files import refused, small_capture, write_images, write_text_model, write_transforms
+from capture_files import context_of, refused, small_capture, write_images, write_text_model, write_transforms
 from fuzz_readers import tiny_field
 from test_pipeline import Recorder
 
@@ -19,11 +19,8 @@ from jsecon import load_capture, load_field, load_gaussians, save_field, save_ga
 from jsecon.files import exclusive_lock, reading, write_text
 from jsecon.pipeline import cache, run as pipeline, scene
 from jsecon.pipeline.scene import plan_capture
-from jsecon.pipeline.stages import RunContext
 from jsecon.read.captures import build
 from jsecon.read.captures.images import write_image
-from jsecon.vision.colours import ColourEmbedder
-from jsecon.vision.protocols import Models
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -95,7 +92,7 @@ class Meddler(Recorder):
 
 
 def test_a_file_that_changes_while_it_is_read_is_told_and_nothing_of_it_is_kept(capture, tmp_path):
-    work = RunContext(pipeline.Options(capture), Models(ColourEmbedder()), tmp_path / "out")
+    work = context_of(capture, tmp_path / "out")
     (tmp_path / "out").mkdir()
 
     def loaded_by(console):

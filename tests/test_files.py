@@ -4,7 +4,7 @@ import io
 
 import numpy as np
 import pytest
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file
 
 from jsecon.files import READ_ERRORS, map_npy, parse_json, read_arrays, write_arrays
 
@@ -30,12 +30,6 @@ def test_arrays_and_their_description_come_back(tmp_path, mapped):
         assert arrays[name].ctypes.data % array.itemsize == 0
         np.testing.assert_array_equal(arrays[name], array)
         np.testing.assert_array_equal(others[name], array)
-
-
-def test_a_file_of_another_program_is_told_from_a_damaged_one(tmp_path):
-    save_file({"a": np.ones(3)}, tmp_path / "a.safetensors", {"format": "pt"})
-    with pytest.raises(ValueError, match="another program"):
-        read_arrays(tmp_path / "a.safetensors")
 
 
 def test_every_byte_counts(tmp_path):

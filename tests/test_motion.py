@@ -10,20 +10,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from capture_files import png, refused
+from capture_files import context_of, png, refused
 from photo_files import FOCAL, HEIGHT, WIDTH, apart, write_photos
 from PIL import Image
 
 from jsecon.app import cli
-from jsecon.pipeline.options import Options
 from jsecon.pipeline.run import compute_stages
 from jsecon.pipeline.scene import plan_capture
-from jsecon.pipeline.stages import KEY_FILE, RunContext
+from jsecon.pipeline.stages import KEY_FILE
 from jsecon.poses import sfm
 from jsecon.poses.sfm import find_poses
 from jsecon.read.captures.capture import load_capture, read_posed_images, unposed_photographs
-from jsecon.vision.colours import ColourEmbedder
-from jsecon.vision.protocols import Models
 
 COUNT = 8
 
@@ -183,7 +180,7 @@ def test_a_run_finds_the_poses_first_and_keeps_them_with_its_output_among_the_ph
         return Path(shutil.copytree(found[0], work / "capture", symlinks=True)), found[1]
 
     def again(**changes):
-        context = RunContext(Options(folder, holdout=4, **changes), Models(ColourEmbedder()), out)
+        context = context_of(folder, out, holdout=4, **changes)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("jsecon.pipeline.scene.find_poses", copied)
             done = compute_stages(context, plan_capture(context))
@@ -265,7 +262,7 @@ def test_depth_maps_and_masks_of_any_name_are_told_by_their_bits(tmp_path, kind)
 ])  # fmt: skip
 def test_what_lies_beside_photographs_and_is_not_used_is_named_in_the_plan(tmp_path, others, says):
     _touch(tmp_path, "a.jpg", "b.jpg", "c.jpg", *others)
-    stage = plan_capture(RunContext(Options(tmp_path), Models(ColourEmbedder()), tmp_path / "f"))[0]
+    stage = plan_capture(context_of(tmp_path, tmp_path / "f"))[0]
     assert "3 photographs" in stage.how
     assert (others[0].rpartition("/")[2] in stage.how) == bool(says)
     assert says in stage.how

@@ -21,7 +21,6 @@ from jsecon import (
 )
 from jsecon.app.querying import file_stem, write_answer
 from jsecon.files import path_within
-from jsecon.query.expressions import parse_query
 from jsecon.read.captures.images import write_image
 from jsecon.vision.colours import ColourEmbedder
 
@@ -109,20 +108,6 @@ def test_names_lead_out_of_no_folder(tmp_path):
             path_within(tmp_path, name)
     for name in ("a.png", "a/b.png", "..a.png", "a/../b.png", "C.png"):
         assert path_within(tmp_path, name) == tmp_path / name
-
-
-@pytest.mark.parametrize(("question", "wanted", "unwanted"), [
-    ('"tea or coffee"', ["tea or coffee"], []), ('"red mug"', ["red mug"], []),
-    ("'tea or coffee' or mug", ["tea or coffee", "mug"], []),
-    ("“tea or coffee” but not “a cup but not full”", ["tea or coffee"], ["a cup but not full"]),
-    ('"mug" or "bowl" but not "handle" or lid', ["mug", "bowl"], ["handle", "lid"]),
-    ("kid's toy or dog's bone", ["kid's toy", "dog's bone"], []),
-    ("kids' toys or dogs' bones", ["kids' toys", "dogs' bones"], []),
-    ("'kid's cup or mug'", ["kid's cup or mug"], []), ('the "tea or coffee" pot', ['the "tea or coffee" pot'], []),
-    ('"red', ["red"], []),
-])  # fmt: skip
-def test_quotes_protect_and_are_removed(question, wanted, unwanted):
-    assert parse_query(question) == (wanted, unwanted)
 
 
 @pytest.mark.parametrize(("scale", "shift"), [(1.0, 5_400_000.25), (1e-3, 0.0), (1000.0, 0.0), (1e-6, 0.0)])

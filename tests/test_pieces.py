@@ -5,30 +5,44 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_field import make_field, rows_of_a_kind, shares
+from small_field import make_field, rows_of_a_kind, shares, unit_rows
 
 from jsecon import QueryRules, Regions, query_anchored, query_region
 from jsecon.query.match import MIN_FRAGMENT_OVERLAP, regions_with
 
-EMBEDDINGS = np.eye(9, dtype=np.float32)
+
+def belongs(first, similarity, known, rows, overlap, rules):
+    """The rule as it is stated, in float64."""
+    best, middle = similarity[known].max(), np.median(similarity[known])
+
+    def reaches(relative_score):
+        return known & (similarity >= middle + relative_score * (best - middle)) & (best > middle)
+
+    expected = np.arange(len(rows)) == first
+    if rules.all_of_class:
+        expected |= reaches(rules.same_class_score)
+    expected |= reaches(rules.fragment_score) & (overlap[expected] >= MIN_FRAGMENT_OVERLAP).any(0)
+    apart = rows - rows.sum(0, dtype=np.float64) / (known.sum() + 1)
+    apart /= np.linalg.norm(apart, axis=1, keepdims=True)
+    return expected | (known & (apart @ apart[first] >= rules.duplicate_cosine))
 
 
-def test_a_fragment_is_near_the_text_and_shares_gaussians_with_the_best_region():
+def test_fragments_duplicates_and_things_of_a_class_answer_with_the_best_region():
     rng = np.random.default_rng(0)
-    rules = QueryRules(duplicate_cosine=None)
-    for _ in range(20):
-        similarity, known = rng.normal(size=9).astype(np.float32), rng.random(9) < 0.8
-        overlap = np.where(rng.random((9, 9)) < 0.5, 0.0, rng.random((9, 9))).astype(np.float32)
-        first = np.where(known, similarity, -9).argmax()
-        best, middle = similarity[known].max(), np.median(similarity[known])
-        near = known & (similarity >= middle + 0.5 * (best - middle)) & (best > middle)
-        expected = near & (overlap[first] >= MIN_FRAGMENT_OVERLAP)
-        expected[first] = True
-        got = regions_with(jnp.asarray(first), similarity, known, EMBEDDINGS, overlap, rules)
-        np.testing.assert_array_equal(got, expected)
-    alone = np.arange(9) == first
+    class_rules = (QueryRules(all_of_class=True, same_class_score=score) for score in (0.3, 0.8))
+    for rules in (QueryRules(), *class_rules):
+        for _ in range(20):
+            rows, known = unit_rows(rng, 9, 12), rng.random(9) < 0.8
+            rows[0] = (rows[1] + 0.2 * rows[0]) / np.linalg.norm(rows[1] + 0.2 * rows[0])  # seen twice
+            rows[~known] = 0
+            similarity = (rows @ unit_rows(rng, 1, 12)[0]).astype(np.float32)
+            overlap = np.where(rng.random((9, 9)) < 0.5, 0.0, rng.random((9, 9))).astype(np.float32)
+            first = np.where(known, similarity, -9).argmax()
+            got = regions_with(jnp.asarray(first), similarity, known, rows, overlap, rules)
+            np.testing.assert_array_equal(got, belongs(first, similarity, known, rows, overlap, rules))
+    alone, rules = np.arange(9) == first, QueryRules(duplicate_cosine=None)
     for values, usable in ((similarity, np.zeros(9, bool)), (np.zeros(9, np.float32), np.ones(9, bool))):
-        got = regions_with(jnp.asarray(first), values, usable, EMBEDDINGS, overlap, rules)
+        got = regions_with(jnp.asarray(first), values, usable, rows, overlap, rules)
         np.testing.assert_array_equal(got, alone)
 
 

@@ -6,7 +6,7 @@ import json
 import cv2
 import numpy as np
 import pytest
-from capture_files import transforms, write_images
+from capture_files import context_of, transforms, write_images
 from test_corrections import (
     capture as capture,  # fixtures
     errors,
@@ -15,13 +15,9 @@ from test_corrections import (
 )
 from test_fit import same
 
-from jsecon.pipeline.options import Options
 from jsecon.pipeline.run import compute_stages
 from jsecon.pipeline.scene import plan_capture
-from jsecon.pipeline.stages import RunContext
 from jsecon.poses import refine
-from jsecon.vision.colours import ColourEmbedder
-from jsecon.vision.protocols import Models
 
 
 def write(capture, folder, *, depth=True):
@@ -39,8 +35,7 @@ def write(capture, folder, *, depth=True):
 
 def load(folder, out, **options):
     """What the first stage of a run makes of a capture, and what it told."""
-    given = Options(capture=folder, holdout=6, steps=2000, **options)
-    work = RunContext(given, Models(ColourEmbedder()), out)
+    work = context_of(folder, out, holdout=6, steps=2000, **options)
     done = compute_stages(work, plan_capture(work))
     return done.results.load, " ".join(done.notes), done.steps[0].status
 
@@ -66,7 +61,7 @@ def test_by_default_a_rough_capture_with_depth_is_corrected_once(capture, truth,
 
 def test_without_depth_or_with_gaussians_nothing_is_tried(capture, tmp_path):
     def how(folder, **options):
-        return plan_capture(RunContext(Options(folder, **options), Models(ColourEmbedder()), tmp_path / "out"))[-1]
+        return plan_capture(context_of(folder, tmp_path / "out", **options))[-1]
 
     plain = write(capture, tmp_path / "plain", depth=False)
     deep = write(capture, tmp_path / "deep")

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import MANY
 from jax.test_util import check_grads
 from small_field import KnownTexts, make_field, unit_rows
 
@@ -51,6 +52,14 @@ def test_equals_the_formula_and_rows_without_a_direction_are_unknown(rows):
     assert got.shape == known.shape == (0,)
 
 
+@pytest.mark.parametrize("count", [7, MANY])
+def test_texts_together_have_the_similarities_of_float64(count):
+    embeddings, texts, words = (unit_rows(np.random.default_rng(3), n, SIZE) for n in (count, 3, 4))
+    found, known = jax.jit(jax.vmap(lambda text: region_similarities(embeddings, text, words, "contrast")))(texts)
+    assert np.asarray(known).all()
+    np.testing.assert_allclose(found, [exact(embeddings, text, words) for text in texts], atol=5e-6)
+
+
 def test_gradient_equals_central_differences(rows, x64):
     given = tuple(jnp.asarray(a, jnp.float64) for a in rows)
     similar = jax.jit(lambda *given: region_similarities(*given, "contrast")[0])
@@ -89,13 +98,9 @@ def test_evidence_is_of_views_and_counts_against_the_best_known_region():
     np.testing.assert_array_equal(view_count_weight(jnp.asarray([[7], [7]])), 1)  # one view: no difference
 
 
-def exact_quantile(embeddings, text, words):
-    """The share of words, without the tenth that is nearest to the text, that are less similar to their best region."""
-    return exact_standing(embeddings, text, words, np.ones(len(embeddings)))[0]
-
-
 def exact_standing(embeddings, text, words, weight):
-    """That share, and the margin of the text among the words by regions of some weights."""
+    """The share of words, without the tenth that is nearest to the text, that are less similar to their best region;
+    and the margin of the text among the words by regions of some weights."""
     rows, words, text = (unit(np.asarray(a, np.float64)) for a in (embeddings, words, text))
     mean = words.mean(0)
     order = np.argsort(-(unit(words - mean) @ unit(text - mean)), kind="stable")[int(0.1 * len(words)) :]
@@ -196,7 +201,7 @@ def test_a_list_of_classes_is_compared_in_deviations_of_each_text(worded):
 
 def test_an_answer_has_its_rank_and_that_of_an_old_field_has_none(worded, tmp_path):
     field, texts = worded
-    ranks = [exact_quantile(field.regions.embeddings, text, field.unrelated_words) for text in texts]
+    ranks = [exact_standing(field.regions.embeddings, text, field.unrelated_words, np.ones(5))[0] for text in texts]
     rows = {"seen": texts[int(np.argmax(ranks))], "unseen": texts[int(np.argmin(ranks))]}
 
     def answers(words):

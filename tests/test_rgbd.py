@@ -7,17 +7,13 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from capture_files import refused, small_capture
+from capture_files import context_of, refused, small_capture
 from scipy.spatial.transform import Rotation
 
 from jsecon import load_capture
-from jsecon.pipeline.options import Options
 from jsecon.pipeline.scene import plan_capture
-from jsecon.pipeline.stages import RunContext
 from jsecon.read.captures.images import read_depth, write_image
 from jsecon.read.captures.lens import Lens, resample_depth
-from jsecon.vision.colours import ColourEmbedder
-from jsecon.vision.protocols import Models
 
 _RANDOM = small_capture(count=12)
 _ONE = {name: np.full(12, getattr(_RANDOM.cameras, name)[0]) for name in ("fx", "fy", "cx", "cy")}
@@ -279,6 +275,5 @@ def test_depth_of_the_largest_number_is_unknown(tmp_path):
 ])  # fmt: skip
 def test_a_part_of_a_capture_names_the_whole(tmp_path, write, inner):
     write(tmp_path / "scan")
-    work = RunContext(Options(tmp_path / "scan" / inner), Models(ColourEmbedder()), tmp_path / "out")
     with refused(inner, "part of a", tmp_path / "scan"):
-        plan_capture(work)
+        plan_capture(context_of(tmp_path / "scan" / inner, tmp_path / "out"))

@@ -5,19 +5,16 @@ import json
 
 import numpy as np
 import pytest
-from capture_files import refused, small_capture
+from capture_files import context_of, refused, small_capture
 from scipy.spatial.transform import Rotation
 from splat_files import scene
 from test_gaussian_files import gaussians
 
 from jsecon import load_gaussians, render_rgb, save_gaussians
-from jsecon.pipeline.options import Options
 from jsecon.pipeline.run import run_stages
-from jsecon.pipeline.stages import Checkpoint, Results, RunContext, StageInput
+from jsecon.pipeline.stages import Checkpoint, Results, StageInput
 from jsecon.read.captures.nerfstudio import source_from_trained
 from jsecon.splat.transform import transform_gaussians
-from jsecon.vision.colours import ColourEmbedder
-from jsecon.vision.protocols import Models
 
 TURN = np.array([[0, 0, 1, 0.3], [1, 0, 0, -0.2], [0, 1, 0, 0.5], [0, 0, 0, 1.0]])
 TRAINED = np.diag([0.4, 0.4, 0.4, 1]) @ TURN
@@ -26,7 +23,7 @@ TRAINED = np.diag([0.4, 0.4, 0.4, 1]) @ TURN
 
 def read(capture, file, name="gaussians", **results):
     """The outcome of the stage that reads `file` (or another, given the results before it), and the stage."""
-    work = RunContext(Options(capture=file.parent, gaussians=file), Models(ColourEmbedder()), file.parent / "out")
+    work = context_of(file.parent, file.parent / "out", gaussians=file)
     stage = next(stage for stage in run_stages(work) if stage.name == name)
     stage_input = StageInput(work, Results(load=capture, **results), lambda done, total: None, Checkpoint(work.out))
     return stage.compute(stage_input), stage

@@ -116,26 +116,15 @@ def test_a_token_is_asked_for_where_one_is_set(scenes):
 
 
 def test_fields_are_opened_by_their_folders_names_and_the_address_is_told(scenes, tmp_path):
-    files = [tmp_path / name / "field.safetensors" for name in ("a", "b")]
+    files = [tmp_path / name / "desk" / "field.safetensors" for name in ("a", "b")]
     for file in files:
-        file.parent.mkdir()
+        file.parent.mkdir(parents=True)
         save_field(file, scenes["desk"].field)
-    assert list(open_scenes(files, None)) == ["a", "b"]
+    assert [scene.name for scene in open_scenes(files, None).values()] == ["a/desk", "b/desk"]
     with refused("given twice"):
         open_scenes([files[0], files[0].parent], None)
     told, _ = prepare([files[0].parent, files[1]], host="127.0.0.1", port=0, token="", embedder=None)
     assert int(told["address"].removeprefix("http://127.0.0.1:")) > 0
-    assert [scene["name"] for scene in told["fields"]] == ["a", "b"]
+    assert [scene["name"] for scene in told["fields"]] == ["a/desk", "b/desk"]
     with refused("a token that clients must have"):
         prepare(files, host="0.0.0.0", port=0, token="", embedder=None)
-
-
-def test_splats_of_one_name_are_told_apart_by_their_folders(scenes, tmp_path, monkeypatch):
-    save_field(tmp_path / "field.safetensors", scenes["desk"].field)
-    monkeypatch.setattr("jsecon.app.scene._field_of_gaussians", lambda *_: tmp_path / "field.safetensors")
-    files = [tmp_path / name for name in ("a/cloud.ply", "b/cloud.ply", "b/room.spz")]
-    for file in files:
-        file.parent.mkdir(exist_ok=True)
-        file.write_bytes(b"of Gaussians")
-    scenes = open_scenes(files, None)
-    assert list(scenes) == [scene.name for scene in scenes.values()] == ["a/cloud", "b/cloud", "room"]

@@ -8,7 +8,7 @@ import pytest
 from small_field import KnownTexts, make_field, rows_of_a_kind, shares, unit_rows
 from table_field import table_field
 
-from jsecon import InputError, QueryRules, Regions, Scene, match_regions
+from jsecon import InputError, QueryRules, Regions, Scene
 from jsecon.query.answer import query_several
 
 
@@ -16,25 +16,6 @@ from jsecon.query.answer import query_several
 def field(scene, cameras):
     field, _ = make_field(scene, cameras)
     return dataclasses.replace(field, regions=Regions(rows_of_a_kind(), field.regions.pixel_counts))
-
-
-def test_the_rule_is_the_stated_one(field):
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        rows, text = unit_rows(rng, 9, 12), unit_rows(rng, 1, 12)[0]
-        known = rng.random(9) < 0.8
-        rows[~known] = 0
-        similarity = rows.astype(np.float64) @ text
-        best, middle = similarity[known].max(), np.median(similarity[known])
-        apart = rows - rows.sum(0, dtype=np.float64) / (known.sum() + 1)
-        apart /= np.linalg.norm(apart, axis=1, keepdims=True)
-        alike = apart @ apart[np.where(known, similarity, -2).argmax()] >= 0.9
-        regions = Regions(rows, np.zeros((9, 4), np.int32))
-        made = dataclasses.replace(field, regions=regions, votes=dataclasses.replace(field.votes, overlap=None))
-        for kind in (0.3, 0.8):
-            expected = ((similarity >= middle + kind * (best - middle)) | alike) & known & (best >= 0.2)
-            got = match_regions(made, text[None], QueryRules(all_of_class=True, same_class_score=kind))
-            np.testing.assert_array_equal(got.chosen, expected)
 
 
 def test_unwanted_regions_are_left_out_unless_the_wanted_text_fits_them_better(field):

@@ -1,6 +1,6 @@
 """Votes made ready to be asked: which views show a region, how much of a Gaussian regions have, how far they overlap.
 
-`exact_share` and `exact_overlap` are the definitions, Gaussian by Gaussian in float64.
+`small_field.shares_of` and `exact_overlap` are the definitions in float64.
 """
 
 import dataclasses
@@ -9,11 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import MANY
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra.numpy import arrays
 from jax.test_util import check_grads
 from scipy.stats import beta
-from small_field import seen_of
+from small_field import seen_of, shares_of
 
 from jsecon.field.membership import (
     CORRELATION,
@@ -63,19 +64,6 @@ def exact_shown(votes, regions):
     return np.where(place >= 0, np.take_along_axis(of_region, np.maximum(place, 0), 1), 0.0)
 
 
-def exact_share(votes, chosen):
-    votes = jax.tree.map(np.asarray, votes)
-    share, all_seen = np.zeros(len(votes.total)), seen_of(votes)
-    for n in range(len(share)):
-        weight, seen = 0.0, 0.0
-        for k, region in enumerate(np.asarray(votes.regions[n])):
-            if 0 <= region < len(chosen) and chosen[region]:
-                weight += float(votes.weights[n, k])
-                seen = max(seen, all_seen[n, k])
-        share[n] = min(weight / seen, 1.0) if seen > 0 and votes.views[n] > 0 else 0.0
-    return share
-
-
 def exact_overlap(votes):
     votes = jax.tree.map(np.asarray, votes)
     seen = seen_of(votes)
@@ -88,7 +76,7 @@ def exact_overlap(votes):
     return np.divide(both, either, out=np.zeros_like(both), where=either > 0)
 
 
-@pytest.mark.parametrize("count", [0, 1, 400])
+@pytest.mark.parametrize("count", [0, 1, 400, MANY])
 def test_shown_and_overlap_are_the_stated_sums_under_jit_as_eagerly(count):
     votes, regions = cast(count)
     found = _add_visible_weight(votes, regions)
@@ -127,7 +115,8 @@ def test_votes_without_views_or_of_other_views_are_refused():
         _add_visible_weight(votes, dataclasses.replace(regions, pixel_counts=regions.pixel_counts[:, 1:]))
 
 
-@pytest.mark.parametrize(("count", "shown"), [(500, False), (400, True)])
+@pytest.mark.parametrize("shown", [False, True])
+@pytest.mark.parametrize("count", [400, MANY])
 def test_share_is_the_definition_under_jit_and_vmap(count, shown):
     votes = jax.tree.map(jnp.asarray, known_votes(count, shown=shown))
     chosen = np.random.default_rng(1).random((3, REGIONS)) < 0.5
@@ -136,7 +125,7 @@ def test_share_is_the_definition_under_jit_and_vmap(count, shown):
         alone = inside_fraction(votes, one)
         np.testing.assert_array_equal(alone.fraction, together.fraction[n])
         np.testing.assert_array_equal(alone.known, np.asarray(alone.fraction) > 0)
-        np.testing.assert_allclose(alone.fraction, exact_share(votes, one), atol=1e-6)
+        np.testing.assert_allclose(alone.fraction, shares_of(votes, np.flatnonzero(one)), atol=1e-6)
 
 
 @pytest.mark.parametrize("shown", [False, True])

@@ -12,7 +12,7 @@ from small_field import KnownTexts, make_field, unit_rows
 
 from experiments.export.vocabulary import write_vocabulary
 from jsecon import Scene, query_anchored, query_several
-from jsecon.networks.clip import ClipEmbedder, read_preprocessing
+from jsecon.networks.clip import ClipEmbedder
 from jsecon.networks.tokenizer import TextTokenizer, _TextRules, read_text_rules
 from jsecon.query.match import presence_prob
 from jsecon.query.rules import MIN_COSINE, MIN_PRESENCE, QueryRules
@@ -85,12 +85,6 @@ def test_the_name_follows_the_rules_and_not_the_scale(folders, tmp_path):
     name = ClipEmbedder(clip).name
     write_json(clip / "config.json", {"embed_dim": 3, "text_cfg": {"context_length": 77, "vocab_size": 49408}})
     assert (ClipEmbedder(clip).name, ClipEmbedder(clip).logits) == (name, None)
-
-
-def test_mobileclip_s_images_are_not_normalised(tmp_path):
-    path = tmp_path / "preprocessor_config.json"
-    write_json(path, {"do_normalize": False, "do_rescale": True, "rescale_factor": 1 / 255, "crop_size": 256})
-    assert read_preprocessing(path) == ((0.0,) * 3, (1.0,) * 3, 256)
 
 
 def test_a_length_that_is_left_out_is_transformers_own(tmp_path):

@@ -5,13 +5,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from capture_files import context_of
 
-from jsecon.pipeline.options import Options
 from jsecon.pipeline.scene import plan_capture
-from jsecon.pipeline.stages import RunContext
 from jsecon.read.captures.video import write_frames
-from jsecon.vision.colours import ColourEmbedder
-from jsecon.vision.protocols import Models
 
 SHARP = (2, 7, 12, 16, 20, 29)
 """of 30 frames, one in each stretch of five"""
@@ -46,7 +43,7 @@ def test_the_sharpest_frame_of_each_stretch_is_taken(video, tmp_path):
 def test_a_run_on_a_video_takes_as_many_frames_as_it_is_told(video, tmp_path):
     keys = []
     for frames in (None, 20, 30):
-        work = RunContext(Options(video, frames=frames), Models(ColourEmbedder()), tmp_path)
+        work = context_of(video, tmp_path, frames=frames)
         poses, load = plan_capture(work)
         assert f"the {frames or 150} sharpest frames of walk.avi" in poses.how
         assert load.after == ("poses",)

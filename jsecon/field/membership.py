@@ -252,46 +252,41 @@ def _lookup(chosen: Bool[Array, " r"]) -> Callable[[Array], Array]:
     return inside
 
 
-def membership_probability(
-    share: Float[Array, " n"], votes: Votes, *, correlation: float = CORRELATION
-) -> Float[Array, " n"]:
+def membership_probability(share: Float[Array, " n"], votes: Votes) -> Float[Array, " n"]:
     """Computes the probability that most of a Gaussian belongs to what was selected. Pure.
 
     Views are draws, of which n count as independent. Under a flat prior the true part has the posterior Beta(1 + n
     share, 1 + n (1 - share)), and the probability is its mass above one half. n is the number of views, at most the
-    Gaussian's weight in pixels, damped by the correlation r to n / (1 + (n - 1) r). So 0.9 of one view's weight is less
+    Gaussian's weight in pixels, damped by r = CORRELATION to n / (1 + (n - 1) r). So 0.9 of one view's weight is less
     certain than 0.9 of twenty views'.
 
     Args:
       share: (N,) in [0, 1], similarity of a query by votes (`inside_fraction`).
       votes: Votes of the N Gaussians.
-      correlation: Correlation of the errors of two views, in [0, 1].
 
     Returns:
       (N,) in [0, 1]; 0 for Gaussians that were never seen.
     """
-    return _probability(jnp.asarray(share), jnp.asarray(votes.views), jnp.asarray(votes.total), correlation)
+    return _probability(jnp.asarray(share), jnp.asarray(votes.views), jnp.asarray(votes.total))
 
 
 def probability_inside(share: Float[Array, " n"], votes: Votes, mask: Bool[Array, " n"]) -> Float[np.ndarray, " m"]:
     """Computes `membership_probability` of the M selected Gaussians alone, without a program. Host code."""
     rows = np.flatnonzero(np.asarray(mask))
     share, views, total = (np.asarray(column)[rows] for column in (share, votes.views, votes.total))
-    return _mass_above_half(share, views, total, CORRELATION, np, scipy.special.betainc)
+    return _mass_above_half(share, views, total, np, scipy.special.betainc)
 
 
 @stored_jit
-def _probability(share: Array, views: Array, total: Array, correlation: Array | float) -> Array:
-    return _mass_above_half(share, views, total, correlation, jnp, betainc)
+def _probability(share: Array, views: Array, total: Array) -> Array:
+    return _mass_above_half(share, views, total, jnp, betainc)
 
 
-def _mass_above_half(
-    share: Any, views: Any, total: Any, correlation: Any, xp: Any, betainc: Callable[[Any, Any, Any], Any]
-) -> Any:
+def _mass_above_half(share: Any, views: Any, total: Any, xp: Any, betainc: Callable[[Any, Any, Any], Any]) -> Any:
     """Computes `membership_probability` with the functions of a module, NumPy or jax.numpy."""
     known = (views > 0) & xp.isfinite(share) & xp.isfinite(total) & (total > 0)
     count = xp.where(known, xp.minimum(views.astype(share.dtype), total), 1)
-    count = count / (1 + xp.maximum(count - 1, 0) * correlation)
+    count = count / (1 + xp.maximum(count - 1, 0) * CORRELATION)
     inside = xp.clip(xp.where(known, share, 0.5), 0, 1) * count
     # 1 - I_{1/2}(a, b) = I_{1/2}(b, a), without the cancellation.
     return xp.where(known, betainc(1 + count - inside, 1 + inside, 0.5), 0)
