@@ -1,7 +1,8 @@
-"""The stages of objects: labels of the training frames, embeddings of the regions, parts of the scene."""
+"""The stages of objects: labels of the training frames, embeddings of the regions, parts of the scene, votes, codes."""
 
 import functools
 import itertools
+import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -15,10 +16,14 @@ from jsecon.association.consensus import clean_tracks, pieces_on_masks, track_ma
 from jsecon.association.run_lengths import cache_masks_as_rle
 from jsecon.association.scene import SceneSuperpixels
 from jsecon.errors import InputError
+from jsecon.field.columns import vote_blocks
+from jsecon.field.evidence import region_votes, votes_memory
 from jsecon.field.regions import Embed, choose_crops, crop_geometry, embeddings_of_masks, region_embeddings, scene_parts
 from jsecon.fit.depth import points_from_depth
 from jsecon.networks.hub import model_name
 from jsecon.paper.algorithm1 import masklets
+from jsecon.paper.autoencoder import encode, train_autoencoder
+from jsecon.paper.distill import distill_votes
 from jsecon.paper.tracker import GeometricTracker
 from jsecon.parallel import map_over_processes
 from jsecon.pipeline.options import Options
@@ -32,10 +37,11 @@ from jsecon.pipeline.stages import (
     StageResult,
     training_frames,
 )
+from jsecon.process import memory_budget
 from jsecon.read.captures.frames import evenly_spaced
 from jsecon.read.masks.masks import load_features, load_labels, load_proposals
 from jsecon.splat.render import render_depth
-from jsecon.types import Camera, Capture, Gaussians, Progress
+from jsecon.types import Camera, Capture, Codes, Gaussians, Progress
 from jsecon.views.cover import LEAST_GAIN, frames_by_need
 from jsecon.vision.classical import GRANULARITIES, ClassicalSegmenter
 from jsecon.vision.protocols import Segmenter
@@ -43,9 +49,9 @@ from jsecon.vision.surfaces import smooth_depth, surfaces_from_depth
 
 
 def plan_objects(context: RunContext) -> list[Stage]:
-    """Plans the objects, their embeddings, and small parts of the scene if the options ask for them."""
+    """Plans objects, their embeddings and votes; parts of the scene, and codes, if the options ask for them."""
     parts = [_plan_parts(context)] if context.options.parts else []
-    return [_plan_labels(context), _plan_regions(context), *parts]
+    return [_plan_labels(context), _plan_regions(context), *parts, *_plan_lifting(context)]
 
 
 def _plan_labels(context: RunContext) -> Stage:
@@ -108,6 +114,18 @@ def _plan_parts(context: RunContext) -> Stage:
     key_options["embedder"] = context.models.embedder.name
     files = (context.options.features,)
     return Stage("parts", how, _find_parts, after=after, key_options=key_options, files=files)
+
+
+def _plan_lifting(context: RunContext) -> list[Stage]:
+    """Plans the votes of the regions for each Gaussian, and the codes of the paper if the options ask for them."""
+    how, after = "the strongest regions of each Gaussian", ("load", "gaussians", "objects")
+    key_options = context.key_options("centre_pixel_weight")
+    votes = Stage("votes", how, _accumulate_votes, after=after, key_options=key_options, distributed=True)
+    if not context.options.paper:
+        return [votes]
+    how = "3 numbers per region by an autoencoder, distilled into the Gaussians by their votes"
+    key_options = context.key_options("seed")
+    return [votes, Stage("codes", how, _compute_codes, after=("regions", "votes"), key_options=key_options)]
 
 
 def _chooses_frames(context: RunContext) -> bool:
@@ -337,3 +355,36 @@ def _masks_with_embeddings(
         labels = results.objects.labels
         return lambda t: labels[t][None] == np.unique(labels[t][labels[t] >= 0])[:, None, None], by_model
     return _frame_proposals(context, view, results.gaussians)[0], by_model
+
+
+def _accumulate_votes(stage: StageInput) -> StageResult:
+    """Accumulates votes, on disk if they do not fit into memory; the votes are the same."""
+    options, capture, scene = stage.context.options, stage.results.load, stage.results.gaussians
+    labels, folder = stage.results.objects.labels, stage.checkpoint.folder
+    cameras = capture.cameras[stage.results.objects.frames]
+    count = int(labels.max()) + 1
+    settings = {"centre_pixel_weight": options.centre_pixel_weight, "by_view": True, "progress": stage.progress}
+    needed, budget = votes_memory(scene.count, len(labels)), memory_budget()
+    on_disk = needed > budget and jax.process_count() == 1  # several processes exchange them in memory
+    notes = ()
+    if on_disk:
+        shutil.rmtree(folder, ignore_errors=True)  # of a run that was stopped
+        sizes = f"{needed / 2**30:.2g} GiB otherwise, where memory has room for {budget / 2**30:.2g}"
+        notes = (f"votes are kept on disk: {sizes}",)
+    accumulated = region_votes(scene, cameras, labels, count, folder=folder if on_disk else None, **settings)
+    unseen = int((np.asarray(accumulated.views) == 0).sum())
+    if unseen:
+        notes = (*notes, f"no frame sees {unseen} of {scene.count} Gaussians")
+    return StageResult(accumulated, notes)
+
+
+def _compute_codes(stage: StageInput) -> StageResult:
+    """Trains the paper's autoencoder, and distils the codes of the regions into the Gaussians by their votes."""
+    options, embeddings, cast = stage.context.options, stage.results.regions.embeddings, stage.results.votes
+    if not np.any(np.asarray(embeddings)):
+        raise InputError("--paper", "no region has an embedding to train the autoencoder on", remedy="Leave it out.")
+    key = jax.random.key(options.seed)
+    autoencoder = train_autoencoder(embeddings, latent=3, key=key, progress=stage.progress)
+    table = encode(autoencoder, embeddings)
+    codes = np.concatenate([np.asarray(distill_votes(block, table)) for block in vote_blocks(cast)])
+    return StageResult(Codes(codes, table, autoencoder))

@@ -18,9 +18,10 @@ import numpy as np
 from jsecon.backend import start_backend
 from jsecon.errors import InputError, is_out_of_memory
 from jsecon.field.field import load_field, save_field
+from jsecon.field.membership import normalise_votes
 from jsecon.files import FIELD_FILE, exclusive_lock
 from jsecon.parallel import allgather_tree
-from jsecon.pipeline import cache, lifting, model_loading
+from jsecon.pipeline import cache, model_loading
 from jsecon.pipeline.objects import plan_objects
 from jsecon.pipeline.options import Options, check_ranges, is_bare_scene, require_writable
 from jsecon.pipeline.progress import Console, Step
@@ -44,8 +45,11 @@ from jsecon.read.captures.build import plan_frames
 from jsecon.read.captures.capture import read_posed_images
 from jsecon.read.captures.frames import FrameOptions, evenly_spaced
 from jsecon.read.masks.masks import load_features, load_labels, load_proposals
-from jsecon.types import Capture, Gaussians, LanguageField, Quality
+from jsecon.types import Capture, Gaussians, LanguageField, Quality, Regions
+from jsecon.views.frame import find_up_axis, given_up
 from jsecon.vision.classical import require_contrib
+from jsecon.vision.protocols import Embedder
+from jsecon.vision.unrelated_words import embed_unrelated_words
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,9 +104,7 @@ class Run:
 
 def run_stages(context: RunContext) -> list[Stage]:
     """Plans the stages of a run. Mask files come before the long fit, so that their errors are found early."""
-    by_name = {
-        stage.name: stage for stage in [*plan_scene(context), *plan_objects(context), *lifting.plan_lifting(context)]
-    }
+    by_name = {stage.name: stage for stage in [*plan_scene(context), *plan_objects(context)]}
     early = ("objects", "gaussians") if context.options.masks is not None else ("gaussians", "objects")
     order = ("poses", "load", *early, "regions", "parts", "votes", "codes", "held_out")
     return [by_name[name] for name in order if name in by_name]
@@ -282,7 +284,7 @@ def run(
     with console.progress("field"):
         warnings = [note.removeprefix(WARNING) for note in state.notes if note.startswith(WARNING)]
         origin = provenance(context.options, state.keys, embedder.name, out, warnings)
-        field = lifting.join_field(results, embedder, origin, context.options)
+        field = _join_field(results, embedder, origin, context.options)
         save_field(out / FIELD_FILE, field)
     seconds["field"] = time.monotonic() - started
     console.done("field", seconds["field"], True)
@@ -292,6 +294,31 @@ def run(
     programs = {name: count - before[name] for name, count in compilation_counts().items()}
     made = results.load, results.objects.labels, results.objects.frames, results.held_out
     return Run(field, context.options, *made, state.steps, seconds, state.notes, programs)
+
+
+def _join_field(results: Results, embedder: Embedder, provenance: str, options: Options) -> LanguageField:
+    """Joins the results of a run to a field."""
+    capture, embedded = results.load, results.regions
+    pixels = np.zeros((embedded.count, len(capture.names)), np.int32)
+    pixels[:, results.objects.frames] = embedded.pixel_counts
+    given = None if options.up is None else given_up(options.up, capture.source_from_scene)
+    scale = capture.metres_per_unit if options.metres_per_unit is None else options.metres_per_unit
+    return LanguageField(
+        gaussians=results.gaussians,
+        votes=normalise_votes(results.votes, embedded),
+        regions=Regions(embedded.embeddings, pixels),
+        cameras=capture.cameras,
+        canonical_phrases=np.asarray(embedder.canonical_phrases, np.float32),
+        source_from_scene=np.asarray(capture.source_from_scene),
+        names=capture.names,
+        embedder=embedder.name,
+        provenance=provenance,
+        parts=results.parts,
+        unrelated_words=embed_unrelated_words(embedder).astype(np.float16),
+        codes=results.codes,
+        up=given or capture.up or find_up_axis(results.gaussians, capture.cameras),
+        metres_per_unit=scale,
+    )
 
 
 def _open_context(options: Options, out: Path) -> RunContext:

@@ -7,8 +7,8 @@
     objects    objects.plan_objects   load, gaussians (--masks: load alone)
     regions    objects.plan_objects   load, objects
     parts      objects.plan_objects   load, gaussians, objects, with --parts
-    votes      lifting.plan_lifting   load, gaussians, objects
-    codes      lifting.plan_lifting   regions, votes, with --paper
+    votes      objects.plan_objects   load, gaussians, objects
+    codes      objects.plan_objects   regions, votes, with --paper
     held_out   scene.plan_scene       load, gaussians, if there are photographs
 
 Each plan states how the stage works, for what a run prints first; the stages that it reads (`after`); and the options,

@@ -16,9 +16,6 @@ from jsecon.fit.start import gaussians_from_points
 from jsecon.read.masks.masks import LEVELS, load_features
 from jsecon.read.splats.files import save_gaussians
 
-TRACKED = "ours, tracks"
-CHEAP = ("VALA", TRACKED)
-
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
@@ -40,20 +37,6 @@ def with_gaussians(plan, *levels):
             points = gaussians_from_points(capture.points, capture.point_colors, opacity=0.8, scale=0.4)
             save_gaussians(root / scene / "point_cloud.ply", points)
     return plan
-
-
-@pytest.mark.long
-def test_table_1_in_small(folder):
-    """.ci/run fills all tables in small; test_cells has the resumption."""
-    plan = with_gaussians(small(lerf.QUICK, folder, "lerf", methods=CHEAP, level="perfect"))
-    lerf.main(plan)
-    place = folder / "lerf"
-    assert {file.name for file in place.iterdir()} >= {"config.json", "metrics.json", "table.md", "figure.webp"}
-    cells = {cell["method"]: cell for cell in json.loads((place / "metrics.json").read_text())["cells"]}
-    assert set(cells) == set(CHEAP)
-    assert all(cell["twin"] and cell["pairs"] > 0 for cell in cells.values())
-    # 80x60 px, points as Gaussians: they are rough, the masks true.
-    assert cells[TRACKED]["miou"] > 0.3
 
 
 def test_best_thresholds_are_those_of_single_queries():
