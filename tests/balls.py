@@ -3,9 +3,7 @@
 import functools
 
 import numpy as np
-from conftest import gaussians_at, look_at
-
-from jsecon.types import Camera
+from conftest import cameras_of, gaussians_at, look_at
 
 WIDTH, HEIGHT, VIEWS = 96, 72, 24
 COLOURS = np.asarray([(150, 150, 150), (200, 40, 40), (40, 90, 200), (60, 160, 60)], np.uint8)
@@ -31,8 +29,7 @@ def ring_of_balls():
     gaussians = gaussians_at(points, scales[:, None])
     centres = [(2.2 * np.sin(a), -1.0, -2.2 * np.cos(a)) for a in 2 * np.pi * np.arange(VIEWS) / VIEWS]
     poses = np.stack([look_at(centre, (0.0, -0.2, 0.0)) for centre in centres])
-    ones = np.ones(VIEWS, np.float32)
-    cameras = Camera(poses, 90 * ones, 90 * ones, WIDTH / 2 * ones, HEIGHT / 2 * ones, width=WIDTH, height=HEIGHT)
+    cameras = cameras_of(poses, (90, 90, WIDTH / 2, HEIGHT / 2), WIDTH, HEIGHT)
     x, y = np.meshgrid((np.arange(WIDTH) + 0.5 - WIDTH / 2) / 90, (np.arange(HEIGHT) + 0.5 - HEIGHT / 2) / 90)
     truth = np.zeros((VIEWS, HEIGHT, WIDTH), np.int16)
     for t, (pose, origin) in enumerate(zip(poses.astype(np.float64), centres)):

@@ -2,10 +2,8 @@
 
 import base64
 import contextlib
-import html
 import itertools
 import json
-import re
 import shutil
 import subprocess
 import time
@@ -15,14 +13,10 @@ from pathlib import Path
 from typing import Any
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-WEBGL = (
-    "--enable-unsafe-swiftshader", "--use-gl=angle", "--use-angle=swiftshader", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync",
-)  # fmt: skip
-"""options of pages that draw"""
 OPTIONS = (
-    "--headless=new", "--no-sandbox", *WEBGL, "--disable-extensions", "--disable-dev-shm-usage",
-    "--remote-debugging-port=0", "--remote-allow-origins=*",
+    "--headless=new", "--no-sandbox", "--enable-unsafe-swiftshader", "--use-gl=angle", "--use-angle=swiftshader",
+    "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
+    "--disable-extensions", "--disable-dev-shm-usage", "--remote-debugging-port=0", "--remote-allow-origins=*",
 )  # fmt: skip
 
 
@@ -89,20 +83,6 @@ def until(found: Callable[[], Any], told: str, seconds: float = 20.0) -> Any:
     return value
 
 
-def driven(text: str, script: str, folder: Path, *options: str) -> dict:
-    """What a script notes of a page, in its object `found`; `options` are Chromium's."""
-    assert CHROMIUM is not None
-    written = "out.id = 'found', out.textContent = JSON.stringify(found), document.body.append(out)"
-    guarded = f"try {{ {script} }} catch (error) {{ found.error = String(error); }}"
-    whole = f"const found = {{}}, out = document.createElement('pre'); (async () => {{ {guarded} {written}; }})();"
-    file = folder / "page.html"
-    file.write_text(text.replace("</body>", f"<script>{whole}</script></body>"))
-    given = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder / 'browser'}", "--dump-dom"]
-    command = [CHROMIUM, *given, *options, f"file://{file}"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    return json.loads(html.unescape(re.search(r'<pre id="found">(.*?)</pre>', done.stdout, re.DOTALL).group(1)))
-
-
 @contextlib.contextmanager
 def opened(address: str, folder: Path, *, width: int = 960, height: int = 640) -> Iterator[Page]:
     """A page at an address; `folder` keeps what the browser writes."""
@@ -124,3 +104,11 @@ def opened(address: str, folder: Path, *, width: int = 960, height: int = 640) -
                 yield page
         finally:
             process.terminate()
+
+
+def driven(text: str, script: str, folder: Path, **size: int) -> dict:
+    """What a script notes of a page, in its object `found`."""
+    (folder / "page.html").write_text(text)
+    with opened(f"file://{folder / 'page.html'}", folder, **size) as page:
+        page.until("document.readyState === 'complete'")
+        return page.js(f"(async () => {{ const found = {{}}; {script} return found; }})()")

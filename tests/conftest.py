@@ -71,7 +71,7 @@ settings.load_profile("jsecon")
 import numpy as np  # noqa: E402
 
 from experiments.memory_maps import clear_programs  # noqa: E402
-from jsecon.types import Camera, Gaussians  # noqa: E402
+from jsecon.types import Camera, Capture, Gaussians  # noqa: E402
 
 MANY = pytest.param(40_000, marks=[pytest.mark.as_shipped, pytest.mark.long])
 """so many rows that jax was silently wrong in float32 (its issue 39103: about 32,769 to 43,000); in every run
@@ -146,12 +146,24 @@ def look_at(centre, target=(0.0, 0.0, 0.0), up=(0.0, -1.0, 0.0), dtype=np.float3
     return matrix.astype(dtype)
 
 
+def cameras_of(poses, lens, width: int, height: int) -> Camera:
+    """Cameras of one lens (fx, fy, cx, cy) at `poses` (T, 4, 4), float32."""
+    columns = (np.full(len(poses), number, np.float32) for number in lens)
+    return Camera(np.asarray(poses, np.float32), *columns, width=width, height=height)
+
+
+def capture_of(frames, cameras, held_out, depths=None, **more) -> Capture:
+    """A capture without points, whose frames are called f0, f1 and so on."""
+    points = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    names = tuple(f"f{t}" for t in range(len(frames)))
+    return Capture(np.asarray(frames, np.uint8), cameras, *points, held_out, depths, np.eye(4), names, **more)
+
+
 @pytest.fixture(scope="session")
 def cameras() -> Camera:
     """Four cameras of 48x40 on a ring of radius 2.5 about the scene, principal point off the middle; a batch."""
     poses = np.stack([look_at((2.5 * np.sin(a), -0.7, -2.5 * np.cos(a))) for a in (0.0, 1.4, 3.0, 4.7)])
-    ones = np.ones(4, np.float32)
-    return Camera(poses, 45 * ones, 43 * ones, 25.5 * ones, 19.0 * ones, width=48, height=40)
+    return cameras_of(poses, (45, 43, 25.5, 19), 48, 40)
 
 
 @pytest.fixture(scope="session")

@@ -4,11 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from conftest import look_at
+from conftest import cameras_of, capture_of, look_at
 from scipy.linalg import expm
 
 from jsecon.poses.alignment import align_cameras
-from jsecon.types import Camera, Capture
+from jsecon.types import Capture
 
 VIEWS, WIDTH, HEIGHT, FOCAL = 10, 120, 90, 110.0
 
@@ -29,12 +29,8 @@ def in_a_corner() -> Capture:
         shades = [np.sin(point @ wave + phase) for wave, phase in (((5, 3, 7), 0), ((-4, 8, 2), 1), ((9, -6, 5), 2))]
         frames.append(np.rint(110 + 60 * np.stack(shades, axis=-1)))
         depths.append(depth)
-    lens = (np.full(VIEWS, value, np.float32) for value in (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2))
-    cameras = Camera(poses.astype(np.float32), *lens, width=WIDTH, height=HEIGHT)
-    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
-    held_out, depths = np.arange(VIEWS) == VIEWS - 1, np.float32(depths)
-    names, source_from_scene = tuple(f"f{t}" for t in range(VIEWS)), np.eye(4, dtype=np.float32)
-    return Capture(np.uint8(frames), cameras, *nothing, held_out, depths, source_from_scene, names)
+    cameras = cameras_of(poses, (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2), WIDTH, HEIGHT)
+    return capture_of(frames, cameras, np.arange(VIEWS) == VIEWS - 1, np.float32(depths))
 
 
 def moved(capture: Capture, centimetres: float, degrees: float) -> Capture:

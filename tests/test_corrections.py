@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import gaussians_at, look_at
+from conftest import cameras_of, capture_of, gaussians_at, look_at
 from scipy.linalg import expm
 from test_fit import same
 
-from jsecon import Camera, Capture, render
+from jsecon import render
 from jsecon.fit.corrections import (
     CorrectionRates,
     Corrections,
@@ -53,15 +53,12 @@ def photographed(truth, poses):
     """A capture of `truth` with depth, the third frame held out; no pixel is ignored, so that all fits share programs
     with the one that ignores some."""
     count = len(poses)
-    cameras = Camera(np.stack(poses), *(np.full(count, v, np.float32) for v in (30, 30, 16, 12)), width=32, height=24)
+    cameras = cameras_of(poses, (30, 30, 16, 12), 32, 24)
     views = [render(truth, camera, np.maximum(0.5 + 0.28209479 * truth.sh[:, 0], 0), depth=True) for camera in
              (jax.tree.map(jnp.asarray, cameras[t]) for t in range(count))]  # fmt: skip
     frames = np.stack([np.rint(np.clip(view.features, 0, 1) * 255).astype(np.uint8) for view in views])
     depths = np.stack([np.where(view.alpha > 0.5, view.depth, 0) for view in views]).astype(np.float32)
-    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
-    names = tuple(f"f{t}" for t in range(count))
-    ignored = np.zeros(frames.shape[:3], bool)
-    return Capture(frames, cameras, *nothing, np.arange(count) == 2, depths, np.eye(4), names, ignored=ignored)
+    return capture_of(frames, cameras, np.arange(count) == 2, depths, ignored=np.zeros(frames.shape[:3], bool))
 
 
 @pytest.fixture(scope="module")

@@ -58,6 +58,35 @@ def rows_of(scene, file) -> np.ndarray:
     return np.sort([place[mean.tobytes()] for mean in np.asarray(load_gaussians(file).means, np.float32)]).astype(int)
 
 
+@pytest.fixture(scope="module")
+def client(door):
+    """Asks over HTTP."""
+    pytest.importorskip("fastapi", reason="the extra serve is not installed")
+    from starlette.testclient import TestClient
+
+    from jsecon.app.server import application
+
+    return TestClient(application({"table": door[0]}), "http://127.0.0.1:8765")
+
+
+@pytest.fixture(scope="module")
+def find(door):
+    """Gives the results of the tool `find` for texts."""
+    pytest.importorskip("mcp", reason="the extra mcp is not installed")
+    from mcp import Client
+
+    from jsecon.app.mcp_server import make_server
+
+    opened = Future()
+    opened.set_result(door[0])
+
+    async def call(texts):
+        async with Client(make_server({"table": opened})) as tools:
+            return [await tools.call_tool("find", {"text": text}) for text in texts]
+
+    return lambda *texts: asyncio.run(call(texts))
+
+
 def test_they_are_of_all_kinds(door):
     answers = [door[0].ask(question) for question in (*TEXTS, *POINTED)]
     assert {answer.by for answer in answers} == {"votes", "relation", "outline"}
@@ -96,24 +125,8 @@ def test_the_export_of_one_thing(door, tmp_path):
     np.testing.assert_array_equal(rows_of(scene, tmp_path / "rest.ply"), rest)
 
 
-def test_every_door_names_the_word_that_it_does_not_understand(door, tmp_path, capsys):
-    pytest.importorskip("fastapi", reason="the extra serve is not installed")
-    pytest.importorskip("mcp", reason="the extra mcp is not installed")
-    from mcp import Client
-    from starlette.testclient import TestClient
-
-    from jsecon.app.mcp_server import make_server
-    from jsecon.app.server import application
-
-    scene, file, _ = door
-    opened = Future()
-    opened.set_result(scene)
-    client = TestClient(application({"table": scene}), "http://127.0.0.1:8765")
-
-    async def find(text):
-        async with Client(make_server({"table": opened})) as tools:
-            return await tools.call_tool("find", {"text": text})
-
+def test_every_door_names_the_word_that_it_does_not_understand(door, client, find, tmp_path, capsys):
+    _, file, _ = door
     for text, word in REFUSED.items():
         for verb in (["query", file, text], ["export", file, "--only", text], ["export", file, "--without", text]):
             assert run_cli(*verb, "--out", tmp_path / "out.ply") == 2
@@ -121,20 +134,14 @@ def test_every_door_names_the_word_that_it_does_not_understand(door, tmp_path, c
         replies = [client.post("/query", json={"text": text}), client.get("/selection.ply", params={"text": text})]
         replies.append(client.get("/mask.png", params={"text": text, "frame": "#0"}))
         assert [(reply.status_code, word in reply.text) for reply in replies] == [(422, True)] * 3
-        told = asyncio.run(find(text))
+        (told,) = find(text)
         assert told.is_error
         assert word in told.content[0].text
     assert not (tmp_path / "out.ply").is_file()
 
 
-def test_http(door, tmp_path):
-    pytest.importorskip("fastapi", reason="the extra serve is not installed")
-    from starlette.testclient import TestClient
-
-    from jsecon.app.server import application
-
+def test_http(door, client, tmp_path):
     scene, _, rows = door
-    client = TestClient(application({"table": scene}), "http://127.0.0.1:8765")
     for text in TEXTS:
         record = client.post("/query", json={"text": text}).json()
         assert {k: v for k, v in record.items() if k != "field"} == json.loads(json.dumps(scene.ask(text).as_dict()))
@@ -148,21 +155,9 @@ def test_http(door, tmp_path):
     assert pixel["region"] == scene.ask(POINTED[0]).as_dict()["region"]
 
 
-def test_tools_of_language_models(door):
-    pytest.importorskip("mcp", reason="the extra mcp is not installed")
-    from mcp import Client
-
-    from jsecon.app.mcp_server import make_server
-
-    scene, opened = door[0], Future()
-    opened.set_result(scene)
-
-    async def ask():
-        async with Client(make_server({"table": opened})) as client:
-            return [(await client.call_tool("find", {"text": text})).structured_content for text in TEXTS]
-
-    for text, record in zip(TEXTS, asyncio.run(ask()), strict=True):
-        expected = json.loads(json.dumps(scene.ask(text).as_dict()))
+def test_tools_of_language_models(door, find):
+    for text, told in zip(TEXTS, find(*TEXTS), strict=True):
+        record, expected = told.structured_content, json.loads(json.dumps(door[0].ask(text).as_dict()))
         assert {name: record[name] for name in expected} == expected
 
 

@@ -6,11 +6,11 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import gaussians_at, look_at
+from conftest import cameras_of, gaussians_at, look_at
 from small_field import field_of, lone_votes
 
 import jsecon
-from jsecon import Camera, Regions, normalise_votes, save_field
+from jsecon import Regions, normalise_votes, save_field
 from jsecon.app import cli
 from jsecon.vision.colours import PALETTE, ColourEmbedder
 from jsecon.vision.unrelated_words import embed_unrelated_words
@@ -33,8 +33,7 @@ def two_rooms():
     means, thing = (np.concatenate(column) for column in zip(*sheets))
     scene = gaussians_at(means, 0.05, logit=2.5)  # the sheets overlap: about a hundredth passes
     sides = [(-2.0, y, 0.1) for y in (-0.3, 0.0, 0.3)] + [(2.0, y, 0.1) for y in (-0.3, 0.0, 0.3)]
-    lens = (np.full(6, value, np.float32) for value in (40, 40, 16, 16))
-    cameras = Camera(np.stack([look_at(eye) for eye in sides]), *lens, width=32, height=32)
+    cameras = cameras_of([look_at(eye) for eye in sides], (40, 40, 16, 16), 32, 32)
     one_hot = jnp.asarray(np.eye(3, dtype=np.float32)[thing])
     images = [np.asarray(jsecon.render(scene, cameras[t], one_hot).features) for t in range(6)]
     labels = np.stack([np.where(image.sum(-1) > 0.5, image.argmax(-1), -1) for image in images]).astype(np.int32)

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import gaussians_at, look_at
+from conftest import cameras_of, capture_of, gaussians_at, look_at
 
-from jsecon import Camera, Capture, InputError, render, render_rgb
+from jsecon import InputError, render, render_rgb
 from jsecon.fit import step as one_step
 from jsecon.fit.growth import drop_free_rows
 from jsecon.fit.optimise import Schedule, _init_fit_state, _view_order, fit_gaussians
@@ -39,12 +39,10 @@ def truth():
 @pytest.fixture(scope="module")
 def capture(truth):
     """Photographs of `truth`, 8 bits, the last of the five held out."""
-    poses = np.stack([look_at((2.2 * np.sin(a), -0.6, -2.2 * np.cos(a))) for a in np.linspace(-0.8, 0.8, VIEWS)])
-    cameras = Camera(poses, *(np.full(VIEWS, v, np.float32) for v in (30, 30, 16, 12)), width=32, height=24)
+    poses = [look_at((2.2 * np.sin(a), -0.6, -2.2 * np.cos(a))) for a in np.linspace(-0.8, 0.8, VIEWS)]
+    cameras = cameras_of(poses, (30, 30, 16, 12), 32, 24)
     images = [render_rgb(truth, jax.tree.map(jnp.asarray, cameras[t])).features for t in range(VIEWS)]
-    frames = np.stack([np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8) for image in images])
-    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
-    return Capture(frames, cameras, *nothing, np.arange(VIEWS) == 2, None, np.eye(4), tuple("abcde"))
+    return capture_of([np.rint(np.clip(image, 0, 1) * 255) for image in images], cameras, np.arange(VIEWS) == 2)
 
 
 @pytest.fixture(scope="module")

@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import cameras_of, capture_of
 from jax.test_util import check_grads
 
 from jsecon.fit.photometric import photometric_loss, psnr, ssim_map
 from jsecon.fit.quality import is_weak, measure_quality
 from jsecon.fit.start import gaussians_from_points
-from jsecon.types import Camera, Capture
 
 
 def images(shape=(13, 17, 3), seed=0, dtype=np.float32):
@@ -99,11 +99,8 @@ BEHIND = gaussians_from_points(np.array([[0, 0, -5.0]], np.float32), np.zeros((1
 
 def held_out_capture(frames, **more):
     """Frames of 32x24, all held out."""
-    count = len(frames)
-    lens = [np.full(count, v, np.float32) for v in (30, 30, 16, 12)]
-    cameras = Camera(np.tile(np.eye(4, dtype=np.float32), (count, 1, 1)), *lens, width=32, height=24)
-    points = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
-    return Capture(frames, cameras, *points, np.ones(count, bool), None, np.eye(4), tuple("abc"[:count]), **more)
+    cameras = cameras_of([np.eye(4)] * len(frames), (30, 30, 16, 12), 32, 24)
+    return capture_of(frames, cameras, np.ones(len(frames), bool), **more)
 
 
 def test_large_frames_are_compared_at_the_size_asked():

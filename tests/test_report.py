@@ -81,7 +81,7 @@ found.requests = performance.getEntriesByType("resource").filter(e => !e.name.st
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
 def test_in_a_browser_pictures_are_enlarged_and_cards_open(page, tmp_path):
-    found = driven(page, PILOT, tmp_path, "--window-size=500,800", "--virtual-time-budget=5000")
+    found = driven(page, PILOT, tmp_path, width=500, height=800)
     assert found["enlarged"] == [True, True]
     assert found["closed"] is False
     assert found["opened"]

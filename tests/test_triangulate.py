@@ -5,9 +5,9 @@ import dataclasses
 import cv2
 import numpy as np
 import pytest
-from conftest import look_at
+from conftest import cameras_of, capture_of, look_at
 
-from jsecon import Camera, Capture, InputError
+from jsecon import InputError
 from jsecon.fit.start import starting_gaussians
 from jsecon.fit.triangulate import triangulated_points
 
@@ -39,9 +39,7 @@ def plane_capture(count=5, textured=True):
     frames = np.array([picture(p) if textured else np.full((HEIGHT, WIDTH, 3), 90, np.uint8) for p in pose])
     held_out = np.zeros(count, bool)
     held_out[2] = True
-    camera = Camera(pose, *(np.full(count, v) for v in (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)), WIDTH, HEIGHT)
-    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
-    return Capture(frames, camera, *nothing, held_out, None, np.eye(4), tuple(map(str, range(count))))
+    return capture_of(frames, cameras_of(pose, (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2), WIDTH, HEIGHT), held_out)
 
 
 def test_points_of_a_textured_plane_lie_on_it():

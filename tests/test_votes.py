@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import cameras_of
 from reference import weights_reference
 
 from jsecon import plan_view
@@ -15,7 +16,7 @@ from jsecon.field.evidence import _sum_evidence, region_votes, view_evidence
 from jsecon.field.membership import normalise_votes
 from jsecon.splat.render import render_rgb
 from jsecon.splat.visible import geometry_of_rows, render_in_blocks, visible_rows
-from jsecon.types import Camera, Gaussians, Regions, Votes
+from jsecon.types import Gaussians, Regions, Votes
 
 REGIONS = 11
 COLUMNS = "regions", "weights", "labelled", "total", "max_pixel_weight", "views"
@@ -63,8 +64,8 @@ def ball(count, views, width, height, *, opaque=0.0, seed=0):
     arrays = *arrays, rng.normal(size=(count, 4)), rng.normal(opaque, 1, count), np.zeros((count, 1, 3))
     poses = np.tile(np.eye(4, dtype=np.float32), (views, 1, 1))
     poses[:, 2, 3] = 4 - 0.3 * np.arange(views)
-    lens = (np.full(views, v, np.float32) for v in (0.9 * width, 0.9 * width, width / 2, height / 2))
-    return Gaussians(*(a.astype(np.float32) for a in arrays)), Camera(poses, *lens, width, height)
+    cameras = cameras_of(poses, (0.9 * width, 0.9 * width, width / 2, height / 2), width, height)
+    return Gaussians(*(a.astype(np.float32) for a in arrays)), cameras
 
 
 def test_equals_the_oracles_weights(cast, expected):

@@ -1,19 +1,18 @@
 """The film: a WebP of a quarter of a minute, on a way around what the cameras look at, in which answers light up."""
 
 import numpy as np
-from conftest import look_at
+from conftest import cameras_of, look_at
 from PIL import Image
 from small_field import make_field, true_regions
 
 from experiments.rooms import film
 from jsecon.app.records import Answer, Query
-from jsecon.types import Camera, Selection
+from jsecon.types import Selection
 
 
 def ring(angles, radius=2.0, height=0.5):
     poses = [look_at((radius * np.cos(a), radius * np.sin(a), height), (0.1, 0.0, 0.0), up=(0, 0, 1)) for a in angles]
-    ones = np.ones(len(angles), np.float32)
-    return Camera(np.stack(poses), 40 * ones, 40 * ones, 16 * ones, 12 * ones, 32, 24)
+    return cameras_of(poses, (40, 40, 16, 12), 32, 24)
 
 
 def angles_of(cameras):

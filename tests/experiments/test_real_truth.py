@@ -1,28 +1,22 @@
 """Truth on real captures: connected parts of instance ids, and outlines drawn by hand."""
 
+import dataclasses
 import json
 
 import numpy as np
+from conftest import cameras_of, capture_of
 
 from experiments.datasets import bonsai_outlines, named_objects
-from jsecon.types import Camera, Capture
-
-
-def capture_of(cameras, names, depths=None):
-    count = len(names)
-    frames = np.zeros((count, cameras.height, cameras.width, 3), np.uint8)
-    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
-    return Capture(frames, cameras, *nothing, np.ones(count, bool), depths, np.eye(4), names)
 
 
 def test_an_id_in_two_places_is_two_objects():
     """Two views, one beside the other, of a plane at 1 m; no depth in a corner of the first."""
     poses = np.tile(np.eye(4, dtype=np.float32), (2, 1, 1))
     poses[1, 1, 3] = 0.02
-    lens = [np.full(2, number, np.float32) for number in (40, 40, 20, 20)]
     depths = np.ones((2, 40, 40), np.float32)
     depths[0, 36:, 36:] = 0
-    flat_capture = capture_of(Camera(poses, *lens, width=40, height=40), ("a", "b"), depths)
+    cameras = cameras_of(poses, (40, 40, 20, 20), 40, 40)
+    flat_capture = capture_of(np.zeros((2, 40, 40, 3)), cameras, np.ones(2, bool), depths)
     ids = np.zeros((2, 40, 40), np.int16)
     ids[:, :, :10] = ids[:, :, 30:] = 1
     ids[0, 20, 12] = 1  # a speck: of the part next to it
@@ -40,8 +34,9 @@ def test_an_id_in_two_places_is_two_objects():
 
 def test_outlines_do_not_overlap_and_are_many():
     names = tuple(json.loads(bonsai_outlines.OUTLINES.read_text())["frames"])
-    poses, ones = np.tile(np.eye(4, dtype=np.float32), (len(names), 1, 1)), np.ones(len(names), np.float32)
-    things = bonsai_outlines.outlines(capture_of(Camera(poses, ones, ones, ones, ones, 400, 266), names))
+    cameras, count = cameras_of([np.eye(4)] * len(names), (1, 1, 1, 1), 400, 266), len(names)
+    capture = capture_of(np.zeros((count, 266, 400, 3)), cameras, np.ones(count, bool))
+    things = bonsai_outlines.outlines(dataclasses.replace(capture, names=names))
     assert len([thing for thing, frames in things.items() if len(frames) >= 2]) >= 6
     for t in range(8):
         here = np.stack([frames[t] for frames in things.values() if t in frames])
