@@ -6,12 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jsecon.app.records import Answer, Query
 from jsecon.field.evidence import region_votes
 from jsecon.field.membership import LABELLED_PART, SEEN_PART
 from jsecon.paper.distill import distill_votes
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.render import render
-from jsecon.types import Camera, Codes, Gaussians, LanguageField, Regions, Votes
+from jsecon.types import Camera, Codes, Gaussians, LanguageField, Regions, Selection, Votes
 from jsecon.vision.colours import ColourEmbedder
 
 REGIONS = 5
@@ -121,6 +122,12 @@ def lone_votes(regions, count: int) -> Votes:
     ones = np.ones(len(regions), np.float32)
     views = np.full(len(regions), 3, np.int32)
     return Votes(np.int32(regions)[:, None], ones[:, None], ones, ones, ones, views, np.int32(0), count)
+
+
+def answer_of(field, text, mask, similarity=None, *, region=0, score=0.5) -> Answer:
+    """An answer by votes; Gaussians inside have the similarity 1 by default."""
+    mask, share = np.array(mask, bool), np.array(mask if similarity is None else similarity, np.float32)
+    return Answer(Query(text), "votes", mask, Selection(mask, share, np.int32(region), np.float32(score)), field)
 
 
 def field_of(votes: Votes, regions: Regions, **own) -> LanguageField:

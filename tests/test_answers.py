@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 from capture_files import refused, run_cli
-from small_field import colour_field
+from small_field import answer_of, colour_field
 from test_gltf import read_glb
 
-from jsecon import Answer, Query, Scene, load_gaussians, objects, save_field
+from jsecon import Scene, load_gaussians, objects, save_field
 from jsecon.app.querying import _write_answers
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Console
@@ -118,8 +118,7 @@ def test_an_answer_replaces_the_files_of_the_last_one_to_the_same_text(saved, tm
     own = {"pink.json", *told["masks"].values(), *(told[ending] for ending in ("ply", "glb") if told.get(ending))}
     assert {path.name for path in tmp_path.iterdir()} == {"answers.html", *others, *beside, *own}
     found = Scene(field).ask("pink")
-    nothing = Answer(Query("pink"), "votes", np.zeros_like(found.mask), found.selection, field, count=0)
-    _write_answers(Scene(field), [nothing], tmp_path, Console())
+    _write_answers(Scene(field), [answer_of(field, "pink", 0 * found.mask)], tmp_path, Console())
     assert {path.name for path in tmp_path.iterdir()} == {"answers.html", *others, *beside, "pink.json"}
 
 

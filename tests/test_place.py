@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from conftest import gaussians_at
 from scipy.spatial.transform import Rotation
-from small_field import make_field
+from small_field import answer_of, make_field
 from table_field import table_field
 
 import jsecon
-from jsecon import Answer, InputError, Query, Scene, Selection
+from jsecon import InputError, Scene
 
 SIZE = np.array([0.5, 0.3, 0.1])
 
@@ -25,10 +25,8 @@ def answer(scene, cameras):
     inside[32:] = -inside[:32]
     turn = Rotation.from_euler("zyx", [40, 25, 10], degrees=True)
     means = turn.apply(inside * SIZE) + np.array([1.0, 2.0, 3.0])
-    every, share = np.ones(64, bool), np.ones(64, np.float32)
-    selection = Selection(every, share, np.int32(0), np.float32(0.7))
     field = dataclasses.replace(field, gaussians=gaussians_at(means, 1e-3))
-    return Answer(Query("brick"), "votes", every, selection, field), turn, means
+    return answer_of(field, "brick", np.ones(64)), turn, means
 
 
 def test_the_oriented_box_is_that_of_the_brick(answer):

@@ -163,12 +163,3 @@ def test_an_image_size_that_no_tile_divides(scene):
     features = random_features(scene.count, 3)
     expected, _ = render_reference(scene, camera, features)
     np.testing.assert_allclose(render(scene, camera, features).features, expected, atol=np.abs(features).max() / 255)
-
-
-def test_nothing_to_see_and_nothing_at_all(scene, camera):
-    nobody = jax.tree.map(lambda a: a[:0], scene)
-    rendering = render(nobody, camera, np.zeros((0, 3), np.float32))
-    assert float(jnp.abs(rendering.features).max()) == 0
-    assert float(rendering.alpha.max()) == 0
-    behind = dataclasses.replace(scene, means=scene.means + np.float32([0, 0, -50]))
-    assert float(render(behind, camera, random_features(scene.count, 3)).alpha.max()) == 0

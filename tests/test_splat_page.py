@@ -9,25 +9,19 @@ import jax
 import numpy as np
 import pytest
 from browser import CHROMIUM, driven
-from small_field import make_field
+from small_field import answer_of, make_field
 
 from jsecon.app.catalogue import main_regions
-from jsecon.app.records import Answer, Query
 from jsecon.app.viewer.static_page import NO_REGION, page
 from jsecon.errors import InputError
 from jsecon.splat.sh import C0
-from jsecon.types import Selection
 
 
 @pytest.fixture(scope="module")
 def made(scene, cameras):
     field, mask = make_field(scene, cameras)[0], main_regions(make_field(scene, cameras)[0]) == 1
-    answers = [
-        Answer(
-            Query(text), "votes", rows, Selection(rows, np.float32(rows), np.int32(region), np.float32(score)), field
-        )
-        for text, rows, region, score in (("the second </script>", mask, 1, 0.75), ("nothing", 0 * mask > 0, -1, 0.01))
-    ]
+    first = answer_of(field, "the second </script>", mask, region=1, score=0.75)
+    answers = [first, answer_of(field, "nothing", 0 * mask, region=-1, score=0.01)]
     return field, answers, page(field, answers, title="A <room>")
 
 

@@ -15,17 +15,16 @@ import pytest
 pytest.importorskip("viser", reason="the extra viewer is not installed")
 import viser
 from browser import CHROMIUM, opened, until
-from small_field import colour_field
+from small_field import answer_of, colour_field
 
 from jsecon import Camera, InputError, load_gaussians, region_at, save_field
 from jsecon.app.catalogue import main_regions
 from jsecon.app.pictures import palette
-from jsecon.app.records import Answer, Query, Region
+from jsecon.app.records import Query, Region
 from jsecon.app.scene import Scene
 from jsecon.app.viewer.layer import MAX_STD, SplatLayer
 from jsecon.app.viewer.window import ANSWER_HUE, COLOURINGS, Viewer, ViewState, _highlight, _region_along, open_viewer
 from jsecon.query.pointing import region_shares_seen
-from jsecon.types import Selection
 from jsecon.vision.colours import BASIC, ColourEmbedder
 
 MUG = ViewState(("red mug",))
@@ -52,15 +51,11 @@ def test_colours_of_answers_differ_and_do_not_depend_on_their_number():
 
 
 def test_a_gaussian_of_two_answers_has_the_colour_of_the_better_one(field):
-    def answer_of(mask, similarity):
-        mask, zero = np.array(mask, bool), np.zeros((), np.float32)
-        selection = Selection(mask, np.array(similarity, np.float32), np.zeros((), np.int32), zero)
-        return Answer(Query("mug"), "votes", mask, selection, field)
-
     base = np.array([[200, 100, 0]] * 4, np.uint8)
     failed = InputError("query", "no words")
-    assert _highlight(base, [failed, answer_of([0, 0, 0, 0], [0, 0, 0, 0])]) is base
-    first, second = answer_of([1, 1, 0, 0], [0.9, 0.6, 0.1, 0]), answer_of([0, 1, 1, 0], [0, 0.8, np.nan, 0])
+    assert _highlight(base, [failed, answer_of(field, "mug", [0, 0, 0, 0])]) is base
+    first = answer_of(field, "mug", [1, 1, 0, 0], [0.9, 0.6, 0.1, 0])
+    second = answer_of(field, "mug", [0, 1, 1, 0], [0, 0.8, np.nan, 0])
     colours = _highlight(base, [first, failed, second]).astype(int)
     tinted = (0.45 * base[0] + 0.55 * palette(3, ANSWER_HUE)).astype(int)
     np.testing.assert_allclose(colours[:3], [tinted[0], tinted[2], tinted[2]], atol=1)

@@ -3,11 +3,9 @@
 import numpy as np
 from conftest import cameras_of, look_at
 from PIL import Image
-from small_field import make_field, true_regions
+from small_field import answer_of, make_field, true_regions
 
 from experiments.rooms import film
-from jsecon.app.records import Answer, Query
-from jsecon.types import Selection
 
 
 def ring(angles, radius=2.0, height=0.5):
@@ -35,11 +33,7 @@ def test_the_way_is_a_whole_turn_around_what_the_cameras_look_at():
 def test_an_answer_is_dark_before_its_turn_and_bright_after(scene, cameras, tmp_path, monkeypatch):
     monkeypatch.setattr(film, "SECONDS", 2)
     field, _ = make_field(scene, cameras)
-    answers = []
-    for region in (1, 3):
-        mask = true_regions(scene) == region
-        selection = Selection(mask, mask.astype(np.float32), np.int32(region), np.float32(0.5))
-        answers.append(Answer(Query(f"slab {region}"), "votes", mask, selection, field))
+    answers = [answer_of(field, f"slab {region}", true_regions(scene) == region) for region in (1, 3)]
     size = film.write_film(field, answers, tmp_path / "film.webp")
     assert size == (tmp_path / "film.webp").stat().st_size < 2 * 2**20
     with Image.open(tmp_path / "film.webp") as found:
