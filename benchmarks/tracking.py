@@ -117,7 +117,7 @@ def main() -> None:
         labels = masklets(frames, lambda frame, t: proposals(t), tracker)
         labels = tracker.consistent(frames, labels)
     else:
-        labels = track_masks(frames, tracker.views)
+        labels = track_masks(frames, tracker.views).labels
     rest = time.perf_counter() - start
     peak = peak_memory_mib() / 1024
     shared = np.zeros((count + 1, int(labels.max()) + 2), np.int64)

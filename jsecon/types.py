@@ -341,6 +341,9 @@ class LanguageField(_Shown):
     """which way is up in the field's world; None: a field of an earlier version."""
     metres_per_unit: float | None = None
     """metres of one unit of the capture files' world; None: not known."""
+    tree: Array | None = None
+    """(M,) int32 parent of each node, -1 at the top: nodes 0 .. R-1 are the regions, later ones unions of earlier ones.
+    None where masks came from files or a tracker."""
 
 
 _TEXTS = {"names": (), "embedder": "", "provenance": "{}", "up": None, "metres_per_unit": None}

@@ -14,11 +14,20 @@ from jsecon.association.consensus import (
 )
 from jsecon.association.scene import SceneSuperpixels
 from jsecon.field.evidence import region_votes
+from jsecon.field.regions import node_regions
 
 
 @pytest.fixture(scope="module")
 def world():
     return ring_of_balls()
+
+
+def linkage(*args, **options):
+    return _average_linkage(*args, **options)[0]
+
+
+def group(*args, **options):
+    return _group_by_consensus(*args, **options).owner
 
 
 def scene_of(world, proposals, atoms=60):
@@ -43,7 +52,7 @@ def as_truth(labels, truth):
 def test_finds_the_three_balls_and_the_floor(world, scene):
     _, _, frames, truth, _ = world
     calls = []
-    labels = track_masks(frames, scene, progress=lambda *row: calls.append(row))
+    labels = track_masks(frames, scene, progress=lambda *row: calls.append(row)).labels
     assert labels.max() == 3
     assert np.nanmin(ious(as_truth(labels, truth) - 1, truth, 3)) > 0.9
     assert calls[-1] == (VIEWS, VIEWS)
@@ -58,10 +67,27 @@ def test_frames_that_merge_cut_or_propose_nothing_are_outvoted(world):
     for t in (5, 12):
         worse[t] = np.concatenate([proposals[t] & left, proposals[t] & ~left])
     worse[20] = np.zeros((0, HEIGHT, WIDTH), bool)
-    labels = as_truth(track_masks(frames, scene_of(world, worse, atoms=300)), truth)
+    labels = as_truth(track_masks(frames, scene_of(world, worse, atoms=300)).labels, truth)
     scores = ious(labels - 1, truth, 3)
     assert np.nanmean(scores) > 0.85
     assert np.nanmean(scores[[2, 9, 16, 20]]) > 0.6  # and there, too, the Gaussians tell the balls apart
+
+
+def test_what_some_views_cut_has_a_common_node(world):
+    """Half of the views cut a ball into its upper and its lower half; no view joins two balls."""
+    _, _, frames, truth, proposals = world
+    cut = list(proposals)
+    for t in range(0, VIEWS, 2):
+        rows = np.flatnonzero((truth[t] == 1).any(1))
+        upper = np.arange(HEIGHT)[:, None] < rows.mean() if len(rows) else np.ones((HEIGHT, 1), bool)
+        cut[t] = np.concatenate([proposals[t] & upper, proposals[t] & ~upper])
+    found = track_masks(frames, scene_of(world, cut, atoms=300), agreement=0.8)
+    count = int(found.labels.max()) + 1
+    inside = [np.bincount(truth[found.labels == r] + 1, minlength=5)[1:].argmax() for r in range(count)]
+    halves = [r for r in range(count) if inside[r] == 1]
+    assert len(halves) >= 2
+    assert halves in [node_regions(found.tree, count, node) for node in range(count, len(found.tree))]
+    assert all(found.tree[r] < 0 or found.tree[r] >= count for r in range(count))
 
 
 def test_the_weight_on_masks_is_that_of_the_splatting(world, scene):
@@ -112,7 +138,7 @@ def test_average_linkage_joins_what_the_slow_twin_joins(seed, count, least):
     both = rng.uniform(0.1, 2.0, (count, count))
     ratio = rng.uniform(0.0, 1.0, (count, count))
     both, ratio = both + both.T, (ratio + ratio.T) / 2
-    got = _average_linkage(both * ratio, both, least_ratio=least)
+    got = linkage(both * ratio, both, least_ratio=least)
     assert same_partition(got, joined_pair_by_pair(both * ratio, both, least))
     np.testing.assert_array_equal(np.unique(got), np.arange(got.max() + 1))
 
@@ -120,15 +146,15 @@ def test_average_linkage_joins_what_the_slow_twin_joins(seed, count, least):
 def test_average_linkage_of_ties_large_sums_and_pairs_that_are_hardly_seen_together():
     for scale in (1e-20, 1.0, 1e20):
         both = np.full((40, 40), scale)
-        assert _average_linkage(both, both, least_ratio=1.0).max() == 0  # all pairs alike
-        assert _average_linkage(0.5 * both, both, least_ratio=0.6).max() == 39
+        assert linkage(both, both, least_ratio=1.0).max() == 0  # all pairs alike
+        assert linkage(0.5 * both, both, least_ratio=0.6).max() == 39
     rng = np.random.default_rng(0)
     rows = rng.random((300, 30)).astype(np.float32) * 1e-3
     both = rows @ rows.T  # as float32 products come: not exactly symmetric sums
-    assert _average_linkage(0.9 * both, both, least_ratio=0.5).max() == 0
+    assert linkage(0.9 * both, both, least_ratio=0.5).max() == 0
     both = np.asarray([[1.0, 0.01], [0.01, 1.0]])  # hardly seen together
-    assert _average_linkage(both, both, least_ratio=0.5, least_shared=0.0).max() == 0
-    assert _average_linkage(both, both, least_ratio=0.5, least_shared=0.02).max() == 1
+    assert linkage(both, both, least_ratio=0.5, least_shared=0.0).max() == 0
+    assert linkage(both, both, least_ratio=0.5, least_shared=0.02).max() == 1
 
 
 def turned(rng):
@@ -167,9 +193,9 @@ def test_what_rises_out_of_a_plane_leaves_it_and_the_plane_stays_whole():
     names = [np.zeros(800, int) if t % 2 else truth for t in range(12)]
     masks = [sparse.csr_matrix((np.ones(800, np.float32), (np.arange(800), name)), shape=(800, 2)) for name in names]
     given = sparse.hstack(masks, format="csr"), sparse.csr_matrix(np.ones((800, 12), np.float32)), np.ones(800), means
-    assert _group_by_consensus(*given, pieces=80).max() == 0
-    assert _group_by_consensus(*given, pieces=80, surface_width=5.0).max() == 0
-    assert same_partition(_group_by_consensus(*given, pieces=80, surface_width=0.8), truth)
+    assert group(*given, pieces=80).max() == 0
+    assert group(*given, pieces=80, surface_width=5.0).max() == 0
+    assert same_partition(group(*given, pieces=80, surface_width=0.8), truth)
 
 
 def made_scene(views=12, wrong=0, seed=0):
@@ -189,20 +215,20 @@ def made_scene(views=12, wrong=0, seed=0):
 @pytest.mark.parametrize("wrong", [0, 4])
 def test_views_that_merge_everything_are_outvoted_in_any_order_of_frames_and_masks(wrong):
     membership, visible, weights, means, truth = made_scene(wrong=wrong)
-    assert same_partition(_group_by_consensus(membership, visible, weights, means, pieces=24), truth)
-    cells = _group_by_consensus(membership, visible, weights, means, pieces=24, agreement=2.0)  # joins no two pieces
+    assert same_partition(group(membership, visible, weights, means, pieces=24), truth)
+    cells = group(membership, visible, weights, means, pieces=24, agreement=2.0)  # joins no two pieces
     assert all(len(np.unique(truth[cells == cell])) == 1 for cell in np.unique(cells))
     order = np.random.default_rng(1).permutation(membership.shape[1])
-    got = _group_by_consensus(membership[:, order], visible[:, ::-1], weights, means, pieces=24)
+    got = group(membership[:, order], visible[:, ::-1], weights, means, pieces=24)
     assert same_partition(got, truth)
 
 
 def test_most_views_decide_and_rows_and_frames_that_disagree_are_refused(world, scene):
     membership, visible, weights, means, _ = made_scene(wrong=8)  # of 12
-    assert _group_by_consensus(membership, visible, weights, means, pieces=24).max() == 0
-    assert _group_by_consensus(membership, visible, weights, means, pieces=24, agreement=0.7).max() == 2
+    assert group(membership, visible, weights, means, pieces=24).max() == 0
+    assert group(membership, visible, weights, means, pieces=24, agreement=0.7).max() == 2
     with pytest.raises(ValueError, match="N rows"):
-        _group_by_consensus(membership[1:], visible, weights, means)
+        group(membership[1:], visible, weights, means)
     with pytest.raises(ValueError, match="frames"):
         track_masks(world[2][1:], scene)
     for work in (track_masks, pieces_on_masks):
@@ -214,9 +240,9 @@ def test_few_points_and_points_that_are_never_seen():
     membership, visible, weights, means, truth = made_scene()
     for count in (1, 2, 5):
         few = (part[:count] for part in (membership, visible, weights, means))
-        assert _group_by_consensus(*few).max() == 0  # all of one clump
+        assert group(*few).max() == 0  # all of one clump
     weights[::7], means[::7] = 0.0, np.nan
-    got = _group_by_consensus(membership, visible, weights, means, pieces=24)
+    got = group(membership, visible, weights, means, pieces=24)
     assert (got[::7] == -1).all()
     assert same_partition(got[weights > 0], truth[weights > 0])
-    assert (_group_by_consensus(membership, visible, 0 * weights, means) == -1).all()
+    assert (group(membership, visible, 0 * weights, means) == -1).all()

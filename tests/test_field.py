@@ -208,3 +208,20 @@ def test_numbers_that_are_not_finite_are_found_a_piece_at_a_time(path, monkeypat
     rewritten(path, lambda header, arrays: arrays["gaussians.means"].__setitem__((63, 2), np.nan))
     with pytest.raises(InputError, match=r"gaussians\.means with numbers that are not finite"):
         check_field(path)
+
+
+ALONE = [-1] * REGIONS
+
+
+@pytest.mark.parametrize("tree", [ALONE[1:], [*ALONE, 0], [1, *ALONE[1:]], [REGIONS, *ALONE[1:]], [-1.0] * REGIONS])
+def test_a_tree_that_is_none_is_refused(field, tmp_path, tree):
+    """Too few nodes, a parent before its child, a region under a region, a parent that is not there, no integers."""
+    with pytest.raises(ValueError, match="a tree whose nodes"):
+        save_field(tmp_path / "field.safetensors", dataclasses.replace(field, tree=np.array(tree)))
+
+
+def test_a_field_keeps_its_tree(field, tmp_path):
+    count = field.regions.count
+    tree = np.array([count, count, *[-1] * (count - 1)], np.int32)
+    save_field(tmp_path / "field.safetensors", dataclasses.replace(field, tree=tree))
+    np.testing.assert_array_equal(load_field(tmp_path / "field.safetensors").tree, tree)

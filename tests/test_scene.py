@@ -41,6 +41,21 @@ def test_the_region_of_another_field_selects_nothing_with_a_word(table):
     assert table.ask(Region(5)).reason == ""
 
 
+def test_a_node_of_the_tree_selects_the_regions_under_it():
+    field, embedder = table_field()
+    tree = np.array([6, 7, 6, -1, -1, -1, 7, -1], np.int32)  # the mugs and the bottle, step by step
+    scene = Scene(dataclasses.replace(field, tree=tree), embedder, up=(0, 0, 1))
+    parts = [scene.ask(Region(region)).mask for region in (0, 1, 2)]
+    first = scene.wider(Region(2))
+    whole = scene.wider(first)
+    assert (first, whole, scene.wider(whole), scene.wider(Region(3))) == (Region(6), Region(7), None, None)
+    np.testing.assert_array_equal(scene.ask(first).mask, parts[0] | parts[2])
+    np.testing.assert_array_equal(scene.ask(whole).mask, np.any(parts, axis=0))
+    assert (scene.ask(whole).count, scene.ask(whole).as_dict()["region"]) == (3, 7)
+    assert scene.best_frames(scene.ask(whole), 1) == [0]
+    assert "there is no region 8" in str(scene.ask(Region(8)))
+
+
 @pytest.mark.parametrize(("question", "options", "problem"), [
     (At("nowhere", 1, 1), {}, "no such frame"), (At(0, 99, 200), {}, "outside the frame"),
     (At(0, 0, 0), {}, "no region lies under"), (Box(0, 1, 1, 5, 5), {"by": "code"}, "by the outline alone"),

@@ -31,11 +31,16 @@ MUG = ViewState(("red mug",))
 
 
 def test_clicks_and_texts_change_the_questions_and_the_controls_their_options():
-    state = MUG.with_question(Region(3))
+    state = MUG.with_click([Region(3)])
     assert state.questions == (Region(3),)
-    assert state.with_question(Region(3)).questions == ()
-    assert MUG.with_question(Region(3), add=True).questions == ("red mug", Region(3))
-    assert state.with_question(Region(4), add=True).with_question(Region(3), add=True).questions == (Region(4),)
+    assert state.with_click([Region(3)]).questions == ()
+    assert MUG.with_click([Region(3)], add=True).questions == ("red mug", Region(3))
+    assert state.with_click([Region(4)], add=True).with_click([Region(3)], add=True).questions == (Region(4),)
+    above = [Region(3), Region(9)]  # the second has the first under it
+    wider = state.with_click(above, add=True)
+    assert wider.questions == (Region(9),)
+    assert wider.with_click([Region(2), Region(9)], add=True).questions == ()
+    assert state.with_question("red mug", add=True).with_click(above).questions == (Region(9),)
     assert ViewState().with_question("mug; bowl").queries == (Query("mug; bowl", threshold=0.5),)
     assert MUG.with_question("bowl", add=True).with_question("red mug", add=True).questions == ("bowl", "red mug")
     assert MUG.with_question("  ").questions == ()

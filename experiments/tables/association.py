@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.rivals.evidence import Evidence, unit
-from jsecon.association.consensus import clean_tracks, track_masks
+from jsecon.association.consensus import track_masks
 from jsecon.association.scene import SceneSuperpixels
 
 ROWS = 64
@@ -79,7 +79,7 @@ def by_consensus(
     """
     given = jax.tree.map(jnp.asarray, (levels[0].gaussians, levels[0].cameras))
     scene = SceneSuperpixels(*given, lambda t: proposals(levels, t), centre_pixel_weight=centre)
-    return associated(levels, clean_tracks(track_masks(frames, scene, seed=seed, **how)))
+    return associated(levels, track_masks(frames, scene, seed=seed, **how).labels)
 
 
 def proposals(levels: Sequence[Evidence], t: int) -> np.ndarray:

@@ -309,9 +309,19 @@ class Scene:
     def _answer_region(self, query: Query, region: int, why: str) -> Answer:
         """Selects the Gaussians of a region, and of those that the query's options add to it."""
         found = answer_question(self.field, region, self._rules(query, ONE_REGION), outliers=query.outliers)
-        last = self.field.regions.count - 1
+        last = (self.field.regions.count if self.field.tree is None else len(self.field.tree)) - 1
         reason = "" if 0 <= region <= last else f"there is no region {region}: the regions are 0 to {last}"
         return self._finish(query, found[:3], {"text encoder": why}, reason)
+
+    def wider(self, region: Region) -> Region | None:
+        """What a region belongs to: the next larger thing that views see as one; None if nothing larger is known.
+
+        Args:
+          region: A region, or what this method returned.
+        """
+        tree = self.field.tree
+        parent = -1 if tree is None or not 0 <= region.id < len(tree) else int(tree[region.id])
+        return None if parent < 0 else Region(parent)
 
     def _rules(self, query: Query, rules: QueryRules) -> QueryRules:
         """Rules with the options of a query."""
@@ -504,7 +514,7 @@ class Scene:
           Indices, best first: by the pixels of its region, or without a region by the centres in view.
         """
         region = int(answer.selection.region)
-        if region >= 0:
+        if 0 <= region < self.field.regions.count:
             visible = np.asarray(self.field.regions.pixel_counts)[region]
         else:
             means = np.asarray(self.field.gaussians.means)[answer.rows]

@@ -7,10 +7,15 @@ mask clustering by view consensus (Yan et al., CVPR 2024), between pieces of the
 
 Pieces off each other's plane need more views to join. So a chair that many masks merge with the floor leaves it, and
 the floor stays whole from wall to wall.
+
+Groups that fewer views agree on are joined further, to a tree (`Objects.tree`): what fell apart, or belongs together as
+a mug and its handle do, has a common node.
 """
 
+from typing import NamedTuple
+
 import numpy as np
-from jaxtyping import Float, Int, Int16, Integer, UInt8
+from jaxtyping import Float, Int, Int16, Int32, Integer, UInt8
 from scipy import sparse
 
 from jsecon.association.scene import (
@@ -29,6 +34,31 @@ MAX_PIECES = 3000
 """Maximum number of pieces of a scene."""
 SURFACE_WIDTH = 0.08
 """Distance from a plane at which pieces count as off it, as a share of the median depth: 12 cm in a small room."""
+TREE_AGREEMENT = 0.05
+"""Probability of a common mask up to which groups are joined in the tree."""
+NEW_NODE = 0.1
+"""Share of its weight that a join must add to make a node of its own."""
+
+
+class Objects(NamedTuple):
+    """The objects that frames show."""
+
+    labels: Int16[np.ndarray, "t h w"]
+    """(T, H, W) object 0 .. R-1 of each pixel, -1 for none."""
+    tree: Int32[np.ndarray, " m"] | None = None
+    """(M,) parent of each node, -1 at the top: nodes 0 .. R-1 are the objects, later ones unions of earlier ones. None
+    if it is not known what belongs together."""
+
+
+class _Groups(NamedTuple):
+    """Gaussians by group."""
+
+    owner: Int[np.ndarray, " n"]
+    """(N,) group 0 .. R-1, -1 if it is never seen."""
+    joins: list[tuple[int, int]]
+    """Pairs of groups that join, in turn; the first of a pair stands for both after it."""
+    weight: Float[np.ndarray, " r"]
+    """(R,) rendering weight of each group."""
 
 
 def _group_by_consensus(
@@ -41,8 +71,8 @@ def _group_by_consensus(
     agreement: float = 0.4,
     pieces: int = MAX_PIECES,
     seed: int = 0,
-) -> Int[np.ndarray, " n"]:
-    """Groups Gaussians into objects by the consensus of the views: (N,) object 0 .. R-1, -1 if it is never seen.
+) -> _Groups:
+    """Groups Gaussians into objects by the consensus of the views, and joins the groups further to a tree.
 
     The Gaussians are first gathered into small pieces (`_scene_pieces`). Then `_average_linkage` joins pieces while the
     views that see two groups put both into one mask with a probability of at least `agreement`, or of 1 if they lie off
@@ -65,7 +95,7 @@ def _group_by_consensus(
     live = np.flatnonzero(piece >= 0)
     owner = np.full(len(piece), -1, np.int64)
     if not len(live):
-        return owner
+        return _Groups(owner, [], np.zeros(0))
     shape = (int(piece.max()) + 1, len(piece))
     gather = sparse.csr_matrix((weights[live], (piece[live], live)), shape=shape)
     in_masks, in_view = gather @ membership, gather @ visible
@@ -73,8 +103,15 @@ def _group_by_consensus(
     coplanarity = _coplanarity(*_piece_planes(gather[:, live], means[live]), surface_width)
     together = (in_masks @ in_masks.T).toarray() * (off_plane + (1.0 - off_plane) * coplanarity)
     both = (in_view @ in_view.T).toarray()
-    owner[live] = _average_linkage(together, both, least_ratio=agreement, least_shared=0.02)[piece[live]]
-    return owner
+    group, _ = _average_linkage(together, both, least_ratio=agreement, least_shared=0.02)
+    owner[live] = group[piece[live]]
+    member = one_hot(group, int(group.max()) + 1)
+    _, joins = _average_linkage(
+        *(member.T @ (member.T @ matrix).T for matrix in (together, both)),
+        least_ratio=TREE_AGREEMENT,
+        least_shared=0.02,
+    )
+    return _Groups(owner, joins, np.bincount(owner[live], weights[live]))
 
 
 def _piece_planes(
@@ -171,8 +208,8 @@ def _cell_means(points: Float[np.ndarray, "n d"], cell: Int[np.ndarray, " n"]) -
 
 def _average_linkage(
     together: Float[np.ndarray, "k k"], both: Float[np.ndarray, "k k"], *, least_ratio: float, least_shared: float = 0.0
-) -> Int[np.ndarray, " k"]:
-    """Clusters K items by weighted average linkage: (K,) group 0 .. R-1.
+) -> tuple[Int[np.ndarray, " k"], list[tuple[int, int]]]:
+    """Clusters K items by weighted average linkage: (K,) group 0 .. R-1, and the pairs that were joined, in turn.
 
     The similarity of two groups a and b is
 
@@ -181,11 +218,12 @@ def _average_linkage(
     if V_ab > 0 and V_ab >= least_shared sqrt(V_aa V_bb), and 0 otherwise: the mean of w / v over all pairs of members,
     weighted by v. Chains of nearest neighbours need O(K^2) time: s of a union lies between those of its parts, so they
     end in the same groups as repeatedly joining the best pair. `together` is w and `both` is v; groups of a similarity
-    below `least_ratio` stay separate.
+    below `least_ratio` stay separate. The first item of a pair stands for both after it.
     """
     together, both = ((matrix + matrix.T) / 2.0 for matrix in (together.astype(np.float64), both.astype(np.float64)))
     count = len(together)
     parent = np.arange(count)
+    joins: list[tuple[int, int]] = []
     waiting, live = np.ones((2, count), bool)  # a chain may start here; not joined yet
 
     def ratios(a: int) -> Float[np.ndarray, " k"]:
@@ -212,6 +250,7 @@ def _average_linkage(
             b = chain[-2]
             chain = chain[:-2]
             a, b = min(a, b), max(a, b)
+            joins.append((a, b))
             for matrix in (together, both):  # kept exactly symmetric: with rounding errors a chain could cycle
                 union = matrix[a, a] + 2.0 * matrix[a, b] + matrix[b, b]
                 matrix[a] += matrix[b]
@@ -222,7 +261,7 @@ def _average_linkage(
             chain.append(b)
     while not np.array_equal(parent, parent[parent]):
         parent = parent[parent]
-    return relabel_sequential(parent)
+    return relabel_sequential(parent), joins
 
 
 def track_masks(
@@ -232,10 +271,11 @@ def track_masks(
     agreement: float = 0.4,
     seed: int = 0,
     progress: Progress | None = None,
-) -> Int16[np.ndarray, "t h w"]:
+) -> Objects:
     """Follows objects through the frames by consensus, independent of the order of the frames.
 
-    The Gaussians are grouped by `_group_by_consensus`, and the groups are assigned the superpixels of each frame.
+    The Gaussians are grouped by `_group_by_consensus`, and the groups are assigned the superpixels of each frame. Those
+    that few frames show are removed (`clean_tracks`).
 
     Args:
       frames: (T, H, W, 3) uint8.
@@ -248,14 +288,40 @@ def track_masks(
     views, means = scene.all(frames, progress), np.asarray(scene.gaussians.means, np.float32)
     width = SURFACE_WIDTH * scene.median_depth
     signatures = _mask_signatures(views, scene.count)
-    owner = _group_by_consensus(*signatures, means, surface_width=width, agreement=agreement, seed=seed)
-    count = int(owner.max(initial=-1)) + 1
+    groups = _group_by_consensus(*signatures, means, surface_width=width, agreement=agreement, seed=seed)
+    owner, count = groups.owner, len(groups.weight)
     labels = np.full(frames.shape[:3], -1, np.int16)
     for image, view in zip(labels, views):
         if count:
             mass = (view.votes.T @ one_hot(owner[view.seen], count)).toarray()
             image[:] = assign_superpixels(view, mass, mass.sum(1, keepdims=True))[view.labels]
-    return labels
+    cleaned, number = _clean(labels, count)
+    return Objects(cleaned, _object_tree(groups, number))
+
+
+def _object_tree(groups: _Groups, number: Int[np.ndarray, " g"]) -> Int32[np.ndarray, " m"]:
+    """Builds the tree of objects: (M,) parent of each node, as `Objects.tree` has it.
+
+    `number` is the object of each group, -1 for one that was removed. A join that adds less than NEW_NODE to a union
+    makes no node: what joins becomes a child of the union.
+    """
+    count = int(number.max(initial=-1)) + 1
+    node, parent, weight = number.tolist(), [-1] * count, np.zeros(count).tolist()
+    for group, own in enumerate(number):
+        if own >= 0:
+            weight[own] = float(groups.weight[group])
+    for first, second in groups.joins:
+        small, large = sorted((node[first], node[second]), key=lambda n: (n >= 0, weight[n] if n >= 0 else 0.0))
+        if small >= 0 and (large < count or weight[small] >= NEW_NODE * (weight[small] + weight[large])):
+            parent[large] = len(parent)
+            parent.append(-1)
+            weight.append(weight[large])
+            large = parent[large]
+        if small >= 0:
+            parent[small] = large
+            weight[large] += weight[small]
+        node[first] = large
+    return np.array(parent, np.int32)
 
 
 def clean_tracks(
@@ -269,9 +335,15 @@ def clean_tracks(
       min_views: Least number of frames that show an object.
     """
     labels = np.asarray(labels).astype(np.int32)
-    count = int(labels.max(initial=-1)) + 1
+    return _clean(labels, int(labels.max(initial=-1)) + 1, min_area, min_views)[0]
+
+
+def _clean(
+    labels: Integer[np.ndarray, "t h w"], count: int, min_area: float = 0.001, min_views: int = 2
+) -> tuple[Int16[np.ndarray, "t h w"], Int[np.ndarray, " r"]]:
+    """Cleans the labels of `count` objects as `clean_tracks` does; also the new number of each, -1 if it is removed."""
     if count == 0:
-        return np.full(labels.shape, -1, np.int16)
+        return np.full(labels.shape, -1, np.int16), np.zeros(0, int)
     areas = np.stack([np.bincount(image[image >= 0].reshape(-1), minlength=count) for image in labels])  # (T, R)
     shown = areas >= max(min_area * labels[0].size, 1)
     kept = shown.sum(0) >= min_views
@@ -280,7 +352,7 @@ def clean_tracks(
     number = np.full(count + 1, -1, np.int16)  # the last entry is for label -1
     number[order] = np.arange(len(order))
     table = np.where(np.concatenate([shown, np.zeros((len(labels), 1), bool)], 1), number, -1).astype(np.int16)
-    return np.stack([row[image] for row, image in zip(table, labels)])
+    return np.stack([row[image] for row, image in zip(table, labels)]), number[:-1]
 
 
 def pieces_on_masks(

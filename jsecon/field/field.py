@@ -43,6 +43,7 @@ _LETTERS = {
     "p": ("parts.weight", 0),
     "w": ("unrelated_words", 0),
     "b": ("gaussians.sh", 1),
+    "m": ("tree", 0),
 }
 """Array and axis of each of a field's sizes."""
 _SHAPES = {
@@ -62,10 +63,12 @@ _SHAPES = {
     ("p", "e"): "parts.embeddings",
     ("w", "e"): "unrelated_words",
     (4, 4): "source_from_scene",
+    ("m",): "tree",
 }
 _OPTIONAL = (
     "gaussians.sh", "votes.weight_where_region_visible", "votes.overlap", "parts.part", "parts.embeddings",
     "unrelated_words", "codes.gaussians", "codes.regions",
+    "tree",
 )  # fmt: skip
 
 
@@ -201,6 +204,8 @@ def _oddity(field: LanguageField, checked: bool = True) -> str | None:
                 return f"{name} with numbers beyond {sizes[name]}"
     if field.gaussians.sh is not None and field.gaussians.sh.shape[1] not in COEFFICIENT_COUNTS:
         return f"harmonics of {field.gaussians.sh.shape[1]} functions"
+    if field.tree is not None and not _is_tree(np.asarray(field.tree), field.regions.count):
+        return "a tree whose nodes do not come before their parents, or of which an object is no leaf"
     texts = (*field.names, field.embedder, field.provenance)
     if not all(isinstance(text, str) for text in texts) or not isinstance(parse_json(field.provenance), dict):
         return "names, embedder or provenance that are no texts, or no JSON object"
@@ -216,6 +221,13 @@ def _oddity(field: LanguageField, checked: bool = True) -> str | None:
     if isinstance(coder, Autoencoder) and not _layers_fit(coder, dim, latent):
         return "an autoencoder whose layers do not lead from embeddings to codes and back"
     return None
+
+
+def _is_tree(parent: np.ndarray, count: int) -> bool:
+    """Whether these are the parents of the nodes of a tree whose leaves are `count` regions."""
+    own = np.arange(len(parent))
+    inner = (parent > own) & (parent >= count) & (parent < len(parent))
+    return parent.dtype.kind == "i" and len(parent) >= count and bool(((parent == -1) | inner).all())
 
 
 def _is_up_axis(up: Any) -> bool:

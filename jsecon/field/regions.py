@@ -219,6 +219,15 @@ def mean_residuals(embeddings: Float[Array, "r e"]) -> tuple[Float[Array, "r e"]
     return jnp.where(known[:, None], units - total, 0.0), known
 
 
+def node_regions(tree: Int[np.ndarray, " m"], count: int, node: int) -> list[int]:
+    """Lists the regions under a node of `LanguageField.tree`, of a field of `count` regions; a region is its own."""
+    under = {node}
+    for child in range(node - 1, -1, -1):  # parents come after their children
+        if int(tree[child]) in under:
+            under.add(child)
+    return sorted(child for child in under if child < count)
+
+
 def scene_parts(part: Int[np.ndarray, " n"], cast: Any, embeddings: Float[np.ndarray, "m e"]) -> Parts:
     """Embeds the parts of a scene: of each the mean over masks, weighted by what its Gaussians cast on them. Host code.
 

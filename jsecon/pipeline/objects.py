@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsecon.association.consensus import clean_tracks, pieces_on_masks, track_masks
+from jsecon.association.consensus import Objects, clean_tracks, pieces_on_masks, track_masks
 from jsecon.association.run_lengths import cache_masks_as_rle
 from jsecon.association.scene import SceneSuperpixels
 from jsecon.errors import InputError
@@ -199,10 +199,10 @@ def _find_objects(stage: StageInput) -> StageResult:
     frames, why_fewer = _frames_of_vision(stage)
     view = _TrainingView(stage.results.load, context.options, frames)
     proposals, notes = _frame_proposals(context, view, scene)
-    labels = _associate_masks(context, view, scene, proposals, stage.progress, stage.checkpoint)
+    found = _associate_masks(context, view, scene, proposals, stage.progress, stage.checkpoint)
     context.models.close()
-    _require_regions(labels, str(context.options.capture))
-    return StageResult(ObjectLabels(labels, frames), notes=(*why_fewer, *notes))
+    _require_regions(found.labels, str(context.options.capture))
+    return StageResult(ObjectLabels(found.labels, frames, found.tree), notes=(*why_fewer, *notes))
 
 
 def _frame_proposals(
@@ -256,13 +256,12 @@ def _associate_masks(
     proposals: Callable[[int], np.ndarray],
     progress: Progress,
     checkpoint: Checkpoint,
-) -> np.ndarray:
-    """Associates proposals by consensus or by a tracker: (T, H, W) int16 labels, -1 for no region."""
+) -> Objects:
+    """Associates proposals by consensus or by a tracker, which makes no tree."""
     options, frames, cameras = context.options, view.frames, view.cameras
     if options.associated_by == "consensus":
         scene = SceneSuperpixels(gaussians, cameras, proposals, centre_pixel_weight=options.centre_pixel_weight)
-        labels = track_masks(frames, scene, agreement=options.agreement, seed=options.seed, progress=progress)
-        return clean_tracks(labels)
+        return track_masks(frames, scene, agreement=options.agreement, seed=options.seed, progress=progress)
     tracker = context.models.tracker or GeometricTracker(gaussians, cameras, proposals)
     labels = masklets(
         frames,
@@ -274,7 +273,7 @@ def _associate_masks(
     )
     if isinstance(tracker, GeometricTracker):
         labels = tracker.consistent(frames, labels)
-    return clean_tracks(labels)
+    return Objects(clean_tracks(labels))
 
 
 def _require_regions(labels: np.ndarray, where: str) -> None:

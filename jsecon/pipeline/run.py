@@ -318,6 +318,7 @@ def _join_field(results: Results, embedder: Embedder, provenance: str, options: 
         codes=results.codes,
         up=given or capture.up or find_up_axis(results.gaussians, capture.cameras),
         metres_per_unit=scale,
+        tree=results.objects.tree,
     )
 
 

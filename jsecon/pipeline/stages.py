@@ -52,6 +52,8 @@ class ObjectLabels:
     """(T, H, W) int16, -1 for no region."""
     frames: np.ndarray
     """(T,) which frames of the capture these are, ascending."""
+    tree: np.ndarray | None = None
+    """(M,) int32 parent of each node, as `LanguageField.tree` has it."""
 
 
 class Results:

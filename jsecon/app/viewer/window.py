@@ -67,14 +67,18 @@ class ViewState:
         return tuple(Query(question, **options) for question in self.questions)
 
     def with_question(self, question: str | Region, *, add: bool = False) -> "ViewState":
-        """Highlights a question in place of the others, or beside them.
-
-        A blank text highlights nothing. A region that is highlighted is removed.
-        """
+        """Highlights a question in place of the others, or beside them. A blank text highlights nothing."""
         others = tuple(other for other in self.questions if add and other != question)
-        removed = isinstance(question, Region) and question in self.questions
-        new = () if removed or not str(question).strip() else (question,)
-        return dataclasses.replace(self, questions=(*others, *new))
+        return dataclasses.replace(self, questions=(*others, *((question,) if str(question).strip() else ())))
+
+    def with_click(self, above: Sequence[Region], *, add: bool = False) -> "ViewState":
+        """Highlights the first of a region and what it belongs to, or the one after that which is highlighted.
+
+        After the last of them nothing is highlighted.
+        """
+        held = next((k for k, region in enumerate(above) if region in self.questions), -1)
+        state = dataclasses.replace(self, questions=tuple(q for q in self.questions if add and q != above[held]))
+        return state.with_question(above[held + 1], add=True) if held + 1 < len(above) else state
 
 
 def _highlight(base: UInt8[np.ndarray, "n 3"], answers: Sequence[Answer | InputError]) -> UInt8[np.ndarray, "n 3"]:
@@ -149,7 +153,10 @@ class Viewer:
         region = _region_along(self.scene.field, start, direction, focal=focal, visible=self._visible())
         if region < 0:
             raise InputError("", "no region is known there: it is background, or no frame shows it")
-        return state.with_question(Region(region), add=add)
+        above = [Region(region)]
+        while (wider := self.scene.wider(above[-1])) is not None:
+            above.append(wider)
+        return state.with_click(above, add=add)
 
     def _export(self, client: Any) -> None:
         """Sends the highlighted Gaussians as a .ply."""
