@@ -149,7 +149,7 @@ def _page(scene: Scene, catalogue: Catalogue, records: list[dict[str, Any]], con
             progress(record["id"] + 1, len(records))
     lead = "The objects of the scene. Open an object to see it in the frames that show most of it."
     more = f"{len(cards[True])} more: surroundings, and what few of the frames that see it show"
-    folded = [report.fold(more, report.grid(cards[True]))] if cards[True] else []
+    folded = [report.grid(cards[True], folded=more)] if cards[True] else []
     return report.page("Objects", lead, [report.grid(cards[False]), *folded])
 
 

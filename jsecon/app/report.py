@@ -45,21 +45,20 @@ def figure(image: np.ndarray, caption: str, *, strong: str = "", sharp: bool = F
     return f"<figure>{picture}<figcaption>{bold}{_escaped(caption)}</figcaption></figure>"
 
 
-def grid(elements: Iterable[str], columns: int | None = None) -> str:
-    """Puts elements side by side: figures in so many columns on a wide screen, or cards in as many as there is room."""
+def grid(elements: Iterable[str], columns: int | None = None, *, folded: str = "") -> str:
+    """Puts elements side by side: figures in so many columns on a wide screen, or cards in as many as there is room.
+
+    A click on the title `folded`, if there is one, opens them.
+    """
     kind = 'cards"' if columns is None else f'grid" style="--columns:{columns}"'
-    return f'<div class="{kind}>{"".join(elements)}</div>'
+    whole = f'<div class="{kind}>{"".join(elements)}</div>'
+    return f"<details><summary>{_escaped(folded)}</summary>{whole}</details>" if folded else whole
 
 
 def card(image: np.ndarray, title: str, words: str, *parts: str) -> str:
     """Makes a card of an RGB image with words under it, which a click opens to show its elements."""
     summary = f"<summary>{_image(image, title)}<b>{_escaped(title)}</b><span>{_escaped(words)}</span></summary>"
     return f'<details class="card">{summary}{"".join(parts)}</details>'
-
-
-def fold(title: str, *parts: str) -> str:
-    """Makes elements that a click on their title opens."""
-    return f"<details><summary>{_escaped(title)}</summary>{''.join(parts)}</details>"
 
 
 def _data_uri(image: np.ndarray, *, sharp: bool = False) -> str:
