@@ -6,17 +6,22 @@ import json
 import jax
 import numpy as np
 import pytest
-from capture_files import small_capture, transforms
+from capture_files import run_cli, small_capture, transforms, write_text_model
 from conftest import gaussians_at
 from scipy.spatial.transform import Rotation
 
 import jsecon
 from jsecon.app.cli import main
+from jsecon.pipeline.options import Options
+from jsecon.pipeline.results import Checkpoint, Results, RunContext, StageInput
+from jsecon.pipeline.scene import plan_scene
 from jsecon.splat.transform import transform_gaussians
 from jsecon.views import plan
 from jsecon.views.cover import frames_by_need
 from jsecon.views.frame import inner_scene, scene_frame, surface_points
 from jsecon.views.plan import place_cameras
+from jsecon.vision.colours import ColourEmbedder
+from jsecon.vision.protocols import Models
 
 BALLS = {"red": (0.8, 0.1, 0.1), "blue": (0.1, 0.2, 0.8), "green": (0.1, 0.6, 0.15)}
 CENTRES = np.array([(-1.2, -0.8, 0.4), (1.0, 0.2, 0.4), (-0.2, 1.1, 0.4)])
@@ -311,6 +316,105 @@ def test_given_cameras_take_the_place_of_planned_views(object_alone, around, tmp
     assert field.names == ("a0", "a1", "a2", "a3")
     mine = jsecon.render_rgb(field.gaussians, field.cameras[1]).alpha
     assert np.abs(mine - jsecon.render_rgb(object_alone, planned[1]).alpha).mean() < 0.01
+
+
+@pytest.fixture
+def splat(object_alone, tmp_path):
+    """The object where INRIA's training leaves it, in OUTPUT/point_cloud/iteration_7."""
+    file = tmp_path / "point_cloud" / "iteration_7" / "point_cloud.ply"
+    file.parent.mkdir(parents=True)
+    jsecon.save_gaussians(file, object_alone)
+    return file
+
+
+@pytest.fixture(scope="module")
+def posed(around):
+    """A capture whose cameras look at the object from around."""
+    names = tuple(f"a{n}" for n in range(len(around.cameras)))
+    return dataclasses.replace(small_capture(len(names)), cameras=around.cameras, names=names)
+
+
+def inria(capture, turn=None):
+    """The cameras of a capture as INRIA's cameras.json, their poses times `turn`."""
+    rows, cameras = [], capture.cameras
+    for name, camera in zip(capture.names, cameras):
+        pose = np.linalg.inv(np.asarray(camera.world_to_camera, np.float64)) @ (np.eye(4) if turn is None else turn)
+        row = {"img_name": f"{name}.png", "width": cameras.width, "height": cameras.height, "fx": float(camera.fx)}
+        rows.append(row | {"fy": float(camera.fy), "position": pose[:3, 3].tolist(), "rotation": pose[:3, :3].tolist()})
+    return rows
+
+
+def views_of(splat, **options):
+    """The capture of renders that a run makes of a splat, its notes, and what the run plans."""
+    work = RunContext(Options(capture=splat, long_side=160, **options), Models(ColourEmbedder()), splat.parent / "out")
+    stage = plan_scene(work)[0]
+    result = stage.compute(StageInput(work, Results(), lambda done, total: None, Checkpoint(work.out)))
+    return result.value, " ".join(result.notes), stage.how
+
+
+@pytest.mark.parametrize("kind", ["cameras.json", "transforms.json", "applied", "sparse"])
+def test_poses_beside_or_above_a_splat_take_the_place_of_planned_views(splat, posed, object_alone, tmp_path, kind):
+    """nerfstudio's splat is in the world that it trained in, turned and made smaller; its poses are not, and may be of
+    a world that an applied_transform made of the source's."""
+    up = None
+    if kind == "cameras.json":
+        (tmp_path / kind).write_text(json.dumps(inria(posed)))
+    elif kind == "sparse":
+        write_text_model(posed, tmp_path / "sparse" / "0")
+    else:
+        applied = np.eye(4)[[0, 2, 1, 3]] * [[1], [1], [-1], [1]] if kind == "applied" else np.eye(4)
+        turn = np.eye(4)[[2, 0, 1, 3]]
+        trained = np.diag([0.4, 0.4, 0.4, 1]) @ turn
+        content = transforms(
+            posed, applied_transform=applied[:3].tolist(), orientation_override="none", ply_file_path="a.ply"
+        )
+        (tmp_path / "transforms.json").write_text(json.dumps(content))
+        told = {"transform": (turn @ applied)[:3].tolist(), "scale": 0.4}
+        (splat.parent / "dataparser_transforms.json").write_text(json.dumps(told))
+        jsecon.save_gaussians(splat, object_alone, similarity=trained)
+        up = turn[:3, 2]
+    capture, notes, how = views_of(splat)
+    assert kind in how or "transforms.json" in how
+    assert "WARNING" not in notes
+    assert f"6 views at poses of {tmp_path}" in notes
+    assert capture.names == posed.names
+    for frame, camera in zip(capture.frames, posed.cameras):
+        image = np.asarray(jsecon.render_rgb(object_alone, camera).features)
+        assert np.abs(frame / 255 - np.clip(image, 0, 1)).mean() < 0.005
+    assert up is None or np.allclose(capture.up.axis, up)
+
+
+def look_away(posed):
+    return json.dumps(inria(posed, np.diag([-1.0, 1, -1, 1])))
+
+
+@pytest.mark.parametrize(("content", "words"), [
+    (look_away, "0% of which show 0% of point_cloud.ply"),
+    (lambda posed: json.dumps(inria(posed))[:-9], "not JSON"),
+    (lambda posed: json.dumps([{**row, "fx": None} for row in inria(posed)]), "camera 0"),
+    (lambda posed: json.dumps([{**row, "rotation": [1, 2]} for row in inria(posed)]), "camera 0"),
+    (lambda posed: json.dumps({"cameras": []}), "'frames' is missing"),
+    (lambda posed: "[]", "no frame"),
+], ids=["elsewhere", "cut", "no focal length", "no rotation", "another file", "empty"])  # fmt: skip
+def test_poses_that_do_not_show_the_splat_are_named_and_views_planned(splat, posed, tmp_path, content, words):
+    (tmp_path / "cameras.json").write_text(content(posed))
+    capture, notes, _ = views_of(splat)
+    assert notes.startswith("WARNING: Views are planned")
+    assert f"{tmp_path / 'cameras.json'}: " in notes
+    assert words in notes
+    assert capture.names[0] == "view_000"
+    assert len(capture.names) == 24
+
+
+def test_a_number_of_views_plans_them_although_poses_lie_beside(splat, posed, capsys):
+    (splat.parent / "cameras.json").write_text(json.dumps(inria(posed)))
+    assert run_cli("run", splat, "--out", splat.parent / "field", "--dry-run") == 0
+    assert "cameras.json" in capsys.readouterr().out
+    capture, _, how = views_of(splat, views=3)
+    assert "3 virtual views, planned" in how
+    assert capture.names == ("view_000", "view_001", "view_002")
+    capture, _, _ = views_of(splat, cameras=splat.parent / "cameras.json")
+    assert capture.names == posed.names
 
 
 @pytest.mark.parametrize(

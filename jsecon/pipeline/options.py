@@ -133,12 +133,14 @@ class BareOptions:
     """Options of a scene of Gaussians that comes without photographs.
 
     Attributes:
-      views: Number of virtual views that are planned and rendered, at least 2.
-      cameras: Renders the scene from these poses instead of planned ones: a COLMAP model, or a transforms.json. Their
-        images are not needed.
+      views: Plans and renders this number of virtual views, at least 2. By default 24 are taken from poses that lie in
+        the folder of the scene or up to two above (INRIA's cameras.json, a transforms.json, a COLMAP sparse/). They are
+        planned if there are none, or if these do not show the scene.
+      cameras: Renders the scene from all of these poses instead: a COLMAP model, a transforms.json, or INRIA's
+        cameras.json. Their images are not needed.
     """
 
-    views: Annotated[Option[int], Range(2, 1000)] = 24
+    views: Annotated[Option[int | None], Range(2, 1000)] = None
     cameras: Option[Path | None] = None
 
 

@@ -1,13 +1,16 @@
 """The stages of a scene: poses, frames, Gaussians and their quality, with photographs or without.
 
-A scene that comes without photographs is rendered from virtual views, or from given poses. Only `_load_frames` and
-`_measure_held_out` read held-out frames.
+A scene that comes without photographs is rendered from given poses, from those that lie near it, or from planned views.
+Only `_load_frames` and `_measure_held_out` read held-out frames.
 """
 
 import dataclasses
+import os
 import shutil
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -26,14 +29,29 @@ from jsecon.read.captures.capture import (
     read_posed_images,
     unposed_photographs,
 )
-from jsecon.read.captures.frames import FrameOptions, frame_names, make_rigid, transform_poses, usable_images
+from jsecon.read.captures.frames import (
+    FrameOptions,
+    PosedImages,
+    evenly_spaced,
+    frame_names,
+    make_rigid,
+    transform_poses,
+    usable_images,
+)
 from jsecon.read.captures.nerfstudio import source_from_trained
 from jsecon.read.captures.video import DEFAULT_VIDEO_FRAMES, is_video, write_frames
 from jsecon.splat.transform import transform_gaussians
-from jsecon.types import Camera, Capture, Gaussians, UpAxis
+from jsecon.types import Camera, Capture, Gaussians, Progress, UpAxis
 from jsecon.views.capture import render_capture
-from jsecon.views.frame import scene_frame, surface_points
-from jsecon.views.plan import place_cameras
+from jsecon.views.frame import find_up_axis, scene_frame, surface_points
+from jsecon.views.plan import DEFAULT_VIEWS, cover_with, place_cameras
+
+_TRAINED = "dataparser_transforms.json"
+"""file of nerfstudio with the world in which it trained"""
+_MOST_POSES = 256
+"""poses, evenly spaced, among which views are chosen"""
+_LEAST_USABLE, _LEAST_COVERAGE = 0.8, 0.7
+"""shares of poses that show some of a scene, and of the scene that they show, from which they are in its world"""
 
 
 def plan_capture(context: RunContext) -> list[Stage]:
@@ -74,17 +92,31 @@ def _plan_load(context: RunContext, capture: Path) -> Stage:
 
 def _plan_rendered_views(context: RunContext) -> Stage:
     """Plans the stage "load" of a scene without photographs."""
-    options = context.options
-    files = (options.capture, options.cameras)
+    options, near = context.options, _poses_near(context.options)
+    files = (options.capture, options.cameras, near, near and _near(options.capture, _TRAINED))
     skipped = {"photographs": "the scene comes without any", "held_out": "no photograph to compare with"}
-    if options.cameras is None:
-        how = f"{options.views} virtual views, planned from the Gaussians of {options.capture.name}"
-        key_options = context.key_options("views", "up", "long_side")
-    else:
+    key_options = context.key_options("views", "up", "long_side")
+    if options.cameras is not None:
         how = f"the scene rendered from the poses of {options.cameras.name}"
         key_options = context.key_options("long_side")
         skipped["planned views"] = f"the poses are given ({options.cameras.name})"
+    elif near is not None:
+        how = f"{DEFAULT_VIEWS} of the poses of {near}, or planned views if these do not show {options.capture.name}"
+    else:
+        how = f"{options.views or DEFAULT_VIEWS} virtual views, planned from the Gaussians of {options.capture.name}"
     return Stage("load", how, _render_views, key_options=key_options, files=files, skipped=skipped)
+
+
+def _near(scene: Path, *names: str) -> Path | None:
+    """The first of some files in the folder of a scene and the two above, where INRIA and nerfstudio leave them."""
+    places = [folder / name for folder in Path(os.path.abspath(scene)).parents[:3] for name in names]
+    return next((place for place in places if place.exists()), None)
+
+
+def _poses_near(options: Options) -> Path | None:
+    """The poses that lie near a scene, if the options leave its views open."""
+    is_open = options.cameras is None and options.views is None
+    return _near(options.capture, "cameras.json", "transforms.json", "sparse") if is_open else None
 
 
 def plan_scene(context: RunContext) -> list[Stage]:
@@ -104,8 +136,8 @@ def _plan_gaussians(context: RunContext) -> Stage:
         length = f"{options.steps} steps" if options.minutes is None else f"{options.minutes:g} minutes"
         how, key_options = f"fitted to the frames in {length}", context.key_options("steps", "minutes", "seed")
         return Stage("gaussians", how, _fit_scene, after=("load",), key_options=key_options)
-    transform = path.parent / "dataparser_transforms.json"
-    key_options = {"trained": transform.read_text(errors="replace")} if transform.is_file() and not bare else {}
+    transform = None if bare else _near(path, _TRAINED)
+    key_options = {} if transform is None else {"trained": transform.read_text(errors="replace")}
     skipped = {"photometric fit": f"the scene's Gaussians are given ({path.name})"}
     read = _read_bare_scene if bare else _read_gaussians_of_capture
     how = f"read from {path.name}"
@@ -176,8 +208,8 @@ def _read_gaussians_of_capture(stage: StageInput) -> StageResult:
     path, capture = stage.context.options.gaussians, stage.results.load
     assert path is not None
     scene, read_notes = read_scene(path)
-    transform = path.parent / "dataparser_transforms.json"
-    trained = source_from_trained(transform) if transform.is_file() else None
+    transform = _near(path, _TRAINED)
+    trained = None if transform is None else source_from_trained(transform)
     placed, notes = place_in_capture(scene, capture, path, trained, stage.progress)
     check_overlap(placed, capture.cameras[training_frames(capture.held_out)], str(path))
     return StageResult(placed, notes=(*notes, *read_notes))
@@ -229,30 +261,92 @@ def _measure_held_out(stage: StageInput) -> StageResult:
     return StageResult(measure(), notes=notes)
 
 
+class _Views(NamedTuple):
+    """Where a scene without photographs is rendered from."""
+
+    cameras: Camera
+    """Batch of T, in the scene's world."""
+    names: Sequence[str]
+    """T names."""
+    notes: tuple[str, ...] = ()
+    """What the user should know, a sentence each."""
+    up: UpAxis | None = None
+    """Which way is up in the scene's world, if that is known with the views."""
+
+
 def _render_views(stage: StageInput) -> StageResult:
-    """Renders a scene without photographs from planned views, or from the poses of a file."""
-    options, notes, up = stage.context.options, (), None
+    """Renders a scene without photographs from the poses of a file, from those near it, or from planned views."""
+    options, near = stage.context.options, _poses_near(stage.context.options)
     source, _ = read_scene(options.capture)
     source_from_scene = _world_of_scene(source)
     scene = _into_world(source, source_from_scene)
-    if options.cameras is None:
-        planned = place_cameras(
-            scene,
-            views=options.views,
-            width=options.long_side,
-            height=options.long_side * 3 // 4,
-            up=None if options.up is None else np.array(options.up, np.float64),
-            progress=stage.progress,
-        )
-        frame = planned.frame
-        up = UpAxis(tuple(frame.axes[2].tolist()), f"the scene, {frame.evidence}", frame.sure)
-        cameras, notes = planned.cameras, (f"{planned}.", *(WARNING + note for note in planned.lack_of_detail()))
-        names = tuple(f"view_{index:03d}" for index in range(len(cameras)))
-    else:
-        cameras, names = _load_poses(options.cameras, options.long_side, source_from_scene)
-        check_overlap(scene, cameras, str(options.cameras))
-    capture = render_capture(scene, cameras, names, source_from_scene, notes=notes, up=up)
+    views, refused = None, ()
+    if options.cameras is not None:
+        _, cameras, names = _load_poses(options.cameras, options.long_side)
+        views = _Views(_moved(cameras, np.linalg.inv(source_from_scene)), names)
+        check_overlap(scene, views.cameras, str(options.cameras))
+    elif near is not None:
+        try:
+            views = _choose_near(near, options, scene, source_from_scene, stage.progress)
+        except InputError as error:
+            refused = (f"{WARNING}Views are planned, as the poses near the scene cannot be used. {error}",)
+    views = views or _plan_views(options, scene, stage.progress)
+    notes = refused + views.notes
+    capture = render_capture(scene, views.cameras, tuple(views.names), source_from_scene, notes=notes, up=views.up)
     return StageResult(capture, notes=notes)
+
+
+def _plan_views(options: Options, scene: Gaussians, progress: Progress) -> _Views:
+    """Plans virtual views of a scene."""
+    planned = place_cameras(
+        scene,
+        views=options.views or DEFAULT_VIEWS,
+        width=options.long_side,
+        height=options.long_side * 3 // 4,
+        up=None if options.up is None else np.array(options.up, np.float64),
+        progress=progress,
+    )
+    frame = planned.frame
+    up = UpAxis(tuple(frame.axes[2].tolist()), f"the scene, {frame.evidence}", frame.sure)
+    names = [f"view_{index:03d}" for index in range(len(planned.cameras))]
+    return _Views(planned.cameras, names, (f"{planned}.", *(WARNING + note for note in planned.lack_of_detail())), up)
+
+
+def _choose_near(
+    near: Path, options: Options, scene: Gaussians, source_from_scene: np.ndarray, progress: Progress
+) -> _Views:
+    """Chooses views among the poses that lie near a scene, in the first world where they show nearly most of it.
+
+    The worlds are the one that nerfstudio trains in, if its file is there, that of the poses, and that of the files that
+    they were made from. Raises InputError if the poses show too little of the scene in each.
+    """
+    posed, cameras, names = _load_poses(near, options.long_side)
+    rows = evenly_spaced(len(cameras), _MOST_POSES)
+    transform, worlds = _near(options.capture, _TRAINED), [np.eye(4), np.asarray(posed.source_from_poses)]
+    if transform is not None:
+        to_trained = np.linalg.inv(source_from_trained(transform))
+        worlds = [to_trained @ worlds[1], to_trained, *worlds]
+    views = []
+    for n, world in enumerate(worlds):
+        if not any(np.allclose(world, other) for other in worlds[:n]):
+            scene_from_poses = np.linalg.inv(source_from_scene) @ world
+            there = _moved(cameras[rows], scene_from_poses)
+            views.append((cover_with(scene, there, DEFAULT_VIEWS, progress), there, scene_from_poses))
+    best = max(cover.coverage for cover, _, _ in views)
+    cover, there, scene_from_poses = next(view for view in views if view[0].coverage >= best - 0.05)
+    found = f"{len(cameras)} cameras, {cover.usable:.0%} of which show {cover.coverage:.0%} of {options.capture.name}"
+    if cover.usable < _LEAST_USABLE or cover.coverage < _LEAST_COVERAGE:
+        remedy = (
+            "Put poses in the world of the scene there, with the dataparser_transforms.json of nerfstudio's training."
+        )
+        raise InputError(near, found, f"at least {_LEAST_USABLE:.0%} and {_LEAST_COVERAGE:.0%}", remedy)
+    up = find_up_axis(scene, there)
+    if posed.up is not None:
+        axis = scene_from_poses[:3, :3] @ posed.up.axis
+        up = dataclasses.replace(posed.up, axis=tuple((axis / np.linalg.norm(axis)).tolist()))
+    note = f"{len(cover.chosen)} views at poses of {near}: {found}."
+    chosen = np.sort(cover.chosen)
+    return _Views(there[chosen], [names[row] for row in rows[chosen]], (note,), up)
 
 
 def _world_of_scene(gaussians: Gaussians) -> np.ndarray:
@@ -276,24 +370,30 @@ def _into_world(gaussians: Gaussians, source_from_scene: np.ndarray) -> Gaussian
     return dataclasses.replace(moved, means=np.asarray(moved.means, np.float32))
 
 
-def _load_poses(path: Path, long_side: int, source_from_scene: np.ndarray) -> tuple[Camera, tuple[str, ...]]:
-    """Returns T cameras to render from, and their names.
+def _load_poses(path: Path, long_side: int) -> tuple[PosedImages, Camera, tuple[str, ...]]:
+    """Reads T poses to render from: as they are, and T cameras in float64 in their world, and their names.
 
     `path` is a capture, whose images need not be there, such as the folder of a COLMAP model or a transforms.json. All
     cameras get the size of the first lens, shrunk to `long_side`, each with its field of view and without distortion.
     """
-    images, _ = usable_images(read_posed_images(path))
+    posed = read_posed_images(path.parent if path.name == "sparse" else path)
+    images, _ = usable_images(posed)
     lenses = [image.lens for image in images if image.lens is not None]
     if not images or len(lenses) < len(images):
         problem = "one of its frames has no size" if images else "it has no frame"
         raise InputError(path, problem, "at least one pose, each with w and h", "Estimate the poses again.")
     width, height = FrameOptions(long_side=long_side).size((lenses[0].width, lenses[0].height))
     sized = [lens.resized(width, height) for lens in lenses]
-    intrinsics = np.array([[lens.fx, lens.fy, lens.cx, lens.cy] for lens in sized], np.float32)
+    fx, fy, cx, cy = np.array([[lens.fx, lens.fy, lens.cx, lens.cy] for lens in sized], np.float32).T
     poses = np.stack([make_rigid(image.world_to_camera, path, image.name) for image in images])
-    poses = transform_poses(poses, np.linalg.inv(source_from_scene)).astype(np.float32)
-    fx, fy, cx, cy = intrinsics.T
-    return Camera(poses, fx, fy, cx, cy, width, height), frame_names([image.name for image in images], path)
+    names = frame_names([image.name for image in images], path)
+    return posed, Camera(poses, fx, fy, cx, cy, width, height), names
+
+
+def _moved(cameras: Camera, world: np.ndarray) -> Camera:
+    """Moves cameras by a similarity of their world, into float32."""
+    poses = transform_poses(np.asarray(cameras.world_to_camera), world)
+    return dataclasses.replace(cameras, world_to_camera=poses.astype(np.float32))
 
 
 def _read_bare_scene(stage: StageInput) -> StageResult:

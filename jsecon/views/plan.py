@@ -1,4 +1,4 @@
-"""Which virtual views show a bare scene best: candidates, small renders of them, and a greedy cover.
+"""Which views show a bare scene best: small renders of candidates, planned or given, and a greedy cover.
 
 A scene is a room or an object. In a room, candidates stand in free places inside and look around; around an object
 they stand on orbits. The two kinds are never mixed: from outside a room, the things in it are a few pixels.
@@ -6,7 +6,7 @@ they stand on orbits. The two kinds are never mixed: from outside a room, the th
 
 import dataclasses
 from collections.abc import Callable
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 
 from jsecon.errors import InputError, require
 from jsecon.field.evidence import region_votes
+from jsecon.fit.resize import scale_cameras
 from jsecon.types import Camera, Gaussians, Progress
 from jsecon.views.cover import SEEN_PX, greedy_cover
 from jsecon.views.frame import SceneFrame, inner_scene, scene_frame, surface_points
@@ -32,6 +33,12 @@ FOG_SHARE = 0.4
 """a view is fog if Gaussians with a standard deviation above a tenth of its width have this share of its weight"""
 VIEWS_AT_ONCE = 64
 """candidates that are rendered between two reports"""
+DEFAULT_VIEWS = 24
+"""views of a scene, planned or chosen from given ones"""
+_LEAST_ALPHA = 0.03
+"""mean alpha of a view from which it shows some of the scene"""
+_SHOWN_SHARE = 0.03
+"""share of the mean weight of a Gaussian from which given views show it, whatever the number of Gaussians"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +75,7 @@ class _PlannedViews:
 def place_cameras(
     gaussians: Gaussians,
     *,
-    views: int = 24,
+    views: int = DEFAULT_VIEWS,
     width: int = 400,
     height: int = 300,
     up: np.ndarray | None = None,
@@ -90,33 +97,83 @@ def place_cameras(
     places = _free_places(points, frame)
     inside = _interior_cameras(frame, places)
     orbits = _orbit_cameras(frame)
-    inner = np.flatnonzero(inner_scene(gaussians))
-    counted = inner[np.unique(np.linspace(0, len(inner) - 1, min(len(inner), 100_000)).astype(int))]
     total = len(inside) + len(orbits)
 
     def report(start: int) -> Callable[[int], None]:
         return lambda done: None if progress is None else progress(start + done, total)
 
-    seen, alpha, fog = _weights_by_view(gaussians, inside, inner, counted, frame.diagonal, report(0))
+    def weights(poses: np.ndarray, start: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        cameras = _cameras(poses, CANDIDATE_WIDTH, CANDIDATE_HEIGHT)
+        return _weights_by_view(gaussians, counted, cameras, frame.diagonal, report(start))
+
+    counted = _Counted.of(gaussians)
+    seen, alpha, fog = weights(inside, 0)
     kind: Literal["room", "object"] = "room" if _is_room(alpha, len(places)) else "object"
     candidates = inside
     if kind == "object":
         candidates = orbits
-        seen, alpha, fog = _weights_by_view(gaussians, orbits, inner, counted, frame.diagonal, report(len(inside)))
-    usable = np.flatnonzero(alpha >= 0.03)  # those that show some of the scene
+        seen, alpha, fog = weights(orbits, len(inside))
+    usable = np.flatnonzero(alpha >= _LEAST_ALPHA)
     clear = usable[fog[usable] < FOG_SHARE]
     usable = clear if len(clear) >= views else usable  # a scene of few large Gaussians has no clear view
     if not len(usable):
         remedy = "Open it in a viewer to check it, or give cameras of your own with --cameras FILE."
         raise InputError("scene", "no virtual view shows it", "", remedy)
-    opacity = 1 / (1 + np.exp(-np.asarray(gaussians.opacity_logits, np.float64)[counted]))
-    shown = seen[usable] / SEEN_PX
-    chosen = greedy_cover(shown, opacity, views)
-    once = np.minimum(shown[chosen].sum(0), 1)
-    coverage = float(opacity @ once / max(opacity.sum(), 1e-30))
-    chosen = usable[chosen]
+    chosen = usable[greedy_cover(seen[usable] / SEEN_PX, counted.opacity, views)]
     cameras = _cameras(candidates[chosen], width, height)
+    coverage = counted.share_seen(seen[chosen], SEEN_PX)
     return _PlannedViews(cameras, frame, kind, coverage, int((fog[chosen] >= FOG_SHARE).sum()))
+
+
+class _Cover(NamedTuple):
+    """A choice of given cameras, and how well they show a scene."""
+
+    chosen: np.ndarray
+    """(K,) which cameras are chosen."""
+    usable: float
+    """Share of all cameras that show some of the scene and no fog."""
+    coverage: float
+    """Share of the scene without its surroundings, by opacity, that these show."""
+
+
+def cover_with(gaussians: Gaussians, cameras: Camera, views: int, progress: Progress | None = None) -> _Cover:
+    """Chooses those of given cameras that together show a scene best, and measures how well all of them show it."""
+    diagonal = scene_frame(surface_points(gaussians), np.eye(3)[2]).diagonal
+    counted = _Counted.of(gaussians)
+    small = scale_cameras(cameras, CANDIDATE_WIDTH / max(cameras.width, cameras.height))
+
+    def report(done: int) -> None:
+        if progress is not None:
+            progress(done, len(cameras))
+
+    seen, alpha, fog = _weights_by_view(gaussians, counted, small, diagonal, report)
+    usable = np.flatnonzero((alpha >= _LEAST_ALPHA) & (fog < FOG_SHARE))
+    even_px = max(float(seen.sum(0).mean()), 1e-30)
+    chosen = usable[greedy_cover(seen[usable] / SEEN_PX, counted.opacity, views)]
+    coverage = counted.share_seen(seen[usable], _SHOWN_SHARE * even_px)
+    return _Cover(chosen, len(usable) / len(cameras), coverage)
+
+
+class _Counted(NamedTuple):
+    """The Gaussians by which views are compared."""
+
+    inner: np.ndarray
+    """Gaussians of the scene without its surroundings."""
+    sample: np.ndarray
+    """(M,) at most 100,000 of them, evenly spaced."""
+    opacity: np.ndarray
+    """(M,) of the sample."""
+
+    @classmethod
+    def of(cls, gaussians: Gaussians) -> "_Counted":
+        """Counts the inner Gaussians of a scene."""
+        inner = np.flatnonzero(inner_scene(gaussians))
+        sample = inner[np.unique(np.linspace(0, len(inner) - 1, min(len(inner), 100_000)).astype(int))]
+        return cls(inner, sample, 1 / (1 + np.exp(-np.asarray(gaussians.opacity_logits, np.float64)[sample])))
+
+    def share_seen(self, seen: np.ndarray, least_px: float) -> float:
+        """Share of the sample, by opacity, that has a weight of `least_px` in views, of the weights (V, M) in each."""
+        return float(self.opacity @ np.minimum(seen.sum(0) / least_px, 1) / max(self.opacity.sum(), 1e-30))
 
 
 def _free_places(points: Float[np.ndarray, "p 3"], frame: SceneFrame) -> Float[np.ndarray, "k 3"]:
@@ -209,33 +266,28 @@ def _cameras(poses: np.ndarray, width: int, height: int) -> Camera:
 
 
 def _weights_by_view(
-    gaussians: Gaussians,
-    poses: np.ndarray,
-    inner: np.ndarray,
-    counted: np.ndarray,
-    diagonal: float,
-    report: Callable[[int], None],
+    gaussians: Gaussians, counted: _Counted, cameras: Camera, diagonal: float, report: Callable[[int], None]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the weight of `counted` Gaussians in each small view (V, M), and the mean alpha and the fog of each (V,).
+    """Returns the weight of the sample in each small view (V, M), and the mean alpha and the fog of each (V,).
 
     The alpha is that of the inner scene: a sky encloses no place.
     """
-    seen = np.zeros((len(poses), len(counted)), np.float32)
-    alpha, fog = np.zeros((2, len(poses)))
-    cameras = _cameras(poses, CANDIDATE_WIDTH, CANDIDATE_HEIGHT)
-    labels = np.full((VIEWS_AT_ONCE, CANDIDATE_HEIGHT, CANDIDATE_WIDTH), -1, np.int32)
-    means = np.asarray(gaussians.means, np.float64)[counted]
-    widest = np.exp(np.asarray(gaussians.log_scales, np.float64)[counted].max(1))
+    seen = np.zeros((len(cameras), len(counted.sample)), np.float32)
+    alpha, fog = np.zeros((2, len(cameras)))
+    pixels, poses = cameras.width * cameras.height, np.asarray(cameras.world_to_camera)
+    labels = np.full((VIEWS_AT_ONCE, cameras.height, cameras.width), -1, np.int32)
+    means = np.asarray(gaussians.means, np.float64)[counted.sample]
+    widest = np.exp(np.asarray(gaussians.log_scales, np.float64)[counted.sample].max(1))
     for start in range(0, len(poses), VIEWS_AT_ONCE):
         rows = np.minimum(np.arange(start, start + VIEWS_AT_ONCE), len(poses) - 1)  # one program for all chunks
         votes = region_votes(gaussians, cameras[rows], labels, 1, top=1, by_view=True, near=0.01 * diagonal)
         by_view = np.asarray(votes.by_view)[: len(poses) - start]
         for view, weights in enumerate(by_view, start):
-            seen[view] = weights[counted]
-            alpha[view] = weights[inner].sum() / (CANDIDATE_WIDTH * CANDIDATE_HEIGHT)
+            seen[view] = weights[counted.sample]
+            alpha[view] = weights[counted.inner].sum() / pixels
             with np.errstate(invalid="ignore"):  # centres that are not finite have no weight
                 depth = means @ poses[view, 2, :3] + poses[view, 2, 3]
-            wide = widest * cameras.fx[view] > 0.1 * CANDIDATE_WIDTH * depth
+            wide = widest * cameras.fx[view] > 0.1 * cameras.width * depth
             fog[view] = seen[view, wide].sum() / max(seen[view].sum(), 1e-30)
         report(min(start + VIEWS_AT_ONCE, len(poses)))
     return seen, alpha, fog

@@ -162,11 +162,9 @@ def make_rigid(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Floa
 def transform_poses(
     poses: Float[np.ndarray, "... 4 4"], world: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, "... 4 4"]:
-    """Moves world-to-camera poses by a similarity of the world, without rotation: the cameras see the same."""
+    """Moves world-to-camera poses by a similarity of the world: the cameras see the same."""
     if np.array_equal(world, np.eye(4)):
         return poses
-    factor = world[0, 0]
-    origin = -world[:3, 3] / factor
-    moved = np.array(poses, np.float64)
-    moved[..., :3, 3] = factor * (poses[..., :3, 3] + poses[..., :3, :3] @ origin)
+    moved = np.asarray(poses, np.float64) @ np.linalg.inv(world)
+    moved[..., :3, :] *= np.cbrt(np.linalg.det(world[:3, :3]))
     return moved

@@ -1,5 +1,7 @@
 """nerfstudio and instant-ngp captures, on the host: transforms.json and the images that it names.
 
+INRIA's cameras.json, which lies beside a trained splat, is told from it by its content: a list of cameras.
+
 Format: nerfstudio docs/quickstart/data_conventions.md, instant-ngp scripts/colmap2nerf.py. transform_matrix is
 camera-to-world in OpenGL camera axes (x right, y up, looking along -z): columns 1 and 2 are negated for OpenCV axes.
 The world is the file's own; `PosedImages.source_from_poses` undoes what made it of the source's (applied_transform,
@@ -54,6 +56,8 @@ def _read_nerfstudio(path: Path) -> PosedImages:
     file = path / "transforms.json" if path.is_dir() else path
     file = file if file.is_file() else path / "transforms_train.json"
     content = read_json(file, "a transforms.json", _REMEDY)
+    if isinstance(content, list):
+        return _read_inria(file, content)
     images, scaled = [], 0
     with reading(file, remedy=_REMEDY):
         tested = path / "transforms_test.json"
@@ -79,9 +83,23 @@ def _read_nerfstudio(path: Path) -> PosedImages:
             notes.append(f"The intrinsics of {scaled} frames are shares of the image size; they were scaled to pixels.")
         up = _stated_up(content)
         source_from_poses = _source_from_poses(content, scale)
-        cloud = _named_file(file, content, "ply_file_path")
+        photographed = any(image.image is not None for image in images)  # poses alone need no points
+        cloud = _named_file(file, content, "ply_file_path") if photographed else None
     points = () if cloud is None else load_point_cloud(cloud)
     return PosedImages(images, file, *points, source_from_poses=source_from_poses, notes=tuple(notes), up=up)
+
+
+def _read_inria(file: Path, cameras: list[dict[str, Any]]) -> PosedImages:
+    """The cameras of INRIA's cameras.json: position and rotation are camera-to-world, in OpenCV axes."""
+    images = []
+    for index, camera in enumerate(cameras):
+        with reading(file, remedy="Copy it again from the folder of the training.", problem=f"camera {index} is wrong"):
+            name, pose = str(camera["img_name"]), np.eye(4)
+            pose[:3] = np.column_stack([camera["rotation"], camera["position"]])
+            width, height, fx, fy = (_number(camera, key, 0.0) for key in ("width", "height", "fx", "fy"))
+            lens = Lens(round(width), round(height), fx, fy, width / 2, height / 2)
+            images.append(PosedImage(name, None, lens, np.linalg.inv(rigid_or_nan(pose, file, name))))
+    return PosedImages(images, file)
 
 
 def _split_frames(file: Path, content: dict[str, Any]) -> tuple[list[tuple[dict[str, Any], bool | None]], list[str]]:
