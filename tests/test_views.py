@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 import jsecon
 from jsecon.app.cli import main
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.results import Checkpoint, Results, RunContext, StageInput
 from jsecon.pipeline.scene import plan_scene
+from jsecon.pipeline.stages import Checkpoint, Results, RunContext, StageInput
 from jsecon.splat.transform import transform_gaussians
 from jsecon.views import plan
 from jsecon.views.cover import frames_by_need
