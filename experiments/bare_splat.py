@@ -1,11 +1,11 @@
 """A bare splat against the same scene with its photographs.
 
     python -m experiments.bare_splat [--seeds 1 2 3 4 5] [--demos FOLDER]
-    python -m experiments.bare_splat --field FIELD       (a field of `jsecon run` on a capture)
+    python -m experiments.bare_splat --field FIELD [--poses]      (a field of `jsecon run` on a capture)
 
 Each made-up room and its fields come from experiments/demo_rooms.py, kept in DEMOS/SEED. Its fitted Gaussians are
 written to a .ply, turned, scaled by 0.01 to 100 and shifted at random, and `jsecon run scene.ply` makes a field
-without photographs.
+without photographs. With --poses, the cameras of the field lie beside it as INRIA's cameras.json.
 
 - label mIoU: for each true object (the demo's field of exact masks), the best IoU of its Gaussians with those of one
   region; a Gaussian belongs to its strongest region if that has half of its weight. The ratio is bare / photographs.
@@ -28,6 +28,7 @@ from scipy.spatial.transform import Rotation
 import jsecon
 from experiments import results
 from experiments.demo_rooms import fields_of_room
+from jsecon.read.captures.frames import transform_poses
 
 SMALLEST = 50
 """Gaussians of a region that is matched"""
@@ -41,6 +42,7 @@ class Options:
     demos: str = str(results.HOME.parent / "demos")
     field: str = ""
     views: int = 24
+    poses: bool = False
     out: str = ""
 
 
@@ -81,7 +83,19 @@ def compare(photographs: np.ndarray, bare: np.ndarray, truth: np.ndarray | None)
     return {name: float(value) for name, value in figures.items()}
 
 
-def bare_field(field: jsecon.LanguageField, seed: int, folder: Path, views: int) -> tuple[jsecon.LanguageField, float]:
+def write_cameras(path: Path, field: jsecon.LanguageField, world: np.ndarray) -> None:
+    """Writes the cameras of a field, in another world, as INRIA's cameras.json."""
+    rows, cameras = [], field.cameras
+    poses = np.linalg.inv(transform_poses(np.asarray(cameras.world_to_camera, np.float64), world))
+    for name, camera, pose in zip(field.names, cameras, poses):
+        row = {"img_name": name, "width": cameras.width, "height": cameras.height, "fx": float(camera.fx)}
+        rows.append(row | {"fy": float(camera.fy), "position": pose[:3, 3].tolist(), "rotation": pose[:3, :3].tolist()})
+    path.write_text(json.dumps(rows))
+
+
+def bare_field(
+    field: jsecon.LanguageField, seed: int, folder: Path, views: int, *, poses: bool = False
+) -> tuple[jsecon.LanguageField, float]:
     """The field of the same Gaussians without photographs, in a world of their own, and the seconds of its run."""
     rng = np.random.default_rng(seed)
     world = np.eye(4)
@@ -90,7 +104,11 @@ def bare_field(field: jsecon.LanguageField, seed: int, folder: Path, views: int)
     folder.mkdir(parents=True, exist_ok=True)
     jsecon.save_gaussians(folder / "scene.ply", field.gaussians, similarity=world)
     began = time.perf_counter()
-    command = [sys.executable, "-m", "jsecon", "run", "scene.ply", "--out", "field", "--views", str(views)]
+    command = [sys.executable, "-m", "jsecon", "run", "scene.ply", "--out", "field"]
+    if poses:
+        write_cameras(folder / "cameras.json", field, world)
+    else:
+        command += ["--views", str(views)]
     with (folder / "run.log").open("w") as log:
         subprocess.run(command, cwd=folder, check=True, stdout=log, stderr=subprocess.STDOUT)
     return jsecon.load_field(folder / "field" / "field.safetensors"), time.perf_counter() - began
@@ -109,7 +127,8 @@ def main(options: Options) -> dict[str, dict]:
             scenes.append((f"room {seed}", seed, demo / "field.safetensors", demo / "true_masks" / "field.safetensors"))
     for name, seed, path, true_path in scenes:
         field = jsecon.load_field(path)
-        bare, seconds = bare_field(field, seed, Path(options.out) / "runs" / name.replace(" ", "_"), options.views)
+        folder = Path(options.out) / "runs" / name.replace(" ", "_")
+        bare, seconds = bare_field(field, seed, folder, options.views, poses=options.poses)
         truth = None if true_path is None else strongest_regions(jsecon.load_field(true_path))
         figures = compare(strongest_regions(field), strongest_regions(bare), truth)
         seen = float((np.asarray(bare.votes.views) > 0).mean())
