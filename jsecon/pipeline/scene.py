@@ -317,7 +317,7 @@ def _choose_near(
 ) -> _Views:
     """Chooses views among the poses that lie near a scene, in the first world where they show nearly most of it.
 
-    The worlds are the one that nerfstudio trains in, if its file is there, that of the poses, and that of the files from
+    The worlds are that of nerfstudio's training, if its file is there, that of the poses, and that of the files from
     which these were made. Raises InputError if the poses show too little of the scene in each.
     """
     posed, cameras, names = _load_poses(near, options.long_side)
