@@ -119,7 +119,8 @@ def main(options: Options) -> dict[str, dict]:
     found: dict[str, dict] = {}
     scenes: list[tuple[str, int, Path, Path | None]] = []
     if options.field:
-        scenes.append((Path(options.field).parent.name, 0, Path(options.field), None))
+        name, path = Path(options.field).parent.name, Path(options.field)
+        scenes += [(f"{name} in world {seed}", seed, path, None) for seed in options.seeds]
     else:
         for seed in options.seeds:
             demo = Path(options.demos) / str(seed)

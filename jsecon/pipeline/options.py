@@ -133,8 +133,8 @@ class BareOptions:
     """Options of a scene of Gaussians that comes without photographs.
 
     Attributes:
-      views: Plans and renders this number of virtual views, at least 2. By default 24 are taken from poses that lie in
-        the folder of the scene or up to two above (INRIA's cameras.json, a transforms.json, a COLMAP sparse/). They are
+      views: Plans and renders this number of virtual views, at least 2. By default 48 are taken from poses that lie in
+        the folder of the scene or up to two above (INRIA's cameras.json, a transforms.json, a COLMAP sparse/); 24 are
         planned if there are none, or if these do not show the scene.
       cameras: Renders the scene from all of these poses instead: a COLMAP model, a transforms.json, or INRIA's
         cameras.json. Their images are not needed.
