@@ -337,11 +337,11 @@ def _choose_near(
     best = max(cover.coverage for cover, _, _ in views)
     cover, there, scene_from_poses = next(view for view in views if view[0].coverage >= best - 0.05)
     found = f"{len(cameras)} cameras, {cover.usable:.0%} of which show {cover.coverage:.0%} of {options.capture.name}"
-    if cover.usable < _LEAST_USABLE or cover.coverage < _LEAST_COVERAGE:
+    if min(len(rows) / 2, cover.usable / _LEAST_USABLE, cover.coverage / _LEAST_COVERAGE) < 1:
         remedy = (
             "Put poses in the world of the scene there, with the dataparser_transforms.json of nerfstudio's training."
         )
-        raise InputError(near, found, f"at least {_LEAST_USABLE:.0%} and {_LEAST_COVERAGE:.0%}", remedy)
+        raise InputError(near, found, f"2 cameras, {_LEAST_USABLE:.0%} and {_LEAST_COVERAGE:.0%} or more", remedy)
     up = find_up_axis(scene, there)
     if posed.up is not None:
         axis = scene_from_poses[:3, :3] @ posed.up.axis
