@@ -96,7 +96,7 @@ def answer_question(
         match = match_region(field, query, rules)
         several = rules.duplicate_cosine is not None
         if field.tree is not None and (count := field.regions.count) <= query < len(field.tree):
-            chosen = np.isin(np.arange(count), node_regions(field.tree, count, int(query)))
+            chosen = np.isin(np.arange(count), node_regions(np.asarray(field.tree), count, int(query)))
             match, several = RegionMatch(chosen, np.asarray(query, np.int32), np.asarray(1.0, np.float32)), True
     else:
         match = match_regions(field, query, rules, excluded=excluded)
