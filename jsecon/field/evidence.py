@@ -179,7 +179,7 @@ def view_evidence(
     labels = np.where(labels < 0, num_regions, labels).astype(np.int32)
     tiles, names, steps = _tile_labels(plan, labels)
     steps = int(steps)
-    room = 64 << (2 * max(-(-(steps - 1).bit_length() // 2) - 3, 0))  # powers of 4: views share a program
+    room = 1 << 2 * max(-(-(steps - 1).bit_length() // 2), 5)  # powers of 4 from 1,024 on: views share a program
     done, *chunks = _list_chunks(plan, (tiles, names), room, centre_pixel_weight)
     ids, slots, sums, largest = (np.asarray(chunk)[: int(done)] for chunk in chunks)
     entries = np.flatnonzero(sums)
@@ -193,7 +193,8 @@ def view_evidence(
     rounded = np.rint(weights.data.astype(np.float32) * np.float32(_RESOLUTION)) / np.float32(_RESOLUTION)
     starts = np.append(weights.indptr[seen], len(rounded)).astype(np.int32)
     own = (seen if rows is None else rows[seen]).astype(np.int32)
-    return ViewEvidence(own, starts, weights.indices.astype(np.int32), rounded, peaks[seen], int(plan.overflow))
+    overflow = int(np.asarray(plan.lists.overflow).sum())
+    return ViewEvidence(own, starts, weights.indices.astype(np.int32), rounded, peaks[seen], overflow)
 
 
 @jax.jit

@@ -17,7 +17,7 @@ from jsecon.fit.photometric import photometric_loss
 from jsecon.fit.resize import resize_frame, resize_mask, scale_cameras
 from jsecon.parallel import AXIS, MESH_OPTIONS, map_rows
 from jsecon.splat.capacity import default_capacity, enough_capacity
-from jsecon.splat.render import render
+from jsecon.splat.plan import plan_view, render_plan
 from jsecon.splat.sh import colours_from_sh
 from jsecon.types import Array, Camera, Capture, Gaussians, Leaf, record
 
@@ -162,7 +162,9 @@ def _view_loss(
     colours = map_rows(colours_from_sh, gaussians, camera, mesh)
     # The votes are the gradient of a fourth channel of zeros: they need no separate pass.
     features = jnp.concatenate([colours, vote_channel], axis=1)
-    rendering = render(gaussians, camera, features, capacity=capacity, mesh=mesh, depth=view.depth is not None)
+    plan = plan_view(gaussians, camera, capacity=capacity, mesh=mesh)
+    # Features that are not finite end the fit in any case.
+    rendering = render_plan(plan, features, depth=view.depth is not None, finite=True)
     image, votes = rendering.features[..., :3], rendering.features[..., 3]
     image = image if correction is None else apply_exposure(image, correction.colours)
     target = view.frame.astype(image.dtype) / 255.0

@@ -258,10 +258,10 @@ def _attribute_gradient(moments: Array, attributes: Array, corners: tuple[Array,
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4, 5))
-def _rasterize(
+def rasterize_finite(
     splats: Array, features: Array, lists: TileLists, width: int, height: int, mesh: Mesh | None
 ) -> tuple[Array, Array]:
-    """Composites finite features; arguments and results as for `rasterize_nan_contained`."""
+    """Composites finite features as `rasterize_nan_contained` does, in half of its program."""
     return _forward(splats, features, lists, width, height, mesh)[:2]
 
 
@@ -287,7 +287,7 @@ def _rasterize_backward(width, height, mesh, residual, cotangents):
     return by_splat, gradient.astype(features.dtype), None
 
 
-_rasterize.defvjp(_rasterize_forward, _rasterize_backward, symbolic_zeros=True)
+rasterize_finite.defvjp(_rasterize_forward, _rasterize_backward, symbolic_zeros=True)
 
 
 def _forward(splats, features, lists, width: int, height: int, mesh: Mesh | None) -> tuple[Array, Array, Array]:
@@ -348,11 +348,13 @@ def rasterize_nan_contained(
       transmittance (H, W). Those pixels and features have gradient zero.
     """
     finite = jnp.isfinite(features)
-    image, transmittance = _rasterize(splats, jnp.where(finite, features, 0.0), lists, width, height, mesh)
+    image, transmittance = rasterize_finite(splats, jnp.where(finite, features, 0.0), lists, width, height, mesh)
     bad = lax.stop_gradient(1.0 - finite.all(1, keepdims=True).astype(splats.dtype))
 
     def mark(bad) -> Array:
-        image, _ = cast(tuple[Array, Array], _rasterize(lax.stop_gradient(splats), bad, lists, width, height, mesh))
+        image, _ = cast(
+            tuple[Array, Array], rasterize_finite(lax.stop_gradient(splats), bad, lists, width, height, mesh)
+        )
         return image[..., 0] > 0
 
     touched = lax.cond(_any(bad), mark, lambda bad: jnp.zeros((height, width), bool), bad)

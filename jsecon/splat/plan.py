@@ -22,7 +22,7 @@ from jsecon.numerics import NEAR, all_finite, is_traced
 from jsecon.parallel import MESH_OPTIONS, map_rows
 from jsecon.programs import stored_jit
 from jsecon.splat.capacity import default_capacity, enough_capacity, round_capacity
-from jsecon.splat.composite import rasterize_nan_contained
+from jsecon.splat.composite import rasterize_finite, rasterize_nan_contained
 from jsecon.splat.project import Projection, check_gaussians, project
 from jsecon.splat.strips import map_strips
 from jsecon.splat.tiles import TileLists, tile_lists
@@ -174,11 +174,12 @@ def _cut_lists(plan: ViewPlan, length: int | None = None) -> ViewPlan:
     return dataclasses.replace(plan, lists=dataclasses.replace(plan.lists, gaussians=ids))
 
 
-def _composite_plan(plan: ViewPlan, features: Array, background: Array | None, depth: bool) -> Rendering:
+def _composite_plan(plan: ViewPlan, features: Array, background: Array | None, depth: bool, finite: bool) -> Rendering:
     """Renders features through a plan. Pure; arguments as for `render_plan`."""
     features = jnp.asarray(features).astype(plan.splats.dtype)
     columns = jnp.concatenate([features, plan.depths[:, None]], axis=1) if depth else features
-    image, transmittance = rasterize_nan_contained(plan.splats, columns, plan.lists, plan.width, plan.height, plan.mesh)
+    rasterize = rasterize_finite if finite else rasterize_nan_contained
+    image, transmittance = rasterize(plan.splats, columns, plan.lists, plan.width, plan.height, plan.mesh)
     image, transmittance = (jnp.where(plan.camera_is_finite, a, jnp.nan) for a in (image, transmittance))
     alpha, expected_depth = 1 - transmittance, None
     if depth:
@@ -191,13 +192,18 @@ def _composite_plan(plan: ViewPlan, features: Array, background: Array | None, d
 
 
 _composite_plan_compiled: list[Any] = [
-    stored_jit(_composite_plan, static_argnums=(3,)),
-    jax.jit(_composite_plan, static_argnums=3, compiler_options=MESH_OPTIONS),
+    stored_jit(_composite_plan, static_argnums=(3, 4)),
+    jax.jit(_composite_plan, static_argnums=(3, 4), compiler_options=MESH_OPTIONS),
 ]
 
 
 def render_plan(
-    plan: ViewPlan, features: Float[Array, "n d"], *, background: Array | None = None, depth: bool = False
+    plan: ViewPlan,
+    features: Float[Array, "n d"],
+    *,
+    background: Array | None = None,
+    depth: bool = False,
+    finite: bool = False,
 ) -> Rendering:
     """Renders per-Gaussian features through a plan: `render` without projection and sorting.
 
@@ -206,6 +212,8 @@ def render_plan(
       features: (N, D) numbers.
       background: (D,) numbers or one, added with weight 1 - alpha.
       depth: Whether to render the expected z-depth too.
+      finite: Whether all features are known to be finite: a program that contains NaN takes twice as long to compile.
+        Outside of a trace they are looked at.
 
     Returns:
       Features (H, W, D), alpha (H, W), overflow, and depth (H, W) in world units or None.
@@ -219,7 +227,9 @@ def render_plan(
         return _empty_rendering(plan, features.shape[1], background, depth)
     traced = is_traced((plan, features, background))
     run = _composite_plan if traced else _composite_plan_compiled[plan.mesh is not None]
-    return run(plan, features, background, depth)
+    if not traced and not depth and jax.default_backend() == "cpu":
+        finite = finite or bool(np.isfinite(np.asarray(features)).all())
+    return run(plan, features, background, depth, finite)
 
 
 def _empty_rendering(plan: ViewPlan, channels: int, background: Array | None, depth: bool) -> Rendering:

@@ -161,7 +161,8 @@ def tile_lists(
     # Pairs are laid out Gaussian after Gaussian; `owner` is the Gaussian of each. The cumulative sum saturates instead
     # of wrapping at 2^31 pairs: beyond the capacity its exact value affects only the overflow.
     areas = (x1 - x0) * (y1 - y0)
-    ends = _saturating_cumsum(areas)
+    can_wrap = len(areas) * number >= 2**31
+    ends = _saturating_cumsum(areas) if can_wrap else jnp.cumsum(areas, dtype=jnp.int32)
     starts, total = ends - areas, jnp.minimum(ends[-1], capacity)
     marks = jnp.zeros(room + 1, jnp.int32).at[jnp.minimum(starts, room)].add(1, mode="promise_in_bounds")
     boxes = jnp.stack([starts, x0, y0, jnp.maximum(x1 - x0, 1)], axis=-1)
