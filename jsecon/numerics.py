@@ -2,6 +2,7 @@
 
 import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -40,6 +41,22 @@ def is_finite_and_bounded(*numbers: Any) -> bool:
     return all(bool((np.abs(np.asarray(values, np.float64)) <= MAX_COORDINATE).all()) for values in numbers)
 
 
+def array_module(*arrays: Any) -> Any:
+    """Returns NumPy for NumPy's arrays, which it computes without a program, and jax.numpy if any is jax's."""
+    return jnp if any(isinstance(array, jax.Array) for array in arrays) else np
+
+
+def inline_jit(function: Callable) -> Callable:
+    """Compiles a function of arrays if any is jax's, inline in a trace; see `array_module`."""
+    compiled = jax.jit(function, inline=True)
+
+    @functools.wraps(function)
+    def call(*arrays):
+        return (function if array_module(*jax.tree.leaves(arrays)) is np else compiled)(*arrays)
+
+    return call
+
+
 def safe_scale(size: Array) -> Array:
     """Chooses a power of two that brings numbers to where squares neither overflow nor vanish.
 
@@ -49,8 +66,9 @@ def safe_scale(size: Array) -> Array:
     """
     limit = jnp.finfo(size.dtype).maxexp
     far, shift = limit * 5 // 16, limit * 21 // 32
-    factor = jnp.where(size > 2.0**far, 2.0**-shift, jnp.where(size < 2.0**-far, 2.0**shift, 1.0))
-    return jax.lax.stop_gradient(factor.astype(size.dtype))
+    xp = array_module(size)
+    factor = xp.where(size > 2.0**far, 2.0**-shift, xp.where(size < 2.0**-far, 2.0**shift, 1.0)).astype(size.dtype)
+    return factor if xp is np else jax.lax.stop_gradient(factor)
 
 
 @functools.partial(jax.jit, inline=True)
@@ -66,16 +84,17 @@ def safe_norm(x: Array) -> Array:
     return jnp.squeeze(length, -1)
 
 
-@functools.partial(jax.jit, inline=True)
+@inline_jit
 def normalize(x: Array) -> Array:
     """Scales vectors to unit length."""
-    x = jnp.asarray(x)
-    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=-1, keepdims=True, initial=0.0))
-    usable = (largest > 0) & jnp.isfinite(largest)
-    scaled = jnp.where(usable, x * safe_scale(largest), 0.0)
-    squares = jnp.sum(scaled * scaled, axis=-1, keepdims=True)
-    unit = scaled / jnp.sqrt(jnp.where(usable, squares, 1.0))
-    return jnp.where(usable, unit, jnp.where(largest == 0, 0.0, jnp.nan))
+    xp = array_module(x)
+    largest = xp.max(xp.abs(x), axis=-1, keepdims=True, initial=0.0)
+    largest = largest if xp is np else jax.lax.stop_gradient(largest)
+    usable = (largest > 0) & xp.isfinite(largest)
+    scaled = xp.where(usable, x * safe_scale(largest), 0.0)
+    squares = xp.sum(scaled * scaled, axis=-1, keepdims=True)
+    unit = scaled / xp.sqrt(xp.where(usable, squares, 1.0))
+    return xp.where(usable, unit, xp.where(largest == 0, 0.0, xp.nan).astype(unit.dtype))
 
 
 @jax.custom_jvp
@@ -91,18 +110,20 @@ def sigmoid(x: Array) -> Array:
 sigmoid.defjvps(lambda tangent, value, x: tangent * value * jax.nn.sigmoid(-x))
 
 
-@functools.partial(jax.jit, inline=True)
+@inline_jit
 def cosine(x: Array, y: Array) -> Array:
     """Computes cosines by multiply-and-sum, which jax issue 39103 leaves right."""
-    return jnp.sum(normalize(x) * normalize(y), axis=-1)
+    return (normalize(x) * normalize(y)).sum(axis=-1)
 
 
-@functools.partial(jax.jit, inline=True)
+@inline_jit
 def cosine_matrix(x: Array, y: Array) -> Array:
     """Computes the (N, M) cosines of (N, d) and (M, d) vectors as one matrix product.
 
     It is the form that jax issue 39103 leaves right.
     """
+    if array_module(x, y) is np:
+        return normalize(x) @ normalize(y).T
     return jnp.matmul(normalize(x), normalize(y).T, precision=FULL_PRECISION)
 
 

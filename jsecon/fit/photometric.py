@@ -9,6 +9,7 @@ sigma 1.5 px, zero padding of 5 px, C1 = 0.01^2, C2 = 0.03^2, mean over pixels a
 
 import functools
 import operator
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ from jax.sharding import Mesh
 from jaxtyping import Float
 
 from jsecon.errors import require_shape
+from jsecon.numerics import array_module
 from jsecon.parallel import map_over_devices
 from jsecon.splat.fusion import compute_once, opaque_true
 from jsecon.types import Array
@@ -29,7 +31,8 @@ SSIM_SHARE = 0.2
 """Share of SSIM in the loss (Kerbl et al. 2023)."""
 
 
-def _window() -> np.ndarray:
+def gaussian_window() -> np.ndarray:
+    """Returns the 11 weights of the SSIM window along one axis."""
     offsets = np.arange(-RADIUS_PX, RADIUS_PX + 1)
     weights = np.exp(-(offsets**2) / (2 * 1.5**2))
     return weights / weights.sum()
@@ -47,9 +50,8 @@ def _blur_once(image, axis: int):
 def _shifts(image: Array, axis: int, step: int) -> Array:
     """The window along one axis with a step between its numbers; without padding."""
     size = image.shape[axis] - 2 * RADIUS_PX * step
-    terms = (
-        float(w) * jax.lax.slice_in_dim(image, i * step, i * step + size, axis=axis) for i, w in enumerate(_window())
-    )
+    starts = range(0, image.shape[axis], step)
+    terms = (float(w) * jax.lax.slice_in_dim(image, i, i + size, axis=axis) for i, w in zip(starts, gaussian_window()))
     return functools.reduce(operator.add, terms)
 
 
@@ -63,12 +65,14 @@ def _gaussian_blur(image: Float[Array, "h w c"]) -> Float[Array, "h w c"]:
 _gaussian_blur.defvjp(lambda image: (_gaussian_blur(image), None), lambda _, cotangent: (_gaussian_blur(cotangent),))
 
 
-def ssim_map(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[Array, "h w c"]:
+def ssim_map(
+    image: Float[Array, "h w c"], target: Float[Array, "_ _ _"], blur: Callable = _gaussian_blur
+) -> Float[Array, "h w c"]:
     """Computes the structural similarity of each pixel and channel, in [-1, 1] (Wang 2004, eq. 13)."""
     # Five blurs instead of one of a stack: slicing the gradient of the stack costs XLA four times the blurs.
-    mean_i, mean_t = _gaussian_blur(image), _gaussian_blur(target)
-    square_i, square_t = _gaussian_blur(image * image), _gaussian_blur(target * target)
-    product = _gaussian_blur(image * target)
+    mean_i, mean_t = blur(image), blur(target)
+    square_i, square_t = blur(image * image), blur(target * target)
+    product = blur(image * target)
     variance_i, variance_t = square_i - mean_i * mean_i, square_t - mean_t * mean_t
     covariance = product - mean_i * mean_t
     numerator = (2 * mean_i * mean_t + _C1) * (2 * covariance + _C2)
@@ -160,7 +164,9 @@ def _loss_of_rows(x: Array, y: Array, inside: Array, channels: int) -> tuple[Arr
     return jnp.sum(jnp.where(inside[inner], loss, 0.0)), compute_once(always, gradient, *partials, x, y)
 
 
-def psnr(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[Array, ""]:
+@np.errstate(divide="ignore")
+def psnr(image: Float[Array, "*pixels c"], target: Float[Array, "*pixels c"]) -> Float[Array, ""]:
     """Computes the peak signal-to-noise ratio in dB, infinite for equal images; clamp a rendering to [0, 1] first."""
     difference = image - target
-    return -10.0 * jnp.log10(jnp.mean(difference * difference))
+    xp = array_module(difference)
+    return xp.asarray(-10.0 * xp.log10((difference * difference).mean()))

@@ -2,16 +2,16 @@
 
 from collections.abc import Iterator, Sequence
 
+import cv2
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from jsecon.fit.photometric import psnr, ssim_map
+from jsecon.fit.photometric import gaussian_window, psnr, ssim_map
 from jsecon.fit.resize import resize_frame, resize_mask, shrink_cameras
 from jsecon.parallel import map_over_processes
 from jsecon.splat.render import render_rgb
-from jsecon.types import Array, Capture, Gaussians, Progress, Quality
+from jsecon.types import Capture, Gaussians, Progress, Quality
 
 QUICK_LONG_SIDE = 400
 """Longer side in px at which weak frames are looked for: a thousand large frames would take half an hour."""
@@ -21,14 +21,20 @@ MIN_GAP_DB, MIN_GAP_SPREADS = 5.0, 5.0
 """Least distance below the median PSNR at which a frame is called weak, in dB, and in median absolute deviations."""
 
 
-@jax.jit
-def _compare(image: Array, frame: UInt8[Array, "h w 3"], counted: Bool[Array, "h w"]) -> tuple[Array, Array]:
+def _compare(
+    image: Float[np.ndarray, "h w 3"], frame: UInt8[np.ndarray, "h w 3"], counted: Bool[np.ndarray, "h w"]
+) -> tuple[float, float]:
     """PSNR over the counted pixels, and the mean SSIM over their windows, with the rendering in place of the others."""
-    image, target = jnp.clip(image, 0, 1), frame.astype(jnp.float32) / 255.0
-    target = jnp.where(counted[..., None], target, image)
-    share = jnp.mean(counted.astype(image.dtype))
-    similarity = 1 - jnp.sum((1 - ssim_map(image, target)) * counted[..., None]) / (share * image.size)
-    return psnr(image, target) + 10 * jnp.log10(share), similarity
+    image = np.clip(image, 0, 1)
+    target = np.where(counted[..., None], frame.astype(np.float32) / 255, image)
+    similarity = ssim_map(image, target, _blur)[counted].mean(dtype=np.float64)
+    return float(psnr(image[counted], target[counted])), float(similarity)
+
+
+def _blur(image: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
+    """Blurs an image with the SSIM window, with zeros outside of it, by OpenCV: no program is compiled for a size."""
+    window = gaussian_window()
+    return cv2.sepFilter2D(image, -1, window, window, borderType=cv2.BORDER_CONSTANT)
 
 
 def measure_quality(
@@ -56,7 +62,7 @@ def measure_quality(
       PSNR and SSIM of each frame; frames of which less than MIN_COUNTED_SHARE counts are skipped.
     """
     chosen = np.flatnonzero(capture.held_out) if frames is None else np.asarray(frames)
-    gaussians, cameras = jax.device_put(gaussians), capture.cameras
+    gaussians, cameras = jax.device_put(gaussians), jax.tree.map(np.asarray, capture.cameras)
     if long_side is not None:
         cameras = shrink_cameras(cameras, long_side)
 
@@ -68,9 +74,9 @@ def measure_quality(
     chosen = np.array([t for t in chosen.tolist() if counted_pixels(t).mean() >= MIN_COUNTED_SHARE], int)
 
     def compare(t: int) -> list[float]:
-        image = render_rgb(gaussians, cameras[t], background=background).features
+        image = np.asarray(render_rgb(gaussians, cameras[t], background=background).features)
         frame = resize_frame(np.asarray(capture.frames[t]), cameras)
-        return [float(value) for value in _compare(image, frame, counted_pixels(t))]
+        return list(_compare(image, frame, counted_pixels(t)))
 
     def rows(positions: Sequence[int]) -> Iterator[list[float]]:
         return map(compare, chosen[list(positions)].tolist())
