@@ -12,7 +12,7 @@ from small_field import KnownTexts, make_field, unit_rows
 
 from jsecon import Regions, Scene, load_field, query_anchored, query_classes, query_region, query_several, save_field
 from jsecon.field.similarity import similarities
-from jsecon.query.match import region_similarities, view_count_weight, word_similarities
+from jsecon.query.match import compare_words, region_similarities, view_count_weight
 from jsecon.query.rules import ABSENT, FOUND, FOUND_MARGIN, MIN_COSINE, MIN_MARGIN, UNSURE, QueryRules
 
 SIZE = 12
@@ -37,10 +37,11 @@ def rows():
 
 def test_equals_the_formula_and_rows_without_a_direction_are_unknown(rows):
     embeddings, text, words = rows
-    plain = similarities(jnp.asarray(embeddings), jnp.asarray(text))[0]
+    plain = similarities(embeddings, text)[0]
+    np.testing.assert_allclose(plain, similarities(jnp.asarray(embeddings), jnp.asarray(text))[0], atol=1e-6)
     np.testing.assert_array_equal(region_similarities(*rows, "cosine")[0], plain)
     np.testing.assert_array_equal(region_similarities(embeddings, text, None, "contrast")[0], plain)
-    np.testing.assert_allclose(word_similarities(embeddings, words, "cosine"), words @ embeddings.T, atol=1e-6)
+    np.testing.assert_allclose(compare_words(embeddings, words, "cosine").similarity, words @ embeddings.T, atol=1e-6)
     more = np.concatenate([embeddings, np.zeros((1, SIZE), np.float32), np.full((1, SIZE), np.nan, np.float32)])
     got, known = region_similarities(more, text, words, "contrast")
     np.testing.assert_array_equal(known, [True] * 7 + [False] * 2)

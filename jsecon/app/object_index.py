@@ -169,7 +169,7 @@ class ObjectIndex:
     def _measure_object(self, regions: tuple[int, ...]) -> tuple[np.ndarray, ObjectShapes, bool] | None:
         """Returns Gaussians and shape of the object of some regions, and `is_sure`; None if it has no Gaussian."""
         voters = np.unique(np.concatenate([self._voters[region] for region in regions]))
-        share = inside_fraction_of_regions(votes_of_rows(self._votes, voters), regions)
+        share = inside_fraction_of_regions(votes_of_rows(self._votes, voters), regions).fraction
         rows, share = voters[share >= SHARE_THRESHOLD], share[share >= SHARE_THRESHOLD]
         gaussians = gaussian_rows(dataclasses.replace(self._field.gaussians, sh=None), rows)
         weight = share * self._votes.total[rows]

@@ -135,10 +135,11 @@ def _write_answers(
     """
     sections: dict[str, str] = {}
     records: dict[str, dict[str, Any]] = {}
+    for answer in answers:  # before the pictures, which take longer
+        console.print_line(str(answer))
     with console.progress("pictures") as progress:
         for n, answer in enumerate(answers):
             stem = file_stem(answer.query)
-            console.print_line(str(answer))
             if stem not in records:  # else the question stands there twice
                 masks = {t: scene.mask(answer, t) for t in scene.best_frames(answer, max(views, 1))}
                 records[stem] = write_answer(answer, scene, out, dict(list(masks.items())[:views]), ending=ending)

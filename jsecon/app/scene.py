@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Int, UInt8
 
@@ -298,8 +297,8 @@ class Scene:
         if query.by == "code" and (query.all_of_class or len(included + excluded) > 1):
             problem = "codes cannot select several regions"
             raise InputError(f"query {str(query)!r}", problem, remedy="Ask by votes, or for one thing.")
-        embedded = embedder.embed_text(included + excluded)  # NumPy's slices need no compilation
-        texts, without = jax.device_put((embedded[: len(included)], embedded[len(included) :]))
+        embedded = embedder.embed_text(included + excluded)
+        texts, without = embedded[: len(included)], embedded[len(included) :]
         found = answer_question(field, texts, rules, excluded=without, outliers=query.outliers)
         by_parts = "no region holds the object, so the parts that match the text were selected"
         warnings = [] if found[1].mask.any() else run_warnings(field)
@@ -549,7 +548,7 @@ class Scene:
                 rows[: len(chosen)] = chosen
                 mask = np.arange(len(rows)) < len(chosen)
                 gaussians = jax.device_put(gaussian_rows(gaussians, rows))
-            return np.asarray(selection_mask(gaussians, self._cameras[self.frame_index(frame)], jnp.asarray(mask)))
+            return np.asarray(selection_mask(gaussians, self._cameras[self.frame_index(frame)], mask))
 
     @functools.cached_property
     def _gaussians(self) -> Gaussians:

@@ -2,11 +2,11 @@
 
 from collections.abc import Iterable
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jsecon.errors import require
+from jsecon.numerics import array_module
 from jsecon.types import Array
 
 Point = tuple[float | int, float | int]
@@ -28,8 +28,8 @@ def iou(predicted: Bool[Array, "..."], true: Bool[Array, "..."]) -> Float[Array,
     """
     got, remedy = f"{predicted.shape} and {true.shape}", "Render the prediction at the size of the truth."
     require(predicted.shape == true.shape, "iou", got, "one shape", remedy)
-    both, either = jnp.sum(predicted & true), jnp.sum(predicted | true)
-    return jnp.where(either > 0, both / jnp.maximum(either, 1), 1.0)
+    xp, both, either = array_module(predicted, true), (predicted & true).sum(), (predicted | true).sum()
+    return xp.asarray(xp.where(either > 0, both / xp.maximum(either, 1), 1.0))
 
 
 def mean_iou(ious: Iterable[float | None]) -> float:

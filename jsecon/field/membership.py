@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float, Int
 from jsecon.errors import require
 from jsecon.field.columns import is_mapped, row_slices, votes_of_rows
 from jsecon.field.regions import ALIKE_THRESHOLD, mean_residuals
-from jsecon.numerics import FULL_PRECISION, cosine_matrix
+from jsecon.numerics import FULL_PRECISION, cosine_matrix, inline_jit
 from jsecon.programs import stored_jit
 from jsecon.types import Array, Regions, Votes
 
@@ -99,13 +99,13 @@ def _by_view(votes: Votes, regions: Regions) -> Array:
     return cast(Array, votes.by_view)
 
 
-@jax.jit
+@inline_jit
 def _views_that_show(regions: Regions) -> Bool[Array, "r t"]:
     """Finds the views (R, T) that show a region, or one that is alike: regions that queries join are shown together."""
-    apart, known = mean_residuals(jnp.asarray(regions.embeddings))
+    apart, known = mean_residuals(regions.embeddings)
     alike = cosine_matrix(apart, apart) >= ALIKE_THRESHOLD
-    alike = (alike & known[:, None] & known[None]) | jnp.eye(regions.count, dtype=bool)
-    return (alike.astype(jnp.float32) @ (jnp.asarray(regions.pixel_counts) > 0).astype(jnp.float32)) > 0
+    alike = (alike & known[:, None] & known[None]) | np.eye(regions.count, dtype=bool)
+    return (alike.astype(np.float32) @ (regions.pixel_counts > 0).astype(np.float32)) > 0
 
 
 @jax.jit
@@ -216,7 +216,7 @@ def inside_fraction(votes: Votes, chosen: Bool[Array, " r"]) -> _InsideFraction:
     return _InsideFraction(jnp.where(known, jnp.clip(weight / jnp.where(known, seen, 1.0), 0.0, 1.0), 0.0), known)
 
 
-def inside_fraction_of_regions(votes: Votes, regions: Sequence[int]) -> Float[np.ndarray, " n"]:
+def inside_fraction_of_regions(votes: Votes, regions: Sequence[int] | np.ndarray) -> _InsideFraction:
     """Computes the same bits as `inside_fraction` with NumPy, for a few regions: it compiles no program. Host code."""
     inside = np.isin(votes.regions, regions)
     weights, total = np.asarray(votes.weights), np.asarray(votes.total)
@@ -226,7 +226,7 @@ def inside_fraction_of_regions(votes: Votes, regions: Sequence[int]) -> Float[np
     seen = np.where(inside, seen, 0).max(1)
     weight = functools.reduce(np.add, np.where(inside, weights, 0).T)  # in the order of `inside_fraction`
     known = (np.asarray(votes.views) > 0) & (seen > 0) & np.isfinite(seen) & np.isfinite(weight)
-    return np.where(known, np.clip(weight / np.where(known, seen, 1), 0, 1), 0)
+    return _InsideFraction(np.where(known, np.clip(weight / np.where(known, seen, 1), 0, 1), 0), known)
 
 
 def _lookup(chosen: Bool[Array, " r"]) -> Callable[[Array], Array]:

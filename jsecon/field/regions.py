@@ -5,18 +5,15 @@ directions. An encoder needs a fifth of a second for each view (SigLIP 2, two co
 most of its errors (docs/models.md).
 """
 
-import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from scipy import sparse
 
 from jsecon.errors import require, require_shape
-from jsecon.numerics import normalize, require_labels
+from jsecon.numerics import array_module, inline_jit, normalize, require_labels
 from jsecon.parallel import map_over_processes
 from jsecon.types import Array, Camera, Parts, Progress, Regions
 
@@ -204,7 +201,7 @@ def _unit_rows(rows: np.ndarray) -> np.ndarray:
     return np.where(length > 0, rows / np.where(length > 0, length, 1.0), 0.0).astype(np.float32)
 
 
-@functools.partial(jax.jit, inline=True)
+@inline_jit
 def mean_residuals(embeddings: Float[Array, "r e"]) -> tuple[Float[Array, "r e"], Bool[Array, " r"]]:
     """Computes what sets each of R regions apart from the others, and which regions have an embedding. Pure.
 
@@ -212,11 +209,11 @@ def mean_residuals(embeddings: Float[Array, "r e"]) -> tuple[Float[Array, "r e"]
 
     with unit embeddings e of the n regions that have one. The factor lets a single region keep its own direction.
     """
-    units = normalize(embeddings)
-    known = jnp.all(jnp.isfinite(units), axis=-1) & jnp.any(units != 0, axis=-1)
-    units = jnp.where(known[:, None], units, 0.0)
-    total = jnp.sum(units, axis=0) / (jnp.sum(known, dtype=units.dtype) + 1)
-    return jnp.where(known[:, None], units - total, 0.0), known
+    units, xp = normalize(embeddings), array_module(embeddings)
+    known = xp.isfinite(units).all(axis=-1) & (units != 0).any(axis=-1)
+    units = xp.where(known[:, None], units, 0.0)
+    total = units.sum(axis=0) / (known.sum(dtype=units.dtype) + 1)
+    return xp.where(known[:, None], units - total, 0.0), known
 
 
 def node_regions(tree: Int[np.ndarray, " m"], count: int, node: int) -> list[int]:

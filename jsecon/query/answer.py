@@ -22,18 +22,19 @@ from jaxtyping import Bool, Float, Int
 
 from jsecon.errors import require
 from jsecon.field.columns import is_mapped, vote_blocks
-from jsecon.field.membership import inside_fraction
+from jsecon.field.membership import inside_fraction, inside_fraction_of_regions
 from jsecon.field.regions import node_regions
 from jsecon.field.similarity import Number, similarities
+from jsecon.numerics import array_module, is_traced
 from jsecon.paper.queries import select_by_code
 from jsecon.programs import stored_jit
 from jsecon.query.match import (
+    compare_words,
     join_fragments,
     parts_fallback,
     regions_with,
     score_text,
     unrelated_words,
-    word_similarities,
 )
 from jsecon.query.outliers import OutlierResult, split_outliers
 from jsecon.query.rules import ABSENT, ALL_OF_CLASS, FOUND, ONE_REGION, RULES, QueryRules
@@ -62,6 +63,8 @@ NO_REGIONS = RegionMatch(
     np.zeros(0, bool), np.asarray(-1, np.int32), np.asarray(0.0, np.float32), state=np.asarray(ABSENT)
 )
 """The match of a field without regions."""
+_FEW = 1 << 17
+"""Gaussians up to which NumPy selects, in 10 ms: to compile a program takes a second."""
 
 
 class _Answered(NamedTuple):
@@ -138,29 +141,34 @@ def match_regions(
       ValueError: An embedding has another size.
     """
     size = field.regions.embeddings.shape[1]
-    excluded = jnp.zeros((0, size)) if excluded is None else excluded
+    excluded = np.zeros((0, size), np.float32) if excluded is None else excluded
     fit = all(texts.ndim == 2 and texts.shape[1] == size for texts in (queries, excluded)) and len(queries) >= 1
     remedy = f"Embed the text with the field's embedder{f', {field.embedder}' if field.embedder else ''}."
     shapes = f"queries {queries.shape}, excluded {excluded.shape}"
     require(fit, "match_regions", shapes, f"(Q >= 1, {size}) and (U, {size})", remedy)
     if field.regions.count == 0:
         return NO_REGIONS
-    arrays = field.regions.embeddings, field.regions.pixel_counts, field.votes.overlap, queries, excluded
-    return _match(*jax.tree.map(jnp.asarray, arrays), unrelated_words(field), rules)
+    regions = field.regions.embeddings, field.regions.pixel_counts, field.votes.overlap
+    arrays = *regions, queries, excluded, unrelated_words(field)
+    if is_traced((arrays, rules)):
+        return _match_traced(*arrays, rules)
+    return _match(*jax.tree.map(np.asarray, arrays), rules)  # by NumPy: it compiles no program
 
 
-@stored_jit
+@np.errstate(invalid="ignore")
 def _match(embeddings, pixels, overlap, queries, excluded, words, rules: QueryRules) -> RegionMatch:
-    word_scores = None if words is None else word_similarities(embeddings, words, rules.retrieval)
+    xp = array_module(embeddings, queries, rules.min_rank)
+    word_scores = compare_words(embeddings, words, rules.retrieval)
 
     def match_each(texts):
         def match_text(text):
-            scores = score_text(embeddings, text, pixels, words, word_scores, rules)
+            scores = score_text(embeddings, text, pixels, word_scores, rules)
             chosen = regions_with(scores.best, scores.similarity, scores.known, embeddings, overlap, rules)
             return scores, chosen & scores.known & (scores.state > ABSENT)
 
-        scores, chosen = jax.vmap(match_text)(texts)
-        return scores, chosen.any(0), jnp.max(jnp.where(chosen, scores.similarity, -jnp.inf), axis=0)
+        rows = [match_text(text) for text in texts] if xp is np else []
+        scores, chosen = jax.tree.map(lambda *row: np.stack(row), *rows) if rows else jax.vmap(match_text)(texts)
+        return scores, chosen.any(0), xp.where(chosen, scores.similarity, -xp.inf).max(axis=0)
 
     scores, chosen, similarity = match_each(queries)
     if len(excluded):
@@ -168,24 +176,28 @@ def _match(embeddings, pixels, overlap, queries, excluded, words, rules: QueryRu
         # Equal up to rounding: a text that is both included and excluded matches nothing.
         chosen &= ~(rejected & (against >= similarity - 1e-5))
     # The best region of a text is before those that join it, whose similarity may be larger: similarities span 2.
-    is_best = jnp.any((jnp.arange(len(embeddings)) == scores.best[:, None]) & (scores.state > ABSENT)[:, None], axis=0)
-    best = jnp.argmax(jnp.where(chosen, similarity + 4.0 * is_best, -jnp.inf))
-    matches = jnp.any(chosen)
+    is_best = ((xp.arange(len(embeddings)) == scores.best[:, None]) & (scores.state > ABSENT)[:, None]).any(axis=0)
+    best = xp.argmax(xp.where(chosen, similarity + 4.0 * is_best, -xp.inf))
+    matches = chosen.any()
 
     def of_best(rows):
-        return jnp.take_along_axis(rows, scores.best[:, None], axis=1)[:, 0]
+        return xp.take_along_axis(rows, scores.best[:, None], axis=1)[:, 0]
 
     known = of_best(scores.known)
-    nearest = jnp.where(jnp.any(known), jnp.max(jnp.where(known, of_best(scores.similarity), -jnp.inf)), 0.0)
-    presence = None if scores.presence is None else jnp.max(scores.presence, axis=0)
+    nearest = xp.where(known.any(), xp.where(known, of_best(scores.similarity), -xp.inf).max(), 0.0)
+    presence = None if scores.presence is None else scores.presence.max(axis=0)
+    ranked = known & ~xp.isnan(scores.rank)
     return RegionMatch(
-        jnp.asarray(chosen),
-        jnp.where(matches, best, -1).astype(jnp.int32),
-        jnp.where(matches, similarity[best], nearest),
-        jnp.nanmax(jnp.where(known, scores.rank, jnp.nan)),
-        None if presence is None else jnp.where(matches, presence[best], jnp.max(presence)),
-        jnp.where(matches, jnp.max(scores.state), ABSENT),
+        chosen,
+        xp.where(matches, best, -1).astype(np.int32),
+        xp.where(matches, similarity[best], nearest),
+        xp.where(ranked.any(), xp.where(ranked, scores.rank, -xp.inf).max(), xp.nan).astype(similarity.dtype),
+        None if presence is None else xp.where(matches, presence[best], presence.max()),
+        xp.where(matches, scores.state.max(), ABSENT),
     )
+
+
+_match_traced = jax.jit(_match)
 
 
 def match_region(field: LanguageField, region: Number, rules: QueryRules = ONE_REGION) -> RegionMatch:
@@ -217,6 +229,9 @@ def select_gaussians(field: LanguageField, match: RegionMatch, rules: QueryRules
     """
     if rules.code_threshold is not None:
         return select_by_code(field, match, rules.code_threshold)
+    if field.gaussians.count <= _FEW and not is_traced((field.votes, match, rules)):
+        share, known = inside_fraction_of_regions(field.votes, np.flatnonzero(match.chosen))
+        return Selection(known & (share >= rules.min_share) & (np.asarray(match.region) >= 0), share, *match[1:])
     if not is_mapped(field.votes):
         return _select_from_votes(jax.tree.map(jnp.asarray, field.votes), match, rules.min_share)
     parts = [_select_from_votes(votes, match, rules.min_share) for votes in vote_blocks(field.votes)]
@@ -254,7 +269,7 @@ def query_anchored(field: LanguageField, text_embedding: Float[Array, " e"], *, 
     Raises:
       ValueError: The embedding has another size.
     """
-    return query_several(field, jnp.asarray(text_embedding)[None], rules=rules)
+    return query_several(field, text_embedding[None], rules=rules)
 
 
 def query_region(field: LanguageField, region: Number, *, rules: QueryRules = ONE_REGION) -> Selection:

@@ -13,11 +13,11 @@ from jaxtyping import Float, Int
 from jsecon.errors import require
 from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction, ratio, vote_columns
 from jsecon.query.match import (
+    compare_words,
     presence_prob,
     region_similarities,
     unrelated_words,
     view_count_weight,
-    word_similarities,
 )
 from jsecon.query.rules import ABSENT, RULES, QueryRules
 from jsecon.types import Array, LanguageField
@@ -92,8 +92,9 @@ def _classes(embeddings, texts, pixels, votes, words, rules: QueryRules, standar
         return jnp.take_along_axis(table, best[:, None], axis=1)[:, 0]
 
     standing = presence = None
-    if words is not None:
-        scores = word_similarities(embeddings, words, rules.retrieval)
+    word_scores = compare_words(embeddings, words, rules.retrieval)
+    if word_scores is not None:
+        scores = word_scores.similarity
         count = jnp.sum(jnp.isfinite(scores), axis=0)
         below = jnp.sum(scores < of_best(plain), axis=0, dtype=plain.dtype)
         standing = (jnp.where(count > 0, below / jnp.maximum(count, 1), 1.0), None)

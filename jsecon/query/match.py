@@ -20,12 +20,10 @@ LGS, arXiv 2412.01807). `parts_fallback` finds the parts that match a text clear
 Pure functions but for `join_fragments` and `parts_fallback`.
 """
 
-import functools
 from collections.abc import Sequence
 from typing import NamedTuple, cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
@@ -33,7 +31,7 @@ from jsecon.errors import require
 from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.field.regions import mean_residuals
 from jsecon.field.similarity import Number, similarities
-from jsecon.numerics import cosine_matrix, normalize
+from jsecon.numerics import array_module, cosine_matrix, inline_jit, normalize
 from jsecon.programs import stored_jit
 from jsecon.query.outliers import best_cluster
 from jsecon.query.rules import ABSENT, QueryRules
@@ -57,7 +55,7 @@ and less where the object's parts differ from their surroundings (9 of 468 texts
 def unrelated_words(field: LanguageField) -> Array | None:
     """Returns the unrelated words of a field (W, E), or None if it has none."""
     words = field.unrelated_words
-    return jnp.asarray(words) if words is not None and len(words) else None
+    return words if words is not None and len(words) else None
 
 
 class _TextScores(NamedTuple):
@@ -77,28 +75,55 @@ class _TextScores(NamedTuple):
     """Share of unrelated words that match the scene less than the text does; NaN without such words."""
 
 
+class _WordScores(NamedTuple):
+    """W unrelated words, compared with the regions once for all texts."""
+
+    mean: Float[Array, " e"]
+    """Mean of the unit words."""
+    apart: Float[Array, "w e"]
+    """Unit words minus the mean."""
+    similarity: Float[Array, "w r"]
+    """Cosine of each word with each region, as a text has it; NaN if unknown."""
+
+
+def compare_words(
+    embeddings: Float[Array, "r e"], words: Float[Array, "w e"] | None, retrieval: str
+) -> _WordScores | None:
+    """Compares regions with unrelated words, as `region_similarities` does with a text; None without words."""
+    if words is None:
+        return None
+    units = normalize(words.astype(embeddings.dtype))
+    mean = _mean(units)
+    apart = units - mean
+    directions = units if retrieval == "cosine" else apart
+    # As one product of matrices: W queries of their own would walk all regions W times.
+    known = (directions != 0).any(axis=1)[:, None] & (embeddings != 0).any(axis=1)
+    cosines = cosine_matrix(directions, embeddings)
+    return _WordScores(mean, apart, array_module(cosines).where(known, cosines, np.nan))
+
+
 def score_text(
     embeddings: Float[Array, "r e"],
     text: Float[Array, " e"],
     pixels: Shaped[Array, "r t"],
-    words: Float[Array, "w e"] | None,
-    word_scores: Float[Array, "w r"] | None,
+    words: _WordScores | None,
     rules: QueryRules,
 ) -> _TextScores:
-    """Compares one text with all regions, and with unrelated words (`word_similarities`) if there are any."""
-    similarity, known = region_similarities(embeddings, text, words, rules.retrieval)
+    """Compares one text with all regions, and with unrelated words (`compare_words`) if there are any."""
+    similarity, known = similarities(embeddings, _text_direction(text, words and words.mean, rules.retrieval))
+    xp = array_module(similarity)
     presence = None if rules.logits is None else presence_prob(embeddings, text, rules.logits)
     weight = view_count_weight(pixels).astype(similarity.dtype)
     weighted = similarity
     if rules.retrieval != "cosine" and words is not None:  # the plain cosine is the paper's, without weights
-        weighted = jnp.where(similarity > 0, similarity * weight, similarity)
-    best = jnp.argmax(jnp.where(known, weighted, -jnp.inf))
+        weighted = xp.where(similarity > 0, similarity * weight, similarity)
+    best = xp.argmax(xp.where(known, weighted, -xp.inf))
     standing = None
-    rank = jnp.asarray(jnp.nan, similarity.dtype)
-    if words is not None and word_scores is not None:
-        weight = jnp.where(known, weight, 0.0)
-        reach = jnp.max(jnp.where(known, similarity, -jnp.inf)), _height(similarity, weight)
-        standing = standing_among_words(reach, text, words, word_scores, weight)
+    rank = xp.asarray(xp.nan, similarity.dtype)
+    if words is not None:
+        weight = xp.where(known, weight, 0.0)
+        reach = xp.max(xp.where(known, similarity, -xp.inf)), _height(similarity, weight)
+        standing = _standing_among_words(reach, text, words, weight)
         rank = standing[0]
     state = rules.judge(standing, similarity[best], None if presence is None else presence[best])
     return _TextScores(similarity, known, presence, best, state, rank)
@@ -113,8 +138,8 @@ def judge_texts(
     rules: QueryRules,
 ) -> Int[Array, " q"]:
     """Judges whether a scene has what each text names: indices of `rules.STATES`, those of `score_text`."""
-    word_scores = None if words is None else word_similarities(embeddings, words, rules.retrieval)
-    return jax.vmap(lambda text: score_text(embeddings, text, pixels, words, word_scores, rules).state)(texts)
+    word_scores = compare_words(embeddings, words, rules.retrieval)
+    return jax.vmap(lambda text: score_text(embeddings, text, pixels, word_scores, rules).state)(texts)
 
 
 def region_similarities(
@@ -124,35 +149,24 @@ def region_similarities(
 
     "contrast" subtracts the mean of the unrelated words from the text; "cosine" does not.
     """
-    return similarities(embeddings, _text_direction(text, words, retrieval))
+    mean = None if words is None else _mean(normalize(words.astype(text.dtype)))
+    return similarities(embeddings, _text_direction(text, mean, retrieval))
 
 
-def word_similarities(
-    embeddings: Float[Array, "r e"], words: Float[Array, "w e"], retrieval: str
-) -> Float[Array, "w r"]:
-    """Compares regions with unrelated words, as `region_similarities` does with a text; NaN if unknown."""
-    words = words.astype(embeddings.dtype)
-    words = _text_direction(words, words, retrieval)
-    # As one product of matrices: W queries of their own would walk all regions W times.
-    known = jnp.any(words != 0, axis=1)[:, None] & jnp.any(embeddings != 0, axis=1)
-    return jnp.where(known, cosine_matrix(words, embeddings), jnp.nan)
+def _mean(units: Float[Array, "w e"]) -> Float[Array, " e"]:
+    """Returns the mean of the rows, by NumPy in float64: equal words have no direction of their own."""
+    return units.mean(axis=0, dtype=np.float64 if array_module(units) is np else None).astype(units.dtype)
 
 
-def _text_direction(
-    text: Float[Array, "*batch e"], words: Float[Array, "w e"] | None, retrieval: str
-) -> Float[Array, "*batch e"]:
-    """Returns unit texts (..., E), by "contrast" minus the mean of the W unit unrelated words if there are any."""
-    unit = normalize(text)
-    if retrieval == "cosine" or words is None:
-        return unit
-    return unit - jnp.mean(normalize(words.astype(text.dtype)), axis=0)
+def _text_direction(text: Float[Array, " e"], mean: Float[Array, " e"] | None, retrieval: str) -> Float[Array, " e"]:
+    """Returns a unit text, by "contrast" minus the mean of the unit unrelated words if there are any."""
+    return normalize(text) if retrieval == "cosine" or mean is None else normalize(text) - mean
 
 
-def standing_among_words(
-    reach: tuple[Float[Array, ""], Float[Array, ""]],
+def _standing_among_words(
+    reach: tuple[Number, Number],
     text: Float[Array, " e"],
-    words: Float[Array, "w e"],
-    scores: Float[Array, "w r"],
+    words: _WordScores,
     weight: Float[Array, " r"],
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Compares how well a text and unrelated words match a scene: the rank of the text, and its margin.
@@ -166,35 +180,36 @@ def standing_among_words(
     more similar to all regions than others are. In a scene of few things the words differ more.
 
     The tenth of the words that is nearest to the text is left out: the scene often has what is like it. `reach` has the
-    largest similarity of the text and its height, and `scores` are the similarities of the words.
+    largest similarity of the text and its height.
     """
-    largest = jnp.max(jnp.where(jnp.isfinite(scores), scores, -jnp.inf), axis=1)
-    units = normalize(words.astype(text.dtype))
-    mean = jnp.mean(units, axis=0)
-    near = cosine_matrix((normalize(text) - mean)[None], units - mean)[0]
-    others = jnp.argsort(-near)[int(0.1 * len(words)) :]
-    known = jnp.isfinite(largest)[others]
-    count = jnp.maximum(jnp.sum(known), 1)
+    xp, scores = array_module(text, words.similarity), words.similarity
+    largest = xp.where(xp.isfinite(scores), scores, -xp.inf).max(axis=1)
+    near = cosine_matrix((normalize(text) - words.mean)[None], words.apart)[0]
+    others = xp.argsort(-near, stable=True)[int(0.1 * len(scores)) :]
+    known = xp.isfinite(largest)[others]
+    count = xp.maximum(known.sum(dtype=text.dtype), 1)
 
     def deviations(value, of_words):
-        of_words = jnp.where(known, of_words[others], 0.0)
-        level = jnp.sum(of_words) / count
-        spread = jnp.sqrt(jnp.sum(jnp.where(known, of_words - level, 0.0) ** 2) / count)
-        return (value - level) / jnp.maximum(spread, 1e-6)
+        of_words = xp.where(known, of_words[others], 0.0)
+        level = of_words.sum() / count
+        spread = xp.sqrt((xp.where(known, of_words - level, 0.0) ** 2).sum() / count)
+        return (value - level) / xp.maximum(spread, 1e-6)
 
-    heights = jax.vmap(_height, in_axes=(0, None))(scores, weight)
-    margin = jnp.maximum(deviations(reach[0], largest), HEIGHT_WEIGHT * deviations(reach[1], heights))
-    below = jnp.sum(known & (largest[others] < reach[0]), dtype=text.dtype) / count
-    return jnp.where(jnp.any(known), below, 1.0), jnp.where(jnp.any(known), margin, jnp.inf)
+    heights = _height(scores, weight)
+    margin = xp.maximum(deviations(reach[0], largest), HEIGHT_WEIGHT * deviations(reach[1], heights))
+    below = (known & (largest[others] < reach[0])).sum(dtype=text.dtype) / count
+    return xp.where(known.any(), below, 1.0), xp.where(known.any(), margin, xp.inf)
 
 
+@np.errstate(over="ignore")
 def presence_prob(embeddings: Float[Array, "r e"], text: Float[Array, " e"], logits: Logits) -> Float[Array, " r"]:
     """Computes the probability that a text is true of each region: sigmoid(scale cos + bias); 0 without a direction."""
     cosines, known = similarities(embeddings, text)
-    return jnp.where(known, jax.nn.sigmoid(logits.scale * cosines + logits.bias), 0.0)
+    xp = array_module(cosines)
+    return xp.where(known, 1 / (1 + xp.exp(-(logits.scale * cosines + logits.bias))), 0.0)
 
 
-@functools.partial(jax.jit, inline=True)
+@inline_jit
 def view_count_weight(pixels: Shaped[Array, "r t"]) -> Float[Array, " r"]:
     """Weights each region by the number of views that show it; 1 everywhere if no pixels are known.
 
@@ -203,25 +218,28 @@ def view_count_weight(pixels: Shaped[Array, "r t"]) -> Float[Array, " r"]:
     So 400 pixels make a full view: a crop of 20 x 20 pixels shows an image encoder little. A sliver that few views show
     has one colour, so its embedding is purer than that of the object that it belongs to.
     """
-    views = jnp.sum(jnp.minimum(jnp.asarray(pixels) / 400.0, 1.0), axis=-1)
+    xp = array_module(pixels)
+    views = xp.minimum(pixels / 400.0, 1.0).sum(axis=-1)
     weight = views / (views + 2.0)
-    largest = jnp.max(weight, initial=0.0)
-    return jnp.where(largest > 0, weight / jnp.where(largest > 0, largest, 1.0), 1.0)
+    largest = weight.max(initial=0.0)
+    return xp.where(largest > 0, weight / xp.where(largest > 0, largest, 1.0), 1.0)
 
 
-def _height(similarity: Float[Array, " r"], weight: Float[Array, " r"]) -> Float[Array, ""]:
+def _height(similarity: Float[Array, "*batch r"], weight: Float[Array, " r"]) -> Number:
     """How far the best region's similarity is above the weighted mean; regions of no weight do not count."""
-    counted = (weight > 0) & jnp.isfinite(similarity)
-    similarity = jnp.where(counted, similarity, 0.0)
-    weight = jnp.where(counted, weight, 0.0)
-    weighted = jnp.where(similarity > 0, similarity * weight, similarity)
-    best = similarity[jnp.argmax(jnp.where(counted, weighted, -jnp.inf))]
-    total = jnp.sum(weight)
-    return best - jnp.sum(weight * similarity) / jnp.where(total > 0, total, 1.0)
+    xp = array_module(similarity, weight)
+    counted = (weight > 0) & xp.isfinite(similarity)
+    similarity = xp.where(counted, similarity, 0.0)
+    weight = xp.where(counted, weight, 0.0)
+    weighted = xp.where(similarity > 0, similarity * weight, similarity)
+    row = xp.where(counted, weighted, -xp.inf).argmax(axis=-1)
+    best = xp.take_along_axis(similarity, row[..., None], axis=-1)[..., 0]
+    total = weight.sum(axis=-1)
+    return best - (weight * similarity).sum(axis=-1) / xp.where(total > 0, total, 1.0)
 
 
 def regions_with(
-    best: Int[Array, ""],
+    best: Number,
     similarity: Float[Array, " r"],
     known: Bool[Array, " r"],
     embeddings: Float[Array, "r e"],
@@ -233,11 +251,12 @@ def regions_with(
     `similarity` is that of each region with the question, where `known` it means something. Without `Votes.overlap` no
     fragments are joined.
     """
-    chosen = jnp.arange(embeddings.shape[0]) == best
+    xp = array_module(similarity, embeddings)
+    chosen = xp.arange(embeddings.shape[0]) == best
     if rules.all_of_class:
         chosen |= _reaches(similarity, known, rules.same_class_score)
     if rules.fragment_score is not None and overlap is not None:
-        overlaps = jnp.max(jnp.where(chosen[:, None], overlap, 0.0), axis=0) >= MIN_FRAGMENT_OVERLAP
+        overlaps = xp.where(chosen[:, None], overlap, 0.0).max(axis=0) >= MIN_FRAGMENT_OVERLAP
         chosen |= overlaps & _reaches(similarity, known, rules.fragment_score)
     if rules.duplicate_cosine is not None:
         residuals, usable = mean_residuals(embeddings)
@@ -248,9 +267,19 @@ def regions_with(
 
 def _reaches(similarity: Float[Array, " r"], known: Bool[Array, " r"], relative_score: Number) -> Bool[Array, " r"]:
     """Finds regions with a similarity of at least m + `relative_score` (b - m), m the median and b > m the largest."""
-    median = jnp.nanmedian(jnp.where(known, similarity, jnp.nan))
-    largest = jnp.max(jnp.where(known, similarity, -jnp.inf))
-    return known & (similarity >= median + relative_score * (largest - median)) & (largest > median)
+    median, largest = _median_and_largest(similarity, known)
+    reach = array_module(similarity).where(largest > median, largest - median, 0.0)
+    return known & (similarity >= median + relative_score * reach) & (largest > median)
+
+
+def _median_and_largest(similarity: Float[Array, " r"], known: Bool[Array, " r"]) -> tuple[Number, Number]:
+    """Finds the median and the largest of the known similarities; infinite if none is known."""
+    xp = array_module(similarity)
+    ordered, count = xp.sort(xp.where(known, similarity, xp.inf)), known.sum()
+    largest = xp.where(known, similarity, -xp.inf).max(initial=-xp.inf)
+    if not len(ordered):
+        return largest, largest
+    return 0.5 * ordered[xp.maximum(count - 1, 0) // 2] + 0.5 * ordered[count // 2], largest
 
 
 def join_fragments(regions: Sequence[int] | np.ndarray, overlap: np.ndarray | None) -> list[tuple[int, ...]]:
@@ -284,8 +313,8 @@ def parts_fallback(
       The selection; its region is -1.
     """
     require(field.parts is not None, "parts_fallback", "a field without parts", "its parts", "Run with --parts.")
-    parts, text, words = cast(Parts, field.parts), jnp.asarray(text), unrelated_words(field)
-    scores = np.asarray(_part_scores(parts, text, words, retrieval=rules.retrieval))
+    parts, text, words = cast(Parts, jax.tree.map(np.asarray, field.parts)), np.asarray(text), unrelated_words(field)
+    scores = _part_scores(parts, text, words, rules.retrieval)
     on_scale, of_scores = np.array([0.0, SHARE_THRESHOLD, 1.0]), np.array([0.0, PART_SCORE, 1.0])
     least = float(np.interp(rules.min_share, on_scale, of_scores))
     mask = best_cluster(scores >= least, scores, field.gaussians.means)
@@ -298,46 +327,45 @@ def parts_fallback(
         return np.bincount(rows[rows >= 0], minlength=len(parts.weight)).astype(np.float32)
 
     inside = count(part[mask]) / np.maximum(count(part), 1.0)
-    pooled, similar, standing = _pooled(parts.embeddings, parts.weight, inside, text, words, retrieval=rules.retrieval)
+    pooled, similar, standing = _pooled(parts.embeddings, parts.weight, inside, text, words, rules.retrieval)
     presence = None if rules.logits is None else presence_prob(pooled[None], text, rules.logits)[0]
     state = rules.judge(standing, similar, presence)
     if not mask.any() or float(region_score) >= MIN_REGION_RATIO * float(similar) or int(state) == ABSENT:
         return None
-    region, rank = jnp.asarray(-1, jnp.int32), jnp.asarray(jnp.nan) if standing is None else standing[0]
-    return Selection(jnp.asarray(mask), jnp.asarray(similarity), region, similar, rank, presence, state)
+    rank = np.float32(np.nan) if standing is None else standing[0]
+    return Selection(mask, similarity, np.asarray(-1, np.int32), similar, rank, presence, state)
 
 
-@functools.partial(jax.jit, static_argnames="retrieval")
 def _part_scores(
-    parts: Parts, text: Float[Array, " e"], words: Float[Array, "w e"] | None, *, retrieval: str
-) -> Float[Array, " n"]:
-    """Computes the relative score of the part of each Gaussian: 0 of the median part, 1 of the most similar one. Pure.
+    parts: Parts, text: Float[np.ndarray, " e"], words: Float[np.ndarray, "w e"] | None, retrieval: str
+) -> Float[np.ndarray, " n"]:
+    """Computes the relative score of the part of each Gaussian: 0 of the median part, 1 of the most similar one.
 
     It is 0 for Gaussians without a part, and for all if all parts are equally similar.
     """
     similarity, known = region_similarities(parts.embeddings, text, words, retrieval)
-    median = jnp.nanmedian(jnp.where(known, similarity, jnp.nan))
-    reach = jnp.max(jnp.where(known, similarity, -jnp.inf), initial=-jnp.inf) - median
-    scores = jnp.where(known & (reach > 0), (similarity - median) / jnp.where(reach > 0, reach, 1.0), 0.0)
-    return jnp.concatenate([scores, jnp.zeros(1, scores.dtype)])[parts.part]  # part -1: the last
+    median, largest = _median_and_largest(similarity, known)
+    scores = np.zeros(len(similarity) + 1, similarity.dtype)  # part -1: the last
+    if largest > median:
+        scores[:-1] = np.where(known, (similarity - median) / (largest - median), 0.0)
+    return scores[parts.part]
 
 
-@functools.partial(jax.jit, static_argnames="retrieval")
 def _pooled(
-    embeddings: Array, weight: Array, inside: Array, text: Array, words: Array | None, *, retrieval: str
-) -> tuple[Array, Array, tuple[Array, Array] | None]:
+    embeddings: np.ndarray,
+    weight: np.ndarray,
+    inside: np.ndarray,
+    text: np.ndarray,
+    words: np.ndarray | None,
+    retrieval: str,
+) -> tuple[Array, Number, tuple[Array, Array] | None]:
     """Embedding (E,) of P parts, of each the share `inside` (P,), its similarity, and its standing among the words."""
-    pooled = normalize(jnp.sum((weight * inside)[:, None] * embeddings, axis=0))
+    pooled = normalize(((weight * inside)[:, None] * embeddings).sum(axis=0))
     similar = region_similarities(pooled[None], text, words, retrieval)[0][0]
     if words is None:
         return pooled, similar, None
     of_parts, known = region_similarities(embeddings, text, words, retrieval)
-    share = known / jnp.maximum(jnp.sum(known), 1)
-    reach = similar, similar - jnp.sum(share * of_parts)
-    return (
-        pooled,
-        similar,
-        standing_among_words(
-            reach, text, words, word_similarities(embeddings, words, retrieval), known.astype(text.dtype)
-        ),
-    )
+    share = known / np.maximum(known.sum(dtype=text.dtype), 1)
+    reach = similar, similar - (share * of_parts).sum()
+    word_scores = cast(_WordScores, compare_words(embeddings, words, retrieval))
+    return pooled, similar, _standing_among_words(reach, text, word_scores, known.astype(text.dtype))

@@ -2,11 +2,12 @@
 
 import dataclasses
 
-import jax.numpy as jnp
+import jax
+import numpy as np
 from jaxtyping import Bool, Float
 
 from jsecon.errors import require_shape
-from jsecon.programs import stored_jit
+from jsecon.numerics import array_module, is_traced
 from jsecon.splat.render import render
 from jsecon.types import Array, Camera, Gaussians, Rendering
 
@@ -43,7 +44,8 @@ def selection_mask(
     Raises:
       ValueError: Shapes disagree.
     """
-    return render_selection(gaussians, camera, mask, capacity=capacity).alpha > threshold
+    alpha = render_selection(gaussians, camera, mask, capacity=capacity).alpha
+    return (alpha if is_traced(alpha) else np.asarray(alpha)) > threshold
 
 
 def render_selection(
@@ -59,15 +61,17 @@ def render_selection(
     Features (H, W, 3) are sum alpha T similarity, three times; similarities are 1 by default.
     """
     require_shape("mask", mask, (gaussians.count,), "Pass one truth value per Gaussian.")
-    logits, features = _alone(gaussians.opacity_logits, mask, similarity)
+    arrays = gaussians.opacity_logits, mask, similarity
+    arrays = arrays if is_traced(arrays) else jax.tree.map(np.asarray, arrays)  # NumPy compiles no program
+    logits, features = _alone(*arrays)
     return render(dataclasses.replace(gaussians, opacity_logits=logits), camera, features, capacity=capacity)
 
 
-@stored_jit
 def _alone(logits: Array, mask: Array, similarity: Array | None) -> tuple[Array, Array]:
     """Returns opacity logits that hide what is not selected, and the features of each Gaussian.
 
     The features have three columns, so that the program that renders colours serves.
     """
-    features = jnp.where(mask, jnp.ones_like(logits) if similarity is None else similarity, 0.0)
-    return jnp.where(mask, logits, HIDDEN_LOGIT), jnp.broadcast_to(features[:, None], (*features.shape, 3))
+    xp = array_module(logits, mask, similarity)
+    features = xp.where(mask, xp.ones_like(logits) if similarity is None else similarity, xp.zeros_like(logits))
+    return xp.where(mask, logits, HIDDEN_LOGIT), xp.broadcast_to(features[:, None], (*features.shape, 3))

@@ -3,12 +3,12 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 
 from jsecon.errors import require_one_of
 from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.field.regions import ALIKE_THRESHOLD
 from jsecon.field.similarity import Number
+from jsecon.numerics import array_module
 from jsecon.types import static
 from jsecon.vision.protocols import Logits
 
@@ -18,7 +18,7 @@ STATES = ("absent", "unsure", "found")
 """Whether the scene has what a text names. If "unsure", the best match is selected, and may be something else."""
 ABSENT, UNSURE, FOUND = range(3)
 MIN_MARGIN, FOUND_MARGIN = 0.7, 1.45
-"""Margins among unrelated words (`standing_among_words`) from which a text is unsure, and from which it is found."""
+"""Margins of a text among unrelated words (query/match.py) from which it is unsure, and from which it is found."""
 MIN_RANK = 0.82
 """Smallest share of unrelated words (`LanguageField.unrelated_words`) that must match a region less than its class of
 a list does. Of whole scenes it is the least that refuses 0.8 of absent texts with simulated CLIP at medium noise."""
@@ -68,9 +68,9 @@ class QueryRules:
     def judge(self, standing, similarity, presence):
         """Decides whether the scene has what a text names: the one judgement of texts, of regions and of parts.
 
-        `standing` is the text's rank and margin among unrelated words (`standing_among_words`), None without such
-        words; the margin is None where a region is compared with a list of classes. `presence`, the probability that
-        the text is true, is None without `logits`. Returns an index of STATES.
+        `standing` is the text's rank and margin among unrelated words (query/match.py), None without such words; the
+        margin is None where a region is compared with a list of classes. `presence`, the probability that the text is
+        true, is None without `logits`. Returns an index of STATES.
         """
         if self.min_score is not None or standing is None:
             value, default = (similarity, MIN_COSINE) if presence is None else (presence, MIN_PRESENCE)
@@ -81,7 +81,8 @@ class QueryRules:
         state = UNSURE * (margin >= MIN_MARGIN) + (FOUND - UNSURE) * (margin >= FOUND_MARGIN)
         if self.min_rank is None:
             return state
-        return jnp.where(rank >= self.min_rank, jnp.maximum(state, UNSURE), ABSENT)
+        xp = array_module(rank, margin)
+        return xp.where(rank >= self.min_rank, xp.maximum(state, UNSURE), ABSENT)
 
 
 RULES = QueryRules()
