@@ -12,6 +12,7 @@ paper's GT-anchored query). Gaussians are then compared with regions, so almost 
 All but `trim` and `answer_question` can be traced: jit them, or vmap them over texts.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -149,13 +150,23 @@ def match_regions(
     if field.regions.count == 0:
         return NO_REGIONS
     regions = field.regions.embeddings, field.regions.pixel_counts, field.votes.overlap
-    arrays = *regions, queries, excluded, unrelated_words(field)
-    if is_traced((arrays, rules)):
-        return _match_traced(*arrays, rules)
-    return _match(*jax.tree.map(np.asarray, arrays), rules)  # by NumPy: it compiles no program
+    return _match((*regions, queries, excluded, unrelated_words(field)), rules)
 
 
-@np.errstate(invalid="ignore")
+def _by_numpy(function: Callable) -> Callable:
+    """Outside of a trace gives a function of arrays and rules NumPy's arrays, so that it compiles no program."""
+    compiled = jax.jit(lambda arrays, rules: function(*arrays, rules))
+
+    def call(arrays: tuple, rules: QueryRules) -> RegionMatch:
+        if is_traced((arrays, rules)):
+            return compiled(arrays, rules)
+        with np.errstate(invalid="ignore"):
+            return function(*jax.tree.map(np.asarray, arrays), rules)
+
+    return call
+
+
+@_by_numpy
 def _match(embeddings, pixels, overlap, queries, excluded, words, rules: QueryRules) -> RegionMatch:
     xp = array_module(embeddings, queries, rules.min_rank)
     word_scores = compare_words(embeddings, words, rules.retrieval)
@@ -197,27 +208,25 @@ def _match(embeddings, pixels, overlap, queries, excluded, words, rules: QueryRu
     )
 
 
-_match_traced = jax.jit(_match)
-
-
 def match_region(field: LanguageField, region: Number, rules: QueryRules = ONE_REGION) -> RegionMatch:
     """Matches a region in place of a text, with score 1, and by other rules those that belong to it. Pure.
 
     An id that the field does not have, such as -1, has region -1 and score 0; one that is no integer is a ValueError.
     """
-    integral = jnp.issubdtype(jnp.asarray(region).dtype, jnp.integer)
+    integral = jnp.issubdtype(jnp.result_type(region), jnp.integer)
     require(integral, "match_region", region, "the id of a region, an integer", "region_at finds the one of a pixel.")
     if field.regions.count == 0:
         return NO_REGIONS
-    return _match_one(jnp.asarray(field.regions.embeddings), field.votes.overlap, jnp.asarray(region), rules)
+    return _match_one((field.regions.embeddings, field.votes.overlap, region), rules)
 
 
-@jax.jit
+@_by_numpy
 def _match_one(embeddings, overlap, region, rules: QueryRules) -> RegionMatch:
-    valid, row = (region >= 0) & (region < len(embeddings)), jnp.maximum(region, 0)
+    xp = array_module(embeddings, region)
+    valid, row = (region >= 0) & (region < len(embeddings)), xp.clip(region, 0, len(embeddings) - 1)
     similarity, known = similarities(embeddings, embeddings[row])
     chosen = regions_with(row, similarity, known, embeddings, overlap, rules)
-    return RegionMatch(chosen & valid, jnp.where(valid, region, -1).astype(jnp.int32), valid.astype(embeddings.dtype))
+    return RegionMatch(chosen & valid, xp.where(valid, region, -1).astype(np.int32), valid.astype(embeddings.dtype))
 
 
 def select_gaussians(field: LanguageField, match: RegionMatch, rules: QueryRules = RULES) -> Selection:
