@@ -34,7 +34,7 @@ FOG_SHARE = 0.4
 VIEWS_AT_ONCE = 64
 """candidates that are rendered between two reports"""
 DEFAULT_VIEWS = 24
-"""views of a scene, planned or chosen from given ones"""
+"""views that are planned"""
 _LEAST_ALPHA = 0.03
 """mean alpha of a view from which it shows some of the scene"""
 _SHOWN_SHARE = 0.03
