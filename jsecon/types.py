@@ -277,7 +277,7 @@ class Autoencoder:
     """Parameters of one scene's autoencoder (`train_autoencoder`)."""
 
     encoder: Leaf
-    """{"params", "batch_stats"}: nested dicts of arrays, in the layout of flax."""
+    """{"params", "batch_stats"}: nested dicts of arrays, flax's layout."""
     decoder: Leaf
     """{"params"}: nested dicts of arrays."""
 

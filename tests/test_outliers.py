@@ -4,7 +4,6 @@ import time
 
 import numpy as np
 import pytest
-from sklearn.cluster import DBSCAN
 
 from jsecon.query.outliers import remove_outliers, split_outliers
 
@@ -77,17 +76,6 @@ def test_half_a_million_points_in_seconds():
     assert time.process_time() - start < 15  # about 2 s; scikit-learn runs out of memory on the dense ball's lists
     assert kept[250_000:].all()
     assert not kept[:250_000].any()
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_the_largest_cluster_is_that_of_scikit_learn(seed):
-    rng = np.random.default_rng(seed)
-    points = rng.normal(size=(600, 3)) * rng.choice([0.2, 1.0], (600, 1)) + rng.choice([0.0, 2.5], (600, 1))
-    for eps in (0.2, 0.3, 0.45):  # many small clusters that share rims, to few large ones
-        labels = DBSCAN(eps=eps, min_samples=10).fit(points).labels_
-        every, largest = labels >= 0, labels == np.bincount(labels[labels >= 0]).argmax()
-        for keep, expected in (("all", every), ("largest", largest)):
-            np.testing.assert_array_equal(remove_outliers(points, np.ones(600, bool), keep=keep, eps=eps), expected)
 
 
 def test_options_out_of_range_are_told():

@@ -23,7 +23,7 @@ MIN_DISK = 200 << 20
 """bytes of the compiled programs of some runs"""
 REINSTALL = 'Run: pip install --force-reinstall "jsecon"'
 """remedy of a broken package"""
-MODULES = {"opencv_contrib_python_headless": "cv2", "pillow": "PIL"}
+MODULES = {"opencv_contrib_python_headless": "cv2", "pillow": "PIL", "scikit_learn": "sklearn"}
 """required package -> its module, if that has another name"""
 
 

@@ -124,7 +124,7 @@ def _start(units: Array, key: Key, plan: _Plan) -> Any:
         # PyTorch's default, which LangSplat starts from: weights and biases uniform in +-1/sqrt(inputs).
         spread.append(np.full(leaf.size, 0.0 if norm else shapes[part][name]["kernel"].shape[0] ** -0.5))
     middle, spread = (jnp.asarray(np.concatenate(values), units.dtype) for values in (middle, spread))
-    # One draw for all layers compiles several times faster than a draw a layer.
+    # One draw for all layers compiles several times faster than flax's initialisers, a draw a layer.
     vector = middle + spread * jax.random.uniform(key, middle.shape, units.dtype, -1.0, 1.0)
     stats = {
         name: {"mean": jnp.zeros_like(norm["mean"]), "var": jnp.ones_like(norm["var"])} for name, norm in stats.items()
@@ -135,21 +135,11 @@ def _start(units: Array, key: Key, plan: _Plan) -> Any:
 
 def _shapes(units: Array, plan: _Plan) -> tuple[Any, Any]:
     """Shapes of the parameters {"encoder", "decoder"} and of the batch statistics."""
-
-    def shapes(**sizes):
-        return {
-            name: jax.ShapeDtypeStruct(tuple(np.atleast_1d(size).tolist()), units.dtype) for name, size in sizes.items()
-        }
-
-    def dense(inputs, widths):
-        layers = enumerate(zip((inputs, *widths), widths))
-        return {f"Dense_{n}": shapes(kernel=size, bias=size[1]) for n, size in layers}
-
-    inward, outward = plan.encoder_widths, plan.decoder_widths
-    norms = {f"BatchNorm_{n}": width for n, width in enumerate(inward[:-1])}
-    encoder = dense(units.shape[1], inward) | {name: shapes(scale=width, bias=width) for name, width in norms.items()}
-    stats = {name: shapes(mean=width, var=width) for name, width in norms.items()}
-    return {"encoder": encoder, "decoder": dense(inward[-1], outward)}, stats
+    key, codes = jax.random.key(0), jnp.zeros((1, plan.encoder_widths[-1]), units.dtype)
+    encoder, decoder = _layers()
+    first = jax.eval_shape(lambda: encoder(plan.encoder_widths).init(key, units[:1], train=False))
+    second = jax.eval_shape(lambda: decoder(plan.decoder_widths).init(key, codes))
+    return {"encoder": first["params"], "decoder": second["params"]}, first["batch_stats"]
 
 
 def _unflatten(vector: Any, shapes: Any) -> Any:
@@ -173,17 +163,19 @@ def _epochs(
 ) -> Any:
     count = units.shape[0]
     size = -(-count // plan.batches)
+    encoder, decoder = (layers(widths) for layers, widths in zip(_layers(), (plan.encoder_widths, plan.decoder_widths)))
     optimizer = _optimizer()
     shapes, _ = _shapes(units, plan)
 
     def difference(params, codes, x, weight):
-        out = _decoder(params["decoder"], codes)
+        out: Any = decoder.apply({"params": params["decoder"]}, codes)
         return jnp.mean((out - x) ** 2) + weight * (1 - jnp.mean(cosine(out, x)))
 
     def loss(vector, stats, x):
         params = _unflatten(vector, shapes)
-        codes, stats = _encoder(params["encoder"], stats, x, train=True)
-        return difference(params, codes, x, 0.001), stats
+        variables = {"params": params["encoder"], "batch_stats": stats}
+        codes, changed = encoder.apply(variables, x, train=True, mutable=["batch_stats"])
+        return difference(params, codes, x, 0.001), changed["batch_stats"]
 
     def step(state, x) -> tuple[Any, None]:
         vector, stats, moments = state
@@ -200,7 +192,7 @@ def _epochs(
         def judge(best):
             vector, stats, _ = state
             params = _unflatten(vector, shapes)
-            codes, _ = _encoder(params["encoder"], stats, units, train=False)
+            codes = encoder.apply({"params": params["encoder"], "batch_stats": stats}, units, train=False)
             # LangSplat trains with the cosine term at 0.001 and chooses its checkpoint with it at full weight.
             value = difference(params, codes, units, 1.0)
             return jax.tree.map(lambda new, old: jnp.where(value < best[0], new, old), (value, vector, stats), best)
@@ -210,40 +202,46 @@ def _epochs(
     return jax.lax.fori_loop(start, stop, epoch, carry)
 
 
+def _widths(params: Any) -> tuple[int, ...]:
+    layers = sum(name.startswith("Dense_") for name in params)
+    return tuple(params[f"Dense_{i}"]["kernel"].shape[-1] for i in range(layers))
+
+
 @jax.jit
 def _encode(variables: Any, rows: Array) -> Array:
-    codes, _ = _encoder(variables["params"], variables["batch_stats"], rows, train=False)
+    codes: Any = _layers()[0](_widths(variables["params"])).apply(variables, rows, train=False)
     return jnp.where(jnp.any(rows != 0, axis=-1, keepdims=True), codes, 0.0)
 
 
 @jax.jit
-def _decode(variables: Any, rows: Array) -> Array:
-    return _decoder(variables["params"], rows)
+def _decode(variables: Any, rows: Array) -> Any:
+    return _layers()[1](_widths(variables["params"])).apply(variables, rows)
 
 
-def _encoder(params: Any, stats: Any, x: Array, *, train: bool) -> tuple[Array, Any]:
-    """Dense layers, before each but the first a batch normalisation and a ReLU; and the batch statistics after it."""
-    after = dict(stats)
-    x = _dense(params["Dense_0"], x)
-    for index in range(len(stats)):
-        name = f"BatchNorm_{index}"
-        mean, var = stats[name]["mean"], stats[name]["var"]
-        if train:
-            before, mean = mean, jnp.mean(x, axis=0)
-            now = jnp.maximum(jnp.mean(x * x, axis=0) - mean * mean, 0.0)
-            after[name] = {"mean": 0.9 * before + 0.1 * mean, "var": 0.9 * var + 0.1 * now}
-            var = now
-        x = (x - mean) * (jax.lax.rsqrt(var + 1e-5) * params[name]["scale"]) + params[name]["bias"]
-        x = _dense(params[f"Dense_{index + 1}"], jax.nn.relu(x))
-    return normalize(x), after
+@functools.cache
+def _layers() -> tuple[Any, Any]:
+    """Encoder and decoder, by their widths. flax is imported here, late: a field is read without it."""
+    from flax import linen as nn
 
+    class Encoder(nn.Module):
+        widths: tuple[int, ...]
 
-def _decoder(params: Any, x: Array) -> Array:
-    """Dense layers with a ReLU between them."""
-    for index in range(len(params)):
-        x = _dense(params[f"Dense_{index}"], jax.nn.relu(x) if index else x)
-    return normalize(x)
+        @nn.compact
+        def __call__(self, x, train: bool):
+            x = nn.Dense(self.widths[0], param_dtype=x.dtype, precision=FULL_PRECISION)(x)
+            for width in self.widths[1:]:
+                norm = nn.BatchNorm(use_running_average=not train, momentum=0.9, epsilon=1e-5, param_dtype=x.dtype)
+                x = nn.relu(norm(x))
+                x = nn.Dense(width, param_dtype=x.dtype, precision=FULL_PRECISION)(x)
+            return normalize(x)
 
+    class Decoder(nn.Module):
+        widths: tuple[int, ...]
 
-def _dense(layer: Any, x: Array) -> Array:
-    return jnp.matmul(x, layer["kernel"], precision=FULL_PRECISION) + layer["bias"]
+        @nn.compact
+        def __call__(self, x):
+            for index, width in enumerate(self.widths):
+                x = nn.Dense(width, param_dtype=x.dtype, precision=FULL_PRECISION)(nn.relu(x) if index else x)
+            return normalize(x)
+
+    return Encoder, Decoder

@@ -1,4 +1,4 @@
-"""Selected Gaussians that lie apart from the rest: DBSCAN on their centres (the paper's last step).
+"""Selected Gaussians that lie apart from the rest: scikit-learn's DBSCAN on their centres (the paper's last step).
 
 Host code. DBSCAN lists all neighbours of every point. Where thousands of splats lie within eps of each other, those
 lists are quadratic in time and memory. A large selection is therefore clustered by voxels: one point for each, with the
@@ -156,23 +156,15 @@ def _default_eps(points: Float[Array, "m 3"], *, spacings: float = EPS_SPACINGS)
 
 
 def _dbscan(points: Float[np.ndarray, "m 3"], eps: float, min_samples: int = MIN_SAMPLES) -> Int[np.ndarray, " m"]:
-    """Clusters points as scikit-learn's DBSCAN: counted from 0 in the order of their first core point, -1 for noise.
+    """Clusters points by scikit-learn's DBSCAN: counted from 0 in the order of their first core point, -1 for noise.
 
     Above 5,000 points those of one voxel have one label.
     """
+    from sklearn.cluster import DBSCAN
+
     places, voxel, count = _places(points, eps)
-    a, b = KDTree(places, balanced_tree=False).query_pairs(eps, output_type="ndarray").T
-    near = count + np.bincount(a, count[b], len(places)) + np.bincount(b, count[a], len(places))
-    core = near >= min_samples
-    a, b = np.where(core[a], a, b), np.where(core[a], b, a)  # the core point first
-    linked = core[a] & core[b]
-    graph = csr_array((np.ones(linked.sum()), (a[linked], b[linked])), shape=(len(places), len(places)))
-    _, first, cluster = np.unique(connected_components(graph, directed=False)[1][core], True, True)
-    labels = np.full(len(places), len(places))
-    labels[core] = np.argsort(np.argsort(first))[cluster]
-    rim = core[a] & ~core[b]
-    np.minimum.at(labels, b[rim], labels[a[rim]])
-    return np.where(labels < len(places), labels, -1)[voxel]
+    weight = count if len(places) < len(points) else None  # of ones it would add up each list of neighbours
+    return DBSCAN(eps=eps, min_samples=min_samples).fit(places, sample_weight=weight).labels_[voxel]
 
 
 def _one_component(points: np.ndarray, eps: float) -> bool:
@@ -183,8 +175,8 @@ def _one_component(points: np.ndarray, eps: float) -> bool:
     ends = near[linked], np.concatenate([[0], np.cumsum(linked.sum(1))])
     graph = csr_array((np.ones(len(ends[0])), *ends), shape=(len(places), len(places)))
     count, component = connected_components(graph, directed=False)
-    # The nearest links are enough where the points are evenly spaced, and where a component is so small that the links
-    # of its points show all that is near.
+    # The nearest links are enough where the points are evenly spaced, and spare the import of scikit-learn; also where
+    # a component is so small that the links of its points show all that is near.
     if count == 1 or np.bincount(component).min() < _LINKS:
         return count == 1
     return bool((_dbscan(points, eps, 1) == 0).all())

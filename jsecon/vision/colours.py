@@ -12,6 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import scipy  # loads scipy.optimize on its first use, which most texts do without
 from jaxtyping import Bool, Float32, UInt8
 
 from jsecon.errors import InputError, require_shape
@@ -141,7 +142,7 @@ class ColourEmbedder:
         points = np.stack([self._by_name[name] for name in (basic, *_SHADES[basic])])
         shade = _GREY_SHADE if basic == "grey" else _SHADE
         similarity = np.where(np.arange(len(points)) == 0, 1.0, shade)
-        return points, _nonnegative_weights(_kernel(points, points).astype(np.float64), similarity).astype(np.float32)
+        return points, scipy.optimize.nnls(_kernel(points, points).astype(np.float64), similarity)[0].astype(np.float32)
 
     def _distribution(self, phrase: list[str]) -> tuple[np.ndarray, np.ndarray]:
         """CIELAB points (P, 3) and weights (P,) of a run of modifiers and colour words."""
@@ -218,20 +219,6 @@ class ColourEmbedder:
         if all(ish for _, ish in names):
             mixed = mixed * np.asarray([1.0, 0.7, 0.7], np.float32)  # 'greenish' is greener than grey, not green
         return mixed.astype(np.float32)
-
-
-def _nonnegative_weights(matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Finds weights >= 0 with the least |matrix @ weights - target| among all sets of the few columns.
-
-    It is `scipy.optimize.nnls`, whose import takes a third of a second.
-    """
-    best = np.zeros(len(target))
-    for chosen in itertools.product((False, True), repeat=len(target)):
-        weights = np.zeros(len(target))
-        weights[list(chosen)] = np.linalg.lstsq(matrix[:, list(chosen)], target)[0]
-        if (weights >= 0).all() and np.linalg.norm(matrix @ weights - target) < np.linalg.norm(matrix @ best - target):
-            best = weights
-    return best
 
 
 def _kernel(x: np.ndarray, y: np.ndarray) -> np.ndarray:
