@@ -96,7 +96,7 @@ def test_a_file_that_changes_while_it_is_read_is_told_and_nothing_of_it_is_kept(
     (tmp_path / "out").mkdir()
 
     def loaded_by(console):
-        pipeline.compute_stages(work, plan_capture(work), console)
+        pipeline._compute_stages(work, plan_capture(work), console)
         return console.fresh["load"]
 
     with refused(capture, "files that changed while stage load read them", "same command again"):

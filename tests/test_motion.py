@@ -15,7 +15,7 @@ from photo_files import FOCAL, HEIGHT, WIDTH, apart, write_photos
 from PIL import Image
 
 from jsecon.app import cli
-from jsecon.pipeline.run import compute_stages
+from jsecon.pipeline.run import _compute_stages
 from jsecon.pipeline.scene import plan_capture
 from jsecon.pipeline.stages import KEY_FILE
 from jsecon.poses import sfm
@@ -183,7 +183,7 @@ def test_a_run_finds_the_poses_first_and_keeps_them_with_its_output_among_the_ph
         context = context_of(folder, out, holdout=4, **changes)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("jsecon.pipeline.scene.find_poses", copied)
-            done = compute_stages(context, plan_capture(context))
+            done = _compute_stages(context, plan_capture(context))
         return {step.name: step.status for step in done.steps}, " ".join(done.notes)
 
     ran, cached = {"poses": "run", "load": "run"}, {"poses": "cached", "load": "cached"}

@@ -22,7 +22,7 @@ from jsecon.fit.start import starting_gaussians
 from jsecon.networks.sam import SamSegmenter
 from jsecon.pipeline import model_loading, run as pipeline
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.run import run_stages
+from jsecon.pipeline.run import _run_stages
 from jsecon.pipeline.stages import Checkpoint, Results, RunContext, StageInput
 from jsecon.vision.stores import StoredSegmenter
 
@@ -124,7 +124,7 @@ def test_a_segmenter_takes_the_frames_that_number_and_time_allow(seen, tmp_path)
     for limit, count in (({"vision_frames": 3}, 3), ({"vision_minutes": 1e-6}, 2)):
         options = dataclasses.replace(run.options, **limit)
         context = RunContext(options, model_loading.open_models(options, tmp_path), tmp_path)
-        stage = next(stage for stage in run_stages(context) if stage.name == "objects")
+        stage = next(stage for stage in _run_stages(context) if stage.name == "objects")
         none = Checkpoint(tmp_path / "none.safetensors")
         found = stage.compute(StageInput(context, results, lambda done, total: None, none))
         assert len(found.value.labels) == len(found.value.frames) == count
@@ -169,7 +169,7 @@ def test_regions_take_their_embeddings_from_langsplat_s_files(room, splat, model
     options = Options(room, gaussians=splat, holdout=4, masks=folder, features=folder, parts=True)
     work = RunContext(options, model_loading.open_models(options, tmp_path), tmp_path)
     assert work.models.embedder.name == "given-3"
-    planned, results = {s.name: s for s in run_stages(work)}, Results(load=capture, gaussians=load_gaussians(splat))
+    planned, results = {s.name: s for s in _run_stages(work)}, Results(load=capture, gaussians=load_gaussians(splat))
     stage = planned["regions"]
     given = StageInput(work, results, lambda done, total: None, Checkpoint(tmp_path / "none.safetensors"))
     assert "embedder" in stage.skipped

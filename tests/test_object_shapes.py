@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jsecon import Camera, object_shapes
-from jsecon.views.frame import up_of_cameras
+from jsecon.views.frame import _up_of_cameras
 
 SIZE = np.array([0.5, 0.3, 0.2])
 
@@ -56,10 +56,10 @@ def test_up_is_across_the_x_axes_of_cameras_that_look_down():
         pose = np.tile(np.eye(4), (7, 1, 1))
         pose[:, :3, :3] = turns.inv().as_matrix()
         ones = np.ones(7)
-        up = np.array(up_of_cameras(Camera(pose, ones, ones, ones, ones, 4, 4)[chosen]).axis)
+        up = np.array(_up_of_cameras(Camera(pose, ones, ones, ones, ones, 4, 4)[chosen]).axis)
         assert up[2] > (0.999 if chosen == slice(None) else 0.8)
     for first in (np.eye(4), np.diag([-1.0, -1, 1, 1])):
         poses = np.stack([first, first @ np.diag([1.0, -1, -1, 1])])  # the second stands on its head
-        up = np.array(up_of_cameras(Camera(poses, *(np.ones(2),) * 4, 4, 4)).axis)
+        up = np.array(_up_of_cameras(Camera(poses, *(np.ones(2),) * 4, 4, 4)).axis)
         np.testing.assert_allclose(np.linalg.norm(up), 1)
         assert abs(up[2]) < 1e-6  # across the optical axes

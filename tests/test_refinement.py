@@ -15,7 +15,7 @@ from test_corrections import (
 )
 from test_fit import same
 
-from jsecon.pipeline.run import compute_stages
+from jsecon.pipeline.run import _compute_stages
 from jsecon.pipeline.scene import plan_capture
 from jsecon.poses import refine
 
@@ -36,7 +36,7 @@ def write(capture, folder, *, depth=True):
 def load(folder, out, **options):
     """What the first stage of a run makes of a capture, and what it told."""
     work = context_of(folder, out, holdout=6, steps=2000, **options)
-    done = compute_stages(work, plan_capture(work))
+    done = _compute_stages(work, plan_capture(work))
     return done.results.load, " ".join(done.notes), done.steps[0].status
 
 

@@ -11,7 +11,7 @@ from splat_files import scene
 from test_gaussian_files import gaussians
 
 from jsecon import load_gaussians, render_rgb, save_gaussians
-from jsecon.pipeline.run import run_stages
+from jsecon.pipeline.run import _run_stages
 from jsecon.pipeline.stages import Checkpoint, Results, StageInput
 from jsecon.read.captures.nerfstudio import source_from_trained
 from jsecon.splat.transform import transform_gaussians
@@ -24,7 +24,7 @@ TRAINED = np.diag([0.4, 0.4, 0.4, 1]) @ TURN
 def read(capture, file, name="gaussians", **results):
     """The outcome of the stage that reads `file` (or another, given the results before it), and the stage."""
     work = context_of(file.parent, file.parent / "out", gaussians=file)
-    stage = next(stage for stage in run_stages(work) if stage.name == name)
+    stage = next(stage for stage in _run_stages(work) if stage.name == name)
     stage_input = StageInput(work, Results(load=capture, **results), lambda done, total: None, Checkpoint(work.out))
     return stage.compute(stage_input), stage
 

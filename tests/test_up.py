@@ -12,7 +12,7 @@ from jsecon import At, load_field, save_field
 from jsecon.app.scene import Scene
 from jsecon.errors import InputError
 from jsecon.types import Camera, UpAxis
-from jsecon.views.frame import find_up_axis, up_of_cameras
+from jsecon.views.frame import _up_of_cameras, find_up_axis
 
 ROLLS = {
     "level": lambda k: 0,
@@ -42,7 +42,7 @@ def cameras_around(roll, *, around=360.0, count=12, turn=None):
 def test_the_cameras_tell_up_however_they_are_rolled(name):
     for seed in (0, 1):
         turn = Rotation.random(random_state=seed)
-        up = up_of_cameras(cameras_around(ROLLS[name], turn=turn))
+        up = _up_of_cameras(cameras_around(ROLLS[name], turn=turn))
         assert np.degrees(np.arccos(min(1.0, up.axis @ turn.as_matrix()[:, 2]))) < 4
         assert up.sure == (name in ("level", "some a quarter"))
         assert ("level" in up.evidence) == (name == "level")

@@ -102,7 +102,7 @@ class Run:
     """Number of programs that jax compiled ("all"), and of those that it read "from_disk"."""
 
 
-def run_stages(context: RunContext) -> list[Stage]:
+def _run_stages(context: RunContext) -> list[Stage]:
     """Plans the stages of a run. Mask files come before the long fit, so that their errors are found early."""
     by_name = {stage.name: stage for stage in [*plan_scene(context), *plan_objects(context)]}
     early = ("objects", "gaussians") if context.options.masks is not None else ("gaussians", "objects")
@@ -179,7 +179,7 @@ def _owns_output(stage: Stage, stage_list: list[Stage], paths: dict[str, Path]) 
     return all(paths[other.name].exists() for other in stage_list if stage.name in other.after)
 
 
-def compute_stages(
+def _compute_stages(
     context: RunContext,
     stage_list: list[Stage],
     console: Console | None = None,
@@ -257,7 +257,7 @@ def _broadcast(stage: Stage | None, state: _RunState) -> None:
 def run_worker(options: Options, out: Path) -> None:
     """Computes each stage that the first process calls for, until it ends the work. It writes no file."""
     context, results = _open_context(options, out), Results()
-    by_name = {stage.name: stage for stage in run_stages(context)}
+    by_name = {stage.name: stage for stage in _run_stages(context)}
     while (call := allgather_tree(None)[0])["stage"]:
         vars(results).update(call["results"])
         checkpoint = Checkpoint(out / "worker")
@@ -278,7 +278,7 @@ def run(
     """
     console, before = console or Console(), compilation_counts()
     context = _open_context(options, out)
-    state = compute_stages(context, run_stages(context), console, on_scene)
+    state = _compute_stages(context, _run_stages(context), console, on_scene)
     results, seconds, embedder = state.results, state.seconds, context.models.embedder
     started = time.monotonic()
     with console.progress("field"):
@@ -335,7 +335,7 @@ def current_field(options: Options, out: Path) -> Path | None:
     if not path.is_file():
         return None
     context = _open_context(options, out)
-    keys = _plan(context, run_stages(context)).keys
+    keys = _plan(context, _run_stages(context)).keys
     try:
         origin = json.loads(load_field(path, mapped=True).provenance)
     except (InputError, ValueError):  # damaged: the run writes it anew
@@ -347,7 +347,7 @@ def dry_run(options: Options, out: Path, *, scene_only: bool = False, console: C
     """Lists the stages that `run` would compute, and writes no file."""
     with console.progress("plan"):
         context = _open_context(options, out)
-        plan = _plan(context, plan_scene(context) if scene_only else run_stages(context))
+        plan = _plan(context, plan_scene(context) if scene_only else _run_stages(context))
         context.models.require_ready(plan.running)
         _check_inputs(context, plan)
     console.print_line(f"{options.capture} -> {out}, a dry run")
@@ -389,5 +389,5 @@ def _check_inputs(context: RunContext, plan: _RunState) -> None:
 def fit(options: Options, out: Path, *, console: Console | None = None) -> tuple[Gaussians, Capture, Quality]:
     """Computes the stages of `run` that make and measure the scene, into the same cache, so that a `run` continues."""
     context = _open_context(options, out)
-    results = compute_stages(context, plan_scene(context), console).results
+    results = _compute_stages(context, plan_scene(context), console).results
     return results.gaussians, results.load, results.held_out

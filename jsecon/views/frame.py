@@ -19,7 +19,7 @@ from jsecon.types import Camera, Gaussians, LanguageField, UpAxis
 from jsecon.views.upright import TRIM, find_up
 
 _DIRECTIONS = 1500
-"""directions that `up_of_cameras` judges, 5 degrees apart"""
+"""directions that `_up_of_cameras` judges, 5 degrees apart"""
 _ROLL_BINS = 45
 _ROLL_SPREAD = 2 * np.pi / _ROLL_BINS
 """radians, of the rolls of cameras that are held alike"""
@@ -164,7 +164,7 @@ def _direction(up: Any) -> np.ndarray:
     return up
 
 
-def up_of_cameras(cameras: Camera) -> UpAxis:
+def _up_of_cameras(cameras: Camera) -> UpAxis:
     """Finds the up axis of a scene from its cameras, whatever their roll.
 
     People hold cameras level or turned by a quarter, all alike or some of them, turn around more than they look up and
@@ -257,7 +257,7 @@ def find_up_axis(gaussians: Gaussians, cameras: Camera) -> UpAxis:
     It is not sure where cameras that are surely level tell otherwise. Where the cameras only tell an axis, not which
     end of it is up, the scene does.
     """
-    from_cameras = up_of_cameras(cameras)
+    from_cameras = _up_of_cameras(cameras)
     axis = np.array(from_cameras.axis)
     with contextlib.suppress(InputError):  # a scene without a surface
         up, sure, evidence = find_up(surface_points(gaussians))
