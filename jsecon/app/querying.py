@@ -120,7 +120,7 @@ def write_answer(
 def _write_answers(
     scene: Scene, answers: Sequence[Answer], out: Path, console: Console, *, views: int = 3, ending: str = "ply"
 ) -> dict[str, Any]:
-    """Writes the files of answers and OUT/answers.html, and prints a line for each.
+    """Writes the files of answers and OUT/answers.html, and prints a line for each. Without views it renders nothing.
 
     Args:
       scene: The scene.
@@ -141,8 +141,8 @@ def _write_answers(
         for n, answer in enumerate(answers):
             stem = file_stem(answer.query)
             if stem not in records:  # else the question stands there twice
-                masks = {t: scene.mask(answer, t) for t in scene.best_frames(answer, max(views, 1))}
-                records[stem] = write_answer(answer, scene, out, dict(list(masks.items())[:views]), ending=ending)
+                masks = {t: scene.mask(answer, t) for t in scene.best_frames(answer, views)}
+                records[stem] = write_answer(answer, scene, out, masks, ending=ending)
                 counts = records[stem]["outliers"]
                 words = f"{counts['dropped']} of {counts['selected']} selected Gaussians stand apart and were dropped"
                 if counts["dropped"]:
@@ -152,10 +152,14 @@ def _write_answers(
                 words = f"Selected by {answer.by}: {answer.describe()}. {words}."
                 sections[stem] = report.section(str(answer.query), words, report.grid(figures, 3))
             progress(n + 1, len(answers))
-    lead = "The mask of each selection over the rendered scene."
-    write_text(out / PAGE, report.page("Answers", lead, list(sections.values())))
-    console.print_line(f"pictures  {out / PAGE}")
-    written = {"folder": out, "pictures": out / PAGE}
+    written = {"folder": out}
+    if views:
+        lead = "The mask of each selection over the rendered scene."
+        write_text(out / PAGE, report.page("Answers", lead, list(sections.values())))
+        console.print_line(f"pictures  {out / PAGE}")
+        written["pictures"] = out / PAGE
+    else:
+        remove_files(out, [PAGE])  # of an earlier command
     return {"written": written, "answers": [records[file_stem(answer.query)] for answer in answers]}
 
 

@@ -194,7 +194,8 @@ class Query(_FieldVerb):
         similarity lies at least 0.75 of the way from the median region to the best one (by votes).
       keep_outliers: Keeps the Gaussians that stand apart from the rest of an answer. By default DBSCAN drops them, and
         clusters with less than a tenth of the largest one's weight in the views. The .json counts them.
-      views: Number of masks to write for each query.
+      views: Number of masks to write for each query. 0 leaves out answers.html too: nothing is rendered, and the first
+        query on a machine takes a third of its time.
       format: Format of the selected Gaussians. The glb is glTF with Khronos' KHR_gaussian_splatting, y up.
     """
 
