@@ -74,7 +74,7 @@ def test_an_ending_that_cannot_be_written_is_refused_before_anything_is_read(tmp
 def test_answers_without_a_region_or_gaussians_and_a_text_that_is_not_utf8(saved, tmp_path, capsys):
     field, file = saved
     odd = os.fsdecode(b"caf\xe9 red")
-    asked = "query", file, "red but not red", odd, "red", "--out", tmp_path, "--views", 0
+    asked = "query", file, "red but not red", odd, "red", "--out", tmp_path, "--views", 1
     assert run_cli(*asked, "--json") == 2
     told = json.loads(capsys.readouterr().out)
     assert "is not UTF-8" in told["error"]["message"]
