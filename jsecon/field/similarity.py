@@ -1,6 +1,7 @@
 """Cosines of rows with one vector, as every query needs them: of Gaussians' codes or of regions' embeddings. Pure."""
 
 import functools
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -36,8 +37,9 @@ def _by_column(codes: Array, unit: Array) -> tuple[Array, Array, Array]:
     largest = functools.reduce(xp.maximum, (xp.abs(column) for column in columns), zero)
     factor = xp.where(xp.isfinite(largest), safe_scale(largest), 0.0)
     scaled = [column * factor for column in columns]
-    dots = sum((column * unit[k] for k, column in enumerate(scaled)), start=zero)
-    return largest, dots, sum((column * column for column in scaled), start=zero)
+    dots: Any = sum((column * unit[k] for k, column in enumerate(scaled)), start=zero)
+    squares: Any = sum((column * column for column in scaled), start=zero)
+    return largest, dots, squares
 
 
 def _by_row(codes: Array, unit: Array) -> tuple[Array, Array, Array]:

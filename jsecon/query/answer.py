@@ -199,7 +199,7 @@ def _match(embeddings, pixels, overlap, queries, excluded, words, rules: QueryRu
     presence = None if scores.presence is None else scores.presence.max(axis=0)
     ranked = known & ~xp.isnan(scores.rank)
     return RegionMatch(
-        chosen,
+        xp.asarray(chosen),
         xp.where(matches, best, -1).astype(np.int32),
         xp.where(matches, similarity[best], nearest),
         xp.where(ranked.any(), xp.where(ranked, scores.rank, -xp.inf).max(), xp.nan).astype(similarity.dtype),

@@ -316,7 +316,7 @@ def parts_fallback(
     parts, text, words = cast(Parts, jax.tree.map(np.asarray, field.parts)), np.asarray(text), unrelated_words(field)
     scores = _part_scores(parts, text, words, rules.retrieval)
     on_scale, of_scores = np.array([0.0, SHARE_THRESHOLD, 1.0]), np.array([0.0, PART_SCORE, 1.0])
-    least = float(np.interp(rules.min_share, on_scale, of_scores))
+    least = float(np.interp(float(rules.min_share), on_scale, of_scores))
     mask = best_cluster(scores >= least, scores, field.gaussians.means)
     similarity = np.interp(scores, of_scores, on_scale).astype(np.float32)
     # Parts that match but lie outside of the chosen cluster are shown as unlike the text.
@@ -332,12 +332,13 @@ def parts_fallback(
     state = rules.judge(standing, similar, presence)
     if not mask.any() or float(region_score) >= MIN_REGION_RATIO * float(similar) or int(state) == ABSENT:
         return None
-    rank = np.float32(np.nan) if standing is None else standing[0]
-    return Selection(mask, similarity, np.asarray(-1, np.int32), similar, rank, presence, state)
+    rank = np.nan if standing is None else standing[0]
+    numbers = np.asarray(-1, np.int32), np.asarray(similar), np.asarray(rank, np.float32)
+    return Selection(mask, similarity, *numbers, presence, state)
 
 
 def _part_scores(
-    parts: Parts, text: Float[np.ndarray, " e"], words: Float[np.ndarray, "w e"] | None, retrieval: str
+    parts: Parts, text: Float[Array, " e"], words: Float[Array, "w e"] | None, retrieval: str
 ) -> Float[np.ndarray, " n"]:
     """Computes the relative score of the part of each Gaussian: 0 of the median part, 1 of the most similar one.
 
@@ -352,12 +353,7 @@ def _part_scores(
 
 
 def _pooled(
-    embeddings: np.ndarray,
-    weight: np.ndarray,
-    inside: np.ndarray,
-    text: np.ndarray,
-    words: np.ndarray | None,
-    retrieval: str,
+    embeddings: Array, weight: Array, inside: Array, text: Array, words: Array | None, retrieval: str
 ) -> tuple[Array, Number, tuple[Array, Array] | None]:
     """Embedding (E,) of P parts, of each the share `inside` (P,), its similarity, and its standing among the words."""
     pooled = normalize(((weight * inside)[:, None] * embeddings).sum(axis=0))

@@ -1,6 +1,7 @@
 """A selection as a 2D mask: render the selected Gaussians alone, threshold their alpha (OpenGaussian's protocol)."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import numpy as np
@@ -61,7 +62,7 @@ def render_selection(
     Features (H, W, 3) are sum alpha T similarity, three times; similarities are 1 by default.
     """
     require_shape("mask", mask, (gaussians.count,), "Pass one truth value per Gaussian.")
-    arrays = gaussians.opacity_logits, mask, similarity
+    arrays: Any = gaussians.opacity_logits, mask, similarity
     arrays = arrays if is_traced(arrays) else jax.tree.map(np.asarray, arrays)  # NumPy compiles no program
     logits, features = _alone(*arrays)
     return render(dataclasses.replace(gaussians, opacity_logits=logits), camera, features, capacity=capacity)
