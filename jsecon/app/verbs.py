@@ -195,7 +195,7 @@ class Query(_FieldVerb):
       keep_outliers: Keeps the Gaussians that stand apart from the rest of an answer. By default DBSCAN drops them, and
         clusters with less than a tenth of the largest one's weight in the views. The .json counts them.
       views: Number of masks to write for each query. 0 leaves out answers.html too: nothing is rendered, and the first
-        query on a machine takes a quarter of its time.
+        query on a machine takes a third of its time.
       format: Format of the selected Gaussians. The glb is glTF with Khronos' KHR_gaussian_splatting, y up.
     """
 
