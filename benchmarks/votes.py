@@ -31,13 +31,11 @@ from jsecon.types import Camera, Gaussians
 def voting_views(run: Path, width: int) -> tuple[Gaussians, Camera, np.ndarray, int]:
     """Gaussians, the voting views' cameras and labels (T, H, W) at `width` pixels, and the number of regions."""
     field = jsecon.load_field(run / "field.safetensors")
-    stored = {}
-    for stage in ("objects", "load"):
-        files = sorted((run / "cache").glob(f"{stage}-*.safetensors"), key=lambda file: file.stat().st_mtime)
-        if not files:
-            raise InputError(run, f"it has no cache of the stage {stage}", "the folder of a whole run", "jsecon run")
-        stored[stage] = read_arrays(files[-1])[1]
-    labels, voting = stored["objects"]["root.value"], ~stored["load"]["root.value.held_out"]
+    files = sorted((run / "cache").glob("objects-*.safetensors"), key=lambda file: file.stat().st_mtime)
+    if not files:
+        raise InputError(run, "it has no cache of the stage objects", "the folder of a whole run", "jsecon run")
+    objects = read_arrays(files[-1])[1]
+    labels, voting = objects["root.value.labels"], objects["root.value.frames"]
     scale = width / field.cameras.width
     height = round(field.cameras.height * scale)
     lens = {name: getattr(field.cameras, name) * np.float32(scale) for name in ("fx", "fy", "cx", "cy")}
