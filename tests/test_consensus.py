@@ -196,6 +196,7 @@ def test_what_rises_out_of_a_plane_leaves_it_and_the_plane_stays_whole():
     assert group(*given, pieces=80).max() == 0
     assert group(*given, pieces=80, surface_width=5.0).max() == 0
     assert same_partition(group(*given, pieces=80, surface_width=0.8), truth)
+    assert group(*given, pieces=200, surface_width=0.8).max() == 0  # pieces of four Gaussians have no plane
 
 
 def made_scene(views=12, wrong=0, seed=0):

@@ -34,6 +34,8 @@ MAX_PIECES = 3000
 """Maximum number of pieces of a scene."""
 SURFACE_WIDTH = 0.08
 """Distance from a plane at which pieces count as off it, as a share of the median depth: 12 cm in a small room."""
+LEAST_IN_PLANE = 8
+"""Gaussians from which a piece has a plane: those of sparse scenes, of four Gaussians each, tore balls to shreds."""
 TREE_AGREEMENT = 0.05
 """Probability of a common mask up to which groups are joined in the tree."""
 NEW_NODE = 0.1
@@ -101,6 +103,8 @@ def _group_by_consensus(
     in_masks, in_view = gather @ membership, gather @ visible
     off_plane = min(agreement, 1.0)  # then a probability of 1 equals `agreement` in the plane
     coplanarity = _coplanarity(*_piece_planes(gather[:, live], means[live]), surface_width)
+    sparse_pieces = np.bincount(piece[live]) < LEAST_IN_PLANE
+    coplanarity[sparse_pieces[:, None] | sparse_pieces] = 1.0
     together = (in_masks @ in_masks.T).toarray() * (off_plane + (1.0 - off_plane) * coplanarity)
     both = (in_view @ in_view.T).toarray()
     group, _ = _average_linkage(together, both, least_ratio=agreement, least_shared=0.02)
