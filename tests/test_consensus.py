@@ -8,6 +8,8 @@ from jsecon.association.consensus import (
     _average_linkage,
     _coplanarity,
     _group_by_consensus,
+    _Groups,
+    _object_tree,
     _piece_planes,
     pieces_on_masks,
     track_masks,
@@ -88,6 +90,27 @@ def test_what_some_views_cut_has_a_common_node(world):
     assert len(halves) >= 2
     assert halves in [node_regions(found.tree, count, node) for node in range(count, len(found.tree))]
     assert all(found.tree[r] < 0 or found.tree[r] >= count for r in range(count))
+
+
+def test_parents_come_after_their_children_in_any_tree():
+    """Random groups and joins, some of groups that were removed: what joined is under one node, and a tree it is."""
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        count = int(rng.integers(1, 12))
+        kept = rng.uniform(size=count) < 0.8
+        number = np.where(kept, np.cumsum(kept) - 1, -1)
+        roots, joins, sets = list(range(count)), [], [{g} for g in range(count)]
+        while len(roots) > 1 and rng.uniform() < 0.9:
+            a, b = sorted(rng.choice(roots, 2, replace=False).tolist())
+            joins.append((a, b))
+            roots.remove(b)
+            sets[a] |= sets[b]
+        tree = _object_tree(_Groups(np.zeros(0, int), joins, 10 ** rng.uniform(-3, 0, count)), number)
+        own = np.arange(len(tree))
+        assert ((tree == -1) | ((tree > own) & (tree >= kept.sum()))).all()
+        tops = [node_regions(tree, int(kept.sum()), int(node)) for node in np.flatnonzero(tree < 0)]
+        expected = [sorted(number[list(sets[root])][number[list(sets[root])] >= 0].tolist()) for root in roots]
+        assert sorted(tops) == sorted(filter(None, expected))
 
 
 def test_the_weight_on_masks_is_that_of_the_splatting(world, scene):

@@ -316,7 +316,8 @@ def _object_tree(groups: _Groups, number: Int[np.ndarray, " g"]) -> Int32[np.nda
             weight[own] = float(groups.weight[group])
     for first, second in groups.joins:
         small, large = sorted((node[first], node[second]), key=lambda n: (n >= 0, weight[n] if n >= 0 else 0.0))
-        if small >= 0 and (large < count or weight[small] >= NEW_NODE * (weight[small] + weight[large])):
+        adds_much = large < count or weight[small] >= NEW_NODE * (weight[small] + weight[large])
+        if small >= 0 and (adds_much or small > large):  # parents come after their children
             parent[large] = len(parent)
             parent.append(-1)
             weight.append(weight[large])
