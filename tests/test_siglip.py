@@ -144,6 +144,9 @@ def test_presence_is_the_sigmoid_of_the_cosine_also_under_jit_and_vmap(field):
     given = embeddings.astype(np.float32), texts.astype(np.float32)
     found = jax.jit(jax.vmap(lambda text: presence_prob(given[0], text, Logits(7.0, -2.0))))(given[1])
     np.testing.assert_allclose(found, expected, atol=1e-6)
+    np.testing.assert_allclose(presence_prob(given[0], given[1][0], Logits(7.0, -2.0)), expected[0], atol=1e-6)
+    slope = jax.grad(lambda text: presence_prob(given[0], text, Logits(7.0, -200.0)).sum())(given[1][0])
+    assert np.isfinite(slope).all()  # though exp(200) overflows
     many = jax.vmap(lambda text: query_anchored(field, text, rules=QueryRules(logits=Logits(50.0, -10.0))).region)(
         given[1]
     )

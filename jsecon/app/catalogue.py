@@ -172,12 +172,12 @@ def objects(
     surroundings = np.array([bool(SURROUNDINGS & set(name.lower().split())) for name in text[order[:, 0]]], bool)
     whole = _wholes(field, groups, members, size, surroundings)
     labels, part_labels, confidence = _assign(field, groups, whole)
-    own = [np.flatnonzero((labels if whole[k] < 0 else part_labels) == k) for k in range(len(whole))]
-    gaussians = np.array([len(rows) for rows in own], int)
-    shown = members @ pixels
-    views = np.asarray(field.votes.views)
-    sure = np.array([is_sure(pixels, views[rows]) for pixels, rows in zip(shown, own)], bool)
-    complete = np.array([_frames_around(field, rows)[pixels > 0].sum() for pixels, rows in zip(shown, own)], int)
+    groups_of = zip(whole, _places(labels, len(whole)), _places(part_labels, len(whole)))
+    own = [parts if above >= 0 else wholes for above, wholes, parts in groups_of]
+    gaussians = np.array([len(group) for group in own], int)
+    shown, views = members @ pixels, np.asarray(field.votes.views)
+    sure = np.array([is_sure(row, views[group]) for row, group in zip(shown, own)], bool)
+    complete = np.array([_frames_around(field, group)[row > 0].sum() for row, group in zip(shown, own)], int)
     top, listed = np.where(whole < 0, np.arange(len(whole)), whole), gaussians >= MIN_SAMPLES
     order_of_wholes = (top, -gaussians[top], -complete[top], ~sure[top], surroundings[top])
     rows = np.lexsort((-gaussians, whole >= 0, *order_of_wholes))  # each part behind its whole
@@ -418,6 +418,12 @@ def _assign(field: LanguageField, groups: np.ndarray, whole: np.ndarray) -> tupl
     labels, part_labels = np.concatenate(labels), np.concatenate(part_labels)
     counts = _counts(labels, len(whole)) + _counts(part_labels, len(whole))
     return labels, part_labels, total / np.maximum(counts, 1)
+
+
+def _places(labels: np.ndarray, count: int) -> list[np.ndarray]:
+    """Lists the places of each of `count` labels, rising."""
+    order = np.argsort(labels, kind="stable")
+    return np.split(order, np.searchsorted(labels[order], np.arange(count + 1)))[1:-1]
 
 
 def _counts(labels: np.ndarray, count: int) -> np.ndarray:

@@ -35,8 +35,9 @@ def _objects(verb: verbs.Objects, console: Console) -> verbs.VerbResult:
         if record["id"] not in unsure:
             console.print_line(f"{record['id']:>4}  {_title(record)}: {_words(record)}")
     if unsure:
-        few = f"fewer than {SURE_SHARE:.0%} of the frames that see them show them, so they may be fragments"
-        console.print_line(f"  {unsure[0]} to {unsure[-1]} are unsure: {few}")
+        ids = " to ".join(map(str, sorted({unsure[0], unsure[-1]})))
+        few = f"shown by fewer than {SURE_SHARE:.0%} of the frames that see it, so perhaps a fragment"
+        console.print_line(f"  unsure, {few}: {ids}")
     if hidden := int((listed.regions < 0).sum()):
         console.print_line(f"  too small to be listed, with fewer than {MIN_SAMPLES} Gaussians: {hidden} regions")
     elif not records:

@@ -117,9 +117,8 @@ class ObjectIndex:
         groups = self._best_named(texts, join_fragments(regions, self._joined))
         made = [(group, self._object(group)) for group in groups]
         state = int(match.state)
-        return [Object(phrase, group, *parts, state=state) for group, parts in made if parts is not None], float(
-            match.rank
-        )
+        found = [Object(phrase, group, *parts, state=state) for group, parts in made if parts is not None]
+        return found, float(match.rank)
 
     def _all_objects(self) -> list[Object]:
         """Lists the objects of the catalogue without surroundings, by their best names."""

@@ -310,10 +310,9 @@ def _object_tree(groups: _Groups, number: Int[np.ndarray, " g"]) -> Int32[np.nda
     makes no node: what joins becomes a child of the union.
     """
     count = int(number.max(initial=-1)) + 1
-    node, parent, weight = number.tolist(), [-1] * count, np.zeros(count).tolist()
-    for group, own in enumerate(number):
-        if own >= 0:
-            weight[own] = float(groups.weight[group])
+    node, parent, weight = number.tolist(), [-1] * count, [0.0] * count
+    for group in np.flatnonzero(number >= 0):
+        weight[node[group]] = float(groups.weight[group])
     for first, second in groups.joins:
         small, large = sorted((node[first], node[second]), key=lambda n: (n >= 0, weight[n] if n >= 0 else 0.0))
         adds_much = large < count or weight[small] >= NEW_NODE * (weight[small] + weight[large])

@@ -205,7 +205,7 @@ def _oddity(field: LanguageField, checked: bool = True) -> str | None:
     if field.gaussians.sh is not None and field.gaussians.sh.shape[1] not in COEFFICIENT_COUNTS:
         return f"harmonics of {field.gaussians.sh.shape[1]} functions"
     if field.tree is not None and not _is_tree(np.asarray(field.tree), field.regions.count):
-        return "a tree whose nodes do not come before their parents, or of which an object is no leaf"
+        return "a tree whose nodes do not come before their parents, or of which a region is no leaf"
     texts = (*field.names, field.embedder, field.provenance)
     if not all(isinstance(text, str) for text in texts) or not isinstance(parse_json(field.provenance), dict):
         return "names, embedder or provenance that are no texts, or no JSON object"

@@ -25,6 +25,7 @@ from typing import NamedTuple, cast
 
 import jax
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float, Int, Shaped
 
 from jsecon.errors import require
@@ -201,12 +202,12 @@ def _standing_among_words(
     return xp.where(known.any(), below, 1.0), xp.where(known.any(), margin, xp.inf)
 
 
-@np.errstate(over="ignore")
 def presence_prob(embeddings: Float[Array, "r e"], text: Float[Array, " e"], logits: Logits) -> Float[Array, " r"]:
     """Computes the probability that a text is true of each region: sigmoid(scale cos + bias); 0 without a direction."""
     cosines, known = similarities(embeddings, text)
     xp = array_module(cosines)
-    return xp.where(known, 1 / (1 + xp.exp(-(logits.scale * cosines + logits.bias))), 0.0)
+    sigmoid = scipy.special.expit if xp is np else jax.nn.sigmoid
+    return xp.where(known, sigmoid(logits.scale * cosines + logits.bias), 0.0)
 
 
 @inline_jit

@@ -89,7 +89,7 @@ def _read_nerfstudio(path: Path) -> PosedImages:
     return PosedImages(images, file, *points, source_from_poses=source_from_poses, notes=tuple(notes), up=up)
 
 
-def _read_inria(file: Path, cameras: list[dict[str, Any]]) -> PosedImages:
+def _read_inria(file: Path, cameras: list[Any]) -> PosedImages:
     """The cameras of INRIA's cameras.json: position and rotation are camera-to-world, in OpenCV axes."""
     images = []
     for index, camera in enumerate(cameras):
