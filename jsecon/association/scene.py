@@ -152,7 +152,7 @@ def assign_superpixels(
     With t_a the weight of all Gaussians on a superpixel a, and sums over a proposal p that weigh it by its share in p:
 
         share of a superpixel  s_ac = m_ac / k_a,  reliable if k_a >= 0.5 t_a and t_a >= 0.2 px(a)
-        share of a proposal    s_pc = m_pc / k_p,  reliable if k_p >= 0.5 t_p
+        share of a proposal    s_pc = m_pc / k_p,  reliable if k_p >= 0.5 t_p and t_p >= 0.2 px(p)
 
     1. A reliable superpixel goes to the class with the largest share, if that is at least 0.6.
     2. Then each reliable proposal, from the weakest to the strongest in v = max_c s_pc, if v >= 0.4, assigns
@@ -160,16 +160,18 @@ def assign_superpixels(
        classes of m_pc >= 0.5 sum_a m_ac and m_pc >= MIN_SUPERPIXEL_PX, a reliable superpixel goes to the one of them
        with the largest s_ac.
 
-    `mass` is m_ac, the weight of the Gaussians of each class on each superpixel, and `known_mass` k_a, that of the
-    Gaussians whose class is known.
+    So what shows no Gaussians, such as the space around a splat without photographs, goes to no class. `mass` is m_ac,
+    the weight of the Gaussians of each class on each superpixel, and `known_mass` k_a, that of the Gaussians whose
+    class is known.
     """
     total = view.votes.T @ np.ones((len(view.seen), 1), np.float32)
     share_of_superpixel = mass / np.maximum(known_mass, 1e-6)
-    area = np.bincount(view.labels.reshape(-1), minlength=len(total))
-    is_reliable = (known_mass >= 0.5 * total)[:, 0] & (total[:, 0] >= 0.2 * area)
+    area = np.bincount(view.labels.reshape(-1), minlength=len(total))[:, None]
+    is_reliable = ((known_mass >= 0.5 * total) & (total >= 0.2 * area))[:, 0]
     inside, known_inside = view.proposals @ mass, view.proposals @ known_mass  # (M, C), (M, 1)
     share = inside / np.maximum(known_inside, 1e-6)
-    reliable = (known_inside >= 0.5 * (view.proposals @ total))[:, 0]
+    total_inside = view.proposals @ total
+    reliable = ((known_inside >= 0.5 * total_inside) & (total_inside >= 0.2 * (view.proposals @ area)))[:, 0]
     merged = (inside >= 0.5 * mass.sum(0)) & (inside >= MIN_SUPERPIXEL_PX)
 
     certain = is_reliable & (share_of_superpixel.max(1) >= 0.6)
