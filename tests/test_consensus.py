@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 from balls import HEIGHT, VIEWS, WIDTH, ious, ring_of_balls
@@ -73,6 +75,16 @@ def test_frames_that_merge_cut_or_propose_nothing_are_outvoted(world):
     scores = ious(labels - 1, truth, 3)
     assert np.nanmean(scores) > 0.85
     assert np.nanmean(scores[[2, 9, 16, 20]]) > 0.6  # and there, too, the Gaussians tell the balls apart
+
+
+def test_what_shows_no_gaussians_is_no_object(world):
+    """The disc is gone but for a faint haze, as around a splat without photographs; a mask of each frame shows it."""
+    gaussians, cameras, frames, truth, proposals = world
+    on_disc = np.arange(gaussians.count) < 2500
+    faint = dataclasses.replace(gaussians, opacity_logits=np.where(on_disc, -6.0, np.asarray(gaussians.opacity_logits)))
+    labels = track_masks(frames, scene_of((faint, cameras), proposals)).labels
+    assert (labels[truth == 0] >= 0).mean() < 0.02
+    assert all((labels[truth == ball] >= 0).mean() > 0.9 for ball in (1, 2, 3))
 
 
 def test_what_some_views_cut_has_a_common_node(world):
