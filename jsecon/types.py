@@ -253,6 +253,10 @@ class Regions:
     """(R, E) unit length; pixel-weighted mean of the views' embeddings (paper: phi_bar); zero where never embedded."""
     pixel_counts: Array
     """(R, T) int32 pixels of the region in each view; 0 where it is not seen."""
+    embedded: Array | None = None
+    """(C, 2) int32 region and view of each embedding that was averaged; a saved field has them in its ledger."""
+    view_embeddings: Array | None = None
+    """(C, E) float32 these embeddings."""
 
     @property
     def count(self) -> int:

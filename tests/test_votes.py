@@ -12,7 +12,7 @@ from reference import weights_reference
 from jsecon import plan_view
 from jsecon.errors import InputError
 from jsecon.field import columns, evidence
-from jsecon.field.evidence import _sum_evidence, region_votes, view_evidence
+from jsecon.field.evidence import region_votes, sum_evidence, view_evidence
 from jsecon.field.membership import normalise_votes
 from jsecon.splat.render import render_rgb
 from jsecon.splat.visible import geometry_of_rows, render_in_blocks, visible_rows
@@ -122,10 +122,10 @@ def test_no_order_of_views_changes_a_bit(cast, scene, cameras, labels):
     """Nor do parts that are added up apart: each is exact."""
     views = [view_evidence(scene, cameras[t], labels[t], REGIONS) for t in range(4)]
     order = [2, 0, 3, 1]
-    turned = _sum_evidence([views[t] for t in order], scene.count, REGIONS, top=REGIONS, by_view=True)
+    turned = sum_evidence([views[t] for t in order], scene.count, REGIONS, top=REGIONS, by_view=True)
     assert_same_bits(turned, cast, COLUMNS)
     np.testing.assert_array_equal(turned.by_view, cast.by_view[order])
-    some = _sum_evidence([views[t] for t in (3, 1)], scene.count, REGIONS, top=REGIONS)
+    some = sum_evidence([views[t] for t in (3, 1)], scene.count, REGIONS, top=REGIONS)
     alone = region_votes(scene, cameras[np.array([1, 3])], labels[[1, 3]], REGIONS, top=REGIONS)
     assert_same_bits(some, alone, COLUMNS)
 

@@ -41,6 +41,10 @@ class _Check:
 
 def _doctor(verb: verbs.Doctor, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon doctor`; a check that fails and that every run depends on is an error."""
+    if verb.field is not None:
+        from jsecon.app.living import describe_ledger
+
+        return describe_ledger(verb.field, console)
     with console.progress("checks"):
         checks = [_Check("python", "ok", f"{platform.python_version()}, {platform.platform(terse=True)}")]
         checks += [_check_packages(), *_check_jax()]

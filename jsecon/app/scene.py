@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import re
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,14 +26,16 @@ from jsecon.app.records import Answer, At, Box, Mask, Query, Question, Region, g
 from jsecon.errors import InputError
 from jsecon.field.columns import is_mapped
 from jsecon.field.field import check_field, load_field
+from jsecon.field.ledger import Ledger, add_views, forget_views
+from jsecon.field.ledger_file import load_ledger, save_with_ledger
 from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.field.regions import ALIKE_THRESHOLD
-from jsecon.files import FIELD_FILE
+from jsecon.files import FIELD_FILE, parse_json
 from jsecon.networks.hub import parse_model
 from jsecon.paper.queries import CODE_THRESHOLD
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Console
-from jsecon.pipeline.sources import locate_sources, run_warnings
+from jsecon.pipeline.sources import forget_warnings, locate_sources, move_hints, run_warnings
 from jsecon.process import MEMORY, memory_budget
 from jsecon.query.answer import answer_question, trim
 from jsecon.query.expressions import is_expression, parse_query
@@ -45,7 +47,7 @@ from jsecon.query.rules import ONE_REGION, QueryRules
 from jsecon.read.captures.images import read_pixels
 from jsecon.read.masks.masks import resize_nearest
 from jsecon.read.splats.files import save_gaussians
-from jsecon.types import Gaussians, LanguageField, Selection
+from jsecon.types import Capture, Gaussians, LanguageField, Selection
 
 CACHED_BYTES = 1 << 28
 """bytes of the answers that a scene keeps, of five bytes a Gaussian each"""
@@ -94,7 +96,7 @@ def open_scene(
 
         parse_model(model, "embedder")
         embedder = functools.partial(field_embedder, folder=model)
-    return Scene(field, embedder, up=up, name=named.name)
+    return Scene(field, embedder, up=up, name=named.name, ledger=functools.partial(load_ledger, file, field))
 
 
 def open_scenes(
@@ -157,6 +159,7 @@ class Scene:
       embedder: Its embedder, or a function that makes one of the field; None opens it when a text needs it.
       up: Up axis of the capture's world; None takes the field's own.
       name: Name of the scene.
+      ledger: Returns the ledger of the field's views, which `add` and `forget` need.
 
     Attributes:
       field: The field.
@@ -170,8 +173,10 @@ class Scene:
         *,
         up: Sequence[float | int] | None = None,
         name: str = "scene",
+        ledger: Callable[[], Ledger] | None = None,
     ):
         self.field = field
+        self._read_ledger = ledger
         self.name = name
         self._embedder = embedder
         self._up = up
@@ -213,6 +218,112 @@ class Scene:
         if self.field.regions.count == 0:
             raise InputError("field", "it has no regions, so no objects", remedy="Make it again with other --masks.")
         return ObjectIndex(self._text_field, self.embedder, self._up, lambda: self._catalogue)
+
+    @functools.cached_property
+    def ledger(self) -> Ledger:
+        """What each view contributes to the field (`jsecon.field.ledger`).
+
+        Raises:
+          InputError: The field has none, or its file is damaged.
+        """
+        self._require_memory("a change of its views")
+        if self._read_ledger is None:
+            raise InputError(f"scene {self.name}", "it has no ledger of its views", remedy="Open it by open_scene.")
+        return self._read_ledger()
+
+    def add(
+        self,
+        photos: str | Path | Capture,
+        *,
+        poses: str | Path | None = None,
+        masks: str | Path | None = None,
+        refused: list[InputError] | None = None,
+        console: Console | None = None,
+    ) -> "Scene":
+        """Adds photographs of the same scene: its regions grow by what they show.
+
+        Old poses and Gaussians stay as they are. To the last bit, the votes are those of one run with all frames and
+        the same regions, in whatever order they are added. Photographs that the field has by their names are left out.
+
+        Args:
+          photos: A capture, its folder, a folder of photographs, or one photograph. Photographs without poses get them
+            from what the field's own frames show.
+          poses: A capture's file or folder with the poses of the photographs, in the world of the field's capture.
+          masks: Folder of masks of the new frames, as `jsecon run --proposals` takes them. A mask that matches no
+            region opens one. None finds masks by colour and texture.
+          refused: Receives the error of each photograph that cannot be read or placed, and the others are added. None
+            raises the first.
+          console: Receives the progress.
+
+        Returns:
+          The new scene.
+
+        Raises:
+          InputError: The field has no ledger, or no photograph can be added.
+        """
+        from jsecon.pipeline.new_frames import make_views, read_frames  # late: questions to a field need none of it
+
+        console, errors = console or Console(), [] if refused is None else refused
+
+        def refuse(error: InputError) -> None:
+            if refused is None:
+                raise error
+            refused.append(error)
+
+        with self._lock:
+            ledger, embedder = self.ledger, self.embedder
+            paths = (None if path is None else Path(path) for path in (poses, masks))
+            pose_file, mask_folder = paths
+            photos = photos if isinstance(photos, Capture) else Path(photos)
+            with console.progress("frames") as progress:
+                frames = read_frames(self.field, ledger, photos, pose_file, refuse, progress)
+            if not frames:
+                raise errors.pop()
+            with console.progress("views") as progress:
+                views, _ = make_views(self.field, ledger, frames, embedder, mask_folder, progress)
+            with console.progress("votes"):
+                return self._with(*add_views(self.field, ledger, views))
+
+    def forget(self, frames: Sequence[int | str]) -> "Scene":
+        """Takes frames out: votes, embeddings, poses and pictures, as if they had never been there.
+
+        The Gaussians stay, which a run may have fitted to these frames too.
+
+        Args:
+          frames: Their names or indices (`frame_index`).
+
+        Returns:
+          The new scene.
+
+        Raises:
+          InputError: The field has no such frame, no ledger, or no frame would be left.
+        """
+        with self._lock:
+            names = {self.field.names[self.frame_index(frame)] for frame in frames}
+            if names >= {*self.ledger.views}:
+                raise InputError("frames", "no frame with evidence would be left", remedy="Delete the field instead.")
+            field = forget_warnings(self.field, sorted(names))
+            return self._with(*forget_views(field, self.ledger, names))
+
+    def _with(self, field: LanguageField, ledger: Ledger) -> "Scene":
+        """A scene of another state of the field."""
+        scene = Scene(field, self._embedder, up=self._up, name=self.name)
+        opened = {"embedder": self.embedder} if "embedder" in vars(self) else {}
+        vars(scene).update(opened, ledger=ledger)
+        return scene
+
+    def save(self, path: str | Path) -> None:
+        """Writes the field, and its ledger beside it if it has one, atomically.
+
+        Args:
+          path: Path of the file, such as field.safetensors.
+
+        Raises:
+          InputError: The folder cannot be written.
+        """
+        path, has_ledger = Path(path), "ledger" in vars(self) or "ledger" in parse_json(self.field.provenance)
+        ledger = self.ledger if has_ledger else None
+        save_with_ledger(path, move_hints(self.field, path.parent), ledger)
 
     def _require_memory(self, what: str) -> None:
         """Raises InputError if the field is mapped, which `what` needs in memory."""

@@ -249,6 +249,55 @@ class Objects(_FieldVerb):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class Add(_FieldVerb):
+    """Adds photographs of the same scene to a field, without running it anew.
+
+    Regions of the field grow by what the photographs show. The Gaussians, and the poses of the field's frames, stay as
+    they are. Photographs without poses are placed by the pictures of the field's own frames; one that shares too little
+    with them is refused. Frames that the field has by their names are left out.
+
+    Attributes:
+      photos: A capture of any format of jsecon run, a folder of photographs, or one photograph.
+      poses: Capture, COLMAP model or transforms.json with the poses of the photographs, in the world of the field's
+        capture.
+      masks: Folder of masks of the new frames, as for jsecon run --proposals. A mask that matches no region opens one.
+        Without it, jsecon finds masks by colour and texture.
+      out: Folder for the new field. Without it, the field is replaced.
+    """
+
+    examples = (
+        "jsecon add my_field new_photographs --out my_field_2",
+        "jsecon add my_field room/IMG_0412.jpg",
+    )
+
+    photos: Positional[Path]
+    poses: Option[Path | None] = None
+    masks: Option[Path | None] = None
+    out: Option[Path | None] = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Forget(Verb):
+    """Removes frames from a field, as if they had never been there.
+
+    No file of the field keeps a byte of them: votes, embeddings, poses, names and pictures. Without --out, the cache,
+    the poses and the report of the run, which show them, are removed from the field's folder too. The Gaussians stay,
+    which the run may have fitted to these frames.
+
+    Attributes:
+      field: Path of field.safetensors, or the folder that jsecon run wrote it to.
+      frames: Names of the frames.
+      out: Folder for the new field. Without it, the field is replaced.
+    """
+
+    examples = ("jsecon forget my_field --frames IMG_0412 IMG_0413",)
+
+    field: Positional[Path]
+    frames: Option[list[str]]
+    out: Option[Path | None] = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Export(_FieldVerb):
     """Writes the scene of a field, or objects of it, for other programs.
 
@@ -402,9 +451,14 @@ class Doctor(Verb):
     It prints a line each about the backend's numbers, jax and its devices, cores, memory, the folder of compiled
     programs and its room, and each extra with the command that installs it. The exit code is 2 if a check fails that
     every run depends on. `jsecon models check` examines models.
+
+    Attributes:
+      field: A field to describe instead: what its ledger holds of each kind, and how large that is.
     """
 
-    examples = ("jsecon doctor",)
+    examples = ("jsecon doctor", "jsecon doctor my_field")
+
+    field: Positional[Path | None] = None
 
 
 VERBS: dict[type[Verb], str] = {
@@ -413,6 +467,8 @@ VERBS: dict[type[Verb], str] = {
     Fit: "app.running:_fit",
     Query: "app.querying:_query",
     Objects: "app.exports:_objects",
+    Add: "app.living:_add",
+    Forget: "app.living:_forget",
     Export: "app.exports:_export",
     View: "app.viewer.window:_view",
     Eval: "app.evaluation:_eval",

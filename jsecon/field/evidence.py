@@ -6,15 +6,18 @@ embeddings or codes needs (Eq. 3 of the paper with one-hot labels).
 
 A view gives one sparse list of (Gaussian, region, weight), and the votes are the sum of the lists. Weights of a view
 are rounded to multiples of 2^-24 px, which float64 adds up without error: the votes do not depend, to the last bit, on
-the order of the views, nor on how devices, processes or blocks of Gaussians share the work.
+the order of the views, nor on how devices, processes or blocks of Gaussians share the work. They are also rounded to 17
+bits, which packs them to half the room (`pack_evidence`).
 """
 
 import contextlib
 import dataclasses
 import functools
+import json
 import os
 import shutil
 import tempfile
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Float, Float32, Int, Int32, Shaped
+from jaxtyping import Float, Float32, Int, Int32, Shaped, UInt8
 from scipy import sparse
 
 from jsecon.errors import InputError, require, require_shape
@@ -40,8 +43,14 @@ from jsecon.types import Array, Camera, Gaussians, Progress, Votes
 _RESOLUTION = 2.0**24
 """Weights of a view are multiples of its inverse, px. The faintest weight of a pixel is 4e-7 (1/255 of the last
 transmittance), and float64 adds up 2^29 px of weight without error."""
+TOP = 8
+"""Strongest regions that a Gaussian keeps."""
+_BITS = 17
+"""Significant bits of a weight: an error of 4e-6 of it, where float32's sums of pixels have 1e-6."""
 _SLOTS = 4
 """Labels of a tile that are summed at once. A tile of 8x8 pixels seldom shows more; then its batch is scanned again."""
+_HEAD = 96
+"""bytes at the start of a packed list that say how long its columns are"""
 _MAX_WHOLE = 1 << 21
 """Gaussians of a scene above which each view is planned for those alone that it can see."""
 _MAX_ENTRIES = 1 << 24
@@ -88,7 +97,7 @@ def region_votes(
     labels: Any,
     num_regions: int,
     *,
-    top: int = 8,
+    top: int = TOP,
     by_view: bool = False,
     centre_pixel_weight: float = 0.0,
     capacity: int | None = None,
@@ -139,17 +148,31 @@ def region_votes(
         require_labels(labels, num_regions)
     if is_traced((gaussians, cameras, labels)):
         return _scan_votes(gaussians, cameras, labels, num_regions, top, by_view, **options)
+    with scratch_folder(folder) as scratch:
+        lists = list_evidence(gaussians, cameras, labels, num_regions, folder=scratch, progress=progress, **options)
+        return sum_evidence(lists, gaussians.count, num_regions, top=top, by_view=by_view, folder=folder)
+
+
+def list_evidence(
+    gaussians: Gaussians,
+    cameras: Camera,
+    labels: Any,
+    num_regions: int,
+    *,
+    folder: Path | None = None,
+    progress: Progress | None = None,
+    **options: Any,
+) -> list[ViewEvidence]:
+    """Lists what each view casts on the Gaussians, on all cores and processes; `folder` keeps the lists on disk."""
     cameras = jax.tree.map(np.asarray, cameras)
     if gaussians.count <= _MAX_WHOLE:  # once for all views
         gaussians = jax.device_put(dataclasses.replace(gaussians, sh=None))
-    with _scratch_folder(folder) as scratch:
 
-        def view(t: int) -> tuple:  # a plain one, which processes can exchange
-            evidence = view_evidence(gaussians, cameras[t], np.asarray(labels[t]), num_regions, **options)
-            return tuple(evidence if scratch is None else _on_disk(evidence, scratch / str(t)))
+    def view(t: int) -> tuple:  # a plain one, which processes can exchange
+        evidence = view_evidence(gaussians, cameras[t], np.asarray(labels[t]), num_regions, **options)
+        return tuple(evidence if folder is None else _on_disk(evidence, folder / str(t)))
 
-        lists = [ViewEvidence(*evidence) for evidence in map_views(views, view, progress)]
-        return _sum_evidence(lists, gaussians.count, num_regions, top=top, by_view=by_view, folder=folder)
+    return [ViewEvidence(*evidence) for evidence in map_views(len(labels), view, progress)]
 
 
 def view_evidence(
@@ -191,10 +214,17 @@ def view_evidence(
     np.maximum.at(peaks, ids.reshape(-1), largest.reshape(-1))
     seen = np.flatnonzero(np.diff(weights.indptr))
     rounded = np.rint(weights.data.astype(np.float32) * np.float32(_RESOLUTION)) / np.float32(_RESOLUTION)
+    rounded, peaks = _round_mantissa(rounded), _round_mantissa(peaks)
     starts = np.append(weights.indptr[seen], len(rounded)).astype(np.int32)
     own = (seen if rows is None else rows[seen]).astype(np.int32)
     overflow = int(np.asarray(plan.lists.overflow).sum())
     return ViewEvidence(own, starts, weights.indices.astype(np.int32), rounded, peaks[seen], overflow)
+
+
+def _round_mantissa(values: Float32[np.ndarray, " e"]) -> Float32[np.ndarray, " e"]:
+    """Rounds non-negative numbers to _BITS significant bits: multiples of 2^-24 stay such."""
+    dropped = 24 - _BITS
+    return ((values.view(np.uint32) + np.uint32(1 << dropped - 1)) >> dropped << dropped).view(np.float32)
 
 
 @jax.jit
@@ -359,16 +389,17 @@ def _dense_view_backward(columns, centre_pixel_weight, capacity, kept, cotangent
 _dense_view.defvjp(_dense_view_forward, _dense_view_backward)
 
 
-def _sum_evidence(
+def sum_evidence(
     views: Sequence[ViewEvidence],
     count: int,
     num_regions: int,
     *,
-    top: int = 8,
+    top: int = TOP,
     by_view: bool = False,
     folder: str | os.PathLike | None = None,
 ) -> Votes:
     """Adds up the lists of views to votes of `count` Gaussians, a block of rows at a time; see `region_votes`."""
+    top = min(top, max(num_regions, 1))
     size = max(_MAX_ENTRIES // max(len(views), 1), 1)
     blocks = (slice(first, min(first + size, count)) for first in range(0, max(count, 1), size))
     columns = (_sum_rows([view._of_rows(rows) for view in views], rows, num_regions, top, by_view) for rows in blocks)
@@ -418,6 +449,37 @@ def _strongest(votes: Any, top: int) -> tuple[Int32[np.ndarray, "n k"], Float32[
     return ids, largest
 
 
+def pack_evidence(evidence: ViewEvidence, num_regions: int) -> UInt8[np.ndarray, " b"]:
+    """Packs a list of a view to bytes, some 5 an entry, without loss; no region is -1, whatever their number is."""
+    columns = {
+        "gaussians": np.diff(evidence.gaussians, prepend=np.int32(0)),
+        "lengths": np.diff(evidence.starts),
+        "regions": np.where(evidence.regions == num_regions, -1, evidence.regions),
+        "weights": evidence.weights.view(np.uint32),
+        "max_pixel_weights": evidence.max_pixel_weights.view(np.uint32),
+    }
+    # The bytes of each place together, from which deflate drops those that are 0 throughout.
+    planes = {name: np.asarray(column, "<u4").view(np.uint8).reshape(-1, 4).T for name, column in columns.items()}
+    parts = [zlib.compress(plane.tobytes(), 1) for plane in planes.values()]
+    head = json.dumps([int(evidence.overflow), *map(len, parts)]).encode().ljust(_HEAD)
+    return np.frombuffer(b"".join([head, *parts]), np.uint8)
+
+
+def unpack_evidence(packed: UInt8[np.ndarray, " b"], num_regions: int) -> ViewEvidence:
+    """Unpacks what `pack_evidence` packed; ValueError if it is damaged."""
+    overflow, *sizes = json.loads(packed[:_HEAD].tobytes())
+    parts = np.split(packed[_HEAD:], np.cumsum(sizes))[:-1]
+    planes = (np.frombuffer(zlib.decompress(part.tobytes()), np.uint8).reshape(4, -1) for part in parts)
+    gaussians, lengths, regions, weights, peaks = (np.ascontiguousarray(p.T).view("<u4")[:, 0] for p in planes)
+    regions = np.where(regions.view(np.int32) < 0, num_regions, regions).astype(np.int32)
+    starts = np.cumsum(np.append(np.uint32(0), lengths), dtype=np.int32)
+    fits = len(gaussians) == len(lengths) == len(peaks) and len(regions) == len(weights) == starts[-1]
+    if not fits or (regions > num_regions).any():
+        raise ValueError("the evidence of a view is damaged")
+    ids = np.cumsum(gaussians, dtype=np.int32)
+    return ViewEvidence(ids, starts, regions, weights.view(np.float32), peaks.view(np.float32), overflow)
+
+
 def votes_memory(count: int, views: int) -> int:
     """Bounds the bytes of `region_votes` with `by_view`, beside its inputs, if every view sees all Gaussians."""
     return (4 + 24) * views * count
@@ -447,7 +509,7 @@ def _distinct_labels(tiles: Int[Array, "n p"], slots: int) -> Int[Array, "n q"]:
 
 
 @contextlib.contextmanager
-def _scratch_folder(folder: str | os.PathLike | None) -> Iterator[Path | None]:
+def scratch_folder(folder: str | os.PathLike | None) -> Iterator[Path | None]:
     """A folder inside `folder` that is removed afterwards; None if there is none."""
     if folder is None:
         yield None

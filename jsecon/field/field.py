@@ -107,7 +107,7 @@ def load_field(path: str | os.PathLike, *, mapped: bool = False) -> LanguageFiel
     return _read(Path(path), MAPPED if mapped else sys.maxsize, checked=not mapped)
 
 
-class _Provenance(str):
+class Provenance(str):
     """A field's provenance that knows the folder of the file that it was read from."""
 
     folder: Path
@@ -142,7 +142,7 @@ def _read(path: Path, mapped: int, checked: bool) -> LanguageField:
         field = jax.tree.map(_on_device, field)
     if problem is not None:
         raise InputError(path, problem, "arrays of one N, R, d, E and T", _REMEDY)
-    provenance = _Provenance(field.provenance)
+    provenance = Provenance(field.provenance)
     provenance.folder = path.resolve().parent
     return dataclasses.replace(field, provenance=provenance)
 

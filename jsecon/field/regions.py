@@ -179,23 +179,27 @@ def _pool_embeddings(
     def embed_frames(frames: Sequence[int]) -> Iterator[np.ndarray | None]:
         for t in frames:
             seen = np.flatnonzero(embedded[:, t])
-            yield np.asarray(embed(t, labels[t][None] == seen[:, None, None]), np.float64) if len(seen) else None
+            yield np.asarray(embed(t, labels[t][None] == seen[:, None, None]), np.float32) if len(seen) else None
 
     total: np.ndarray | None = None
+    places, single = [np.zeros((0, 2), np.int32)], []
     for t, rows in enumerate(map_over_processes(len(labels), embed_frames, progress)):
         if rows is not None:
             seen = np.flatnonzero(embedded[:, t])
             require_shape("embed", rows, (len(seen), "E"), "An embedder returns one row per mask.")
             total = np.zeros((count, rows.shape[1])) if total is None else total
-            total[seen] += pixels[seen, t, None] * rows
+            total[seen] += pixels[seen, t, None] * rows.astype(np.float64)
+            places.append(np.stack([seen, np.full(len(seen), t)], axis=1).astype(np.int32))
+            single.append(rows)
     if not len(labels):
         total = np.zeros((count, 0))
     elif total is None:  # without a label the embedder alone knows E
         total = np.zeros((count, np.asarray(embed(0, np.zeros((1, *labels.shape[1:]), bool))).shape[1]))
-    return Regions(embeddings=_unit_rows(total), pixel_counts=pixels)
+    rows = np.concatenate([np.zeros((0, total.shape[1]), np.float32), *single])
+    return Regions(unit_rows(total), pixels, np.concatenate(places), rows)
 
 
-def _unit_rows(rows: np.ndarray) -> np.ndarray:
+def unit_rows(rows: np.ndarray) -> np.ndarray:
     """Rows scaled to unit length, float32; zero rows stay zero."""
     length = np.linalg.norm(rows, axis=1, keepdims=True)
     return np.where(length > 0, rows / np.where(length > 0, length, 1.0), 0.0).astype(np.float32)
@@ -241,4 +245,4 @@ def scene_parts(part: Int[np.ndarray, " n"], cast: Any, embeddings: Float[np.nda
     gather = sparse.csr_matrix((np.ones(len(members), np.float32), (part[members], members)), shape=(count, len(part)))
     weight = gather @ cast
     total = np.asarray(weight @ np.asarray(embeddings, np.float32), np.float32).reshape(count, embeddings.shape[1])
-    return Parts(part.astype(np.int32), _unit_rows(total), np.asarray(weight.sum(1), np.float32).reshape(count))
+    return Parts(part.astype(np.int32), unit_rows(total), np.asarray(weight.sum(1), np.float32).reshape(count))

@@ -6,6 +6,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -17,7 +18,7 @@ from jsecon.association.run_lengths import cache_masks_as_rle
 from jsecon.association.scene import SceneSuperpixels
 from jsecon.errors import InputError
 from jsecon.field.columns import vote_blocks
-from jsecon.field.evidence import region_votes, votes_memory
+from jsecon.field.evidence import list_evidence, pack_evidence, scratch_folder, sum_evidence, votes_memory
 from jsecon.field.regions import Embed, choose_crops, crop_geometry, embeddings_of_masks, region_embeddings, scene_parts
 from jsecon.fit.depth import points_from_depth
 from jsecon.networks.hub import model_name
@@ -28,6 +29,7 @@ from jsecon.paper.tracker import GeometricTracker
 from jsecon.parallel import map_over_processes
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.stages import (
+    CastVotes,
     Checkpoint,
     ObjectLabels,
     Results,
@@ -37,7 +39,7 @@ from jsecon.pipeline.stages import (
     StageResult,
     training_frames,
 )
-from jsecon.process import memory_budget
+from jsecon.process import cores, memory_budget
 from jsecon.read.captures.frames import evenly_spaced
 from jsecon.read.masks.masks import load_features, load_labels, load_proposals
 from jsecon.splat.render import render_depth
@@ -119,7 +121,7 @@ def _plan_parts(context: RunContext) -> Stage:
 def _plan_lifting(context: RunContext) -> list[Stage]:
     """Plans the votes of the regions for each Gaussian, and the codes of the paper if the options ask for them."""
     how, after = "the strongest regions of each Gaussian", ("load", "gaussians", "objects")
-    key_options = context.key_options("centre_pixel_weight")
+    key_options = context.key_options("centre_pixel_weight", "ledger")
     votes = Stage("votes", how, _accumulate_votes, after=after, key_options=key_options, distributed=True)
     if not context.options.paper:
         return [votes]
@@ -362,7 +364,6 @@ def _accumulate_votes(stage: StageInput) -> StageResult:
     labels, folder = stage.results.objects.labels, stage.checkpoint.folder
     cameras = capture.cameras[stage.results.objects.frames]
     count = int(labels.max()) + 1
-    settings = {"centre_pixel_weight": options.centre_pixel_weight, "by_view": True, "progress": stage.progress}
     needed, budget = votes_memory(scene.count, len(labels)), memory_budget()
     on_disk = needed > budget and jax.process_count() == 1  # several processes exchange them in memory
     notes = ()
@@ -370,16 +371,22 @@ def _accumulate_votes(stage: StageInput) -> StageResult:
         shutil.rmtree(folder, ignore_errors=True)  # of a run that was stopped
         sizes = f"{needed / 2**30:.2g} GiB otherwise, where memory has room for {budget / 2**30:.2g}"
         notes = (f"votes are kept on disk: {sizes}",)
-    accumulated = region_votes(scene, cameras, labels, count, folder=folder if on_disk else None, **settings)
+    settings = {"centre_pixel_weight": options.centre_pixel_weight, "progress": stage.progress}
+    with scratch_folder(folder if on_disk else None) as scratch:
+        lists = list_evidence(scene, cameras, labels, count, folder=scratch, **settings)
+        where = folder if on_disk else None
+        accumulated = sum_evidence(lists, scene.count, count, by_view=True, folder=where)
+        with ThreadPoolExecutor(cores()) as pool:
+            packed = tuple(pool.map(lambda view: pack_evidence(view, count), lists)) if options.ledger else ()
     unseen = int((np.asarray(accumulated.views) == 0).sum())
     if unseen:
         notes = (*notes, f"no frame sees {unseen} of {scene.count} Gaussians")
-    return StageResult(accumulated, notes)
+    return StageResult(CastVotes(accumulated, packed), notes)
 
 
 def _compute_codes(stage: StageInput) -> StageResult:
     """Trains the paper's autoencoder, and distils the codes of the regions into the Gaussians by their votes."""
-    options, embeddings, cast = stage.context.options, stage.results.regions.embeddings, stage.results.votes
+    options, embeddings, cast = stage.context.options, stage.results.regions.embeddings, stage.results.votes.sum
     if not np.any(np.asarray(embeddings)):
         raise InputError("--paper", "no region has an embedding to train the autoencoder on", remedy="Leave it out.")
     key = jax.random.key(options.seed)

@@ -17,7 +17,9 @@ import numpy as np
 
 from jsecon.backend import start_backend
 from jsecon.errors import InputError, is_out_of_memory
-from jsecon.field.field import load_field, save_field
+from jsecon.field.field import load_field
+from jsecon.field.ledger import Ledger, LedgerView, camera_row
+from jsecon.field.ledger_file import save_with_ledger
 from jsecon.field.membership import normalise_votes
 from jsecon.files import FIELD_FILE, exclusive_lock
 from jsecon.parallel import allgather_tree
@@ -44,6 +46,7 @@ from jsecon.process import compilation_counts
 from jsecon.read.captures.build import plan_frames
 from jsecon.read.captures.capture import read_posed_images
 from jsecon.read.captures.frames import FrameOptions, evenly_spaced
+from jsecon.read.captures.images import encode_jpeg
 from jsecon.read.masks.masks import load_features, load_labels, load_proposals
 from jsecon.types import Capture, Gaussians, LanguageField, Quality, Regions
 from jsecon.views.frame import find_up_axis, given_up
@@ -285,7 +288,7 @@ def run(
         warnings = [note.removeprefix(WARNING) for note in state.notes if note.startswith(WARNING)]
         origin = provenance(context.options, state.keys, embedder.name, out, warnings)
         field = _join_field(results, embedder, origin, context.options)
-        save_field(out / FIELD_FILE, field)
+        field = save_with_ledger(out / FIELD_FILE, field, _make_ledger(results) if options.ledger else None)
     seconds["field"] = time.monotonic() - started
     console.done("field", seconds["field"], True)
     if field.up is not None and not field.up.sure:
@@ -305,7 +308,7 @@ def _join_field(results: Results, embedder: Embedder, provenance: str, options: 
     scale = capture.metres_per_unit if options.metres_per_unit is None else options.metres_per_unit
     return LanguageField(
         gaussians=results.gaussians,
-        votes=normalise_votes(results.votes, embedded),
+        votes=normalise_votes(results.votes.sum, embedded),
         regions=Regions(embedded.embeddings, pixels),
         cameras=capture.cameras,
         canonical_phrases=np.asarray(embedder.canonical_phrases, np.float32),
@@ -320,6 +323,20 @@ def _join_field(results: Results, embedder: Embedder, provenance: str, options: 
         metres_per_unit=scale,
         tree=results.objects.tree,
     )
+
+
+def _make_ledger(results: Results) -> Ledger:
+    """Gathers what each view contributed to the field of a run."""
+    capture, regions, views = results.load, results.regions, {}
+    assert regions.embedded is not None
+    assert regions.view_embeddings is not None
+    for t, (frame, evidence) in enumerate(zip(results.objects.frames, results.votes.evidence)):
+        shown, rows = np.flatnonzero(regions.pixel_counts[:, t]), regions.embedded[:, 1] == t
+        pixels = np.stack([shown, regions.pixel_counts[shown, t]]).astype(np.int32)
+        embedded = regions.embedded[rows, 0], regions.view_embeddings[rows]
+        row, picture = camera_row(capture.cameras[frame]), encode_jpeg(np.asarray(capture.frames[frame]))
+        views[capture.names[frame]] = LedgerView(evidence, pixels, *embedded, row, picture)
+    return Ledger(regions.count, views)
 
 
 def _open_context(options: Options, out: Path) -> RunContext:

@@ -4,6 +4,7 @@ A field may come from anybody. So its hints are paths relative to its file, abso
 is used only if the name that follows from its content is the one that the run used.
 """
 
+import dataclasses
 import json
 import os
 import re
@@ -13,6 +14,7 @@ from typing import NamedTuple
 
 import jsecon
 from jsecon.errors import InputError
+from jsecon.field.field import Provenance
 from jsecon.files import parse_json
 from jsecon.networks.hub import cached_address
 from jsecon.pipeline.options import Options
@@ -41,6 +43,35 @@ def provenance(options: Options, keys: dict[str, str], embedder: str, out: Path,
     origin = {"jsecon": jsecon.__version__, "options": values | models, "keys": keys, "embedder": embedder}
     origin |= {"folders": _relative_folders(options, out), "models": models, "warnings": list(warnings)}
     return json.dumps(origin, sort_keys=True)
+
+
+def forget_warnings(field: LanguageField, names: Sequence[str]) -> LanguageField:
+    """Leaves out what the run warned of some frames."""
+    origin = parse_json(field.provenance)
+    origin["warnings"] = [text for text in origin.get("warnings", []) if not any(name in text for name in names)]
+    return _with_origin(field, origin, getattr(field.provenance, "folder", None))
+
+
+def move_hints(field: LanguageField, folder: Path) -> LanguageField:
+    """Makes the hints of a field, which are relative to its file, those of a file in another folder."""
+    before, after = getattr(field.provenance, "folder", None), folder.resolve()
+    if before is None or before == after:
+        return field
+    origin = parse_json(field.provenance)
+    hints = origin.get("folders", {}).items()
+    found = {kind: _resolve(before, hint) for kind, hint in hints}
+    try:
+        origin["folders"] = {k: Path(os.path.relpath(p, after)).as_posix() for k, p in found.items() if p is not None}
+    except ValueError:  # another drive of Windows
+        origin["folders"] = {}
+    return _with_origin(field, origin, after)
+
+
+def _with_origin(field: LanguageField, origin: dict, folder: Path | None) -> LanguageField:
+    provenance = Provenance(json.dumps(origin, sort_keys=True))
+    if folder is not None:
+        provenance.folder = folder
+    return dataclasses.replace(field, provenance=provenance)
 
 
 def run_warnings(field: LanguageField) -> list[str]:

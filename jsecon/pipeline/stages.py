@@ -56,6 +56,16 @@ class ObjectLabels:
     """(M,) int32 parent of each node, as `LanguageField.tree` has it."""
 
 
+@dataclasses.dataclass(frozen=True)
+class CastVotes:
+    """Votes, and the lists that they are the sum of."""
+
+    sum: Votes
+    """Weight of each region on each Gaussian."""
+    evidence: tuple[np.ndarray, ...]
+    """The list of each view, packed (`pack_evidence`); () without a ledger."""
+
+
 class Results:
     """Results of the finished stages, by the names of the stages. Reading one that is missing raises AttributeError."""
 
@@ -69,7 +79,7 @@ class Results:
     """R regions of the training frames"""
     parts: Parts | None = None
     """parts of the scene, if the options ask for them"""
-    votes: Votes
+    votes: CastVotes
     """weight of each region on each Gaussian"""
     codes: Codes | None = None
     """codes of the paper, if the options ask for them"""

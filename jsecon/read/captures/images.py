@@ -253,6 +253,19 @@ def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"] | UInt[np.nd
         temporary.write_bytes(data.tobytes())
 
 
+def encode_jpeg(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, " b"]:
+    """Encodes RGB as a JPEG of quality 90."""
+    return cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 90])[1].ravel()
+
+
+def decode_jpeg(data: UInt8[np.ndarray, " b"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Decodes what `encode_jpeg` encoded; ValueError if it is damaged."""
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    if image is None:
+        raise ValueError("a picture is no JPEG")
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
 def read_label_image(path: str | Path) -> Int[np.ndarray, "h w"]:
     """Reads the ids of a label image (.png or .npy).
 

@@ -1,0 +1,143 @@
+"""The ledger of a field: what each view contributes to it, so that views are added and taken away exactly. Pure.
+
+A field is a sum over views, but for the strongest K regions of a Gaussian, its largest pixel weight and the views that
+show a region. So nothing is subtracted: a field is summed anew from the views that the ledger holds. Views are summed
+in the order of their names, and weights add up without error (`jsecon.field.evidence`). So the field is the same, to
+the last bit, in whatever order views came, and after one is forgotten as if it had never been there.
+"""
+
+import dataclasses
+import re
+from collections.abc import Collection, Mapping
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float32, Int32, UInt8
+
+from jsecon.errors import require
+from jsecon.field.evidence import TOP, sum_evidence, unpack_evidence
+from jsecon.field.membership import normalise_votes
+from jsecon.field.regions import unit_rows
+from jsecon.types import Camera, LanguageField, Regions
+
+
+class LedgerView(NamedTuple):
+    """What one view contributes to a field."""
+
+    evidence: UInt8[np.ndarray, " b"]
+    """Its list of Gaussians, regions and weights, packed (`pack_evidence`)."""
+    pixel_counts: Int32[np.ndarray, "2 m"]
+    """The regions that it shows, and their pixels."""
+    embedded: Int32[np.ndarray, " c"]
+    """Regions that were embedded in it."""
+    embeddings: Float32[np.ndarray, "c e"]
+    """Unit embeddings of these; zero where there was none."""
+    camera: Float32[np.ndarray, " 20"]
+    """Its pose (4, 4) row by row, then fx, fy, cx, cy."""
+    picture: UInt8[np.ndarray, " j"]
+    """The photograph at the size of the field's frames, as a JPEG."""
+
+
+class Ledger(NamedTuple):
+    """The views of a field."""
+
+    num_regions: int
+    views: Mapping[str, LedgerView]
+    """By the names of the frames."""
+
+
+def view_order(name: str) -> tuple[str, str]:
+    """Returns the key by which frames are ordered: their names, and the numbers in them (9 before 10)."""
+    return re.sub(r"\d+", lambda number: number[0].zfill(20), name), name
+
+
+def camera_row(camera: Camera) -> Float32[np.ndarray, " 20"]:
+    """Joins the numbers of one camera as `LedgerView.camera` has them."""
+    lens = [camera.fx, camera.fy, camera.cx, camera.cy]
+    return np.concatenate([np.ravel(camera.world_to_camera), lens]).astype(np.float32)
+
+
+def add_views(field: LanguageField, ledger: Ledger, views: Mapping[str, LedgerView]) -> tuple[LanguageField, Ledger]:
+    """Adds views to a field: as one run with all of these views and the same regions makes it, to the last bit.
+
+    Regions of the new views that the field lacks get the next ids. Codes of the paper, which would need training, are
+    dropped. The scene, and the cameras of the old views, stay as they are.
+
+    Args:
+      field: The field.
+      ledger: Its ledger.
+      views: New views by name.
+
+    Returns:
+      The new field and its ledger.
+
+    Raises:
+      ValueError: The field has a view of that name.
+    """
+    twice = sorted(set(views) & set(field.names))
+    require(not twice, "add_views", f"views that are there already: {twice[:3]}", "new names", "Forget them first.")
+    counts = [ledger.num_regions, *(int(view.pixel_counts[0].max(initial=-1)) + 1 for view in views.values())]
+    return _sum_views(field, Ledger(max(counts), {**ledger.views, **views}), {*field.names, *views})
+
+
+def forget_views(field: LanguageField, ledger: Ledger, names: Collection[str]) -> tuple[LanguageField, Ledger]:
+    """Takes frames out of a field: as one run without them and with the same regions makes it, to the last bit.
+
+    A region that no other view shows keeps its id, without votes and embedding. Parts, and codes of the paper, come
+    from all views together and are dropped. The Gaussians stay.
+
+    Args:
+      field: The field.
+      ledger: Its ledger.
+      names: Names of frames of the field, also of ones that had no part in its votes.
+
+    Returns:
+      The new field and its ledger.
+
+    Raises:
+      ValueError: The field has no frame of that name, or no other frame.
+    """
+    names, known = set(names), set(field.names)
+    require(names <= known, "forget_views", sorted(names - known)[:3], "names of the field's frames", "Check them.")
+    views = {name: view for name, view in ledger.views.items() if name not in names}
+    require(len(views) > 0, "forget_views", "all views", "at least one view that stays", "Delete the field instead.")
+    field = dataclasses.replace(field, parts=None)
+    return _sum_views(field, Ledger(ledger.num_regions, views), known - names)
+
+
+def _sum_views(field: LanguageField, ledger: Ledger, names: Collection[str]) -> tuple[LanguageField, Ledger]:
+    """Sums the views of a ledger to the field of frames, the ledger's and others that have no part in the votes."""
+    count, top = ledger.num_regions, field.votes.regions.shape[1]
+    top = max(top, TOP) if top == field.regions.count else top  # a field of few regions holds all
+    ordered = sorted(names, key=view_order)
+    views = {name: ledger.views[name] for name in ordered if name in ledger.views}
+    lists = [unpack_evidence(view.evidence, count) for view in views.values()]
+    votes = sum_evidence(lists, field.gaussians.count, count, top=top, by_view=True)
+    total = np.zeros((count, field.regions.embeddings.shape[1]))
+    pixels = np.zeros((count, len(views)), np.int32)
+    for t, view in enumerate(views.values()):
+        pixels[view.pixel_counts[0], t] = view.pixel_counts[1]
+        total[view.embedded] += pixels[view.embedded, t, None] * view.embeddings.astype(np.float64)
+    embeddings = unit_rows(total)
+    all_pixels = np.zeros((count, len(ordered)), np.int32)
+    all_pixels[:, [name in views for name in ordered]] = pixels
+    rows = dict(zip(field.names, map(camera_row, jax.tree.map(np.asarray, field.cameras))))
+    rows |= {name: view.camera for name, view in views.items() if name not in rows}
+    cameras = np.stack([rows[name] for name in ordered])
+    width, height = field.cameras.width, field.cameras.height
+    return dataclasses.replace(
+        field,
+        votes=normalise_votes(votes, Regions(embeddings, pixels)),
+        regions=Regions(embeddings, all_pixels),
+        cameras=Camera(cameras[:, :16].reshape(-1, 4, 4), *cameras[:, 16:].T, width, height),
+        names=tuple(ordered),
+        tree=None if field.tree is None else _grow_tree(np.asarray(field.tree), field.regions.count, count),
+        codes=None,
+    ), Ledger(count, views)
+
+
+def _grow_tree(tree: Int32[np.ndarray, " m"], old: int, new: int) -> Int32[np.ndarray, " _"]:
+    """Adds regions without a parent to a tree; the unions of regions come after all regions."""
+    moved = np.where(tree >= old, tree + new - old, tree)
+    return np.concatenate([moved[:old], np.full(new - old, -1), moved[old:]]).astype(np.int32)

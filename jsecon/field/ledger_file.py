@@ -1,0 +1,93 @@
+"""The ledger's file, beside its field: NAME.evidence/DIGEST.safetensors, whose digest the field's provenance names.
+
+The ledger is written first, then the field, each atomically. So a field never meets the ledger of another, whenever a
+program is stopped, and what no field names is removed by the next that writes there.
+"""
+
+import dataclasses
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jsecon.errors import InputError
+from jsecon.field.field import save_field
+from jsecon.field.ledger import Ledger, LedgerView
+from jsecon.files import (
+    atomic_write,
+    pack_tree,
+    parse_json,
+    read_arrays,
+    reading,
+    remove_files,
+    unpack_tree,
+    write_arrays,
+)
+from jsecon.types import LanguageField
+
+_REMEDY = "Make the field again with jsecon run, without --no-ledger; the finished stages are reused."
+
+
+def ledger_folder(path: Path) -> Path:
+    """Returns the folder of the ledger of a field's file."""
+    return path.with_suffix(".evidence")
+
+
+def save_with_ledger(path: Path, field: LanguageField, ledger: Ledger | None) -> LanguageField:
+    """Writes a field and its ledger; returns the field as it was written. Ledgers of other fields there are removed."""
+    folder, origin = ledger_folder(path), parse_json(field.provenance)
+    origin.pop("ledger", None)
+    if ledger is not None:
+        arrays: dict[str, np.ndarray] = {}
+        tree = pack_tree({"num_regions": ledger.num_regions, "views": _as_dicts(ledger)}, "", arrays)
+        digest = hashlib.blake2b(json.dumps(tree, sort_keys=True).encode(), digest_size=12)
+        for array in arrays.values():
+            digest.update(np.ascontiguousarray(array).view(np.uint8).data if array.size else b"")
+        origin["ledger"] = digest.hexdigest()
+        if not (folder / _file_name(origin)).is_file():
+            with atomic_write(folder / _file_name(origin)) as temporary:
+                write_arrays(temporary, arrays, {"format": "jsecon-ledger", "version": 1, "ledger": tree})
+    field = dataclasses.replace(field, provenance=json.dumps(origin, sort_keys=True))
+    save_field(path, field)
+    remove_stale(path, field)
+    return field
+
+
+def remove_stale(path: Path, field: LanguageField) -> None:
+    """Removes ledgers of earlier states of a field, which a stopped program may have left, too."""
+    folder, origin = ledger_folder(path), parse_json(field.provenance)
+    if folder.is_dir():
+        remove_files(folder, sorted({*os.listdir(folder)} - {_file_name(origin)}))
+        if "ledger" not in origin:
+            folder.rmdir()
+
+
+def load_ledger(path: Path, field: LanguageField) -> Ledger:
+    """Reads the ledger of a field's file."""
+    origin = parse_json(field.provenance)
+    file = ledger_folder(path) / _file_name(origin)
+    if "ledger" not in origin:
+        raise InputError(path, "the field has no ledger of its views", remedy=_REMEDY)
+    if not file.is_file():
+        problem = f"its ledger is missing: {file.parent.name}/{file.name}"
+        raise InputError(path, problem, remedy=f"Copy that folder along with the field. {_REMEDY}")
+    with reading(file, "a whole one", _REMEDY, problem="the ledger is damaged"):
+        header, arrays = read_arrays(file)
+        if not isinstance(header, dict) or header.get("format") != "jsecon-ledger" or header.get("version") != 1:
+            raise InputError(file, "it is no ledger of this version of jsecon", remedy=_REMEDY)
+        tree = unpack_tree(header["ledger"], arrays)
+        ledger = Ledger(tree["num_regions"], {name: LedgerView(**view) for name, view in tree["views"].items()})
+        if ledger.num_regions != field.regions.count or not {*ledger.views} <= {*field.names}:
+            raise InputError(file, "it is the ledger of another field", remedy=_REMEDY)
+        return ledger
+
+
+def _file_name(origin: Any) -> str:
+    return f"{origin.get('ledger', '')}.safetensors"
+
+
+def _as_dicts(ledger: Ledger) -> dict[str, dict[str, np.ndarray]]:
+    return {name: view._asdict() for name, view in ledger.views.items()}
