@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float, Int
 from jsecon.errors import require
 from jsecon.field.columns import is_mapped, row_slices, votes_of_rows
 from jsecon.field.regions import ALIKE_THRESHOLD, mean_residuals
-from jsecon.numerics import FULL_PRECISION, cosine_matrix, inline_jit
+from jsecon.numerics import FULL_PRECISION, array_module, cosine_matrix, inline_jit
 from jsecon.programs import stored_jit
 from jsecon.types import Array, Regions, Votes
 
@@ -38,6 +38,8 @@ is selected where it has a fifth of that weight or more. Measured on replica_apa
 in 30 to 90 % of the views, and swallowed by their neighbours."""
 SEEN_PART = 0.05
 """The same of its weight on all pixels, for scenes of which only a few objects have masks."""
+VIEWS = 16
+"""Number of which that of views is made a multiple."""
 CORRELATION = 0.05
 """Correlation of two views' errors: a tracker's loss or a proposal's cut lasts, so views beyond about 20 add little."""
 
@@ -65,7 +67,7 @@ def normalise_votes(votes: Votes, regions: Regions) -> Votes:
       ValueError: The votes have no `by_view`, or other views than `regions`.
     """
     if not is_mapped(votes):
-        return _with_overlap(_add_visible_weight(votes, regions))
+        return _with_overlap(_add_visible_weight(*_pad_views(votes, regions)))
     shows = _views_that_show(regions)
     sums = jnp.zeros((regions.count, regions.count), jnp.float32)
     visible = [np.zeros((0, votes.regions.shape[1]), np.float32)]
@@ -76,6 +78,15 @@ def normalise_votes(votes: Votes, regions: Regions) -> Votes:
         visible.append(np.asarray(block.weight_where_region_visible))
     visible = np.concatenate(visible)
     return dataclasses.replace(votes, by_view=None, weight_where_region_visible=visible, overlap=_soft_iou(sums))
+
+
+def _pad_views(votes: Votes, regions: Regions) -> tuple[Votes, Regions]:
+    """Adds views that show nothing, up to a multiple of VIEWS: fields of about as many views share their programs."""
+    by_view = _by_view(votes, regions)
+    missing = -by_view.shape[0] % VIEWS
+    by_view = array_module(by_view).pad(by_view, [(0, missing), (0, 0)])
+    pixels = array_module(regions.pixel_counts).pad(regions.pixel_counts, [(0, 0), (0, missing)])
+    return dataclasses.replace(votes, by_view=by_view), dataclasses.replace(regions, pixel_counts=pixels)
 
 
 def _add_visible_weight(votes: Votes, regions: Regions) -> Votes:
