@@ -18,7 +18,7 @@ from jsecon.association.consensus import (
 )
 from jsecon.association.scene import SceneSuperpixels
 from jsecon.field.evidence import region_votes
-from jsecon.field.regions import node_regions
+from jsecon.field.regions import node_members
 
 
 @pytest.fixture(scope="module")
@@ -36,6 +36,11 @@ def group(*args, **options):
 
 def scene_of(world, proposals, atoms=60):
     return SceneSuperpixels(world[0], world[1], proposals, superpixels_per_frame=atoms)
+
+
+def regions_of(tree, count, node):
+    """Regions under a node of a tree of `count` regions."""
+    return np.flatnonzero(node_members(tree, np.arange(count), int(node))).tolist()
 
 
 @pytest.fixture(scope="module")
@@ -95,13 +100,25 @@ def test_what_some_views_cut_has_a_common_node(world):
         rows = np.flatnonzero((truth[t] == 1).any(1))
         upper = np.arange(HEIGHT)[:, None] < rows.mean() if len(rows) else np.ones((HEIGHT, 1), bool)
         cut[t] = np.concatenate([proposals[t] & upper, proposals[t] & ~upper])
-    found = track_masks(frames, scene_of(world, cut, atoms=300), agreement=0.8)
+    scene = scene_of(world, cut, atoms=300)
+    found = track_masks(frames, scene, agreement=0.8)
     count = int(found.labels.max()) + 1
     inside = [np.bincount(truth[found.labels == r] + 1, minlength=5)[1:].argmax() for r in range(count)]
     halves = [r for r in range(count) if inside[r] == 1]
     assert len(halves) >= 2
-    assert halves in [node_regions(found.tree, count, node) for node in range(count, len(found.tree))]
+    unions = [regions_of(found.tree, count, node) for node in range(count, len(found.tree))]
+    assert halves in unions
     assert all(found.tree[r] < 0 or found.tree[r] >= count for r in range(count))
+
+    merged = track_masks(frames, scene)  # fewer views need agree: the ball is one object, of parts
+    count = int(merged.labels.max()) + 1
+    ball = int(np.bincount(merged.labels[truth == 1] + 1).argmax()) - 1
+    of_ball = np.arange(2500, 4000)
+    members = [node_members(merged.tree, merged.leaf, node)[of_ball] for node in range(len(merged.tree))]
+    assert members[ball].mean() > 0.8
+    upper = np.asarray(world[0].means)[of_ball, 1] < -0.3
+    for half in (upper, ~upper):
+        assert max((half & found).sum() / (half | found).sum() for found in members[count:]) > 0.55
 
 
 def test_parents_come_after_their_children_in_any_tree():
@@ -120,7 +137,7 @@ def test_parents_come_after_their_children_in_any_tree():
         tree = _object_tree(_Groups(np.zeros(0, int), joins, 10 ** rng.uniform(-3, 0, count)), number)
         own = np.arange(len(tree))
         assert ((tree == -1) | ((tree > own) & (tree >= kept.sum()))).all()
-        tops = [node_regions(tree, int(kept.sum()), int(node)) for node in np.flatnonzero(tree < 0)]
+        tops = [regions_of(tree, int(kept.sum()), node) for node in np.flatnonzero(tree < 0)]
         expected = [sorted(number[list(sets[root])][number[list(sets[root])] >= 0].tolist()) for root in roots]
         assert sorted(tops) == sorted(filter(None, expected))
 

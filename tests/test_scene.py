@@ -41,19 +41,24 @@ def test_the_region_of_another_field_selects_nothing_with_a_word(table):
     assert table.ask(Region(5)).reason == ""
 
 
-def test_a_node_of_the_tree_selects_the_regions_under_it():
+def test_a_node_of_the_tree_selects_the_gaussians_under_it():
     field, embedder = table_field()
-    tree = np.array([6, 7, 6, -1, -1, -1, 7, -1], np.int32)  # the mugs and the bottle, step by step
-    scene = Scene(dataclasses.replace(field, tree=tree), embedder, up=(0, 0, 1))
-    parts = [scene.ask(Region(region)).mask for region in (0, 1, 2)]
+    # The mugs and the bottle join step by step; the plate has two parts, of 40 and 80 Gaussians.
+    tree = np.array([6, 7, 6, -1, -1, -1, 7, -1, 3, 3], np.int32)
+    leaf = np.repeat(np.array([0, 1, 2, 8, 9, 4, 5], np.int32), (120, 120, 120, 40, 80, 120, 120))
+    scene = Scene(dataclasses.replace(field, tree=tree, leaf=leaf), embedder, up=(0, 0, 1))
+    things = [scene.ask(Region(region)).mask for region in range(6)]
     first = scene.wider(Region(2))
     whole = scene.wider(first)
     assert (first, whole, scene.wider(whole), scene.wider(Region(3))) == (Region(6), Region(7), None, None)
-    np.testing.assert_array_equal(scene.ask(first).mask, parts[0] | parts[2])
-    np.testing.assert_array_equal(scene.ask(whole).mask, np.any(parts, axis=0))
-    assert (scene.ask(whole).count, scene.ask(whole).as_dict()["region"]) == (3, 7)
+    np.testing.assert_array_equal(scene.ask(first).mask, things[0] | things[2])
+    np.testing.assert_array_equal(scene.ask(whole).mask, things[0] | things[1] | things[2])
+    assert (scene.ask(whole).count, scene.ask(whole).as_dict()["region"]) == (1, 7)
     assert scene.best_frames(scene.ask(whole), 1) == [0]
-    assert "there is no region 8" in str(scene.ask(Region(8)))
+    assert (scene.parts(Region(3)), scene.wider(Region(8))) == ([Region(9), Region(8)], Region(3))
+    np.testing.assert_array_equal(scene.ask(Region(8)).mask | scene.ask(Region(9)).mask, things[3])
+    assert (scene.parts(Region(8)), scene.parts(whole)) == ([], [Region(6), Region(1)])
+    assert "there is no region 10" in str(scene.ask(Region(10)))
 
 
 @pytest.mark.parametrize(("question", "options", "problem"), [

@@ -36,8 +36,8 @@ SURFACE_WIDTH = 0.08
 """Distance from a plane at which pieces count as off it, as a share of the median depth: 12 cm in a small room."""
 LEAST_IN_PLANE = 8
 """Gaussians from which a piece has a plane: those of sparse scenes, of four Gaussians each, tore balls to shreds."""
-TREE_AGREEMENT = 0.05
-"""Probability of a common mask up to which groups are joined in the tree."""
+TREE_AGREEMENT, PART_AGREEMENT = 0.05, 0.9
+"""Probabilities of a common mask up to which objects, and above which parts of objects, are joined in the tree."""
 NEW_NODE = 0.1
 """Share of its weight that a join must add to make a node of its own."""
 
@@ -48,8 +48,9 @@ class Objects(NamedTuple):
     labels: Int16[np.ndarray, "t h w"]
     """(T, H, W) object 0 .. R-1 of each pixel, -1 for none."""
     tree: Int32[np.ndarray, " m"] | None = None
-    """(M,) parent of each node, -1 at the top: nodes 0 .. R-1 are the objects, later ones unions of earlier ones. None
-    if it is not known what belongs together."""
+    """(M,) parent of each node, as `LanguageField.tree` has it. None if it is not known what belongs together."""
+    leaf: Int32[np.ndarray, " n"] | None = None
+    """(N,) smallest node of each Gaussian, as `LanguageField.leaf` has it."""
 
 
 class _Groups(NamedTuple):
@@ -61,6 +62,8 @@ class _Groups(NamedTuple):
     """Pairs of groups that join, in turn; the first of a pair stands for both after it."""
     weight: Float[np.ndarray, " r"]
     """(R,) rendering weight of each group."""
+    parts: "_Groups | None" = None
+    """The groups that joined to these, and how."""
 
 
 def _group_by_consensus(
@@ -78,7 +81,8 @@ def _group_by_consensus(
 
     The Gaussians are first gathered into small pieces (`_scene_pieces`). Then `_average_linkage` joins pieces while the
     views that see two groups put both into one mask with a probability of at least `agreement`, or of 1 if they lie off
-    each other's plane (`_coplanarity`). Groups that have less than 0.02 of their visibility in common stay separate.
+    each other's plane (`_coplanarity`). What joins at PART_AGREEMENT is a part. Groups that have less than 0.02 of
+    their visibility in common stay separate.
 
     Args:
       membership: (N, M) share of each Gaussian in each of the M masks of all frames, times its visibility there.
@@ -107,15 +111,14 @@ def _group_by_consensus(
     coplanarity[sparse_pieces[:, None] | sparse_pieces] = 1.0
     together = (in_masks @ in_masks.T).toarray() * (off_plane + (1.0 - off_plane) * coplanarity)
     both = (in_view @ in_view.T).toarray()
-    group, _ = _average_linkage(together, both, least_ratio=agreement, least_shared=0.02)
-    owner[live] = group[piece[live]]
-    member = one_hot(group, int(group.max()) + 1)
-    _, joins = _average_linkage(
-        *(member.T @ (member.T @ matrix).T for matrix in (together, both)),
-        least_ratio=TREE_AGREEMENT,
-        least_shared=0.02,
-    )
-    return _Groups(owner, joins, np.bincount(owner[live], weights[live]))
+    group, groups = np.arange(len(both)), None
+    for least_ratio in (max(PART_AGREEMENT, agreement), agreement, TREE_AGREEMENT):
+        joined, joins = _average_linkage(together, both, least_ratio=least_ratio, least_shared=0.02)
+        owner[live] = group[piece[live]]
+        groups = _Groups(owner.copy(), joins, np.bincount(owner[live], weights[live]), groups)
+        member, group = one_hot(joined, int(joined.max()) + 1), joined[group]
+        together, both = (member.T @ (member.T @ matrix).T for matrix in (together, both))
+    return groups
 
 
 def _piece_planes(
@@ -300,7 +303,7 @@ def track_masks(
             mass = (view.votes.T @ one_hot(owner[view.seen], count)).toarray()
             image[:] = assign_superpixels(view, mass, mass.sum(1, keepdims=True))[view.labels]
     cleaned, number = _clean(labels, count)
-    return Objects(cleaned, _object_tree(groups, number))
+    return Objects(cleaned, *_with_parts(_object_tree(groups, number), groups, number))
 
 
 def _object_tree(groups: _Groups, number: Int[np.ndarray, " g"]) -> Int32[np.ndarray, " m"]:
@@ -326,6 +329,34 @@ def _object_tree(groups: _Groups, number: Int[np.ndarray, " g"]) -> Int32[np.nda
             weight[large] += weight[small]
         node[first] = large
     return np.array(parent, np.int32)
+
+
+def _with_parts(
+    tree: Int32[np.ndarray, " m"], groups: _Groups, number: Int[np.ndarray, " g"]
+) -> tuple[Int32[np.ndarray, " p"], Int32[np.ndarray, " n"]]:
+    """Adds the parts of objects to their tree, and finds the smallest node of each Gaussian (N,), -1 for none.
+
+    Arguments as for `_object_tree`, whose result is `tree`. An object of a single part has no further node.
+    """
+    parts = groups.parts
+    if parts is None:
+        return tree, np.full(len(groups.owner), -1, np.int32)
+    known = groups.owner >= 0
+    of_part = np.full(len(parts.weight), -1)
+    of_part[parts.owner[known]] = number[groups.owner[known]]
+    kept = of_part >= 0
+    below = _object_tree(parts, np.where(kept, np.cumsum(kept) - 1, -1))
+    whole = np.pad(of_part[kept], (0, len(below) - kept.sum()), constant_values=-1)
+    for child, parent in enumerate(below):
+        if parent >= 0:
+            whole[parent] = whole[child]
+    is_top = below < 0  # the object itself
+    node = np.where(is_top, whole, len(tree) + np.cumsum(~is_top) - 1)
+    leaf = np.full(len(groups.owner), -1, np.int32)
+    of_leaf = np.full(len(kept), -1)
+    of_leaf[kept] = node[: kept.sum()]
+    leaf[known] = of_leaf[parts.owner[known]]
+    return np.concatenate([tree, node[below[~is_top]]]).astype(np.int32), leaf
 
 
 def clean_tracks(

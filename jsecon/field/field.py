@@ -50,7 +50,7 @@ _SHAPES = {
     ("n", 3): "gaussians.means gaussians.log_scales",
     ("n", 4): "gaussians.quaternions",
     ("n", "b", 3): "gaussians.sh",
-    ("n",): "gaussians.opacity_logits votes.labelled votes.total votes.max_pixel_weight votes.views parts.part",
+    ("n",): "gaussians.opacity_logits votes.labelled votes.total votes.max_pixel_weight votes.views parts.part leaf",
     ("n", "d"): "codes.gaussians",
     ("n", "k"): "votes.regions votes.weights votes.weight_where_region_visible",
     ("r", "e"): "regions.embeddings",
@@ -68,7 +68,7 @@ _SHAPES = {
 _OPTIONAL = (
     "gaussians.sh", "votes.weight_where_region_visible", "votes.overlap", "parts.part", "parts.embeddings",
     "unrelated_words", "codes.gaussians", "codes.regions",
-    "tree",
+    "tree", "leaf",
 )  # fmt: skip
 
 
@@ -191,6 +191,7 @@ def _disagreement(field: LanguageField) -> str | None:
 def _oddity(field: LanguageField, checked: bool = True) -> str | None:
     """What is wrong with the numbers or texts, in words, or None; mapped columns are read only if `checked`."""
     sizes = {"votes.regions": field.regions.count, "parts.part": field.parts and len(field.parts.weight)}
+    sizes["leaf"] = 0 if field.tree is None else len(field.tree)
     for place, leaf in jax.tree_util.tree_leaves_with_path(field):
         if isinstance(leaf, np.memmap) and not checked:
             continue
@@ -204,8 +205,10 @@ def _oddity(field: LanguageField, checked: bool = True) -> str | None:
                 return f"{name} with numbers beyond {sizes[name]}"
     if field.gaussians.sh is not None and field.gaussians.sh.shape[1] not in COEFFICIENT_COUNTS:
         return f"harmonics of {field.gaussians.sh.shape[1]} functions"
+    if (field.tree is None) != (field.leaf is None):
+        return "a tree without the smallest nodes of its Gaussians, or these without a tree"
     if field.tree is not None and not _is_tree(np.asarray(field.tree), field.regions.count):
-        return "a tree whose nodes do not come before their parents, or of which a region is no leaf"
+        return "a tree whose nodes do not come before their parents, or form circles"
     texts = (*field.names, field.embedder, field.provenance)
     if not all(isinstance(text, str) for text in texts) or not isinstance(parse_json(field.provenance), dict):
         return "names, embedder or provenance that are no texts, or no JSON object"
@@ -224,10 +227,17 @@ def _oddity(field: LanguageField, checked: bool = True) -> str | None:
 
 
 def _is_tree(parent: np.ndarray, count: int) -> bool:
-    """Whether these are the parents of the nodes of a tree whose leaves are `count` regions."""
+    """Whether these are the parents of the nodes of a tree over `count` regions and their parts."""
+    if parent.dtype.kind != "i" or len(parent) < count:
+        return False
     own = np.arange(len(parent))
-    inner = (parent > own) & (parent >= count) & (parent < len(parent))
-    return parent.dtype.kind == "i" and len(parent) >= count and bool(((parent == -1) | inner).all())
+    above = ((parent > own) & (parent >= count) & (parent < len(parent))) | (parent == -1)
+    of_region = (own >= count) & (parent >= 0) & (parent < count)
+    if not (above | of_region).all():
+        return False
+    for _ in range(len(parent).bit_length()):  # no node is above itself
+        parent = np.where(parent >= 0, parent[parent], -1)
+    return bool((parent == -1).all())
 
 
 def _is_up_axis(up: Any) -> bool:

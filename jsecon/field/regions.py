@@ -220,13 +220,13 @@ def mean_residuals(embeddings: Float[Array, "r e"]) -> tuple[Float[Array, "r e"]
     return xp.where(known[:, None], units - total, 0.0), known
 
 
-def node_regions(tree: Int[np.ndarray, " m"], count: int, node: int) -> list[int]:
-    """Lists the regions under a node of `LanguageField.tree`, of a field of `count` regions; a region is its own."""
-    under = {node}
-    for child in range(node - 1, -1, -1):  # parents come after their children
-        if int(tree[child]) in under:
-            under.add(child)
-    return sorted(child for child in under if child < count)
+def node_members(tree: Int[np.ndarray, " m"], leaf: Int[np.ndarray, " n"], node: int) -> Bool[np.ndarray, " n"]:
+    """Finds what belongs to a node of `LanguageField.tree`: (N,) of what has the smallest nodes `leaf`, -1 for none."""
+    under, fresh = np.zeros(len(tree) + 1, bool), np.array([node])  # the last entry is that of -1
+    while len(fresh):
+        under[fresh] = True
+        fresh = np.flatnonzero(under[tree] & ~under[:-1])
+    return under[leaf]
 
 
 def scene_parts(part: Int[np.ndarray, " n"], cast: Any, embeddings: Float[np.ndarray, "m e"]) -> Parts:

@@ -204,7 +204,7 @@ def _find_objects(stage: StageInput) -> StageResult:
     found = _associate_masks(context, view, scene, proposals, stage.progress, stage.checkpoint)
     context.models.close()
     _require_regions(found.labels, str(context.options.capture))
-    return StageResult(ObjectLabels(found.labels, frames, found.tree), notes=(*why_fewer, *notes))
+    return StageResult(ObjectLabels(found.labels, frames, found.tree, found.leaf), notes=(*why_fewer, *notes))
 
 
 def _frame_proposals(

@@ -322,6 +322,7 @@ def _join_field(results: Results, embedder: Embedder, provenance: str, options: 
         up=given or capture.up or find_up_axis(results.gaussians, capture.cameras),
         metres_per_unit=scale,
         tree=results.objects.tree,
+        leaf=results.objects.leaf,
     )
 
 

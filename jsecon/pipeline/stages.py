@@ -54,6 +54,8 @@ class ObjectLabels:
     """(T,) which frames of the capture these are, ascending."""
     tree: np.ndarray | None = None
     """(M,) int32 parent of each node, as `LanguageField.tree` has it."""
+    leaf: np.ndarray | None = None
+    """(N,) int32 smallest node of each Gaussian, as `LanguageField.leaf` has it."""
 
 
 @dataclasses.dataclass(frozen=True)

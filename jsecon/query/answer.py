@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Int
 from jsecon.errors import require
 from jsecon.field.columns import is_mapped, vote_blocks
 from jsecon.field.membership import inside_fraction, inside_fraction_of_regions
-from jsecon.field.regions import node_regions
+from jsecon.field.regions import node_members
 from jsecon.field.similarity import Number, similarities
 from jsecon.numerics import array_module, is_traced
 from jsecon.paper.queries import select_by_code
@@ -92,16 +92,17 @@ def answer_question(
     """Answers a question by the path of this page. Host code.
 
     `query` has the embeddings of one text or several, or is the id of a region that stands in place of a text, or of a
-    node of `LanguageField.tree` for all regions under it.
+    node of `LanguageField.tree` for the Gaussians under it.
     `outliers` drops the Gaussians that lie apart; regions of the `excluded` texts are left out.
     """
     parts = None
     if isinstance(query, int | np.integer):
         match = match_region(field, query, rules)
         several = rules.duplicate_cosine is not None
-        if field.tree is not None and (count := field.regions.count) <= query < len(field.tree):
-            chosen = np.isin(np.arange(count), node_regions(np.asarray(field.tree), count, int(query)))
-            match, several = RegionMatch(chosen, np.asarray(query, np.int32), np.asarray(1.0, np.float32)), True
+        if field.tree is not None and field.regions.count <= query < len(field.tree):
+            members = node_members(np.asarray(field.tree), np.asarray(field.leaf), int(query))
+            numbers = np.asarray(query, np.int32), np.asarray(1.0, np.float32)
+            parts, several = Selection(members, members.astype(np.float32), *numbers), True
     else:
         match = match_regions(field, query, rules, excluded=excluded)
         several = rules.all_of_class or len(query) > 1 or (excluded is not None and len(excluded) > 0)
