@@ -213,15 +213,31 @@ def test_numbers_that_are_not_finite_are_found_a_piece_at_a_time(path, monkeypat
 ALONE = [-1] * REGIONS
 
 
-@pytest.mark.parametrize("tree", [ALONE[1:], [*ALONE, 0], [1, *ALONE[1:]], [REGIONS, *ALONE[1:]], [-1.0] * REGIONS])
+@pytest.mark.parametrize("tree", [
+    ALONE[1:], [1, *ALONE[1:]], [REGIONS, *ALONE[1:]], [-1.0] * REGIONS, [REGIONS, *ALONE[1:], 0],
+])  # fmt: skip
 def test_a_tree_that_is_none_is_refused(field, tmp_path, tree):
-    """Too few nodes, a parent before its child, a region under a region, a parent that is not there, no integers."""
+    """Too few nodes, a region under a region, a parent that is not there, no integers, a circle."""
+    nodes = dataclasses.replace(field, tree=np.array(tree), leaf=np.full(field.gaussians.count, -1, np.int32))
     with pytest.raises(ValueError, match="a tree whose nodes"):
-        save_field(tmp_path / "field.safetensors", dataclasses.replace(field, tree=np.array(tree)))
+        save_field(tmp_path / "field.safetensors", nodes)
+
+
+@pytest.mark.parametrize(("tree", "leaf", "problem"), [
+    (ALONE, None, "a tree without the smallest nodes"), (ALONE, REGIONS, "beyond"),
+])  # fmt: skip
+def test_a_tree_and_the_nodes_of_its_gaussians_belong_together(field, tmp_path, tree, leaf, problem):
+    leaf = None if leaf is None else np.full(field.gaussians.count, leaf, np.int32)
+    nodes = dataclasses.replace(field, tree=np.array(tree), leaf=leaf)
+    with pytest.raises(ValueError, match=problem):
+        save_field(tmp_path / "field.safetensors", nodes)
 
 
 def test_a_field_keeps_its_tree(field, tmp_path):
     count = field.regions.count
     tree = np.array([count, count, *[-1] * (count - 1)], np.int32)
-    save_field(tmp_path / "field.safetensors", dataclasses.replace(field, tree=tree))
+    save_field(
+        tmp_path / "field.safetensors",
+        dataclasses.replace(field, tree=tree, leaf=np.arange(field.gaussians.count, dtype=np.int32) % REGIONS),
+    )
     np.testing.assert_array_equal(load_field(tmp_path / "field.safetensors").tree, tree)

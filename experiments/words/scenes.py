@@ -35,7 +35,7 @@ from jsecon.field.evidence import region_votes
 from jsecon.fit.start import starting_gaussians
 from jsecon.pipeline.objects import plan_objects
 from jsecon.pipeline.options import Options as RunOptions
-from jsecon.pipeline.stages import Checkpoint, Results, RunContext, StageInput
+from jsecon.pipeline.stages import Checkpoint, ObjectLabels, Results, RunContext, StageInput
 from jsecon.read.captures.capture import load_capture
 from jsecon.types import Camera, Capture, Gaussians, Regions, Votes
 from jsecon.vision.colours import ColourEmbedder
@@ -94,6 +94,10 @@ class WordScene:
     """(N,) name of each Gaussian by views that do not vote; len(names) = something else, -1 = not judged."""
     region_names: np.ndarray
     """(R,) the true name of each region; len(names) = something else, -1 = not known."""
+    things: np.ndarray
+    """(N,) the single thing that each Gaussian is of, by views that do not vote; -1 = not known."""
+    found: ObjectLabels | None = None
+    """What default masks were found to show, with its tree; None where masks are given."""
     outlined: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
     """Frames (G, H, W, 3) in which things are outlined one by one, the things in them (G, H, W), -1 = none, and the
     name of each thing (X,), -1 = none that is asked for."""
@@ -137,14 +141,14 @@ class WordScene:
         return Regions(unit(gather @ np.asarray(embeddings, np.float64)), self.pixels)
 
 
-def _default_masks(capture: Capture, gaussians: Gaussians) -> np.ndarray:
-    """labels (T, H, W) of the views that vote, by the vision without weights as `jsecon run` has it."""
+def _default_masks(capture: Capture, gaussians: Gaussians) -> ObjectLabels:
+    """Objects of the views that vote, by the vision without weights as `jsecon run` has it."""
     work, loaded = RunContext(RunOptions(Path()), Models(ColourEmbedder()), Path()), Results(load=capture)
     loaded.gaussians = _on_device(gaussians)
     return (
         plan_objects(work)[0]
         .compute(StageInput(work, loaded, lambda done, total: None, Checkpoint(Path("objects"))))
-        .value.labels
+        .value
     )
 
 
@@ -173,9 +177,10 @@ def _replica(masks: str) -> WordScene:
     by_silent = names_of_objects(object_of, near, count, len(names))
     by_all = names_of_objects(labels_of_points(points, objects, count), near, count, len(names))
     voting = np.flatnonzero(~capture.held_out)
-    labels, region_names = objects[voting], by_all
+    labels, region_names, found = objects[voting], by_all, None
     if masks == DEFAULT:
-        labels = _default_masks(capture, gaussians)
+        found = _default_masks(capture, gaussians)
+        labels = found.labels
         named = _named(objects[voting], by_all)
         region_names = names_of_objects(labels.ravel(), named.ravel(), int(labels.max()) + 1, len(names))
     return WordScene(
@@ -188,6 +193,8 @@ def _replica(masks: str) -> WordScene:
         asked=np.array([names.index(word) for word in CLASSES]),
         truth=_named(object_of, by_silent),
         region_names=region_names,
+        things=object_of,
+        found=found,
     )
 
 
@@ -197,11 +204,13 @@ def _apc(masks: str) -> WordScene:
     capture, objects = apc_bin.load_apc(options.capture, **how)
     gaussians = apc_bin.build_gaussians(capture, options)
     voting, judged, count = np.flatnonzero(~capture.held_out), np.flatnonzero(capture.held_out), len(APC_TEXTS)
-    labels, region_names = objects[voting], np.arange(count + 1)
+    labels, region_names, found = objects[voting], np.arange(count + 1), None
     if masks == DEFAULT:
-        labels = _default_masks(capture, gaussians)
+        found = _default_masks(capture, gaussians)
+        labels = found.labels
         region_names = names_of_objects(labels.ravel(), objects[voting].ravel(), int(labels.max()) + 1, count + 1)
     frames = np.asarray(capture.frames)
+    truth = _names_by_views(gaussians, capture.cameras[judged], objects[judged], count + 1)
     return WordScene(
         name="apc_bin",
         gaussians=gaussians,
@@ -210,8 +219,10 @@ def _apc(masks: str) -> WordScene:
         labels=labels,
         names=APC_TEXTS,
         asked=np.arange(count),
-        truth=_names_by_views(gaussians, capture.cameras[judged], objects[judged], count + 1),
+        truth=truth,
         region_names=region_names,
+        things=np.where(truth < count, truth, -1),
+        found=found,
         outlined=(frames, objects, np.array([*range(count), -1])),
     )
 
@@ -236,7 +247,10 @@ def _bonsai(masks: str) -> WordScene:
     thing_names = np.array([names.index(BONSAI_TEXTS[thing]) for thing in things])
     outlines = np.where(outlined >= 0, thing_names[outlined], len(names)).astype(np.int16)
     truth = _names_by_views(gaussians, capture.cameras[frames], outlines, len(names) + 1)
-    voting, labels = np.flatnonzero(~np.asarray(capture.held_out)), _default_masks(capture, gaussians)
+    voting, found = np.flatnonzero(~np.asarray(capture.held_out)), _default_masks(capture, gaussians)
+    labels = found.labels
+    by_thing = np.where(outlined >= 0, outlined, len(things))
+    thing = _names_by_views(gaussians, capture.cameras[frames], by_thing, len(things) + 1)
     # No frame has both an outline and a region: a region's name is that of most Gaussians that it is strongest on.
     strongest = _names_by_views(gaussians, capture.cameras[voting], labels, int(labels.max()) + 1)
     return WordScene(
@@ -249,6 +263,8 @@ def _bonsai(masks: str) -> WordScene:
         asked=np.arange(len(names)),
         truth=truth,
         region_names=names_of_objects(strongest, truth, int(labels.max()) + 1, len(names) + 1),
+        things=np.where(thing < len(things), thing, -1),
+        found=found,
         outlined=(np.asarray(capture.frames)[frames], outlined, thing_names),
     )
 
