@@ -87,14 +87,16 @@ def test_views_added_in_any_order_make_the_field_of_one_run(scene, cameras, labe
 
 
 def test_regions_that_a_field_lacks_are_added(scene, cameras, labels, rows, views):
-    """They come before the unions of its tree, which keep their regions."""
+    """They come before the unions and parts of its tree, which keep their regions."""
     few = {name: view for name, view in views.items() if 4 not in view.pixel_counts[0]}
     assert len(few) == 3
     field = run_on(scene, cameras, labels, rows, [0, 1, 2])
     four = Regions(field.regions.embeddings[:4], field.regions.pixel_counts[:4])
-    field = dataclasses.replace(field, regions=four, tree=np.array([4, 4, -1, -1, -1], np.int32))
+    leaf = np.arange(field.gaussians.count, dtype=np.int32) % 6
+    field = dataclasses.replace(field, regions=four, tree=np.array([4, 4, -1, -1, -1, 3], np.int32), leaf=leaf)
     grown, ledger = add_views(field, Ledger(4, few), {NAMES[3]: views[NAMES[3]]})
-    np.testing.assert_array_equal(grown.tree, [5, 5, -1, -1, -1, -1])
+    np.testing.assert_array_equal(grown.tree, [5, 5, -1, -1, -1, -1, 3])
+    np.testing.assert_array_equal(grown.leaf, leaf + (leaf >= 4))
     assert ledger.num_regions == grown.regions.count == REGIONS
     whole = run_on(scene, cameras, labels, rows, [0, 1, 2, 3])
     for name in ("weights", "regions", "weight_where_region_visible"):

@@ -132,12 +132,15 @@ def _sum_views(field: LanguageField, ledger: Ledger, names: Collection[str]) -> 
         regions=Regions(embeddings, all_pixels),
         cameras=Camera(cameras[:, :16].reshape(-1, 4, 4), *cameras[:, 16:].T, width, height),
         names=tuple(ordered),
-        tree=None if field.tree is None else _grow_tree(np.asarray(field.tree), field.regions.count, count),
+        **_grown_tree(field, count),
         codes=None,
     ), Ledger(count, views)
 
 
-def _grow_tree(tree: Int32[np.ndarray, " m"], old: int, new: int) -> Int32[np.ndarray, " _"]:
-    """Adds regions without a parent to a tree; the unions of regions come after all regions."""
-    moved = np.where(tree >= old, tree + new - old, tree)
-    return np.concatenate([moved[:old], np.full(new - old, -1), moved[old:]]).astype(np.int32)
+def _grown_tree(field: LanguageField, count: int) -> dict[str, np.ndarray]:
+    """Tree and smallest nodes of a field that has `count` regions now: new ones stand alone, before all other nodes."""
+    if field.tree is None:
+        return {}
+    old, tree, leaf = field.regions.count, np.asarray(field.tree), np.asarray(field.leaf)
+    tree, leaf = (np.where(nodes >= old, nodes + count - old, nodes).astype(np.int32) for nodes in (tree, leaf))
+    return {"tree": np.insert(tree, old, np.full(count - old, -1)), "leaf": leaf}
