@@ -63,7 +63,7 @@ def jsecon_imports(path: Path) -> set[str]:
 GROUND = ("types", "numerics", "errors", "files", "parallel", "process", "programs", "backend")
 LAYERS = (
     "splat", "vision", "read", "fit", "poses", "networks", "field", "association", "paper", "query", "evaluate",
-    "views", "pipeline", "app", "demo",
+    "views", "change", "pipeline", "app", "demo",
 )  # fmt: skip
 """packages, lowest first: each imports the modules of the root, itself, and packages before it"""
 

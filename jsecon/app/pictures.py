@@ -54,13 +54,13 @@ def selection_overlay(
     """Shows a selection in a frame: outlined, dark outside, tinted inside; with the outline of the truth, if any."""
     image = frame.astype(np.float32)
     image = np.where(mask[..., None], (1 - tint) * image + tint * np.array(SELECTED, np.float32), 0.5 * image)
-    image = _outlined(image.astype(np.uint8), mask, SELECTED, 1)
+    image = outlined(image.astype(np.uint8), mask, SELECTED, 1)
     if truth is not None:
-        image = _outlined(_outlined(image, truth, (0, 0, 0), 3), truth, (255, 255, 255), 1)
+        image = outlined(outlined(image, truth, (0, 0, 0), 3), truth, (255, 255, 255), 1)
     return image
 
 
-def _outlined(image: np.ndarray, mask: np.ndarray, colour: tuple[int, ...], thickness: int) -> np.ndarray:
+def outlined(image: np.ndarray, mask: np.ndarray, colour: tuple[int, ...], thickness: int) -> np.ndarray:
     """Draws the outline of a mask into an image."""
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     image = np.ascontiguousarray(image)

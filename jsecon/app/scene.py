@@ -20,6 +20,7 @@ from jaxtyping import Bool, Int, UInt8
 
 from jsecon.app import pictures
 from jsecon.app.catalogue import Catalogue, objects
+from jsecon.app.comparison import Changes, find_changes
 from jsecon.app.object_index import ObjectIndex, choose_shades
 from jsecon.app.opening import locate_field, name_fields
 from jsecon.app.records import Answer, At, Box, Mask, Query, Question, Region, gaussian_rows
@@ -582,6 +583,24 @@ class Scene:
             if vocabulary is None:
                 return self._catalogue
             return objects(self.field, vocabulary, self.embedder, up=self._up)
+
+    def changes(self, capture: Capture) -> Changes:
+        """Finds what became of each object, and what is new, in new photographs.
+
+        An object is the same, moved, gone, of another look, or not seen. Light, shadows and exposure are no changes.
+
+        Args:
+          capture: The photographs, with poses in the world of the field's own capture, and with depth if there is any.
+
+        Returns:
+          The changes; `records()` has plain values.
+
+        Raises:
+          InputError: The photographs show another place, or the field is too large for memory.
+        """
+        with self._lock:
+            self._require_memory("a comparison")
+            return find_changes(self.field, self._catalogue, capture)
 
     def prepare(self) -> None:
         """Compiles what questions need, so that the first question is as fast as later ones.

@@ -327,6 +327,28 @@ class Export(_FieldVerb):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class Changes(_FieldVerb):
+    """Finds what moved, is gone or is new in new photographs of a field's place.
+
+    Writes changes.json, changes.csv, and changes.html with pictures before and after and a plan from above. Each object
+    is the same, moved, gone, of another look, or not seen; each change has a probability, and the frames that prove it.
+    Light, shadows and exposure are no changes. Walls, floors and the like do not change.
+
+    Attributes:
+      photos: A capture with poses in the world of the field's own capture, with or without depth, in any format of
+        jsecon run; or another file of Gaussians of the same place.
+      out: Output folder.
+      transform: Text file with a 4x4 similarity from the world of that file of Gaussians to the field's capture.
+    """
+
+    examples = ("jsecon changes my_field/field.safetensors new_capture --out changes",)
+
+    photos: Positional[Path]
+    out: Option[Path] = Path("changes")
+    transform: Option[Path | None] = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class View(_FieldVerb):
     """Shows a field in a browser and answers queries there.
 
@@ -470,6 +492,7 @@ VERBS: dict[type[Verb], str] = {
     Add: "app.living:_add",
     Forget: "app.living:_forget",
     Export: "app.exports:_export",
+    Changes: "app.changes:_changes",
     View: "app.viewer.window:_view",
     Eval: "app.evaluation:_eval",
     Serve: "app.server:_serve",

@@ -69,6 +69,7 @@ def render_rgb(
     background: Array | None = None,
     capacity: int | None = None,
     near: float = NEAR,
+    depth: bool = False,
     mesh: Mesh | None = None,
 ) -> Rendering:
     """Renders colour from spherical harmonics.
@@ -79,6 +80,7 @@ def render_rgb(
       background: (3,) colour, added with weight 1 - alpha.
       capacity: Number of (block, Gaussian) pairs, see `render`.
       near: Near plane, world units.
+      depth: Whether to render depth in the same pass, see `render`.
       mesh: Devices of this process to divide the work among, see `render`; None uses one.
 
     Returns:
@@ -89,7 +91,8 @@ def render_rgb(
     """
     check_gaussians(gaussians, camera)
     rgb = _colours(gaussians, camera)
-    return render(gaussians, camera, rgb, background=background, capacity=capacity, near=near, mesh=mesh)
+    options = {"capacity": capacity, "near": near, "depth": depth, "mesh": mesh}
+    return render(gaussians, camera, rgb, background=background, **options)
 
 
 _colours = stored_jit(colours_from_sh)

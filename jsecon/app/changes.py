@@ -1,0 +1,146 @@
+"""`jsecon changes`: what changed of the objects of a field, as JSON, a table, and a page with pictures and a plan."""
+
+import csv
+import io
+import json
+from typing import Any
+
+import cv2
+import numpy as np
+
+from jsecon.app import pictures, report, verbs
+from jsecon.app.comparison import LONG_SIDE, Changes, splat_capture
+from jsecon.app.records import unit_of
+from jsecon.app.scene import open_scene
+from jsecon.change.detect import KINDS
+from jsecon.errors import InputError
+from jsecon.files import write_text
+from jsecon.pipeline.options import is_bare_scene, require_writable
+from jsecon.pipeline.progress import Console
+from jsecon.read.captures.capture import load_capture
+from jsecon.views.frame import field_up
+
+_PLAN = 700
+"""Longer side of the plan, px."""
+COLOURS = {"moved": (40, 110, 230), "gone": (220, 50, 60), "new": (20, 150, 80), "look": (190, 120, 20)}
+"""RGB of the kinds of changes."""
+
+
+def _changes(verb: verbs.Changes, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon changes`; the result has the records of the changes."""
+    require_writable(verb.out)
+    if verb.transform is not None and not is_bare_scene(verb.photos):
+        raise InputError("--transform", "photographs have poses", remedy="Leave it out: it is for a file of Gaussians.")
+    scene = open_scene(verb.field, embedder=verb.embedder, console=console)
+    with console.progress("photographs") as progress:
+        if is_bare_scene(verb.photos):
+            capture = splat_capture(scene.field, verb.photos, verb.transform)
+        else:
+            capture = load_capture(verb.photos, long_side=LONG_SIDE, holdout=0, progress=progress)
+    with console.progress("changes"):
+        changes = scene.changes(capture)
+    records = changes.records()
+    for record in records:
+        if record["kind"] not in ("same", "not seen"):
+            console.print_line(_words(record))
+    count = {kind: sum(record["kind"] == kind for record in records) for kind in KINDS}
+    console.print_line(", ".join(f"{number} {kind}" for kind, number in count.items() if number) or "no objects")
+    files = {name: verb.out / f"changes.{name}" for name in ("json", "csv", "html")}
+    content = {"frame": "the capture's world", "unit": unit_of(scene.field), "changes": records}
+    write_text(files["json"], json.dumps(content, indent=2) + "\n")
+    write_text(files["csv"], _table(records))
+    with console.progress("pictures"):
+        write_text(files["html"], changes_page(changes))
+    console.print_line(f"pictures  {files['html']}")
+    return {"changes": records, "written": files}
+
+
+def _words(record: dict[str, Any]) -> str:
+    """Says what changed in a line."""
+    name = record["name"] or "something"
+    title = f"{record['kind']:>6}  {name}" + ("" if record["id"] is None else f" (object {record['id']})")
+    places = [", ".join(f"{x:.2f}" for x in place) for place in (record["from"], record["to"]) if place is not None]
+    words = f"from ({places[0]}) to ({places[1]})" if len(places) == 2 else f"at ({places[0]})"
+    if record["kind"] == "moved":
+        words += f", by {record['distance']:.2f}, turned by {record['turned_degrees']:.0f} degrees"
+    return f"{title}: {words}, probability {record['probability']:.2f}, seen in {', '.join(record['frames'][:3])}"
+
+
+def _table(records: list[dict[str, Any]]) -> str:
+    """The records as CSV, a coordinate a column."""
+    text = io.StringIO()
+    ends = [f"{end}_{axis}" for end in ("from", "to") for axis in "xyz"]
+    names = ("kind", "name", "id", "region", "probability", "distance", "turned_degrees")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*names, *ends, "frames"])
+    for record in records:
+        places = [x for end in ("from", "to") for x in record[end] or ("", "", "")]
+        writer.writerow([*(record[name] for name in names), *places, " ".join(record["frames"])])
+    return text.getvalue()
+
+
+def changes_page(changes: Changes) -> str:
+    """The page of changes: a plan from above, and before and after of each."""
+    records, cards = changes.records(), []
+    plan = report.figure(_draw_plan(changes), "From above: blue moved, red gone, green new, brown another look.")
+    for change, record in zip(changes.found, records):
+        if change.kind in ("same", "not seen") or not change.frames:
+            continue
+        shown = change.before if change.before.any() else change.after
+        t = max(change.frames, key=lambda t: int(shown[t].sum() + change.after[t].sum()))
+        camera = changes.capture.cameras[t]
+        images = pictures.render_picture(changes.field.gaussians, camera), changes.capture.frames[t]
+        colour = COLOURS[change.kind]
+        outlined = [
+            pictures.outlined(image, mask, colour, 2)
+            for image, mask in zip(images, (change.before[t], change.after[t]))
+        ]
+        pair = [report.figure(image, words) for image, words in zip(outlined, ("before", changes.capture.names[t]))]
+        title, _, words = _words(record).strip().partition(": ")
+        cards.append(report.section(title, words, report.grid(pair, 2)))
+    rest = [(r["name"], r["id"], r["kind"], r["probability"]) for r in records if r["kind"] in ("same", "not seen")]
+    table = report.table(("object", "id", "", "probability"), rest)
+    lead = f"{len(cards)} changes, {len(rest)} other objects, by {len(changes.capture.names)} photographs."
+    parts = [report.section("Plan", "", report.grid([plan], 2)), *cards, report.section("Other objects", "", table)]
+    return report.page("Changes", lead, parts)
+
+
+def _draw_plan(changes: Changes) -> np.ndarray:
+    """Draws the scene from above, with a mark of each change and an arrow of what moved."""
+    field = changes.field
+    up = np.array(field_up(field).axis)
+    first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    first /= np.linalg.norm(first)
+    flat = np.stack([first, np.cross(up, first)], 1)
+    means = np.asarray(field.gaussians.means, np.float64)
+    labels = changes.catalogue.labels
+    ends = [change.place for change in changes.found]
+    ends += [np.linalg.inv(c.motion)[:3, :3] @ c.place + np.linalg.inv(c.motion)[:3, 3] for c in changes.found]
+    near = np.concatenate([means[labels >= 0], *np.reshape(ends, (-1, 1, 3))]) @ flat
+    low, high = np.quantile(near, [0.01, 0.99], axis=0)
+    margin = 0.15 * (high - low).max()
+    low, high = (
+        np.minimum(low, near[-2 * len(ends) :].min(0)) - margin,
+        np.maximum(high, near[-2 * len(ends) :].max(0)) + margin,
+    )
+    scale = _PLAN / (high - low).max()
+    width, height = np.ceil((high - low) * scale).astype(int)
+
+    def place(points):
+        spot = (points @ flat - low) * scale
+        return np.stack([spot[..., 0], height - 1 - spot[..., 1]], -1).round().astype(int)
+
+    image = np.full((height, width, 3), 245, np.uint8)
+    order = np.argsort(means @ up)
+    rgb = np.clip(0.5 + 0.2820948 * np.asarray(field.gaussians.sh)[:, 0], 0, 1)
+    shown = (0.45 * rgb + 0.55) * 255
+    top = np.quantile(means[labels >= 0] @ up, 0.999) if (labels >= 0).any() else np.inf
+    for n in order[(means[order] @ up) <= top + 0.05]:
+        cv2.circle(image, place(means[n]).tolist(), max(int(0.006 * _PLAN), 1), shown[n].tolist(), -1)
+    for change, end, start in zip(changes.found, ends, ends[len(changes.found) :]):
+        if change.kind in COLOURS:
+            colour, (x, y) = COLOURS[change.kind], place(end).tolist()
+            if change.kind == "moved":
+                cv2.arrowedLine(image, place(start).tolist(), (x, y), colour, 3, cv2.LINE_AA, tipLength=0.12)
+            cv2.circle(image, (x, y), 14, colour, 3, cv2.LINE_AA)
+    return image

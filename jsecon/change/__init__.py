@@ -1,0 +1,1 @@
+"""What changed in a scene since it was made."""

@@ -1,0 +1,493 @@
+"""What changed of the objects of a scene since it was made: its renderings against new photographs with cameras.
+
+An object whose pixels the scene does not explain in any frame that sees it is displaced. The scene without the
+displaced objects is compared again: what it leaves unexplained, coherent over the frames, is where something new
+stands. Each displaced object is placed there, turned and shifted until its rendering explains most; if it explains
+enough, it moved. Else it is gone where the scene without it explains the photographs, and what is left is new. An
+object that too few pixels see keeps its state: it is not seen, never gone. NumPy arrays in and out.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import cv2
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+from scipy.spatial.transform import Rotation
+
+from jsecon.change.compare import colour_cost, depth_cost, find_shift, fit_exposure, shifted
+from jsecon.errors import InputError, require_shape
+from jsecon.field.evidence import view_evidence
+from jsecon.query.render import HIDDEN_LOGIT
+from jsecon.splat.render import render, render_rgb
+from jsecon.splat.sh import C0
+from jsecon.types import Camera, Gaussians
+
+KINDS = ("same", "moved", "gone", "new", "look", "not seen")
+"""What became of an object; "look": it stands where it was and looks another way."""
+MIN_EXPLAINED = 0.3
+"""Share of a photograph's pixels that the scene must explain, or it shows another place."""
+MIN_PIXELS = 14.0
+"""Pixels of an object in a frame, at the size of `object_changes`, from which the frame sees it."""
+DISPLACED_SHARE = 0.5
+"""Share of an object's pixels that the scene does not explain from which the object is not where it was."""
+GONE_MARGIN = 0.25
+"""By how much the scene without an object must explain its pixels better, in mean cost, for it to be gone."""
+MIN_GAIN = 0.25
+"""Cost that a moved object must take away at its new place, per pixel of its silhouette."""
+_KNOWN = 0.8
+"""Alpha from which a rendering tells what a pixel shows."""
+_MAX_PLACES = 6
+"""Places with unexplained pixels, the largest, where displaced objects are searched for."""
+_FIT_FRAMES = 4
+"""Frames, the best ones, that poses of moved objects are fitted to."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Change:
+    """What became of an object, or a new one."""
+
+    kind: str
+    """One of KINDS."""
+    object: int
+    """Label of the object; -1 of a new one."""
+    probability: float
+    """That the kind is right."""
+    frames: tuple[int, ...]
+    """Frames that prove it, best first."""
+    motion: np.ndarray
+    """(4, 4) rigid motion of the object's Gaussians, world units; identity unless it moved."""
+    place: np.ndarray
+    """(3,) middle of the object now, or where it was last, world."""
+    before: np.ndarray
+    """(F, H, W) bool pixels where the object would be seen had nothing changed."""
+    after: np.ndarray
+    """(F, H, W) bool pixels where it is seen now."""
+
+
+class _View(NamedTuple):
+    """A frame with what the scene shows in it."""
+
+    camera: Camera
+    photo: np.ndarray
+    """(H, W, 3) in the colours of the scene."""
+    depth: np.ndarray | None
+    rgb: np.ndarray
+    """(H, W, 3) of the rendering, alpha (H, W) and z-depth (H, W)."""
+    alpha: np.ndarray
+    z: np.ndarray
+    cost: np.ndarray
+    """(H, W) how little the rendering explains the photograph, 0 to 1; NaN where that is not known."""
+
+    def compare(self, rgb: np.ndarray, alpha: np.ndarray, z: np.ndarray, window=np.s_[:, :]) -> np.ndarray:
+        """The cost of a rendering inside a window."""
+        cost = colour_cost(self.photo[window], rgb)
+        if self.depth is not None:
+            apart = depth_cost(self.depth[window], z)
+            cost = np.where(np.isnan(apart), cost, np.maximum(0.6 * cost, np.abs(apart)))
+        return np.where(alpha >= _KNOWN, cost, np.nan)
+
+    def render(self, gaussians: Gaussians) -> "_View":
+        """The same frame with what other Gaussians show."""
+        image = _render(gaussians, self.camera)
+        return self._replace(rgb=image[0], alpha=image[1], z=image[2], cost=self.compare(*image))
+
+    def place(self, discs: "_Discs", motion: np.ndarray) -> tuple["_View", np.ndarray]:
+        """The same frame with an object added to what it shows, after a motion, and its visible silhouette."""
+        found = discs.draw(self.camera, motion)
+        if found is None:
+            return self, np.zeros_like(self.alpha, bool)
+        window, rgb, z = found
+        behind = self.z[window]
+        inside = (z > 0) & ((z < behind * 1.02) | (self.alpha[window] < 0.5))
+        silhouette, new = np.zeros_like(self.alpha, bool), [a.copy() for a in (self.rgb, self.alpha, self.z, self.cost)]
+        silhouette[window] = inside
+        new[0][window] = np.where(inside[..., None], rgb, new[0][window])
+        new[1][window] = np.where(inside, 1, new[1][window])
+        new[2][window] = np.where(inside, z, behind)
+        new[3][window] = self.compare(*(a[window] for a in new[:3]), window)
+        return self._replace(rgb=new[0], alpha=new[1], z=new[2], cost=new[3]), silhouette
+
+
+class _Discs:
+    """The Gaussians of an object as opaque discs: drawn thousands of times, in a millisecond each."""
+
+    def __init__(self, gaussians: Gaussians, rows: np.ndarray):
+        self.means = np.asarray(gaussians.means, np.float64)[rows]
+        self.radii = 1.1 * np.exp(np.sort(np.asarray(gaussians.log_scales, np.float64)[rows], axis=1)[:, 1])
+        self.colours = np.clip(0.5 + C0 * np.asarray(gaussians.sh)[rows, 0], 0, 1)
+
+    def draw(self, camera: Camera, motion: np.ndarray) -> tuple[tuple[slice, slice], np.ndarray, np.ndarray] | None:
+        """Draws them after a motion: a window of the image, with colours and z-depth there, 0 where there is none."""
+        pose = np.asarray(camera.world_to_camera, np.float64) @ motion
+        local = self.means @ pose[:3, :3].T + pose[:3, 3]
+        order = np.argsort(-local[:, 2])  # the nearest is drawn last
+        x, y, z = local[order].T
+        seen = z > 1e-6
+        x, y, z, order = x[seen], y[seen], z[seen], order[seen]
+        focal = float(camera.fx)
+        u, v = focal * x / z + float(camera.cx), float(camera.fy) * y / z + float(camera.cy)
+        radii = np.clip(self.radii[order] * focal / z, 0.75, 24)
+        reach = int(np.ceil(radii.max(initial=1)))
+        steps = np.arange(-reach, reach + 1)
+        columns, rows = np.floor(u)[:, None, None] + steps, np.floor(v)[:, None, None] + steps[:, None]
+        near = (columns + 0.5 - u[:, None, None]) ** 2 + (rows + 0.5 - v[:, None, None]) ** 2 <= radii[
+            :, None, None
+        ] ** 2
+        near &= (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)
+        owner, i, j = np.nonzero(near)
+        if not len(owner):
+            return None
+        rows, columns = rows[owner, i, 0].astype(int), columns[owner, 0, j].astype(int)
+        top, left = max(rows.min() - 2, 0), max(columns.min() - 2, 0)
+        window = slice(top, min(rows.max() + 3, camera.height)), slice(left, min(columns.max() + 3, camera.width))
+        shape = window[0].stop - top, window[1].stop - left
+        rgb, depth = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)
+        rgb[rows - top, columns - left] = self.colours[order[owner]]
+        depth[rows - top, columns - left] = z[owner]
+        return window, rgb, depth
+
+
+def _render(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Renders colour (clamped), alpha and z-depth."""
+    image = render_rgb(gaussians, camera, depth=True)
+    return np.clip(np.asarray(image.features), 0, 1), np.asarray(image.alpha), np.asarray(image.depth)
+
+
+def hide(gaussians: Gaussians, mask: Bool[np.ndarray, " n"]) -> Gaussians:
+    """Makes some Gaussians transparent."""
+    logits = np.where(mask, np.float32(HIDDEN_LOGIT), np.asarray(gaussians.opacity_logits))
+    return dataclasses.replace(gaussians, opacity_logits=logits)
+
+
+def _first_view(gaussians: Gaussians, camera: Camera, frame: np.ndarray, depth: np.ndarray | None) -> _View:
+    """Renders a frame, and aligns the photograph and its exposure to that."""
+    image = _render(gaussians, camera)
+    photo, known = frame.astype(np.float32) / 255, image[1] >= _KNOWN
+    shift = find_shift(photo, image[0], known)
+    photo = fit_exposure(shifted(photo, shift), image[0], known)
+    depth = None if depth is None else shifted(np.asarray(depth, np.float32), shift)
+    view = _View(camera, photo, depth, *image, image[1])
+    return view._replace(cost=view.compare(*image))
+
+
+def _pooled(view: _View, gaussians: Gaussians, labels: np.ndarray, count: int) -> np.ndarray:
+    """Sums each object's weight on pixels that are explained, that are not, and that are not known: (K, 3).
+
+    The walk is that of the votes (`view_evidence`). A measured surface in front of the scene tells nothing of what it
+    hides.
+    """
+    image = np.where(np.isnan(view.cost), -1, view.cost > 0.5).astype(np.int32)
+    if view.depth is not None:
+        image = np.where(np.nan_to_num(depth_cost(view.depth, view.z)) < -0.5, -1, image)
+    matrix = view_evidence(gaussians, view.camera, image, 2).matrix(len(labels), 2)
+    inside = np.flatnonzero(labels >= 0)
+    columns = matrix[inside].toarray()
+    return np.stack([np.bincount(labels[inside], column, count) for column in columns.T], axis=1)
+
+
+def object_changes(
+    gaussians: Gaussians,
+    labels: Int[np.ndarray, " n"],
+    frames: UInt8[np.ndarray, "f h w 3"],
+    cameras: Camera,
+    depths: Float[np.ndarray, "f h w"] | None = None,
+    *,
+    up: Float[np.ndarray, " 3"],
+) -> list[Change]:
+    """Finds what became of each object of a scene, and what is new, in new photographs.
+
+    Args:
+      gaussians: Scene of N Gaussians.
+      labels: Object of each Gaussian, 0 .. K-1; -1 for surroundings, which do not change.
+      frames: New photographs.
+      cameras: Batch of F cameras in the scene's world.
+      depths: z-depth of the photographs, world units, 0 = unknown.
+      up: Up axis of the scene's world, unit length.
+
+    Returns:
+      A change for each of the K objects, in order, then the new ones.
+    """
+    require_shape("labels", labels, (gaussians.count,), "Give one label per Gaussian.")
+    gaussians, cameras = jax.tree.map(np.asarray, (gaussians, cameras))
+    count = int(labels.max(initial=-1)) + 1
+    given = [None] * len(frames) if depths is None else depths
+    views = [_first_view(gaussians, camera, frame, depth) for camera, frame, depth in zip(cameras, frames, given)]
+    for t, view in enumerate(views):
+        explained = float((view.cost < 0.5).mean())
+        if explained < MIN_EXPLAINED:
+            problem = f"the scene explains {explained:.0%} of its pixels"
+            remedy = (
+                "Check that it shows the place of the field, and that its pose is in the world of the field's capture."
+            )
+            raise InputError(f"photograph {t + 1}", problem, f"{MIN_EXPLAINED:.0%} or more", remedy)
+    pooled = np.stack([_pooled(view, gaussians, labels, count) for view in views], axis=1)  # (K, F, 3)
+    known = pooled[..., :2].sum(-1)
+    differing = pooled[..., 1] / np.maximum(known, 1e-9)
+    seen = known >= MIN_PIXELS
+    # A frame that shows an object where it was weighs twice: what stands before it in another frame hides it there.
+    weight = np.where(seen, np.minimum(known / 60, 1), 0) * np.where(differing < DISPLACED_SHARE, 2, 1)
+    excess = np.where(seen, weight * (differing - DISPLACED_SHARE), 0).sum(1) / np.maximum(weight.sum(1), 1e-9)
+    displaced = seen.any(1) & (excess > 0)
+    search = _Search(gaussians, labels, views, up / np.linalg.norm(up), displaced)
+    changes = [search.unmoved(k, seen[k], excess[k], differing[k]) for k in range(count)]
+    for k, change in search.moved().items():
+        changes[k] = change
+    clusters = search.clusters(min(2, len(views)))
+    for k in np.flatnonzero(displaced).tolist():
+        if changes[k].kind != "moved":
+            changes[k], clusters = search.gone(k, seen[k], clusters)
+    return changes + [search.new(cluster) for cluster in clusters]
+
+
+class _Cluster(NamedTuple):
+    """Unexplained pixels of several frames that one thing at one place would show."""
+
+    place: np.ndarray
+    """(3,) its lower end on what it stands on, world."""
+    size: float
+    """World units."""
+    masks: dict[int, np.ndarray]
+    """Frame -> (H, W) bool."""
+
+
+class _Search:
+    """The search for what is displaced and what is new; its views lose what was found."""
+
+    def __init__(self, gaussians, labels, views, up, displaced):
+        """Renders the scene without what is displaced."""
+        self.gaussians, self.labels, self.up, self.displaced = gaussians, labels, up, displaced
+        self.first = views
+        hidden = np.append(displaced, False)[labels]
+        self.views = [view.render(hide(gaussians, hidden)) for view in views] if displaced.any() else views
+        side = np.eye(3)[np.argmin(np.abs(up))]
+        first = np.cross(up, side)
+        first /= np.linalg.norm(first)
+        self.flat = np.stack([first, np.cross(up, first)])
+        self.means = np.asarray(gaussians.means, np.float64)
+        self.discs = {k: _Discs(gaussians, np.flatnonzero(labels == k)) for k in np.flatnonzero(displaced).tolist()}
+
+    def _middle(self, k: int) -> np.ndarray:
+        return np.median(self.means[self.labels == k], axis=0)
+
+    def silhouettes(self, k: int) -> np.ndarray:
+        """(F, H, W) the pixels that an object makes up in the scene as it was."""
+        channel = np.repeat((self.labels == k)[:, None], 3, 1).astype(np.float32)
+        return np.stack(
+            [
+                np.asarray(render(self.gaussians, v.camera, channel, depth=True).features)[..., 0] > 0.5
+                for v in self.first
+            ]
+        )
+
+    def unmoved(self, k: int, seen: np.ndarray, excess: float, differing: np.ndarray) -> Change:
+        """The change of an object that is where it was, or that no frame sees."""
+        empty = np.zeros((len(self.first), *self.first[0].alpha.shape), bool)
+        kind = "same" if seen.any() else "not seen"
+        order = [int(t) for t in np.argsort(differing) if seen[t]]
+        probability = 1 / (1 + np.exp(12 * excess)) if seen.any() else 1.0
+        return Change(kind, k, float(probability), tuple(order), np.eye(4), self._middle(k), empty, empty)
+
+    def clusters(self, min_frames: int) -> list[_Cluster]:
+        """Places the unexplained pixels of the frames, and joins those that lie at one place."""
+        found = [cluster for t in range(len(self.views)) for cluster in self._components(t)]
+        groups: list[list[_Cluster]] = []
+        for cluster in sorted(found, key=lambda c: -sum(mask.sum() for mask in c.masks.values())):
+            for group in groups:
+                away = np.linalg.norm(np.mean([other.place for other in group], 0) - cluster.place)
+                if away < 0.75 * max(cluster.size, group[0].size) and not (set(group[0].masks) & set(cluster.masks)):
+                    group.append(cluster)
+                    group[0].masks.update(cluster.masks)
+                    break
+            else:
+                groups.append([cluster])
+        return [
+            _Cluster(np.mean([c.place for c in group], 0), float(np.median([c.size for c in group])), group[0].masks)
+            for group in groups
+            if len(group[0].masks) >= min_frames
+        ]
+
+    def _components(self, t: int) -> list[_Cluster]:
+        """The connected unexplained pixels of a frame, each with the place where it stands."""
+        view = self.views[t]
+        mask = (np.nan_to_num(view.cost) > 0.5).astype(np.uint8)
+        mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+        number, image, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
+        pose = np.asarray(view.camera.world_to_camera, np.float64)
+        down = -(pose[:3, :3] @ self.up)[:2]
+        height, width = mask.shape
+        result = []
+        for n in range(1, number):
+            left, top, across, tall, area = stats[n]
+            if area < MIN_PIXELS or left == 0 or top == 0 or left + across == width or top + tall == height:
+                continue
+            inside = image == n
+            rows, columns = np.nonzero(inside)
+            along = down[0] * columns + down[1] * rows
+            if view.depth is not None and (view.depth[inside] > 0).any():
+                depth = float(np.median(view.depth[inside][view.depth[inside] > 0]))
+                points = self._back_project(
+                    view.camera, columns, rows, np.where(view.depth[inside] > 0, view.depth[inside], depth)
+                )
+                place, size = np.median(points, 0), depth * np.sqrt(area) / float(view.camera.fx)
+                place = place + self.up * (np.quantile(points @ self.up, 0.05) - place @ self.up)
+            else:
+                low = along >= np.quantile(along, 0.95)
+                column, row = columns[low].mean(), rows[low].mean()
+                z = float(np.median(view.z[rows[low], columns[low]]))
+                contact = self._back_project(view.camera, column, row, z)
+                size = z * np.sqrt(area) / float(view.camera.fx)
+                ahead = contact - np.asarray(view.camera.centres, np.float64)
+                ahead -= (ahead @ self.up) * self.up
+                place = contact + 0.4 * size * ahead / max(np.linalg.norm(ahead), 1e-9)
+            result.append(_Cluster(place, size, {t: inside}))
+        return result
+
+    def _back_project(self, camera, columns, rows, z):
+        x = (np.asarray(columns) + 0.5 - float(camera.cx)) / float(camera.fx)
+        y = (np.asarray(rows) + 0.5 - float(camera.cy)) / float(camera.fy)
+        local = np.stack([x * z, y * z, np.broadcast_to(z, np.shape(x))], -1)
+        pose = np.asarray(camera.world_to_camera, np.float64)
+        return (local - pose[:3, 3]) @ pose[:3, :3]
+
+    def moved(self) -> dict[int, Change]:
+        """Finds the displaced objects elsewhere, the one that explains most first."""
+        result: dict[int, Change] = {}
+        left = set(map(int, np.flatnonzero(self.displaced)))
+        while left:
+            clusters = self.clusters(min(2, len(self.views)))[:_MAX_PLACES]
+            places = [(None, cluster.place, cluster.size) for cluster in clusters]
+            places += [(k, *self._stand(k)) for k in np.flatnonzero(self.displaced).tolist()]  # where others stood
+            fits = [self._fit(k, *place) for k in left for other, *place in places if k != other]
+            fits = [fit for fit in fits if fit is not None and fit.gain >= MIN_GAIN]
+            if not fits:
+                break
+            best = max(fits, key=lambda fit: fit.total)
+            left.discard(best.object)
+            before, masks = self.silhouettes(best.object), []
+            for t, view in enumerate(self.views):
+                self.views[t], inside = view.place(self.discs[best.object], best.motion)
+                masks.append(inside)
+            order = tuple(int(t) for t in np.argsort([-m.sum() for m in masks]) if masks[t].sum() >= MIN_PIXELS)
+            place = self._middle(best.object) @ best.motion[:3, :3].T + best.motion[:3, 3]
+            probability = 1 / (1 + np.exp(-14 * (best.gain - MIN_GAIN) - 0.5))
+            result[best.object] = Change(
+                "moved", best.object, float(probability), order, best.motion, place, before, np.stack(masks)
+            )
+        return result
+
+    def _motion(self, k: int, pose: np.ndarray) -> np.ndarray:
+        """The motion that turns an object about its middle by pose[2], and shifts it by pose[:2] and up by pose[3]."""
+        middle, motion = self._middle(k), np.eye(4)
+        motion[:3, :3] = Rotation.from_rotvec(self.up * pose[2]).as_matrix()
+        motion[:3, 3] = middle - motion[:3, :3] @ middle + pose[:2] @ self.flat + pose[3] * self.up
+        return motion
+
+    def _stand(self, k: int) -> tuple[np.ndarray, float]:
+        """The lower end of an object, and its size."""
+        own = self.means[self.labels == k]
+        extent = float(np.linalg.norm(np.quantile(own, 0.95, 0) - np.quantile(own, 0.05, 0))) / np.sqrt(2)
+        middle = self._middle(k)
+        return middle + (np.quantile(own @ self.up, 0.03) - middle @ self.up) * self.up, extent
+
+    def _fit(self, k: int, place: np.ndarray, size: float) -> "_Fit | None":
+        """Turns and shifts an object about a place until it explains most of the photographs there."""
+        stand, extent = self._stand(k)
+        if not 1 / 3 < size / max(extent, 1e-9) < 3:
+            return None
+        middle = self._middle(k)
+        shift = (place - middle) @ self.flat.T
+        lift = float((place - stand) @ self.up)
+        lift = 0.0 if abs(lift) < 0.35 * extent else lift
+        frames = self._frames_near(middle + shift @ self.flat + lift * self.up)
+
+        def score(pose: np.ndarray) -> tuple[float, int, int]:
+            motion, total, pixels, agreeing = self._motion(k, pose), 0.0, 0, 0
+            for t in frames:
+                view, inside = self.views[t].place(self.discs[k], motion)
+                own = float(np.nansum(self.views[t].cost - view.cost))
+                total += own
+                pixels += int(inside.sum())
+                agreeing += own > 0.5 * MIN_GAIN * inside.sum() > 0
+            return total, pixels, agreeing
+
+        best = np.array([*shift, 0.0, lift])
+        value = score(best)
+        if value[1] < MIN_PIXELS or value[0] < -0.1 * value[1]:
+            return None
+        axes = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)]) * extent
+        for n, (step, turn) in enumerate(((0.35, 0.8), (0.18, 0.4), (0.09, 0.2), (0.045, 0.1))):
+            turns = np.arange(1, 8) * np.pi / 4 if n == 1 else (-turn, turn) if n else ()
+            moves = [np.array([*step * axis, 0, 0]) for axis in axes] + [np.array([0, 0, angle, 0]) for angle in turns]
+            for _ in range(3):
+                options = [best + move for move in moves]
+                values = [score(option) for option in options]
+                top = int(np.argmax([option_value[0] for option_value in values]))
+                if values[top][0] <= value[0]:
+                    break
+                best, value = options[top], values[top]
+        if value[2] < min(2, len(frames)):
+            return None
+        gain = value[0] / max(value[1], 1)
+        return _Fit(k, self._motion(k, best), value[0], gain)
+
+    def _frames_near(self, place: np.ndarray) -> list[int]:
+        """The frames that see a place, at most _FIT_FRAMES, the nearest first."""
+        depths = []
+        for view in self.views:
+            camera, pose = view.camera, np.asarray(view.camera.world_to_camera, np.float64)
+            x, y, z = pose[:3, :3] @ place + pose[:3, 3]
+            u, v = x / z * float(camera.fx) + float(camera.cx), y / z * float(camera.fy) + float(camera.cy)
+            depths.append(z if z > 0 and 0 <= u < camera.width and 0 <= v < camera.height else np.inf)
+        return [int(t) for t in np.argsort(depths)[:_FIT_FRAMES] if np.isfinite(depths[t])]
+
+    def gone(self, k: int, seen: np.ndarray, clusters: list[_Cluster]) -> tuple[Change, list[_Cluster]]:
+        """The change of an object that is not where it was, nor elsewhere, and the clusters that it does not explain.
+
+        It is gone where the scene without it explains the photographs. Where something of its outline stands in its
+        place, it has another look. Else something hides it.
+        """
+        before = self.silhouettes(k)
+        inside = [(first.cost[m], view.cost[m]) for first, view, m in zip(self.first, self.views, before)]
+        margins = [np.nanmean(a - b) if len(a) and np.isfinite(a - b).any() else 0.0 for a, b in inside]
+        margin = float(np.mean(np.asarray(margins)[seen]))
+        order = tuple(int(t) for t in np.argsort(-np.asarray(margins)) if seen[t])
+        wider = [cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0 for mask in before]
+        own, others, after = [], [], np.zeros_like(before)
+        for cluster in clusters:
+            pixels = sum(int(mask.sum()) for mask in cluster.masks.values())
+            shared = sum(int((mask & wider[t]).sum()) for t, mask in cluster.masks.items())
+            (own if shared > 0.6 * pixels else others).append(cluster)
+        for cluster in own:
+            for t, mask in cluster.masks.items():
+                after[t] |= mask
+        if margin >= GONE_MARGIN:
+            kind, after, probability = "gone", np.zeros_like(before), 1 / (1 + np.exp(-10 * (margin - GONE_MARGIN)))
+        else:
+            filled = (after & before).sum() / max(before[list(seen)].sum(), 1)
+            kind = "look" if filled > 0.5 else "not seen"
+            probability = filled if kind == "look" else 1 - filled
+        return Change(kind, k, float(probability), order, np.eye(4), self._middle(k), before, after), others
+
+    def new(self, cluster: _Cluster) -> Change:
+        """Something that no object explains, coherent over the frames."""
+        after = np.zeros((len(self.views), *self.views[0].alpha.shape), bool)
+        for t, mask in cluster.masks.items():
+            after[t] = mask
+        visible = max(len(self._frames_near(cluster.place)), len(cluster.masks))
+        order = tuple(sorted(cluster.masks, key=lambda t: -int(cluster.masks[t].sum())))
+        place = cluster.place + 0.5 * cluster.size * self.up
+        probability = 0.4 + 0.55 * len(cluster.masks) / visible
+        return Change("new", -1, probability, order, np.eye(4), place, np.zeros_like(after), after)
+
+
+class _Fit(NamedTuple):
+    """An object at another place."""
+
+    object: int
+    motion: np.ndarray
+    total: float
+    """Cost that it takes away, px."""
+    gain: float
+    """The same per pixel of its silhouette."""

@@ -1,0 +1,76 @@
+"""Changes of a scene: each kind is found; exposure, and what no photograph sees, is no change."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from conftest import cameras_of, gaussians_at, look_at
+
+from jsecon import InputError
+from jsecon.change.detect import object_changes
+from jsecon.splat.render import render_rgb
+
+UP = np.array([0.0, 0.0, 1.0])
+COLOURS = {"red": (0.8, 0.1, 0.1), "blue": (0.1, 0.2, 0.8), "green": (0.1, 0.6, 0.2), "orange": (0.95, 0.5, 0.1)}
+PLACES = {"red": (-0.35, 0.2), "blue": (0.3, 0.3), "green": (0.3, -0.35), "orange": (-0.3, -0.3)}
+
+
+def scene_of(**places):
+    """A grey table with upright bars of the named colours at (x, y), and the label of each Gaussian.
+
+    There are four bars, so that scenes share programs: the rest is transparent.
+    """
+    flat = np.stack(np.meshgrid(np.arange(-0.75, 0.76, 0.05), np.arange(-0.75, 0.76, 0.05)), -1).reshape(-1, 2)
+    grid = np.stack(np.meshgrid(*(np.arange(-n, n + 1) for n in (1, 3)), np.arange(6)), -1).reshape(-1, 3) * 0.035
+    bars = [grid + np.array([*places.get(name, (0, 0)), 0.03]) for name in COLOURS]
+    labels = np.repeat([-1, *range(4)], [len(flat), *map(len, bars)])
+    colours = np.array([(0.55, 0.5, 0.45), *COLOURS.values()])[labels + 1]
+    logits = np.array([3.0, *(3.0 if name in places else -30.0 for name in COLOURS)])[labels + 1]
+    means = np.concatenate([np.column_stack([flat, np.zeros(len(flat))]), *bars])
+    sizes = np.where(labels < 0, 0.03, 0.02)[:, None]
+    scene = gaussians_at(means, sizes, logit=logits, sh=((colours - 0.5) / 0.2820948)[:, None])
+    return scene, np.where(logits > 0, labels, -1)
+
+
+@pytest.fixture(scope="module")
+def eyes():
+    poses = [look_at(1.5 * np.array([np.cos(a), np.sin(a), 0.6]), up=UP) for a in (0.4, 2.4, 4.6)]
+    return cameras_of(poses, (80, 80, 48, 36), 96, 72)
+
+
+def photographs(gaussians, cameras):
+    images = [np.asarray(render_rgb(gaussians, camera, depth=True).features) for camera in cameras]
+    return np.stack([(255 * np.clip(image, 0, 1)).astype(np.uint8) for image in images])
+
+
+def test_each_kind_is_found_and_light_is_none(eyes):
+    before, labels = scene_of(red=PLACES["red"], blue=PLACES["blue"], green=PLACES["green"])
+    after, _ = scene_of(red=(-0.1, -0.05), green=PLACES["green"], orange=PLACES["orange"])
+    found = object_changes(before, labels, photographs(after, eyes), eyes, up=UP)
+    assert [change.kind for change in found] == ["moved", "gone", "same", "new"]
+    moved, gone, _, new = found
+    np.testing.assert_allclose(moved.motion[:2, 3] + moved.motion[:2, :2] @ PLACES["red"], (-0.1, -0.05), atol=0.03)
+    np.testing.assert_allclose(new.place[:2], PLACES["orange"], atol=0.06)
+    assert len(gone.frames) == 3
+    assert min(change.probability for change in found) > 0.8
+    darker = (0.6 * photographs(before, eyes) + 8).astype(np.uint8)
+    assert {change.kind for change in object_changes(before, labels, darker, eyes, up=UP)} == {"same"}
+
+
+def test_unseen_is_not_gone_and_another_place_is_refused(eyes):
+    before, labels = scene_of(red=PLACES["red"], blue=(0.3, 30.0))
+    frames = photographs(scene_of(red=PLACES["red"])[0], eyes)
+    assert [change.kind for change in object_changes(before, labels, frames, eyes, up=UP)] == ["same", "not seen"]
+    with pytest.raises(InputError, match="photograph 1: the scene explains"):
+        object_changes(before, labels, 255 * (np.indices(frames.shape).sum(0) % 2).astype(np.uint8), eyes, up=UP)
+
+
+def test_depth_alone_tells_what_is_gone(eyes):
+    """Of the table's colour, so that colours tell nothing."""
+    before, labels = scene_of(red=PLACES["red"], blue=PLACES["blue"])
+    grey = dataclasses.replace(before, sh=np.broadcast_to(before.sh[:1], before.sh.shape))
+    logits = np.where(labels == 1, np.float32(-30), grey.opacity_logits)
+    after = dataclasses.replace(grey, opacity_logits=logits)
+    depths = np.stack([np.asarray(render_rgb(after, camera, depth=True).depth) for camera in eyes])
+    found = object_changes(grey, labels, photographs(after, eyes), eyes, depths, up=UP)
+    assert [change.kind for change in found] == ["same", "gone"]
