@@ -4,7 +4,7 @@
 
 A node is a region, a union of regions or a part of one. Its fit to a thing is the IoU of their Gaussians, among those
 that views tell the thing of which do not vote. The best node of each thing, mean over the things. Things of fewer than
-100 points are left out of replica_apartment_0, and its things are divided: rules were chosen on the even ones.
+100 points are left out of replica_apartment_0, and its things are divided: rules were chosen on those of even ids.
 """
 
 import dataclasses
@@ -49,7 +49,11 @@ def main(options: Options = Options()) -> dict:
         judged = np.flatnonzero(np.bincount(known) >= LEAST_POINTS.get(name, 1))
         halves = {name: judged}
         if name in LEAST_POINTS:
-            halves = {f"{name}, even things": judged[::2], f"{name}, odd things": judged[1::2], f"{name}, all": judged}
+            halves = {
+                f"{name}, even ids": judged[judged % 2 == 0],
+                f"{name}, odd ids": judged[judged % 2 == 1],
+                name: judged,
+            }
         flat, every = (
             best_fits(found.tree, found.leaf, scene.things, nodes)
             for nodes in (np.arange(count), np.arange(len(found.tree)))

@@ -5,9 +5,11 @@ import contextlib
 import importlib.util
 import os
 import re
+import runpy
 import shlex
 import shutil
 import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -48,6 +50,7 @@ def demo_folder(room, room_run, tmp_path, monkeypatch):
     """The current folder, with what the pages take from `jsecon demo`."""
     (tmp_path / "jsecon-demo").mkdir()
     shutil.copy(room_run[1] / "field.safetensors", tmp_path / "jsecon-demo")
+    shutil.copytree(room_run[1] / "field.evidence", tmp_path / "jsecon-demo" / "field.evidence")
     (tmp_path / "jsecon-demo" / "capture").symlink_to(room)
     monkeypatch.chdir(tmp_path)
 
@@ -61,6 +64,14 @@ def test_the_python_of_a_page_runs_one_block_after_the_other(page, demo_folder, 
     assert printed or "print(" not in page.read_text()
     if page.name == "README.md":
         assert re.search(r"read as 'orange ball', on white plate: \d objects?.* \d+ of \d+ Gaussians, ", printed)
+
+
+@pytest.mark.parametrize("script", sorted((HOME / "docs" / "examples").glob("*.py")), ids=_name)
+def test_an_example_runs_and_passes_its_own_check(script, demo_folder, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [str(script)])
+    runpy.run_path(str(script), run_name="__main__")
+    assert capsys.readouterr().out
+    assert len(script.read_text().splitlines()) <= 50
 
 
 @pytest.mark.parametrize("page", PAGES, ids=_name)
