@@ -106,9 +106,9 @@ def test_regions_that_a_field_lacks_are_added(scene, cameras, labels, rows, view
 def test_packing_a_view_loses_nothing(scene, camera, labels):
     evidence = view_evidence(scene, camera, labels[0], REGIONS)
     packed = pack_evidence(evidence, REGIONS)
-    for a, b in zip(unpack_evidence(packed, REGIONS), evidence):
+    for a, b in zip(unpack_evidence(packed, scene.count, REGIONS), evidence):
         np.testing.assert_array_equal(a, b)
-    more = unpack_evidence(packed, REGIONS + 2)  # pixels of no region stay such
+    more = unpack_evidence(packed, scene.count, REGIONS + 2)  # pixels of no region stay such
     np.testing.assert_array_equal(more.regions == REGIONS + 2, evidence.regions == REGIONS)
 
 

@@ -273,15 +273,14 @@ class Scene:
 
         with self._lock:
             ledger, embedder = self.ledger, self.embedder
-            paths = (None if path is None else Path(path) for path in (poses, masks))
-            pose_file, mask_folder = paths
+            pose_file, mask_folder = (None if path is None else Path(path) for path in (poses, masks))
             photos = photos if isinstance(photos, Capture) else Path(photos)
             with console.progress("frames") as progress:
                 frames = read_frames(self.field, ledger, photos, pose_file, refuse, progress)
-            if not frames:
-                raise errors.pop()
             with console.progress("views") as progress:
-                views, _ = make_views(self.field, ledger, frames, embedder, mask_folder, progress)
+                views = make_views(self.field, ledger, frames, embedder, mask_folder, refuse, progress)
+            if not views:
+                raise errors.pop()
             with console.progress("votes"):
                 return self._with(*add_views(self.field, ledger, views))
 

@@ -102,7 +102,7 @@ class Run(_PipelineVerb, InputOptions):
 
     Its stages estimate poses that the capture lacks, fit Gaussians or read them, find objects or read their masks,
     embed each region, and add up its votes on the Gaussians. It lists the stages first, and writes field.safetensors,
-    report.html, metrics.json and cache to the output folder.
+    field.evidence, report.html, metrics.json and cache to the output folder.
 
     Attributes:
       out: Output folder.

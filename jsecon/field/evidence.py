@@ -13,12 +13,12 @@ bits, which packs them to half the room (`pack_evidence`).
 import contextlib
 import dataclasses
 import functools
-import json
 import os
 import shutil
 import tempfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,6 +33,7 @@ from jsecon.errors import InputError, require, require_shape
 from jsecon.files import map_npy
 from jsecon.numerics import FULL_PRECISION, NEAR, is_traced, require_labels
 from jsecon.parallel import MESH_OPTIONS, map_views
+from jsecon.process import cores
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.fusion import compute_once
 from jsecon.splat.plan import ViewPlan, plan_view, render_plan
@@ -49,8 +50,8 @@ _BITS = 17
 """Significant bits of a weight: an error of 4e-6 of it, where float32's sums of pixels have 1e-6."""
 _SLOTS = 4
 """Labels of a tile that are summed at once. A tile of 8x8 pixels seldom shows more; then its batch is scanned again."""
-_HEAD = 96
-"""bytes at the start of a packed list that say how long its columns are"""
+_HEAD = 23
+"""numbers at the start of a packed list: its Gaussians, entries and overflow, and the bytes of each of 20 planes"""
 _MAX_WHOLE = 1 << 21
 """Gaussians of a scene above which each view is planned for those alone that it can see."""
 _MAX_ENTRIES = 1 << 24
@@ -399,40 +400,70 @@ def sum_evidence(
     folder: str | os.PathLike | None = None,
 ) -> Votes:
     """Adds up the lists of views to votes of `count` Gaussians, a block of rows at a time; see `region_votes`."""
-    top = min(top, max(num_regions, 1))
-    size = max(_MAX_ENTRIES // max(len(views), 1), 1)
+    size = _block_rows(len(views), num_regions)
     blocks = (slice(first, min(first + size, count)) for first in range(0, max(count, 1), size))
-    columns = (_sum_rows([view._of_rows(rows) for view in views], rows, num_regions, top, by_view) for rows in blocks)
+    sums = (_sum_rows([view._of_rows(rows) for view in views], rows, num_regions) for rows in blocks)
+    columns = (_cut_sum(each, top, by_view) for each in sums)
     joined = _join(columns) if folder is None else _write_columns(Path(folder), columns, count)
     if by_view:
         joined["by_view"] = joined["by_view"].T
     return Votes(**joined, overflow=np.asarray(sum(view.overflow for view in views), np.int32), num_regions=num_regions)
 
 
-def _sum_rows(
-    views: Sequence[ViewEvidence], rows: slice, num_regions: int, top: int, by_view: bool
-) -> dict[str, np.ndarray]:
-    """Sums a block of rows over all views: the columns of its votes."""
+class EvidenceSum(NamedTuple):
+    """The sum of the lists of views before it is cut to the strongest regions: further views add up exactly."""
+
+    weights: Any
+    """csr_matrix (N, R) float64 weight on each region."""
+    total: Float[np.ndarray, " n"]
+    """(N,) float64 weight on all pixels."""
+    views: Int32[np.ndarray, " n"]
+    """(N,) views with any weight."""
+    max_pixel_weight: Float32[np.ndarray, " n"]
+    """(N,) largest alpha T at any pixel."""
+    by_view: Float32[np.ndarray, "n t"]
+    """(N, T) weight in each view."""
+    overflow: int = 0
+    """Pairs beyond the capacity."""
+
+    def votes(self, top: int) -> Votes:
+        """Cuts the sum to the `top` strongest regions of each Gaussian."""
+        columns = _cut_sum(self, top, True)
+        columns["by_view"] = columns["by_view"].T
+        return Votes(**columns, overflow=np.asarray(self.overflow, np.int32), num_regions=self.weights.shape[1])
+
+
+def _block_rows(views: int, num_regions: int) -> int:
+    """Returns how many Gaussians are added up at once."""
+    return max(_MAX_ENTRIES // max(views, num_regions, 1), 1)
+
+
+def _sum_rows(views: Sequence[ViewEvidence], rows: slice, num_regions: int) -> EvidenceSum:
+    """Sums a block of rows over all views."""
     count = rows.stop - rows.start
     total, seen, peak = np.zeros(count), np.zeros(count, np.int32), np.zeros(count, np.float32)
-    each = np.zeros((count, len(views) if by_view else 0), np.float32)
+    each, dense = np.zeros((len(views), count), np.float32).T, np.zeros((count, num_regions + 1))
     for t, view in enumerate(views):
         own = np.add.reduceat(view.weights, view.starts[:-1], dtype=np.float64) if len(view.gaussians) else 0.0
         total[view.gaussians] += own
         seen[view.gaussians] += 1
         peak[view.gaussians] = np.maximum(peak[view.gaussians], view.max_pixel_weights)
-        if by_view:
-            each[view.gaussians, t] = own
-    nothing = np.zeros(0, np.int32)
-    owners = np.concatenate([nothing, *(np.repeat(view.gaussians, np.diff(view.starts)) for view in views)])
-    regions = np.concatenate([nothing, *(view.regions for view in views)])
-    weights = np.concatenate([np.zeros(0), *(view.weights for view in views)])
-    inside = regions < num_regions
-    votes = sparse.csr_matrix((weights[inside], (owners[inside], regions[inside])), shape=(count, max(num_regions, 1)))
-    columns = dict(zip(("regions", "weights"), _strongest(votes, top)))
-    columns |= {"labelled": np.asarray(votes.sum(1)).reshape(-1), "total": total, "max_pixel_weight": peak}
-    columns = {name: a.astype(np.float32) if a.dtype == np.float64 else a for name, a in columns.items()}
-    return columns | {"views": seen} | ({"by_view": each} if by_view else {})
+        each[view.gaussians, t] = own
+        # A view has each pair of a Gaussian and a region once.
+        first = np.repeat(view.gaussians.astype(np.int64) * (num_regions + 1), np.diff(view.starts))
+        dense.reshape(-1)[first + view.regions] += view.weights
+    weights = sparse.csr_matrix(dense[:, :num_regions])
+    return EvidenceSum(weights, total, seen, peak, each, sum(view.overflow for view in views))
+
+
+def _cut_sum(evidence: EvidenceSum, top: int, by_view: bool) -> dict[str, np.ndarray]:
+    """Computes the columns of votes."""
+    columns = dict(
+        zip(("regions", "weights"), _strongest(evidence.weights, min(top, max(evidence.weights.shape[1], 1))))
+    )
+    columns["labelled"] = np.asarray(evidence.weights.sum(1)).reshape(-1).astype(np.float32)
+    columns |= {"total": evidence.total.astype(np.float32), "max_pixel_weight": evidence.max_pixel_weight}
+    return columns | {"views": evidence.views} | ({"by_view": evidence.by_view} if by_view else {})
 
 
 def _strongest(votes: Any, top: int) -> tuple[Int32[np.ndarray, "n k"], Float32[np.ndarray, "n k"]]:
@@ -449,35 +480,70 @@ def _strongest(votes: Any, top: int) -> tuple[Int32[np.ndarray, "n k"], Float32[
     return ids, largest
 
 
+def add_evidence(
+    evidence: EvidenceSum, views: Sequence[ViewEvidence], places: Sequence[int], num_regions: int
+) -> EvidenceSum:
+    """Adds views to a sum, to the same bits as if all were summed at once; `places` are their columns of `by_view`."""
+    more, count = sum_views(views, len(evidence.total), num_regions), len(evidence.views)
+    old = evidence.weights
+    weights = sparse.csr_matrix((old.data, old.indices, old.indptr), shape=(count, num_regions)) + more.weights
+    by_view = np.empty((count, evidence.by_view.shape[1] + len(views)), np.float32, order="F")
+    is_new = np.isin(np.arange(by_view.shape[1]), places)
+    by_view[:, ~is_new], by_view[:, is_new] = evidence.by_view, more.by_view
+    peak = np.maximum(evidence.max_pixel_weight, more.max_pixel_weight)
+    sums = evidence.total + more.total, evidence.views + more.views
+    return EvidenceSum(weights, *sums, peak, by_view, evidence.overflow + more.overflow)
+
+
+def sum_views(views: Sequence[ViewEvidence], count: int, num_regions: int) -> EvidenceSum:
+    """Adds up the lists of views, before the cut to the strongest regions."""
+    size = _block_rows(len(views), num_regions)
+    blocks = [slice(first, min(first + size, count)) for first in range(0, max(count, 1), size)]
+    parts = [_sum_rows([view._of_rows(rows) for view in views], rows, num_regions) for rows in blocks]
+    columns = (np.concatenate(column) for column in list(zip(*parts))[1:5])
+    return EvidenceSum(sparse.vstack([part.weights for part in parts], "csr"), *columns, parts[0].overflow)
+
+
 def pack_evidence(evidence: ViewEvidence, num_regions: int) -> UInt8[np.ndarray, " b"]:
     """Packs a list of a view to bytes, some 5 an entry, without loss; no region is -1, whatever their number is."""
-    columns = {
-        "gaussians": np.diff(evidence.gaussians, prepend=np.int32(0)),
-        "lengths": np.diff(evidence.starts),
-        "regions": np.where(evidence.regions == num_regions, -1, evidence.regions),
-        "weights": evidence.weights.view(np.uint32),
-        "max_pixel_weights": evidence.max_pixel_weights.view(np.uint32),
-    }
-    # The bytes of each place together, from which deflate drops those that are 0 throughout.
-    planes = {name: np.asarray(column, "<u4").view(np.uint8).reshape(-1, 4).T for name, column in columns.items()}
-    parts = [zlib.compress(plane.tobytes(), 1) for plane in planes.values()]
-    head = json.dumps([int(evidence.overflow), *map(len, parts)]).encode().ljust(_HEAD)
-    return np.frombuffer(b"".join([head, *parts]), np.uint8)
+    columns = (
+        np.diff(evidence.gaussians, prepend=np.int32(0)),
+        np.diff(evidence.starts),
+        np.where(evidence.regions == num_regions, 0, evidence.regions + 1),
+        evidence.weights.view(np.uint32),
+        evidence.max_pixel_weights.view(np.uint32),
+    )
+    # The bytes of each place together: those that are 0 throughout are left out, and deflate shrinks the others.
+    planes = [np.asarray(column, "<u4").view(np.uint8).reshape(-1, 4).T for column in columns]
+    parts = [zlib.compress(plane.tobytes(), 1) if plane.any() else b"" for column in planes for plane in column]
+    sizes = len(evidence.gaussians), len(evidence.regions), int(evidence.overflow)
+    head = np.array([*sizes, *map(len, parts)], "<u4")
+    return np.frombuffer(b"".join([head.tobytes(), *parts]), np.uint8)
 
 
-def unpack_evidence(packed: UInt8[np.ndarray, " b"], num_regions: int) -> ViewEvidence:
-    """Unpacks what `pack_evidence` packed; ValueError if it is damaged."""
-    overflow, *sizes = json.loads(packed[:_HEAD].tobytes())
-    parts = np.split(packed[_HEAD:], np.cumsum(sizes))[:-1]
-    planes = (np.frombuffer(zlib.decompress(part.tobytes()), np.uint8).reshape(4, -1) for part in parts)
-    gaussians, lengths, regions, weights, peaks = (np.ascontiguousarray(p.T).view("<u4")[:, 0] for p in planes)
-    regions = np.where(regions.view(np.int32) < 0, num_regions, regions).astype(np.int32)
+def unpack_evidence(packed: UInt8[np.ndarray, " b"], count: int, num_regions: int) -> ViewEvidence:
+    """Unpacks what `pack_evidence` packed of `count` Gaussians; ValueError if it is damaged."""
+    head = packed[: 4 * _HEAD].view("<u4").astype(np.int64)
+    (seen, entries, overflow), ends = head[:3], 4 * _HEAD + np.cumsum(head[3:])
+    columns = [np.zeros(size, np.uint32) for size in (seen, seen, entries, entries, seen)]
+    for n, (end, size) in enumerate(zip(ends, head[3:])):
+        if size:
+            plane = np.frombuffer(zlib.decompress(packed[end - size : end].data), np.uint8)
+            columns[n // 4].view(np.uint8)[n % 4 :: 4] = plane
+    gaussians, lengths, regions, weights, peaks = columns
     starts = np.cumsum(np.append(np.uint32(0), lengths), dtype=np.int32)
-    fits = len(gaussians) == len(lengths) == len(peaks) and len(regions) == len(weights) == starts[-1]
-    if not fits or (regions > num_regions).any():
+    ids = np.cumsum(gaussians, dtype=np.int64)
+    regions = np.where(regions == 0, num_regions, regions.astype(np.int32) - 1).astype(np.int32)
+    if starts[-1] != entries or (len(ids) and ids[-1] >= count) or (regions > num_regions).any():
         raise ValueError("the evidence of a view is damaged")
-    ids = np.cumsum(gaussians, dtype=np.int32)
-    return ViewEvidence(ids, starts, regions, weights.view(np.float32), peaks.view(np.float32), overflow)
+    rows = ids.astype(np.int32), starts, regions, weights.view(np.float32), peaks.view(np.float32)
+    return ViewEvidence(*rows, int(overflow))
+
+
+def unpack_views(packed: Sequence[UInt8[np.ndarray, " _"]], count: int, num_regions: int) -> list[ViewEvidence]:
+    """Unpacks the lists of views on all cores."""
+    with ThreadPoolExecutor(cores()) as pool:
+        return list(pool.map(lambda view: unpack_evidence(view, count, num_regions), packed))
 
 
 def votes_memory(count: int, views: int) -> int:

@@ -3,7 +3,8 @@
 A field is a sum over views, but for the strongest K regions of a Gaussian, its largest pixel weight and the views that
 show a region. So nothing is subtracted: a field is summed anew from the views that the ledger holds. Views are summed
 in the order of their names, and weights add up without error (`jsecon.field.evidence`). So the field is the same, to
-the last bit, in whatever order views came, and after one is forgotten as if it had never been there.
+the last bit, in whatever order views came, and after one is forgotten as if it had never been there. Adding needs only
+the sum before the cut, which a ledger keeps once it is known.
 """
 
 import dataclasses
@@ -16,7 +17,7 @@ import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 
 from jsecon.errors import require
-from jsecon.field.evidence import TOP, sum_evidence, unpack_evidence
+from jsecon.field.evidence import TOP, EvidenceSum, add_evidence, sum_views, unpack_views
 from jsecon.field.membership import normalise_votes
 from jsecon.field.regions import unit_rows
 from jsecon.types import Camera, LanguageField, Regions
@@ -39,12 +40,15 @@ class LedgerView(NamedTuple):
     """The photograph at the size of the field's frames, as a JPEG."""
 
 
-class Ledger(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Ledger:
     """The views of a field."""
 
     num_regions: int
     views: Mapping[str, LedgerView]
     """By the names of the frames."""
+    sum: EvidenceSum | None = dataclasses.field(default=None, repr=False, compare=False)
+    """The sum of all, in the order of their names, where it is known: to add a view is then quick."""
 
 
 def view_order(name: str) -> tuple[str, str]:
@@ -78,7 +82,12 @@ def add_views(field: LanguageField, ledger: Ledger, views: Mapping[str, LedgerVi
     twice = sorted(set(views) & set(field.names))
     require(not twice, "add_views", f"views that are there already: {twice[:3]}", "new names", "Forget them first.")
     counts = [ledger.num_regions, *(int(view.pixel_counts[0].max(initial=-1)) + 1 for view in views.values())]
-    return _sum_views(field, Ledger(max(counts), {**ledger.views, **views}), {*field.names, *views})
+    count, ordered = max(counts), sorted({**ledger.views, **views}, key=view_order)
+    before = _sum_all(field, ledger) if ledger.sum is None else ledger.sum
+    new = [name for name in ordered if name in views]
+    lists = unpack_views([views[name].evidence for name in new], field.gaussians.count, count)
+    total = add_evidence(before, lists, [ordered.index(name) for name in new], count)
+    return _build_field(field, Ledger(count, {**ledger.views, **views}, total), {*field.names, *views})
 
 
 def forget_views(field: LanguageField, ledger: Ledger, names: Collection[str]) -> tuple[LanguageField, Ledger]:
@@ -103,17 +112,25 @@ def forget_views(field: LanguageField, ledger: Ledger, names: Collection[str]) -
     views = {name: view for name, view in ledger.views.items() if name not in names}
     require(len(views) > 0, "forget_views", "all views", "at least one view that stays", "Delete the field instead.")
     field = dataclasses.replace(field, parts=None)
-    return _sum_views(field, Ledger(ledger.num_regions, views), known - names)
+    ledger = Ledger(ledger.num_regions, views)
+    return _build_field(field, dataclasses.replace(ledger, sum=_sum_all(field, ledger)), known - names)
 
 
-def _sum_views(field: LanguageField, ledger: Ledger, names: Collection[str]) -> tuple[LanguageField, Ledger]:
-    """Sums the views of a ledger to the field of frames, the ledger's and others that have no part in the votes."""
+def _sum_all(field: LanguageField, ledger: Ledger) -> EvidenceSum:
+    """Sums the views of a ledger in the order of their names."""
+    packed = [ledger.views[name].evidence for name in sorted(ledger.views, key=view_order)]
+    lists = unpack_views(packed, field.gaussians.count, ledger.num_regions)
+    return sum_views(lists, field.gaussians.count, ledger.num_regions)
+
+
+def _build_field(field: LanguageField, ledger: Ledger, names: Collection[str]) -> tuple[LanguageField, Ledger]:
+    """Builds the field of frames from a ledger and its sum; some frames may have no part in the votes."""
     count, top = ledger.num_regions, field.votes.regions.shape[1]
     top = max(top, TOP) if top == field.regions.count else top  # a field of few regions holds all
     ordered = sorted(names, key=view_order)
     views = {name: ledger.views[name] for name in ordered if name in ledger.views}
-    lists = [unpack_evidence(view.evidence, count) for view in views.values()]
-    votes = sum_evidence(lists, field.gaussians.count, count, top=top, by_view=True)
+    assert ledger.sum is not None
+    votes = ledger.sum.votes(top)
     total = np.zeros((count, field.regions.embeddings.shape[1]))
     pixels = np.zeros((count, len(views)), np.int32)
     for t, view in enumerate(views.values()):
@@ -126,7 +143,7 @@ def _sum_views(field: LanguageField, ledger: Ledger, names: Collection[str]) -> 
     rows |= {name: view.camera for name, view in views.items() if name not in rows}
     cameras = np.stack([rows[name] for name in ordered])
     width, height = field.cameras.width, field.cameras.height
-    return dataclasses.replace(
+    new = dataclasses.replace(
         field,
         votes=normalise_votes(votes, Regions(embeddings, pixels)),
         regions=Regions(embeddings, all_pixels),
@@ -134,7 +151,8 @@ def _sum_views(field: LanguageField, ledger: Ledger, names: Collection[str]) -> 
         names=tuple(ordered),
         **_grown_tree(field, count),
         codes=None,
-    ), Ledger(count, views)
+    )
+    return new, ledger
 
 
 def _grown_tree(field: LanguageField, count: int) -> dict[str, np.ndarray]:

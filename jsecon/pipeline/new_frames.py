@@ -10,18 +10,19 @@ import jax
 import numpy as np
 from jaxtyping import UInt8
 
-from jsecon.association.scene import SceneSuperpixels, label_by_regions
+from jsecon.association.scene import FrameSuperpixels, SceneSuperpixels, label_by_regions
 from jsecon.errors import InputError, join_first
 from jsecon.field.evidence import pack_evidence, view_evidence
 from jsecon.field.ledger import Ledger, LedgerView, camera_row, view_order
 from jsecon.field.membership import LABELLED_PART, SHARE_THRESHOLD
 from jsecon.fit.resize import resize_camera, resize_frame
-from jsecon.poses.resection import MIN_INLIERS, Landmarks, find_pose, fits_scene
+from jsecon.poses.resection import MIN_INLIERS, Landmarks, find_pose
 from jsecon.read.captures.build import build_capture
 from jsecon.read.captures.capture import read_posed_images, unposed_photographs
 from jsecon.read.captures.frames import FrameOptions, frame_names, transform_poses
 from jsecon.read.captures.images import decode_jpeg, encode_jpeg, is_photograph, read_image
 from jsecon.read.masks.masks import load_proposals
+from jsecon.splat.sh import C0
 from jsecon.types import Camera, Capture, LanguageField, Progress
 from jsecon.vision.classical import GRANULARITIES, ClassicalSegmenter
 from jsecon.vision.protocols import Embedder
@@ -58,19 +59,11 @@ def read_frames(
     scene_from_capture = np.linalg.inv(field.source_from_scene) @ np.asarray(capture.source_from_scene)
     moved = transform_poses(np.asarray(capture.cameras.world_to_camera), scene_from_capture)
     cameras = dataclasses.replace(capture.cameras, world_to_camera=moved.astype(np.float32))
+    cameras = jax.tree.map(np.asarray, cameras)
     rows = _without_known(field, {name: t for t, name in enumerate(capture.names)}, "photographs")
     frames = {}
     for done, (name, t) in enumerate(rows.items()):
-        frame = _sized(field, np.asarray(capture.frames[t]), jax.tree.map(lambda a, t=t: np.asarray(a)[t], cameras))
-        like = fits_scene(frame.pixels, field.gaussians, frame.camera)
-        if like >= MIN_CORRELATION:
-            frames[name] = frame
-        else:
-            problem = (
-                f"it does not look like the scene from its pose (correlation {like:.2f}, {MIN_CORRELATION} needed)"
-            )
-            remedy = "Give poses in the world of the field's capture, or the photographs alone to find their poses."
-            refuse(InputError(f"photograph {name}", problem, remedy=remedy))
+        frames[name] = _sized(field, np.asarray(capture.frames[t]), cameras[t])
         progress(done + 1, len(rows))
     return frames
 
@@ -146,11 +139,6 @@ def _place(
             problem = f"only {found.inliers} of its features agree with the field on a pose, {MIN_INLIERS} needed"
             remedy = "Photograph more of what the field shows, from nearer to its views, or give its pose (--poses)."
             refuse(InputError(file, problem, remedy=remedy))
-        elif (like := fits_scene(photo, field.gaussians, found.camera)) < MIN_CORRELATION:
-            problem = (
-                f"it does not look like the scene from the pose that {found.inliers} features agree on ({like:.2f})"
-            )
-            refuse(InputError(file, problem, remedy="Give its pose (--poses), or leave it out."))
         else:
             frames[name] = _sized(field, photo, found.camera)
         progress(done + 1, len(files))
@@ -163,9 +151,13 @@ def make_views(
     frames: Mapping[str, NewFrame],
     embedder: Embedder,
     masks: Path | None,
+    refuse: Callable[[InputError], None],
     progress: Progress,
-) -> tuple[dict[str, LedgerView], int]:
-    """Labels new frames with the field's regions, embeds these, and lists their evidence; counts new regions."""
+) -> dict[str, LedgerView]:
+    """Labels new frames with the field's regions, embeds these, and lists their evidence.
+
+    `refuse` gets the error of each photograph that is unlike the scene.
+    """
     options = json.loads(field.provenance).get("options", {})
     centre = {"centre_pixel_weight": float(options.get("centre_pixel_weight", 0.0))}
     segment = ClassicalSegmenter(**GRANULARITIES[options.get("granularity", "medium")])
@@ -183,6 +175,14 @@ def make_views(
         found = segment(pixels, 0) if proposals is None else proposals(done)
         batch = jax.tree.map(lambda a: np.asarray(a)[None], camera)
         view = SceneSuperpixels(gaussians, batch, [found], **centre).all(pixels[None])[0]
+        progress(done + 1, len(frames))
+        if (like := _likeness(view, field, pixels)) < MIN_CORRELATION:
+            problem = (
+                f"it does not look like the scene from its pose (correlation {like:.2f}, {MIN_CORRELATION} needed)"
+            )
+            remedy = "Give poses in the world of the field's capture, or the photographs alone to find their poses."
+            refuse(InputError(f"photograph {name}", problem, remedy=remedy))
+            continue
         labels, new = label_by_regions(view, owner, count, unknown, split=masks is not None)
         evidence = view_evidence(gaussians, camera, labels, count + new, **centre)
         if new:  # the next frame may show them too
@@ -196,5 +196,18 @@ def make_views(
         pixel_counts = np.stack([shown, areas]).astype(np.int32)
         packed = pack_evidence(evidence, count)
         views[name] = LedgerView(packed, pixel_counts, pixel_counts[0], rows, camera_row(camera), encode_jpeg(pixels))
-        progress(done + 1, len(frames))
-    return views, count - ledger.num_regions
+    return views
+
+
+def _likeness(view: FrameSuperpixels, field: LanguageField, pixels: UInt8[np.ndarray, "h w 3"]) -> float:
+    """Correlates the mean colours of a photograph's superpixels with those of the Gaussians that lie on them."""
+    flat, labels = pixels.reshape(-1, 3), view.labels.reshape(-1)
+    area = np.bincount(labels)
+    photo = np.stack([np.bincount(labels, column) for column in flat.T], 1) / area[:, None]
+    colours = np.clip(0.5 + C0 * np.asarray(field.gaussians.sh)[view.seen, 0], 0, 1)
+    total = np.maximum(np.asarray(view.votes.sum(0)).ravel(), 1e-6)
+    pair = np.stack([photo, view.votes.T @ colours / total[:, None]]) * 1.0
+    weight = np.where(total >= 0.2 * area, area, 0.0)[:, None] / area.sum()
+    pair -= (pair * weight).sum(1, keepdims=True) / max(weight.sum(), 1e-9)
+    squares = (pair**2 * weight).sum((1, 2))
+    return float((pair[0] * pair[1] * weight).sum() / max(np.sqrt(squares.prod()), 1e-9))

@@ -260,12 +260,3 @@ def _flow_matches(photo: UInt8[np.ndarray, "h w 3"], gaussians: Gaussians, camer
     places, known = _places(gaussians, camera, start.astype(np.float64) + 0.5)
     kept = known & inside & (np.linalg.norm(there[y, x] + returned, axis=1) < 1) & (structure > np.median(structure))
     return _Matches(end[kept].astype(np.float64) + 0.5, places[kept])
-
-
-def fits_scene(photo: UInt8[np.ndarray, "h w 3"], gaussians: Gaussians, camera: Camera) -> float:
-    """Returns the correlation of a photograph with what the scene shows from its camera, at 64 px."""
-    size = 64, max(round(64 * camera.height / camera.width), 1)
-    image = np.clip(np.asarray(render_rgb(gaussians, camera).features), 0, 1)
-    pair = np.stack([cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (image, np.float32(photo) / 255)])
-    pair = (pair - pair.mean((1, 2), keepdims=True)).reshape(2, -1).astype(np.float64)
-    return float((pair[0] * pair[1]).sum() / max(np.sqrt((pair**2).sum(1).prod()), 1e-9))
