@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 from jsecon import Camera, Capture, Gaussians, LanguageField, Regions, Scene, open_scene, render_rgb
 from jsecon.field.evidence import list_evidence, pack_evidence, sum_evidence
 from jsecon.field.ledger import Ledger, LedgerView, camera_row
-from jsecon.field.ledger_file import ledger_folder, save_with_ledger
+from jsecon.field.ledger_file import save_with_ledger
 from jsecon.field.membership import normalise_votes
 from jsecon.field.regions import region_embeddings
 from jsecon.read.captures.images import encode_jpeg, write_image
@@ -94,7 +94,7 @@ def make_field(count: int, views: int, path: Path) -> list[Metric]:
     field = dataclasses.replace(field, unrelated_words=np.zeros((0, embedder.dim), np.float32))
     save_with_ledger(path, field, Ledger(count_regions, ledger))
     entries = sum(len(view.weights) for view in lists)
-    size = sum(file.stat().st_size for file in ledger_folder(path).iterdir())
+    size = sum(file.stat().st_size for file in path.with_suffix(".evidence").iterdir())
     note = f"{entries} entries of {views} views, {size / 2**20:.1f} MiB with pictures, {sum(map(len, packed))} bytes"
     return [
         Metric("bytes of an entry of the ledger", sum(map(len, packed)) / entries, "", "lower", 0.1, note),

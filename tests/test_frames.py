@@ -10,7 +10,7 @@ from capture_files import refused, run_cli
 from conftest import cameras_of, gaussians_at, look_at
 
 from jsecon import open_scene, render_rgb
-from jsecon.association.scene import SceneSuperpixels, label_by_regions
+from jsecon.association.scene import SceneSuperpixels, label_by_regions, one_hot
 from jsecon.poses.resection import MIN_INLIERS, Landmarks, find_pose
 
 
@@ -37,15 +37,15 @@ def test_a_photograph_finds_its_pose_by_those_of_the_field(bumpy_wall):
     scene, cameras, pictures = bumpy_wall
     others = np.array([0, 1, 3, 4])
     landmarks = Landmarks(scene, cameras[others], [pictures[t] for t in others])
-    found = find_pose(pictures[2], landmarks)
-    assert found.inliers >= 2 * MIN_INLIERS
-    pose, true = (np.asarray(c.world_to_camera, np.float64) for c in (found.camera, cameras[2]))
+    found, inliers = find_pose(pictures[2], landmarks)
+    assert inliers >= 2 * MIN_INLIERS
+    pose, true = (np.asarray(c.world_to_camera, np.float64) for c in (found, cameras[2]))
     assert np.degrees(np.arccos(np.clip((np.trace(pose[:3, :3] @ true[:3, :3].T) - 1) / 2, -1, 1))) < 0.2
     assert np.linalg.norm(centre(pose) - centre(true)) < 0.01
     zoomed = cv2.resize(pictures[2][15:135, 20:180], (200, 150))  # another lens: 1.25 times the focal length
-    found = find_pose(zoomed, landmarks)
-    assert float(found.camera.fx) == pytest.approx(250, rel=0.02)
-    assert np.linalg.norm(centre(np.asarray(found.camera.world_to_camera, np.float64)) - centre(true)) < 0.05
+    found, _ = find_pose(zoomed, landmarks)
+    assert float(found.fx) == pytest.approx(250, rel=0.02)
+    assert np.linalg.norm(centre(np.asarray(found.world_to_camera, np.float64)) - centre(true)) < 0.05
 
 
 def test_photographs_of_another_place_have_no_pose(bumpy_wall):
@@ -53,9 +53,9 @@ def test_photographs_of_another_place_have_no_pose(bumpy_wall):
     noise = np.random.default_rng(1).integers(0, 256, (150, 200, 3), np.uint8)
     landmarks = Landmarks(scene, cameras, pictures)
     for photo in (cv2.GaussianBlur(noise, (0, 0), 2), np.full_like(noise, 90)):
-        found = find_pose(photo, landmarks)
-        assert found.camera is None
-        assert found.inliers < MIN_INLIERS
+        found, inliers = find_pose(photo, landmarks)
+        assert found is None
+        assert inliers < MIN_INLIERS
 
 
 def test_a_new_view_takes_the_regions_of_its_gaussians():
@@ -69,19 +69,23 @@ def test_a_new_view_takes_the_regions_of_its_gaussians():
         seen = truth[0] > 0
         return (labels == expected)[seen].mean()
 
-    labels, new = label_by_regions(view, owner, 4, all_known)
+    labels, new = label_by_regions(view, owner, one_hot(owner, 4), all_known)
     assert new == 0
     assert agreement(labels, truth[0]) > 0.95
     without = np.where(owner == 2, -1, owner)
-    labels, new = label_by_regions(view, without, 4, without < 0)
+    labels, new = label_by_regions(view, without, one_hot(without, 4), without < 0)
     assert new == 1
     assert agreement(labels, np.where(truth[0] == 2, 4, truth[0])) > 0.95
     merged = np.where(owner == 1, 0, owner)
-    labels, new = label_by_regions(view, merged, 4, all_known)
+    labels, new = label_by_regions(view, merged, one_hot(merged, 4), all_known)
     assert new == 0
-    labels, new = label_by_regions(view, merged, 4, all_known, split=True)
+    labels, new = label_by_regions(view, merged, one_hot(merged, 4), all_known, split=True)
     assert new == 1
     assert agreement(labels, np.where(truth[0] == 1, 4, truth[0])) > 0.95
+    both = one_hot(merged, 4) + one_hot(np.where(owner == 1, 1, -1), 4)  # a frame before had split it
+    labels, new = label_by_regions(view, merged, both, all_known, split=True)
+    assert new == 0
+    assert agreement(labels, truth[0]) > 0.95
 
 
 @pytest.fixture
@@ -104,7 +108,7 @@ def test_a_frame_that_was_forgotten_is_added_again(field, room):
     before, after = (np.asarray(s.field.regions.pixel_counts)[:, t] for s in (scene, grown))
     assert np.minimum(before, after[: len(before)]).sum() > 0.9 * before.sum()
     same = np.asarray(grown.field.votes.regions)[:, 0] == np.asarray(scene.field.votes.regions)[:, 0]
-    assert same.mean() > 0.99
+    assert same.mean() > 0.97
     with refused("already"):
         grown.add(room)
 

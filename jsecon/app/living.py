@@ -51,8 +51,11 @@ def _forget(verb: verbs.Forget, console: Console) -> verbs.VerbResult:
 @contextlib.contextmanager
 def _changing(field: Path, out: Path | None) -> Iterator[Path]:
     """Yields the path of the field to write, for one process at a time; what a stopped one left there is removed."""
-    old = locate_field(field).file
-    path = old if out is None else out / FIELD_FILE
+    old = locate_field(field)
+    if old.splat is not None:
+        problem = "it is a file of Gaussians, whose views are rendered"
+        raise InputError(field, problem, remedy=f"Give its field, {old.file.parent}, or make one of photographs.")
+    path = old.file if out is None else out / FIELD_FILE
     require_writable(path.parent)
     with exclusive_lock(path.parent):
         if path.is_file():

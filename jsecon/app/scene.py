@@ -278,7 +278,7 @@ class Scene:
             with console.progress("frames") as progress:
                 frames = read_frames(self.field, ledger, photos, pose_file, refuse, progress)
             with console.progress("views") as progress:
-                views = make_views(self.field, ledger, frames, embedder, mask_folder, refuse, progress)
+                views = make_views(self.field, frames, embedder, mask_folder, refuse, progress)
             if not views:
                 raise errors.pop()
             with console.progress("votes"):

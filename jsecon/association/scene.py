@@ -190,42 +190,43 @@ def assign_superpixels(
 def label_by_regions(
     view: FrameSuperpixels,
     owner: Int[np.ndarray, " n"],
-    count: int,
+    consensus: Sparse,
     unknown: Bool[np.ndarray, " n"],
     *,
     split: bool = False,
 ) -> tuple[Int32[np.ndarray, "h w"], int]:
-    """Labels a new view with the regions of a scene; what belongs to none gets labels from `count` on.
+    """Labels a new view with the regions of a scene; what belongs to none gets labels from their number on.
 
-    A mask and a region match by the consensus ratio in both directions: the share of the mask's weight that lies on the
-    region's Gaussians, and the share of the region's visible weight that lies in the mask. Superpixels take the regions
-    of their Gaussians (`assign_superpixels`). A mask opens a region if most of its weight lies on Gaussians that are
-    `unknown`; with `split` also if it is a small part of one region, as a mug on a table that no mask had cut out.
+    Superpixels take the regions of their Gaussians (`assign_superpixels`). A mask takes a region as a whole if both are
+    the same in the new view: at least half of the mask's weight lies in the region, and half of the region's in the
+    mask. What matches no region in both directions opens one if most of its weight lies on `unknown` Gaussians; with
+    `split` also if it lies in a larger region, as a mug on a table that no mask had cut out.
 
     Args:
       view: The view with its masks.
       owner: Region of each of the N Gaussians, -1 for none.
-      count: Number of regions.
+      consensus: (N, R) share of each Gaussian in each region, over the views that see both.
       unknown: Gaussians on which a region may be opened.
-      split: Whether a mask that lies in a region and fills less than half of it is a region of its own.
+      split: Whether a part of a region may be one of its own.
 
     Returns:
       (H, W) labels, -1 for none, and the number of new regions.
     """
+    count = consensus.shape[1]
     mass = (view.votes.T @ one_hot(owner[view.seen], max(count, 1))).toarray()
     classes = assign_superpixels(view, mass, mass.sum(1, keepdims=True))
-    total = np.asarray(view.votes.sum(0)).ravel()
-    fresh = view.votes.T @ unknown[view.seen].astype(np.float32)
-    area = np.bincount(view.labels.reshape(-1), minlength=len(total))
+    total, shares = np.asarray(view.votes.sum(0)).ravel(), (view.votes.T @ consensus[view.seen]).toarray()
+    fresh, area = view.votes.T @ (unknown[view.seen] * 1.0), np.bincount(view.labels.reshape(-1))
     new = 0
     for share in view.proposals:
-        inside = mass.T @ share
-        weight, region = share @ total, inside.argmax()
-        is_unknown = share @ fresh >= 0.5 * weight
-        is_part = split and inside[region] >= 0.5 * weight and inside[region] < 0.5 * mass[:, region].sum()
-        members = (share > 0.5) & (classes < count)
-        if weight >= 0.2 * (share @ area) and (is_unknown or is_part) and area[members].sum() >= 0.5 * (share @ area):
-            classes[members] = count + new
+        weight, inside, members = share @ total, shares.T @ share, share > 0.5
+        both = np.minimum(inside / max(weight, 1e-6), inside / np.maximum(shares.sum(0), 1e-6))
+        if weight < 0.2 * (share @ area):
+            continue
+        if both.max(initial=0) >= 0.5:
+            classes[members & (classes < count)] = both.argmax()
+        elif share @ fresh >= 0.5 * weight or (split and inside.max(initial=0) >= 0.5 * weight):
+            classes[members & (classes < count)] = count + new
             new += 1
     return classes[view.labels].astype(np.int32), new
 

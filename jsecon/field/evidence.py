@@ -400,14 +400,12 @@ def sum_evidence(
     folder: str | os.PathLike | None = None,
 ) -> Votes:
     """Adds up the lists of views to votes of `count` Gaussians, a block of rows at a time; see `region_votes`."""
-    size = _block_rows(len(views), num_regions)
-    blocks = (slice(first, min(first + size, count)) for first in range(0, max(count, 1), size))
-    sums = (_sum_rows([view._of_rows(rows) for view in views], rows, num_regions) for rows in blocks)
-    columns = (_cut_sum(each, top, by_view) for each in sums)
-    joined = _join(columns) if folder is None else _write_columns(Path(folder), columns, count)
-    if by_view:
-        joined["by_view"] = joined["by_view"].T
-    return Votes(**joined, overflow=np.asarray(sum(view.overflow for view in views), np.int32), num_regions=num_regions)
+    if folder is None:
+        votes = sum_views(views, count, num_regions, by_view=by_view).votes(top)
+    else:
+        columns = (_cut_sum(each, top) for each in _sum_blocks(views, count, num_regions, by_view))
+        votes = _make_votes(_write_columns(Path(folder), columns, count), sum(v.overflow for v in views), num_regions)
+    return votes if by_view else dataclasses.replace(votes, by_view=None)
 
 
 class EvidenceSum(NamedTuple):
@@ -428,27 +426,35 @@ class EvidenceSum(NamedTuple):
 
     def votes(self, top: int) -> Votes:
         """Cuts the sum to the `top` strongest regions of each Gaussian."""
-        columns = _cut_sum(self, top, True)
-        columns["by_view"] = columns["by_view"].T
-        return Votes(**columns, overflow=np.asarray(self.overflow, np.int32), num_regions=self.weights.shape[1])
+        return _make_votes(_cut_sum(self, top), self.overflow, self.weights.shape[1])
 
 
-def _block_rows(views: int, num_regions: int) -> int:
-    """Returns how many Gaussians are added up at once."""
-    return max(_MAX_ENTRIES // max(views, num_regions, 1), 1)
+def _make_votes(columns: dict[str, np.ndarray], overflow: int, num_regions: int) -> Votes:
+    columns = columns | {"by_view": columns["by_view"].T}
+    return Votes(**columns, overflow=np.asarray(overflow, np.int32), num_regions=num_regions)
 
 
-def _sum_rows(views: Sequence[ViewEvidence], rows: slice, num_regions: int) -> EvidenceSum:
+def _sum_blocks(views: Sequence[ViewEvidence], count: int, num_regions: int, by_view: bool) -> Iterator[EvidenceSum]:
+    """Sums the lists of views, a block of Gaussians at a time."""
+    size = max(_MAX_ENTRIES // max(len(views), num_regions, 1), 1)
+    for first in range(0, max(count, 1), size):
+        rows = slice(first, min(first + size, count))
+        yield _sum_rows([view._of_rows(rows) for view in views], rows, num_regions, by_view)
+
+
+def _sum_rows(views: Sequence[ViewEvidence], rows: slice, num_regions: int, by_view: bool) -> EvidenceSum:
     """Sums a block of rows over all views."""
     count = rows.stop - rows.start
     total, seen, peak = np.zeros(count), np.zeros(count, np.int32), np.zeros(count, np.float32)
-    each, dense = np.zeros((len(views), count), np.float32).T, np.zeros((count, num_regions + 1))
+    each = np.zeros((len(views) if by_view else 0, count), np.float32).T
+    dense = np.zeros((count, num_regions + 1))
     for t, view in enumerate(views):
         own = np.add.reduceat(view.weights, view.starts[:-1], dtype=np.float64) if len(view.gaussians) else 0.0
         total[view.gaussians] += own
         seen[view.gaussians] += 1
         peak[view.gaussians] = np.maximum(peak[view.gaussians], view.max_pixel_weights)
-        each[view.gaussians, t] = own
+        if by_view:
+            each[view.gaussians, t] = own
         # A view has each pair of a Gaussian and a region once.
         first = np.repeat(view.gaussians.astype(np.int64) * (num_regions + 1), np.diff(view.starts))
         dense.reshape(-1)[first + view.regions] += view.weights
@@ -456,14 +462,13 @@ def _sum_rows(views: Sequence[ViewEvidence], rows: slice, num_regions: int) -> E
     return EvidenceSum(weights, total, seen, peak, each, sum(view.overflow for view in views))
 
 
-def _cut_sum(evidence: EvidenceSum, top: int, by_view: bool) -> dict[str, np.ndarray]:
+def _cut_sum(evidence: EvidenceSum, top: int) -> dict[str, np.ndarray]:
     """Computes the columns of votes."""
-    columns = dict(
-        zip(("regions", "weights"), _strongest(evidence.weights, min(top, max(evidence.weights.shape[1], 1))))
-    )
-    columns["labelled"] = np.asarray(evidence.weights.sum(1)).reshape(-1).astype(np.float32)
-    columns |= {"total": evidence.total.astype(np.float32), "max_pixel_weight": evidence.max_pixel_weight}
-    return columns | {"views": evidence.views} | ({"by_view": evidence.by_view} if by_view else {})
+    weights, columns = evidence.weights, evidence._asdict()
+    columns["regions"], columns["weights"] = _strongest(weights, min(top, max(weights.shape[1], 1)))
+    columns["labelled"] = np.asarray(weights.sum(1)).reshape(-1).astype(np.float32)
+    columns["total"] = evidence.total.astype(np.float32)
+    return {name: column for name, column in columns.items() if name != "overflow"}
 
 
 def _strongest(votes: Any, top: int) -> tuple[Int32[np.ndarray, "n k"], Float32[np.ndarray, "n k"]]:
@@ -495,13 +500,10 @@ def add_evidence(
     return EvidenceSum(weights, *sums, peak, by_view, evidence.overflow + more.overflow)
 
 
-def sum_views(views: Sequence[ViewEvidence], count: int, num_regions: int) -> EvidenceSum:
+def sum_views(views: Sequence[ViewEvidence], count: int, num_regions: int, *, by_view: bool = True) -> EvidenceSum:
     """Adds up the lists of views, before the cut to the strongest regions."""
-    size = _block_rows(len(views), num_regions)
-    blocks = [slice(first, min(first + size, count)) for first in range(0, max(count, 1), size)]
-    parts = [_sum_rows([view._of_rows(rows) for view in views], rows, num_regions) for rows in blocks]
-    columns = (np.concatenate(column) for column in list(zip(*parts))[1:5])
-    return EvidenceSum(sparse.vstack([part.weights for part in parts], "csr"), *columns, parts[0].overflow)
+    weights, *columns, overflow = zip(*_sum_blocks(views, count, num_regions, by_view))
+    return EvidenceSum(sparse.vstack(weights, "csr"), *map(np.concatenate, columns), overflow[0])
 
 
 def pack_evidence(evidence: ViewEvidence, num_regions: int) -> UInt8[np.ndarray, " b"]:
@@ -601,12 +603,6 @@ def _on_disk(view: ViewEvidence, path: Path) -> ViewEvidence:
     for name, column in columns.items():
         np.save(f"{path}-{name}.npy", column)
     return view._replace(**{name: map_npy(Path(f"{path}-{name}.npy")) for name in columns})
-
-
-def _join(blocks: Iterator[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """The columns of all blocks, in memory."""
-    parts = list(blocks)
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def _write_columns(folder: Path, blocks: Iterator[dict[str, np.ndarray]], count: int) -> dict[str, np.ndarray]:

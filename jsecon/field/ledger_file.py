@@ -9,7 +9,6 @@ import hashlib
 import json
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -31,26 +30,26 @@ from jsecon.types import LanguageField
 _REMEDY = "Make the field again with jsecon run, without --no-ledger; the finished stages are reused."
 
 
-def ledger_folder(path: Path) -> Path:
-    """Returns the folder of the ledger of a field's file."""
-    return path.with_suffix(".evidence")
+def ledger_file(path: Path, field: LanguageField) -> Path:
+    """Returns the path of the ledger of a field's file."""
+    return path.with_suffix(".evidence") / f"{parse_json(field.provenance).get('ledger')}.safetensors"
 
 
 def save_with_ledger(path: Path, field: LanguageField, ledger: Ledger | None) -> LanguageField:
     """Writes a field and its ledger; returns the field as it was written. Ledgers of other fields there are removed."""
-    folder, origin = ledger_folder(path), parse_json(field.provenance)
+    origin, arrays, tree = parse_json(field.provenance), {}, {}
     origin.pop("ledger", None)
     if ledger is not None:
-        arrays: dict[str, np.ndarray] = {}
-        tree = pack_tree({"num_regions": ledger.num_regions, "views": _as_dicts(ledger)}, "", arrays)
+        views = {name: view._asdict() for name, view in ledger.views.items()}
+        tree = pack_tree({"num_regions": ledger.num_regions, "views": views}, "", arrays)
         digest = hashlib.blake2b(json.dumps(tree, sort_keys=True).encode(), digest_size=12)
         for array in arrays.values():
-            digest.update(np.ascontiguousarray(array).view(np.uint8).data if array.size else b"")
+            digest.update(np.ascontiguousarray(array))
         origin["ledger"] = digest.hexdigest()
-        if not (folder / _file_name(origin)).is_file():
-            with atomic_write(folder / _file_name(origin)) as temporary:
-                write_arrays(temporary, arrays, {"format": "jsecon-ledger", "version": 1, "ledger": tree})
     field = dataclasses.replace(field, provenance=json.dumps(origin, sort_keys=True))
+    if ledger is not None and not ledger_file(path, field).is_file():
+        with atomic_write(ledger_file(path, field)) as temporary:
+            write_arrays(temporary, arrays, {"format": "jsecon-ledger", "version": 1, "ledger": tree})
     save_field(path, field)
     remove_stale(path, field)
     return field
@@ -58,36 +57,25 @@ def save_with_ledger(path: Path, field: LanguageField, ledger: Ledger | None) ->
 
 def remove_stale(path: Path, field: LanguageField) -> None:
     """Removes ledgers of earlier states of a field, which a stopped program may have left, too."""
-    folder, origin = ledger_folder(path), parse_json(field.provenance)
-    if folder.is_dir():
-        remove_files(folder, sorted({*os.listdir(folder)} - {_file_name(origin)}))
-        if "ledger" not in origin:
-            folder.rmdir()
+    file = ledger_file(path, field)
+    if file.parent.is_dir():
+        remove_files(file.parent, {*os.listdir(file.parent)} - {file.name})
 
 
 def load_ledger(path: Path, field: LanguageField) -> Ledger:
     """Reads the ledger of a field's file."""
-    origin = parse_json(field.provenance)
-    file = ledger_folder(path) / _file_name(origin)
-    if "ledger" not in origin:
+    file = ledger_file(path, field)
+    if "ledger" not in parse_json(field.provenance):
         raise InputError(path, "the field has no ledger of its views", remedy=_REMEDY)
     if not file.is_file():
         problem = f"its ledger is missing: {file.parent.name}/{file.name}"
         raise InputError(path, problem, remedy=f"Copy that folder along with the field. {_REMEDY}")
     with reading(file, "a whole one", _REMEDY, problem="the ledger is damaged"):
         header, arrays = read_arrays(file)
-        if not isinstance(header, dict) or header.get("format") != "jsecon-ledger" or header.get("version") != 1:
+        if [header.get("format"), header.get("version")] != ["jsecon-ledger", 1]:
             raise InputError(file, "it is no ledger of this version of jsecon", remedy=_REMEDY)
         tree = unpack_tree(header["ledger"], arrays)
         ledger = Ledger(tree["num_regions"], {name: LedgerView(**view) for name, view in tree["views"].items()})
         if ledger.num_regions != field.regions.count or not {*ledger.views} <= {*field.names}:
             raise InputError(file, "it is the ledger of another field", remedy=_REMEDY)
         return ledger
-
-
-def _file_name(origin: Any) -> str:
-    return f"{origin.get('ledger', '')}.safetensors"
-
-
-def _as_dicts(ledger: Ledger) -> dict[str, dict[str, np.ndarray]]:
-    return {name: view._asdict() for name, view in ledger.views.items()}

@@ -19,25 +19,28 @@ MIN_POINTS = 50
 """Least number of points for a scene: with fewer the views do not overlap or have no texture."""
 
 
-class _Features(NamedTuple):
+class Features(NamedTuple):
+    """SIFT features of a frame."""
+
     rays: np.ndarray  # (F, 2) x / z and y / z in camera axes
     descriptors: np.ndarray  # (F, 128) float32, RootSIFT
     colors: np.ndarray  # (F, 3) uint8
 
 
-def _detect(frame: np.ndarray, camera: Camera) -> _Features:
+def detect_features(frame: np.ndarray, camera: Camera) -> Features:
+    """Detects the features of a frame (h, w, 3) uint8."""
     # OpenCV's default contrast threshold is 0.04; lower gives more points.
     sift = cv2.SIFT.create(nfeatures=6000, contrastThreshold=0.015)  # type: ignore[attr-defined]
     keypoints, descriptors = sift.detectAndCompute(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), None)
     if not keypoints:
-        return _Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros((0, 3), np.uint8))
+        return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros((0, 3), np.uint8))
     xy = np.array([k.pt for k in keypoints], np.float64)
     descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))  # Arandjelovic 2012
     height, width = frame.shape[:2]
     column, row = np.clip(np.rint(xy).astype(int), 0, [width - 1, height - 1]).T
     # OpenCV's pixel centres are integers.
     rays = (xy + 0.5 - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-    return _Features(rays, descriptors.astype(np.float32), frame[row, column])
+    return Features(rays, descriptors.astype(np.float32), frame[row, column])
 
 
 def _view_pairs(poses: np.ndarray) -> list[tuple[int, int]]:
@@ -53,8 +56,8 @@ def _view_pairs(poses: np.ndarray) -> list[tuple[int, int]]:
     return sorted({(min(i, int(j)), max(i, int(j))) for i in range(len(rotation)) for j in nearest[i]})
 
 
-def _match(a: _Features, b: _Features) -> np.ndarray:
-    """(M, 2) indices of mutual nearest descriptors that pass Lowe's ratio."""
+def match_features(a: Features, b: Features) -> np.ndarray:
+    """Returns (M, 2) indices of mutual nearest descriptors that pass Lowe's ratio."""
     if len(a.rays) < 2 or len(b.rays) < 2:
         return np.zeros((0, 2), int)
     similarity = a.descriptors @ b.descriptors.T
@@ -112,12 +115,12 @@ def triangulated_points(capture: Capture, *, progress: Progress | None = None) -
     report = progress or (lambda done, total: None)
     features = []
     for n, t in enumerate(used):
-        features.append(_detect(np.ascontiguousarray(capture.frames[t]), cameras[n]))
+        features.append(detect_features(np.ascontiguousarray(capture.frames[t]), cameras[n]))
         report(n + 1, total)
     first = np.cumsum([0, *(len(f.rays) for f in features)])
     edges, points, parallax = [np.zeros((0, 2), int)], [np.zeros((0, 3))], [np.zeros(0)]
     for n, (i, j) in enumerate(pairs):
-        matches = _match(features[i], features[j])
+        matches = match_features(features[i], features[j])
         if len(matches):
             rays = features[i].rays[matches[:, 0]], features[j].rays[matches[:, 1]]
             of_pair, angle = _triangulate_matches(poses[i], poses[j], *rays, float(cameras.fx[i]))

@@ -1,20 +1,22 @@
 """New photographs of a scene that has a field: their poses, their labels, and what they contribute to the ledger."""
 
-import dataclasses
-import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import jax
 import numpy as np
 from jaxtyping import UInt8
+from scipy import sparse
 
 from jsecon.association.scene import FrameSuperpixels, SceneSuperpixels, label_by_regions
 from jsecon.errors import InputError, join_first
 from jsecon.field.evidence import pack_evidence, view_evidence
 from jsecon.field.ledger import Ledger, LedgerView, camera_row, view_order
 from jsecon.field.membership import LABELLED_PART, SHARE_THRESHOLD
+from jsecon.files import parse_json
 from jsecon.fit.resize import resize_camera, resize_frame
 from jsecon.poses.resection import MIN_INLIERS, Landmarks, find_pose
 from jsecon.read.captures.build import build_capture
@@ -23,7 +25,7 @@ from jsecon.read.captures.frames import FrameOptions, frame_names, transform_pos
 from jsecon.read.captures.images import decode_jpeg, encode_jpeg, is_photograph, read_image
 from jsecon.read.masks.masks import load_proposals
 from jsecon.splat.sh import C0
-from jsecon.types import Camera, Capture, LanguageField, Progress
+from jsecon.types import Camera, Capture, LanguageField, Progress, Votes
 from jsecon.vision.classical import GRANULARITIES, ClassicalSegmenter
 from jsecon.vision.protocols import Embedder
 
@@ -51,16 +53,17 @@ def read_frames(
 
     `refuse` gets the error of each photograph that cannot be read or placed.
     """
-    if isinstance(photos, Path) and poses is None and (files := _photographs(photos)):
-        names = dict(zip(frame_names([file.name for file in files], photos), files))
-        new = _without_known(field, names, photos)
-        return _place(field, ledger, new, refuse, progress)
+    if isinstance(photos, Path) and poses is None:
+        files = [photos] if photos.is_file() and is_photograph(photos) else unposed_photographs(photos)[0]
+        if files:
+            names = frame_names([file.name for file in files], photos)
+            return _place(field, ledger, _without_known(field, names, files), refuse, progress)
     capture = photos if isinstance(photos, Capture) else _read_capture(field, photos, poses)
     scene_from_capture = np.linalg.inv(field.source_from_scene) @ np.asarray(capture.source_from_scene)
     moved = transform_poses(np.asarray(capture.cameras.world_to_camera), scene_from_capture)
-    cameras = dataclasses.replace(capture.cameras, world_to_camera=moved.astype(np.float32))
+    cameras = replace(capture.cameras, world_to_camera=moved.astype(np.float32))
     cameras = jax.tree.map(np.asarray, cameras)
-    rows = _without_known(field, {name: t for t, name in enumerate(capture.names)}, "photographs")
+    rows = _without_known(field, capture.names, range(len(capture.names)))
     frames = {}
     for done, (name, t) in enumerate(rows.items()):
         frames[name] = _sized(field, np.asarray(capture.frames[t]), cameras[t])
@@ -68,42 +71,29 @@ def read_frames(
     return frames
 
 
-def _photographs(path: Path) -> list[Path]:
-    """Lists photographs without poses: one file, or those of a folder."""
-    if path.is_file() and is_photograph(path):
-        return [path]
-    return unposed_photographs(path)[0]
-
-
-def _without_known(field: LanguageField, new: Mapping[str, Any], where: object) -> dict[str, Any]:
-    """Leaves out frames that the field has by their names, in order."""
-    fresh = {name: new[name] for name in sorted(new, key=view_order) if name not in field.names}
+def _without_known(field: LanguageField, names: Sequence[str], items: Sequence[Any]) -> dict[str, Any]:
+    """Leaves out frames that the field has by their names."""
+    new = dict(zip(names, items))
+    fresh = {name: new[name] for name in sorted({*new} - {*field.names}, key=view_order)}
     if not fresh:
         problem = f"the field has frames of all {len(new)} names already ({join_first(list(new))})"
-        raise InputError(where, problem, remedy="Forget them first (jsecon forget), or rename the new ones.")
+        raise InputError("photographs", problem, remedy="Forget them first (jsecon forget), or rename the new ones.")
     return fresh
 
 
 def _read_capture(field: LanguageField, photos: Path, poses: Path | None) -> Capture:
-    """Reads a capture, or photographs whose poses are in another file."""
+    """Reads a capture, or photographs whose poses are in another file; only what the field lacks."""
     posed = read_posed_images(photos if poses is None else poses)
+    images = list(posed.images)
     if poses is not None:
-        folder = photos if photos.is_dir() else photos.parent
-        files = {file.name: file for file in folder.rglob("*") if file.is_file()}
-        chosen = {photos.name} if photos.is_file() else set(files)
-        images = [image for image in posed.images if Path(image.name).name in chosen]
+        files = {file.name: file for file in (photos.rglob("*") if photos.is_dir() else [photos])}
+        images = [replace(i, image=files[Path(i.name).name]) for i in images if Path(i.name).name in files]
         if not images:
             problem = f"none of its {len(posed.images)} poses is of a photograph in {photos}"
             raise InputError(poses, problem, remedy="Names of photographs must be those that the poses name.")
-        images = [dataclasses.replace(image, image=files[Path(image.name).name]) for image in images]
-        posed = dataclasses.replace(posed, images=images)
-    missing = dataclasses.replace(posed, images=[i for i in posed.images if _frame_name(i.name) not in field.names])
-    posed = missing if missing.images else posed
-    return build_capture(posed, FrameOptions(long_side=max(field.cameras.width, field.cameras.height), holdout=0))
-
-
-def _frame_name(name: str) -> str:
-    return frame_names([name], "")[0]
+    new = _without_known(field, frame_names([image.name for image in images], photos), images)
+    size = FrameOptions(long_side=max(field.cameras.width, field.cameras.height), holdout=0)
+    return build_capture(replace(posed, images=list(new.values())), size)
 
 
 def _sized(field: LanguageField, pixels: UInt8[np.ndarray, "h w 3"], camera: Camera) -> NewFrame:
@@ -131,23 +121,21 @@ def _place(
         except InputError as error:
             refuse(error)
             continue
-        small = min(side / max(photo.shape[:2]), 1.0)
-        size = Camera(np.eye(4), *np.ones(4), *(max(round(length * small), 1) for length in photo.shape[1::-1]))
-        photo = resize_frame(photo, size)
-        found = find_pose(photo, landmarks)
-        if found.camera is None:
-            problem = f"only {found.inliers} of its features agree with the field on a pose, {MIN_INLIERS} needed"
+        size = FrameOptions(long_side=side).size(photo.shape[1::-1])
+        photo = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
+        camera, inliers = find_pose(photo, landmarks)
+        if camera is None:
+            problem = f"only {inliers} of its features agree with the field on a pose, {MIN_INLIERS} needed"
             remedy = "Photograph more of what the field shows, from nearer to its views, or give its pose (--poses)."
             refuse(InputError(file, problem, remedy=remedy))
         else:
-            frames[name] = _sized(field, photo, found.camera)
+            frames[name] = _sized(field, photo, camera)
         progress(done + 1, len(files))
     return frames
 
 
 def make_views(
     field: LanguageField,
-    ledger: Ledger,
     frames: Mapping[str, NewFrame],
     embedder: Embedder,
     masks: Path | None,
@@ -158,23 +146,24 @@ def make_views(
 
     `refuse` gets the error of each photograph that is unlike the scene.
     """
-    options = json.loads(field.provenance).get("options", {})
+    options = parse_json(field.provenance).get("options", {})
     centre = {"centre_pixel_weight": float(options.get("centre_pixel_weight", 0.0))}
-    segment = ClassicalSegmenter(**GRANULARITIES[options.get("granularity", "medium")])
-    proposals = None
+    propose = ClassicalSegmenter(**GRANULARITIES.get(options.get("granularity"), GRANULARITIES["medium"]))
     if masks is not None:
         size = field.cameras.height, field.cameras.width
-        proposals, _ = load_proposals(masks, list(frames), size, level=options.get("level", "l"))
-    gaussians = jax.device_put(dataclasses.replace(field.gaussians, sh=None))  # as a run's, whose programs are compiled
-    votes, count, views = jax.tree.map(np.asarray, field.votes), ledger.num_regions, {}
+        read = load_proposals(masks, list(frames), size, level=options.get("level", "l"))[0]
+        propose = lambda pixels, index: read(index)  # noqa: E731
+    gaussians = jax.device_put(replace(field.gaussians, sh=None))  # as a run's, whose programs are compiled
+    votes, views = jax.tree.map(np.asarray, field.votes), {}
     held = (votes.labelled >= LABELLED_PART * SHARE_THRESHOLD * votes.total) & (votes.views > 0)
     owner = np.where(held, votes.regions[:, 0], -1)
     # Without masks from outside, leftovers that many views left without a region stay so.
     unknown = (owner < 0) if masks is not None else votes.views == 0
+    consensus = _consensus(votes)
     for done, (name, (pixels, camera)) in enumerate(frames.items()):
-        found = segment(pixels, 0) if proposals is None else proposals(done)
         batch = jax.tree.map(lambda a: np.asarray(a)[None], camera)
-        view = SceneSuperpixels(gaussians, batch, [found], **centre).all(pixels[None])[0]
+        scene = SceneSuperpixels(gaussians, batch, [propose(pixels, done)], **centre)
+        view = scene.all(pixels[None])[0]
         progress(done + 1, len(frames))
         if (like := _likeness(view, field, pixels)) < MIN_CORRELATION:
             problem = (
@@ -183,20 +172,27 @@ def make_views(
             remedy = "Give poses in the world of the field's capture, or the photographs alone to find their poses."
             refuse(InputError(f"photograph {name}", problem, remedy=remedy))
             continue
-        labels, new = label_by_regions(view, owner, count, unknown, split=masks is not None)
-        evidence = view_evidence(gaussians, camera, labels, count + new, **centre)
+        labels, new = label_by_regions(view, owner, consensus, unknown, split=masks is not None)
+        old, count = consensus.shape[1], consensus.shape[1] + new
+        evidence = view_evidence(gaussians, camera, labels, count, **centre)
         if new:  # the next frame may show them too
-            opened = evidence.matrix(len(owner), count + new)[:, count : count + new]
-            strongest = np.asarray(opened.argmax(1)).ravel()
-            most = (np.asarray(opened.sum(1)).ravel() > 0) & unknown
-            owner, unknown = np.where(most, count + strongest, owner), unknown & ~most
-        count += new
+            own = evidence.matrix(len(owner), count)
+            opened = own[:, old:count].multiply(1 / np.maximum(own.sum(1), 1e-9))
+            consensus = sparse.hstack([consensus, opened], "csr")
         shown, areas = np.unique(labels[labels >= 0], return_counts=True)
         rows = np.asarray(embedder.embed_regions(pixels, labels[None] == shown[:, None, None]), np.float32)
         pixel_counts = np.stack([shown, areas]).astype(np.int32)
         packed = pack_evidence(evidence, count)
         views[name] = LedgerView(packed, pixel_counts, pixel_counts[0], rows, camera_row(camera), encode_jpeg(pixels))
     return views
+
+
+def _consensus(votes: Votes) -> Any:
+    """Returns the share (N, R) of each Gaussian in its regions, over the views that see both."""
+    rows, columns = np.nonzero(votes.weights)
+    seen = votes.total[:, None] if votes.weight_where_region_visible is None else votes.weight_where_region_visible
+    share = (votes.weights / np.maximum(seen, 1e-9))[rows, columns]
+    return sparse.csr_matrix((share, (rows, votes.regions[rows, columns])), (len(votes.total), votes.num_regions))
 
 
 def _likeness(view: FrameSuperpixels, field: LanguageField, pixels: UInt8[np.ndarray, "h w 3"]) -> float:

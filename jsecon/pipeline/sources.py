@@ -4,13 +4,14 @@ A field may come from anybody. So its hints are paths relative to its file, abso
 is used only if the name that follows from its content is the one that the run used.
 """
 
+import contextlib
 import dataclasses
 import json
 import os
 import re
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jsecon
 from jsecon.errors import InputError
@@ -47,28 +48,24 @@ def provenance(options: Options, keys: dict[str, str], embedder: str, out: Path,
 
 def forget_warnings(field: LanguageField, names: Sequence[str]) -> LanguageField:
     """Leaves out what the run warned of some frames."""
-    origin = parse_json(field.provenance)
-    origin["warnings"] = [text for text in origin.get("warnings", []) if not any(name in text for name in names)]
-    return _with_origin(field, origin, getattr(field.provenance, "folder", None))
+    warnings = parse_json(field.provenance).get("warnings", [])
+    kept = [text for text in warnings if not any(name in text for name in names)]
+    return _with_origin(field, getattr(field.provenance, "folder", None), warnings=kept)
 
 
 def move_hints(field: LanguageField, folder: Path) -> LanguageField:
     """Makes the hints of a field, which are relative to its file, those of a file in another folder."""
-    before, after = getattr(field.provenance, "folder", None), folder.resolve()
-    if before is None or before == after:
+    if (before := getattr(field.provenance, "folder", None)) in (None, folder.resolve()):
         return field
-    origin = parse_json(field.provenance)
-    hints = origin.get("folders", {}).items()
-    found = {kind: _resolve(before, hint) for kind, hint in hints}
-    try:
-        origin["folders"] = {k: Path(os.path.relpath(p, after)).as_posix() for k, p in found.items() if p is not None}
-    except ValueError:  # another drive of Windows
-        origin["folders"] = {}
-    return _with_origin(field, origin, after)
+    hints = {kind: _resolve(before, hint) for kind, hint in parse_json(field.provenance).get("folders", {}).items()}
+    with contextlib.suppress(ValueError):  # another drive of Windows
+        hints = {k: Path(os.path.relpath(path, folder.resolve())).as_posix() for k, path in hints.items() if path}
+        return _with_origin(field, folder.resolve(), folders=hints)
+    return _with_origin(field, folder.resolve(), folders={})
 
 
-def _with_origin(field: LanguageField, origin: dict, folder: Path | None) -> LanguageField:
-    provenance = Provenance(json.dumps(origin, sort_keys=True))
+def _with_origin(field: LanguageField, folder: Path | None, **changes: Any) -> LanguageField:
+    provenance = Provenance(json.dumps(parse_json(field.provenance) | changes, sort_keys=True))
     if folder is not None:
         provenance.folder = folder
     return dataclasses.replace(field, provenance=provenance)
