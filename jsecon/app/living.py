@@ -7,7 +7,6 @@ from pathlib import Path
 
 from jsecon.app import verbs
 from jsecon.app.opening import locate_field
-from jsecon.app.running import FILES, FIRST_VIEW
 from jsecon.app.scene import open_scene
 from jsecon.errors import InputError, join_first
 from jsecon.field.field import load_field
@@ -65,6 +64,8 @@ def _changing(field: Path, out: Path | None) -> Iterator[Path]:
 
 def _remove_traces(folder: Path) -> list[str]:
     """Removes what a run keeps of its frames beside the field; returns the names."""
+    from jsecon.app.running import FILES, FIRST_VIEW  # late: to add frames needs no run
+
     names = [name for name in (*FILES[1:], FIRST_VIEW) if (folder / name).is_file()]
     remove_files(folder, names)
     if is_output_folder(folder):
