@@ -29,8 +29,9 @@ from jsecon.types import Camera, Capture, LanguageField, Progress, Votes
 from jsecon.vision.classical import GRANULARITIES, ClassicalSegmenter
 from jsecon.vision.protocols import Embedder
 
-MIN_CORRELATION = 0.7
-"""Correlation of a photograph with what the scene shows from its pose, below which they do not belong together."""
+MIN_CORRELATION = 0.75
+"""Least correlation of a photograph with what the scene shows from its pose. Held-out photographs of fox and bonsai have
+0.95 and more from their own poses, and up to 0.72 from those of their neighbours."""
 
 
 class NewFrame(NamedTuple):
