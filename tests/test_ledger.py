@@ -1,8 +1,10 @@
 """Views that are added to a field and forgotten: it is the field of one run, to the last bit, and keeps no trace."""
 
 import dataclasses
+import errno
 import itertools
 import json
+import os
 
 import jax
 import numpy as np
@@ -11,12 +13,14 @@ from capture_files import refused
 from small_field import REGIONS, labels_of, make_field, true_regions, unit_rows
 
 from jsecon.app.scene import open_scene
+from jsecon.errors import InputError
 from jsecon.field.evidence import pack_evidence, region_votes, unpack_evidence, view_evidence
 from jsecon.field.field import load_field
 from jsecon.field.ledger import Ledger, LedgerView, add_views, camera_row, forget_views
 from jsecon.field.ledger_file import ledger_file, load_ledger, save_with_ledger
 from jsecon.field.membership import normalise_votes
 from jsecon.field.regions import region_embeddings
+from jsecon.pipeline.sources import locate_sources
 from jsecon.types import Regions
 
 NAMES = "view_2", "view_9", "view_10", "view_11"
@@ -128,6 +132,41 @@ def test_no_byte_of_a_forgotten_frame_stays_in_its_files(scene, cameras, labels,
     assert len(files(tmp_path)) == 2
     assert b"a sparse scene" in content
     assert_equal(load_field(path), less.field)
+
+
+@pytest.mark.parametrize("fault", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
+@pytest.mark.parametrize("step", [1, 2])
+def test_a_stop_leaves_the_old_field(scene, cameras, labels, rows, views, tmp_path, monkeypatch, step, fault):
+    path = tmp_path / "field.safetensors"
+    save_with_ledger(path, run_on(scene, cameras, labels, rows, [0, 1, 2, 3]), Ledger(REGIONS, views))
+    less, steps, replace = open_scene(path).forget([NAMES[0]]), itertools.count(1), os.replace
+
+    def fail(*paths):
+        if next(steps) == step:
+            raise fault
+        replace(*paths)
+
+    with monkeypatch.context() as patch, pytest.raises((InputError, KeyboardInterrupt)) as info:
+        patch.setattr(os, "replace", fail)
+        less.save(path)
+    assert isinstance(fault, KeyboardInterrupt) or "No space left" in str(info.value)
+    again = open_scene(path)
+    assert again.field.names == NAMES
+    assert {*again.ledger.views} == {*NAMES}
+    again.forget([NAMES[0]]).save(path)
+    assert len(files(tmp_path)) == 2
+
+
+def test_a_field_in_another_folder_still_finds_its_capture(scene, cameras, tmp_path):
+    (tmp_path / "a" / "capture").mkdir(parents=True)
+    hints = json.dumps({"folders": {"capture": "capture"}})
+    save_with_ledger(
+        tmp_path / "a" / "field.safetensors", dataclasses.replace(make_field(scene, cameras)[0], provenance=hints), None
+    )
+    open_scene(tmp_path / "a").save(tmp_path / "b" / "c" / "field.safetensors")
+    found = locate_sources(load_field(tmp_path / "b" / "c" / "field.safetensors")).capture
+    assert found is not None
+    assert found.samefile(tmp_path / "a" / "capture")
 
 
 def files(folder):

@@ -30,7 +30,7 @@ from jsecon.vision.classical import GRANULARITIES, ClassicalSegmenter
 from jsecon.vision.protocols import Embedder
 
 MIN_CORRELATION = 0.75
-"""Least correlation of a photograph with what the scene shows from its pose. Held-out photographs of fox and bonsai have
+"""Least correlation of a photograph with what the scene shows from its pose. Held-out ones of fox and bonsai have
 0.95 and more from their own poses, and up to 0.72 from those of their neighbours."""
 
 
