@@ -5,8 +5,8 @@
 Each field is one that `jsecon run CAPTURE --out FIELD` made, with frames held out. For each:
 
 - A third of its views are forgotten, and added again in 1, 2 and 8 batches and in several orders. Votes, embeddings and
-  poses must be those of the run. Each of eight views alone is forgotten, and votes are summed anew without it, from the lists
-  of the others; and the field is written, and its files are searched for what the ledger held of the view.
+  poses must be those of the run. Each of eight views alone is forgotten, and votes are summed anew without it, from the
+  lists of the others. The field is written, and its files are searched for what the ledger held of the view.
 - The held-out photographs are placed without their poses. Errors are in degrees, and in percent of the diameter of the
   camera centres. Those of the other captures must be refused.
 """
