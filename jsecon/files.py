@@ -15,6 +15,7 @@ import math
 import os
 import struct
 import sys
+import tempfile
 import tokenize
 import uuid
 import zipfile
@@ -28,6 +29,7 @@ from filelock import FileLock, Timeout
 from safetensors import SafetensorError, safe_open
 
 from jsecon.errors import InputError, describe_error, is_out_of_memory, machine_error, require
+from jsecon.process import memory_budget
 
 READ_ERRORS = (
     *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ImportError, RuntimeError),
@@ -212,6 +214,13 @@ def reading(
         if isinstance(error, InputError):
             raise
         raise InputError(path, f"{problem} ({describe_error(error)})", expected, remedy) from error
+
+
+def scratch_array(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    """Makes an array to be filled; one of more than a quarter of the memory budget lies in a file that has no name."""
+    if math.prod(shape) * np.dtype(dtype).itemsize <= memory_budget() / 4:
+        return np.empty(shape, dtype)
+    return np.memmap(tempfile.TemporaryFile(), dtype, "w+", shape=shape)
 
 
 def map_npy(path: Path) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
@@ -208,25 +209,51 @@ def test_exported_objects_and_labels_are_those_of_the_catalogue(field, file, tmp
     np.testing.assert_array_equal(read_vertices(scene)["object_id"], labels)
     whole = load_gaussians(scene)
     np.testing.assert_array_equal(whole.means, field.gaussians.means)
-    files = sorted(folder.iterdir())
+    files = sorted(folder.glob("*.ply"))
     assert len(files) == len(catalogue)
+    records = json.loads((folder / "labels.json").read_text())["objects"]
+    assert (tmp_path / "labels.json").read_text() == (folder / "labels.json").read_text()
+    classes = np.array([record["class_id"] for record in records])
+    np.testing.assert_array_equal(read_vertices(scene)["class_id"], np.append(classes, -1)[labels])
+    assert [record["name"] for record in records] == catalogue.names[:, 0].tolist()
+    assert len({tuple(record["colour"]) for record in records}) == len(records)
     for n, path in enumerate(files):
         assert path.name.startswith(f"{n:03d}-{catalogue.names[n, 0]}")
         np.testing.assert_array_equal(load_gaussians(path).means, np.asarray(whole.means)[labels == n])
 
 
+def test_a_usda_has_a_prim_for_each_object_to_the_bit(field, file, tmp_path):
+    assert run_cli("export", file, "--out", tmp_path / "scene.usda") == 0
+    catalogue, found = jsecon.objects(field), {}
+    for prim in (tmp_path / "scene.usda").read_text().split("def ParticleField3DGaussianSplat ")[1:]:
+        number = int(re.search(r"int object_id = (-?\d+)", prim)[1])
+        columns = (re.search(rf"{name} = \[(.*)\]", prim)[1] for name in ("positions", "Coefficients", "opacities"))
+        found[number] = [np.array(re.findall(r"[-+.\de]+", column), np.float32) for column in columns]
+        if number >= 0:
+            name = catalogue.names[number, 0]
+            assert prim.startswith(f'"object_{number:03d}_{name}"')
+            assert f'string name = "{name}"' in prim
+    assert set(found) == set(catalogue.labels)
+    for number, (positions, harmonics, opacities) in found.items():
+        rows = np.flatnonzero(catalogue.labels == number)
+        np.testing.assert_array_equal(positions.reshape(-1, 3), np.asarray(field.gaussians.means)[rows])
+        np.testing.assert_array_equal(harmonics.reshape(len(rows), -1, 3), np.asarray(field.gaussians.sh)[rows])
+        logits = np.asarray(field.gaussians.opacity_logits, np.float64)[rows]
+        np.testing.assert_allclose(opacities, 1 / (1 + np.exp(-logits)), rtol=1e-6)
+
+
 def test_an_export_of_objects_replaces_those_of_the_last_one_and_nothing_else(field, file, tmp_path):
     folder = tmp_path / "objects"
     assert run_cli("export", file, "--objects", folder) == 0
-    assert len(list(folder.iterdir())) == REGIONS
-    first = sorted(folder.iterdir())[0]
+    assert len(list(folder.glob("*.ply"))) == REGIONS
+    first = sorted(folder.glob("*.ply"))[0]
     mine = {"001-scan.ply": b"ply\n", "copy of it.ply": first.read_bytes(), "notes.txt": b"mine"}
     for name, content in mine.items():
         (folder / name).write_bytes(content)
     votes = dataclasses.replace(field.votes, regions=np.where(field.votes.regions > 1, -1, field.votes.regions))
     save_field(file, dataclasses.replace(field, votes=votes))
     assert run_cli("export", file, "--objects", folder) == 0
-    written = {path.name for path in folder.iterdir()} - set(mine)
+    written = {path.name for path in folder.glob("*.ply")} - set(mine)
     assert len(written) == 2
     assert set(mine) <= {path.name for path in folder.iterdir()}
 

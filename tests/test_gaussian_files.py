@@ -67,7 +67,7 @@ def test_numbers_come_back_within_the_formats_steps(tmp_path, name):
 def test_blocks_of_any_size_give_the_same_bytes_in_another_world(tmp_path, monkeypatch, ending):
     turn = np.diag([-2.0, -2.0, 2.0, 1.0])
     turn[:3, 3] = 1, 2, 3
-    given, ids = gaussians(SCENE), {"object_ids": np.arange(600) % 7 - 1}
+    given, ids = gaussians(SCENE), {"ids": {"object_id": np.arange(600) % 7 - 1}}
     files = [tmp_path / f"{name}.{ending}" for name in ("whole", "blocks")]
     save_gaussians(files[0], given, **ids, similarity=turn)
     monkeypatch.setattr(transform, "BLOCK_ROWS", 77)

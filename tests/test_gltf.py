@@ -69,7 +69,7 @@ def test_read_back_as_written(tmp_path, basis):
     """To float32: sizes and opacities by way of their exponential and sigmoid."""
     given = scene(101, basis)
     given["opacity_logits"][:2] = np.inf, -np.inf
-    save_gaussians(tmp_path / "a.glb", gaussians(given), object_ids=np.arange(101) - 1)
+    save_gaussians(tmp_path / "a.glb", gaussians(given), ids={"object_id": np.arange(101) - 1})
     np.testing.assert_array_equal(read_glb(tmp_path / "a.glb")[1]["_OBJECT_ID"][:, 0], np.arange(101) - 1)
     found = load_gaussians(tmp_path / "a.glb")
     sign = np.sign((np.asarray(found.quaternions) * given["quaternions"]).sum(1, keepdims=True))  # q and -q turn alike

@@ -1,16 +1,18 @@
 """Relations between objects: properties of the predicates, the grammar, and answers of 0, 1 or several objects."""
 
+import csv
 import dataclasses
 import json
 
 import jax
 import numpy as np
 import pytest
+from capture_files import run_cli
 from hypothesis import given, settings, strategies as st
 from table_field import THINGS, table_field
 
 import jsecon
-from jsecon import InputError, ObjectShapes, Regions, Scene, save_field
+from jsecon import InputError, ObjectShapes, Regions, Scene, open_scene, save_field
 from jsecon.app import cli
 from jsecon.query.expressions import ANCHORED_ORDERS, RELATIONS
 from jsecon.query.relations import Viewpoint, between_scores, order_values, pair_scores
@@ -210,6 +212,25 @@ def test_measures_are_in_the_captures_world():
     assert told["angle"] == pytest.approx(np.degrees(np.arctan2(0.1, 0.5)), abs=2)
     with pytest.raises(InputError, match="names 2 objects"):
         Scene(field, embedder).measure("the red mug", "the dark green bottle")
+
+
+def test_a_known_length_gives_metres_which_the_field_keeps(tmp_path, capsys):
+    field, _ = table_field(source_from_scene=np.diag([2.0, 2.0, 2.0, 1.0]))
+    save_field(tmp_path / "field.safetensors", field)
+    plate, ball, bottle = "white plate", "orange ball", "dark green bottle"
+    assert run_cli("measure", tmp_path, "--scale", plate, bottle, 0.52) == 0  # true: |(0, 0.5, 0.14)|
+    assert run_cli("measure", tmp_path, plate, ball, bottle, "--out", tmp_path / "lengths.csv") == 0
+    with (tmp_path / "lengths.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["a"], row["b"], row["unit"]) for row in rows[:2]] == [
+        (plate, ball, "metres"), (plate, bottle, "metres")
+    ]  # fmt: skip
+    assert [float(row["centers"]) for row in rows] == pytest.approx([0.06, 0.52, np.hypot(0.5, 0.08)], rel=0.05)
+    scene = open_scene(tmp_path)
+    assert scene.ask("the orange ball within 0.1 m of the white plate").count == 1
+    assert scene.measure((1, 2, 3), (1, 2, 5))["centers"] == pytest.approx(2 * scene.field.metres_per_unit)
+    assert run_cli("measure", tmp_path, "--scale", plate, plate, 1.0) == 2
+    assert "Give two places" in capsys.readouterr().err
 
 
 def test_odd_input_has_an_error_of_its_own(scene):

@@ -76,7 +76,6 @@ def few_candidates():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plan, "PLACES", 4)
         patch.setattr(plan, "ORBIT_YAWS", 8)
-        patch.setattr(plan, "VIEWS_AT_ONCE", 48)
         yield
 
 

@@ -152,7 +152,7 @@ def test_a_scene_cut_to_what_a_view_sees_has_the_same_votes(monkeypatch, opaque)
     scene.means[: count // 2, 0] += 50  # beside every view
     blocks = np.random.default_rng(1).integers(-1, 7, (2, 6, 8)).repeat(20, 1).repeat(20, 2)
     whole = region_votes(scene, cameras, blocks, 7, top=3)
-    monkeypatch.setattr(evidence, "_MAX_WHOLE", 1000)
+    monkeypatch.setattr(evidence, "MAX_WHOLE", 1000)
     cut = region_votes(scene, cameras, blocks, 7, top=3)
     assert not np.asarray(cut.views[: count // 2]).any()
     for name in ("weights", "labelled", "total"):

@@ -1,5 +1,6 @@
 """The catalogue of a field: its objects with names, boxes, sizes and parts."""
 
+import colorsys
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
@@ -8,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from scipy.sparse.csgraph import connected_components
 from scipy.special import softmax
 
@@ -89,6 +90,12 @@ class Catalogue:
         """K."""
         return len(self.parent)
 
+    @functools.cached_property
+    def class_ids(self) -> Int[np.ndarray, " k"]:
+        """(K,) number of each object's best name among all names, sorted; -1 without a name."""
+        classes = {name: n for n, name in enumerate(sorted(set(self.names[:, 0]) - {""}))}
+        return np.array([classes.get(name, -1) for name in self.names[:, 0]], np.int32)
+
     def mask(self, index: int | np.integer) -> Bool[np.ndarray, " n"]:
         """Selects the Gaussians of an object.
 
@@ -115,6 +122,9 @@ class Catalogue:
         box = {"center": rounded(shape.center, length), "size": rounded(2 * shape.half_size, length)}
         return {
             "id": n,
+            "name": self.names[n, 0],
+            "class_id": int(self.class_ids[n]),
+            "colour": palette(n + 1)[n].tolist(),
             "names": [{"name": name, "probability": round(float(p), 4)} for name, p in names if name],
             "surroundings": bool(self.surroundings[n]),
             "sure": bool(self.sure[n]),
@@ -274,6 +284,13 @@ def _name(
     missing = ((0, 0), (0, NAMES - order.shape[1]))
     best = np.pad(np.take_along_axis(probability, order, axis=1), missing)
     return np.pad(order, missing, constant_values=len(names)), best
+
+
+def palette(count: int, hue: float = 0.11) -> UInt8[np.ndarray, "n 3"]:
+    """Chooses RGB of regions 0 .. count-1, none of which depends on `count`: golden angles apart, from a hue on."""
+    hues = (hue + 0.61803398875 * np.arange(count)) % 1.0
+    colours = [colorsys.hls_to_rgb(h, (0.62, 0.42, 0.72)[i % 3], 0.85) for i, h in enumerate(hues)]
+    return (np.asarray(colours, np.float64).reshape(count, 3) * 255).astype(np.uint8)
 
 
 def main_regions(field: LanguageField) -> Int[np.ndarray, " n"]:

@@ -13,6 +13,7 @@ from jsecon.app.catalogue import SURE_SHARE, Catalogue
 from jsecon.app.querying import slug
 from jsecon.app.records import decimals, unit_of
 from jsecon.app.scene import Scene, open_scene
+from jsecon.app.shapes import require_shapes_format, write_shapes
 from jsecon.errors import InputError
 from jsecon.files import remove_files, write_text
 from jsecon.pipeline.options import require_writable
@@ -45,12 +46,17 @@ def _objects(verb: verbs.Objects, console: Console) -> verbs.VerbResult:
     if verb.out is None:
         return {"objects": records}
     files = {"objects": verb.out / "objects.json", "catalogue": verb.out / "catalogue.html"}
-    up = {"up": listed.up.round(6).tolist(), "up_evidence": listed.up_evidence}
-    content = {"frame": "the capture's world", "unit": unit_of(scene.field)} | up | {"objects": records}
-    write_text(files["objects"], json.dumps(content, indent=2) + "\n")
+    _write_records(files["objects"], scene, listed, records)
     write_text(files["catalogue"], _page(scene, listed, records, console))
     console.print_line(f"pictures  {files['catalogue']}")
     return {"objects": records, "written": files}
+
+
+def _write_records(file: Path, scene: Scene, listed: Catalogue, records: list[dict[str, Any]]) -> None:
+    """Writes the records of the objects as JSON."""
+    up = {"up": listed.up.round(6).tolist(), "up_evidence": listed.up_evidence}
+    content = {"frame": "the capture's world", "unit": unit_of(scene.field)} | up | {"objects": records}
+    write_text(file, json.dumps(content, indent=2) + "\n")
 
 
 def _read_vocabulary(file: Path) -> list[str]:
@@ -81,25 +87,38 @@ def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
     mask = None if answer is None else ~answer.mask if verb.without is not None else answer.mask
     count = scene.field.gaussians.count if mask is None else int(mask.sum())
     result: verbs.VerbResult = {"written": {}, "gaussians": count}
+    with console.progress("objects"):
+        listed = scene.objects()
+        records = listed.records()
+    written = result["written"]
     with console.progress("files"):
         if verb.out is not None:
-            scene.export(verb.out, mask, object_ids=scene.objects().labels if verb.with_labels else None)
+            has_labels = verb.with_labels or verb.out.suffix.lower() == ".usda"
+            scene.export(verb.out, mask, labels=listed if has_labels else None)
             result["bytes"] = verb.out.stat().st_size
-            result["written"]["scene"] = verb.out
+            written["scene"] = verb.out
             console.print_line(f"{count} Gaussians, {result['bytes'] / 2**20:.1f} MiB  {verb.out}")
         if verb.objects is not None:
-            files = _save_objects(scene, verb.objects)
-            result["written"]["objects"] = files
-            console.print_line(f"{len(files)} objects  {verb.objects}")
+            written["objects"] = _save_objects(scene, verb.objects)
+            console.print_line(f"{len(written['objects'])} objects  {verb.objects}")
+        if verb.shapes is not None:
+            written["shapes"] = write_shapes(scene, listed, records, verb.shapes)
+            console.print_line(f"shapes  {verb.shapes}")
+        files = [written.get("scene"), *written.get("objects", [])[:1], *written.get("shapes", [])[:1]]
+        written["labels"] = [folder / "labels.json" for folder in {file.parent: None for file in files if file}]
+        for file in written["labels"]:
+            _write_records(file, scene, listed, records)
     return result
 
 
 def _check_export(verb: verbs.Export) -> None:
     """Raises InputError for options of an export that say nothing, or that cannot be combined."""
-    if verb.out is None and verb.objects is None:
-        raise InputError("export", "there is nothing to write", remedy="Give --out scene.ply or --objects.")
+    if verb.out is None and verb.objects is None and verb.shapes is None:
+        raise InputError("export", "there is nothing to write", remedy="Give --out scene.ply, --objects or --shapes.")
+    if verb.shapes is not None:
+        require_shapes_format(verb.shapes)
     if verb.with_labels and (verb.out is None or verb.out.suffix.lower() == ".spz"):
-        raise InputError("--with-labels", "only a .ply or .glb holds them", remedy="Give --out scene.ply.")
+        raise InputError("--with-labels", "a .spz cannot hold them", remedy="Give --out scene.ply.")
     if verb.only is not None and verb.without is not None:
         raise InputError("--only", "it cannot be combined with --without", remedy="Export twice, with one of them.")
     if verb.objects is not None and (verb.only is not None or verb.without is not None):

@@ -260,21 +260,28 @@ class ObjectIndex:
         ]
         return f"{', '.join(words[:-1])} or {words[-1]}"
 
-    def distances(self, first: Object, second: Object) -> dict[str, Any]:
-        """Distances of two objects, in metres if they are known; angle of the second above the horizontal, degrees."""
-        means = np.asarray(self._field.gaussians.means, np.float64)
-        surfaces = float(KDTree(means[first.rows]).query(means[second.rows])[0].min())
-        line = second.shape.center[0] - first.shape.center[0]
+    def distances(self, first: Object | np.ndarray, second: Object | np.ndarray) -> dict[str, Any]:
+        """Distances of two objects, or points (3,) of the field's world, in metres if they are known.
+
+        The angle is that of the second above the horizontal, degrees.
+        """
+        points, middles, axes, halves = zip(*map(self._extent, (first, second)))
+        surfaces = float(KDTree(points[0]).query(points[1])[0].min())
+        line = middles[1] - middles[0]
         centers = float(np.linalg.norm(line))
         way = line / max(centers, 1e-300)
-        reach = [
-            float(np.min(np.asarray(shape.half_size[0]) / np.maximum(np.abs(shape.axes[0].T @ way), 1e-12)))
-            for shape in (first.shape, second.shape)
-        ]
+        reach = sum(float(np.min(half / np.maximum(np.abs(turn.T @ way), 1e-12))) for turn, half in zip(axes, halves))
         angle = float(np.degrees(np.arcsin(np.clip(way @ self.up, -1, 1))))
         metres = self._field.metres_per_unit
         scale = world_scale(self._field) * (metres or 1.0)
-        lengths = scale * np.array([surfaces, centers, max(centers - sum(reach), 0.0)])
+        lengths = scale * np.array([surfaces, centers, max(centers - reach, 0.0)])
         result: dict[str, Any] = dict(zip(("surfaces", "centers", "gap"), rounded(lengths, scale * centers)))
         unit = "capture units" if metres is None else "metres"
         return result | {"angle": round(angle, 2), "unit": unit, "up": str(self._up_axis)}
+
+    def _extent(self, place: Object | np.ndarray) -> tuple[np.ndarray, ...]:
+        """Points (M, 3), middle (3,), axes (3, 3) and half sizes (3,) of an object or a point."""
+        if isinstance(place, np.ndarray):
+            return place[None], place, np.eye(3), np.zeros(3)
+        means = np.asarray(self._field.gaussians.means, np.float64)[place.rows]
+        return means, place.shape.center[0], place.shape.axes[0], np.asarray(place.shape.half_size[0])

@@ -3,15 +3,13 @@
 jsecon.types calls `to_html` through the table of contents when a notebook asks.
 """
 
-import colorsys
-
 import cv2
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from jsecon.app import report
-from jsecon.app.catalogue import main_regions
+from jsecon.app.catalogue import main_regions, palette
 from jsecon.field.columns import is_mapped
 from jsecon.fit.resize import resize_frame, scale_cameras
 from jsecon.read.captures.frames import evenly_spaced
@@ -23,13 +21,6 @@ SELECTED = (255, 64, 160)
 """RGB of a selection, which no natural object has"""
 UNKNOWN = 0.25
 """grey of Gaussians without a region, 0 to 1"""
-
-
-def palette(count: int, hue: float = 0.11) -> UInt8[np.ndarray, "n 3"]:
-    """Chooses RGB of regions 0 .. count-1, none of which depends on `count`: golden angles apart, from a hue on."""
-    hues = (hue + 0.61803398875 * np.arange(count)) % 1.0
-    colours = [colorsys.hls_to_rgb(h, (0.62, 0.42, 0.72)[i % 3], 0.85) for i, h in enumerate(hues)]
-    return (np.asarray(colours, np.float64).reshape(count, 3) * 255).astype(np.uint8)
 
 
 def label_overlay(frame: UInt8[np.ndarray, "h w 3"], labels: Int[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 
 from jsecon.errors import InputError, require_one_of
 from jsecon.field.membership import probability_inside
+from jsecon.files import scratch_array
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.referring import Object
 from jsecon.query.rules import ABSENT, FOUND, STATES, UNSURE
@@ -356,8 +357,16 @@ def source_shapes(
 
 
 def gaussian_rows(gaussians: Gaussians, rows: np.ndarray | Bool[np.ndarray, " n"]) -> Gaussians:
-    """Takes some of the Gaussians, by their ids or a mask, as NumPy arrays."""
-    return jax.tree.map(lambda column: np.asarray(column)[np.asarray(rows)], gaussians)
+    """Takes some of the Gaussians, by their ids or a mask, as NumPy arrays (`scratch_array`)."""
+    ids = np.asarray(rows)
+    ids = np.flatnonzero(ids) if ids.dtype == bool else ids
+
+    def take(column: Any) -> np.ndarray:
+        column = np.asarray(column)
+        out = scratch_array((len(ids), *column.shape[1:]), column.dtype)
+        return np.take(column, ids, axis=0, out=out, mode="clip")  # other modes copy
+
+    return jax.tree.map(take, gaussians)
 
 
 def world_scale(field: LanguageField) -> float:

@@ -16,7 +16,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Int, UInt8
+from jaxtyping import Bool, UInt8
 
 from jsecon.app import pictures
 from jsecon.app.catalogue import Catalogue, objects
@@ -539,16 +539,18 @@ class Scene:
             raise InputError(f"query {text!r}", problem, "one object", remedy[:1].upper() + remedy[1:])
         return answer
 
-    def measure(self, a: str, b: str, *, frame: int | str | None = None) -> dict[str, Any]:
-        """Measures the distance between two objects.
+    def measure(
+        self, a: str | Sequence[float | int], b: str | Sequence[float | int], *, frame: int | str | None = None
+    ) -> dict[str, Any]:
+        """Measures the distance between two objects or points.
 
         Args:
-          a: Text that names the first object.
-          b: Text that names the second.
+          a: Text that names the first object, or a point (x, y, z) of the capture's world.
+          b: The same of the second.
           frame: As for `relate`.
 
         Returns:
-          Plain values: the texts "a" and "b"; "surfaces", the smallest distance between Gaussians of the two;
+          Plain values: "a" and "b"; "surfaces", the smallest distance between Gaussians of the two;
           "centers", that of the middles of their boxes; "gap", the free way between their boxes on the line between the
           middles, 0 where they meet; "angle", degrees of the second above the horizontal as seen from the first; the
           "unit" of the lengths (metres if the capture's format guarantees them or the run was given a scale, else
@@ -558,8 +560,38 @@ class Scene:
           InputError: As for `relate`; or a text names no object, or several.
         """
         with self._lock:
-            first, second = (self.locate(text, frame=frame, relate=True).objects[0] for text in (a, b))
-            return {"a": a, "b": b} | self._index.distances(first, second)
+            places = []
+            for end in (a, b):
+                named = isinstance(end, str)
+                places.append(self.locate(end, frame=frame, relate=True).objects[0] if named else self._point(end))
+            return {"a": a, "b": b} | self._index.distances(*places)
+
+    def _point(self, point: Sequence[float | int]) -> np.ndarray:
+        """Moves a point (3,) of the capture's world to the field's, in float64."""
+        scene_from_source = np.linalg.inv(np.asarray(self.field.source_from_scene, np.float64))
+        return scene_from_source[:3, :3] @ np.asarray(point, np.float64) + scene_from_source[:3, 3]
+
+    def scaled(self, a: str | Sequence[float | int], b: str | Sequence[float | int], metres: float | int) -> "Scene":
+        """Gives the scene its scale by one known length, which replaces any other.
+
+        Args:
+          a: Text or point, as for `measure`.
+          b: The same of the other end.
+          metres: Length between the middles of the two, m, above 0.
+
+        Returns:
+          A scene whose field knows its `metres_per_unit`; `save_field` keeps it.
+
+        Raises:
+          InputError: As for `measure`; or the two are one place.
+        """
+        bare = dataclasses.replace(self.field, metres_per_unit=None)
+        length = Scene(bare, self._embedder, up=self._up).measure(a, b)["centers"]
+        if not length > 0 or not metres > 0:
+            problem = f"{metres:g} m are not the length between {a} and {b}, which are {length:g} units apart"
+            raise InputError("scale", problem, remedy="Give two places and the length between them.")
+        field = dataclasses.replace(self.field, metres_per_unit=metres / length)
+        return Scene(field, self._embedder, up=self._up, name=self.name)
 
     @functools.cached_property
     def _catalogue(self) -> Catalogue:
@@ -721,27 +753,30 @@ class Scene:
         file: str | Path,
         selected: Answer | Bool[np.ndarray, " n"] | None = None,
         *,
-        object_ids: Int[np.ndarray, " n"] | None = None,
+        labels: Catalogue | None = None,
         comment: str = "",
     ) -> None:
         """Writes Gaussians in the world of the capture's files, in blocks, so that a mapped field need not fit memory.
 
         Args:
-          file: The .ply, .spz or .glb to write.
+          file: The .ply, .spz, .glb or .usda to write.
           selected: Answer or mask whose Gaussians are written; None writes the whole scene.
-          object_ids: (N,) ids of the Gaussians' objects (`Catalogue.labels`), which a .ply and a .glb can hold.
+          labels: Catalogue of the scene. A .ply and a .glb get the object_id and the class_id of each Gaussian, a .usda
+            a prim for each object; a .spz has no place for them.
           comment: As for `save_gaussians`.
 
         Raises:
           InputError: The file cannot be written.
         """
-        gaussians = self.field.gaussians
+        gaussians, ids, names = self.field.gaussians, {}, ()
+        if labels is not None:
+            names = labels.names[:, 0].tolist()
+            ids = {"object_id": labels.labels, "class_id": np.append(labels.class_ids, -1)[labels.labels]}
         if selected is not None:
             rows = np.flatnonzero(selected.mask if isinstance(selected, Answer) else selected)
-            gaussians = gaussian_rows(gaussians, rows)
-            object_ids = None if object_ids is None else object_ids[rows]
+            gaussians, ids = gaussian_rows(gaussians, rows), {name: column[rows] for name, column in ids.items()}
         world = self.field.source_from_scene
-        save_gaussians(file, gaussians, similarity=world, object_ids=object_ids, comment=comment)
+        save_gaussians(file, gaussians, similarity=world, ids=ids, names=names, comment=comment)
 
 
 def locate(

@@ -29,6 +29,9 @@ T = TypeVar("T")
 Repeated: TypeAlias = Option[UseAppendAction[list[T]]]
 """option that can be repeated"""
 By = Literal["votes", "code"]
+_TwoPoints: TypeAlias = tuple[float, float, float, float, float, float]
+_TwoPointsAndLength: TypeAlias = tuple[float, float, float, float, float, float, float]
+_PLACE = Range(-1e9, 1e9)
 
 VerbResult: TypeAlias = dict[str, Any]
 """Files and figures of a verb, which --json prints: plain values, paths and records; under "errors" the InputErrors of
@@ -301,14 +304,19 @@ class Forget(Verb):
 class Export(_FieldVerb):
     """Writes the scene of a field, or objects of it, for other programs.
 
-    The scene is in the capture's world. A .glb is glTF with Khronos' KHR_gaussian_splatting, y up. A .spz needs the
-    extra formats.
+    The scene is in the capture's world. A .glb is glTF with Khronos' KHR_gaussian_splatting, y up. A .usda is a text of
+    OpenUSD with a prim for each object. A .spz needs the extra formats. The file labels.json beside each export has id,
+    name, probability, colour, box, parent and frames of each object.
 
     Attributes:
-      out: The .ply (INRIA's layout), .spz or .glb to write.
-      with_labels: Adds object_id, the id of each Gaussian's object in jsecon objects or -1, to the .ply or .glb.
+      out: The .ply (INRIA's layout), .spz, .glb or .usda to write.
+      with_labels: Adds object_id, the id of each Gaussian's object in jsecon objects or -1, and class_id, which objects
+        of one name share, to the .ply or .glb.
       objects: Folder to write a .ply of each object to, named by its id and name. They replace those of an earlier
         export to that folder.
+      shapes: File for the solids of whole objects but surroundings, in metres if their length is known: .json (box,
+        convex hull, and the best of box, cylinder and sphere), .obj (hulls), .xml (MuJoCo's MJCF) or .yaml (MoveIt's
+        CollisionObjects). A folder gets all four.
       only: Exports only the Gaussians that jsecon query selects for this text.
       without: Exports all other Gaussians than those. Both exports together hold each Gaussian of the scene once.
     """
@@ -316,12 +324,14 @@ class Export(_FieldVerb):
     examples = (
         "jsecon export my_field/field.safetensors --out scene.glb",
         "jsecon export my_field/field.safetensors --objects objects",
+        "jsecon export my_field/field.safetensors --shapes robot",
         'jsecon export my_field/field.safetensors --without "red mug" --out rest.ply',
     )
 
     out: Option[Path | None] = None
     with_labels: Option[bool] = False
     objects: Option[Path | None] = None
+    shapes: Option[Path | None] = None
     only: Option[str | None] = None
     without: Option[str | None] = None
 
@@ -346,6 +356,67 @@ class Changes(_FieldVerb):
     photos: Positional[Path]
     out: Option[Path] = Path("changes")
     transform: Option[Path | None] = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Clean(Verb):
+    """Removes what hangs in a scene and shows nothing of it.
+
+    Views that cover the scene tell four kinds: unseen Gaussians, faint ones, which weigh less than 1/255 in each pixel,
+    and floaters and haze, which hang in front of surfaces in most of their pixels. The views are at the poses that lie
+    near the scene, as for jsecon run, or are planned. Prints how many of each kind went, and how the pictures changed.
+
+    Attributes:
+      scene: A file of Gaussians (.ply, .spz, .sog, .splat, .glb), or a field.
+      out: The .ply, .spz, .glb or .usda to write.
+      cameras: Poses to look from instead: a COLMAP model, a transforms.json, or INRIA's cameras.json.
+      views: Number of views to plan, in place of poses near the scene.
+      capture: Capture of the scene, as for jsecon run. Its poses are the views, and its photographs give the PSNR
+        before and after.
+      keep_objects: Keeps every Gaussian of an object of the field, which is made first where the scene has none.
+    """
+
+    examples = (
+        "jsecon clean scene.ply --out clean.ply",
+        "jsecon clean scene.ply --out clean.ply --capture my_capture",
+    )
+
+    scene: Positional[Path]
+    out: Option[Path]
+    cameras: Option[Path | None] = None
+    views: Annotated[Option[int | None], Range(2, 1000)] = None
+    capture: Option[Path | None] = None
+    keep_objects: Option[bool] = False
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Measure(_FieldVerb):
+    """Measures lengths between things or points, and gives a field its scale by one known length.
+
+    Lengths are those between the middles, between the surfaces, and the gap between the boxes. They are in metres if
+    the capture's format has them or a length is known, else in units of the capture. The field keeps its scale, and
+    every answer uses it ("within 1 m of the table").
+
+    Attributes:
+      texts: Things to measure between, each with each other.
+      points: Two points of the capture's world to measure between.
+      scale: Two things, and the length between their middles in metres.
+      scale_points: Two points of the capture's world, and the length between them in metres.
+      out: CSV file of the lengths.
+    """
+
+    examples = (
+        'jsecon measure my_field "red mug" "white plate" --out lengths.csv',
+        'jsecon measure my_field --scale "white plate" "dark green bottle" 0.82',
+    )
+
+    texts: Positional[list[str]]
+    points: Annotated[Repeated[_TwoPoints], arg(metavar="X Y Z X Y Z"), _PLACE] = dataclasses.field(
+        default_factory=list
+    )
+    scale: Annotated[Option[tuple[str, str, float] | None], arg(metavar="A B METRES"), Range(0, 1e9, above=True)] = None
+    scale_points: Annotated[Option[_TwoPointsAndLength | None], arg(metavar="X Y Z X Y Z METRES"), _PLACE] = None
+    out: Option[Path | None] = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -493,6 +564,8 @@ VERBS: dict[type[Verb], str] = {
     Forget: "app.living:_forget",
     Export: "app.exports:_export",
     Changes: "app.changes:_changes",
+    Clean: "app.cleaning:_clean",
+    Measure: "app.measuring:_measure",
     View: "app.viewer.window:_view",
     Eval: "app.evaluation:_eval",
     Serve: "app.server:_serve",

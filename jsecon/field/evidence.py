@@ -52,7 +52,7 @@ _SLOTS = 4
 """Labels of a tile that are summed at once. A tile of 8x8 pixels seldom shows more; then its batch is scanned again."""
 _HEAD = 23
 """numbers at the start of a packed list: its Gaussians, entries and overflow, and the bytes of each of 20 planes"""
-_MAX_WHOLE = 1 << 21
+MAX_WHOLE = 1 << 21
 """Gaussians of a scene above which each view is planned for those alone that it can see."""
 _MAX_ENTRIES = 1 << 24
 """Entries, at most one a view and Gaussian on average, that are added up at once."""
@@ -166,7 +166,7 @@ def list_evidence(
 ) -> list[ViewEvidence]:
     """Lists what each view casts on the Gaussians, on all cores and processes; `folder` keeps the lists on disk."""
     cameras = jax.tree.map(np.asarray, cameras)
-    if gaussians.count <= _MAX_WHOLE:  # once for all views
+    if gaussians.count <= MAX_WHOLE:  # once for all views
         gaussians = jax.device_put(dataclasses.replace(gaussians, sh=None))
 
     def view(t: int) -> tuple:  # a plain one, which processes can exchange
@@ -190,7 +190,7 @@ def view_evidence(
     require_shape("labels", labels, (camera.height, camera.width), "Give images of the camera's size.")
     require_labels(labels, num_regions)
     rows = None
-    if gaussians.count > _MAX_WHOLE:
+    if gaussians.count > MAX_WHOLE:
         rows = visible_rows(gaussians, camera, near=near)
         gaussians = geometry_of_rows(gaussians, rows)
         measured = plan_capacity(gaussians, camera, margin=1.0, devices=1, near=near)
@@ -226,6 +226,17 @@ def _round_mantissa(values: Float32[np.ndarray, " e"]) -> Float32[np.ndarray, " 
     """Rounds non-negative numbers to _BITS significant bits: multiples of 2^-24 stay such."""
     dropped = 24 - _BITS
     return ((values.view(np.uint32) + np.uint32(1 << dropped - 1)) >> dropped << dropped).view(np.float32)
+
+
+def each_view(count: int, views: int, view: Callable[[int], Any], progress: Progress | None = None) -> Iterator[Any]:
+    """Yields what each view of N Gaussians gives: computed on all cores, or one by one of a large scene."""
+    if count <= MAX_WHOLE:
+        yield from map_views(views, view, progress)
+        return
+    for t in range(views):
+        yield view(t)
+        if progress is not None:
+            progress(t + 1, views)
 
 
 @jax.jit

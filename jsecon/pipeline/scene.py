@@ -278,24 +278,43 @@ class _Views(NamedTuple):
 
 def _render_views(stage: StageInput) -> StageResult:
     """Renders a scene without photographs from the poses of a file, from those near it, or from planned views."""
-    options, near = stage.context.options, _poses_near(stage.context.options)
+    bare = open_bare_scene(stage.context.options, stage.progress)
+    views, world = bare.views, bare.source_from_scene
+    capture = render_capture(bare.scene, views.cameras, tuple(views.names), world, notes=views.notes, up=views.up)
+    return StageResult(capture, notes=views.notes)
+
+
+class _BareScene(NamedTuple):
+    """A scene without photographs, with views of it."""
+
+    source: Gaussians
+    """As its file has it."""
+    scene: Gaussians
+    """In a world of ordinary numbers."""
+    source_from_scene: np.ndarray
+    """(4, 4) similarity from that world to the file's."""
+    views: _Views
+
+
+def open_bare_scene(options: Options, progress: Progress) -> _BareScene:
+    """Reads a scene without photographs, and finds views of it: given ones, those near it, or planned ones."""
+    near = _poses_near(options)
     source, _ = read_scene(options.capture)
     source_from_scene = _world_of_scene(source)
     scene = _into_world(source, source_from_scene)
-    views, refused = None, ()
     if options.cameras is not None:
         _, cameras, names = _load_poses(options.cameras, options.long_side)
         views = _Views(_moved(cameras, np.linalg.inv(source_from_scene)), names)
         check_overlap(scene, views.cameras, str(options.cameras))
-    elif near is not None:
+        return _BareScene(source, scene, source_from_scene, views)
+    refused, views = (), None
+    if near is not None:
         try:
-            views = _choose_near(near, options, scene, source_from_scene, stage.progress)
+            views = _choose_near(near, options, scene, source_from_scene, progress)
         except InputError as error:
             refused = (f"{WARNING}Views are planned, as the poses near the scene cannot be used. {error}",)
-    views = views or _plan_views(options, scene, stage.progress)
-    notes = refused + views.notes
-    capture = render_capture(scene, views.cameras, tuple(views.names), source_from_scene, notes=notes, up=views.up)
-    return StageResult(capture, notes=notes)
+    views = views or _plan_views(options, scene, progress)
+    return _BareScene(source, scene, source_from_scene, views._replace(notes=refused + views.notes))
 
 
 def _plan_views(options: Options, scene: Gaussians, progress: Progress) -> _Views:
@@ -367,9 +386,11 @@ def _world_of_scene(gaussians: Gaussians) -> np.ndarray:
 
 
 def _into_world(gaussians: Gaussians, source_from_scene: np.ndarray) -> Gaussians:
-    """Moves Gaussians from the world of their file into that of the capture, in float32."""
-    moved = transform_gaussians(gaussians, np.linalg.inv(source_from_scene))
-    return dataclasses.replace(moved, means=np.asarray(moved.means, np.float32))
+    """Moves Gaussians from the world of their file into that of the capture, in float32; colours need no rotation."""
+    moved = transform_gaussians(
+        dataclasses.replace(gaussians, sh=gaussians.sh[:, :1]), np.linalg.inv(source_from_scene)
+    )
+    return dataclasses.replace(moved, means=np.asarray(moved.means, np.float32), sh=gaussians.sh)
 
 
 def _load_poses(path: Path, long_side: int) -> tuple[PosedImages, Camera, tuple[str, ...]]:

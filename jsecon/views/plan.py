@@ -8,12 +8,13 @@ import dataclasses
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from jsecon.errors import InputError, require
-from jsecon.field.evidence import region_votes
+from jsecon.field.evidence import MAX_WHOLE, each_view, view_evidence
 from jsecon.fit.resize import scale_cameras
 from jsecon.types import Camera, Gaussians, Progress
 from jsecon.views.cover import SEEN_PX, greedy_cover
@@ -31,8 +32,6 @@ ORBIT_YAWS, ORBIT_PITCHES, ORBIT_DISTANCES = 16, (5.0, 25.0, 50.0), (1.0, 0.5)
 """orbits around an object: views around, degrees above the horizon, distances in units of the fitting one"""
 FOG_SHARE = 0.4
 """a view is fog if Gaussians with a standard deviation above a tenth of its width have this share of its weight"""
-VIEWS_AT_ONCE = 64
-"""candidates that are rendered between two reports"""
 DEFAULT_VIEWS = 24
 """views that are planned"""
 _LEAST_ALPHA = 0.03
@@ -272,22 +271,24 @@ def _weights_by_view(
 
     The alpha is that of the inner scene: a sky encloses no place.
     """
-    seen = np.zeros((len(cameras), len(counted.sample)), np.float32)
-    alpha, fog = np.zeros((2, len(cameras)))
     pixels, poses = cameras.width * cameras.height, np.asarray(cameras.world_to_camera)
-    labels = np.full((VIEWS_AT_ONCE, cameras.height, cameras.width), -1, np.int32)
     means = np.asarray(gaussians.means, np.float64)[counted.sample]
     widest = np.exp(np.asarray(gaussians.log_scales, np.float64)[counted.sample].max(1))
-    for start in range(0, len(poses), VIEWS_AT_ONCE):
-        rows = np.minimum(np.arange(start, start + VIEWS_AT_ONCE), len(poses) - 1)  # one program for all chunks
-        votes = region_votes(gaussians, cameras[rows], labels, 1, top=1, by_view=True, near=0.01 * diagonal)
-        by_view = np.asarray(votes.by_view)[: len(poses) - start]
-        for view, weights in enumerate(by_view, start):
-            seen[view] = weights[counted.sample]
-            alpha[view] = weights[counted.inner].sum() / pixels
-            with np.errstate(invalid="ignore"):  # centres that are not finite have no weight
-                depth = means @ poses[view, 2, :3] + poses[view, 2, 3]
-            wide = widest * cameras.fx[view] > 0.1 * cameras.width * depth
-            fog[view] = seen[view, wide].sum() / max(seen[view].sum(), 1e-30)
-        report(min(start + VIEWS_AT_ONCE, len(poses)))
+    whole, cameras = np.zeros((cameras.height, cameras.width), np.int32), jax.tree.map(np.asarray, cameras)
+    if gaussians.count <= MAX_WHOLE:  # once for all views
+        gaussians = jax.device_put(dataclasses.replace(gaussians, sh=None))
+
+    def view(t: int) -> tuple[np.ndarray, float, float]:
+        evidence = view_evidence(gaussians, cameras[t], whole, 1, near=0.01 * diagonal)
+        weights = np.zeros(gaussians.count, np.float32)
+        weights[evidence.gaussians] = evidence.weights  # one entry each
+        shown = weights[counted.sample]
+        with np.errstate(invalid="ignore"):  # centres that are not finite have no weight
+            depth = means @ poses[t, 2, :3] + poses[t, 2, 3]
+        wide = widest * cameras.fx[t] > 0.1 * cameras.width * depth
+        return shown, weights[counted.inner].sum() / pixels, shown[wide].sum() / max(shown.sum(), 1e-30)
+
+    found = [*each_view(gaussians.count, len(poses), view, lambda done, _: report(done))]
+    seen = np.array([shown for shown, _, _ in found], np.float32).reshape(len(poses), len(means))
+    alpha, fog = np.array([shares for _, *shares in found]).reshape(-1, 2).T
     return seen, alpha, fog

@@ -24,7 +24,8 @@ from jaxtyping import Bool, Float, UInt8
 
 from jsecon.app import verbs
 from jsecon.app.access import is_allowed_host, listen
-from jsecon.app.pictures import palette, region_colours
+from jsecon.app.catalogue import palette
+from jsecon.app.pictures import region_colours
 from jsecon.app.querying import file_stem
 from jsecon.app.records import Answer, Query, Region
 from jsecon.app.scene import Scene, open_scene

@@ -17,8 +17,9 @@ import json
 import struct
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -31,6 +32,7 @@ from jsecon.files import atomic_write, parse_json, reading
 from jsecon.read.registry import Reader, find_reader
 from jsecon.read.splats.gltf import read_glb, save_glb
 from jsecon.read.splats.ply import drawable_gaussians, read_ply, read_ply_file, save_ply, usable_blocks
+from jsecon.read.splats.usd import save_usda
 from jsecon.splat.project import check_gaussians, unusable_rows
 from jsecon.splat.sh import C0
 from jsecon.splat.transform import float32_rounding, transform_axes, transform_gaussians
@@ -147,7 +149,7 @@ def _spz_axes(records: bytes) -> np.ndarray:
     return axes
 
 
-def _save_spz(path: Path, gaussians: Gaussians, object_ids: Any, similarity: Float[Array, "4 4"] | None) -> None:
+def _save_spz(path: Path, gaussians: Gaussians, ids: Any, similarity: Float[Array, "4 4"] | None) -> None:
     """Writes a .spz of version 3, with the finest positions that hold the farthest Gaussian in 24 bits."""
     gsply = _import_gsply(path)
     into = _SPZ_AXES if similarity is None else _SPZ_AXES @ np.asarray(similarity, np.float64)
@@ -317,19 +319,23 @@ def save_gaussians(
     path: str | Path,
     gaussians: Gaussians,
     *,
-    object_ids: Int[Array, " n"] | None = None,
+    ids: Mapping[str, Int[Array, " n"]] = MappingProxyType({}),
+    names: Sequence[str] = (),
     similarity: Float[Array, "4 4"] | None = None,
     comment: str = "",
 ) -> None:
-    """Writes Gaussians as a .ply (INRIA's layout, exact), a .glb, or a .spz (version 3, by gsply).
+    """Writes Gaussians as a .ply (INRIA's layout, exact), a .glb, a .usda, or a .spz (version 3, by gsply).
 
     A .ply and a .glb are written in blocks: memory-mapped arrays need not fit into memory. A .spz holds positions in 24
-    bits, sizes to 3 % and from 4.5e-5 to 379 units, opacities and colours in 8 bits, rotations in 32.
+    bits, sizes to 3 % and from 4.5e-5 to 379 units, opacities and colours in 8 bits, rotations in 32. A .usda is a text
+    of OpenUSD with a ParticleField3DGaussianSplat for each object.
 
     Args:
       path: The file; its suffix names the format.
       gaussians: N Gaussians.
-      object_ids: (N,) ids of objects, -1 for none: a property of a .ply, an attribute of a .glb. A .spz has no place.
+      ids: Integers of each Gaussian by name, such as "object_id", -1 for none: properties of a .ply, attributes of a
+        .glb. A .usda has a prim for each "object_id". A .spz has no place.
+      names: Names of the objects by id, for a .usda.
       similarity: (4, 4) transform into the world of the file.
       comment: ASCII line for the header of a .ply; the other formats have no place.
 
@@ -341,12 +347,12 @@ def save_gaussians(
     path = Path(path)
     require_writable_format(path)
     check_gaussians(gaussians)
-    if object_ids is not None:
-        require_shape("object_ids", object_ids, (gaussians.count,), "Give one id per Gaussian.")
+    for name, column in ids.items():
+        require_shape(name, column, (gaussians.count,), "Give one id per Gaussian.")
     if not gaussians.count and path.suffix.lower() != ".ply":
         raise InputError(path, "there are no Gaussians to write", remedy="Write a .ply, which may be empty.")
-    options = {"comment": comment} if path.suffix.lower() == ".ply" else {}
-    _WRITERS[path.suffix.lower()](path, gaussians, object_ids, similarity, **options)
+    options: dict[str, Any] = {".ply": {"comment": comment}, ".usda": {"names": names}}.get(path.suffix.lower(), {})
+    _WRITERS[path.suffix.lower()](path, gaussians, ids, similarity, **options)
 
 
 def require_writable_format(path: Path) -> None:
@@ -358,5 +364,7 @@ def require_writable_format(path: Path) -> None:
         _import_gsply(path)
 
 
-_WRITERS: dict[str, Callable[..., None]] = {".ply": save_ply, ".spz": _save_spz, ".glb": save_glb}
-"""suffix -> function that writes a file from Gaussians, ids of objects or None, and a similarity or None"""
+_WRITERS: dict[str, Callable[..., None]] = {
+    ".ply": save_ply, ".spz": _save_spz, ".glb": save_glb, ".usda": save_usda
+}  # fmt: skip
+"""suffix -> function that writes a file from Gaussians, ids by name, and a similarity or None"""

@@ -11,7 +11,7 @@ import dataclasses
 import json
 import math
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -39,12 +39,12 @@ _REMEDY = "Export the Gaussians alone, uncompressed, in sRGB colours and with al
 
 
 def save_glb(
-    path: Path, gaussians: Gaussians, object_ids: Int[Array, " n"] | None, similarity: Float[Array, "4 4"] | None
+    path: Path, gaussians: Gaussians, ids: Mapping[str, Int[Array, " n"]], similarity: Float[Array, "4 4"] | None
 ) -> None:
     """Writes Gaussians in float32, in glTF's axes: (x, y, z) becomes (-x, -y, z), y up.
 
     If float32 would not hold the positions (coordinates of a map projection), they are relative to the translation of
-    the node. Object ids are the attribute _OBJECT_ID, -1 for none.
+    the node. Ids are attributes such as _OBJECT_ID.
     """
     count, into = gaussians.count, _AXES if similarity is None else _AXES @ np.asarray(similarity, np.float64)
     origin = np.zeros(3)
@@ -55,8 +55,7 @@ def save_glb(
         """Yields the number of a block's first Gaussian, and its attributes as the file has them."""
         for rows, block in usable_blocks(path, part, into):
             attributes = _attributes(dataclasses.replace(block, means=block.means - origin))
-            if object_ids is not None:
-                attributes["_OBJECT_ID"] = np.asarray(object_ids[rows])[:, None]
+            attributes |= {f"_{name.upper()}": np.asarray(column[rows])[:, None] for name, column in ids.items()}
             kinds = {name: np.uint8 if name == "COLOR_0" else "<f4" for name in attributes}
             yield rows.start, {name: np.ascontiguousarray(a, kinds[name]) for name, a in attributes.items()}
 

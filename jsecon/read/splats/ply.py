@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from jsecon.errors import InputError
-from jsecon.files import atomic_write, reading
+from jsecon.files import atomic_write, reading, scratch_array
 from jsecon.splat.project import unusable_rows
 from jsecon.splat.sh import C0
 from jsecon.splat.transform import BLOCK_ROWS, float32_rounding, transform_blocks
@@ -160,7 +160,7 @@ def read_ply(path: Path) -> Gaussians:
     exact = all(np.can_cast(table.dtype[name], np.float32) for name in _POSITION)
     means = np.empty((count, 3), np.float32 if exact else np.float64)
     log_scales, quaternions, logits = (np.empty((count, *shape), np.float32) for shape in ((3,), (4,), ()))
-    sh = np.empty((count, 1 + rest // 3, 3), np.float32)
+    sh = scratch_array((count, 1 + rest // 3, 3), np.float32)
     for first in range(0, count, BLOCK_ROWS):
         rows = slice(first, first + BLOCK_ROWS)
         vertices = table[rows]
@@ -200,7 +200,7 @@ def drawable_gaussians(path: Path, means: np.ndarray, *others: np.ndarray) -> Ga
     All become float32, but for means of float64.
     """
     kinds = (np.float64 if means.dtype == np.float64 else np.float32, *(4 * (np.float32,)))
-    gaussians = Gaussians(*(np.ascontiguousarray(array, kind) for array, kind in zip((means, *others), kinds)))
+    gaussians = Gaussians(*(np.require(array, kind, "C") for array, kind in zip((means, *others), kinds)))
     _require_drawable(path, gaussians, 0, "Remove these Gaussians (SuperSplat drops them on loading), or train again.")
     return gaussians
 
@@ -231,29 +231,29 @@ def _require_drawable(path: str | Path, gaussians: Gaussians, first: int, remedy
 def save_ply(
     path: Path,
     gaussians: Gaussians,
-    object_ids: Int[Array, " n"] | None,
+    ids: Mapping[str, Int[Array, " n"]],
     similarity: Float[Array, "4 4"] | None,
     comment: str = "",
 ) -> None:
     """Writes Gaussians in INRIA's layout: binary little endian float32, normals zero, f_rest channel-major.
 
     Float32 Gaussians come back bit by bit. Positions are written in float64 if float32 would not hold them (coordinates
-    of a map projection). Object ids are a further property, int32, which other readers skip.
+    of a map projection). Ids are further properties, int32, which other readers skip.
     """
     rest_names = (f"f_rest_{index}" for index in range(3 * (gaussians.sh.shape[1] - 1)))
     names = (*_POSITION, "nx", "ny", "nz", *_DC, *rest_names, *_OPACITY, *_SCALE, *_ROTATION)
     is_double = needs_float64(gaussians, similarity)
     kinds = ("double" if is_double and name in _POSITION else "float" for name in names)
     properties = [f"property {kind} {name}" for kind, name in zip(kinds, names)]
-    properties += [] if object_ids is None else ["property int object_id"]
+    properties += [f"property int {name}" for name in ids]
     vertices = f"element vertex {gaussians.count}"
     comments = [f"comment {comment}"] if comment else []
     header = ["ply", "format binary_little_endian 1.0", *comments, vertices, *properties, "end_header\n"]
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         file.write("\n".join(header).encode())
         for rows, block in usable_blocks(path, gaussians, similarity):
-            ids = None if object_ids is None else np.asarray(object_ids[rows])
-            file.write(_table(block, is_double, ids).tobytes())  # tofile hides a full disk
+            own = {name: np.asarray(column[rows]) for name, column in ids.items()}
+            file.write(_table(block, is_double, own).tobytes())  # tofile hides a full disk
 
 
 def needs_float64(gaussians: Gaussians, similarity: Float[Array, "4 4"] | None = None) -> bool:
@@ -268,7 +268,7 @@ def needs_float64(gaussians: Gaussians, similarity: Float[Array, "4 4"] | None =
     return far > 0.01 * gaussians.count
 
 
-def _table(block: Gaussians, is_double: bool, object_ids: np.ndarray | None) -> np.ndarray:
+def _table(block: Gaussians, is_double: bool, ids: Mapping[str, np.ndarray]) -> np.ndarray:
     """The rows of a file."""
     sh = np.asarray(block.sh, np.float32)
     count = len(sh)
@@ -276,12 +276,12 @@ def _table(block: Gaussians, is_double: bool, object_ids: np.ndarray | None) -> 
     normals, opacity = np.zeros((count, 3)), np.asarray(block.opacity_logits)[:, None]
     columns = [normals, sh[:, 0], rest, opacity, block.log_scales, block.quaternions]
     others = np.concatenate([np.asarray(column, "<f4") for column in columns], axis=1)
-    last = [] if object_ids is None else [("object_id", "<i4")]
+    last = [(name, "<i4") for name in ids]
     kinds = [("means", "<f8" if is_double else "<f4", 3), ("others", "<f4", others.shape[1]), *last]
     rows = np.empty(count, kinds)
     rows["means"], rows["others"] = block.means, others
-    if object_ids is not None:
-        rows["object_id"] = object_ids
+    for name, column in ids.items():
+        rows[name] = column
     return rows
 
 

@@ -1,0 +1,98 @@
+"""`jsecon clean`: a scene without its floaters, haze and unseen Gaussians, and what that does to its pictures."""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from jsecon.app import pictures, verbs
+from jsecon.app.records import gaussian_rows
+from jsecon.app.scene import open_scene
+from jsecon.errors import InputError
+from jsecon.fit.photometric import psnr
+from jsecon.fit.quality import measure_quality
+from jsecon.pipeline.options import Options, is_bare_scene
+from jsecon.pipeline.progress import Console
+from jsecon.pipeline.scene import open_bare_scene
+from jsecon.pipeline.scene_files import fit_background, place_in_capture, read_scene
+from jsecon.read.captures.capture import load_capture
+from jsecon.read.captures.frames import evenly_spaced
+from jsecon.read.splats.files import require_writable_format, save_gaussians
+from jsecon.splat.transform import transform_gaussians
+from jsecon.types import Camera, Capture, Gaussians, Progress
+from jsecon.views.clean import KINDS, find_litter, without
+
+COMPARED = 12
+"""views, evenly spaced, in which pictures before and after are compared"""
+MAX_VIEWS = 128
+"""views, evenly spaced, that are looked at"""
+
+
+def _clean(verb: verbs.Clean, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon clean`; the result has the number of each kind, and the PSNR before and after."""
+    require_writable_format(verb.out)
+    if verb.scene.resolve() == verb.out.resolve():
+        raise InputError("--out", "it is the scene itself", remedy="Write to another file.")
+    if verb.capture is not None and (verb.cameras is not None or verb.views is not None):
+        raise InputError("--capture", "its poses are the views", remedy="Leave --cameras and --views out.")
+    opened = None
+    if verb.keep_objects or not is_bare_scene(verb.scene):
+        opened = open_scene(verb.scene, console=console)
+    with console.progress("views") as progress:
+        source, scene, cameras, capture = _open(verb, opened and opened.field, console, progress)
+    cameras = jax.tree.map(np.asarray, cameras[evenly_spaced(len(cameras), MAX_VIEWS)])
+    with console.progress("clean") as progress:
+        kinds = find_litter(scene, cameras, progress)
+    if verb.keep_objects and opened is not None:
+        kinds[opened.objects().labels >= 0] = 0
+    counts = {kind: int((kinds == n).sum()) for n, kind in enumerate(KINDS)}
+    if not counts["kept"]:
+        raise InputError(verb.scene, "no Gaussian would be left", remedy="Check the views: --cameras FILE.")
+    words = ", ".join(f"{count} {kind} ({count / len(kinds):.1%})" for kind, count in list(counts.items())[1:])
+    console.print_line(f"gone    {words}")
+    with console.progress("quality") as progress:
+        quality, line = _quality(scene, without(scene, kinds > 0), cameras, capture, progress)
+    console.print_line(line)
+    with console.progress("files"):
+        save_gaussians(verb.out, gaussian_rows(source, kinds == 0))
+    console.print_line(f"{counts['kept']} Gaussians, {verb.out.stat().st_size / 2**20:.1f} MiB  {verb.out}")
+    return {"written": {"scene": verb.out}, "gaussians": counts} | quality
+
+
+def _open(verb: verbs.Clean, field: Any, console: Console, progress: Progress) -> tuple[Any, ...]:
+    """Returns the Gaussians as the file has them and in the world of the views, the views, and the photographs."""
+    if (verb.capture is None and field is None) or verb.cameras is not None or verb.views is not None:
+        bare = open_bare_scene(Options(verb.scene, cameras=verb.cameras, views=verb.views), progress)
+        for note in bare.views.notes:
+            console.note(note)
+        return bare.source, bare.scene, bare.views.cameras, None
+    if field is None:
+        source = read_scene(verb.scene)[0]
+    else:
+        source = transform_gaussians(field.gaussians, field.source_from_scene)
+    if verb.capture is None:
+        return source, field.gaussians, field.cameras, None
+    capture = load_capture(verb.capture, long_side=Options.long_side, progress=progress)
+    placed, notes = place_in_capture(source, capture, verb.scene, None, progress)
+    for note in notes:
+        console.note(note)
+    return source, placed, capture.cameras, capture
+
+
+def _quality(
+    before: Gaussians, after: Gaussians, cameras: Camera, capture: Capture | None, progress: Progress
+) -> tuple[dict[str, Any], str]:
+    """Compares pictures before and after, with photographs if there are any, and says what came out."""
+    if capture is None:
+        values = []
+        for t in evenly_spaced(len(cameras), COMPARED):
+            pair = [pictures.render_picture(part, cameras[t]) / np.float32(255) for part in (before, after)]
+            values.append(float(psnr(*pair)))
+        value = float(np.median(values))
+        return {"psnr_between": value}, f"quality pictures before and after agree to {value:.2f} dB (median)"
+    frames = evenly_spaced(len(capture.frames), COMPARED)
+    background = fit_background(before, capture)
+    found = [measure_quality(part, capture, frames=frames, background=background) for part in (before, after)]
+    first, last = (float(np.mean(quality.psnr)) for quality in found)
+    line = f"quality {first:.2f} dB before, {last:.2f} dB after, PSNR of {len(frames)} photographs"
+    return {"psnr_before": first, "psnr_after": last}, line

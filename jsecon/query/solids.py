@@ -1,0 +1,86 @@
+"""Solids of objects, for robots and simulators: the convex hull, and the best of a box, a cylinder and a sphere.
+
+A primitive has the volume of the hull, but for the box, which is that of `object_shapes`. The one whose surface lies
+nearest to that of the hull is taken. Host code.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import ConvexHull, QhullError
+
+from jsecon.query.object_shapes import ObjectShapes
+
+_FLAT = 1e-3
+"""Least thickness of a hull, in units of the longest side of the box."""
+_SAMPLES = 2000
+"""Points of a hull's surface by which primitives are compared."""
+
+
+class Solid(NamedTuple):
+    """The solids of one object, in the world of its shape."""
+
+    vertices: Float[np.ndarray, "v 3"]
+    """(V, 3) corners of the hull."""
+    triangles: Int[np.ndarray, "f 3"]
+    """(F, 3) its faces, counter-clockwise as seen from outside."""
+    volume: float
+    """Its volume."""
+    primitive: str
+    """"box", "cylinder" or "sphere", in the middle of the object's box."""
+    size: tuple[float, ...]
+    """Three sides of a box; radius and height of a cylinder; radius of a sphere."""
+    axes: Float[np.ndarray, "3 3"]
+    """(3, 3) right-handed unit columns: axes of the primitive, a cylinder's along the third."""
+
+
+def object_solid(means: Float[np.ndarray, "n 3"], spreads: Float[np.ndarray, "n 3 3"], shape: ObjectShapes) -> Solid:
+    """Measures one object from centres and `gaussian_spreads` of its Gaussians, and from its shape.
+
+    The hull reaches one deviation beyond the centres, but not out of the object's box.
+    """
+    half = np.maximum(shape.half_size, _FLAT * shape.half_size.max())
+    ends = np.concatenate([means + side * spreads[:, :, axis] for axis in range(3) for side in (-1, 1)])
+    local = (ends - shape.center) @ shape.axes
+    local = local[(np.abs(local) <= half * (1 + 1e-9)).all(1)]
+    corners = half * np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    try:
+        hull = ConvexHull(local)
+    except (QhullError, ValueError):  # flat, or of fewer than four points
+        hull = ConvexHull(corners)
+    kept, places = np.unique(hull.simplices, return_inverse=True)
+    vertices, triangles = hull.points[kept], places.reshape(-1, 3)
+    first, second, third = vertices[triangles].transpose(1, 0, 2)
+    normals = np.cross(second - first, third - first)
+    inwards = (normals * hull.equations[:, :3]).sum(1) < 0
+    triangles[inwards] = triangles[inwards][:, ::-1]
+    name, size, axis = _primitive(vertices, triangles, np.linalg.norm(normals, axis=1), float(hull.volume), half)
+    axes = np.roll(shape.axes, 2 - axis, axis=1)
+    return Solid(vertices @ shape.axes.T + shape.center, triangles, float(hull.volume), name, size, axes)
+
+
+def _primitive(
+    vertices: np.ndarray, triangles: np.ndarray, areas: np.ndarray, volume: float, half: np.ndarray
+) -> tuple[str, tuple[float, ...], int]:
+    """Returns name, size and axis of the primitive whose surface is nearest to that of a hull in its box's axes."""
+    draw = np.random.default_rng(0)
+    faces = vertices[triangles[draw.choice(len(areas), _SAMPLES, p=areas / areas.sum())]]
+    points = np.einsum("mk,mkd->md", draw.dirichlet(np.ones(3), _SAMPLES), faces)
+    radius = np.cbrt(0.75 * volume / np.pi)
+    found: list[tuple[float, str, tuple[float, ...], int]] = [
+        (_distance(np.abs(points) - half), "box", tuple((2 * half).tolist()), 2),
+        (float(np.abs(np.linalg.norm(points, axis=1) - radius).mean()), "sphere", (float(radius),), 2),
+    ]
+    for axis in range(3):
+        across = np.sqrt(volume / (2 * np.pi * half[axis]))
+        around = np.linalg.norm(np.delete(points, axis, axis=1), axis=1) - across
+        beyond = np.stack([around, np.abs(points[:, axis]) - half[axis]], axis=1)
+        found.append((_distance(beyond), "cylinder", (float(across), 2 * float(half[axis])), axis))
+    return min(found)[1:]
+
+
+def _distance(beyond: np.ndarray) -> float:
+    """Mean distance of points to a surface, of how far they lie beyond each of its pairs of sides (M, S)."""
+    outside = np.linalg.norm(np.maximum(beyond, 0), axis=1)
+    return float((outside - np.minimum(beyond.max(1), 0)).mean())

@@ -1,0 +1,121 @@
+"""Which Gaussians of a scene show nothing of it: unseen, faint, haze and floaters. Host code.
+
+A Gaussian hangs in front of a surface where a pixel shows that surface farther away. The share of its weight on such
+pixels tells floaters and haze from surfaces. The first pass compares with the depth of all Gaussians, of which floaters
+are a part; the second one with the depth of those that passed the first. Thin things hang in front of surfaces too: so
+only what overlaps with hardly any other Gaussian goes.
+"""
+
+import dataclasses
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int, Int8
+from scipy.spatial import KDTree
+
+from jsecon.field.evidence import MAX_WHOLE, each_view, view_evidence
+from jsecon.splat.render import render_depth
+from jsecon.splat.visible import geometry_of_rows, visible_rows
+from jsecon.types import Camera, Gaussians, Progress
+
+KINDS = ("kept", "unseen", "faint", "haze", "floaters")
+"""what `find_litter` tells apart: its numbers are places here"""
+FAINT = 1 / 255
+"""Largest weight of a pixel below which a Gaussian changes no picture of 8 bits."""
+HAZE = 0.1
+"""Largest weight of a pixel below which what hangs in front of a surface is called haze."""
+_FIRST_SHARE, _SHARE = 0.4, 0.6
+"""Shares of a Gaussian's weight in front of surfaces from which it is left out of the second pass, and goes. Measured
+with experiments/clean.py."""
+_FIRST_GAP, _GAP = 0.03, 0.06
+"""Shares of the depth by which a surface lies behind what hangs in front of it, in each pass."""
+_NEIGHBOURS, _COMPANY = 9, 2
+"""Nearest Gaussians that are asked for, and number of these with which what belongs to a surface overlaps."""
+_REACH = (0.8, 1.0)
+"""Sums of both largest deviations within which two Gaussians overlap: of haze, and of all others."""
+_LEAST_ALPHA = 0.3
+"""Alpha of a pixel from which it shows a surface."""
+_STEP = 0.01
+"""Ratio of two depths that are told apart, less one."""
+
+
+def find_litter(gaussians: Gaussians, cameras: Camera, progress: Progress | None = None) -> Int8[np.ndarray, " n"]:
+    """Finds the kind (`KINDS`) of each of N Gaussians from T views that cover the scene.
+
+    Memory beside the Gaussians is that of one view, where they are too many for `MAX_WHOLE`.
+    """
+    count, seen = gaussians.count, np.ones(gaussians.count, bool)
+    means = np.asarray(gaussians.means, np.float32)
+    share = peak = np.zeros(count, np.float32)
+    reach = np.exp(np.asarray(gaussians.log_scales).max(1))
+    if count <= MAX_WHOLE:  # once for all views
+        gaussians = jax.device_put(dataclasses.replace(gaussians, sh=None))
+    for n, (least, gap) in enumerate(((_FIRST_SHARE, _FIRST_GAP), (_SHARE, _GAP))):
+        front, total, peak = np.zeros((3, count), np.float32)
+        with_surface = _with_opacity(gaussians, seen)
+
+        def view(t: int, with_surface=with_surface, gap=gap) -> tuple[np.ndarray, ...]:
+            return _view(gaussians, with_surface, means, cameras[t], gap)
+
+        def report(done: int, views: int, first: int = n * len(cameras)) -> None:
+            if progress is not None:
+                progress(first + done, 2 * views)
+
+        for rows, own_front, own_total, own_peak in each_view(count, len(cameras), view, report):
+            front[rows] += own_front
+            total[rows] += own_total
+            peak[rows] = np.maximum(peak[rows], own_peak)
+        share = front / np.maximum(total, 1e-30)
+        seen = share < least
+    hanging = ~seen
+    hanging[hanging] = _is_apart(means, reach, peak, np.flatnonzero(hanging))
+    kinds = np.where(hanging, np.where(peak < HAZE, 3, 4), 0)
+    return np.where(peak <= 0, 1, np.where(peak < FAINT, 2, kinds)).astype(np.int8)
+
+
+def without(gaussians: Gaussians, gone: np.ndarray) -> Gaussians:
+    """Makes some Gaussians (N,) transparent; all columns but that of the opacities are shared."""
+    return _with_opacity(gaussians, ~gone)
+
+
+def _with_opacity(gaussians: Gaussians, kept: np.ndarray) -> Gaussians:
+    logits = np.where(kept, np.asarray(gaussians.opacity_logits), np.float32(-np.inf))
+    return dataclasses.replace(gaussians, opacity_logits=logits)
+
+
+def _is_apart(
+    means: Float[np.ndarray, "n 3"],
+    reach: Float[np.ndarray, " n"],
+    peak: Float[np.ndarray, " n"],
+    rows: Int[np.ndarray, " m"],
+) -> Bool[np.ndarray, " m"]:
+    """Tells which of some Gaussians overlap with fewer than `_COMPANY` others that are no haze."""
+    solid = np.flatnonzero(peak >= HAZE)
+    if not len(solid):
+        return np.ones(len(rows), bool)
+    distance, near = KDTree(means[solid]).query(means[rows], min(_NEIGHBOURS, len(solid)))
+    distance, others = (a.reshape(len(rows), -1) for a in (distance, solid[near]))
+    touching = distance <= np.where(peak[rows] < HAZE, *_REACH)[:, None] * (reach[others] + reach[rows, None])
+    return (touching & (others != rows[:, None])).sum(1) < _COMPANY
+
+
+def _view(
+    gaussians: Gaussians, surface: Gaussians, means: Float[np.ndarray, "n 3"], camera: Camera, gap: float
+) -> tuple[np.ndarray, ...]:
+    """Returns the Gaussians of a view, their weight in front of the surface and on it, and their largest weight."""
+    part = surface
+    if surface.count > MAX_WHOLE:
+        part = geometry_of_rows(surface, visible_rows(surface, camera))
+    depth, alpha = map(np.asarray, render_depth(part, camera))
+    shown = (alpha >= _LEAST_ALPHA) & (depth > 0)
+    nearest = float(depth[shown].min(initial=np.inf))
+    bins = np.where(shown, np.log(np.where(shown, depth, 1) / nearest) / np.log1p(_STEP), -1).astype(np.int32)
+    regions = int(bins.max(initial=-1)) + 1
+    found = view_evidence(gaussians, camera, bins, regions)
+    rows, pose = found.gaussians, np.asarray(camera.world_to_camera, np.float32)
+    own = np.repeat(np.arange(len(rows)), np.diff(found.starts))
+    middles = np.append(nearest * (1 + _STEP) ** (np.arange(regions) + 0.5), 0)  # the last is that of no surface
+    behind = middles[found.regions] > (1 + gap) * (means[rows] @ pose[2, :3] + pose[2, 3])[own]
+    weights = np.where(found.regions < regions, found.weights, 0)
+    front = np.bincount(own, weights * behind, len(rows))
+    return rows, front, np.bincount(own, weights, len(rows)), found.max_pixel_weights
