@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int, Int8
 from scipy.spatial import KDTree
 
 from jsecon.field.evidence import MAX_WHOLE, each_view, view_evidence
+from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.render import render_depth
 from jsecon.splat.visible import geometry_of_rows, visible_rows
 from jsecon.types import Camera, Gaussians, Progress
@@ -42,20 +43,21 @@ _STEP = 0.01
 def find_litter(gaussians: Gaussians, cameras: Camera, progress: Progress | None = None) -> Int8[np.ndarray, " n"]:
     """Finds the kind (`KINDS`) of each of N Gaussians from T views that cover the scene.
 
-    Memory beside the Gaussians is that of one view, where they are too many for `MAX_WHOLE`.
+    Above `MAX_WHOLE` Gaussians, memory beside them is that of a quarter of one view.
     """
     count, seen = gaussians.count, np.ones(gaussians.count, bool)
     means = np.asarray(gaussians.means, np.float32)
-    share = peak = np.zeros(count, np.float32)
+    peak = np.zeros(count, np.float32)
     reach = np.exp(np.asarray(gaussians.log_scales).max(1))
     if count <= MAX_WHOLE:  # once for all views
         gaussians = jax.device_put(dataclasses.replace(gaussians, sh=None))
+    else:
+        cameras = _quarters(cameras)
     for n, (least, gap) in enumerate(((_FIRST_SHARE, _FIRST_GAP), (_SHARE, _GAP))):
         front, total, peak = np.zeros((3, count), np.float32)
-        with_surface = _with_opacity(gaussians, seen)
 
-        def view(t: int, with_surface=with_surface, gap=gap) -> tuple[np.ndarray, ...]:
-            return _view(gaussians, with_surface, means, cameras[t], gap)
+        def view(t: int, seen=seen, gap=gap) -> tuple[np.ndarray, ...]:
+            return _view(gaussians, seen, cameras[t], gap)
 
         def report(done: int, views: int, first: int = n * len(cameras)) -> None:
             if progress is not None:
@@ -65,8 +67,7 @@ def find_litter(gaussians: Gaussians, cameras: Camera, progress: Progress | None
             front[rows] += own_front
             total[rows] += own_total
             peak[rows] = np.maximum(peak[rows], own_peak)
-        share = front / np.maximum(total, 1e-30)
-        seen = share < least
+        seen = front < least * np.maximum(total, 1e-30)
     hanging = ~seen
     hanging[hanging] = _is_apart(means, reach, peak, np.flatnonzero(hanging))
     kinds = np.where(hanging, np.where(peak < HAZE, 3, 4), 0)
@@ -99,14 +100,27 @@ def _is_apart(
     return (touching & (others != rows[:, None])).sum(1) < _COMPANY
 
 
-def _view(
-    gaussians: Gaussians, surface: Gaussians, means: Float[np.ndarray, "n 3"], camera: Camera, gap: float
-) -> tuple[np.ndarray, ...]:
-    """Returns the Gaussians of a view, their weight in front of the surface and on it, and their largest weight."""
-    part = surface
-    if surface.count > MAX_WHOLE:
-        part = geometry_of_rows(surface, visible_rows(surface, camera))
-    depth, alpha = map(np.asarray, render_depth(part, camera))
+def _quarters(cameras: Camera) -> Camera:
+    """Divides T views into 4 T, which overlap by a pixel where a side is odd."""
+    width, height = -(-cameras.width // 2), -(-cameras.height // 2)
+    corners = [(x, y) for x in (0, cameras.width - width) for y in (0, cameras.height - height)]
+    moved = [dataclasses.replace(cameras, cx=cameras.cx - x, cy=cameras.cy - y) for x, y in corners]
+    whole = jax.tree.map(lambda *parts: np.concatenate(parts), *moved)
+    return dataclasses.replace(whole, width=width, height=height)
+
+
+def _view(gaussians: Gaussians, seen: Bool[np.ndarray, " n"], camera: Camera, gap: float) -> tuple[np.ndarray, ...]:
+    """Returns the Gaussians of a view, their weight in front of the surface and on it, and their largest weight.
+
+    The surface is that of the Gaussians that are `seen`.
+    """
+    ids, capacity = np.arange(gaussians.count), None
+    if gaussians.count > MAX_WHOLE:
+        ids = visible_rows(gaussians, camera)
+        gaussians = geometry_of_rows(gaussians, ids)
+        seen = np.pad(seen[ids], (0, gaussians.count - len(ids)))
+        capacity = max(plan_capacity(gaussians, camera, margin=1.0, devices=1), 1)
+    depth, alpha = map(np.asarray, render_depth(_with_opacity(gaussians, seen), camera, capacity=capacity))
     shown = (alpha >= _LEAST_ALPHA) & (depth > 0)
     nearest = float(depth[shown].min(initial=np.inf))
     bins = np.where(shown, np.log(np.where(shown, depth, 1) / nearest) / np.log1p(_STEP), -1).astype(np.int32)
@@ -115,7 +129,7 @@ def _view(
     rows, pose = found.gaussians, np.asarray(camera.world_to_camera, np.float32)
     own = np.repeat(np.arange(len(rows)), np.diff(found.starts))
     middles = np.append(nearest * (1 + _STEP) ** (np.arange(regions) + 0.5), 0)  # the last is that of no surface
-    behind = middles[found.regions] > (1 + gap) * (means[rows] @ pose[2, :3] + pose[2, 3])[own]
+    z = np.asarray(gaussians.means, np.float32)[rows] @ pose[2, :3] + pose[2, 3]
     weights = np.where(found.regions < regions, found.weights, 0)
-    front = np.bincount(own, weights * behind, len(rows))
-    return rows, front, np.bincount(own, weights, len(rows)), found.max_pixel_weights
+    front = np.bincount(own, weights * (middles[found.regions] > (1 + gap) * z[own]), len(rows))
+    return ids[rows], front, np.bincount(own, weights, len(rows)), found.max_pixel_weights
