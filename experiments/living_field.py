@@ -11,6 +11,7 @@ Each field is one that `jsecon run CAPTURE --out FIELD` made, with frames held o
   camera centres. Those of the other captures must be refused.
 """
 
+import contextlib
 import dataclasses
 import tempfile
 from pathlib import Path
@@ -110,9 +111,10 @@ def refused(scene: Scene, captures: list[Path], most: int, scratch: Path) -> tup
             :: max(len(list((capture / "images").iterdir())) // most, 1)
         ]:
             (scratch / f"{capture.name}_{file.name}").symlink_to(file.resolve())
-    count, errors = len(list(scratch.iterdir())), list[InputError]()
-    read_frames(scene.field, scene.ledger, scratch, None, errors.append, lambda done, total: None)
-    return len(errors), count
+    count, grown = len(list(scratch.iterdir())), scene
+    with contextlib.suppress(InputError):  # all are refused
+        grown = scene.add(scratch, refused=[])
+    return count - len(grown.field.names) + len(scene.field.names), count
 
 
 def main(options: Options) -> dict:

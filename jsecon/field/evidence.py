@@ -458,7 +458,7 @@ def _sum_rows(views: Sequence[ViewEvidence], rows: slice, num_regions: int, by_v
     count = rows.stop - rows.start
     total, seen, peak = np.zeros(count), np.zeros(count, np.int32), np.zeros(count, np.float32)
     each = np.zeros((len(views) if by_view else 0, count), np.float32).T
-    dense = np.zeros((count, num_regions + 1))
+    cells, entries = [np.zeros(0, np.int64)], [np.zeros(0, np.float32)]
     for t, view in enumerate(views):
         own = np.add.reduceat(view.weights, view.starts[:-1], dtype=np.float64) if len(view.gaussians) else 0.0
         total[view.gaussians] += own
@@ -466,10 +466,11 @@ def _sum_rows(views: Sequence[ViewEvidence], rows: slice, num_regions: int, by_v
         peak[view.gaussians] = np.maximum(peak[view.gaussians], view.max_pixel_weights)
         if by_view:
             each[view.gaussians, t] = own
-        # A view has each pair of a Gaussian and a region once.
-        first = np.repeat(view.gaussians.astype(np.int64) * (num_regions + 1), np.diff(view.starts))
-        dense.reshape(-1)[first + view.regions] += view.weights
-    weights = sparse.csr_matrix(dense[:, :num_regions])
+        rows_of_dense = view.gaussians.astype(np.int64) * (num_regions + 1)
+        cells.append(np.repeat(rows_of_dense, np.diff(view.starts)) + view.regions)
+        entries.append(view.weights)
+    dense = np.bincount(np.concatenate(cells), np.concatenate(entries), count * (num_regions + 1))
+    weights = sparse.csr_matrix(dense.reshape(count, num_regions + 1)[:, :num_regions])
     return EvidenceSum(weights, total, seen, peak, each, sum(view.overflow for view in views))
 
 
