@@ -298,6 +298,24 @@ class Codes:
     """What encodes a text in the same way, an `Autoencoder`."""
 
 
+@record
+class Event:
+    """A change of a field, with what it replaced there."""
+
+    rows: Array
+    """(M,) int32 Gaussians that it changed."""
+    gaussians: Gaussians
+    """(M,) these before."""
+    views: Array
+    """(M,) int32 `Votes.views` of these before."""
+    regions: Array
+    """(L,) int32 regions that it changed."""
+    embeddings: Array
+    """(L, E) theirs before."""
+    description: str = static()
+    """JSON: kind, date, name, region, frames, from and to in the capture's world."""
+
+
 class _Texts(tuple):
     """Texts of a record that jit shall not compile for: any two are equal to it."""
 
@@ -351,9 +369,11 @@ class LanguageField(_Shown):
     tracker."""
     leaf: Array | None = None
     """(N,) int32 smallest node of each Gaussian, -1 for none: a part of a region, or a region without parts."""
+    history: tuple[Event, ...] = ()
+    """changes of the field since it was made, in order of time (NumPy)."""
 
 
-_TEXTS = {"names": (), "embedder": "", "provenance": "{}", "up": None, "metres_per_unit": None}
+_TEXTS = {"names": (), "embedder": "", "provenance": "{}", "up": None, "metres_per_unit": None, "history": ()}
 """Static fields of LanguageField, and their values inside of a trace."""
 _ARRAYS = tuple(part.name for part in dataclasses.fields(LanguageField) if part.name not in _TEXTS)
 

@@ -2,13 +2,17 @@
 
 import dataclasses
 
+import jax
 import numpy as np
 import pytest
-from conftest import cameras_of, gaussians_at, look_at
+from conftest import cameras_of, capture_of, gaussians_at, look_at
+from small_field import lone_votes
 
-from jsecon import InputError
+from jsecon import InputError, LanguageField, Regions, Scene, load_field, save_field
 from jsecon.change.detect import object_changes
 from jsecon.splat.render import render_rgb
+from jsecon.types import UpAxis
+from jsecon.vision.colours import ColourEmbedder
 
 UP = np.array([0.0, 0.0, 1.0])
 COLOURS = {"red": (0.8, 0.1, 0.1), "blue": (0.1, 0.2, 0.8), "green": (0.1, 0.6, 0.2), "orange": (0.95, 0.5, 0.1)}
@@ -74,3 +78,42 @@ def test_depth_alone_tells_what_is_gone(eyes):
     depths = np.stack([np.asarray(render_rgb(after, camera, depth=True).depth) for camera in eyes])
     found = object_changes(grey, labels, photographs(after, eyes), eyes, depths, up=UP)
     assert [change.kind for change in found] == ["same", "gone"]
+
+
+def test_an_updated_field_answers_as_things_are_now_and_as_they_were(eyes, tmp_path):
+    before, labels = scene_of(red=PLACES["red"], blue=PLACES["blue"], green=PLACES["green"])
+    after, _ = scene_of(red=(-0.1, -0.05), green=PLACES["green"], orange=PLACES["orange"])
+    embedder = ColourEmbedder()
+    votes = lone_votes(np.maximum(labels, 0), 3)
+    votes = dataclasses.replace(
+        votes, views=np.where(labels < 0, 0, 3).astype(np.int32), overlap=np.eye(3, dtype=np.float32)
+    )
+    regions = Regions(embedder.embed_text(["red", "blue", "green"]), np.full((3, 3), 400, np.int32))
+    words = embedder.canonical_phrases, np.eye(4), ("a", "b", "c"), embedder.name
+    field = LanguageField(
+        before,
+        votes,
+        regions,
+        eyes,
+        *words,
+        unrelated_words=embedder.unrelated_words,
+        up=UpAxis((0.0, 0.0, 1.0), "given"),
+    )
+    old = Scene(field, embedder)
+    capture = capture_of(photographs(after, eyes), eyes, np.zeros(3, bool))
+    save_field(tmp_path / "new.safetensors", old.update(capture, date="2026-11-28").field)
+    new = Scene(load_field(tmp_path / "new.safetensors"), embedder)
+    assert [(event["kind"], event["region"]) for event in new.history()] == [("moved", 0), ("gone", 1), ("new", 3)]
+    np.testing.assert_allclose(new.ask("red").place.center[:2], (-0.1, -0.05), atol=0.03)
+    assert old.ask("blue").state == "found"
+    assert not new.ask("blue").mask.any()
+    np.testing.assert_allclose(new.ask("orange").place.center[:2], PLACES["orange"], atol=0.06)
+    np.testing.assert_array_equal(new.ask("what moved?").rows, np.flatnonzero(labels == 0))
+    np.testing.assert_array_equal(new.ask("what is gone").rows, np.flatnonzero(labels == 1))
+    then = new.as_of("2026-11-27")
+    for now, was in zip(jax.tree.leaves(then.field.gaussians), jax.tree.leaves(before)):
+        np.testing.assert_array_equal(now[: before.count], was)
+    for text in ("red", "blue", "green", "orange"):
+        np.testing.assert_array_equal(then.ask(text).rows, old.ask(text).rows)
+    with pytest.raises(InputError, match="before the last change"):
+        new.update(capture, date="2026-11-01")

@@ -1,27 +1,35 @@
-"""`jsecon changes`: what changed of the objects of a field, as JSON, a table, and a page with pictures and a plan."""
+"""`jsecon changes` and `jsecon update`: what changed, as JSON, a table, and a page with pictures and a plan."""
 
+import contextlib
 import csv
+import datetime
 import io
 import json
+import re
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from jsecon.app import pictures, report, verbs
 from jsecon.app.comparison import LONG_SIDE, Changes, splat_capture
+from jsecon.app.opening import locate_field
 from jsecon.app.records import unit_of
-from jsecon.app.scene import open_scene
+from jsecon.app.scene import Scene, open_scene
 from jsecon.change.detect import KINDS
 from jsecon.errors import InputError
-from jsecon.files import write_text
+from jsecon.files import FIELD_FILE, exclusive_lock, write_text
 from jsecon.pipeline.options import is_bare_scene, require_writable
 from jsecon.pipeline.progress import Console
-from jsecon.read.captures.capture import load_capture
+from jsecon.read.captures.capture import load_capture, read_posed_images
 from jsecon.views.frame import field_up
 
 _PLAN = 700
 """Longer side of the plan, px."""
+_EXIF, _TAKEN, _DATE = 0x8769, 0x9003, re.compile(r"(\d{4}):(\d\d):(\d\d)")
+"""EXIF's block of a photograph, its tag DateTimeOriginal, and the date in that."""
 COLOURS = {"moved": (40, 110, 230), "gone": (220, 50, 60), "new": (20, 150, 80), "look": (190, 120, 20)}
 """RGB of the kinds of changes."""
 
@@ -31,22 +39,66 @@ def _changes(verb: verbs.Changes, console: Console) -> verbs.VerbResult:
     require_writable(verb.out)
     if verb.transform is not None and not is_bare_scene(verb.photos):
         raise InputError("--transform", "photographs have poses", remedy="Leave it out: it is for a file of Gaussians.")
+    return _write_changes(_compare(verb, console, verb.transform)[1], verb.out, console)
+
+
+def _compare(
+    verb: verbs.Changes | verbs.Update, console: Console, transform: Path | None = None
+) -> tuple[Scene, Changes]:
+    """Opens the field of a verb, and compares it with the photographs, or with another file of Gaussians."""
     scene = open_scene(verb.field, embedder=verb.embedder, console=console)
     with console.progress("photographs") as progress:
         if is_bare_scene(verb.photos):
-            capture = splat_capture(scene.field, verb.photos, verb.transform)
+            capture = splat_capture(scene.field, verb.photos, transform)
         else:
             capture = load_capture(verb.photos, long_side=LONG_SIDE, holdout=0, progress=progress)
     with console.progress("changes"):
-        changes = scene.changes(capture)
+        return scene, scene.changes(capture)
+
+
+def _update(verb: verbs.Update, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon update`; the result has the records of the changes."""
+    out = locate_field(verb.field).file.parent if verb.out is None else verb.out
+    require_writable(out)
+    if is_bare_scene(verb.photos):
+        raise InputError(verb.photos, "a file of Gaussians", "photographs", "jsecon changes compares two of them.")
+    date, origin = verb.date, "--date"
+    if date is None:
+        date = photographed(verb.photos)
+        origin = "the photographs"
+    if date is None:
+        date, origin = datetime.date.today().isoformat(), "today, as the photographs have no date"
+    scene, changes = _compare(verb, console)
+    updated = scene.update(changes, date=date)
+    result = _write_changes(changes, out, console)
+    path = out / FIELD_FILE
+    with exclusive_lock(out), console.progress("write"):
+        updated.save(path)
+    console.print_line(f"date    {date} ({origin})\nfield   {path}")
+    return result | {"date": date, "written": {**result["written"], "field": path}}
+
+
+def photographed(folder: Path) -> str | None:
+    """The latest date that photographs of a folder have in their EXIF; None if none has one."""
+    dates = []
+    for image in read_posed_images(folder).images:
+        if image.image is not None:
+            with contextlib.suppress(OSError), Image.open(image.image) as opened:
+                text = str(opened.getexif().get_ifd(_EXIF).get(_TAKEN, ""))
+                dates += ["-".join(match.groups()) for match in [_DATE.match(text)] if match]
+    return max(dates, default=None)
+
+
+def _write_changes(changes: Changes, out: Path, console: Console) -> verbs.VerbResult:
+    """Prints changes, and writes changes.json, changes.csv and changes.html to a folder."""
     records = changes.records()
     for record in records:
         if record["kind"] not in ("same", "not seen"):
             console.print_line(_words(record))
     count = {kind: sum(record["kind"] == kind for record in records) for kind in KINDS}
     console.print_line(", ".join(f"{number} {kind}" for kind, number in count.items() if number) or "no objects")
-    files = {name: verb.out / f"changes.{name}" for name in ("json", "csv", "html")}
-    content = {"frame": "the capture's world", "unit": unit_of(scene.field), "changes": records}
+    files = {name: out / f"changes.{name}" for name in ("json", "csv", "html")}
+    content = {"frame": "the capture's world", "unit": unit_of(changes.field), "changes": records}
     write_text(files["json"], json.dumps(content, indent=2) + "\n")
     write_text(files["csv"], _table(records))
     with console.progress("pictures"):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import json
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +13,19 @@ import numpy as np
 from jsecon.app.catalogue import Catalogue
 from jsecon.app.records import rounded, source_points
 from jsecon.change.detect import Change, object_changes
+from jsecon.change.history import NewThing, add_frames, add_object, events, move_object, remove_object
 from jsecon.errors import InputError
-from jsecon.fit.resize import resize_frame, shrink_cameras
+from jsecon.files import parse_json
+from jsecon.fit.resize import resize_camera, resize_frame, shrink_cameras
+from jsecon.fit.start import gaussians_from_points
 from jsecon.pipeline.scene_files import read_scene
 from jsecon.read.captures.frames import evenly_spaced, transform_poses
 from jsecon.splat.render import render_depth
 from jsecon.splat.transform import transform_gaussians
-from jsecon.types import Capture, LanguageField
+from jsecon.types import Camera, Capture, Gaussians, LanguageField
 from jsecon.views.capture import render_capture
 from jsecon.views.frame import field_up
+from jsecon.vision.protocols import Embedder
 
 LONG_SIDE = 320
 """Longest side at which photographs are compared, px."""
@@ -94,6 +99,80 @@ def find_changes(field: LanguageField, listed: Catalogue, capture: Capture) -> C
     kept = [change for change in found if change.object < 0 or (labels == change.object).any()]
     capture = dataclasses.replace(capture, frames=frames, cameras=cameras, depths=depths)
     return Changes(field, listed, capture, tuple(kept))
+
+
+def apply_changes(changes: Changes, embedder: Embedder, date: str) -> LanguageField:
+    """Applies changes to their field, with a date: what moved moves, what is gone is absent, what is new is added."""
+    field, listed = changes.field, changes.catalogue
+    if (known := [event["date"] for event in events(field)]) and date < known[-1]:
+        raise InputError("--date", f"{date} is before the last change of the field, {known[-1]}", remedy="Check it.")
+    found = list(zip(changes.found, changes.records()))
+    new = [change for change, _ in found if change.kind == "new" and change.frames]
+    shown = sorted({t for change in new for t in change.frames})
+    names = {t: _new_name(changes.capture.names[t], date, field.names) for t in shown}
+    if shown:
+        cameras = jax.tree.map(lambda a: np.asarray(a)[shown], changes.capture.cameras)
+        sized = resize_camera(cameras, field.cameras.width, field.cameras.height)
+        field = add_frames(field, sized, [names[t] for t in shown])
+    for change, record in found:
+        description = record | {"date": date}
+        mask = np.zeros(field.gaussians.count, bool)
+        if change.object >= 0:
+            mask[: len(listed.labels)] = listed.labels == change.object
+        if change.kind == "moved":
+            field = move_object(field, mask, change.motion, description)
+        elif change.kind == "gone":
+            field = remove_object(field, mask, np.flatnonzero(listed.regions == change.object).tolist(), description)
+        elif change.kind == "look":
+            field = remove_object(field, mask & False, (), description)
+        elif change.kind == "new" and change.frames:
+            field = add_object(field, _new_thing(changes, change, embedder, names), description)
+    origin = parse_json(field.provenance)
+    origin.pop("ledger", None)  # whose regions and Gaussians are others
+    return dataclasses.replace(field, provenance=json.dumps(origin, sort_keys=True))
+
+
+def _new_name(name: str, date: str, known: tuple[str, ...]) -> str:
+    """A name of a new frame that the field does not have."""
+    options = (name, f"{name}_{date}", *(f"{name}_{date}_{n}" for n in range(2, len(known) + 3)))
+    return next(option for option in options if option not in known)
+
+
+def _new_thing(changes: Changes, change: Change, embedder: Embedder, names: dict[int, str]) -> NewThing:
+    """The Gaussians and the embedding of something new, from the pixels that show it."""
+    capture, field = changes.capture, changes.field
+    points, colours, total = [], [], 0.0
+    for t in change.frames:
+        mask, frame = change.after[t], np.asarray(capture.frames[t])
+        camera = jax.tree.map(lambda a, t=t: np.asarray(a)[t], capture.cameras)
+        points.append(_surface(mask, camera, change.place, None if capture.depths is None else capture.depths[t]))
+        colours.append(frame[mask])
+        total = total + mask.sum() * np.asarray(embedder.embed_regions(frame, mask[None]), np.float64)[0]
+    gaussians = gaussians_from_points(np.concatenate(points), np.concatenate(colours), opacity=0.9, scale=0.6)
+    bands = np.asarray(field.gaussians.sh).shape[1]
+    sh = np.zeros((gaussians.count, bands, 3), np.float32)
+    sh[:, 0] = np.asarray(gaussians.sh)[:, 0]
+    columns: Gaussians = dataclasses.replace(jax.tree.map(np.asarray, gaussians), sh=sh)
+    scale = field.cameras.width * field.cameras.height / (capture.cameras.width * capture.cameras.height)
+    pixels = {names[t]: round(int(change.after[t].sum()) * scale) for t in change.frames}
+    return NewThing(columns, (total / max(np.linalg.norm(total), 1e-12)).astype(np.float32), pixels)
+
+
+def _surface(mask: np.ndarray, camera: Camera, place: np.ndarray, depth: np.ndarray | None) -> np.ndarray:
+    """Points (P, 3) of a mask's pixels: at their depth, or on a dome as deep as it is wide around a place."""
+    pose = np.asarray(camera.world_to_camera, np.float64)
+    rows, columns = np.nonzero(mask)
+    x, y = (columns + 0.5 - float(camera.cx)) / float(camera.fx), (rows + 0.5 - float(camera.cy)) / float(camera.fy)
+    middle = float(pose[2, :3] @ place + pose[2, 3])
+    inward = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)[rows, columns]
+    largest = inward.max()
+    z = middle - np.sqrt(np.maximum(largest**2 - (largest - inward) ** 2, 0)) * middle / float(camera.fx)
+    if depth is not None:
+        measured = np.asarray(depth, np.float64)[rows, columns]
+        known = measured[measured > 0]
+        usual = np.median(known) if len(known) else middle
+        z = np.where(np.abs(measured - usual) < largest * 4 * usual / float(camera.fx), measured, usual)
+    return (np.stack([x * z, y * z, z], 1) - pose[:3, 3]) @ pose[:3, :3]
 
 
 def splat_capture(field: LanguageField, file: Path, transform: Path | None) -> Capture:

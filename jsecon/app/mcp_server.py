@@ -80,6 +80,10 @@ class _Tools:
         world = {"unit": unit_of(scene.field), "up": listed.up.tolist(), "up_evidence": listed.up_evidence}
         return {"count": len(listed)} | world | {"objects": listed.records()[:100]}
 
+    def history(self, field: FieldName = None) -> dict[str, Any]:
+        """Lists what moved, is gone, is new or looks another way since a field was made, in order of time."""
+        return {"changes": self._scene(field).history()}
+
     def locate(self, text: Words, frame: Frame = None, field: FieldName = None) -> dict[str, Any]:
         """Locates one thing: oriented box, and the middle of its top, where a gripper from above would close."""
         scene = self._scene(field)
@@ -115,7 +119,7 @@ def make_server(scenes: Mapping[str, Future[Any]]) -> MCPServer:
     server = MCPServer("jsecon", instructions=words, version=jsecon.__version__)
     tools = _Tools(scenes)
     annotations = ToolAnnotations(read_only_hint=True, open_world_hint=False, idempotent_hint=True)
-    for method in (tools.find, tools.objects, tools.locate, tools.measure, tools.render):
+    for method in (tools.find, tools.objects, tools.history, tools.locate, tools.measure, tools.render):
         text = inspect.getdoc(method)
         structured = method != tools.render
         server.add_tool(_tool(method, tools), description=text, annotations=annotations, structured_output=structured)

@@ -40,6 +40,7 @@ def _query(verb: verbs.Query, console: Console) -> verbs.VerbResult:
     require_writable(verb.out)
     require_writable_format(verb.out / f"answer.{verb.format}")
     scene = open_scene(verb.field, embedder=verb.embedder, up=verb.up, out=verb.out / "field", console=console)
+    scene = scene if verb.as_of is None else scene.as_of(verb.as_of)
     with console.progress("answers"):
         if verb.texts:
             _ = scene.embedder  # without it one error stands for all texts

@@ -137,7 +137,8 @@ class Answer:
 
     Attributes:
       query: The query, with the names of its frames.
-      by: "votes" or "code"; "outline" for a box or masks; "relation" for a text that tells things apart.
+      by: "votes" or "code"; "outline" for a box or masks; "relation" for a text that tells things apart; "history" for
+        what moved, is gone or is new.
       mask: (N,) bool, the selected Gaussians, without outliers.
       selection: The Gaussians before outliers were dropped, with similarity, best region (-1 for none) and score.
       field: The field.
@@ -283,14 +284,14 @@ class Answer:
             up = "" if self.up is None else f"up is from {self.up}"
             sentences = [f"read as {self.reading}{seen}: {number}", self.reason.rstrip("."), up, self.question]
             return ". ".join(filter(None, [*sentences, self._counts()]))
-        return self._counts()
+        return ", ".join([self.reason, self._counts()]) if self.by == "history" else self._counts()
 
     def _counts(self) -> str:
         """Counts, score and place, separated by commas."""
         region = int(self.selection.region)
         parts = [f"{len(self.rows)} of {self.field.gaussians.count} Gaussians"]
         parts += [f"{self.count} objects"] if self.count > 1 else []
-        if self.by != "relation":
+        if self.by not in ("relation", "history"):
             parts.append(f"score {float(self.selection.score):.3f}")
             if (rank := _known(self.selection.rank)) is not None:
                 parts.append(f"more similar than {int(100 * rank + 1e-6)} % of unrelated words")

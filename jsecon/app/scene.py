@@ -20,10 +20,11 @@ from jaxtyping import Bool, UInt8
 
 from jsecon.app import pictures
 from jsecon.app.catalogue import Catalogue, objects
-from jsecon.app.comparison import Changes, find_changes
+from jsecon.app.comparison import Changes, apply_changes, find_changes
 from jsecon.app.object_index import ObjectIndex, choose_shades
 from jsecon.app.opening import locate_field, name_fields
 from jsecon.app.records import Answer, At, Box, Mask, Query, Question, Region, gaussian_rows
+from jsecon.change.history import change_question, events, field_as_of, read_date
 from jsecon.errors import InputError
 from jsecon.field.columns import is_mapped
 from jsecon.field.field import check_field, load_field
@@ -381,6 +382,8 @@ class Scene:
         if query.by == "code" and self.field.codes is None:
             raise InputError("", "This field has no codes", remedy="Run jsecon run --paper, or ask by votes.")
         if isinstance(question, str):
+            if (kind := change_question(question)) is not None:
+                return self._answer_history(query, kind)
             return self.relate(question, frame=query.frame) if is_expression(question) else self._answer_text(query)
         if isinstance(question, Box | Mask):
             return self._answer_outline(query, question)
@@ -632,6 +635,54 @@ class Scene:
         with self._lock:
             self._require_memory("a comparison")
             return find_changes(self.field, self._catalogue, capture)
+
+    def update(self, changes: Capture | Changes, *, date: str) -> "Scene":
+        """Applies what changed: objects move or are gone, and new ones come. Ids of regions stay.
+
+        The field's history keeps what it was (`as_of`, `history`). The new scene has no ledger of its views.
+
+        Args:
+          changes: What `changes` returned, or the photographs.
+          date: Date of the photographs, as in "2026-11-28", or a date and a time.
+
+        Returns:
+          The new scene.
+
+        Raises:
+          InputError: As for `changes`; or the date is none, or is before that of the last update.
+        """
+        date = read_date(date)
+        with self._lock:
+            changes = self.changes(changes) if isinstance(changes, Capture) else changes
+            return self._at(apply_changes(changes, self.embedder, date))
+
+    def as_of(self, date: str) -> "Scene":
+        """The scene as it was at the end of a date, such as "2026-11-01".
+
+        Raises:
+          InputError: The date is none.
+        """
+        return self._at(field_as_of(self.field, read_date(date)))
+
+    def history(self) -> list[dict[str, Any]]:
+        """Plain values of each change of the field since it was made, in order of time."""
+        return events(self.field)
+
+    def _at(self, field: LanguageField) -> "Scene":
+        """A scene of another date."""
+        return Scene(field, self._embedder and self.embedder, up=self._up, name=self.name)
+
+    def _answer_history(self, query: Query, kind: str) -> Answer:
+        """Selects what moved, is gone or is new."""
+        found = [e for e in zip(self.field.history, self.history()) if kind in ("", e[1]["kind"])]
+        mask = np.zeros(self.field.gaussians.count, bool)
+        for event, _ in found:
+            mask[np.asarray(event.rows)] = True
+        words = [f"{told['name'] or 'something'} {told['kind']} {told['date']}" for _, told in found]
+        reason = "; ".join(words) or "the history of the field has no such change (jsecon update)"
+        region, score = np.asarray(-1, np.int32), np.asarray(float(len(found) > 0), np.float32)
+        selection = Selection(mask, mask.astype(np.float32), region, score)
+        return Answer(query, "history", mask, selection, self.field, count=len(found), reason=reason)
 
     def prepare(self) -> None:
         """Compiles what questions need, so that the first question is as fast as later ones.

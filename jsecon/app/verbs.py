@@ -200,6 +200,7 @@ class Query(_FieldVerb):
       views: Number of masks to write for each query. 0 leaves out answers.html too: nothing is rendered, and the first
         query on a machine takes a third of its time.
       format: Format of the selected Gaussians. The glb is glTF with Khronos' KHR_gaussian_splatting, y up.
+      as_of: Asks a field of jsecon update as it was at the end of a date, such as 2026-11-01.
     """
 
     examples = (
@@ -226,6 +227,7 @@ class Query(_FieldVerb):
     keep_outliers: Option[bool] = False
     views: Annotated[Option[int], Range(0, 1000)] = 3
     format: Option[Literal["ply", "spz", "glb"]] = "ply"
+    as_of: Option[str | None] = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -356,6 +358,27 @@ class Changes(_FieldVerb):
     photos: Positional[Path]
     out: Option[Path] = Path("changes")
     transform: Option[Path | None] = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Update(_FieldVerb):
+    """Applies what changed in new photographs to a field, whose history keeps what was.
+
+    An object that moved keeps its region and goes to its new place. One that is gone is transparent and answers no
+    query. A new one gets Gaussians and the next region. `jsecon query --as-of DATE` asks the field as it was, and "what
+    moved", "what is gone" and "what is new" ask for its changes. Also writes the files of jsecon changes.
+
+    Attributes:
+      photos: A capture, as for jsecon changes.
+      out: Folder for the new field. Without it, the field is replaced.
+      date: Date of the photographs, such as 2026-11-28. By default it is that of their EXIF data, else today.
+    """
+
+    examples = ("jsecon update my_field new_capture --out my_field_2 --date 2026-11-28",)
+
+    photos: Positional[Path]
+    out: Option[Path | None] = None
+    date: Option[str | None] = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -564,6 +587,7 @@ VERBS: dict[type[Verb], str] = {
     Forget: "app.living:_forget",
     Export: "app.exports:_export",
     Changes: "app.changes:_changes",
+    Update: "app.changes:_update",
     Clean: "app.cleaning:_clean",
     Measure: "app.measuring:_measure",
     View: "app.viewer.window:_view",

@@ -23,11 +23,12 @@ from jsecon.files import atomic_write, pack_tree, parse_json, read_arrays, readi
 from jsecon.read.captures.images import MAX_PIXELS
 from jsecon.splat.project import unusable_rows
 from jsecon.splat.sh import COEFFICIENT_COUNTS
-from jsecon.types import Autoencoder, Camera, Codes, Gaussians, LanguageField, Parts, Regions, UpAxis, Votes
+from jsecon.types import Autoencoder, Camera, Codes, Event, Gaussians, LanguageField, Parts, Regions, UpAxis, Votes
 
 VERSION = 3
 _RECORDS = {
-    cls.__name__: cls for cls in (LanguageField, Gaussians, Votes, Regions, Parts, Camera, Codes, Autoencoder, UpAxis)
+    cls.__name__: cls
+    for cls in (LanguageField, Gaussians, Votes, Regions, Parts, Camera, Codes, Autoencoder, UpAxis, Event)
 }
 MAPPED = 1 << 20
 """bytes of a column from which a mapped field leaves it on disk"""
@@ -219,6 +220,8 @@ def _oddity(field: LanguageField, checked: bool = True) -> str | None:
         return f"a unit of {scale!r} metres"
     if not 0 < field.cameras.width * field.cameras.height <= MAX_PIXELS:
         return f"views of {field.cameras.width}x{field.cameras.height} px"
+    if not all(_is_event(event, field) for event in field.history):
+        return "a history that does not fit its Gaussians and regions"
     codes, dim = field.codes, field.regions.embeddings.shape[1]
     coder, latent = (None, 0) if codes is None else (codes.autoencoder, codes.regions.shape[1])
     if isinstance(coder, Autoencoder) and not _layers_fit(coder, dim, latent):
@@ -238,6 +241,21 @@ def _is_tree(parent: np.ndarray, count: int) -> bool:
     for _ in range(len(parent).bit_length()):  # no node is above itself
         parent = np.where(parent >= 0, parent[parent], -1)
     return bool((parent == -1).all())
+
+
+def _is_event(event: Any, field: LanguageField) -> bool:
+    """Whether an event of a file belongs to the history of a field."""
+    if not isinstance(event, Event) or not isinstance(event.gaussians, Gaussians):
+        return False
+    whole = (event.rows, field.gaussians), (event.regions, field.regions)
+    if not all(ids.dtype.kind == "i" and ((ids >= 0) & (ids < owner.count)).all() for ids, owner in whole):
+        return False
+    columns = zip(jax.tree.leaves(event.gaussians), jax.tree.leaves(field.gaussians), strict=True)
+    fits = all(a.shape == (len(event.rows), *b.shape[1:]) and np.isfinite(a).all() for a, b in columns)
+    fits &= event.views.shape == event.rows.shape
+    fits &= event.embeddings.shape == (len(event.regions), field.regions.embeddings.shape[1])
+    described = parse_json(event.description)
+    return fits and isinstance(described, dict) and all(isinstance(described.get(k), str) for k in ("kind", "date"))
 
 
 def _is_up_axis(up: Any) -> bool:
