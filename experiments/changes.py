@@ -9,13 +9,15 @@ and photographed from other places, with poses: RGB with true poses, and RGB-D w
 AP is that of SceneDiff with the kind of change: changes of all rooms, the most probable first, are right if their masks
 in the new photographs have an IoU of at least 0.5 with those of a true change of the same kind. Masks are the pixels
 where the thing would be seen had nothing changed (gone, moved) and where it is seen now (new, moved). A turned thing
-counts as moved. The seeds 0 to 4 chose the constants.
+counts as moved. Things that moved or are gone are asked for by their colours in the updated field, and in the field as
+it was. The seeds 0 to 4 chose the constants.
 """
 
 import dataclasses
 import time
 from pathlib import Path
 
+import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -34,6 +36,7 @@ from jsecon.field.membership import normalise_votes
 from jsecon.field.regions import region_embeddings
 from jsecon.fit.depth import points_from_depth
 from jsecon.fit.start import gaussians_from_points
+from jsecon.query.render import HIDDEN_LOGIT
 from jsecon.types import Camera, Capture, LanguageField
 from jsecon.vision.colours import ColourEmbedder
 
@@ -41,6 +44,10 @@ KINDS = ("remove", "move", "add", "swap", "turn", "nothing", "other light", "oth
 UNTURNED = ("box", "mug", "kettle", "pot", "teddy")
 """Shapes that look another way when they are turned."""
 SIZE = {"width": 160, "height": 120}
+GAUSSIANS = 26_000
+"""Gaussians of each field, with transparent ones, so that all rooms share their programs."""
+FOUND_M = 0.05
+"""Distance of an answer's middle from that of the thing, along the table, up to which it is found at its place, m."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,7 +162,12 @@ def room_field(room: Room, *, views: int = 16) -> LanguageField:
     points, colours = (
         np.concatenate([a[near], b[far]]) for a, b in ((cloud.points, coarse.points), (cloud.colors, coarse.colors))
     )
-    scene = gaussians_from_points(points, colours, opacity=0.9, scale=0.5, max_scale=0.08)
+    chosen = np.random.default_rng(0).permutation(len(points))[:GAUSSIANS]
+    scene = gaussians_from_points(points[chosen], colours[chosen], opacity=0.9, scale=0.5, max_scale=0.08)
+    more = GAUSSIANS - len(chosen)
+    scene = jax.tree.map(lambda a: np.concatenate([a, np.repeat(np.asarray(a)[:1], more, 0)]), scene)
+    logits = np.where(np.arange(GAUSSIANS) < len(chosen), scene.opacity_logits, np.float32(HIDDEN_LOGIT))
+    scene = dataclasses.replace(scene, opacity_logits=logits)
     embedder = ColourEmbedder()
     labels = np.asarray(instances, np.int16)
     regions = region_embeddings(frames, labels, embedder.embed_regions, num_regions=len(room.objects))
@@ -274,6 +286,26 @@ def judge(changes: Changes, case: Case, shots: dict[str, np.ndarray], chosen: np
     return {"found": found, "truth": len(truth), "moved": moved}
 
 
+def ask_updated(scene: Scene, changes: Changes, case: Case) -> list[tuple[str, bool, bool]]:
+    """Asks for each thing that moved or is gone by its colour, in the updated field and in the field as it was.
+
+    Returns:
+      The kind, and whether the answers of the two are right: at the new place, or no Gaussian.
+    """
+    rows, new = [], scene.update(changes, date="2026-11-28")
+
+    def is_right(asked: Scene, kind: str, i: int, j: int) -> bool:
+        answer = asked.ask(case.before[i].colour)
+        if kind == "gone":
+            return not answer.mask.any()
+        return bool(answer.mask.any()) and np.linalg.norm(answer.place.center[:2] - case.after[j].spot) < FOUND_M
+
+    for kind, i, j in case.changes:
+        if kind != "new":
+            rows.append((kind, bool(is_right(new, kind, i, j)), bool(is_right(scene, kind, i, j))))
+    return rows
+
+
 def average_precision(found: list[tuple[float, bool]], truth: int) -> float:
     """Area under precision over recall, of changes with probabilities."""
     order = sorted(found, key=lambda pair: -pair[0])
@@ -289,7 +321,7 @@ def measure_room(seed: int, options: Options) -> dict:
     most = max(options.counts)
     field = load_room_field(folder, seed)
     for kind in KINDS:
-        shots = load_case(folder, seed, kind, max(most, 10))
+        shots = load_case(folder, seed, kind, most)
         if options.only_make:
             continue
         cameras, case = new_cameras(seed + 1000 * KINDS.index(kind), len(shots["frames"])), make_case(seed, kind)
@@ -304,6 +336,7 @@ def measure_room(seed: int, options: Options) -> dict:
                 rows[f"{kind}, {count}, {'RGB-D' if depth else 'RGB'}"] = {
                     **judge(changes, case, shots, chosen),
                     "seconds": seconds,
+                    "asked": ask_updated(scene, changes, case) if kind in ("remove", "move") else [],
                 }
     return rows
 
@@ -337,6 +370,13 @@ def main(options: Options) -> dict:
                 "false in other exposure": quiet["other exposure"],
                 "place of moved, cm": 100 * float(np.median([error for error, _ in moved])) if moved else float("nan"),
                 "same id": float(np.mean([same for _, same in moved])) if moved else float("nan"),
+                **{
+                    f"{words}, {when}": float(
+                        np.mean([row[n] for cell in every for row in cell["asked"] if row[0] == kind])
+                    )
+                    for kind, words in (("moved", "moved found"), ("gone", "gone refused"))
+                    for n, when in ((1, "updated"), (2, "as it was"))
+                },
                 "seconds, median": float(np.median([cell["seconds"] for cell in every])),
             }
             lines.append((count, sensor, *figure.values()))
@@ -346,8 +386,8 @@ def main(options: Options) -> dict:
                 wrong = sum(not pair[1] for cell in cells[kind] for pair in cell["found"])
                 parts.append(f"{right} of {sum(cell['truth'] for cell in cells[kind])}, {wrong} false")
             kinds.append((count, sensor, *parts))
-    header = ("photographs", "", *next(iter(figures.values())))
-    text = results.table(header, lines) + "\n\n" + results.table(("photographs", "", *KINDS[:5]), kinds)
+    header = ("photographs", "sensor", *next(iter(figures.values())))
+    text = results.table(header, lines) + "\n\n" + results.table(("photographs", "sensor", *KINDS[:5]), kinds)
     results.save(out, options, figures, text)
     print(text)
     return figures

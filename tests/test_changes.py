@@ -5,9 +5,11 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+from capture_files import run_cli
 from conftest import cameras_of, capture_of, gaussians_at, look_at
 from small_field import lone_votes
 
+from experiments.rooms.writers import write_colmap
 from jsecon import InputError, LanguageField, Regions, Scene, load_field, save_field
 from jsecon.change.detect import object_changes
 from jsecon.splat.render import render_rgb
@@ -101,8 +103,15 @@ def test_an_updated_field_answers_as_things_are_now_and_as_they_were(eyes, tmp_p
     )
     old = Scene(field, embedder)
     capture = capture_of(photographs(after, eyes), eyes, np.zeros(3, bool))
-    save_field(tmp_path / "new.safetensors", old.update(capture, date="2026-11-28").field)
-    new = Scene(load_field(tmp_path / "new.safetensors"), embedder)
+    save_field(tmp_path / "old.safetensors", field)
+    write_colmap(capture, tmp_path / "photos")
+    options = "--out", tmp_path / "new", "--date", "2026-11-28"
+    assert run_cli("update", tmp_path / "old.safetensors", tmp_path / "photos", *options) == 0
+    assert [row.split(",")[:2] for row in (tmp_path / "new" / "changes.csv").read_text().splitlines()[1:]] == [
+        ["moved", "red"], ["gone", "blue"], ["same", "green"], ["new", ""],
+    ]  # fmt: skip
+    assert "moved red (object" in (tmp_path / "new" / "changes.html").read_text()
+    new = Scene(load_field(tmp_path / "new" / "field.safetensors"), embedder)
     assert [(event["kind"], event["region"]) for event in new.history()] == [("moved", 0), ("gone", 1), ("new", 3)]
     np.testing.assert_allclose(new.ask("red").place.center[:2], (-0.1, -0.05), atol=0.03)
     assert old.ask("blue").state == "found"

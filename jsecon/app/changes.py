@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 from jsecon.app import pictures, report, verbs
-from jsecon.app.comparison import LONG_SIDE, Changes, splat_capture
+from jsecon.app.comparison import LONG_SIDE, Changes, placed_capture, splat_capture
 from jsecon.app.opening import locate_field
 from jsecon.app.records import unit_of
 from jsecon.app.scene import Scene, open_scene
@@ -23,7 +23,8 @@ from jsecon.errors import InputError
 from jsecon.files import FIELD_FILE, exclusive_lock, write_text
 from jsecon.pipeline.options import is_bare_scene, require_writable
 from jsecon.pipeline.progress import Console
-from jsecon.read.captures.capture import load_capture, read_posed_images
+from jsecon.read.captures.capture import load_capture, read_posed_images, unposed_photographs
+from jsecon.read.captures.images import IMAGE_SUFFIXES
 from jsecon.views.frame import field_up
 
 _PLAN = 700
@@ -39,21 +40,28 @@ def _changes(verb: verbs.Changes, console: Console) -> verbs.VerbResult:
     require_writable(verb.out)
     if verb.transform is not None and not is_bare_scene(verb.photos):
         raise InputError("--transform", "photographs have poses", remedy="Leave it out: it is for a file of Gaussians.")
-    return _write_changes(_compare(verb, console, verb.transform)[1], verb.out, console)
+    _, changes, refused = _compare(verb, console, verb.transform)
+    return _write_changes(changes, verb.out, console) | {"errors": refused}
 
 
 def _compare(
     verb: verbs.Changes | verbs.Update, console: Console, transform: Path | None = None
-) -> tuple[Scene, Changes]:
-    """Opens the field of a verb, and compares it with the photographs, or with another file of Gaussians."""
+) -> tuple[Scene, Changes, list[InputError]]:
+    """Opens the field of a verb, and compares it with photographs, or with another file of Gaussians.
+
+    The errors are those of photographs that cannot be placed.
+    """
+    refused: list[InputError] = []
     scene = open_scene(verb.field, embedder=verb.embedder, console=console)
     with console.progress("photographs") as progress:
         if is_bare_scene(verb.photos):
             capture = splat_capture(scene.field, verb.photos, transform)
+        elif _without_poses(verb.photos):
+            capture = placed_capture(scene.field, scene.ledger, verb.photos, refused, progress)
         else:
             capture = load_capture(verb.photos, long_side=LONG_SIDE, holdout=0, progress=progress)
     with console.progress("changes"):
-        return scene, scene.changes(capture)
+        return scene, scene.changes(capture), refused
 
 
 def _update(verb: verbs.Update, console: Console) -> verbs.VerbResult:
@@ -68,22 +76,28 @@ def _update(verb: verbs.Update, console: Console) -> verbs.VerbResult:
         origin = "the photographs"
     if date is None:
         date, origin = datetime.date.today().isoformat(), "today, as the photographs have no date"
-    scene, changes = _compare(verb, console)
+    scene, changes, refused = _compare(verb, console)
     updated = scene.update(changes, date=date)
     result = _write_changes(changes, out, console)
     path = out / FIELD_FILE
     with exclusive_lock(out), console.progress("write"):
         updated.save(path)
     console.print_line(f"date    {date} ({origin})\nfield   {path}")
-    return result | {"date": date, "written": {**result["written"], "field": path}}
+    return result | {"date": date, "errors": refused, "written": {**result["written"], "field": path}}
+
+
+def _without_poses(path: Path) -> list[Path]:
+    """Photographs without poses: one file, or those of a folder; none of a capture."""
+    return [path] if path.suffix.lower() in IMAGE_SUFFIXES else unposed_photographs(path)[0]
 
 
 def photographed(folder: Path) -> str | None:
     """The latest date that photographs of a folder have in their EXIF; None if none has one."""
     dates = []
-    for image in read_posed_images(folder).images:
-        if image.image is not None:
-            with contextlib.suppress(OSError), Image.open(image.image) as opened:
+    files = _without_poses(folder) or [image.image for image in read_posed_images(folder).images]
+    for file in files:
+        if file is not None:
+            with contextlib.suppress(OSError), Image.open(file) as opened:
                 text = str(opened.getexif().get_ifd(_EXIF).get(_TAKEN, ""))
                 dates += ["-".join(match.groups()) for match in [_DATE.match(text)] if match]
     return max(dates, default=None)

@@ -15,6 +15,7 @@ from jsecon.app.records import rounded, source_points
 from jsecon.change.detect import Change, object_changes
 from jsecon.change.history import NewThing, add_frames, add_object, events, move_object, remove_object
 from jsecon.errors import InputError
+from jsecon.field.ledger import Ledger
 from jsecon.files import parse_json
 from jsecon.fit.resize import resize_camera, resize_frame, shrink_cameras
 from jsecon.fit.start import gaussians_from_points
@@ -22,7 +23,7 @@ from jsecon.pipeline.scene_files import read_scene
 from jsecon.read.captures.frames import evenly_spaced, transform_poses
 from jsecon.splat.render import render_depth
 from jsecon.splat.transform import transform_gaussians
-from jsecon.types import Camera, Capture, Gaussians, LanguageField
+from jsecon.types import Camera, Capture, Gaussians, LanguageField, Progress
 from jsecon.views.capture import render_capture
 from jsecon.views.frame import field_up
 from jsecon.vision.protocols import Embedder
@@ -186,6 +187,21 @@ def splat_capture(field: LanguageField, file: Path, transform: Path | None) -> C
     capture = render_capture(moved, cameras, tuple(field.names[t] for t in rows), np.asarray(field.source_from_scene))
     depths = [np.where(a > 0.5, d, 0) for d, a in (map(np.asarray, render_depth(moved, c)) for c in cameras)]
     return dataclasses.replace(capture, depths=np.stack(depths))
+
+
+def placed_capture(
+    field: LanguageField, ledger: Ledger, photos: Path, refused: list[InputError], progress: Progress
+) -> Capture:
+    """Places photographs without poses by the pictures of a field's ledger; `refused` gets the errors of the others."""
+    from jsecon.pipeline.new_frames import read_frames  # late: questions to a field need none of it
+
+    placed = read_frames(field, ledger, photos, None, refused.append, progress)
+    if not placed:
+        raise refused.pop()
+    cameras = jax.tree.map(lambda *columns: np.stack(columns), *(frame.camera for frame in placed.values()))
+    frames, nothing = np.stack([frame.pixels for frame in placed.values()]), np.zeros((0, 3), np.float32)
+    none, world = np.zeros(len(frames), bool), np.asarray(field.source_from_scene)
+    return Capture(frames, cameras, nothing, nothing.astype(np.uint8), none, None, world, tuple(placed))
 
 
 def _read_matrix(file: Path | None) -> np.ndarray:

@@ -155,6 +155,11 @@ def application(scenes: Mapping[str, Scene], *, token: str = "") -> FastAPI:
         world = {"unit": unit_of(scene.field), "up": listed.up.tolist(), "up_evidence": listed.up_evidence}
         return _AsciiResponse({"field": scene.name} | world | {"objects": listed.records()})
 
+    @app.get("/changes", summary="What moved, is gone or is new since a field was made, in order of time")
+    def changes(request: Annotated[_Request, Parameters()]) -> Response:
+        scene = find_scene(scenes, request.field)
+        return _AsciiResponse({"field": scene.name, "changes": scene.history()})
+
     @app.get("/selection.ply", summary="The selected Gaussians in the capture's world")
     def selection(request: Annotated[_Selection, Parameters()]) -> Response:
         scene = find_scene(scenes, request.field)

@@ -348,7 +348,8 @@ class Changes(_FieldVerb):
 
     Attributes:
       photos: A capture with poses in the world of the field's own capture, with or without depth, in any format of
-        jsecon run; or another file of Gaussians of the same place.
+        jsecon run; photographs without poses, which are placed as by jsecon add; or another file of Gaussians of the
+        same place.
       out: Output folder.
       transform: Text file with a 4x4 similarity from the world of that file of Gaussians to the field's capture.
     """
@@ -369,7 +370,7 @@ class Update(_FieldVerb):
     moved", "what is gone" and "what is new" ask for its changes. Also writes the files of jsecon changes.
 
     Attributes:
-      photos: A capture, as for jsecon changes.
+      photos: A capture or photographs, as for jsecon changes.
       out: Folder for the new field. Without it, the field is replaced.
       date: Date of the photographs, such as 2026-11-28. By default it is that of their EXIF data, else today.
     """

@@ -36,6 +36,10 @@ GONE_MARGIN = 0.25
 """By how much the scene without an object must explain its pixels better, in mean cost, for it to be gone."""
 MIN_GAIN = 0.25
 """Cost that a moved object must take away at its new place, per pixel of its silhouette."""
+TURN_SHARE = 0.15
+"""Share of an object's pixels that the scene does not explain from which it may be turned."""
+MIN_TURN_GAIN = 0.04
+"""Cost that a turn must take away, per pixel of the object, beyond what the unturned object does."""
 _KNOWN = 0.8
 """Alpha from which a rendering tells what a pixel shows."""
 _MAX_PLACES = 6
@@ -234,6 +238,9 @@ def object_changes(
     changes = [search.unmoved(k, seen[k], excess[k], differing[k]) for k in range(count)]
     for k, change in search.moved().items():
         changes[k] = change
+    for k in np.flatnonzero(seen.any(1) & ~displaced).tolist():
+        if float(np.average(differing[k], weights=np.where(seen[k], known[k], 0))) >= TURN_SHARE:
+            changes[k] = search.turned(changes[k])
     clusters = search.clusters(min(2, len(views)))
     for k in np.flatnonzero(displaced).tolist():
         if changes[k].kind != "moved":
@@ -383,6 +390,32 @@ class _Search:
         motion[:3, :3] = Rotation.from_rotvec(self.up * pose[2]).as_matrix()
         motion[:3, 3] = middle - motion[:3, :3] @ middle + pose[:2] @ self.flat + pose[3] * self.up
         return motion
+
+    def turned(self, change: Change) -> Change:
+        """The change of an object that is where it was: turned, if that explains clearly more; else the same."""
+        k = change.object
+        views = [self.first[t].render(hide(self.gaussians, self.labels == k)) for t in change.frames[:_FIT_FRAMES]]
+        discs = _Discs(self.gaussians, np.flatnonzero(self.labels == k))
+
+        def score(angle: float) -> tuple[float, int]:
+            placed = [view.place(discs, self._motion(k, np.array([0, 0, angle, 0]))) for view in views]
+            gains = [float(np.nansum(view.cost - new.cost)) for view, (new, _) in zip(views, placed)]
+            return sum(gains), sum(int(inside.sum()) for _, inside in placed)
+
+        angles = np.radians(np.arange(20, 341, 20))
+        unturned, pixels = score(0.0)
+        values = [score(angle)[0] for angle in angles]
+        angle = float(angles[int(np.argmax(values))])
+        gain = (max(values) - unturned) / max(pixels, 1)
+        if gain < MIN_TURN_GAIN:
+            return change
+        motion = self._motion(k, np.array([0, 0, angle, 0]))
+        probability = 1 / (1 + np.exp(-40 * (gain - MIN_TURN_GAIN)))
+        before = self.silhouettes(k)
+        after = np.stack([view.place(discs, motion)[1] for view in self.views])
+        return dataclasses.replace(
+            change, kind="moved", probability=float(probability), motion=motion, before=before, after=after
+        )
 
     def _stand(self, k: int) -> tuple[np.ndarray, float]:
         """The lower end of an object, and its size."""
