@@ -44,6 +44,8 @@ _KNOWN = 0.8
 """Alpha from which a rendering tells what a pixel shows."""
 _MAX_PLACES = 6
 """Places with unexplained pixels, the largest, where displaced objects are searched for."""
+_DISCS = 3000
+"""Discs, at most, that stand for an object: of larger ones, every second or third Gaussian is a larger disc."""
 _FIT_FRAMES = 4
 """Frames, the best ones, that poses of moved objects are fitted to."""
 
@@ -118,8 +120,12 @@ class _Discs:
     """The Gaussians of an object as opaque discs: drawn thousands of times, in a millisecond each."""
 
     def __init__(self, gaussians: Gaussians, rows: np.ndarray):
+        step = -(-len(rows) // _DISCS)
+        rows = rows[::step]
         self.means = np.asarray(gaussians.means, np.float64)[rows]
-        self.radii = 1.1 * np.exp(np.sort(np.asarray(gaussians.log_scales, np.float64)[rows], axis=1)[:, 1])
+        self.radii = (
+            1.1 * np.sqrt(step) * np.exp(np.sort(np.asarray(gaussians.log_scales, np.float64)[rows], axis=1)[:, 1])
+        )
         self.colours = np.clip(0.5 + C0 * np.asarray(gaussians.sh)[rows, 0], 0, 1)
 
     def draw(self, camera: Camera, motion: np.ndarray) -> tuple[tuple[slice, slice], np.ndarray, np.ndarray] | None:
@@ -136,9 +142,8 @@ class _Discs:
         reach = int(np.ceil(radii.max(initial=1)))
         steps = np.arange(-reach, reach + 1)
         columns, rows = np.floor(u)[:, None, None] + steps, np.floor(v)[:, None, None] + steps[:, None]
-        near = (columns + 0.5 - u[:, None, None]) ** 2 + (rows + 0.5 - v[:, None, None]) ** 2 <= radii[
-            :, None, None
-        ] ** 2
+        u, v, radii = (a[:, None, None] for a in (u, v, radii))
+        near = (columns + 0.5 - u) ** 2 + (rows + 0.5 - v) ** 2 <= radii**2
         near &= (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)
         owner, i, j = np.nonzero(near)
         if not len(owner):
