@@ -36,9 +36,9 @@ GONE_MARGIN = 0.25
 """By how much the scene without an object must explain its pixels better, in mean cost, for it to be gone."""
 MIN_GAIN = 0.25
 """Cost that a moved object must take away at its new place, per pixel of its silhouette."""
-TURN_SHARE = 0.15
+TURN_SHARE = 0.1
 """Share of an object's pixels that the scene does not explain from which it may be turned."""
-MIN_TURN_GAIN = 0.04
+MIN_TURN_GAIN = 0.03
 """Cost that a turn must take away, per pixel of the object, beyond what the unturned object does."""
 _KNOWN = 0.8
 """Alpha from which a rendering tells what a pixel shows."""
@@ -241,11 +241,11 @@ def object_changes(
     displaced = seen.any(1) & (excess > 0)
     search = _Search(gaussians, labels, views, up / np.linalg.norm(up), displaced)
     changes = [search.unmoved(k, seen[k], excess[k], differing[k]) for k in range(count)]
+    shares = (known * differing).sum(1) / np.maximum(known.sum(1), 1e-9)
+    for k in np.flatnonzero(seen.any(1) & ~displaced & (shares >= TURN_SHARE)).tolist():
+        changes[k] = search.turned(changes[k])
     for k, change in search.moved().items():
         changes[k] = change
-    for k in np.flatnonzero(seen.any(1) & ~displaced).tolist():
-        if float(np.average(differing[k], weights=np.where(seen[k], known[k], 0))) >= TURN_SHARE:
-            changes[k] = search.turned(changes[k])
     clusters = search.clusters(min(2, len(views)))
     for k in np.flatnonzero(displaced).tolist():
         if changes[k].kind != "moved":
@@ -265,7 +265,7 @@ class _Cluster(NamedTuple):
 
 
 class _Search:
-    """The search for what is displaced and what is new; its views lose what was found."""
+    """The search for what is turned, displaced and new; its views show what was found."""
 
     def __init__(self, gaussians, labels, views, up, displaced):
         """Renders the scene without what is displaced."""
@@ -278,6 +278,7 @@ class _Search:
         first /= np.linalg.norm(first)
         self.flat = np.stack([first, np.cross(up, first)])
         self.means = np.asarray(gaussians.means, np.float64)
+        self.turns: dict[int, tuple[_Discs, np.ndarray]] = {}
         self.discs = {k: _Discs(gaussians, np.flatnonzero(labels == k)) for k in np.flatnonzero(displaced).tolist()}
 
     def _middle(self, k: int) -> np.ndarray:
@@ -415,11 +416,17 @@ class _Search:
         if gain < MIN_TURN_GAIN:
             return change
         motion = self._motion(k, np.array([0, 0, angle, 0]))
-        probability = 1 / (1 + np.exp(-40 * (gain - MIN_TURN_GAIN)))
+        self.turns[k] = discs, motion
+        hidden = np.append(self.displaced, False)
+        hidden[list(self.turns)] = True
+        self.views = [view.render(hide(self.gaussians, hidden[self.labels])) for view in self.first]
+        for placed in self.turns.values():
+            both = [view.place(*placed) for view in self.views]
+            self.views, after = [view for view, _ in both], np.stack([inside for _, inside in both])
+        probability = float(1 / (1 + np.exp(-40 * (gain - MIN_TURN_GAIN))))
         before = self.silhouettes(k)
-        after = np.stack([view.place(discs, motion)[1] for view in self.views])
         return dataclasses.replace(
-            change, kind="moved", probability=float(probability), motion=motion, before=before, after=after
+            change, kind="moved", probability=probability, motion=motion, before=before, after=after
         )
 
     def _stand(self, k: int) -> tuple[np.ndarray, float]:
