@@ -38,8 +38,10 @@ MIN_GAIN = 0.25
 """Cost that a moved object must take away at its new place, per pixel of its silhouette."""
 TURN_SHARE = 0.1
 """Share of an object's pixels that the scene does not explain from which it may be turned."""
-MIN_TURN_GAIN = 0.03
+MIN_TURN_GAIN = 0.035
 """Cost that a turn must take away, per pixel of the object, beyond what the unturned object does."""
+MIN_RADIUS = 2.0
+"""Radius of the largest disc in the pixels of a new thing: edges that lie a pixel off are narrower."""
 _KNOWN = 0.8
 """Alpha from which a rendering tells what a pixel shows."""
 _MAX_PLACES = 6
@@ -262,6 +264,8 @@ class _Cluster(NamedTuple):
     """World units."""
     masks: dict[int, np.ndarray]
     """Frame -> (H, W) bool."""
+    radius: float
+    """Radius of the largest disc in a mask, px."""
 
 
 class _Search:
@@ -316,7 +320,12 @@ class _Search:
             else:
                 groups.append([cluster])
         return [
-            _Cluster(np.mean([c.place for c in group], 0), float(np.median([c.size for c in group])), group[0].masks)
+            _Cluster(
+                np.mean([c.place for c in group], 0),
+                float(np.median([c.size for c in group])),
+                group[0].masks,
+                max(c.radius for c in group),
+            )
             for group in groups
             if len(group[0].masks) >= min_frames
         ]
@@ -336,6 +345,10 @@ class _Search:
             if area < MIN_PIXELS or left == 0 or top == 0 or left + across == width or top + tall == height:
                 continue
             inside = image == n
+            radius = float(cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, 5).max())
+            nearer = view.depth is None or np.nan_to_num(depth_cost(view.depth, view.z))[inside] < -0.3
+            if radius < MIN_RADIUS or np.mean(nearer) < 0.5:
+                continue
             rows, columns = np.nonzero(inside)
             along = down[0] * columns + down[1] * rows
             if view.depth is not None and (view.depth[inside] > 0).any():
@@ -354,7 +367,7 @@ class _Search:
                 ahead = contact - np.asarray(view.camera.centres, np.float64)
                 ahead -= (ahead @ self.up) * self.up
                 place = contact + 0.4 * size * ahead / max(np.linalg.norm(ahead), 1e-9)
-            result.append(_Cluster(place, size, {t: inside}))
+            result.append(_Cluster(place, size, {t: inside}, radius))
         return result
 
     def _back_project(self, camera, columns, rows, z):
@@ -523,8 +536,8 @@ class _Search:
         visible = max(len(self._frames_near(cluster.place)), len(cluster.masks))
         order = tuple(sorted(cluster.masks, key=lambda t: -int(cluster.masks[t].sum())))
         place = cluster.place + 0.5 * cluster.size * self.up
-        probability = 0.4 + 0.55 * len(cluster.masks) / visible
-        return Change("new", -1, probability, order, np.eye(4), place, np.zeros_like(after), after)
+        probability = len(cluster.masks) / (visible + 0.5) * (1 - np.exp(1 - cluster.radius / 1.5))
+        return Change("new", -1, float(probability), order, np.eye(4), place, np.zeros_like(after), after)
 
 
 class _Fit(NamedTuple):
