@@ -162,7 +162,7 @@ def changes_page(changes: Changes) -> str:
             for image, mask in zip(images, (change.before[t], change.after[t]))
         ]
         pair = [report.figure(image, words) for image, words in zip(outlined, ("before", changes.capture.names[t]))]
-        title, _, words = _words(record).strip().partition(": ")
+        title, _, words = " ".join(_words(record).split()).partition(": ")
         cards.append(report.section(title, words, report.grid(pair, 2)))
     rest = [(r["name"], r["id"], r["kind"], r["probability"]) for r in records if r["kind"] in ("same", "not seen")]
     table = report.table(("object", "id", "", "probability"), rest)
