@@ -37,7 +37,7 @@ GONE_MARGIN = 0.25
 MIN_GAIN = 0.25
 """Cost that a moved object must take away at its new place, per pixel of its silhouette."""
 TURN_SHARE = 0.1
-"""Share of an object's pixels that the scene does not explain from which it may be turned."""
+"""Share of an object's pixels in two frames or more that the scene does not explain from which it may be turned."""
 MIN_TURN_GAIN = 0.035
 """Cost that a turn must take away, per pixel of the object, beyond what the unturned object does."""
 MIN_RADIUS = 2.0
@@ -244,7 +244,7 @@ def object_changes(
     search = _Search(gaussians, labels, views, up / np.linalg.norm(up), displaced)
     changes = [search.unmoved(k, seen[k], excess[k], differing[k]) for k in range(count)]
     shares = (known * differing).sum(1) / np.maximum(known.sum(1), 1e-9)
-    for k in np.flatnonzero(seen.any(1) & ~displaced & (shares >= TURN_SHARE)).tolist():
+    for k in np.flatnonzero((seen.sum(1) > 1) & ~displaced & (shares >= TURN_SHARE)).tolist():
         changes[k] = search.turned(changes[k])
     for k, change in search.moved().items():
         changes[k] = change
