@@ -47,7 +47,7 @@ def call(server, name, **arguments):
 
 def test_every_tool_has_a_schema_and_only_reads(server):
     tools = use(server, lambda client: client.list_tools()).tools
-    assert {tool.name for tool in tools} == {"find", "objects", "locate", "measure", "render"}
+    assert {tool.name for tool in tools} == {"find", "history", "objects", "locate", "measure", "render"}
     for tool in tools:
         assert tool.annotations.read_only_hint
         assert "field" in tool.input_schema["properties"]
