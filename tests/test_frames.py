@@ -126,7 +126,9 @@ def test_the_command_line_forgets_and_adds(field, room, tmp_path, capsys):
     noise = np.random.default_rng(0).integers(0, 256, (30, 40, 3), np.uint8)
     cv2.imwrite(str(photos / "elsewhere.png"), cv2.resize(noise, (160, 120)))
     assert run_cli("add", field, photos) == 2
-    assert "of its features agree" in capsys.readouterr().err
+    printed = capsys.readouterr().err
+    assert "broken.jpg" in printed
+    assert "of its features agree" in printed
     assert {path: path.read_bytes() for path in field.rglob("*.safetensors")} == before
     assert run_cli("add", field, room, "--out", tmp_path / "more") == 0
     assert name in open_scene(tmp_path / "more").field.names

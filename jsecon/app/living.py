@@ -11,9 +11,10 @@ from jsecon.app.scene import open_scene
 from jsecon.errors import InputError, join_first
 from jsecon.field.field import load_field
 from jsecon.field.ledger_file import load_ledger, remove_stale
-from jsecon.files import FIELD_FILE, exclusive_lock, is_output_folder, remove_files
+from jsecon.files import FIELD_FILE, exclusive_lock, remove_files
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console
+from jsecon.pipeline.stages import KEY_FILE
 
 
 def _add(verb: verbs.Add, console: Console) -> verbs.VerbResult:
@@ -21,7 +22,10 @@ def _add(verb: verbs.Add, console: Console) -> verbs.VerbResult:
     refused: list[InputError] = []
     with _changing(verb.field, verb.out) as path:
         scene = open_scene(verb.field, embedder=verb.embedder, console=console)
-        grown = scene.add(verb.photos, poses=verb.poses, masks=verb.masks, refused=refused, console=console)
+        try:
+            grown = scene.add(verb.photos, poses=verb.poses, masks=verb.masks, refused=refused, console=console)
+        except InputError as error:
+            return {"errors": [*refused, error]}
         with console.progress("write"):
             grown.save(path)
     added = [name for name in grown.field.names if name not in scene.field.names]
@@ -68,10 +72,11 @@ def _remove_traces(folder: Path) -> list[str]:
 
     names = [name for name in (*FILES[1:], FIRST_VIEW) if (folder / name).is_file()]
     remove_files(folder, names)
-    if is_output_folder(folder):
-        for place in [place for place in ("cache", "poses", "queries") if (folder / place).is_dir()]:
-            shutil.rmtree(folder / place)
-            names.append(f"{place}/")
+    cache = "cache/CACHEDIR.TAG"  # as of a run; beside it `jsecon demo` keeps pictures of its answers
+    marks = {"cache": cache, "queries": cache, "poses": f"poses/{KEY_FILE}"}
+    for place in [place for place, mark in marks.items() if (folder / mark).is_file() and (folder / place).is_dir()]:
+        shutil.rmtree(folder / place)
+        names.append(f"{place}/")
     return names
 
 
