@@ -30,7 +30,7 @@ def _add(verb: verbs.Add, console: Console) -> verbs.VerbResult:
             grown.save(path)
     added = [name for name in grown.field.names if name not in scene.field.names]
     opened = grown.field.regions.count - scene.field.regions.count
-    console.print_line(f"added   {len(added)} frames ({join_first(added)}), {opened} new regions\nfield   {path}")
+    console.print_line(f"added   {join_first(added)}; {opened} new regions\nfield   {path}")
     return {"written": [path], "added": added, "new_regions": opened, "errors": refused}
 
 
