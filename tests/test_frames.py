@@ -1,5 +1,6 @@
 """Photographs that are added to a field by `Scene.add` and the command line: poses, labels, what is refused."""
 
+import dataclasses
 import shutil
 
 import cv2
@@ -42,6 +43,12 @@ def test_a_photograph_finds_its_pose_by_those_of_the_field(bumpy_wall):
     pose, true = (np.asarray(c.world_to_camera, np.float64) for c in (found, cameras[2]))
     assert np.degrees(np.arccos(np.clip((np.trace(pose[:3, :3] @ true[:3, :3].T) - 1) / 2, -1, 1))) < 0.2
     assert np.linalg.norm(centre(pose) - centre(true)) < 0.01
+    moved = np.asarray(cameras.world_to_camera).copy()  # the photograph was taken where the world begins
+    moved[:, :3, 3] += moved[:, :3, :3] @ centre(true)
+    own = dataclasses.replace(scene, means=np.asarray(scene.means) - centre(true).astype(np.float32))
+    cameras_there = dataclasses.replace(cameras[others], world_to_camera=moved[others])
+    there, _ = find_pose(pictures[2], Landmarks(own, cameras_there, [pictures[t] for t in others]))
+    assert np.linalg.norm(centre(np.asarray(there.world_to_camera, np.float64))) < 0.01
     zoomed = cv2.resize(pictures[2][15:135, 20:180], (200, 150))  # another lens: 1.25 times the focal length
     found, _ = find_pose(zoomed, landmarks)
     assert float(found.fx) == pytest.approx(250, rel=0.02)

@@ -151,12 +151,12 @@ def _refine(
     is_free: bool,
 ) -> tuple[Float[np.ndarray, "4 4"], float]:
     """Refines a pose, and the zoom if it is free, by least squares of the distances in px, robustly."""
-    extent = np.abs(pose[:3, 3]).max()
+    away = np.median(np.linalg.norm(places @ pose[:3, :3].T + pose[:3, 3], axis=1))
 
     def moved(x: np.ndarray) -> tuple[np.ndarray, float]:
         result = pose.copy()
         result[:3, :3] = Rotation.from_rotvec(x[:3]).as_matrix() @ pose[:3, :3]
-        result[:3, 3] += x[3:6] * extent
+        result[:3, 3] += x[3:6] * away
         return result, zoom * float(np.exp(x[6:].sum()))
 
     def residuals(x: np.ndarray) -> np.ndarray:
