@@ -286,7 +286,8 @@ class _Search:
         self.discs = {k: _Discs(gaussians, np.flatnonzero(labels == k)) for k in np.flatnonzero(displaced).tolist()}
 
     def _middle(self, k: int) -> np.ndarray:
-        return np.median(self.means[self.labels == k], axis=0)
+        own = self.means[self.labels == k]
+        return np.median(own, axis=0) if len(own) else np.zeros(3)
 
     def silhouettes(self, k: int) -> np.ndarray:
         """(F, H, W) the pixels that an object makes up in the scene as it was."""
