@@ -92,7 +92,7 @@ def test_it_answers_before_its_fields_are_open_and_a_call_waits(server, monkeypa
     async def ask():
         async with Client(make_server(scenes)) as client:
             assert client.server_info.version == jsecon.__version__
-            assert len((await client.list_tools()).tools) == 5
+            assert len((await client.list_tools()).tools) == 6
             arguments = {"text": "red mug"}
             slow = await client.call_tool("find", arguments, progress_callback=heard)
             return slow, await client.call_tool("find", arguments | {"field": "broken"})
