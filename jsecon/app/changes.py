@@ -155,7 +155,7 @@ def changes_page(changes: Changes) -> str:
         shown = change.before if change.before.any() else change.after
         t = max(change.frames, key=lambda t: int(shown[t].sum() + change.after[t].sum()))
         camera = changes.capture.cameras[t]
-        images = pictures.render_picture(changes.field.gaussians, camera), changes.capture.frames[t]
+        images = pictures.render_picture(changes.field.gaussians, camera), np.asarray(changes.capture.frames[t])
         colour = COLOURS[change.kind]
         outlined = [
             pictures.outlined(image, mask, colour, 2)

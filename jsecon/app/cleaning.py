@@ -71,6 +71,7 @@ def _open(verb: verbs.Clean, field: Any, console: Console, progress: Progress) -
     else:
         source = transform_gaussians(field.gaussians, field.source_from_scene)
     if verb.capture is None:
+        assert field is not None
         return source, field.gaussians, field.cameras, None
     capture = load_capture(verb.capture, long_side=Options.long_side, progress=progress)
     placed, notes = place_in_capture(source, capture, verb.scene, None, progress)

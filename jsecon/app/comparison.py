@@ -142,11 +142,12 @@ def _new_name(name: str, date: str, known: tuple[str, ...]) -> str:
 def _new_thing(changes: Changes, change: Change, embedder: Embedder, names: dict[int, str]) -> NewThing:
     """The Gaussians and the embedding of something new, from the pixels that show it."""
     capture, field = changes.capture, changes.field
-    points, colours, total = [], [], 0.0
+    points, colours, total = [], [], np.zeros(())
     for t in change.frames:
         mask, frame = change.after[t], np.asarray(capture.frames[t])
         camera = jax.tree.map(lambda a, t=t: np.asarray(a)[t], capture.cameras)
-        points.append(_surface(mask, camera, change.place, None if capture.depths is None else capture.depths[t]))
+        depth = None if capture.depths is None else np.asarray(capture.depths[t])
+        points.append(_surface(mask, camera, change.place, depth))
         colours.append(frame[mask])
         total = total + mask.sum() * np.asarray(embedder.embed_regions(frame, mask[None]), np.float64)[0]
     gaussians = gaussians_from_points(np.concatenate(points), np.concatenate(colours), opacity=0.9, scale=0.6)

@@ -13,7 +13,7 @@ from jsecon.field.field import save_field
 from jsecon.files import write_text
 from jsecon.pipeline.progress import Console
 
-COLUMNS = ("a", "b", "surfaces", "centers", "gap", "angle", "unit")
+COLUMNS: tuple[str, ...] = ("a", "b", "surfaces", "centers", "gap", "angle", "unit")
 """columns of the CSV, values of `Scene.measure`"""
 
 

@@ -8,7 +8,7 @@ object that too few pixels see keeps its state: it is not seen, never gone. NumP
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import jax
@@ -114,7 +114,7 @@ class _View(NamedTuple):
         new[0][window] = np.where(inside[..., None], rgb, new[0][window])
         new[1][window] = np.where(inside, 1, new[1][window])
         new[2][window] = np.where(inside, z, behind)
-        new[3][window] = self.compare(*(a[window] for a in new[:3]), window)
+        new[3][window] = self.compare(*(a[window] for a in new[:3]), window=window)
         return self._replace(rgb=new[0], alpha=new[1], z=new[2], cost=new[3]), silhouette
 
 
@@ -384,7 +384,7 @@ class _Search:
         left = set(map(int, np.flatnonzero(self.displaced)))
         while left:
             clusters = self.clusters(min(2, len(self.views)))[:_MAX_PLACES]
-            places = [(None, cluster.place, cluster.size) for cluster in clusters]
+            places: list[Any] = [(None, cluster.place, cluster.size) for cluster in clusters]
             places += [(k, *self._stand(k)) for k in np.flatnonzero(self.displaced).tolist()]  # where others stood
             fits = [self._fit(k, *place) for k in left for other, *place in places if k != other]
             fits = [fit for fit in fits if fit is not None and fit.gain >= MIN_GAIN]

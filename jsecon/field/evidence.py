@@ -515,7 +515,7 @@ def add_evidence(
 def sum_views(views: Sequence[ViewEvidence], count: int, num_regions: int, *, by_view: bool = True) -> EvidenceSum:
     """Adds up the lists of views, before the cut to the strongest regions."""
     weights, *columns, overflow = zip(*_sum_blocks(views, count, num_regions, by_view))
-    return EvidenceSum(sparse.vstack(weights, "csr"), *map(np.concatenate, columns), overflow[0])
+    return EvidenceSum(sparse.vstack(weights, "csr"), *map(np.concatenate, columns), overflow=overflow[0])
 
 
 def pack_evidence(evidence: ViewEvidence, num_regions: int) -> UInt8[np.ndarray, " b"]:

@@ -147,7 +147,7 @@ def _build_field(field: LanguageField, ledger: Ledger, names: Collection[str]) -
         field,
         votes=normalise_votes(votes, Regions(embeddings, pixels)),
         regions=Regions(embeddings, all_pixels),
-        cameras=Camera(cameras[:, :16].reshape(-1, 4, 4), *cameras[:, 16:].T, width, height),
+        cameras=Camera(cameras[:, :16].reshape(-1, 4, 4), *cameras[:, 16:].T, width=width, height=height),
         names=tuple(ordered),
         **_grown_tree(field, count),
         codes=None,

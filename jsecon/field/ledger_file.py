@@ -44,7 +44,7 @@ def save_with_ledger(path: Path, field: LanguageField, ledger: Ledger | None) ->
         tree = pack_tree({"num_regions": ledger.num_regions, "views": views}, "", arrays)
         digest = hashlib.blake2b(json.dumps(tree, sort_keys=True).encode(), digest_size=12)
         for array in arrays.values():
-            digest.update(np.ascontiguousarray(array))
+            digest.update(np.ascontiguousarray(array).data)
         origin["ledger"] = digest.hexdigest()
     field = dataclasses.replace(field, provenance=json.dumps(origin, sort_keys=True))
     if ledger is not None and not ledger_file(path, field).is_file():

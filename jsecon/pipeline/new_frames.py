@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import cv2
 import jax
@@ -148,7 +148,7 @@ def make_views(
     `refuse` gets the error of each photograph that is unlike the scene.
     """
     options = parse_json(field.provenance).get("options", {})
-    centre = {"centre_pixel_weight": float(options.get("centre_pixel_weight", 0.0))}
+    centre: dict[str, Any] = {"centre_pixel_weight": float(options.get("centre_pixel_weight", 0.0))}
     propose = ClassicalSegmenter(**GRANULARITIES.get(options.get("granularity"), GRANULARITIES["medium"]))
     if masks is not None:
         size = field.cameras.height, field.cameras.width
@@ -179,7 +179,7 @@ def make_views(
         if new:  # the next frame may show them too
             own = evidence.matrix(len(owner), count)
             opened = own[:, old:count].multiply(1 / np.maximum(own.sum(1), 1e-9))
-            consensus = sparse.hstack([consensus, opened], "csr")
+            consensus = cast(Any, sparse.hstack([consensus, opened], "csr"))
         shown, areas = np.unique(labels[labels >= 0], return_counts=True)
         rows = np.asarray(embedder.embed_regions(pixels, labels[None] == shown[:, None, None]), np.float32)
         pixel_counts = np.stack([shown, areas]).astype(np.int32)

@@ -334,7 +334,7 @@ def _make_ledger(results: Results) -> Ledger:
     for t, (frame, evidence) in enumerate(zip(results.objects.frames, results.votes.evidence)):
         shown, rows = np.flatnonzero(regions.pixel_counts[:, t]), regions.embedded[:, 1] == t
         pixels = np.stack([shown, regions.pixel_counts[shown, t]]).astype(np.int32)
-        embedded = regions.embedded[rows, 0], regions.view_embeddings[rows]
+        embedded = np.asarray(regions.embedded[rows, 0]), np.asarray(regions.view_embeddings[rows])
         row, picture = camera_row(capture.cameras[frame]), encode_jpeg(np.asarray(capture.frames[frame]))
         views[capture.names[frame]] = LedgerView(evidence, pixels, *embedded, row, picture)
     return Ledger(regions.count, views)

@@ -8,6 +8,7 @@ no part in this, so they stay.
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any, cast
 
 import cv2
 import jax
@@ -51,11 +52,11 @@ class Landmarks:
     def lens(self, width: int, height: int) -> Camera:
         """Guesses the lens of a photograph: the median one of the views, its centre only for the same aspect."""
         poses, *numbers = (np.median(column, axis=0) for column in jax.tree.leaves(self.cameras))
-        usual = Camera(poses, *numbers, self.cameras.width, self.cameras.height)
+        usual = Camera(poses, *numbers, width=self.cameras.width, height=self.cameras.height)
         if same_aspect((width, height), (usual.width, usual.height)):
             return resize_camera(usual, width, height)
         focal = usual.fx * max(width, height) / max(usual.width, usual.height)
-        return Camera(poses, focal, focal, np.float32(width / 2), np.float32(height / 2), width, height)
+        return Camera(poses, focal, focal, *np.array([width / 2, height / 2], np.float32), width=width, height=height)
 
     def alike(self, photo: UInt8[np.ndarray, "h w 3"]) -> list[int]:
         """Lists the views, those whose picture looks most like a photograph first."""
@@ -96,7 +97,8 @@ def find_pose(photo: UInt8[np.ndarray, "h w 3"], landmarks: Landmarks) -> tuple[
             if done and len(inliers) > count:
                 pose = np.eye(4)
                 pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(motion[0])[0], motion[1].ravel()
-                count, best = len(inliers), (pose, zoom, rays[inliers.ravel()], places[inliers.ravel()])
+                own = inliers.ravel().astype(int)
+                count, best = len(own), (pose, zoom, rays[own], places[own])
         if count >= 3 * MIN_INLIERS:
             break
     if best is None or count < MIN_INLIERS:
@@ -173,7 +175,7 @@ def _flow_matches(
     """Matches a photograph with the scene rendered by a camera, by optical flow that leads back to where it began."""
     image = (np.clip(np.asarray(render_rgb(gaussians, camera).features), 0, 1) * 255).astype(np.uint8)
     rendered, real = (cv2.cvtColor(each, cv2.COLOR_RGB2GRAY) for each in (image, photo))
-    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    flow = cast(Any, cv2).DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     there, back = flow.calc(rendered, real, None), flow.calc(real, rendered, None)
     y, x = (axis.ravel() for axis in np.mgrid[2 : photo.shape[0] - 2 : 4, 2 : photo.shape[1] - 2 : 4])
     start = np.stack([x, y], 1).astype(np.float32)

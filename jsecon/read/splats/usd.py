@@ -43,7 +43,7 @@ def save_usda(
         for number in np.unique(objects):
             rows = np.flatnonzero(objects == number)
             own = {name: int(column[rows[0]]) for name, column in ids.items()}
-            name = names[number] if 0 <= number < len(names) else ""
+            name = names[int(number)] if 0 <= number < len(names) else ""
             word = re.sub(r"[^0-9A-Za-z]+", "_", name).strip("_")
             prim = "rest" if number < 0 else f"object_{number:03d}{'_' * bool(word)}{word}"
             data = [f"int {key} = {value}" for key, value in own.items()]
@@ -69,7 +69,7 @@ def _attributes(part: Gaussians) -> Iterator[str]:
         opacities = 1 / (1 + np.exp(-part.opacity_logits.astype(np.float64)))
     harmonics = "radiance:sphericalHarmonics"
     yield from _array("float3[] extent", extent)
-    yield from _array("point3f[] positions", part.means)
+    yield from _array("point3f[] positions", np.asarray(part.means))
     yield from _array("quatf[] orientations", unit)
     yield from _array("float3[] scales", np.exp(part.log_scales))
     yield from _array("float[] opacities", opacities)
