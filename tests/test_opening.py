@@ -91,7 +91,8 @@ def test_every_verb_takes_a_folder_or_a_splat(folder, tmp_path, capsys, monkeypa
     assert run_cli("objects", path) == 0
     lines = capsys.readouterr().out.splitlines()
     assert run_cli("export", path, "--objects", tmp_path / "objects") == 0
-    assert len(list((tmp_path / "objects").glob("*.ply"))) == sum("Gaussians" in line for line in lines if " at (" in line)
+    files = list((tmp_path / "objects").glob("*.ply"))
+    assert len(files) == sum("Gaussians" in line for line in lines if " at (" in line)
     assert run_cli("view", path, "--export", tmp_path / "page.html") == 0
     assert run_cli("eval", path, "--labels", tmp_path / "labels") == 2
     assert "labels" in capsys.readouterr().err
