@@ -43,6 +43,22 @@ def test_a_field_is_exported_in_every_format(saved, tmp_path, ending):
         np.testing.assert_allclose(load_gaussians(out).means, means, atol=2**-16)
 
 
+@pytest.mark.parametrize("embedder", ["colours-1", "clip-of-nowhere"])
+def test_a_scene_is_exported_without_names_where_they_cannot_be_had(saved, tmp_path, monkeypatch, capsys, embedder):
+    """The model of the names is not on this machine, or the field is larger than memory."""
+    field, _ = saved
+    save_field(tmp_path / "field.safetensors", dataclasses.replace(field, embedder=embedder))
+    if embedder == "colours-1":
+        monkeypatch.setenv("JSECON_MEMORY", "1e-9")
+        monkeypatch.setattr("jsecon.field.field.MAPPED", 1)
+    assert run_cli("export", tmp_path / "field.safetensors", "--out", tmp_path / "scene.ply") == 0
+    assert "no labels.json is written: " in capsys.readouterr().out
+    assert load_gaussians(tmp_path / "scene.ply").count == field.gaussians.count
+    assert not (tmp_path / "labels.json").exists()
+    if embedder != "colours-1":
+        assert run_cli("export", tmp_path / "field.safetensors", "--objects", tmp_path / "objects") == 2
+
+
 @pytest.mark.parametrize("ending", ["ply", "spz", "glb"])
 def test_a_selection_is_written_in_every_format_with_its_masks(saved, tmp_path, ending):
     field, file = saved

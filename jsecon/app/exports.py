@@ -15,6 +15,7 @@ from jsecon.app.records import decimals, unit_of
 from jsecon.app.scene import Scene, open_scene
 from jsecon.app.shapes import require_shapes_format, write_shapes
 from jsecon.errors import InputError
+from jsecon.field.columns import is_mapped
 from jsecon.files import remove_files, write_text
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console
@@ -87,13 +88,13 @@ def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
     mask = None if answer is None else ~answer.mask if verb.without is not None else answer.mask
     count = scene.field.gaussians.count if mask is None else int(mask.sum())
     result: verbs.VerbResult = {"written": {}, "gaussians": count}
+    has_labels = verb.out is not None and (verb.with_labels or verb.out.suffix.lower() == ".usda")
     with console.progress("objects"):
-        listed = scene.objects()
-        records = listed.records()
+        listed = _list_objects(scene, has_labels or verb.out is None or bool(verb.objects or verb.shapes), console)
+        records = [] if listed is None else listed.records()
     written = result["written"]
     with console.progress("files"):
         if verb.out is not None:
-            has_labels = verb.with_labels or verb.out.suffix.lower() == ".usda"
             scene.export(verb.out, mask, labels=listed if has_labels else None)
             result["bytes"] = verb.out.stat().st_size
             written["scene"] = verb.out
@@ -101,14 +102,29 @@ def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
         if verb.objects is not None:
             written["objects"] = _save_objects(scene, verb.objects)
             console.print_line(f"{len(written['objects'])} objects  {verb.objects}")
-        if verb.shapes is not None:
+        if verb.shapes is not None and listed is not None:
             written["shapes"] = write_shapes(scene, listed, records, verb.shapes)
             console.print_line(f"shapes  {verb.shapes}")
         files = [written.get("scene"), *written.get("objects", [])[:1], *written.get("shapes", [])[:1]]
-        written["labels"] = [folder / "labels.json" for folder in {file.parent: None for file in files if file}]
-        for file in written["labels"]:
-            _write_records(file, scene, listed, records)
+        if listed is not None:
+            written["labels"] = [folder / "labels.json" for folder in {file.parent: None for file in files if file}]
+            for file in written["labels"]:
+                _write_records(file, scene, listed, records)
     return result
+
+
+def _list_objects(scene: Scene, is_needed: bool, console: Console) -> Catalogue | None:
+    """Lists the objects; None with a note where an export can do without and they cannot be had."""
+    reason: Any = "the field is larger than memory"
+    if is_needed or not is_mapped(scene.field):
+        try:
+            return scene.objects()
+        except InputError as error:  # such as no model for the names
+            if is_needed:
+                raise
+            reason = error
+    console.note(f"no labels.json is written: {reason}")
+    return None
 
 
 def _check_export(verb: verbs.Export) -> None:
