@@ -23,17 +23,14 @@ from scipy.spatial.transform import Rotation
 
 from experiments import results
 from experiments.cells import append_cell, read_cells
-from experiments.relations import SRGB
+from experiments.relations import SRGB, field_of_masks
 from experiments.rooms.capture import look_at, room_cameras
 from experiments.rooms.raycast import render_views, trace_rays
 from experiments.rooms.room import Room, build_room, footprint_radius, place_object, scatter_circles
 from experiments.rooms.shapes import SHAPES
 from jsecon import Scene
 from jsecon.app.comparison import Changes
-from jsecon.field.evidence import region_votes
 from jsecon.field.field import load_field, save_field
-from jsecon.field.membership import normalise_votes
-from jsecon.field.regions import region_embeddings
 from jsecon.fit.depth import points_from_depth
 from jsecon.fit.start import gaussians_from_points
 from jsecon.query.render import HIDDEN_LOGIT
@@ -168,21 +165,7 @@ def room_field(room: Room, *, views: int = 16) -> LanguageField:
     scene = jax.tree.map(lambda a: np.concatenate([a, np.repeat(np.asarray(a)[:1], more, 0)]), scene)
     logits = np.where(np.arange(GAUSSIANS) < len(chosen), scene.opacity_logits, np.float32(HIDDEN_LOGIT))
     scene = dataclasses.replace(scene, opacity_logits=logits)
-    embedder = ColourEmbedder()
-    labels = np.asarray(instances, np.int16)
-    regions = region_embeddings(frames, labels, embedder.embed_regions, num_regions=len(room.objects))
-    votes = normalise_votes(region_votes(scene, cameras, labels, len(room.objects), by_view=True), regions)
-    return LanguageField(
-        gaussians=scene,
-        votes=votes,
-        regions=regions,
-        cameras=cameras,
-        canonical_phrases=np.asarray(embedder.canonical_phrases, np.float32),
-        source_from_scene=np.eye(4),
-        names=names,
-        embedder=embedder.name,
-        unrelated_words=np.asarray(embedder.unrelated_words, np.float16),
-    )
+    return field_of_masks(scene, cameras, frames, instances, len(room.objects))
 
 
 def photographs(seed: int, kind: str, count: int) -> dict[str, np.ndarray]:

@@ -48,7 +48,7 @@ from jsecon.field.membership import normalise_votes
 from jsecon.field.regions import region_embeddings
 from jsecon.fit.depth import points_from_depth
 from jsecon.fit.start import gaussians_from_points
-from jsecon.types import Camera, Capture, LanguageField
+from jsecon.types import Camera, Capture, Gaussians, LanguageField
 from jsecon.vision.colours import ColourEmbedder
 
 SRGB = {
@@ -341,10 +341,17 @@ def true_field(room: Room) -> LanguageField:
     close = (np.abs(cloud.points[:, :2]) < 0.75).all(1) & (cloud.points[:, 2] > -0.1)
     scene = gaussians_from_points(cloud.points[close], cloud.colors[close], opacity=0.9, scale=0.5, max_scale=0.02)
     scene, cameras = jax.tree.map(jnp.asarray, (scene, cameras))
+    return field_of_masks(scene, cameras, frames, instances, len(room.objects))
+
+
+def field_of_masks(
+    scene: Gaussians, cameras: Camera, frames: np.ndarray, instances: np.ndarray, count: int
+) -> LanguageField:
+    """The field of a scene whose views (T, H, W) show `count` instances, named by their colours."""
     embedder = ColourEmbedder()
     labels = np.asarray(instances, np.int16)
-    regions = region_embeddings(frames, labels, embedder.embed_regions, num_regions=len(room.objects))
-    votes = region_votes(scene, cameras, labels, len(room.objects), by_view=True)
+    regions = region_embeddings(frames, labels, embedder.embed_regions, num_regions=count)
+    votes = region_votes(scene, cameras, labels, count, by_view=True)
     votes = normalise_votes(votes, regions)
     return LanguageField(
         gaussians=scene,
@@ -353,7 +360,7 @@ def true_field(room: Room) -> LanguageField:
         cameras=cameras,
         canonical_phrases=np.asarray(embedder.canonical_phrases, np.float32),
         source_from_scene=np.eye(4),
-        names=names,
+        names=tuple(f"frame_{view + 1:05d}" for view in range(len(frames))),
         embedder=embedder.name,
         unrelated_words=np.asarray(embedder.unrelated_words, np.float16),
     )

@@ -18,7 +18,7 @@ for number, (name, *_) in enumerate(catalogue.names):
     mask = catalogue.labels == number
     if mask.any() and not catalogue.surroundings[number]:
         file = folder / f"{number:03d}.ply"
-        scene.export(file, mask)  # the Gaussians as they are: add-ons such as KIRI's or SplatForge's open them
+        scene.export(file, mask)  # for an add-on that opens Gaussians
         table[file.name] = {"name": name, "gaussians": int(mask.sum())}
 (folder / "names.json").write_text(json.dumps(table, indent=1))
 print(len(table), "objects in", folder)

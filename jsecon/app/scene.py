@@ -306,11 +306,14 @@ class Scene:
             field = forget_warnings(self.field, sorted(names))
             return self._with(*forget_views(field, self.ledger, names))
 
-    def _with(self, field: LanguageField, ledger: Ledger) -> "Scene":
-        """A scene of another state of the field."""
-        scene = Scene(field, self._embedder, up=self._up, name=self.name)
-        opened = {"embedder": self.embedder} if "embedder" in vars(self) else {}
-        vars(scene).update(opened, ledger=ledger)
+    def _with(self, field: LanguageField, ledger: Ledger | None = None) -> "Scene":
+        """A scene of another state of the field, with the same ledger if its provenance names one and none is given."""
+        is_same = ledger is None and "ledger" in parse_json(field.provenance)
+        scene = Scene(field, self._embedder, up=self._up, name=self.name, ledger=self._read_ledger if is_same else None)
+        kept = ("embedder", "ledger") if is_same else ("embedder",)
+        vars(scene).update({name: vars(self)[name] for name in kept if name in vars(self)})
+        if ledger is not None:
+            vars(scene)["ledger"] = ledger
         return scene
 
     def save(self, path: str | Path) -> None:
@@ -583,7 +586,7 @@ class Scene:
           metres: Length between the middles of the two, m, above 0.
 
         Returns:
-          A scene whose field knows its `metres_per_unit`; `save_field` keeps it.
+          A scene whose field knows its `metres_per_unit`; `save` keeps it.
 
         Raises:
           InputError: As for `measure`; or the two are one place.
@@ -593,8 +596,7 @@ class Scene:
         if not length > 0 or not metres > 0:
             problem = f"{metres:g} m are not the length between {a} and {b}, which are {length:g} units apart"
             raise InputError("scale", problem, remedy="Give two places and the length between them.")
-        field = dataclasses.replace(self.field, metres_per_unit=metres / length)
-        return Scene(field, self._embedder, up=self._up, name=self.name)
+        return self._with(dataclasses.replace(self.field, metres_per_unit=metres / length))
 
     @functools.cached_property
     def _catalogue(self) -> Catalogue:
@@ -654,7 +656,7 @@ class Scene:
         date = read_date(date)
         with self._lock:
             changes = self.changes(changes) if isinstance(changes, Capture) else changes
-            return self._at(apply_changes(changes, self.embedder, date))
+            return self._with(apply_changes(changes, self.embedder, date))
 
     def as_of(self, date: str) -> "Scene":
         """The scene as it was at the end of a date, such as "2026-11-01".
@@ -662,15 +664,11 @@ class Scene:
         Raises:
           InputError: The date is none.
         """
-        return self._at(field_as_of(self.field, read_date(date)))
+        return self._with(field_as_of(self.field, read_date(date)))
 
     def history(self) -> list[dict[str, Any]]:
         """Plain values of each change of the field since it was made, in order of time."""
         return events(self.field)
-
-    def _at(self, field: LanguageField) -> "Scene":
-        """A scene of another date."""
-        return Scene(field, self._embedder and self.embedder, up=self._up, name=self.name)
 
     def _answer_history(self, query: Query, kind: str) -> Answer:
         """Selects what moved, is gone or is new."""

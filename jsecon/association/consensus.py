@@ -36,8 +36,10 @@ SURFACE_WIDTH = 0.08
 """Distance from a plane at which pieces count as off it, as a share of the median depth: 12 cm in a small room."""
 LEAST_IN_PLANE = 8
 """Gaussians from which a piece has a plane: those of sparse scenes, of four Gaussians each, tore balls to shreds."""
-TREE_AGREEMENT, PART_AGREEMENT = 0.05, 0.9
-"""Probabilities of a common mask up to which objects, and above which parts of objects, are joined in the tree."""
+PART_AGREEMENT = 0.9
+"""Probability of a common mask from which pieces are one part of an object."""
+TREE_AGREEMENT = 0.05
+"""Probability of a common mask down to which objects are joined to unions in the tree."""
 NEW_NODE = 0.1
 """Share of its weight that a join must add to make a node of its own."""
 
