@@ -11,8 +11,13 @@ from small_field import lone_votes
 
 from experiments.rooms.writers import write_colmap
 from jsecon import InputError, LanguageField, Regions, Scene, load_field, save_field
+from jsecon.app.scene import open_scene
 from jsecon.change.detect import object_changes
-from jsecon.splat.render import render_rgb
+from jsecon.field.evidence import pack_evidence, view_evidence
+from jsecon.field.ledger import Ledger, LedgerView, add_views, camera_row
+from jsecon.field.ledger_file import save_with_ledger
+from jsecon.read.captures.images import encode_jpeg
+from jsecon.splat.render import render, render_rgb
 from jsecon.types import UpAxis
 from jsecon.vision.colours import ColourEmbedder
 
@@ -126,3 +131,58 @@ def test_an_updated_field_answers_as_things_are_now_and_as_they_were(eyes, tmp_p
         np.testing.assert_array_equal(then.ask(text).rows, old.ask(text).rows)
     with pytest.raises(InputError, match="before the last change"):
         new.update(capture, date="2026-11-01")
+
+
+def field_with_ledger(gaussians, labels, eyes, frames):
+    """The field that a run makes of three views, whose masks are the bars, and its ledger."""
+    embedder, views, things = ColourEmbedder(), {}, np.eye(4, dtype=np.float32)[labels] * (labels >= 0)[:, None]
+    for name, camera, frame in zip(("a", "b", "c"), eyes, frames):
+        shares = np.asarray(render(gaussians, camera, things, depth=True).features)
+        image = np.where(shares.max(-1) > 0.5, shares.argmax(-1), -1)
+        evidence = pack_evidence(view_evidence(gaussians, camera, image, 3), 3)
+        shown, pixels = np.unique(image[image >= 0], return_counts=True)
+        rows = embedder.embed_regions(frame, image[None] == shown[:, None, None])
+        pixels = np.stack([shown, pixels]).astype(np.int32)
+        views[name] = LedgerView(evidence, pixels, pixels[0], rows, camera_row(camera), encode_jpeg(frame))
+    empty = Regions(np.zeros((3, embedder.dim), np.float32), np.zeros((3, 0), np.int32))
+    votes = dataclasses.replace(lone_votes(np.maximum(labels, 0), 3), overlap=np.eye(3, dtype=np.float32))
+    words = embedder.canonical_phrases, np.eye(4), (), embedder.name
+    more = {"unrelated_words": embedder.unrelated_words, "up": UpAxis((0.0, 0.0, 1.0), "given")}
+    none = jax.tree.map(lambda a: np.asarray(a)[:0], eyes)
+    return add_views(LanguageField(gaussians, votes, empty, none, *words, **more), Ledger(3, {}), views)
+
+
+def test_frames_are_added_and_forgotten_after_an_update_and_it_is_updated_again(eyes, tmp_path):
+    before, labels = scene_of(red=PLACES["red"], blue=PLACES["blue"], green=PLACES["green"])
+    places = {"red": (-0.1, -0.05), "green": PLACES["green"], "orange": PLACES["orange"]}
+    after, later = scene_of(**places)[0], scene_of(**places | {"green": (0.35, 0.3)})[0]
+    path, names = tmp_path / "field.safetensors", ("d", "e", "f")
+    save_with_ledger(path, *field_with_ledger(before, labels, eyes, photographs(before, eyes)))
+    day2 = dataclasses.replace(capture_of(photographs(after, eyes), eyes, np.zeros(3, bool)), names=names)
+    open_scene(path).update(day2, date="2026-11-02").save(path)
+    updated = open_scene(path)
+    assert {*updated.ledger.views} == {"a", "b", "c", *names}
+    more = dataclasses.replace(day2, frames=day2.frames[:1], cameras=eyes[:1], names=("g",))
+    grown = updated.add(more)
+    for name in ("regions", "weights", "total", "views", "weight_where_region_visible"):
+        rebuilt, old = (np.asarray(getattr(s.field.votes, name)) for s in (grown.forget(["g"]), updated))
+        np.testing.assert_array_equal(rebuilt, old, err_msg=name)
+    for scene in (updated, grown, grown.forget(["d"])):
+        np.testing.assert_allclose(scene.ask("red").place.center[:2], places["red"], atol=0.03)
+        np.testing.assert_allclose(scene.ask("orange").place.center[:2], places["orange"], atol=0.06)
+        assert not scene.ask("blue").mask.any()
+    day3 = dataclasses.replace(day2, frames=photographs(later, eyes), names=("h", "i", "j"))
+    last = grown.update(day3, date="2026-11-03")
+    assert [(e["kind"], e["region"]) for e in last.history()] == [("moved", 0), ("gone", 1), ("new", 3), ("moved", 2)]
+    np.testing.assert_allclose(last.ask("green").place.center[:2], (0.35, 0.3), atol=0.03)
+    then = last.as_of("2026-11-01")
+    np.testing.assert_allclose(then.ask("blue").place.center[:2], PLACES["blue"], atol=0.03)
+    assert not then.ask("orange").mask.any()
+
+
+def test_what_too_little_shows_is_unsure_and_not_applied(eyes):
+    before, labels = scene_of(red=PLACES["red"], blue=PLACES["blue"])
+    frames = photographs(scene_of(red=PLACES["red"])[0], eyes)
+    gone = object_changes(before, labels, frames, eyes, up=UP)[1]
+    certain = object_changes(before, labels, frames, eyes, up=UP, min_probability=gone.probability + 0.001)[1]
+    assert (gone.kind, certain.kind, certain.suspected) == ("gone", "unsure", "gone")

@@ -61,7 +61,7 @@ def _compare(
         else:
             capture = load_capture(verb.photos, long_side=LONG_SIDE, holdout=0, progress=progress)
     with console.progress("changes"):
-        return scene, scene.changes(capture), refused
+        return scene, scene.changes(capture, min_probability=verb.min_probability), refused
 
 
 def _update(verb: verbs.Update, console: Console) -> verbs.VerbResult:
@@ -122,12 +122,14 @@ def _write_changes(changes: Changes, out: Path, console: Console) -> verbs.VerbR
 
 
 def _words(record: dict[str, Any]) -> str:
-    """Says what changed in a line."""
-    name = record["name"] or "something"
+    """Says in a line what changed, or what may have changed."""
+    name, doubt = record["name"] or "something", record.get("suspected")
     title = f"{record['kind']:>6}  {name}" + ("" if record["id"] is None else f" (object {record['id']})")
     places = [", ".join(f"{x:.2f}" for x in place) for place in (record["from"], record["to"]) if place is not None]
     words = f"from ({places[0]}) to ({places[1]})" if len(places) == 2 else f"at ({places[0]})"
-    if record["kind"] == "moved":
+    if doubt:
+        words = f"perhaps {doubt}, {words}; too little shows it"
+    if "moved" in (record["kind"], doubt):
         words += f", by {record['distance']:.2f}, turned by {record['turned_degrees']:.0f} degrees"
     return f"{title}: {words}, probability {record['probability']:.2f}, seen in {', '.join(record['frames'][:3])}"
 
@@ -136,12 +138,12 @@ def _table(records: list[dict[str, Any]]) -> str:
     """The records as CSV, a coordinate a column."""
     text = io.StringIO()
     ends = [f"{end}_{axis}" for end in ("from", "to") for axis in "xyz"]
-    names = ("kind", "name", "id", "region", "probability", "distance", "turned_degrees")
+    names = ("kind", "name", "id", "region", "probability", "suspected", "distance", "turned_degrees")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*names, *ends, "frames"])
     for record in records:
         places = [x for end in ("from", "to") for x in record[end] or ("", "", "")]
-        writer.writerow([*(record[name] for name in names), *places, " ".join(record["frames"])])
+        writer.writerow([*(record.get(name, "") for name in names), *places, " ".join(record["frames"])])
     return text.getvalue()
 
 
@@ -150,7 +152,7 @@ def changes_page(changes: Changes) -> str:
     records, cards = changes.records(), []
     plan = report.figure(_draw_plan(changes), "From above: blue moved, red gone, green new, brown another look.")
     for change, record in zip(changes.found, records):
-        if change.kind in ("same", "not seen") or not change.frames:
+        if change.kind not in COLOURS or not change.frames:
             continue
         shown = change.before if change.before.any() else change.after
         t = max(change.frames, key=lambda t: int(shown[t].sum() + change.after[t].sum()))
@@ -164,8 +166,12 @@ def changes_page(changes: Changes) -> str:
         pair = [report.figure(image, words) for image, words in zip(outlined, ("before", changes.capture.names[t]))]
         title, _, words = " ".join(_words(record).split()).partition(": ")
         cards.append(report.section(title, words, report.grid(pair, 2)))
-    rest = [(r["name"], r["id"], r["kind"], r["probability"]) for r in records if r["kind"] in ("same", "not seen")]
-    table = report.table(("object", "id", "", "probability"), rest)
+    rest = [
+        (r["name"], r["id"], r["kind"], r.get("suspected", ""), r["probability"])
+        for r in records
+        if r["kind"] not in COLOURS
+    ]
+    table = report.table(("object", "id", "", "perhaps", "probability"), rest)
     lead = f"{len(cards)} changes, {len(rest)} other objects, by {len(changes.capture.names)} photographs."
     parts = [report.section("Plan", "", report.grid([plan], 2)), *cards, report.section("Other objects", "", table)]
     return report.page("Changes", lead, parts)

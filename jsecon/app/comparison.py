@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +12,14 @@ import numpy as np
 from jsecon.app.catalogue import Catalogue
 from jsecon.app.records import rounded, source_points
 from jsecon.change.detect import Change, object_changes
-from jsecon.change.history import NewThing, add_frames, add_object, events, move_object, remove_object
+from jsecon.change.history import NewThing, add_frames, add_object, events, move_object, new_view, remove_object
 from jsecon.errors import InputError
 from jsecon.field.ledger import Ledger
-from jsecon.files import parse_json
 from jsecon.fit.resize import resize_camera, resize_frame, shrink_cameras
 from jsecon.fit.start import gaussians_from_points
 from jsecon.pipeline.scene_files import read_scene
 from jsecon.read.captures.frames import evenly_spaced, transform_poses
+from jsecon.read.captures.images import encode_jpeg
 from jsecon.splat.render import render_depth
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Camera, Capture, Gaussians, LanguageField, Progress
@@ -56,17 +55,19 @@ class Changes:
 
     def _record(self, change: Change) -> dict[str, Any]:
         field, listed = self.field, self.catalogue
-        record: dict[str, Any] = {"kind": change.kind, "probability": round(change.probability, 3)}
+        kinds = {"kind": change.kind} | ({"suspected": change.suspected} if change.suspected else {})
+        record: dict[str, Any] = kinds | {"probability": round(change.probability, 3)}
         name = str(listed.names[change.object, 0]) if change.object >= 0 else ""
         ids = {"id": change.object, "region": main_region(field, listed, change.object)} if change.object >= 0 else {}
         record |= {"name": name} | ({"id": None, "region": None} | ids)
         now = source_points(field, change.place[None])[0]
         start = now
-        if change.kind == "moved":
+        if "moved" in (change.kind, change.suspected):
             inverse = np.linalg.inv(change.motion)
             start = source_points(field, (change.place @ inverse[:3, :3].T + inverse[:3, 3])[None])[0]
-        record["from"] = None if change.kind == "new" else rounded(start, 1.0)
-        record["to"] = None if change.kind in ("gone", "not seen") else rounded(now, 1.0)
+        kind = change.suspected or change.kind
+        record["from"] = None if kind == "new" else rounded(start, 1.0)
+        record["to"] = None if kind in ("gone", "not seen") else rounded(now, 1.0)
         record["distance"] = round(float(np.linalg.norm(now - start)), 4)
         cosine = (np.trace(change.motion[:3, :3]) - 1) / 2
         record["turned_degrees"] = round(float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))), 1)
@@ -81,7 +82,7 @@ def main_region(field: LanguageField, catalogue: Catalogue, index: int) -> int:
     return int(own[pixels.argmax()]) if len(own) else -1
 
 
-def find_changes(field: LanguageField, listed: Catalogue, capture: Capture) -> Changes:
+def find_changes(field: LanguageField, listed: Catalogue, capture: Capture, min_probability: float) -> Changes:
     """Compares a field with a capture whose poses are in the world of the field's own capture."""
     world = np.linalg.inv(np.asarray(field.source_from_scene, np.float64)) @ np.asarray(capture.source_from_scene)
     poses = transform_poses(np.asarray(capture.cameras.world_to_camera), world).astype(np.float32)
@@ -96,14 +97,19 @@ def find_changes(field: LanguageField, listed: Catalogue, capture: Capture) -> C
     things = np.append(~listed.surroundings, False)
     labels = np.where(things[listed.labels], listed.labels, -1)
     up = np.array(field_up(field).axis)
-    found = object_changes(field.gaussians, labels, frames, cameras, depths, up=up)
+    found = object_changes(field.gaussians, labels, frames, cameras, depths, up=up, min_probability=min_probability)
     kept = [change for change in found if change.object < 0 or (labels == change.object).any()]
     capture = dataclasses.replace(capture, frames=frames, cameras=cameras, depths=depths)
     return Changes(field, listed, capture, tuple(kept))
 
 
-def apply_changes(changes: Changes, embedder: Embedder, date: str) -> LanguageField:
-    """Applies changes to their field, with a date: what moved moves, what is gone is absent, what is new is added."""
+def apply_changes(
+    changes: Changes, embedder: Embedder, date: str, ledger: Ledger | None
+) -> tuple[LanguageField, Ledger | None]:
+    """Applies changes to their field, with a date: what moved moves, what is gone is absent, what is new is added.
+
+    The ledger keeps the evidence of all views: of which region a Gaussian is stays true, also if it moves.
+    """
     field, listed = changes.field, changes.catalogue
     if (known := [event["date"] for event in events(field)]) and date < known[-1]:
         raise InputError("--date", f"{date} is before the last change of the field, {known[-1]}", remedy="Check it.")
@@ -128,9 +134,13 @@ def apply_changes(changes: Changes, embedder: Embedder, date: str) -> LanguageFi
             field = remove_object(field, mask & False, (), description)
         elif change.kind == "new" and change.frames:
             field = add_object(field, _new_thing(changes, change, embedder, names), description)
-    origin = parse_json(field.provenance)
-    origin.pop("ledger", None)  # whose regions and Gaussians are others
-    return dataclasses.replace(field, provenance=json.dumps(origin, sort_keys=True))
+    if ledger is None:
+        return field, None
+    views = {}
+    for t, name in names.items():
+        camera = jax.tree.map(np.asarray, field.cameras)[field.names.index(name)]
+        views[name] = new_view(field, name, encode_jpeg(resize_frame(changes.capture.frames[t], camera)))
+    return field, Ledger(field.regions.count, {**ledger.views, **views})
 
 
 def _new_name(name: str, date: str, known: tuple[str, ...]) -> str:

@@ -24,6 +24,7 @@ from jsecon.app.comparison import Changes, apply_changes, find_changes
 from jsecon.app.object_index import ObjectIndex, choose_shades
 from jsecon.app.opening import locate_field, name_fields
 from jsecon.app.records import Answer, At, Box, Mask, Query, Question, Region, gaussian_rows
+from jsecon.change import MIN_PROBABILITY
 from jsecon.change.history import change_question, events, field_as_of, read_date
 from jsecon.errors import InputError
 from jsecon.field.columns import is_mapped
@@ -325,9 +326,13 @@ class Scene:
         Raises:
           InputError: The folder cannot be written.
         """
-        path, has_ledger = Path(path), "ledger" in vars(self) or "ledger" in parse_json(self.field.provenance)
-        ledger = self.ledger if has_ledger else None
-        save_with_ledger(path, move_hints(self.field, path.parent), ledger)
+        path = Path(path)
+        save_with_ledger(path, move_hints(self.field, path.parent), self._kept_ledger())
+
+    def _kept_ledger(self) -> Ledger | None:
+        """The ledger, None if the field has none."""
+        has_ledger = "ledger" in vars(self) or "ledger" in parse_json(self.field.provenance)
+        return self.ledger if has_ledger else None
 
     def _require_memory(self, what: str) -> None:
         """Raises InputError if the field is mapped, which `what` needs in memory."""
@@ -620,13 +625,15 @@ class Scene:
                 return self._catalogue
             return objects(self.field, vocabulary, self.embedder, up=self._up)
 
-    def changes(self, capture: Capture) -> Changes:
+    def changes(self, capture: Capture, *, min_probability: float = MIN_PROBABILITY) -> Changes:
         """Finds what became of each object, and what is new, in new photographs.
 
-        An object is the same, moved, gone, of another look, or not seen. Light, shadows and exposure are no changes.
+        An object is the same, moved, gone, of another look, unsure or not seen. Light, shadows and exposure are no
+        changes.
 
         Args:
           capture: The photographs, with poses in the world of the field's own capture, and with depth if there is any.
+          min_probability: Probability of what became of an object below which it is "unsure", and no change.
 
         Returns:
           The changes; `records()` has plain values.
@@ -636,12 +643,12 @@ class Scene:
         """
         with self._lock:
             self._require_memory("a comparison")
-            return find_changes(self.field, self._catalogue, capture)
+            return find_changes(self.field, self._catalogue, capture, min_probability)
 
     def update(self, changes: Capture | Changes, *, date: str) -> "Scene":
         """Applies what changed: objects move or are gone, and new ones come. Ids of regions stay.
 
-        The field's history keeps what it was (`as_of`, `history`). The new scene has no ledger of its views.
+        The field's history keeps what it was (`as_of`, `history`). What is unsure stays as it is.
 
         Args:
           changes: What `changes` returned, or the photographs.
@@ -656,7 +663,7 @@ class Scene:
         date = read_date(date)
         with self._lock:
             changes = self.changes(changes) if isinstance(changes, Capture) else changes
-            return self._with(apply_changes(changes, self.embedder, date))
+            return self._with(*apply_changes(changes, self.embedder, date, self._kept_ledger()))
 
     def as_of(self, date: str) -> "Scene":
         """The scene as it was at the end of a date, such as "2026-11-01".

@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeAlias, TypeVar
 
 from tyro.conf import Positional, UseAppendAction, arg
 
+from jsecon.change import MIN_PROBABILITY
 from jsecon.networks.hub import Role
 from jsecon.pipeline.options import (
     BareOptions,
@@ -339,45 +340,55 @@ class Export(_FieldVerb):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Changes(_FieldVerb):
-    """Finds what moved, is gone or is new in new photographs of a field's place.
-
-    Writes changes.json, changes.csv, and changes.html with pictures before and after and a plan from above. Each object
-    is the same, moved, gone, of another look, or not seen; each change has a probability, and the frames that prove it.
-    Light, shadows and exposure are no changes. Walls, floors and the like do not change.
+class _ChangesVerb(_FieldVerb):
+    """Options of the verbs that find changes.
 
     Attributes:
       photos: A capture with poses in the world of the field's own capture, with or without depth, in any format of
-        jsecon run; photographs without poses, which are placed as by jsecon add; or another file of Gaussians of the
-        same place.
+        jsecon run; photographs without poses, which are placed as by jsecon add; or, for jsecon changes, another file
+        of Gaussians of the same place.
+      min_probability: Probability of what became of an object below which it is unsure, and no change.
+    """
+
+    photos: Positional[Path]
+    min_probability: Annotated[Option[float], Range(0, 1)] = MIN_PROBABILITY
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Changes(_ChangesVerb):
+    """Finds what moved, is gone or is new in new photographs of a field's place.
+
+    Writes changes.json, changes.csv, and changes.html with pictures before and after and a plan from above. Each object
+    is the same, moved, gone, of another look, unsure, or not seen, with a probability, and the frames that prove it.
+    Light, shadows and exposure are no changes. Walls, floors and the like do not change.
+
+    Attributes:
       out: Output folder.
       transform: Text file with a 4x4 similarity from the world of that file of Gaussians to the field's capture.
     """
 
     examples = ("jsecon changes my_field/field.safetensors new_capture --out changes",)
 
-    photos: Positional[Path]
     out: Option[Path] = Path("changes")
     transform: Option[Path | None] = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Update(_FieldVerb):
+class Update(_ChangesVerb):
     """Applies what changed in new photographs to a field, whose history keeps what was.
 
     An object that moved keeps its region and goes to its new place. One that is gone is transparent and answers no
     query. A new one gets Gaussians and the next region. `jsecon query --as-of DATE` asks the field as it was, and "what
-    moved", "what is gone" and "what is new" ask for its changes. Also writes the files of jsecon changes.
+    moved", "what is gone" and "what is new" ask for its changes. What is unsure stays as it was. The files of jsecon
+    changes are written too.
 
     Attributes:
-      photos: A capture or photographs, as for jsecon changes.
       out: Folder for the new field. Without it, the field is replaced.
       date: Date of the photographs, such as 2026-11-28. By default it is that of their EXIF data, else today.
     """
 
     examples = ("jsecon update my_field new_capture --out my_field_2 --date 2026-11-28",)
 
-    photos: Positional[Path]
     out: Option[Path | None] = None
     date: Option[str | None] = None
 

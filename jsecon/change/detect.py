@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial.transform import Rotation
 
+from jsecon.change import MIN_PROBABILITY
 from jsecon.change.compare import colour_cost, depth_cost, find_shift, fit_exposure, shifted
 from jsecon.errors import InputError, require_shape
 from jsecon.field.evidence import view_evidence
@@ -24,8 +25,8 @@ from jsecon.splat.render import render, render_rgb
 from jsecon.splat.sh import C0
 from jsecon.types import Camera, Gaussians
 
-KINDS = ("same", "moved", "gone", "new", "look", "not seen")
-"""What became of an object; "look": it stands where it was and looks another way."""
+KINDS = ("same", "moved", "gone", "new", "look", "unsure", "not seen")
+"""What became of an object; "look": it stands where it was and looks another way; "unsure": too little shows it."""
 MIN_EXPLAINED = 0.3
 """Share of a photograph's pixels that the scene must explain, or it shows another place."""
 MIN_PIXELS = 14.0
@@ -72,6 +73,8 @@ class Change:
     """(F, H, W) bool pixels where the object would be seen had nothing changed."""
     after: np.ndarray
     """(F, H, W) bool pixels where it is seen now."""
+    suspected: str = ""
+    """The likeliest kind where `kind` is "unsure"."""
 
 
 class _View(NamedTuple):
@@ -206,6 +209,7 @@ def object_changes(
     depths: Float[np.ndarray, "f h w"] | None = None,
     *,
     up: Float[np.ndarray, " 3"],
+    min_probability: float = MIN_PROBABILITY,
 ) -> list[Change]:
     """Finds what became of each object of a scene, and what is new, in new photographs.
 
@@ -216,6 +220,7 @@ def object_changes(
       cameras: Batch of F cameras in the scene's world.
       depths: z-depth of the photographs, world units, 0 = unknown.
       up: Up axis of the scene's world, unit length.
+      min_probability: Probability of a kind below which it is "unsure".
 
     Returns:
       A change for each of the K objects, in order, then the new ones.
@@ -252,7 +257,13 @@ def object_changes(
     for k in np.flatnonzero(displaced).tolist():
         if changes[k].kind != "moved":
             changes[k], clusters = search.gone(k, seen[k], clusters)
-    return changes + [search.new(cluster) for cluster in clusters]
+    changes += [search.new(cluster) for cluster in clusters]
+    return [
+        dataclasses.replace(change, kind="unsure", suspected=change.kind)
+        if change.probability < min_probability
+        else change
+        for change in changes
+    ]
 
 
 class _Cluster(NamedTuple):

@@ -14,9 +14,12 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
 from jsecon.errors import InputError
+from jsecon.field.evidence import ViewEvidence, pack_evidence
+from jsecon.field.ledger import LedgerView, camera_row
+from jsecon.files import parse_json
 from jsecon.query.render import HIDDEN_LOGIT
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Camera, Event, Gaussians, LanguageField
@@ -28,6 +31,10 @@ _QUESTION = re.compile(
 )
 _KINDS = {"moved": "moved", "changed": ""} | dict.fromkeys(("new", "added", "appeared"), "new")
 _KINDS |= dict.fromkeys(("gone", "missing", "disappeared", "removed"), "gone")
+
+
+_WEIGHT, _PEAK = np.float32(4.0), np.float32(0.9)
+"""Weight of a Gaussian of a new thing in each frame that shows it, px, and the largest at a pixel."""
 
 
 class NewThing(NamedTuple):
@@ -114,11 +121,11 @@ def add_object(field: LanguageField, thing: NewThing, description: dict[str, Any
     count, number = thing.gaussians.count, field.regions.count
     first, views = field.gaussians.count, np.full(count, len(thing.pixel_counts), np.int32)
     votes, width = field.votes, field.votes.regions.shape[1]
-    weight = np.full(count, 4.0 * len(thing.pixel_counts), np.float32)
+    weight = _WEIGHT * views.astype(np.float32)
     regions, weights = np.full((count, width), -1, np.int32), np.zeros((count, width), np.float32)
     regions[:, 0], weights[:, 0] = number, weight
     columns = {"regions": regions, "weights": weights, "labelled": weight, "total": weight, "views": views}
-    columns |= {"max_pixel_weight": np.full(count, 0.9, np.float32), "weight_where_region_visible": weights}
+    columns |= {"max_pixel_weight": np.full(count, _PEAK), "weight_where_region_visible": weights}
     grown = {
         name: np.concatenate([np.asarray(getattr(votes, name)), column])
         for name, column in columns.items()
@@ -166,6 +173,20 @@ def add_frames(field: LanguageField, cameras: Camera, names: Sequence[str]) -> L
     return dataclasses.replace(field, cameras=both, regions=regions, names=(*field.names, *names))
 
 
+def new_view(field: LanguageField, name: str, picture: UInt8[np.ndarray, " j"]) -> LedgerView:
+    """What a frame of `add_frames` contributes: the votes that `add_object` gave the new things in it."""
+    t, votes, regions = field.names.index(name), field.votes, field.regions
+    shown = np.flatnonzero(np.asarray(regions.pixel_counts)[:, t]).astype(np.int32)
+    rows = np.flatnonzero(np.isin(votes.regions[:, 0], shown)).astype(np.int32)
+    columns = np.asarray(votes.regions)[rows, 0], np.full(len(rows), _WEIGHT), np.full(len(rows), _PEAK)
+    packed = pack_evidence(ViewEvidence(rows, np.arange(len(rows) + 1, dtype=np.int32), *columns), regions.count)
+    pixels, camera = (
+        np.stack([shown, np.asarray(regions.pixel_counts)[shown, t]]),
+        jax.tree.map(np.asarray, field.cameras)[t],
+    )
+    return LedgerView(packed, pixels, shown, np.asarray(regions.embeddings)[shown], camera_row(camera), picture)
+
+
 def events(field: LanguageField) -> list[dict[str, Any]]:
     """The descriptions of a field's events, in order of time."""
     return [json.loads(event.description) for event in field.history]
@@ -177,4 +198,6 @@ def field_as_of(field: LanguageField, date: str) -> LanguageField:
     kept = sum(known[: len(date)] <= date for known in dates)
     for event in reversed(field.history[kept:]):
         field = _patched(field, event)
-    return dataclasses.replace(field, history=field.history[:kept])
+    origin = parse_json(field.provenance)
+    origin.pop("ledger", None)  # which knows only what is there now
+    return dataclasses.replace(field, history=field.history[:kept], provenance=json.dumps(origin, sort_keys=True))

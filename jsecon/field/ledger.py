@@ -8,6 +8,7 @@ the sum before the cut, which a ledger keeps once it is known.
 """
 
 import dataclasses
+import json
 import re
 from collections.abc import Collection, Mapping
 from typing import NamedTuple
@@ -152,7 +153,25 @@ def _build_field(field: LanguageField, ledger: Ledger, names: Collection[str]) -
         **_grown_tree(field, count),
         codes=None,
     )
-    return new, ledger
+    return _with_history(new), ledger
+
+
+def _with_history(field: LanguageField) -> LanguageField:
+    """Makes absent what the history says is gone; events that restore it get what the ledger's views say of it."""
+    views, embeddings, events = np.array(field.votes.views), np.array(field.regions.embeddings), []
+    kinds = [json.loads(event.description)["kind"] for event in field.history]
+    for event, kind in zip(field.history, kinds):
+        before = {"views": views[event.rows], "embeddings": embeddings[event.regions]}
+        before = {name: column * (kind != "new") for name, column in before.items()}
+        events.append(dataclasses.replace(event, **before))
+    for event, kind in zip(field.history, kinds):
+        if kind == "gone":
+            views[event.rows], embeddings[event.regions] = 0, 0
+    votes, regions = (
+        dataclasses.replace(field.votes, views=views),
+        dataclasses.replace(field.regions, embeddings=embeddings),
+    )
+    return dataclasses.replace(field, votes=votes, regions=regions, history=tuple(events))
 
 
 def _grown_tree(field: LanguageField, count: int) -> dict[str, np.ndarray]:

@@ -157,10 +157,13 @@ def make_views(
     gaussians = jax.device_put(replace(field.gaussians, sh=None))  # as a run's, whose programs are compiled
     votes, views = jax.tree.map(np.asarray, field.votes), {}
     held = (votes.labelled >= LABELLED_PART * SHARE_THRESHOLD * votes.total) & (votes.views > 0)
-    owner = np.where(held, votes.regions[:, 0], -1)
+    strongest, uncovered = votes.regions[:, 0], np.zeros(len(held), bool)
+    for event in field.history:  # what lay behind a thing that went has the votes of that thing's pixels
+        uncovered |= np.isin(strongest, strongest[event.rows]) & ~np.isin(np.arange(len(held)), event.rows)
+    owner = np.where(held & ~uncovered, strongest, -1)
     # Without masks from outside, leftovers that many views left without a region stay so.
     unknown = (owner < 0) if masks is not None else votes.views == 0
-    consensus = _consensus(votes)
+    consensus = cast(Any, sparse.diags_array(~uncovered * 1.0) @ _consensus(votes))
     for done, (name, (pixels, camera)) in enumerate(frames.items()):
         batch = jax.tree.map(lambda a: np.asarray(a)[None], camera)
         scene = SceneSuperpixels(gaussians, batch, [propose(pixels, done)], **centre)
