@@ -158,3 +158,20 @@ def test_the_ci_runs_exactly_the_second_command():
     ).stdout  # fmt: skip
     assert found == _blocks("bash", (HOME / "README.md").read_text())[1]
     assert os.access(HOME / ".ci" / "run", os.X_OK)
+
+
+def test_a_figure_that_differs_from_its_results_or_has_no_source_is_named(tmp_path):
+    results = "experiments/results/lerf"
+    files = {
+        f"{results}/metrics.json": '{"ours": 0.85}',
+        f"{results}/table.md": "",
+        "README.md": "It has 0.84\nin 12 s.\n",
+    }
+    files["docs/figures.csv"] = "figure,pages,kind,source\n0.84,README.md,result,lerf['ours']\n"
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    assert runpy.run_path(str(HOME / "docs/check_figures.py"))["faults"](tmp_path) == [
+        "README.md:1: 0.84 is 0.85 by lerf['ours']",
+        "README.md:2: no row of docs/figures.csv has 12 s",
+    ]
