@@ -8,7 +8,7 @@ Walls, floor and table top are painted and lit once, so that their shadows are t
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Float, Float32, Int16, UInt8
@@ -296,9 +296,27 @@ _OFFSETS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 """Offsets from the pixel's centre of the rays that are averaged to its colour, px."""
 
 
+@dataclasses.dataclass(frozen=True)
+class PanoramaCamera:
+    """Pose of an equirectangular image: its middle looks along z, its rows and columns are equal steps of angles."""
+
+    world_to_camera: np.ndarray
+    width: int
+    height: int
+
+
 def _rays(camera, dx, dy):
-    """World origin (3,) and directions (3, H * W). Their camera z is 1, so that ray parameters are z-depths."""
+    """World origin (3,) and directions (3, H * W). Their camera z is 1, so that ray parameters are z-depths.
+
+    Directions of a panorama have length 1, and the parameters are distances.
+    """
     pose = np.asarray(camera.world_to_camera, np.float32)
+    if isinstance(camera, PanoramaCamera):
+        longitude = 2 * np.pi * ((np.arange(camera.width) + 0.5 + dx) / camera.width - 0.5)
+        latitude = np.pi * ((np.arange(camera.height) + 0.5 + dy) / camera.height - 0.5)[:, None]
+        x, z = np.cos(latitude) * np.sin(longitude), np.cos(latitude) * np.cos(longitude)
+        local = np.stack([x, np.broadcast_to(np.sin(latitude), x.shape), z]).reshape(3, -1).astype(np.float32)
+        return -pose[:3, :3].T @ pose[:3, 3], pose[:3, :3].T @ local
     x = (np.arange(camera.width, dtype=np.float32) + np.float32(0.5 + dx) - float(camera.cx)) / float(camera.fx)
     y = (np.arange(camera.height, dtype=np.float32) + np.float32(0.5 + dy) - float(camera.cy)) / float(camera.fy)
     x, y = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
@@ -311,6 +329,16 @@ def _window(camera, bound):
     pose = np.asarray(camera.world_to_camera, np.float64)
     x, y, z = pose[:3, :3] @ bound[:3] + pose[:3, 3]
     r = float(bound[3])
+    if isinstance(camera, PanoramaCamera):
+        distance, level = np.sqrt(x * x + y * y + z * z), np.hypot(x, z)
+        half = np.arcsin(min(r / distance, 1.0))
+        rows, columns = ((np.arctan2(y, level) + sign * half) / np.pi + 0.5 for sign in (-1, 1)), slice(None)
+        if r < level:
+            wide = np.arcsin(r / level) / (2 * np.pi)
+            low, high = ((np.arctan2(x, z) / (2 * np.pi) + 0.5 + sign * wide) * camera.width for sign in (-1, 1))
+            columns = slice(int(low) - 1, int(high) + 2) if low > 1 and high < camera.width - 1 else columns
+        low, high = (row * camera.height for row in rows)
+        return slice(max(int(low) - 1, 0), int(high) + 2), columns
     if z + r <= 0:
         return slice(0, 0), slice(0, 0)
     if z <= 1.01 * r:
@@ -324,7 +352,7 @@ def _window(camera, bound):
 
 
 def trace_rays(
-    room: Room, camera: Camera, *, dx: float = 0.0, dy: float = 0.0
+    room: Room, camera: Camera | PanoramaCamera, *, dx: float = 0.0, dy: float = 0.0
 ) -> tuple[Float32[np.ndarray, "h w"], Int16[np.ndarray, "h w"]]:
     """Traces one ray through each pixel.
 
@@ -413,23 +441,23 @@ def _linear_to_srgb(rgb: Float[np.ndarray, "... 3"]) -> UInt8[np.ndarray, "... 3
 
 
 def render_views(
-    room: Room, cameras: Camera, *, coarser: int = 1, progress: Progress | None = None
+    room: Room, cameras: Camera | Sequence[PanoramaCamera], *, coarser: int = 1, progress: Progress | None = None
 ) -> tuple[UInt8[np.ndarray, "t h w 3"], Int16[np.ndarray, "t h w"], Float32[np.ndarray, "t h w"]]:
     """Renders a room.
 
     Args:
       room: The room.
-      cameras: T cameras inside the room (leading batch axis).
+      cameras: T cameras inside the room (leading batch axis), or panoramas.
       coarser: Factor on the texels of walls, floor and table (`bake_room`).
       progress: Called with the number of finished views and T.
 
     Returns:
-      Frames, instances (index of the object, -1 = background) and z-depths (m).
+      Frames, instances (index of the object, -1 = background) and z-depths (m; distances in panoramas).
     """
     baked = bake_room(room, coarser=coarser)
     lamps = room.lamp_points
     owners = np.array([part.owner for part in room.parts] + [-1], np.int16)
-    count = int(np.asarray(cameras.fx).shape[0])
+    count = len(cameras)
     frames, instances, depths = [], [], []
     for view in range(count):
         camera = cameras[view]

@@ -94,10 +94,13 @@ class InputOptions:
         files, of its poses, of a dataparser_transforms.json near it, or the one that gsplat or nerfstudio normalise
         to: jsecon renders a few frames to find out, and warns if none fits. Without it, Gaussians are fitted to the
         frames.
+      panoramas: Tells that the photographs, or the video, without poses show all directions (360 degrees,
+        equirectangular). Needed only where their files do not say so.
     """
 
     capture: tyro.conf.Positional[Path]
     gaussians: Option[Path | None] = None
+    panoramas: Option[bool] = False
 
 
 @dataclasses.dataclass(frozen=True)

@@ -38,8 +38,10 @@ from jsecon.read.captures.frames import (
     transform_poses,
     usable_images,
 )
+from jsecon.read.captures.lens import PANORAMA, undistorted_pinhole
 from jsecon.read.captures.nerfstudio import source_from_trained
-from jsecon.read.captures.video import DEFAULT_VIDEO_FRAMES, is_video, write_frames
+from jsecon.read.captures.panoramas import find_panoramas
+from jsecon.read.captures.video import DEFAULT_VIDEO_FRAMES, is_panorama_video, is_video, write_frames
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Camera, Capture, Gaussians, Progress, UpAxis
 from jsecon.views.capture import render_capture
@@ -59,17 +61,24 @@ _LEAST_USABLE, _LEAST_COVERAGE = 0.8, 0.7
 def plan_capture(context: RunContext) -> list[Stage]:
     """Plans the capture, and before it the poses if there are photographs or a video without poses."""
     options, capture = context.options, context.options.capture
+    files, notes = unposed_photographs(capture)
+    if options.panoramas and not files and not is_video(capture):
+        problem = "the input is no folder of photographs without poses, and no video"
+        raise InputError("--panoramas", problem, remedy="Leave it out: the camera model of a capture names panoramas.")
     if is_bare_scene(capture):
         return [_plan_rendered_views(context)]
     if is_video(capture):
         what = f"the {options.frames or DEFAULT_VIDEO_FRAMES} sharpest frames of {capture.name}, evenly spread"
         key_options, files = context.key_options("frames"), [capture]
-    else:
-        files, notes = unposed_photographs(capture)
-        if not files:
-            return [_plan_load(context, capture)]
-        what = " ".join([f"{len(files)} photographs, which have none{'.' * bool(notes)}", *notes])
+    elif files:
+        panoramas, hints = find_panoramas(files, declared=options.panoramas)
+        notes += hints
+        kind = f"photographs, {sum(panoramas)} of them panoramas," if any(panoramas) else "photographs,"
+        what = " ".join([f"{len(files)} {kind} which have none{'.' * bool(notes)}", *notes])
         key_options = {"names": [photo.relative_to(capture).as_posix() for photo in files]}
+    else:
+        return [_plan_load(context, capture)]
+    key_options |= context.key_options("panoramas")
     how = f"found by structure from motion (pycolmap) for {what}"
     folder = context.out / "poses"
     poses = Stage("poses", how, _estimate_poses, key_options=key_options, files=tuple(files), output_dir=folder)
@@ -156,14 +165,16 @@ def _estimate_poses(stage: StageInput) -> StageResult:
         photos, found = write_frames(capture, folder / "frames", frames=frames, progress=stage.progress)
     else:
         photos, found = unposed_photographs(capture)
-    posed, notes = find_poses(photos, folder, where=capture, progress=stage.progress)
+    declared = context.options.panoramas or (video and is_panorama_video(capture))
+    panoramas, hints = find_panoramas(photos, declared=declared)
+    posed, notes = find_poses(photos, folder, panoramas=panoramas, where=capture, progress=stage.progress)
     if video:
         shutil.rmtree(posed / "images")
         (folder / "frames").rename(posed / "images")
     shutil.rmtree(out, ignore_errors=True)
     shutil.move(posed, out)
     write_text(out / KEY_FILE, folder.name)
-    return StageResult(None, (*found, *notes, f"The poses are in {out}: COLMAP opens them."))
+    return StageResult(None, (*found, *hints, *notes, f"The poses are in {out}: COLMAP opens them."))
 
 
 def _refinement(options: Options, capture: Path) -> str:
@@ -405,6 +416,7 @@ def _load_poses(path: Path, long_side: int) -> tuple[PosedImages, Camera, tuple[
     if not images or len(lenses) < len(images):
         problem = "one of its frames has no size" if images else "it has no frame"
         raise InputError(path, problem, "at least one pose, each with w and h", "Estimate the poses again.")
+    lenses = [undistorted_pinhole(lens, path) if lens.model == PANORAMA else lens for lens in lenses]
     width, height = FrameOptions(long_side=long_side).size((lenses[0].width, lenses[0].height))
     sized = [lens.resized(width, height) for lens in lenses]
     fx, fy, cx, cy = np.array([[lens.fx, lens.fy, lens.cx, lens.cy] for lens in sized], np.float32).T

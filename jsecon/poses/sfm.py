@@ -5,6 +5,8 @@ The steps are COLMAP's own: SIFT features, matches of image pairs, a global mode
 ALL_PAIRS photographs, every pair is matched. Above, each photograph is matched with its neighbours in name order and
 with those that look most alike, by a vocabulary of visual words made of the photographs themselves.
 
+A panorama has one pose: its features are matched as directions. Below it, where its operator stands, no feature counts.
+
 COLMAP writes to the standard streams, ends its process when an internal check fails, and cannot be stopped within a
 step. After `import pycolmap`, Pillow ends the process when it saves a PNG. Therefore the steps run in a process of
 their own. Features and matches stay in WORK/database.db: a stopped run resumes there.
@@ -31,6 +33,7 @@ from jsecon.files import write_text
 from jsecon.process import cores
 from jsecon.read.captures.frames import frame_names
 from jsecon.read.captures.images import image_header, read_image, write_image
+from jsecon.read.captures.lens import OPERATOR_DEGREES, PANORAMA
 from jsecon.types import Progress
 
 MIN_PHOTOS = 3
@@ -44,14 +47,17 @@ MIN_EXPLAINED, MIN_EXPLAINED_OF_MEDIAN = 0.6, 0.3
 photograph relative to the median. In a right model of 125 photographs the median was 0.87 and the least 0.59; two
 wrongly placed ones had 0.08 and 0.12."""
 
+_PANORAMA_SIDES = 3
+"""Width of a panorama over that of a photograph of 120 degrees with as many pixels a degree."""
+
 
 class _Job(NamedTuple):
     """Photographs, by the names of their links in WORK/links."""
 
     names: dict[str, str]
     """Name of each link -> name of its photograph."""
-    lenses: list[list[str]]
-    """Links that share a lens, group by group."""
+    lenses: list[tuple[list[str], tuple[int, int] | None]]
+    """Links that share a lens, group by group, with the (width, height) of panoramas, which need a mask."""
     upsampled: bool
     """Whether features are also detected at twice the size."""
 
@@ -87,7 +93,12 @@ def _check_photographs(photos: Sequence[Path], where: object) -> list[str]:
 
 
 def find_poses(
-    photos: Sequence[Path], work: Path, *, where: object = "photographs", progress: Progress | None = None
+    photos: Sequence[Path],
+    work: Path,
+    *,
+    panoramas: Sequence[bool] = (),
+    where: object = "photographs",
+    progress: Progress | None = None,
 ) -> tuple[Path, tuple[str, ...]]:
     """Estimates the poses of photographs.
 
@@ -98,6 +109,7 @@ def find_poses(
     Args:
       photos: The photographs.
       work: Folder in which the steps keep their state; the caller removes it.
+      panoramas: Whether each photograph is a panorama; by default none is.
       where: Name of the capture for errors.
       progress: Called with (done, total): photographs, then pairs, then photographs with a pose.
 
@@ -115,10 +127,13 @@ def find_poses(
         copied = image_header(photo).orientation != 1 or photo.suffix.lower() in (".heic", ".heif", ".avif")
         links.append(f"{number:06d}{'.png' if copied else photo.suffix.lower()}")  # COLMAP's lists split at spaces
         _link(photo, work / "links" / links[-1], upright_copy=copied)
-    lenses = [[links[n] for n in group] for group in _lens_groups(photos, sizes)]
+    panoramas = panoramas or [False] * len(photos)
+    groups = _lens_groups(photos, sizes, panoramas)
+    lenses = [([links[n] for n in group], sizes[group[0]] if panoramas[group[0]] else None) for group in groups]
     # Features of small photographs are also detected at twice the size: 5,400 instead of 880 on photographs of 799 x
     # 532, where 880 gave wrong poses.
-    upsampled = max(max(set(sizes), key=sizes.count)) <= 1000
+    spans = [max(size) / (_PANORAMA_SIDES if is_panorama else 1) for size, is_panorama in zip(sizes, panoramas)]
+    upsampled = max(set(spans), key=spans.count) <= 1000
     model = _run_in_own_process(work, _Job(dict(zip(links, original)), lenses, upsampled), progress)
     if len(model.registered) < MIN_PHOTOS:
         remedy = "Take more that overlap by two thirds: sharp photographs of a still scene, from different places."
@@ -137,7 +152,9 @@ def find_poses(
     return work / "capture", tuple(notes)
 
 
-def _lens_groups(photos: Sequence[Path], sizes: Sequence[tuple[int, int]]) -> list[list[int]]:
+def _lens_groups(
+    photos: Sequence[Path], sizes: Sequence[tuple[int, int]], panoramas: Sequence[bool]
+) -> list[list[int]]:
     """Indices of the photographs that share a lens, group by group."""
     groups: dict[Any, list[int]] = collections.defaultdict(list)
     for index, (photo, size) in enumerate(zip(photos, sizes)):
@@ -149,7 +166,7 @@ def _lens_groups(photos: Sequence[Path], sizes: Sequence[tuple[int, int]]) -> li
             tags = exif.get(0x0110), folder.get(0x920A), folder.get(0xA405)  # model, focal length, and of 35 mm film
             if any(tag is not None for tag in tags):
                 lens = tuple(map(str, tags))
-        groups[size, lens].append(index)
+        groups[size, "panoramas" if panoramas[index] else lens].append(index)
     return list(groups.values())
 
 
@@ -228,22 +245,31 @@ def _extract(colmap: Any, job: _Job, work: Path, progress: Progress) -> None:
     """Detects the features of the photographs that have none in the database."""
     database, total = work / "database.db", len(job.names)
     options, reader = colmap.FeatureExtractionOptions(), colmap.ImageReaderOptions()
-    options.max_image_size, options.num_threads, options.sift.max_num_features = 1600, cores(), 4096
-    options.sift.first_octave = -1 if job.upsampled else 0
-    reader.camera_model = "OPENCV"
+    options.num_threads, options.sift.first_octave = cores(), -1 if job.upsampled else 0
     with colmap.Database.open(database) as opened:
         imported = opened.num_images() == total
     if not imported:
         for file in work.glob("database.db*"):
             file.unlink()
         colmap.Database.open(database).close()
-        for group in job.lenses:
+        for group, panorama in job.lenses:
+            reader.camera_model = "OPENCV" if panorama is None else PANORAMA
             colmap.import_images(database, work / "links", colmap.CameraMode.SINGLE, image_names=group, options=reader)
-    names = list(job.names)
-    for start in range(0, total, 4):  # COLMAP skips those that have features
-        part = {"image_names": names[start : start + 4], "reader_options": reader, "extraction_options": options}
-        colmap.extract_features(database, work / "links", device=colmap.Device.cpu, **part)
-        progress(min(start + 4, total), total)
+    done = 0
+    for group, panorama in job.lenses:
+        options.max_image_size, options.sift.max_num_features, reader.camera_mask_path = 1600, 4096, ""
+        if panorama is not None:
+            options.max_image_size, options.sift.max_num_features = 1600 * _PANORAMA_SIDES, 2 * 4096
+            reader.camera_mask_path = work / "mask.png"
+            width, height = panorama
+            mask = np.full((height, width), 255, np.uint8)
+            mask[height - round(height * OPERATOR_DEGREES / 180) :] = 0
+            write_image(reader.camera_mask_path, mask)
+        for start in range(0, len(group), 4):  # COLMAP skips those that have features
+            part = {"image_names": group[start : start + 4], "reader_options": reader, "extraction_options": options}
+            colmap.extract_features(database, work / "links", device=colmap.Device.cpu, **part)
+            done += len(part["image_names"])
+            progress(done, total)
 
 
 def _match(colmap: Any, work: Path, progress: Progress) -> None:

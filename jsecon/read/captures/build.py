@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from jsecon.errors import InputError
 from jsecon.numerics import MAX_COORDINATE
@@ -39,7 +39,14 @@ from jsecon.read.captures.frames import (
     usable_images,
 )
 from jsecon.read.captures.images import apply_orientation, image_header, read_depth, read_image
-from jsecon.read.captures.lens import Lens, resample_depth, undistorted_pinhole, undistortion_maps
+from jsecon.read.captures.lens import (
+    PANORAMA,
+    Lens,
+    operator_mask,
+    resample_depth,
+    undistorted_pinhole,
+    undistortion_maps,
+)
 from jsecon.types import Camera, Capture, ImageFile, Progress
 
 _MAX_IN_MEMORY = 1 << 30
@@ -66,6 +73,14 @@ class _Frame(NamedTuple):
     def size(self) -> tuple[int, int]:
         """(width, height) of the lens."""
         return self.lens.width, self.lens.height
+
+    @property
+    def undistorted_size(self) -> tuple[int, int]:
+        """(width, height) before all frames get one size."""
+        if self.lens.model != PANORAMA:
+            return self.size
+        view = undistorted_pinhole(self.lens, self.name)
+        return view.width, view.height
 
 
 def _resolve_orientations(frames: Sequence[_Frame], posed: PosedImages) -> tuple[list[_Frame], list[str]]:
@@ -142,22 +157,37 @@ def plan_frames(
     Of the images, only headers are read.
     """
     frames, _ = _in_order(posed)
-    frames, _ = _resolve_orientations([frames[i] for i in evenly_spaced(len(frames), options.frames)], posed)
+    frames, _ = _resolve_orientations(_choose(frames, options), posed)
     for lens in {frame.lens for frame in frames}:
         undistorted_pinhole(lens, posed.where)
     files = {frame.name: _file(frame) for frame in frames}
     return files, options.size(_commonest_size(frames)), _hold_out(frames, options)[0]
 
 
+def _photographs(frames: Sequence[_Frame]) -> tuple[Int[np.ndarray, " t"], int]:
+    """The number of the photograph that each frame is from, which views of a panorama share, and how many there are."""
+    numbers: dict[Path, int] = {}
+    return np.array([numbers.setdefault(frame.image, len(numbers)) for frame in frames]), len(numbers)
+
+
+def _choose(frames: Sequence[_Frame], options: FrameOptions) -> list[_Frame]:
+    """The frames of evenly spaced photographs, as many as the options allow."""
+    photographs, count = _photographs(frames)
+    limit = None if options.frames is None else max(1, options.frames * count // len(frames))
+    chosen = np.isin(photographs, evenly_spaced(count, limit))
+    return [frames[t] for t in np.flatnonzero(chosen)]
+
+
 def _hold_out(frames: Sequence[_Frame], options: FrameOptions) -> tuple[Bool[np.ndarray, " t"], list[str]]:
-    """Chooses the held-out frames: by the options, by the capture's own split, or every eighth; adds notes."""
+    """Chooses held-out frames: by the options, by the capture's own split, or every eighth photograph's; adds notes."""
     own, notes = np.array([bool(frame.posed.held_out) for frame in frames]), []
     has_split = any(frame.posed.held_out is not None for frame in frames)
     if has_split and options.holdout is None:
         held_out = own
         notes.append(f"{own.sum()} of {len(own)} frames are held out, those that the capture's own split sets aside.")
     else:
-        held_out = holdout_mask(len(frames), 8 if options.holdout is None else options.holdout)
+        photographs, count = _photographs(frames)
+        held_out = holdout_mask(count, 8 if options.holdout is None else options.holdout)[photographs]
     if has_split and options.holdout is not None:
         notes.append(f"The capture's own split, {own.sum()} frames for testing, is not used: a holdout is given.")
     if held_out.all():
@@ -168,7 +198,7 @@ def _hold_out(frames: Sequence[_Frame], options: FrameOptions) -> tuple[Bool[np.
 
 def _file(frame: _Frame) -> ImageFile:
     """The image of a frame as `Capture.files` has it."""
-    return ImageFile(frame.posed.name, *frame.size, frame.orientation)
+    return ImageFile(frame.posed.name, *frame.undistorted_size, frame.orientation)
 
 
 def _in_order(posed: PosedImages) -> tuple[list[_Frame], list[str]]:
@@ -195,20 +225,26 @@ def _in_order(posed: PosedImages) -> tuple[list[_Frame], list[str]]:
 
 def _commonest_size(frames: Sequence[_Frame]) -> tuple[int, int]:
     """The commonest (width, height)."""
-    return collections.Counter(frame.size for frame in frames).most_common(1)[0][0]
+    return collections.Counter(frame.undistorted_size for frame in frames).most_common(1)[0][0]
 
 
-def _read_pixels(
-    frame: _Frame, maps: tuple[np.ndarray, np.ndarray] | None, size: tuple[int, int]
-) -> tuple[UInt8[np.ndarray, "h w 3"], bool]:
-    """The undistorted frame at `size` (width, height), and whether it had transparent pixels."""
-    pixels, is_transparent = read_image(frame.image, upright=frame.orientation != 1)
+def _shrink_panorama(frame: _Frame, side: int) -> _Frame:
+    """Shrinks a panorama to what its views need, twice the `side` of the frames: many are of 20 megapixels or more."""
+    width = min(6 * side, frame.lens.width)
+    return frame._replace(lens=frame.lens.resized(width, width // 2)) if frame.lens.model == PANORAMA else frame
+
+
+def _undistort(
+    pixels: UInt8[np.ndarray, "h w 3"], lens: Lens, maps: tuple[np.ndarray, np.ndarray] | None, size: tuple[int, int]
+) -> UInt8[np.ndarray, "p q 3"]:
+    """The undistorted image at `size` (width, height)."""
     if maps is not None:
-        pixels = cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        border = cv2.BORDER_WRAP if lens.model == PANORAMA else cv2.BORDER_REPLICATE
+        pixels = cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=border)
     if pixels.shape[1::-1] == size:
-        return pixels, is_transparent
+        return pixels
     shrinks = size[0] <= pixels.shape[1] and size[1] <= pixels.shape[0]
-    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR), is_transparent
+    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
 
 
 def _read_depth(
@@ -250,41 +286,57 @@ def build_capture(posed: PosedImages, options: FrameOptions, *, progress: Progre
     poses = np.stack([frame.pose for frame in frames])
     world, world_notes = _normalizing_transform(poses, posed.points, depths)  # of all frames, whichever are taken
     notes += [*posed.notes, *world_notes, *_camera_jumps(frames)]
-    unsized = [frames[i] for i in evenly_spaced(len(frames), options.frames)]
+    unsized = _choose(frames, options)
     if len(unsized) < len(frames):
         notes.append(f"{len(unsized)} of {len(frames)} frames were taken, evenly spaced.")
     frames, orientation_notes = _resolve_orientations(unsized, posed)
     notes += orientation_notes
     if rescaled := sum(frame.size != before.size for frame, before in zip(frames, unsized)):
         notes.append(f"{rescaled} images have another size than their camera model; its intrinsics were scaled.")
-    pinholes = {lens: undistorted_pinhole(lens, posed.where) for lens in {frame.lens for frame in frames}}
-    if bent := sum(frame.lens.distorted for frame in frames):
+    if bent := sum(frame.lens.distorted and frame.lens.model != PANORAMA for frame in frames):
         notes.append(f"{bent} images were undistorted; masks and labels must be of the undistorted images.")
     width, height = _commonest_size(frames)
-    if odd := sum(frame.size != (width, height) for frame in frames):
+    if odd := sum(frame.undistorted_size != (width, height) for frame in frames):
         notes.append(f"{odd} images were resized to {width}x{height}, the commonest size, with their intrinsics.")
     width, height = options.size((width, height))
+    files = tuple(map(_file, frames))
+    frames = [_shrink_panorama(frame, width) for frame in frames]
+    pinholes = {lens: undistorted_pinhole(lens, posed.where) for lens in {frame.lens for frame in frames}}
 
     pixels = _allocate_frames((len(frames), height, width, 3))
     has_depth = any(frame.posed.depth for frame in frames)
     depth_maps = np.zeros((len(frames), height, width), np.float32) if has_depth else None
-    cached_maps = functools.lru_cache(maxsize=4)(undistortion_maps)
+    cached_maps = functools.lru_cache(maxsize=8)(undistortion_maps)
 
-    def read(index: int) -> bool:
-        frame = frames[index]
-        maps = cached_maps(frame.lens, pinholes[frame.lens]) if frame.lens.distorted else None
-        pixels[index], is_transparent = _read_pixels(frame, maps, (width, height))
-        if frame.posed.depth is not None and depth_maps is not None:
-            depth_maps[index] = _read_depth(frame.posed.depth, frame, maps, (width, height), world[0, 0])
+    ignored = None
+    if any(frame.lens.model == PANORAMA for frame in frames):
+        ignored = _allocate_frames(pixels.shape[:3]).view(bool)
+    photographs, count = _photographs(frames)
+
+    def read(photograph: int) -> bool:
+        rows = np.flatnonzero(photographs == photograph)
+        first = frames[rows[0]]
+        image, is_transparent = read_image(first.image, upright=first.orientation != 1)
+        if first.lens.model == PANORAMA and image.shape[1::-1] != first.size:
+            image = cv2.resize(image, first.size, interpolation=cv2.INTER_AREA)
+        for t in rows:
+            lens, depth = frames[t].lens, frames[t].posed.depth
+            maps = cached_maps(lens, pinholes[lens]) if lens.distorted else None
+            pixels[t] = _undistort(image, lens, maps, (width, height))
+            if ignored is not None:
+                is_view = lens.model == PANORAMA
+                ignored[t] = operator_mask(lens, pinholes[lens].resized(width, height)) if is_view else False
+            if depth is not None and depth_maps is not None:
+                depth_maps[t] = _read_depth(depth, frames[t], maps, (width, height), world[0, 0])
         return is_transparent
 
     transparent = 0
     with ThreadPoolExecutor(cores()) as pool:
         try:
-            for done, is_transparent in enumerate(pool.map(read, range(len(frames))), start=1):
+            for done, is_transparent in enumerate(pool.map(read, range(count)), start=1):
                 transparent += is_transparent
                 if progress is not None:
-                    progress(done, len(frames))
+                    progress(done, count)
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
@@ -305,7 +357,8 @@ def build_capture(posed: PosedImages, options: FrameOptions, *, progress: Progre
         source_from_scene=np.asarray(posed.source_from_poses, np.float64) @ from_world,
         names=tuple(frame.name for frame in frames),
         notes=tuple(notes),
-        files=tuple(map(_file, frames)),
+        ignored=ignored,
+        files=files,
         poses_from_scene=from_world,
         up=posed.up,
         metres_per_unit=posed.metres_per_unit,
@@ -318,6 +371,7 @@ def _camera_jumps(frames: Sequence[_Frame]) -> list[str]:
     A reconstruction of 125 photographs with five errors had steps of 11 to 20 there; when right, its largest was 2.2,
     and that of a walk with one cut 9.9.
     """
+    frames = [frames[t] for t in np.unique(_photographs(frames)[0], return_index=True)[1]]
     steps = np.linalg.norm(np.diff(_centres(np.stack([frame.pose for frame in frames])), axis=0), axis=1)
     median = float(np.median(steps)) if len(steps) else 0.0
     far = [f"{frames[t].name} to {frames[t + 1].name}" for t in np.flatnonzero(steps > 10 * median).tolist()]

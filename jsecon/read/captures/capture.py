@@ -12,15 +12,16 @@ from pathlib import Path
 
 from jsecon.errors import InputError, join_first
 from jsecon.files import describe_substitute, is_output_folder, list_files, reading
-from jsecon.read.captures import colmap, nerfstudio, rgbd
+from jsecon.read.captures import colmap, nerfstudio, opensfm, rgbd
 from jsecon.read.captures.build import build_capture
 from jsecon.read.captures.frames import FrameOptions, PosedImages
 from jsecon.read.captures.images import IMAGE_SUFFIXES, convert_remedy, is_photograph, unread_format
+from jsecon.read.captures.panoramas import cut_panoramas
 from jsecon.read.captures.video import is_video
 from jsecon.read.registry import Reader, find_reader
 from jsecon.types import Capture, Progress
 
-READERS = (*colmap.READERS, *nerfstudio.READERS, *colmap.NESTED_READERS, *rgbd.READERS)
+READERS = (*colmap.READERS, *nerfstudio.READERS, *colmap.NESTED_READERS, *opensfm.READERS, *rgbd.READERS)
 """The formats, the preferred first: a folder of both COLMAP and nerfstudio is read as COLMAP, which has the points."""
 _OTHER_IMAGES = re.compile(r"mask|depth|segmentation|proposal|label|confidence|normal|thumb")
 """in the name of a folder whose images are not photographs"""
@@ -77,7 +78,7 @@ def read_posed_images(path: Path) -> PosedImages:
     if reader is None:
         raise _no_capture(path)
     with reading(path, remedy="Export the capture again."):
-        return reader.read(path)
+        return cut_panoramas(reader.read(path))
 
 
 def _find_reader(path: Path) -> Reader | None:

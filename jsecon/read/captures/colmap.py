@@ -24,7 +24,7 @@ from jsecon.files import path_within, read_lines, read_text, reading
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.read.captures.frames import PosedImage, PosedImages
 from jsecon.read.captures.images import find_image
-from jsecon.read.captures.lens import Lens
+from jsecon.read.captures.lens import PANORAMA, Lens, panorama_lens
 from jsecon.read.registry import Reader
 
 _MARK = "cameras.[bt][ix][nt]"
@@ -47,7 +47,7 @@ _PARAMETERS = {
     "SIMPLE_FISHEYE": 3,
     "FISHEYE": 4,
     "EUCM": 6,
-    "EQUIRECTANGULAR": 2,
+    PANORAMA: 2,
 }
 """camera models in the order of their numbers in binary files, from 0 on -> number of parameters"""
 _PYCOLMAP = ("FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE", "DIVISION", "EUCM")
@@ -141,14 +141,13 @@ def _parse_lines(file: Path, layout: str, parse: Callable[[str], Any]) -> list:
 
 def _lens(file: Path, model: str, width: int, height: int, parameters: tuple[float, ...]) -> Lens:
     """The lens of a camera of a model file."""
-    if model == "EQUIRECTANGULAR":
-        remedy = "Cut perspective views out of the panoramas (colmap panorama_sfm.py does) and load those."
-        raise InputError(file, f"the camera model {model} sees all around, which is not supported", remedy=remedy)
     if model not in _PARAMETERS:
-        known = ", ".join(name for name in _PARAMETERS if name != "EQUIRECTANGULAR")
-        raise InputError(file, f"the camera model {model} is unknown", f"one of {known}", _UNDISTORT)
+        raise InputError(file, f"the camera model {model} is unknown", f"one of {', '.join(_PARAMETERS)}", _UNDISTORT)
     if len(parameters) != _PARAMETERS[model]:
         raise InputError(file, f"a {model} camera has {len(parameters)} parameters", str(_PARAMETERS[model]), _REMEDY)
+    if model == PANORAMA:
+        with reading(file, remedy=_REMEDY, problem="a camera cannot be read"):
+            return panorama_lens(width, height)
     focals = 1 if model.startswith("SIMPLE_") or model in ("RADIAL", "RADIAL_FISHEYE") else 2
     fx, fy = parameters[0], parameters[focals - 1]
     cx, cy, *distortion = parameters[focals:]

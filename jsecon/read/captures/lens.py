@@ -1,6 +1,8 @@
 """Lenses of captures, on the host, and the pinhole lens that replaces a distorted one.
 
-OpenCV projects two models, Brown's and Kannala and Brandt's; pycolmap (extra sfm) projects COLMAP's others.
+OpenCV projects two models, Brown's and Kannala and Brandt's; pycolmap (extra sfm) projects COLMAP's others. A panorama
+(equirectangular, 360 x 180 degrees) becomes several pinhole views. Its middle looks along z, and its columns and rows
+are equal steps of longitude and latitude, as in COLMAP, nerfstudio and OpenSfM.
 
 Pixels are counted as everywhere here (and in COLMAP): the centre of the first pixel is at (0.5, 0.5). OpenCV puts it at
 (0, 0), hence the half pixels below.
@@ -13,10 +15,25 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
 
 from jsecon.errors import InputError
 from jsecon.numerics import is_finite_and_bounded
+
+PANORAMA = "EQUIRECTANGULAR"
+"""COLMAP's model of a panorama, whose focal lengths here are px per radian"""
+PANORAMA_VIEWS = np.concatenate(
+    [
+        Rotation.from_euler("Y", np.arange(0, -360, -60)[:, None], degrees=True).as_matrix(),
+        Rotation.from_euler("X", [[90], [-90]], degrees=True).as_matrix(),
+    ]
+)
+"""(8, 3, 3) rotations from the axes of a panorama to those of its views: six along the horizon, one up and one down"""
+_VIEW_TANGENT = 1.1
+"""tangent of half a view's angle, 95 degrees in all: from 1.07 on, the views of a panorama leave no gap"""
+OPERATOR_DEGREES = 30.0
+"""half angle of the cone straight below a panorama in which its tripod, or whoever carries it, is seen"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +58,10 @@ class Lens:
     fisheye: bool = False
     """equidistant model (Kannala and Brandt) instead of the polynomial one (Brown)."""
     model: str | None = None
-    """one of COLMAP's models with two focal lengths that OpenCV does not have; None: OpenCV's, see `fisheye`."""
+    """one of COLMAP's models with two focal lengths that OpenCV does not have, or PANORAMA; None: OpenCV's, see
+    `fisheye`."""
+    view: int = 0
+    """row of PANORAMA_VIEWS, of a panorama."""
 
     def __post_init__(self) -> None:
         """Raises ValueError if no image can have been taken with it."""
@@ -67,6 +87,27 @@ class Lens:
         )
 
 
+def panorama_lens(width: int, height: int) -> Lens:
+    """Makes the lens of a panorama; ValueError if it is not twice as wide as high."""
+    if width != 2 * height:
+        raise ValueError(f"a panorama of {width}x{height} px; one of all directions is twice as wide as high")
+    return Lens(width, height, width / (2 * np.pi), height / np.pi, width / 2, height / 2, model=PANORAMA)
+
+
+def operator_mask(lens: Lens, pinhole: Lens) -> Bool[np.ndarray, "h w"]:
+    """Marks the pixels of a panorama's view within the cone straight below it: True is left out."""
+    directions = _directions(pinhole)
+    down = directions @ PANORAMA_VIEWS[lens.view][:, 1]
+    return down > np.cos(np.radians(OPERATOR_DEGREES)) * np.linalg.norm(directions, axis=-1)
+
+
+def _directions(pinhole: Lens) -> Float[np.ndarray, "h w 3"]:
+    """Directions of a pinhole's pixels in the camera's frame, z = 1."""
+    columns = (np.arange(pinhole.width) + 0.5 - pinhole.cx) / pinhole.fx
+    rows = (np.arange(pinhole.height) + 0.5 - pinhole.cy) / pinhole.fy
+    return np.stack([*np.meshgrid(columns, rows), np.ones((pinhole.height, pinhole.width))], axis=-1)
+
+
 def _colmap_camera(lens: Lens) -> Any:
     """Pycolmap's camera of a lens."""
     try:
@@ -86,15 +127,17 @@ def _opencv(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     return matrix, np.pad(np.array(lens.distortion, np.float64), (0, size - len(lens.distortion)))
 
 
-def _distort(lens: Lens, directions: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """Projects directions, x/z and y/z in the camera's frame, into the distorted image, px."""
-    points = np.ascontiguousarray(directions, np.float64)
-    spatial = np.concatenate([points, np.ones((len(points), 1))], axis=1)
+def _distort(lens: Lens, spatial: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+    """Projects directions in the camera's frame, z = 1, into the distorted image, px."""
+    if lens.model == PANORAMA:
+        x, y, z = PANORAMA_VIEWS[lens.view].T @ spatial.T
+        rows = lens.cy + lens.fy * np.arctan2(y, np.hypot(x, z))
+        return np.stack([lens.cx + lens.fx * np.arctan2(x, z), rows.clip(0.5, lens.height - 0.5)], axis=-1)
     if lens.model is not None:
         return _colmap_camera(lens).img_from_cam(spatial)  # NaN beyond the range of the model
     matrix, coefficients = _opencv(lens)
     if lens.fisheye:
-        pixels = cv2.fisheye.distortPoints(points[None], matrix, coefficients)
+        pixels = cv2.fisheye.distortPoints(np.ascontiguousarray(spatial[None, :, :2]), matrix, coefficients)
     else:
         pixels, _ = cv2.projectPoints(spatial, np.zeros(3), np.zeros(3), matrix, coefficients)
     return pixels.reshape(-1, 2) + 0.5
@@ -112,7 +155,8 @@ def _covered(lens: Lens, zoom: float) -> bool:
     border *= [lens.width, lens.height]
     ends = (border - [lens.cx, lens.cy]) / [lens.fx * zoom, lens.fy * zoom]
     rays = ends[:, None] * np.linspace(0, 1, 65)[:, None]
-    pixels = _distort(lens, rays.reshape(-1, 2)).reshape(rays.shape)
+    spatial = np.pad(rays.reshape(-1, 2), ((0, 0), (0, 1)), constant_values=1.0)
+    pixels = _distort(lens, spatial).reshape(rays.shape)
     if not np.isfinite(pixels).all():
         return False
     radius = np.linalg.norm((pixels - pixels[:, :1]) / [lens.fx, lens.fy], axis=-1)
@@ -124,8 +168,13 @@ def _covered(lens: Lens, zoom: float) -> bool:
 def undistorted_pinhole(lens: Lens, where: object) -> Lens:
     """Finds the widest pinhole lens, of the same size and principal point, whose image has no empty border.
 
-    An empty border could not be told from black things. `where` names the file of the lens for errors.
+    An empty border could not be told from black things. `where` names the file of the lens for errors. For
+    a view of a panorama, it is the pinhole lens of the view.
     """
+    if lens.model == PANORAMA:
+        side = max(1, round(lens.width / 3))
+        focal = side / (2 * _VIEW_TANGENT)
+        return Lens(side, side, focal, focal, side / 2, side / 2)
     if not lens.distorted:
         return dataclasses.replace(lens, distortion=())
     # Covered at a zoom means covered at every larger one: its rays are the same, but shorter. So bisection is exact.
@@ -145,11 +194,9 @@ def undistorted_pinhole(lens: Lens, where: object) -> Lens:
 def undistortion_maps(lens: Lens, pinhole: Lens) -> tuple[np.ndarray, np.ndarray]:
     """Computes where each pixel of the undistorted image lies in the distorted one: two tables for cv2.remap."""
     if lens.model is not None:
-        columns = (np.arange(pinhole.width) + 0.5 - pinhole.cx) / pinhole.fx
-        rows = (np.arange(pinhole.height) + 0.5 - pinhole.cy) / pinhole.fy
-        directions = np.stack(np.meshgrid(columns, rows), axis=-1)
-        pixels = _distort(lens, directions.reshape(-1, 2)).reshape(directions.shape) - 0.5
-        return pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32)
+        pixels = _distort(lens, _directions(pinhole).reshape(-1, 3)) - 0.5
+        columns, rows = pixels.T.reshape(2, pinhole.height, pinhole.width).astype(np.float32)
+        return columns, rows
     matrix, coefficients = _opencv(lens)
     target, _ = _opencv(pinhole)
     make = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap

@@ -21,7 +21,7 @@ from jsecon.files import read_json, reading
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.read.captures.frames import PosedImage, PosedImages, make_rigid, rigid_or_nan
 from jsecon.read.captures.images import IMAGE_SUFFIXES, find_image, size_around
-from jsecon.read.captures.lens import Lens
+from jsecon.read.captures.lens import PANORAMA, Lens, panorama_lens
 from jsecon.read.registry import Reader
 from jsecon.read.splats.ply import load_point_cloud
 from jsecon.types import UpAxis
@@ -225,8 +225,8 @@ def _lens(keys: dict[str, Any], image: Path | None) -> tuple[Lens | None, bool]:
     The lens is None if neither gives its size.
     """
     model = str(keys.get("camera_model", "OPENCV")).upper()
-    if model not in _PERSPECTIVE | _FISHEYE:
-        known = ", ".join(sorted(_PERSPECTIVE | _FISHEYE))
+    if model not in _PERSPECTIVE | _FISHEYE | {PANORAMA}:
+        known = ", ".join(sorted(_PERSPECTIVE | _FISHEYE | {PANORAMA}))
         raise ValueError(f"camera_model {model} is none of {known}: undistort the images first")
     if other := next((key for key in ("ftheta_p0", "latlong", "equirectangular") if keys.get(key)), None):
         raise ValueError(f"its lens is one of instant-ngp's own, {other}: undistort the images first")
@@ -237,6 +237,8 @@ def _lens(keys: dict[str, Any], image: Path | None) -> tuple[Lens | None, bool]:
         width, height = size_around(image, keys.get("cx"), keys.get("cy"))
     else:
         return None, False
+    if model == PANORAMA:
+        return panorama_lens(width, height), False
     fx, fy = _focal(keys, "fl_x", "camera_angle_x", width), _focal(keys, "fl_y", "camera_angle_y", height)
     fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
     if fx is None or fy is None:

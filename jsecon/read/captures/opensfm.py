@@ -1,0 +1,70 @@
+"""OpenSfM's reconstruction.json, on the host, as OpenDroneMap and WebODM write it too; panoramas among its cameras.
+
+Format: OpenSfM doc/source/dataset.rst and opensfm/io.py. A shot's rotation is an angle-axis vector, world-to-camera in
+OpenCV axes. Focal lengths and centres are shares of the image's longer side, and centres are relative to its middle.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from jsecon.errors import InputError
+from jsecon.files import parse_json, reading
+from jsecon.read.captures.frames import PosedImage, PosedImages
+from jsecon.read.captures.images import find_image
+from jsecon.read.captures.lens import Lens, panorama_lens
+from jsecon.read.registry import Reader
+
+_REMEDY = "Run OpenSfM's reconstruct again."
+_PANORAMAS = ("spherical", "equirectangular")
+_DISTORTION = {
+    "perspective": ("k1", "k2"),
+    "simple_radial": ("k1",),
+    "radial": ("k1", "k2"),
+    "brown": ("k1", "k2", "p1", "p2", "k3"),
+    "fisheye": ("k1", "k2"),
+    "fisheye_opencv": ("k1", "k2", "k3", "k4"),
+}
+"""projection types of one centre -> OpenCV's coefficients, in its order"""
+
+
+def _read_opensfm(path: Path) -> PosedImages:
+    """Reads the posed images and points of the largest reconstruction; the images lie in images/."""
+    file = path / "reconstruction.json"
+    with reading(file, remedy=_REMEDY):
+        models = sorted(parse_json(file.read_bytes()), key=lambda model: -len(model["shots"]))
+        notes = [f"There are {len(models)} reconstructions; the largest is used."] if models[1:] else []
+        lenses = {name: _lens(file, name, camera) for name, camera in models[0]["cameras"].items()}
+        images = []
+        for name, shot in models[0]["shots"].items():
+            pose = np.eye(4)
+            pose[:3, :3] = Rotation.from_rotvec(np.array(shot["rotation"], np.float64)).as_matrix()
+            pose[:3, 3] = shot["translation"]
+            images.append(PosedImage(name, find_image(path / "images", name), lenses[shot["camera"]], pose))
+        points = models[0].get("points", {}).values()
+        places = np.array([point["coordinates"] for point in points], np.float64).reshape(-1, 3)
+        colours = np.array([point["color"] for point in points], np.float64).reshape(-1, 3)
+    return PosedImages(
+        images, file, places, colours.clip(0, 255).astype(np.uint8), notes=tuple(notes), ignores_exif=True
+    )
+
+
+def _lens(file: Path, name: str, camera: dict[str, Any]) -> Lens:
+    """The lens of a camera."""
+    model, width, height = camera["projection_type"], int(camera["width"]), int(camera["height"])
+    if model in _PANORAMAS:
+        return panorama_lens(width, height)
+    if model not in _DISTORTION:
+        known = ", ".join((*_PANORAMAS, *_DISTORTION))
+        raise InputError(file, f"camera {name} has projection_type {model}", f"one of {known}", "Undistort first.")
+    side, distortion = max(width, height), [float(camera.get(key, 0.0)) for key in _DISTORTION[model]]
+    fx, fy = (side * float(camera.get(key, camera.get("focal", 0.0))) for key in ("focal_x", "focal_y"))
+    cx, cy = width / 2 + side * float(camera.get("c_x", 0.0)), height / 2 + side * float(camera.get("c_y", 0.0))
+    is_fisheye = "fisheye" in model
+    distortion += [0.0] * (4 - len(distortion))
+    return Lens(width, height, fx, fy, cx, cy, tuple(distortion), is_fisheye)
+
+
+READERS = (Reader("OpenSfM", ("reconstruction.json",), _read_opensfm),)
