@@ -175,7 +175,7 @@ def test_a_run_finds_the_poses_first_and_keeps_them_with_its_output_among_the_ph
     folder, asked = shutil.copytree(photos[0], tmp_path / "walk"), []
     out, other = folder / "f", folder / "g"
 
-    def copied(photos, work, *, where, progress):
+    def copied(photos, work, *, panoramas, where, progress):
         asked.append(where)
         return Path(shutil.copytree(found[0], work / "capture", symlinks=True)), found[1]
 

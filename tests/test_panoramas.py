@@ -214,7 +214,8 @@ def test_poses_of_panoramas_are_found(tmp_path):
             columns, rows = ((across + 1) * 191.5).round().astype(int).T
             image[side == k] = walls[k][rows, columns]
         write_image(tmp_path / "images" / f"pano_{n}.png", image)
-    capture, notes = find_poses(unposed_photographs(tmp_path)[0], tmp_path / "work", panoramas=[True] * count)
+    photos = unposed_photographs(tmp_path)[0]
+    capture, notes = find_poses(photos, tmp_path / "work", panoramas=photos)
     assert "3 of 3 photographs" in notes[0]
     cameras = load_capture(capture).cameras[::8]
     distances, degrees = apart(np.asarray(cameras.world_to_camera, np.float64), true)

@@ -108,7 +108,7 @@ AT_ORIGIN = scene(30) | {"means": np.zeros((30, 3))}
 IDS = np.arange(864, dtype=np.uint8).reshape(MASK_SIZE) % 4
 DAMAGE = {
     "colmap/text": [
-        (put(CAMERAS, "1 EQUIRECTANGULAR 24 16 24 16"), "cameras.txt", "EQUIRECTANGULAR", "perspective views"),
+        (put(CAMERAS, "1 EQUIRECTANGULAR 24 16 24 16"), "cameras.txt", "24x16", "twice as wide as high"),
         (put(CAMERAS, "1 NEW_FISHEYE 24 16 24 16"), "cameras.txt", "NEW_FISHEYE", "image_undistorter"),
     ],
     "colmap/binary": [
@@ -124,7 +124,7 @@ DAMAGE = {
         (key(JSON, [[1, 2], [3, 4]], *POSE), "shape (2, 2)"), (key(JSON, [0, 0, 0], "up"), "not all 0"),
         (key(JSON, GONE, "camera_angle_x"), "no focal length", "camera_angle_x"),
         (key(JSON, 4.0, "camera_angle_x"), "camera_angle_x = 4.0"), (key(JSON, 0.1, "k4"), JSON, "k4"),
-        (key(JSON, "EQUIRECTANGULAR", "camera_model"), JSON, "EQUIRECTANGULAR"),
+        (key(JSON, "EQUIRECTANGULAR", "camera_model"), JSON, "twice as wide"),
         (key(JSON, 0.1, "ftheta_p0"), JSON, "ftheta_p0"),
         (lambda entry: shutil.rmtree(entry / "images"), JSON, "none of which"),
     ],

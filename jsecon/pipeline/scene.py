@@ -23,12 +23,7 @@ from jsecon.pipeline.options import Options, is_bare_scene
 from jsecon.pipeline.scene_files import check_overlap, fit_background, place_in_capture, read_scene
 from jsecon.pipeline.stages import KEY_FILE, WARNING, RunContext, Stage, StageInput, StageResult, training_frames
 from jsecon.poses.sfm import find_poses
-from jsecon.read.captures.capture import (
-    has_depth,
-    load_capture,
-    read_posed_images,
-    unposed_photographs,
-)
+from jsecon.read.captures.capture import has_depth, load_capture, read_posed_images, unposed_photographs
 from jsecon.read.captures.frames import (
     FrameOptions,
     PosedImages,
@@ -73,7 +68,7 @@ def plan_capture(context: RunContext) -> list[Stage]:
     elif files:
         panoramas, hints = find_panoramas(files, declared=options.panoramas)
         notes += hints
-        kind = f"photographs, {sum(panoramas)} of them panoramas," if any(panoramas) else "photographs,"
+        kind = f"photographs, {len(panoramas)} of them panoramas," if panoramas else "photographs,"
         what = " ".join([f"{len(files)} {kind} which have none{'.' * bool(notes)}", *notes])
         key_options = {"names": [photo.relative_to(capture).as_posix() for photo in files]}
     else:

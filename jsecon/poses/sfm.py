@@ -19,7 +19,7 @@ import multiprocessing
 import os
 import shutil
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -56,10 +56,8 @@ class _Job(NamedTuple):
 
     names: dict[str, str]
     """Name of each link -> name of its photograph."""
-    lenses: list[tuple[list[str], tuple[int, int] | None]]
-    """Links that share a lens, group by group, with the (width, height) of panoramas, which need a mask."""
-    upsampled: bool
-    """Whether features are also detected at twice the size."""
+    lenses: list[tuple[list[str], tuple[int, int], bool]]
+    """Links that share a lens, group by group, their (width, height), and whether they are panoramas."""
 
 
 class _Model(NamedTuple):
@@ -96,7 +94,7 @@ def find_poses(
     photos: Sequence[Path],
     work: Path,
     *,
-    panoramas: Sequence[bool] = (),
+    panoramas: Collection[Path] = (),
     where: object = "photographs",
     progress: Progress | None = None,
 ) -> tuple[Path, tuple[str, ...]]:
@@ -109,7 +107,7 @@ def find_poses(
     Args:
       photos: The photographs.
       work: Folder in which the steps keep their state; the caller removes it.
-      panoramas: Whether each photograph is a panorama; by default none is.
+      panoramas: Those of the photographs that are panoramas.
       where: Name of the capture for errors.
       progress: Called with (done, total): photographs, then pairs, then photographs with a pose.
 
@@ -127,14 +125,9 @@ def find_poses(
         copied = image_header(photo).orientation != 1 or photo.suffix.lower() in (".heic", ".heif", ".avif")
         links.append(f"{number:06d}{'.png' if copied else photo.suffix.lower()}")  # COLMAP's lists split at spaces
         _link(photo, work / "links" / links[-1], upright_copy=copied)
-    panoramas = panoramas or [False] * len(photos)
     groups = _lens_groups(photos, sizes, panoramas)
-    lenses = [([links[n] for n in group], sizes[group[0]] if panoramas[group[0]] else None) for group in groups]
-    # Features of small photographs are also detected at twice the size: 5,400 instead of 880 on photographs of 799 x
-    # 532, where 880 gave wrong poses.
-    spans = [max(size) / (_PANORAMA_SIDES if is_panorama else 1) for size, is_panorama in zip(sizes, panoramas)]
-    upsampled = max(set(spans), key=spans.count) <= 1000
-    model = _run_in_own_process(work, _Job(dict(zip(links, original)), lenses, upsampled), progress)
+    lenses = [([links[n] for n in group], sizes[group[0]], photos[group[0]] in panoramas) for group in groups]
+    model = _run_in_own_process(work, _Job(dict(zip(links, original)), lenses), progress)
     if len(model.registered) < MIN_PHOTOS:
         remedy = "Take more that overlap by two thirds: sharp photographs of a still scene, from different places."
         raise InputError(where, f"fewer than {MIN_PHOTOS} of {len(photos)} photographs match each other", remedy=remedy)
@@ -153,7 +146,7 @@ def find_poses(
 
 
 def _lens_groups(
-    photos: Sequence[Path], sizes: Sequence[tuple[int, int]], panoramas: Sequence[bool]
+    photos: Sequence[Path], sizes: Sequence[tuple[int, int]], panoramas: Collection[Path] = ()
 ) -> list[list[int]]:
     """Indices of the photographs that share a lens, group by group."""
     groups: dict[Any, list[int]] = collections.defaultdict(list)
@@ -166,7 +159,7 @@ def _lens_groups(
             tags = exif.get(0x0110), folder.get(0x920A), folder.get(0xA405)  # model, focal length, and of 35 mm film
             if any(tag is not None for tag in tags):
                 lens = tuple(map(str, tags))
-        groups[size, "panoramas" if panoramas[index] else lens].append(index)
+        groups[size, photo in panoramas, lens].append(index)
     return list(groups.values())
 
 
@@ -245,23 +238,24 @@ def _extract(colmap: Any, job: _Job, work: Path, progress: Progress) -> None:
     """Detects the features of the photographs that have none in the database."""
     database, total = work / "database.db", len(job.names)
     options, reader = colmap.FeatureExtractionOptions(), colmap.ImageReaderOptions()
-    options.num_threads, options.sift.first_octave = cores(), -1 if job.upsampled else 0
+    options.num_threads, done = cores(), 0
     with colmap.Database.open(database) as opened:
         imported = opened.num_images() == total
     if not imported:
         for file in work.glob("database.db*"):
             file.unlink()
         colmap.Database.open(database).close()
-        for group, panorama in job.lenses:
-            reader.camera_model = "OPENCV" if panorama is None else PANORAMA
+        for group, _, is_panorama in job.lenses:
+            reader.camera_model = PANORAMA if is_panorama else "OPENCV"
             colmap.import_images(database, work / "links", colmap.CameraMode.SINGLE, image_names=group, options=reader)
-    done = 0
-    for group, panorama in job.lenses:
-        options.max_image_size, options.sift.max_num_features, reader.camera_mask_path = 1600, 4096, ""
-        if panorama is not None:
-            options.max_image_size, options.sift.max_num_features = 1600 * _PANORAMA_SIDES, 2 * 4096
-            reader.camera_mask_path = work / "mask.png"
-            width, height = panorama
+    for group, (width, height), is_panorama in job.lenses:
+        views = _PANORAMA_SIDES if is_panorama else 1
+        options.max_image_size, options.sift.max_num_features = 1600 * views, 8192 if is_panorama else 4096
+        # Features of small photographs are also detected at twice the size: 5,400 instead of 880 on photographs of 799
+        # x 532, where 880 gave wrong poses.
+        options.sift.first_octave = -1 if max(width, height) <= 1000 * views else 0
+        reader.camera_mask_path = work / "mask.png" if is_panorama else ""
+        if is_panorama:
             mask = np.full((height, width), 255, np.uint8)
             mask[height - round(height * OPERATOR_DEGREES / 180) :] = 0
             write_image(reader.camera_mask_path, mask)

@@ -39,14 +39,7 @@ from jsecon.read.captures.frames import (
     usable_images,
 )
 from jsecon.read.captures.images import apply_orientation, image_header, read_depth, read_image
-from jsecon.read.captures.lens import (
-    PANORAMA,
-    Lens,
-    operator_mask,
-    resample_depth,
-    undistorted_pinhole,
-    undistortion_maps,
-)
+from jsecon.read.captures.lens import Lens, operator_mask, resample_depth, undistorted_pinhole, undistortion_maps
 from jsecon.types import Camera, Capture, ImageFile, Progress
 
 _MAX_IN_MEMORY = 1 << 30
@@ -73,14 +66,6 @@ class _Frame(NamedTuple):
     def size(self) -> tuple[int, int]:
         """(width, height) of the lens."""
         return self.lens.width, self.lens.height
-
-    @property
-    def undistorted_size(self) -> tuple[int, int]:
-        """(width, height) before all frames get one size."""
-        if self.lens.model != PANORAMA:
-            return self.size
-        view = undistorted_pinhole(self.lens, self.name)
-        return view.width, view.height
 
 
 def _resolve_orientations(frames: Sequence[_Frame], posed: PosedImages) -> tuple[list[_Frame], list[str]]:
@@ -198,7 +183,7 @@ def _hold_out(frames: Sequence[_Frame], options: FrameOptions) -> tuple[Bool[np.
 
 def _file(frame: _Frame) -> ImageFile:
     """The image of a frame as `Capture.files` has it."""
-    return ImageFile(frame.posed.name, *frame.undistorted_size, frame.orientation)
+    return ImageFile(frame.posed.name, *frame.lens.undistorted_size, frame.orientation, frame.lens.view)
 
 
 def _in_order(posed: PosedImages) -> tuple[list[_Frame], list[str]]:
@@ -225,13 +210,13 @@ def _in_order(posed: PosedImages) -> tuple[list[_Frame], list[str]]:
 
 def _commonest_size(frames: Sequence[_Frame]) -> tuple[int, int]:
     """The commonest (width, height)."""
-    return collections.Counter(frame.undistorted_size for frame in frames).most_common(1)[0][0]
+    return collections.Counter(frame.lens.undistorted_size for frame in frames).most_common(1)[0][0]
 
 
 def _shrink_panorama(frame: _Frame, side: int) -> _Frame:
     """Shrinks a panorama to what its views need, twice the `side` of the frames: many are of 20 megapixels or more."""
     width = min(6 * side, frame.lens.width)
-    return frame._replace(lens=frame.lens.resized(width, width // 2)) if frame.lens.model == PANORAMA else frame
+    return frame if frame.lens.view is None else frame._replace(lens=frame.lens.resized(width, width // 2))
 
 
 def _undistort(
@@ -239,7 +224,7 @@ def _undistort(
 ) -> UInt8[np.ndarray, "p q 3"]:
     """The undistorted image at `size` (width, height)."""
     if maps is not None:
-        border = cv2.BORDER_WRAP if lens.model == PANORAMA else cv2.BORDER_REPLICATE
+        border = cv2.BORDER_REPLICATE if lens.view is None else cv2.BORDER_WRAP
         pixels = cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=border)
     if pixels.shape[1::-1] == size:
         return pixels
@@ -293,10 +278,10 @@ def build_capture(posed: PosedImages, options: FrameOptions, *, progress: Progre
     notes += orientation_notes
     if rescaled := sum(frame.size != before.size for frame, before in zip(frames, unsized)):
         notes.append(f"{rescaled} images have another size than their camera model; its intrinsics were scaled.")
-    if bent := sum(frame.lens.distorted and frame.lens.model != PANORAMA for frame in frames):
+    if bent := sum(frame.lens.distorted and frame.lens.view is None for frame in frames):
         notes.append(f"{bent} images were undistorted; masks and labels must be of the undistorted images.")
     width, height = _commonest_size(frames)
-    if odd := sum(frame.undistorted_size != (width, height) for frame in frames):
+    if odd := sum(frame.lens.undistorted_size != (width, height) for frame in frames):
         notes.append(f"{odd} images were resized to {width}x{height}, the commonest size, with their intrinsics.")
     width, height = options.size((width, height))
     files = tuple(map(_file, frames))
@@ -308,24 +293,22 @@ def build_capture(posed: PosedImages, options: FrameOptions, *, progress: Progre
     depth_maps = np.zeros((len(frames), height, width), np.float32) if has_depth else None
     cached_maps = functools.lru_cache(maxsize=8)(undistortion_maps)
 
-    ignored = None
-    if any(frame.lens.model == PANORAMA for frame in frames):
-        ignored = _allocate_frames(pixels.shape[:3]).view(bool)
+    has_views = any(frame.lens.view is not None for frame in frames)
+    ignored = _allocate_frames(pixels.shape[:3]).view(bool) if has_views else None
     photographs, count = _photographs(frames)
 
     def read(photograph: int) -> bool:
         rows = np.flatnonzero(photographs == photograph)
         first = frames[rows[0]]
         image, is_transparent = read_image(first.image, upright=first.orientation != 1)
-        if first.lens.model == PANORAMA and image.shape[1::-1] != first.size:
+        if image.shape[1::-1] != first.size:
             image = cv2.resize(image, first.size, interpolation=cv2.INTER_AREA)
         for t in rows:
             lens, depth = frames[t].lens, frames[t].posed.depth
             maps = cached_maps(lens, pinholes[lens]) if lens.distorted else None
             pixels[t] = _undistort(image, lens, maps, (width, height))
             if ignored is not None:
-                is_view = lens.model == PANORAMA
-                ignored[t] = operator_mask(lens, pinholes[lens].resized(width, height)) if is_view else False
+                ignored[t] = operator_mask(lens, pinholes[lens].resized(width, height))
             if depth is not None and depth_maps is not None:
                 depth_maps[t] = _read_depth(depth, frames[t], maps, (width, height), world[0, 0])
         return is_transparent

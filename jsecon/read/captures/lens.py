@@ -60,8 +60,8 @@ class Lens:
     model: str | None = None
     """one of COLMAP's models with two focal lengths that OpenCV does not have, or PANORAMA; None: OpenCV's, see
     `fisheye`."""
-    view: int = 0
-    """row of PANORAMA_VIEWS, of a panorama."""
+    view: int | None = None
+    """row of PANORAMA_VIEWS, of a view of a panorama."""
 
     def __post_init__(self) -> None:
         """Raises ValueError if no image can have been taken with it."""
@@ -79,6 +79,12 @@ class Lens:
         """Whether its images must be resampled before they are those of a pinhole."""
         return self.fisheye or self.model is not None or any(k != 0 for k in self.distortion)
 
+    @property
+    def undistorted_size(self) -> tuple[int, int]:
+        """(width, height) of its undistorted images; of a panorama, of a view with as many pixels a degree."""
+        side = max(1, round(self.width / 3))
+        return (self.width, self.height) if self.view is None else (side, side)
+
     def resized(self, width: int, height: int) -> Lens:
         """Scales the lens to another size of the same image, px; its distortion stays."""
         x, y = width / self.width, height / self.height
@@ -95,7 +101,9 @@ def panorama_lens(width: int, height: int) -> Lens:
 
 
 def operator_mask(lens: Lens, pinhole: Lens) -> Bool[np.ndarray, "h w"]:
-    """Marks the pixels of a panorama's view within the cone straight below it: True is left out."""
+    """Marks the pixels of a panorama's view within the cone straight below it, and no pixel of another lens."""
+    if lens.view is None:
+        return np.zeros((pinhole.height, pinhole.width), bool)
     directions = _directions(pinhole)
     down = directions @ PANORAMA_VIEWS[lens.view][:, 1]
     return down > np.cos(np.radians(OPERATOR_DEGREES)) * np.linalg.norm(directions, axis=-1)
@@ -129,7 +137,7 @@ def _opencv(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
 
 def _distort(lens: Lens, spatial: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
     """Projects directions in the camera's frame, z = 1, into the distorted image, px."""
-    if lens.model == PANORAMA:
+    if lens.view is not None:
         x, y, z = PANORAMA_VIEWS[lens.view].T @ spatial.T
         rows = lens.cy + lens.fy * np.arctan2(y, np.hypot(x, z))
         return np.stack([lens.cx + lens.fx * np.arctan2(x, z), rows.clip(0.5, lens.height - 0.5)], axis=-1)
@@ -171,8 +179,8 @@ def undistorted_pinhole(lens: Lens, where: object) -> Lens:
     An empty border could not be told from black things. `where` names the file of the lens for errors. For
     a view of a panorama, it is the pinhole lens of the view.
     """
-    if lens.model == PANORAMA:
-        side = max(1, round(lens.width / 3))
+    if lens.view is not None:
+        side, _ = lens.undistorted_size
         focal = side / (2 * _VIEW_TANGENT)
         return Lens(side, side, focal, focal, side / 2, side / 2)
     if not lens.distorted:

@@ -31,17 +31,8 @@ _FISHEYE = {"OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEY
 _OF_LENS = {"camera_model", "is_fisheye", "w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y"}
 _OF_LENS |= {"k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "ftheta_p0", "latlong", "equirectangular"}
 _SPLITS = ("train_filenames", "val_filenames", "test_filenames")
-_KNOWN = {
-    *_OF_LENS,
-    *_SPLITS,
-    "frames",
-    "up",
-    "orientation_override",
-    "val_frames",
-    "test_frames",
-    "applied_transform",
-    "applied_scale",
-}
+_KNOWN = {*_OF_LENS, *_SPLITS, "frames", "up", "orientation_override", "val_frames", "test_frames"}
+_KNOWN |= {"applied_transform", "applied_scale"}
 _KNOWN |= {"depth_unit_scale_factor", "ply_file_path", "file_path", "transform_matrix", "depth_file_path", "mask_path"}
 _KNOWN |= {"aabb_scale", "scale", "offset", "colmap_im_id", "camera_id", "sharpness", "timestamp"}
 """keys that are used, or that change no number"""

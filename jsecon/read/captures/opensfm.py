@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jsecon.errors import InputError
-from jsecon.files import parse_json, reading
+from jsecon.files import read_json, reading
 from jsecon.read.captures.frames import PosedImage, PosedImages
 from jsecon.read.captures.images import find_image
 from jsecon.read.captures.lens import Lens, panorama_lens
@@ -34,7 +34,7 @@ def _read_opensfm(path: Path) -> PosedImages:
     """Reads the posed images and points of the largest reconstruction; the images lie in images/."""
     file = path / "reconstruction.json"
     with reading(file, remedy=_REMEDY):
-        models = sorted(parse_json(file.read_bytes()), key=lambda model: -len(model["shots"]))
+        models = sorted(read_json(file, "a reconstruction.json", _REMEDY), key=lambda model: -len(model["shots"]))
         notes = [f"There are {len(models)} reconstructions; the largest is used."] if models[1:] else []
         lenses = {name: _lens(file, name, camera) for name, camera in models[0]["cameras"].items()}
         images = []

@@ -21,48 +21,42 @@ def has_mark(head: bytes) -> bool:
     return _MARK.search(head) is not None
 
 
-def find_panoramas(photos: Sequence[Path], *, declared: bool) -> tuple[list[bool], tuple[str, ...]]:
-    """Tells which photographs are panoramas, by marks in their files or as the user `declared` all to be, and notes.
+def find_panoramas(photos: Sequence[Path], *, declared: bool) -> tuple[list[Path], tuple[str, ...]]:
+    """Finds the panoramas among photographs, by marks in their files or as the user `declared` all to be, and notes.
 
     A panorama is twice as wide as high.
     """
-    sizes = [image_header(photo).upright for photo in photos]
-    wide = [width == 2 * height for width, height in sizes]
-    if declared and not all(wide):
-        first = wide.index(False)
-        expected = "twice as wide as high, as a panorama of all directions is"
-        remedy = "Export the whole sphere, or leave out --panoramas."
-        raise InputError(photos[first], "its size is {}x{}".format(*sizes[first]), expected, remedy)
-    found = [is_wide and (declared or _is_marked(photo)) for photo, is_wide in zip(photos, wide)]
-    if not (unmarked := sum(wide) - sum(found)):
-        return found, ()
+    found, unmarked = [], 0
+    for photo in photos:
+        width, height = image_header(photo).upright
+        if declared and width != 2 * height:
+            expected = "twice as wide as high, as a panorama of all directions is"
+            remedy = "Export the whole sphere, or leave out --panoramas."
+            raise InputError(photo, f"its size is {width}x{height}", expected, remedy)
+        if width == 2 * height:
+            with photo.open("rb") as file:
+                is_found = declared or has_mark(file.read(_HEAD))
+            found += [photo] if is_found else []
+            unmarked += not is_found
     note = f"{unmarked} photographs are twice as wide as high, but their files do not call them panoramas."
-    return found, (f"{note} Give --panoramas if they show all directions.",)
+    return found, (f"{note} Give --panoramas if they show all directions.",) if unmarked else ()
 
 
-def _is_marked(photo: Path) -> bool:
-    """Whether a photograph says that it is equirectangular."""
-    with photo.open("rb") as file:
-        return has_mark(file.read(_HEAD))
+def _cut_view(panorama: PosedImage, view: int) -> PosedImage:
+    """A view of a panorama."""
+    pose, path = panorama.world_to_camera.copy(), PurePosixPath(panorama.name)
+    pose[:3] = PANORAMA_VIEWS[view] @ pose[:3]
+    name, lens = f"{path.stem}_{view}{path.suffix}", dataclasses.replace(panorama.lens, view=view)
+    return dataclasses.replace(panorama, name=str(path.with_name(name)), lens=lens, world_to_camera=pose, depth=None)
 
 
 def cut_panoramas(posed: PosedImages) -> PosedImages:
     """Replaces each panorama of a capture by its views, which share its file; their numbers follow its name."""
-    images: list[PosedImage] = []
-    for image in posed.images:
-        lens, path = image.lens, PurePosixPath(image.name)
-        if lens is None or lens.model != PANORAMA:
-            images.append(image)
-            continue
-        for view, rotation in enumerate(PANORAMA_VIEWS):
-            pose = image.world_to_camera.copy()
-            pose[:3] = rotation @ pose[:3]
-            name = str(path.with_name(f"{path.stem}_{view}{path.suffix}"))
-            turned = dataclasses.replace(lens, view=view)
-            images.append(dataclasses.replace(image, name=name, lens=turned, world_to_camera=pose, depth=None))
     panoramas = [image for image in posed.images if image.lens is not None and image.lens.model == PANORAMA]
     if not panoramas:
         return posed
+    images = [image for image in posed.images if image.lens is None or image.lens.model != PANORAMA]
+    images += [_cut_view(image, view) for image in panoramas for view in range(len(PANORAMA_VIEWS))]
     each = f"{len(PANORAMA_VIEWS)} views each, of 95 degrees; what lies within 30 degrees of straight down is left out"
     notes = [f"{len(panoramas)} panoramas are cut into {each}, as the operator stands there."]
     if any(image.depth is not None for image in panoramas):
