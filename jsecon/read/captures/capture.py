@@ -50,8 +50,8 @@ def load_capture(
     """Loads a capture.
 
     Formats are COLMAP (sparse/0 and images/), nerfstudio and instant-ngp (transforms.json), ScanNet, TUM, ARKitScenes,
-    Polycam, Record3D and OpenSfM. A folder of both COLMAP and nerfstudio is read as COLMAP, which has the points. Frames
-    come in name order; a panorama becomes eight of them.
+    Polycam, Record3D and OpenSfM. A folder of both COLMAP and nerfstudio is read as COLMAP, which has the points.
+    Frames come in name order; a panorama becomes eight of them.
 
     Args:
       path: Folder of the capture, or a file of transforms with any name.
