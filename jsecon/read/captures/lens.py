@@ -29,7 +29,7 @@ PANORAMA_VIEWS = np.concatenate(
         Rotation.from_euler("X", [[90], [-90]], degrees=True).as_matrix(),
     ]
 )
-"""(8, 3, 3) rotations from the axes of a panorama to those of its views: six along the horizon, one up and one down"""
+"""(8, 3, 3) rotations from the axes of a panorama to those of its views: six along the horizon, one down and one up"""
 _VIEW_TANGENT = 1.1
 """tangent of half a view's angle, 95 degrees in all: from 1.07 on, the views of a panorama leave no gap"""
 OPERATOR_DEGREES = 30.0
