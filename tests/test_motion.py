@@ -261,7 +261,9 @@ def test_depth_maps_and_masks_of_any_name_are_told_by_their_bits(tmp_path, kind)
     (["IMG_1.dng", "walk.mov"], "2 files"),
 ])  # fmt: skip
 def test_what_lies_beside_photographs_and_is_not_used_is_named_in_the_plan(tmp_path, others, says):
-    _touch(tmp_path, "a.jpg", "b.jpg", "c.jpg", *others)
+    _touch(tmp_path, *others)
+    for name in "abc":
+        cv2.imwrite(str(tmp_path / f"{name}.jpg"), np.zeros((6, 8, 3), np.uint8))
     stage = plan_capture(context_of(tmp_path, tmp_path / "f"))[0]
     assert "3 photographs" in stage.how
     assert (others[0].rpartition("/")[2] in stage.how) == bool(says)
