@@ -102,7 +102,7 @@ def faults(root: Path) -> list[str]:
             pairs = [pair for pair in zip(cells(title)[1:], values) if any(text.lower() in pair[1] for text in alone)]
             by_cell = pairs and all(stands(value, [label, head, value], rows) for head, value in pairs)
             if not of_results or not (by_cell or stands(" ".join(values), [label, *values], rows)):
-                found.append(f"{page}:{line}: no row of docs/figures.csv has {', '.join(alone)}")
+                found.append(f"{page}:{line}: no row of docs/figures.csv or of results has {', '.join(alone)}")
     return found
 
 

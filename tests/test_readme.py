@@ -173,5 +173,5 @@ def test_a_figure_that_differs_from_its_results_or_has_no_source_is_named(tmp_pa
         (tmp_path / name).write_text(text)
     assert runpy.run_path(str(HOME / "docs/check_figures.py"))["faults"](tmp_path) == [
         "README.md:1: 0.84 is 0.85 by lerf['ours']",
-        "README.md:2: no row of docs/figures.csv has 12 s",
+        "README.md:2: no row of docs/figures.csv or of results has 12 s",
     ]
