@@ -1,6 +1,7 @@
-"""Votes, queries and export of a scene whose columns stay on disk: seconds, peak memory, growth.
+"""Votes, queries, export and cleaning of a scene whose columns stay on disk: seconds, peak memory, growth.
 
     python benchmarks/larger_than_memory.py --gaussians 20000000 --views 20        (11 GB in FOLDER while it runs)
+    python benchmarks/larger_than_memory.py --clean --views 12        (`jsecon clean`, a .ply of 1.4 GB to another)
     python benchmarks/larger_than_memory.py --growth votes        (or: queries)
 
 A made-up landscape of 100 m, hills and low growth, in the order of a curve that fills the ground; a hundred regions are
@@ -29,6 +30,7 @@ import jax
 import numpy as np
 
 import jsecon
+from jsecon.app import cli
 from jsecon.files import map_npy
 from jsecon.types import Camera, Gaussians, LanguageField, Regions, Selection, Votes
 
@@ -194,6 +196,25 @@ def export_step(folder: Path, *_: int) -> dict[str, float]:
     return told
 
 
+def clean_step(folder: Path, views: int, width: int, height: int) -> dict[str, float]:
+    """`jsecon clean` of a file; without views, from planned ones."""
+    told: dict[str, float] = {}
+    options = []
+    if views:
+        cameras = ring(views, width, height)
+        lens = {"width": width, "height": height, "fx": 0.8 * width, "fy": 0.8 * width}
+        rows = [
+            {"img_name": f"{n}", "position": pose[:3, 3].tolist(), "rotation": pose[:3, :3].tolist()} | lens
+            for n, pose in enumerate(np.linalg.inv(cameras.world_to_camera.astype(np.float64)))
+        ]
+        (folder / "poses.json").write_text(json.dumps(rows))
+        options = ["--cameras", str(folder / "poses.json")]
+    command = ["clean", str(folder / "large.ply"), "--out", str(folder / "clean.ply"), *options]
+    code = timed(told, "cleaned, s", lambda: cli.main([*command, "--json"]))
+    assert code == 0
+    return told
+
+
 def finished(gaussians, cameras, labels, regions, **how):
     """Votes in blocks with all that queries read."""
     return jsecon.normalise_votes(jsecon.region_votes(gaussians, cameras, labels, REGIONS, **how), regions)
@@ -234,7 +255,7 @@ def part_step(folder: Path, views: int, width: int, height: int) -> dict[str, fl
     return told
 
 
-STEPS = {"votes": votes_step, "query": query_step, "export": export_step, "part": part_step}
+STEPS = {"votes": votes_step, "query": query_step, "export": export_step, "part": part_step, "clean": clean_step}
 
 
 def one(step: str, folder: Path, *sizes: int) -> dict[str, float]:
@@ -260,6 +281,15 @@ def whole(base: Path, count: int, views: int) -> None:
     print(f"{count:,} Gaussians made in {time.perf_counter() - start:.0f} s\n| step | what | figure |\n|---|---|---|")
     for step, sizes in (("votes", (views, 1280, 720)), ("query", ()), ("export", ()), ("part", (4, 1280, 720))):
         show(step, one(step, base, *sizes))
+
+
+def clean(base: Path, count: int, views: int) -> None:
+    """Writes a file and cleans it. Its memory is that of one program, from file to file."""
+    if not (base / "large.ply").exists():
+        write_landscape(base / "scene", count)
+        jsecon.save_gaussians(base / "large.ply", mapped(base / "scene"))
+        shutil.rmtree(base / "scene")
+    show(f"clean {count:,}", one("clean", base, views, 400, 300))
 
 
 def cast(base: Path, count: int, views: int, width: int, height: int) -> dict[str, float]:
@@ -340,6 +370,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=20)
     parser.add_argument("--growth", choices=("votes", "queries"))
     parser.add_argument("--folder", type=Path, help="where the columns go; by default a temporary folder")
+    parser.add_argument("--clean", action="store_true", help="of a file; --views 0 plans them")
     parser.add_argument("--one", nargs="+", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.one:
@@ -348,7 +379,9 @@ def main() -> None:
         peak = peak_memory_mib() / 1024
         return print(json.dumps(told | {"peak GiB": peak}))
     with tempfile.TemporaryDirectory(dir=given.folder) as base:
-        if given.growth:
+        if given.clean:
+            clean(Path(base), given.gaussians, given.views)
+        elif given.growth:
             {"votes": growth, "queries": query_growth}[given.growth](Path(base), given.gaussians)
         else:
             whole(Path(base), given.gaussians, given.views)

@@ -86,9 +86,9 @@ def main() -> None:
 
     from jsecon.association.consensus import track_masks
     from jsecon.association.run_lengths import cache_masks_as_rle
-    from jsecon.fit.start import gaussians_from_points
     from jsecon.paper.algorithm1 import masklets
     from jsecon.paper.tracker import GeometricTracker
+    from jsecon.splat.points import gaussians_from_points
     from jsecon.types import Camera
     from jsecon.vision.classical import ClassicalSegmenter
 

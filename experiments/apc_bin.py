@@ -25,13 +25,13 @@ from jsecon.field.evidence import region_votes
 from jsecon.field.membership import normalise_votes
 from jsecon.fit.depth import points_from_depth
 from jsecon.fit.quality import measure_quality
-from jsecon.fit.start import gaussians_from_points
 from jsecon.paper.distill import distill_votes
 from jsecon.paper.queries import select_by_code
 from jsecon.query.answer import match_region, select_gaussians
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.render import selection_mask
 from jsecon.query.rules import QueryRules
+from jsecon.splat.points import gaussians_from_points
 from jsecon.types import Camera, Capture, Codes, Gaussians, LanguageField, Regions
 
 OBJECTS = {48: "chenille stems", 114: "bunny book", 132: "kleenex tissue box", 144: "joke book"}

@@ -32,8 +32,8 @@ from jsecon import Scene
 from jsecon.app.comparison import Changes
 from jsecon.field.field import load_field, save_field
 from jsecon.fit.depth import points_from_depth
-from jsecon.fit.start import gaussians_from_points
 from jsecon.query.render import HIDDEN_LOGIT
+from jsecon.splat.points import gaussians_from_points
 from jsecon.types import Camera, Capture, LanguageField
 from jsecon.vision.colours import ColourEmbedder
 

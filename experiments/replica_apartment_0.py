@@ -28,9 +28,9 @@ from experiments.tables.codes import region_codes
 from jsecon.errors import InputError
 from jsecon.field.evidence import region_votes
 from jsecon.fit.depth import DepthPoints, points_from_depth
-from jsecon.fit.start import gaussians_from_points
 from jsecon.numerics import cosine_matrix
 from jsecon.paper.distill import distill_votes
+from jsecon.splat.points import gaussians_from_points
 from jsecon.types import Camera, Capture, Gaussians
 
 _HEX = """

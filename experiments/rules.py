@@ -32,11 +32,11 @@ from experiments.tables.association import associated
 from experiments.tables.ours import field_of, parts_of
 from experiments.tables.setting import Setting
 from jsecon.field.evidence import region_votes
-from jsecon.fit.start import gaussians_from_points
 from jsecon.query.answer import match_regions, query_anchored, query_several
 from jsecon.query.match import parts_fallback
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.rules import MIN_COSINE, STATES, QueryRules
+from jsecon.splat.points import gaussians_from_points
 from jsecon.types import LanguageField
 
 AS_IT_IS = "as it is"

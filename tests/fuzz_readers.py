@@ -15,6 +15,7 @@ import numpy as np
 from capture_files import png, small_capture, transforms, write_images, write_text_model, write_transforms
 from clip_files import write_clip, write_tokenizer
 from PIL import Image
+from point_files import WRITERS, points_of
 from sam2_files import write_sam2
 from sam_files import write_sam
 from siglip_files import write_siglip
@@ -38,7 +39,7 @@ from jsecon.read.masks import masks
 from jsecon.read.masks.labels import load_lerf_labels
 from jsecon.read.masks.masks import FrameMasks, TrackedMasks
 from jsecon.read.splats.files import read_gaussians, save_gaussians
-from jsecon.read.splats.ply import load_point_cloud
+from jsecon.read.splats.points import load_point_cloud
 from jsecon.types import Capture, Codes, Gaussians, LanguageField, Parts, Regions
 
 NAMES, MASK_SIZE = ("a", "b"), (24, 36)
@@ -101,6 +102,8 @@ def _clouds(folder: Path) -> None:
         for kind in ("uchar", "ushort", "float", None):
             colours = {c: rng.random(30) * 200 for c in ("red", "green", "blue")} if kind else {}
             write_ply(folder / f"{form}-{kind}.ply", xyz | colours, form, dict.fromkeys(colours, kind))
+    for name, write in WRITERS.items():
+        write(folder / name, *points_of(30))
 
 
 def _placed_points(file: Path) -> tuple[np.ndarray, ...]:

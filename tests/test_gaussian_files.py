@@ -157,7 +157,7 @@ def test_sure_opacities_flat_gaussians_and_none(tmp_path):
 ])  # fmt: skip
 def test_other_formats_say_what_to_run(tmp_path, name, says):
     (tmp_path / name).write_bytes(b"something")
-    with refused(name, says, ".spz, .sog or .splat"):
+    with refused(name, says, ".sog, .splat"):
         load_gaussians(tmp_path / name)
 
 

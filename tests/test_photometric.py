@@ -11,7 +11,7 @@ from jax.test_util import check_grads
 
 from jsecon.fit.photometric import photometric_loss, psnr, ssim_map
 from jsecon.fit.quality import is_weak, measure_quality
-from jsecon.fit.start import gaussians_from_points
+from jsecon.splat.points import gaussians_from_points
 
 
 def images(shape=(13, 17, 3), seed=0, dtype=np.float32):

@@ -5,7 +5,7 @@ import pytest
 from splat_files import C0, PLY_NAMES, gaussians, opacity, ply_columns, scene, spz, write_ply
 
 from jsecon.read.splats.files import load_gaussians, save_gaussians
-from jsecon.read.splats.ply import load_point_cloud
+from jsecon.read.splats.points import load_point_cloud
 
 
 @pytest.mark.parametrize("basis", [1, 4, 9, 16])

@@ -10,7 +10,8 @@ from hypothesis import given, settings, strategies as st
 from experiments.datasets.depth_points import labels_of_points
 from jsecon import InputError
 from jsecon.fit.depth import points_from_depth
-from jsecon.fit.start import gaussians_from_points, starting_gaussians
+from jsecon.fit.start import starting_gaussians
+from jsecon.splat.points import gaussians_from_points
 from jsecon.splat.sh import C0
 
 

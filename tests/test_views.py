@@ -4,10 +4,12 @@ import dataclasses
 import json
 
 import jax
+import laspy
 import numpy as np
 import pytest
 from capture_files import refused, run_cli, small_capture, transforms, write_text_model
 from conftest import gaussians_at
+from point_files import OFFSET, las
 from scipy.spatial.transform import Rotation
 
 import jsecon
@@ -15,6 +17,7 @@ from jsecon.app.cli import main
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.scene import plan_scene
 from jsecon.pipeline.stages import Checkpoint, Results, RunContext, StageInput
+from jsecon.splat.sh import C0
 from jsecon.splat.transform import transform_gaussians
 from jsecon.views import plan
 from jsecon.views.cover import frames_by_need
@@ -274,6 +277,27 @@ def test_no_view_looks_through_fog():
 def test_a_scene_that_cannot_be_judged_is_refused(object_alone, change, clause):
     with pytest.raises(jsecon.InputError, match=clause):
         place_cameras(dataclasses.replace(object_alone, **change(object_alone)))
+
+
+def test_a_cloud_without_photographs_answers_a_text_and_gets_its_labels(room, tmp_path):
+    """At coordinates of a map, whose reference system goes with the answers."""
+    cloud, out = tmp_path / "cloud.laz", tmp_path / "labelled.laz"
+    points = np.asarray(room.means, np.float64) + OFFSET
+    las(cloud, points, np.rint(255 * np.clip(0.5 + C0 * room.sh[:, 0], 0, 1)).astype(np.uint8))
+    field = tmp_path / "field"
+    assert main(["run", str(cloud), "--out", str(field), "--views", "8", "--long-side", "160"]) == 0
+    assert main(["export", str(field), "--out", str(out)]) == 0
+    told = json.loads((tmp_path / "labels.json").read_text())
+    assert told["crs"] == "EPSG:25832"
+    ball = next(row for row in told["objects"] if row["name"] == "red")
+    np.testing.assert_allclose(ball["box"]["center"], points[-1200:-800].mean(0), atol=0.1)
+    written, truth = laspy.read(out), np.zeros(len(points), bool)
+    truth[-1200:-800] = True
+    found = np.asarray(written.object_id) == ball["id"]
+    assert (found & truth).sum() / (found | truth).sum() > 0.8
+    np.testing.assert_allclose(written.xyz, points, rtol=0, atol=6e-4)
+    assert main(["export", str(field), "--out", str(out), "--only", "red ball"]) == 0
+    assert 300 < len(laspy.read(out).points) < 600
 
 
 def test_a_splat_without_photographs_answers_a_text(room, tmp_path, capsys):

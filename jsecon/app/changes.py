@@ -16,7 +16,7 @@ from PIL import Image
 from jsecon.app import pictures, report, verbs
 from jsecon.app.comparison import LONG_SIDE, Changes, placed_capture, splat_capture
 from jsecon.app.opening import locate_field
-from jsecon.app.records import unit_of
+from jsecon.app.records import world_record
 from jsecon.app.scene import Scene, open_scene
 from jsecon.change.detect import KINDS
 from jsecon.errors import InputError
@@ -112,7 +112,7 @@ def _write_changes(changes: Changes, out: Path, console: Console) -> verbs.VerbR
     count = {kind: sum(record["kind"] == kind for record in records) for kind in KINDS}
     console.print_line(", ".join(f"{number} {kind}" for kind, number in count.items() if number) or "no objects")
     files = {name: out / f"changes.{name}" for name in ("json", "csv", "html")}
-    content = {"frame": "the capture's world", "unit": unit_of(changes.field), "changes": records}
+    content = {"frame": "the capture's world", "changes": records} | world_record(changes.field)
     write_text(files["json"], json.dumps(content, indent=2) + "\n")
     write_text(files["csv"], _table(records))
     with console.progress("pictures"):

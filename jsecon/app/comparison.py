@@ -16,10 +16,10 @@ from jsecon.change.history import NewThing, add_frames, add_object, events, move
 from jsecon.errors import InputError
 from jsecon.field.ledger import Ledger
 from jsecon.fit.resize import resize_camera, resize_frame, shrink_cameras
-from jsecon.fit.start import gaussians_from_points
 from jsecon.pipeline.scene_files import read_scene
 from jsecon.read.captures.frames import evenly_spaced, transform_poses
 from jsecon.read.captures.images import encode_jpeg
+from jsecon.splat.points import gaussians_from_points
 from jsecon.splat.render import render_depth
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Camera, Capture, Gaussians, LanguageField, Progress

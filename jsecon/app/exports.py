@@ -11,7 +11,7 @@ import numpy as np
 from jsecon.app import pictures, report, verbs
 from jsecon.app.catalogue import SURE_SHARE, Catalogue
 from jsecon.app.querying import slug
-from jsecon.app.records import decimals, unit_of
+from jsecon.app.records import decimals, world_record
 from jsecon.app.scene import Scene, open_scene
 from jsecon.app.shapes import require_shapes_format, write_shapes
 from jsecon.errors import InputError
@@ -56,7 +56,7 @@ def _objects(verb: verbs.Objects, console: Console) -> verbs.VerbResult:
 def _write_records(file: Path, scene: Scene, listed: Catalogue, records: list[dict[str, Any]]) -> None:
     """Writes the records of the objects as JSON."""
     up = {"up": listed.up.round(6).tolist(), "up_evidence": listed.up_evidence}
-    content = {"frame": "the capture's world", "unit": unit_of(scene.field)} | up | {"objects": records}
+    content = {"frame": "the capture's world"} | world_record(scene.field) | up | {"objects": records}
     write_text(file, json.dumps(content, indent=2) + "\n")
 
 
@@ -76,8 +76,10 @@ def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon export`; the result has the number of exported Gaussians and the bytes of the scene."""
     _check_export(verb)
     text = verb.only if verb.only is not None else verb.without
+    suffix = "" if verb.out is None else verb.out.suffix.lower()
+    points = verb.points or suffix in (".las", ".laz")
     if verb.out is not None:
-        require_writable_format(verb.out)
+        require_writable_format(verb.out, points)
     scene = open_scene(verb.field, embedder=verb.embedder, console=console)
     answer = None if text is None else scene.ask(text)
     if answer is not None and not len(answer.rows):
@@ -88,17 +90,19 @@ def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
     mask = None if answer is None else ~answer.mask if verb.without is not None else answer.mask
     count = scene.field.gaussians.count if mask is None else int(mask.sum())
     result: verbs.VerbResult = {"written": {}, "gaussians": count}
-    has_labels = verb.out is not None and (verb.with_labels or verb.out.suffix.lower() == ".usda")
+    has_labels = verb.out is not None and (verb.with_labels or points or suffix == ".usda")
     with console.progress("objects"):
         listed = _list_objects(scene, has_labels or verb.out is None or bool(verb.objects or verb.shapes), console)
         records = [] if listed is None else listed.records()
     written = result["written"]
     with console.progress("files"):
         if verb.out is not None:
-            scene.export(verb.out, mask, labels=listed if has_labels else None)
+            scene.export(verb.out, mask, labels=listed if has_labels else None, points=points)
             result["bytes"] = verb.out.stat().st_size
             written["scene"] = verb.out
-            console.print_line(f"{count} Gaussians, {result['bytes'] / 2**20:.1f} MiB  {verb.out}")
+            console.print_line(
+                f"{'points of ' * points}{count} Gaussians, {result['bytes'] / 2**20:.1f} MiB  {verb.out}"
+            )
         if verb.objects is not None:
             written["objects"] = _save_objects(scene, verb.objects)
             console.print_line(f"{len(written['objects'])} objects  {verb.objects}")

@@ -73,11 +73,11 @@ class _Tools:
 
     def objects(self, field: FieldName = None) -> dict[str, Any]:
         """Lists the objects of a scene with names, sizes and places, the largest first; at most 100."""
-        from jsecon.app.records import unit_of  # late: it imports jax
+        from jsecon.app.records import world_record  # late: it imports jax
 
         scene = self._scene(field)
         listed = scene.objects()
-        world = {"unit": unit_of(scene.field), "up": listed.up.tolist(), "up_evidence": listed.up_evidence}
+        world = world_record(scene.field) | {"up": listed.up.tolist(), "up_evidence": listed.up_evidence}
         return {"count": len(listed)} | world | {"objects": listed.records()[:100]}
 
     def history(self, field: FieldName = None) -> dict[str, Any]:

@@ -21,7 +21,7 @@ _KINDS = (
     (b"", "a file of another kind"),
 )
 """first bytes of files that are no fields, and what these files are"""
-_REMEDY = "Give field.safetensors, the folder that jsecon run wrote it to, or a splat (.ply, .spz, .sog, .splat, .glb)."
+_REMEDY = "Give field.safetensors, the folder that jsecon run wrote it to, a splat or a point cloud."
 
 
 class FieldPath(NamedTuple):

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 
 from jsecon.errors import InputError, require_one_of
 from jsecon.field.membership import probability_inside
-from jsecon.files import scratch_array
+from jsecon.files import parse_json, scratch_array
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.referring import Object
 from jsecon.query.rules import ABSENT, FOUND, STATES, UNSURE
@@ -236,7 +236,7 @@ class Answer:
             "place": self._place_record() if len(self.rows) else None,
             "reason": self.reason,
             "skipped": dict(self.skipped),
-            "unit": unit_of(self.field),
+            **world_record(self.field),
             "frame_size": [self.field.cameras.width, self.field.cameras.height],
         }
         if self.by != "relation":
@@ -341,10 +341,12 @@ def source_up(field: LanguageField, up: UpAxis) -> UpAxis:
     return dataclasses.replace(up, axis=tuple(axis.round(6).tolist()))
 
 
-def unit_of(field: LanguageField) -> str:
-    """Names the unit of coordinates in the capture's world."""
-    scale = field.metres_per_unit
-    return "capture units" if scale is None else "metres" if scale == 1 else f"capture units of {scale:g} metres"
+def world_record(field: LanguageField) -> dict[str, Any]:
+    """Describes the capture's world: its unit and, if a point cloud named one, its reference system."""
+    scale, crs = field.metres_per_unit, parse_json(field.provenance or "{}").get("crs", "")
+    unit = "capture units" if scale is None else "metres" if scale == 1 else f"capture units of {scale:g} metres"
+    offset = np.asarray(field.source_from_scene, np.float64)[:3, 3].tolist()
+    return {"unit": unit} | ({"crs": crs, "offset": offset} if crs else {})
 
 
 def source_shapes(

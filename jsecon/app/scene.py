@@ -23,7 +23,7 @@ from jsecon.app.catalogue import Catalogue, objects
 from jsecon.app.comparison import Changes, apply_changes, find_changes
 from jsecon.app.object_index import ObjectIndex, choose_shades
 from jsecon.app.opening import locate_field, name_fields
-from jsecon.app.records import Answer, At, Box, Mask, Query, Question, Region, gaussian_rows
+from jsecon.app.records import Answer, At, Box, Mask, Query, Question, Region, gaussian_rows, world_record
 from jsecon.change import MIN_PROBABILITY
 from jsecon.change.history import change_question, events, field_as_of, read_date
 from jsecon.errors import InputError
@@ -50,6 +50,9 @@ from jsecon.query.rules import ONE_REGION, QueryRules
 from jsecon.read.captures.images import read_pixels
 from jsecon.read.masks.masks import resize_nearest
 from jsecon.read.splats.files import save_gaussians
+from jsecon.read.splats.points import load_point_cloud, save_point_cloud
+from jsecon.splat.points import nearest_gaussians
+from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Capture, Gaussians, LanguageField, Selection
 
 CACHED_BYTES = 1 << 28
@@ -810,28 +813,42 @@ class Scene:
         selected: Answer | Bool[np.ndarray, " n"] | None = None,
         *,
         labels: Catalogue | None = None,
+        points: bool = False,
         comment: str = "",
     ) -> None:
         """Writes Gaussians in the world of the capture's files, in blocks, so that a mapped field need not fit memory.
 
         Args:
-          file: The .ply, .spz, .glb or .usda to write.
+          file: The .ply, .spz, .glb or .usda to write; with points .las, .laz or .ply.
           selected: Answer or mask whose Gaussians are written; None writes the whole scene.
-          labels: Catalogue of the scene. A .ply and a .glb get the object_id and the class_id of each Gaussian, a .usda
-            a prim for each object; a .spz has no place for them.
+          labels: Catalogue of the scene. A .ply, a .glb and points get the object_id and the class_id of each Gaussian,
+            a .usda a prim for each object; a .spz has no place for them.
+          points: Whether to write, in place of Gaussians, the points of the file that the field was made of or that its
+            fit started from: those whose nearest Gaussian is near and written, with its labels; all without `selected`.
           comment: As for `save_gaussians`.
 
         Raises:
-          InputError: The file cannot be written.
+          InputError: The file cannot be written, or the field has no points.
         """
-        gaussians, ids, names = self.field.gaussians, {}, ()
+        field, ids, names, world = self.field, {}, (), self.field.source_from_scene
+        gaussians = field.gaussians
         if labels is not None:
-            names = labels.names[:, 0].tolist()
-            ids = {"object_id": labels.labels, "class_id": np.append(labels.class_ids, -1)[labels.labels]}
-        if selected is not None:
-            rows = np.flatnonzero(selected.mask if isinstance(selected, Answer) else selected)
+            names, classes = labels.names[:, 0].tolist(), np.append(labels.class_ids, np.int32(-1))
+            ids = {"object_id": labels.labels, "class_id": classes[labels.labels]}
+        mask = selected.mask if isinstance(selected, Answer) else selected
+        if points:
+            cloud = locate_sources(field).points
+            if cloud is None:
+                problem, remedy = "the field has no file of points that is still there", "Make it of one, or keep that."
+                raise InputError(f"scene {self.name}", problem, remedy=remedy)
+            placed = transform_gaussians(dataclasses.replace(gaussians, sh=gaussians.sh[:, :1]), world)
+            near = nearest_gaussians(load_point_cloud(cloud).points, placed)
+            rows = np.arange(len(near)) if mask is None else np.flatnonzero(np.append(mask, False)[near])
+            ids = {name: np.append(column, np.int32(-1))[near[rows]] for name, column in ids.items()}
+            return save_point_cloud(Path(file), cloud, rows, ids, world_record(field).get("crs", ""))
+        if mask is not None:
+            rows = np.flatnonzero(mask)
             gaussians, ids = gaussian_rows(gaussians, rows), {name: column[rows] for name, column in ids.items()}
-        world = self.field.source_from_scene
         save_gaussians(file, gaussians, similarity=world, ids=ids, names=names, comment=comment)
 
 

@@ -26,7 +26,7 @@ import jsecon
 from jsecon.app import verbs
 from jsecon.app.access import bracketed, is_allowed_host, listen, token_for
 from jsecon.app.opening import find_scene
-from jsecon.app.records import At, Query, unit_of
+from jsecon.app.records import At, Query, world_record
 from jsecon.app.scene import Scene, open_scenes
 from jsecon.errors import InputError
 from jsecon.pipeline.progress import Console
@@ -152,7 +152,7 @@ def application(scenes: Mapping[str, Scene], *, token: str = "") -> FastAPI:
     def objects(request: Annotated[_Request, Parameters()]) -> Response:
         scene = find_scene(scenes, request.field)
         listed = scene.objects()
-        world = {"unit": unit_of(scene.field), "up": listed.up.tolist(), "up_evidence": listed.up_evidence}
+        world = world_record(scene.field) | {"up": listed.up.tolist(), "up_evidence": listed.up_evidence}
         return _AsciiResponse({"field": scene.name} | world | {"objects": listed.records()})
 
     @app.get("/changes", summary="What moved, is gone or is new since a field was made, in order of time")

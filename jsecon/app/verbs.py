@@ -153,8 +153,8 @@ class _FieldVerb(Verb):
     """Options of the verbs that read a field and understand texts.
 
     Attributes:
-      field: Path of field.safetensors, the folder that jsecon run wrote it to, or a file of Gaussians without
-        photographs, of which the field is made once, to NAME_field beside NAME.ply.
+      field: Path of field.safetensors, the folder that jsecon run wrote it to, or a file of Gaussians or
+        points without photographs, of which the field is made once, to NAME_field beside NAME.ply.
       embedder: The CLIP model that the field was made with: a name, hub:owner/name, or a folder. By default it is the
         one that the run used.
     """
@@ -312,7 +312,7 @@ class Export(_FieldVerb):
     name, probability, colour, box, parent and frames of each object.
 
     Attributes:
-      out: The .ply (INRIA's layout), .spz, .glb or .usda to write.
+      out: The .ply (INRIA's layout), .spz, .glb, .usda, .las or .laz to write.
       with_labels: Adds object_id, the id of each Gaussian's object in jsecon objects or -1, and class_id, which objects
         of one name share, to the .ply or .glb.
       objects: Folder to write a .ply of each object to, named by its id and name. They replace those of an earlier
@@ -320,6 +320,8 @@ class Export(_FieldVerb):
       shapes: File for the solids of whole objects but surroundings, in metres if their length is known: .json (box,
         convex hull, and the best of box, cylinder and sphere), .obj (hulls), .xml (MuJoCo's MJCF) or .yaml (MoveIt's
         CollisionObjects). A folder gets all four.
+      points: Writes, to a .las, .laz or .ply, the points of the file that the field was made of or that its fit started
+        from, with object_id and class_id of the nearest Gaussian, in their order. A .las or .laz always has points.
       only: Exports only the Gaussians that jsecon query selects for this text.
       without: Exports all other Gaussians than those. Both exports together hold each Gaussian of the scene once.
     """
@@ -328,6 +330,7 @@ class Export(_FieldVerb):
         "jsecon export my_field/field.safetensors --out scene.glb",
         "jsecon export my_field/field.safetensors --objects objects",
         "jsecon export my_field/field.safetensors --shapes robot",
+        "jsecon export scan_field/field.safetensors --out labelled.laz",
         'jsecon export my_field/field.safetensors --without "red mug" --out rest.ply',
     )
 
@@ -335,6 +338,7 @@ class Export(_FieldVerb):
     with_labels: Option[bool] = False
     objects: Option[Path | None] = None
     shapes: Option[Path | None] = None
+    points: Option[bool] = False
     only: Option[str | None] = None
     without: Option[str | None] = None
 

@@ -190,11 +190,10 @@ def view_evidence(
     require_shape("labels", labels, (camera.height, camera.width), "Give images of the camera's size.")
     require_labels(labels, num_regions)
     rows = None
-    if gaussians.count > MAX_WHOLE:
+    if gaussians.count > MAX_WHOLE and capacity is None:
         rows = visible_rows(gaussians, camera, near=near)
         gaussians = geometry_of_rows(gaussians, rows)
-        measured = plan_capacity(gaussians, camera, margin=1.0, devices=1, near=near)
-        capacity = max(measured, 1) if capacity is None else capacity
+        capacity = plan_capacity(gaussians, camera, margin=1.0, devices=1, near=near)
     elif not gaussians.count:
         nothing, weightless = np.zeros(0, np.int32), np.zeros(0, np.float32)
         return ViewEvidence(nothing, np.zeros(1, np.int32), nothing, weightless, weightless)

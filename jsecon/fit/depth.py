@@ -1,13 +1,12 @@
 """Points from depth frames: back-projection, then one point per voxel. Host code (NumPy)."""
 
-import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from jsecon.errors import InputError, require
-from jsecon.types import Array, Capture
+from jsecon.splat.points import voxel_for, voxel_ids, voxel_means
+from jsecon.types import Capture
 
 
 class DepthPoints(NamedTuple):
@@ -45,25 +44,6 @@ def back_project_frame(capture: Capture, frame: int, stride: int):
     return world, np.asarray(capture.frames[frame])[rows, columns], np.stack([rows, columns], axis=1)
 
 
-def _voxel_ids(points: np.ndarray, voxel: float) -> np.ndarray:
-    """(S,) voxel of each point, numbered 0 .. P-1 without gaps."""
-    cells = np.floor((points - points.min(axis=0)) / voxel).astype(np.int64)
-    size, expected = cells.max(axis=0) + 1, f"large enough for the extent {np.ptp(points, axis=0)}"
-    require(math.prod(map(float, size)) < 2**62, "voxel", voxel, expected, "Choose a larger voxel.")
-    return np.unique(np.ravel_multi_index(tuple(cells.T), tuple(size)), return_inverse=True)[1]
-
-
-def _voxel_for(points: Float[Array, "s 3"], max_points: int) -> float:
-    """Finds the smallest voxel edge (to 2 %) that leaves at most `max_points` voxels of the points (S, 3) occupied."""
-    points = np.asarray(points, np.float64)
-    high = float(np.max(np.ptp(points, axis=0))) * 1.001 + 1e-9
-    low = high / 2**20
-    while high / low > 1.02:
-        middle = math.sqrt(low * high)
-        low, high = (middle, high) if _voxel_ids(points, middle).max() >= max_points else (low, middle)
-    return high
-
-
 def points_from_depth(
     capture: Capture, *, voxel: float = 0.0, max_points: int | None = None, stride: int = 1
 ) -> DepthPoints:
@@ -82,11 +62,10 @@ def points_from_depth(
         raise InputError("capture", "no pixel with a known depth", "depths above 0", "Check their encoding and unit.")
     points, colors, pixels = (np.concatenate(columns) for columns in zip(*parts))
     frame = np.repeat(chosen, [len(world) for world, _, _ in parts])
-    if max_points is not None and (not voxel or _voxel_ids(points, voxel).max() >= max_points):
-        voxel = _voxel_for(points, max_points)
-    ids = _voxel_ids(points, voxel)
-    counts = np.bincount(ids)
-    mean, color = (np.stack([np.bincount(ids, a) for a in v.T], axis=1) / counts[:, None] for v in (points, colors))
+    if max_points is not None and (not voxel or voxel_ids(points, voxel).max() >= max_points):
+        voxel = voxel_for(points, max_points)
+    ids = voxel_ids(points, voxel)
+    mean, color = voxel_means(ids, points, colors)
     return DepthPoints(
         mean.astype(np.float32),
         np.rint(color).astype(np.uint8),

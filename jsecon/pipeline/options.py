@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, TypeAlias, TypeVar, get_type_hints
 import tyro
 
 from jsecon.errors import InputError, describe_error
+from jsecon.read.registry import SCENES
 
 T = TypeVar("T")
 
@@ -87,19 +88,22 @@ class InputOptions:
     Attributes:
       capture: Folder with images/ and sparse/0 (COLMAP), or with transforms.json (nerfstudio, instant-ngp); a folder of
         ScanNet, TUM, ARKitScenes, Polycam, Record3D or OpenSfM; or a folder of photographs, or a video, without poses
-        (extra sfm). Or a file of Gaussians (.ply, .spz, .sog, .splat, .glb) without photographs: jsecon renders it
-        from poses that lie near it, or plans virtual views.
+        (extra sfm). Or a file of Gaussians (.ply, .spz, .sog, .splat, .glb) or a point cloud (.las, .laz, .e57, .pcd,
+        .xyz, .txt, .ply) without photographs: jsecon renders it from poses that lie near it, or plans virtual views.
       gaussians: File with the 3D Gaussians of the scene: .ply (INRIA's layout, also of 2D Gaussians, or SuperSplat's
         compressed one), .glb, .spz, .splat, with the extra formats also .sog. Its world may be that of the capture's
         files, of its poses, of a dataparser_transforms.json near it, or the one that gsplat or nerfstudio normalise
         to: jsecon renders a few frames to find out, and warns if none fits. Without it, Gaussians are fitted to the
         frames.
+      points: Point cloud (.las, .laz, .e57, .pcd, .xyz, .txt, .ply) in the world of the capture's files, such as a
+        laser scan. The fit starts from it, and follows its depth where the capture has none of its own.
       panoramas: Tells that the photographs, or the video, without poses show all directions (360 degrees,
         equirectangular). Needed only where their files do not say so.
     """
 
     capture: tyro.conf.Positional[Path]
     gaussians: Option[Path | None] = None
+    points: Option[Path | None] = None
     panoramas: Option[bool] = False
 
 
@@ -243,8 +247,8 @@ class Options(FieldOptions, ModelOptions, MaskOptions, BareOptions, SceneOptions
 
 
 def is_bare_scene(capture: Path) -> bool:
-    """Whether the input of a run is a file of Gaussians instead of a capture."""
-    return capture.suffix.lower() in (".ply", ".spz", ".sog", ".splat", ".glb") and not capture.is_dir()
+    """Whether the input of a run is a file of Gaussians or points instead of a capture."""
+    return capture.suffix.lower() in SCENES and not capture.is_dir()
 
 
 def require_writable(folder: Path, *, create: bool = True) -> None:

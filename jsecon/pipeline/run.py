@@ -48,6 +48,7 @@ from jsecon.read.captures.capture import read_posed_images
 from jsecon.read.captures.frames import FrameOptions, evenly_spaced
 from jsecon.read.captures.images import encode_jpeg
 from jsecon.read.masks.masks import load_features, load_labels, load_proposals
+from jsecon.read.splats.points import load_point_cloud
 from jsecon.types import Capture, Gaussians, LanguageField, Quality, Regions
 from jsecon.views.frame import find_up_axis, given_up
 from jsecon.vision.classical import require_contrib
@@ -154,9 +155,10 @@ def _require_options_apply(options: Options) -> None:
             remedy = "--views sets the number of views." if bare else "--frames sets the most."
             flag = f"--{name.replace('_', '-')}"
             raise InputError(flag, f"{options.capture.name} is {kind}", remedy=f"Leave it out; {remedy}")
-    if bare and options.gaussians is not None:
-        problem = f"{options.capture.name} is a scene of Gaussians itself"
-        raise InputError("--gaussians", problem, "", "Leave out --gaussians, or give the folder of the photographs.")
+    for name in ("gaussians", "points"):
+        if bare and getattr(options, name) is not None:
+            problem = f"{options.capture.name} is a scene of Gaussians or points itself"
+            raise InputError(f"--{name}", problem, "", f"Leave out --{name}, or give the folder of the photographs.")
 
 
 def _require_own_folder(options: Options, out: Path) -> None:
@@ -387,6 +389,8 @@ def _check_inputs(context: RunContext, plan: _RunState) -> None:
         return
     if options.gaussians is not None and "gaussians" in running:
         read_scene(options.gaussians)
+    if options.points is not None and "load" in running:
+        load_point_cloud(options.points)
     if "poses" in running:
         require_pycolmap(options.capture)
         return

@@ -20,7 +20,7 @@ from jsecon.files import write_text
 from jsecon.fit.quality import QUICK_LONG_SIDE, is_weak, measure_quality
 from jsecon.fit.start import starting_gaussians
 from jsecon.pipeline.options import Options, is_bare_scene
-from jsecon.pipeline.scene_files import check_overlap, fit_background, place_in_capture, read_scene
+from jsecon.pipeline.scene_files import check_overlap, fit_background, place_in_capture, read_scene, with_points
 from jsecon.pipeline.stages import KEY_FILE, WARNING, RunContext, Stage, StageInput, StageResult, training_frames
 from jsecon.poses.sfm import find_poses
 from jsecon.read.captures.capture import has_depth, load_capture, read_posed_images, unposed_photographs
@@ -47,6 +47,8 @@ _TRAINED = "dataparser_transforms.json"
 """file of nerfstudio with the world in which it trained"""
 _NEAR_VIEWS = 48
 """views at poses near a scene: they take no longer than planning 24 does, and match more"""
+_PLANNED = 1 << 16
+"""Gaussians of a scene, at most, by which views are planned, at 80x60 px"""
 _MOST_POSES = 256
 """poses, evenly spaced, among which views are chosen"""
 _LEAST_USABLE, _LEAST_COVERAGE = 0.8, 0.7
@@ -76,6 +78,9 @@ def plan_capture(context: RunContext) -> list[Stage]:
     key_options |= context.key_options("panoramas")
     how = f"found by structure from motion (pycolmap) for {what}"
     folder = context.out / "poses"
+    if context.options.points is not None:
+        problem = "the photographs have no poses, so no world that the points could be in"
+        raise InputError("--points", problem, "", "Give a capture with poses in the world of the points.")
     poses = Stage("poses", how, _estimate_poses, key_options=key_options, files=tuple(files), output_dir=folder)
     return [poses, dataclasses.replace(_plan_load(context, folder), after=("poses",), files=())]
 
@@ -93,7 +98,7 @@ def _plan_load(context: RunContext, capture: Path) -> Stage:
         key_options |= context.key_options("seed", "steps", "minutes") | {"refine": refine}
         how += ", corrected by short fits"
         how += " in about half of the fit's time where that helps" * (refine == "auto")
-    return Stage("load", how, _load_frames, key_options=key_options, files=(capture,))
+    return Stage("load", how, _load_frames, key_options=key_options, files=(capture, options.points))
 
 
 def _plan_rendered_views(context: RunContext) -> Stage:
@@ -186,6 +191,8 @@ def _load_frames(stage: StageInput) -> StageResult:
     options, sizes = stage.context.options, stage.context.key_options("long_side", "frames", "holdout")
     folder = stage.context.out / "poses" if hasattr(stage.results, "poses") else options.capture
     capture = load_capture(folder, **sizes, progress=stage.progress)
+    if options.points is not None:
+        capture = with_points(capture, options.points, stage.progress)
     train = training_frames(capture.held_out)
     count, height, width = capture.frames.shape[:3]
     frames = f"{count} frames of {width}x{height}, {count - len(train)} of them held out"
@@ -230,7 +237,8 @@ def _fit_scene(stage: StageInput) -> StageResult:
     options, capture, start = stage.context.options, stage.results.load, stage.checkpoint.read()
     notes = ()
     if start is None:
-        start, origin = starting_gaussians(capture, sh_degree=2, progress=stage.progress)
+        started = capture if options.points is None else dataclasses.replace(capture, depths=None)
+        start, origin = starting_gaussians(started, sh_degree=2, progress=stage.progress)
         check_overlap(start, capture.cameras[training_frames(capture.held_out)], str(options.capture))
         notes = (f"start of the fit: {origin}",)
     pixels, minutes = capture.cameras.width * capture.cameras.height, options.minutes
@@ -306,7 +314,7 @@ def open_bare_scene(options: Options, progress: Progress) -> _BareScene:
     """Reads a scene without photographs, and finds views of it: given ones, those near it, or planned ones."""
     near = _poses_near(options)
     source, _ = read_scene(options.capture)
-    source_from_scene = _world_of_scene(source)
+    source_from_scene = _world_of_scene(_every_nth(source))
     scene = _into_world(source, source_from_scene)
     if options.cameras is not None:
         _, cameras, names = _load_poses(options.cameras, options.long_side)
@@ -316,11 +324,18 @@ def open_bare_scene(options: Options, progress: Progress) -> _BareScene:
     refused, views = (), None
     if near is not None:
         try:
-            views = _choose_near(near, options, scene, source_from_scene, progress)
+            views = _choose_near(near, options, _every_nth(scene), source_from_scene, progress)
         except InputError as error:
             refused = (f"{WARNING}Views are planned, as the poses near the scene cannot be used. {error}",)
-    views = views or _plan_views(options, scene, progress)
+    views = views or _plan_views(options, _every_nth(scene), progress)
     return _BareScene(source, scene, source_from_scene, views._replace(notes=refused + views.notes))
+
+
+def _every_nth(scene: Gaussians) -> Gaussians:
+    """Takes few enough of a large scene's Gaussians to plan views, so much wider that they cover as much."""
+    step = -(-scene.count // _PLANNED)
+    part = scene if step == 1 else jax.tree.map(lambda column: np.asarray(column[::step]), scene)
+    return dataclasses.replace(part, log_scales=part.log_scales + np.float32(0.5 * np.log(step)))
 
 
 def _plan_views(options: Options, scene: Gaussians, progress: Progress) -> _Views:

@@ -6,6 +6,7 @@ more with the photograph of the same camera than with the others. That holds for
 below that of a plain colour. A file does not record either over which colour the scene was trained: that is fitted.
 """
 
+import dataclasses
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,9 +24,14 @@ from jsecon.numerics import FRUSTUM_MARGIN, NEAR
 from jsecon.pipeline.stages import WARNING
 from jsecon.read.captures.frames import evenly_spaced, transform_poses
 from jsecon.read.splats.files import MAX_READ_ROUNDING, read_gaussians
-from jsecon.splat.render import render_rgb
+from jsecon.read.splats.points import gaussians_of_cloud
+from jsecon.splat.render import render_depth, render_rgb
+from jsecon.splat.sh import C0
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Camera, Capture, Gaussians, Progress
+
+_START_POINTS = 100_000
+"""points of a cloud from which a fit starts, as many as from depth frames"""
 
 
 def read_scene(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
@@ -34,6 +40,24 @@ def read_scene(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
     if not scene.count:
         raise InputError(path, "the file holds no Gaussians", "at least one", "Export the scene again.")
     return scene, notes
+
+
+def with_points(capture: Capture, path: Path, progress: Progress) -> Capture:
+    """Gives a capture the points of a cloud in the world of its files, and their depth if it has none of its own."""
+    cloud, notes = gaussians_of_cloud(path, _START_POINTS)
+    scene = jax.tree.map(jnp.asarray, transform_gaussians(cloud, np.linalg.inv(capture.source_from_scene)))
+    train = np.flatnonzero(~np.asarray(capture.held_out))
+    check_overlap(scene, capture.cameras[train], str(path))
+    depths = capture.depths
+    if depths is None:
+        depths = np.zeros(capture.frames.shape[:3], np.float32)
+        for n, t in enumerate(train):
+            depth, alpha = map(np.asarray, render_depth(scene, capture.cameras[int(t)]))
+            depths[t] = np.where(alpha > 0.5, depth, 0)
+            progress(n + 1, len(train))
+    colours = np.rint(255 * np.clip(0.5 + C0 * cloud.sh[:, 0], 0, 1)).astype(np.uint8)
+    given = {"points": np.asarray(scene.means), "point_colors": colours, "depths": depths}
+    return dataclasses.replace(capture, **given, notes=(*capture.notes, *notes))
 
 
 class _Placement(NamedTuple):

@@ -18,7 +18,8 @@ from jsecon.errors import InputError
 from jsecon.field.field import Provenance
 from jsecon.files import parse_json
 from jsecon.networks.hub import cached_address
-from jsecon.pipeline.options import Options
+from jsecon.pipeline.options import Options, is_bare_scene
+from jsecon.read.splats.points import read_crs
 from jsecon.types import LanguageField
 
 
@@ -31,6 +32,8 @@ class Sources(NamedTuple):
     """its folder, if that still exists"""
     capture: Path | None
     """folder of the capture, if that still exists"""
+    points: Path | None
+    """file of the points or Gaussians that the run was given, if that still exists"""
     address: str | None = None
     """where the model is on the hub ("hub:owner/name@commit"), if the run took it from there"""
 
@@ -43,6 +46,8 @@ def provenance(options: Options, keys: dict[str, str], embedder: str, out: Path,
     models = {name: address for name, address in addresses.items() if address is not None}
     origin = {"jsecon": jsecon.__version__, "options": values | models, "keys": keys, "embedder": embedder}
     origin |= {"folders": _relative_folders(options, out), "models": models, "warnings": list(warnings)}
+    cloud = _given_points(options)
+    origin["crs"] = "" if cloud is None else read_crs(cloud)
     return json.dumps(origin, sort_keys=True)
 
 
@@ -80,11 +85,17 @@ def run_warnings(field: LanguageField) -> list[str]:
         return []
 
 
+def _given_points(options: Options) -> Path | None:
+    """The file of points or Gaussians of a run."""
+    bare = is_bare_scene(options.capture)
+    return options.capture if bare else options.points or options.gaussians
+
+
 def _relative_folders(options: Options, out: Path) -> dict[str, str]:
     """Folders of options, relative to the output folder."""
     folders = {}
-    for name in ("embedder", "capture"):
-        folder = getattr(options, name)
+    for name in ("embedder", "capture", "points"):
+        folder = _given_points(options) if name == "points" else getattr(options, name)
         if folder is not None and cached_address(folder) is None:
             try:
                 folders[name] = Path(os.path.relpath(os.path.realpath(folder), os.path.realpath(out))).as_posix()
@@ -105,8 +116,8 @@ def locate_sources(field: LanguageField, beside: Path | None = None) -> Sources:
     except (ValueError, TypeError, AttributeError) as error:
         remedy = "Give the folders yourself, with --embedder and --images, or run the capture again."
         raise InputError("field", "its provenance is not what jsecon run writes", remedy=remedy) from error
-    model, capture = (_resolve(beside, folders.get(kind)) for kind in ("embedder", "capture"))
-    return Sources(name or None, model, capture, models.get("embedder"))
+    found = [_resolve(beside, folders.get(kind)) for kind in ("embedder", "capture", "points")]
+    return Sources(name or None, *found, models.get("embedder"))
 
 
 def _resolve(beside: Path | None, hint: str | None) -> Path | None:

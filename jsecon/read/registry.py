@@ -4,14 +4,19 @@ A row has the name of a format, the marks that tell it, and the function that re
 entry point whose object is a `Reader`; the groups are jsecon.captures, jsecon.masks and jsecon.splats.
 """
 
+import contextlib
 import functools
+import importlib
 import importlib.metadata
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from jsecon.errors import InputError, describe_error
+
+SCENES = (".ply", ".spz", ".sog", ".splat", ".glb", ".las", ".laz", ".e57", ".pcd", ".xyz", ".txt")
+"""suffixes of files of Gaussians or points, which may be scenes without photographs"""
 
 
 class Reader(NamedTuple):
@@ -58,3 +63,21 @@ def _added_readers(group: str, path: tuple[str, ...]) -> tuple[Reader, ...]:
 def find_reader(group: str, own: Sequence[Reader], path: Path) -> Reader | None:
     """Finds the first reader of `readers` whose marks a file or folder has."""
     return next((reader for reader in readers(group, own) if reader.fits(path)), None)
+
+
+@contextlib.contextmanager
+def decoding(path: Path, name: str) -> Iterator[Any]:
+    """Yields a package of the extra formats; whatever it raises on damaged bytes becomes an InputError."""
+    import numpy as np  # late: to read a command line needs none of it
+
+    try:
+        with np.errstate(invalid="ignore", over="ignore"):
+            yield importlib.import_module(name)
+    except InputError:
+        raise
+    except ImportError as error:
+        problem = f"a {path.suffix.lower()} like this needs the package {error.name or name}, which is not installed"
+        raise InputError(path, problem, remedy="Run: pip install 'jsecon[formats]' (or use a plain .ply).") from error
+    except Exception as error:
+        problem = f"the file is damaged or cut short ({describe_error(error).replace(f': {path}', '')})"
+        raise InputError(path, problem, remedy="Export it again, or as an uncompressed .ply.") from error

@@ -7,6 +7,7 @@ only what overlaps with hardly any other Gaussian goes.
 """
 
 import dataclasses
+import functools
 
 import jax
 import numpy as np
@@ -49,15 +50,19 @@ def find_litter(gaussians: Gaussians, cameras: Camera, progress: Progress | None
     means = np.asarray(gaussians.means, np.float32)
     peak = np.zeros(count, np.float32)
     reach = np.exp(np.asarray(gaussians.log_scales).max(1))
+    part_of, room = None, [0, 0]
     if count <= MAX_WHOLE:  # once for all views
         gaussians = jax.device_put(dataclasses.replace(gaussians, sh=None))
     else:
+        part_of = functools.lru_cache(1)(functools.partial(_part, gaussians, cameras))
         cameras = _quarters(cameras)
     for n, (least, gap) in enumerate(((_FIRST_SHARE, _FIRST_GAP), (_SHARE, _GAP))):
         front, total, peak = np.zeros((3, count), np.float32)
 
         def view(t: int, seen=seen, gap=gap) -> tuple[np.ndarray, ...]:
-            return _view(gaussians, seen, cameras[t], gap)
+            if part_of is None:
+                return _view(gaussians, seen, cameras[t], gap)
+            return _quarter(*part_of(t // 4), seen, cameras[t], gap, room)
 
         def report(done: int, views: int, first: int = n * len(cameras)) -> None:
             if progress is not None:
@@ -105,31 +110,48 @@ def _quarters(cameras: Camera) -> Camera:
     width, height = -(-cameras.width // 2), -(-cameras.height // 2)
     corners = [(x, y) for x in (0, cameras.width - width) for y in (0, cameras.height - height)]
     moved = [dataclasses.replace(cameras, cx=cameras.cx - x, cy=cameras.cy - y) for x, y in corners]
-    whole = jax.tree.map(lambda *parts: np.concatenate(parts), *moved)
+    whole = jax.tree.map(lambda *parts: np.stack(parts, 1).reshape(-1, *parts[0].shape[1:]), *moved)
     return dataclasses.replace(whole, width=width, height=height)
 
 
-def _view(gaussians: Gaussians, seen: Bool[np.ndarray, " n"], camera: Camera, gap: float) -> tuple[np.ndarray, ...]:
+def _part(gaussians: Gaussians, cameras: Camera, t: int) -> tuple[np.ndarray, Gaussians]:
+    """Returns the Gaussians that a view can see: their rows, and their geometry in memory."""
+    rows = visible_rows(gaussians, cameras[t])
+    return rows, geometry_of_rows(gaussians, rows)
+
+
+def _quarter(
+    rows: np.ndarray, part: Gaussians, seen: np.ndarray, camera: Camera, gap: float, room: list[int]
+) -> tuple[np.ndarray, ...]:
+    """Does what `_view` does of a quarter of a view, of its `_part`.
+
+    `room` keeps the largest powers of two of Gaussians and of their pairs, so that quarters share programs.
+    """
+    ids = visible_rows(part, camera)
+    room[0] = max(room[0], 1 << len(ids).bit_length())
+    gaussians = geometry_of_rows(part, ids, room[0])
+    room[1] = max(room[1], 1 << plan_capacity(gaussians, camera, margin=1.0, devices=1).bit_length())
+    inside, *columns = _view(gaussians, np.pad(seen[rows[ids]], (0, room[0] - len(ids))), camera, gap, room[1])
+    return rows[ids[inside]], *columns
+
+
+def _view(
+    gaussians: Gaussians, seen: Bool[np.ndarray, " n"], camera: Camera, gap: float, capacity: int | None = None
+) -> tuple[np.ndarray, ...]:
     """Returns the Gaussians of a view, their weight in front of the surface and on it, and their largest weight.
 
     The surface is that of the Gaussians that are `seen`.
     """
-    ids, capacity = np.arange(gaussians.count), None
-    if gaussians.count > MAX_WHOLE:
-        ids = visible_rows(gaussians, camera)
-        gaussians = geometry_of_rows(gaussians, ids)
-        seen = np.pad(seen[ids], (0, gaussians.count - len(ids)))
-        capacity = max(plan_capacity(gaussians, camera, margin=1.0, devices=1), 1)
     depth, alpha = map(np.asarray, render_depth(_with_opacity(gaussians, seen), camera, capacity=capacity))
     shown = (alpha >= _LEAST_ALPHA) & (depth > 0)
     nearest = float(depth[shown].min(initial=np.inf))
     bins = np.where(shown, np.log(np.where(shown, depth, 1) / nearest) / np.log1p(_STEP), -1).astype(np.int32)
     regions = int(bins.max(initial=-1)) + 1
-    found = view_evidence(gaussians, camera, bins, regions)
+    found = view_evidence(gaussians, camera, bins, regions, capacity=capacity)
     rows, pose = found.gaussians, np.asarray(camera.world_to_camera, np.float32)
     own = np.repeat(np.arange(len(rows)), np.diff(found.starts))
     middles = np.append(nearest * (1 + _STEP) ** (np.arange(regions) + 0.5), 0)  # the last is that of no surface
     z = np.asarray(gaussians.means, np.float32)[rows] @ pose[2, :3] + pose[2, 3]
     weights = np.where(found.regions < regions, found.weights, 0)
     front = np.bincount(own, weights * (middles[found.regions] > (1 + gap) * z[own]), len(rows))
-    return ids[rows], front, np.bincount(own, weights, len(rows)), found.max_pixel_weights
+    return rows, front, np.bincount(own, weights, len(rows)), found.max_pixel_weights

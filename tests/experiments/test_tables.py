@@ -12,9 +12,9 @@ import pytest
 from experiments import lerf, ovs3d, replica, threshold_sweep
 from experiments.tables import fill
 from experiments.tables.setting import levels_of, prepare
-from jsecon.fit.start import gaussians_from_points
 from jsecon.read.masks.masks import LEVELS, load_features
 from jsecon.read.splats.files import save_gaussians
+from jsecon.splat.points import gaussians_from_points
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from jsecon.read.captures.frames import FrameOptions, PosedImages
 from jsecon.read.captures.images import IMAGE_SUFFIXES, convert_remedy, is_photograph, unread_format
 from jsecon.read.captures.panoramas import cut_panoramas
 from jsecon.read.captures.video import is_video
-from jsecon.read.registry import Reader, find_reader
+from jsecon.read.registry import SCENES, Reader, find_reader
 from jsecon.types import Capture, Progress
 
 READERS = (*colmap.READERS, *nerfstudio.READERS, *colmap.NESTED_READERS, *opensfm.READERS, *rgbd.READERS)
@@ -220,7 +220,7 @@ def _no_capture(path: Path) -> InputError:
     videos = [child for child in entries if is_video(child)]
     unread = [child for child in (*entries, *path.glob("images/*")) if unread_format(child)] if path.is_dir() else []
     archives = [child for child in entries if _is_archive(child)]
-    scenes = [child for child in entries if child.suffix.lower() in (".ply", ".spz", ".sog", ".splat", ".glb")]
+    scenes = [child for child in entries if child.suffix.lower() in SCENES[:-1]]
     scenes = sorted(path.glob("point_cloud/*/*.ply"), key=lambda file: file.stat().st_mtime) or scenes  # INRIA's
     if not path.exists():
         problem, remedy = "there is no such file or folder", "Check the path."

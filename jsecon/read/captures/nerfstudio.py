@@ -23,7 +23,7 @@ from jsecon.read.captures.frames import PosedImage, PosedImages, make_rigid, rig
 from jsecon.read.captures.images import IMAGE_SUFFIXES, find_image, size_around
 from jsecon.read.captures.lens import PANORAMA, Lens, panorama_lens
 from jsecon.read.registry import Reader
-from jsecon.read.splats.ply import load_point_cloud
+from jsecon.read.splats.points import load_point_cloud
 from jsecon.types import UpAxis
 
 _PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE"}

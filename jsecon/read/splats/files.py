@@ -9,7 +9,6 @@ of a .sog without a check of their sizes. It returns linear positions, log scale
 opacities.
 """
 
-import contextlib
 import dataclasses
 import gzip
 import io
@@ -17,7 +16,7 @@ import json
 import struct
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -27,48 +26,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jsecon.errors import InputError, describe_error, require_shape
+from jsecon.errors import InputError, require_shape
 from jsecon.files import atomic_write, parse_json, reading
-from jsecon.read.registry import Reader, find_reader
+from jsecon.read.registry import SCENES, Reader, decoding, find_reader
 from jsecon.read.splats.gltf import read_glb, save_glb
 from jsecon.read.splats.ply import drawable_gaussians, read_ply, read_ply_file, save_ply, usable_blocks
+from jsecon.read.splats.points import READERS as POINTS, gaussians_of_cloud
 from jsecon.read.splats.usd import save_usda
 from jsecon.splat.project import check_gaussians, unusable_rows
 from jsecon.splat.sh import C0
 from jsecon.splat.transform import float32_rounding, transform_axes, transform_gaussians
 from jsecon.types import Array, Gaussians
 
-_FORMATS = "Gaussians as .ply (INRIA's or SuperSplat's compressed), .glb, .spz, .sog or .splat"
+_FORMATS = f"Gaussians or points as {', '.join(SCENES[:-1])} or {SCENES[-1]}"
 MAX_READ_ROUNDING = 0.25
 """Rounding of a Gaussian's centre by float32, relative to its largest standard deviation, above which a file is not
 read."""
-_AGAIN = "Export it again, or as an uncompressed .ply."
 _SPZ_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 """from a .ply's x right, y down, z forward to .spz's x right, y up, z back; and back again"""
-
-
-def _import_gsply(path: Path) -> Any:
-    """Imports gsply, of the extra formats; `path` is the file that needs it."""
-    try:
-        import gsply
-    except ImportError as error:
-        problem = f"a {path.suffix.lower()} like this needs the package gsply, which is not installed"
-        raise InputError(path, problem, remedy="Run: pip install 'jsecon[formats]' (or use a plain .ply).") from error
-    return gsply
-
-
-@contextlib.contextmanager
-def _decoding(path: Path) -> Iterator[Any]:
-    """Yields gsply; whatever it raises on damaged bytes becomes an InputError."""
-    gsply = _import_gsply(path)
-    try:
-        with np.errstate(invalid="ignore", over="ignore"):
-            yield gsply
-    except InputError:
-        raise
-    except Exception as error:
-        problem = f"the file is damaged or cut short ({describe_error(error).replace(f': {path}', '')})"
-        raise InputError(path, problem, remedy=_AGAIN) from error
 
 
 def _usable_gaussians(path: Path, *columns: np.ndarray) -> tuple[Gaussians, tuple[str, ...]]:
@@ -106,7 +81,7 @@ def _read_spz(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
 
     Versions 2 and 3 are one gzip stream, with records behind the numbers; version 4 has them behind the header.
     """
-    with _decoding(path) as gsply:
+    with decoding(path, "gsply") as gsply:
         data = path.read_bytes()
         is_gzip = data.startswith(b"\x1f\x8b")
         body = gzip.decompress(data) if is_gzip else data
@@ -151,7 +126,6 @@ def _spz_axes(records: bytes) -> np.ndarray:
 
 def _save_spz(path: Path, gaussians: Gaussians, ids: Any, similarity: Float[Array, "4 4"] | None) -> None:
     """Writes a .spz of version 3, with the finest positions that hold the farthest Gaussian in 24 bits."""
-    gsply = _import_gsply(path)
     into = _SPZ_AXES if similarity is None else _SPZ_AXES @ np.asarray(similarity, np.float64)
     blocks = [block for _, block in usable_blocks(path, gaussians, into)]
     whole = jax.tree.map(lambda *parts: np.concatenate(parts).astype(np.float32), *blocks)
@@ -167,14 +141,14 @@ def _save_spz(path: Path, gaussians: Gaussians, ids: Any, similarity: Float[Arra
         raise InputError(path, problem, "sizes from 4.5e-5 to 379 units in a .spz", "Write a .ply, or scale the scene.")
     constant, rest = np.ascontiguousarray(whole.sh[:, 0]), np.ascontiguousarray(whole.sh[:, 1:])
     columns = whole.means, whole.log_scales, whole.quaternions, whole.opacity_logits, constant
-    with atomic_write(path) as temporary, np.errstate(over="ignore"):
+    with atomic_write(path) as temporary, decoding(path, "gsply") as gsply:
         data = gsply.GSData.from_arrays(*columns, shN=rest if rest.size else None, format="ply")
         gsply.write_spz(temporary, data, version=3, fractional_bits=bits)
 
 
 def _read_compressed_ply(path: Path, header: Any) -> tuple[Gaussians, tuple[str, ...]]:
     """Reads SuperSplat's compressed .ply (github.com/playcanvas/splat-transform, decompress-ply.ts)."""
-    with _decoding(path) as gsply:
+    with decoding(path, "gsply") as gsply:
         chunk, vertex, *rest = header.elements
         bounds = ("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b")
         fields = [
@@ -195,7 +169,7 @@ def _read_compressed_ply(path: Path, header: Any) -> tuple[Gaussians, tuple[str,
 
 def _read_sog(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
     """Reads PlayCanvas' .sog, images in a zip."""
-    with _decoding(path) as gsply:
+    with decoding(path, "gsply") as gsply:
         with zipfile.ZipFile(path) as archive:
             meta = parse_json(archive.read("meta.json"))
             codebooks = {
@@ -246,8 +220,13 @@ def _read_ply(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
     header = read_ply_file(path)[1]
     comments = [comment.lower().replace(":", " ").split() for comment in header.comments]
     is_antialiased = ["splatrendermode", "mip"] in comments or ["antialiased", "1"] in comments  # of Brush, Postshot
-    is_compressed = any(name == "packed_position" for element in header.elements for name, _ in element.fields)
-    gaussians, notes = _read_compressed_ply(path, header) if is_compressed else (read_ply(path), ())
+    names = {name for element in header.elements for name, _ in element.fields}
+    if "packed_position" in names:
+        gaussians, notes = _read_compressed_ply(path, header)
+    elif any(name.startswith(("f_dc_", "scale_", "rot_", "opacity")) for name in names):
+        gaussians, notes = read_ply(path), ()
+    else:
+        gaussians, notes = gaussians_of_cloud(path)
     return gaussians, (*notes, *_antialiasing_notes(path, is_antialiased))
 
 
@@ -257,12 +236,14 @@ READERS = (
     Reader("SPZ", (".spz",), _read_spz),
     Reader("SOG", (".sog",), _read_sog),
     Reader("splat", (".splat",), _read_splat),
+    *(Reader(name, marks, gaussians_of_cloud) for name, marks, _ in POINTS),
 )
 
 
 def load_gaussians(path: str | Path, *, similarity: Float[Array, "4 4"] | None = None) -> Gaussians:
     """Reads Gaussians from a .ply (INRIA's layout, or SuperSplat's compressed one), .glb, .spz, .sog or .splat.
 
+    Points of a .las, .laz, .e57, .pcd, .xyz, .txt or .ply become round, opaque Gaussians, at most 200,000.
     All come in the world of the .ply that they were made from: .spz and .glb have y up by their makers' definition, and
     are turned back, (x, -y, -z) and (-x, -y, z). Warns (UserWarning) if a file was trained with antialiasing, which is
     not done.
@@ -355,13 +336,15 @@ def save_gaussians(
     _WRITERS[path.suffix.lower()](path, gaussians, ids, similarity, **options)
 
 
-def require_writable_format(path: Path) -> None:
-    """Checks that `save_gaussians` can write a file, which need not exist."""
-    if path.suffix.lower() not in _WRITERS:
+def require_writable_format(path: Path, points: bool = False) -> None:
+    """Checks that `save_gaussians`, or `save_point_cloud`, can write a file, which need not exist."""
+    known = (".las", ".laz", ".ply") if points else tuple(_WRITERS)
+    if path.suffix.lower() not in known:
         remedy = f"For example: {path.stem}.ply; npx @playcanvas/splat-transform makes other formats of it."
-        raise InputError(path, f"its name ends in {path.suffix or 'no suffix'}", " or ".join(_WRITERS), remedy)
+        raise InputError(path, f"its name ends in {path.suffix or 'no suffix'}", " or ".join(known), remedy)
     if path.suffix.lower() == ".spz":
-        _import_gsply(path)
+        with decoding(path, "gsply"):
+            pass
 
 
 _WRITERS: dict[str, Callable[..., None]] = {

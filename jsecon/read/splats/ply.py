@@ -1,4 +1,4 @@
-"""Gaussians and point clouds as .ply files, on the host.
+"""Gaussians as .ply files, and vertices of any kind, on the host.
 
 The container is read whatever its properties: text or binary, either byte order, lists (http://paulbourke.net/
 dataformats/ply). The package plyfile is not used: it is under GPLv3+ and jsecon under Apache-2.0. Gaussians have the
@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 
 from jsecon.errors import InputError
-from jsecon.files import atomic_write, reading, scratch_array
+from jsecon.files import atomic_write, scratch_array
 from jsecon.splat.project import unusable_rows
 from jsecon.splat.sh import C0
 from jsecon.splat.transform import BLOCK_ROWS, float32_rounding, transform_blocks
@@ -100,7 +100,7 @@ def read_ply_file(path: Path) -> tuple[memoryview, _Header]:
     return data, _parse_header(data)
 
 
-def _read_vertices(path: Path) -> np.ndarray:
+def read_vertices(path: Path) -> np.ndarray:
     """(N,) structured array of the vertices' properties; of a binary file, mapped into memory."""
     data, header = read_ply_file(path)
     names = [element.name for element in header.elements]
@@ -144,14 +144,14 @@ def read_ply(path: Path) -> Gaussians:
 
     Other properties and elements are ignored.
     """
-    table = _read_vertices(path)
+    table = read_vertices(path)
     count, names = len(table), table.dtype.names or ()
     scales = _SCALE if "scale_2" in names else _SCALE[:2]
     has_rgb = not set(_DC) & set(names) and all(name in names and table.dtype[name] == np.uint8 for name in _RGB)
     colours = _RGB if has_rgb else _DC
     if missing := [name for name in (*_POSITION, *colours, *_OPACITY, *scales, *_ROTATION) if name not in names]:
         layout = "3D Gaussians in INRIA's layout (x y z, f_dc_0..2, opacity, scale_0..2, rot_0..3)"
-        raise ValueError(f"its vertices have no {', '.join(missing)}, expected {layout}: a point cloud is not enough")
+        raise ValueError(f"its vertices have no {', '.join(missing)}, expected {layout}")
     rest = sum(name.startswith("f_rest_") for name in names)
     rest_names = [f"f_rest_{index}" for index in range(rest)]
     if rest not in (0, 9, 24, 45) or any(name not in names for name in rest_names):
@@ -246,14 +246,17 @@ def save_ply(
     kinds = ("double" if is_double and name in _POSITION else "float" for name in names)
     properties = [f"property {kind} {name}" for kind, name in zip(kinds, names)]
     properties += [f"property int {name}" for name in ids]
-    vertices = f"element vertex {gaussians.count}"
-    comments = [f"comment {comment}"] if comment else []
-    header = ["ply", "format binary_little_endian 1.0", *comments, vertices, *properties, "end_header\n"]
     with atomic_write(path) as temporary, temporary.open("wb") as file:
-        file.write("\n".join(header).encode())
+        file.write(_header(gaussians.count, properties, comment))
         for rows, block in usable_blocks(path, gaussians, similarity):
             own = {name: np.asarray(column[rows]) for name, column in ids.items()}
             file.write(_table(block, is_double, own).tobytes())  # tofile hides a full disk
+
+
+def _header(count: int, properties: list[str], comment: str) -> bytes:
+    comments = [f"comment {comment}"] if comment else []
+    start = ["ply", "format binary_little_endian 1.0", *comments, f"element vertex {count}"]
+    return "\n".join([*start, *properties, "end_header\n"]).encode()
 
 
 def needs_float64(gaussians: Gaussians, similarity: Float[Array, "4 4"] | None = None) -> bool:
@@ -285,14 +288,11 @@ def _table(block: Gaussians, is_double: bool, ids: Mapping[str, np.ndarray]) -> 
     return rows
 
 
-def load_point_cloud(path: str | Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
-    """Reads a plain point cloud (.ply): (P, 3) float64 points, uint8 colours, grey if the file has none of 8 bits."""
-    with reading(path, remedy="Export the file again."):
-        vertices = _read_vertices(Path(path))
-        names = vertices.dtype.names or ()
-        if missing := [name for name in _POSITION if name not in names]:
-            raise ValueError(f"its vertices have no {', '.join(missing)}, expected a point cloud with x y z")
-        points = _columns(vertices, _POSITION, np.float64)
-    if not all(name in names and vertices.dtype[name] == np.uint8 for name in _RGB):
-        return points, np.full((len(points), 3), 128, np.uint8)
-    return points, _columns(vertices, _RGB, np.uint8)
+def write_vertices(path: Path, columns: Sequence[tuple[str, str, np.ndarray]], comment: str = "") -> None:
+    """Writes a .ply of vertices: names, types (a .ply's words) and columns of their properties."""
+    rows = np.empty(len(columns[0][2]), [(name, "<" + _TYPES[kind]) for name, kind, _ in columns])
+    for name, _, column in columns:
+        rows[name] = column
+    with path.open("wb") as file:
+        file.write(_header(len(rows), [f"property {kind} {name}" for name, kind, _ in columns], comment))
+        file.write(rows.tobytes())

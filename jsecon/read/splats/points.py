@@ -1,0 +1,234 @@
+"""Point clouds as files, on the host: .las and .laz, .e57, .pcd, .xyz, and a .ply without Gaussians.
+
+`READERS` is the table of formats. A reader takes the file, and returns its points in float64 and in its order, with
+colours: those of the file, else its intensities as greys. Packages of the extra formats decode them: laspy, pye57 and
+pypcd4, and pyproj the names of coordinate reference systems.
+"""
+
+import contextlib
+import dataclasses
+import itertools
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Int, UInt8
+
+from jsecon.errors import InputError
+from jsecon.files import atomic_write, read_lines, reading
+from jsecon.read.registry import Reader, decoding
+from jsecon.read.splats.ply import read_vertices, write_vertices
+from jsecon.splat.points import gaussians_from_points, voxel_for, voxel_ids, voxel_means
+from jsecon.types import Gaussians
+
+MAX_GAUSSIANS = 200_000
+"""Gaussians of a cloud: 24 views of 400x300 px have 14 pixels for each."""
+_COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+_INTENSITIES = ("intensity", "scalar_intensity", "reflectance")
+_GREY = 128
+FIRST_CLASS, LAST_CLASS = 64, 255
+"""classes of LAS that its users may define, in points of 8 bits for the class"""
+
+
+class PointCloud(NamedTuple):
+    """P points of a file."""
+
+    points: np.ndarray
+    """(P, 3) float64, in the world of the file."""
+    colors: np.ndarray
+    """(P, 3) uint8."""
+
+
+def _cloud(columns: Mapping[str, np.ndarray]) -> PointCloud:
+    """Makes a cloud of the columns of a file."""
+    columns = {name.lower(): column for name, column in columns.items()}
+    if missing := [axis for axis in "xyz" if axis not in columns]:
+        raise ValueError(f"its points have no {', '.join(missing)}, expected a point cloud with x y z")
+    points = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    return PointCloud(points, _colours(columns, len(points)))
+
+
+@np.errstate(invalid="ignore")
+def _colours(columns: Mapping[str, np.ndarray], count: int) -> UInt8[np.ndarray, "p 3"]:
+    """The colours of points: as they are, or packed into one number (PCL), of 8 or 16 bits or shares; or greys."""
+    if "rgb" in columns and columns["rgb"].dtype.itemsize == 4:
+        packed = np.ascontiguousarray(columns["rgb"]).view(np.uint32)
+        return (packed[:, None] >> np.array([16, 8, 0], np.uint32)).astype(np.uint8)
+    for names in _COLOURS:
+        if all(name in columns for name in names) and any(columns[name].any() for name in names):
+            values = np.stack([columns[name] for name in names], axis=1)
+            shares = values.dtype.kind == "f" and np.nanmax(values) <= 1
+            top = 1 if shares else 255 if np.nanmax(values) <= 255 else 65535
+            return np.rint(np.clip(np.nan_to_num(values) * (255 / top), 0, 255)).astype(np.uint8)
+    for name in _INTENSITIES:
+        if name in columns and columns[name].any():
+            low, high = np.nanquantile(columns[name], [0.01, 0.99])
+            shares = (np.nan_to_num(columns[name].astype(np.float64)) - low) / max(high - low, 1e-30)
+            return np.repeat(np.rint(255 * np.clip(shares, 0, 1)).astype(np.uint8)[:, None], 3, axis=1)
+    return np.full((count, 3), _GREY, np.uint8)
+
+
+def _read_las(path: Path) -> PointCloud:
+    with decoding(path, "laspy") as laspy:
+        las = laspy.read(path)
+        if len(las.points) < las.header.point_count:
+            raise EOFError
+        names = {*las.point_format.dimension_names} & {*_COLOURS[0], *_INTENSITIES}
+        return _cloud({name: np.asarray(las[name]) for name in (*names, *"xyz")})
+
+
+def _read_e57(path: Path) -> PointCloud:
+    """Reads all scans of a .e57, each moved by its pose."""
+    with decoding(path, "pye57") as pye57, pye57.E57(str(path)) as file:
+        scans = range(file.scan_count)
+        parts = [file.read_scan(n, colors=True, intensity=True, ignore_missing_fields=True) for n in scans]
+        clouds = [
+            _cloud({name.removeprefix("cartesian").removeprefix("color"): part[name] for name in part})
+            for part in parts
+        ]
+        return PointCloud(*map(np.concatenate, zip(*clouds)))
+
+
+def _read_pcd(path: Path) -> PointCloud:
+    with decoding(path, "pypcd4") as pypcd4:
+        cloud = pypcd4.PointCloud.from_path(path)
+        if len(cloud.pc_data) < cloud.metadata.points:
+            raise EOFError
+        return _cloud({name: cloud.pc_data[name] for name in cloud.pc_data.dtype.names})
+
+
+def _read_xyz(path: Path) -> PointCloud:
+    """Reads a text with a point in each line: columns as a header names them, else x y z, intensity, red green blue."""
+    lines = [line.lower().strip(" /#\t\r\n") for line in itertools.islice(read_lines(path), 50)]
+    heads = [re.split(r"[\s,;]+", line) for line in lines]
+    first = next((n for n, words in enumerate(heads) if len(words) > 2 and _is_numbers(words)), None)
+    if first is None:
+        raise ValueError("none of its first lines has three numbers")
+    mark = next((mark for mark in ",;" if mark in lines[first]), None)
+    table = np.loadtxt(path, delimiter=mark, skiprows=first, ndmin=2, encoding="utf-8-sig")
+    names = heads[first - 1] if first else []
+    if len(names) != table.shape[1] or not {*"xyz"} <= {*names}:
+        colours = slice(4, 7) if table.shape[1] == 7 else slice(3, 6)
+        names = [*"xyz", *(["intensity"] if table.shape[1] in (4, 7) else [])]
+        names += "rgb" if table.shape[1] > 5 and (table[:, colours] >= 0).all() else ""
+    return _cloud(dict(zip(names, table.T)))
+
+
+def _is_numbers(words: list[str]) -> bool:
+    with contextlib.suppress(ValueError):
+        return bool([float(word) for word in words])
+    return False
+
+
+def read_point_ply(path: Path) -> PointCloud:
+    """Reads a .ply of points."""
+    vertices = read_vertices(path)
+    return _cloud({name: vertices[name] for name in vertices.dtype.names or ()})
+
+
+READERS = (
+    Reader("LAS", (".las", ".laz"), _read_las),
+    Reader("E57", (".e57",), _read_e57),
+    Reader("PCD", (".pcd",), _read_pcd),
+    Reader("XYZ", (".xyz", ".txt"), _read_xyz),
+    Reader("PLY of points", (".ply",), read_point_ply),
+)
+
+
+def load_point_cloud(path: str | Path) -> PointCloud:
+    """Reads a point cloud of any of these formats."""
+    path = Path(path)
+    reader = next((reader for reader in READERS if reader.fits(path)), None)
+    if reader is None:
+        expected = "points as .las, .laz, .e57, .pcd, .xyz, .txt or .ply"
+        raise InputError(path, f"its name ends in {path.suffix or 'no suffix'}", expected, "Convert it to a .laz.")
+    with reading(path, remedy="Export the file again."):
+        cloud = reader.read(path)
+        if not len(cloud.points):
+            raise ValueError("it has no points")
+    return cloud
+
+
+def gaussians_of_cloud(path: Path, most: int = MAX_GAUSSIANS) -> tuple[Gaussians, tuple[str, ...]]:
+    """Makes Gaussians of a cloud, and notes: round, opaque ones, no larger than three times the median.
+
+    Means are float64. Of more than `most` points it takes the mean of each voxel.
+    """
+    points, colors = load_point_cloud(path)
+    known = np.isfinite(points).all(axis=1)
+    points, colors, notes = points[known], colors[known], ()
+    if not len(points):
+        raise InputError(path, "none of its points has finite coordinates", remedy="Export it again.")
+    if len(points) > most:
+        voxel = voxel_for(points, most)
+        means, colours = voxel_means(voxel_ids(points, voxel), points - points[0], colors)
+        notes = (f"{len(points):,} points of {path.name} became {len(means):,} Gaussians, one per {voxel:.3g} units.",)
+        points, colors = means + points[0], np.rint(colours).astype(np.uint8)
+    gaussians = gaussians_from_points(points - points[0], colors, opacity=0.95, scale=0.6)
+    sizes = np.minimum(gaussians.log_scales, np.median(gaussians.log_scales) + math.log(3))
+    return dataclasses.replace(gaussians, means=points, log_scales=sizes), notes
+
+
+def read_crs(path: Path) -> str:
+    """Reads which coordinate reference system a cloud is in: "EPSG:25832", or a WKT without a code; "" for unknown."""
+    crs = None
+    if path.suffix.lower() in (".las", ".laz"):
+        with decoding(path, "laspy") as laspy, laspy.open(path) as file:
+            crs = file.header.parse_crs()
+    elif path.suffix.lower() == ".e57":
+        with decoding(path, "pye57") as pye57, pye57.E57(str(path)) as file:
+            text = file.root["coordinateMetadata"].value() if file.root.isDefined("coordinateMetadata") else ""
+        with decoding(path, "pyproj") as pyproj, contextlib.suppress(pyproj.exceptions.CRSError):
+            crs = pyproj.CRS.from_user_input(text) if text else None
+    code = crs and crs.to_epsg()
+    return f"EPSG:{code}" if code else crs.to_wkt() if crs else ""
+
+
+def save_point_cloud(
+    path: Path, source: Path, rows: Int[np.ndarray, " m"], ids: Mapping[str, Int[np.ndarray, " m"]], crs: str
+) -> None:
+    """Writes rows of the points of a file with ids of each, int32.
+
+    From .las to .las all columns stay as they are, bit for bit. A class above -1 becomes the classification
+    FIRST_CLASS + class where points have 8 bits for it.
+    """
+    with atomic_write(path) as temporary:
+        if path.suffix.lower() == ".ply":
+            points, colors = load_point_cloud(source)
+            columns = [(axis, "double", points[rows, n]) for n, axis in enumerate("xyz")]
+            columns += [(name, "uchar", colors[rows, n]) for n, name in enumerate(_COLOURS[0])]
+            columns += [(name, "int", column) for name, column in ids.items()]
+            write_vertices(temporary, columns, f"crs {crs}" if crs.startswith("EPSG:") else "")
+            return
+        with decoding(source, "laspy") as laspy:
+            if source.suffix.lower() in (".las", ".laz"):
+                las = laspy.read(source)
+                las.points = las.points[rows]
+            else:
+                las = _new_las(laspy, *(column[rows] for column in load_point_cloud(source)), crs)
+            las.add_extra_dims([laspy.ExtraBytesParams(name, np.int32) for name in ids])
+            for name, column in ids.items():
+                las[name] = column
+            if "class_id" in ids and las.point_format.id > 5:
+                classes = ids["class_id"]
+                fits = (classes >= 0) & (classes <= LAST_CLASS - FIRST_CLASS)
+                las.classification = np.where(fits, FIRST_CLASS + classes, las.classification)
+            las.write(str(temporary), do_compress=path.suffix.lower() == ".laz")
+
+
+def _new_las(laspy: Any, points: np.ndarray, colors: np.ndarray, crs: str) -> Any:
+    """Makes LAS data of points, at the finest power of ten that holds them."""
+    las = laspy.create(point_format=7, file_version="1.4")
+    extent = max(float(np.ptp(points, axis=0).max()), 1e-6)
+    las.header.offsets = np.floor(points.min(axis=0))
+    las.header.scales = np.full(3, 10.0 ** math.ceil(math.log10(extent / 2e9)))
+    if crs:
+        import pyproj
+
+        las.header.add_crs(pyproj.CRS.from_user_input(crs))
+    las.x, las.y, las.z = points.T
+    las.red, las.green, las.blue = colors.T.astype(np.uint16) * 257
+    return las
