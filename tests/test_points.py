@@ -123,6 +123,24 @@ def test_a_cloud_gives_a_capture_its_points_and_their_depth(tmp_path):
     assert run_cli("run", tmp_path / "ball.laz", "--points", tmp_path / "ball.laz", "--out", tmp_path / "field") == 2
 
 
+def test_labels_replace_older_ones_and_points_without_a_place_need_a_ply(tmp_path):
+    points, colours = points_of()
+    las(tmp_path / "a.las", points, colours)
+    for n in (1, 2):
+        ids = {"object_id": np.full(60, n, np.int32)}
+        save_point_cloud(tmp_path / "a.las", tmp_path / "a.las", np.arange(60), ids, "")
+        np.testing.assert_array_equal(laspy.read(tmp_path / "a.las").object_id, n)
+    points[3] = np.nan
+    WRITERS["binary.pcd"](tmp_path / "a.pcd", points, colours)
+    assert read_gaussians(tmp_path / "a.pcd")[0].count == 59
+    with refused("a.pcd", "Write a .ply"):
+        save_point_cloud(tmp_path / "b.las", tmp_path / "a.pcd", np.arange(60), ids, "")
+    save_point_cloud(tmp_path / "b.ply", tmp_path / "a.pcd", np.arange(60), ids, "")
+    np.testing.assert_array_equal(load_point_cloud(tmp_path / "b.ply").points, points)
+    with refused("a.las", "near the Gaussians"):
+        save_point_cloud(tmp_path / "b.las", tmp_path / "a.las", np.arange(0), {}, "")
+
+
 def test_what_cannot_be_read_is_said(tmp_path, monkeypatch):
     points, colours = points_of()
     for name in ("a.laz", "a.e57", "binary.pcd", "compressed.pcd", "points.ply"):

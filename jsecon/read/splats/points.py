@@ -28,7 +28,8 @@ MAX_GAUSSIANS = 200_000
 """Gaussians of a cloud: 24 views of 400x300 px have 14 pixels for each."""
 _COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 _INTENSITIES = ("intensity", "scalar_intensity", "reflectance")
-_GREY = 128
+_NUMBERS = re.compile(r"(?:[-+]?(?:nan|[\d.]+(?:e[-+]?\d+)?)(?:[\s,;]+|$)){3,}")
+"""a line of a text with a point"""
 FIRST_CLASS, LAST_CLASS = 64, 255
 """classes of LAS that its users may define, in points of 8 bits for the class"""
 
@@ -44,7 +45,7 @@ class PointCloud(NamedTuple):
 
 def _cloud(columns: Mapping[str, np.ndarray]) -> PointCloud:
     """Makes a cloud of the columns of a file."""
-    columns = {name.lower(): column for name, column in columns.items()}
+    columns = {re.sub("^cartesian|^color", "", name.lower()): column for name, column in columns.items()}
     if missing := [axis for axis in "xyz" if axis not in columns]:
         raise ValueError(f"its points have no {', '.join(missing)}, expected a point cloud with x y z")
     points = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
@@ -68,7 +69,7 @@ def _colours(columns: Mapping[str, np.ndarray], count: int) -> UInt8[np.ndarray,
             low, high = np.nanquantile(columns[name], [0.01, 0.99])
             shares = (np.nan_to_num(columns[name].astype(np.float64)) - low) / max(high - low, 1e-30)
             return np.repeat(np.rint(255 * np.clip(shares, 0, 1)).astype(np.uint8)[:, None], 3, axis=1)
-    return np.full((count, 3), _GREY, np.uint8)
+    return np.full((count, 3), 128, np.uint8)
 
 
 def _read_las(path: Path) -> PointCloud:
@@ -83,12 +84,8 @@ def _read_las(path: Path) -> PointCloud:
 def _read_e57(path: Path) -> PointCloud:
     """Reads all scans of a .e57, each moved by its pose."""
     with decoding(path, "pye57") as pye57, pye57.E57(str(path)) as file:
-        scans = range(file.scan_count)
-        parts = [file.read_scan(n, colors=True, intensity=True, ignore_missing_fields=True) for n in scans]
-        clouds = [
-            _cloud({name.removeprefix("cartesian").removeprefix("color"): part[name] for name in part})
-            for part in parts
-        ]
+        options = {"colors": True, "intensity": True, "ignore_missing_fields": True}
+        clouds = [_cloud(file.read_scan(n, **options)) for n in range(file.scan_count)]
         return PointCloud(*map(np.concatenate, zip(*clouds)))
 
 
@@ -103,24 +100,17 @@ def _read_pcd(path: Path) -> PointCloud:
 def _read_xyz(path: Path) -> PointCloud:
     """Reads a text with a point in each line: columns as a header names them, else x y z, intensity, red green blue."""
     lines = [line.lower().strip(" /#\t\r\n") for line in itertools.islice(read_lines(path), 50)]
-    heads = [re.split(r"[\s,;]+", line) for line in lines]
-    first = next((n for n, words in enumerate(heads) if len(words) > 2 and _is_numbers(words)), None)
+    first = next((n for n, line in enumerate(lines) if _NUMBERS.fullmatch(line)), None)
     if first is None:
         raise ValueError("none of its first lines has three numbers")
     mark = next((mark for mark in ",;" if mark in lines[first]), None)
     table = np.loadtxt(path, delimiter=mark, skiprows=first, ndmin=2, encoding="utf-8-sig")
-    names = heads[first - 1] if first else []
+    names = re.split(r"[\s,;]+", lines[first - 1]) if first else []
     if len(names) != table.shape[1] or not {*"xyz"} <= {*names}:
         colours = slice(4, 7) if table.shape[1] == 7 else slice(3, 6)
         names = [*"xyz", *(["intensity"] if table.shape[1] in (4, 7) else [])]
         names += "rgb" if table.shape[1] > 5 and (table[:, colours] >= 0).all() else ""
     return _cloud(dict(zip(names, table.T)))
-
-
-def _is_numbers(words: list[str]) -> bool:
-    with contextlib.suppress(ValueError):
-        return bool([float(word) for word in words])
-    return False
 
 
 def read_point_ply(path: Path) -> PointCloud:
@@ -195,36 +185,42 @@ def save_point_cloud(
     From .las to .las all columns stay as they are, bit for bit. A class above -1 becomes the classification
     FIRST_CLASS + class where points have 8 bits for it.
     """
-    with atomic_write(path) as temporary:
-        if path.suffix.lower() == ".ply":
-            points, colors = load_point_cloud(source)
-            columns = [(axis, "double", points[rows, n]) for n, axis in enumerate("xyz")]
-            columns += [(name, "uchar", colors[rows, n]) for n, name in enumerate(_COLOURS[0])]
-            columns += [(name, "int", column) for name, column in ids.items()]
+    if not len(rows):
+        raise InputError(source, "none of its points lies near the Gaussians", remedy="Check its world.")
+    if path.suffix.lower() == ".ply":
+        points, colors = load_point_cloud(source)
+        columns = [(axis, "double", points[rows, n]) for n, axis in enumerate("xyz")]
+        columns += [(name, "uchar", colors[rows, n]) for n, name in enumerate(_COLOURS[0])]
+        columns += [(name, "int", column) for name, column in ids.items()]
+        with atomic_write(path) as temporary:
             write_vertices(temporary, columns, f"crs {crs}" if crs.startswith("EPSG:") else "")
-            return
-        with decoding(source, "laspy") as laspy:
-            if source.suffix.lower() in (".las", ".laz"):
-                las = laspy.read(source)
-                las.points = las.points[rows]
-            else:
-                las = _new_las(laspy, *(column[rows] for column in load_point_cloud(source)), crs)
-            las.add_extra_dims([laspy.ExtraBytesParams(name, np.int32) for name in ids])
-            for name, column in ids.items():
-                las[name] = column
-            if "class_id" in ids and las.point_format.id > 5:
-                classes = ids["class_id"]
-                fits = (classes >= 0) & (classes <= LAST_CLASS - FIRST_CLASS)
-                las.classification = np.where(fits, FIRST_CLASS + classes, las.classification)
-            las.write(str(temporary), do_compress=path.suffix.lower() == ".laz")
+        return
+    with decoding(source, "laspy") as laspy:
+        if source.suffix.lower() in (".las", ".laz"):
+            las = laspy.read(source)
+            las.points = las.points[rows]
+        else:
+            las = _new_las(laspy, source, rows, crs)
+        old = {*las.point_format.extra_dimension_names}
+        las.add_extra_dims([laspy.ExtraBytesParams(name, np.int32) for name in ids if name not in old])
+        for name, column in ids.items():
+            las[name] = column
+        classes = FIRST_CLASS + ids.get("class_id", np.array(-1))
+        if las.point_format.id > 5:
+            fits = (classes >= FIRST_CLASS) & (classes <= LAST_CLASS)
+            las.classification = np.where(fits, classes, las.classification)
+    with atomic_write(path) as temporary:
+        las.write(str(temporary), do_compress=path.suffix.lower() == ".laz")
 
 
-def _new_las(laspy: Any, points: np.ndarray, colors: np.ndarray, crs: str) -> Any:
-    """Makes LAS data of points, at the finest power of ten that holds them."""
+def _new_las(laspy: Any, source: Path, rows: np.ndarray, crs: str) -> Any:
+    """Makes LAS data of points of a file, at the finest power of ten that holds them."""
+    points, colors = (column[rows] for column in load_point_cloud(source))
+    if not np.isfinite(points).all():
+        raise InputError(source, "some of its points have no place, and a .las holds no such", remedy="Write a .ply.")
     las = laspy.create(point_format=7, file_version="1.4")
-    extent = max(float(np.ptp(points, axis=0).max()), 1e-6)
     las.header.offsets = np.floor(points.min(axis=0))
-    las.header.scales = np.full(3, 10.0 ** math.ceil(math.log10(extent / 2e9)))
+    las.header.scales = np.full(3, 10.0 ** math.ceil(math.log10(max(np.ptp(points, axis=0).max(), 1e-6) / 2e9)))
     if crs:
         import pyproj
 
