@@ -1,5 +1,6 @@
 """The viewer: its states and colours, what its steps do to a field, and in a browser what a person would try."""
 
+import csv
 import dataclasses
 import http.client
 import subprocess
@@ -17,14 +18,25 @@ import viser
 from browser import CHROMIUM, opened, until
 from small_field import answer_of, colour_field
 
-from jsecon import Camera, InputError, load_gaussians, region_at, save_field
+from jsecon import Camera, Gaussians, InputError, load_gaussians, region_at, save_field
 from jsecon.app.catalogue import main_regions
 from jsecon.app.pictures import palette
 from jsecon.app.records import Query, Region
 from jsecon.app.scene import Scene
 from jsecon.app.viewer.layer import MAX_STD, SplatLayer
-from jsecon.app.viewer.window import ANSWER_HUE, COLOURINGS, Viewer, ViewState, _highlight, _region_along, open_viewer
-from jsecon.query.pointing import region_shares_seen
+from jsecon.app.viewer.window import (
+    ANSWER_HUE,
+    COLOURINGS,
+    RAY_VIEW_SIDE,
+    Viewer,
+    ViewState,
+    _highlight,
+    _region_along,
+    _shown,
+    _view_along,
+    open_viewer,
+)
+from jsecon.query.pointing import depth_seen, region_shares_seen
 from jsecon.vision.colours import BASIC, ColourEmbedder
 
 MUG = ViewState(("red mug",))
@@ -178,6 +190,29 @@ def test_the_file_of_the_selection(viewer, tmp_path):
     assert load_gaussians(tmp_path / name).count == mask_of(viewer, Region(1)).sum()
 
 
+def test_two_clicks_measure_a_length(viewer):
+    field, sent = viewer.scene.field, []
+    client = SimpleNamespace(send_file_download=lambda name, content, **_: sent.append((name, content.decode())))
+    camera = jax.tree.map(np.asarray, field.cameras)[0]
+    start, focal, points = np.asarray(camera.centres), float(camera.fx), []
+    for x, y in ((24, 20), (18, 28)):
+        direction = camera.world_to_camera[:3, :3].T @ [(x + 0.5 - camera.cx) / focal, (y + 0.5 - camera.cy) / focal, 1]
+        ray = SimpleNamespace(ray_origin=start * viewer.layer.scale, ray_direction=direction)
+        settled(viewer, lambda ray=ray: viewer.then(lambda _: viewer._measure(ray, focal)))
+        points.append(start + direction * depth_seen(field.gaussians, camera, x, y))
+    length = np.linalg.norm(points[1] - points[0])
+    assert f"{length:.2g}"[:3] in viewer.panel._notice.content
+    settled(viewer, lambda: viewer.then(lambda _: viewer._export(client)))
+    ((name, text),) = sent
+    (row,) = csv.DictReader(text.splitlines())
+    assert (name, row["unit"]) == ("lengths.csv", "capture units")
+    assert float(row["centers"]) == pytest.approx(length, rel=0.02)
+    away = SimpleNamespace(ray_origin=start * viewer.layer.scale, ray_direction=-camera.world_to_camera[2, :3])
+    settled(viewer, lambda: viewer.then(lambda _: viewer._measure(away, focal)))
+    assert "nothing is there" in viewer.panel._notice.content
+    viewer._lengths.clear()
+
+
 def test_a_taken_port_and_a_missing_extra_are_refused(viewer, monkeypatch):
     with pytest.raises(InputError, match="--port"):
         open_viewer(viewer.scene, port=viewer.server.get_port(), state=ViewState())
@@ -217,16 +252,29 @@ def test_a_ray_meets_the_region_of_its_pixel_and_passes_what_is_hidden(field):
     agree = []
     for x, y in ((24, 20), (18, 14), (30, 26), (20, 28), (28, 12), (24, 30)):
         ray = turn.T @ [(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, 1]
-        found = _region_along(field, centre, ray, focal=float(camera.fx), visible=everything)
+        found = _region_along(field, _view_along(centre, ray, float(camera.fx)))
         agree.append(found == region_at(field, 0, x, y))
     assert sum(agree) >= 5, agree  # the frame's own Jacobian differs off its axis
     first, *others = (
-        _region_along(field, centre, ray, focal=45.0, visible=visible)
+        _region_along(_shown(field, visible), _view_along(centre, ray, 45.0))
         for ray, visible in ((turn[2], everything), (turn[2], ~everything), (-turn[2], everything))
     )
     assert first >= 0
     assert others == [-1, -1]
-    assert _region_along(field, centre, turn[2], focal=45.0, visible=main_regions(field) != first) != first
+    ahead = _view_along(centre, turn[2], 45.0)
+    assert _region_along(_shown(field, main_regions(field) != first), ahead) != first
+
+
+@pytest.mark.parametrize(("faint", "depth"), [(0.2, 4.0), (0.8, 2.0)])
+def test_a_pixel_is_as_deep_as_half_of_what_it_shows(faint, depth):
+    """One opaque Gaussian, and another before it."""
+    opacities = np.array([0.95, faint])
+    means = np.array([[0, 0, 4.0], [0, 0, 2.0]])
+    turns = np.array([[1.0, 0, 0, 0]] * 2)
+    gaussians = Gaussians(means, np.full((2, 3), -2.0), turns, np.log(opacities / (1 - opacities)), None)
+    camera = _view_along(np.zeros(3), np.array([0, 0, 1.0]), 500.0)
+    assert depth_seen(gaussians, camera, RAY_VIEW_SIDE // 2, RAY_VIEW_SIDE // 2) == pytest.approx(depth)
+    assert depth_seen(gaussians, camera, 0, 0) is None
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 import csv
 import io
 import itertools
+from collections.abc import Sequence
 from typing import Any
 
 from jsecon.app import verbs
@@ -42,10 +43,15 @@ def _measure(verb: verbs.Measure, console: Console) -> verbs.VerbResult:
     result: verbs.VerbResult = {"measurements": rows, "metres_per_unit": scene.field.metres_per_unit}
     if verb.out is None:
         return result
-    with io.StringIO() as text:
-        writer = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-        write_text(verb.out, text.getvalue())
+    write_text(verb.out, table_of_lengths(rows))
     console.print_line(f"table   {verb.out}")
     return result | {"written": {"table": verb.out}}
+
+
+def table_of_lengths(rows: Sequence[dict[str, Any]]) -> str:
+    """Writes values of `Scene.measure` as CSV."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()

@@ -25,6 +25,7 @@ from jaxtyping import Bool, Float, UInt8
 from jsecon.app import verbs
 from jsecon.app.access import is_allowed_host, listen
 from jsecon.app.catalogue import palette
+from jsecon.app.measuring import table_of_lengths
 from jsecon.app.pictures import region_colours
 from jsecon.app.querying import file_stem
 from jsecon.app.records import Answer, Query, Region
@@ -34,7 +35,7 @@ from jsecon.app.viewer.static_page import export_page
 from jsecon.errors import InputError
 from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.pipeline.progress import Console
-from jsecon.query.pointing import MIN_SHARE, region_shares_seen
+from jsecon.query.pointing import MIN_SHARE, depth_seen, region_shares_seen
 from jsecon.query.render import HIDDEN_LOGIT
 from jsecon.types import Camera, LanguageField
 
@@ -122,6 +123,8 @@ class Viewer:
         self.panel = _Panel(self, server)
         regions = (255 * region_colours(scene.field)).astype(np.uint8)
         self._base_colours = {"photo": self.layer.photo, "region": regions}
+        self._start_point: np.ndarray | None = None  # of the length that the next click ends
+        self._lengths: list[dict[str, Any]] = []
         self._steps: queue.SimpleQueue[Callable[[ViewState], ViewState | None] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, daemon=True)
 
@@ -150,8 +153,7 @@ class Viewer:
 
     def _clicked(self, state: ViewState, ray: Any, focal: float, *, add: bool) -> ViewState:
         """Highlights the region that the ray of an event in the window's world meets; focal length in px."""
-        start, direction = np.asarray(ray.ray_origin) / self.layer.scale, np.asarray(ray.ray_direction)
-        region = _region_along(self.scene.field, start, direction, focal=focal, visible=self._visible())
+        region = _region_along(*self._along(ray, focal))
         if region < 0:
             raise InputError("", "no region is known there: it is background, or no frame shows it")
         above = [Region(region)]
@@ -159,14 +161,39 @@ class Viewer:
             above.append(wider)
         return state.with_click(above, add=add)
 
+    def _measure(self, ray: Any, focal: float) -> None:
+        """Starts a length where a ray meets the scene, or ends the one that was started, draws it and tells it."""
+        point = _point_along(*self._along(ray, focal))
+        if point is None:
+            raise InputError("", "nothing is there to measure to")
+        start, self._start_point = self._start_point, point
+        if start is None:
+            self.layer.draw_length(len(self._lengths), point, point, "")
+            return
+        self._start_point, world = None, np.asarray(self.scene.field.source_from_scene, np.float64)
+        row = self.scene.measure(*((world[:3, :3] @ end + world[:3, 3]).tolist() for end in (start, point)))
+        words = f"{row['centers']:.4g} {row['unit']}"
+        self.layer.draw_length(len(self._lengths), start, point, words)
+        self._lengths.append(row)
+        self.panel.show_notice(words)
+
+    def _along(self, ray: Any, focal: float) -> tuple[LanguageField, Camera]:
+        """The visible part of the field, and a view whose middle pixel looks along a ray of the window's world."""
+        start, direction = np.asarray(ray.ray_origin) / self.layer.scale, np.asarray(ray.ray_direction)
+        return _shown(self.scene.field, self._visible()), _view_along(start, direction, focal)
+
     def _export(self, client: Any) -> None:
-        """Sends the highlighted Gaussians as a .ply."""
-        if not (found := self._found()):
+        """Sends the highlighted Gaussians as a .ply, and the measured lengths as a .csv."""
+        found = self._found()
+        if self._lengths:
+            client.send_file_download("lengths.csv", table_of_lengths(self._lengths).encode(), save_immediately=True)
+        elif not found:
             raise InputError("", "no Gaussian is selected, so there is no file to export")
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder, f"{file_stem(found[0].query)}.ply")
-            self.scene.export(file, np.any([answer.mask for answer in found], axis=0))
-            client.send_file_download(file.name, file.read_bytes(), save_immediately=True)
+        if found:
+            with tempfile.TemporaryDirectory() as folder:
+                file = Path(folder, f"{file_stem(found[0].query)}.ply")
+                self.scene.export(file, np.any([answer.mask for answer in found], axis=0))
+                client.send_file_download(file.name, file.read_bytes(), save_immediately=True)
 
     def _work(self) -> None:
         """Takes the steps in turn, and draws the last state when no step waits."""
@@ -234,7 +261,10 @@ class _Panel:
             "only_selected": gui.add_checkbox("only the selection", default.only_selected, hint="Hide everything else"),
             "colouring": gui.add_dropdown("colour", COLOURINGS, initial_value=default.colouring),
         }
-        export = gui.add_button("export", hint="Download the selected Gaussians as a .ply")
+        hint = "Two clicks in the scene draw and tell the length between them"
+        self._measure = gui.add_checkbox("measure", False, hint=hint)
+        hint = "Download the selected Gaussians as a .ply, and the measured lengths as a .csv"
+        export = gui.add_button("export", hint=hint)
         hint = "Go to the camera of a frame"
         frame = gui.add_dropdown("frame", ("choose", *self._names), initial_value="choose", hint=hint)
 
@@ -262,6 +292,9 @@ class _Panel:
     def _click_scene(self, event: Any) -> None:
         camera = event.client.camera
         focal = camera.image_height / 2 / np.tan(camera.fov / 2)
+        if self._measure.value:
+            self._viewer.then(lambda _: self._viewer._measure(event, focal))
+            return
         add = self._add.value or event.modifier == "shift"
         self._viewer.then(lambda state: self._viewer._clicked(state, event, focal, add=add))
 
@@ -308,15 +341,14 @@ def _box(text: str, colour: str = "#fa0") -> str:
     return f'<div style="{style}">{text}</div>'
 
 
-def _region_along(
-    field: LanguageField,
-    origin: Float[np.ndarray, "3"],
-    direction: Float[np.ndarray, "3"],
-    *,
-    focal: float,
-    visible: Bool[np.ndarray, " n"],
-) -> int:
-    """Finds the region that makes up most of what a ray in the field's world meets of the visible Gaussians, or -1.
+def _shown(field: LanguageField, visible: Bool[np.ndarray, " n"]) -> LanguageField:
+    """A field whose other Gaussians are transparent."""
+    logits = jnp.where(jnp.asarray(visible), field.gaussians.opacity_logits, HIDDEN_LOGIT)
+    return dataclasses.replace(field, gaussians=dataclasses.replace(field.gaussians, opacity_logits=logits))
+
+
+def _view_along(origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"], focal: float) -> Camera:
+    """A view whose middle pixel looks along a ray in the field's world.
 
     `focal` is the focal length (px) of the view that the ray belongs to: it decides how large a pixel is.
     """
@@ -327,11 +359,20 @@ def _region_along(
     pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
     pose[:3, 3] = -pose[:3, :3] @ np.asarray(origin, np.float64)
     intrinsics = (np.asarray(x, np.float32) for x in (focal, focal, RAY_VIEW_SIDE / 2, RAY_VIEW_SIDE / 2))
-    camera = Camera(pose.astype(np.float32), *intrinsics, width=RAY_VIEW_SIDE, height=RAY_VIEW_SIDE)
-    logits = jnp.where(jnp.asarray(visible), field.gaussians.opacity_logits, HIDDEN_LOGIT)
-    field = dataclasses.replace(field, gaussians=dataclasses.replace(field.gaussians, opacity_logits=logits))
+    return Camera(pose.astype(np.float32), *intrinsics, width=RAY_VIEW_SIDE, height=RAY_VIEW_SIDE)
+
+
+def _region_along(field: LanguageField, camera: Camera) -> int:
+    """The region that makes up most of the middle pixel of a view, or -1."""
     shares = region_shares_seen(field, camera, RAY_VIEW_SIDE // 2, RAY_VIEW_SIDE // 2)
     return int(shares.argmax()) if shares.size and shares.max() >= MIN_SHARE else -1
+
+
+def _point_along(field: LanguageField, camera: Camera) -> Float[np.ndarray, "3"] | None:
+    """The point (3,) that the middle pixel of a view shows, or None."""
+    depth = depth_seen(field.gaussians, camera, RAY_VIEW_SIDE // 2, RAY_VIEW_SIDE // 2)
+    pose = np.asarray(camera.world_to_camera, np.float64)
+    return None if depth is None else pose[:3, :3].T @ ([0, 0, depth] - pose[:3, 3])
 
 
 @contextlib.contextmanager
