@@ -12,7 +12,6 @@ paper's GT-anchored query). Gaussians are then compared with regions, so almost 
 All but `trim` and `answer_question` can be traced: jit them, or vmap them over texts.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -24,17 +23,17 @@ from jaxtyping import Bool, Float, Int
 from jsecon.errors import require
 from jsecon.field.columns import is_mapped, vote_blocks
 from jsecon.field.membership import inside_fraction, inside_fraction_of_regions
-from jsecon.field.regions import node_members
 from jsecon.field.similarity import Number, similarities
 from jsecon.numerics import array_module, is_traced
 from jsecon.paper.queries import select_by_code
-from jsecon.programs import stored_jit
+from jsecon.programs import numpy_outside_traces, stored_jit
 from jsecon.query.match import (
     compare_words,
     join_fragments,
     parts_fallback,
     regions_with,
     score_text,
+    select_node,
     unrelated_words,
 )
 from jsecon.query.outliers import OutlierResult, split_outliers
@@ -100,9 +99,7 @@ def answer_question(
         match = match_region(field, query, rules)
         several = rules.duplicate_cosine is not None
         if field.tree is not None and field.regions.count <= query < len(field.tree):
-            members = node_members(np.asarray(field.tree), np.asarray(field.leaf), int(query))
-            numbers = np.asarray(query, np.int32), np.asarray(1.0, np.float32)
-            parts, several = Selection(members, members.astype(np.float32), *numbers), True
+            parts, several = select_node(field, int(query)), True
     else:
         match = match_regions(field, query, rules, excluded=excluded)
         several = rules.all_of_class or len(query) > 1 or (excluded is not None and len(excluded) > 0)
@@ -154,20 +151,7 @@ def match_regions(
     return _match((*regions, queries, excluded, unrelated_words(field)), rules)
 
 
-def _by_numpy(function: Callable) -> Callable:
-    """Outside of a trace gives a function of arrays and rules NumPy's arrays, so that it compiles no program."""
-    compiled = jax.jit(lambda arrays, rules: function(*arrays, rules))
-
-    def call(arrays: tuple, rules: QueryRules) -> RegionMatch:
-        if is_traced((arrays, rules)):
-            return compiled(arrays, rules)
-        with np.errstate(invalid="ignore"):
-            return function(*jax.tree.map(np.asarray, arrays), rules)
-
-    return call
-
-
-@_by_numpy
+@numpy_outside_traces
 def _match(embeddings, pixels, overlap, queries, excluded, words, rules: QueryRules) -> RegionMatch:
     xp = array_module(embeddings, queries, rules.min_rank)
     word_scores = compare_words(embeddings, words, rules.retrieval)
@@ -221,7 +205,7 @@ def match_region(field: LanguageField, region: Number, rules: QueryRules = ONE_R
     return _match_one((field.regions.embeddings, field.votes.overlap, region), rules)
 
 
-@_by_numpy
+@numpy_outside_traces
 def _match_one(embeddings, overlap, region, rules: QueryRules) -> RegionMatch:
     xp = array_module(embeddings, region)
     valid, row = (region >= 0) & (region < len(embeddings)), xp.clip(region, 0, len(embeddings) - 1)

@@ -30,7 +30,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from jsecon.errors import require
 from jsecon.field.membership import SHARE_THRESHOLD
-from jsecon.field.regions import mean_residuals
+from jsecon.field.regions import mean_residuals, node_members
 from jsecon.field.similarity import Number, similarities
 from jsecon.numerics import array_module, cosine_matrix, inline_jit, normalize
 from jsecon.programs import stored_jit
@@ -293,6 +293,12 @@ def join_fragments(regions: Sequence[int] | np.ndarray, overlap: np.ndarray | No
         near = [g for g in groups if overlap is not None and (overlap[region, list(g)] >= MIN_FRAGMENT_OVERLAP).any()]
         groups = [g for g in groups if g not in near] + [set().union({region}, *near)]
     return sorted(tuple(sorted(group)) for group in groups)
+
+
+def select_node(field: LanguageField, node: int) -> Selection:
+    """Selects the Gaussians under a node of `LanguageField.tree`, with score 1."""
+    members = node_members(np.asarray(field.tree), np.asarray(field.leaf), node)
+    return Selection(members, members.astype(np.float32), np.asarray(node, np.int32), np.asarray(1.0, np.float32))
 
 
 def parts_fallback(
