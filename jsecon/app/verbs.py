@@ -218,7 +218,7 @@ class Query(_FieldVerb):
     box: Annotated[Repeated[tuple[str, int, int, int, int]], arg(metavar="FRAME X0 Y0 X1 Y1"), Range(0, 100_000)] = (
         dataclasses.field(default_factory=list)
     )
-    out: Option[Path]
+    out: Option[Path] = Path("answers")
     from_frame: Annotated[Option[str | None], arg(name="from", metavar="FRAME")] = None
     up: Direction[Option[tuple[float, float, float] | None]] = None
     by: Option[By] = "votes"
