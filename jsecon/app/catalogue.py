@@ -24,7 +24,7 @@ from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_sh
 from jsecon.query.outliers import MIN_SAMPLES
 from jsecon.query.rules import ABSENT, QueryRules
 from jsecon.types import Array, LanguageField, Votes
-from jsecon.views.frame import field_up
+from jsecon.views.frame import field_up, inner_scene
 from jsecon.vision.unrelated_words import UNRELATED_WORDS, embed_unrelated_words
 
 NAMES = 3
@@ -37,6 +37,8 @@ PART_CONTAINMENT = 0.4
 of its mug lies in the mug by one half."""
 SOFTMAX_SCALE = 100.0
 """Scale of cosines in CLIP's softmax over texts, to which its training is clipped (arXiv 2103.00020)."""
+SMALL_SHARE = 0.22
+"""Longest side of a thing, as a share of the scene's middle one, below which it is no background."""
 # fmt: off
 SURROUNDINGS = frozenset((
     "wall", "walls", "floor", "ceiling", "ground", "background", "sky", "lawn", "grass", "road", "pavement", "carpet",
@@ -177,8 +179,10 @@ def objects(
     present = np.zeros(len(texts), bool)
     if len(members) and len(texts):
         present = np.asarray(judge_texts(*map(jnp.asarray, arrays), unrelated_words(field), rules)) > ABSENT
-    order, probability = _name(members @ weighted, embeddings, scale, present)
     text = np.asarray((*texts, ""), object)
+    is_background = np.array(["background" in name.lower().split() for name in texts], bool)
+    allowed = present & ~(_is_small(field, groups, main)[:, None] & is_background)
+    order, probability = _name(members @ weighted, embeddings, scale, allowed)
     surroundings = np.array([bool(SURROUNDINGS & set(name.lower().split())) for name in text[order[:, 0]]], bool)
     whole = _wholes(field, groups, members, size, surroundings)
     labels, part_labels, confidence = _assign(field, groups, whole)
@@ -268,18 +272,18 @@ def _vocabulary(
 
 
 def _name(
-    embeddings: np.ndarray, names: np.ndarray, scale: float, present: Bool[np.ndarray, " v"]
+    embeddings: np.ndarray, names: np.ndarray, scale: float, allowed: Bool[np.ndarray, "k v"]
 ) -> tuple[Int[np.ndarray, "k m"], Float[np.ndarray, "k m"]]:
     """Returns the most probable of V names (V, E) of K embeddings (K, E) of any length, and their probabilities.
 
-    A name that is not `present`, because a query finds it absent, has probability 0: the catalogue and queries have one
+    A name that is not `allowed`, because a query finds it absent, has probability 0: the catalogue and queries have one
     judgement. A name's index is V where the vocabulary has fewer than `NAMES`, and its probability 0.
     """
     rows, columns = np.asarray(embeddings, np.float64), np.asarray(names, np.float64)
     lengths = np.linalg.norm(rows, axis=1)[:, None] * np.linalg.norm(columns, axis=1)
     cosines = rows @ columns.T / np.where(lengths > 0, lengths, 1.0)
     probability = softmax(scale * cosines, axis=1) if len(names) else cosines
-    raw, probability = probability, np.where(present, probability, 0.0)
+    raw, probability = probability, np.where(allowed, probability, 0.0)
     order = np.lexsort((-raw, -probability), axis=1)[:, :NAMES]  # stable
     missing = ((0, 0), (0, NAMES - order.shape[1]))
     best = np.pad(np.take_along_axis(probability, order, axis=1), missing)
@@ -309,6 +313,21 @@ def _sizes(field: LanguageField) -> tuple[Float[np.ndarray, " r"], Int[np.ndarra
         rows = np.arange(len(best))
         main.append(np.where(shares[rows, best] >= SHARE_THRESHOLD, regions[rows, best], -1))
     return size, np.concatenate(main)
+
+
+def _is_small(
+    field: LanguageField, groups: Int[np.ndarray, " r"], main: Int[np.ndarray, " n"]
+) -> Bool[np.ndarray, " k"]:
+    """Whether groups of regions are too small to be background, however much of near frames they fill."""
+    means = np.asarray(field.gaussians.means, np.float64)
+
+    def sides(rows: np.ndarray) -> np.ndarray:
+        own = means[rows][np.isfinite(means[rows]).all(1)]
+        return np.ptp(np.quantile(own, (0.05, 0.95), axis=0), axis=0) if len(own) else np.full(3, np.inf)
+
+    limit = SMALL_SHARE * np.median(sides(inner_scene(field.gaussians)))
+    owned = _places(np.append(groups, -1)[main], int(groups.max(initial=-1)) + 1)
+    return np.array([sides(rows).max() < limit for rows in owned], bool)
 
 
 @stored_jit
