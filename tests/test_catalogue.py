@@ -126,6 +126,21 @@ def test_what_most_frames_show_whole_comes_first_and_what_few_show_last():
     assert sorted(found["sure"] for found in answer.as_dict()["relation"]["objects"]) == [False, True]
 
 
+@pytest.mark.parametrize(("side", "is_background"), [(0.3, [False] * 4), (3.0, [True] * 4)])
+def test_what_is_small_beside_the_scene_is_no_background_however_near_the_frames(field, side, is_background):
+    """Four cubes around the middle of a floor, whose embeddings say that they fill the frames."""
+    own, rng = true_regions(field.gaussians), np.random.default_rng(0)
+    means = rng.uniform(-0.5, 0.5, (len(own), 3)) * np.where((own == 4)[:, None], [6.0, 6.0, 0.01], side)
+    corners = np.array([[1, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0], [0, 0, -side / 2]], np.float32)
+    small = np.full_like(field.gaussians.log_scales, -5)
+    gaussians = dataclasses.replace(field.gaussians, means=(means + corners[own]).astype(np.float32), log_scales=small)
+    names = [f"{colour} background" for colour in COLOURS]
+    regions = dataclasses.replace(field.regions, embeddings=EMBEDDER.embed_text(names))
+    found = jsecon.objects(dataclasses.replace(field, gaussians=gaussians, regions=regions))
+    wanted = dict(zip(COLOURS, [*is_background, True]))
+    assert {str(name).split()[0]: bool(flag) for name, flag in zip(found.names[:, 0], found.surroundings)} == wanted
+
+
 def test_names_come_from_the_vocabulary_that_is_given(field):
     catalogue = jsecon.objects(field, ["red floor", "green mug"])
     floor = catalogue.regions[0]
