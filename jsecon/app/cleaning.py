@@ -39,7 +39,7 @@ def _clean(verb: verbs.Clean, console: Console) -> verbs.VerbResult:
     if verb.keep_objects or not is_bare_scene(verb.scene):
         opened = open_scene(verb.scene, console=console)
     with console.progress("views") as progress:
-        source, scene, cameras, capture = _open(verb, opened and opened.field, console, progress)
+        scene, cameras, capture = _open(verb, opened and opened.field, console, progress)
     cameras = jax.tree.map(np.asarray, cameras[evenly_spaced(len(cameras), MAX_VIEWS)])
     with console.progress("clean") as progress:
         kinds = find_litter(scene, cameras, progress)
@@ -54,30 +54,34 @@ def _clean(verb: verbs.Clean, console: Console) -> verbs.VerbResult:
         quality, line = _quality(scene, without(scene, kinds > 0), cameras, capture, progress)
     console.print_line(line)
     with console.progress("files"):
-        save_gaussians(verb.out, gaussian_rows(source, kinds == 0))
+        del scene  # read again, a large one fits into memory once
+        save_gaussians(verb.out, gaussian_rows(_source(verb, opened and opened.field), kinds == 0))
     console.print_line(f"{counts['kept']} Gaussians, {verb.out.stat().st_size / 2**20:.1f} MiB  {verb.out}")
     return {"written": {"scene": verb.out}, "gaussians": counts} | quality
 
 
 def _open(verb: verbs.Clean, field: Any, console: Console, progress: Progress) -> tuple[Any, ...]:
-    """Returns the Gaussians as the file has them and in the world of the views, the views, and the photographs."""
+    """Returns the Gaussians in the world of the views, the views, and the photographs."""
     if (verb.capture is None and field is None) or verb.cameras is not None or verb.views is not None:
         bare = open_bare_scene(Options(verb.scene, cameras=verb.cameras, views=verb.views), progress)
         for note in bare.views.notes:
             console.note(note)
-        return bare.source, bare.scene, bare.views.cameras, None
-    if field is None:
-        source = read_scene(verb.scene)[0]
-    else:
-        source = transform_gaussians(field.gaussians, field.source_from_scene)
+        return bare.scene, bare.views.cameras, None
     if verb.capture is None:
         assert field is not None
-        return source, field.gaussians, field.cameras, None
+        return field.gaussians, field.cameras, None
     capture = load_capture(verb.capture, long_side=Options.long_side, progress=progress)
-    placed, notes = place_in_capture(source, capture, verb.scene, None, progress)
+    placed, notes = place_in_capture(_source(verb, field), capture, verb.scene, None, progress)
     for note in notes:
         console.note(note)
-    return source, placed, capture.cameras, capture
+    return placed, capture.cameras, capture
+
+
+def _source(verb: verbs.Clean, field: Any) -> Gaussians:
+    """Returns the Gaussians as the file has them."""
+    if is_bare_scene(verb.scene):
+        return read_scene(verb.scene)[0]
+    return transform_gaussians(field.gaussians, field.source_from_scene)
 
 
 def _quality(

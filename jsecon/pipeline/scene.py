@@ -301,8 +301,6 @@ def _render_views(stage: StageInput) -> StageResult:
 class _BareScene(NamedTuple):
     """A scene without photographs, with views of it."""
 
-    source: Gaussians
-    """As its file has it."""
     scene: Gaussians
     """In a world of ordinary numbers."""
     source_from_scene: np.ndarray
@@ -320,7 +318,7 @@ def open_bare_scene(options: Options, progress: Progress) -> _BareScene:
         _, cameras, names = _load_poses(options.cameras, options.long_side)
         views = _Views(_moved(cameras, np.linalg.inv(source_from_scene)), names)
         check_overlap(scene, views.cameras, str(options.cameras))
-        return _BareScene(source, scene, source_from_scene, views)
+        return _BareScene(scene, source_from_scene, views)
     refused, views = (), None
     if near is not None:
         try:
@@ -328,7 +326,7 @@ def open_bare_scene(options: Options, progress: Progress) -> _BareScene:
         except InputError as error:
             refused = (f"{WARNING}Views are planned, as the poses near the scene cannot be used. {error}",)
     views = views or _plan_views(options, _every_nth(scene), progress)
-    return _BareScene(source, scene, source_from_scene, views._replace(notes=refused + views.notes))
+    return _BareScene(scene, source_from_scene, views._replace(notes=refused + views.notes))
 
 
 def _every_nth(scene: Gaussians) -> Gaussians:

@@ -46,9 +46,9 @@ def _padded_size(count: int) -> int:
     return max(-(-count // step), 1) * step
 
 
-def geometry_of_rows(gaussians: Gaussians, ids: Int[np.ndarray, " m"], size: int = 0) -> Gaussians:
-    """Reads the geometry of some Gaussians, in black, then transparent ones up to `size` or `_padded_size(M)`."""
-    size = size or _padded_size(len(ids))
+def geometry_of_rows(gaussians: Gaussians, ids: Int[np.ndarray, " m"], least: int = 0) -> Gaussians:
+    """Reads the geometry of some Gaussians, in black, then transparent ones up to `_padded_size(M)`, or `least`."""
+    size = max(_padded_size(len(ids)), least)
     bare = dataclasses.replace(gaussians, sh=np.zeros((gaussians.count, 0, 3), np.float32))
 
     def fill(a):

@@ -125,12 +125,12 @@ def _quarter(
 ) -> tuple[np.ndarray, ...]:
     """Does what `_view` does of a quarter of a view, of its `_part`.
 
-    `room` keeps the largest powers of two of Gaussians and of their pairs, so that quarters share programs.
+    `room` keeps the largest numbers of Gaussians and of their pairs, so that quarters share programs.
     """
     ids = visible_rows(part, camera)
-    room[0] = max(room[0], 1 << len(ids).bit_length())
     gaussians = geometry_of_rows(part, ids, room[0])
-    room[1] = max(room[1], 1 << plan_capacity(gaussians, camera, margin=1.0, devices=1).bit_length())
+    room[0] = gaussians.count
+    room[1] = max(room[1], plan_capacity(gaussians, camera, margin=1.0, devices=1))
     inside, *columns = _view(gaussians, np.pad(seen[rows[ids]], (0, room[0] - len(ids))), camera, gap, room[1])
     return rows[ids[inside]], *columns
 
