@@ -6,7 +6,7 @@ import json
 import cv2
 import numpy as np
 import pytest
-from capture_files import assert_same, small_capture, transforms, write_images, write_transforms
+from capture_files import assert_same, refused, small_capture, transforms, write_images, write_transforms
 from splat_files import write_ply
 
 from jsecon.read.captures.capture import load_capture
@@ -53,7 +53,7 @@ def test_camera_angle_and_sizes_from_the_images(tmp_path):
     np.testing.assert_array_equal(cameras.cy, 8)
 
 
-def test_missing_images_and_unused_masks_are_said(tmp_path):
+def test_missing_images_are_said(tmp_path):
     write_transforms(CAPTURE, tmp_path)
     (tmp_path / "images/frame_001.png").unlink()
     (tmp_path / "images/frame_002.png").unlink()
@@ -63,8 +63,19 @@ def test_missing_images_and_unused_masks_are_said(tmp_path):
     np.testing.assert_array_equal(loaded.held_out, [True, False, True])
     assert "2 of 5" in loaded.notes[0]
     assert "frame_001" in loaded.notes[0]
-    masked = load_changed(tmp_path, lambda content: content["frames"][0].update(mask_path="m.png"))
-    assert "mask_path" in masked.notes[0]
+
+
+@pytest.mark.parametrize("size", [(16, 24), (32, 48)])
+def test_black_pixels_of_a_mask_are_ignored(tmp_path, size):
+    kept = np.full(size, 255, np.uint8)
+    kept[: size[0] // 2, : size[1] // 4] = 0
+    cv2.imwrite(str(tmp_path / "m.png"), kept)
+    loaded = load_changed(tmp_path, lambda content: content["frames"][1].update(mask_path="m.png"), holdout=0)
+    expected = np.zeros((5, 16, 24), bool)
+    expected[1, :8, :6] = True
+    np.testing.assert_array_equal(loaded.ignored, expected)
+    with refused("missing.png", "mask_path of transforms.json"):
+        load_changed(tmp_path, lambda content: content["frames"][0].update(mask_path="missing.png"))
 
 
 def test_applied_transform_and_scale_are_undone(tmp_path):

@@ -132,6 +132,8 @@ def test_a_segmenter_takes_the_frames_that_number_and_time_allow(seen, tmp_path)
         assert f"{count} of 6 training frames: --{next(iter(limit)).replace('_', '-')} allows no more" in found.notes[0]
     with refused("--vision-minutes", "name a --segmenter"):
         again(run, tmp_path / "out", segmenter=None, vision_minutes=1.0)
+    with refused("--ignore", "--models auto"):
+        again(run, tmp_path / "out", segmenter=None, ignore="person")
 
 
 def test_sam_2_follows_what_sam_proposes(seen, tmp_path):

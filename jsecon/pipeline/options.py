@@ -161,6 +161,8 @@ class MaskOptions:
         _s.npy. Without it, jsecon finds the objects in the frames.
       proposals: Folder of masks of single frames, to be brought together over the frames: <frame>.json of SAM's
         generator, a COCO file of all frames, LangSplat's _s.npy, PNGs or .npy, named like the masks of --masks.
+      ignore: What is no part of the scene, such as "person, screen": a segmenter and an embedder find it in each frame.
+        Its pixels count nowhere, and OUT/masks has them in black, as nerfstudio and LichtFeld Studio read masks.
       granularity: Without --masks, how large the objects are that jsecon finds by itself. Fine separates parts of
         things. Coarse joins the colours of a thing, and separates things by the depth that the Gaussians render.
       association: How the proposals of the frames are brought together: what most views agree on (consensus), or
@@ -171,6 +173,7 @@ class MaskOptions:
 
     masks: Option[Path | None] = None
     proposals: Option[Path | None] = None
+    ignore: Option[str | None] = None
     granularity: Option[Literal["fine", "medium", "coarse"]] = "medium"
     association: Option[Literal["consensus", "tracking"]] = "consensus"
     agreement: Annotated[Option[float], Range(0, 1, above=True)] = 0.4

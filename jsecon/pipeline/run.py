@@ -149,7 +149,7 @@ def _require_options_apply(options: Options) -> None:
     """Raises InputError if an option is set that the input has no use for."""
     bare = is_bare_scene(options.capture)
     defaults = {field.name: field.default for field in dataclasses.fields(options)}
-    for name in ("frames", "holdout", "refine") if bare else ("views", "cameras"):
+    for name in ("frames", "holdout", "refine", "ignore") if bare else ("views", "cameras"):
         if getattr(options, name) != defaults[name]:
             kind = "a scene without photographs" if bare else "a capture, which has its own views"
             remedy = "--views sets the number of views." if bare else "--frames sets the most."

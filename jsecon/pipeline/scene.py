@@ -19,6 +19,7 @@ from jsecon.errors import InputError
 from jsecon.files import write_text
 from jsecon.fit.quality import QUICK_LONG_SIDE, is_weak, measure_quality
 from jsecon.fit.start import starting_gaussians
+from jsecon.pipeline.ignoring import ignore_named
 from jsecon.pipeline.options import Options, is_bare_scene
 from jsecon.pipeline.scene_files import check_overlap, fit_background, place_in_capture, read_scene, with_points
 from jsecon.pipeline.stages import KEY_FILE, WARNING, RunContext, Stage, StageInput, StageResult, training_frames
@@ -98,6 +99,11 @@ def _plan_load(context: RunContext, capture: Path) -> Stage:
         key_options |= context.key_options("seed", "steps", "minutes") | {"refine": refine}
         how += ", corrected by short fits"
         how += " in about half of the fit's time where that helps" * (refine == "auto")
+    if options.ignore is not None:
+        models = context.models
+        key_options |= context.key_options("ignore") | {"embedder": models.embedder.name}
+        key_options["segmenter"] = None if models.segmenter is None else models.segmenter.name
+        how += f", without the pixels of {options.ignore}"
     return Stage("load", how, _load_frames, key_options=key_options, files=(capture, options.points))
 
 
@@ -193,6 +199,9 @@ def _load_frames(stage: StageInput) -> StageResult:
     capture = load_capture(folder, **sizes, progress=stage.progress)
     if options.points is not None:
         capture = with_points(capture, options.points, stage.progress)
+    if options.ignore is not None:
+        texts = [text.strip() for text in options.ignore.split(",")]
+        capture = ignore_named(capture, texts, stage.context.models, stage.context.out / "masks", stage.progress)
     train = training_frames(capture.held_out)
     count, height, width = capture.frames.shape[:3]
     frames = f"{count} frames of {width}x{height}, {count - len(train)} of them held out"

@@ -293,8 +293,8 @@ def build_capture(posed: PosedImages, options: FrameOptions, *, progress: Progre
     depth_maps = np.zeros((len(frames), height, width), np.float32) if has_depth else None
     cached_maps = functools.lru_cache(maxsize=8)(undistortion_maps)
 
-    has_views = any(frame.lens.view is not None for frame in frames)
-    ignored = _allocate_frames(pixels.shape[:3]).view(bool) if has_views else None
+    has_ignored = any(frame.lens.view is not None or frame.posed.mask for frame in frames)
+    ignored = _allocate_frames(pixels.shape[:3]).view(bool) if has_ignored else None
     photographs, count = _photographs(frames)
 
     def read(photograph: int) -> bool:
@@ -309,6 +309,10 @@ def build_capture(posed: PosedImages, options: FrameOptions, *, progress: Progre
             pixels[t] = _undistort(image, lens, maps, (width, height))
             if ignored is not None:
                 ignored[t] = operator_mask(lens, pinholes[lens].resized(width, height))
+            if (mask := frames[t].posed.mask) is not None and ignored is not None:
+                kept, _ = read_image(mask, upright=first.orientation != 1)
+                kept = cv2.resize(kept, first.size, interpolation=cv2.INTER_NEAREST_EXACT)
+                ignored[t] |= (_undistort(kept, lens, maps, (width, height)) < 128).all(axis=-1)
             if depth is not None and depth_maps is not None:
                 depth_maps[t] = _read_depth(depth, frames[t], maps, (width, height), world[0, 0])
         return is_transparent

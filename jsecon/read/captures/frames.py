@@ -35,6 +35,8 @@ class PosedImage:
     """Pinhole lens of the depth map, at the same place; None: the image's, at the map's size."""
     held_out: bool | None = None
     """Whether the capture's own split keeps it from training; None if it has no split."""
+    mask: Path | None = None
+    """Image whose black pixels are to be ignored."""
 
 
 @dataclasses.dataclass(frozen=True)

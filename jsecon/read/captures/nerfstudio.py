@@ -66,10 +66,9 @@ def _read_nerfstudio(path: Path) -> PosedImages:
                 lens, is_scaled = _lens({**content, **entry}, image)
                 scaled += is_scaled
                 depth = None if image is None else _named_file(file, entry, "depth_file_path")
-                full_name = _full_name(name, image)
-                images.append(PosedImage(full_name, image, lens, np.linalg.inv(pose), depth, unit, held_out=held_out))
-        if any("mask_path" in entry for entry, _ in entries):
-            notes.append("The masks named by mask_path (pixels to ignore) were not used.")
+                mask = None if image is None else _named_file(file, entry, "mask_path")
+                full_name, pose = _full_name(name, image), np.linalg.inv(pose)
+                images.append(PosedImage(full_name, image, lens, pose, depth, unit, held_out=held_out, mask=mask))
         if scaled:
             notes.append(f"The intrinsics of {scaled} frames are shares of the image size; they were scaled to pixels.")
         up = _stated_up(content)
