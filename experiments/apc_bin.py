@@ -16,13 +16,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
+from PIL import Image
 
 from experiments import results
 from experiments.datasets.depth_points import confirmed_depths
+from jsecon.app.catalogue import palette
+from jsecon.app.pictures import outlined
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import accuracy_at, iou, mean_iou
 from jsecon.field.evidence import region_votes
 from jsecon.field.membership import normalise_votes
+from jsecon.files import atomic_write
 from jsecon.fit.depth import points_from_depth
 from jsecon.fit.quality import measure_quality
 from jsecon.paper.distill import distill_votes
@@ -177,6 +181,19 @@ def evaluate(
     return rows
 
 
+def draw_answers(field: LanguageField, capture: Capture, labels: np.ndarray, options: Options) -> np.ndarray:
+    """A held-out photograph (H, W, 3), and beside it the objects' Gaussians in it, with the outlines of the truth."""
+    t = int(np.flatnonzero(capture.held_out)[1])
+    frame, camera = np.asarray(capture.frames[t]), jax.tree.map(jnp.asarray, capture.cameras[t])
+    answers = (0.5 * frame).astype(np.uint8)
+    for index, colour in enumerate(palette(len(OBJECTS))):
+        chosen = select_gaussians(field, match_region(field, index), QueryRules(min_share=options.threshold)).mask
+        mask = np.asarray(selection_mask(field.gaussians, camera, chosen))
+        answers[mask] = (0.5 * frame[mask] + 0.5 * colour).astype(np.uint8)
+        answers = outlined(answers, labels[t] == index, (255, 255, 255), 2)
+    return np.concatenate([frame, answers], axis=1)
+
+
 def main(options: Options = Options()) -> dict:
     """Runs the experiment, writes its results and returns the metrics."""
     began = time.perf_counter()
@@ -205,6 +222,8 @@ def main(options: Options = Options()) -> dict:
     out = Path(options.out)
     series = {way: [metrics["objects"][way][name] for name in OBJECTS.values()] for way in WAYS}
     results.save(out, options, metrics, table, results.bars(list(OBJECTS.values()), series, "IoU, held-out views"))
+    with atomic_write(out / "answers.webp") as temporary:
+        Image.fromarray(draw_answers(field, capture, labels, options)).save(temporary, "WEBP", quality=80)
     print(table)
     return metrics
 
