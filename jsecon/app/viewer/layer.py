@@ -114,7 +114,7 @@ class SplatLayer:
         """Draws a length between two points (3,) of the field's world, with words in its middle."""
         ends = (self.scale * np.stack([start, end])).astype(np.float32)
         scene, name = self._server.scene, f"/lengths/{number}"
-        scene.add_point_cloud(f"{name}/ends", ends, LENGTH_COLOUR, point_size=3.0, point_shape="circle")
+        scene.add_point_cloud(f"{name}/ends", ends, LENGTH_COLOUR, point_size=1.5, point_shape="circle")
         if words:
             scene.add_line_segments(f"{name}/line", ends[None], LENGTH_COLOUR, thickness=3.0, thickness_units="screen")
             scene.add_label(f"{name}/label", words, position=ends.mean(0), anchor="bottom-center")
