@@ -139,7 +139,7 @@ def apply_changes(
     views = {}
     for t, name in names.items():
         camera = jax.tree.map(np.asarray, field.cameras)[field.names.index(name)]
-        views[name] = new_view(field, name, encode_jpeg(resize_frame(changes.capture.frames[t], camera)))
+        views[name] = new_view(field, name, encode_jpeg(resize_frame(np.asarray(changes.capture.frames[t]), camera)))
     return field, Ledger(field.regions.count, {**ledger.views, **views})
 
 

@@ -116,8 +116,8 @@ def locate_sources(field: LanguageField, beside: Path | None = None) -> Sources:
     except (ValueError, TypeError, AttributeError) as error:
         remedy = "Give the folders yourself, with --embedder and --images, or run the capture again."
         raise InputError("field", "its provenance is not what jsecon run writes", remedy=remedy) from error
-    found = [_resolve(beside, folders.get(kind)) for kind in ("embedder", "capture", "points")]
-    return Sources(name or None, *found, models.get("embedder"))
+    embedder, capture, points = (_resolve(beside, folders.get(kind)) for kind in ("embedder", "capture", "points"))
+    return Sources(name or None, embedder, capture, points, models.get("embedder"))
 
 
 def _resolve(beside: Path | None, hint: str | None) -> Path | None:

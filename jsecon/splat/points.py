@@ -25,7 +25,7 @@ def _voxel_keys(points: np.ndarray, voxel: float) -> np.ndarray:
     cells = np.floor((points - points.min(axis=0)) / voxel).astype(np.int64)
     size, expected = cells.max(axis=0) + 1, f"large enough for the extent {np.ptp(points, axis=0)}"
     require(math.prod(map(float, size)) < 2**62, "voxel", voxel, expected, "Choose a larger voxel.")
-    return np.ravel_multi_index(tuple(cells.T), tuple(size))
+    return np.asarray(np.ravel_multi_index(tuple(cells.T), tuple(size)))
 
 
 def voxel_for(points: Float[Array, "s 3"], max_points: int) -> float:

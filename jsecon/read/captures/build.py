@@ -160,7 +160,7 @@ def _choose(frames: Sequence[_Frame], options: FrameOptions) -> list[_Frame]:
     photographs, count = _photographs(frames)
     limit = None if options.frames is None else max(1, options.frames * count // len(frames))
     chosen = np.isin(photographs, evenly_spaced(count, limit))
-    return [frames[t] for t in np.flatnonzero(chosen)]
+    return [frame for frame, is_chosen in zip(frames, chosen) if is_chosen]
 
 
 def _hold_out(frames: Sequence[_Frame], options: FrameOptions) -> tuple[Bool[np.ndarray, " t"], list[str]]:
