@@ -44,14 +44,14 @@ def detect_features(frame: np.ndarray, camera: Camera) -> Features:
 
 
 def _view_pairs(poses: np.ndarray) -> list[tuple[int, int]]:
-    """Pairs each view with the six nearest in place (in units of the median spacing) and direction."""
+    """Pairs each view with the six from other places that are nearest in place (in median spacings) and direction."""
     rotation = poses[:, :3, :3]
     centres = -np.einsum("tji,tj->ti", rotation, poses[:, :3, 3])
     distance = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
     apart = distance[distance > 0]
     spread = float(np.median(apart)) if apart.size else 1.0
     angle = np.arccos(np.clip(rotation[:, 2] @ rotation[:, 2].T, -1, 1))
-    cost = distance / spread + angle + 1e9 * np.eye(len(rotation))
+    cost = distance / spread + angle + 1e9 * (distance < 1e-6 * spread)  # views of a panorama have no parallax
     nearest = np.argsort(cost, axis=1, kind="stable")[:, : min(6, len(rotation) - 1)]
     return sorted({(min(i, int(j)), max(i, int(j))) for i in range(len(rotation)) for j in nearest[i]})
 
