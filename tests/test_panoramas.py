@@ -14,7 +14,8 @@ from jsecon.pipeline.scene import plan_capture
 from jsecon.poses.sfm import find_poses
 from jsecon.read.captures.capture import load_capture, unposed_photographs
 from jsecon.read.captures.images import write_image
-from jsecon.read.captures.video import is_panorama_video
+from jsecon.read.captures.panoramas import has_mark
+from jsecon.read.captures.video import read_header
 
 WIDTH, HEIGHT = 384, 192
 COUNT = 3
@@ -190,8 +191,8 @@ def test_a_video_of_panoramas_is_told_by_its_header(tmp_path, mark):
 
     (tmp_path / "round.mp4").write_bytes(boxes(b"trak" + mark))
     (tmp_path / "walk.mp4").write_bytes(boxes(b"trak"))
-    assert is_panorama_video(tmp_path / "round.mp4")
-    assert not is_panorama_video(tmp_path / "walk.mp4")
+    assert has_mark(read_header(tmp_path / "round.mp4"))
+    assert not has_mark(read_header(tmp_path / "walk.mp4"))
 
 
 def test_poses_of_panoramas_are_found(tmp_path):

@@ -36,8 +36,8 @@ from jsecon.read.captures.frames import (
 )
 from jsecon.read.captures.lens import PANORAMA, undistorted_pinhole
 from jsecon.read.captures.nerfstudio import source_from_trained
-from jsecon.read.captures.panoramas import find_panoramas
-from jsecon.read.captures.video import DEFAULT_VIDEO_FRAMES, is_panorama_video, is_video, write_frames
+from jsecon.read.captures.panoramas import find_panoramas, has_mark
+from jsecon.read.captures.video import DEFAULT_VIDEO_FRAMES, is_video, read_header, write_frames
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Camera, Capture, Gaussians, Progress, UpAxis
 from jsecon.views.capture import render_capture
@@ -171,7 +171,7 @@ def _estimate_poses(stage: StageInput) -> StageResult:
         photos, found = write_frames(capture, folder / "frames", frames=frames, progress=stage.progress)
     else:
         photos, found = unposed_photographs(capture)
-    declared = context.options.panoramas or (video and is_panorama_video(capture))
+    declared = context.options.panoramas or (video and has_mark(read_header(capture)))
     panoramas, hints = find_panoramas(photos, declared=declared)
     posed, notes = find_poses(photos, folder, panoramas=panoramas, where=capture, progress=stage.progress)
     if video:

@@ -145,9 +145,7 @@ def find_poses(
     return work / "capture", tuple(notes)
 
 
-def _lens_groups(
-    photos: Sequence[Path], sizes: Sequence[tuple[int, int]], panoramas: Collection[Path] = ()
-) -> list[list[int]]:
+def _lens_groups(photos: Sequence[Path], sizes: Sequence[Any], panoramas: Collection[Path] = ()) -> list[list[int]]:
     """Indices of the photographs that share a lens, group by group."""
     groups: dict[Any, list[int]] = collections.defaultdict(list)
     for index, (photo, size) in enumerate(zip(photos, sizes)):

@@ -146,8 +146,7 @@ def _lens(file: Path, model: str, width: int, height: int, parameters: tuple[flo
     if len(parameters) != _PARAMETERS[model]:
         raise InputError(file, f"a {model} camera has {len(parameters)} parameters", str(_PARAMETERS[model]), _REMEDY)
     if model == PANORAMA:
-        with reading(file, remedy=_REMEDY, problem="a camera cannot be read"):
-            return panorama_lens(width, height)
+        return panorama_lens(file, width, height)
     focals = 1 if model.startswith("SIMPLE_") or model in ("RADIAL", "RADIAL_FISHEYE") else 2
     fx, fy = parameters[0], parameters[focals - 1]
     cx, cy, *distortion = parameters[focals:]

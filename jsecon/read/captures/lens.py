@@ -23,12 +23,8 @@ from jsecon.numerics import is_finite_and_bounded
 
 PANORAMA = "EQUIRECTANGULAR"
 """COLMAP's model of a panorama, whose focal lengths here are px per radian"""
-PANORAMA_VIEWS = np.concatenate(
-    [
-        Rotation.from_euler("Y", np.arange(0, -360, -60)[:, None], degrees=True).as_matrix(),
-        Rotation.from_euler("X", [[90], [-90]], degrees=True).as_matrix(),
-    ]
-)
+_TURNS = [*((-60 * view, 0) for view in range(6)), (0, 90), (0, -90)]
+PANORAMA_VIEWS = Rotation.from_euler("YX", _TURNS, degrees=True).as_matrix()
 """(8, 3, 3) rotations from the axes of a panorama to those of its views: six along the horizon, one down and one up"""
 _VIEW_TANGENT = 1.1
 """tangent of half a view's angle, 95 degrees in all: from 1.07 on, the views of a panorama leave no gap"""
@@ -93,10 +89,11 @@ class Lens:
         )
 
 
-def panorama_lens(width: int, height: int) -> Lens:
-    """Makes the lens of a panorama; ValueError if it is not twice as wide as high."""
+def panorama_lens(where: object, width: int, height: int) -> Lens:
+    """Makes the lens of a panorama; `where` names its file in the error of another aspect than 2:1."""
     if width != 2 * height:
-        raise ValueError(f"a panorama of {width}x{height} px; one of all directions is twice as wide as high")
+        remedy = "Export the whole sphere, or give it as a photograph."
+        raise InputError(where, f"the panorama is {width}x{height}", "twice as wide as high", remedy)
     return Lens(width, height, width / (2 * np.pi), height / np.pi, width / 2, height / 2, model=PANORAMA)
 
 

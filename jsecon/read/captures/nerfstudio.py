@@ -228,7 +228,7 @@ def _lens(keys: dict[str, Any], image: Path | None) -> tuple[Lens | None, bool]:
     else:
         return None, False
     if model == PANORAMA:
-        return panorama_lens(width, height), False
+        return panorama_lens(image or "a frame", width, height), False
     fx, fy = _focal(keys, "fl_x", "camera_angle_x", width), _focal(keys, "fl_y", "camera_angle_y", height)
     fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
     if fx is None or fy is None:

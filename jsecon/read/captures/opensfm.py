@@ -55,16 +55,15 @@ def _lens(file: Path, name: str, camera: dict[str, Any]) -> Lens:
     """The lens of a camera."""
     model, width, height = camera["projection_type"], int(camera["width"]), int(camera["height"])
     if model in _PANORAMAS:
-        return panorama_lens(width, height)
+        return panorama_lens(file, width, height)
     if model not in _DISTORTION:
         known = ", ".join((*_PANORAMAS, *_DISTORTION))
         raise InputError(file, f"camera {name} has projection_type {model}", f"one of {known}", "Undistort first.")
     side, distortion = max(width, height), [float(camera.get(key, 0.0)) for key in _DISTORTION[model]]
     fx, fy = (side * float(camera.get(key, camera.get("focal", 0.0))) for key in ("focal_x", "focal_y"))
     cx, cy = width / 2 + side * float(camera.get("c_x", 0.0)), height / 2 + side * float(camera.get("c_y", 0.0))
-    is_fisheye = "fisheye" in model
     distortion += [0.0] * (4 - len(distortion))
-    return Lens(width, height, fx, fy, cx, cy, tuple(distortion), is_fisheye)
+    return Lens(width, height, fx, fy, cx, cy, tuple(distortion), fisheye="fisheye" in model)
 
 
 READERS = (Reader("OpenSfM", ("reconstruction.json",), _read_opensfm),)

@@ -5,10 +5,9 @@ import re
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
-from jsecon.errors import InputError
 from jsecon.read.captures.frames import PosedImage, PosedImages
 from jsecon.read.captures.images import image_header
-from jsecon.read.captures.lens import PANORAMA, PANORAMA_VIEWS
+from jsecon.read.captures.lens import PANORAMA, PANORAMA_VIEWS, panorama_lens
 
 _MARK = re.compile(rb"ProjectionType\s*(?:=\s*[\"']|>)\s*equirectangular|sv3d.{0,200}?equi", re.DOTALL)
 """of XMP (GPano), and of Google's spherical video, versions 1 and 2"""
@@ -29,10 +28,8 @@ def find_panoramas(photos: Sequence[Path], *, declared: bool) -> tuple[list[Path
     found, unmarked = [], 0
     for photo in photos:
         width, height = image_header(photo).upright
-        if declared and width != 2 * height:
-            expected = "twice as wide as high, as a panorama of all directions is"
-            remedy = "Export the whole sphere, or leave out --panoramas."
-            raise InputError(photo, f"its size is {width}x{height}", expected, remedy)
+        if declared:
+            panorama_lens(photo, width, height)  # refuses another aspect
         if width == 2 * height:
             with photo.open("rb") as file:
                 is_found = declared or has_mark(file.read(_HEAD))

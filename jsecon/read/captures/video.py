@@ -15,7 +15,6 @@ from jaxtyping import UInt8
 from jsecon.errors import InputError
 from jsecon.files import reading
 from jsecon.read.captures.images import write_image
-from jsecon.read.captures.panoramas import has_mark
 from jsecon.types import Progress
 
 DEFAULT_VIDEO_FRAMES = 150
@@ -80,12 +79,7 @@ def _missing_notes(video: Path, count: int, end: int, total: int) -> tuple[str, 
     return (f"{note} The others are used; copy the video again to have all.",)
 
 
-def is_panorama_video(video: Path) -> bool:
-    """Whether the header of a video says that its frames are panoramas."""
-    return has_mark(_read_header(video))
-
-
-def _read_header(video: Path) -> bytes:
+def read_header(video: Path) -> bytes:
     """The first bytes of a video, or the box that describes it."""
     with video.open("rb") as file:
         head = file.read(1 << 16)
@@ -106,7 +100,7 @@ def _read_header(video: Path) -> bytes:
 def _colour_notes(video: Path) -> tuple[str, ...]:
     """Says that colours are off if a video is HDR, which OpenCV decodes as if it were not."""
     # Of ISO/IEC 23091-2's transfer characteristics, 16 is PQ (HDR10, Dolby Vision) and 18 is HLG.
-    found = re.search(rb"colr(?:nclx|nclc)..\0([\x10\x12])|\x55\xba\x81([\x10\x12])", _read_header(video), re.DOTALL)
+    found = re.search(rb"colr(?:nclx|nclc)..\0([\x10\x12])|\x55\xba\x81([\x10\x12])", read_header(video), re.DOTALL)
     if found is None:
         return ()
     sdr = "zscale=t=linear:npl=100,tonemap=hable,zscale=p=bt709:t=bt709:m=bt709,format=yuv420p"
