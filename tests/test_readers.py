@@ -124,7 +124,7 @@ DAMAGE = {
         (key(JSON, [[1, 2], [3, 4]], *POSE), "shape (2, 2)"), (key(JSON, [0, 0, 0], "up"), "not all 0"),
         (key(JSON, GONE, "camera_angle_x"), "no focal length", "camera_angle_x"),
         (key(JSON, 4.0, "camera_angle_x"), "camera_angle_x = 4.0"), (key(JSON, 0.1, "k4"), JSON, "k4"),
-        (key(JSON, "EQUIRECTANGULAR", "camera_model"), JSON, "twice as wide"),
+        (key(JSON, "EQUIRECTANGULAR", "camera_model"), "twice as wide"),
         (key(JSON, 0.1, "ftheta_p0"), JSON, "ftheta_p0"),
         (lambda entry: shutil.rmtree(entry / "images"), JSON, "none of which"),
     ],

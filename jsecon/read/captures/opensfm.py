@@ -45,10 +45,8 @@ def _read_opensfm(path: Path) -> PosedImages:
             images.append(PosedImage(name, find_image(path / "images", name), lenses[shot["camera"]], pose))
         points = models[0].get("points", {}).values()
         places = np.array([point["coordinates"] for point in points], np.float64).reshape(-1, 3)
-        colours = np.array([point["color"] for point in points], np.float64).reshape(-1, 3)
-    return PosedImages(
-        images, file, places, colours.clip(0, 255).astype(np.uint8), notes=tuple(notes), ignores_exif=True
-    )
+        colours = np.array([point["color"] for point in points], np.float64).reshape(-1, 3).clip(0, 255)
+    return PosedImages(images, file, places, colours.astype(np.uint8), notes=tuple(notes), ignores_exif=True)
 
 
 def _lens(file: Path, name: str, camera: dict[str, Any]) -> Lens:

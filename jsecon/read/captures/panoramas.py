@@ -44,8 +44,9 @@ def _cut_view(panorama: PosedImage, view: int) -> PosedImage:
     assert panorama.lens is not None
     pose, path = panorama.world_to_camera.copy(), PurePosixPath(panorama.name)
     pose[:3] = PANORAMA_VIEWS[view] @ pose[:3]
-    name, lens = f"{path.stem}_{view}{path.suffix}", dataclasses.replace(panorama.lens, view=view)
-    return dataclasses.replace(panorama, name=str(path.with_name(name)), lens=lens, world_to_camera=pose, depth=None)
+    name = str(path.with_name(f"{path.stem}_{view}{path.suffix}"))
+    lens = dataclasses.replace(panorama.lens, view=view)
+    return dataclasses.replace(panorama, name=name, lens=lens, world_to_camera=pose, depth=None)
 
 
 def cut_panoramas(posed: PosedImages) -> PosedImages:
