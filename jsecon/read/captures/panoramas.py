@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 
 from jsecon.read.captures.frames import PosedImage, PosedImages
 from jsecon.read.captures.images import image_header
-from jsecon.read.captures.lens import PANORAMA, PANORAMA_VIEWS, panorama_lens
+from jsecon.read.captures.lens import PANORAMA, PANORAMA_VIEWS, Lens, panorama_lens
 
 _MARK = re.compile(rb"ProjectionType\s*(?:=\s*[\"']|>)\s*equirectangular|sv3d.{0,200}?equi", re.DOTALL)
 """of XMP (GPano), and of Google's spherical video, versions 1 and 2"""
@@ -39,25 +39,26 @@ def find_panoramas(photos: Sequence[Path], *, declared: bool) -> tuple[list[Path
     return found, (f"{note} Give --panoramas if they show all directions.",) if unmarked else ()
 
 
-def _cut_view(panorama: PosedImage, view: int) -> PosedImage:
+def _cut_view(panorama: PosedImage, lens: Lens, view: int) -> PosedImage:
     """A view of a panorama."""
     assert panorama.lens is not None
     pose, path = panorama.world_to_camera.copy(), PurePosixPath(panorama.name)
     pose[:3] = PANORAMA_VIEWS[view] @ pose[:3]
     name = str(path.with_name(f"{path.stem}_{view}{path.suffix}"))
-    lens = dataclasses.replace(panorama.lens, view=view)
-    return dataclasses.replace(panorama, name=name, lens=lens, world_to_camera=pose, depth=None)
+    turned = dataclasses.replace(lens, view=view)
+    return dataclasses.replace(panorama, name=name, lens=turned, world_to_camera=pose, depth=None)
 
 
 def cut_panoramas(posed: PosedImages) -> PosedImages:
     """Replaces each panorama of a capture by its views, which share its file; their numbers follow its name."""
-    panoramas = [image for image in posed.images if image.lens is not None and image.lens.model == PANORAMA]
+    lenses = [(image, image.lens) for image in posed.images if image.lens is not None]
+    panoramas = [(image, lens) for image, lens in lenses if lens.model == PANORAMA]
     if not panoramas:
         return posed
     images = [image for image in posed.images if image.lens is None or image.lens.model != PANORAMA]
-    images += [_cut_view(image, view) for image in panoramas for view in range(len(PANORAMA_VIEWS))]
+    images += [_cut_view(*panorama, view) for panorama in panoramas for view in range(len(PANORAMA_VIEWS))]
     each = f"{len(PANORAMA_VIEWS)} views each, of 95 degrees; what lies within 30 degrees of straight down is left out"
     notes = [f"{len(panoramas)} panoramas are cut into {each}, as the operator stands there."]
-    if any(image.depth is not None for image in panoramas):
+    if any(image.depth is not None for image, _ in panoramas):
         notes.append("Depth maps of panoramas are not read.")
     return dataclasses.replace(posed, images=images, notes=(*posed.notes, *notes))
