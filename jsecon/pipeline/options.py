@@ -113,7 +113,8 @@ class SceneOptions:
 
     Attributes:
       long_side: Longest side of the frames in pixels, at least 16. Smaller frames keep their size.
-      frames: Maximum number of frames, evenly spaced, at least 2. By default all frames are used, of a video 150.
+      frames: Maximum number of frames, evenly spaced, at least 2; a panorama counts as one. By default all frames are
+        used, of a video 150, or 50 panoramas.
       holdout: Every how many frames one is held out for measuring; 0 holds out no frame. By default those that the
         capture's own split sets aside are held out, or else every eighth.
       refine: When to correct camera poses and exposures by short fits before anything else. With auto, captures with

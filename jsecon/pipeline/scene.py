@@ -66,7 +66,9 @@ def plan_capture(context: RunContext) -> list[Stage]:
     if is_bare_scene(capture):
         return [_plan_rendered_views(context)]
     if is_video(capture):
-        what = f"the {options.frames or DEFAULT_VIDEO_FRAMES} sharpest frames of {capture.name}, evenly spread"
+        count, is_round = _frames_of_video(options)
+        kind = "panoramas" if is_round else "frames"
+        what = f"the {count} sharpest {kind} of {capture.name}, evenly spread"
         key_options, files = context.key_options("frames"), [capture]
     elif files:
         panoramas, hints = find_panoramas(files, declared=options.panoramas)
@@ -84,6 +86,12 @@ def plan_capture(context: RunContext) -> list[Stage]:
         raise InputError("--points", problem, "", "Give a capture with poses in the world of the points.")
     poses = Stage("poses", how, _estimate_poses, key_options=key_options, files=tuple(files), output_dir=folder)
     return [poses, dataclasses.replace(_plan_load(context, folder), after=("poses",), files=())]
+
+
+def _frames_of_video(options: Options) -> tuple[int, bool]:
+    """How many frames of a video are taken, and whether they are panoramas, of which each shows more."""
+    is_round = options.panoramas or has_mark(read_header(options.capture))
+    return options.frames or DEFAULT_VIDEO_FRAMES // (3 if is_round else 1), is_round
 
 
 def _plan_load(context: RunContext, capture: Path) -> Stage:
@@ -165,13 +173,12 @@ def _estimate_poses(stage: StageInput) -> StageResult:
     """Finds the poses of photographs or of a video's frames, and writes them as a COLMAP capture to OUT/poses."""
     context, folder = stage.context, stage.checkpoint.folder
     capture, out = context.options.capture, context.out / "poses"
-    video = is_video(capture)
+    video, declared = is_video(capture), context.options.panoramas
     if video:
-        frames = context.options.frames
+        frames, declared = _frames_of_video(context.options)
         photos, found = write_frames(capture, folder / "frames", frames=frames, progress=stage.progress)
     else:
         photos, found = unposed_photographs(capture)
-    declared = context.options.panoramas or (video and has_mark(read_header(capture)))
     panoramas, hints = find_panoramas(photos, declared=declared)
     posed, notes = find_poses(photos, folder, panoramas=panoramas, where=capture, progress=stage.progress)
     if video:

@@ -158,8 +158,7 @@ def _photographs(frames: Sequence[_Frame]) -> tuple[Int[np.ndarray, " t"], int]:
 def _choose(frames: Sequence[_Frame], options: FrameOptions) -> list[_Frame]:
     """The frames of evenly spaced photographs, as many as the options allow."""
     photographs, count = _photographs(frames)
-    limit = None if options.frames is None else max(1, options.frames * count // len(frames))
-    chosen = np.isin(photographs, evenly_spaced(count, limit))
+    chosen = np.isin(photographs, evenly_spaced(count, options.frames))
     return [frame for frame, is_chosen in zip(frames, chosen) if is_chosen]
 
 

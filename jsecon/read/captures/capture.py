@@ -57,7 +57,7 @@ def load_capture(
       path: Folder of the capture, or a file of transforms with any name.
       downscale: Divides width and height, at least 1.
       long_side: Longest side of the frames, px, if `downscale` is None; None: no limit.
-      frames: Most frames, evenly spaced; None: all.
+      frames: Most frames, evenly spaced, the views of a panorama together one; None: all.
       holdout: k holds out the frames 0, k, 2k, ..., and 0 no frame. None holds out those that the capture's own split
         sets aside (train_filenames, test_filenames, test_frames), or else every eighth.
       progress: Called with (frames done, frames).

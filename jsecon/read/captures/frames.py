@@ -67,7 +67,7 @@ class FrameOptions:
     Attributes:
       downscale: Divides width and height, at least 1.
       long_side: Longest side of the frames, px, if `downscale` is None; None: no limit.
-      frames: Most frames, evenly spaced; None: all.
+      frames: Most frames, evenly spaced, the views of a panorama together one; None: all.
       holdout: k holds out the frames 0, k, 2k, ..., and 0 no frame; None: the capture's own split, or else 8.
     """
 
