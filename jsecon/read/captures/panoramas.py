@@ -41,7 +41,6 @@ def find_panoramas(photos: Sequence[Path], *, declared: bool) -> tuple[list[Path
 
 def _cut_view(panorama: PosedImage, lens: Lens, view: int) -> PosedImage:
     """A view of a panorama."""
-    assert panorama.lens is not None
     pose, path = panorama.world_to_camera.copy(), PurePosixPath(panorama.name)
     pose[:3] = PANORAMA_VIEWS[view] @ pose[:3]
     name = str(path.with_name(f"{path.stem}_{view}{path.suffix}"))
