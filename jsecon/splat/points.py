@@ -31,11 +31,14 @@ def _voxel_keys(points: np.ndarray, voxel: float) -> np.ndarray:
 def voxel_for(points: Float[Array, "s 3"], max_points: int) -> float:
     """Finds the smallest voxel edge (to 2 %) that leaves at most `max_points` voxels of the points (S, 3) occupied."""
     points = np.asarray(points, np.float64)
+    sample = points[:: max(len(points) // (5 * max_points), 1)]  # which lies in nearly as many voxels
     high = float(np.max(np.ptp(points, axis=0))) * 1.001 + 1e-9
     low = high / 2**20
     while high / low > 1.02:
         middle = math.sqrt(low * high)
-        low, high = (middle, high) if len(np.unique(_voxel_keys(points, middle))) > max_points else (low, middle)
+        low, high = (middle, high) if len(np.unique(_voxel_keys(sample, middle))) > max_points else (low, middle)
+    while len(sample) < len(points) and len(np.unique(_voxel_keys(points, high))) > max_points:
+        high *= 1.02
     return high
 
 
