@@ -6,11 +6,12 @@ Ray-traced rooms (the ray tracer shares no code with the renderer) of nine thing
 its true masks, and Gaussians from true depth. Then the room is changed, lit anew or photographed with another exposure,
 and photographed from other places, with poses: RGB with true poses, and RGB-D with noise of 1 cm and of 0.5 degrees.
 
-AP is that of SceneDiff with the kind of change: changes of all rooms, the most probable first, are right if their masks
-in the new photographs have an IoU of at least 0.5 with those of a true change of the same kind. Masks are the pixels
-where the thing would be seen had nothing changed (gone, moved) and where it is seen now (new, moved). A turned thing
-counts as moved. Things that moved or are gone are asked for by their colours in the updated field, and in the field as
-it was. The seeds 0 to 4 chose the constants.
+AP is that of SceneDiff with the kind of change: changes of all rooms, the most probable first, also those too unsure to
+be reported, are right if their masks in the new photographs have an IoU of at least 0.5 with those of a true change of
+the same kind. Masks are the pixels where the thing would be seen had nothing changed (gone, moved) and where it is seen
+now (new, moved). A turned thing counts as moved. The other columns count what is reported. Things that moved or are
+gone are asked for by their colours in the updated field, and in the field as it was. The seeds 0 to 4 chose the
+constants.
 """
 
 import dataclasses
@@ -236,8 +237,9 @@ def judge(changes: Changes, case: Case, shots: dict[str, np.ndarray], chosen: np
     """Compares the changes of a case with the truth.
 
     Returns:
-      "found": (probability, whether it is right) of each change; "truth": number of true changes; "moved": of each true
-      moved thing that a right change found, the error of its place, m, and whether it has its id.
+      "found": (probability, whether it is right, its kind, whether it is reported) of each change; "truth": number of
+      true changes; "moved": of each true moved thing that a right change found, the error of its place, m, and whether
+      it has its id.
     """
     before, after = shots["before"][chosen], shots["after"][chosen]
     truth = []
@@ -249,20 +251,21 @@ def judge(changes: Changes, case: Case, shots: dict[str, np.ndarray], chosen: np
     order = sorted(range(len(records)), key=lambda n: -records[n]["probability"])
     for n in order:
         change, record = changes.found[n], records[n]
-        if change.kind in ("same", "not seen"):
+        likeliest = change.suspected or change.kind
+        if likeliest in ("same", "not seen"):
             continue
-        masks = np.stack([change.before & (change.kind != "new"), change.after & (change.kind != "gone")])
+        masks = np.stack([change.before & (likeliest != "new"), change.after & (likeliest != "gone")])
         ious = [
-            (masks & true).sum() / max((masks | true).sum(), 1) if kind == change.kind and k not in taken else 0.0
+            (masks & true).sum() / max((masks | true).sum(), 1) if kind == likeliest and k not in taken else 0.0
             for k, (kind, _, _, true) in enumerate(truth)
         ]
         best = int(np.argmax(ious)) if ious else -1
         right = best >= 0 and ious[best] >= 0.5
-        found.append((record["probability"], bool(right), change.kind))
+        found.append((record["probability"], bool(right), likeliest, not change.suspected))
         if right:
             taken.add(best)
             _, i, j, _ = truth[best]
-            if change.kind == "moved":
+            if likeliest == "moved":
                 spot = change.motion[:3, :3] @ [*case.before[i].spot, 0] + change.motion[:3, 3]
                 error = float(np.linalg.norm(spot[:2] - case.after[j].spot))
                 moved.append((error, record["region"] == i))
@@ -345,7 +348,8 @@ def main(options: Options) -> dict:
             every = [cell for column in cells.values() for cell in column]
             found = [tuple(pair) for cell in every for pair in cell["found"]]
             moved = [pair for cell in every for pair in cell["moved"]]
-            quiet = {k: sum(len(cell["found"]) for cell in cells[k]) for k in KINDS[5:]}
+            reported = {k: [pair for cell in cells[k] for pair in cell["found"] if pair[3]] for k in KINDS}
+            quiet = {k: len(reported[k]) for k in KINDS[5:]}
             figures[f"{count} {sensor}"] = figure = {
                 "AP": average_precision(found, sum(cell["truth"] for cell in every)),
                 "false in nothing": quiet["nothing"],
@@ -365,8 +369,8 @@ def main(options: Options) -> dict:
             lines.append((count, sensor, *figure.values()))
             parts = []
             for kind in KINDS[:5]:
-                right = sum(pair[1] for cell in cells[kind] for pair in cell["found"])
-                wrong = sum(not pair[1] for cell in cells[kind] for pair in cell["found"])
+                right = sum(pair[1] for pair in reported[kind])
+                wrong = len(reported[kind]) - right
                 parts.append(f"{right} of {sum(cell['truth'] for cell in cells[kind])}, {wrong} false")
             kinds.append((count, sensor, *parts))
     header = ("photographs", "sensor", *next(iter(figures.values())))

@@ -1,21 +1,28 @@
 """Changes of a scene: each kind is found; exposure, and what no photograph sees, is no change."""
 
+import base64
 import dataclasses
 
+import cv2
 import jax
 import numpy as np
 import pytest
 from capture_files import run_cli
 from conftest import cameras_of, capture_of, gaussians_at, look_at
+from PIL import Image
 from small_field import lone_votes
+from starlette.testclient import TestClient
 
 from experiments.rooms.writers import write_colmap
 from jsecon import InputError, LanguageField, Regions, Scene, load_field, save_field
 from jsecon.app.scene import open_scene
+from jsecon.app.server import application
+from jsecon.change.compare import depth_cost
 from jsecon.change.detect import object_changes
 from jsecon.field.evidence import pack_evidence, view_evidence
 from jsecon.field.ledger import Ledger, LedgerView, add_views, camera_row
 from jsecon.field.ledger_file import save_with_ledger
+from jsecon.read.captures.capture import taken_on
 from jsecon.read.captures.images import encode_jpeg
 from jsecon.splat.render import render, render_rgb
 from jsecon.types import UpAxis
@@ -85,6 +92,17 @@ def test_depth_alone_tells_what_is_gone(eyes):
     depths = np.stack([np.asarray(render_rgb(after, camera, depth=True).depth) for camera in eyes])
     found = object_changes(grey, labels, photographs(after, eyes), eyes, depths, up=UP)
     assert [change.kind for change in found] == ["same", "gone"]
+
+
+def test_depth_shows_low_things_and_no_edge_that_lies_a_pixel_off():
+    table, edge = np.full((12, 12), 1.4), np.full((12, 12), 1.4)
+    edge[:, 6:] = 1.0
+    np.testing.assert_array_equal(depth_cost(np.roll(edge, 1, axis=0), np.roll(edge, 1, axis=1)), 0)
+    low = table.copy()
+    low[4:8, 4:8] = 1.37
+    np.testing.assert_allclose(depth_cost(low, table)[4:8, 4:8], -(1.5 * 0.03 / (0.03 * 1.4) - 0.5))
+    assert not depth_cost(low, table)[:4].any()
+    assert np.isnan(depth_cost(np.zeros((12, 12)), table)).all()
 
 
 def test_an_updated_field_answers_as_things_are_now_and_as_they_were(eyes, tmp_path):
@@ -164,6 +182,14 @@ def test_frames_are_added_and_forgotten_after_an_update_and_it_is_updated_again(
     assert {*updated.ledger.views} == {"a", "b", "c", *names}
     more = dataclasses.replace(day2, frames=day2.frames[:1], cameras=eyes[:1], names=("g",))
     grown = updated.add(more)
+    pose = np.linalg.inv(np.asarray(eyes.world_to_camera[0], np.float64)) @ np.diag([1.0, -1, -1, 1])
+    lens = {"fl_x": 80, "fl_y": 80, "cx": 48, "cy": 36, "w": 96, "h": 72}
+    image = base64.b64encode(cv2.imencode(".png", more.frames[0][..., ::-1])[1].tobytes()).decode()
+    shot = {"name": "g.png", "image": image, "pose": lens | {"transform_matrix": pose.tolist()}}
+    client = TestClient(application(scenes := {updated.name: updated}), "http://127.0.0.1")
+    assert client.post("/frames", json=shot).json() == {"field": updated.name, "frames": 7}
+    np.testing.assert_allclose(scenes[updated.name].field.votes.weights, grown.field.votes.weights, atol=1e-3)
+    assert client.post("/frames", json=shot).status_code == 422  # of that name already
     for name in ("regions", "weights", "total", "views", "weight_where_region_visible"):
         rebuilt, old = (np.asarray(getattr(s.field.votes, name)) for s in (grown.forget(["g"]), updated))
         np.testing.assert_array_equal(rebuilt, old, err_msg=name)
@@ -175,9 +201,25 @@ def test_frames_are_added_and_forgotten_after_an_update_and_it_is_updated_again(
     last = grown.update(day3, date="2026-11-03")
     assert [(e["kind"], e["region"]) for e in last.history()] == [("moved", 0), ("gone", 1), ("new", 3), ("moved", 2)]
     np.testing.assert_allclose(last.ask("green").place.center[:2], (0.35, 0.3), atol=0.03)
-    then = last.as_of("2026-11-01")
+    assert [change.kind for change in updated.changes(last).found if change.kind != "same"] == ["moved"]
+    then = Scene(dataclasses.replace(last.field, provenance='{"date": "2026-11-01"}'), last.embedder).as_of(
+        "2026-11-01"
+    )
     np.testing.assert_allclose(then.ask("blue").place.center[:2], PLACES["blue"], atol=0.03)
     assert not then.ask("orange").mask.any()
+    with pytest.raises(InputError, match="2026-10-31 is before the field's photographs, of 2026-11-01"):
+        then.as_of("2026-10-31")
+
+
+def test_the_date_of_photographs_is_the_latest_of_their_exif_data(tmp_path):
+    for number, date in enumerate(("2026:11:03 10:00:00", "2026:11:01 09:00:00", None)):
+        exif = Image.Exif()
+        if date is not None:
+            exif.get_ifd(0x8769)[0x9003] = date
+        Image.new("RGB", (8, 8)).save(tmp_path / f"{number}.jpg", exif=exif)
+    assert taken_on(tmp_path) == "2026-11-03"
+    assert taken_on(tmp_path / "1.jpg") == "2026-11-01"
+    assert taken_on(tmp_path / "2.jpg") is None
 
 
 def test_what_too_little_shows_is_unsure_and_not_applied(eyes):

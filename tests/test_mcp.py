@@ -47,7 +47,7 @@ def call(server, name, **arguments):
 
 def test_every_tool_has_a_schema_and_only_reads(server):
     tools = use(server, lambda client: client.list_tools()).tools
-    assert {tool.name for tool in tools} == {"find", "history", "objects", "locate", "measure", "render"}
+    assert {tool.name for tool in tools} == {"changes", "find", "history", "objects", "locate", "measure", "render"}
     for tool in tools:
         assert tool.annotations.read_only_hint
         assert "field" in tool.input_schema["properties"]
@@ -64,7 +64,8 @@ def test_the_tools_answer(server):
 
 
 @pytest.mark.parametrize(("name", "arguments", "words"), [
-    ("find", {"text": "red mug", "field": "../etc"}, "no such field"), ("find", {"text": " "}, "pattern"),
+    ("find", {"text": "red mug", "field": "../etc"}, "no such field"), ("changes", {"later": "x"}, "no such field"),
+    ("find", {"text": " "}, "pattern"),
     ("find", {"text": "the meaning of life"}, "colour"), ("find", {"text": "word " * 200}, "at most"),
     ("find", {"text": "the leftmost red mug", "frame": "nowhere"}, "no such frame"),
     ("locate", {"text": "red mug"}, "names 2 objects"), ("measure", {"a": "red mug"}, "b"),
@@ -92,7 +93,7 @@ def test_it_answers_before_its_fields_are_open_and_a_call_waits(server, monkeypa
     async def ask():
         async with Client(make_server(scenes)) as client:
             assert client.server_info.version == jsecon.__version__
-            assert len((await client.list_tools()).tools) == 6
+            assert len((await client.list_tools()).tools) == 7
             arguments = {"text": "red mug"}
             slow = await client.call_tool("find", arguments, progress_callback=heard)
             return slow, await client.call_tool("find", arguments | {"field": "broken"})

@@ -1,36 +1,32 @@
 """`jsecon changes` and `jsecon update`: what changed, as JSON, a table, and a page with pictures and a plan."""
 
-import contextlib
 import csv
 import datetime
 import io
 import json
-import re
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from PIL import Image
 
 from jsecon.app import pictures, report, verbs
-from jsecon.app.comparison import LONG_SIDE, Changes, placed_capture, splat_capture
+from jsecon.app.comparison import LONG_SIDE, Changes, placed_capture, read_similarity, splat_capture
 from jsecon.app.opening import locate_field
 from jsecon.app.records import world_record
 from jsecon.app.scene import Scene, open_scene
 from jsecon.change.detect import KINDS
 from jsecon.errors import InputError
 from jsecon.files import FIELD_FILE, exclusive_lock, write_text
-from jsecon.pipeline.options import is_bare_scene, require_writable
+from jsecon.pipeline.options import is_bare_scene, read_date, require_writable
 from jsecon.pipeline.progress import Console
-from jsecon.read.captures.capture import load_capture, read_posed_images, unposed_photographs
-from jsecon.read.captures.images import IMAGE_SUFFIXES
+from jsecon.pipeline.scene_files import read_scene
+from jsecon.read.captures.capture import load_capture, lone_photographs, taken_on
+from jsecon.splat.sh import C0
 from jsecon.views.frame import field_up
 
 _PLAN = 700
 """Longer side of the plan, px."""
-_EXIF, _TAKEN, _DATE = 0x8769, 0x9003, re.compile(r"(\d{4}):(\d\d):(\d\d)")
-"""EXIF's block of a photograph, its tag DateTimeOriginal, and the date in that."""
 COLOURS = {"moved": (40, 110, 230), "gone": (220, 50, 60), "new": (20, 150, 80), "look": (190, 120, 20)}
 """RGB of the kinds of changes."""
 
@@ -55,8 +51,8 @@ def _compare(
     scene = open_scene(verb.field, embedder=verb.embedder, console=console)
     with console.progress("photographs") as progress:
         if is_bare_scene(verb.photos):
-            capture = splat_capture(scene.field, verb.photos, transform)
-        elif _without_poses(verb.photos):
+            capture = splat_capture(scene.field, read_scene(verb.photos)[0], read_similarity(transform))
+        elif lone_photographs(verb.photos):
             capture = placed_capture(scene.field, scene.ledger, verb.photos, refused, progress)
         else:
             capture = load_capture(verb.photos, long_side=LONG_SIDE, holdout=0, progress=progress)
@@ -72,10 +68,10 @@ def _update(verb: verbs.Update, console: Console) -> verbs.VerbResult:
         raise InputError(verb.photos, "a file of Gaussians", "photographs", "jsecon changes compares two of them.")
     date, origin = verb.date, "--date"
     if date is None:
-        date = photographed(verb.photos)
-        origin = "the photographs"
+        date, origin = taken_on(verb.photos), "the photographs"
     if date is None:
         date, origin = datetime.date.today().isoformat(), "today, as the photographs have no date"
+    read_date(date)
     scene, changes, refused = _compare(verb, console)
     updated = scene.update(changes, date=date)
     result = _write_changes(changes, out, console)
@@ -84,23 +80,6 @@ def _update(verb: verbs.Update, console: Console) -> verbs.VerbResult:
         updated.save(path)
     console.print_line(f"date    {date} ({origin})\nfield   {path}")
     return result | {"date": date, "errors": refused, "written": {**result["written"], "field": path}}
-
-
-def _without_poses(path: Path) -> list[Path]:
-    """Photographs without poses: one file, or those of a folder; none of a capture."""
-    return [path] if path.suffix.lower() in IMAGE_SUFFIXES else unposed_photographs(path)[0]
-
-
-def photographed(folder: Path) -> str | None:
-    """The latest date that photographs of a folder have in their EXIF; None if none has one."""
-    dates = []
-    files = _without_poses(folder) or [image.image for image in read_posed_images(folder).images]
-    for file in files:
-        if file is not None:
-            with contextlib.suppress(OSError), Image.open(file) as opened:
-                text = str(opened.getexif().get_ifd(_EXIF).get(_TAKEN, ""))
-                dates += ["-".join(match.groups()) for match in [_DATE.match(text)] if match]
-    return max(dates, default=None)
 
 
 def _write_changes(changes: Changes, out: Path, console: Console) -> verbs.VerbResult:
@@ -166,12 +145,10 @@ def changes_page(changes: Changes) -> str:
         pair = [report.figure(image, words) for image, words in zip(outlined, ("before", changes.capture.names[t]))]
         title, _, words = " ".join(_words(record).split()).partition(": ")
         cards.append(report.section(title, words, report.grid(pair, 2)))
-    rest = [
-        (r["name"], r["id"], r["kind"], r.get("suspected", ""), r["probability"])
-        for r in records
-        if r["kind"] not in COLOURS
-    ]
-    table = report.table(("object", "id", "", "perhaps", "probability"), rest)
+    others = [r for r in records if r["kind"] not in COLOURS]
+    doubts = [f" ({r['suspected']}?)" if "suspected" in r else "" for r in others]
+    rest = [(r["name"], r["id"], r["kind"] + doubt, r["probability"]) for r, doubt in zip(others, doubts)]
+    table = report.table(("object", "id", "", "probability"), rest)
     lead = f"{len(cards)} changes, {len(rest)} other objects, by {len(changes.capture.names)} photographs."
     parts = [report.section("Plan", "", report.grid([plan], 2)), *cards, report.section("Other objects", "", table)]
     return report.page("Changes", lead, parts)
@@ -179,40 +156,34 @@ def changes_page(changes: Changes) -> str:
 
 def _draw_plan(changes: Changes) -> np.ndarray:
     """Draws the scene from above, with a mark of each change and an arrow of what moved."""
-    field = changes.field
+    field, listed = changes.field, changes.catalogue
+    things = np.append(~listed.surroundings, False)[listed.labels]
     up = np.array(field_up(field).axis)
     first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     first /= np.linalg.norm(first)
     flat = np.stack([first, np.cross(up, first)], 1)
     means = np.asarray(field.gaussians.means, np.float64)
-    labels = changes.catalogue.labels
-    ends = [change.place for change in changes.found]
-    ends += [np.linalg.inv(c.motion)[:3, :3] @ c.place + np.linalg.inv(c.motion)[:3, 3] for c in changes.found]
-    near = np.concatenate([means[labels >= 0], *np.reshape(ends, (-1, 1, 3))]) @ flat
-    low, high = np.quantile(near, [0.01, 0.99], axis=0)
+    middle = np.quantile(means[things if things.any() else ...] @ flat, [0.01, 0.99], axis=0)
+    near = np.stack([*middle, *(end @ flat for change in changes.found for end in (change.start, change.place))])
+    low, high = near.min(0), near.max(0)
     margin = 0.15 * (high - low).max()
-    low, high = (
-        np.minimum(low, near[-2 * len(ends) :].min(0)) - margin,
-        np.maximum(high, near[-2 * len(ends) :].max(0)) + margin,
-    )
-    scale = _PLAN / (high - low).max()
-    width, height = np.ceil((high - low) * scale).astype(int)
+    scale = _PLAN / ((high - low).max() + 2 * margin)
+    width, height = np.ceil((high - low + 2 * margin) * scale).astype(int)
 
-    def place(points):
-        spot = (points @ flat - low) * scale
-        return np.stack([spot[..., 0], height - 1 - spot[..., 1]], -1).round().astype(int)
+    def place(point):
+        x, y = (point @ flat - low + margin) * scale
+        return round(x), height - 1 - round(y)
 
     image = np.full((height, width, 3), 245, np.uint8)
-    order = np.argsort(means @ up)
-    rgb = np.clip(0.5 + 0.2820948 * np.asarray(field.gaussians.sh)[:, 0], 0, 1)
-    shown = (0.45 * rgb + 0.55) * 255
-    top = np.quantile(means[labels >= 0] @ up, 0.999) if (labels >= 0).any() else np.inf
-    for n in order[(means[order] @ up) <= top + 0.05]:
-        cv2.circle(image, place(means[n]).tolist(), max(int(0.006 * _PLAN), 1), shown[n].tolist(), -1)
-    for change, end, start in zip(changes.found, ends, ends[len(changes.found) :]):
+    shown = (0.45 * np.clip(0.5 + C0 * np.asarray(field.gaussians.sh)[:, 0], 0, 1) + 0.55) * 255
+    heights = means @ up
+    top = heights[things].max() if things.any() else np.inf
+    for n in np.argsort(heights)[: np.sum(heights <= top)]:
+        cv2.circle(image, place(means[n]), max(int(0.006 * _PLAN), 1), shown[n].tolist(), -1)
+    for change in changes.found:
         if change.kind in COLOURS:
-            colour, (x, y) = COLOURS[change.kind], place(end).tolist()
+            colour, end = COLOURS[change.kind], place(change.place)
             if change.kind == "moved":
-                cv2.arrowedLine(image, place(start).tolist(), (x, y), colour, 3, cv2.LINE_AA, tipLength=0.12)
-            cv2.circle(image, (x, y), 14, colour, 3, cv2.LINE_AA)
+                cv2.arrowedLine(image, place(change.start), end, colour, 3, cv2.LINE_AA, tipLength=0.12)
+            cv2.circle(image, end, 14, colour, 3, cv2.LINE_AA)
     return image

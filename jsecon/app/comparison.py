@@ -12,11 +12,11 @@ import numpy as np
 from jsecon.app.catalogue import Catalogue
 from jsecon.app.records import rounded, source_points
 from jsecon.change.detect import Change, object_changes
-from jsecon.change.history import NewThing, add_frames, add_object, events, move_object, new_view, remove_object
-from jsecon.errors import InputError
+from jsecon.change.history import NewThing, add_frames, add_object, dates, move_object, new_view, remove_object
+from jsecon.errors import InputError, require
 from jsecon.field.ledger import Ledger
+from jsecon.files import reading
 from jsecon.fit.resize import resize_camera, resize_frame, shrink_cameras
-from jsecon.pipeline.scene_files import read_scene
 from jsecon.read.captures.frames import evenly_spaced, transform_poses
 from jsecon.read.captures.images import encode_jpeg
 from jsecon.splat.points import gaussians_from_points
@@ -60,11 +60,7 @@ class Changes:
         name = str(listed.names[change.object, 0]) if change.object >= 0 else ""
         ids = {"id": change.object, "region": main_region(field, listed, change.object)} if change.object >= 0 else {}
         record |= {"name": name} | ({"id": None, "region": None} | ids)
-        now = source_points(field, change.place[None])[0]
-        start = now
-        if "moved" in (change.kind, change.suspected):
-            inverse = np.linalg.inv(change.motion)
-            start = source_points(field, (change.place @ inverse[:3, :3].T + inverse[:3, 3])[None])[0]
+        now, start = source_points(field, np.stack([change.place, change.start]))
         kind = change.suspected or change.kind
         record["from"] = None if kind == "new" else rounded(start, 1.0)
         record["to"] = None if kind in ("gone", "not seen") else rounded(now, 1.0)
@@ -111,8 +107,8 @@ def apply_changes(
     The ledger keeps the evidence of all views: of which region a Gaussian is stays true, also if it moves.
     """
     field, listed = changes.field, changes.catalogue
-    if (known := [event["date"] for event in events(field)]) and date < known[-1]:
-        raise InputError("--date", f"{date} is before the last change of the field, {known[-1]}", remedy="Check it.")
+    if date < (last := dates(field)[-1]):
+        raise InputError("--date", f"{date} is before the last change of the field, {last}", remedy="Check it.")
     found = list(zip(changes.found, changes.records()))
     new = [change for change, _ in found if change.kind == "new" and change.frames]
     shown = sorted({t for change in new for t in change.frames})
@@ -187,10 +183,9 @@ def _surface(mask: np.ndarray, camera: Camera, place: np.ndarray, depth: np.ndar
     return (np.stack([x * z, y * z, z], 1) - pose[:3, 3]) @ pose[:3, :3]
 
 
-def splat_capture(field: LanguageField, file: Path, transform: Path | None) -> Capture:
-    """Renders another splat of the same place, with depth, from views of a field."""
-    gaussians, _ = read_scene(file)
-    into_field = np.linalg.inv(np.asarray(field.source_from_scene, np.float64)) @ _read_matrix(transform)
+def splat_capture(field: LanguageField, gaussians: Gaussians, transform: np.ndarray) -> Capture:
+    """Renders other Gaussians of a field's place, with depth, from its views; `transform` takes them to its capture."""
+    into_field = np.linalg.inv(np.asarray(field.source_from_scene, np.float64)) @ transform
     moved = transform_gaussians(gaussians, into_field)
     moved = dataclasses.replace(moved, means=np.asarray(moved.means, np.float32))
     rows = evenly_spaced(len(field.names), SPLAT_VIEWS)
@@ -215,17 +210,12 @@ def placed_capture(
     return Capture(frames, cameras, nothing, nothing.astype(np.uint8), none, None, world, tuple(placed))
 
 
-def _read_matrix(file: Path | None) -> np.ndarray:
-    """Reads a 4x4 similarity from a text file."""
+def read_similarity(file: Path | None) -> np.ndarray:
+    """Reads a 4x4 similarity from a text file; without one it is the identity."""
     if file is None:
         return np.eye(4)
-    try:
-        matrix = np.loadtxt(file)
-    except (OSError, ValueError) as error:
-        raise InputError(
-            file, f"cannot read it ({error})", remedy="Give a text file of four rows of numbers."
-        ) from error
-    turn = matrix[:3, :3] @ matrix[:3, :3].T if matrix.shape == (4, 4) else np.zeros((3, 3))
-    if not turn[0, 0] > 0 or not np.allclose(turn / turn[0, 0], np.eye(3), atol=1e-3) or np.linalg.det(matrix) < 0:
-        raise InputError(file, "no similarity", "4 rows of 4 numbers: rotation times scale, and shift", "Check it.")
+    with reading(file, "4 rows of 4 numbers: rotation times scale, and shift", "Check it."):
+        matrix = np.loadtxt(file).reshape(4, 4)
+        turn = matrix[:3, :3] / max(np.cbrt(np.linalg.det(matrix[:3, :3])), 1e-12)
+        require(np.allclose(turn @ turn.T, np.eye(3), atol=1e-3), "matrix", "no similarity", "one", "Check it.")
     return matrix

@@ -84,6 +84,13 @@ class _Tools:
         """Lists what moved, is gone, is new or looks another way since a field was made, in order of time."""
         return {"changes": self._scene(field).history()}
 
+    def changes(
+        self, later: Annotated[str, Field(description="Name of the later field")], field: FieldName = None
+    ) -> dict[str, Any]:
+        """Lists what moved, is gone, is new, looks another way or is unsure in a later field of the same place."""
+        found = self._scene(field).changes(self._scene(later)).records()
+        return {"changes": [record for record in found if record["kind"] != "same"]}
+
     def locate(self, text: Words, frame: Frame = None, field: FieldName = None) -> dict[str, Any]:
         """Locates one thing: oriented box, and the middle of its top, where a gripper from above would close."""
         scene = self._scene(field)
@@ -119,7 +126,8 @@ def make_server(scenes: Mapping[str, Future[Any]]) -> MCPServer:
     server = MCPServer("jsecon", instructions=words, version=jsecon.__version__)
     tools = _Tools(scenes)
     annotations = ToolAnnotations(read_only_hint=True, open_world_hint=False, idempotent_hint=True)
-    for method in (tools.find, tools.objects, tools.history, tools.locate, tools.measure, tools.render):
+    methods = tools.find, tools.objects, tools.changes, tools.history, tools.locate, tools.measure, tools.render
+    for method in methods:
         text = inspect.getdoc(method)
         structured = method != tools.render
         server.add_tool(_tool(method, tools), description=text, annotations=annotations, structured_output=structured)

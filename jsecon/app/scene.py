@@ -20,12 +20,12 @@ from jaxtyping import Bool, UInt8
 
 from jsecon.app import pictures
 from jsecon.app.catalogue import Catalogue, objects
-from jsecon.app.comparison import Changes, apply_changes, find_changes
+from jsecon.app.comparison import Changes, apply_changes, find_changes, splat_capture
 from jsecon.app.object_index import ObjectIndex, choose_shades
 from jsecon.app.opening import locate_field, name_fields
 from jsecon.app.records import Answer, At, Box, Mask, Query, Question, Region, gaussian_rows, world_record
 from jsecon.change import MIN_PROBABILITY
-from jsecon.change.history import change_question, events, field_as_of, read_date
+from jsecon.change.history import change_question, events, field_as_of
 from jsecon.errors import InputError
 from jsecon.field.columns import is_mapped
 from jsecon.field.field import check_field, load_field
@@ -36,7 +36,7 @@ from jsecon.field.regions import ALIKE_THRESHOLD
 from jsecon.files import FIELD_FILE, parse_json
 from jsecon.networks.hub import parse_model
 from jsecon.paper.queries import CODE_THRESHOLD
-from jsecon.pipeline.options import Options
+from jsecon.pipeline.options import Options, read_date
 from jsecon.pipeline.progress import Console
 from jsecon.pipeline.sources import forget_warnings, locate_sources, move_hints, run_warnings
 from jsecon.process import MEMORY, memory_budget
@@ -628,14 +628,15 @@ class Scene:
                 return self._catalogue
             return objects(self.field, vocabulary, self.embedder, up=self._up)
 
-    def changes(self, capture: Capture, *, min_probability: float = MIN_PROBABILITY) -> Changes:
+    def changes(self, later: "Capture | Scene", *, min_probability: float = MIN_PROBABILITY) -> Changes:
         """Finds what became of each object, and what is new, in new photographs.
 
         An object is the same, moved, gone, of another look, unsure or not seen. Light, shadows and exposure are no
         changes.
 
         Args:
-          capture: The photographs, with poses in the world of the field's own capture, and with depth if there is any.
+          later: The photographs, with poses in the world of the field's own capture, and with depth if there is any; or
+            a later scene of the same place, of the same world.
           min_probability: Probability of what became of an object below which it is "unsure", and no change.
 
         Returns:
@@ -646,7 +647,9 @@ class Scene:
         """
         with self._lock:
             self._require_memory("a comparison")
-            return find_changes(self.field, self._catalogue, capture, min_probability)
+            if isinstance(later, Scene):
+                later = splat_capture(self.field, later.field.gaussians, np.asarray(later.field.source_from_scene))
+            return find_changes(self.field, self._catalogue, later, min_probability)
 
     def update(self, changes: Capture | Changes, *, date: str) -> "Scene":
         """Applies what changed: objects move or are gone, and new ones come. Ids of regions stay.

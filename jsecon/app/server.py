@@ -1,16 +1,17 @@
 """`jsecon serve`: fields over HTTP (extra `serve`).
 
 FastAPI makes /openapi.json from the models below, and answers each question in a thread; a scene computes one at a
-time. A request reads only the fields: no name in it is a path.
+time. A request reads only the fields, and photographs are added in memory: no name in it is a path.
 """
 
 import hmac
 import json
 import re
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+import threading
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from fastapi import FastAPI, HTTPException, Query as Parameters, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictFloat, StrictInt, StrictStr, StringConstraints
+from pydantic.types import Base64Bytes
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException as AnyHTTPException
 
@@ -31,13 +33,16 @@ from jsecon.app.scene import Scene, open_scenes
 from jsecon.errors import InputError
 from jsecon.pipeline.progress import Console
 
-MAX_BODY = 64 * 1024
-"""bytes of a request's body"""
+MAX_BODY, MAX_FRAME = 64 * 1024, 32 * 1024 * 1024
+"""bytes of a request's body, and of one with a photograph"""
 
 Text = Annotated[str, StringConstraints(strict=True, min_length=1, max_length=500, pattern=r"\S")]
 Frame: TypeAlias = StrictStr | StrictInt
 Name = Annotated[str | None, Field(description="Name of a field; the first by default")]
 Seen = Annotated[Frame | None, Field(description="Frame from which left, right, front and behind are seen")]
+
+
+_PoseKey = Literal["transform_matrix", "fl_x", "fl_y", "cx", "cy", "w", "h"]
 
 
 class _Request(BaseModel):
@@ -72,6 +77,12 @@ class _MaskOf(_Selection):
     frame: str | None = None
 
 
+class _NewFrame(_Request):
+    name: Annotated[str, StringConstraints(pattern=r"^[\w-][\w.-]{0,80}\.(jpg|jpeg|png)$")]
+    image: Base64Bytes = Field(description="The file's bytes in base64")
+    pose: dict[_PoseKey, Any] | None = Field(None, description="A frame of a transforms.json; by default it is found")
+
+
 class _AsciiResponse(JSONResponse):
     """JSON in ASCII, which can hold any text of a request."""
 
@@ -98,8 +109,8 @@ class _Guard:
             nonlocal size
             message = await receive()
             size += len(message.get("body", b""))
-            if size > MAX_BODY:
-                raise HTTPException(413, f"The body has more than {MAX_BODY} bytes.", {"connection": "close"})
+            if size > (most := MAX_FRAME if scope["path"] == "/frames" else MAX_BODY):
+                raise HTTPException(413, f"The body has more than {most} bytes.", {"connection": "close"})
             return message
 
         await self._app(scope, limited, send)
@@ -118,7 +129,7 @@ class _Guard:
         return None
 
 
-def application(scenes: Mapping[str, Scene], *, token: str = "") -> FastAPI:
+def application(scenes: dict[str, Scene], *, token: str = "") -> FastAPI:
     """Makes the ASGI application of scenes by name, the first of which is the default.
 
     Requests must carry the token, or without one name this machine.
@@ -132,6 +143,7 @@ def application(scenes: Mapping[str, Scene], *, token: str = "") -> FastAPI:
         default_response_class=_AsciiResponse,
     )
     app.add_middleware(_Guard, token=token)
+    adding = threading.Lock()
 
     @app.post("/query", summary="Count, score and place of the answer to a text or a pixel")
     def query(request: _Question) -> Response:
@@ -159,6 +171,17 @@ def application(scenes: Mapping[str, Scene], *, token: str = "") -> FastAPI:
     def changes(request: Annotated[_Request, Parameters()]) -> Response:
         scene = find_scene(scenes, request.field)
         return _AsciiResponse({"field": scene.name, "changes": scene.history()})
+
+    @app.post("/frames", summary="Adds a photograph to a field, as jsecon add does, until the server stops")
+    def frames(request: _NewFrame) -> Response:
+        with adding, tempfile.TemporaryDirectory() as folder:
+            scene = find_scene(scenes, request.field)
+            Path(folder, request.name).write_bytes(request.image)
+            if request.pose is not None:
+                shot = request.pose | {"file_path": request.name}
+                Path(folder, "transforms.json").write_text(json.dumps({"frames": [shot]}))
+            scenes[scene.name] = grown = scene.add(folder)
+        return _AsciiResponse({"field": scene.name, "frames": len(grown.field.names)})
 
     @app.get("/selection.ply", summary="The selected Gaussians in the capture's world")
     def selection(request: Annotated[_Selection, Parameters()]) -> Response:

@@ -4,6 +4,8 @@ Pure functions on NumPy arrays. Photographs are compared in the colours of the s
 A pixel may be lighter or darker by a factor, at a small cost, because light and shadows change what nothing moved.
 """
 
+from collections.abc import Iterator
+
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
@@ -12,7 +14,7 @@ COLOUR_STEP = 22.0
 """CIELAB distance from which a pixel is not explained at all; half of it decides."""
 _LIGHT_STEP = 40.0
 """CIELAB distance that a factor of e in lightness is worth."""
-_DEPTH_STEP = 0.06
+_DEPTH_STEP = 0.03
 """Difference of depth from which a pixel is not explained, as a share of the depth; a third of it is noise."""
 _REACH = 0.025
 """Largest shift of a photograph against the rendering of its pose, as a share of its width."""
@@ -66,28 +68,35 @@ def shifted(image: np.ndarray, shift: tuple[int, int]) -> np.ndarray:
 
 
 def colour_cost(
-    photo: Float32[np.ndarray, "h w 3"], render: Float32[np.ndarray, "h w 3"], reach: int = 1
+    photo: Float32[np.ndarray, "h w 3"], render: Float32[np.ndarray, "h w 3"]
 ) -> Float32[np.ndarray, "h w"]:
-    """How little a rendering explains the colours of a photograph, 0 to 1: least over shifts of up to `reach` px."""
+    """How little a rendering explains the colours of a photograph, 0 to 1: least over shifts of up to one px."""
     best = np.full(photo.shape[:2], np.inf, np.float32)
     lab = cv2.cvtColor(np.clip(photo, 0, 1), cv2.COLOR_RGB2LAB)
-    for y in range(-reach, reach + 1):
-        for x in range(-reach, reach + 1):
-            moved = shifted(render, (y, x))
-            gain = ((photo * moved).sum(-1) + 1e-3) / ((moved * moved).sum(-1) + 1e-3)
-            gain = np.clip(gain, 0.4, 2.5)
-            other = cv2.cvtColor(np.clip(moved * gain[..., None], 0, 1).astype(np.float32), cv2.COLOR_RGB2LAB)
-            distance = ((lab - other) ** 2).sum(-1) + (_LIGHT_STEP * np.log(gain)) ** 2
-            best = np.minimum(best, distance)
+    for moved in _shifts(render):
+        gain = (np.einsum("hwc,hwc->hw", photo, moved) + 1e-3) / (np.einsum("hwc,hwc->hw", moved, moved) + 1e-3)
+        gain = np.clip(gain, 0.4, 2.5).astype(np.float32)
+        apart = lab - cv2.cvtColor(np.clip(moved * gain[..., None], 0, 1), cv2.COLOR_RGB2LAB)
+        best = np.minimum(best, np.einsum("hwc,hwc->hw", apart, apart) + (_LIGHT_STEP * np.log(gain)) ** 2)
     return np.minimum(np.sqrt(best) / COLOUR_STEP, 1.0)
+
+
+def _shifts(image: np.ndarray) -> Iterator[np.ndarray]:
+    """An image moved by up to one px each way; its edge is repeated."""
+    height, width = image.shape[:2]
+    padded = cv2.copyMakeBorder(image, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
+    for y in range(3):
+        for x in range(3):
+            yield padded[y : y + height, x : x + width]
 
 
 def depth_cost(depth: Float[np.ndarray, "h w"], rendered: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """How little rendered depth explains a measured one, -1 to 1: negative where the measured surface is nearer.
 
-    NaN where either is unknown (0).
+    It is that of least size over shifts of up to one px; NaN where either is unknown (0).
     """
-    known = (depth > 0) & (rendered > 0)
-    difference = (depth - rendered) / (_DEPTH_STEP * np.maximum(rendered, 1e-9))
-    cost = np.sign(difference) * np.clip(1.5 * np.abs(difference) - 0.5, 0, 1)
-    return np.where(known, cost, np.nan)
+    known, best = (depth > 0) & (rendered > 0), np.full(depth.shape, np.inf)
+    for moved in _shifts(rendered):
+        difference = np.where(moved > 0, (depth - moved) / (_DEPTH_STEP * np.maximum(moved, 1e-9)), np.inf)
+        best = np.where(np.abs(difference) < np.abs(best), difference, best)
+    return np.where(known, np.sign(best) * np.clip(1.5 * np.abs(best) - 0.5, 0, 1), np.nan)

@@ -8,7 +8,9 @@ object that too few pixels see keeps its state: it is not seen, never gone. NumP
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import cv2
 import jax
@@ -43,6 +45,8 @@ MIN_TURN_GAIN = 0.035
 """Cost that a turn must take away, per pixel of the object, beyond what the unturned object does."""
 MIN_RADIUS = 2.0
 """Radius of the largest disc in the pixels of a new thing: edges that lie a pixel off are narrower."""
+MIN_MOVE = 0.2
+"""Shift, as a share of its size, or turn, radians, from which an object has moved."""
 _KNOWN = 0.8
 """Alpha from which a rendering tells what a pixel shows."""
 _MAX_PLACES = 6
@@ -75,6 +79,11 @@ class Change:
     """(F, H, W) bool pixels where it is seen now."""
     suspected: str = ""
     """The likeliest kind where `kind` is "unsure"."""
+
+    @property
+    def start(self) -> np.ndarray:
+        """(3,) `place` before the motion."""
+        return np.linalg.solve(self.motion, np.append(self.place, 1.0))[:3]
 
 
 class _View(NamedTuple):
@@ -181,7 +190,9 @@ def _first_view(gaussians: Gaussians, camera: Camera, frame: np.ndarray, depth: 
     photo, known = frame.astype(np.float32) / 255, image[1] >= _KNOWN
     shift = find_shift(photo, image[0], known)
     photo = fit_exposure(shifted(photo, shift), image[0], known)
-    depth = None if depth is None else shifted(np.asarray(depth, np.float32), shift)
+    if depth is not None:
+        depth = shifted(np.asarray(depth, np.float32), shift)
+        depth = np.where(depth > 0, cv2.medianBlur(depth, 3), 0)  # a third of the noise
     view = _View(camera, photo, depth, *image, image[1])
     return view._replace(cost=view.compare(*image))
 
@@ -234,9 +245,7 @@ def object_changes(
         explained = float((view.cost < 0.5).mean())
         if explained < MIN_EXPLAINED:
             problem = f"the scene explains {explained:.0%} of its pixels"
-            remedy = (
-                "Check that it shows the place of the field, and that its pose is in the world of the field's capture."
-            )
+            remedy = "Check that it shows the field's place, and that its pose is in the world of the field's capture."
             raise InputError(f"photograph {t + 1}", problem, f"{MIN_EXPLAINED:.0%} or more", remedy)
     pooled = np.stack([_pooled(view, gaussians, labels, count) for view in views], axis=1)  # (K, F, 3)
     known = pooled[..., :2].sum(-1)
@@ -246,16 +255,17 @@ def object_changes(
     weight = np.where(seen, np.minimum(known / 60, 1), 0) * np.where(differing < DISPLACED_SHARE, 2, 1)
     excess = np.where(seen, weight * (differing - DISPLACED_SHARE), 0).sum(1) / np.maximum(weight.sum(1), 1e-9)
     displaced = seen.any(1) & (excess > 0)
-    search = _Search(gaussians, labels, views, up / np.linalg.norm(up), displaced)
+    search = _Search(gaussians, labels, views, up / np.linalg.norm(up))
     changes = [search.unmoved(k, seen[k], excess[k], differing[k]) for k in range(count)]
     shares = (known * differing).sum(1) / np.maximum(known.sum(1), 1e-9)
-    for k in np.flatnonzero((seen.sum(1) > 1) & ~displaced & (shares >= TURN_SHARE)).tolist():
-        changes[k] = search.turned(changes[k])
-    for k, change in search.moved().items():
-        changes[k] = change
+    suspects = np.flatnonzero((seen.sum(1) > 1) & ~displaced & (shares >= TURN_SHARE)).tolist()
+    turns = {k: turn for k in suspects if (turn := search.turn(changes[k])) is not None}
+    search.remove(np.flatnonzero(displaced).tolist(), list(turns))
+    moved = {k: search.settle(k, *turn) for k, turn in turns.items()} | search.moved()
+    changes = [moved.get(k, change) for k, change in enumerate(changes)]
     clusters = search.clusters(min(2, len(views)))
     for k in np.flatnonzero(displaced).tolist():
-        if changes[k].kind != "moved":
+        if k not in moved:
             changes[k], clusters = search.gone(k, seen[k], clusters)
     changes += [search.new(cluster) for cluster in clusters]
     return [
@@ -279,22 +289,32 @@ class _Cluster(NamedTuple):
     """Radius of the largest disc in a mask, px."""
 
 
+def _gains(views: Sequence[_View], discs: _Discs, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The cost that an object takes away in each view after a motion, and the pixels of its silhouette."""
+    placed = [view.place(discs, motion) for view in views]
+    gains = [float(np.nansum(view.cost - new.cost)) for view, (new, _) in zip(views, placed)]
+    return np.array(gains), np.array([inside.sum() for _, inside in placed])
+
+
+def _sigmoid(evidence: float) -> float:
+    return float(1 / (1 + np.exp(-evidence)))
+
+
 class _Search:
     """The search for what is turned, displaced and new; its views show what was found."""
 
-    def __init__(self, gaussians, labels, views, up, displaced):
-        """Renders the scene without what is displaced."""
-        self.gaussians, self.labels, self.up, self.displaced = gaussians, labels, up, displaced
-        self.first = views
-        hidden = np.append(displaced, False)[labels]
-        self.views = [view.render(hide(gaussians, hidden)) for view in views] if displaced.any() else views
-        side = np.eye(3)[np.argmin(np.abs(up))]
-        first = np.cross(up, side)
+    def __init__(self, gaussians, labels, views, up):
+        self.gaussians, self.labels, self.up, self.first = gaussians, labels, up, views
+        first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
         first /= np.linalg.norm(first)
         self.flat = np.stack([first, np.cross(up, first)])
         self.means = np.asarray(gaussians.means, np.float64)
-        self.turns: dict[int, tuple[_Discs, np.ndarray]] = {}
-        self.discs = {k: _Discs(gaussians, np.flatnonzero(labels == k)) for k in np.flatnonzero(displaced).tolist()}
+        self.discs = functools.cache(lambda k: _Discs(gaussians, np.flatnonzero(labels == k)))
+
+    def remove(self, displaced: list[int], turned: list[int]) -> None:
+        """Renders the scene without some objects."""
+        self.displaced, mask = displaced, np.isin(self.labels, [*displaced, *turned])
+        self.views = [view.render(hide(self.gaussians, mask)) if mask.any() else view for view in self.first]
 
     def _middle(self, k: int) -> np.ndarray:
         own = self.means[self.labels == k]
@@ -315,8 +335,8 @@ class _Search:
         empty = np.zeros((len(self.first), *self.first[0].alpha.shape), bool)
         kind = "same" if seen.any() else "not seen"
         order = [int(t) for t in np.argsort(differing) if seen[t]]
-        probability = 1 / (1 + np.exp(12 * excess)) if seen.any() else 1.0
-        return Change(kind, k, float(probability), tuple(order), np.eye(4), self._middle(k), empty, empty)
+        probability = _sigmoid(-12 * excess) if seen.any() else 1.0
+        return Change(kind, k, probability, tuple(order), np.eye(4), self._middle(k), empty, empty)
 
     def clusters(self, min_frames: int) -> list[_Cluster]:
         """Places the unexplained pixels of the frames, and joins those that lie at one place."""
@@ -363,57 +383,49 @@ class _Search:
                 continue
             rows, columns = np.nonzero(inside)
             along = down[0] * columns + down[1] * rows
-            if view.depth is not None and (view.depth[inside] > 0).any():
-                depth = float(np.median(view.depth[inside][view.depth[inside] > 0]))
-                points = self._back_project(
-                    view.camera, columns, rows, np.where(view.depth[inside] > 0, view.depth[inside], depth)
-                )
-                place, size = np.median(points, 0), depth * np.sqrt(area) / float(view.camera.fx)
-                place = place + self.up * (np.quantile(points @ self.up, 0.05) - place @ self.up)
-            else:
-                low = along >= np.quantile(along, 0.95)
-                column, row = columns[low].mean(), rows[low].mean()
-                z = float(np.median(view.z[rows[low], columns[low]]))
-                contact = self._back_project(view.camera, column, row, z)
-                size = z * np.sqrt(area) / float(view.camera.fx)
-                ahead = contact - np.asarray(view.camera.centres, np.float64)
-                ahead -= (ahead @ self.up) * self.up
-                place = contact + 0.4 * size * ahead / max(np.linalg.norm(ahead), 1e-9)
+            low = along >= np.quantile(along, 0.95)
+            z = float(np.median(view.z[rows[low], columns[low]]))
+            x = (columns[low].mean() + 0.5 - float(view.camera.cx)) / float(view.camera.fx)
+            y = (rows[low].mean() + 0.5 - float(view.camera.cy)) / float(view.camera.fy)
+            contact = (np.array([x * z, y * z, z]) - pose[:3, 3]) @ pose[:3, :3]
+            size = z * np.sqrt(area) / float(view.camera.fx)
+            ahead = contact - np.asarray(view.camera.centres, np.float64)
+            ahead -= (ahead @ self.up) * self.up
+            place = contact + 0.4 * size * ahead / max(np.linalg.norm(ahead), 1e-9)
             result.append(_Cluster(place, size, {t: inside}, radius))
         return result
-
-    def _back_project(self, camera, columns, rows, z):
-        x = (np.asarray(columns) + 0.5 - float(camera.cx)) / float(camera.fx)
-        y = (np.asarray(rows) + 0.5 - float(camera.cy)) / float(camera.fy)
-        local = np.stack([x * z, y * z, np.broadcast_to(z, np.shape(x))], -1)
-        pose = np.asarray(camera.world_to_camera, np.float64)
-        return (local - pose[:3, 3]) @ pose[:3, :3]
 
     def moved(self) -> dict[int, Change]:
         """Finds the displaced objects elsewhere, the one that explains most first."""
         result: dict[int, Change] = {}
-        left = set(map(int, np.flatnonzero(self.displaced)))
+        left = set(self.displaced)
         while left:
             clusters = self.clusters(min(2, len(self.views)))[:_MAX_PLACES]
-            places: list[Any] = [(None, cluster.place, cluster.size) for cluster in clusters]
-            places += [(k, *self._stand(k)) for k in np.flatnonzero(self.displaced).tolist()]  # where others stood
-            fits = [self._fit(k, *place) for k in left for other, *place in places if k != other]
+            places = [(cluster.place, cluster.size) for cluster in clusters]
+            places += [self._stand(k) for k in self.displaced]  # its own, too: what moved may hide it, or it is turned
+            fits = [self._fit(k, *place) for k in left for place in places]
             fits = [fit for fit in fits if fit is not None and fit.gain >= MIN_GAIN]
             if not fits:
                 break
             best = max(fits, key=lambda fit: fit.total)
             left.discard(best.object)
-            before, masks = self.silhouettes(best.object), []
-            for t, view in enumerate(self.views):
-                self.views[t], inside = view.place(self.discs[best.object], best.motion)
-                masks.append(inside)
-            order = tuple(int(t) for t in np.argsort([-m.sum() for m in masks]) if masks[t].sum() >= MIN_PIXELS)
-            place = self._middle(best.object) @ best.motion[:3, :3].T + best.motion[:3, 3]
-            probability = 1 / (1 + np.exp(-14 * (best.gain - MIN_GAIN) - 0.5))
-            result[best.object] = Change(
-                "moved", best.object, float(probability), order, best.motion, place, before, np.stack(masks)
-            )
+            result[best.object] = self.settle(best.object, best.motion, 14 * (best.gain - MIN_GAIN) + 0.5)
         return result
+
+    def settle(self, k: int, motion: np.ndarray, evidence: float) -> Change:
+        """Puts an object into the views where it is now; `evidence` is the logit of its probability."""
+        before, masks = self.silhouettes(k), []
+        for t, view in enumerate(self.views):
+            self.views[t], inside = view.place(self.discs(k), motion)
+            masks.append(inside)
+        order = tuple(int(t) for t in np.argsort([-m.sum() for m in masks]) if masks[t].sum() >= MIN_PIXELS)
+        middle = self._middle(k)
+        place = middle @ motion[:3, :3].T + motion[:3, 3]
+        evidence -= len(order) < 2
+        away = np.linalg.norm(place - middle) / max(self._stand(k)[1], 1e-9)
+        if away < MIN_MOVE and Rotation.from_matrix(motion[:3, :3]).magnitude() < MIN_MOVE:
+            return Change("same", k, _sigmoid(evidence), order, np.eye(4), middle, before, before)
+        return Change("moved", k, _sigmoid(evidence), order, motion, place, before, np.stack(masks))
 
     def _motion(self, k: int, pose: np.ndarray) -> np.ndarray:
         """The motion that turns an object about its middle by pose[2], and shifts it by pose[:2] and up by pose[3]."""
@@ -422,37 +434,15 @@ class _Search:
         motion[:3, 3] = middle - motion[:3, :3] @ middle + pose[:2] @ self.flat + pose[3] * self.up
         return motion
 
-    def turned(self, change: Change) -> Change:
-        """The change of an object that is where it was: turned, if that explains clearly more; else the same."""
+    def turn(self, change: Change) -> tuple[np.ndarray, float] | None:
+        """The motion of an object that is where it was and turned, if that explains clearly more, and its evidence."""
         k = change.object
         views = [self.first[t].render(hide(self.gaussians, self.labels == k)) for t in change.frames[:_FIT_FRAMES]]
-        discs = _Discs(self.gaussians, np.flatnonzero(self.labels == k))
-
-        def score(angle: float) -> tuple[float, int]:
-            placed = [view.place(discs, self._motion(k, np.array([0, 0, angle, 0]))) for view in views]
-            gains = [float(np.nansum(view.cost - new.cost)) for view, (new, _) in zip(views, placed)]
-            return sum(gains), sum(int(inside.sum()) for _, inside in placed)
-
-        angles = np.radians(np.arange(20, 341, 20))
-        unturned, pixels = score(0.0)
-        values = [score(angle)[0] for angle in angles]
-        angle = float(angles[int(np.argmax(values))])
-        gain = (max(values) - unturned) / max(pixels, 1)
-        if gain < MIN_TURN_GAIN:
-            return change
-        motion = self._motion(k, np.array([0, 0, angle, 0]))
-        self.turns[k] = discs, motion
-        hidden = np.append(self.displaced, False)
-        hidden[list(self.turns)] = True
-        self.views = [view.render(hide(self.gaussians, hidden[self.labels])) for view in self.first]
-        for placed in self.turns.values():
-            both = [view.place(*placed) for view in self.views]
-            self.views, after = [view for view, _ in both], np.stack([inside for _, inside in both])
-        probability = float(1 / (1 + np.exp(-40 * (gain - MIN_TURN_GAIN))))
-        before = self.silhouettes(k)
-        return dataclasses.replace(
-            change, kind="moved", probability=probability, motion=motion, before=before, after=after
-        )
+        motions = [self._motion(k, np.array([0, 0, angle, 0])) for angle in np.radians(np.arange(0, 341, 20))]
+        scores = [_gains(views, self.discs(k), motion) for motion in motions]
+        values, pixels = [gains.sum() for gains, _ in scores], scores[0][1].sum()
+        gain = (max(values) - values[0]) / max(pixels, 1)
+        return None if gain < MIN_TURN_GAIN else (motions[int(np.argmax(values))], 40 * (gain - MIN_TURN_GAIN))
 
     def _stand(self, k: int) -> tuple[np.ndarray, float]:
         """The lower end of an object, and its size."""
@@ -473,14 +463,8 @@ class _Search:
         frames = self._frames_near(middle + shift @ self.flat + lift * self.up)
 
         def score(pose: np.ndarray) -> tuple[float, int, int]:
-            motion, total, pixels, agreeing = self._motion(k, pose), 0.0, 0, 0
-            for t in frames:
-                view, inside = self.views[t].place(self.discs[k], motion)
-                own = float(np.nansum(self.views[t].cost - view.cost))
-                total += own
-                pixels += int(inside.sum())
-                agreeing += own > 0.5 * MIN_GAIN * inside.sum() > 0
-            return total, pixels, agreeing
+            gains, pixels = _gains([self.views[t] for t in frames], self.discs(k), self._motion(k, pose))
+            return float(gains.sum()), int(pixels.sum()), int((gains > np.maximum(0.5 * MIN_GAIN * pixels, 0)).sum())
 
         best = np.array([*shift, 0.0, lift])
         value = score(best)
@@ -533,7 +517,7 @@ class _Search:
             for t, mask in cluster.masks.items():
                 after[t] |= mask
         if margin >= GONE_MARGIN:
-            kind, after, probability = "gone", np.zeros_like(before), 1 / (1 + np.exp(-10 * (margin - GONE_MARGIN)))
+            kind, after, probability = "gone", np.zeros_like(before), _sigmoid(10 * (margin - GONE_MARGIN))
         else:
             filled = (after & before).sum() / max(before[list(seen)].sum(), 1)
             kind = "look" if filled > 0.5 else "not seen"

@@ -6,7 +6,6 @@ its Gaussians nor its regions answer a query; what is new has Gaussians and a re
 """
 
 import dataclasses
-import datetime
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -18,7 +17,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from jsecon.errors import InputError
 from jsecon.field.evidence import ViewEvidence, pack_evidence
-from jsecon.field.ledger import LedgerView, camera_row
+from jsecon.field.ledger import LedgerView, camera_row, grown_tree
 from jsecon.files import parse_json
 from jsecon.query.render import HIDDEN_LOGIT
 from jsecon.splat.transform import transform_gaussians
@@ -45,15 +44,6 @@ class NewThing(NamedTuple):
     embedding: Float[np.ndarray, " e"]
     pixel_counts: Mapping[str, int]
     """New frame -> its pixels there."""
-
-
-def read_date(text: str) -> str:
-    """Reads a date, or a date with a time, as ISO 8601 writes it; InputError for any other."""
-    try:
-        datetime.datetime.fromisoformat(text)
-    except ValueError as error:
-        raise InputError("--date", f"{text!r} is no date", "YYYY-MM-DD", "For example 2026-11-28.") from error
-    return text
 
 
 def change_question(text: str) -> str | None:
@@ -136,11 +126,9 @@ def add_object(field: LanguageField, thing: NewThing, description: dict[str, Any
         grown["overlap"][-1, -1] = 1
     pixels = np.array([[thing.pixel_counts.get(name, 0) for name in field.names]], np.int32)
     old = field.regions
-    tree, leaf = field.tree, field.leaf
-    if tree is not None:
-        tree, leaf = (np.where(nodes >= number, nodes + 1, nodes) for nodes in map(np.asarray, (tree, leaf)))
-        tree = np.insert(tree, number, -1).astype(np.int32)
-        leaf = np.concatenate([leaf, np.full(count, number)]).astype(np.int32)
+    nodes = grown_tree(field, number + 1)
+    if nodes:
+        nodes["leaf"] = np.append(nodes["leaf"], np.full(count, number, np.int32))
     parts = field.parts
     if parts is not None:
         parts = dataclasses.replace(parts, part=np.concatenate([parts.part, np.full(count, -1, np.int32)]))
@@ -154,9 +142,8 @@ def add_object(field: LanguageField, thing: NewThing, description: dict[str, Any
             embeddings=join(old.embeddings, thing.embedding[None]),
             pixel_counts=join(old.pixel_counts, pixels),
         ),
-        tree=tree,
-        leaf=leaf,
         parts=parts,
+        **nodes,
         codes=None,
     )
     mask = np.arange(field.gaussians.count) >= first
@@ -187,6 +174,11 @@ def new_view(field: LanguageField, name: str, picture: UInt8[np.ndarray, " j"]) 
     return LedgerView(packed, pixels, shown, np.asarray(regions.embeddings)[shown], camera_row(camera), picture)
 
 
+def dates(field: LanguageField) -> list[str]:
+    """The dates of a field's states: of its run, "" if that is not known, and of its events."""
+    return [parse_json(field.provenance).get("date") or "", *(event["date"] for event in events(field))]
+
+
 def events(field: LanguageField) -> list[dict[str, Any]]:
     """The descriptions of a field's events, in order of time."""
     return [json.loads(event.description) for event in field.history]
@@ -194,8 +186,14 @@ def events(field: LanguageField) -> list[dict[str, Any]]:
 
 def field_as_of(field: LanguageField, date: str) -> LanguageField:
     """The field as it was at the end of a date: events after it are put back, and things that came later are absent."""
-    dates = [event["date"] for event in events(field)]
-    kept = sum(known[: len(date)] <= date for known in dates)
+    first, *others = (known[: len(date)] for known in dates(field))
+    if date < first:
+        raise InputError(
+            "--as-of", f"{date} is before the field's photographs, of {first}", remedy="Ask for a later date."
+        )
+    kept = sum(known <= date for known in others)
+    if kept == len(others):
+        return field
     for event in reversed(field.history[kept:]):
         field = _patched(field, event)
     origin = parse_json(field.provenance)

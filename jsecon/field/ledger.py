@@ -150,7 +150,7 @@ def _build_field(field: LanguageField, ledger: Ledger, names: Collection[str]) -
         regions=Regions(embeddings, all_pixels),
         cameras=Camera(cameras[:, :16].reshape(-1, 4, 4), *cameras[:, 16:].T, width=width, height=height),
         names=tuple(ordered),
-        **_grown_tree(field, count),
+        **grown_tree(field, count),
         codes=None,
     )
     return _with_history(new), ledger
@@ -159,22 +159,18 @@ def _build_field(field: LanguageField, ledger: Ledger, names: Collection[str]) -
 def _with_history(field: LanguageField) -> LanguageField:
     """Makes absent what the history says is gone; events that restore it get what the ledger's views say of it."""
     views, embeddings, events = np.array(field.votes.views), np.array(field.regions.embeddings), []
-    kinds = [json.loads(event.description)["kind"] for event in field.history]
-    for event, kind in zip(field.history, kinds):
-        before = {"views": views[event.rows], "embeddings": embeddings[event.regions]}
-        before = {name: column * (kind != "new") for name, column in before.items()}
-        events.append(dataclasses.replace(event, **before))
-    for event, kind in zip(field.history, kinds):
+    for event in field.history:
+        kind = json.loads(event.description)["kind"]
+        columns = {"views": views[event.rows], "embeddings": embeddings[event.regions]}
+        events.append(dataclasses.replace(event, **{n: column * (kind != "new") for n, column in columns.items()}))
         if kind == "gone":
             views[event.rows], embeddings[event.regions] = 0, 0
-    votes, regions = (
-        dataclasses.replace(field.votes, views=views),
-        dataclasses.replace(field.regions, embeddings=embeddings),
-    )
+    votes = dataclasses.replace(field.votes, views=views)
+    regions = dataclasses.replace(field.regions, embeddings=embeddings)
     return dataclasses.replace(field, votes=votes, regions=regions, history=tuple(events))
 
 
-def _grown_tree(field: LanguageField, count: int) -> dict[str, np.ndarray]:
+def grown_tree(field: LanguageField, count: int) -> dict[str, np.ndarray]:
     """Tree and smallest nodes of a field that has `count` regions now: new ones stand alone, before all other nodes."""
     if field.tree is None:
         return {}

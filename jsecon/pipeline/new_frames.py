@@ -20,9 +20,9 @@ from jsecon.files import parse_json
 from jsecon.fit.resize import resize_camera, resize_frame
 from jsecon.poses.resection import MIN_INLIERS, Landmarks, find_pose
 from jsecon.read.captures.build import build_capture
-from jsecon.read.captures.capture import read_posed_images, unposed_photographs
+from jsecon.read.captures.capture import lone_photographs, read_posed_images
 from jsecon.read.captures.frames import FrameOptions, frame_names, transform_poses
-from jsecon.read.captures.images import decode_jpeg, encode_jpeg, is_photograph, read_image
+from jsecon.read.captures.images import decode_jpeg, encode_jpeg, read_image
 from jsecon.read.masks.masks import load_proposals
 from jsecon.splat.sh import C0
 from jsecon.types import Camera, Capture, LanguageField, Progress, Votes
@@ -55,7 +55,7 @@ def read_frames(
     `refuse` gets the error of each photograph that cannot be read or placed.
     """
     if isinstance(photos, Path) and poses is None:
-        files = [photos] if photos.is_file() and is_photograph(photos) else unposed_photographs(photos)[0]
+        files = lone_photographs(photos)
         if files:
             names = frame_names([file.name for file in files], photos)
             return _place(field, ledger, _without_known(field, names, files), refuse, progress)

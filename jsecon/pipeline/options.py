@@ -5,6 +5,7 @@ values it accepts. Each class is a group of the help.
 """
 
 import dataclasses
+import datetime
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -230,6 +231,8 @@ class FieldOptions:
         it, else it follows from what rests on what, else from the cameras without their roll.
       metres_per_unit: Metres of one unit of the files' world, if you measured it. Captures of depth cameras and phones
         have metres; lengths in all others are in units of the capture without it.
+      date: Date of the photographs, such as 2026-11-01, from which on the field is true (jsecon query --as-of). By
+        default it is the latest of their EXIF data.
     """
 
     parts: Option[bool] = False
@@ -238,6 +241,7 @@ class FieldOptions:
     centre_pixel_weight: Annotated[Option[float], Range(0, 1)] = 0.0
     up: Direction[Option[tuple[float, float, float] | None]] = None
     metres_per_unit: Annotated[Option[float | None], Range(0, 1e9, above=True)] = None
+    date: Option[str | None] = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -253,6 +257,15 @@ class Options(FieldOptions, ModelOptions, MaskOptions, BareOptions, SceneOptions
 def is_bare_scene(capture: Path) -> bool:
     """Whether the input of a run is a file of Gaussians or points instead of a capture."""
     return capture.suffix.lower() in SCENES and not capture.is_dir()
+
+
+def read_date(text: str) -> str:
+    """Reads a date, or a date with a time, as ISO 8601 writes it; InputError for any other."""
+    try:
+        datetime.datetime.fromisoformat(text)
+    except ValueError as error:
+        raise InputError("--date", f"{text!r} is no date", "YYYY-MM-DD", "For example 2026-11-28.") from error
+    return text
 
 
 def require_writable(folder: Path, *, create: bool = True) -> None:

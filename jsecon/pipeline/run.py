@@ -25,7 +25,7 @@ from jsecon.files import FIELD_FILE, exclusive_lock
 from jsecon.parallel import allgather_tree
 from jsecon.pipeline import cache, model_loading
 from jsecon.pipeline.objects import plan_objects
-from jsecon.pipeline.options import Options, check_ranges, is_bare_scene, require_writable
+from jsecon.pipeline.options import Options, check_ranges, is_bare_scene, read_date, require_writable
 from jsecon.pipeline.progress import Console, Step
 from jsecon.pipeline.scene import plan_scene
 from jsecon.pipeline.scene_files import read_scene
@@ -131,8 +131,10 @@ def _plan(context: RunContext, stage_list: list[Stage]) -> _RunState:
 
 
 def _require_inputs(options: Options) -> None:
-    """Raises InputError for a missing file, a number that is out of its range, or several sources of masks."""
+    """Raises InputError for a missing file, a value that is out of its range, or several sources of masks."""
     check_ranges(options)
+    if options.date is not None:
+        read_date(options.date)
     _require_options_apply(options)
     for name, value in vars(options).items():
         flag = f"--{name.replace('_', '-')}"

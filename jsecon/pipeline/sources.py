@@ -19,6 +19,7 @@ from jsecon.field.field import Provenance
 from jsecon.files import parse_json
 from jsecon.networks.hub import cached_address
 from jsecon.pipeline.options import Options, is_bare_scene
+from jsecon.read.captures.capture import taken_on
 from jsecon.read.splats.points import read_crs
 from jsecon.types import LanguageField
 
@@ -48,6 +49,7 @@ def provenance(options: Options, keys: dict[str, str], embedder: str, out: Path,
     origin |= {"folders": _relative_folders(options, out), "models": models, "warnings": list(warnings)}
     cloud = _given_points(options)
     origin["crs"] = "" if cloud is None else read_crs(cloud)
+    origin["date"] = options.date or taken_on(options.capture)
     return json.dumps(origin, sort_keys=True)
 
 

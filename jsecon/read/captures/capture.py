@@ -5,10 +5,13 @@ and poses in OpenCV axes. Other packages add readers by entry points in the grou
 """
 
 import collections
+import contextlib
 import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
+
+from PIL import Image
 
 from jsecon.errors import InputError, join_first
 from jsecon.files import describe_substitute, is_output_folder, list_files, reading
@@ -32,6 +35,8 @@ _IMAGE_WORD = re.compile(r"(?<![a-z])(colou?r|rgba?|images?|img|frame|photo)(?![
 """words in names of images, beside each other: frame0001.jpg and depth0001.png, a.color.png and a.depth.png"""
 _JPEG = (".jpg", ".JPG", ".jpeg", ".JPEG")
 """suffixes of photographs, whose masks may be a .png of the same name"""
+_EXIF, _TAKEN, _DATE = 0x8769, 0x9003, re.compile(r"(\d{4}):(\d\d):(\d\d)")
+"""EXIF's block of a photograph, its tag DateTimeOriginal, and the date in that"""
 _POSE_FOLDER = re.compile(r"(camera_?)?poses?|cams?|cameras|extrinsics?|traj(ectory)?")
 _POSE_FILE = re.compile(
     r".*(pose|traj|extrinsic|odometry|ground_?truth|camera).*\.(txt|json|npy|npz|csv|log|xml|ya?ml)"
@@ -161,6 +166,22 @@ def unposed_photographs(path: Path) -> tuple[list[Path], tuple[str, ...]]:
         folder, name = above
         raise InputError(path, f"its photographs are part of a {name} capture", remedy=f"Give that: {folder}")
     return photos, _notes_beside(path, photos, others) if photos else ()
+
+
+def lone_photographs(path: Path) -> list[Path]:
+    """Photographs without poses: one file, or those of a folder; none of a capture."""
+    return [path] if path.is_file() and _is_image(path) else unposed_photographs(path)[0]
+
+
+def taken_on(path: Path) -> str | None:
+    """The latest date, YYYY-MM-DD, in the EXIF data of photographs or of those of a capture; None if none has one."""
+    dates = []
+    with contextlib.suppress(InputError):
+        for file in lone_photographs(path) or [image.image for image in read_posed_images(path).images]:
+            with contextlib.suppress(OSError, SyntaxError, ValueError), Image.open(file or "") as opened:
+                text = str(opened.getexif().get_ifd(_EXIF).get(_TAKEN))
+                dates += ["-".join(match.groups()) for match in [_DATE.match(text)] if match]
+    return max(dates, default=None)
 
 
 def _capture_above(path: Path) -> tuple[Path, str] | None:
