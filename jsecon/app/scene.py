@@ -677,7 +677,7 @@ class Scene:
         Raises:
           InputError: The date is none.
         """
-        return self._with(field_as_of(self.field, read_date(date)))
+        return self._with(field_as_of(self.field, read_date(date, "--as-of")))
 
     def history(self) -> list[dict[str, Any]]:
         """Plain values of each change of the field since it was made, in order of time."""

@@ -259,12 +259,12 @@ def is_bare_scene(capture: Path) -> bool:
     return capture.suffix.lower() in SCENES and not capture.is_dir()
 
 
-def read_date(text: str) -> str:
+def read_date(text: str, option: str = "--date") -> str:
     """Reads a date, or a date with a time, as ISO 8601 writes it; InputError for any other."""
     try:
         datetime.datetime.fromisoformat(text)
     except ValueError as error:
-        raise InputError("--date", f"{text!r} is no date", "YYYY-MM-DD", "For example 2026-11-28.") from error
+        raise InputError(option, f"{text!r} is no date", "YYYY-MM-DD", "For example 2026-11-28.") from error
     return text
 
 
