@@ -49,7 +49,7 @@ def save_with_ledger(path: Path, field: LanguageField, ledger: Ledger | None) ->
     field = dataclasses.replace(field, provenance=json.dumps(origin, sort_keys=True))
     if ledger is not None and not ledger_file(path, field).is_file():
         with atomic_write(ledger_file(path, field)) as temporary:
-            write_arrays(temporary, arrays, {"format": "jsecon-ledger", "version": 1, "ledger": tree})
+            write_arrays(temporary, arrays, {"format": "jsecon-ledger", "version": 2, "ledger": tree})
     save_field(path, field)
     remove_stale(path, field)
     return field
@@ -72,7 +72,7 @@ def load_ledger(path: Path, field: LanguageField) -> Ledger:
         raise InputError(path, problem, remedy=f"Copy that folder along with the field. {_REMEDY}")
     with reading(file, "a whole one", _REMEDY, problem="the ledger is damaged"):
         header, arrays = read_arrays(file)
-        if [header.get("format"), header.get("version")] != ["jsecon-ledger", 1]:
+        if [header.get("format"), header.get("version")] != ["jsecon-ledger", 2]:
             raise InputError(file, "it is no ledger of this version of jsecon", remedy=_REMEDY)
         tree = unpack_tree(header["ledger"], arrays)
         ledger = Ledger(tree["num_regions"], {name: LedgerView(**view) for name, view in tree["views"].items()})
