@@ -174,7 +174,7 @@ class Capture(_Shown):
     notes: tuple[str, ...] = static(default=())
     """What the loader left out or changed, a sentence each."""
     ignored: Array | None = None
-    """(T, H, W) bool: what a fit shall not look at, as what moved; or None."""
+    """(T, H, W) bool: pixels that no fit and no region counts, as of what moved, or overexposed ones; or None."""
     files: tuple[ImageFile, ...] = static(default=())
     """T images, or () if the frames have no files. Masks, proposals and depth follow their folders."""
     poses_from_scene: Array | None = None

@@ -190,7 +190,7 @@ def _read_masks(stage: StageInput) -> StageResult:
     folder, view = stage.context.options.masks, _TrainingView(stage.results.load, stage.context.options, frames)
     assert folder is not None
     loaded = load_labels(folder, view.names, view.size, **view.mask_layout, progress=stage.progress)
-    _clear_operator(loaded.labels, view)
+    _clear_ignored(loaded.labels, view)
     _require_regions(loaded.labels, str(folder))
     notes = (f"{len(loaded.ids)} regions in the masks", *loaded.notes)
     return StageResult(ObjectLabels(loaded.labels, frames), notes)
@@ -204,7 +204,7 @@ def _find_objects(stage: StageInput) -> StageResult:
     proposals, notes = _frame_proposals(context, view, scene)
     found = _associate_masks(context, view, scene, proposals, stage.progress, stage.checkpoint)
     context.models.close()
-    _clear_operator(found.labels, view)
+    _clear_ignored(found.labels, view)
     _require_regions(found.labels, str(context.options.capture))
     return StageResult(ObjectLabels(found.labels, frames, found.tree, found.leaf), notes=(*why_fewer, *notes))
 
@@ -280,12 +280,11 @@ def _associate_masks(
     return Objects(clean_tracks(labels))
 
 
-def _clear_operator(labels: np.ndarray, view: _TrainingView) -> None:
-    """Takes the labels off the ignored pixels of views of panoramas, in which the operator stands."""
-    capture = view.capture
-    for row, t in enumerate(view.train):
-        if capture.ignored is not None and capture.files and capture.files[t].view is not None:
-            labels[row][np.asarray(capture.ignored[t])] = -1
+def _clear_ignored(labels: np.ndarray, view: _TrainingView) -> None:
+    """Takes the labels off the ignored pixels: of an operator, of a mask, of what --ignore names."""
+    if view.capture.ignored is not None:
+        for row, t in enumerate(view.train):
+            labels[row][np.asarray(view.capture.ignored[t])] = -1
 
 
 def _require_regions(labels: np.ndarray, where: str) -> None:
