@@ -19,7 +19,7 @@ def folder(tmp_path):
     jax.config.update("jax_compilation_cache_dir", before)
 
 
-def counted():
+def counted(small_kernels=False):
     """A stored program, and the list that its traces grow."""
     traces = []
 
@@ -27,13 +27,14 @@ def counted():
         traces.append(power)
         return {"y": factor * x**power}
 
-    return stored_jit(scaled, static_argnums=(2,)), traces
+    return stored_jit(scaled, static_argnums=(2,), small_kernels=small_kernels), traces
 
 
-def test_the_next_process_does_not_trace(folder):
+@pytest.mark.parametrize("small_kernels", [False, True])
+def test_the_next_process_does_not_trace(folder, small_kernels):
     x = np.linspace(0, 1, 5, dtype=np.float32)
     for repeat in range(2):  # each `counted` has programs of its own, like a process
-        run, traces = counted()
+        run, traces = counted(small_kernels)
         np.testing.assert_array_equal(run(x, 2.0, 3)["y"], jax.jit(lambda x: 2.0 * x**3)(x))
         np.testing.assert_array_equal(run(x, 3.0, 3)["y"], jax.jit(lambda x: 3.0 * x**3)(x))
         assert traces == ([] if repeat else [3])
@@ -51,8 +52,9 @@ def test_other_types_and_options_are_other_programs(folder):
     assert traces == [2, 2, 3, 3]
 
 
-def test_inside_of_a_trace_it_is_an_ordinary_function(folder):
-    run, _ = counted()
+@pytest.mark.parametrize("small_kernels", [False, True])
+def test_inside_of_a_trace_it_is_an_ordinary_function(folder, small_kernels):
+    run, _ = counted(small_kernels)
     slope = jax.vmap(jax.grad(lambda x: run(x, 2.0, 2)["y"]))(jnp.arange(3.0))
     np.testing.assert_array_equal(slope, [0, 4, 8])
     assert not list(folder.glob("*.trace"))

@@ -83,7 +83,7 @@ def _view_lists(projection: Projection, width: int, height: int, capacity: int, 
 
 # of one device, and over a mesh
 _make_plan_compiled: list[Any] = [
-    stored_jit(_make_plan, static_argnums=(2, 4)),
+    stored_jit(_make_plan, static_argnums=(2, 4), small_kernels=True),
     jax.jit(_make_plan, static_argnums=(2, 4), compiler_options=MESH_OPTIONS),
 ]
 
