@@ -30,9 +30,9 @@ def stored_jit(function: Callable, *, static_argnums: tuple[int, ...] = (), smal
       function: Pure function of positional arguments. Its result holds arrays in tuples and records (`jsecon.types`),
         and named tuples that are registered with jax.export.
       static_argnums: As for jax.jit. A trace belongs to the repr of such an argument.
-      small_kernels: Whether the function is made of many small kernels, as tile lists are: without XLA's fusion emitters
-        it compiles in half of the time and runs as fast. Compositing, of few long ones, would run at a third of the
-        speed.
+      small_kernels: Whether the function is made of many small kernels, as tile lists are. Without XLA's fusion
+        emitters it then compiles in half of the time and runs as fast. Compositing, of few long ones, would run at a
+        third of the speed.
 
     Returns:
       The compiled function.
@@ -41,7 +41,7 @@ def stored_jit(function: Callable, *, static_argnums: tuple[int, ...] = (), smal
     programs: dict[Any, Callable] = {}
 
     def options() -> dict[str, bool] | None:
-        return _without_emitters() if small_kernels else None
+        return without_emitters() if small_kernels else None
 
     @functools.cache
     def compiled() -> Callable:
@@ -110,7 +110,7 @@ def _stored(file: Path, function: Any, types: list[Any]) -> export.Exported:
 
 
 @functools.cache
-def _without_emitters() -> dict[str, bool] | None:
+def without_emitters() -> dict[str, bool] | None:
     """Returns the options of a program without fusion emitters; None if this release of XLA has no such option."""
     option = {"xla_cpu_use_fusion_emitters": False}
     try:
