@@ -12,7 +12,7 @@ from reference import weights_reference
 from jsecon import plan_view
 from jsecon.errors import InputError
 from jsecon.field import columns, evidence
-from jsecon.field.evidence import region_votes, sum_evidence, view_evidence
+from jsecon.field.evidence import IGNORED, region_votes, sum_evidence, view_evidence
 from jsecon.field.membership import normalise_votes
 from jsecon.splat.render import render_rgb
 from jsecon.splat.visible import geometry_of_rows, render_in_blocks, visible_rows
@@ -24,10 +24,11 @@ COLUMNS = "regions", "weights", "labelled", "total", "max_pixel_weight", "views"
 
 @pytest.fixture(scope="module")
 def labels(cameras):
-    """Four label images: blocks, one of them noise (many regions in a tile), one with nothing labelled."""
+    """Four label images: blocks, one of them noise (many regions in a tile), one half ignored, one with no region."""
     rng = np.random.default_rng(5)
     blocks = rng.integers(-1, REGIONS, (4, 5, 6)).repeat(8, 1).repeat(8, 2).astype(np.int32)
     blocks[1] = rng.integers(-1, REGIONS, (40, 48))
+    blocks[2, :, 10:35] = IGNORED
     blocks[3] = -1
     return blocks
 
@@ -38,9 +39,10 @@ def expected(scene, cameras, labels):
     votes, total = np.zeros((scene.count, REGIONS)), np.zeros((4, scene.count))
     peak, views = np.zeros(scene.count), np.zeros(scene.count, int)
     for t in range(4):
-        weights = weights_reference(scene, cameras[t]).reshape(-1, scene.count)
+        weights = weights_reference(scene, cameras[t]).reshape(-1, scene.count)[labels[t].reshape(-1) != IGNORED]
+        counted = labels[t][labels[t] != IGNORED]
         for r in range(REGIONS):
-            votes[:, r] += weights[labels[t].reshape(-1) == r].sum(0)
+            votes[:, r] += weights[counted == r].sum(0)
         total[t] = weights.sum(0)
         peak = np.maximum(peak, weights.max(0))
         views += weights.sum(0) > 0
@@ -87,7 +89,7 @@ def test_inside_a_trace_they_are_the_same_also_under_vmap(cast, scene, cameras, 
     def votes_of(labels):
         return region_votes(scene, cameras, labels, REGIONS, top=REGIONS, by_view=True)
 
-    beyond = jnp.where(labels < 0, REGIONS, labels)
+    beyond = jnp.where(labels == -1, REGIONS, labels)
     batched = jax.tree.map(lambda a: a[0], jax.vmap(votes_of)(beyond[None]))
     for inside in (jax.jit(votes_of)(beyond), batched):
         np.testing.assert_allclose(inside.dense(), cast.dense(), rtol=1e-5, atol=1e-5)
@@ -99,7 +101,7 @@ def test_inside_a_trace_they_are_the_same_also_under_vmap(cast, scene, cameras, 
 
 def test_they_have_the_derivative_of_the_twins_weights(scene, cameras, labels):
     """Along a direction, of the votes of some regions, against central differences in float64."""
-    pair, some = cameras[:1], labels[1:2]
+    pair, some = cameras[:1], np.where(labels[2:3] == IGNORED, IGNORED, labels[1:2])
     rng = np.random.default_rng(3)
     columns, weight = {name: getattr(scene, name) for name in ("opacity_logits", "means")}, rng.random(REGIONS)
 
@@ -110,7 +112,7 @@ def test_they_have_the_derivative_of_the_twins_weights(scene, cameras, labels):
     def exact(name, change):
         moved = dataclasses.replace(scene, **{name: columns[name].astype(np.float64) + change})
         weights = weights_reference(moved, pair[0]).sum(-1)
-        return (weights * np.append(1 + weight, 0)[some[0]]).sum()
+        return (weights * np.append(1 + weight, [0, 0])[some[0]]).sum()
 
     for name, gradient in jax.jit(jax.grad(weighted))(columns).items():
         along = rng.normal(size=gradient.shape)
@@ -172,7 +174,7 @@ def test_at_the_centre_they_are_the_weights_of_that_pixel(scene, cameras, labels
         height, width, _ = weights.shape
         for n, (x, y) in enumerate(np.floor(splats[:, :2]).astype(int)):
             if splats[n, 5] > 0 and 0 <= x < width and 0 <= y < height:
-                total[t, n] = weights[y, x, n]
+                total[t, n] = weights[y, x, n] * (labels[t, y, x] != IGNORED)
                 if labels[t, y, x] >= 0:
                     votes[n, labels[t, y, x]] += weights[y, x, n]
     mixed = (1 - share) * np.asarray(cast.dense()) + share * votes

@@ -31,7 +31,7 @@ from scipy import sparse
 
 from jsecon.errors import InputError, require, require_shape
 from jsecon.files import map_npy
-from jsecon.numerics import FULL_PRECISION, NEAR, is_traced, require_labels
+from jsecon.numerics import FULL_PRECISION, NEAR, array_module, is_traced, require_labels
 from jsecon.parallel import MESH_OPTIONS, map_views
 from jsecon.process import cores
 from jsecon.splat.capacity import plan_capacity
@@ -44,6 +44,8 @@ from jsecon.types import Array, Camera, Gaussians, Progress, Votes
 _RESOLUTION = 2.0**24
 """Weights of a view are multiples of its inverse, px. The faintest weight of a pixel is 4e-7 (1/255 of the last
 transmittance), and float64 adds up 2^29 px of weight without error."""
+IGNORED = -2
+"""Label of a pixel that counts neither for a region nor against one."""
 TOP = 8
 """Strongest regions that a Gaussian keeps."""
 _BITS = 17
@@ -115,8 +117,9 @@ def region_votes(
     Args:
       gaussians: Scene of N Gaussians; its columns may be memory-mapped.
       cameras: Batch of T cameras.
-      labels: (T, H, W) integers below `num_regions`, -1 where a pixel belongs to no region; or T images (H, W), of
-        which `labels[t]` reads one, in several threads. Inside a trace R and more count as -1.
+      labels: (T, H, W) integers below `num_regions`, -1 where a pixel belongs to no region, IGNORED where it is no part
+        of the scene; or T images (H, W), of which `labels[t]` reads one, in several threads. Inside a trace R and more
+        count as -1.
       num_regions: R.
       top: Number of strongest regions that each Gaussian keeps.
       by_view: Whether to keep each view's total too (`Votes.by_view`), as `normalise_votes` needs it.
@@ -198,9 +201,7 @@ def view_evidence(
         nothing, weightless = np.zeros(0, np.int32), np.zeros(0, np.float32)
         return ViewEvidence(nothing, np.zeros(1, np.int32), nothing, weightless, weightless)
     plan = plan_view(gaussians, camera, capacity=capacity, near=near)
-    labels = np.asarray(labels, np.int32)
-    labels = np.where(labels < 0, num_regions, labels).astype(np.int32)
-    tiles, names, steps = _tile_labels(plan, labels)
+    tiles, names, steps = _tile_labels(plan, _named(np.asarray(labels, np.int32), num_regions))
     steps = int(steps)
     room = 1 << 2 * max(-(-(steps - 1).bit_length() // 2), 5)  # powers of 4 from 1,024 on: views share a program
     done, *chunks = _list_chunks(plan, (tiles, names), room, centre_pixel_weight)
@@ -236,6 +237,13 @@ def each_view(count: int, views: int, view: Callable[[int], Any], progress: Prog
         yield view(t)
         if progress is not None:
             progress(t + 1, views)
+
+
+def _named(labels: Array, num_regions: int) -> Array:
+    """Gives pixels of no region the label `num_regions`, and ignored ones -1, as those outside of the image have."""
+    xp = array_module(labels)
+    known = (labels >= 0) & (labels < num_regions)
+    return xp.where(labels == IGNORED, -1, xp.where(known, labels, num_regions)).astype(np.int32)
 
 
 @jax.jit
@@ -333,8 +341,7 @@ def _scan_votes(
 
     def one_view(state, view):
         camera, image = view
-        image = image.astype(jnp.int32)
-        image = jnp.where((image >= 0) & (image < num_regions), image, num_regions)
+        image = _named(image.astype(jnp.int32), num_regions)
         scene = gaussians, camera, jnp.asarray(near, dtype)
         own, peaks, missing = _dense_view(scene, image, num_regions + 1, centre_pixel_weight, capacity)
         seen = own.sum(1)
@@ -362,7 +369,10 @@ def _dense_view(
     centre_pixel_weight: float,
     capacity: int | None,
 ) -> tuple[Array, Array, Array]:
-    """Sums one view's weights on labels 0 .. `columns` - 1, (N, columns); with each one's largest, and the overflow."""
+    """Sums one view's weights on labels 0 .. `columns` - 1, (N, columns); with each one's largest, and the overflow.
+
+    Pixels of label -1 do not count.
+    """
     gaussians, camera, near = scene
     plan = plan_view(gaussians, camera, capacity=capacity, near=near)
 
@@ -392,7 +402,7 @@ def _dense_view_backward(columns, centre_pixel_weight, capacity, kept, cotangent
         gaussians, camera, near = scene
         plan = plan_view(gaussians, camera, capacity=capacity, near=near)
         image = render_plan(plan, cotangents[0]).features
-        return jnp.take_along_axis(image, labels[..., None], axis=-1).sum()
+        return jnp.where(labels >= 0, jnp.take_along_axis(image, labels[..., None], axis=-1)[..., 0], 0.0).sum()
 
     return jax.grad(along_cotangent)(scene), None
 

@@ -18,7 +18,7 @@ from jsecon.association.run_lengths import cache_masks_as_rle
 from jsecon.association.scene import SceneSuperpixels
 from jsecon.errors import InputError
 from jsecon.field.columns import vote_blocks
-from jsecon.field.evidence import list_evidence, pack_evidence, scratch_folder, sum_evidence, votes_memory
+from jsecon.field.evidence import IGNORED, list_evidence, pack_evidence, scratch_folder, sum_evidence, votes_memory
 from jsecon.field.regions import Embed, choose_crops, crop_geometry, embeddings_of_masks, region_embeddings, scene_parts
 from jsecon.fit.depth import points_from_depth
 from jsecon.networks.hub import model_name
@@ -371,8 +371,10 @@ def _accumulate_votes(stage: StageInput) -> StageResult:
     """Accumulates votes, on disk if they do not fit into memory; the votes are the same."""
     options, capture, scene = stage.context.options, stage.results.load, stage.results.gaussians
     labels, folder = stage.results.objects.labels, stage.checkpoint.folder
-    cameras = capture.cameras[stage.results.objects.frames]
-    count = int(labels.max()) + 1
+    frames = stage.results.objects.frames
+    cameras, count = capture.cameras[frames], int(labels.max()) + 1
+    if capture.ignored is not None:  # what stood before a Gaussian there says nothing of it
+        labels = np.where(np.asarray(capture.ignored)[frames], IGNORED, labels)
     needed, budget = votes_memory(scene.count, len(labels)), memory_budget()
     on_disk = needed > budget and jax.process_count() == 1  # several processes exchange them in memory
     notes = ()
