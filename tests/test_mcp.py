@@ -117,7 +117,7 @@ def test_it_starts_without_jax_and_refuses_what_is_no_field_before_the_protocol(
     command = [sys.executable, "-c", program, "mcp", str(tmp_path / "a.json")]
     done = subprocess.run(command, capture_output=True, text=True, stdin=subprocess.DEVNULL)
     assert (done.returncode, done.stdout) == (2, "")
-    assert "a JSON file, expected a field" in done.stderr
+    assert "a file of another kind, expected a field" in done.stderr
 
 
 def test_over_standard_input_and_output(tmp_path):

@@ -26,7 +26,6 @@ from jsecon.app.scene import Scene
 from jsecon.app.viewer.layer import MAX_STD, SplatLayer
 from jsecon.app.viewer.window import (
     ANSWER_HUE,
-    COLOURINGS,
     RAY_VIEW_SIDE,
     Viewer,
     ViewState,
@@ -131,7 +130,7 @@ def colours(layer: SplatLayer) -> np.ndarray:
 
 
 def words_of(viewer: Viewer) -> str:
-    return viewer.panel._messages.content
+    return viewer._messages.content
 
 
 def test_a_text_is_highlighted(viewer):
@@ -154,16 +153,6 @@ def test_only_the_selection(viewer):
     np.testing.assert_array_equal(colours(viewer.layer)[:, 3], opacity)
 
 
-@pytest.mark.parametrize("colouring", COLOURINGS)
-def test_every_colouring(viewer, colouring):
-    show(viewer, lambda state: dataclasses.replace(state, colouring=colouring))
-    before = colours(viewer.layer)
-    kinds = len(np.unique(before[:, :3], axis=0))
-    assert kinds > 2
-    ask(viewer, word_of(viewer))
-    assert (colours(viewer.layer)[:, :3] != before[:, :3]).any()
-
-
 def test_odd_texts_and_faults_are_reported_and_the_viewer_goes_on(viewer, capsys):
     ask(viewer, "the meaning of life", "black or ''", "<script>alert(1)</script> red")
     assert "no colour word" in words_of(viewer)
@@ -172,7 +161,7 @@ def test_odd_texts_and_faults_are_reported_and_the_viewer_goes_on(viewer, capsys
     ask(viewer, Region(4000))
     assert "there is no region 4000" in words_of(viewer)
     show(viewer, lambda state: 1 / 0)
-    assert "The terminal shows its trace" in viewer.panel._notice.content
+    assert "The terminal shows its trace" in viewer._notice.content
     assert "ZeroDivisionError" in capsys.readouterr().err
     assert ask(viewer, Region(1)).questions == (Region(1),)
 
@@ -181,7 +170,7 @@ def test_the_file_of_the_selection(viewer, tmp_path):
     sent = []
     client = SimpleNamespace(send_file_download=lambda name, content, **_: sent.append((name, content)))
     settled(viewer, lambda: viewer.then(lambda _: viewer._export(client)))
-    assert "no Gaussian is selected" in viewer.panel._notice.content
+    assert "no Gaussian is selected" in viewer._notice.content
     ask(viewer, Region(1))
     settled(viewer, lambda: viewer.then(lambda _: viewer._export(client)))
     ((name, content),) = sent
@@ -201,7 +190,7 @@ def test_two_clicks_measure_a_length(viewer):
         settled(viewer, lambda ray=ray: viewer.then(lambda _: viewer._measure(ray, focal)))
         points.append(start + direction * depth_seen(field.gaussians, camera, x, y))
     length = np.linalg.norm(points[1] - points[0])
-    assert f"{length:.2g}"[:3] in viewer.panel._notice.content
+    assert f"{length:.2g}"[:3] in viewer._notice.content
     settled(viewer, lambda: viewer.then(lambda _: viewer._export(client)))
     ((name, text),) = sent
     (row,) = csv.DictReader(text.splitlines())
@@ -209,7 +198,7 @@ def test_two_clicks_measure_a_length(viewer):
     assert float(row["centers"]) == pytest.approx(length, rel=0.02)
     away = SimpleNamespace(ray_origin=start * viewer.layer.scale, ray_direction=-camera.world_to_camera[2, :3])
     settled(viewer, lambda: viewer.then(lambda _: viewer._measure(away, focal)))
-    assert "nothing is there" in viewer.panel._notice.content
+    assert "nothing is there" in viewer._notice.content
     viewer._lengths.clear()
 
 

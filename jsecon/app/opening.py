@@ -12,15 +12,6 @@ from jsecon.files import FIELD_FILE, describe_substitute, reading
 from jsecon.pipeline.options import is_bare_scene
 
 T = TypeVar("T")
-_KINDS = (
-    *((head, "a JSON file") for head in (b"{", b"[")),
-    *((head, "an image") for head in (b"\x89PNG", b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"BM")),
-    *((head, "a file of Gaussians under another suffix") for head in (b"ply", b"glTF", b"NGSP")),
-    (b"\x93NUMPY", "an array of NumPy"),
-    (b"%PDF", "a PDF"),
-    (b"", "a file of another kind"),
-)
-"""first bytes of files that are no fields, and what these files are"""
 _REMEDY = "Give field.safetensors, the folder that jsecon run wrote it to, a splat or a point cloud."
 
 
@@ -58,8 +49,7 @@ def locate_field(path: Path, out: Path | None = None) -> FieldPath:
         folder = path.with_name(f"{path.stem}_field") if out is None else out
         return FieldPath(path.resolve().with_suffix(""), folder / FIELD_FILE, path)
     if path.suffix != ".safetensors" and head[8:9] != b"{":  # what is damaged is the reader's to say
-        what = next(what for start, what in _KINDS if head.lstrip().startswith(start)) if head else "an empty file"
-        raise InputError(path, f"it is {what}", "a field", _REMEDY)
+        raise InputError(path, "it is a file of another kind" if head else "it is an empty file", "a field", _REMEDY)
     place = path.resolve()
     return FieldPath(place.parent if path.name == FIELD_FILE else place.with_suffix(""), path, None)
 

@@ -6,7 +6,7 @@ attributes are the help texts of the options.
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeAlias, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias, TypeVar, dataclass_transform
 
 from tyro.conf import Positional, UseAppendAction, arg
 
@@ -53,16 +53,22 @@ class OutputOptions:
     debug: Option[bool] = False
 
 
+@dataclass_transform(frozen_default=True, kw_only_default=True)
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Verb:
-    """Base of the verbs. Its help shows the examples, command lines; `extra` is the extra of jsecon that it needs."""
+    """Base of the verbs, whose classes become frozen dataclasses.
+
+    Its help shows the examples, command lines; `extra` is the extra of jsecon that it needs.
+    """
 
     examples: ClassVar[tuple[str, ...]]
     extra: ClassVar[str] = ""
     output: OutputOptions = OutputOptions()
 
+    def __init_subclass__(cls) -> None:
+        dataclasses.dataclass(frozen=True, kw_only=True)(cls)
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+
 class Demo(Verb):
     """Copies the capture of a made-up room, builds its field, queries it and writes a report.
 
@@ -79,7 +85,6 @@ class Demo(Verb):
     out: Option[Path] = Path("jsecon-demo")
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class _PipelineVerb(Verb):
     """Options of the verbs that compute stages.
 
@@ -100,7 +105,6 @@ class _PipelineVerb(Verb):
         return Options(**{name: value for name, value in values.items() if name in names})
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Run(_PipelineVerb, InputOptions):
     """Builds the language field of a capture.
 
@@ -129,7 +133,6 @@ class Run(_PipelineVerb, InputOptions):
     field: FieldOptions = dataclasses.field(default_factory=FieldOptions)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Fit(_PipelineVerb):
     """Fits Gaussians to a capture, and no more.
 
@@ -148,7 +151,6 @@ class Fit(_PipelineVerb):
     out: Option[Path]
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class _FieldVerb(Verb):
     """Options of the verbs that read a field and understand texts.
 
@@ -163,7 +165,6 @@ class _FieldVerb(Verb):
     embedder: ModelOption = None
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Query(_FieldVerb):
     """Selects the Gaussians of a text, of a pixel, or of an outline.
 
@@ -231,7 +232,6 @@ class Query(_FieldVerb):
     as_of: Option[str | None] = None
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Objects(_FieldVerb):
     """Lists the objects of a field with names, boxes and sizes.
 
@@ -254,7 +254,6 @@ class Objects(_FieldVerb):
     vocabulary: Option[Path | None] = None
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Add(_FieldVerb):
     """Adds photographs of the same scene to a field, without running it anew.
 
@@ -282,7 +281,6 @@ class Add(_FieldVerb):
     out: Option[Path | None] = None
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Forget(Verb):
     """Removes frames from a field, as if they had never been there.
 
@@ -303,7 +301,6 @@ class Forget(Verb):
     out: Option[Path | None] = None
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Export(_FieldVerb):
     """Writes the scene of a field, or objects of it, for other programs.
 
@@ -343,7 +340,6 @@ class Export(_FieldVerb):
     without: Option[str | None] = None
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class _ChangesVerb(_FieldVerb):
     """Options of the verbs that find changes.
 
@@ -358,7 +354,6 @@ class _ChangesVerb(_FieldVerb):
     min_probability: Annotated[Option[float], Range(0, 1)] = MIN_PROBABILITY
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Changes(_ChangesVerb):
     """Finds what moved, is gone or is new in new photographs of a field's place.
 
@@ -377,7 +372,6 @@ class Changes(_ChangesVerb):
     transform: Option[Path | None] = None
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Update(_ChangesVerb):
     """Applies what changed in new photographs to a field, whose history keeps what was.
 
@@ -397,7 +391,6 @@ class Update(_ChangesVerb):
     date: Option[str | None] = None
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Clean(Verb):
     """Removes what hangs in a scene and shows nothing of it.
 
@@ -428,7 +421,6 @@ class Clean(Verb):
     keep_objects: Option[bool] = False
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Measure(_FieldVerb):
     """Measures lengths between things or points, and gives a field its scale by one known length.
 
@@ -458,7 +450,6 @@ class Measure(_FieldVerb):
     out: Option[Path | None] = None
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class View(_FieldVerb):
     """Shows a field in a browser and answers queries there.
 
@@ -482,7 +473,6 @@ class View(_FieldVerb):
     port: Annotated[Option[int], Range(0, 65535)] = 8766
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Eval(_FieldVerb):
     """Measures a field against labels.
 
@@ -501,7 +491,6 @@ class Eval(_FieldVerb):
     out: Option[Path | None] = None
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class _FieldsVerb(Verb):
     """Options of the verbs that keep fields open.
 
@@ -516,7 +505,6 @@ class _FieldsVerb(Verb):
     embedder: ModelOption = None
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Serve(_FieldsVerb):
     """Answers queries over HTTP, with fields that are loaded once.
 
@@ -539,7 +527,6 @@ class Serve(_FieldsVerb):
     token: Option[str] = ""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Mcp(_FieldsVerb):
     """Offers fields to language models as tools.
 
@@ -552,7 +539,6 @@ class Mcp(_FieldsVerb):
     extra = "mcp"
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Models(Verb):
     """Lists, fetches and examines models.
 
@@ -576,7 +562,6 @@ class Models(Verb):
     role: Option[Role | None] = None
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Doctor(Verb):
     """Checks whether this machine has what runs need.
 

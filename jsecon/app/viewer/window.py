@@ -15,7 +15,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any
 from urllib.parse import urlsplit
 
 import jax.numpy as jnp
@@ -26,9 +26,8 @@ from jsecon.app import verbs
 from jsecon.app.access import is_allowed_host, listen
 from jsecon.app.catalogue import palette
 from jsecon.app.measuring import table_of_lengths
-from jsecon.app.pictures import region_colours
 from jsecon.app.querying import file_stem
-from jsecon.app.records import Answer, Query, Region
+from jsecon.app.records import Answer, Query, Region, source_points
 from jsecon.app.scene import Scene, open_scene
 from jsecon.app.viewer.layer import SplatLayer
 from jsecon.app.viewer.static_page import export_page
@@ -41,9 +40,6 @@ from jsecon.types import Camera, LanguageField
 
 RAY_VIEW_SIDE = 1025
 """side of the view that looks along a ray, px; the ray meets the centre of its middle pixel"""
-Colouring: TypeAlias = Literal["photo", "region"]
-COLOURINGS: tuple[Colouring, ...] = get_args(Colouring)
-"""What the colours of the Gaussians show: the photographs, or regions."""
 ANSWER_HUE = 0.91
 """hue of the first answer in `palette`, pink: few natural objects have it"""
 
@@ -60,7 +56,6 @@ class ViewState:
     """Whether to select all regions that match instead of the best one."""
     only_selected: bool = False
     """Whether the selected Gaussians alone are visible, if there are any."""
-    colouring: Colouring = "photo"
 
     @property
     def queries(self) -> tuple[Query, ...]:
@@ -101,7 +96,7 @@ def _highlight(base: UInt8[np.ndarray, "n 3"], answers: Sequence[Answer | InputE
 
 
 class Viewer:
-    """A scene, its window, and the thread that draws.
+    """A scene, its window with the controls, and the thread that draws.
 
     Args:
       scene: The scene.
@@ -111,7 +106,6 @@ class Viewer:
       state: The present state.
       drawn: The state that the window shows.
       layer: The Gaussians in the window.
-      panel: The controls.
     """
 
     def __init__(self, scene: Scene, server: Any):
@@ -120,13 +114,66 @@ class Viewer:
         self.state = ViewState()
         self.drawn: ViewState | None = None
         self.layer = SplatLayer(server, scene.field)
-        self.panel = _Panel(self, server)
-        regions = (255 * region_colours(scene.field)).astype(np.uint8)
-        self._base_colours = {"photo": self.layer.photo, "region": regions}
         self._start_point: np.ndarray | None = None  # of the length that the next click ends
         self._lengths: list[dict[str, Any]] = []
         self._steps: queue.SimpleQueue[Callable[[ViewState], ViewState | None] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, daemon=True)
+        self._add_controls()
+
+    def _add_controls(self) -> None:
+        """Makes the controls; each event of them becomes a step."""
+        gui, default, names = self.server.gui, ViewState(), self.scene.field.names
+        gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="medium")
+        gui.set_panel_label(f"jsecon · {self.scene.name}")
+        with gui.add_form(None) as text_form:
+            self._text = gui.add_text("find", "", hint="Text to find, then press enter")
+        hint = "Keep what is selected when you find or click something else"
+        self._add = gui.add_checkbox("add to selection", False, hint=hint)
+        self._messages = gui.add_html("")
+        self._notice = gui.add_html("")
+        every = "Select every region that matches, not only the best one"
+        share = "Smallest share of a Gaussian that must lie in the matching regions"
+        self._controls = {
+            "all_of_class": gui.add_checkbox("all of its kind", default.all_of_class, hint=every),
+            "threshold": gui.add_slider("threshold", 0.0, 1.0, 0.01, default.threshold, hint=share),
+            "only_selected": gui.add_checkbox("only the selection", default.only_selected, hint="Hide everything else"),
+        }
+        hint = "Two clicks in the scene draw and tell the length between them"
+        self._measuring = gui.add_checkbox("measure", False, hint=hint)
+        hint = "Download the selected Gaussians as a .ply, and the measured lengths as a .csv"
+        export = gui.add_button("export", hint=hint)
+        hint = "Go to the camera of a frame"
+        frame = gui.add_dropdown("frame", ("choose", *names), initial_value="choose", hint=hint)
+
+        text_form.on_submit(_in_order(self._find))
+        for name, control in self._controls.items():
+            control.on_update(_in_order(lambda event, name=name: self._set_control(name, event.target.value)))
+        export.on_click(_in_order(lambda event: self.then(lambda _: self._export(event.client))))
+        frame.on_update(_in_order(self._choose_frame))
+        for modifier in (None, "shift"):
+            self.server.scene.on_click(modifier=modifier)(_in_order(self._click_scene))
+
+    def _find(self, event: Any) -> None:
+        text, add = self._text.value, self._add.value
+        self.then(lambda state: state.with_question(text, add=add))
+
+    def _set_control(self, name: str, value: Any) -> None:
+        if getattr(self.state, name) != value:
+            self.then(lambda state: dataclasses.replace(state, **{name: value}))
+
+    def _choose_frame(self, event: Any) -> None:
+        names = self.scene.field.names
+        if event.client is not None and event.target.value in names:
+            self.then(lambda _: self.layer.go_to(event.client, names.index(event.target.value)))
+
+    def _click_scene(self, event: Any) -> None:
+        camera = event.client.camera
+        focal = camera.image_height / 2 / np.tan(camera.fov / 2)
+        if self._measuring.value:
+            self.then(lambda _: self._measure(event, focal))
+            return
+        add = self._add.value or event.modifier == "shift"
+        self.then(lambda state: self._clicked(state, event, focal, add=add))
 
     def _start(self, state: ViewState) -> None:
         """Draws the first state, and starts the thread, which first compiles what questions need."""
@@ -170,12 +217,12 @@ class Viewer:
         if start is None:
             self.layer.draw_length(len(self._lengths), point, point, "")
             return
-        self._start_point, world = None, np.asarray(self.scene.field.source_from_scene, np.float64)
-        row = self.scene.measure(*((world[:3, :3] @ end + world[:3, 3]).tolist() for end in (start, point)))
+        self._start_point = None
+        row = self.scene.measure(*source_points(self.scene.field, np.stack([start, point])).tolist())
         words = f"{row['centers']:.4g} {row['unit']}"
         self.layer.draw_length(len(self._lengths), start, point, words)
         self._lengths.append(row)
-        self.panel.show_notice(words)
+        self._show_notice(words)
 
     def _along(self, ray: Any, focal: float) -> tuple[LanguageField, Camera]:
         """The visible part of the field, and a view whose middle pixel looks along a ray of the window's world."""
@@ -203,9 +250,9 @@ class Viewer:
                 if self._steps.empty() and self.state != self.drawn:
                     self._draw()
             except InputError as error:
-                self.panel.show_notice(error)
+                self._show_notice(error)
             except Exception:
-                self.panel.show_notice("Internal error. The terminal shows its trace.")
+                self._show_notice("Internal error. The terminal shows its trace.")
                 traceback.print_exc()
 
     def _prepare(self, state: ViewState) -> None:
@@ -224,90 +271,19 @@ class Viewer:
         return np.ones(self.scene.field.gaussians.count, bool)
 
     def _draw(self) -> None:
-        """Colours the Gaussians of the window, and describes the answers."""
+        """Colours the Gaussians of the window, sets the controls, and describes the answer or error of each question."""
         state = self.state
         answers = self.scene.ask_all(state.queries)
-        self.layer.paint(_highlight(self._base_colours[state.colouring], answers), self._visible())
-        self.panel.show(state, answers)
-        self.drawn = state
-
-
-class _Panel:
-    """The controls, and the events by which they act on the viewer.
-
-    Args:
-      viewer: The viewer.
-      server: The viser server.
-    """
-
-    def __init__(self, viewer: Any, server: Any):
-        self._viewer = viewer
-        self._names = viewer.scene.field.names
-        gui = server.gui
-        gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="medium")
-        gui.set_panel_label(f"jsecon · {viewer.scene.name}")
-        default = ViewState()
-        with gui.add_form(None) as text_form:
-            self._text = gui.add_text("find", "", hint="Text to find, then press enter")
-        hint = "Keep what is selected when you find or click something else"
-        self._add = gui.add_checkbox("add to selection", False, hint=hint)
-        self._messages = gui.add_html("")
-        self._notice = gui.add_html("")
-        every = "Select every region that matches, not only the best one"
-        share = "Smallest share of a Gaussian that must lie in the matching regions"
-        self._controls = {
-            "all_of_class": gui.add_checkbox("all of its kind", default.all_of_class, hint=every),
-            "threshold": gui.add_slider("threshold", 0.0, 1.0, 0.01, default.threshold, hint=share),
-            "only_selected": gui.add_checkbox("only the selection", default.only_selected, hint="Hide everything else"),
-            "colouring": gui.add_dropdown("colour", COLOURINGS, initial_value=default.colouring),
-        }
-        hint = "Two clicks in the scene draw and tell the length between them"
-        self._measure = gui.add_checkbox("measure", False, hint=hint)
-        hint = "Download the selected Gaussians as a .ply, and the measured lengths as a .csv"
-        export = gui.add_button("export", hint=hint)
-        hint = "Go to the camera of a frame"
-        frame = gui.add_dropdown("frame", ("choose", *self._names), initial_value="choose", hint=hint)
-
-        text_form.on_submit(_in_order(self._find))
-        for name, control in self._controls.items():
-            control.on_update(_in_order(lambda event, name=name: self._set_control(name, event.target.value)))
-        export.on_click(_in_order(lambda event: viewer.then(lambda _: viewer._export(event.client))))
-        frame.on_update(_in_order(self._choose_frame))
-        for modifier in (None, "shift"):
-            server.scene.on_click(modifier=modifier)(_in_order(self._click_scene))
-
-    def _find(self, event: Any) -> None:
-        text, add = self._text.value, self._add.value
-        self._viewer.then(lambda state: state.with_question(text, add=add))
-
-    def _set_control(self, name: str, value: Any) -> None:
-        if getattr(self._viewer.state, name) != value:
-            self._viewer.then(lambda state: dataclasses.replace(state, **{name: value}))
-
-    def _choose_frame(self, event: Any) -> None:
-        if event.client is not None and event.target.value in self._names:
-            frame = self._names.index(event.target.value)
-            self._viewer.then(lambda _: self._viewer.layer.go_to(event.client, frame))
-
-    def _click_scene(self, event: Any) -> None:
-        camera = event.client.camera
-        focal = camera.image_height / 2 / np.tan(camera.fov / 2)
-        if self._measure.value:
-            self._viewer.then(lambda _: self._viewer._measure(event, focal))
-            return
-        add = self._add.value or event.modifier == "shift"
-        self._viewer.then(lambda state: self._viewer._clicked(state, event, focal, add=add))
-
-    def show(self, state: ViewState, answers: Sequence[Answer | InputError]) -> None:
-        """Sets the controls to a state, and describes the answer or the error of each of its questions."""
+        self.layer.paint(_highlight(self.layer.photo, answers), self._visible())
         texts = [question for question in state.questions if isinstance(question, str)]
         self._text.value = texts[-1] if texts else ""
         for name, control in self._controls.items():
             control.value = getattr(state, name)
         self._messages.content = "".join(map(_message, range(len(answers)), state.queries, answers))
-        self.show_notice("")
+        self._show_notice("")
+        self.drawn = state
 
-    def show_notice(self, text: str | InputError) -> None:
+    def _show_notice(self, text: str | InputError) -> None:
         """Shows a notice above the answers; "" removes it."""
         words = _error(text) if isinstance(text, InputError) else html.escape(text)
         self._notice.content = _box(words) if words else ""
