@@ -7,9 +7,11 @@ code.
 
 import codecs
 import contextlib
+import csv
 import dataclasses
 import errno
 import importlib
+import io
 import json
 import math
 import os
@@ -20,7 +22,7 @@ import tokenize
 import uuid
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -145,6 +147,15 @@ def write_text(path: str | os.PathLike, text: str) -> None:
     r"""Writes a text (UTF-8) atomically."""
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
+
+
+def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
+    """Writes values of some columns as CSV; a value that a row lacks is empty."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
 
 
 def read_text(path: Path) -> str:

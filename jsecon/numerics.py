@@ -57,6 +57,13 @@ def inline_jit(function: Callable) -> Callable:
     return call
 
 
+def axes_across(direction: np.ndarray) -> np.ndarray:
+    """Returns two unit axes (2, 3) across a unit direction (3,) and each other; with it they are right-handed."""
+    first = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(direction, first)])
+
+
 def safe_scale(size: Array) -> Array:
     """Chooses a power of two that brings numbers to where squares neither overflow nor vanish.
 

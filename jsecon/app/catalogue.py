@@ -3,7 +3,7 @@
 import colorsys
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from scipy.sparse.csgraph import connected_components
 from scipy.special import softmax
 
-from jsecon.app.records import gaussian_rows, rounded, source_shapes, source_up
+from jsecon.app.records import gaussian_rows, rounded, source_shapes, source_up, world_record
 from jsecon.errors import InputError
 from jsecon.field.columns import vote_blocks
 from jsecon.field.membership import SHARE_THRESHOLD, membership_probability, ratio, vote_columns, vote_shares
@@ -23,6 +23,7 @@ from jsecon.query.match import MIN_FRAGMENT_OVERLAP, judge_texts, regions_with, 
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.outliers import MIN_SAMPLES
 from jsecon.query.rules import ABSENT, QueryRules
+from jsecon.splat.visible import points_in_view
 from jsecon.types import Array, LanguageField, Votes
 from jsecon.views.frame import field_up, inner_scene
 from jsecon.vision.unrelated_words import UNRELATED_WORDS, embed_unrelated_words
@@ -88,6 +89,8 @@ class Catalogue:
     """what the up axis was taken from, and whether that is sure."""
     frame_names: tuple[str, ...]
     """names of the field's frames."""
+    world: Mapping[str, Any]
+    """the unit of that world, and its reference system if it has one."""
 
     def __len__(self) -> int:
         """K."""
@@ -116,6 +119,11 @@ class Catalogue:
         `pandas.json_normalize` makes a table of them.
         """
         return [self._record(n) for n in range(len(self))]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values of the objects and of their world for JSON: the same at every door."""
+        up = {"up": self.up.round(6).tolist(), "up_evidence": self.up_evidence}
+        return {"frame": "the capture's world", **self.world, **up, "objects": self.records()}
 
     def _record(self, n: int) -> dict[str, Any]:
         """Plain values of one object."""
@@ -223,6 +231,7 @@ def objects(
         up=source_axis,
         up_evidence=str(axis),
         frame_names=field.names,
+        world=world_record(field),
     )
 
 
@@ -235,18 +244,9 @@ def _frames_around(field: LanguageField, rows: Int[np.ndarray, " m"]) -> Bool[np
     """Finds the frames in which the box of some Gaussians lies whole."""
     if not len(rows):
         return np.zeros(len(field.names), bool)
-    cameras = jax.tree.map(np.asarray, field.cameras)
     means = np.asarray(field.gaussians.means)[rows]
-    ends = np.stack([means.min(0), means.max(0)])
-    corners = np.stack(np.meshgrid(*ends.T), -1).reshape(-1, 3)
-    x, y, z = np.moveaxis(
-        corners @ cameras.world_to_camera[:, :3, :3].mT + cameras.world_to_camera[:, None, :3, 3], -1, 0
-    )
-    depth = np.maximum(z, 1e-9)
-    column = x / depth * cameras.fx[:, None] + cameras.cx[:, None]
-    row = y / depth * cameras.fy[:, None] + cameras.cy[:, None]
-    inside = (z > 0) & (column >= 0) & (column < cameras.width) & (row >= 0) & (row < cameras.height)
-    return inside.all(1)
+    corners = np.stack(np.meshgrid(*np.stack([means.min(0), means.max(0)], 1)), -1).reshape(-1, 3)
+    return points_in_view(field.cameras, corners).all(1)
 
 
 def _vocabulary(

@@ -1,8 +1,6 @@
 """`jsecon changes` and `jsecon update`: what changed, as JSON, a table, and a page with pictures and a plan."""
 
-import csv
 import datetime
-import io
 import json
 from pathlib import Path
 from typing import Any
@@ -17,7 +15,8 @@ from jsecon.app.records import world_record
 from jsecon.app.scene import Scene, open_scene
 from jsecon.change.detect import KINDS
 from jsecon.errors import InputError
-from jsecon.files import FIELD_FILE, exclusive_lock, write_text
+from jsecon.files import FIELD_FILE, csv_text, exclusive_lock, write_text
+from jsecon.numerics import axes_across
 from jsecon.pipeline.options import is_bare_scene, read_date, require_writable
 from jsecon.pipeline.progress import Console
 from jsecon.pipeline.scene_files import read_scene
@@ -95,7 +94,7 @@ def _write_changes(changes: Changes, out: Path, console: Console) -> verbs.VerbR
     write_text(files["json"], json.dumps(content, indent=2) + "\n")
     write_text(files["csv"], _table(records))
     with console.progress("pictures"):
-        write_text(files["html"], changes_page(changes))
+        write_text(files["html"], _page(changes))
     console.print_line(f"pictures  {files['html']}")
     return {"changes": records, "written": files}
 
@@ -115,18 +114,14 @@ def _words(record: dict[str, Any]) -> str:
 
 def _table(records: list[dict[str, Any]]) -> str:
     """The records as CSV, a coordinate a column."""
-    text = io.StringIO()
-    ends = [f"{end}_{axis}" for end in ("from", "to") for axis in "xyz"]
+    ends = {end: [f"{end}_{axis}" for axis in "xyz"] for end in ("from", "to")}
     names = ("kind", "name", "id", "region", "probability", "suspected", "distance", "turned_degrees")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*names, *ends, "frames"])
-    for record in records:
-        places = [x for end in ("from", "to") for x in record[end] or ("", "", "")]
-        writer.writerow([*(record.get(name, "") for name in names), *places, " ".join(record["frames"])])
-    return text.getvalue()
+    rows = [record | {"frames": " ".join(record["frames"])} for record in records]
+    rows = [row | dict(pair for end in ends for pair in zip(ends[end], row[end] or ())) for row in rows]
+    return csv_text((*names, *ends["from"], *ends["to"], "frames"), rows)
 
 
-def changes_page(changes: Changes) -> str:
+def _page(changes: Changes) -> str:
     """The page of changes: a plan from above, and before and after of each."""
     records, cards = changes.records(), []
     plan = report.figure(_draw_plan(changes), "From above: blue moved, red gone, green new, brown another look.")
@@ -159,9 +154,7 @@ def _draw_plan(changes: Changes) -> np.ndarray:
     field, listed = changes.field, changes.catalogue
     things = np.append(~listed.surroundings, False)[listed.labels]
     up = np.array(field_up(field).axis)
-    first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-    first /= np.linalg.norm(first)
-    flat = np.stack([first, np.cross(up, first)], 1)
+    flat = axes_across(up).T
     means = np.asarray(field.gaussians.means, np.float64)
     middle = np.quantile(means[things if things.any() else ...] @ flat, [0.01, 0.99], axis=0)
     near = np.stack([*middle, *(end @ flat for change in changes.found for end in (change.start, change.place))])

@@ -11,7 +11,7 @@ import numpy as np
 from jsecon.app import pictures, report, verbs
 from jsecon.app.catalogue import SURE_SHARE, Catalogue
 from jsecon.app.querying import slug
-from jsecon.app.records import decimals, world_record
+from jsecon.app.records import decimals
 from jsecon.app.scene import Scene, open_scene
 from jsecon.app.shapes import require_shapes_format, write_shapes
 from jsecon.errors import InputError
@@ -47,17 +47,15 @@ def _objects(verb: verbs.Objects, console: Console) -> verbs.VerbResult:
     if verb.out is None:
         return {"objects": records}
     files = {"objects": verb.out / "objects.json", "catalogue": verb.out / "catalogue.html"}
-    _write_records(files["objects"], scene, listed, records)
+    _write_records(files["objects"], listed)
     write_text(files["catalogue"], _page(scene, listed, records, console))
     console.print_line(f"pictures  {files['catalogue']}")
     return {"objects": records, "written": files}
 
 
-def _write_records(file: Path, scene: Scene, listed: Catalogue, records: list[dict[str, Any]]) -> None:
+def _write_records(file: Path, listed: Catalogue) -> None:
     """Writes the records of the objects as JSON."""
-    up = {"up": listed.up.round(6).tolist(), "up_evidence": listed.up_evidence}
-    content = {"frame": "the capture's world"} | world_record(scene.field) | up | {"objects": records}
-    write_text(file, json.dumps(content, indent=2) + "\n")
+    write_text(file, json.dumps(listed.as_dict(), indent=2) + "\n")
 
 
 def _read_vocabulary(file: Path) -> list[str]:
@@ -113,7 +111,7 @@ def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
         if listed is not None:
             written["labels"] = [folder / "labels.json" for folder in {file.parent: None for file in files if file}]
             for file in written["labels"]:
-                _write_records(file, scene, listed, records)
+                _write_records(file, listed)
     return result
 
 

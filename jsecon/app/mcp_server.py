@@ -73,12 +73,8 @@ class _Tools:
 
     def objects(self, field: FieldName = None) -> dict[str, Any]:
         """Lists the objects of a scene with names, sizes and places, the largest first; at most 100."""
-        from jsecon.app.records import world_record  # late: it imports jax
-
-        scene = self._scene(field)
-        listed = scene.objects()
-        world = world_record(scene.field) | {"up": listed.up.tolist(), "up_evidence": listed.up_evidence}
-        return {"count": len(listed)} | world | {"objects": listed.records()[:100]}
+        listed = self._scene(field).objects().as_dict()
+        return listed | {"count": len(listed["objects"]), "objects": listed["objects"][:100]}
 
     def history(self, field: FieldName = None) -> dict[str, Any]:
         """Lists what moved, is gone, is new or looks another way since a field was made, in order of time."""
@@ -159,7 +155,7 @@ def _open_fields(
 
             scene = open_prepared(name, path, embedder, console)
             scenes[name].set_result(scene)
-            line = f"{name}: {scene.field.gaussians.count} Gaussians, {scene.field.regions.count} regions"
+            line = str(scene)
         except Exception as error:  # of a bug too: a call waits for it
             if not isinstance(error, InputError):
                 problem = f"the field cannot be opened ({describe_error(error)})"

@@ -1,9 +1,6 @@
 """`jsecon measure`: lengths between things or points, as lines and as CSV, and a scale from one known length."""
 
-import csv
-import io
 import itertools
-from collections.abc import Sequence
 from typing import Any
 
 from jsecon.app import verbs
@@ -11,10 +8,10 @@ from jsecon.app.opening import locate_field
 from jsecon.app.scene import open_scene
 from jsecon.errors import InputError
 from jsecon.field.field import save_field
-from jsecon.files import write_text
+from jsecon.files import csv_text, write_text
 from jsecon.pipeline.progress import Console
 
-COLUMNS: tuple[str, ...] = ("a", "b", "surfaces", "centers", "gap", "angle", "unit")
+LENGTH_COLUMNS = ("a", "b", "surfaces", "centers", "gap", "angle", "unit")
 """columns of the CSV, values of `Scene.measure`"""
 
 
@@ -43,15 +40,6 @@ def _measure(verb: verbs.Measure, console: Console) -> verbs.VerbResult:
     result: verbs.VerbResult = {"measurements": rows, "metres_per_unit": scene.field.metres_per_unit}
     if verb.out is None:
         return result
-    write_text(verb.out, table_of_lengths(rows))
+    write_text(verb.out, csv_text(LENGTH_COLUMNS, rows))
     console.print_line(f"table   {verb.out}")
     return result | {"written": {"table": verb.out}}
-
-
-def table_of_lengths(rows: Sequence[dict[str, Any]]) -> str:
-    """Writes values of `Scene.measure` as CSV."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()

@@ -24,13 +24,10 @@ from jsecon.pipeline.options import is_bare_scene, require_writable
 from jsecon.pipeline.progress import Console
 from jsecon.query.expressions import is_expression
 from jsecon.read.captures.images import write_image
-from jsecon.read.splats.files import require_writable_format
 
-PAGE = "answers.html"
+_PAGE = "answers.html"
 """page of a command's answers in its folder"""
-FORMATS = ("ply", "spz", "glb")
-"""formats of the Gaussians of an answer, keys of its record"""
-MAX_SLUG_BYTES = 80
+_MAX_SLUG_BYTES = 80
 """bytes of a slug; a file name may have 255 bytes, two slugs and their hashes among them"""
 
 
@@ -38,7 +35,6 @@ def _query(verb: verbs.Query, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon query`; the result has the records of the answers, and the errors of failed queries."""
     queries = _queries(verb)
     require_writable(verb.out)
-    require_writable_format(verb.out / f"answer.{verb.format}")
     scene = open_scene(verb.field, embedder=verb.embedder, up=verb.up, out=verb.out / "field", console=console)
     scene = scene if verb.as_of is None else scene.as_of(verb.as_of)
     with console.progress("answers"):
@@ -48,13 +44,12 @@ def _query(verb: verbs.Query, console: Console) -> verbs.VerbResult:
     answers = [answer for answer in results if not isinstance(answer, InputError)]
     if any(answer.by == "relation" for answer in answers):
         console.note("Words in quotes are searched for as they stand, without relations.")
-    files: dict[str, Any] = {"views": verb.views, "ending": verb.format}
     for query, result in zip(queries, results):
         if isinstance(result, InputError) and isinstance(query.question, str):
             _remove_answer(verb.out, file_stem(query))
     if not answers:
-        remove_files(verb.out, [PAGE])
-    result = _write_answers(scene, answers, verb.out, console, **files) if answers else {"answers": []}
+        remove_files(verb.out, [_PAGE])
+    result = _write_answers(scene, answers, verb.out, console, verb.views) if answers else {"answers": []}
     return result | {"errors": [error for error in results if isinstance(error, InputError)]}
 
 
@@ -92,7 +87,7 @@ def _frames_of(pairs: list[str]) -> dict[int | str, Path]:
 
 
 def write_answer(
-    answer: Answer, scene: Scene, out: Path, masks: Mapping[int, Bool[np.ndarray, "h w"]], *, ending: str = "ply"
+    answer: Answer, scene: Scene, out: Path, masks: Mapping[int, Bool[np.ndarray, "h w"]]
 ) -> dict[str, Any]:
     """Writes the files of an answer, of an empty one its record alone, and returns the record of the .json.
 
@@ -103,14 +98,13 @@ def write_answer(
       scene: The scene that gave it.
       out: Output folder.
       masks: Index of a frame -> mask to write (`Scene.mask`).
-      ending: Format of the Gaussians: ply, spz or glb.
     """
     stem = file_stem(answer.query)
     _remove_answer(out, stem)
-    record = answer.as_dict() | {ending: None, "masks": {}}
+    record = answer.as_dict() | {"ply": None, "masks": {}}
     if len(answer.rows):
-        record[ending] = f"{stem}.{ending}"
-        scene.export(out / record[ending], answer)
+        record["ply"] = f"{stem}.ply"
+        scene.export(out / record["ply"], answer)
         for t, mask in masks.items():
             record["masks"][scene.field.names[t]] = file = f"{stem}-{_frame_stem(scene, t)}.png"
             write_image(out / file, mask.astype(np.uint8) * 255)
@@ -118,21 +112,11 @@ def write_answer(
     return record
 
 
-def _write_answers(
-    scene: Scene, answers: Sequence[Answer], out: Path, console: Console, *, views: int = 3, ending: str = "ply"
-) -> dict[str, Any]:
-    """Writes the files of answers and OUT/answers.html, and prints a line for each. Without views it renders nothing.
+def _write_answers(scene: Scene, answers: Sequence[Answer], out: Path, console: Console, views: int) -> dict[str, Any]:
+    """Writes the files of answers and OUT/answers.html, and prints a line for each.
 
-    Args:
-      scene: The scene.
-      answers: The answers.
-      out: Output folder.
-      console: Receives the lines.
-      views: Number of masks of each answer.
-      ending: Format of the Gaussians: ply, spz or glb.
-
-    Returns:
-      Paths of the files under "written", and the records under "answers".
+    `views` is the number of masks of each answer; without any it renders nothing. The result has paths under "written",
+    and the records under "answers".
     """
     sections: dict[str, str] = {}
     records: dict[str, dict[str, Any]] = {}
@@ -143,7 +127,7 @@ def _write_answers(
             stem = file_stem(answer.query)
             if stem not in records:  # else the question stands there twice
                 masks = {t: scene.mask(answer, t) for t in scene.best_frames(answer, views)}
-                records[stem] = write_answer(answer, scene, out, masks, ending=ending)
+                records[stem] = write_answer(answer, scene, out, masks)
                 counts = records[stem]["outliers"]
                 words = f"{counts['dropped']} of {counts['selected']} selected Gaussians stand apart and were dropped"
                 if counts["dropped"]:
@@ -156,11 +140,11 @@ def _write_answers(
     written = {"folder": out}
     if views:
         lead = "The mask of each selection over the rendered scene."
-        write_text(out / PAGE, report.page("Answers", lead, list(sections.values())))
-        console.print_line(f"pictures  {out / PAGE}")
-        written["pictures"] = out / PAGE
+        write_text(out / _PAGE, report.page("Answers", lead, list(sections.values())))
+        console.print_line(f"pictures  {out / _PAGE}")
+        written["pictures"] = out / _PAGE
     else:
-        remove_files(out, [PAGE])  # of an earlier command
+        remove_files(out, [_PAGE])  # of an earlier command
     return {"written": written, "answers": [records[file_stem(answer.query)] for answer in answers]}
 
 
@@ -168,7 +152,7 @@ def _remove_answer(out: Path, stem: str) -> None:
     """Removes the files of an earlier answer: its record, and the Gaussians and masks that the record lists."""
     try:
         earlier = parse_json((out / f"{stem}.json").read_bytes())
-        names = [*(earlier.get(ending) for ending in FORMATS), *earlier.get("masks", {}).values()]
+        names = [earlier.get("ply"), *earlier.get("masks", {}).values()]
     except (OSError, ValueError, AttributeError):  # there is none, or another program wrote it
         return
     texts = [name for name in names if isinstance(name, str) and name.isprintable()]
@@ -182,7 +166,7 @@ def file_stem(query: Query) -> str:
     pointed = re.fullmatch(r"(at|box|region) .*\d", name, re.DOTALL)  # a text may be called like a pixel
     by_name = bool(pointed) != isinstance(question, str) and not isinstance(question, Mask)
     device = re.fullmatch(r"con|prn|aux|nul|(com|lpt)\d", plain)  # on Windows, whatever its ending
-    short = len(plain.encode()) <= MAX_SLUG_BYTES and not device
+    short = len(plain.encode()) <= _MAX_SLUG_BYTES and not device
     if by_name and short and plain.replace("-", " ") == name:
         return plain
     return _hashed(plain, question if isinstance(question, str) else repr(question))
@@ -193,7 +177,7 @@ def _frame_stem(scene: Scene, frame: int) -> str:
     name = scene.field.names[frame]
     # Unique on a file system without case, too.
     unique = [other.casefold() for other in scene.field.names].count(name.casefold()) == 1
-    ordinary = re.fullmatch(r"[A-Za-z0-9_]+", name) and len(name) <= MAX_SLUG_BYTES and unique
+    ordinary = re.fullmatch(r"[A-Za-z0-9_]+", name) and len(name) <= _MAX_SLUG_BYTES and unique
     return name if ordinary else _hashed(slug(name), name)
 
 
@@ -206,5 +190,5 @@ def slug(text: str) -> str:
 def _hashed(slug: str, key: str) -> str:
     """Returns the beginning of a slug, and a hash of the key behind two hyphens, which no slug has."""
     digest = hashlib.sha256(key.encode("utf-8", "surrogatepass")).hexdigest()[:10]
-    start = slug.encode("utf-8", "replace")[:MAX_SLUG_BYTES].decode("utf-8", "ignore")
+    start = slug.encode("utf-8", "replace")[:_MAX_SLUG_BYTES].decode("utf-8", "ignore")
     return f"{start}--{digest}"

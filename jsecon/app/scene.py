@@ -53,6 +53,7 @@ from jsecon.read.splats.files import save_gaussians
 from jsecon.read.splats.points import load_point_cloud, save_point_cloud
 from jsecon.splat.points import nearest_gaussians
 from jsecon.splat.transform import transform_gaussians
+from jsecon.splat.visible import points_in_view
 from jsecon.types import Capture, Gaussians, LanguageField, Selection
 
 CACHED_BYTES = 1 << 28
@@ -191,6 +192,10 @@ class Scene:
         self._answers = functools.lru_cache(count)(lambda query: self._answer(query))
         self._cameras = jax.tree.map(np.asarray, field.cameras)  # whose items need no compilation
         self._photo = functools.cache(lambda t: pictures.render_picture(self._gaussians, self._cameras[t]))
+
+    def __str__(self) -> str:
+        """Its name and its size, in a line."""
+        return f"{self.name}: {self.field.gaussians.count} Gaussians, {self.field.regions.count} regions"
 
     @functools.cached_property
     def embedder(self) -> Any:
@@ -753,13 +758,7 @@ class Scene:
             visible = np.asarray(self.field.regions.pixel_counts)[region]
         else:
             means = np.asarray(self.field.gaussians.means)[answer.rows]
-            cameras = self._cameras
-            pose = np.asarray(cameras.world_to_camera)
-            local = np.einsum("tij,nj->tni", pose[:, :3, :3], means) + pose[:, None, :3, 3]
-            z = np.where(local[..., 2] > 0, local[..., 2], np.nan)
-            u = cameras.fx[:, None] * local[..., 0] / z + cameras.cx[:, None]
-            v = cameras.fy[:, None] * local[..., 1] / z + cameras.cy[:, None]
-            visible = ((u >= 0) & (u < cameras.width) & (v >= 0) & (v < cameras.height)).sum(1)
+            visible = points_in_view(self._cameras, means).sum(1)
         order = np.argsort(-visible, kind="stable")[:count]
         return [int(t) for t in order if visible[t] > 0]
 

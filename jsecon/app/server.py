@@ -9,7 +9,7 @@ import json
 import re
 import tempfile
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -28,7 +28,7 @@ import jsecon
 from jsecon.app import verbs
 from jsecon.app.access import bracketed, is_allowed_host, listen, token_for
 from jsecon.app.opening import find_scene
-from jsecon.app.records import At, Query, world_record
+from jsecon.app.records import At, Query
 from jsecon.app.scene import Scene, open_scenes
 from jsecon.errors import InputError
 from jsecon.pipeline.progress import Console
@@ -163,9 +163,7 @@ def application(scenes: dict[str, Scene], *, token: str = "") -> FastAPI:
     @app.get("/objects", summary="The objects of a field: names, boxes, Gaussians")
     def objects(request: Annotated[_Request, Parameters()]) -> Response:
         scene = find_scene(scenes, request.field)
-        listed = scene.objects()
-        world = world_record(scene.field) | {"up": listed.up.tolist(), "up_evidence": listed.up_evidence}
-        return _AsciiResponse({"field": scene.name} | world | {"objects": listed.records()})
+        return _AsciiResponse({"field": scene.name} | scene.objects().as_dict())
 
     @app.get("/changes", summary="What moved, is gone or is new since a field was made, in order of time")
     def changes(request: Annotated[_Request, Parameters()]) -> Response:
@@ -240,36 +238,16 @@ def _describe(scene: Scene) -> dict[str, Any]:
     return {"name": scene.name, **counts, "frames": list(field.names), "size": size}
 
 
-def prepare(
-    files: Sequence[Path],
-    *,
-    host: str,
-    port: int,
-    token: str,
-    embedder: str | Path | None,
-    console: Console | None = None,
-) -> tuple[dict[str, Any], Callable[[], None]]:
-    """Opens fields and listens; returns address and fields, and the function that answers requests until it is stopped.
-
-    `port` 0 takes a free one, and `token` "" that of the environment.
-    """
-    token = token_for(host, token)
-    listening = listen(host, port)
-    scenes = open_scenes(files, embedder, console)
-    app = application(scenes, token=token)
+def _serve(verb: verbs.Serve, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon serve`: address, fields, and under "then" what answers requests until it is stopped."""
+    token = token_for(verb.host, verb.token)
+    listening = listen(verb.host, verb.port)
+    scenes = open_scenes(verb.fields, verb.embedder, console)
     # The limit counts cheap requests too; those beyond it get 503.
     options: dict[str, Any] = {"timeout_keep_alive": 5, "limit_concurrency": 256}
+    app = application(scenes, token=token)
     config = uvicorn.Config(app, log_level="warning", ws="none", server_header=False, **options)
-    address = f"http://{bracketed(host)}:{listening.getsockname()[1]}"
-    description = {"address": address, "fields": [_describe(scene) for scene in scenes.values()]}
-    return description, lambda: uvicorn.Server(config).run(sockets=[listening])
-
-
-def _serve(verb: verbs.Serve, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon serve`; the result is as of `prepare`, with its function under "then"."""
-    options: dict[str, Any] = {"host": verb.host, "port": verb.port, "token": verb.token, "embedder": verb.embedder}
-    result, serve = prepare(verb.fields, **options, console=console)
-    for scene in result["fields"]:
-        console.print_line(f"{scene['name']}: {scene['gaussians']} Gaussians, {scene['regions']} regions")
-    console.print_line(result["address"])
-    return result | {"then": serve}
+    address = f"http://{bracketed(verb.host)}:{listening.getsockname()[1]}"
+    fields = [_describe(scene) for scene in scenes.values()]
+    console.print_line("\n".join([*map(str, scenes.values()), address]))
+    return {"address": address, "fields": fields, "then": lambda: uvicorn.Server(config).run(sockets=[listening])}

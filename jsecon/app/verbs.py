@@ -66,6 +66,7 @@ class Verb:
     output: OutputOptions = OutputOptions()
 
     def __init_subclass__(cls) -> None:
+        """Makes a dataclass of the class of a verb."""
         dataclasses.dataclass(frozen=True, kw_only=True)(cls)
 
 
@@ -201,7 +202,6 @@ class Query(_FieldVerb):
         clusters with less than a tenth of the largest one's weight in the views. The .json counts them.
       views: Number of masks to write for each query. 0 leaves out answers.html too: nothing is rendered, and the first
         query on a machine takes a third of its time.
-      format: Format of the selected Gaussians. The glb is glTF with Khronos' KHR_gaussian_splatting, y up.
       as_of: Asks a field of jsecon update as it was at the end of a date, such as 2026-11-01.
     """
 
@@ -228,7 +228,6 @@ class Query(_FieldVerb):
     all: Option[bool] = False
     keep_outliers: Option[bool] = False
     views: Annotated[Option[int], Range(0, 1000)] = 3
-    format: Option[Literal["ply", "spz", "glb"]] = "ply"
     as_of: Option[str | None] = None
 
 

@@ -22,9 +22,11 @@ from jsecon.change import MIN_PROBABILITY
 from jsecon.change.compare import colour_cost, depth_cost, find_shift, fit_exposure, shifted
 from jsecon.errors import InputError, require_shape
 from jsecon.field.evidence import view_evidence
-from jsecon.query.render import HIDDEN_LOGIT
+from jsecon.numerics import axes_across
+from jsecon.query.render import hide
 from jsecon.splat.render import render, render_rgb
 from jsecon.splat.sh import C0
+from jsecon.splat.visible import points_in_view
 from jsecon.types import Camera, Gaussians
 
 KINDS = ("same", "moved", "gone", "new", "look", "unsure", "not seen")
@@ -178,12 +180,6 @@ def _render(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarra
     return np.clip(np.asarray(image.features), 0, 1), np.asarray(image.alpha), np.asarray(image.depth)
 
 
-def hide(gaussians: Gaussians, mask: Bool[np.ndarray, " n"]) -> Gaussians:
-    """Makes some Gaussians transparent."""
-    logits = np.where(mask, np.float32(HIDDEN_LOGIT), np.asarray(gaussians.opacity_logits))
-    return dataclasses.replace(gaussians, opacity_logits=logits)
-
-
 def _first_view(gaussians: Gaussians, camera: Camera, frame: np.ndarray, depth: np.ndarray | None) -> _View:
     """Renders a frame, and aligns the photograph and its exposure to that."""
     image = _render(gaussians, camera)
@@ -255,7 +251,7 @@ def object_changes(
     weight = np.where(seen, np.minimum(known / 60, 1), 0) * np.where(differing < DISPLACED_SHARE, 2, 1)
     excess = np.where(seen, weight * (differing - DISPLACED_SHARE), 0).sum(1) / np.maximum(weight.sum(1), 1e-9)
     displaced = seen.any(1) & (excess > 0)
-    search = _Search(gaussians, labels, views, up / np.linalg.norm(up))
+    search = _Search(gaussians, labels, views, cameras, up / np.linalg.norm(up))
     changes = [search.unmoved(k, seen[k], excess[k], differing[k]) for k in range(count)]
     shares = (known * differing).sum(1) / np.maximum(known.sum(1), 1e-9)
     suspects = np.flatnonzero((seen.sum(1) > 1) & ~displaced & (shares >= TURN_SHARE)).tolist()
@@ -303,11 +299,9 @@ def _sigmoid(evidence: float) -> float:
 class _Search:
     """The search for what is turned, displaced and new; its views show what was found."""
 
-    def __init__(self, gaussians, labels, views, up):
-        self.gaussians, self.labels, self.up, self.first = gaussians, labels, up, views
-        first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-        first /= np.linalg.norm(first)
-        self.flat = np.stack([first, np.cross(up, first)])
+    def __init__(self, gaussians, labels, views, cameras, up):
+        self.gaussians, self.labels, self.first, self.cameras, self.up = gaussians, labels, views, cameras, up
+        self.flat = axes_across(up)
         self.means = np.asarray(gaussians.means, np.float64)
         self.discs = functools.cache(lambda k: _Discs(gaussians, np.flatnonzero(labels == k)))
 
@@ -488,12 +482,10 @@ class _Search:
 
     def _frames_near(self, place: np.ndarray) -> list[int]:
         """The frames that see a place, at most _FIT_FRAMES, the nearest first."""
-        depths = []
-        for view in self.views:
-            camera, pose = view.camera, np.asarray(view.camera.world_to_camera, np.float64)
-            x, y, z = pose[:3, :3] @ place + pose[:3, 3]
-            u, v = x / z * float(camera.fx) + float(camera.cx), y / z * float(camera.fy) + float(camera.cy)
-            depths.append(z if z > 0 and 0 <= u < camera.width and 0 <= v < camera.height else np.inf)
+        poses = self.cameras.world_to_camera
+        depths = np.where(
+            points_in_view(self.cameras, place[None])[:, 0], poses[:, 2, :3] @ place + poses[:, 2, 3], np.inf
+        )
         return [int(t) for t in np.argsort(depths)[:_FIT_FRAMES] if np.isfinite(depths[t])]
 
     def gone(self, k: int, seen: np.ndarray, clusters: list[_Cluster]) -> tuple[Change, list[_Cluster]]:

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from jsecon.errors import require, require_shape
+from jsecon.numerics import axes_across
 from jsecon.types import Array, Gaussians, Leaf, record
 
 BOX_TAIL = 0.02
@@ -119,9 +120,7 @@ def _upright_turns(up: np.ndarray) -> np.ndarray:
     """Returns axes (2 _YAW_STEPS + 1, 3) of upright boxes: horizontal ones, the ones across to these, and up."""
     require(bool(np.linalg.norm(up) > 0), "object_shapes", f"up {up.tolist()}", "a direction", "For example 0 0 1.")
     up = up / np.linalg.norm(up)
-    first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-    first /= np.linalg.norm(first)
-    second = np.cross(up, first)
+    first, second = axes_across(up)
     yaw = 0.5 * np.pi * np.arange(_YAW_STEPS)[:, None] / _YAW_STEPS
     turned = [np.cos(yaw) * first + np.sin(yaw) * second, np.cos(yaw) * second - np.sin(yaw) * first]
     return np.concatenate([*turned, up[None]])

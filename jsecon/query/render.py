@@ -20,6 +20,12 @@ HIDDEN_LOGIT = -30.0
 """Opacity logit of hidden Gaussians: an opacity of 1e-13 is culled in projection, and every number stays finite."""
 
 
+def hide(gaussians: Gaussians, mask: Bool[np.ndarray, " n"]) -> Gaussians:
+    """Makes some Gaussians transparent."""
+    logits = np.where(mask, np.float32(HIDDEN_LOGIT), np.asarray(gaussians.opacity_logits))
+    return dataclasses.replace(gaussians, opacity_logits=logits)
+
+
 def selection_mask(
     gaussians: Gaussians,
     camera: Camera,

@@ -10,7 +10,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jsecon.numerics import NEAR
 from jsecon.splat.project import check_gaussians, project
@@ -33,6 +33,17 @@ def visible_rows(
         block = jax.tree.map(lambda a, first=first: np.asarray(a[first : first + rows], np.float32), geometry)
         ids.append(first + np.flatnonzero(np.asarray(_is_visible(block, camera, near))))
     return np.concatenate(ids)
+
+
+def points_in_view(cameras: Camera, points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, "t p"]:
+    """Tells which points each of T cameras has in its picture, whatever may hide them."""
+    shown = []
+    for camera in jax.tree.map(np.asarray, cameras):
+        x, y, z = camera.world_to_camera[:3, :3] @ points.T + camera.world_to_camera[:3, 3:]
+        z = np.where(z > 0, z, np.nan)
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        shown.append((u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height))
+    return np.array(shown, bool).reshape(-1, len(points))
 
 
 @functools.partial(jax.jit, static_argnums=2)

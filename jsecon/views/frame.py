@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
 from jsecon.errors import InputError
+from jsecon.numerics import axes_across
 from jsecon.types import Camera, Gaussians, LanguageField, UpAxis
 from jsecon.views.upright import TRIM, find_up
 
@@ -139,10 +140,7 @@ def scene_frame(points: Float[np.ndarray, "p 3"], up: np.ndarray | None = None) 
     else:
         up, sure, evidence = _direction(up), True, "given"
     up = up / np.linalg.norm(up)
-    side = np.eye(3)[np.argmin(np.abs(up))]
-    first = np.cross(up, side)
-    first /= np.linalg.norm(first)
-    second = np.cross(up, first)
+    first, second = axes_across(up)
     flat = np.stack([points @ first, points @ second], axis=1)
     middle = np.median(flat, axis=0)
     size = np.abs(flat - middle).max()

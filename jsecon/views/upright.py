@@ -19,6 +19,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from jsecon.numerics import axes_across
+
 TRIM = 0.02
 """share of the surface that lies outside the robust bounds on each side of an axis: floaters and far background"""
 _PLANE_TOLERANCE = 0.01
@@ -197,9 +199,7 @@ def _footprint(points: np.ndarray, up: np.ndarray) -> float:
     """Area of the convex hull of points seen along a direction."""
     if len(points) < 3:
         return 0.0
-    first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-    first /= np.linalg.norm(first)
-    flat = points @ np.stack([first, np.cross(up, first)], axis=1)
+    flat = points @ axes_across(up).T
     flat -= flat.mean(0)
     size = float(np.abs(flat).max()) or 1.0
     return size**2 * cv2.contourArea(cv2.convexHull((flat / size).astype(np.float32)))

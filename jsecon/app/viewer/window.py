@@ -18,14 +18,13 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from jsecon.app import verbs
 from jsecon.app.access import is_allowed_host, listen
 from jsecon.app.catalogue import palette
-from jsecon.app.measuring import table_of_lengths
+from jsecon.app.measuring import LENGTH_COLUMNS
 from jsecon.app.querying import file_stem
 from jsecon.app.records import Answer, Query, Region, source_points
 from jsecon.app.scene import Scene, open_scene
@@ -33,9 +32,11 @@ from jsecon.app.viewer.layer import SplatLayer
 from jsecon.app.viewer.static_page import export_page
 from jsecon.errors import InputError
 from jsecon.field.membership import SHARE_THRESHOLD
+from jsecon.files import csv_text
+from jsecon.numerics import axes_across
 from jsecon.pipeline.progress import Console
 from jsecon.query.pointing import MIN_SHARE, depth_seen, region_shares_seen
-from jsecon.query.render import HIDDEN_LOGIT
+from jsecon.query.render import hide
 from jsecon.types import Camera, LanguageField
 
 RAY_VIEW_SIDE = 1025
@@ -227,13 +228,16 @@ class Viewer:
     def _along(self, ray: Any, focal: float) -> tuple[LanguageField, Camera]:
         """The visible part of the field, and a view whose middle pixel looks along a ray of the window's world."""
         start, direction = np.asarray(ray.ray_origin) / self.layer.scale, np.asarray(ray.ray_direction)
-        return _shown(self.scene.field, self._visible()), _view_along(start, direction, focal)
+        field = self.scene.field
+        field = dataclasses.replace(field, gaussians=hide(field.gaussians, ~self._visible()))
+        return field, _view_along(start, direction, focal)
 
     def _export(self, client: Any) -> None:
         """Sends the highlighted Gaussians as a .ply, and the measured lengths as a .csv."""
         found = self._found()
         if self._lengths:
-            client.send_file_download("lengths.csv", table_of_lengths(self._lengths).encode(), save_immediately=True)
+            lengths = csv_text(LENGTH_COLUMNS, self._lengths).encode()
+            client.send_file_download("lengths.csv", lengths, save_immediately=True)
         elif not found:
             raise InputError("", "no Gaussian is selected, so there is no file to export")
         if found:
@@ -271,7 +275,7 @@ class Viewer:
         return np.ones(self.scene.field.gaussians.count, bool)
 
     def _draw(self) -> None:
-        """Colours the Gaussians of the window, sets the controls, and describes the answer or error of each question."""
+        """Colours the Gaussians, sets the controls, and describes the answer or the error of each question."""
         state = self.state
         answers = self.scene.ask_all(state.queries)
         self.layer.paint(_highlight(self.layer.photo, answers), self._visible())
@@ -317,22 +321,14 @@ def _box(text: str, colour: str = "#fa0") -> str:
     return f'<div style="{style}">{text}</div>'
 
 
-def _shown(field: LanguageField, visible: Bool[np.ndarray, " n"]) -> LanguageField:
-    """A field whose other Gaussians are transparent."""
-    logits = jnp.where(jnp.asarray(visible), field.gaussians.opacity_logits, HIDDEN_LOGIT)
-    return dataclasses.replace(field, gaussians=dataclasses.replace(field.gaussians, opacity_logits=logits))
-
-
 def _view_along(origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"], focal: float) -> Camera:
     """A view whose middle pixel looks along a ray in the field's world.
 
     `focal` is the focal length (px) of the view that the ray belongs to: it decides how large a pixel is.
     """
     forward = np.asarray(direction, np.float64) / np.linalg.norm(direction)
-    right = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
-    right /= np.linalg.norm(right)
     pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    pose[:3, :3] = np.stack([*axes_across(forward), forward])
     pose[:3, 3] = -pose[:3, :3] @ np.asarray(origin, np.float64)
     intrinsics = (np.asarray(x, np.float32) for x in (focal, focal, RAY_VIEW_SIDE / 2, RAY_VIEW_SIDE / 2))
     return Camera(pose.astype(np.float32), *intrinsics, width=RAY_VIEW_SIDE, height=RAY_VIEW_SIDE)
@@ -417,7 +413,7 @@ def _view(verb: verbs.View, console: Console) -> verbs.VerbResult:
         _ = scene.embedder
     state = ViewState(tuple(dict.fromkeys(verb.texts)))
     viewer = open_viewer(scene, port=verb.port, state=state)
-    console.print_line(f"{scene.name}: {scene.field.gaussians.count} Gaussians, {scene.field.regions.count} regions")
+    console.print_line(str(scene))
     console.print_line(f"http://127.0.0.1:{viewer.server.get_port()}")
     viewer._run()
     return {}
