@@ -15,7 +15,7 @@ from typing import NamedTuple
 import cv2
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from scipy.spatial.transform import Rotation
 
 from jsecon.change import MIN_PROBABILITY
@@ -483,9 +483,8 @@ class _Search:
     def _frames_near(self, place: np.ndarray) -> list[int]:
         """The frames that see a place, at most _FIT_FRAMES, the nearest first."""
         poses = self.cameras.world_to_camera
-        depths = np.where(
-            points_in_view(self.cameras, place[None])[:, 0], poses[:, 2, :3] @ place + poses[:, 2, 3], np.inf
-        )
+        depths = poses[:, 2, :3] @ place + poses[:, 2, 3]
+        depths[~points_in_view(self.cameras, place[None])[:, 0]] = np.inf
         return [int(t) for t in np.argsort(depths)[:_FIT_FRAMES] if np.isfinite(depths[t])]
 
     def gone(self, k: int, seen: np.ndarray, clusters: list[_Cluster]) -> tuple[Change, list[_Cluster]]:
