@@ -84,8 +84,8 @@ def measure(folder: Path, seed: int, options: Options) -> tuple[dict[str, float]
     run, masked = fields_of_room(folder, seed, options.quick)
     labels, scene = load_lerf_labels(folder / "capture" / "label"), Scene(run.field)
     cameras = {name: run.field.cameras[t] for t, name in enumerate(run.field.names)}
-    rows, summary = evaluation.evaluate(scene, labels, Console(), ("anchored",))["anchored"]
-    _, exact = evaluation.evaluate(Scene(masked.field), labels, Console(), ("anchored",))["anchored"]
+    rows, summary = evaluation.evaluate(scene, labels, Console())
+    _, exact = evaluation.evaluate(Scene(masked.field), labels, Console())
     select = one_step(run, scene.embedder)
     alpha = {"alpha_thresholds": (ALPHA_THRESHOLD,)}
     direct = evaluate_at_thresholds(run.field.gaussians, cameras, labels, select, **alpha)[ALPHA_THRESHOLD][1]

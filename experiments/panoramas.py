@@ -114,7 +114,7 @@ def measure(folder: Path, row: str, room: Room, options: Options) -> dict[str, f
     quality = measure_quality(run.field.gaussians, exact, frames=kept)
     labels = [label_frame(names[t], instances[t], room.names, MIN_LABEL_PIXELS) for t in held_out]
     labels = [label for label in labels if label.objects and label.name in run.capture.names]
-    _, summary = evaluation.evaluate(Scene(run.field), labels, Console(), ("anchored",))["anchored"]
+    _, summary = evaluation.evaluate(Scene(run.field), labels, Console())
     figures = {"registered": len(rows) / 8, "PSNR, dB": float(np.mean(quality.psnr)), "mIoU": float(summary["miou"])}
     errors = (
         pose_errors(np.asarray(run.capture.cameras.world_to_camera[::8], np.float64), panorama_poses(room.seed))

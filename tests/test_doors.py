@@ -178,7 +178,7 @@ def test_the_evaluation(door):
     scene, _, rows = door
     outline = np.ones((80, 100), bool), np.array([[0, 0, 100, 80]], np.float32)
     labels = [LabelledFrame("frame_0", 100, 80, dict.fromkeys(TEXTS, outline))]
-    measured = evaluate(scene, labels, Console(), ("anchored",))["anchored"][0]
+    measured = evaluate(scene, labels, Console())[0]
     assert {row.query: row.selected for row in measured} == {text: len(rows[text]) for text in TEXTS}
 
 

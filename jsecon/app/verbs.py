@@ -477,7 +477,7 @@ class Eval(_FieldVerb):
 
     The protocol is point-level and rendered, on LERF-style labels (one .json per frame): the selected Gaussians alone
     are rendered, and alpha > 0.7 is compared with each labelled mask. A missing prediction counts as 0. Prints mIoU,
-    mAcc@0.25 and localisation accuracy of each kind of query, and writes evaluation.json with every pair.
+    mAcc@0.25 and localisation accuracy, and writes evaluation.json with every pair.
 
     Attributes:
       labels: Folder of LERF label files (frame.json).
@@ -565,7 +565,7 @@ class Doctor(Verb):
     """Checks whether this machine has what runs need.
 
     It prints a line each about the backend's numbers, jax and its devices, cores, memory, the folder of compiled
-    programs and its room, and each extra with the command that installs it. The exit code is 2 if a check fails that
+    programs, and each extra with the command that installs it. The exit code is 2 if a check fails that
     every run depends on. `jsecon models check` examines models.
 
     Attributes:

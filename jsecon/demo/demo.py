@@ -35,7 +35,7 @@ def _demo(verb: verbs.Demo, console: Console) -> verbs.VerbResult:
     run = pipeline.run(options, out, console=console, on_scene=partial(running.show_scene, out, console))
     scene, labels = Scene(run.field), load_lerf_labels(capture / "label")
     console.print_line("measured on the held-out views")
-    rows, summary = evaluation.evaluate(scene, labels, console, ("anchored",))["anchored"]
+    rows, summary = evaluation.evaluate(scene, labels, console)
     texts = sorted({name for frame in labels for name in frame.objects})
     with console.progress("answers"):
         for text in texts:
