@@ -6,27 +6,29 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import jax
 import numpy as np
 
 from jsecon.app import pictures, report, verbs
-from jsecon.app.comparison import LONG_SIDE, Changes, placed_capture, read_similarity, splat_capture
+from jsecon.app.comparison import LONG_SIDE, Changes, splat_capture
 from jsecon.app.opening import locate_field
 from jsecon.app.records import world_record
 from jsecon.app.scene import Scene, open_scene
 from jsecon.change.detect import KINDS
-from jsecon.errors import InputError
-from jsecon.files import FIELD_FILE, csv_text, exclusive_lock, write_text
+from jsecon.errors import InputError, require
+from jsecon.field.ledger import Ledger
+from jsecon.files import FIELD_FILE, csv_text, exclusive_lock, reading, write_text
 from jsecon.numerics import axes_across
+from jsecon.pipeline.new_frames import read_frames
 from jsecon.pipeline.options import is_bare_scene, read_date, require_writable
 from jsecon.pipeline.progress import Console
 from jsecon.pipeline.scene_files import read_scene
 from jsecon.read.captures.capture import load_capture, lone_photographs, taken_on
 from jsecon.splat.sh import C0
+from jsecon.types import Capture, LanguageField, Progress
 from jsecon.views.frame import field_up
 
-_PLAN = 700
-"""Longer side of the plan, px."""
-COLOURS = {"moved": (40, 110, 230), "gone": (220, 50, 60), "new": (20, 150, 80), "look": (190, 120, 20)}
+_COLOURS = {"moved": (40, 110, 230), "gone": (220, 50, 60), "new": (20, 150, 80), "look": (190, 120, 20)}
 """RGB of the kinds of changes."""
 
 
@@ -50,13 +52,37 @@ def _compare(
     scene = open_scene(verb.field, embedder=verb.embedder, console=console)
     with console.progress("photographs") as progress:
         if is_bare_scene(verb.photos):
-            capture = splat_capture(scene.field, read_scene(verb.photos)[0], read_similarity(transform))
+            capture = splat_capture(scene.field, read_scene(verb.photos)[0], _read_similarity(transform))
         elif lone_photographs(verb.photos):
-            capture = placed_capture(scene.field, scene.ledger, verb.photos, refused, progress)
+            capture = _placed_capture(scene.field, scene.ledger, verb.photos, refused, progress)
         else:
             capture = load_capture(verb.photos, long_side=LONG_SIDE, holdout=0, progress=progress)
     with console.progress("changes"):
         return scene, scene.changes(capture, min_probability=verb.min_probability), refused
+
+
+def _placed_capture(
+    field: LanguageField, ledger: Ledger, photos: Path, refused: list[InputError], progress: Progress
+) -> Capture:
+    """Places photographs without poses by the pictures of a field's ledger; `refused` gets the errors of the others."""
+    placed = read_frames(field, ledger, photos, None, refused.append, progress)
+    if not placed:
+        raise refused.pop()
+    cameras = jax.tree.map(lambda *columns: np.stack(columns), *(frame.camera for frame in placed.values()))
+    frames, nothing = np.stack([frame.pixels for frame in placed.values()]), np.zeros((0, 3), np.float32)
+    none, world = np.zeros(len(frames), bool), np.asarray(field.source_from_scene)
+    return Capture(frames, cameras, nothing, nothing.astype(np.uint8), none, None, world, tuple(placed))
+
+
+def _read_similarity(file: Path | None) -> np.ndarray:
+    """Reads a 4x4 similarity from a text file; without one it is the identity."""
+    if file is None:
+        return np.eye(4)
+    with reading(file, "4 rows of 4 numbers: rotation times scale, and shift", "Check it."):
+        matrix = np.loadtxt(file).reshape(4, 4)
+        turn = matrix[:3, :3] / max(np.cbrt(np.linalg.det(matrix[:3, :3])), 1e-12)
+        require(np.allclose(turn @ turn.T, np.eye(3), atol=1e-3), "matrix", "no similarity", "one", "Check it.")
+    return matrix
 
 
 def _update(verb: verbs.Update, console: Console) -> verbs.VerbResult:
@@ -126,13 +152,13 @@ def _page(changes: Changes) -> str:
     records, cards = changes.records(), []
     plan = report.figure(_draw_plan(changes), "From above: blue moved, red gone, green new, brown another look.")
     for change, record in zip(changes.found, records):
-        if change.kind not in COLOURS or not change.frames:
+        if change.kind not in _COLOURS or not change.frames:
             continue
         shown = change.before if change.before.any() else change.after
         t = max(change.frames, key=lambda t: int(shown[t].sum() + change.after[t].sum()))
         camera = changes.capture.cameras[t]
         images = pictures.render_picture(changes.field.gaussians, camera), np.asarray(changes.capture.frames[t])
-        colour = COLOURS[change.kind]
+        colour = _COLOURS[change.kind]
         outlined = [
             pictures.outlined(image, mask, colour, 2)
             for image, mask in zip(images, (change.before[t], change.after[t]))
@@ -140,7 +166,7 @@ def _page(changes: Changes) -> str:
         pair = [report.figure(image, words) for image, words in zip(outlined, ("before", changes.capture.names[t]))]
         title, _, words = " ".join(_words(record).split()).partition(": ")
         cards.append(report.section(title, words, report.grid(pair, 2)))
-    others = [r for r in records if r["kind"] not in COLOURS]
+    others = [r for r in records if r["kind"] not in _COLOURS]
     doubts = [f" ({r['suspected']}?)" if "suspected" in r else "" for r in others]
     rest = [(r["name"], r["id"], r["kind"] + doubt, r["probability"]) for r, doubt in zip(others, doubts)]
     table = report.table(("object", "id", "", "probability"), rest)
@@ -160,7 +186,8 @@ def _draw_plan(changes: Changes) -> np.ndarray:
     near = np.stack([*middle, *(end @ flat for change in changes.found for end in (change.start, change.place))])
     low, high = near.min(0), near.max(0)
     margin = 0.15 * (high - low).max()
-    scale = _PLAN / ((high - low).max() + 2 * margin)
+    side = 700  # px, the longer one
+    scale = side / ((high - low).max() + 2 * margin)
     width, height = np.ceil((high - low + 2 * margin) * scale).astype(int)
 
     def place(point):
@@ -172,10 +199,10 @@ def _draw_plan(changes: Changes) -> np.ndarray:
     heights = means @ up
     top = heights[things].max() if things.any() else np.inf
     for n in np.argsort(heights)[: np.sum(heights <= top)]:
-        cv2.circle(image, place(means[n]), max(int(0.006 * _PLAN), 1), shown[n].tolist(), -1)
+        cv2.circle(image, place(means[n]), 4, shown[n].tolist(), -1)
     for change in changes.found:
-        if change.kind in COLOURS:
-            colour, end = COLOURS[change.kind], place(change.place)
+        if change.kind in _COLOURS:
+            colour, end = _COLOURS[change.kind], place(change.place)
             if change.kind == "moved":
                 cv2.arrowedLine(image, place(change.start), end, colour, 3, cv2.LINE_AA, tipLength=0.12)
             cv2.circle(image, end, 14, colour, 3, cv2.LINE_AA)

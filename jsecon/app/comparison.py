@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -13,24 +12,21 @@ from jsecon.app.catalogue import Catalogue
 from jsecon.app.records import rounded, source_points
 from jsecon.change.detect import Change, object_changes
 from jsecon.change.history import NewThing, add_frames, add_object, dates, move_object, new_view, remove_object
-from jsecon.errors import InputError, require
+from jsecon.errors import InputError
 from jsecon.field.ledger import Ledger
-from jsecon.files import reading
 from jsecon.fit.resize import resize_camera, resize_frame, shrink_cameras
 from jsecon.read.captures.frames import evenly_spaced, transform_poses
 from jsecon.read.captures.images import encode_jpeg
 from jsecon.splat.points import gaussians_from_points
 from jsecon.splat.render import render_depth
 from jsecon.splat.transform import transform_gaussians
-from jsecon.types import Camera, Capture, Gaussians, LanguageField, Progress
+from jsecon.types import Camera, Capture, Gaussians, LanguageField
 from jsecon.views.capture import render_capture
 from jsecon.views.frame import field_up
 from jsecon.vision.protocols import Embedder
 
 LONG_SIDE = 320
 """Longest side at which photographs are compared, px."""
-SPLAT_VIEWS = 8
-"""Views of a field from which another splat is rendered."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,24 +50,27 @@ class Changes:
         return [self._record(change) for change in self.found]
 
     def _record(self, change: Change) -> dict[str, Any]:
-        field, listed = self.field, self.catalogue
-        kinds = {"kind": change.kind} | ({"suspected": change.suspected} if change.suspected else {})
-        record: dict[str, Any] = kinds | {"probability": round(change.probability, 3)}
-        name = str(listed.names[change.object, 0]) if change.object >= 0 else ""
-        ids = {"id": change.object, "region": main_region(field, listed, change.object)} if change.object >= 0 else {}
-        record |= {"name": name} | ({"id": None, "region": None} | ids)
+        field, listed, index = self.field, self.catalogue, change.object
         now, start = source_points(field, np.stack([change.place, change.start]))
         kind = change.suspected or change.kind
-        record["from"] = None if kind == "new" else rounded(start, 1.0)
-        record["to"] = None if kind in ("gone", "not seen") else rounded(now, 1.0)
-        record["distance"] = round(float(np.linalg.norm(now - start)), 4)
         cosine = (np.trace(change.motion[:3, :3]) - 1) / 2
-        record["turned_degrees"] = round(float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))), 1)
-        record["frames"] = [self.capture.names[t] for t in change.frames[:5]]
-        return record
+        is_known = index >= 0
+        return {
+            "kind": change.kind,
+            **({"suspected": change.suspected} if change.suspected else {}),
+            "probability": round(change.probability, 3),
+            "name": str(listed.names[index, 0]) if is_known else "",
+            "id": index if is_known else None,
+            "region": _main_region(field, listed, index) if is_known else None,
+            "from": None if kind == "new" else rounded(start, 1.0),
+            "to": None if kind in ("gone", "not seen") else rounded(now, 1.0),
+            "distance": round(float(np.linalg.norm(now - start)), 4),
+            "turned_degrees": round(float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))), 1),
+            "frames": [self.capture.names[t] for t in change.frames[:5]],
+        }
 
 
-def main_region(field: LanguageField, catalogue: Catalogue, index: int) -> int:
+def _main_region(field: LanguageField, catalogue: Catalogue, index: int) -> int:
     """The region that shows most of an object of the catalogue: its name for good, while ids are those of one field."""
     own = np.flatnonzero(catalogue.regions == index)
     pixels = np.asarray(field.regions.pixel_counts)[own].sum(1)
@@ -188,34 +187,8 @@ def splat_capture(field: LanguageField, gaussians: Gaussians, transform: np.ndar
     into_field = np.linalg.inv(np.asarray(field.source_from_scene, np.float64)) @ transform
     moved = transform_gaussians(gaussians, into_field)
     moved = dataclasses.replace(moved, means=np.asarray(moved.means, np.float32))
-    rows = evenly_spaced(len(field.names), SPLAT_VIEWS)
+    rows = evenly_spaced(len(field.names), 8)
     cameras = shrink_cameras(jax.tree.map(lambda a: np.asarray(a)[rows], field.cameras), LONG_SIDE)
     capture = render_capture(moved, cameras, tuple(field.names[t] for t in rows), np.asarray(field.source_from_scene))
     depths = [np.where(a > 0.5, d, 0) for d, a in (map(np.asarray, render_depth(moved, c)) for c in cameras)]
     return dataclasses.replace(capture, depths=np.stack(depths))
-
-
-def placed_capture(
-    field: LanguageField, ledger: Ledger, photos: Path, refused: list[InputError], progress: Progress
-) -> Capture:
-    """Places photographs without poses by the pictures of a field's ledger; `refused` gets the errors of the others."""
-    from jsecon.pipeline.new_frames import read_frames  # late: questions to a field need none of it
-
-    placed = read_frames(field, ledger, photos, None, refused.append, progress)
-    if not placed:
-        raise refused.pop()
-    cameras = jax.tree.map(lambda *columns: np.stack(columns), *(frame.camera for frame in placed.values()))
-    frames, nothing = np.stack([frame.pixels for frame in placed.values()]), np.zeros((0, 3), np.float32)
-    none, world = np.zeros(len(frames), bool), np.asarray(field.source_from_scene)
-    return Capture(frames, cameras, nothing, nothing.astype(np.uint8), none, None, world, tuple(placed))
-
-
-def read_similarity(file: Path | None) -> np.ndarray:
-    """Reads a 4x4 similarity from a text file; without one it is the identity."""
-    if file is None:
-        return np.eye(4)
-    with reading(file, "4 rows of 4 numbers: rotation times scale, and shift", "Check it."):
-        matrix = np.loadtxt(file).reshape(4, 4)
-        turn = matrix[:3, :3] / max(np.cbrt(np.linalg.det(matrix[:3, :3])), 1e-12)
-        require(np.allclose(turn @ turn.T, np.eye(3), atol=1e-3), "matrix", "no similarity", "one", "Check it.")
-    return matrix
