@@ -12,7 +12,7 @@ from table_field import table_field
 
 from jsecon import save_field
 from jsecon.app import verbs
-from jsecon.app.scene import Scene, open_scenes
+from jsecon.app.scene import Scene
 from jsecon.app.server import MAX_BODY, _serve, application
 from jsecon.pipeline.progress import Console
 from jsecon.vision.colours import ColourEmbedder
@@ -122,9 +122,6 @@ def test_fields_are_opened_by_their_folders_names_and_the_address_is_told(scenes
     for file in files:
         file.parent.mkdir(parents=True)
         save_field(file, scenes["desk"].field)
-    assert [scene.name for scene in open_scenes(files, None).values()] == ["a/desk", "b/desk"]
-    with refused("given twice"):
-        open_scenes([files[0], files[0].parent], None)
     told = _serve(verbs.Serve(fields=[files[0].parent, files[1]], port=0), Console())
     assert int(told["address"].removeprefix("http://127.0.0.1:")) > 0
     assert [scene["name"] for scene in told["fields"]] == ["a/desk", "b/desk"]

@@ -22,7 +22,7 @@ from jsecon.app import pictures
 from jsecon.app.catalogue import Catalogue, objects
 from jsecon.app.comparison import Changes, apply_changes, find_changes, splat_capture
 from jsecon.app.object_index import ObjectIndex, choose_shades
-from jsecon.app.opening import locate_field, name_fields
+from jsecon.app.opening import locate_field
 from jsecon.app.records import Answer, At, Box, Mask, Query, Question, Region, gaussian_rows, world_record
 from jsecon.change import MIN_PROBABILITY
 from jsecon.change.history import change_question, events, field_as_of
@@ -103,15 +103,9 @@ def open_scene(
 
         parse_model(model, "embedder")
         embedder = functools.partial(field_embedder, folder=model)
-    return Scene(field, embedder, up=up, name=named.name, ledger=functools.partial(load_ledger, file, field))
-
-
-def open_scenes(
-    paths: Sequence[Path], embedder: str | Path | None, console: Console | None = None
-) -> "dict[str, Scene]":
-    """Opens fields by their names (`name_fields`), and prepares them for questions."""
-    options = embedder, console or Console()
-    return {name: open_prepared(name, path, *options) for name, path in name_fields(paths).items()}
+    has_ledger = "ledger" in parse_json(field.provenance)
+    ledger = functools.partial(load_ledger, file, field) if has_ledger else None
+    return Scene(field, embedder, up=up, name=named.name, ledger=ledger)
 
 
 def open_prepared(name: str, path: Path, embedder: str | Path | None, console: Console) -> "Scene":
@@ -166,7 +160,7 @@ class Scene:
       embedder: Its embedder, or a function that makes one of the field; None opens it when a text needs it.
       up: Up axis of the capture's world; None takes the field's own.
       name: Name of the scene.
-      ledger: Returns the ledger of the field's views, which `add` and `forget` need.
+      ledger: Returns the ledger of the field's views, which `add` and `forget` need; None if the field has none.
 
     Attributes:
       field: The field.
@@ -239,7 +233,8 @@ class Scene:
         """
         self._require_memory("a change of its views")
         if self._read_ledger is None:
-            raise InputError(f"scene {self.name}", "it has no ledger of its views", remedy="Open it by open_scene.")
+            remedy = "Make the field again with jsecon run, without --no-ledger; the finished stages are reused."
+            raise InputError(f"scene {self.name}", "the field has no ledger of its views", remedy=remedy)
         return self._read_ledger()
 
     def add(
@@ -292,7 +287,8 @@ class Scene:
             if not views:
                 raise errors.pop()
             with console.progress("votes"):
-                return self._with(*add_views(self.field, ledger, views))
+                field, grown = add_views(self.field, ledger, views)
+                return self._with(field, lambda: grown)
 
     def forget(self, frames: Sequence[int | str]) -> "Scene":
         """Takes frames out: votes, embeddings, poses and pictures, as if they had never been there.
@@ -313,16 +309,14 @@ class Scene:
             if names >= {*self.ledger.views}:
                 raise InputError("frames", "no frame with evidence would be left", remedy="Delete the field instead.")
             field = forget_warnings(self.field, sorted(names))
-            return self._with(*forget_views(field, self.ledger, names))
+            field, ledger = forget_views(field, self.ledger, names)
+            return self._with(field, lambda: ledger)
 
-    def _with(self, field: LanguageField, ledger: Ledger | None = None) -> "Scene":
-        """A scene of another state of the field, with the same ledger if its provenance names one and none is given."""
-        is_same = ledger is None and "ledger" in parse_json(field.provenance)
-        scene = Scene(field, self._embedder, up=self._up, name=self.name, ledger=self._read_ledger if is_same else None)
-        kept = ("embedder", "ledger") if is_same else ("embedder",)
-        vars(scene).update({name: vars(self)[name] for name in kept if name in vars(self)})
-        if ledger is not None:
-            vars(scene)["ledger"] = ledger
+    def _with(self, field: LanguageField, ledger: Callable[[], Ledger] | None) -> "Scene":
+        """A scene of another state of the field, with what returns its ledger."""
+        scene = Scene(field, self._embedder, up=self._up, name=self.name, ledger=ledger)
+        if "embedder" in vars(self):
+            scene.embedder = self.embedder
         return scene
 
     def save(self, path: str | Path) -> None:
@@ -335,12 +329,8 @@ class Scene:
           InputError: The folder cannot be written.
         """
         path = Path(path)
-        save_with_ledger(path, move_hints(self.field, path.parent), self._kept_ledger())
-
-    def _kept_ledger(self) -> Ledger | None:
-        """The ledger, None if the field has none."""
-        has_ledger = "ledger" in vars(self) or "ledger" in parse_json(self.field.provenance)
-        return self.ledger if has_ledger else None
+        ledger = None if self._read_ledger is None else self.ledger
+        save_with_ledger(path, move_hints(self.field, path.parent), ledger)
 
     def _require_memory(self, what: str) -> None:
         """Raises InputError if the field is mapped, which `what` needs in memory."""
@@ -609,7 +599,7 @@ class Scene:
         if not length > 0 or not metres > 0:
             problem = f"{metres:g} m are not the length between {a} and {b}, which are {length:g} units apart"
             raise InputError("scale", problem, remedy="Give two places and the length between them.")
-        return self._with(dataclasses.replace(self.field, metres_per_unit=metres / length))
+        return self._with(dataclasses.replace(self.field, metres_per_unit=metres / length), self._read_ledger)
 
     @functools.cached_property
     def _catalogue(self) -> Catalogue:
@@ -674,7 +664,9 @@ class Scene:
         date = read_date(date)
         with self._lock:
             changes = self.changes(changes) if isinstance(changes, Capture) else changes
-            return self._with(*apply_changes(changes, self.embedder, date, self._kept_ledger()))
+            ledger = None if self._read_ledger is None else self.ledger
+            field, kept = apply_changes(changes, self.embedder, date, ledger)
+            return self._with(field, None if kept is None else lambda: kept)
 
     def as_of(self, date: str) -> "Scene":
         """The scene as it was at the end of a date, such as "2026-11-01".
@@ -682,7 +674,8 @@ class Scene:
         Raises:
           InputError: The date is none.
         """
-        return self._with(field_as_of(self.field, read_date(date, "--as-of")))
+        field = field_as_of(self.field, read_date(date, "--as-of"))
+        return self._with(field, self._read_ledger if field is self.field else None)
 
     def history(self) -> list[dict[str, Any]]:
         """Plain values of each change of the field since it was made, in order of time."""

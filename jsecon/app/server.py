@@ -27,9 +27,9 @@ from starlette.exceptions import HTTPException as AnyHTTPException
 import jsecon
 from jsecon.app import verbs
 from jsecon.app.access import bracketed, is_allowed_host, listen, token_for
-from jsecon.app.opening import find_scene
+from jsecon.app.opening import find_scene, name_fields
 from jsecon.app.records import At, Query
-from jsecon.app.scene import Scene, open_scenes
+from jsecon.app.scene import Scene, open_prepared
 from jsecon.errors import InputError
 from jsecon.pipeline.progress import Console
 
@@ -242,7 +242,9 @@ def _serve(verb: verbs.Serve, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon serve`: address, fields, and under "then" what answers requests until it is stopped."""
     token = token_for(verb.host, verb.token)
     listening = listen(verb.host, verb.port)
-    scenes = open_scenes(verb.fields, verb.embedder, console)
+    scenes = {
+        name: open_prepared(name, path, verb.embedder, console) for name, path in name_fields(verb.fields).items()
+    }
     # The limit counts cheap requests too; those beyond it get 503.
     options: dict[str, Any] = {"timeout_keep_alive": 5, "limit_concurrency": 256}
     app = application(scenes, token=token)
