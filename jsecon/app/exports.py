@@ -91,7 +91,6 @@ def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
     has_labels = verb.out is not None and (verb.with_labels or points or suffix == ".usda")
     with console.progress("objects"):
         listed = _list_objects(scene, has_labels or verb.out is None or bool(verb.objects or verb.shapes), console)
-        records = [] if listed is None else listed.records()
     written = result["written"]
     with console.progress("files"):
         if verb.out is not None:
@@ -105,7 +104,7 @@ def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
             written["objects"] = _save_objects(scene, verb.objects)
             console.print_line(f"{len(written['objects'])} objects  {verb.objects}")
         if verb.shapes is not None and listed is not None:
-            written["shapes"] = write_shapes(scene, listed, records, verb.shapes)
+            written["shapes"] = write_shapes(scene, listed, verb.shapes)
             console.print_line(f"shapes  {verb.shapes}")
         files = [written.get("scene"), *written.get("objects", [])[:1], *written.get("shapes", [])[:1]]
         if listed is not None:

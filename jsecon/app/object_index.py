@@ -217,7 +217,6 @@ class ObjectIndex:
         place = next((n for n, outcome in enumerate(outcomes) if outcome.chosen), 0)
         best, others = outcomes[place], outcomes[place + 1 :]
         chosen = {found.regions for found in best.chosen}
-        differing = [found for outcome in others for found in outcome.chosen if found.regions not in chosen]
         question = ""
         if best.undecided:
             number = str(len(best.chosen)) if best.undecided is best.chosen else "which"
@@ -246,7 +245,6 @@ class ObjectIndex:
             viewpoint=words if expression.depends_on_view else "",
             up=self._up_axis if expression.conditions or expression.thing.order else None,
             used=tuple(best.used),
-            alternatives=tuple({found.regions: found for found in [*best.alternatives, *differing]}.values()),
             question=question,
         )
 

@@ -150,7 +150,6 @@ class Answer:
       reading: With by="relation", how the text was read; else "".
       viewpoint: From where directions were seen; "" if nothing depends on it.
       used: The objects that `objects` were compared with.
-      alternatives: Other objects of the name, best first.
       question: What would settle which object is meant; "" if nothing has to be.
       up: Which way was up in the field's world, if the text has a relation or an order.
     """
@@ -168,7 +167,6 @@ class Answer:
     reading: str = ""
     viewpoint: str = ""
     used: tuple[Object, ...] = ()
-    alternatives: tuple[Object, ...] = ()
     question: str = ""
     up: UpAxis | None = None
 
@@ -244,7 +242,7 @@ class Answer:
         relation: dict[str, Any] = {name: getattr(self, name) for name in ("reading", "viewpoint", "question")}
         relation["ambiguous"] = bool(self.question)
         relation["up"] = None if self.up is None else dataclasses.asdict(source_up(self.field, self.up))
-        for name in ("objects", "used", "alternatives"):
+        for name in ("objects", "used"):
             relation[name] = [self._object_record(found) for found in getattr(self, name)]
         return record | {"relation": relation}
 

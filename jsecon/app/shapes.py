@@ -40,14 +40,14 @@ class _Item(NamedTuple):
         return Rotation.from_matrix(self.solid.axes)
 
 
-def write_shapes(scene: Scene, listed: Catalogue, records: list[dict[str, Any]], out: Path) -> list[Path]:
+def write_shapes(scene: Scene, listed: Catalogue, out: Path) -> list[Path]:
     """Writes the solids of all whole objects but surroundings, as the file's suffix says, or in a folder as all four.
 
     They stand in the capture's world, in metres if the field knows their length.
     """
     scale = scene.field.metres_per_unit or 1.0
     items = []
-    for record in records:
+    for record in listed.records():
         if record["parent"] is None and not record["surroundings"]:
             shape = listed.shapes[record["id"]]
             gaussians = gaussian_rows(scene.field.gaussians, listed.mask(record["id"]))

@@ -51,8 +51,6 @@ class _ReferringResult:
 
     chosen: list[Object]
     """The objects, best first."""
-    alternatives: list[Object] = dataclasses.field(default_factory=list)
-    """Other objects of the name, with scores of at least 0.2, best first."""
     used: list[Object] = dataclasses.field(default_factory=list)
     """The objects that they were compared with."""
     undecided: list[Object] = dataclasses.field(default_factory=list)
@@ -101,30 +99,26 @@ def evaluate(
         candidates = [dataclasses.replace(found, conditions=row) for found, row in zip(candidates, named)]
     valid = [k for k, found in enumerate(candidates) if found.score >= SATISFIED]
     valid = [k for k in valid if all(np.isfinite(values[k]) for _, values in orders)]
-    rest = [k for k in range(len(candidates)) if k not in valid and candidates[k].score >= 0.2]
     if not valid:
-        return _ReferringResult([], [candidates[k] for k in rest], used, reason=_nearest_miss(candidates))
+        return _ReferringResult([], used, reason=_nearest_miss(candidates))
     matches = len(valid)
     valid.sort(key=lambda k: -candidates[k].score)
     if thing.order is not None:
         orders.append((thing.order, np.asarray(order_values(shapes, view)[thing.order])))
     close: list[int] = []
-    others: list[int] = []
     for name, values in orders:
         count = len(valid)
-        valid, close, others = _ordered(shapes, valid, values, thing, name)
+        valid, close = _ordered(shapes, valid, values, thing, name)
         if not valid:
             reason = f"there are {count} {thing.text!r}, so none is number {thing.rank}"
-            return _ReferringResult([], [candidates[k] for k in others], used, reason=reason)
+            return _ReferringResult([], used, reason=reason)
     chosen = [candidates[k] for k in valid]
-    alternatives = [candidates[k] for k in dict.fromkeys([*close, *others, *rest])]
     undecided = [chosen[-1], *(candidates[k] for k in close)] if close else []
     if len(chosen) > 1 and not thing.every and not orders and thing.number is None:
         undecided = chosen
     counts = [(thing.number, len(chosen)), (thing.among, matches)]
     wrong = [f"the text says {said} and {count} match" for said, count in counts if said not in (None, count)]
-    reason = "; ".join(wrong)
-    return _ReferringResult(chosen, alternatives, used, undecided, reason)
+    return _ReferringResult(chosen, used, undecided, "; ".join(wrong))
 
 
 def _apart(a: Sequence[Object], b: Sequence[Object]) -> Bool[np.ndarray, "k l"]:
@@ -160,8 +154,8 @@ def _condition_scores(
 
 def _ordered(
     shapes: ObjectShapes, valid: Sequence[int], values: np.ndarray, thing: NounPhrase, name: str
-) -> tuple[list[int], list[int], list[int]]:
-    """Chooses by an order: the objects, the others that are as good by a hair, and all others."""
+) -> tuple[list[int], list[int]]:
+    """Chooses by an order: the objects, and the others that are as good by a hair."""
     ranked = sorted(valid, key=lambda k: values[k])
     count = (thing.number or 1) if thing.every or (thing.number or 0) > 1 else 1
     first = thing.rank - 1 if name not in ANCHORED_ORDERS else 0
@@ -170,7 +164,7 @@ def _ordered(
     # Within 0.02 radians, or 0.08 of the mean half of the sides, neither is clearly before the other.
     tolerance = 0.02 if name in ("leftmost", "rightmost") else 0.08 * np.median(shapes.half_size.mean(-1)[ranked])
     close = [k for k in others if chosen and min(abs(values[k] - values[c]) for c in chosen) <= tolerance]
-    return chosen, close, others
+    return chosen, close
 
 
 def _nearest_miss(candidates: Sequence[Object]) -> str:
