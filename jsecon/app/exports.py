@@ -4,7 +4,6 @@ import contextlib
 import json
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from jsecon.app.scene import Scene, open_scene
 from jsecon.app.shapes import require_shapes_format, write_shapes
 from jsecon.errors import InputError
 from jsecon.field.columns import is_mapped
-from jsecon.files import remove_files, write_text
+from jsecon.files import parse_json, remove_files, write_text
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console
 from jsecon.query.outliers import MIN_SAMPLES
@@ -100,8 +99,8 @@ def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
             console.print_line(
                 f"{'points of ' * points}{count} Gaussians, {result['bytes'] / 2**20:.1f} MiB  {verb.out}"
             )
-        if verb.objects is not None:
-            written["objects"] = _save_objects(scene, verb.objects)
+        if verb.objects is not None and listed is not None:
+            written["objects"] = _save_objects(scene, listed, verb.objects)
             console.print_line(f"{len(written['objects'])} objects  {verb.objects}")
         if verb.shapes is not None and listed is not None:
             written["shapes"] = write_shapes(scene, listed, verb.shapes)
@@ -143,31 +142,26 @@ def _check_export(verb: verbs.Export) -> None:
         raise InputError("--objects", problem, remedy="Leave one of them out.")
 
 
-def _save_objects(scene: Scene, folder: Path) -> list[Path]:
+def _save_objects(scene: Scene, listed: Catalogue, folder: Path) -> list[Path]:
     """Writes a .ply of each object, named by its id and name; of a whole with the Gaussians of its parts.
 
-    They replace those that an earlier export wrote to the folder.
+    They replace those of an earlier export to the folder, whose labels.json names them.
     """
+    earlier: list[str] = []
+    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # there is none, or it is another program's
+        earlier = [_object_file(record) for record in parse_json((folder / "labels.json").read_bytes())["objects"]]
+    remove_files(folder, earlier)
     files = []
-    catalogue = scene.objects()
-    remove_files(folder, [file.name for file in folder.glob("*.ply") if _is_exported_object(file)])
-    for record in catalogue.records():
-        name = slug(_title(record)).encode()[:60].decode("utf-8", "ignore")
-        files.append(folder / f"{record['id']:03d}-{name}.ply")
-        scene.export(files[-1], catalogue.mask(record["id"]), comment=_object_comment(files[-1]))
+    for record in listed.records():
+        files.append(folder / _object_file(record))
+        scene.export(files[-1], listed.mask(record["id"]))
     return files
 
 
-def _object_comment(file: Path) -> str:
-    """Returns the comment in the file of an object, which tells it from a file that has another origin or name."""
-    return f"jsecon object {quote(file.name)}"
-
-
-def _is_exported_object(file: Path) -> bool:
-    """Whether an earlier export of objects wrote this file under this name."""
-    with contextlib.suppress(OSError), file.open("rb") as opened:
-        return f"comment {_object_comment(file)}\n".encode() in opened.read(2000)
-    return False
+def _object_file(record: dict[str, Any]) -> str:
+    """Names the file of an object by its id and name."""
+    name = slug(_title(record)).encode()[:60].decode("utf-8", "ignore")
+    return f"{record['id']:03d}-{name}.ply"
 
 
 def _page(scene: Scene, catalogue: Catalogue, records: list[dict[str, Any]], console: Console) -> str:

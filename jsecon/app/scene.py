@@ -809,7 +809,6 @@ class Scene:
         *,
         labels: Catalogue | None = None,
         points: bool = False,
-        comment: str = "",
     ) -> None:
         """Writes Gaussians in the world of the capture's files, in blocks, so that a mapped field need not fit memory.
 
@@ -820,7 +819,6 @@ class Scene:
             a .usda a prim for each object; a .spz has no place for them.
           points: Whether to write, in place of Gaussians, the points of the file that the field was made of or that its
             fit started from: those whose nearest Gaussian is near and written, with its labels; all without `selected`.
-          comment: As for `save_gaussians`.
 
         Raises:
           InputError: The file cannot be written, or the field has no points.
@@ -844,7 +842,7 @@ class Scene:
         if mask is not None:
             rows = np.flatnonzero(mask)
             gaussians, ids = gaussian_rows(gaussians, rows), {name: column[rows] for name, column in ids.items()}
-        save_gaussians(file, gaussians, similarity=world, ids=ids, names=names, comment=comment)
+        save_gaussians(file, gaussians, similarity=world, ids=ids, names=names)
 
 
 def locate(

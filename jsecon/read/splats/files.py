@@ -303,7 +303,6 @@ def save_gaussians(
     ids: Mapping[str, Int[Array, " n"]] = MappingProxyType({}),
     names: Sequence[str] = (),
     similarity: Float[Array, "4 4"] | None = None,
-    comment: str = "",
 ) -> None:
     """Writes Gaussians as a .ply (INRIA's layout, exact), a .glb, a .usda, or a .spz (version 3, by gsply).
 
@@ -318,7 +317,6 @@ def save_gaussians(
         .glb. A .usda has a prim for each "object_id". A .spz has no place.
       names: Names of the objects by id, for a .usda.
       similarity: (4, 4) transform into the world of the file.
-      comment: ASCII line for the header of a .ply; the other formats have no place.
 
     Raises:
       ValueError: Shapes disagree.
@@ -332,7 +330,7 @@ def save_gaussians(
         require_shape(name, column, (gaussians.count,), "Give one id per Gaussian.")
     if not gaussians.count and path.suffix.lower() != ".ply":
         raise InputError(path, "there are no Gaussians to write", remedy="Write a .ply, which may be empty.")
-    options: dict[str, Any] = {".ply": {"comment": comment}, ".usda": {"names": names}}.get(path.suffix.lower(), {})
+    options = {"names": names} if path.suffix.lower() == ".usda" else {}
     _WRITERS[path.suffix.lower()](path, gaussians, ids, similarity, **options)
 
 

@@ -233,7 +233,6 @@ def save_ply(
     gaussians: Gaussians,
     ids: Mapping[str, Int[Array, " n"]],
     similarity: Float[Array, "4 4"] | None,
-    comment: str = "",
 ) -> None:
     """Writes Gaussians in INRIA's layout: binary little endian float32, normals zero, f_rest channel-major.
 
@@ -247,13 +246,13 @@ def save_ply(
     properties = [f"property {kind} {name}" for kind, name in zip(kinds, names)]
     properties += [f"property int {name}" for name in ids]
     with atomic_write(path) as temporary, temporary.open("wb") as file:
-        file.write(_header(gaussians.count, properties, comment))
+        file.write(_header(gaussians.count, properties))
         for rows, block in usable_blocks(path, gaussians, similarity):
             own = {name: np.asarray(column[rows]) for name, column in ids.items()}
             file.write(_table(block, is_double, own).tobytes())  # tofile hides a full disk
 
 
-def _header(count: int, properties: list[str], comment: str) -> bytes:
+def _header(count: int, properties: list[str], comment: str = "") -> bytes:
     comments = [f"comment {comment}"] if comment else []
     start = ["ply", "format binary_little_endian 1.0", *comments, f"element vertex {count}"]
     return "\n".join([*start, *properties, "end_header\n"]).encode()
