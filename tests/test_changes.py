@@ -14,7 +14,7 @@ from small_field import lone_votes
 from starlette.testclient import TestClient
 
 from experiments.rooms.writers import write_colmap
-from jsecon import InputError, LanguageField, Regions, Scene, load_field, save_field
+from jsecon import InputError, LanguageField, Regions, Scene, load_field
 from jsecon.app.scene import open_scene
 from jsecon.app.server import application
 from jsecon.change.compare import depth_cost
@@ -105,28 +105,33 @@ def test_depth_shows_low_things_and_no_edge_that_lies_a_pixel_off():
     assert np.isnan(depth_cost(np.zeros((12, 12)), table)).all()
 
 
+def field_with_ledger(gaussians, labels, eyes, frames):
+    """The field that a run makes of three views, whose masks are the bars, and its ledger."""
+    embedder, views, things = ColourEmbedder(), {}, np.eye(4, dtype=np.float32)[labels] * (labels >= 0)[:, None]
+    for name, camera, frame in zip(("a", "b", "c"), eyes, frames):
+        shares = np.asarray(render(gaussians, camera, things, depth=True).features)
+        image = np.where(shares.max(-1) > 0.5, shares.argmax(-1), -1)
+        evidence = pack_evidence(view_evidence(gaussians, camera, image, 3), 3)
+        shown, pixels = np.unique(image[image >= 0], return_counts=True)
+        rows = embedder.embed_regions(frame, image[None] == shown[:, None, None])
+        pixels = np.stack([shown, pixels]).astype(np.int32)
+        views[name] = LedgerView(evidence, pixels, pixels[0], rows, camera_row(camera), encode_jpeg(frame))
+    empty = Regions(np.zeros((3, embedder.dim), np.float32), np.zeros((3, 0), np.int32))
+    votes = dataclasses.replace(lone_votes(np.maximum(labels, 0), 3), overlap=np.eye(3, dtype=np.float32))
+    words = embedder.canonical_phrases, np.eye(4), (), embedder.name
+    more = {"unrelated_words": embedder.unrelated_words, "up": UpAxis((0.0, 0.0, 1.0), "given")}
+    none = jax.tree.map(lambda a: np.asarray(a)[:0], eyes)
+    return add_views(LanguageField(gaussians, votes, empty, none, *words, **more), Ledger(3, {}), views)
+
+
 def test_an_updated_field_answers_as_things_are_now_and_as_they_were(eyes, tmp_path):
     before, labels = scene_of(red=PLACES["red"], blue=PLACES["blue"], green=PLACES["green"])
     after, _ = scene_of(red=(-0.1, -0.05), green=PLACES["green"], orange=PLACES["orange"])
     embedder = ColourEmbedder()
-    votes = lone_votes(np.maximum(labels, 0), 3)
-    votes = dataclasses.replace(
-        votes, views=np.where(labels < 0, 0, 3).astype(np.int32), overlap=np.eye(3, dtype=np.float32)
-    )
-    regions = Regions(embedder.embed_text(["red", "blue", "green"]), np.full((3, 3), 400, np.int32))
-    words = embedder.canonical_phrases, np.eye(4), ("a", "b", "c"), embedder.name
-    field = LanguageField(
-        before,
-        votes,
-        regions,
-        eyes,
-        *words,
-        unrelated_words=embedder.unrelated_words,
-        up=UpAxis((0.0, 0.0, 1.0), "given"),
-    )
+    field, ledger = field_with_ledger(before, labels, eyes, photographs(before, eyes))
     old = Scene(field, embedder)
     capture = capture_of(photographs(after, eyes), eyes, np.zeros(3, bool))
-    save_field(tmp_path / "old.safetensors", field)
+    save_with_ledger(tmp_path / "old.safetensors", field, ledger)
     write_colmap(capture, tmp_path / "photos")
     options = "--out", tmp_path / "new", "--date", "2026-11-28"
     assert run_cli("update", tmp_path / "old.safetensors", tmp_path / "photos", *options) == 0
@@ -149,25 +154,8 @@ def test_an_updated_field_answers_as_things_are_now_and_as_they_were(eyes, tmp_p
         np.testing.assert_array_equal(then.ask(text).rows, old.ask(text).rows)
     with pytest.raises(InputError, match="before the last change"):
         new.update(capture, date="2026-11-01")
-
-
-def field_with_ledger(gaussians, labels, eyes, frames):
-    """The field that a run makes of three views, whose masks are the bars, and its ledger."""
-    embedder, views, things = ColourEmbedder(), {}, np.eye(4, dtype=np.float32)[labels] * (labels >= 0)[:, None]
-    for name, camera, frame in zip(("a", "b", "c"), eyes, frames):
-        shares = np.asarray(render(gaussians, camera, things, depth=True).features)
-        image = np.where(shares.max(-1) > 0.5, shares.argmax(-1), -1)
-        evidence = pack_evidence(view_evidence(gaussians, camera, image, 3), 3)
-        shown, pixels = np.unique(image[image >= 0], return_counts=True)
-        rows = embedder.embed_regions(frame, image[None] == shown[:, None, None])
-        pixels = np.stack([shown, pixels]).astype(np.int32)
-        views[name] = LedgerView(evidence, pixels, pixels[0], rows, camera_row(camera), encode_jpeg(frame))
-    empty = Regions(np.zeros((3, embedder.dim), np.float32), np.zeros((3, 0), np.int32))
-    votes = dataclasses.replace(lone_votes(np.maximum(labels, 0), 3), overlap=np.eye(3, dtype=np.float32))
-    words = embedder.canonical_phrases, np.eye(4), (), embedder.name
-    more = {"unrelated_words": embedder.unrelated_words, "up": UpAxis((0.0, 0.0, 1.0), "given")}
-    none = jax.tree.map(lambda a: np.asarray(a)[:0], eyes)
-    return add_views(LanguageField(gaussians, votes, empty, none, *words, **more), Ledger(3, {}), views)
+    with pytest.raises(InputError, match="no ledger of its views"):
+        old.update(capture, date="2026-11-28")
 
 
 def test_frames_are_added_and_forgotten_after_an_update_and_it_is_updated_again(eyes, tmp_path):

@@ -41,4 +41,3 @@ def test_what_every_run_needs_and_is_wrong_is_exit_code_2(capsys, monkeypatch):
     assert "without ximgproc" in checks["packages"][1]
     assert {error["where"] for error in printed["errors"]} == {"packages", "backend", "memory"}
     assert all(error["remedy"] for error in printed["errors"])
-

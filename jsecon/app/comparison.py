@@ -11,9 +11,10 @@ import numpy as np
 from jsecon.app.catalogue import Catalogue
 from jsecon.app.records import rounded, source_points
 from jsecon.change.detect import Change, object_changes
-from jsecon.change.history import NewThing, add_frames, add_object, dates, move_object, new_view, remove_object
+from jsecon.change.history import add_objects, dates, move_object, remove_object
 from jsecon.errors import InputError
-from jsecon.field.ledger import Ledger
+from jsecon.field.evidence import ViewEvidence, pack_evidence
+from jsecon.field.ledger import Ledger, LedgerView, camera_row
 from jsecon.fit.resize import resize_camera, resize_frame, shrink_cameras
 from jsecon.read.captures.frames import evenly_spaced, transform_poses
 from jsecon.read.captures.images import encode_jpeg
@@ -108,16 +109,8 @@ def apply_changes(
     field, listed = changes.field, changes.catalogue
     if date < (last := dates(field)[-1]):
         raise InputError("--date", f"{date} is before the last change of the field, {last}", remedy="Check it.")
-    found = list(zip(changes.found, changes.records()))
-    new = [change for change, _ in found if change.kind == "new" and change.frames]
-    shown = sorted({t for change in new for t in change.frames})
-    names = {t: _new_name(changes.capture.names[t], date, field.names) for t in shown}
-    if shown:
-        cameras = jax.tree.map(lambda a: np.asarray(a)[shown], changes.capture.cameras)
-        sized = resize_camera(cameras, field.cameras.width, field.cameras.height)
-        field = add_frames(field, sized, [names[t] for t in shown])
-    for change, record in found:
-        description = record | {"date": date}
+    found = [(change, record | {"date": date}) for change, record in zip(changes.found, changes.records())]
+    for change, description in found:
         mask = np.zeros(field.gaussians.count, bool)
         if change.object >= 0:
             mask[: len(listed.labels)] = listed.labels == change.object
@@ -127,15 +120,23 @@ def apply_changes(
             field = remove_object(field, mask, np.flatnonzero(listed.regions == change.object).tolist(), description)
         elif change.kind == "look":
             field = remove_object(field, mask & False, (), description)
-        elif change.kind == "new" and change.frames:
-            field = add_object(field, _new_thing(changes, change, embedder, names), description)
+    new = [(change, description) for change, description in found if change.kind == "new" and change.frames]
+    if not new:
+        return field, ledger
     if ledger is None:
-        return field, None
-    views = {}
-    for t, name in names.items():
-        camera = jax.tree.map(np.asarray, field.cameras)[field.names.index(name)]
-        views[name] = new_view(field, name, encode_jpeg(resize_frame(np.asarray(changes.capture.frames[t]), camera)))
-    return field, Ledger(field.regions.count, {**ledger.views, **views})
+        remedy = "Make the field again with jsecon run, without --no-ledger."
+        raise InputError("field", "it has no ledger of its views, which gets what is new", remedy=remedy)
+    things = [_new_gaussians(changes, change) for change, _ in new]
+    first = np.cumsum([field.gaussians.count, *(thing.count for thing in things)])
+    views: dict[str, LedgerView] = {}
+    for t in sorted({t for change, _ in new for t in change.frames}):
+        shown = [k for k, (change, _) in enumerate(new) if t in change.frames]
+        rows = np.concatenate([np.arange(first[k], first[k + 1]) for k in shown])
+        regions = np.repeat(field.regions.count + np.array(shown), [things[k].count for k in shown])
+        masks = np.stack([new[k][0].after[t] for k in shown])
+        name = _new_name(changes.capture.names[t], date, (*field.names, *views))
+        views[name] = _new_view(changes, embedder, t, masks, rows, regions)
+    return add_objects(field, ledger, things, views, [description for _, description in new])
 
 
 def _new_name(name: str, date: str, known: tuple[str, ...]) -> str:
@@ -144,25 +145,41 @@ def _new_name(name: str, date: str, known: tuple[str, ...]) -> str:
     return next(option for option in options if option not in known)
 
 
-def _new_thing(changes: Changes, change: Change, embedder: Embedder, names: dict[int, str]) -> NewThing:
-    """The Gaussians and the embedding of something new, from the pixels that show it."""
-    capture, field = changes.capture, changes.field
-    points, colours, total = [], [], np.zeros(())
+def _new_view(
+    changes: Changes, embedder: Embedder, t: int, masks: np.ndarray, rows: np.ndarray, regions: np.ndarray
+) -> LedgerView:
+    """What a frame contributes that shows new things: their masks (M, H, W), Gaussians, and the regions of these.
+
+    Each Gaussian has a weight of 4 px in it, and 0.9 at its strongest pixel.
+    """
+    size, capture = changes.field.cameras, changes.capture
+    frame, camera = np.asarray(capture.frames[t]), jax.tree.map(lambda a: np.asarray(a)[t], capture.cameras)
+    weights, peaks = np.full(len(rows), 4.0, np.float32), np.full(len(rows), 0.9, np.float32)
+    starts = np.arange(len(rows) + 1, dtype=np.int32)
+    evidence = ViewEvidence(rows.astype(np.int32), starts, regions.astype(np.int32), weights, peaks)
+    larger = size.width * size.height / frame[..., 0].size
+    pixels = np.stack([np.unique(regions), np.rint(larger * masks.sum((1, 2)))]).astype(np.int32)
+    embeddings = np.asarray(embedder.embed_regions(frame, masks), np.float32)
+    camera = resize_camera(camera, size.width, size.height)
+    picture = encode_jpeg(resize_frame(frame, camera))
+    packed = pack_evidence(evidence, int(regions.max()) + 1)
+    return LedgerView(packed, pixels, pixels[0], embeddings, camera_row(camera), picture)
+
+
+def _new_gaussians(changes: Changes, change: Change) -> Gaussians:
+    """The Gaussians of something new, from the pixels that show it."""
+    capture = changes.capture
+    points, colours = [], []
     for t in change.frames:
-        mask, frame = change.after[t], np.asarray(capture.frames[t])
+        mask = change.after[t]
         camera = jax.tree.map(lambda a, t=t: np.asarray(a)[t], capture.cameras)
         depth = None if capture.depths is None else np.asarray(capture.depths[t])
         points.append(_surface(mask, camera, change.place, depth))
-        colours.append(frame[mask])
-        total = total + mask.sum() * np.asarray(embedder.embed_regions(frame, mask[None]), np.float64)[0]
+        colours.append(np.asarray(capture.frames[t])[mask])
     gaussians = gaussians_from_points(np.concatenate(points), np.concatenate(colours), opacity=0.9, scale=0.6)
-    bands = np.asarray(field.gaussians.sh).shape[1]
-    sh = np.zeros((gaussians.count, bands, 3), np.float32)
+    sh = np.zeros((gaussians.count, np.asarray(changes.field.gaussians.sh).shape[1], 3), np.float32)
     sh[:, 0] = np.asarray(gaussians.sh)[:, 0]
-    columns: Gaussians = dataclasses.replace(jax.tree.map(np.asarray, gaussians), sh=sh)
-    scale = field.cameras.width * field.cameras.height / (capture.cameras.width * capture.cameras.height)
-    pixels = {names[t]: round(int(change.after[t].sum()) * scale) for t in change.frames}
-    return NewThing(columns, (total / max(np.linalg.norm(total), 1e-12)).astype(np.float32), pixels)
+    return dataclasses.replace(jax.tree.map(np.asarray, gaussians), sh=sh)
 
 
 def _surface(mask: np.ndarray, camera: Camera, place: np.ndarray, depth: np.ndarray | None) -> np.ndarray:

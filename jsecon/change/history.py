@@ -9,19 +9,18 @@ import dataclasses
 import json
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 
 from jsecon.errors import InputError
-from jsecon.field.evidence import ViewEvidence, pack_evidence
-from jsecon.field.ledger import LedgerView, camera_row, grown_tree
+from jsecon.field.ledger import Ledger, LedgerView, add_views
 from jsecon.files import parse_json
 from jsecon.query.render import HIDDEN_LOGIT
 from jsecon.splat.transform import transform_gaussians
-from jsecon.types import Camera, Event, Gaussians, LanguageField
+from jsecon.types import Event, Gaussians, LanguageField
 
 _QUESTION = re.compile(
     r"(?:what|which (?:things?|objects?))(?:'s| has| have| is| are| was| were)?"
@@ -30,20 +29,6 @@ _QUESTION = re.compile(
 )
 _KINDS = {"moved": "moved", "changed": ""} | dict.fromkeys(("new", "added", "appeared"), "new")
 _KINDS |= dict.fromkeys(("gone", "missing", "disappeared", "removed"), "gone")
-
-
-_WEIGHT, _PEAK = np.float32(4.0), np.float32(0.9)
-"""Weight of a Gaussian of a new thing in each frame that shows it, px, and the largest at a pixel."""
-
-
-class NewThing(NamedTuple):
-    """A thing that a field gets."""
-
-    gaussians: Gaussians
-    """In the field's world, with as many harmonics as the field's."""
-    embedding: Float[np.ndarray, " e"]
-    pixel_counts: Mapping[str, int]
-    """New frame -> its pixels there."""
 
 
 def change_question(text: str) -> str | None:
@@ -106,72 +91,33 @@ def remove_object(
     return _remembered(field, event, new)
 
 
-def add_object(field: LanguageField, thing: NewThing, description: dict[str, Any]) -> LanguageField:
-    """Adds the Gaussians of a thing and its region, which gets the next id; frames of it must be the field's."""
-    count, number = thing.gaussians.count, field.regions.count
-    first, views = field.gaussians.count, np.full(count, len(thing.pixel_counts), np.int32)
-    votes, width = field.votes, field.votes.regions.shape[1]
-    weight = _WEIGHT * views.astype(np.float32)
-    regions, weights = np.full((count, width), -1, np.int32), np.zeros((count, width), np.float32)
-    regions[:, 0], weights[:, 0] = number, weight
-    columns = {"regions": regions, "weights": weights, "labelled": weight, "total": weight, "views": views}
-    columns |= {"max_pixel_weight": np.full(count, _PEAK), "weight_where_region_visible": weights}
-    grown = {
-        name: np.concatenate([np.asarray(getattr(votes, name)), column])
-        for name, column in columns.items()
-        if getattr(votes, name) is not None
-    }
-    if votes.overlap is not None:
-        grown["overlap"] = np.pad(np.asarray(votes.overlap), (0, 1))
-        grown["overlap"][-1, -1] = 1
-    pixels = np.array([[thing.pixel_counts.get(name, 0) for name in field.names]], np.int32)
-    old = field.regions
-    nodes = grown_tree(field, number + 1)
-    if nodes:
-        nodes["leaf"] = np.append(nodes["leaf"], np.full(count, number, np.int32))
+def add_objects(
+    field: LanguageField,
+    ledger: Ledger,
+    things: Sequence[Gaussians],
+    views: Mapping[str, LedgerView],
+    descriptions: Sequence[dict[str, Any]],
+) -> tuple[LanguageField, Ledger]:
+    """Adds things to a field and its ledger: Gaussians of the field's world, and new views that show them.
+
+    Each gets the next region, of which `views` speak already, and Gaussians behind those of the field.
+    """
+    region, first = field.regions.count, field.gaussians.count
+    owners = np.repeat(np.arange(region, region + len(things)), [thing.count for thing in things]).astype(np.int32)
+    gaussians = jax.tree.map(lambda *columns: np.concatenate(columns), field.gaussians, *things)
     parts = field.parts
     if parts is not None:
-        parts = dataclasses.replace(parts, part=np.concatenate([parts.part, np.full(count, -1, np.int32)]))
-    join = lambda a, b: np.concatenate([np.asarray(a), np.asarray(b, np.asarray(a).dtype)])  # noqa: E731
-    field = dataclasses.replace(
-        field,
-        gaussians=jax.tree.map(join, field.gaussians, thing.gaussians),
-        votes=dataclasses.replace(votes, **grown, num_regions=number + 1),
-        regions=dataclasses.replace(
-            old,
-            embeddings=join(old.embeddings, thing.embedding[None]),
-            pixel_counts=join(old.pixel_counts, pixels),
-        ),
-        parts=parts,
-        **nodes,
-        codes=None,
-    )
-    mask = np.arange(field.gaussians.count) >= first
-    absent = remove_object(field, mask, [number], {})
-    before = _event(absent, np.flatnonzero(mask), np.array([number]), description | {"region": number})
-    return dataclasses.replace(field, history=(*field.history, before))
-
-
-def add_frames(field: LanguageField, cameras: Camera, names: Sequence[str]) -> LanguageField:
-    """Adds frames, whose cameras have the size of the field's, that show none of its regions yet."""
-    both = jax.tree.map(lambda a, b: np.concatenate([np.asarray(a), np.asarray(b)]), field.cameras, cameras)
-    pixels = np.pad(np.asarray(field.regions.pixel_counts), ((0, 0), (0, len(names))))
-    regions = dataclasses.replace(field.regions, pixel_counts=pixels)
-    return dataclasses.replace(field, cameras=both, regions=regions, names=(*field.names, *names))
-
-
-def new_view(field: LanguageField, name: str, picture: UInt8[np.ndarray, " j"]) -> LedgerView:
-    """What a frame of `add_frames` contributes: the votes that `add_object` gave the new things in it."""
-    t, votes, regions = field.names.index(name), field.votes, field.regions
-    shown = np.flatnonzero(np.asarray(regions.pixel_counts)[:, t]).astype(np.int32)
-    rows = np.flatnonzero(np.isin(votes.regions[:, 0], shown)).astype(np.int32)
-    columns = np.asarray(votes.regions)[rows, 0], np.full(len(rows), _WEIGHT), np.full(len(rows), _PEAK)
-    packed = pack_evidence(ViewEvidence(rows, np.arange(len(rows) + 1, dtype=np.int32), *columns), regions.count)
-    pixels, camera = (
-        np.stack([shown, np.asarray(regions.pixel_counts)[shown, t]]),
-        jax.tree.map(np.asarray, field.cameras)[t],
-    )
-    return LedgerView(packed, pixels, shown, np.asarray(regions.embeddings)[shown], camera_row(camera), picture)
+        parts = dataclasses.replace(parts, part=np.append(parts.part, np.full(len(owners), -1, np.int32)))
+    field = dataclasses.replace(field, gaussians=gaussians, parts=parts)
+    field, ledger = add_views(field, Ledger(ledger.num_regions, ledger.views), views)
+    if field.leaf is not None:
+        field = dataclasses.replace(field, leaf=np.append(field.leaf, owners))
+    history = field.history
+    for number, description in enumerate(descriptions, region):
+        rows = first + np.flatnonzero(owners == number)
+        absent = remove_object(field, np.isin(np.arange(field.gaussians.count), rows), [number], {})
+        history = *history, _event(absent, rows, np.array([number]), description | {"region": number})
+    return dataclasses.replace(field, history=history), ledger
 
 
 def dates(field: LanguageField) -> list[str]:
