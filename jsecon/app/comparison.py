@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 from typing import Any
 
 import cv2
@@ -176,10 +177,9 @@ def _new_gaussians(changes: Changes, change: Change) -> Gaussians:
         depth = None if capture.depths is None else np.asarray(capture.depths[t])
         points.append(_surface(mask, camera, change.place, depth))
         colours.append(np.asarray(capture.frames[t])[mask])
-    gaussians = gaussians_from_points(np.concatenate(points), np.concatenate(colours), opacity=0.9, scale=0.6)
-    sh = np.zeros((gaussians.count, np.asarray(changes.field.gaussians.sh).shape[1], 3), np.float32)
-    sh[:, 0] = np.asarray(gaussians.sh)[:, 0]
-    return dataclasses.replace(jax.tree.map(np.asarray, gaussians), sh=sh)
+    degree = math.isqrt(changes.field.gaussians.sh.shape[1]) - 1
+    place = np.concatenate(points)
+    return gaussians_from_points(place, np.concatenate(colours), opacity=0.9, scale=0.6, sh_degree=degree)
 
 
 def _surface(mask: np.ndarray, camera: Camera, place: np.ndarray, depth: np.ndarray | None) -> np.ndarray:
