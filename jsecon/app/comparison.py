@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -101,20 +102,19 @@ def find_changes(field: LanguageField, listed: Catalogue, capture: Capture, min_
 
 
 def apply_changes(
-    changes: Changes, embedder: Embedder, date: str, ledger: Ledger | None
+    changes: Changes, embedder: Embedder, date: str, ledger: Callable[[], Ledger]
 ) -> tuple[LanguageField, Ledger | None]:
     """Applies changes to their field, with a date: what moved moves, what is gone is absent, what is new is added.
 
-    The ledger keeps the evidence of all views: of which region a Gaussian is stays true, also if it moves.
+    Of which region a Gaussian is stays true, also if it moves. So the ledger grows only by what is new; the second
+    result is None if it stays.
     """
     field, listed = changes.field, changes.catalogue
     if date < (last := dates(field)[-1]):
         raise InputError("--date", f"{date} is before the last change of the field, {last}", remedy="Check it.")
     found = [(change, record | {"date": date}) for change, record in zip(changes.found, changes.records())]
     for change, description in found:
-        mask = np.zeros(field.gaussians.count, bool)
-        if change.object >= 0:
-            mask[: len(listed.labels)] = listed.labels == change.object
+        mask = (listed.labels == change.object) & (change.object >= 0)
         if change.kind == "moved":
             field = move_object(field, mask, change.motion, description)
         elif change.kind == "gone":
@@ -123,10 +123,7 @@ def apply_changes(
             field = remove_object(field, mask & False, (), description)
     new = [(change, description) for change, description in found if change.kind == "new" and change.frames]
     if not new:
-        return field, ledger
-    if ledger is None:
-        remedy = "Make the field again with jsecon run, without --no-ledger."
-        raise InputError("field", "it has no ledger of its views, which gets what is new", remedy=remedy)
+        return field, None
     things = [_new_gaussians(changes, change) for change, _ in new]
     first = np.cumsum([field.gaussians.count, *(thing.count for thing in things)])
     views: dict[str, LedgerView] = {}
@@ -137,7 +134,7 @@ def apply_changes(
         masks = np.stack([new[k][0].after[t] for k in shown])
         name = _new_name(changes.capture.names[t], date, (*field.names, *views))
         views[name] = _new_view(changes, embedder, t, masks, rows, regions)
-    return add_objects(field, ledger, things, views, [description for _, description in new])
+    return add_objects(field, ledger(), things, views, [description for _, description in new])
 
 
 def _new_name(name: str, date: str, known: tuple[str, ...]) -> str:

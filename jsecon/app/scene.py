@@ -664,9 +664,8 @@ class Scene:
         date = read_date(date)
         with self._lock:
             changes = self.changes(changes) if isinstance(changes, Capture) else changes
-            ledger = None if self._read_ledger is None else self.ledger
-            field, kept = apply_changes(changes, self.embedder, date, ledger)
-            return self._with(field, None if kept is None else lambda: kept)
+            field, ledger = apply_changes(changes, self.embedder, date, lambda: self.ledger)
+            return self._with(field, self._read_ledger if ledger is None else lambda: ledger)
 
     def as_of(self, date: str) -> "Scene":
         """The scene as it was at the end of a date, such as "2026-11-01".
