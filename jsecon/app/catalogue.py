@@ -66,7 +66,7 @@ class Catalogue:
     surroundings: np.ndarray
     """(K,) bool: the best name is one of walls, floors and the like."""
     sure: np.ndarray
-    """(K,) bool: enough of the frames that see it show it (`is_sure`); what is unsure may be a fragment."""
+    """(K,) bool: enough of the frames that see it show it; what is unsure may be a fragment."""
     parent: np.ndarray
     """(K,) int id of the object that this one is a part of, or -1. A parent has none."""
     confidence: np.ndarray
@@ -180,7 +180,7 @@ def objects(
     upright = np.array(axis.axis)
     texts, embeddings, scale, rules = _vocabulary(field, vocabulary, embedder)
     size, main = _sizes(field)
-    groups = region_objects(field, main, upright)
+    groups = _region_objects(field, main, upright)
     members = np.arange(groups.max(initial=-1) + 1)[:, None] == groups  # (G, R)
     pixels = np.asarray(field.regions.pixel_counts, np.float64)
     weighted = pixels.sum(1)[:, None] * np.asarray(field.regions.embeddings, np.float64)
@@ -199,7 +199,7 @@ def objects(
     own = [parts if above >= 0 else wholes for above, wholes, parts in groups_of]
     gaussians = np.array([len(group) for group in own], int)
     shown, views = members @ pixels, np.asarray(field.votes.views)
-    sure = np.array([is_sure(row, views[group]) for row, group in zip(shown, own)], bool)
+    sure = np.array([_is_sure(row, views[group]) for row, group in zip(shown, own)], bool)
     complete = np.array([_frames_around(field, group)[row > 0].sum() for row, group in zip(shown, own)], int)
     top, listed = np.where(whole < 0, np.arange(len(whole)), whole), gaussians >= MIN_SAMPLES
     order_of_wholes = (top, -gaussians[top], -complete[top], ~sure[top], surroundings[top])
@@ -235,7 +235,7 @@ def objects(
     )
 
 
-def is_sure(pixels: Shaped[np.ndarray, " t"], views: Shaped[np.ndarray, " m"]) -> bool:
+def _is_sure(pixels: Shaped[np.ndarray, " t"], views: Shaped[np.ndarray, " m"]) -> bool:
     """Whether enough of the frames that see an object show it, by its pixels in each and the views of its Gaussians."""
     return bool(len(views) and np.count_nonzero(pixels) >= SURE_SHARE * np.median(views))
 
@@ -357,7 +357,7 @@ def _same_object(
     return (itself | (matched(QueryRules()) & (overlap >= MIN_FRAGMENT_OVERLAP)), alike)
 
 
-def region_objects(field: LanguageField, main: np.ndarray, up: np.ndarray) -> Int[np.ndarray, " r"]:
+def _region_objects(field: LanguageField, main: np.ndarray, up: np.ndarray) -> Int[np.ndarray, " r"]:
     """Returns the group of each region, by the rules of `objects`: those that show one object have the same one.
 
     `main` are the `main_regions`, and `up` is the unit up axis in the field's world.

@@ -1,13 +1,13 @@
 """The objects of a field by name: what referring expressions such as "the red mug left of the bottle" choose from.
 
-The text is parsed (query/expressions), the regions of each named object are matched as any query does and their pieces
-joined, and conditions and orders choose among the objects (query/referring). Nothing is guessed: an answer is 0, 1 or
-several objects, with what came nearest or what would settle which is meant.
+The text is parsed (query/expressions), the regions of each named object are matched as any query does, the catalogue
+tells which objects they belong to, and conditions and orders choose among these (query/referring). Nothing is guessed:
+an answer is 0, 1 or several objects, with what came nearest or what would settle which is meant.
 """
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -15,24 +15,17 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import KDTree
 
-from jsecon.app.catalogue import Catalogue, is_sure, main_regions, region_objects
-from jsecon.app.records import Answer, Object, Query, gaussian_rows, rounded, source_points, world_scale
+from jsecon.app.catalogue import Catalogue
+from jsecon.app.records import Answer, Object, Query, rounded, source_points
 from jsecon.errors import InputError
-from jsecon.field.columns import votes_of_rows
-from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction_of_regions
 from jsecon.query.answer import RegionMatch, match_regions
 from jsecon.query.expressions import ANY_OBJECT, parse_expression
-from jsecon.query.match import join_fragments
-from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.referring import evaluate
 from jsecon.query.relations import Viewpoint, order_values, viewpoint
 from jsecon.query.rules import ABSENT, FOUND, MIN_RANK, QueryRules
-from jsecon.types import LanguageField, Selection
-from jsecon.views.frame import field_up
-
-MAX_KEPT = 1024
-"""number of phrases, and of objects, that are kept"""
+from jsecon.read.captures.frames import transform_poses
+from jsecon.types import LanguageField, Selection, UpAxis
 
 
 def choose_shades(
@@ -71,76 +64,66 @@ def choose_shades(
 
 
 class ObjectIndex:
-    """The objects that phrases name, with their Gaussians, boxes and points. It keeps the last ones.
+    """The objects of the catalogue that phrases name, in the world of the capture. It keeps what the last ones name.
 
     Args:
       field: The field, with what texts are compared with.
       embedder: Its embedder.
-      up: (3,) up axis in the capture's world; None takes the field's own.
-      catalogue: Returns all objects, for texts that name none.
+      catalogue: Its objects.
+      up: Its up axis.
     """
 
-    def __init__(
-        self,
-        field: LanguageField,
-        embedder: Any,
-        up: Sequence[float | int] | None,
-        catalogue: Callable[[], Catalogue],
-    ):
-        """Finds the up axis; objects are measured when they are first asked for."""
-        self._up_axis = field_up(field, up)
-        self.up = np.array(self._up_axis.axis)
+    def __init__(self, field: LanguageField, embedder: Any, catalogue: Catalogue, up: UpAxis):
         regions = jax.tree.map(jnp.asarray, field.regions)  # on the device once, not for each phrase
         reference = None if field.unrelated_words is None else jnp.asarray(field.unrelated_words)
-        cameras = jax.tree.map(np.asarray, field.cameras)  # on which jax would compile each step of a viewpoint
-        self._field = dataclasses.replace(field, regions=regions, unrelated_words=reference, cameras=cameras)
+        self._field = dataclasses.replace(field, regions=regions, unrelated_words=reference)
         self._embedder = embedder
-        self._catalogue = catalogue
+        self._catalogue, self._up = catalogue, up
+        poses = transform_poses(np.asarray(field.cameras.world_to_camera), np.asarray(field.source_from_scene))
+        self._cameras = dataclasses.replace(jax.tree.map(np.asarray, field.cameras), world_to_camera=poses)
         self._rules = QueryRules(all_of_class=True, logits=getattr(embedder, "logits", None))
-        self._votes = jax.tree.map(np.asarray, field.votes)
-        self._object = functools.lru_cache(MAX_KEPT)(self._measure_object)
-        self._objects_of = functools.lru_cache(MAX_KEPT)(self._find_objects)
+        self._objects_of = functools.lru_cache(1024)(self._find_objects)
 
     def _find_objects(self, phrase: str) -> tuple[list[Object], float]:
-        """Finds the objects that a phrase names: regions that match it, those of one object joined.
+        """Finds the objects that a phrase names: those with a region that matches it.
 
-        These overlap, or are one object in the catalogue: the ends of a beam whose middle is hidden. Where a text is
-        the best name of some of the objects, the others do not count. The second value is the share of unrelated words
-        that are less similar to the scene than the phrase.
+        Where a text is the best name of some of the objects, the others do not count. The second value is the share of
+        unrelated words that are less similar to the scene than the phrase.
         """
+        listed = self._catalogue
         if phrase == ANY_OBJECT:
-            return self._all_objects(), np.nan
+            things = np.flatnonzero(~listed.surroundings).tolist()
+            return [self._object(str(listed.names[n, 0]) or f"object {n}", n) for n in things], np.nan
         texts = choose_shades(self._field, self._embedder, [phrase], self._rules, every=True)
         embedded = jax.device_put(self._embedder.embed_text(texts))
         match = match_regions(self._field, embedded, self._rules)
         regions = np.flatnonzero(np.asarray(match.chosen)) if int(match.region) >= 0 else np.zeros(0, int)
-        groups = self._best_named(texts, join_fragments(regions, self._joined))
-        made = [(group, self._object(group)) for group in groups]
-        state = int(match.state)
-        found = [Object(phrase, group, *parts, state=state) for group, parts in made if parts is not None]
-        return found, float(match.rank)
+        owners = listed.regions[regions]
+        named = set(owners[self._is_best_name(texts, regions)].tolist()) - {-1}
+        things = sorted(named or set(owners.tolist()) - {-1})
+        return [self._object(phrase, n, int(match.state)) for n in things], float(match.rank)
 
-    def _all_objects(self) -> list[Object]:
-        """Lists the objects of the catalogue without surroundings, by their best names."""
-        catalogue = self._catalogue()
-        things = np.flatnonzero(~catalogue.surroundings)
-        groups = [tuple(int(region) for region in np.flatnonzero(catalogue.regions == thing)) for thing in things]
-        named = [(str(catalogue.names[thing, 0]) or f"object {thing}", group) for thing, group in zip(things, groups)]
-        made = [(name, group, self._object(group)) for name, group in named if group]
-        return [Object(name, group, *parts) for name, group, parts in made if parts is not None]
+    def _object(self, phrase: str, index: int, state: int = FOUND) -> Object:
+        """An object of the catalogue by its id, without the Gaussians that stand apart from it."""
+        listed = self._catalogue
+        mask = listed.mask(index)
+        means, weight = np.asarray(self._field.gaussians.means), np.asarray(self._field.votes.total)
+        rows = np.flatnonzero(remove_outliers(means, mask, keep="supported", weight=weight))
+        regions = tuple(np.flatnonzero(listed.regions == index).tolist())
+        shape = listed.shapes[index : index + 1]
+        return Object(phrase, regions, rows, shape, sure=bool(listed.sure[index]), state=state)
 
-    def _best_named(self, texts: Sequence[str], groups: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
-        """Keeps the objects that no other name of the vocabulary fits better than the text, if there are any.
+    def _is_best_name(self, texts: Sequence[str], regions: np.ndarray) -> np.ndarray:
+        """Which regions no other name of the vocabulary fits better than the text; all, if there is no vocabulary.
 
         "Orange" means the orange thing where there is a dark orange one too.
         """
-        if len(texts) > 1 or len(groups) < 2 or self._names is None:
-            return groups
-        embeddings = np.asarray(self._field.regions.embeddings)
+        if len(texts) > 1 or self._names is None:
+            return np.ones(len(regions), bool)
+        embeddings = np.asarray(self._field.regions.embeddings)[regions]
         similarity = embeddings @ np.asarray(self._embedder.embed_text(list(texts)))[0]
         # A name that is as near within rounding fits no better.
-        fits = similarity >= (embeddings @ self._names.T).max(1) - 1e-4
-        return [group for group in groups if fits[list(group)].any()] or groups
+        return similarity >= (embeddings @ self._names.T).max(1) - 1e-4
 
     @functools.cached_property
     def _names(self) -> np.ndarray | None:
@@ -148,58 +131,24 @@ class ObjectIndex:
         names = getattr(self._embedder, "vocabulary", ())
         return np.asarray(self._embedder.embed_text(list(names))) if names else None
 
-    @functools.cached_property
-    def _joined(self) -> np.ndarray:
-        """(R, R) overlap of the regions; 1 for those of one object."""
-        groups = region_objects(self._field, main_regions(self._field), self.up)
-        same = (groups[:, None] == groups).astype(np.float32)
-        return same if self._votes.overlap is None else np.maximum(self._votes.overlap, same)
-
-    @functools.cached_property
-    def _voters(self) -> list[np.ndarray]:
-        """The Gaussians that have votes for each region, rising."""
-        regions = self._votes.regions
-        count = self._field.regions.count
-        owners = np.where((regions >= 0) & (regions < count), regions, count).ravel()
-        order = np.argsort(owners.astype(np.uint16 if count < 1 << 16 else np.int32), kind="stable")
-        ends = np.cumsum(np.bincount(owners, minlength=count + 1))[:count]
-        return np.split(order // regions.shape[1], ends)[:count]
-
-    def _measure_object(self, regions: tuple[int, ...]) -> tuple[np.ndarray, ObjectShapes, bool] | None:
-        """Returns Gaussians and shape of the object of some regions, and `is_sure`; None if it has no Gaussian."""
-        voters = np.unique(np.concatenate([self._voters[region] for region in regions]))
-        share = inside_fraction_of_regions(votes_of_rows(self._votes, voters), regions).fraction
-        rows, share = voters[share >= SHARE_THRESHOLD], share[share >= SHARE_THRESHOLD]
-        gaussians = gaussian_rows(dataclasses.replace(self._field.gaussians, sh=None), rows)
-        weight = share * self._votes.total[rows]
-        kept = remove_outliers(gaussians.means, np.ones(len(rows), bool), keep="supported", weight=weight)
-        if not kept.any():
-            return None
-        gaussians = gaussian_rows(gaussians, kept)
-        spreads = gaussian_spreads(gaussians)
-        shape = object_shapes(gaussians.means, np.zeros(gaussians.count, int), self.up, spreads=spreads)
-        pixels = np.asarray(self._field.regions.pixel_counts)[list(regions)].sum(0)
-        return rows[kept], shape, is_sure(pixels, self._votes.views[rows[kept]])
-
     def _view(self, frame: int | None) -> tuple[Viewpoint, str]:
         """From where directions are seen, and what that is in words.
 
         Without a frame it is the mean camera, or the frame that shows most objects where the cameras look in all
         directions.
         """
-        cameras = self._field.cameras
+        cameras, up = self._cameras, self._catalogue.up
         if frame is None:
             ahead = np.asarray(cameras.world_to_camera, np.float64)[:, 2, :3]
-            ahead = ahead - (ahead @ self.up)[:, None] * self.up
+            ahead = ahead - (ahead @ up)[:, None] * up
             ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
             mean = ahead.mean(0)
             if np.linalg.norm(mean) >= 0.5:  # they look one way
                 middle = np.asarray(cameras.centres, np.float64).mean(0)
-                return Viewpoint(middle, mean / np.linalg.norm(mean), self.up), "as seen from the mean of the cameras"
+                return Viewpoint(middle, mean / np.linalg.norm(mean), up), "as seen from the mean of the cameras"
             pixels = np.asarray(self._field.regions.pixel_counts, np.int64)
             frame = int(np.lexsort((pixels.sum(0), (pixels > 0).sum(0)))[-1])
-        camera = jax.tree.map(np.asarray, cameras[frame])
-        return viewpoint(camera, self.up), f"as seen from {self._field.names[frame]}"
+        return viewpoint(cameras[frame], up), f"as seen from {self._field.names[frame]}"
 
     def answer(self, query: Query, frame: int | None) -> Answer:
         """Finds the objects that a referring expression names, with directions as seen from a frame."""
@@ -209,8 +158,7 @@ class ObjectIndex:
             problem = "the size of this scene in metres is not known, so no distance in metres can be compared"
             remedy = 'Ask in units of the capture ("within 2 units of"), or run with --metres-per-unit.'
             raise InputError(f"expression {str(query)!r}", problem, remedy=remedy)
-        unit = 1.0 / world_scale(self._field)
-        units = unit, unit / (metres or 1.0)
+        units = 1.0, 1.0 / (metres or 1.0)
         view, words = self._view(frame)
         readings = expression.readings()
         outcomes = [evaluate(self._objects_of, expression.thing, reading, view, units) for reading in readings]
@@ -243,14 +191,14 @@ class ObjectIndex:
             objects=tuple(best.chosen),
             reading=expression.describe(readings[place]),
             viewpoint=words if expression.depends_on_view else "",
-            up=self._up_axis if expression.conditions or expression.thing.order else None,
+            up=self._up if expression.conditions or expression.thing.order else None,
             used=tuple(best.used),
             question=question,
         )
 
     def _tell_apart(self, objects: Sequence[Object], view: Viewpoint) -> str:
         """Says how objects of one name could be told apart: from left to right."""
-        centers = source_points(self._field, np.concatenate([found.shape.center for found in objects]))
+        centers = np.concatenate([found.shape.center for found in objects])
         bearing = [order_values(found.shape, view)["leftmost"][0] for found in objects]
         places = ["the left one", *["a middle one"] * (len(objects) - 2), "the right one"]
         words = [
@@ -259,7 +207,7 @@ class ObjectIndex:
         return f"{', '.join(words[:-1])} or {words[-1]}"
 
     def distances(self, first: Object | np.ndarray, second: Object | np.ndarray) -> dict[str, Any]:
-        """Distances of two objects, or points (3,) of the field's world, in metres if they are known.
+        """Distances of two objects, or points (3,), in metres if they are known.
 
         The angle is that of the second above the horizontal, degrees.
         """
@@ -269,17 +217,17 @@ class ObjectIndex:
         centers = float(np.linalg.norm(line))
         way = line / max(centers, 1e-300)
         reach = sum(float(np.min(half / np.maximum(np.abs(turn.T @ way), 1e-12))) for turn, half in zip(axes, halves))
-        angle = float(np.degrees(np.arcsin(np.clip(way @ self.up, -1, 1))))
+        angle = float(np.degrees(np.arcsin(np.clip(way @ self._catalogue.up, -1, 1))))
         metres = self._field.metres_per_unit
-        scale = world_scale(self._field) * (metres or 1.0)
+        scale = metres or 1.0
         lengths = scale * np.array([surfaces, centers, max(centers - reach, 0.0)])
         result: dict[str, Any] = dict(zip(("surfaces", "centers", "gap"), rounded(lengths, scale * centers)))
         unit = "capture units" if metres is None else "metres"
-        return result | {"angle": round(angle, 2), "unit": unit, "up": str(self._up_axis)}
+        return result | {"angle": round(angle, 2), "unit": unit, "up": str(self._up)}
 
     def _extent(self, place: Object | np.ndarray) -> tuple[np.ndarray, ...]:
         """Points (M, 3), middle (3,), axes (3, 3) and half sizes (3,) of an object or a point."""
         if isinstance(place, np.ndarray):
             return place[None], place, np.eye(3), np.zeros(3)
-        means = np.asarray(self._field.gaussians.means, np.float64)[place.rows]
-        return means, place.shape.center[0], place.shape.axes[0], np.asarray(place.shape.half_size[0])
+        points = source_points(self._field, np.asarray(self._field.gaussians.means)[place.rows])
+        return points, place.shape.center[0], place.shape.axes[0], place.shape.half_size[0]

@@ -260,13 +260,13 @@ class Answer:
 
     def _object_record(self, found: Object) -> dict[str, Any]:
         """An object as plain values."""
-        size = 2 * world_scale(self.field) * np.asarray(found.shape.half_size[0])
+        size = 2 * found.shape.half_size[0]
         length = float(np.linalg.norm(size))
         return {
             "phrase": found.phrase,
             "regions": list(found.regions),
             "gaussians": len(found.rows),
-            "center": rounded(source_points(self.field, found.shape.center)[0], length),
+            "center": rounded(found.shape.center[0], length),
             "size": rounded(size, length),
             "score": round(found.score, 4),
             "sure": found.sure,
@@ -335,7 +335,8 @@ def source_points(field: LanguageField, points: Float[np.ndarray, "m 3"]) -> Flo
 
 def source_up(field: LanguageField, up: UpAxis) -> UpAxis:
     """Turns an up axis of the field's world into the capture's."""
-    axis = np.asarray(field.source_from_scene, np.float64)[:3, :3] @ np.array(up.axis) / world_scale(field)
+    turn = np.asarray(field.source_from_scene, np.float64)[:3, :3]
+    axis = turn @ np.array(up.axis) / np.cbrt(abs(np.linalg.det(turn)))
     return dataclasses.replace(up, axis=tuple(axis.round(6).tolist()))
 
 
@@ -368,11 +369,6 @@ def gaussian_rows(gaussians: Gaussians, rows: np.ndarray | Bool[np.ndarray, " n"
         return np.take(column, ids, axis=0, out=out, mode="clip")  # other modes copy
 
     return jax.tree.map(take, gaussians)
-
-
-def world_scale(field: LanguageField) -> float:
-    """Units of the capture's world per unit of the field's."""
-    return float(np.cbrt(abs(np.linalg.det(np.asarray(field.source_from_scene, np.float64)[:3, :3]))))
 
 
 def decimals(size: float, part: float) -> int:

@@ -55,6 +55,7 @@ from jsecon.splat.points import nearest_gaussians
 from jsecon.splat.transform import transform_gaussians
 from jsecon.splat.visible import points_in_view
 from jsecon.types import Capture, Gaussians, LanguageField, Selection
+from jsecon.views.frame import field_up
 
 CACHED_BYTES = 1 << 28
 """bytes of the answers that a scene keeps, of five bytes a Gaussian each"""
@@ -222,7 +223,7 @@ class Scene:
         self._require_memory("a relation, an order or a number")
         if self.field.regions.count == 0:
             raise InputError("field", "it has no regions, so no objects", remedy="Make it again with other --masks.")
-        return ObjectIndex(self._text_field, self.embedder, self._up, lambda: self._catalogue)
+        return ObjectIndex(self._text_field, self.embedder, self._catalogue, field_up(self.field, self._up))
 
     @functools.cached_property
     def ledger(self) -> Ledger:
@@ -572,13 +573,9 @@ class Scene:
             places = []
             for end in (a, b):
                 named = isinstance(end, str)
-                places.append(self.locate(end, frame=frame, relate=True).objects[0] if named else self._point(end))
+                place = self.locate(end, frame=frame, relate=True).objects[0] if named else np.asarray(end, np.float64)
+                places.append(place)
             return {"a": a, "b": b} | self._index.distances(*places)
-
-    def _point(self, point: Sequence[float | int]) -> np.ndarray:
-        """Moves a point (3,) of the capture's world to the field's, in float64."""
-        scene_from_source = np.linalg.inv(np.asarray(self.field.source_from_scene, np.float64))
-        return scene_from_source[:3, :3] @ np.asarray(point, np.float64) + scene_from_source[:3, 3]
 
     def scaled(self, a: str | Sequence[float | int], b: str | Sequence[float | int], metres: float | int) -> "Scene":
         """Gives the scene its scale by one known length, which replaces any other.

@@ -27,7 +27,7 @@ class Object:
     rows: np.ndarray
     """(M,) its Gaussians."""
     shape: ObjectShapes
-    """Its box and points, in the field's world."""
+    """Its box and points, in the world of the capture."""
     sure: bool = True
     """Whether enough of the frames that see it show it; else it may be a fragment."""
     state: int = FOUND
