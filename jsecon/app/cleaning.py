@@ -22,11 +22,6 @@ from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Camera, Capture, Gaussians, Progress
 from jsecon.views.clean import KINDS, find_litter, without
 
-COMPARED = 12
-"""views, evenly spaced, in which pictures before and after are compared"""
-MAX_VIEWS = 128
-"""views, evenly spaced, that are looked at"""
-
 
 def _clean(verb: verbs.Clean, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon clean`; the result has the number of each kind, and the PSNR before and after."""
@@ -40,7 +35,7 @@ def _clean(verb: verbs.Clean, console: Console) -> verbs.VerbResult:
         opened = open_scene(verb.scene, console=console)
     with console.progress("views") as progress:
         scene, cameras, capture = _open(verb, opened and opened.field, console, progress)
-    cameras = jax.tree.map(np.asarray, cameras[evenly_spaced(len(cameras), MAX_VIEWS)])
+    cameras = jax.tree.map(np.asarray, cameras[evenly_spaced(len(cameras), 128)])  # more would show little more
     with console.progress("clean") as progress:
         kinds = find_litter(scene, cameras, progress)
     if verb.keep_objects and opened is not None:
@@ -88,14 +83,14 @@ def _quality(
     before: Gaussians, after: Gaussians, cameras: Camera, capture: Capture | None, progress: Progress
 ) -> tuple[dict[str, Any], str]:
     """Compares pictures before and after, with photographs if there are any, and says what came out."""
+    frames = evenly_spaced(len(cameras if capture is None else capture.frames), 12)
     if capture is None:
         values = []
-        for t in evenly_spaced(len(cameras), COMPARED):
+        for t in frames:
             pair = [pictures.render_picture(part, cameras[t]) / np.float32(255) for part in (before, after)]
             values.append(float(psnr(*pair)))
         value = float(np.median(values))
         return {"psnr_between": value}, f"quality pictures before and after agree to {value:.2f} dB (median)"
-    frames = evenly_spaced(len(capture.frames), COMPARED)
     background = fit_background(before, capture)
     found = [measure_quality(part, capture, frames=frames, background=background) for part in (before, after)]
     first, last = (float(np.mean(quality.psnr)) for quality in found)

@@ -32,8 +32,6 @@ from jsecon.app.opening import find_scene, name_fields
 from jsecon.errors import InputError, describe_error
 from jsecon.pipeline.progress import Console
 
-HANDSHAKE_SECONDS = 0.5
-"""s from the start of the protocol to that of the thread: the import of jax would slow the first answers down"""
 PROGRESS_SECONDS = 2.0
 """s between messages to the client while a call waits for its field"""
 
@@ -174,7 +172,8 @@ def _mcp(verb: verbs.Mcp, console: Console) -> verbs.VerbResult:
     server = make_server(scenes)
 
     def serve() -> None:
-        opening = threading.Timer(HANDSHAKE_SECONDS, _open_fields, (fields, scenes, verb.embedder, console))
+        # Half a second later: the import of jax would slow the first answers down.
+        opening = threading.Timer(0.5, _open_fields, (fields, scenes, verb.embedder, console))
         opening.daemon = True
         opening.start()
         try:

@@ -19,8 +19,6 @@ from jsecon.types import Camera, Capture, Gaussians, LanguageField
 
 SELECTED = (255, 64, 160)
 """RGB of a selection, which no natural object has"""
-UNKNOWN = 0.25
-"""grey of Gaussians without a region, 0 to 1"""
 
 
 def label_overlay(frame: UInt8[np.ndarray, "h w 3"], labels: Int[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -61,7 +59,7 @@ def outlined(image: np.ndarray, mask: np.ndarray, colour: tuple[int, ...], thick
 
 def region_colours(field: LanguageField) -> Float[np.ndarray, "n 3"]:
     """Returns the colour of each Gaussian's main region in [0, 1]; grey without a region."""
-    return np.concatenate([palette(field.regions.count) / 255, np.full((1, 3), UNKNOWN)])[main_regions(field)]
+    return np.concatenate([palette(field.regions.count) / 255, np.full((1, 3), 0.25)])[main_regions(field)]
 
 
 def render_picture(

@@ -16,8 +16,6 @@ _LIGHT_STEP = 40.0
 """CIELAB distance that a factor of e in lightness is worth."""
 _DEPTH_STEP = 0.03
 """Difference of depth from which a pixel is not explained, as a share of the depth; a third of it is noise."""
-_REACH = 0.025
-"""Largest shift of a photograph against the rendering of its pose, as a share of its width."""
 
 
 def fit_exposure(
@@ -53,7 +51,7 @@ def find_shift(
         return np.minimum(np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)), 0.5)
 
     own, other = edges(photo), edges(render)
-    reach = max(round(_REACH * photo.shape[1]), 1)
+    reach = max(round(0.025 * photo.shape[1]), 1)  # px; errors of poses are smaller
     shifts = [(y, x) for y in range(-reach, reach + 1) for x in range(-reach, reach + 1)]
     shifts.sort(key=lambda shift: shift[0] ** 2 + shift[1] ** 2)
     errors = [np.abs(shifted(own, shift) - other)[known].mean() for shift in shifts]

@@ -51,10 +51,6 @@ MIN_MOVE = 0.2
 """Shift, as a share of its size, or turn, radians, from which an object has moved."""
 _KNOWN = 0.8
 """Alpha from which a rendering tells what a pixel shows."""
-_MAX_PLACES = 6
-"""Places with unexplained pixels, the largest, where displaced objects are searched for."""
-_DISCS = 3000
-"""Discs, at most, that stand for an object: of larger ones, every second or third Gaussian is a larger disc."""
 _FIT_FRAMES = 4
 """Frames, the best ones, that poses of moved objects are fitted to."""
 
@@ -136,7 +132,7 @@ class _Discs:
     """The Gaussians of an object as opaque discs: drawn thousands of times, in a millisecond each."""
 
     def __init__(self, gaussians: Gaussians, rows: np.ndarray):
-        step = -(-len(rows) // _DISCS)
+        step = -(-len(rows) // 3000)  # of a large object every second or third Gaussian is a larger disc
         rows = rows[::step]
         self.means = np.asarray(gaussians.means, np.float64)[rows]
         self.radii = (
@@ -394,7 +390,7 @@ class _Search:
         result: dict[int, Change] = {}
         left = set(self.displaced)
         while left:
-            clusters = self.clusters(min(2, len(self.views)))[:_MAX_PLACES]
+            clusters = self.clusters(min(2, len(self.views)))[:6]  # the largest
             places = [(cluster.place, cluster.size) for cluster in clusters]
             places += [self._stand(k) for k in self.displaced]  # its own, too: what moved may hide it, or it is turned
             fits = [self._fit(k, *place) for k in left for place in places]

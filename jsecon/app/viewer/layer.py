@@ -18,9 +18,6 @@ MAX_STD = 200.0
 """largest standard deviation in units of the window, whose median is 1; viser holds covariances in 16 bits, from 0.008
 to 256"""
 
-LENGTH_COLOUR = (255, 220, 0)
-"""of measured lengths"""
-
 
 def first_view(field: LanguageField) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Finds where the first frame was taken, what it looks at, and the up axis, in the field's world."""
@@ -113,8 +110,8 @@ class SplatLayer:
     def draw_length(self, number: int, start: np.ndarray, end: np.ndarray, words: str) -> None:
         """Draws a length between two points (3,) of the field's world, with words in its middle."""
         ends = (self.scale * np.stack([start, end])).astype(np.float32)
-        scene, name = self._server.scene, f"/lengths/{number}"
-        scene.add_point_cloud(f"{name}/ends", ends, LENGTH_COLOUR, point_size=1.5, point_shape="circle")
+        scene, name, yellow = self._server.scene, f"/lengths/{number}", (255, 220, 0)
+        scene.add_point_cloud(f"{name}/ends", ends, yellow, point_size=1.5, point_shape="circle")
         if words:
-            scene.add_line_segments(f"{name}/line", ends[None], LENGTH_COLOUR, thickness=3.0, thickness_units="screen")
+            scene.add_line_segments(f"{name}/line", ends[None], yellow, thickness=3.0, thickness_units="screen")
             scene.add_label(f"{name}/label", words, position=ends.mean(0), anchor="bottom-center")
