@@ -121,19 +121,6 @@ def test_what_is_not_given_has_the_default_of_the_dataclass():
     assert cli.parse(["run", "room", "--out=out", *changed]).options == expected
 
 
-@pytest.mark.parametrize(("line", "options"), [
-    ("f a b --all --out o --at #1 2 3 --at x 4 5", {"texts": ["a", "b"], "at": [("#1", 2, 3), ("x", 4, 5)]}),
-    ("f --mask 0 a.png 1 b.png --mask 2 c.png --out o", {"mask": [["0", "a.png", "1", "b.png"], ["2", "c.png"]]}),
-    ("f --box x 1 2 3 4 --out o", {"box": [("x", 1, 2, 3, 4)]}),
-    ("--out o f a --threshold -0.5 --by votes --by code", {"texts": ["a"], "threshold": -0.5, "by": "code"}),
-    ("f --out o --keep_outliers -- -ish", {"texts": ["-ish"], "keep_outliers": True}),
-])  # fmt: skip
-def test_options_of_a_query_are_read(line, options):
-    query = cli.parse(["query", *line.split()])
-    assert (query.field, query.out) == (Path("f"), Path("o"))
-    assert {name: getattr(query, name) for name in options} == options
-
-
 @pytest.mark.parametrize(("line", "says"), [
     ("run", "CAPTURE --out PATH"), ("fly", "fly is not a verb"), ("qurey f x", "Did you mean query?"),
     ("", "{demo, run,"), ("query f x --out o --thresold 3", "Perhaps you meant: --threshold FLOAT"),
@@ -301,10 +288,3 @@ def test_progress_is_one_line_on_a_terminal_and_several_elsewhere(soon, tty):
     for terminal in (counted, unknown):
         assert terminal.getvalue().endswith("\r\x1b[K" if tty else "\n")  # the line is gone
         assert ("\r" in terminal.getvalue()) == tty
-
-
-def test_short_steps_stay_silent():
-    with Console(err=(err := Terminal(True))).progress("votes") as count:
-        for done in range(100):
-            count(done + 1, 100)
-    assert err.getvalue() == ""

@@ -89,25 +89,6 @@ def test_in_a_browser_pictures_are_enlarged_and_cards_open(page, tmp_path):
     assert found["requests"] == 0
 
 
-def test_labels_are_drawn_in_their_colours_and_unlabelled_pixels_stay_grey():
-    labels = np.full((24, 32), -1)
-    labels[4:20, 4:20] = 3
-    image = pictures.label_overlay(_image(), labels)
-    inside, outside = image[8:16, 8:16].reshape(-1, 3).astype(float), image[:, 24:].reshape(-1, 3)
-    assert (outside.max(1) == outside.min(1)).all()
-    assert np.corrcoef(inside.mean(0), pictures.palette(4)[3])[0, 1] > 0.99
-
-
-def test_a_selection_is_brighter_than_what_it_leaves_and_the_truth_is_outlined():
-    mask, truth = np.zeros((2, 24, 32), bool)
-    mask[6:18, 6:18] = truth[6:18, 12:26] = True
-    frame = np.full((24, 32, 3), 100, np.uint8)
-    image = pictures.selection_overlay(frame, mask, truth)
-    assert image[9, 9, 0] > image[2, 2, 0]
-    assert (image == 255).all(2).any()
-    assert not (pictures.selection_overlay(frame, mask) == 255).all(2).any()
-
-
 def test_a_picture_is_cut_to_a_mask():
     np.testing.assert_array_equal(pictures.crop(_image(), np.zeros((24, 32), bool)), _image())
     mask = np.zeros((240, 320), bool)
