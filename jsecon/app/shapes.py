@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, TypeAlias
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -15,29 +15,11 @@ from jsecon.app.scene import Scene
 from jsecon.errors import InputError
 from jsecon.files import write_text
 from jsecon.query.object_shapes import gaussian_spreads
-from jsecon.query.solids import Solid, object_solid
+from jsecon.query.solids import object_solid
 from jsecon.splat.transform import transform_gaussians
 
-
-class _Item(NamedTuple):
-    """An object: its solids in metres if the field knows them, else in the capture's unit."""
-
-    id: int
-    name: str
-    """Its id and name."""
-    solid: Solid
-    box: dict[str, list[float]]
-    """Center, size and axes of its box; the center is that of the primitive too."""
-
-    @property
-    def centre(self) -> np.ndarray:
-        """(3,) middle of its box and of the primitive."""
-        return np.array(self.box["center"])
-
-    @property
-    def turn(self) -> Rotation:
-        """Rotation of the primitive."""
-        return Rotation.from_matrix(self.solid.axes)
+_Item: TypeAlias = dict[str, Any]
+"""An object with its box, hull and primitive, as the JSON has it with lists in place of arrays."""
 
 
 def write_shapes(scene: Scene, listed: Catalogue, out: Path) -> list[Path]:
@@ -53,11 +35,13 @@ def write_shapes(scene: Scene, listed: Catalogue, out: Path) -> list[Path]:
             gaussians = gaussian_rows(scene.field.gaussians, listed.mask(record["id"]))
             spreads = gaussian_spreads(transform_gaussians(gaussians, scene.field.source_from_scene))
             solid = object_solid(source_points(scene.field, np.asarray(gaussians.means)), spreads, shape)
-            size = tuple(scale * length for length in solid.size)
-            solid = solid._replace(vertices=scale * solid.vertices, volume=scale**3 * solid.volume, size=size)
-            box = {"center": scale * shape.center, "size": 2 * scale * shape.half_size, "axes": shape.axes}
-            box = {key: values.tolist() for key, values in box.items()}
-            items.append(_Item(record["id"], f"{record['id']:03d} {record['name']}".rstrip(), solid, box))
+            center, volume = scale * shape.center, scale**3 * solid.volume
+            hull = {"vertices": scale * solid.vertices, "triangles": solid.triangles, "volume": volume}
+            size = scale * np.array(solid.size)
+            primitive = {"type": solid.primitive, "size": size, "axes": solid.axes, "center": center}
+            box = {"center": center, "size": 2 * scale * shape.half_size, "axes": shape.axes}
+            item = {"id": record["id"], "name": record["name"], "box": box, "hull": hull, "primitive": primitive}
+            items.append(item)
     unit = "capture units" if scene.field.metres_per_unit is None else "metres"
     files = [out] if out.suffix in _WRITERS else [out / f"shapes{suffix}" for suffix in _WRITERS]
     for file in files:
@@ -74,24 +58,28 @@ def require_shapes_format(out: Path) -> None:
 
 def _to_json(items: list[_Item], unit: str) -> str:
     """Returns box, hull and primitive of each object."""
-    objects = []
-    for item in items:
-        solid = item.solid
-        hull = {"vertices": solid.vertices.tolist(), "triangles": solid.triangles.tolist(), "volume": solid.volume}
-        primitive = {"type": solid.primitive, "size": list(solid.size), "axes": solid.axes.tolist()}
-        names = {"id": item.id, "name": item.name[4:]}
-        objects.append(names | {"box": item.box, "hull": hull, "primitive": primitive | {"center": item.box["center"]}})
-    return json.dumps({"unit": unit, "objects": objects}) + "\n"
+    return json.dumps({"unit": unit, "objects": items}, default=np.ndarray.tolist) + "\n"
+
+
+def _title(item: _Item) -> str:
+    """Returns the id and the name of an object."""
+    return f"{item['id']:03d} {item['name']}".rstrip()
+
+
+def _turn(item: _Item) -> np.ndarray:
+    """Returns the rotation of a primitive as a quaternion x, y, z, w."""
+    return Rotation.from_matrix(item["primitive"]["axes"]).as_quat()
 
 
 def _to_obj(items: list[_Item], unit: str) -> str:
     """Returns the hulls as one .obj with an object each."""
     lines, first = [f"# convex hulls of objects, in {unit}"], 1
     for item in items:
-        lines.append(f"o {item.name.replace(' ', '_')}")
-        lines += ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in item.solid.vertices.tolist()]
-        lines += ["f {} {} {}".format(*face) for face in (item.solid.triangles + first).tolist()]
-        first += len(item.solid.vertices)
+        vertices, triangles = item["hull"]["vertices"], item["hull"]["triangles"]
+        lines.append(f"o {_title(item).replace(' ', '_')}")
+        lines += ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in vertices.tolist()]
+        lines += ["f {} {} {}".format(*face) for face in (triangles + first).tolist()]
+        first += len(vertices)
     return "\n".join(lines) + "\n"
 
 
@@ -99,14 +87,13 @@ def _to_mjcf(items: list[_Item], unit: str) -> str:
     """Returns a model for MuJoCo: static bodies, whose primitives collide and whose hulls are seen."""
     assets, bodies = [], []
     for item in items:
-        solid, name = item.solid, quoteattr(item.name)
-        half = {"box": [0.5 * side for side in solid.size], "sphere": list(solid.size)}
-        size = half.get(solid.primitive, [solid.size[0], 0.5 * solid.size[-1]])
-        turn = np.roll(item.turn.as_quat(), 1)
-        assets.append(f"<mesh name={name} vertex={_words(solid.vertices - item.centre)}/>")
+        name, center = quoteattr(_title(item)), item["box"]["center"]
+        kind, size = item["primitive"]["type"], item["primitive"]["size"]
+        half = {"box": 0.5 * size, "sphere": size}.get(kind, np.array([size[0], 0.5 * size[-1]]))
+        assets.append(f"<mesh name={name} vertex={_words(item['hull']['vertices'] - center)}/>")
         bodies.append(
-            f"<body name={name} pos={_words(item.centre)}>"
-            f'<geom name={name} type="{solid.primitive}" size={_words(size)} quat={_words(turn)} group="3"/>'
+            f"<body name={name} pos={_words(center)}>"
+            f'<geom name={name} type="{kind}" size={_words(half)} quat={_words(np.roll(_turn(item), 1))} group="3"/>'
             f'<geom type="mesh" mesh={name} contype="0" conaffinity="0" mass="0"/></body>'
         )
     return (
@@ -128,11 +115,11 @@ def _to_moveit(items: list[_Item], unit: str) -> str:
     kinds = {"box": 1, "sphere": 2, "cylinder": 3}  # of shape_msgs/SolidPrimitive
     messages = []
     for item in items:
-        solid = item.solid
-        size = solid.size[::-1] if solid.primitive == "cylinder" else solid.size  # its height comes first
-        position, turn = (dict(zip("xyzw", row.tolist())) for row in (item.centre, item.turn.as_quat()))
-        message = {"header": {"frame_id": "world"}, "id": item.name, "operation": 0}
-        message |= {"primitives": [{"type": kinds[solid.primitive], "dimensions": list(size)}]}
+        kind, size = item["primitive"]["type"], item["primitive"]["size"].tolist()
+        size = size[::-1] if kind == "cylinder" else size  # its height comes first
+        position, turn = (dict(zip("xyzw", row.tolist())) for row in (item["box"]["center"], _turn(item)))
+        message = {"header": {"frame_id": "world"}, "id": _title(item), "operation": 0}
+        message |= {"primitives": [{"type": kinds[kind], "dimensions": size}]}
         messages.append(message | {"primitive_poses": [{"position": position, "orientation": turn}]})
     return json.dumps({"unit": unit, "collision_objects": messages}, indent=2) + "\n"
 
