@@ -698,7 +698,6 @@ class Scene:
         with self._lock:
             self.mask(self.ask("red"), 0)
             self.relate("red")
-            _ = self._catalogue
 
     def frame_index(self, frame: int | str) -> int:
         """Finds a frame.

@@ -102,6 +102,7 @@ class Viewer:
     Args:
       scene: The scene.
       server: The viser server.
+      state: The first state.
 
     Attributes:
       state: The present state.
@@ -109,17 +110,17 @@ class Viewer:
       layer: The Gaussians in the window.
     """
 
-    def __init__(self, scene: Scene, server: Any):
-        self.scene = scene
-        self.server = server
-        self.state = ViewState()
-        self.drawn: ViewState | None = None
+    def __init__(self, scene: Scene, server: Any, state: ViewState):
+        self.scene, self.server, self.state = scene, server, state
         self.layer = SplatLayer(server, scene.field)
         self._start_point: np.ndarray | None = None  # of the length that the next click ends
         self._lengths: list[dict[str, Any]] = []
         self._steps: queue.SimpleQueue[Callable[[ViewState], ViewState | None] | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._work, daemon=True)
         self._add_controls()
+        self._draw()
+        self.then(self._prepare)
+        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._thread.start()
 
     def _add_controls(self) -> None:
         """Makes the controls; each event of them becomes a step."""
@@ -175,20 +176,6 @@ class Viewer:
             return
         add = self._add.value or event.modifier == "shift"
         self.then(lambda state: self._clicked(state, event, focal, add=add))
-
-    def _start(self, state: ViewState) -> None:
-        """Draws the first state, and starts the thread, which first compiles what questions need."""
-        self.state = state
-        self._draw()
-        self.then(self._prepare)
-        self._thread.start()
-
-    def _run(self) -> None:
-        """Keeps the viewer running until it is interrupted."""
-        try:
-            self.server.sleep_forever()
-        finally:
-            self.stop()  # a thread inside XLA at the interpreter's end aborts it
 
     def stop(self) -> None:
         """Ends the thread."""
@@ -260,6 +247,7 @@ class Viewer:
                 traceback.print_exc()
 
     def _prepare(self, state: ViewState) -> None:
+        """Compiles what questions need."""
         with contextlib.suppress(InputError):  # an embedder without words: each text then has this error
             self.scene.prepare()
 
@@ -285,7 +273,7 @@ class Viewer:
             control.value = getattr(state, name)
         self._messages.content = "".join(map(_message, range(len(answers)), state.queries, answers))
         self._show_notice("")
-        self.drawn = state
+        self.drawn: ViewState | None = state
 
     def _show_notice(self, text: str | InputError) -> None:
         """Shows a notice above the answers; "" removes it."""
@@ -398,9 +386,7 @@ def open_viewer(scene: Scene, *, port: int, state: ViewState) -> Viewer:
     no_banner = contextlib.redirect_stdout(io.StringIO())  # it would come before the viewer can answer
     with no_banner, _guarded_pages():
         server = viser.ViserServer(host, port, label=f"jsecon · {scene.name}", verbose=False)
-    viewer = Viewer(scene, server)
-    viewer._start(state)
-    return viewer
+    return Viewer(scene, server, state)
 
 
 def _view(verb: verbs.View, console: Console) -> verbs.VerbResult:
@@ -415,5 +401,8 @@ def _view(verb: verbs.View, console: Console) -> verbs.VerbResult:
     viewer = open_viewer(scene, port=verb.port, state=state)
     console.print_line(str(scene))
     console.print_line(f"http://127.0.0.1:{viewer.server.get_port()}")
-    viewer._run()
+    try:
+        viewer.server.sleep_forever()
+    finally:
+        viewer.stop()  # a thread inside XLA at the interpreter's end aborts it
     return {}
