@@ -437,24 +437,11 @@ class Scene:
         """What a region belongs to: the next larger thing that views see as one; None if nothing larger is known.
 
         Args:
-          region: A region, or what this method returned.
+          region: A region, or what this method returned. What it consists of has it as parent in `field.tree`.
         """
         tree = self.field.tree
         parent = -1 if tree is None or not 0 <= region.id < len(tree) else int(tree[region.id])
         return None if parent < 0 else Region(parent)
-
-    def parts(self, region: Region) -> list[Region]:
-        """What a region consists of: the parts that nearly all views see as one, the largest first; often none.
-
-        Args:
-          region: A region, or what `wider` or this method returned.
-        """
-        if self.field.tree is None:
-            return []
-        tree = np.asarray(self.field.tree)
-        under = [int(node) for node in np.flatnonzero(tree == region.id)] if region.id >= 0 else []
-        sizes = {node: len(self.ask(Region(node)).rows) for node in under}
-        return [Region(node) for node in sorted(under, key=lambda node: -sizes[node])]
 
     def _rules(self, query: Query, rules: QueryRules) -> QueryRules:
         """Rules with the options of a query."""
