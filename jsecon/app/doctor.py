@@ -1,4 +1,4 @@
-"""`jsecon doctor`: checks what runs need of this machine."""
+"""`jsecon doctor`: checks what runs need of this machine, or describes the ledger of a field."""
 
 import collections
 import dataclasses
@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 from jsecon.app import verbs
+from jsecon.app.opening import locate_field
 from jsecon.errors import InputError, describe_error
 from jsecon.pipeline.progress import Console
 from jsecon.process import available_memory, cores
@@ -36,9 +37,7 @@ class _Check:
 def _doctor(verb: verbs.Doctor, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon doctor`; a check that fails and that every run depends on is an error."""
     if verb.field is not None:
-        from jsecon.app.living import describe_ledger
-
-        return describe_ledger(verb.field, console)
+        return _describe_ledger(verb.field, console)
     with console.progress("checks"):
         checks = [_Check("python", "ok", f"{platform.python_version()}, {platform.platform(terse=True)}")]
         checks += [_check_packages(), *_check_jax()]
@@ -47,6 +46,21 @@ def _doctor(verb: verbs.Doctor, console: Console) -> verbs.VerbResult:
     console.print_line("\n".join(f"{check.status:<8} {check.name:<10} {check.message}" for check in checks))
     failed = [check for check in checks if check.remedy and check.status != "ok"]
     return {"checks": checks, "errors": [InputError(c.name, c.message, remedy=c.remedy) for c in failed]}
+
+
+def _describe_ledger(field: Path, console: Console) -> verbs.VerbResult:
+    """Prints what the ledger of a field holds, and how large each kind is."""
+    from jsecon.field.field import load_field  # late: these import jax, which may be what is broken
+    from jsecon.field.ledger_file import load_ledger
+
+    path = locate_field(field).file
+    ledger = load_ledger(path, load_field(path, mapped=True))
+    views = list(ledger.views.values())
+    sizes = {name: sum(getattr(view, name).nbytes for view in views) for name in views[0]._fields} if views else {}
+    console.print_line(f"ledger of {path}: {len(views)} views, {ledger.num_regions} regions")
+    for name, size in sizes.items():
+        console.print_line(f"{size / 2**20:9.2f} MiB  {name.replace('_', ' ')}")
+    return {"views": list(ledger.views), "regions": ledger.num_regions, "bytes": sizes}
 
 
 def _check_packages() -> _Check:

@@ -15,7 +15,7 @@ from jsecon.app.scene import Scene, open_scene
 from jsecon.app.shapes import require_shapes_format, write_shapes
 from jsecon.errors import InputError
 from jsecon.field.columns import is_mapped
-from jsecon.files import parse_json, remove_files, write_text
+from jsecon.files import parse_json, reading, remove_files, write_text
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console
 from jsecon.query.outliers import MIN_SAMPLES
@@ -59,10 +59,8 @@ def _write_records(file: Path, listed: Catalogue) -> None:
 
 def _read_vocabulary(file: Path) -> list[str]:
     """Reads names in UTF-8, one a line, each once. Empty lines and those that begin with # are left out."""
-    try:
+    with reading(file, remedy="Give a text file with one name a line."):
         lines = [line.strip() for line in file.read_text(encoding="utf-8-sig").splitlines()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(file, f"cannot read it ({error})", remedy="Give a text file with one name a line.") from error
     names = list(dict.fromkeys(line for line in lines if line and not line.startswith("#")))
     if not names:
         raise InputError(file, "it has no names", remedy="Write one name a line.")

@@ -1,4 +1,4 @@
-"""`jsecon add` and `jsecon forget`, and what `jsecon doctor` tells of a field's ledger."""
+"""`jsecon add` and `jsecon forget`."""
 
 import contextlib
 import shutil
@@ -10,7 +10,7 @@ from jsecon.app.opening import locate_field
 from jsecon.app.scene import open_scene
 from jsecon.errors import InputError, join_first
 from jsecon.field.field import load_field
-from jsecon.field.ledger_file import load_ledger, remove_stale
+from jsecon.field.ledger_file import remove_stale
 from jsecon.files import FIELD_FILE, exclusive_lock, remove_files
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console
@@ -78,15 +78,3 @@ def _remove_traces(folder: Path) -> list[str]:
         shutil.rmtree(folder / place)
         names.append(f"{place}/")
     return names
-
-
-def describe_ledger(field: Path, console: Console) -> verbs.VerbResult:
-    """Prints what the ledger of a field holds, and how large each kind is."""
-    path = locate_field(field).file
-    ledger = load_ledger(path, load_field(path, mapped=True))
-    views = list(ledger.views.values())
-    sizes = {name: sum(getattr(view, name).nbytes for view in views) for name in views[0]._fields} if views else {}
-    console.print_line(f"ledger of {path}: {len(views)} views, {ledger.num_regions} regions")
-    for name, size in sizes.items():
-        console.print_line(f"{size / 2**20:9.2f} MiB  {name.replace('_', ' ')}")
-    return {"views": list(ledger.views), "regions": ledger.num_regions, "bytes": sizes}
