@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Literal
 
 from jsecon.app import verbs
-from jsecon.app.opening import locate_field
 from jsecon.errors import InputError, describe_error
 from jsecon.pipeline.progress import Console
 from jsecon.process import available_memory, cores
@@ -50,7 +49,8 @@ def _doctor(verb: verbs.Doctor, console: Console) -> verbs.VerbResult:
 
 def _describe_ledger(field: Path, console: Console) -> verbs.VerbResult:
     """Prints what the ledger of a field holds, and how large each kind is."""
-    from jsecon.field.field import load_field  # late: these import jax, which may be what is broken
+    from jsecon.app.opening import locate_field  # late: what these import may be what is broken
+    from jsecon.field.field import load_field
     from jsecon.field.ledger_file import load_ledger
 
     path = locate_field(field).file
