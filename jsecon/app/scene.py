@@ -578,8 +578,7 @@ class Scene:
         Raises:
           InputError: As for `measure`; or the two are one place.
         """
-        bare = dataclasses.replace(self.field, metres_per_unit=None)
-        length = Scene(bare, self._embedder, up=self._up).measure(a, b)["centers"]
+        length = self.measure(a, b)["centers"] / (self.field.metres_per_unit or 1.0)  # capture units
         if not length > 0 or not metres > 0:
             problem = f"{metres:g} m are not the length between {a} and {b}, which are {length:g} units apart"
             raise InputError("scale", problem, remedy="Give two places and the length between them.")
