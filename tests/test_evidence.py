@@ -82,7 +82,7 @@ def test_a_thing_in_two_pieces_stays_whole_and_what_is_dropped_is_told(scene, ca
     save_field(tmp_path / "field.safetensors", one_region(scene, cameras, means))
     told = ask(tmp_path / "field.safetensors", tmp_path / "out")
     assert told["count"] == 58
-    assert told["outliers"] == {"dropped": 6, "selected": 64, "clusters_kept": 2, "clusters_dropped": 0}
+    assert told["outliers"] == {"dropped": 6, "selected": 64}
     printed = capsys.readouterr().out
     assert "6 of 64" in printed
     assert "--keep-outliers" in printed

@@ -144,7 +144,6 @@ class Answer:
       field: The field.
       count: Number of separate objects: 0 if nothing is selected, and 1 where the selection does not tell.
       reason: Why nothing is selected, or not the number that the text says; "" if there is nothing to say.
-      clusters: Number of clusters that DBSCAN kept and dropped, (0, 0) if it was not needed.
       skipped: Part of the work -> why it was not needed.
       objects: With by="relation", the objects that the text names, best first.
       reading: With by="relation", how the text was read; else "".
@@ -161,7 +160,6 @@ class Answer:
     field: LanguageField = dataclasses.field(repr=False)
     count: int = 1
     reason: str = ""
-    clusters: tuple[int, int] = (0, 0)
     skipped: Mapping[str, str] = dataclasses.field(default_factory=dict)
     objects: tuple[Object, ...] = ()
     reading: str = ""
@@ -225,12 +223,7 @@ class Answer:
             "rank": _known(self.selection.rank),
             "region": region if region >= 0 else None,
             "probability": probability or None,
-            "outliers": {
-                "dropped": selected - len(self.rows),
-                "selected": selected,
-                "clusters_kept": self.clusters[0],
-                "clusters_dropped": self.clusters[1],
-            },
+            "outliers": {"dropped": selected - len(self.rows), "selected": selected},
             "place": self._place_record() if len(self.rows) else None,
             "reason": self.reason,
             "skipped": dict(self.skipped),

@@ -489,7 +489,6 @@ class Scene:
             self.field,
             count=count if outliers.mask.any() else 0,
             reason=reason,
-            clusters=(outliers.clusters_kept, outliers.clusters_dropped),
             skipped=skipped | ({"DBSCAN": outliers.skipped} if outliers.skipped else {}),
         )
 
