@@ -43,7 +43,7 @@ def points_in_view(cameras: Camera, points: Float[np.ndarray, "p 3"]) -> Bool[np
         z = np.where(z > 0, z, np.nan)
         u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
         shown.append((u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height))
-    return np.array(shown, bool).reshape(-1, len(points))
+    return np.array(shown, bool).reshape(len(shown), len(points))
 
 
 @functools.partial(jax.jit, static_argnums=2)
