@@ -29,11 +29,10 @@ from experiments.memory_maps import clear_programs
 from experiments.rivals.evidence import Evidence
 from experiments.tables import twins
 from experiments.tables.association import associated
-from experiments.tables.ours import field_of, parts_of
+from experiments.tables.ours import field_of
 from experiments.tables.setting import Setting
 from jsecon.field.evidence import region_votes
 from jsecon.query.answer import match_regions, query_anchored, query_several
-from jsecon.query.match import parts_fallback
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.rules import MIN_COSINE, STATES, QueryRules
 from jsecon.splat.points import gaussians_from_points
@@ -117,14 +116,6 @@ def every_region(setting: Setting, field: LanguageField, k: int) -> Any:
     return query_several(field, jnp.asarray(setting.texts[k])[None], rules=rules)
 
 
-def instead(setting: Setting, field: LanguageField, k: int) -> Any:
-    """The parts that answer where no region does."""
-    text, rules = jnp.asarray(setting.texts[k]), QueryRules(min_score=NO_REFUSAL)
-    found = query_anchored(field, text, rules=rules)
-    other = parts_fallback(dataclasses.replace(field, parts=parts_of(setting)), text, found.score, rules)
-    return found if other is None else other
-
-
 ROWS: dict[str, Row] = {
     AS_IT_IS: anchored(),
     "the region by the plain cosine": anchored(retrieval="cosine"),
@@ -134,12 +125,9 @@ ROWS: dict[str, Row] = {
     "pieces at 0.75 of the way": anchored(fragment_score=0.75),
     "none alike": anchored(duplicate_cosine=None),
     "all regions that answer": every_region,
-    "parts where no region answers": instead,
     "refusing by the constant": anchored(min_score=None),
     "by the plain cosine, refusing by its constant": anchored(retrieval="cosine", min_score=None),
 }
-OF_PARTS = ("parts where no region answers",)
-"""rows that are asked of consensus alone"""
 
 
 def measure(data: twins.Data, scene: str, seed: int, level: str) -> dict:
@@ -151,7 +139,7 @@ def measure(data: twins.Data, scene: str, seed: int, level: str) -> dict:
     for by in ("consensus", "tracks"):
         field = field_of(setting, by=by)
         told[by] = {}
-        for row in ROWS if by == "consensus" else [row for row in ROWS if row not in OF_PARTS]:
+        for row in ROWS:
             told[by][row] = {}
             for k, query in enumerate(setting.bench.queries):
                 own = truth == names.index(query)

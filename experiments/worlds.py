@@ -20,7 +20,7 @@ from experiments import fair, lerf, results
 from experiments.simulated_vision.worlds import World
 from experiments.tables.fill import Plan, fill
 from experiments.tables.readings import SHARP
-from experiments.tables.rows import TRAINED, WITH_PARTS, rows_of
+from experiments.tables.rows import TRAINED, rows_of
 from jsecon.process import cores
 
 HARD, HALF = 1.0, 0.5
@@ -109,7 +109,7 @@ def is_read(row: str, trained: bool, quick: bool = False) -> bool:
     """Whether a row of `experiments.fair` is one of these tables."""
     method, way = row.split(": ")
     if not trained:
-        return way in (QUICK_READ if quick else READ) and method not in (WITH_PARTS, *TRAINED)
+        return way in (QUICK_READ if quick else READ) and method not in TRAINED
     return method in TRAINED and fair.reading_of(row) in READ_TRAINED
 
 

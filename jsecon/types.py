@@ -267,18 +267,6 @@ class Regions:
 
 
 @record
-class Parts:
-    """Small parts of a scene, each with what all masks that hold it say of it."""
-
-    part: Array
-    """(N,) int32 part of each Gaussian, 0 .. P-1, or -1."""
-    embeddings: Array
-    """(P, E) unit; zero for a part that lies in no mask."""
-    weight: Array
-    """(P,) weight of its Gaussians on masks."""
-
-
-@record
 class Autoencoder:
     """Parameters of one scene's autoencoder (`train_autoencoder`)."""
 
@@ -354,8 +342,6 @@ class LanguageField(_Shown):
     """name of the embedder whose space the regions live in; texts must be embedded by the same."""
     provenance: str = static(default="{}")
     """JSON: version, options, inputs' digests."""
-    parts: Parts | None = None
-    """what single masks say of small parts of the scene, where the run was asked for it."""
     unrelated_words: Array | None = None
     """(W, E) embeddings of words unrelated to the scene, W may be 0: what a text's similarity is
     measured against (jsecon.query.match). None: a field of an earlier version."""

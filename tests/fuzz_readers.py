@@ -40,7 +40,7 @@ from jsecon.read.masks.labels import load_lerf_labels
 from jsecon.read.masks.masks import FrameMasks, TrackedMasks
 from jsecon.read.splats.files import read_gaussians, save_gaussians
 from jsecon.read.splats.points import load_point_cloud
-from jsecon.types import Capture, Codes, Gaussians, LanguageField, Parts, Regions
+from jsecon.types import Capture, Codes, Gaussians, LanguageField, Regions
 
 NAMES, MASK_SIZE = ("a", "b"), (24, 36)
 
@@ -68,7 +68,6 @@ def check_result(found: Any) -> None:
     elif isinstance(found, LanguageField):
         check_result(found.gaussians)
         assert ((found.votes.regions >= -1) & (found.votes.regions < found.regions.count)).all()
-        assert found.parts is None or (found.parts.part < len(found.parts.weight)).all()
         assert isinstance(json.loads(found.provenance), dict)
         assert min(found.cameras.width, found.cameras.height) > 0
         if found.codes is not None:
@@ -230,11 +229,10 @@ def _labels(folder: Path) -> None:
 
 
 def tiny_field(**own) -> LanguageField:
-    """A field of 12 Gaussians, three regions and two parts."""
+    """A field of 12 Gaussians and three regions."""
     rng = np.random.default_rng(0)
     table = {"weight_where_region_visible": np.ones((12, 1), np.float32), "overlap": np.eye(3, dtype=np.float32)}
-    parts = Parts((np.arange(12) % 3 - 1).astype(np.int32), unit_rows(rng, 2, 8), np.ones(2, np.float32))
-    own = {"gaussians": gaussians(scene(12)), "canonical_phrases": unit_rows(rng, 4, 8), "parts": parts, **own}
+    own = {"gaussians": gaussians(scene(12)), "canonical_phrases": unit_rows(rng, 4, 8), **own}
     votes = dataclasses.replace(lone_votes(np.arange(12) % 3, 3), **table)
     return field_of(votes, Regions(unit_rows(rng, 3, 8), np.ones((3, 1), np.int32)), **own)
 
@@ -246,7 +244,7 @@ def _codes() -> Codes:
 
 
 def _fields(folder: Path) -> None:
-    for name, own in {"plain": {}, "coder": {"codes": _codes()}, "bare": {"parts": None}, "mapped": {}}.items():
+    for name, own in {"plain": {}, "coder": {"codes": _codes()}, "mapped": {}}.items():
         save_field(folder / f"{name}.safetensors", tiny_field(**own))
 
 

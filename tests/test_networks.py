@@ -168,7 +168,7 @@ def test_regions_take_their_embeddings_from_langsplat_s_files(room, splat, model
         vectors = np.random.default_rng(t).normal(size=(labels.max() + 1, 3))
         write_features(folder, name, labels, vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
         rows += [] if capture.held_out[t] else list(np.load(folder / f"{name}_f.npy"))
-    options = Options(room, gaussians=splat, holdout=4, masks=folder, features=folder, parts=True)
+    options = Options(room, gaussians=splat, holdout=4, masks=folder, features=folder)
     work = RunContext(options, model_loading.open_models(options, tmp_path), tmp_path)
     assert work.models.embedder.name == "given-3"
     planned, results = {s.name: s for s in _run_stages(work)}, Results(load=capture, gaussians=load_gaussians(splat))
@@ -178,7 +178,6 @@ def test_regions_take_their_embeddings_from_langsplat_s_files(room, splat, model
     results.objects = planned["objects"].compute(given).value
     found = stage.compute(given)
     np.testing.assert_allclose(found.value.embeddings, rows, atol=1e-6)
-    assert planned["parts"].compute(given).value.embeddings.shape[1] == 3
     for name in capture.names:
         write_features(folder, name, np.full((120, 160), -1), np.zeros((0, 3)))
     with refused("no mask of level l"):

@@ -120,18 +120,6 @@ def test_what_is_held_out_never_reaches_the_field(room_run, room, tmp_path):
             np.testing.assert_array_equal(a, b, err_msg=name)
 
 
-def test_parts_of_the_scene_are_a_stage_of_their_own(room_run, tmp_path):
-    run, out = room_run
-    shutil.copytree(out, tmp_path / "out")
-    _, console = again(run, tmp_path / "out", parts=True)
-    assert {name for name, fresh in console.fresh.items() if fresh} == {"parts", "field"}
-    field = load_field(tmp_path / "out" / "field.safetensors")
-    assert field.parts.part.shape == (field.gaussians.count,)
-    assert field.parts.part.max() + 1 == len(field.parts.embeddings) > field.regions.count
-    np.testing.assert_array_equal(field.votes.weights, run.field.votes.weights)
-    assert run.field.parts is None
-
-
 def test_default_vision_finds_regions_by_itself(room, room_run, tmp_path):
     """Segmenter, tracker and colours on the tiny room: the whole default path, on the Gaussians of the other run."""
     run, out = room_run

@@ -84,7 +84,7 @@ def test_wrong_input_and_other_options_are_reported_once(small_run, tmp_path):
     (tmp_path / "empty").mkdir()
     _, error = start([str(tmp_path / "empty")], tmp_path / "out").communicate(timeout=120)
     assert error.count(f"jsecon: {tmp_path / 'empty'}") == 1
-    rank = [*JSECON, *small_run, "--out", str(tmp_path / "out"), "--distributed", "--parts"]
+    rank = [*JSECON, *small_run, "--out", str(tmp_path / "out"), "--distributed", "--paper"]
     running = start(small_run, tmp_path / "out", ["-n", "1", *rank, ":", "-n", "1"])
     _, error = running.communicate(timeout=120)
     assert running.returncode != 0

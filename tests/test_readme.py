@@ -98,7 +98,7 @@ def test_every_command_line_of_a_page_is_one_that_its_program_takes(page, capsys
 
 
 def _check_jsecon(words, whole, capsys):
-    """Parses a command line of jsecon. In a table it may be part of one, such as `jsecon run --parts`."""
+    """Parses a command line of jsecon. In a table it may be part of one, such as `jsecon run --paper`."""
     try:
         with contextlib.suppress(SystemExit):
             cli.parse(words)

@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from scipy import sparse
 
-from jsecon.field.regions import embeddings_of_masks, region_embeddings, scene_parts
+from jsecon.field.regions import embeddings_of_masks, region_embeddings
 
 
 def embed(frame, masks):
@@ -111,33 +110,3 @@ def test_what_is_never_seen_is_zero_and_counts_nowhere():
         region_embeddings(frames, labels, embed, num_regions=2)
     with pytest.raises(ValueError, match="labels"):
         region_embeddings(frames, labels[:, 1:], embed)
-
-
-def made_parts(seed=0, count=200, parts=30, masks=40, dim=16):
-    rng = np.random.default_rng(seed)
-    part = rng.integers(-1, parts, count).astype(np.int32)
-    cast = sparse.random(count, masks, 0.1, format="csr", rng=rng, dtype=np.float32)
-    rows = rng.normal(size=(masks, dim)).astype(np.float32)
-    return part, cast, rows / np.linalg.norm(rows, axis=1, keepdims=True)
-
-
-def test_a_part_has_the_mean_of_the_masks_that_hold_it():
-    part, cast, embeddings = made_parts()
-    found = scene_parts(part, cast, embeddings)
-    dense = cast.toarray().astype(np.float64)
-    for p in range(part.max() + 1):
-        weight = dense[part == p].sum(0)
-        mean = weight @ embeddings.astype(np.float64)
-        expected = mean / np.linalg.norm(mean) if weight.any() else 0 * mean
-        np.testing.assert_allclose(found.embeddings[p], expected, atol=1e-6)
-        np.testing.assert_allclose(found.weight[p], weight.sum(), rtol=1e-5)
-
-
-def test_a_scene_without_masks_or_parts():
-    none = scene_parts(np.full(5, -1), sparse.csr_matrix((5, 0), dtype=np.float32), np.zeros((0, 8), np.float32))
-    assert none.embeddings.shape == (0, 8)
-    assert none.weight.shape == (0,)
-    bare = scene_parts(np.zeros(5, int), sparse.csr_matrix((5, 2), dtype=np.float32), np.eye(2, dtype=np.float32))
-    assert not bare.embeddings.any()
-    with pytest.raises(ValueError, match=r"cast \(5, 2\).*4 Gaussians"):
-        scene_parts(np.zeros(4, int), sparse.csr_matrix((5, 2)), np.eye(2))

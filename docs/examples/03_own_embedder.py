@@ -40,7 +40,7 @@ regions = jsecon.region_embeddings(capture.frames, labels, embedder.embed_region
 votes = jsecon.region_votes(field.gaussians, capture.cameras, labels, len(ids), by_view=True)
 own = {"regions": regions, "votes": jsecon.normalise_votes(votes, regions), "embedder": embedder.name}
 own |= {"cameras": capture.cameras, "names": capture.names, "canonical_phrases": embedder.canonical_phrases}
-field = dataclasses.replace(field, **own, unrelated_words=None, tree=None, leaf=None, parts=None, codes=None)
+field = dataclasses.replace(field, **own, unrelated_words=None, tree=None, leaf=None, codes=None)
 
 answer = jsecon.Scene(field, embedder).ask("cold")
 print(answer)

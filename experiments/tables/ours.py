@@ -8,23 +8,19 @@ import numpy as np
 
 from experiments.rivals.evidence import with_room
 from experiments.tables.answers import Answers, Method, Steps, by_selection
-from experiments.tables.association import Association, associated, by_consensus, proposals
+from experiments.tables.association import Association, associated, by_consensus
 from experiments.tables.codes import encode, region_codes
 from experiments.tables.setting import Setting
-from jsecon.association.consensus import pieces_on_masks
-from jsecon.association.scene import SceneSuperpixels
 from jsecon.field.evidence import region_votes
 from jsecon.field.membership import membership_probability, normalise_votes
-from jsecon.field.regions import scene_parts
 from jsecon.paper.autoencoder import train_autoencoder
 from jsecon.paper.distill import distill_l1, distill_votes
 from jsecon.paper.queries import CODE_THRESHOLD, query_canonical, query_one_step, select_by_code
 from jsecon.query.answer import match_regions, query_anchored, query_several
 from jsecon.query.classes import query_classes
-from jsecon.query.match import parts_fallback
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.rules import RULES, QueryRules
-from jsecon.types import Codes, LanguageField, Parts, Regions, Selection, Votes
+from jsecon.types import Codes, LanguageField, Regions, Selection, Votes
 
 BY_COSINE = {"retrieval": "cosine"}
 """the region of the largest cosine, as the paper finds it"""
@@ -102,19 +98,6 @@ def field_of(
     )
 
 
-def parts_of(setting: Setting) -> Parts:
-    """The scene's parts: pieces that lie near each other in the same masks, with the embeddings of all masks."""
-    evidence, levels = setting.evidence, setting.levels
-
-    def make() -> Parts:
-        views = SceneSuperpixels(evidence.gaussians, evidence.cameras, lambda t: proposals(levels, t))
-        frame, rows = (np.concatenate([np.asarray(getattr(e, k)) for e in levels]) for k in ("frame", "embeddings"))
-        given = pieces_on_masks(setting.frames, views, seed=setting.seed)
-        return scene_parts(*given, rows[np.argsort(frame, kind="stable")])
-
-    return setting.shared.get("parts", make)
-
-
 def of_all_views(field: LanguageField) -> LanguageField:
     """A field whose votes count every view that sees a Gaussian, not only those that show the region."""
     return dataclasses.replace(field, votes=dataclasses.replace(field.votes, weight_where_region_visible=None))
@@ -129,13 +112,11 @@ def ask_field(
     clean: bool = True,
     threshold: float | None = None,
     pieces: bool = False,
-    instead: bool = False,
     min_score: float | None = None,
 ) -> Answers:
     """Queries of a field: `way` is votes, all_views (votes, but every view that sees a Gaussian counts), code,
     probability (of the votes; all anchored, by `retrieval`), one_step or canonical; or all (of all regions that
-    answer). `clean` drops outliers, `pieces` joins the regions that are pieces of what the text found; `instead`: by
-    votes, parts answer where no region does (`parts_fallback`)."""
+    answer). `clean` drops outliers, `pieces` joins the regions that are pieces of what the text found."""
     means = np.asarray(setting.evidence.gaussians.means)
     field = of_all_views(field) if way == "all_views" else field
     phrases, codes = jnp.asarray(field.canonical_phrases), field.codes
@@ -166,9 +147,6 @@ def ask_field(
                 found = select_by_code(field, match, CODE_THRESHOLD if threshold is None else threshold)
             else:
                 found = query_anchored(field, text, rules=dataclasses.replace(rules, **cut))
-            whole = dataclasses.replace(field, parts=parts_of(setting)) if instead else field
-            if instead and (other := parts_fallback(whole, text, found.score, rules)) is not None:
-                found = other
         mask = np.asarray(found.mask)
         return (
             dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, mask, keep="largest")))

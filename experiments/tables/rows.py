@@ -36,8 +36,6 @@ NO_REFUSAL = -1.0
 WAYS = {"votes": "", "all": ", all"}
 """of asking jsecon's regions: the one that answers best with its pieces, all that answer"""
 OURS = {"ours, tracks": "tracks", "ours, consensus": "consensus"}
-WITH_PARTS = "ours, with parts"
-"""those of consensus; where no region answers a text, the parts that do"""
 CENTRES: dict[str, dict[str, float]] = {
     "": {},
     ", centre 0.5": {"centre": 0.5},
@@ -97,15 +95,14 @@ def own(
     chooser: str,
     way: str = "votes",
     even: bool = False,
-    instead: bool = False,
     **regions: float,
 ) -> Method:
-    """jsecon's row of an association's regions, which `regions` are the options of; `way` and `instead` as for
-    `ask_field`; `even`: shares are evened out over neighbours before they are cut."""
+    """jsecon's row of an association's regions, which `regions` are the options of; `way` as for `ask_field`;
+    `even`: shares are evened out over neighbours before they are cut."""
 
     def row(setting: Setting, steps: Steps) -> Answers:
         field = field_of(setting, by=association, **regions)
-        options = {"retrieval": retrieval, "min_score": NO_REFUSAL, "pieces": True, "instead": instead}
+        options = {"retrieval": retrieval, "min_score": NO_REFUSAL, "pieces": True}
         answers = ask_field(setting, field, way, clean=chooser == "threshold" and not even, **options)
         answers = _evened(setting, answers, clean=chooser == "threshold") if even else answers
         return _chosen(setting, answers, chooser, None)
@@ -224,9 +221,6 @@ def rows_of(points: bool) -> dict[str, Method]:
                     found[f"{name}: {rule}, {chooser}{WAYS['all']}"] = own(association, rule, chooser, way="all")
                     for told, options in EVENED.items():
                         found[f"{name}: {rule}, {chooser}{told}"] = own(association, rule, chooser, **options)
-                    for told, options in {"": {}, **EVENED}.items():
-                        row = own(association, rule, chooser, instead=True, **options)
-                        found[f"{WITH_PARTS}: {rule}, {chooser}{told}"] = row
     for rule, chooser in (("", "threshold"), *few):
         told = f"{rule}, {chooser}" if rule else "as published"
         found[f"LangSplat-m: {told}"] = _langsplat_row(rule, chooser)

@@ -290,8 +290,6 @@ class Answer:
             parts.append("unsure: it may be absent")
         if region >= 0:
             parts.append(f"region {region}")
-        elif "regions" in self.skipped:
-            parts.append("parts in place of a region")
         elif self.by in METHODS:
             parts.append(self.reason or "no region matches it")
         if isinstance(self.query.question, At | Box):

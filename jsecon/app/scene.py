@@ -421,17 +421,16 @@ class Scene:
         embedded = embedder.embed_text(included + excluded)
         texts, without = embedded[: len(included)], embedded[len(included) :]
         found = answer_question(field, texts, rules, excluded=without, outliers=query.outliers)
-        by_parts = "no region holds the object, so the parts that match the text were selected"
         warnings = [] if found[1].mask.any() else run_warnings(field)
         reason = " ".join(["no region matches it; the run warned:", *warnings]).rstrip(".") if warnings else ""
-        return self._finish(query, found[:3], {"regions": by_parts} if found.by_parts else {}, reason)
+        return self._finish(query, found, {}, reason)
 
     def _answer_region(self, query: Query, region: int, why: str) -> Answer:
         """Selects the Gaussians of a region, and of those that the query's options add to it."""
         found = answer_question(self.field, region, self._rules(query, ONE_REGION), outliers=query.outliers)
         last = (self.field.regions.count if self.field.tree is None else len(self.field.tree)) - 1
         reason = "" if 0 <= region <= last else f"there is no region {region}: the regions are 0 to {last}"
-        return self._finish(query, found[:3], {"text encoder": why}, reason)
+        return self._finish(query, found, {"text encoder": why}, reason)
 
     def wider(self, region: Region) -> Region | None:
         """What a region belongs to: the next larger thing that views see as one; None if nothing larger is known.

@@ -392,28 +392,6 @@ def _clean(
     return np.stack([row[image] for row, image in zip(table, labels)]), number[:-1]
 
 
-def pieces_on_masks(
-    frames: UInt8[np.ndarray, "t h w 3"],
-    scene: SceneSuperpixels,
-    *,
-    seed: int = 0,
-    progress: Progress | None = None,
-) -> tuple[Int[np.ndarray, " n"], Sparse]:
-    """Computes the pieces of a scene (N,) and the weight of each Gaussian on all masks (N, M), for `scene_parts`.
-
-    The masks of all frames lie in their order. A Gaussian that is never seen has piece -1.
-    """
-    require(seed >= 0, "seed", seed, "at least 0", "Give another seed.")
-    views, means = scene.all(frames, progress), np.asarray(scene.gaussians.means, np.float32)
-    piece = _scene_pieces(*_mask_signatures(views, scene.count), means, pieces=MAX_PIECES, seed=seed)
-    entries, start = [], 0
-    for view in views:
-        cast = _weights_on_masks(view)
-        entries.append((cast.data, view.seen[cast.row], start + cast.col))
-        start += len(view.proposals)
-    return piece, sum_entries(entries, (scene.count, start))
-
-
 def _mask_signatures(views: list[FrameSuperpixels], count: int) -> tuple[Sparse, Sparse, Float[np.ndarray, " n"]]:
     """Computes the input of `_group_by_consensus`: membership (N, M), visible (N, T) and weights (N,).
 

@@ -105,10 +105,7 @@ def add_objects(
     region, first = field.regions.count, field.gaussians.count
     owners = np.repeat(np.arange(region, region + len(things)), [thing.count for thing in things]).astype(np.int32)
     gaussians = jax.tree.map(lambda *columns: np.concatenate(columns), field.gaussians, *things)
-    parts = field.parts
-    if parts is not None:
-        parts = dataclasses.replace(parts, part=np.append(parts.part, np.full(len(owners), -1, np.int32)))
-    field = dataclasses.replace(field, gaussians=gaussians, parts=parts)
+    field = dataclasses.replace(field, gaussians=gaussians)
     field, ledger = add_views(field, Ledger(ledger.num_regions, ledger.views), views)
     if field.leaf is not None:
         field = dataclasses.replace(field, leaf=np.append(field.leaf, owners))

@@ -23,12 +23,11 @@ from jsecon.files import atomic_write, pack_tree, parse_json, read_arrays, readi
 from jsecon.read.captures.images import MAX_PIXELS
 from jsecon.splat.project import unusable_rows
 from jsecon.splat.sh import COEFFICIENT_COUNTS
-from jsecon.types import Autoencoder, Camera, Codes, Event, Gaussians, LanguageField, Parts, Regions, UpAxis, Votes
+from jsecon.types import Autoencoder, Camera, Codes, Event, Gaussians, LanguageField, Regions, UpAxis, Votes
 
 VERSION = 3
 _RECORDS = {
-    cls.__name__: cls
-    for cls in (LanguageField, Gaussians, Votes, Regions, Parts, Camera, Codes, Autoencoder, UpAxis, Event)
+    cls.__name__: cls for cls in (LanguageField, Gaussians, Votes, Regions, Camera, Codes, Autoencoder, UpAxis, Event)
 }
 MAPPED = 1 << 20
 """bytes of a column from which a mapped field leaves it on disk"""
@@ -41,7 +40,6 @@ _LETTERS = {
     "t": ("cameras.world_to_camera", 0),
     "k": ("votes.regions", -1),
     "c": ("canonical_phrases", 0),
-    "p": ("parts.weight", 0),
     "w": ("unrelated_words", 0),
     "b": ("gaussians.sh", 1),
     "m": ("tree", 0),
@@ -51,7 +49,7 @@ _SHAPES = {
     ("n", 3): "gaussians.means gaussians.log_scales",
     ("n", 4): "gaussians.quaternions",
     ("n", "b", 3): "gaussians.sh",
-    ("n",): "gaussians.opacity_logits votes.labelled votes.total votes.max_pixel_weight votes.views parts.part leaf",
+    ("n",): "gaussians.opacity_logits votes.labelled votes.total votes.max_pixel_weight votes.views leaf",
     ("n", "d"): "codes.gaussians",
     ("n", "k"): "votes.regions votes.weights votes.weight_where_region_visible",
     ("r", "e"): "regions.embeddings",
@@ -61,15 +59,13 @@ _SHAPES = {
     ("t",): "cameras.fx cameras.fy cameras.cx cameras.cy",
     (): "votes.overflow",
     ("c", "e"): "canonical_phrases",
-    ("p", "e"): "parts.embeddings",
     ("w", "e"): "unrelated_words",
     (4, 4): "source_from_scene",
     ("m",): "tree",
 }
 _OPTIONAL = (
-    "gaussians.sh", "votes.weight_where_region_visible", "votes.overlap", "parts.part", "parts.embeddings",
-    "unrelated_words", "codes.gaussians", "codes.regions",
-    "tree", "leaf",
+    "gaussians.sh", "votes.weight_where_region_visible", "votes.overlap", "unrelated_words",
+    "codes.gaussians", "codes.regions", "tree", "leaf",
 )  # fmt: skip
 
 
@@ -191,8 +187,7 @@ def _disagreement(field: LanguageField) -> str | None:
 
 def _oddity(field: LanguageField, checked: bool = True) -> str | None:
     """What is wrong with the numbers or texts, in words, or None; mapped columns are read only if `checked`."""
-    sizes = {"votes.regions": field.regions.count, "parts.part": field.parts and len(field.parts.weight)}
-    sizes["leaf"] = 0 if field.tree is None else len(field.tree)
+    sizes = {"votes.regions": field.regions.count, "leaf": 0 if field.tree is None else len(field.tree)}
     for place, leaf in jax.tree_util.tree_leaves_with_path(field):
         if isinstance(leaf, np.memmap) and not checked:
             continue

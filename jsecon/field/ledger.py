@@ -94,8 +94,8 @@ def add_views(field: LanguageField, ledger: Ledger, views: Mapping[str, LedgerVi
 def forget_views(field: LanguageField, ledger: Ledger, names: Collection[str]) -> tuple[LanguageField, Ledger]:
     """Takes frames out of a field: as one run without them and with the same regions makes it, to the last bit.
 
-    A region that no other view shows keeps its id, without votes and embedding. Parts, and codes of the paper, come
-    from all views together and are dropped. The Gaussians stay.
+    A region that no other view shows keeps its id, without votes and embedding. Codes of the paper come from
+    all views together and are dropped. The Gaussians stay.
 
     Args:
       field: The field.
@@ -112,7 +112,6 @@ def forget_views(field: LanguageField, ledger: Ledger, names: Collection[str]) -
     require(names <= known, "forget_views", sorted(names - known)[:3], "names of the field's frames", "Check them.")
     views = {name: view for name, view in ledger.views.items() if name not in names}
     require(len(views) > 0, "forget_views", "all views", "at least one view that stays", "Delete the field instead.")
-    field = dataclasses.replace(field, parts=None)
     ledger = Ledger(ledger.num_regions, views)
     return _build_field(field, dataclasses.replace(ledger, sum=_sum_all(field, ledger)), known - names)
 

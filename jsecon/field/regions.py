@@ -6,16 +6,14 @@ most of its errors (docs/models.md).
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
-from scipy import sparse
 
-from jsecon.errors import require, require_shape
+from jsecon.errors import require_shape
 from jsecon.numerics import array_module, inline_jit, normalize, require_labels
 from jsecon.parallel import map_over_processes
-from jsecon.types import Array, Camera, Parts, Progress, Regions
+from jsecon.types import Array, Camera, Progress, Regions
 
 ALIKE_THRESHOLD = 0.9
 """Cosine of what sets two regions apart from the mean region (`mean_residuals`), from which they are one object seen
@@ -227,22 +225,3 @@ def node_members(tree: Int[np.ndarray, " m"], leaf: Int[np.ndarray, " n"], node:
         under[fresh] = True
         fresh = np.flatnonzero(under[tree] & ~under[:-1])
     return under[leaf]
-
-
-def scene_parts(part: Int[np.ndarray, " n"], cast: Any, embeddings: Float[np.ndarray, "m e"]) -> Parts:
-    """Embeds the parts of a scene: of each the mean over masks, weighted by what its Gaussians cast on them. Host code.
-
-    Args:
-      part: (N,) part of each Gaussian, 0 .. P-1, -1 for no part.
-      cast: (N, M) sparse matrix, the weight of each Gaussian on each mask.
-      embeddings: (M, E) of the masks; a part that lies in none has a zero embedding.
-    """
-    fit = cast.shape == (len(part), len(embeddings))
-    shapes, expected = f"cast {cast.shape}", f"({len(part)} Gaussians, {len(embeddings)} masks)"
-    require(fit, "scene_parts", shapes, expected, "Give a row for each Gaussian and a column for each mask.")
-    members = np.flatnonzero(part >= 0)
-    count = int(part.max(initial=-1)) + 1
-    gather = sparse.csr_matrix((np.ones(len(members), np.float32), (part[members], members)), shape=(count, len(part)))
-    weight = gather @ cast
-    total = np.asarray(weight @ np.asarray(embeddings, np.float32), np.float32).reshape(count, embeddings.shape[1])
-    return Parts(part.astype(np.int32), unit_rows(total), np.asarray(weight.sum(1), np.float32).reshape(count))

@@ -1,4 +1,4 @@
-"""The stages of objects: labels of the training frames, embeddings of the regions, parts of the scene, votes, codes."""
+"""The stages of objects: labels of the training frames, embeddings of the regions, votes, codes."""
 
 import functools
 import itertools
@@ -13,13 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsecon.association.consensus import Objects, clean_tracks, pieces_on_masks, track_masks
+from jsecon.association.consensus import Objects, clean_tracks, track_masks
 from jsecon.association.run_lengths import cache_masks_as_rle
 from jsecon.association.scene import SceneSuperpixels
 from jsecon.errors import InputError
 from jsecon.field.columns import vote_blocks
 from jsecon.field.evidence import IGNORED, list_evidence, pack_evidence, scratch_folder, sum_evidence, votes_memory
-from jsecon.field.regions import Embed, choose_crops, crop_geometry, embeddings_of_masks, region_embeddings, scene_parts
+from jsecon.field.regions import choose_crops, crop_geometry, embeddings_of_masks, region_embeddings
 from jsecon.fit.depth import points_from_depth
 from jsecon.networks.hub import model_name
 from jsecon.paper.algorithm1 import masklets
@@ -32,7 +32,6 @@ from jsecon.pipeline.stages import (
     CastVotes,
     Checkpoint,
     ObjectLabels,
-    Results,
     RunContext,
     Stage,
     StageInput,
@@ -51,9 +50,8 @@ from jsecon.vision.surfaces import smooth_depth, surfaces_from_depth
 
 
 def plan_objects(context: RunContext) -> list[Stage]:
-    """Plans objects, their embeddings and votes; parts of the scene, and codes, if the options ask for them."""
-    parts = [_plan_parts(context)] if context.options.parts else []
-    return [_plan_labels(context), _plan_regions(context), *parts, *_plan_lifting(context)]
+    """Plans objects, their embeddings and votes; and codes, if the options ask for them."""
+    return [_plan_labels(context), _plan_regions(context), *_plan_lifting(context)]
 
 
 def _plan_labels(context: RunContext) -> Stage:
@@ -107,15 +105,6 @@ def _plan_regions(context: RunContext) -> Stage:
     key_options, read, files = context.key_options("level"), _read_embeddings, (options.features,)
     skipped = {"embedder": f"embeddings are given ({options.features.name})"}
     return Stage("regions", how, read, after=after, key_options=key_options, files=files, skipped=skipped)
-
-
-def _plan_parts(context: RunContext) -> Stage:
-    """Plans small parts of the scene."""
-    how, after = "of the scene, by what single masks say of them", ("load", "gaussians", "objects")
-    key_options = context.key_options("seed", "level", "granularity", "centre_pixel_weight")
-    key_options["embedder"] = context.models.embedder.name
-    files = (context.options.features,)
-    return Stage("parts", how, _find_parts, after=after, key_options=key_options, files=files)
 
 
 def _plan_lifting(context: RunContext) -> list[Stage]:
@@ -325,46 +314,6 @@ def _read_embeddings(stage: StageInput) -> StageResult:
     if missing:
         notes = (*notes, f"{missing} regions lie on no mask with one")
     return StageResult(embedded, notes=notes)
-
-
-def _find_parts(stage: StageInput) -> StageResult:
-    """Finds small parts of the scene, each with the embeddings of all single-frame masks that contain it."""
-    context, options = stage.context, stage.context.options
-    view = _TrainingView(stage.results.load, options, stage.results.objects.frames)
-    frames = view.frames
-    masks, embed = _masks_with_embeddings(context, view, stage.results)
-    views = SceneSuperpixels(
-        stage.results.gaussians, view.cameras, masks, centre_pixel_weight=options.centre_pixel_weight
-    )
-    piece, weights = pieces_on_masks(frames, views, seed=options.seed, progress=stage.progress)
-    rows = np.concatenate([embed(t, masks(t)) for t in range(len(frames))])
-    context.models.close()
-    return StageResult(scene_parts(piece, weights, rows))
-
-
-def _masks_with_embeddings(
-    context: RunContext, view: _TrainingView, results: Results
-) -> tuple[Callable[[int], np.ndarray], Embed]:
-    """Masks (M, H, W) of the t-th training frame and their embeddings: of --features, of --masks, or proposals."""
-    options, frames = context.options, view.frames
-
-    def by_model(t, masks):
-        return context.models.embedder.embed_regions(frames[t], masks)
-
-    if options.features is not None:
-        features = load_features(options.features, view.names, view.size, **view.mask_layout)
-
-        def rows(t):
-            return np.flatnonzero(np.asarray(features.frame) == t)
-
-        def masks(t):
-            return features.labels[t][None] == rows(t)[:, None, None]
-
-        return masks, lambda t, masks: features.embeddings[rows(t)]
-    if options.masks is not None:
-        labels = results.objects.labels
-        return lambda t: labels[t][None] == np.unique(labels[t][labels[t] >= 0])[:, None, None], by_model
-    return _frame_proposals(context, view, results.gaussians)[0], by_model
 
 
 def _accumulate_votes(stage: StageInput) -> StageResult:

@@ -221,8 +221,6 @@ class FieldOptions:
     """Options of the language field.
 
     Attributes:
-      parts: Embeds each frame's own masks too, so that query finds things that no region holds, and query --all leaves
-        out what most views took for one with its neighbour. Embeds all masks of all frames, whatever --crops says.
       paper: Also computes the paper's codes, three numbers per Gaussian, which query --by code compares.
       ledger: Leaves out field.evidence/, what each frame contributes to the field, which jsecon add and forget need.
       centre_pixel_weight: Weight of the pixel at a Gaussian's centre against all pixels that it covers, 0 to 1. Use 1
@@ -235,7 +233,6 @@ class FieldOptions:
         default it is the latest of their EXIF data.
     """
 
-    parts: Option[bool] = False
     paper: Option[bool] = False
     ledger: Option[bool] = True
     centre_pixel_weight: Annotated[Option[float], Range(0, 1)] = 0.0

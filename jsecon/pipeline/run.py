@@ -110,7 +110,7 @@ def _run_stages(context: RunContext) -> list[Stage]:
     """Plans the stages of a run. Mask files come before the long fit, so that their errors are found early."""
     by_name = {stage.name: stage for stage in [*plan_scene(context), *plan_objects(context)]}
     early = ("objects", "gaussians") if context.options.masks is not None else ("gaussians", "objects")
-    order = ("poses", "load", *early, "regions", "parts", "votes", "codes", "held_out")
+    order = ("poses", "load", *early, "regions", "votes", "codes", "held_out")
     return [by_name[name] for name in order if name in by_name]
 
 
@@ -320,7 +320,6 @@ def _join_field(results: Results, embedder: Embedder, provenance: str, options: 
         names=capture.names,
         embedder=embedder.name,
         provenance=provenance,
-        parts=results.parts,
         unrelated_words=embed_unrelated_words(embedder).astype(np.float16),
         codes=results.codes,
         up=given or capture.up or find_up_axis(results.gaussians, capture.cameras),

@@ -6,7 +6,6 @@
     gaussians  scene.plan_scene       load: fitted, or read from a file
     objects    objects.plan_objects   load, gaussians (--masks: load alone)
     regions    objects.plan_objects   load, objects
-    parts      objects.plan_objects   load, gaussians, objects, with --parts
     votes      objects.plan_objects   load, gaussians, objects
     codes      objects.plan_objects   regions, votes, with --paper
     held_out   scene.plan_scene       load, gaussians, if there are photographs
@@ -33,7 +32,7 @@ import numpy as np
 from jsecon.errors import InputError
 from jsecon.pipeline import cache
 from jsecon.pipeline.options import Options
-from jsecon.types import Array, Capture, Codes, Gaussians, Parts, Progress, Quality, Regions, Votes
+from jsecon.types import Array, Capture, Codes, Gaussians, Progress, Quality, Regions, Votes
 from jsecon.vision.protocols import Models
 
 CHECKPOINT_SECONDS = 20.0
@@ -79,8 +78,6 @@ class Results:
     """labels of the training frames that vision uses"""
     regions: Regions
     """R regions of the training frames"""
-    parts: Parts | None = None
-    """parts of the scene, if the options ask for them"""
     votes: CastVotes
     """weight of each region on each Gaussian"""
     codes: Codes | None = None

@@ -30,7 +30,6 @@ from jsecon.programs import numpy_outside_traces, stored_jit
 from jsecon.query.match import (
     compare_words,
     join_fragments,
-    parts_fallback,
     regions_with,
     score_text,
     select_node,
@@ -71,13 +70,11 @@ class _Answered(NamedTuple):
     """The answer to a question."""
 
     selection: Selection
-    """The Gaussians of the regions that match, or of the parts that answer in their place (`parts_fallback`)."""
+    """The Gaussians of the regions that match."""
     outliers: OutlierResult
     """The mask of the selection without outliers, and what became of its clusters."""
     objects: int
-    """Number of separate objects: groups of regions that overlap, at most as many as there are clusters. 1 of parts."""
-    by_parts: bool = False
-    """Whether parts answer."""
+    """Number of separate objects: groups of regions that overlap, at most as many as there are clusters."""
 
 
 def answer_question(
@@ -94,24 +91,22 @@ def answer_question(
     node of `LanguageField.tree` for the Gaussians under it.
     `outliers` drops the Gaussians that lie apart; regions of the `excluded` texts are left out.
     """
-    parts = None
+    node = None
     if isinstance(query, int | np.integer):
         match = match_region(field, query, rules)
         several = rules.duplicate_cosine is not None
         if field.tree is not None and field.regions.count <= query < len(field.tree):
-            parts, several = select_node(field, int(query)), True
+            node, several = select_node(field, int(query)), True
     else:
         match = match_regions(field, query, rules, excluded=excluded)
         several = rules.all_of_class or len(query) > 1 or (excluded is not None and len(excluded) > 0)
-        if field.parts is not None and not several and rules.code_threshold is None:
-            parts = parts_fallback(field, query[0], match.score, rules)
-    selection = select_gaussians(field, match, rules) if parts is None else parts
+    selection = select_gaussians(field, match, rules) if node is None else node
     kept = trim(field, selection, ("all" if several else "supported") if outliers else None)
     count, overlap = 1, field.votes.overlap
-    if overlap is not None and parts is None and rules.code_threshold is None:
+    if overlap is not None and node is None and rules.code_threshold is None:
         groups = join_fragments(np.flatnonzero(match.chosen), np.asarray(overlap))
         count = max(1, min(len(groups), kept.clusters_kept))
-    return _Answered(selection, kept, count, parts is not None)
+    return _Answered(selection, kept, count)
 
 
 def match_regions(

@@ -1,4 +1,4 @@
-"""How well each region of a field matches one text, and which regions and parts belong to the match.
+"""How well each region of a field matches one text, and which regions belong to the match.
 
 In a space such as CLIP's all texts lie in one narrow cone and all images in another, so the cosine of a text and an
 image is mostly that of the cones. What a text has in common with all texts is therefore subtracted before it is
@@ -13,30 +13,23 @@ class. `regions_with` has the rule. Relative scores are 0 at the median region a
                  piece of the object. A second object of the class is as similar, but has Gaussians of its own
     duplicate    cos(d, d_best) >= `duplicate_cosine`, d the embedding minus the mean: the same object seen twice
 
-An object that few views have a mask of may be swallowed by its neighbour's region. Each small part of the scene has an
-embedding of its own, the mean over all masks that hold it, as training-free methods give one to each Gaussian (Occam's
-LGS, arXiv 2412.01807). `parts_fallback` finds the parts that match a text clearly better than the best region does.
-
-Pure functions but for `join_fragments` and `parts_fallback`.
+Pure functions but for `join_fragments`.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import jax
 import numpy as np
 import scipy
 from jaxtyping import Bool, Float, Int, Shaped
 
-from jsecon.errors import require
-from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.field.regions import mean_residuals, node_members
 from jsecon.field.similarity import Number, similarities
 from jsecon.numerics import array_module, cosine_matrix, inline_jit, normalize
 from jsecon.programs import stored_jit
-from jsecon.query.outliers import best_cluster
-from jsecon.query.rules import ABSENT, QueryRules
-from jsecon.types import Array, LanguageField, Parts, Selection
+from jsecon.query.rules import QueryRules
+from jsecon.types import Array, LanguageField, Selection
 from jsecon.vision.protocols import Logits
 
 HEIGHT_WEIGHT = 0.5
@@ -45,12 +38,6 @@ are reached by absent colours in ray-traced rooms, and more by what is present w
 MIN_FRAGMENT_OVERLAP = 0.1
 """Smallest soft IoU of the Gaussians of two fragments. In twins of two scenes 106 of 115 pieces reach it, and 4 of 58
 other regions."""
-PART_SCORE = 0.6
-"""Relative score from which a part may belong to the object."""
-MIN_REGION_RATIO = 0.7
-"""A region answers if its similarity is at least this share of that of the best parts. Chosen with PART_SCORE on twins
-of nine scenes, seeds 0 to 2, medium and high noise: regions that show the object have 0.81 and more of it, others 0.51
-and less where the object's parts differ from their surroundings (9 of 468 texts)."""
 
 
 def unrelated_words(field: LanguageField) -> Array | None:
@@ -299,76 +286,3 @@ def select_node(field: LanguageField, node: int) -> Selection:
     """Selects the Gaussians under a node of `LanguageField.tree`, with score 1."""
     members = node_members(np.asarray(field.tree), np.asarray(field.leaf), node)
     return Selection(members, members.astype(np.float32), np.asarray(node, np.int32), np.asarray(1.0, np.float32))
-
-
-def parts_fallback(
-    field: LanguageField, text: Float[Array, " e"], region_score: Float[Array, ""] | float, rules: QueryRules
-) -> Selection | None:
-    """Selects the parts that match a text which no region matches; None if a region does, or no parts do. Host code.
-
-    The parts whose relative score reaches PART_SCORE are clustered. The cluster with the best upper scores is pooled
-    into one embedding. It answers if the best region has less than MIN_REGION_RATIO of its similarity with the text,
-    and the rules do not judge it absent, measured against the parts that match unrelated words best.
-
-    Args:
-      field: Field with parts.
-      text: Embedding of the text.
-      region_score: Similarity of the best region with the text.
-      rules: `min_share` is on the relative score of parts, on a scale that is 0.5 at PART_SCORE.
-
-    Returns:
-      The selection; its region is -1.
-    """
-    require(field.parts is not None, "parts_fallback", "a field without parts", "its parts", "Run with --parts.")
-    parts, text, words = cast(Parts, jax.tree.map(np.asarray, field.parts)), np.asarray(text), unrelated_words(field)
-    scores = _part_scores(parts, text, words, rules.retrieval)
-    on_scale, of_scores = np.array([0.0, SHARE_THRESHOLD, 1.0]), np.array([0.0, PART_SCORE, 1.0])
-    least = float(np.interp(float(rules.min_share), on_scale, of_scores))
-    mask = best_cluster(scores >= least, scores, field.gaussians.means)
-    similarity = np.interp(scores, of_scores, on_scale).astype(np.float32)
-    # Parts that match but lie outside of the chosen cluster are shown as unlike the text.
-    similarity = np.where(mask | (scores < least), similarity, np.minimum(similarity, 0.25))
-    part = np.asarray(parts.part)
-
-    def count(rows):
-        return np.bincount(rows[rows >= 0], minlength=len(parts.weight)).astype(np.float32)
-
-    inside = count(part[mask]) / np.maximum(count(part), 1.0)
-    pooled, similar, standing = _pooled(parts.embeddings, parts.weight, inside, text, words, rules.retrieval)
-    presence = None if rules.logits is None else presence_prob(pooled[None], text, rules.logits)[0]
-    state = rules.judge(standing, similar, presence)
-    if not mask.any() or float(region_score) >= MIN_REGION_RATIO * float(similar) or int(state) == ABSENT:
-        return None
-    rank = np.nan if standing is None else standing[0]
-    numbers = np.asarray(-1, np.int32), np.asarray(similar), np.asarray(rank, np.float32)
-    return Selection(mask, similarity, *numbers, presence, state)
-
-
-def _part_scores(
-    parts: Parts, text: Float[Array, " e"], words: Float[Array, "w e"] | None, retrieval: str
-) -> Float[np.ndarray, " n"]:
-    """Computes the relative score of the part of each Gaussian: 0 of the median part, 1 of the most similar one.
-
-    It is 0 for Gaussians without a part, and for all if all parts are equally similar.
-    """
-    similarity, known = region_similarities(parts.embeddings, text, words, retrieval)
-    median, largest = _median_and_largest(similarity, known)
-    scores = np.zeros(len(similarity) + 1, similarity.dtype)  # part -1: the last
-    if largest > median:
-        scores[:-1] = np.where(known, (similarity - median) / (largest - median), 0.0)
-    return scores[parts.part]
-
-
-def _pooled(
-    embeddings: Array, weight: Array, inside: Array, text: Array, words: Array | None, retrieval: str
-) -> tuple[Array, Number, tuple[Array, Array] | None]:
-    """Embedding (E,) of P parts, of each the share `inside` (P,), its similarity, and its standing among the words."""
-    pooled = normalize(((weight * inside)[:, None] * embeddings).sum(axis=0))
-    similar = region_similarities(pooled[None], text, words, retrieval)[0][0]
-    if words is None:
-        return pooled, similar, None
-    of_parts, known = region_similarities(embeddings, text, words, retrieval)
-    share = known / np.maximum(known.sum(dtype=text.dtype), 1)
-    reach = similar, similar - (share * of_parts).sum()
-    word_scores = cast(_WordScores, compare_words(embeddings, words, retrieval))
-    return pooled, similar, _standing_among_words(reach, text, word_scores, known.astype(text.dtype))

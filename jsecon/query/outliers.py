@@ -114,33 +114,8 @@ def split_outliers(
     return OutlierResult(mask, "", int(stays.sum()), int((~stays).sum()))
 
 
-def best_cluster(
-    mask: Bool[np.ndarray, " n"], scores: Float[np.ndarray, " n"], means: Float[Array, "n 3"]
-) -> Bool[np.ndarray, " n"]:
-    """Finds the cluster of Gaussians whose upper quartile of scores is best; all if there are too few to cluster.
-
-    Parts at the rim of a cluster are mixed with what lies behind. Clusters with less than a tenth of the largest's
-    Gaussians do not compete.
-    """
-    mask = mask & np.isfinite(np.asarray(means)).all(axis=1)
-    chosen = np.flatnonzero(mask)
-    if len(chosen) < MIN_SAMPLES:
-        return mask
-    points = np.asarray(means)[chosen].astype(np.float64)
-    # A smaller radius than for outliers, so that neighbouring objects part.
-    cluster = _dbscan(points, _default_eps(points, spacings=3.0))
-    if cluster.max() < 0:
-        return mask
-    sizes = np.bincount(cluster[cluster >= 0])
-    upper = np.array([np.quantile(scores[chosen][cluster == c], 0.75) for c in range(len(sizes))])
-    stays = upper >= upper[sizes >= 0.1 * sizes.max()].max()
-    result = np.zeros_like(mask)
-    result[chosen[(cluster >= 0) & stays[cluster]]] = True
-    return result
-
-
-def _default_eps(points: Float[Array, "m 3"], *, spacings: float = EPS_SPACINGS) -> float:
-    """Chooses DBSCAN's radius: `spacings` times the median distance of points to their third neighbour.
+def _default_eps(points: Float[Array, "m 3"]) -> float:
+    """Chooses DBSCAN's radius: EPS_SPACINGS times the median distance of points to their third neighbour.
 
     The median is taken over at most 20,000 points. If more than half of the points coincide the spacing is that of the
     distinct ones; the radius is 1 if there is only one place.
@@ -151,7 +126,7 @@ def _default_eps(points: Float[Array, "m 3"], *, spacings: float = EPS_SPACINGS)
             neighbours = min(4, len(candidates))
             spacing = np.median(KDTree(candidates, balanced_tree=False).query(sample, k=neighbours)[0][:, -1])
             if spacing > 0:
-                return float(spacings * spacing)
+                return float(EPS_SPACINGS * spacing)
     return 1.0
 
 
