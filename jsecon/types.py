@@ -396,7 +396,5 @@ class Selection:
     rank: Array | None = None
     """() float: share of unrelated words that are less similar to the scene than the text is; NaN or None where that is
     not known."""
-    presence: Array | None = None
-    """() float: probability that the text is true of the region; None unless the embedder was trained to tell that."""
     state: Array | None = None
     """() int: index of `jsecon.query.rules.STATES`, whether the scene has what the text names; None without a text."""

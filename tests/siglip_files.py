@@ -10,7 +10,6 @@ from clip_files import COLOURS, SIZE, write_textual, write_visual
 
 LENGTH = 12
 HALF = (0.5, 0.5, 0.5)
-SCALE, BIAS = 110.0, -40.0
 TOKENS = ["<pad>", "</s>", "<unk>", *(f"▁{word}" for word in (*COLOURS, "a", "thing", "")), *ascii_lowercase]
 PADDING, UNKNOWN = 0.01, 0.002
 """grey that a filled place adds, and a token that is no colour"""
@@ -51,11 +50,8 @@ def embedded(texts: list[str], length: int = LENGTH) -> np.ndarray:
     return np.asarray(found) / np.linalg.norm(found, axis=1, keepdims=True)
 
 
-def write_siglip(folder: Path, layout: str, *, logits: bool = True) -> Path:
-    """A SigLIP folder of immich's layout or of that of transformers.js, with logits.json."""
-    if logits:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / "logits.json", {"scale": SCALE, "bias": BIAS})
+def write_siglip(folder: Path, layout: str) -> Path:
+    """A SigLIP folder of immich's layout or of that of transformers.js."""
     if layout == "immich":
         write_visual(folder / "visual" / "model.onnx", ("image", "image_embedding"), 1, HALF, HALF)
         write_textual(folder / "textual" / "model.onnx", ("text", "text_embedding"), table(), [1, LENGTH], "int32")

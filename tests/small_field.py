@@ -83,7 +83,7 @@ def _make_field(scene, cameras, dim):
 
 
 class KnownTexts:
-    """An embedder of the texts of `rows`, text -> embedding; `more` are further attributes, such as logits."""
+    """An embedder of the texts of `rows`, text -> embedding; `more` are further attributes."""
 
     name = "known"
 

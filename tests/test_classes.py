@@ -12,7 +12,6 @@ from small_field import field_of, seen_of, unit_rows
 
 from jsecon import QueryRules, Regions, Votes
 from jsecon.query import classes
-from jsecon.vision.protocols import Logits
 
 SIZE, REGIONS, KEPT = 12, 6, 3
 query_classes = functools.partial(classes.query_classes, standardise=False)
@@ -126,14 +125,3 @@ def test_what_is_not_known_has_no_class_and_is_nobodys():
     for wrong in (texts[:, :5], texts[:0]):
         with pytest.raises(ValueError, match="query_classes"):
             query_classes(field, wrong)
-
-
-def test_a_probability_refuses_regions_as_a_similarity_does():
-    field, texts = made_field(600), unit_rows(np.random.default_rng(1), 5, SIZE)
-    best = np.sort((field.regions.embeddings @ texts.T).max(1))
-    least = float(best[2] + best[3]) / 2  # three of six regions are none of the classes
-    logits = Logits(40.0, float(np.log(0.01 / 0.99) - 40 * least))
-    labels, _ = query_classes(field, texts, rules=QueryRules(logits=logits))
-    expected, _ = query_classes(field, texts, rules=QueryRules(min_score=least))
-    np.testing.assert_array_equal(labels, expected)
-    assert 0.1 < (np.asarray(labels) < 0).mean() < 0.9

@@ -91,8 +91,6 @@ def damage(path, change):
     ("siglip", "config.json", {"text_cfg": RULES | {"context_length": 0}}, "texts of 0 tokens"),
     ("siglip", "config.json", {"text_cfg": RULES | {"tokenizer_kwargs": {"clean": "upper"}}}, "cleaned by 'upper'"),
     ("siglip", "config.json", {"text_cfg": RULES | {"tokenizer_kwargs": {"strip": True}}}, "tokenizer_kwargs"),
-    ("siglip", "logits.json", [], ("logits.json", "logit_bias")), ("siglip", "logits.json", {"scale": 0}, "logit_bias"),
-    ("siglip", "logits.json", {"scale": "x"}, "logit_bias"), ("siglip", "logits.json", {"scale": 1e9}, "logit_bias"),
     ("siglip.js", "config.json", {"text_config": {"max_position_embeddings": "x"}}, "texts of 'x' tokens"),
     ("siglip.js", "preprocessor_config.json", {"rescale_factor": 1}, "pixels times 1, not 1/255"),
     ("siglip.js", "tokenizer_config.json", {"tokenizer_class": "BertTokenizer"}, ("'BertTokenizer'", "Siglip")),

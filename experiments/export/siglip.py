@@ -5,18 +5,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from experiments.export.clip import Image, Text, write_half
 from experiments.export.embedder import FRAMES, TEXTS, compared
-from experiments.export.graph import Wrapped, declare_missing_operators, shake, write_graph
+from experiments.export.graph import Wrapped, declare_missing_operators, shake
 from experiments.export.vocabulary import write_vocabulary
 from jsecon.files import write_text
-from jsecon.networks.clip import LOGITS, ClipEmbedder
-
-SCALE, BIAS = 117.330795, -12.932437
-"""put into the random model: about those of the published ones"""
 
 
 def export_open_clip(model: torch.nn.Module, name: str, folder: Path, *, seed: int) -> dict:
@@ -40,7 +35,6 @@ def export_open_clip(model: torch.nn.Module, name: str, folder: Path, *, seed: i
     preprocessing |= {key: usual[key] for key in ("interpolation", "resize_mode")}
     write_text(folder / "visual" / "preprocess_cfg.json", json.dumps(preprocessing, indent=2) + "\n")
     write_text(folder / "config.json", json.dumps(settings, indent=2) + "\n")
-    write_text(folder / LOGITS, json.dumps({"scale": SCALE, "bias": BIAS}) + "\n")
 
     def encode(pixels):
         return model.encode_image(pixels, normalize=True)
@@ -57,15 +51,11 @@ def official_transformers(seed: int) -> torch.nn.Module:
     torch.manual_seed(seed)
     model = transformers.SiglipModel(transformers.SiglipConfig())
     shake(model, seed)
-    with torch.no_grad():
-        model.logit_scale.fill_(float(np.log(SCALE)))
-        model.logit_bias.fill_(BIAS)
     return model.eval().requires_grad_(False)
 
 
 def export_transformers(model: Any, folder: Path, *, seed: int) -> dict:
-    """Writes the folder of a transformers model, with the graph of both encoders, and compares graphs, tokens,
-    embeddings, and the scale and bias that jsecon finds in it."""
+    """Writes the folder of a transformers model, and compares graphs, tokens and embeddings."""
     import transformers
 
     size, length = model.config.vision_config.image_size, model.config.text_config.max_position_embeddings
@@ -81,12 +71,6 @@ def export_transformers(model: Any, folder: Path, *, seed: int) -> dict:
         write_half(onnx / "vision_model.onnx", Pooled(model.vision_model), "pixel_values", images, outputs),
         write_half(onnx / "text_model.onnx", Pooled(model.text_model), "input_ids", ids, outputs),
     ]
-    joint = ["logits_per_image", "logits_per_text", "text_embeds", "image_embeds"]
-    free = {"input_ids": {0: "texts"}, "pixel_values": {0: "images"}}
-    free |= {"text_embeds": {0: "texts"}, "image_embeds": {0: "images"}}
-    given = {"input_ids": ids[:2], "pixel_values": images[:2]}
-    # Scale and bias are what is read from this graph, and those are compared.
-    write_graph(onnx / "model.onnx", Joint(model), given, joint, free=free)
     preprocessing: dict[str, Any] = {"do_normalize": True, "do_rescale": True, "rescale_factor": 1 / 255}
     half = [0.5, 0.5, 0.5]
     preprocessing |= {"image_mean": half, "image_std": half, "size": {"height": size, "width": size}}
@@ -98,10 +82,7 @@ def export_transformers(model: Any, folder: Path, *, seed: int) -> dict:
         return torch.nn.functional.normalize(model.vision_model(pixel_values=pixels).pooler_output, dim=-1)
 
     numbers = {"mean": half, "std": half, "size": [size, size]}
-    found = compared(rows, folder, encode, wanted, ids, numbers)
-    scale, bias = ClipEmbedder(folder).logits or (np.nan, np.nan)
-    logits = {"scale": [scale, SCALE], "bias": [bias, BIAS]}
-    return found | {"logits": logits}
+    return compared(rows, folder, encode, wanted, ids, numbers)
 
 
 class Pooled(Wrapped):
@@ -110,14 +91,6 @@ class Pooled(Wrapped):
     def forward(self, given):
         found = self.model(given)
         return found.last_hidden_state, found.pooler_output
-
-
-class Joint(Wrapped):
-    """Both encoders with scale and bias, as transformers' own forward gives them."""
-
-    def forward(self, input_ids, pixel_values):
-        found = self.model(input_ids=input_ids, pixel_values=pixel_values)
-        return found.logits_per_image, found.logits_per_text, found.text_embeds, found.image_embeds
 
 
 def _corpus() -> list[str]:

@@ -22,7 +22,7 @@ from jsecon.programs import stored_jit
 from jsecon.query.match import MIN_FRAGMENT_OVERLAP, judge_texts, regions_with, unrelated_words
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.outliers import MIN_SAMPLES
-from jsecon.query.rules import ABSENT, QueryRules
+from jsecon.query.rules import ABSENT, RULES, QueryRules
 from jsecon.splat.visible import points_in_view
 from jsecon.types import Array, LanguageField, Votes
 from jsecon.views.frame import field_up, inner_scene
@@ -178,7 +178,7 @@ def objects(
     """
     axis = field_up(field, up)
     upright = np.array(axis.axis)
-    texts, embeddings, scale, rules = _vocabulary(field, vocabulary, embedder)
+    texts, embeddings, scale = _vocabulary(field, vocabulary, embedder)
     size, main = _sizes(field)
     groups = _region_objects(field, main, upright)
     members = np.arange(groups.max(initial=-1) + 1)[:, None] == groups  # (G, R)
@@ -187,7 +187,7 @@ def objects(
     arrays = field.regions.embeddings, embeddings, field.regions.pixel_counts
     present = np.zeros(len(texts), bool)
     if len(members) and len(texts):
-        present = np.asarray(judge_texts(*map(jnp.asarray, arrays), unrelated_words(field), rules)) > ABSENT
+        present = np.asarray(judge_texts(*map(jnp.asarray, arrays), unrelated_words(field), RULES)) > ABSENT
     text = np.asarray((*texts, ""), object)
     is_background = np.array(["background" in name.lower().split() for name in texts], bool)
     allowed = present & ~(_is_small(field, groups, main)[:, None] & is_background)
@@ -251,25 +251,23 @@ def _frames_around(field: LanguageField, rows: Int[np.ndarray, " m"]) -> Bool[np
 
 def _vocabulary(
     field: LanguageField, vocabulary: Sequence[str] | None, embedder: Any
-) -> tuple[tuple[str, ...], np.ndarray, float, QueryRules]:
-    """Returns the names to choose from, their embeddings (V, E), the scale of cosines in the softmax, and the rules."""
+) -> tuple[tuple[str, ...], np.ndarray, float]:
+    """Returns the names to choose from, their embeddings (V, E), and the scale of cosines in the softmax."""
     words_known = field.unrelated_words is not None and len(field.unrelated_words) == len(UNRELATED_WORDS)
     if vocabulary is None and embedder is None and words_known and not field.embedder.startswith("colours"):
         # Without the model.
-        return UNRELATED_WORDS, np.asarray(field.unrelated_words, np.float32), SOFTMAX_SCALE, QueryRules()
+        return UNRELATED_WORDS, np.asarray(field.unrelated_words, np.float32), SOFTMAX_SCALE
     if embedder is None:
         from jsecon.pipeline.model_loading import external_dim, field_embedder
 
         if vocabulary is None and external_dim(field.embedder) is not None:
-            return (), np.zeros((0, field.regions.embeddings.shape[1]), np.float32), SOFTMAX_SCALE, QueryRules()
+            return (), np.zeros((0, field.regions.embeddings.shape[1]), np.float32), SOFTMAX_SCALE
         embedder = field_embedder(field)
-    logits = getattr(embedder, "logits", None)
-    scale = getattr(embedder, "softmax_scale", SOFTMAX_SCALE) if logits is None else logits.scale
     texts = tuple(getattr(embedder, "vocabulary", UNRELATED_WORDS) if vocabulary is None else vocabulary)
     if not texts:
         raise InputError("vocabulary", "it has no names", remedy="Give at least one name.")
     rows = embed_unrelated_words(embedder) if texts == UNRELATED_WORDS else np.asarray(embedder.embed_text(list(texts)))
-    return texts, rows, scale, QueryRules(logits=logits)
+    return texts, rows, getattr(embedder, "softmax_scale", SOFTMAX_SCALE)
 
 
 def _name(

@@ -81,7 +81,7 @@ class ObjectIndex:
         self._catalogue, self._up = catalogue, up
         poses = transform_poses(np.asarray(field.cameras.world_to_camera), np.asarray(field.source_from_scene))
         self._cameras = dataclasses.replace(jax.tree.map(np.asarray, field.cameras), world_to_camera=poses)
-        self._rules = QueryRules(all_of_class=True, logits=getattr(embedder, "logits", None))
+        self._rules = QueryRules(all_of_class=True)
         self._objects_of = functools.lru_cache(1024)(self._find_objects)
 
     def _find_objects(self, phrase: str) -> tuple[list[Object], float]:

@@ -206,8 +206,7 @@ class Answer:
     def as_dict(self) -> dict[str, Any]:
         """The record of the answer as plain values for JSON, in the capture's world: the same at every door."""
         region, selected = int(self.selection.region), int(np.asarray(self.selection.mask).sum())
-        presence = _known(self.selection.presence)
-        probability = {} if presence is None else {"presence": presence}
+        probability = {}
         if len(self.rows) and self.by == "votes":
             inside = probability_inside(self.selection.similarity, self.field.votes, self.mask)
             probability["mean"] = round(float(inside.mean()), 4)

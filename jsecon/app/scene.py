@@ -449,10 +449,7 @@ class Scene:
             options["code_threshold"] = CODE_THRESHOLD if query.threshold is None else query.threshold
         elif query.threshold is not None:
             options["min_share"] = query.threshold
-        if isinstance(query.question, str):
-            # Of an embedder trained to tell whether a text is true of an image; the cosines of all others only rank.
-            options["logits"] = getattr(self.embedder, "logits", None)
-        elif query.all_of_class:
+        if query.all_of_class and not isinstance(query.question, str):
             options |= {"duplicate_cosine": ALIKE_THRESHOLD, "all_of_class": False}
         return dataclasses.replace(rules, **options)
 

@@ -22,16 +22,10 @@ from jsecon.networks.hub import find_files
 from jsecon.networks.session import Graph, Tensor, content_digest
 from jsecon.networks.tokenizer import CLIP_LENGTH, TextTokenizer, read_text_rules
 from jsecon.numerics import is_finite_and_bounded
-from jsecon.vision.protocols import CANONICAL, Logits
+from jsecon.vision.protocols import CANONICAL
 from jsecon.vision.stores import EmbeddingStore
 from jsecon.vision.unrelated_words import cached_unrelated_words
 
-LOGITS = "logits.json"
-"""file of a model folder with the scale and bias of a model trained with a sigmoid"""
-_LOGITS_REMEDY = (
-    f'Write {LOGITS} into the folder, {{"scale": ..., "bias": ...}}: exp of the checkpoint\'s logit_scale, and its '
-    "logit_bias."
-)
 _OUTPUTS = {
     "image": ("embedding", "image_embeds", "image_features", "image_embedding"),
     "text": ("embedding", "text_embeds", "text_features", "text_embedding"),
@@ -107,7 +101,6 @@ class ClipEmbedder:
 
     Attributes:
       name: Name of the space. It follows from the content of the files, so that models are told apart.
-      logits: Scale and bias of a model trained with a sigmoid if the folder has them, else None.
     """
 
     def __init__(self, folder: str | Path, *, store: Path | None = None):
@@ -117,7 +110,6 @@ class ClipEmbedder:
         extra = repr((self._mean, self._std, self._size, *(self._rules or ())))
         digest = content_digest([self._visual_path, self._textual_path], [self._tokenizer_path], extra=extra)
         self.name = f"clip-{digest}"
-        self.logits = _read_logits(Path(folder)) if self._rules is not None else None
         self._store = None if store is None else EmbeddingStore(store, self.name)
 
     @functools.cached_property
@@ -173,8 +165,6 @@ class ClipEmbedder:
         self._embed_phrases(["word"])
         summary = f"images of {self._side}x{self._side} px and texts to {self.dim} numbers"
         self.close()
-        if self._rules is not None and self.logits is None:
-            summary += f"; no scale and bias, so that a text is refused by its cosine. {_LOGITS_REMEDY}"
         return summary
 
     def close(self) -> None:
@@ -240,24 +230,6 @@ class ClipEmbedder:
             remedy = "Take both graphs from one model, with their projections."
             raise InputError(self._textual_path, f"texts of {rows.shape[1]} numbers", expected, remedy)
         return _normalize(rows, self._textual_path)
-
-
-def _read_logits(folder: Path) -> Logits | None:
-    """Reads scale and bias of a model trained with a sigmoid (SigLIP, arXiv 2303.15343), which its graphs do not hold.
-
-    The text is true of the image with probability sigmoid(scale * cosine + bias).
-    """
-    path = folder / LOGITS
-    if not path.is_file():
-        return None
-    # Far above trained values: published SigLIP models have scales near 110 and biases near -15.
-    expected = '{"scale": s, "bias": b}, 0 < s <= 1e4, |b| <= 1e3'
-    content = read_json(path, expected, _LOGITS_REMEDY)
-    with reading(path, expected, _LOGITS_REMEDY):
-        logits = Logits(float(content["scale"]), float(content["bias"]))
-    if not (0 < logits.scale <= 1e4 and abs(logits.bias) <= 1e3):
-        raise InputError(path, f"scale {logits.scale:g}, bias {logits.bias:g}", expected, _LOGITS_REMEDY)
-    return logits
 
 
 def _run_in_batches(

@@ -45,11 +45,11 @@ _LAYOUTS: Mapping[Role, tuple[_Layout, ...]] = {
     "embedder": (
         _Layout(
             ("onnx/vision_model{p}.onnx", "onnx/text_model{p}.onnx", "preprocessor_config.json", "tokenizer.json"),
-            ("config.json", "tokenizer_config.json", "logits.json"),
+            ("config.json", "tokenizer_config.json"),
         ),
         _Layout(
             ("visual/model{p}.onnx", "textual/model{p}.onnx", "visual/preprocess_cfg.json", "textual/tokenizer.json"),
-            ("config.json", "textual/tokenizer_config.json", "logits.json"),
+            ("config.json", "textual/tokenizer_config.json"),
         ),
     ),
     "segmenter": (

@@ -51,8 +51,6 @@ class RegionMatch(NamedTuple):
     """Similarity of the best region, whether it is chosen or not; 0 without regions."""
     rank: Float[Array, ""] | np.ndarray = np.asarray(np.nan, np.float32)
     """Share of unrelated words that match the scene less than the text does; NaN without such words."""
-    presence: Float[Array, ""] | None = None
-    """Probability that the text is true of the best region; None without `QueryRules.logits`."""
     state: Int[Array, ""] | np.ndarray = np.asarray(FOUND, np.int32)
     """Index of `rules.STATES`: whether the scene has what the text names."""
 
@@ -176,14 +174,12 @@ def _match(embeddings, pixels, overlap, queries, excluded, words, rules: QueryRu
 
     known = of_best(scores.known)
     nearest = xp.where(known.any(), xp.where(known, of_best(scores.similarity), -xp.inf).max(), 0.0)
-    presence = None if scores.presence is None else scores.presence.max(axis=0)
     ranked = known & ~xp.isnan(scores.rank)
     return RegionMatch(
         xp.asarray(chosen),
         xp.where(matches, best, -1).astype(np.int32),
         xp.where(matches, similarity[best], nearest),
         xp.where(ranked.any(), xp.where(ranked, scores.rank, -xp.inf).max(), xp.nan).astype(similarity.dtype),
-        None if presence is None else xp.where(matches, presence[best], presence.max()),
         xp.where(matches, scores.state.max(), ABSENT),
     )
 

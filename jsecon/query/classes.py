@@ -14,7 +14,6 @@ from jsecon.errors import require
 from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction, ratio, vote_columns
 from jsecon.query.match import (
     compare_words,
-    presence_prob,
     region_similarities,
     unrelated_words,
     view_count_weight,
@@ -91,16 +90,14 @@ def _classes(embeddings, texts, pixels, votes, words, rules: QueryRules, standar
     def of_best(table):
         return jnp.take_along_axis(table, best[:, None], axis=1)[:, 0]
 
-    standing = presence = None
+    standing = None
     word_scores = compare_words(embeddings, words, rules.retrieval)
     if word_scores is not None:
         scores = word_scores.similarity
         count = jnp.sum(jnp.isfinite(scores), axis=0)
         below = jnp.sum(scores < of_best(plain), axis=0, dtype=plain.dtype)
         standing = (jnp.where(count > 0, below / jnp.maximum(count, 1), 1.0), None)
-    if (logits := rules.logits) is not None:
-        presence = of_best(jax.vmap(lambda text: presence_prob(embeddings, text, logits), out_axes=1)(texts))
-    accepted = (rules.judge(standing, of_best(plain), presence) > ABSENT) & known & jnp.any(valid)
+    accepted = (rules.judge(standing, of_best(plain)) > ABSENT) & known & jnp.any(valid)
     count = votes.regions.shape[0]
 
     def sums(allowed):

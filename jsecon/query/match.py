@@ -21,7 +21,6 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-import scipy
 from jaxtyping import Bool, Float, Int, Shaped
 
 from jsecon.field.regions import mean_residuals, node_members
@@ -30,7 +29,6 @@ from jsecon.numerics import array_module, cosine_matrix, inline_jit, normalize
 from jsecon.programs import stored_jit
 from jsecon.query.rules import QueryRules
 from jsecon.types import Array, LanguageField, Selection
-from jsecon.vision.protocols import Logits
 
 HEIGHT_WEIGHT = 0.5
 """Weight of the heights in the margin of a text among unrelated words: so many deviations of heights as of similarities
@@ -53,8 +51,6 @@ class _TextScores(NamedTuple):
     """Cosine, in [-1, 1]; 0 where it is not known."""
     known: Bool[Array, " r"]
     """Regions with an embedding, if the text has one."""
-    presence: Float[Array, " r"] | None
-    """Probability that the text is true of the region; None without logits."""
     best: Int[Array, ""]
     """The best region: largest similarity times `view_count_weight`."""
     state: Int[Array, ""]
@@ -100,7 +96,6 @@ def score_text(
     """Compares one text with all regions, and with unrelated words (`compare_words`) if there are any."""
     similarity, known = similarities(embeddings, _text_direction(text, words and words.mean, rules.retrieval))
     xp = array_module(similarity)
-    presence = None if rules.logits is None else presence_prob(embeddings, text, rules.logits)
     weight = view_count_weight(pixels).astype(similarity.dtype)
     weighted = similarity
     if rules.retrieval != "cosine" and words is not None:  # the plain cosine is the paper's, without weights
@@ -113,8 +108,8 @@ def score_text(
         reach = xp.max(xp.where(known, similarity, -xp.inf)), _height(similarity, weight)
         standing = _standing_among_words(reach, text, words, weight)
         rank = standing[0]
-    state = rules.judge(standing, similarity[best], None if presence is None else presence[best])
-    return _TextScores(similarity, known, presence, best, state, rank)
+    state = rules.judge(standing, similarity[best])
+    return _TextScores(similarity, known, best, state, rank)
 
 
 @stored_jit
@@ -187,14 +182,6 @@ def _standing_among_words(
     margin = xp.maximum(deviations(reach[0], largest), HEIGHT_WEIGHT * deviations(reach[1], heights))
     below = (known & (largest[others] < reach[0])).sum(dtype=text.dtype) / count
     return xp.where(known.any(), below, 1.0), xp.where(known.any(), margin, xp.inf)
-
-
-def presence_prob(embeddings: Float[Array, "r e"], text: Float[Array, " e"], logits: Logits) -> Float[Array, " r"]:
-    """Computes the probability that a text is true of each region: sigmoid(scale cos + bias); 0 without a direction."""
-    cosines, known = similarities(embeddings, text)
-    xp = array_module(cosines)
-    sigmoid = scipy.special.expit if xp is np else jax.nn.sigmoid
-    return xp.where(known, sigmoid(logits.scale * cosines + logits.bias), 0.0)
 
 
 @inline_jit

@@ -10,7 +10,6 @@ from jsecon.field.regions import ALIKE_THRESHOLD
 from jsecon.field.similarity import Number
 from jsecon.numerics import array_module
 from jsecon.types import static
-from jsecon.vision.protocols import Logits
 
 RETRIEVALS = ("contrast", "cosine")
 """Ways to compare a text with regions: what sets it apart from unrelated words, or the plain cosine (the paper)."""
@@ -25,10 +24,6 @@ a list does. Of whole scenes it is the least that refuses 0.8 of absent texts wi
 MIN_COSINE = 0.2
 """Smallest cosine of the best region, for fields without unrelated words. The paper has such a threshold and does not
 state it. In CLIP ViT-B/16 an image has a cosine of 0.25 to 0.35 with a text that fits and 0.1 to 0.2 with another."""
-MIN_PRESENCE = 0.01
-"""Smallest probability that a text is true of the best region, for embedders with logits and fields without unrelated
-words. SigLIP (arXiv 2303.15343) is trained at one true pair in 32,768, where 0.01 says that a pair is 300 times
-likelier true than at random. Not measured: no trained weights could be had."""
 
 
 @jax.tree_util.register_dataclass
@@ -42,8 +37,7 @@ class QueryRules:
     """Smallest share of unrelated words that must match the scene less than the text does, else it is absent; 0 refuses
     no text. None judges by the margin among these words."""
     min_score: Number | None = None
-    """Smallest similarity of the best region, in place of a comparison with words; a probability where there are
-    `logits`."""
+    """Smallest similarity of the best region, in place of a comparison with words."""
     duplicate_cosine: Number | None = ALIKE_THRESHOLD
     """Cosine from which two regions are one object seen twice, and both answer; None disables it."""
     fragment_score: Number | None = 0.5
@@ -58,23 +52,19 @@ class QueryRules:
     code_threshold: Number | None = None
     """Smallest cosine of a selected Gaussian's code with that of the best region (the paper), in place of `min_share`;
     None selects by votes."""
-    logits: Logits | None = None
-    """Scale and bias of an embedder that was trained to tell whether a text is true of an image."""
 
     def __post_init__(self):
         """Raises ValueError for an unknown retrieval."""
         require_one_of("QueryRules", self.retrieval, RETRIEVALS, f"{RETRIEVALS[0]!r} is the default.")
 
-    def judge(self, standing, similarity, presence):
-        """Decides whether the scene has what a text names: the one judgement of texts, of regions and of parts.
+    def judge(self, standing, similarity):
+        """Decides whether the scene has what a text names: the one judgement of texts and of regions.
 
         `standing` is the text's rank and margin among unrelated words (query/match.py), None without such words; the
-        margin is None where a region is compared with a list of classes. `presence`, the probability that the text is
-        true, is None without `logits`. Returns an index of STATES.
+        margin is None where a region is compared with a list of classes. Returns an index of STATES.
         """
         if self.min_score is not None or standing is None:
-            value, default = (similarity, MIN_COSINE) if presence is None else (presence, MIN_PRESENCE)
-            return FOUND * (value >= (default if self.min_score is None else self.min_score))
+            return FOUND * (similarity >= (MIN_COSINE if self.min_score is None else self.min_score))
         rank, margin = standing
         if margin is None:
             return FOUND * (rank >= (MIN_RANK if self.min_rank is None else self.min_rank))

@@ -5,7 +5,7 @@ Host code: NumPy in, NumPy out. Frames are uint8 RGB.
 
 import dataclasses
 from collections.abc import Collection
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -58,13 +58,6 @@ class Embedder(Protocol):
     def embed_text(self, texts: list[str]) -> np.ndarray:
         """Embeds Q texts: unit rows (Q, E) float32; raises InputError for one that the space cannot represent."""
         ...
-
-
-class Logits(NamedTuple):
-    """Calibration of a cosine: P(text is true of image) = sigmoid(scale * cosine + bias)."""
-
-    scale: float
-    bias: float
 
 
 @dataclasses.dataclass(frozen=True)
