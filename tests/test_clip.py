@@ -77,23 +77,6 @@ def test_crops_are_those_of_langsplat(frame):
         _masked_crop(frame, np.zeros_like(mask), 8)
 
 
-def test_embeddings_are_kept_by_content(folders, frame, masks, tmp_path, monkeypatch):
-    embedder = ClipEmbedder(folders["transformers.js"], store=tmp_path)
-    crops = []
-    through = embedder._run_visual
-    monkeypatch.setattr(embedder, "_run_visual", lambda c: crops.append(len(c)) or through(c))
-    rows = embedder.embed_regions(frame, masks[:3])
-    assert sum(crops) == 3
-    np.testing.assert_array_equal(embedder.embed_regions(frame, masks[[2, 1, 4]]), [*rows[[2, 1]].tolist(), [0, 0, 0]])
-    assert sum(crops) == 3
-    embedder.embed_regions(255 - frame, masks[:1])  # another frame
-    assert sum(crops) == 4
-    for path in tmp_path.glob("*.safetensors"):
-        path.write_bytes(path.read_bytes()[:50])
-    np.testing.assert_array_equal(embedder.embed_regions(frame, masks[:3]), rows)
-    assert sum(crops) == 7
-
-
 def test_the_name_is_that_of_the_content(folders, tmp_path):
     names = {layout: ClipEmbedder(folder).name for layout, folder in folders.items()}
     assert len(set(names.values())) == 2

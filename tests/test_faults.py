@@ -171,7 +171,7 @@ def test_a_platform_that_jax_lacks_is_named_by_every_verb(tmp_path, variable, va
     environ = {key: text for key, text in os.environ.items() if not key.startswith("JAX_PLATFORM")}
     environ |= {variable: value, "PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=tmp_path, env=environ)
-    expected = f"{variable}: it asks for '{value}', which this jax does not have (it has cpu). Unset it, or set"
+    expected = f"{variable}: it asks for '{value}', which this jax does not have. Unset it, or set"
     errors = [line for line in done.stderr.splitlines() if line.startswith("jsecon: ")]
     assert len(errors) == 4, done.stderr
     assert all(expected in line for line in errors)

@@ -8,7 +8,6 @@ it is.
 """
 
 import functools
-import hashlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,7 +22,6 @@ from jsecon.networks.session import Graph, Tensor, content_digest
 from jsecon.networks.tokenizer import CLIP_LENGTH, TextTokenizer, read_text_rules
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.vision.protocols import CANONICAL
-from jsecon.vision.stores import EmbeddingStore
 from jsecon.vision.unrelated_words import cached_unrelated_words
 
 _OUTPUTS = {
@@ -97,20 +95,18 @@ class ClipEmbedder:
 
     Args:
       folder: The model folder.
-      store: Folder that caches embeddings of regions by content; or None.
 
     Attributes:
       name: Name of the space. It follows from the content of the files, so that models are told apart.
     """
 
-    def __init__(self, folder: str | Path, *, store: Path | None = None):
+    def __init__(self, folder: str | Path):
         self._visual_path, self._textual_path, config, self._tokenizer_path = find_files(folder, "embedder")
         self._mean, self._std, self._size = read_preprocessing(config)
         self._rules = read_text_rules(Path(folder), self._tokenizer_path)
         extra = repr((self._mean, self._std, self._size, *(self._rules or ())))
         digest = content_digest([self._visual_path, self._textual_path], [self._tokenizer_path], extra=extra)
         self.name = f"clip-{digest}"
-        self._store = None if store is None else EmbeddingStore(store, self.name)
 
     @functools.cached_property
     def dim(self) -> int:
@@ -136,20 +132,11 @@ class ClipEmbedder:
         self, frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m h w"]
     ) -> Float32[np.ndarray, "m e"]:
         """Embeds the regions of a frame: unit rows, zero for an empty mask."""
-        keys = [hashlib.blake2b(np.packbits(mask).tobytes(), digest_size=16).digest() for mask in masks]
-        known = {} if self._store is None else self._store.read(frame)
-        rows = np.zeros((len(keys), self.dim), np.float32)
-        missing = []
-        for index, key in enumerate(keys):
-            if key in known and known[key].shape == (self.dim,):
-                rows[index] = known[key]
-            elif masks[index].any():
-                missing.append(index)
-        if missing:
-            crops = np.stack([_masked_crop(frame, masks[index], self._side) for index in missing])
-            rows[missing] = _normalize(self._run_visual(crops), self._visual_path)
-        if self._store is not None and missing:
-            self._store.write(frame, known | {keys[index]: rows[index] for index in missing})
+        rows = np.zeros((len(masks), self.dim), np.float32)
+        shown = np.flatnonzero(masks.any((1, 2)))
+        if len(shown):
+            crops = np.stack([_masked_crop(frame, masks[index], self._side) for index in shown])
+            rows[shown] = _normalize(self._run_visual(crops), self._visual_path)
         return rows
 
     def embed_text(self, texts: list[str]) -> Float32[np.ndarray, "q e"]:

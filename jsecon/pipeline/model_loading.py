@@ -81,7 +81,7 @@ def with_folders(options: Options) -> Options:
 
 
 def open_models(options: Options, store: Path) -> Models:
-    """Opens the models of a run by their folders; `store` is the folder that caches proposals and embeddings."""
+    """Opens the models of a run by their folders; `store` is the folder that caches proposals."""
     segmenter = tracker = None
     if options.segmenter is not None:
         from jsecon.networks.sam import SamSegmenter
@@ -100,23 +100,22 @@ def open_models(options: Options, store: Path) -> Models:
         if options.embedder is None:
             return Models(external, segmenter, tracker)
         name = external.name
-    embedder = _open_embedder(name, folder=options.embedder, store=store / "embeddings")
+    embedder = _open_embedder(name, folder=options.embedder)
     return Models(embedder, segmenter, tracker)
 
 
-def _open_embedder(name: str | None = None, *, folder: str | Path | None = None, store: Path | None = None) -> Embedder:
+def _open_embedder(name: str | None = None, *, folder: str | Path | None = None) -> Embedder:
     """Opens an embedder: CLIP if one is named, else colours. InputError is raised if it is of another space.
 
     Args:
       name: Name of the space, or None for any. In an external space any CLIP with embeddings of that length is taken.
       folder: Folder, name or address of a CLIP model.
-      store: Folder that caches embeddings.
     """
     if folder is not None:
         from jsecon.networks.clip import ClipEmbedder
 
         folder = _local_folders({"embedder": parse_model(folder, "embedder")})["embedder"]
-        clip = ClipEmbedder(folder, store=store)
+        clip = ClipEmbedder(folder)
         return _of_space(clip, name, "Give the model that the field was made with: --embedder DIR.")
     if (dim := external_dim(name)) is not None:
         raise _missing_model(dim)
