@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 import jax
+import jax.extend.backend
 import jax.numpy as jnp
 import numpy as np
 
@@ -34,6 +35,7 @@ def start_backend() -> None:
     try:
         jax.devices()
     except Exception as error:  # jax raises RuntimeError, and AssertionError for a platform whose plugin is missing
+        jax.extend.backend.clear_backends()  # else the next call takes the ones that did start
         config: Any = jax.config
         for name in ("jax_platforms", "jax_platform_name"):
             if (value := config.values[name]) not in (None, "", "cpu"):
