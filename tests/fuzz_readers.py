@@ -25,7 +25,6 @@ from test_proposal_files import records
 from test_rgbd import FORMATS as RGBD
 from test_video import moving
 
-from experiments.datasets.feature_files import write_features
 from experiments.rooms.writers import write_colmap
 from jsecon.field.field import check_field, load_field, save_field
 from jsecon.networks.clip import ClipEmbedder
@@ -37,7 +36,7 @@ from jsecon.read.captures import images, video
 from jsecon.read.captures.capture import load_capture
 from jsecon.read.masks import masks
 from jsecon.read.masks.labels import load_lerf_labels
-from jsecon.read.masks.masks import FrameMasks, TrackedMasks
+from jsecon.read.masks.masks import TrackedMasks
 from jsecon.read.splats.files import read_gaussians, save_gaussians
 from jsecon.read.splats.points import load_point_cloud
 from jsecon.types import Capture, Codes, Gaussians, LanguageField, Regions
@@ -62,8 +61,8 @@ def check_result(found: Any) -> None:
         assert found.points.shape == found.point_colors.shape
         assert min(cameras.fx.min(), cameras.fy.min()) > 0
         assert found.depths is None or (found.depths >= 0).all()
-    elif isinstance(found, TrackedMasks | FrameMasks):
-        count = len(found.ids if isinstance(found, TrackedMasks) else found.embeddings)
+    elif isinstance(found, TrackedMasks):
+        count = len(found.ids)
         assert -1 <= found.labels.min() <= found.labels.max() < max(count, 1)
     elif isinstance(found, LanguageField):
         check_result(found.gaussians)
@@ -186,19 +185,6 @@ def _masks(folder: Path) -> None:
         np.save(folder / "levels" / f"{name}_s.npy", np.broadcast_to(image - 1, (4, *MASK_SIZE)).astype(np.float32))
 
 
-def _features(folder: Path) -> None:
-    rng = np.random.default_rng(0)
-    (folder / "langsplat").mkdir()
-    for name in NAMES:
-        write_features(folder / "langsplat", name, rng.integers(-1, 3, (12, 16)), rng.normal(size=(3, 5)))
-
-
-def _read_features(folder: Path) -> FrameMasks:
-    size, found = masks.embedding_size(folder), masks.load_features(folder, NAMES, (12, 16))
-    assert found.embeddings.shape[1] == size or not len(found.embeddings)
-    return found
-
-
 def _proposals(folder: Path) -> None:
     boxes = np.zeros((2, 20, 30), bool)
     boxes[0, 2:9, 3:8] = boxes[1, 4:18, 10:25] = True
@@ -292,7 +278,6 @@ READERS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any], tuple[str
     "images": (_images, _read_image, ()),
     "depths": (_depths, lambda file: images.read_depth(file, 0.001), ()),
     "masks": (_masks, lambda folder: masks.load_labels(folder, NAMES, MASK_SIZE), ()),
-    "features": (_features, _read_features, ()),
     "proposals": (_proposals, _read_proposals, ()),
     "labels": (_labels, lambda folder: [frame.objects for frame in load_lerf_labels(folder)], ()),
     "field": (_fields, _read_field, ()),

@@ -56,7 +56,6 @@ WRONG = {
     "no masks": (lambda room, folder: ["--masks", "nowhere"], "nowhere"),
     "the masks are of no frame": (_wrong_masks, "wrong"),
     "proposals of no frame": (lambda room, folder: ["--proposals", _wrong_masks(room, folder)[1]], "wrong"),
-    "features of no frame": (lambda room, folder: ["--features", folder / "capture" / "images"], "_f.npy"),
     "no model in the folder": (lambda room, folder: ["--embedder", folder / "capture" / "images"], "images"),
     "Gaussians of no known form": (lambda room, folder: ["--gaussians", room / "sparse/0/cameras.bin"], "cameras.bin"),
     "too few frames": (lambda room, folder: ["--frames", 2, "--holdout", 2], "1 of 2 frames"),

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from capture_files import refused
 
-from experiments.datasets.feature_files import write_features
 from jsecon.read.captures.images import write_image
-from jsecon.read.masks.masks import LEVELS, embedding_size, load_features, load_labels, load_proposals
+from jsecon.read.masks.masks import LEVELS, load_labels, load_proposals
 from jsecon.types import ImageFile
 
 NAMES = ("b", "a", "c")
@@ -65,8 +64,6 @@ def test_folders_without_masks_of_the_frames(tmp_path):
         load_labels(tmp_path, NAMES, SIZE)
     with refused("nowhere", "no such folder"):
         load_labels(tmp_path / "nowhere", NAMES, SIZE)
-    with refused(tmp_path, "no _f.npy"):
-        embedding_size(tmp_path)
 
 
 def test_other_sizes(tmp_path):
@@ -106,24 +103,6 @@ def test_too_many_regions(tmp_path):
         np.save(tmp_path / f"{name}_s.npy", np.tile(np.arange(12000.0).reshape(100, 120), (4, 1, 1)))
     with refused("36000 regions", "coarser level"):
         load_labels(tmp_path, NAMES, (100, 120))
-
-
-def test_masks_come_back_with_their_own_rows(tmp_path):
-    rng = np.random.default_rng(0)
-    labels = rng.integers(-1, 3, (2, 12, 16)).astype(np.int16)
-    labels[1][labels[1] == 1] = 0  # mask 1 of the second frame is nowhere
-    rows = rng.normal(size=(2, 3, 5)).astype(np.float32)
-    for t in range(2):
-        write_features(tmp_path, f"frame_{t}", labels[t], rows[t])
-    assert embedding_size(tmp_path) == 5
-    for level in ("default", "l"):
-        found = load_features(tmp_path, ["frame_0", "frame_1"], (12, 16), level=level)
-        np.testing.assert_array_equal(found.frame, [0, 0, 0, 1, 1])
-        for t in range(2):
-            shown = labels[t] >= 0
-            np.testing.assert_array_equal(found.labels[t] >= 0, shown)
-            np.testing.assert_array_equal(found.embeddings[found.labels[t]][shown], rows[t][labels[t]][shown])
-    assert not set(np.unique(found.labels[0])) & set(np.unique(found.labels[1])) - {-1}
 
 
 FRAME = (12, 16)
@@ -310,19 +289,6 @@ def test_one_coco_file_of_all_frames(tmp_path):
         assert notes == ("1 of 3 frames have no masks (the first: c).",)
     with refused("instances.json", "none of its 3 images"):
         load_proposals(tmp_path, ("x",), FRAME)
-
-
-def test_embeddings_lie_in_the_cameras_folders(tmp_path):
-    files = photographs("cam0/a.jpg", "cam1/a.jpg")
-    rows = RNG.normal(size=(2, 2, 3)).astype(np.float32)
-    for n, camera in enumerate(("cam0", "cam1")):
-        (tmp_path / camera).mkdir()
-        np.save(tmp_path / camera / "a_s.npy", np.tile(np.arange(16) // 8, (4, 12, 1)).astype(np.float32))
-        np.save(tmp_path / camera / "a_f.npy", rows[n])
-    found = load_features(tmp_path, tuple(files), FRAME, frames=files)
-    np.testing.assert_array_equal(found.frame, [0, 0, 1, 1])
-    np.testing.assert_array_equal(found.embeddings, rows.reshape(4, 3))
-    np.testing.assert_array_equal(found.labels[1, 0], np.arange(16) // 8 + 2)
 
 
 def things(shift=0):

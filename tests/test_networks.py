@@ -6,7 +6,6 @@ import json
 import shutil
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from capture_files import refused, run_cli
@@ -16,8 +15,7 @@ from sam2_files import write_sam2
 from sam_files import write_sam
 from test_pipeline import Recorder, again
 
-from experiments.datasets.feature_files import write_features
-from jsecon import Scene, load_capture, load_field, load_gaussians, save_field, save_gaussians
+from jsecon import Scene, load_capture, load_field, save_gaussians
 from jsecon.fit.start import starting_gaussians
 from jsecon.networks.sam import SamSegmenter
 from jsecon.pipeline import model_loading, run as pipeline
@@ -160,44 +158,7 @@ def test_query_finds_the_model_by_itself_or_says_what_it_needs(seen, models, tmp
     assert model_loading.field_embedder(lost, models[1]).name == lost.embedder
 
 
-def test_regions_take_their_embeddings_from_langsplat_s_files(room, splat, models, tmp_path):
-    capture, folder, rows = load_capture(room, holdout=4), tmp_path / "language_features", []
-    for t, name in enumerate(capture.names):
-        ids = cv2.imread(str(room / "masks" / f"{name}.png"), cv2.IMREAD_UNCHANGED).astype(int)
-        labels = np.unique(ids, return_inverse=True)[1].reshape(ids.shape) - (0 in ids)
-        vectors = np.random.default_rng(t).normal(size=(labels.max() + 1, 3))
-        write_features(folder, name, labels, vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
-        rows += [] if capture.held_out[t] else list(np.load(folder / f"{name}_f.npy"))
-    options = Options(room, gaussians=splat, holdout=4, masks=folder, features=folder)
-    work = RunContext(options, model_loading.open_models(options, tmp_path), tmp_path)
-    assert work.models.embedder.name == "given-3"
-    planned, results = {s.name: s for s in _run_stages(work)}, Results(load=capture, gaussians=load_gaussians(splat))
-    stage = planned["regions"]
-    given = StageInput(work, results, lambda done, total: None, Checkpoint(tmp_path / "none.safetensors"))
-    assert "embedder" in stage.skipped
-    results.objects = planned["objects"].compute(given).value
-    found = stage.compute(given)
-    np.testing.assert_allclose(found.value.embeddings, rows, atol=1e-6)
-    for name in capture.names:
-        write_features(folder, name, np.full((120, 160), -1), np.zeros((0, 3)))
-    with refused("no mask of level l"):
-        stage.compute(given)
-    with_clip = model_loading.open_models(dataclasses.replace(options, embedder=models[1]), tmp_path).embedder
-    assert with_clip.name.startswith("clip-")
-
-
-def test_texts_need_the_model_of_embeddings_from_files(seen, models, tmp_path, capsys):
-    none = np.zeros((0, 3), np.float32)
-    known = load_field(seen[1] / "field.safetensors")
-    given = dataclasses.replace(known, embedder="given-3", canonical_phrases=none, provenance="{}")
-    save_field(tmp_path / "field.safetensors", given)
-    ask = ["query", tmp_path / "field.safetensors", "red", "--views", "0", "--out", tmp_path / "answers"]
-    assert run_cli(*ask) == 2
-    assert "came from files, 3 numbers each" in capsys.readouterr().err
-    assert run_cli(*ask, "--embedder", models[1], "--min-rank", "0") == 0
-    assert 0 < json.loads((tmp_path / "answers" / "red.json").read_text())["score"] < 1
-    with refused("5, as those from files have"):
-        model_loading._open_embedder("given-5", folder=models[1])
+def test_a_space_of_another_version_is_named():
     with refused("Run the capture again"):
         model_loading._open_embedder("colours-of-the-future")
 

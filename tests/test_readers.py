@@ -199,11 +199,6 @@ DAMAGE = {
         (put("a.png", IDS), "there are both"),
     ],
     "masks/objects": [(put("001/a.png", IDS), "a.png", "3 values")],
-    "features/langsplat": [
-        (put("b_f.npy", np.zeros((2, 5))), "b_f.npy", "(2, 5) for ids up to 2"),
-        (put("b_f.npy", np.zeros((3, 4))), "b_f.npy", "rows of 4 numbers"),
-        (put("b_f.npy", None), "b_f.npy", "cannot be read"), (put("a_f.npy", "no array"), "a_f.npy", "cannot be read"),
-    ],
     "proposals/sam": [
         (put("a.json", "[{"), "a.json", "not JSON"),
         (put("a.json", '[{"bbox": [1, 2, 3, 4]}]'), "a.json", "'segmentation' is missing"),
@@ -245,7 +240,7 @@ SUBSTITUTES = {
 
 @pytest.mark.parametrize("name", [
     *("ply", "splats", "clouds", "colmap", "nerfstudio", "rgbd", "images", "depths"),
-    *("masks", "features", "proposals", "labels", "field", "videos"),
+    *("masks", "proposals", "labels", "field", "videos"),
 ])  # fmt: skip
 def test_what_stands_in_place_of_a_file_is_named(tmp_path, name):
     """Where a file may be missing or hold anything, reading goes on."""

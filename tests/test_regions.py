@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from jsecon.field.regions import embeddings_of_masks, region_embeddings
+from jsecon.field.regions import region_embeddings
 
 
 def embed(frame, masks):
@@ -40,28 +40,6 @@ def test_equals_the_definition(seed):
     regions = region_embeddings(frames, labels, embed, num_regions=7)
     np.testing.assert_allclose(regions.embeddings, slow(frames, labels, 7), atol=1e-6)
     np.testing.assert_array_equal(regions.pixel_counts, [[(image == r).sum() for image in labels] for r in range(7)])
-
-
-@settings(deadline=None, max_examples=20)
-@given(st.integers(0, 2**32 - 1))
-def test_given_embeddings_equal_the_definition(seed):
-    rng = np.random.default_rng(seed)
-    labels = rng.integers(-1, 3, (3, 6, 7)).astype(np.int16)
-    labels[0, 0, 0] = 2
-    masks = np.where(rng.random((3, 6, 7)) < 0.3, -1, rng.integers(0, 9, (3, 6, 7)))
-    rows = rng.normal(size=(9, 4)).astype(np.float32)
-    expected = np.zeros((3, 4))
-    for r in range(3):
-        for t in range(3):
-            inside = (labels[t] == r) & (masks[t] >= 0)
-            if inside.any():
-                mean = rows[masks[t][inside]].astype(np.float64).mean(0)
-                expected[r] += mean / np.linalg.norm(mean) * (labels[t] == r).sum()
-    expected /= np.maximum(np.linalg.norm(expected, axis=1, keepdims=True), 1e-12)
-    found = embeddings_of_masks(labels, masks, rows)
-    np.testing.assert_allclose(found.embeddings, expected, atol=1e-6)
-    with pytest.raises(ValueError, match="masks"):
-        embeddings_of_masks(labels, masks[:2], rows)
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int64])

@@ -9,7 +9,7 @@ from balls import sphere
 from capture_files import run_cli
 from clip_files import write_clip
 from conftest import gaussians_at
-from small_field import field_of, lone_votes
+from small_field import field_of, lone_votes, unit_rows
 from table_field import table_field
 
 import jsecon
@@ -19,6 +19,7 @@ from jsecon.pipeline import run as pipeline
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Console
 from jsecon.types import Regions
+from jsecon.vision.unrelated_words import UNRELATED_WORDS
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +108,8 @@ def test_many_texts_in_many_threads_are_answered_alike_within_bounds(monkeypatch
 
 def test_regions_of_few_gaussians_are_called_too_small(tmp_path, capsys):
     regions = Regions(np.eye(2, 8, dtype=np.float32), np.full((2, 1), 50, np.int32))
-    field = dataclasses.replace(field_of(lone_votes([0] * 9 + [1] * 4, 2), regions), embedder="given-8")
+    words = unit_rows(np.random.default_rng(0), len(UNRELATED_WORDS), 8)  # so no model is needed
+    field = field_of(lone_votes([0] * 9 + [1] * 4, 2), regions, embedder="clip-0", unrelated_words=words)
     jsecon.save_field(tmp_path / "field.safetensors", field)
     assert run_cli("objects", tmp_path / "field.safetensors") == 0
     assert "too small to be listed, with fewer than 10 Gaussians: 2 regions" in capsys.readouterr().out

@@ -1,15 +1,17 @@
-"""Features as LangSplat keeps them, written for twins; and vectors of texts in a JSON."""
+"""Features as LangSplat keeps them, read, and written for twins; and vectors of texts in a JSON."""
 
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from jsecon.errors import InputError
-from jsecon.files import atomic_write, write_text
-from jsecon.read.masks.masks import LEVELS
+from jsecon.files import atomic_write, map_npy, reading, write_text
+from jsecon.read.masks.masks import LEVELS, _compact_ids, _read_level, _Source
+from jsecon.read.registry import Reader
 from jsecon.vision.protocols import CANONICAL
 
 
@@ -22,6 +24,38 @@ def write_features(
     for ending, array in (("_s", levels), ("_f", embeddings.astype(np.float32))):
         with atomic_write(folder / f"{name}{ending}.npy") as temporary:
             np.save(temporary, array)
+
+
+class FrameMasks(NamedTuple):
+    """The masks of single frames with an embedding each."""
+
+    labels: np.ndarray
+    """(T, H, W) int32 rows of `embeddings`, -1 = none; no row is in two frames."""
+    embeddings: np.ndarray
+    """(M, E) float32 unit."""
+    frame: np.ndarray
+    """(M,) int32 the frame of each mask."""
+
+
+def load_features(folder: Path, names: Sequence[str], size: tuple[int, int], *, level: str = "l") -> FrameMasks:
+    """Reads one level of the masks of frames as labels (H, W), with their embeddings. Masks that vanish at this size are
+    skipped."""
+    source = _Source(folder, names, size, level, None, (Reader("LangSplat", ("_s.npy",), _read_level),))
+    remedy = "Run LangSplat's preprocess.py on every frame."
+    if source.missing:
+        raise InputError(folder / f"{source.missing[0]}_s.npy", "there is no such file", remedy=remedy)
+    labels = np.full((len(names), *size), -1, np.int32)
+    rows: list[np.ndarray] = []
+    for t, name in enumerate(names):
+        path, ids = source.read(name)
+        file = path.with_name(path.name[: -len("_s.npy")] + "_f.npy")
+        kept, index = _compact_ids(path, np.asarray(ids))
+        with reading(file, "a row for each id of the _s.npy beside it", remedy):
+            table = map_npy(file)[kept]
+        labels[t] = np.where(index >= 0, index + sum(map(len, rows)), -1)
+        rows.append(table)
+    frame = np.repeat(np.arange(len(rows), dtype=np.int32), [len(each) for each in rows])
+    return FrameMasks(labels, np.concatenate(rows).astype(np.float32), frame)
 
 
 def load_text_features(file: Path, queries: Sequence[str]) -> tuple[Float[np.ndarray, "q e"], Float[np.ndarray, "4 e"]]:

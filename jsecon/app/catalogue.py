@@ -258,10 +258,8 @@ def _vocabulary(
         # Without the model.
         return UNRELATED_WORDS, np.asarray(field.unrelated_words, np.float32), SOFTMAX_SCALE
     if embedder is None:
-        from jsecon.pipeline.model_loading import external_dim, field_embedder
+        from jsecon.pipeline.model_loading import field_embedder
 
-        if vocabulary is None and external_dim(field.embedder) is not None:
-            return (), np.zeros((0, field.regions.embeddings.shape[1]), np.float32), SOFTMAX_SCALE
         embedder = field_embedder(field)
     texts = tuple(getattr(embedder, "vocabulary", UNRELATED_WORDS) if vocabulary is None else vocabulary)
     if not texts:

@@ -23,9 +23,6 @@ which 0.36 are of one class; a cosine of 0.95 of the embeddings themselves joins
 _NEARNESS_POWER = 8
 """power of the cosine that says how near two directions are: 0.5 at 23 degrees, 0.1 at 41"""
 
-Embed = Callable[[int, np.ndarray], np.ndarray]
-"""(frame's index, masks (M, H, W) bool) -> (M, E) unit embeddings, zero where there is no image to embed"""
-
 
 def region_embeddings(
     frames: UInt8[np.ndarray, "t h w 3"],
@@ -37,6 +34,8 @@ def region_embeddings(
     progress: Progress | None = None,
 ) -> Regions:
     """Embeds the regions of a labelled sequence: the mean over the views, scaled to unit length. Host code.
+
+    Several processes share the frames.
 
         phi_r = sum_t omega_t phi_rt,  omega_t = pixels of r in t / pixels of r in all views that are embedded
 
@@ -57,10 +56,38 @@ def region_embeddings(
     """
     require_shape("labels", labels, frames.shape[:3], "Give one label image per frame, of the frame's size.")
 
-    def of_frame(t, masks):
-        return embed(frames[t], masks)
+    largest = int(labels.max()) if labels.size else -1
+    count = largest + 1 if num_regions is None else num_regions
+    require_labels(labels, count)
+    areas = [np.bincount(image[image >= 0].reshape(-1), minlength=count)[:count] for image in labels]
+    pixels = np.stack(areas, axis=1).astype(np.int32) if len(areas) else np.zeros((count, 0), np.int32)
+    embedded = pixels > 0
+    if views is not None:
+        require_shape("views", views, pixels.shape, "Give a row per region and a column per frame.")
+        embedded &= views
 
-    return _pool_embeddings(labels, of_frame, num_regions=num_regions, views=views, progress=progress)
+    def embed_frames(indices: Sequence[int]) -> Iterator[np.ndarray | None]:
+        for t in indices:
+            seen = np.flatnonzero(embedded[:, t])
+            masks = labels[t][None] == seen[:, None, None]
+            yield np.asarray(embed(frames[t], masks), np.float32) if len(seen) else None
+
+    total: np.ndarray | None = None
+    places, single = [np.zeros((0, 2), np.int32)], []
+    for t, rows in enumerate(map_over_processes(len(labels), embed_frames, progress)):
+        if rows is not None:
+            seen = np.flatnonzero(embedded[:, t])
+            require_shape("embed", rows, (len(seen), "E"), "An embedder returns one row per mask.")
+            total = np.zeros((count, rows.shape[1])) if total is None else total
+            total[seen] += pixels[seen, t, None] * rows.astype(np.float64)
+            places.append(np.stack([seen, np.full(len(seen), t)], axis=1).astype(np.int32))
+            single.append(rows)
+    if not len(labels):
+        total = np.zeros((count, 0))
+    elif total is None:  # without a label the embedder alone knows E
+        total = np.zeros((count, np.asarray(embed(frames[0], np.zeros((1, *labels.shape[1:]), bool))).shape[1]))
+    rows = np.concatenate([np.zeros((0, total.shape[1]), np.float32), *single])
+    return Regions(unit_rows(total), pixels, np.concatenate(places), rows)
 
 
 def crop_geometry(
@@ -122,79 +149,6 @@ def choose_crops(
         cosines = np.einsum("rtj,rj->rt", directions, directions[every, best])
         nearness = np.maximum(nearness, np.maximum(cosines, 0.0) ** _NEARNESS_POWER)
     return chosen
-
-
-def embeddings_of_masks(
-    labels: Int[np.ndarray, "t h w"],
-    masks: Int[np.ndarray, "_ _ _"],
-    embeddings: Float[np.ndarray, "m e"],
-    *,
-    progress: Progress | None = None,
-) -> Regions:
-    """Embeds the regions of a labelled sequence from masks of its frames that have embeddings. Host code.
-
-    In each view a region has the mean of the embeddings under its pixels, scaled to unit length. Views in which it lies
-    on no mask do not count.
-
-    Args:
-      labels: (T, H, W) region ids, -1 where a pixel belongs to no region.
-      masks: (T, H, W) rows of `embeddings`, -1 where there is no mask.
-      embeddings: (M, E) of the masks.
-      progress: Called as progress(done, total), in frames.
-    """
-    require_shape("masks", masks, labels.shape, "Give one image of rows per frame, of the labels' size.")
-
-    def under(t: int, regions: np.ndarray) -> np.ndarray:
-        known = masks[t] >= 0
-        rows, place = np.unique(masks[t][known], return_inverse=True)
-        inside = [np.bincount(place[region[known]], minlength=len(rows)) for region in regions]
-        pixels = np.asarray(inside, np.float64).reshape(len(regions), len(rows))
-        sums = pixels @ embeddings[rows].astype(np.float64)
-        return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
-
-    return _pool_embeddings(labels, under, progress=progress)
-
-
-def _pool_embeddings(
-    labels: Shaped[np.ndarray, "t h w"],
-    embed: Embed,
-    *,
-    num_regions: int | None = None,
-    views: Bool[np.ndarray, "r t"] | None = None,
-    progress: Progress | None = None,
-) -> Regions:
-    """`region_embeddings` for an `embed` that takes the index of a frame. Several processes share the frames."""
-    largest = int(labels.max()) if labels.size else -1
-    count = largest + 1 if num_regions is None else num_regions
-    require_labels(labels, count)
-    areas = [np.bincount(image[image >= 0].reshape(-1), minlength=count)[:count] for image in labels]
-    pixels = np.stack(areas, axis=1).astype(np.int32) if len(areas) else np.zeros((count, 0), np.int32)
-    embedded = pixels > 0
-    if views is not None:
-        require_shape("views", views, pixels.shape, "Give a row per region and a column per frame.")
-        embedded &= views
-
-    def embed_frames(frames: Sequence[int]) -> Iterator[np.ndarray | None]:
-        for t in frames:
-            seen = np.flatnonzero(embedded[:, t])
-            yield np.asarray(embed(t, labels[t][None] == seen[:, None, None]), np.float32) if len(seen) else None
-
-    total: np.ndarray | None = None
-    places, single = [np.zeros((0, 2), np.int32)], []
-    for t, rows in enumerate(map_over_processes(len(labels), embed_frames, progress)):
-        if rows is not None:
-            seen = np.flatnonzero(embedded[:, t])
-            require_shape("embed", rows, (len(seen), "E"), "An embedder returns one row per mask.")
-            total = np.zeros((count, rows.shape[1])) if total is None else total
-            total[seen] += pixels[seen, t, None] * rows.astype(np.float64)
-            places.append(np.stack([seen, np.full(len(seen), t)], axis=1).astype(np.int32))
-            single.append(rows)
-    if not len(labels):
-        total = np.zeros((count, 0))
-    elif total is None:  # without a label the embedder alone knows E
-        total = np.zeros((count, np.asarray(embed(0, np.zeros((1, *labels.shape[1:]), bool))).shape[1]))
-    rows = np.concatenate([np.zeros((0, total.shape[1]), np.float32), *single])
-    return Regions(unit_rows(total), pixels, np.concatenate(places), rows)
 
 
 def unit_rows(rows: np.ndarray) -> np.ndarray:

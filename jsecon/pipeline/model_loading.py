@@ -8,9 +8,7 @@ import contextlib
 import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, get_args
-
-import numpy as np
+from typing import TYPE_CHECKING, Any, get_args
 
 from jsecon.errors import InputError
 from jsecon.networks.hub import RECOMMENDED, HubModel, Role, parse_model
@@ -22,37 +20,6 @@ from jsecon.vision.stores import StoredSegmenter
 
 if TYPE_CHECKING:
     from jsecon.networks.clip import ClipEmbedder
-
-_EXTERNAL = "given-"
-"""prefix of the names of external spaces, as fields hold them"""
-
-
-class _ExternalSpace:
-    """Embedder (jsecon.vision.protocols) of embeddings from files of `dim` numbers each, whose model is missing.
-
-    It embeds neither texts nor regions; its regions can be queried by a pixel.
-    """
-
-    def __init__(self, dim: int):
-        self.dim, self.name = dim, f"{_EXTERNAL}{dim}"
-        self.canonical_phrases = self.unrelated_words = np.zeros((0, dim), np.float32)
-
-    def _refuse(self, *args: object, **kwargs: object) -> NoReturn:
-        raise _missing_model(self.dim)
-
-    embed_regions = embed_text = _refuse
-
-
-def external_dim(name: str | None) -> int | None:
-    """Returns the length of the embeddings of an external space by its name; None for the space of an embedder."""
-    return int(name.removeprefix(_EXTERNAL)) if name is not None and name.startswith(_EXTERNAL) else None
-
-
-def _missing_model(dim: int) -> InputError:
-    """Returns the error that the model of an external space is needed."""
-    remedy = "Give its folder: --embedder DIR. Without it, ask by a pixel (--at)."
-    problem = f"regions whose embeddings came from files, {dim} numbers each"
-    return InputError("field", problem, "the CLIP model that made them", remedy)
 
 
 def _local_folders(models: Mapping[Role, HubModel | Path]) -> dict[Role, Path]:
@@ -92,23 +59,14 @@ def open_models(options: Options, store: Path) -> Models:
         from jsecon.networks.sam2 import Sam2Tracker
 
         tracker = Sam2Tracker(Path(options.tracker))
-    name = None
-    if options.features is not None:
-        from jsecon.read.masks.masks import embedding_size
-
-        external = _ExternalSpace(embedding_size(options.features))
-        if options.embedder is None:
-            return Models(external, segmenter, tracker)
-        name = external.name
-    embedder = _open_embedder(name, folder=options.embedder)
-    return Models(embedder, segmenter, tracker)
+    return Models(_open_embedder(folder=options.embedder), segmenter, tracker)
 
 
 def _open_embedder(name: str | None = None, *, folder: str | Path | None = None) -> Embedder:
     """Opens an embedder: CLIP if one is named, else colours. InputError is raised if it is of another space.
 
     Args:
-      name: Name of the space, or None for any. In an external space any CLIP with embeddings of that length is taken.
+      name: Name of the space, or None for any.
       folder: Folder, name or address of a CLIP model.
     """
     if folder is not None:
@@ -117,8 +75,6 @@ def _open_embedder(name: str | None = None, *, folder: str | Path | None = None)
         folder = _local_folders({"embedder": parse_model(folder, "embedder")})["embedder"]
         clip = ClipEmbedder(folder)
         return _of_space(clip, name, "Give the model that the field was made with: --embedder DIR.")
-    if (dim := external_dim(name)) is not None:
-        raise _missing_model(dim)
     from jsecon.vision.colours import ColourEmbedder
 
     if name is not None and name.startswith("clip-"):
@@ -130,11 +86,7 @@ def _open_embedder(name: str | None = None, *, folder: str | Path | None = None)
 
 def _of_space(embedder: Any, name: str | None, remedy: str) -> Embedder:
     """Returns the embedder if it is of a space, or of any if the name is None; else raises InputError."""
-    dim = external_dim(name)
-    if dim is not None and embedder.dim != dim:
-        problem, expected = f"a model whose embeddings have {embedder.dim} numbers", f"{dim}, as those from files have"
-        raise InputError("--embedder", problem, expected, "Give the CLIP model that made the files.")
-    if dim is None and name not in (None, embedder.name):
+    if name not in (None, embedder.name):
         raise InputError("field", f"regions embedded by {name!r}", f"{embedder.name!r}", remedy)
     return embedder
 

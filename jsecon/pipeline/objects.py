@@ -19,7 +19,7 @@ from jsecon.association.scene import SceneSuperpixels
 from jsecon.errors import InputError
 from jsecon.field.columns import vote_blocks
 from jsecon.field.evidence import IGNORED, list_evidence, pack_evidence, scratch_folder, sum_evidence, votes_memory
-from jsecon.field.regions import choose_crops, crop_geometry, embeddings_of_masks, region_embeddings
+from jsecon.field.regions import choose_crops, crop_geometry, region_embeddings
 from jsecon.fit.depth import points_from_depth
 from jsecon.networks.hub import model_name
 from jsecon.paper.algorithm1 import masklets
@@ -40,7 +40,7 @@ from jsecon.pipeline.stages import (
 )
 from jsecon.process import cores, memory_budget
 from jsecon.read.captures.frames import evenly_spaced
-from jsecon.read.masks.masks import load_features, load_labels, load_proposals
+from jsecon.read.masks.masks import load_labels, load_proposals
 from jsecon.splat.render import render_depth
 from jsecon.types import Camera, Capture, Codes, Gaussians, Progress
 from jsecon.views.cover import LEAST_GAIN, frames_by_need
@@ -95,16 +95,11 @@ def _plan_labels(context: RunContext) -> Stage:
 
 
 def _plan_regions(context: RunContext) -> Stage:
-    """Plans an embedding of each region: by the embedder, or from files."""
+    """Plans an embedding of each region."""
     options, embedder, after = context.options, context.models.embedder.name, ("load", "objects")
-    if options.features is None:
-        how = f"embedded by {embedder!r} in at most {options.crops} views each, weighted by pixels"
-        key_options = {"embedder": embedder} | context.key_options("crops")
-        return Stage("regions", how, _embed_objects, after=after, key_options=key_options, distributed=True)
-    how = f"embeddings read from {options.features.name}, level {options.level}, views weighted by pixels"
-    key_options, read, files = context.key_options("level"), _read_embeddings, (options.features,)
-    skipped = {"embedder": f"embeddings are given ({options.features.name})"}
-    return Stage("regions", how, read, after=after, key_options=key_options, files=files, skipped=skipped)
+    how = f"embedded by {embedder!r} in at most {options.crops} views each, weighted by pixels"
+    key_options = {"embedder": embedder} | context.key_options("crops")
+    return Stage("regions", how, _embed_objects, after=after, key_options=key_options, distributed=True)
 
 
 def _plan_lifting(context: RunContext) -> list[Stage]:
@@ -296,24 +291,6 @@ def _embed_objects(stage: StageInput) -> StageResult:
         return StageResult(embedded)
     why = f"a region is embedded in at most {context.options.crops} views (--crops)"
     return StageResult(embedded, notes=(f"{kept} of {total} crops embedded: {why}",))
-
-
-def _read_embeddings(stage: StageInput) -> StageResult:
-    """Reads the embeddings of masks from files, and pools them to those of the regions."""
-    options, labels = stage.context.options, stage.results.objects.labels
-    view = _TrainingView(stage.results.load, options, stage.results.objects.frames)
-    assert options.features is not None
-    features = load_features(options.features, view.names, view.size, **view.mask_layout)
-    if not len(features.embeddings):
-        problem = f"no mask of level {options.level} in any frame"
-        remedy = "Take another --level, or write the files again."
-        raise InputError(options.features, problem, "masks with their embeddings", remedy)
-    embedded = embeddings_of_masks(labels, features.labels, features.embeddings, progress=stage.progress)
-    missing = int((~embedded.embeddings.any(1)).sum())
-    notes = (f"{len(features.embeddings)} embeddings in the files",)
-    if missing:
-        notes = (*notes, f"{missing} regions lie on no mask with one")
-    return StageResult(embedded, notes=notes)
 
 
 def _accumulate_votes(stage: StageInput) -> StageResult:

@@ -190,7 +190,7 @@ class ModelOptions:
       segmenter: SAM model that finds the proposals, instead of colour and texture: a name (edgetam, slimsam, sam2),
         hub:owner/name of huggingface.co, or a folder. `jsecon models list` has sizes and licences. A folder that is
         called like a model is written as a path: ./sam2.
-      level: Level of SAM's proposals and of LangSplat's files: subparts (s), parts (m), wholes (l), or all (default).
+      level: Level of SAM's proposals and of LangSplat's masks: subparts (s), parts (m), wholes (l), or all (default).
       tracker: SAM 2 model that follows the proposals (Algorithm 1 of the paper), instead of consensus: a name (sam2,
         edgetam), hub:owner/name, or a folder.
       embedder: CLIP model for regions and texts, instead of colours: a name (clip, siglip2, mobileclip),
@@ -201,8 +201,6 @@ class ModelOptions:
         segmenter takes those that show most of the scene first, and ends where a further one adds less than 1 %. Other
         masks, and a tracker, take evenly spaced frames, by default all.
       vision_minutes: Time limit of a segmenter in minutes, at least 0.05. It takes at least two frames.
-      features: Folder language_features of LangSplat. Regions take their embeddings from <frame>_s.npy and _f.npy, and
-        texts then need the CLIP model that made them (--embedder, here or of query).
     """
 
     models: Option[Literal["auto"] | None] = None
@@ -213,7 +211,6 @@ class ModelOptions:
     crops: Count[Option[int]] = 5
     vision_frames: Annotated[Option[int | None], Range(2, 1_000_000)] = None
     vision_minutes: Annotated[Option[float | None], Range(0.05, 10_000)] = None
-    features: Option[Path | None] = None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -47,7 +47,7 @@ from jsecon.read.captures.build import plan_frames
 from jsecon.read.captures.capture import read_posed_images
 from jsecon.read.captures.frames import FrameOptions, evenly_spaced
 from jsecon.read.captures.images import encode_jpeg
-from jsecon.read.masks.masks import load_features, load_labels, load_proposals
+from jsecon.read.masks.masks import load_labels, load_proposals
 from jsecon.read.splats.points import load_point_cloud
 from jsecon.types import Capture, Gaussians, LanguageField, Quality, Regions
 from jsecon.views.frame import find_up_axis, given_up
@@ -405,8 +405,6 @@ def _check_inputs(context: RunContext, plan: _RunState) -> None:
         load_labels(options.masks, names, size, **layout, limit=1)
     if options.proposals is not None and "objects" in running:
         load_proposals(options.proposals, names, size, **layout)[0](0)
-    if options.features is not None and "regions" in running:
-        load_features(options.features, names[:1], size, **layout)
 
 
 def fit(options: Options, out: Path, *, console: Console | None = None) -> tuple[Gaussians, Capture, Quality]:

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from experiments import lerf, ovs3d, replica, threshold_sweep
+from experiments.datasets.feature_files import load_features
 from experiments.tables import fill
 from experiments.tables.setting import levels_of, prepare
-from jsecon.read.masks.masks import LEVELS, load_features
+from jsecon.read.masks.masks import LEVELS
 from jsecon.read.splats.files import save_gaussians
 from jsecon.splat.points import gaussians_from_points
 

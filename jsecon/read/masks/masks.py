@@ -34,7 +34,6 @@ from jaxtyping import Bool, Int, Int16
 
 from jsecon.errors import InputError, join_first
 from jsecon.files import list_files, map_npy, reading
-from jsecon.numerics import is_finite_and_bounded
 from jsecon.read.captures.frames import same_aspect
 from jsecon.read.captures.images import IMAGE_SUFFIXES, apply_orientation, read_label_image
 from jsecon.read.masks.json_masks import READER as JSON_READER, ReadMasks, open_coco
@@ -44,7 +43,6 @@ from jsecon.types import ImageFile, Progress
 LEVELS = ("default", "s", "m", "l")
 """levels of LangSplat's `_s.npy`, in their order: all of SAM's masks, subparts, parts, whole objects"""
 _MAX_REGIONS = int(np.iinfo(np.int16).max)
-_PREPROCESS = "Run LangSplat's preprocess.py on every frame."
 _WHITE = 0xFFFFFF
 _LARGEST = (254, 255, 65534, 65535, _WHITE, 2**31 - 1, 2**32 - 1)
 """largest numbers of the types of ids and those before, white among them: masks have them on pixels to ignore"""
@@ -98,17 +96,6 @@ class TrackedMasks(NamedTuple):
     frames are counted from 0 on."""
     notes: tuple[str, ...]
     """What was skipped or changed, a sentence each."""
-
-
-class FrameMasks(NamedTuple):
-    """The masks of single frames with an embedding each."""
-
-    labels: np.ndarray
-    """(T, H, W) int32 rows of `embeddings`, -1 = none; no row is in two frames."""
-    embeddings: np.ndarray
-    """(M, E) float32 unit."""
-    frame: np.ndarray
-    """(M,) int32 the frame of each mask."""
 
 
 class _Match(NamedTuple):
@@ -524,41 +511,3 @@ def load_proposals(
         return np.stack([np.zeros(size, bool), *stored])[1:]
 
     return read, (*source.notes, *_no_object_notes(blended, ignored))
-
-
-def load_features(
-    folder: Path, names: Sequence[str], size: tuple[int, int], *, level: str = "l", frames: AllFrames | None = None
-) -> FrameMasks:
-    """Reads one level of LangSplat's masks as labels (H, W), with their embeddings; arguments as of `load_labels`.
-
-    Masks that vanish at the size asked for are skipped.
-    """
-    source = _Source(folder, names, size, level, frames, (Reader("LangSplat", ("_s.npy",), _read_level),))
-    if source.missing:
-        missing = folder / f"{source.missing[0]}_s.npy"
-        raise InputError(missing, "there is no such file", remedy=_PREPROCESS)
-    labels = np.full((len(names), *size), -1, np.int32)
-    rows: list[np.ndarray] = []
-    for t, name in enumerate(names):
-        path, ids = source.read(name)
-        file = path.with_name(path.name[: -len("_s.npy")] + "_f.npy")
-        kept, index = _compact_ids(path, np.asarray(ids))
-        with reading(file, "a finite row for each id of the _s.npy beside it", _PREPROCESS):
-            table, last = map_npy(file), int(kept.max(initial=-1))
-            if table.ndim != 2 or not is_finite_and_bounded(table) or last >= len(table):
-                raise ValueError(f"it is an array {table.shape} for ids up to {last}")
-            if rows and table.shape[1] != rows[0].shape[1]:
-                raise ValueError(f"it has rows of {table.shape[1]} numbers, those before {rows[0].shape[1]}")
-        labels[t] = np.where(index >= 0, index + sum(map(len, rows)), -1)
-        rows.append(table[kept])
-    frame = np.repeat(np.arange(len(rows), dtype=np.int32), [len(each) for each in rows])
-    return FrameMasks(labels, np.concatenate(rows).astype(np.float32), frame)
-
-
-def embedding_size(folder: Path) -> int:
-    """Reads the size E of the embeddings in a folder, by its first file."""
-    for file in sorted(folder.rglob("*_f.npy")):
-        with reading(file, "a (M, E) array, one row per mask", _PREPROCESS):
-            return int(map_npy(file).shape[1])
-    remedy = "Give the language_features folder that LangSplat's preprocess.py wrote."
-    raise InputError(folder, "it holds no _f.npy", "<frame>_f.npy beside <frame>_s.npy", remedy)
