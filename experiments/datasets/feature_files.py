@@ -38,8 +38,8 @@ class FrameMasks(NamedTuple):
 
 
 def load_features(folder: Path, names: Sequence[str], size: tuple[int, int], *, level: str = "l") -> FrameMasks:
-    """Reads one level of the masks of frames as labels (H, W), with their embeddings. Masks that vanish at this size are
-    skipped."""
+    """Reads one level of the masks of frames as labels (H, W), with their embeddings; without masks that vanish at this
+    size."""
     source = _Source(folder, names, size, level, None, (Reader("LangSplat", ("_s.npy",), _read_level),))
     remedy = "Run LangSplat's preprocess.py on every frame."
     if source.missing:
