@@ -85,7 +85,6 @@ def main() -> None:
     import jax.numpy as jnp
 
     from jsecon.association.consensus import track_masks
-    from jsecon.association.run_lengths import cache_masks_as_rle
     from jsecon.paper.algorithm1 import masklets
     from jsecon.paper.tracker import GeometricTracker
     from jsecon.splat.points import gaussians_from_points
@@ -104,10 +103,9 @@ def main() -> None:
     lens = [np.full(asked.frames, number, np.float32) for number in (focal, focal, size[1] / 2, size[0] / 2)]
     cameras = Camera(jnp.asarray(poses), *map(jnp.asarray, lens), width=size[1], height=size[0])
 
-    def true_masks(t: int) -> np.ndarray:
+    def proposals(t: int) -> np.ndarray:
         return draw(poses[t], focal, size, centres)[0] == np.arange(count + 1)[:, None, None]
 
-    proposals = cache_masks_as_rle(true_masks)  # as a run keeps what its segmenter finds
     tracker = GeometricTracker(gaussians, cameras, proposals)
     start = time.perf_counter()
     tracker.views.all(frames)

@@ -3,7 +3,6 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from jsecon.association.consensus import clean_tracks
-from jsecon.association.run_lengths import encode_masks, encode_rows
 from jsecon.paper.algorithm1 import masklets
 from jsecon.pipeline import cache
 
@@ -149,22 +148,6 @@ def test_goes_on_in_the_middle_of_the_sequence_to_the_same_result(stop, tmp_path
     np.testing.assert_array_equal(masklets(frames_of(truth), segmenter(truth), track, **again), wanted)
     assert track.calls == [call for call in whole.calls if call[0] >= stop]  # what was done is not done again
     assert told[0] == (stop + 1, 6)
-
-
-@settings(deadline=None, max_examples=40)
-@given(st.integers(0, 2**32 - 1), st.integers(0, 4), st.sampled_from([0.0, 0.1, 0.5, 0.95, 1.0]))
-def test_masks_come_back(seed, count, share):
-    masks = np.random.default_rng(seed).random((count, 5, 7)) < share
-    runs = encode_masks(masks)
-    np.testing.assert_array_equal(runs.rows().toarray(), masks.reshape(count, 35))
-    assert (runs.stops > runs.starts).all()
-    changes = np.diff(np.pad(masks.reshape(count, 35), ((0, 0), (1, 1))).astype(int)) == 1
-    np.testing.assert_array_equal(runs.counts, changes.sum(1))
-    again = encode_rows(runs.rows())
-    for name in ("starts", "stops", "counts"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(runs, name))
-    both = runs.concatenate(encode_masks(~masks))
-    np.testing.assert_array_equal(both.rows().toarray(), np.concatenate([masks, ~masks]).reshape(2 * count, 35))
 
 
 def test_bad_shapes_and_the_state_of_another_sequence_are_refused():

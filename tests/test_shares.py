@@ -24,7 +24,6 @@ from jsecon.field.membership import (
     inside_fraction_of_regions,
     membership_probability,
     normalise_votes,
-    probability_inside,
     vote_shares,
 )
 from jsecon.types import Regions, Votes
@@ -227,8 +226,5 @@ def test_probability_equals_the_beta_distribution():
     looks = looks / (1 + np.maximum(looks - 1, 0) * CORRELATION)
     expected = beta.sf(0.5, 1 + share * looks, 1 + (1 - share) * looks)
     np.testing.assert_allclose(membership_probability(share, votes_of(views, total)), expected, atol=2e-5)
-    for mask in (share > 0.3, np.zeros(200, bool), views > 58):
-        inside = probability_inside(share, votes_of(views, total), mask)
-        np.testing.assert_allclose(inside, expected[mask], atol=2e-5)
     unknown = votes_of(np.array([0, 3], np.int32), np.float32([0, np.nan]))
     np.testing.assert_array_equal(membership_probability(np.float32([1, 1]), unknown), 0)

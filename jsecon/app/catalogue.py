@@ -444,7 +444,7 @@ def _assign(field: LanguageField, groups: np.ndarray, whole: np.ndarray) -> tupl
         (top, top_share), (part, part_share) = (_objects_of_gaussians(votes, objects) for objects in (tops, parts))
         part = np.where(above[part] == top, part, -1)
         for label, share in ((np.asarray(top), top_share), (part, part_share)):
-            inside = np.asarray(membership_probability(share, votes))
+            inside = membership_probability(share, votes)
             total += np.bincount(label[label >= 0], inside[label >= 0], len(whole))
         labels.append(np.asarray(top))
         part_labels.append(part)

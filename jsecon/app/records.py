@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jsecon.errors import InputError, require_one_of
-from jsecon.field.membership import probability_inside
+from jsecon.field.columns import votes_of_rows
+from jsecon.field.membership import membership_probability
 from jsecon.files import parse_json, scratch_array
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.referring import Object
@@ -208,7 +209,8 @@ class Answer:
         region, selected = int(self.selection.region), int(np.asarray(self.selection.mask).sum())
         probability = {}
         if len(self.rows) and self.by == "votes":
-            inside = probability_inside(self.selection.similarity, self.field.votes, self.mask)
+            votes = votes_of_rows(self.field.votes, self.rows)
+            inside = membership_probability(np.asarray(self.selection.similarity)[self.rows], votes)
             probability["mean"] = round(float(inside.mean()), 4)
             probability["percentile_10"] = round(float(np.quantile(inside, 0.1)), 4)
         record = {

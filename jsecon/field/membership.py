@@ -13,14 +13,13 @@ weight in views of its own room. Where the votes do not know which views show a 
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
 from jax import lax
-from jax.scipy.special import betainc
 from jaxtyping import Bool, Float, Int
 
 from jsecon.errors import require
@@ -263,8 +262,8 @@ def _lookup(chosen: Bool[Array, " r"]) -> Callable[[Array], Array]:
     return inside
 
 
-def membership_probability(share: Float[Array, " n"], votes: Votes) -> Float[Array, " n"]:
-    """Computes the probability that most of a Gaussian belongs to what was selected. Pure.
+def membership_probability(share: Float[Array, " n"], votes: Votes) -> Float[np.ndarray, " n"]:
+    """Computes the probability that most of a Gaussian belongs to what was selected. Host code.
 
     Views are draws, of which n count as independent. Under a flat prior the true part has the posterior Beta(1 + n
     share, 1 + n (1 - share)), and the probability is its mass above one half. n is the number of views, at most the
@@ -278,26 +277,10 @@ def membership_probability(share: Float[Array, " n"], votes: Votes) -> Float[Arr
     Returns:
       (N,) in [0, 1]; 0 for Gaussians that were never seen.
     """
-    return _probability(jnp.asarray(share), jnp.asarray(votes.views), jnp.asarray(votes.total))
-
-
-def probability_inside(share: Float[Array, " n"], votes: Votes, mask: Bool[Array, " n"]) -> Float[np.ndarray, " m"]:
-    """Computes `membership_probability` of the M selected Gaussians alone, without a program. Host code."""
-    rows = np.flatnonzero(np.asarray(mask))
-    share, views, total = (np.asarray(column)[rows] for column in (share, votes.views, votes.total))
-    return _mass_above_half(share, views, total, np, scipy.special.betainc)
-
-
-@stored_jit
-def _probability(share: Array, views: Array, total: Array) -> Array:
-    return _mass_above_half(share, views, total, jnp, betainc)
-
-
-def _mass_above_half(share: Any, views: Any, total: Any, xp: Any, betainc: Callable[[Any, Any, Any], Any]) -> Any:
-    """Computes `membership_probability` with the functions of a module, NumPy or jax.numpy."""
-    known = (views > 0) & xp.isfinite(share) & xp.isfinite(total) & (total > 0)
-    count = xp.where(known, xp.minimum(views.astype(share.dtype), total), 1)
-    count = count / (1 + xp.maximum(count - 1, 0) * CORRELATION)
-    inside = xp.clip(xp.where(known, share, 0.5), 0, 1) * count
+    share, views, total = (np.asarray(column) for column in (share, votes.views, votes.total))
+    known = (views > 0) & np.isfinite(share) & np.isfinite(total) & (total > 0)
+    count = np.where(known, np.minimum(views.astype(share.dtype), total), 1)
+    count = count / (1 + np.maximum(count - 1, 0) * CORRELATION)
+    inside = np.clip(np.where(known, share, 0.5), 0, 1) * count
     # 1 - I_{1/2}(a, b) = I_{1/2}(b, a), without the cancellation.
-    return xp.where(known, betainc(1 + count - inside, 1 + inside, 0.5), 0)
+    return np.where(known, scipy.special.betainc(1 + count - inside, 1 + inside, 0.5), 0)

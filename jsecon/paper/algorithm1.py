@@ -8,11 +8,10 @@ import dataclasses
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Int16
+from jaxtyping import Bool, Int16
 from scipy import sparse
 
 from jsecon.association.consensus import clean_tracks
-from jsecon.association.run_lengths import RunLengthMasks, encode_masks, encode_rows
 from jsecon.association.scene import Sparse, one_hot
 from jsecon.errors import require, require_shape
 from jsecon.types import Progress
@@ -20,12 +19,57 @@ from jsecon.vision.protocols import Segmenter, Tracker
 
 
 @dataclasses.dataclass(frozen=True)
+class _RunLengthMasks:
+    """R masks over P pixels, which may overlap: some hundred numbers per mask instead of an image."""
+
+    starts: np.ndarray
+    """(K,) int32 first pixel of each run, ascending within a mask."""
+    stops: np.ndarray
+    """(K,) int32 pixel after the last of each run."""
+    counts: np.ndarray
+    """(R,) int32 number of runs of each mask."""
+    pixels: int
+    """P, pixels of an image."""
+
+    def rows(self) -> Sparse:
+        """Decodes the masks as a sparse matrix (R, P) of float32 ones."""
+        lengths = (self.stops - self.starts).astype(np.int64)
+        ends = np.concatenate([[0], np.cumsum(lengths)])
+        columns = np.arange(ends[-1]) + np.repeat(self.starts - ends[:-1], lengths)
+        ends = ends[np.concatenate([[0], np.cumsum(self.counts)])]
+        shape = (len(self.counts), self.pixels)
+        return sparse.csr_matrix((np.ones(len(columns), np.float32), columns.astype(np.int32), ends), shape=shape)
+
+    def concatenate(self, others: "_RunLengthMasks") -> "_RunLengthMasks":
+        """Appends masks over the same pixels."""
+        starts, stops = (np.concatenate(pair) for pair in zip((self.starts, self.stops), (others.starts, others.stops)))
+        return _RunLengthMasks(starts, stops, np.concatenate([self.counts, others.counts]), self.pixels)
+
+
+def _encode_rows(rows: Sparse) -> _RunLengthMasks:
+    """Encodes masks that are the nonzeros of the rows of a csr_matrix (R, P) with sorted indices."""
+    new = np.ones(rows.nnz, bool)
+    new[1:] = np.diff(rows.indices) != 1
+    new[rows.indptr[:-1][np.diff(rows.indptr) > 0]] = True
+    first = np.flatnonzero(new)
+    last = np.append(first[1:], rows.nnz) - 1 if len(first) else first
+    counts = np.diff(np.searchsorted(first, rows.indptr))
+    starts, stops = rows.indices[first], rows.indices[last] + 1
+    return _RunLengthMasks(starts.astype(np.int32), stops.astype(np.int32), counts.astype(np.int32), rows.shape[1])
+
+
+def _encode_masks(masks: Bool[np.ndarray, "r h w"]) -> _RunLengthMasks:
+    """Encodes masks (R, H, W) over P = H W pixels."""
+    return _encode_rows(sparse.csr_matrix(masks.reshape(len(masks), masks.shape[1] * masks.shape[2])))
+
+
+@dataclasses.dataclass(frozen=True)
 class MaskletState:
     """State of `masklets` between two frames, to resume from."""
 
     done: int  # number of frames whose proposals were tracked
-    proposals: list[RunLengthMasks]  # the proposed masks of each frame
-    layers: list[RunLengthMasks]  # the tracked masks of each frame
+    proposals: list[_RunLengthMasks]  # the proposed masks of each frame
+    layers: list[_RunLengthMasks]  # the tracked masks of each frame
 
 
 def masklets(
@@ -169,7 +213,7 @@ class _Layers:
     def __init__(self, count: int, height: int, width: int):
         self.count, self.shape = count, (height, width)
         empty = np.zeros(0, np.int32)
-        self.runs = [RunLengthMasks(empty, empty, empty, height * width) for _ in range(count)]
+        self.runs = [_RunLengthMasks(empty, empty, empty, height * width) for _ in range(count)]
 
     def size(self, t: int) -> int:
         return len(self.runs[t].counts)
@@ -180,14 +224,14 @@ class _Layers:
 
     def add_masks(self, t: int, masks: np.ndarray) -> None:
         """Appends masks (M, H, W) bool to frame t."""
-        self.runs[t] = self.runs[t].concatenate(encode_masks(masks))
+        self.runs[t] = self.runs[t].concatenate(_encode_masks(masks))
 
     def add_labels(self, t: int, labels: np.ndarray, number: int) -> None:
         """Appends `number` masks to frame t: the pixels (H, W) labelled 0, 1, ..."""
         pixels = np.flatnonzero((labels >= 0) & (labels < number))
         ones = np.ones(len(pixels), np.float32)
         rows = sparse.csr_matrix((ones, (labels.reshape(-1)[pixels], pixels)), shape=(number, labels.size))
-        self.runs[t] = self.runs[t].concatenate(encode_rows(rows))
+        self.runs[t] = self.runs[t].concatenate(_encode_rows(rows))
 
     def grouped(self, groups: np.ndarray) -> "_Layers":
         """Unites the masks of each group (R,), in the order of the groups."""
@@ -197,7 +241,7 @@ class _Layers:
         for t in range(self.count):
             united = unite @ self.at(t)
             united.sort_indices()
-            result.runs[t] = encode_rows(united)
+            result.runs[t] = _encode_rows(united)
         return result
 
     def flatten(self, best_first: np.ndarray) -> np.ndarray:

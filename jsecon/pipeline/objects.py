@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsecon.association.consensus import Objects, clean_tracks, track_masks
-from jsecon.association.run_lengths import cache_masks_as_rle
 from jsecon.association.scene import SceneSuperpixels
 from jsecon.errors import InputError
 from jsecon.field.columns import vote_blocks
@@ -209,7 +208,7 @@ def _frame_proposals(
 
         return segment, ()
     classical = _classical_segmenter(options, view, gaussians)
-    return cache_masks_as_rle(lambda t: classical(frames[t], t)), ()
+    return lambda t: classical(frames[t], t), ()
 
 
 def _classical_segmenter(options: Options, view: _TrainingView, gaussians: Gaussians) -> Segmenter:
