@@ -27,8 +27,6 @@ from jsecon.errors import InputError
 
 MEMORY = "JSECON_MEMORY"
 """environment variable: GiB for a scene's columns, in place of half of the free memory"""
-_OPENCV = {"OPENCV_LOG_LEVEL": "OFF", "OPENCV_FFMPEG_LOGLEVEL": "-8", "OPENCV_IO_MAX_IMAGE_PIXELS": str(1 << 27)}
-"""no messages of OpenCV, as an InputError reports damaged files; and the largest image that it allocates"""
 _counts: dict[str, int] = {}
 
 
@@ -40,7 +38,9 @@ def prepare_process(*, keep_programs: bool = True) -> None:
     chosen = _settings(os.environ, cores(), _cpu_features())
     if not keep_programs:
         chosen.pop("JAX_COMPILATION_CACHE_DIR", None)
-    os.environ.update({name: value for name, value in _OPENCV.items() if name not in os.environ} | chosen)
+    # No messages of OpenCV, as an InputError reports damaged files; and the largest image that it allocates.
+    opencv = {"OPENCV_LOG_LEVEL": "OFF", "OPENCV_FFMPEG_LOGLEVEL": "-8", "OPENCV_IO_MAX_IMAGE_PIXELS": str(1 << 27)}
+    os.environ.update({name: value for name, value in opencv.items() if name not in os.environ} | chosen)
     if (folder := chosen.get("JAX_COMPILATION_CACHE_DIR")) is not None:
         _remove_old_programs(Path(folder).parent)
         _remove_damaged_programs(Path(folder))

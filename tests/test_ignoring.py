@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from capture_files import small_capture
 
-from jsecon.pipeline.ignoring import ignore_named, is_named
+from jsecon.pipeline.ignoring import _is_named, ignore_named
 from jsecon.read.captures.images import read_label_image
 from jsecon.types import ImageFile
 from jsecon.vision.classical import ClassicalSegmenter
@@ -18,9 +18,9 @@ def test_a_mask_is_named_by_what_matches_it_better_than_other_words():
     axes = np.eye(200, dtype=np.float32)
     masks = np.stack([axes[0], axes[1], 0.7 * axes[0] + 0.1 * axes[5], 0 * axes[0]])
     words = axes[2:]
-    assert is_named(masks, axes[:1], words).tolist() == [True, False, True, False]
-    assert is_named(masks, axes[:2], words).tolist() == [True, True, True, False]
-    assert is_named(masks, axes[2:3], words).tolist() == [False] * 4
+    assert _is_named(masks, axes[:1], words).tolist() == [True, False, True, False]
+    assert _is_named(masks, axes[:2], words).tolist() == [True, True, True, False]
+    assert _is_named(masks, axes[2:3], words).tolist() == [False] * 4
 
 
 def test_what_is_named_is_ignored_and_its_masks_are_written(tmp_path):

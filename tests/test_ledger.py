@@ -14,7 +14,7 @@ from small_field import REGIONS, labels_of, make_field, true_regions, unit_rows
 
 from jsecon.app.scene import open_scene
 from jsecon.errors import InputError
-from jsecon.field.evidence import pack_evidence, region_votes, unpack_evidence, view_evidence
+from jsecon.field.evidence import _unpack_evidence, pack_evidence, region_votes, view_evidence
 from jsecon.field.field import load_field
 from jsecon.field.ledger import Ledger, LedgerView, add_views, camera_row, forget_views
 from jsecon.field.ledger_file import ledger_file, load_ledger, save_with_ledger
@@ -110,9 +110,9 @@ def test_regions_that_a_field_lacks_are_added(scene, cameras, labels, rows, view
 def test_packing_a_view_loses_nothing(scene, camera, labels):
     evidence = view_evidence(scene, camera, labels[0], REGIONS)
     packed = pack_evidence(evidence, REGIONS)
-    for a, b in zip(unpack_evidence(packed, scene.count, REGIONS), evidence):
+    for a, b in zip(_unpack_evidence(packed, scene.count, REGIONS), evidence):
         np.testing.assert_array_equal(a, b)
-    more = unpack_evidence(packed, scene.count, REGIONS + 2)  # pixels of no region stay such
+    more = _unpack_evidence(packed, scene.count, REGIONS + 2)  # pixels of no region stay such
     np.testing.assert_array_equal(more.regions == REGIONS + 2, evidence.regions == REGIONS)
 
 

@@ -30,16 +30,10 @@ from jsecon.errors import require
 from jsecon.types import Progress
 from jsecon.vision.region_graph import relabel_sequential
 
-MAX_PIECES = 3000
-"""Maximum number of pieces of a scene."""
 SURFACE_WIDTH = 0.08
 """Distance from a plane at which pieces count as off it, as a share of the median depth: 12 cm in a small room."""
-LEAST_IN_PLANE = 8
-"""Gaussians from which a piece has a plane: those of sparse scenes, of four Gaussians each, tore balls to shreds."""
 PART_AGREEMENT = 0.9
 """Probability of a common mask from which pieces are one part of an object."""
-TREE_AGREEMENT = 0.05
-"""Probability of a common mask down to which objects are joined to unions in the tree."""
 NEW_NODE = 0.1
 """Share of its weight that a join must add to make a node of its own."""
 
@@ -76,14 +70,15 @@ def _group_by_consensus(
     *,
     surface_width: float = np.inf,
     agreement: float = 0.4,
-    pieces: int = MAX_PIECES,
+    pieces: int = 3000,
     seed: int = 0,
 ) -> _Groups:
     """Groups Gaussians into objects by the consensus of the views, and joins the groups further to a tree.
 
     The Gaussians are first gathered into small pieces (`_scene_pieces`). Then `_average_linkage` joins pieces while the
     views that see two groups put both into one mask with a probability of at least `agreement`, or of 1 if they lie off
-    each other's plane (`_coplanarity`). What joins at PART_AGREEMENT is a part. Groups that have less than 0.02 of
+    each other's plane (`_coplanarity`). What joins at PART_AGREEMENT is a part, and
+    what joins down to 0.05 a union. Groups that have less than 0.02 of
     their visibility in common stay separate.
 
     Args:
@@ -109,12 +104,13 @@ def _group_by_consensus(
     in_masks, in_view = gather @ membership, gather @ visible
     off_plane = min(agreement, 1.0)  # then a probability of 1 equals `agreement` in the plane
     coplanarity = _coplanarity(*_piece_planes(gather[:, live], means[live]), surface_width)
-    sparse_pieces = np.bincount(piece[live]) < LEAST_IN_PLANE
+    # They have no plane: pieces of four Gaussians each, of sparse scenes, tore balls to shreds.
+    sparse_pieces = np.bincount(piece[live]) < 8
     coplanarity[sparse_pieces[:, None] | sparse_pieces] = 1.0
     together = (in_masks @ in_masks.T).toarray() * (off_plane + (1.0 - off_plane) * coplanarity)
     both = (in_view @ in_view.T).toarray()
     group, groups = np.arange(len(both)), None
-    for least_ratio in (max(PART_AGREEMENT, agreement), agreement, TREE_AGREEMENT):
+    for least_ratio in (max(PART_AGREEMENT, agreement), agreement, 0.05):
         joined, joins = _average_linkage(together, both, least_ratio=least_ratio, least_shared=0.02)
         owner[live] = group[piece[live]]
         groups = _Groups(owner.copy(), joins, np.bincount(owner[live], weights[live]), groups)

@@ -544,7 +544,7 @@ def pack_evidence(evidence: ViewEvidence, num_regions: int) -> UInt8[np.ndarray,
     return np.frombuffer(b"".join([head.tobytes(), *parts]), np.uint8)
 
 
-def unpack_evidence(packed: UInt8[np.ndarray, " b"], count: int, num_regions: int) -> ViewEvidence:
+def _unpack_evidence(packed: UInt8[np.ndarray, " b"], count: int, num_regions: int) -> ViewEvidence:
     """Unpacks what `pack_evidence` packed of `count` Gaussians; ValueError if it is damaged."""
     head = packed[: 4 * _HEAD].view("<u4").astype(np.int64)
     (seen, entries, overflow), ends = head[:3], 4 * _HEAD + np.cumsum(head[3:])
@@ -566,7 +566,7 @@ def unpack_evidence(packed: UInt8[np.ndarray, " b"], count: int, num_regions: in
 def unpack_views(packed: Sequence[UInt8[np.ndarray, " _"]], count: int, num_regions: int) -> list[ViewEvidence]:
     """Unpacks the lists of views on all cores."""
     with ThreadPoolExecutor(cores()) as pool:
-        return list(pool.map(lambda view: unpack_evidence(view, count, num_regions), packed))
+        return list(pool.map(lambda view: _unpack_evidence(view, count, num_regions), packed))
 
 
 def votes_memory(count: int, views: int) -> int:

@@ -29,8 +29,6 @@ _OUTPUTS = {
     "text": ("embedding", "text_embeds", "text_features", "text_embedding"),
 }
 """kind of graph -> the names that its output may have; the first that is there is taken"""
-_BATCH = 16
-"""crops or texts of one run, if the graph does not fix it"""
 
 
 def read_preprocessing(path: Path) -> tuple[tuple[float, ...], tuple[float, ...], int | None]:
@@ -231,7 +229,7 @@ def _run_in_batches(
       feed: Makes the inputs of a batch of rows.
       output: Name of the output.
     """
-    size = fixed or _BATCH
+    size = fixed or 16
     padding = np.zeros((-len(rows) % size if fixed else 0, *rows.shape[1:]), rows.dtype)
     padded = np.concatenate([rows, padding])
     parts = []

@@ -90,7 +90,7 @@ class _Memory(NamedTuple):
     """(C,) float32"""
 
 
-class Sam2Graphs:
+class _Sam2Graphs:
     """The graphs of one model, with the sizes that they agree on, and the steps of the predictor.
 
     Args:
@@ -197,7 +197,7 @@ def _sam2_files(folder: Path) -> dict[str, Path]:
     return {path.stem: path for path in find_files(folder, "tracker")}
 
 
-def open_sam2(folder: Path) -> Sam2Graphs:
+def open_sam2(folder: Path) -> _Sam2Graphs:
     """Opens the model in a folder, or raises InputError if its files do not make one model."""
     files = _sam2_files(folder)
     constants = _read_constants(files["constants"])
@@ -215,7 +215,7 @@ def open_sam2(folder: Path) -> Sam2Graphs:
             graphs[name].require("output", output, None, f"SAM 2's {name.replace('_', ' ')}")
     width = constants.temporal_code.shape[1]
     graphs["memory_encoder"].require("output", "memory_tokens", (None, 1, width), "the encoder of these constants")
-    return Sam2Graphs(graphs, constants, {"S": side, "C": channels, "G": grid, "M": width})
+    return _Sam2Graphs(graphs, constants, {"S": side, "C": channels, "G": grid, "M": width})
 
 
 def _read_constants(path: Path) -> _Constants:
@@ -286,7 +286,7 @@ class _Bank:
 
 
 def follow(
-    model: Sam2Graphs, frames: np.ndarray, start: int, prompts: Sequence[np.ndarray | Points]
+    model: _Sam2Graphs, frames: np.ndarray, start: int, prompts: Sequence[np.ndarray | Points]
 ) -> Iterator[tuple[int, list[np.ndarray]]]:
     """Follows objects from a prompted frame to the last, then back to the first.
 
@@ -336,7 +336,7 @@ class Sam2Tracker:
         self._folder = folder
 
     @functools.cached_property
-    def _graphs(self) -> Sam2Graphs:
+    def _graphs(self) -> _Sam2Graphs:
         return open_sam2(self._folder)
 
     def check(self) -> str:

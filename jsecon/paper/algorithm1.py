@@ -64,7 +64,7 @@ def _encode_masks(masks: Bool[np.ndarray, "r h w"]) -> _RunLengthMasks:
 
 
 @dataclasses.dataclass(frozen=True)
-class MaskletState:
+class _MaskletState:
     """State of `masklets` between two frames, to resume from."""
 
     done: int  # number of frames whose proposals were tracked
@@ -80,8 +80,8 @@ def masklets(
     iou_threshold: float = 0.5,
     min_area: float = 0.001,
     max_masklets: int = 1000,
-    state: MaskletState | None = None,
-    on_checkpoint: Callable[[Callable[[], MaskletState]], None] | None = None,
+    state: _MaskletState | None = None,
+    on_checkpoint: Callable[[Callable[[], _MaskletState]], None] | None = None,
     progress: Progress | None = None,
 ) -> Int16[np.ndarray, "t h w"]:
     """Makes the masklets of a sequence by Algorithm 1 of the paper.
@@ -134,7 +134,7 @@ def masklets(
             for other, image in enumerate(labels):
                 layers.add_labels(other, image, len(prompts))
         if on_checkpoint is not None:
-            on_checkpoint(lambda done=t + 1: MaskletState(done, list(proposals.runs), list(layers.runs)))
+            on_checkpoint(lambda done=t + 1: _MaskletState(done, list(proposals.runs), list(layers.runs)))
         if progress is not None:
             progress(t + 1, count)
     if not count or not layers.size(0):

@@ -15,9 +15,6 @@ from jsecon.types import Capture, Progress
 from jsecon.vision.protocols import Models
 from jsecon.vision.unrelated_words import embed_unrelated_words
 
-NAMED_RANK = 0.98
-"""Share of unrelated words that must match a mask less than a name does: only synonyms may match it better."""
-
 
 def ignore_named(capture: Capture, texts: list[str], models: Models, folder: Path, progress: Progress) -> Capture:
     """Ignores the pixels of masks that show what one of the texts names.
@@ -34,7 +31,7 @@ def ignore_named(capture: Capture, texts: list[str], models: Models, folder: Pat
     for t, (name, file) in enumerate(zip(capture.names, capture.files)):
         frame = np.asarray(capture.frames[t])
         masks = segmenter(frame, t)
-        own = masks[is_named(embedder.embed_regions(frame, masks), named, words)].any(axis=0)
+        own = masks[_is_named(embedder.embed_regions(frame, masks), named, words)].any(axis=0)
         found += bool(own.any())
         ignored[t] |= own
         size = frame.shape[1::-1] if file.view is not None else (file.width, file.height)
@@ -46,13 +43,13 @@ def ignore_named(capture: Capture, texts: list[str], models: Models, folder: Pat
     return dataclasses.replace(capture, ignored=ignored, notes=(*capture.notes, note))
 
 
-def is_named(
+def _is_named(
     masks: Float[np.ndarray, "m e"], texts: Float[np.ndarray, "q e"], words: Float[np.ndarray, "w e"]
 ) -> Bool[np.ndarray, " m"]:
-    """Tells which masks show what one of Q texts names: it matches better than nearly all unrelated words."""
+    """Tells which masks show what one of Q texts names: only synonyms among the unrelated words match better."""
     others = compare_words(masks, words if len(words) else None, RULES.retrieval)
     if others is None:
         raise InputError("--ignore", "the embedder knows no unrelated words to compare with", remedy="Take another.")
     best = np.max([region_similarities(masks, text, words, RULES.retrieval)[0] for text in texts], axis=0)
     below = np.nansum(others.similarity < best, axis=0) / np.maximum(np.isfinite(others.similarity).sum(axis=0), 1)
-    return (below >= NAMED_RANK) & (masks != 0).any(axis=1)
+    return (below >= 0.98) & (masks != 0).any(axis=1)

@@ -34,7 +34,7 @@ MIN_CORRELATION = 0.75
 0.95 and more from their own poses, and up to 0.72 from those of their neighbours."""
 
 
-class NewFrame(NamedTuple):
+class _NewFrame(NamedTuple):
     """A photograph at the size of a field's frames."""
 
     pixels: UInt8[np.ndarray, "h w 3"]
@@ -49,7 +49,7 @@ def read_frames(
     poses: Path | None,
     refuse: Callable[[InputError], None],
     progress: Progress,
-) -> dict[str, NewFrame]:
+) -> dict[str, _NewFrame]:
     """Reads photographs, finds poses that they lack, and leaves out those that the field has.
 
     `refuse` gets the error of each photograph that cannot be read or placed.
@@ -97,10 +97,10 @@ def _read_capture(field: LanguageField, photos: Path, poses: Path | None) -> Cap
     return build_capture(replace(posed, images=list(new.values())), size)
 
 
-def _sized(field: LanguageField, pixels: UInt8[np.ndarray, "h w 3"], camera: Camera) -> NewFrame:
+def _sized(field: LanguageField, pixels: UInt8[np.ndarray, "h w 3"], camera: Camera) -> _NewFrame:
     """Brings a photograph to the size of the field's frames, each axis by its own factor."""
     camera = resize_camera(camera, field.cameras.width, field.cameras.height)
-    return NewFrame(resize_frame(pixels, camera), camera)
+    return _NewFrame(resize_frame(pixels, camera), camera)
 
 
 def _place(
@@ -109,7 +109,7 @@ def _place(
     files: Mapping[str, Path],
     refuse: Callable[[InputError], None],
     progress: Progress,
-) -> dict[str, NewFrame]:
+) -> dict[str, _NewFrame]:
     """Finds the poses of photographs by the pictures of the ledger."""
     rows = [t for t, name in enumerate(field.names) if name in ledger.views]
     cameras = jax.tree.map(lambda a: np.asarray(a)[rows], field.cameras)
@@ -137,7 +137,7 @@ def _place(
 
 def make_views(
     field: LanguageField,
-    frames: Mapping[str, NewFrame],
+    frames: Mapping[str, _NewFrame],
     embedder: Embedder,
     masks: Path | None,
     refuse: Callable[[InputError], None],

@@ -48,10 +48,6 @@ _TRAINED = "dataparser_transforms.json"
 """file of nerfstudio with the world in which it trained"""
 _NEAR_VIEWS = 48
 """views at poses near a scene: they take no longer than planning 24 does, and match more"""
-_PLANNED = 1 << 16
-"""Gaussians of a scene, at most, by which views are planned, at 80x60 px"""
-_MOST_POSES = 256
-"""poses, evenly spaced, among which views are chosen"""
 _LEAST_USABLE, _LEAST_COVERAGE = 0.8, 0.7
 """shares of poses that show some of a scene, and of the scene that they show, from which they are in its world"""
 
@@ -347,7 +343,7 @@ def open_bare_scene(options: Options, progress: Progress) -> _BareScene:
 
 def _every_nth(scene: Gaussians) -> Gaussians:
     """Takes few enough of a large scene's Gaussians to plan views, so much wider that they cover as much."""
-    step = -(-scene.count // _PLANNED)
+    step = -(-scene.count // (1 << 16))  # views are planned at 80x60 px
     part = scene if step == 1 else jax.tree.map(lambda column: np.asarray(column[::step]), scene)
     return dataclasses.replace(part, log_scales=part.log_scales + np.float32(0.5 * np.log(step)))
 
@@ -377,7 +373,7 @@ def _choose_near(
     which these were made. Raises InputError if the poses show too little of the scene in each.
     """
     posed, cameras, names = _load_poses(near, options.long_side)
-    rows = evenly_spaced(len(cameras), _MOST_POSES)
+    rows = evenly_spaced(len(cameras), 256)
     transform, worlds = _near(options.capture, _TRAINED), [np.eye(4), np.asarray(posed.source_from_poses)]
     if transform is not None:
         to_trained = np.linalg.inv(source_from_trained(transform))

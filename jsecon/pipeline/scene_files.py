@@ -30,9 +30,6 @@ from jsecon.splat.sh import C0
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Camera, Capture, Gaussians, Progress
 
-_START_POINTS = 100_000
-"""points of a cloud from which a fit starts, as many as from depth frames"""
-
 
 def read_scene(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
     """Reads a file of Gaussians."""
@@ -44,7 +41,7 @@ def read_scene(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
 
 def with_points(capture: Capture, path: Path, progress: Progress) -> Capture:
     """Gives a capture the points of a cloud in the world of its files, and their depth if it has none of its own."""
-    cloud, notes = gaussians_of_cloud(path, _START_POINTS)
+    cloud, notes = gaussians_of_cloud(path, 100_000)  # as many as a fit starts from with depth frames
     scene = jax.tree.map(jnp.asarray, transform_gaussians(cloud, np.linalg.inv(capture.source_from_scene)))
     train = np.flatnonzero(~np.asarray(capture.held_out))
     check_overlap(scene, capture.cameras[train], str(path))

@@ -24,7 +24,7 @@ from jsecon.read.splats.points import read_crs
 from jsecon.types import LanguageField
 
 
-class Sources(NamedTuple):
+class _Sources(NamedTuple):
     """What the hints of a field lead to."""
 
     embedder: str | None
@@ -106,7 +106,7 @@ def _relative_folders(options: Options, out: Path) -> dict[str, str]:
     return folders
 
 
-def locate_sources(field: LanguageField, beside: Path | None = None) -> Sources:
+def locate_sources(field: LanguageField, beside: Path | None = None) -> _Sources:
     """Locates the model and the capture of a field by the hints of its run."""
     beside = getattr(field.provenance, "folder", None) if beside is None else beside
     try:
@@ -119,7 +119,7 @@ def locate_sources(field: LanguageField, beside: Path | None = None) -> Sources:
         remedy = "Give the folders yourself, with --embedder and --images, or run the capture again."
         raise InputError("field", "its provenance is not what jsecon run writes", remedy=remedy) from error
     embedder, capture, points = (_resolve(beside, folders.get(kind)) for kind in ("embedder", "capture", "points"))
-    return Sources(name or None, embedder, capture, points, models.get("embedder"))
+    return _Sources(name or None, embedder, capture, points, models.get("embedder"))
 
 
 def _resolve(beside: Path | None, hint: str | None) -> Path | None:

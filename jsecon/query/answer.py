@@ -60,8 +60,6 @@ NO_REGIONS = RegionMatch(
     np.zeros(0, bool), np.asarray(-1, np.int32), np.asarray(0.0, np.float32), state=np.asarray(ABSENT)
 )
 """The match of a field without regions."""
-_FEW = 1 << 17
-"""Gaussians up to which NumPy selects, in 10 ms: to compile a program takes a second."""
 
 
 class _Answered(NamedTuple):
@@ -214,7 +212,8 @@ def select_gaussians(field: LanguageField, match: RegionMatch, rules: QueryRules
     """
     if rules.code_threshold is not None:
         return select_by_code(field, match, rules.code_threshold)
-    if field.gaussians.count <= _FEW and not is_traced((field.votes, match, rules)):
+    # Of so few NumPy selects in 10 ms; to compile a program takes a second.
+    if field.gaussians.count <= 1 << 17 and not is_traced((field.votes, match, rules)):
         share, known = inside_fraction_of_regions(field.votes, np.flatnonzero(match.chosen))
         return Selection(known & (share >= rules.min_share) & (np.asarray(match.region) >= 0), share, *match[1:])
     if not is_mapped(field.votes):

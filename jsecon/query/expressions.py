@@ -20,7 +20,7 @@ light", "carry on bag". A word of the grammar therefore belongs to a name where 
     a preposition         at the beginning without "the" ("under cabinet light"), or after a verb ("carry on bag")
 
 In "the mug on the table left of the bottle", the second relation may belong to the mug or to the table:
-`Expression.readings` has both. With "and" before it, it belongs to the mug. Words in quotes are part of an object.
+`_Expression.readings` has both. With "and" before it, it belongs to the mug. Words in quotes are part of an object.
 
 No word of place is dropped: one that looks like a relation or an order and is none of the grammar's is an error that
 names it, such as "opposite", "second" without an order, "other than" or "5 m left of".
@@ -141,7 +141,7 @@ class Condition:
 
 
 @dataclasses.dataclass(frozen=True)
-class Expression:
+class _Expression:
     """What a text asks for."""
 
     thing: NounPhrase
@@ -211,7 +211,7 @@ def _needs_grammar(text: str) -> bool:
     return bool(relations or problem or quantified or phrase.order or unknown) or tokens[0].key in _WORDS["everything"]
 
 
-def parse_expression(text: str) -> Expression:
+def parse_expression(text: str) -> _Expression:
     """Parses a text by the grammar of this module, such as "the second red mug from the left".
 
     A text without relation, order or number is an object alone. Raises InputError for a text that is empty, too long or
@@ -257,7 +257,7 @@ def parse_expression(text: str) -> Expression:
     phrases = [thing, *(anchor for condition in conditions for anchor in condition.anchors)]
     named = [*(condition.relation for condition in conditions), *(phrase.order for phrase in phrases)]
     depends_on_view = not _OF_VIEW.isdisjoint(named)
-    return Expression(thing, tuple(conditions), joined, depends_on_view)
+    return _Expression(thing, tuple(conditions), joined, depends_on_view)
 
 
 def _tokens(text: str) -> list[_Token]:

@@ -21,10 +21,6 @@ EPS_SPACINGS = 6.0
 weakly textured parts leave between splats, and is far below the distance between objects."""
 MIN_SAMPLES = 10
 """Neighbours within eps, itself included, that make a core point; a surface has about 100 within 6 spacings."""
-_EXACT_POINTS = 5_000
-"""Up to so many points are clustered one by one: their lists of neighbours have at most 25 million entries."""
-_LINKS = 16
-"""Nearest neighbours that are tried first to connect all points."""
 
 
 class OutlierResult(NamedTuple):
@@ -145,21 +141,22 @@ def _dbscan(points: Float[np.ndarray, "m 3"], eps: float, min_samples: int = MIN
 def _one_component(points: np.ndarray, eps: float) -> bool:
     """Finds out whether steps of at most eps lead from each of the points (M, 3), M >= 1, to every other."""
     places, _, _ = _places(points, eps)
-    distance, near = map(np.asarray, KDTree(places, balanced_tree=False).query(places, k=_LINKS))
+    links = 16  # nearest neighbours that are tried first
+    distance, near = map(np.asarray, KDTree(places, balanced_tree=False).query(places, k=links))
     linked = distance <= eps
     ends = near[linked], np.concatenate([[0], np.cumsum(linked.sum(1))])
     graph = csr_array((np.ones(len(ends[0])), *ends), shape=(len(places), len(places)))
     count, component = connected_components(graph, directed=False)
     # The nearest links are enough where the points are evenly spaced, and spare the import of scikit-learn; also where
     # a component is so small that the links of its points show all that is near.
-    if count == 1 or np.bincount(component).min() < _LINKS:
+    if count == 1 or np.bincount(component).min() < links:
         return count == 1
     return bool((_dbscan(points, eps, 1) == 0).all())
 
 
 def _places(points: np.ndarray, eps: float) -> tuple[np.ndarray, Int[np.ndarray, " m"], Int[np.ndarray, " v"]]:
     """The points, or the means of the voxels of many; the place of each point, and how many points each has."""
-    if len(points) <= _EXACT_POINTS:
+    if len(points) <= 5_000:  # their lists of neighbours have at most 25 million entries
         return points, np.arange(len(points)), np.ones(len(points), int)
     # A splat lies about half a voxel from the mean of its voxel, so gaps are measured to about a third of eps. 4 voxels
     # along eps take three times as long for a million splats.

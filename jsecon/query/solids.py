@@ -12,11 +12,6 @@ from scipy.spatial import ConvexHull, QhullError
 
 from jsecon.query.object_shapes import ObjectShapes
 
-_FLAT = 1e-3
-"""Least thickness of a hull, in units of the longest side of the box."""
-_SAMPLES = 2000
-"""Points of a hull's surface by which primitives are compared."""
-
 
 class Solid(NamedTuple):
     """The solids of one object, in the world of its shape."""
@@ -40,7 +35,7 @@ def object_solid(means: Float[np.ndarray, "n 3"], spreads: Float[np.ndarray, "n 
 
     The hull reaches one deviation beyond the centres, but not out of the object's box.
     """
-    half = np.maximum(shape.half_size, _FLAT * shape.half_size.max())
+    half = np.maximum(shape.half_size, 1e-3 * shape.half_size.max())  # a flat hull has no volume
     ends = np.concatenate([means + side * spreads[:, :, axis] for axis in range(3) for side in (-1, 1)])
     local = (ends - shape.center) @ shape.axes
     local = local[(np.abs(local) <= half * (1 + 1e-9)).all(1)]
@@ -64,9 +59,9 @@ def _primitive(
     vertices: np.ndarray, triangles: np.ndarray, areas: np.ndarray, volume: float, half: np.ndarray
 ) -> tuple[str, tuple[float, ...], int]:
     """Returns name, size and axis of the primitive whose surface is nearest to that of a hull in its box's axes."""
-    draw = np.random.default_rng(0)
-    faces = vertices[triangles[draw.choice(len(areas), _SAMPLES, p=areas / areas.sum())]]
-    points = np.einsum("mk,mkd->md", draw.dirichlet(np.ones(3), _SAMPLES), faces)
+    draw, count = np.random.default_rng(0), 2000  # points of the surface by which primitives are compared
+    faces = vertices[triangles[draw.choice(len(areas), count, p=areas / areas.sum())]]
+    points = np.einsum("mk,mkd->md", draw.dirichlet(np.ones(3), count), faces)
     radius = np.cbrt(0.75 * volume / np.pi)
     found: list[tuple[float, str, tuple[float, ...], int]] = [
         (_distance(np.abs(points) - half), "box", tuple((2 * half).tolist()), 2),
