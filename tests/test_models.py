@@ -2,11 +2,10 @@
 
 import json
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_files import refused, run_cli
+from capture_files import refused
 from clip_files import token_colours, write_clip, write_textual
 from onnx_files import node, write_graph
 from sam2_files import write_sam2
@@ -16,7 +15,6 @@ from siglip_files import LENGTH, write_siglip
 from jsecon.networks.clip import ClipEmbedder
 from jsecon.networks.sam import SamSegmenter
 from jsecon.networks.sam2 import Sam2Tracker
-from jsecon.pipeline.model_loading import inspect_models
 
 MODELS = {
     "clip": (ClipEmbedder, lambda folder: write_clip(folder, "immich")),
@@ -117,22 +115,3 @@ def test_a_damaged_folder_is_named(tmp_path, model, name, change, words):
     damage(folder / name, change)
     with refused(*([words] if isinstance(words, str) else words)):
         open_model(folder).check()
-
-
-def test_every_graph_is_told_with_its_tensors_and_damage_ends_in_exit_code_2(tmp_path, capsys):
-    folder = write_clip(tmp_path / "clip", "immich")
-    assert run_cli("models", "check", folder) == 0
-    told = capsys.readouterr().out.splitlines()
-    assert {"  textual/model.onnx", "    in   text int32[1, 77]", "    out  embedding float32[1, 3]"} <= set(told)
-    assert {"CLIP: usable", "SAM: not usable"} <= set(told)
-    assert list(inspect_models(write_sam(tmp_path / "sam"))["usable"]) == ["SAM"]
-    assert list(inspect_models(write_sam2(tmp_path / "sam2"))["usable"]) == ["SAM 2"]
-    damage(folder / IMAGES, 100)
-    assert run_cli("models", "check", folder) == 2
-    told = capsys.readouterr()
-    assert "cannot be opened: ONNX Runtime" in told.out
-    assert "no model that can be used" in told.err
-    (tmp_path / "empty").mkdir()
-    assert run_cli("models", "check", tmp_path / "empty") == 2
-    with refused("no such folder"):
-        inspect_models(Path("nowhere"))

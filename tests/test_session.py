@@ -22,9 +22,9 @@ def affine(tmp_path):
 
 
 def test_it_has_the_files_signature_and_runs_by_name_and_converts_within_a_kind(affine):
-    graph = Graph(affine, optimise=False)
+    graph = Graph(affine)
     assert graph.inputs == {"x": Tensor("x", "float32", ("batch", 3))}
-    assert str(graph).endswith("\nout  y float32[batch, 2], z float32[batch, 2]")
+    assert list(map(str, graph.outputs.values())) == ["y float32[batch, 2]", "z float32[batch, 2]"]
     assert [graph.inputs["x"].fixed(axis) for axis in (0, 1, 5)] == [None, 3, None]
     x = np.asarray([[1.0, 2.0, 3.0]])  # float64
     found = Graph(affine).run({"x": x}, ["z", "y"])

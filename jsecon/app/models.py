@@ -1,8 +1,6 @@
-"""`jsecon models`: which models there are, fetching them, and examining them."""
+"""`jsecon models`: which models there are, and fetching them."""
 
 import dataclasses
-import textwrap
-from pathlib import Path
 
 from jsecon.app import verbs
 from jsecon.errors import InputError
@@ -11,13 +9,12 @@ from jsecon.pipeline.progress import Console
 
 
 def _models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon models`; the result has rows, folders or reports, and errors by model."""
+    """Does the work of `jsecon models`; the result has rows or folders, and errors by model."""
     if verb.action == "list":
         return _list_models(console)
     if not verb.names:
-        problem = f"models {verb.action} needs a name"
-        raise InputError("jsecon", problem, remedy="jsecon models list has the names.")
-    return _get_models(verb, console) if verb.action == "get" else _check_models(verb, console)
+        raise InputError("jsecon", "models get needs a name", remedy="jsecon models list has the names.")
+    return _get_models(verb, console)
 
 
 def _list_models(console: Console) -> verbs.VerbResult:
@@ -55,36 +52,3 @@ def _get_models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
             console.print_line(f"{name}  {model.role}  {folder}")
             folders[f"{name} ({model.role})"] = folder
     return {"models": folders, "errors": errors}
-
-
-def _check_models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
-    """Lists the graphs of models on this machine, and what jsecon can use them for."""
-    with console.progress("start"):
-        from jsecon.pipeline.model_loading import inspect_models
-
-    results, errors = [], []
-    for name in verb.names:
-        with console.progress("graphs"):
-            report = inspect_models(_cached_model(name))
-        console.print_line(f"{report['folder']}: {len(report['graphs'])} graphs")
-        for path, signature in report["graphs"].items():
-            console.print_line(f"  {path}\n{textwrap.indent(signature, '    ')}")
-        for key, word in (("usable", "usable"), ("unusable", "not usable")):
-            for kind, summary in report[key].items():
-                console.print_line(f"{kind}: {word}\n  {summary}")
-        results.append(report)
-        if not report["usable"]:
-            problem = f"no model that can be used: neither {', '.join(report['unusable'])}"
-            remedy = "See above for what is missing and where such exports are published."
-            errors.append(InputError(report["folder"], problem, "", remedy))
-    return {"models": results, "errors": errors}
-
-
-def _cached_model(name: str) -> Path:
-    """Returns the folder of a model that is on this machine, by its name, address or folder."""
-    if Path(name).exists() and not any(row.name == name for row in hub.catalogue()):
-        return Path(name)
-    for model in hub.models_of_name(name, None):
-        if (folder := model.cached_folder) is not None:
-            return folder
-    raise InputError(name, "this model is not on this machine", "", f"Fetch it with: jsecon models get {name}")

@@ -539,24 +539,22 @@ class Mcp(_FieldsVerb):
 
 
 class Models(Verb):
-    """Lists, fetches and examines models.
+    """Lists and fetches models.
 
     With list, prints the models that have a name, their sizes and licences, and which of them are on this machine. With
     get, fetches models from huggingface.co into its cache and compares each file with its hash; HF_HOME, HF_ENDPOINT,
-    HF_TOKEN and HF_HUB_OFFLINE work as usual. With check, lists inputs and outputs of each graph, what jsecon can use
-    it for, and what is missing; the exit code is 2 if jsecon cannot use any of them. `hf cache rm` deletes models
-    from the cache.
+    HF_TOKEN and HF_HUB_OFFLINE work as usual. `hf cache rm` deletes models from the cache.
 
     Attributes:
       action: What to do.
-      names: Names, addresses (hub:owner/name or hub:owner/name@revision), and for check also folders. auto stands for
-        the models of `jsecon run --models auto`.
+      names: Names, or addresses (hub:owner/name or hub:owner/name@revision). auto stands for the models of
+        `jsecon run --models auto`.
       role: What the models are for: for get an address needs it, and a name has by default every role of its models.
     """
 
-    examples = ("jsecon models list", "jsecon models get auto", "jsecon models check my_models")
+    examples = ("jsecon models list", "jsecon models get auto")
 
-    action: Positional[Literal["list", "get", "check"]]
+    action: Positional[Literal["list", "get"]]
     names: Positional[list[str]] = dataclasses.field(default_factory=list)
     role: Option[Role | None] = None
 
@@ -566,7 +564,7 @@ class Doctor(Verb):
 
     It prints a line each about the backend's numbers, jax and its devices, cores, memory, the folder of compiled
     programs, and each extra with the command that installs it. The exit code is 2 if a check fails that
-    every run depends on. `jsecon models check` examines models.
+    every run depends on.
 
     Attributes:
       field: A field to describe instead: what its ledger holds of each kind, and how large that is.

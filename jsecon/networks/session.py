@@ -80,32 +80,26 @@ class Graph:
 
     Args:
       path: The .onnx file.
-      optimise: Whether to optimise the graph; False opens it faster, for a look at its signature.
 
     Attributes:
       inputs: Input tensors by name, in the order of the file.
       outputs: Output tensors by name, in the order of the file.
     """
 
-    def __init__(self, path: str | os.PathLike, *, optimise: bool = True):
+    def __init__(self, path: str | os.PathLike):
         self.path = Path(path)
         _check_bytes(self.path)
-        self._session = self._open(optimise=False)
-        self.inputs = {tensor.name: tensor for tensor in map(_tensor, self._session.get_inputs())}
-        self.outputs = {tensor.name: tensor for tensor in map(_tensor, self._session.get_outputs())}
+        session = self._open(optimise=False)
+        self.inputs = {tensor.name: tensor for tensor in map(_tensor, session.get_inputs())}
+        self.outputs = {tensor.name: tensor for tensor in map(_tensor, session.get_outputs())}
         for tensor in self.inputs.values():  # before the optimiser allocates constants of such sizes
             sizes = [size for size in tensor.shape or () if isinstance(size, int) and size > 0]
             if math.prod(sizes) > _MAX_INPUT_NUMBERS:
                 problem = f"an input {tensor.name!r} of {' x '.join(map(str, sizes))} numbers"
                 raise InputError(self.path, problem, f"at most {_MAX_INPUT_NUMBERS}", "Fetch or export the file again.")
-        if optimise:
-            self._session = self._open(optimise=True)
+        self._session = self._open(optimise=True)
         self._run_options = onnxruntime.RunOptions()
         self._run_options.log_severity_level = 4
-
-    def __str__(self) -> str:
-        """Lists the inputs on one line and the outputs on another."""
-        return f"in   {_describe(self.inputs.values())}\nout  {_describe(self.outputs.values())}"
 
     def _open(self, *, optimise: bool) -> onnxruntime.InferenceSession:
         options = onnxruntime.SessionOptions()
@@ -144,7 +138,7 @@ class Graph:
             missing = f"no such {side}; the graph has {_describe(tensors.values())}"
             problem = str(tensors[name]) if name in tensors else missing
             expected = f"{Tensor(name, '', None if shape is None else tuple(shape))}, as {what} has".replace(" [", "[")
-            remedy = "Give the right file; `jsecon models check DIR` lists what each one is."
+            remedy = "Give the right file."
             raise InputError(f"{self.path}, {side} {name!r}", problem, expected, remedy)
         return tensors[name]
 

@@ -6,7 +6,7 @@ closed when its stage is done, to free its memory.
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -129,40 +129,3 @@ def _find_model(field: LanguageField) -> "ClipEmbedder | HubModel | None":
                 if embedder.name == sources.embedder:
                     return embedder
     return on_hub
-
-
-def inspect_models(folder: Path) -> dict[str, Any]:
-    """Opens every graph of a folder and its subfolders, and tries the folder as each kind of model.
-
-    Returns the "folder"; "graphs": inputs and outputs of each .onnx file by its path, or why it cannot be opened; and
-    by kind of model what is "usable" and how, and what is "unusable" and why.
-    """
-    from jsecon.networks.clip import ClipEmbedder
-    from jsecon.networks.sam import SamSegmenter
-    from jsecon.networks.sam2 import Sam2Tracker
-
-    if not folder.is_dir():
-        raise InputError(folder, "no such folder", "a folder of models", "Check the path.")
-    graphs = {path.relative_to(folder).as_posix(): _signature(path) for path in sorted(folder.rglob("*.onnx"))}
-    kinds: list[tuple[str, Role, Callable[[Path], Any]]] = [
-        ("CLIP", "embedder", ClipEmbedder),
-        ("SAM", "segmenter", SamSegmenter),
-        ("SAM 2", "tracker", Sam2Tracker),
-    ]
-    usable, unusable = {}, {}
-    for kind, role, open_model in kinds:
-        try:
-            usable[kind] = f"{open_model(folder).check()}: jsecon run --{role} {folder}"
-        except InputError as error:
-            unusable[kind] = str(error)
-    return {"folder": folder, "graphs": graphs, "usable": usable, "unusable": unusable}
-
-
-def _signature(path: Path) -> str:
-    """Writes the inputs and outputs of a graph, or why it cannot be opened."""
-    from jsecon.networks.session import Graph
-
-    try:
-        return str(Graph(path, optimise=False))
-    except InputError as error:
-        return f"cannot be opened: {error.sentence}"
