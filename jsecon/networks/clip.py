@@ -144,13 +144,11 @@ class ClipEmbedder:
                 raise InputError("text", repr(text), "a text", 'Say what to find, for example "red mug".')
         return self._embed_phrases(texts)
 
-    def check(self) -> str:
-        """Runs the graphs on a black image and a word, closes them, and describes the model in a sentence."""
+    def check(self) -> None:
+        """Runs the graphs on a black image and a word, and closes them."""
         self._run_visual(self._black_image())
         self._embed_phrases(["word"])
-        summary = f"images of {self._side}x{self._side} px and texts to {self.dim} numbers"
         self.close()
-        return summary
 
     def close(self) -> None:
         """Closes the graphs and frees their memory; they are opened again when needed."""

@@ -273,12 +273,9 @@ class SamSegmenter:
         mask = logits > 0
         return _Candidate(mask, iou, stability) if stability >= 0.85 and mask.any() else None
 
-    def check(self) -> str:
-        """Opens and closes the graphs, and describes the model in a sentence."""
-        graphs = self._graphs
-        self.close()
-        kind = "SAM 2" if graphs.stretched else "SAM"
-        return f"masks of every frame; decoder of {kind}, images of {graphs.side} px"
+    def check(self) -> None:
+        """Opens and closes the graphs."""
+        SamGraphs(*self._files)
 
     def close(self) -> None:
         """Closes the graphs and frees their memory; they are opened again when needed."""

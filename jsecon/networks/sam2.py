@@ -339,9 +339,9 @@ class Sam2Tracker:
     def _graphs(self) -> _Sam2Graphs:
         return open_sam2(self._folder)
 
-    def check(self) -> str:
-        """Opens the graphs, and describes the model in a sentence."""
-        return f"objects followed through the frames, images of {open_sam2(self._folder).sizes['S']} px"
+    def check(self) -> None:
+        """Opens and closes the graphs."""
+        open_sam2(self._folder)
 
     def close(self) -> None:
         """Closes the graphs and frees their memory; they are opened again when needed."""

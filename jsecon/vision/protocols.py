@@ -64,8 +64,8 @@ class Embedder(Protocol):
 class Models:
     """Models of a run. A network is opened when first needed and closed when its stage is done.
 
-    Segmenters and trackers that hold a network have a `name` of its content and settings, `check()`, which describes
-    it or raises InputError if it cannot work, and `close()`, which frees its memory until it is needed again.
+    Segmenters and trackers that hold a network have a `name` of its content and settings, `check()`, which raises
+    InputError if it cannot work, and `close()`, which frees its memory until it is needed again.
     """
 
     embedder: Embedder
