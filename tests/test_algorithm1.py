@@ -4,7 +4,6 @@ from hypothesis import given, settings, strategies as st
 
 from jsecon.association.consensus import clean_tracks
 from jsecon.paper.algorithm1 import masklets
-from jsecon.pipeline import cache
 
 
 def squares(frames=5, size=40, *, step=3):
@@ -132,34 +131,23 @@ def test_clean_tracks(seed):
         assert len(np.unique(new[new >= 0])) <= 1
 
 
-@pytest.mark.parametrize("stop", [2, 4])
-def test_goes_on_in_the_middle_of_the_sequence_to_the_same_result(stop, tmp_path):
-    truth = squares(6)
-    truth[3:, 30:38, 30:38] = 3  # comes into view later
-    whole, kept = tracker(truth), []
-    keep = {"on_checkpoint": lambda state: kept.append(state())}
-    wanted = masklets(frames_of(truth), segmenter(truth), whole, **keep)
-    np.testing.assert_array_equal(canonical(wanted), canonical(truth))
-    assert whole.calls[:2] == [(0, 3), (3, 1)]  # what enters late is prompted where it enters
-    cache.save(tmp_path / "state.safetensors", kept[stop - 1])
-    track, told = tracker(truth), []
-    state, _ = cache.load(tmp_path / "state.safetensors")
-    again = {"state": state, "progress": lambda *count: told.append(count)}
-    np.testing.assert_array_equal(masklets(frames_of(truth), segmenter(truth), track, **again), wanted)
-    assert track.calls == [call for call in whole.calls if call[0] >= stop]  # what was done is not done again
-    assert told[0] == (stop + 1, 6)
+def test_what_enters_late_is_prompted_where_it_enters():
+    truth, told = squares(6), []
+    truth[3:, 30:38, 30:38] = 3
+    track = tracker(truth)
+    labels = masklets(frames_of(truth), segmenter(truth), track, progress=lambda *count: told.append(count))
+    np.testing.assert_array_equal(canonical(labels), canonical(truth))
+    assert track.calls[:2] == [(0, 3), (3, 1)]
+    assert told[0] == (1, 6)
 
 
-def test_bad_shapes_and_the_state_of_another_sequence_are_refused():
-    truth, kept = squares(), []
-    masklets(frames_of(truth), segmenter(truth), tracker(truth), on_checkpoint=lambda state: kept.append(state()))
-    assert [state.done for state in kept] == [1, 2, 3, 4, 5]
+def test_bad_shapes_are_refused():
+    truth = squares()
     good = {"frames": frames_of(truth), "segment": segmenter(truth), "track": tracker(truth)}
     for match, wrong in (
         ("frames", {"frames": frames_of(truth)[0]}),
         ("segment", {"segment": lambda frame, index: np.ones((1, 3, 3), bool)}),
         ("track", {"track": lambda frames, index, prompts: np.zeros((1, 40, 40), np.int16)}),
-        ("a state of 4 frames", {"frames": frames_of(squares(4)), "state": kept[0]}),
     ):
         with pytest.raises(ValueError, match=match):
             masklets(**(good | wrong))

@@ -5,7 +5,6 @@ decided here stands in `masklets`.
 """
 
 import dataclasses
-from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Bool, Int16
@@ -63,15 +62,6 @@ def _encode_masks(masks: Bool[np.ndarray, "r h w"]) -> _RunLengthMasks:
     return _encode_rows(sparse.csr_matrix(masks.reshape(len(masks), masks.shape[1] * masks.shape[2])))
 
 
-@dataclasses.dataclass(frozen=True)
-class _MaskletState:
-    """State of `masklets` between two frames, to resume from."""
-
-    done: int  # number of frames whose proposals were tracked
-    proposals: list[_RunLengthMasks]  # the proposed masks of each frame
-    layers: list[_RunLengthMasks]  # the tracked masks of each frame
-
-
 def masklets(
     frames: np.ndarray,
     segment: Segmenter,
@@ -80,8 +70,6 @@ def masklets(
     iou_threshold: float = 0.5,
     min_area: float = 0.001,
     max_masklets: int = 1000,
-    state: _MaskletState | None = None,
-    on_checkpoint: Callable[[Callable[[], _MaskletState]], None] | None = None,
     progress: Progress | None = None,
 ) -> Int16[np.ndarray, "t h w"]:
     """Makes the masklets of a sequence by Algorithm 1 of the paper.
@@ -103,26 +91,19 @@ def masklets(
       iou_threshold: The paper's kappa.
       min_area: Least area of a proposal, as a share of the frame.
       max_masklets: Maximum number of tracked prompts.
-      state: State of a stopped call with the same frames and options, to resume after its last frame.
-      on_checkpoint: Called after each frame with a function that makes the state, which has the size of all masks.
       progress: Called with the number of frames done and of all.
 
     Returns:
       (T, H, W) int16 labels, -1 for no masklet.
 
     Raises:
-      ValueError: Frames, masks or labels have a wrong shape, or the state is of another sequence.
+      ValueError: Frames, masks or labels have a wrong shape.
     """
     rgb = frames.ndim == 4 and frames.shape[3] == 3 and frames.dtype == np.uint8
     require(rgb, "frames", (frames.shape, frames.dtype), "(T, H, W, 3) uint8", "Stack RGB frames of one size.")
     count, height, width = frames.shape[:3]
     proposals, layers = _Layers(count, height, width), _Layers(count, height, width)
-    if state is not None:
-        done, known = state.done, len(state.layers)
-        fits, remedy = known == count and 0 <= done <= count, "Pass the state of this sequence, or no state."
-        require(fits, "state", f"{done} of {known} frames", f"a state of {count} frames", remedy)
-        proposals.runs, layers.runs = list(state.proposals), list(state.layers)
-    for t in range(0 if state is None else state.done, count):
+    for t in range(count):
         masks = np.asarray(segment(frames[t], t), bool)
         require_shape("segment", masks, ("M", height, width), "A segmenter returns masks of the size of the frame.")
         masks = masks[masks.sum((1, 2)) >= max(min_area * height * width, 1)]
@@ -133,8 +114,6 @@ def masklets(
             require_shape("track", labels, (count, height, width), "A tracker returns one label image per frame.")
             for other, image in enumerate(labels):
                 layers.add_labels(other, image, len(prompts))
-        if on_checkpoint is not None:
-            on_checkpoint(lambda done=t + 1: _MaskletState(done, list(proposals.runs), list(layers.runs)))
         if progress is not None:
             progress(t + 1, count)
     if not count or not layers.size(0):

@@ -29,7 +29,6 @@ from jsecon.parallel import map_over_processes
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.stages import (
     CastVotes,
-    Checkpoint,
     ObjectLabels,
     RunContext,
     Stage,
@@ -185,7 +184,7 @@ def _find_objects(stage: StageInput) -> StageResult:
     frames, why_fewer = _frames_of_vision(stage)
     view = _TrainingView(stage.results.load, context.options, frames)
     proposals, notes = _frame_proposals(context, view, scene)
-    found = _associate_masks(context, view, scene, proposals, stage.progress, stage.checkpoint)
+    found = _associate_masks(context, view, scene, proposals, stage.progress)
     context.models.close()
     _clear_ignored(found.labels, view)
     _require_regions(found.labels, str(context.options.capture))
@@ -242,7 +241,6 @@ def _associate_masks(
     gaussians: Gaussians,
     proposals: Callable[[int], np.ndarray],
     progress: Progress,
-    checkpoint: Checkpoint,
 ) -> Objects:
     """Associates proposals by consensus or by a tracker, which makes no tree."""
     options, frames, cameras = context.options, view.frames, view.cameras
@@ -250,14 +248,7 @@ def _associate_masks(
         scene = SceneSuperpixels(gaussians, cameras, proposals, centre_pixel_weight=options.centre_pixel_weight)
         return track_masks(frames, scene, agreement=options.agreement, seed=options.seed, progress=progress)
     tracker = context.models.tracker or GeometricTracker(gaussians, cameras, proposals)
-    labels = masklets(
-        frames,
-        lambda frame, index: proposals(index),
-        tracker,
-        state=checkpoint.read(),
-        on_checkpoint=checkpoint.keep,
-        progress=progress,
-    )
+    labels = masklets(frames, lambda frame, index: proposals(index), tracker, progress=progress)
     if isinstance(tracker, GeometricTracker):
         labels = tracker.consistent(frames, labels)
     return Objects(clean_tracks(labels))

@@ -36,7 +36,7 @@ from jsecon.types import Array, Capture, Codes, Gaussians, Progress, Quality, Re
 from jsecon.vision.protocols import Models
 
 CHECKPOINT_SECONDS = 20.0
-"""s between two checkpoints of a stage; a stop loses at most this and one chunk of steps, or one tracked frame"""
+"""s between two checkpoints of a stage; a stop loses at most this and one chunk of steps"""
 WARNING = "WARNING: "
 """begins a note on what makes answers wrong"""
 KEY_FILE = "made_by.txt"
