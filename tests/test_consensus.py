@@ -13,11 +13,9 @@ from jsecon.association.consensus import (
     _Groups,
     _object_tree,
     _piece_planes,
-    pieces_on_masks,
     track_masks,
 )
 from jsecon.association.scene import SceneSuperpixels
-from jsecon.field.evidence import region_votes
 from jsecon.field.regions import node_members
 
 
@@ -140,22 +138,6 @@ def test_parents_come_after_their_children_in_any_tree():
         tops = [regions_of(tree, int(kept.sum()), node) for node in np.flatnonzero(tree < 0)]
         expected = [sorted(number[list(sets[root])][number[list(sets[root])] >= 0].tolist()) for root in roots]
         assert sorted(tops) == sorted(filter(None, expected))
-
-
-def test_the_weight_on_masks_is_that_of_the_splatting(world, scene):
-    """Masks that part each frame: a Gaussian's weight on them is that of `region_votes` of the frame."""
-    gaussians, cameras, frames, _, proposals = world[:5]
-    _, cast = pieces_on_masks(frames, scene)
-    assert cast.shape == (gaussians.count, sum(map(len, proposals)))
-    start = 0
-    for t in range(3):
-        masks = np.asarray(proposals[t])
-        labels = np.where(masks.any(0), masks.argmax(0), -1)[None]
-        votes = region_votes(gaussians, cameras[t : t + 1], labels, len(masks), top=len(masks))
-        exact = np.asarray(votes.dense())
-        found = cast[:, start : start + len(masks)].toarray()
-        assert np.abs(found - exact).sum() < 0.03 * exact.sum()  # atoms leave out what is negligible
-        start += len(masks)
 
 
 def joined_pair_by_pair(together, both, least):
@@ -284,9 +266,8 @@ def test_most_views_decide_and_rows_and_frames_that_disagree_are_refused(world, 
         group(membership[1:], visible, weights, means)
     with pytest.raises(ValueError, match="frames"):
         track_masks(world[2][1:], scene)
-    for work in (track_masks, pieces_on_masks):
-        with pytest.raises(ValueError, match="seed: got -1"):
-            work(world[2], scene, seed=-1)
+    with pytest.raises(ValueError, match="seed: got -1"):
+        track_masks(world[2], scene, seed=-1)
 
 
 def test_few_points_and_points_that_are_never_seen():
