@@ -242,19 +242,14 @@ def regions_with(
 
 def _reaches(similarity: Float[Array, " r"], known: Bool[Array, " r"], relative_score: Number) -> Bool[Array, " r"]:
     """Finds regions with a similarity of at least m + `relative_score` (b - m), m the median and b > m the largest."""
-    median, largest = _median_and_largest(similarity, known)
-    reach = array_module(similarity).where(largest > median, largest - median, 0.0)
-    return known & (similarity >= median + relative_score * reach) & (largest > median)
-
-
-def _median_and_largest(similarity: Float[Array, " r"], known: Bool[Array, " r"]) -> tuple[Number, Number]:
-    """Finds the median and the largest of the known similarities; infinite if none is known."""
-    xp = array_module(similarity)
+    xp = array_module(similarity, known)
+    if not len(similarity):
+        return known
     ordered, count = xp.sort(xp.where(known, similarity, xp.inf)), known.sum()
-    largest = xp.where(known, similarity, -xp.inf).max(initial=-xp.inf)
-    if not len(ordered):
-        return largest, largest
-    return 0.5 * ordered[xp.maximum(count - 1, 0) // 2] + 0.5 * ordered[count // 2], largest
+    median = 0.5 * ordered[xp.maximum(count - 1, 0) // 2] + 0.5 * ordered[count // 2]
+    largest = xp.where(known, similarity, -xp.inf).max()
+    reach = xp.where(largest > median, largest - median, 0.0)
+    return known & (similarity >= median + relative_score * reach) & (largest > median)
 
 
 def join_fragments(regions: Sequence[int] | np.ndarray, overlap: np.ndarray | None) -> list[tuple[int, ...]]:
