@@ -25,8 +25,8 @@ from experiments.rooms.room import crowded_room
 from experiments.simulated_vision.exact_sam import ExactGridSam, ExactSam, found_shares, level_labels, masks_of
 from jsecon.networks.clip import ClipEmbedder
 from jsecon.networks.hub import Role, find_files
-from jsecon.networks.sam import Level, SamGraphs
-from jsecon.networks.sam2 import follow, open_sam2
+from jsecon.networks.sam import Level, _SamGraphs
+from jsecon.networks.sam2 import _open_sam2, follow
 from jsecon.process import cores
 
 THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9)
@@ -148,7 +148,7 @@ def _seconds(call: Callable[[], Any]) -> float:
 
 
 def _time_segmenter(model: Path, frame: np.ndarray) -> dict[str, Any]:
-    graphs = SamGraphs(*find_files(model, "segmenter"))
+    graphs = _SamGraphs(*find_files(model, "segmenter"))
     encoder = _seconds(lambda: graphs.encode(frame))
     encoded = graphs.encode(frame)
     points = np.random.default_rng(0).uniform(0, 300, (8, 2)).astype(np.float32)
@@ -165,7 +165,7 @@ def _time_embedder(model: Path, frame: np.ndarray, masks: np.ndarray) -> dict[st
 
 
 def _time_tracker(model: Path, frame: np.ndarray) -> dict[str, Any]:
-    graphs = open_sam2(model)
+    graphs = _open_sam2(model)
     frames = np.stack([np.roll(frame, 3 * t, 1) for t in range(3)])
     prompt = np.array([[200.0, 150.0]], np.float32), np.array([1], np.int32)
     seconds = []

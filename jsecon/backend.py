@@ -17,7 +17,7 @@ REMEDY = (
 """measured: jax 0.10.2, the newest for Python 3.11, has issue 39103; 0.11.0 to 0.12.0.1 do not"""
 
 
-class BackendReport(NamedTuple):
+class _BackendReport(NamedTuple):
     """Result of `check_backend`."""
 
     platform: str
@@ -44,7 +44,7 @@ def start_backend() -> None:
         raise InputError("jax", f"it cannot start ({describe_error(error)})", remedy="Run jsecon doctor.") from error
 
 
-def check_backend() -> BackendReport:
+def check_backend() -> _BackendReport:
     """Compares jitted and vmapped cosines at 40,000 rows with NumPy float64, in about a second.
 
     Returns:
@@ -69,7 +69,7 @@ def check_backend() -> BackendReport:
     ]
     unit = normalize(t)
     broken = jax.jit(jax.vmap(lambda f: jnp.max(unit @ (f / jnp.linalg.norm(f)))))(f)
-    report = BackendReport(jax.default_backend(), jax.__version__, max(map(error, ours)), error(broken))
+    report = _BackendReport(jax.default_backend(), jax.__version__, max(map(error, ours)), error(broken))
     if not report.cosine_error < 1e-5:
         problem = f"cosines are off by {report.cosine_error:.2g} on {report.platform} with jax {jax.__version__}"
         raise RuntimeError(f"check_backend: {problem}, expected at most 1e-5. {REMEDY}")

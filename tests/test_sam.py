@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from jsecon.networks import sam
 from jsecon.networks.hub import find_files
-from jsecon.networks.sam import TOKENS, SamGraphs, SamSegmenter, _box_nms, _box_of, _GuidedPrompts, _langsplat_nms
+from jsecon.networks.sam import TOKENS, SamSegmenter, _box_nms, _box_of, _GuidedPrompts, _langsplat_nms, _SamGraphs
 from jsecon.vision.protocols import Segmenter
 
 KINDS = [("sam", 1), ("sam", "batch"), ("sam", 7), ("sam2", "batch")]
@@ -52,8 +52,8 @@ class GridSam(SamSegmenter):
     prompts = GridPrompts
 
 
-def graphs_of(folder) -> SamGraphs:
-    return SamGraphs(*find_files(folder, "segmenter"))
+def graphs_of(folder) -> _SamGraphs:
+    return _SamGraphs(*find_files(folder, "segmenter"))
 
 
 def by_definition(folder, frame, token_of_level):
@@ -150,13 +150,13 @@ def test_sam_2_takes_a_frame_stretched_to_a_square(folders, frame, tmp_path):
 
 
 def test_a_frame_without_anything_good_gives_no_masks(folders, frame, monkeypatch):
-    decode = SamGraphs.decode
+    decode = _SamGraphs.decode
 
     def decode_poorly(*given):
         masks, ious = decode(*given)
         return masks, 0.7 * ious
 
-    monkeypatch.setattr(SamGraphs, "decode", decode_poorly)
+    monkeypatch.setattr(_SamGraphs, "decode", decode_poorly)
     assert SamSegmenter(folders["sam", "batch"])(frame, 0).shape == (0, 120, 160)
 
 

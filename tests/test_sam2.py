@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from sam2_files import CHANNELS, MEAN, MEMORY, POINTERS, SIZE, SLOTS, STD, write_sam2
 
-from jsecon.networks.sam2 import HOLE_AREA, Sam2Tracker, _fill_holes, follow, open_sam2
+from jsecon.networks.sam2 import HOLE_AREA, Sam2Tracker, _fill_holes, _open_sam2, follow
 from jsecon.networks.session import Graph
 from jsecon.vision.protocols import Tracker
 
@@ -123,7 +123,7 @@ def test_frames_forward_and_backward_equal_the_twin(folder):
         (np.array([[12, 6], [25, 18]], np.float32), np.array([2, 3], np.int32)),
         (np.array([[6.0, 9.0]], np.float32), np.array([1], np.int32)),
     ]
-    found = dict(follow(open_sam2(folder), frames, start, prompts))
+    found = dict(follow(_open_sam2(folder), frames, start, prompts))
     assert list(found) == [*range(start, 24), *range(start - 1, -1, -1)]
     signs, changed = set(), 0.0
     for number, prompt in enumerate(prompts):
@@ -148,7 +148,7 @@ def test_tracker_gives_each_pixel_to_the_highest_logit(folder):
     assert labels.shape == frames.shape[:3]
     assert labels.dtype == np.int16
     assert set(np.unique(labels)) <= {-1, 0, 2}
-    for t, logits in follow(open_sam2(folder), frames, 2, [prompts[0], prompts[2]]):
+    for t, logits in follow(_open_sam2(folder), frames, 2, [prompts[0], prompts[2]]):
         whole = np.stack([cv2.resize(_fill_holes(low, HOLE_AREA), (WIDTH, HEIGHT)) for low in logits])
         wanted = np.where(whole.max(0) > 0, np.array([0, 2])[whole.argmax(0)], -1)
         np.testing.assert_array_equal(labels[t], wanted)
@@ -167,7 +167,7 @@ def test_the_name_follows_the_content_and_the_graphs_can_be_dropped(folder, tmp_
 
 @pytest.mark.long
 def test_four_hundred_frames_hold_no_more_than_a_hundred(folder, tmp_path):
-    sam2, peaks = open_sam2(folder), []
+    sam2, peaks = _open_sam2(folder), []
     for count in (100, 400):
         path = tmp_path / f"{count}.npy"
         np.save(path, np.broadcast_to(a_clip(1), (count, HEIGHT, WIDTH, 3)))

@@ -16,7 +16,7 @@ import torch
 
 from experiments.export.graph import STRETCH, Agreement, Wrapped, declare_missing_operators, shake, write_graph
 from jsecon.files import write_text
-from jsecon.networks.sam2 import POINTERS, SLOTS, _Sam2Graphs, follow, open_sam2
+from jsecon.networks.sam2 import POINTERS, SLOTS, _open_sam2, _Sam2Graphs, follow
 
 CONFIG = "sam2.1/sam2.1_hiera_t"
 CENTRE = 4.22
@@ -281,7 +281,7 @@ def _tracked(model: Any, modules: dict[str, tuple], folder: Path, *, count: int 
     """
     frames, point = _moving_disc(count)
     prompt = point, np.array([1], np.int32)
-    opened = open_sam2(folder)
+    opened = _open_sam2(folder)
     in_torch = _Sam2Graphs(
         {name: _TorchGraph(*parts) for name, parts in modules.items()}, opened.constants, opened.sizes
     )

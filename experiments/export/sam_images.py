@@ -17,7 +17,7 @@ from experiments.export.embedder import regions
 from experiments.export.graph import STRETCH, Agreement, Wrapped, declare_missing_operators, shake, write_graph
 from jsecon.files import write_text
 from jsecon.networks.hub import find_files
-from jsecon.networks.sam import SamGraphs
+from jsecon.networks.sam import _SamGraphs
 
 FEATURES = ["image_embeddings.0", "image_embeddings.1", "image_embeddings.2"]
 POINTS = np.array([[40, 40], [120, 60], [60, 95], [3, 110]], np.float32)
@@ -106,7 +106,7 @@ class Decoder(Wrapped):
 def _asked(model: Any, folder: Path, side: int) -> Agreement:
     """Points of a frame put to the folder as SAM's proposals put them, and to the model."""
     frame = regions()[0]
-    graphs = SamGraphs(*find_files(folder, "segmenter"))
+    graphs = _SamGraphs(*find_files(folder, "segmenter"))
     encoded = graphs.encode(frame)
     found = [graphs.decode(encoded, point) for point in POINTS]
     pixels = np.asarray(Image.fromarray(frame).resize((side, side), Image.Resampling.BILINEAR), np.float64) / 255

@@ -22,7 +22,7 @@ from scipy.spatial import KDTree
 from experiments.rivals.descent import descend
 from experiments.rivals.evidence import Evidence, view_plans, with_room
 from jsecon.errors import InputError
-from jsecon.paper.queries import relevancies
+from jsecon.paper.queries import _relevancies
 from jsecon.splat.plan import plan_view, render_plan
 from jsecon.splat.sh import C0
 from jsecon.types import Array, Selection
@@ -41,7 +41,7 @@ RELEVANT, NEARLY = 0.5, 0.9
 """LERF relevancy below which no mask of the first view is the text's, and the share of the best mask's from which
 others are too: theirs take all that the detector found together"""
 
-_relevancies = jax.jit(relevancies)
+_relevancies = jax.jit(_relevancies)
 
 
 @jax.tree_util.register_dataclass

@@ -22,7 +22,7 @@ from scipy.spatial import KDTree
 
 from experiments.rivals.evidence import Evidence, local_masks
 from jsecon.field.evidence import view_evidence
-from jsecon.paper.queries import relevancies
+from jsecon.paper.queries import _relevancies
 from jsecon.splat.fusion import compute_once
 from jsecon.splat.plan import ViewPlan, plan_view
 from jsecon.splat.scan import blend_weights, make_batches, make_table, scan_tiles
@@ -37,7 +37,7 @@ NEIGHBOURS = 10
 READOUT = 0.6
 """VALA's threshold on the smoothed, normalised relevancy"""
 
-_relevancies = jax.jit(relevancies)
+_relevancies = jax.jit(_relevancies)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -66,7 +66,7 @@ def _pieces(labels: np.ndarray) -> Int32[np.ndarray, "h w"]:
 
 
 class ExactGraphs:
-    """Stands in for `SamGraphs`: its masks are true, whatever the frame. It counts its prompts.
+    """Stands in for `_SamGraphs`: its masks are true, whatever the frame. It counts its prompts.
 
     Args:
       labels: Labels (H, W) of the frame by level.

@@ -19,7 +19,7 @@ from experiments.tables.setting import Setting
 from experiments.tables.silhouette import SILHOUETTE_WEIGHTS, fit_silhouette
 from jsecon.errors import require
 from jsecon.numerics import cosine_matrix, normalize
-from jsecon.paper.queries import relevancies
+from jsecon.paper.queries import _relevancies
 from jsecon.types import Selection
 
 RULES = ("cosine", "relevancy", "centred", "contrast")
@@ -57,7 +57,7 @@ def scores(
         found = np.asarray(cosine_matrix(normalize(texts) - words.mean(0), features))
     elif rule == "relevancy":
         found = np.stack(
-            [np.asarray(relevancies(features, t, jnp.asarray(setting.canonical_phrases))[0]) for t in texts]
+            [np.asarray(_relevancies(features, t, jnp.asarray(setting.canonical_phrases))[0]) for t in texts]
         )
     else:
         evidence = setting.evidence if evidence is None else evidence

@@ -53,7 +53,7 @@ class _EncodedFrame(NamedTuple):
     """(H, W) px of the frame within the encoder's square"""
 
 
-class SamGraphs:
+class _SamGraphs:
     """SAM's two graphs, ready to run, or an InputError if one has other tensors than SAM.
 
     Args:
@@ -275,15 +275,15 @@ class SamSegmenter:
 
     def check(self) -> None:
         """Opens and closes the graphs."""
-        SamGraphs(*self._files)
+        _SamGraphs(*self._files)
 
     def close(self) -> None:
         """Closes the graphs and frees their memory; they are opened again when needed."""
         self.__dict__.pop("_graphs", None)
 
     @functools.cached_property
-    def _graphs(self) -> SamGraphs:
-        return SamGraphs(*self._files)
+    def _graphs(self) -> _SamGraphs:
+        return _SamGraphs(*self._files)
 
 
 def _box_of(mask: Bool[np.ndarray, "h w"]) -> tuple[int, int, int, int]:

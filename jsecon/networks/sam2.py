@@ -197,7 +197,7 @@ def _sam2_files(folder: Path) -> dict[str, Path]:
     return {path.stem: path for path in find_files(folder, "tracker")}
 
 
-def open_sam2(folder: Path) -> _Sam2Graphs:
+def _open_sam2(folder: Path) -> _Sam2Graphs:
     """Opens the model in a folder, or raises InputError if its files do not make one model."""
     files = _sam2_files(folder)
     constants = _read_constants(files["constants"])
@@ -337,11 +337,11 @@ class Sam2Tracker:
 
     @functools.cached_property
     def _graphs(self) -> _Sam2Graphs:
-        return open_sam2(self._folder)
+        return _open_sam2(self._folder)
 
     def check(self) -> None:
         """Opens and closes the graphs."""
-        open_sam2(self._folder)
+        _open_sam2(self._folder)
 
     def close(self) -> None:
         """Closes the graphs and frees their memory; they are opened again when needed."""

@@ -81,10 +81,10 @@ def query_canonical(
 
 @jax.jit
 def _canonical(features: Array, text: Array, canonical: Array, threshold: Number) -> Selection:
-    return _selection(*relevancies(features, text, canonical), threshold)
+    return _selection(*_relevancies(features, text, canonical), threshold)
 
 
-def relevancies(
+def _relevancies(
     features: Float[Array, "n d"], text: Float[Array, " d"], canonical: Float[Array, "c d"]
 ) -> tuple[Array, Array]:
     """Computes LERF's relevancy (N,) of a text, see `query_canonical`, and whether it is known (N,); 0 if not."""

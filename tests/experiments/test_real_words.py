@@ -9,7 +9,7 @@ from small_field import unit_rows
 from experiments.words import rules
 from experiments.words.absent import absent_names
 from experiments.words.conse import Conse, Crop, TextVectors, class_weights, conse, cut_out
-from jsecon.paper.queries import relevancies
+from jsecon.paper.queries import _relevancies
 from jsecon.query.match import region_similarities
 from jsecon.vision.protocols import CANONICAL, Embedder
 
@@ -133,7 +133,7 @@ def test_scores_of_all_texts_are_those_of_the_library():
     known = np.arange(6) != 2
     for q, text in enumerate(texts):
         apart = np.asarray(region_similarities(regions, text, words, "contrast")[0])
-        relevancy = np.asarray(relevancies(regions, text, canonical)[0])
+        relevancy = np.asarray(_relevancies(regions, text, canonical)[0])
         np.testing.assert_allclose(found["contrast"][q, known], apart[known], atol=1e-5)
         np.testing.assert_allclose(found["relevancy"][q, known], relevancy[known], atol=1e-5)
         np.testing.assert_allclose(found["cosine"][q, known], (regions @ text)[known], atol=1e-5)
