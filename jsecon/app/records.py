@@ -209,7 +209,7 @@ class Answer:
         region, selected = int(self.selection.region), int(np.asarray(self.selection.mask).sum())
         probability = {}
         if len(self.rows) and self.by == "votes":
-            votes = votes_of_rows(self.field.votes, self.rows)
+            votes = votes_of_rows(jax.tree.map(np.asarray, self.field.votes), self.rows)
             inside = membership_probability(np.asarray(self.selection.similarity)[self.rows], votes)
             probability["mean"] = round(float(inside.mean()), 4)
             probability["percentile_10"] = round(float(np.quantile(inside, 0.1)), 4)
