@@ -41,7 +41,7 @@ def stored_jit(function: Callable, *, static_argnums: tuple[int, ...] = (), smal
     programs: dict[Any, Callable] = {}
 
     def options() -> dict[str, bool] | None:
-        return without_emitters() if small_kernels else None
+        return _without_emitters() if small_kernels else None
 
     @functools.cache
     def compiled() -> Callable:
@@ -110,7 +110,7 @@ def _stored(file: Path, function: Any, types: list[Any]) -> export.Exported:
 
 
 @functools.cache
-def without_emitters() -> dict[str, bool] | None:
+def _without_emitters() -> dict[str, bool] | None:
     """Returns the options of a program without fusion emitters; None if this release of XLA has no such option."""
     option = {"xla_cpu_use_fusion_emitters": False}
     try:

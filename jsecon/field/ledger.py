@@ -149,7 +149,7 @@ def _build_field(field: LanguageField, ledger: Ledger, names: Collection[str]) -
         regions=Regions(embeddings, all_pixels),
         cameras=Camera(cameras[:, :16].reshape(-1, 4, 4), *cameras[:, 16:].T, width=width, height=height),
         names=tuple(ordered),
-        **grown_tree(field, count),
+        **_grown_tree(field, count),
         codes=None,
     )
     return _with_history(new), ledger
@@ -169,7 +169,7 @@ def _with_history(field: LanguageField) -> LanguageField:
     return dataclasses.replace(field, votes=votes, regions=regions, history=tuple(events))
 
 
-def grown_tree(field: LanguageField, count: int) -> dict[str, np.ndarray]:
+def _grown_tree(field: LanguageField, count: int) -> dict[str, np.ndarray]:
     """Tree and smallest nodes of a field that has `count` regions now: new ones stand alone, before all other nodes."""
     if field.tree is None:
         return {}

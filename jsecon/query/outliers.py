@@ -24,7 +24,7 @@ MIN_SAMPLES = 10
 
 
 class OutlierResult(NamedTuple):
-    """A selection without its outliers, and what became of its clusters."""
+    """A selection without its outliers, and how many clusters stay."""
 
     mask: Bool[np.ndarray, " n"]
     """The Gaussians that stay."""
@@ -32,8 +32,6 @@ class OutlierResult(NamedTuple):
     """Why DBSCAN was not needed; empty if it was."""
     clusters_kept: int
     """Clusters that stay."""
-    clusters_dropped: int
-    """Clusters that were dropped."""
 
 
 def remove_outliers(
@@ -90,13 +88,13 @@ def split_outliers(
     mask[chosen[~finite]] = False
     chosen, points = chosen[finite], points[finite]
     if len(chosen) < MIN_SAMPLES:
-        return OutlierResult(mask, f"fewer than {MIN_SAMPLES} Gaussians are selected", 0, 0)
+        return OutlierResult(mask, f"fewer than {MIN_SAMPLES} Gaussians are selected", 0)
     eps = _default_eps(points) if eps is None else eps
     if _one_component(points, eps):  # then nothing lies apart, and DBSCAN is not needed
-        return OutlierResult(mask, "the selection is one component", 1, 0)
+        return OutlierResult(mask, "the selection is one component", 1)
     labels = _dbscan(points, eps)
     if labels.max() < 0:
-        return OutlierResult(mask, "", 0, 0)
+        return OutlierResult(mask, "", 0)
     clustered = labels >= 0
     sizes = np.bincount(labels[clustered])
     stays = np.ones(len(sizes), bool)
@@ -107,7 +105,7 @@ def split_outliers(
         support = np.bincount(labels[clustered], np.nan_to_num(support[clustered], posinf=0.0))
         stays = support >= 0.1 * support.max()
     mask[chosen[~(clustered & stays[labels])]] = False
-    return OutlierResult(mask, "", int(stays.sum()), int((~stays).sum()))
+    return OutlierResult(mask, "", int(stays.sum()))
 
 
 def _default_eps(points: Float[Array, "m 3"]) -> float:
