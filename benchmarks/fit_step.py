@@ -26,7 +26,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from jsecon.fit.growth import pad_with_free_rows
 from jsecon.fit.photometric import photometric_loss
 from jsecon.fit.start import starting_gaussians
-from jsecon.fit.step import LearningRates, StepConfig, StepRunner, TrainState, put_on_devices
+from jsecon.fit.step import LearningRates, StepRunner, TrainState, put_on_devices
 from jsecon.parallel import MESH_OPTIONS, host_mesh, map_rows
 from jsecon.read.captures.capture import load_capture
 from jsecon.splat.capacity import default_capacity, round_capacity
@@ -62,8 +62,8 @@ def main() -> None:
 
     zeros = jax.tree.map(np.zeros_like, gaussians)
     current = put_on_devices(TrainState(gaussians, zeros, zeros, zeros.opacity_logits, None), mesh)
-    steps = StepRunner(dataclasses.replace(capture, held_out=np.arange(9) != 4), mesh)
-    whole_step = functools.partial(steps.run_step, current, 1.0, 0, 0, 0.0, StepConfig(3, LearningRates(), None))
+    steps = StepRunner(dataclasses.replace(capture, held_out=np.arange(9) != 4), mesh, LearningRates(), None)
+    whole_step = functools.partial(steps.run_step, current, 1.0, 0, 0, 0.0, 3)
     reference = functools.partial(jax.jit(jax.value_and_grad(absolute), **options), current.gaussians, camera, frame)
     runs = {"l1": reference, "step": whole_step}
     seconds: dict[str, list[float]] = {name: [] for name in runs}

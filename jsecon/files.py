@@ -229,9 +229,17 @@ def reading(
 
 def scratch_array(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
     """Makes an array to be filled; one of more than a quarter of the memory budget lies in a file that has no name."""
-    if math.prod(shape) * np.dtype(dtype).itemsize <= memory_budget() / 4:
+    if (size := math.prod(shape) * np.dtype(dtype).itemsize) <= memory_budget() / 4:
         return np.empty(shape, dtype)
-    return np.memmap(tempfile.TemporaryFile(), dtype, "w+", shape=shape)
+    with tempfile.TemporaryFile() as file:
+        try:
+            if hasattr(os, "posix_fallocate"):  # a mapped page without a place on the disk ends the process by SIGBUS
+                os.posix_fallocate(file.fileno(), 0, size)
+            return np.memmap(file, dtype, "w+", shape=shape)
+        except OSError as error:
+            problem = f"{error.strerror or error} for {size / 2**30:.1f} GiB"
+            remedy = "Free some room, set TMPDIR to a folder that has it, or take fewer or smaller frames."
+            raise InputError(tempfile.gettempdir(), problem, remedy=remedy) from error
 
 
 def map_npy(path: Path) -> np.ndarray:

@@ -187,25 +187,3 @@ def test_an_ordinary_scene_is_written_in_single_precision(tmp_path, scene):
     """As INRIA's readers expect it, whatever turns and moves it a little."""
     save_gaussians(tmp_path / "a.ply", scene, similarity=np.diag([2.0, 2.0, 2.0, 1.0]) + np.eye(4, k=3))
     assert b"property double" not in (tmp_path / "a.ply").read_bytes()
-
-
-def jumps(centres, folder) -> list[str]:
-    """The notes on jumps of a capture with these camera centres."""
-    capture = small_capture(len(centres))
-    poses = np.tile(np.eye(4), (len(centres), 1, 1))
-    poses[:, :3, 3] = -centres
-    cameras = dataclasses.replace(capture.cameras, world_to_camera=poses)
-    write_transforms(dataclasses.replace(capture, cameras=cameras), folder)
-    return [note for note in load_capture(folder).notes if "jumps in" in note]
-
-
-def test_poses_that_jump_are_told_and_frames_that_do_not_move_or_have_no_order_do_not_jump(tmp_path):
-    along = np.cumsum(np.random.default_rng(0).uniform(0.1, 2.0, 40)) / 40  # steps of a tenth to twice the usual
-    centres = np.stack([np.cos(along), np.zeros(40), np.sin(along)], axis=1)
-    assert jumps(centres, tmp_path) == []
-    assert jumps(centres[np.random.default_rng(2).permutation(40)], tmp_path) == []
-    assert jumps(np.zeros((9, 3)), tmp_path) == []
-    centres[12:15, 0] += 15 / 40
-    (note,) = jumps(centres, tmp_path)
-    assert "2 places" in note
-    assert "frame_011 to frame_012, frame_014 to frame_015)" in note

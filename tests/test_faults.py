@@ -19,7 +19,6 @@ from jsecon import load_capture, load_field, load_gaussians, save_field, save_ga
 from jsecon.files import exclusive_lock, reading, write_text
 from jsecon.pipeline import cache, run as pipeline, scene
 from jsecon.pipeline.scene import plan_capture
-from jsecon.read.captures import build
 from jsecon.read.captures.images import write_image
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -69,8 +68,8 @@ def test_an_opencv_without_its_contrib_modules_is_told_before_anything_runs(capt
 
 def test_frames_that_lie_on_a_full_disk_are_told(capture, no_room, monkeypatch):
     """They are mapped: a page without a place on the disk would end the process."""
-    monkeypatch.setattr(build, "_MAX_IN_MEMORY", 500)
-    with refused("for 0.0 GiB of frames", "TMPDIR"):
+    monkeypatch.setenv("JSECON_MEMORY", "1e-9")
+    with refused("for 0.0 GiB", "TMPDIR"):
         load_capture(capture)
 
 

@@ -20,7 +20,7 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from jsecon.errors import InputError, require
 from jsecon.fit.corrections import CorrectionRates, CorrectionState, identity_corrections
 from jsecon.fit.growth import drop_free_rows, grow, pad_with_free_rows
-from jsecon.fit.step import LearningRates, StepConfig, StepRunner, TrainState, put_on_devices
+from jsecon.fit.step import LearningRates, StepRunner, TrainState, put_on_devices
 from jsecon.parallel import host_mesh
 from jsecon.splat.capacity import round_capacity
 from jsecon.splat.strips import BLOCK
@@ -162,7 +162,7 @@ def fit_gaussians(
     limit = cast(float, seconds if steps is None else steps)
     require(0 < limit < math.inf, "steps, seconds", limits, "a finite number above 0", "Choose a longer fit.")
     mesh = host_mesh(-(-capture.cameras.height // (BLOCK * TILE)))  # no strip is empty
-    runner = StepRunner(capture, mesh)
+    runner = StepRunner(capture, mesh, rates, refine)
     if isinstance(start, FitState):
         state = start
     else:
@@ -178,15 +178,14 @@ def fit_gaussians(
         # A resumed fit has the same chunks.
         count = max(1, min(chunk - first % chunk, math.ceil((1 - done) / pace - 1e-6)))
         size, order = schedule._size(done), _view_order(key, runner.frames, first, first + count)
-        config = StepConfig(int(done / 0.1), rates, refine)
-        program, later = runner.compile(train, size, config), schedule._next_size(done)
+        program, later = runner.compile(train, size), schedule._next_size(done)
         has_all_rows = train.gaussians.count >= schedule.max_gaussians
         if later is not None and has_all_rows and steps is not None:  # a fit with a time limit would lose steps
-            runner.compile(train, later, config)
+            runner.compile(train, later)
         program.result()  # compilation is not counted as time of the fit
         began = time.monotonic()
         shares = done + pace * np.arange(count)
-        train, new_losses = _run_chunk(train, runner, size, order, first, shares, config)
+        train, new_losses = _run_chunk(train, runner, size, order, first, shares)
         losses = np.concatenate([state.losses, np.asarray(new_losses, np.float32)])
         host = _to_host(train, state.train.gaussians.count)
         # A Gaussian that is not finite is invisible: the loss alone does not show it.
@@ -228,13 +227,13 @@ def _run_chunk(
     order: np.ndarray,
     first: int,
     done: np.ndarray,
-    config: StepConfig,
 ) -> tuple[TrainState, list]:
     """Takes a step on each view of `order`, repeated with more capacity if one overflowed; and returns their losses."""
+    degree = int(done[0] / 0.1)  # of the spherical harmonics that learn
     while True:
         after, losses, overflow = state, [], []
         for n, view in enumerate(order):
-            after, loss, missing = runner.run_step(after, size, int(view), first + n, float(done[n]), config)
+            after, loss, missing = runner.run_step(after, size, int(view), first + n, float(done[n]), degree)
             losses.append(loss)
             overflow.append(missing)
             if n >= 2:  # every pending step holds a scene and its moments

@@ -1,7 +1,7 @@
 """One optimisation step of a fit: training view, loss, gradients and Adam, on all devices of this process."""
 
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import cv2
 import jax
@@ -201,15 +201,6 @@ class TrainState:
     """CorrectionState of all frames of the capture; None if they are not refined."""
 
 
-class StepConfig(NamedTuple):
-    """Settings of a step."""
-
-    degree: int
-    """Highest degree of the spherical harmonics that learns; it may exceed the scene's."""
-    rates: LearningRates
-    refine: CorrectionRates | None
-
-
 @record
 class _StepInputs:
     """Numbers of a step; traced, so that one program serves all steps."""
@@ -223,7 +214,7 @@ class _StepInputs:
     done: Leaf
     """() float32 share of the fit that is done."""
     degree: Leaf
-    """() int32, see `StepConfig`."""
+    """() int32 highest degree of the spherical harmonics that learns; it may exceed the scene's."""
     extent: Leaf
     """() float32 cameras' extent, world units."""
     rates: Leaf
@@ -320,9 +311,9 @@ class StepRunner:
       frames: Number of training frames.
     """
 
-    def __init__(self, capture: Capture, mesh: Mesh | None):
+    def __init__(self, capture: Capture, mesh: Mesh | None, rates: LearningRates, refine: CorrectionRates | None):
         """Prepares steps on `mesh`. Raises InputError if every frame is held out."""
-        self._capture, self._mesh = capture, mesh
+        self._capture, self._mesh, self._rates, self._refine = capture, mesh, rates, refine
         self._by_size: dict[float, _TrainingViews] = {}
         self._capacity: dict[tuple[int, float], int] = {}
         self._programs: dict[tuple[int, float, int], Future] = {}
@@ -335,7 +326,7 @@ class StepRunner:
             self._by_size[size] = _TrainingViews(self._capture, size)
         return self._by_size[size]
 
-    def compile(self, state: TrainState, size: float, config: StepConfig) -> Future:
+    def compile(self, state: TrainState, size: float) -> Future:
         """Starts to compile the program for the rows of `state` in another thread, unless that has begun."""
         count, cameras = state.gaussians.count, self._views(size).cameras
         strips = 1 if self._mesh is None else self._mesh.size
@@ -343,13 +334,13 @@ class StepRunner:
         capacity = self._capacity.setdefault((count, size), initial)
         program = count, size, capacity
         if program not in self._programs:
-            arguments = state, *self._arguments(size, 0, 0, 0.0, config), capacity, self._mesh
+            arguments = state, *self._arguments(size, 0, 0, 0.0, 0), capacity, self._mesh
             jitted = _step_compiled[self._mesh is not None]
             self._programs[program] = self._compiler.submit(lambda: jitted.lower(*arguments).compile())
         return self._programs[program]
 
     def run_step(
-        self, state: TrainState, size: float, view: int, index: int, done: float, config: StepConfig
+        self, state: TrainState, size: float, view: int, index: int, done: float, degree: int
     ) -> tuple[TrainState, Array, Array]:
         """Takes one step, see `_step`.
 
@@ -359,22 +350,22 @@ class StepRunner:
           view: Position of the view among the training frames.
           index: Number of earlier steps.
           done: Share of the fit that is done, in [0, 1].
-          config: Settings of the step.
+          degree: Highest degree of the spherical harmonics that learns.
         """
-        program = self.compile(state, size, config).result()
-        return program(state, *self._arguments(size, view, index, done, config))
+        program = self.compile(state, size).result()
+        return program(state, *self._arguments(size, view, index, done, degree))
 
-    def _arguments(self, size: float, view: int, index: int, done: float, config: StepConfig) -> tuple:
-        views = self._views(size)
+    def _arguments(self, size: float, view: int, index: int, done: float, degree: int) -> tuple:
+        views, refine = self._views(size), self._refine
         inputs = _StepInputs(
             step=np.int32(index),
             frame=np.int32(views.frame_indices[view]),
             visits=np.int32(index // len(views.frame_indices)),
             done=np.float32(done),
-            degree=np.int32(config.degree),
+            degree=np.int32(degree),
             extent=views.extent,
-            rates=config.rates,
-            correction_rates=None if config.refine is None else _correction_steps(config.refine, done, views.extent),
+            rates=self._rates,
+            correction_rates=None if refine is None else _correction_steps(refine, done, views.extent),
         )
         sharding = None if self._mesh is None else NamedSharding(self._mesh, PartitionSpec())
         return jax.device_put((views[view], inputs), sharding)

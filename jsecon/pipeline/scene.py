@@ -34,7 +34,7 @@ from jsecon.read.captures.frames import (
     transform_poses,
     usable_images,
 )
-from jsecon.read.captures.lens import PANORAMA, undistorted_pinhole
+from jsecon.read.captures.lens import undistorted_pinhole
 from jsecon.read.captures.nerfstudio import source_from_trained
 from jsecon.read.captures.panoramas import find_panoramas, has_mark
 from jsecon.read.captures.video import DEFAULT_VIDEO_FRAMES, is_video, read_header, write_frames
@@ -436,7 +436,7 @@ def _load_poses(path: Path, long_side: int) -> tuple[PosedImages, Camera, tuple[
     if not images or len(lenses) < len(images):
         problem = "one of its frames has no size" if images else "it has no frame"
         raise InputError(path, problem, "at least one pose, each with w and h", "Estimate the poses again.")
-    lenses = [undistorted_pinhole(lens, path) if lens.model == PANORAMA else lens for lens in lenses]
+    lenses = [undistorted_pinhole(lens, path) if lens.panorama else lens for lens in lenses]
     width, height = FrameOptions(long_side=long_side).size((lenses[0].width, lenses[0].height))
     sized = [lens.resized(width, height) for lens in lenses]
     fx, fy, cx, cy = np.array([[lens.fx, lens.fy, lens.cx, lens.cy] for lens in sized], np.float32).T

@@ -10,10 +10,7 @@ from __future__ import annotations
 import collections
 import dataclasses
 import functools
-import math
-import os
 import re
-import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -24,6 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from jsecon.errors import InputError
+from jsecon.files import scratch_array
 from jsecon.numerics import MAX_COORDINATE
 from jsecon.process import cores
 from jsecon.read.captures.frames import (
@@ -42,8 +40,6 @@ from jsecon.read.captures.images import apply_orientation, image_header, read_de
 from jsecon.read.captures.lens import Lens, operator_mask, resample_depth, undistorted_pinhole, undistortion_maps
 from jsecon.types import Camera, Capture, ImageFile, Progress
 
-_MAX_IN_MEMORY = 1 << 30
-"""bytes of frames that stay in memory; more go to a temporary file"""
 _MIN_DEPTH, _UNIT_STEP = 0.1, 1000.0
 """Units change by a power of the second, as from millimetres to metres, so that the near things are from 0.1 to 100
 world units away: a scene comes out the same from each unit."""
@@ -117,21 +113,6 @@ def _lens_at_size(frame: _Frame, width: int, height: int) -> Lens:
         expected = f"{lens.width}x{lens.height} of its camera, or that aspect"
         raise InputError(frame.image, f"the image is {width}x{height}", expected, remedy)
     return lens if (width, height) == frame.size else lens.resized(width, height)
-
-
-def _allocate_frames(shape: tuple[int, ...]) -> np.ndarray:
-    """Allocates uint8 frames, from _MAX_IN_MEMORY on in a temporary file, of which the system caches what is in use."""
-    if (size := math.prod(shape)) < _MAX_IN_MEMORY:
-        return np.empty(shape, np.uint8)
-    with tempfile.TemporaryFile() as file:
-        try:
-            if hasattr(os, "posix_fallocate"):  # a mapped page without a place on the disk ends the process by SIGBUS
-                os.posix_fallocate(file.fileno(), 0, size)
-            return np.memmap(file, np.uint8, "w+", shape=shape)
-        except OSError as error:
-            problem = f"{error.strerror or error} for {size / 2**30:.1f} GiB of frames"
-            remedy = "Free some room, set TMPDIR to a folder that has it, or take fewer or smaller frames."
-            raise InputError(tempfile.gettempdir(), problem, remedy=remedy) from error
 
 
 def plan_frames(
@@ -269,7 +250,7 @@ def build_capture(posed: PosedImages, options: FrameOptions, *, progress: Progre
     depths = [read_depth(image.depth, image.depth_unit) for image in samples if image.depth is not None]
     poses = np.stack([frame.pose for frame in frames])
     world, world_notes = _normalizing_transform(poses, posed.points, depths)  # of all frames, whichever are taken
-    notes += [*posed.notes, *world_notes, *_camera_jumps(frames)]
+    notes += [*posed.notes, *world_notes]
     unsized = _choose(frames, options)
     if len(unsized) < len(frames):
         notes.append(f"{len(unsized)} of {len(frames)} frames were taken, evenly spaced.")
@@ -287,13 +268,13 @@ def build_capture(posed: PosedImages, options: FrameOptions, *, progress: Progre
     frames = [_shrink_panorama(frame, width) for frame in frames]
     pinholes = {lens: undistorted_pinhole(lens, posed.where) for lens in {frame.lens for frame in frames}}
 
-    pixels = _allocate_frames((len(frames), height, width, 3))
+    pixels = scratch_array((len(frames), height, width, 3), np.uint8)
     has_depth = any(frame.posed.depth for frame in frames)
     depth_maps = np.zeros((len(frames), height, width), np.float32) if has_depth else None
     cached_maps = functools.lru_cache(maxsize=8)(undistortion_maps)
 
     has_ignored = any(frame.lens.view is not None or frame.posed.mask for frame in frames)
-    ignored = _allocate_frames(pixels.shape[:3]).view(bool) if has_ignored else None
+    ignored = scratch_array(pixels.shape[:3], bool) if has_ignored else None
     photographs, count = _photographs(frames)
 
     def read(photograph: int) -> bool:
@@ -349,23 +330,6 @@ def build_capture(posed: PosedImages, options: FrameOptions, *, progress: Progre
         up=posed.up,
         metres_per_unit=posed.metres_per_unit,
     )
-
-
-def _camera_jumps(frames: Sequence[_Frame]) -> list[str]:
-    """Reports places where neighbouring frames' cameras lie more than ten median steps apart: a note, or none.
-
-    A reconstruction of 125 photographs with five errors had steps of 11 to 20 there; when right, its largest was 2.2,
-    and that of a walk with one cut 9.9.
-    """
-    frames = [frames[t] for t in np.unique(_photographs(frames)[0], return_index=True)[1]]
-    steps = np.linalg.norm(np.diff(_centres(np.stack([frame.pose for frame in frames])), axis=0), axis=1)
-    median = float(np.median(steps)) if len(steps) else 0.0
-    far = [f"{frames[t].name} to {frames[t + 1].name}" for t in np.flatnonzero(steps > 10 * median).tolist()]
-    if median == 0 or not far:
-        return []
-    places = ", ".join(far[:5]) + (" ..." if len(far) > 5 else "")
-    jump = f"The camera jumps in {len(far)} places, by up to {steps.max() / median:.0f} of its usual steps ({places})."
-    return [f"{jump} If the frames are one walk, poses there are wrong: check them before you trust the fit."]
 
 
 def _centres(poses: np.ndarray) -> np.ndarray:

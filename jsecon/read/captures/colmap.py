@@ -37,21 +37,20 @@ _PARAMETERS = {
     "OPENCV": 8,
     "OPENCV_FISHEYE": 8,
     "FULL_OPENCV": 12,
-    "FOV": 5,
+    "FOV": 0,
     "SIMPLE_RADIAL_FISHEYE": 4,
     "RADIAL_FISHEYE": 5,
-    "THIN_PRISM_FISHEYE": 12,
-    "RAD_TAN_THIN_PRISM_FISHEYE": 16,
-    "SIMPLE_DIVISION": 4,
-    "DIVISION": 5,
+    "THIN_PRISM_FISHEYE": 0,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 0,
+    "SIMPLE_DIVISION": 0,
+    "DIVISION": 0,
     "SIMPLE_FISHEYE": 3,
     "FISHEYE": 4,
-    "EUCM": 6,
+    "EUCM": 0,
     PANORAMA: 2,
 }
-"""camera models in the order of their numbers in binary files, from 0 on -> number of parameters"""
-_PYCOLMAP = ("FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE", "DIVISION", "EUCM")
-"""models that OpenCV does not have"""
+"""camera models in the order of their numbers in binary files, from 0 on -> number of parameters; 0: not read, as
+OpenCV does not have them"""
 _REMEDY = "Copy the model again, or export it anew with colmap model_converter."
 _UNDISTORT = "Run colmap image_undistorter and load its output."
 
@@ -141,8 +140,9 @@ def _parse_lines(file: Path, layout: str, parse: Callable[[str], Any]) -> list:
 
 def _lens(file: Path, model: str, width: int, height: int, parameters: tuple[float, ...]) -> Lens:
     """The lens of a camera of a model file."""
-    if model not in _PARAMETERS:
-        raise InputError(file, f"the camera model {model} is unknown", f"one of {', '.join(_PARAMETERS)}", _UNDISTORT)
+    if not _PARAMETERS.get(model):
+        known = ", ".join(name for name, count in _PARAMETERS.items() if count)
+        raise InputError(file, f"the camera model {model} is not read", f"one of {known}", _UNDISTORT)
     if len(parameters) != _PARAMETERS[model]:
         raise InputError(file, f"a {model} camera has {len(parameters)} parameters", str(_PARAMETERS[model]), _REMEDY)
     if model == PANORAMA:
@@ -150,11 +150,8 @@ def _lens(file: Path, model: str, width: int, height: int, parameters: tuple[flo
     focals = 1 if model.startswith("SIMPLE_") or model in ("RADIAL", "RADIAL_FISHEYE") else 2
     fx, fy = parameters[0], parameters[focals - 1]
     cx, cy, *distortion = parameters[focals:]
-    model = model.removeprefix("SIMPLE_")
-    projection = model if model in _PYCOLMAP else None
-    is_fisheye = "FISHEYE" in model and projection is None
     with reading(file, remedy=_REMEDY, problem="a camera cannot be read"):
-        return Lens(width, height, fx, fy, cx, cy, tuple(distortion), is_fisheye, projection)
+        return Lens(width, height, fx, fy, cx, cy, tuple(distortion), "FISHEYE" in model)
 
 
 def _read_cameras(model: Path) -> dict[int, Lens]:

@@ -1,8 +1,8 @@
 """Lenses of captures, on the host, and the pinhole lens that replaces a distorted one.
 
-OpenCV projects two models, Brown's and Kannala and Brandt's; pycolmap (extra sfm) projects COLMAP's others. A panorama
-(equirectangular, 360 x 180 degrees) becomes several pinhole views. Its middle looks along z, and its columns and rows
-are equal steps of longitude and latitude, as in COLMAP, nerfstudio and OpenSfM.
+OpenCV projects two models, Brown's and Kannala and Brandt's. A panorama (equirectangular, 360 x 180 degrees) becomes
+several pinhole views. Its middle looks along z, and its columns and rows are equal steps of longitude and latitude, as
+in COLMAP, nerfstudio and OpenSfM.
 
 Pixels are counted as everywhere here (and in COLMAP): the centre of the first pixel is at (0.5, 0.5). OpenCV puts it at
 (0, 0), hence the half pixels below.
@@ -11,7 +11,6 @@ Pixels are counted as everywhere here (and in COLMAP): the centre of the first p
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import cv2
 import numpy as np
@@ -22,7 +21,7 @@ from jsecon.errors import InputError
 from jsecon.numerics import is_finite_and_bounded
 
 PANORAMA = "EQUIRECTANGULAR"
-"""COLMAP's model of a panorama, whose focal lengths here are px per radian"""
+"""COLMAP's and nerfstudio's model of a panorama"""
 _TURNS = [*((-60 * view, 0) for view in range(6)), (0, 90), (0, -90)]
 PANORAMA_VIEWS = Rotation.from_euler("YX", _TURNS, degrees=True).as_matrix()
 """(8, 3, 3) rotations from the axes of a panorama to those of its views: six along the horizon, one down and one up"""
@@ -49,13 +48,11 @@ class Lens:
     cy: float
     """px, from the upper edge of the first pixel."""
     distortion: tuple[float, ...] = ()
-    """OpenCV's order: k1 k2 p1 p2 [k3 [k4 k5 k6]], or k1 k2 k3 k4 where `fisheye`; empty = pinhole. COLMAP's order
-    where `model` names one of its models."""
+    """OpenCV's order: k1 k2 p1 p2 [k3 [k4 k5 k6]], or k1 k2 k3 k4 where `fisheye`; empty = pinhole."""
     fisheye: bool = False
     """equidistant model (Kannala and Brandt) instead of the polynomial one (Brown)."""
-    model: str | None = None
-    """one of COLMAP's models with two focal lengths that OpenCV does not have, or PANORAMA; None: OpenCV's, see
-    `fisheye`."""
+    panorama: bool = False
+    """whether it is that of a panorama, whose focal lengths are px per radian, or of a view of one."""
     view: int | None = None
     """row of PANORAMA_VIEWS, of a view of a panorama."""
 
@@ -73,7 +70,7 @@ class Lens:
     @property
     def distorted(self) -> bool:
         """Whether its images must be resampled before they are those of a pinhole."""
-        return self.fisheye or self.model is not None or any(k != 0 for k in self.distortion)
+        return self.fisheye or self.panorama or any(k != 0 for k in self.distortion)
 
     @property
     def undistorted_size(self) -> tuple[int, int]:
@@ -94,7 +91,7 @@ def panorama_lens(where: object, width: int, height: int) -> Lens:
     if width != 2 * height:
         remedy = "Export the whole sphere, or give it as a photograph."
         raise InputError(where, f"the panorama is {width}x{height}", "twice as wide as high", remedy)
-    return Lens(width, height, width / (2 * np.pi), height / np.pi, width / 2, height / 2, model=PANORAMA)
+    return Lens(width, height, width / (2 * np.pi), height / np.pi, width / 2, height / 2, panorama=True)
 
 
 def operator_mask(lens: Lens, pinhole: Lens) -> Bool[np.ndarray, "h w"]:
@@ -113,18 +110,6 @@ def _directions(pinhole: Lens) -> Float[np.ndarray, "h w 3"]:
     return np.stack([*np.meshgrid(columns, rows), np.ones((pinhole.height, pinhole.width))], axis=-1)
 
 
-def _colmap_camera(lens: Lens) -> Any:
-    """Pycolmap's camera of a lens."""
-    try:
-        import pycolmap
-    except ImportError as error:
-        problem = "this camera model needs pycolmap, which is not installed"
-        remedy = "Run: pip install 'jsecon[sfm]' (or undistort the images: colmap image_undistorter)."
-        raise InputError(lens.model, problem, remedy=remedy) from error
-    parameters = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
-    return pycolmap.Camera(model=lens.model, width=lens.width, height=lens.height, params=parameters)
-
-
 def _opencv(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     """Camera matrix and distortion coefficients as OpenCV has them."""
     matrix = np.array([[lens.fx, 0, lens.cx - 0.5], [0, lens.fy, lens.cy - 0.5], [0, 0, 1]])
@@ -138,8 +123,6 @@ def _distort(lens: Lens, spatial: Float[np.ndarray, "n 3"]) -> Float[np.ndarray,
         x, y, z = PANORAMA_VIEWS[lens.view].T @ spatial.T
         rows = lens.cy + lens.fy * np.arctan2(y, np.hypot(x, z))
         return np.stack([lens.cx + lens.fx * np.arctan2(x, z), rows.clip(0.5, lens.height - 0.5)], axis=-1)
-    if lens.model is not None:
-        return _colmap_camera(lens).img_from_cam(spatial)  # NaN beyond the range of the model
     matrix, coefficients = _opencv(lens)
     if lens.fisheye:
         pixels = cv2.fisheye.distortPoints(np.ascontiguousarray(spatial[None, :, :2]), matrix, coefficients)
@@ -193,12 +176,12 @@ def undistorted_pinhole(lens: Lens, where: object) -> Lens:
     while high - low > 1e-4:
         middle = 0.5 * (low + high)
         low, high = (low, middle) if _covered(lens, middle) else (middle, high)
-    return dataclasses.replace(lens, fx=lens.fx * high, fy=lens.fy * high, distortion=(), fisheye=False, model=None)
+    return dataclasses.replace(lens, fx=lens.fx * high, fy=lens.fy * high, distortion=(), fisheye=False)
 
 
 def undistortion_maps(lens: Lens, pinhole: Lens) -> tuple[np.ndarray, np.ndarray]:
     """Computes where each pixel of the undistorted image lies in the distorted one: two tables for cv2.remap."""
-    if lens.model is not None:
+    if lens.view is not None:
         pixels = _distort(lens, _directions(pinhole).reshape(-1, 3)) - 0.5
         columns, rows = pixels.T.reshape(2, pinhole.height, pinhole.width).astype(np.float32)
         return columns, rows

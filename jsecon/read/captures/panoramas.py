@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 
 from jsecon.read.captures.frames import PosedImage, PosedImages
 from jsecon.read.captures.images import image_header
-from jsecon.read.captures.lens import PANORAMA, PANORAMA_VIEWS, Lens, panorama_lens
+from jsecon.read.captures.lens import PANORAMA_VIEWS, Lens, panorama_lens
 
 _MARK = re.compile(rb"ProjectionType\s*(?:=\s*[\"']|>)\s*equirectangular|sv3d.{0,200}?equi", re.DOTALL)
 """of XMP (GPano), and of Google's spherical video, versions 1 and 2"""
@@ -51,10 +51,10 @@ def _cut_view(panorama: PosedImage, lens: Lens, view: int) -> PosedImage:
 def cut_panoramas(posed: PosedImages) -> PosedImages:
     """Replaces each panorama of a capture by its views, which share its file; their numbers follow its name."""
     lenses = [(image, image.lens) for image in posed.images if image.lens is not None]
-    panoramas = [(image, lens) for image, lens in lenses if lens.model == PANORAMA]
+    panoramas = [(image, lens) for image, lens in lenses if lens.panorama]
     if not panoramas:
         return posed
-    images = [image for image in posed.images if image.lens is None or image.lens.model != PANORAMA]
+    images = [image for image in posed.images if image.lens is None or not image.lens.panorama]
     images += [_cut_view(*panorama, view) for panorama in panoramas for view in range(len(PANORAMA_VIEWS))]
     each = f"{len(PANORAMA_VIEWS)} views each, of 95 degrees; what lies within 30 degrees of straight down is left out"
     notes = [f"{len(panoramas)} panoramas are cut into {each}, as the operator stands there."]

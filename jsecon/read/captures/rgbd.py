@@ -1,7 +1,7 @@
 """Captures of depth cameras and phones, on the host: ScanNet, 7-Scenes, Replica, TUM, ARKitScenes, Polycam, Record3D.
 
-Formats: ScanNet SensReader/python; 7-Scenes' page and BundleFusion's info.txt; NICE-SLAM's renders of Replica; TUM's
-RGB-D benchmark (file_formats); ARKitScenes DATA.md; nerfstudio process_data polycam_utils.py and record3d_utils.py.
+Formats: ScanNet SensReader/python; 7-Scenes' page; NICE-SLAM's renders of Replica; TUM's RGB-D benchmark
+(file_formats); ARKitScenes DATA.md; nerfstudio process_data polycam_utils.py and record3d_utils.py.
 Each keeps its world. Phones look along -z of their own axes, and gravity is along an axis of their worlds: y of Polycam
 and Record3D, z of ARKitScenes. Frames without a pose are left out, and counted in a note.
 """
@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from jsecon.errors import InputError
 from jsecon.files import parse_json, read_text, reading
-from jsecon.read.captures.frames import PosedImage, PosedImages, rigid_or_nan
+from jsecon.read.captures.frames import PosedImage, PosedImages, rigid_or_nan, same_aspect
 from jsecon.read.captures.images import find_image, image_header, size_around
 from jsecon.read.captures.lens import Lens
 from jsecon.read.registry import Reader
@@ -34,7 +34,6 @@ _TUM_INTRINSICS = {
 """fx fy cx cy k1 k2 p1 p2 k3 of the benchmark's cameras freiburg1 to 3, the centre of the first pixel at (0, 0)"""
 _PHONE_AXES = np.array([1.0, -1.0, -1.0, 1.0])
 """signs of the columns of a pose, from the axes of phones: a product of matrices would warn of infinite numbers"""
-_Y_UP, _Z_UP = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 _EXPORT = "Export the capture again."
 _parsing = functools.partial(reading, remedy=_EXPORT)
 """makes errors in parsing a file InputErrors"""
@@ -112,17 +111,16 @@ def _read_scannet(path: Path) -> PosedImages:
 
 
 def _read_seven_scenes(path: Path) -> PosedImages:
-    """Reads a sequence of 7-Scenes, or one in its layout (12-Scenes, BundleFusion)."""
+    """Reads a sequence of 7-Scenes, or one in its layout (12-Scenes)."""
     images = [file for file in _list_images(path) if file.stem.endswith(".color")]
-    lens, depth_lens, scale, notes = _stated_lenses(path, images[0], (640, 480), (585.0, 585.0, 320.0, 240.0), 1000.0)
+    lens, _, notes = _stated_lens(path, images[0], (640, 480), (585.0, 585.0, 320.0, 240.0))
     posed = []
     for image in images:
         stem = image.stem.removesuffix(".color")
         file = path / f"{stem}.pose.txt"
         pose = _numbers(file, 4, 4) if file.is_file() else np.full((4, 4), np.nan)
         if np.isfinite(pose).all():  # not finite where tracking was lost
-            frame = _posed_image(image, lens, pose, find_image(path, f"{stem}.depth.png"))
-            posed.append(dataclasses.replace(frame, depth_lens=depth_lens, depth_unit=1 / scale))
+            posed.append(_posed_image(image, lens, pose, find_image(path, f"{stem}.depth.png")))
     return _posed_images(path, posed, len(images), *notes)
 
 
@@ -135,8 +133,8 @@ def _read_replica(path: Path) -> PosedImages:
     if len(poses) == len(images):
         numbers = [*range(len(images))]
     size = 1200, 680
-    known = 6553.5 if image_header(images[0]).upright == size else 0.0
-    lens, _, scale, notes = _stated_lenses(path, images[0], size, (600.0, 600.0, 600.0, 340.0), known)
+    lens, scale, notes = _stated_lens(path, images[0], size, (600.0, 600.0, 600.0, 340.0))
+    scale = scale or (6553.5 if image_header(images[0]).upright == size else 0.0)
     if not scale:
         notes += ("The depth maps are not used, since no cam_params.json states their scale.",)
     posed = []
@@ -148,18 +146,17 @@ def _read_replica(path: Path) -> PosedImages:
     return _posed_images(path, posed, len(images), *notes)
 
 
-def _stated_lenses(
-    path: Path, image: Path, size: tuple[int, int], intrinsics: tuple[float, ...], scale: float
-) -> tuple[Lens, Lens | None, float, tuple[str, ...]]:
+def _stated_lens(
+    path: Path, image: Path, size: tuple[int, int], intrinsics: tuple[float, ...]
+) -> tuple[Lens, float, tuple[str, ...]]:
     """The lens of a layout without a place for one: of a file, else the benchmark's `intrinsics` of images of `size`.
 
-    Files, in the folder or above it, are intrinsics.txt (fx fy cx cy, or a matrix), BundleFusion's info.txt, and
-    NICE-SLAM's cam_params.json. Also returns the lens of the depth maps, if a file states it, the counts of depth in a
-    unit (`scale` unless a file states them), and notes.
+    Files, in the folder or above it, are intrinsics.txt (fx fy cx cy, or a matrix) and NICE-SLAM's cam_params.json.
+    Also returns the counts of depth in a unit, 0 where no file states them, and notes.
     """
     width, height = image_header(image).upright
     for folder in (path, Path(os.path.abspath(path)).parent):
-        for file in (*sorted(folder.glob("*intrinsics.txt")), folder / "info.txt", folder / "cam_params.json"):
+        for file in (*sorted(folder.glob("*intrinsics.txt")), folder / "cam_params.json"):
             if not file.is_file():
                 continue
             with _parsing(file):
@@ -167,21 +164,15 @@ def _stated_lenses(
                     camera = parse_json(file.read_bytes())["camera"]
                     fx, fy, cx, cy = (float(camera[name]) for name in ("fx", "fy", "cx", "cy"))
                     lens = _lens(camera["w"], camera["h"], fx, fy, cx + 0.5, cy + 0.5)
-                    return lens, None, float(camera.get("scale", scale)), ()
-                if file.name == "info.txt":
-                    info = dict(re.findall(r"m_(\w+) *= *([-+.\de ]+)", read_text(file)))
-                    sizes = (width, height), (int(info["depthWidth"]), int(info["depthHeight"]))
-                    stated = (info[f"calibration{kind}Intrinsic"].split() for kind in ("Color", "Depth"))
-                    lens, depth_lens = (_lens(*side, k[0], k[5], k[2], k[6]) for side, k in zip(sizes, stated))
-                    return lens, depth_lens, float(info.get("depthShift", scale)), ()
+                    return lens, float(camera.get("scale", 0.0)), ()
                 k = [float(word) for line in _lines(file) for word in line.split()]
                 side = {9: 3, 16: 4}.get(len(k))
                 k = k[:4] if side is None else [k[0], k[side + 1], k[2], k[side + 2]]
-                return _lens(width, height, *k), None, scale, ()
+                return _lens(width, height, *k), 0.0, ()
     if (width, height) == size:
         stated = " ".join(f"{number:g}" for number in intrinsics)
         note = f"No file states the intrinsics: the benchmark's (fx fy cx cy {stated}) are taken."
-        return _lens(width, height, *intrinsics), None, scale, (note,)
+        return _lens(width, height, *intrinsics), 0.0, (note,)
     remedy = f"Write fx fy cx cy (px) to {path / 'intrinsics.txt'}, or give the photographs alone to find poses anew."
     problem = f"it has poses, but no file states the intrinsics of its images, which are {width}x{height}"
     raise InputError(path, problem, remedy=remedy)
@@ -247,7 +238,7 @@ def _read_arkitscenes(path: Path) -> PosedImages:
             with _parsing(lens_files[lens]):
                 lens_of_frame = _lens(width, height, *intrinsics)
                 posed.append(_posed_image(image, lens_of_frame, np.linalg.inv(world_to_camera), depth))
-    return _posed_images(path, posed, len(images), up=UpAxis(_Z_UP, "gravity in the capture (ARKitScenes)"))
+    return _posed_images(path, posed, len(images), up=UpAxis((0.0, 0.0, 1.0), "gravity in the capture (ARKitScenes)"))
 
 
 def _read_polycam(path: Path) -> PosedImages:
@@ -269,7 +260,7 @@ def _read_polycam(path: Path) -> PosedImages:
                 rows = [[camera[f"t_{i}{j}"] for j in range(4)] for i in range(3)]
                 pose = np.array([*rows, [0, 0, 0, 1]], np.float64) * _PHONE_AXES
             posed.append(_posed_image(image, lens, pose, find_image(frames / "depth", f"{image.stem}.png")))
-    return _posed_images(path, posed, len(images), up=UpAxis(_Y_UP, "gravity in the capture (Polycam)"))
+    return _posed_images(path, posed, len(images), up=UpAxis((0.0, 1.0, 0.0), "gravity in the capture (Polycam)"))
 
 
 def _polycam_size(camera: Any, uncorrected: Path | None, image: Path) -> tuple[Any, Any]:
@@ -281,8 +272,8 @@ def _polycam_size(camera: Any, uncorrected: Path | None, image: Path) -> tuple[A
         return camera["width"], camera["height"]
     size = size_around(image, camera["cx"], camera["cy"])
     before = {} if uncorrected is None else parse_json(uncorrected.read_bytes())
-    width, height = before.get("width", size[0]), before.get("height", size[1])
-    return (width, height) if abs(width * size[1] - height * size[0]) <= max(width, height) else size
+    stated = before.get("width", size[0]), before.get("height", size[1])
+    return stated if same_aspect(stated, size) else size
 
 
 def _read_record3d(path: Path) -> PosedImages:
@@ -301,7 +292,9 @@ def _read_record3d(path: Path) -> PosedImages:
                 pose = _matrix(Rotation.from_quat(poses[n, :4]), poses[n, 4:]) * _PHONE_AXES
                 posed.append(_posed_image(image, _lens(*size, *intrinsics[n]), pose))
     note = "Record3D's depth was not read: its compression is not supported."
-    return _posed_images(path, posed, len(images), note, up=UpAxis(_Y_UP, "gravity in the capture (Record3D)"))
+    return _posed_images(
+        path, posed, len(images), note, up=UpAxis((0.0, 1.0, 0.0), "gravity in the capture (Record3D)")
+    )
 
 
 READERS = (
