@@ -30,7 +30,7 @@ def saved(scene, cameras, tmp_path_factory):
     return field, file
 
 
-@pytest.mark.parametrize("ending", ["ply", "spz", "glb"])
+@pytest.mark.parametrize("ending", ["ply", "glb"])
 def test_a_field_is_exported_in_every_format(saved, tmp_path, ending):
     field, file = saved
     means, out = np.add(field.gaussians.means, [2, 0, 0]), tmp_path / f"scene.{ending}"

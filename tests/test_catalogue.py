@@ -276,7 +276,7 @@ def test_an_export_of_objects_replaces_those_of_the_last_one_and_nothing_else(fi
 def test_options_of_an_export_that_do_not_fit_are_refused(file, tmp_path, capsys):
     for wrong in (
         ["--only", "red", "--without", "red", "--out", tmp_path / "only.ply"],
-        ["--with-labels", "--out", tmp_path / "scene.spz"], ["--only", "red", "--objects", tmp_path / "objects"], [],
+        ["--with-labels"], ["--only", "red", "--objects", tmp_path / "objects"], [],
     ):  # fmt: skip
         assert run_cli("export", file, *wrong) == 2
         assert "jsecon:" in capsys.readouterr().err

@@ -109,7 +109,7 @@ IDS = np.arange(864, dtype=np.uint8).reshape(MASK_SIZE) % 4
 DAMAGE = {
     "colmap/text": [
         (put(CAMERAS, "1 EQUIRECTANGULAR 24 16 24 16"), "cameras.txt", "24x16", "twice as wide as high"),
-        (put(CAMERAS, "1 NEW_FISHEYE 24 16 24 16"), "cameras.txt", "NEW_FISHEYE", "image_undistorter"),
+        *((put(CAMERAS, f"1 {name} 24 16 24 16"), name, "image_undistorter") for name in ("NEW_FISHEYE", "FOV")),
     ],
     "colmap/binary": [
         (numbers("sparse/0/cameras.bin", 12, "<i", 99), "cameras.bin", "99", "image_undistorter"),

@@ -115,16 +115,6 @@ def write_seven_scenes(folder) -> None:
     (folder / "intrinsics.txt").write_text(" ".join(map(str, K)))
 
 
-def write_bundle_fusion(folder) -> None:
-    """The layout of 7-Scenes with an info.txt."""
-    write_seven_scenes(folder)
-    (folder / "intrinsics.txt").unlink()
-    matrix = f"{K[0]} 0 {K[2]} 0 0 {K[1]} {K[3]} 0 0 0 1 0 0 0 0 1"
-    lines = ["m_sensorName = Structure", "m_colorWidth = 24", "m_depthWidth = 24", "m_depthHeight = 16"]
-    lines += [f"m_calibration{kind}Intrinsic = {matrix}" for kind in ("Color", "Depth")] + ["m_depthShift = 1000"]
-    (folder / "info.txt").write_text("\n".join(lines))
-
-
 def write_replica(folder) -> None:
     """With the parameters of the camera in the scene; the downloads have them one folder up."""
     rows = [np.full(16, np.inf) if n == 4 else pose.ravel() for n, pose in enumerate(poses())]
@@ -136,7 +126,7 @@ def write_replica(folder) -> None:
     (folder / "cam_params.json").write_text(json.dumps({"camera": camera}))
 
 
-WRITERS = write_seven_scenes, write_bundle_fusion, write_replica
+WRITERS = write_seven_scenes, write_replica
 WRITERS += write_scannet, write_tum, write_arkitscenes, write_polycam, write_record3d
 FORMATS = {write.__name__.removeprefix("write_"): write for write in WRITERS}
 

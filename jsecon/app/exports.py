@@ -131,8 +131,8 @@ def _check_export(verb: verbs.Export) -> None:
         raise InputError("export", "there is nothing to write", remedy="Give --out scene.ply, --objects or --shapes.")
     if verb.shapes is not None:
         require_shapes_format(verb.shapes)
-    if verb.with_labels and (verb.out is None or verb.out.suffix.lower() == ".spz"):
-        raise InputError("--with-labels", "a .spz cannot hold them", remedy="Give --out scene.ply.")
+    if verb.with_labels and verb.out is None:
+        raise InputError("--with-labels", "there is no file to write them to", remedy="Give --out scene.ply.")
     if verb.only is not None and verb.without is not None:
         raise InputError("--only", "it cannot be combined with --without", remedy="Export twice, with one of them.")
     if verb.objects is not None and (verb.only is not None or verb.without is not None):

@@ -143,7 +143,7 @@ class Fit(_PipelineVerb):
 
     Attributes:
       capture: The same captures as for jsecon run.
-      out: The .ply (INRIA's layout, which SuperSplat opens), .spz or .glb to write.
+      out: The .ply (INRIA's layout, which SuperSplat opens) or .glb to write.
     """
 
     examples = ("jsecon fit my_capture --out scene.ply --minutes 5",)
@@ -304,11 +304,11 @@ class Export(_FieldVerb):
     """Writes the scene of a field, or objects of it, for other programs.
 
     The scene is in the capture's world. A .glb is glTF with Khronos' KHR_gaussian_splatting, y up. A .usda is a text of
-    OpenUSD with a prim for each object. A .spz needs the extra formats. The file labels.json beside each export has id,
-    name, probability, colour, box, parent and frames of each object.
+    OpenUSD with a prim for each object. The file labels.json beside each export has id, name, probability, colour, box,
+    parent and frames of each object.
 
     Attributes:
-      out: The .ply (INRIA's layout), .spz, .glb, .usda, .las or .laz to write.
+      out: The .ply (INRIA's layout), .glb, .usda, .las or .laz to write.
       with_labels: Adds object_id, the id of each Gaussian's object in jsecon objects or -1, and class_id, which objects
         of one name share, to the .ply or .glb.
       objects: Folder to write a .ply of each object to, named by its id and name. They replace those of an earlier
@@ -399,7 +399,7 @@ class Clean(Verb):
 
     Attributes:
       scene: A file of Gaussians (.ply, .spz, .sog, .splat, .glb), or a field.
-      out: The .ply, .spz, .glb or .usda to write.
+      out: The .ply, .glb or .usda to write.
       cameras: Poses to look from instead: a COLMAP model, a transforms.json, or INRIA's cameras.json.
       views: Number of views to plan, in place of poses near the scene.
       capture: Capture of the scene, as for jsecon run. Its poses are the views, and its photographs give the PSNR

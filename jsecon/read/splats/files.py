@@ -27,10 +27,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jsecon.errors import InputError, require_shape
-from jsecon.files import atomic_write, parse_json, reading
+from jsecon.files import parse_json, reading
 from jsecon.read.registry import SCENES, Reader, decoding, find_reader
 from jsecon.read.splats.gltf import read_glb, save_glb
-from jsecon.read.splats.ply import drawable_gaussians, read_ply, read_ply_file, save_ply, usable_blocks
+from jsecon.read.splats.ply import drawable_gaussians, read_ply, read_ply_file, save_ply
 from jsecon.read.splats.points import READERS as POINTS, gaussians_of_cloud
 from jsecon.read.splats.usd import save_usda
 from jsecon.splat.project import check_gaussians, unusable_rows
@@ -122,28 +122,6 @@ def _spz_axes(records: bytes) -> np.ndarray:
             axes = np.diag(signs)[:, [0, 2, 1, 3] if is_z_up else [0, 1, 2, 3]].astype(float)
         offset += 8 + length
     return axes
-
-
-def _save_spz(path: Path, gaussians: Gaussians, ids: Any, similarity: Float[Array, "4 4"] | None) -> None:
-    """Writes a .spz of version 3, with the finest positions that hold the farthest Gaussian in 24 bits."""
-    into = _SPZ_AXES if similarity is None else _SPZ_AXES @ np.asarray(similarity, np.float64)
-    blocks = [block for _, block in usable_blocks(path, gaussians, into)]
-    whole = jax.tree.map(lambda *parts: np.concatenate(parts).astype(np.float32), *blocks)
-    reach, sizes = float(np.abs(whole.means).max()), whole.log_scales.max(axis=1)
-    finest = 16 if reach > 1 else 24
-    bits = next((n for n in range(finest, 0, -1) if reach * 2.0**n < 1 << 23), 0)
-    if bits == 0 or (bits < finest and (np.exp(sizes) < 2.0 ** (1 - bits)).mean() > 0.5):
-        problem = f"positions up to {reach:,.0f} units from the origin would be rounded to {2.0**-bits:.3g} units"
-        remedy = "Write a .ply or a .glb, or bring the scene nearer to its origin."
-        raise InputError(path, problem, "a rounding below the size of most Gaussians", remedy)
-    if (sizes > 5.95).any() or (sizes < -10.05).mean() > 0.01:
-        problem = f"its Gaussians are up to {np.exp(sizes.max()):.3g} units large, or many are tiny"
-        raise InputError(path, problem, "sizes from 4.5e-5 to 379 units in a .spz", "Write a .ply, or scale the scene.")
-    constant, rest = np.ascontiguousarray(whole.sh[:, 0]), np.ascontiguousarray(whole.sh[:, 1:])
-    columns = whole.means, whole.log_scales, whole.quaternions, whole.opacity_logits, constant
-    with atomic_write(path) as temporary, decoding(path, "gsply") as gsply:
-        data = gsply.GSData.from_arrays(*columns, shN=rest if rest.size else None, format="ply")
-        gsply.write_spz(temporary, data, version=3, fractional_bits=bits)
 
 
 def _read_compressed_ply(path: Path, header: Any) -> tuple[Gaussians, tuple[str, ...]]:
@@ -304,24 +282,22 @@ def save_gaussians(
     names: Sequence[str] = (),
     similarity: Float[Array, "4 4"] | None = None,
 ) -> None:
-    """Writes Gaussians as a .ply (INRIA's layout, exact), a .glb, a .usda, or a .spz (version 3, by gsply).
+    """Writes Gaussians as a .ply (INRIA's layout, exact), a .glb or a .usda.
 
-    A .ply and a .glb are written in blocks: memory-mapped arrays need not fit into memory. A .spz holds positions in 24
-    bits, sizes to 3 % and from 4.5e-5 to 379 units, opacities and colours in 8 bits, rotations in 32. A .usda is a text
-    of OpenUSD with a ParticleField3DGaussianSplat for each object.
+    A .ply and a .glb are written in blocks: memory-mapped arrays need not fit into memory. A .usda is a text of OpenUSD
+    with a ParticleField3DGaussianSplat for each object.
 
     Args:
       path: The file; its suffix names the format.
       gaussians: N Gaussians.
       ids: Integers of each Gaussian by name, such as "object_id", -1 for none: properties of a .ply, attributes of a
-        .glb. A .usda has a prim for each "object_id". A .spz has no place.
+        .glb. A .usda has a prim for each "object_id".
       names: Names of the objects by id, for a .usda.
       similarity: (4, 4) transform into the world of the file.
 
     Raises:
       ValueError: Shapes disagree.
-      InputError: The format cannot be written, gsply is missing for a .spz, a Gaussian cannot be drawn or is out of the
-        format's range, or the folder cannot be written.
+      InputError: The format cannot be written, a Gaussian cannot be drawn, or the folder cannot be written.
     """
     path = Path(path)
     require_writable_format(path)
@@ -340,12 +316,7 @@ def require_writable_format(path: Path, points: bool = False) -> None:
     if path.suffix.lower() not in known:
         remedy = f"For example: {path.stem}.ply; npx @playcanvas/splat-transform makes other formats of it."
         raise InputError(path, f"its name ends in {path.suffix or 'no suffix'}", " or ".join(known), remedy)
-    if path.suffix.lower() == ".spz":
-        with decoding(path, "gsply"):
-            pass
 
 
-_WRITERS: dict[str, Callable[..., None]] = {
-    ".ply": save_ply, ".spz": _save_spz, ".glb": save_glb, ".usda": save_usda
-}  # fmt: skip
+_WRITERS: dict[str, Callable[..., None]] = {".ply": save_ply, ".glb": save_glb, ".usda": save_usda}
 """suffix -> function that writes a file from Gaussians, ids by name, and a similarity or None"""
