@@ -27,8 +27,8 @@ from jsecon.evaluate.metrics import accuracy_at, iou, mean_iou
 from jsecon.field.evidence import region_votes
 from jsecon.field.membership import normalise_votes
 from jsecon.files import atomic_write
-from jsecon.fit.depth import points_from_depth
 from jsecon.fit.quality import measure_quality
+from jsecon.fit.start import points_from_depth
 from jsecon.paper.distill import distill_votes
 from jsecon.paper.queries import select_by_code
 from jsecon.query.answer import match_region, select_gaussians

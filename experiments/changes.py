@@ -32,7 +32,7 @@ from experiments.rooms.shapes import SHAPES
 from jsecon import Scene
 from jsecon.app.comparison import Changes
 from jsecon.field.field import load_field, save_field
-from jsecon.fit.depth import points_from_depth
+from jsecon.fit.start import points_from_depth
 from jsecon.query.render import HIDDEN_LOGIT
 from jsecon.splat.points import gaussians_from_points
 from jsecon.types import Camera, Capture, LanguageField

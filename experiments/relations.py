@@ -46,7 +46,7 @@ from jsecon.field.evidence import region_votes
 from jsecon.field.field import load_field, save_field
 from jsecon.field.membership import normalise_votes
 from jsecon.field.regions import region_embeddings
-from jsecon.fit.depth import points_from_depth
+from jsecon.fit.start import points_from_depth
 from jsecon.splat.points import gaussians_from_points
 from jsecon.types import Camera, Capture, Gaussians, LanguageField
 from jsecon.vision.colours import ColourEmbedder

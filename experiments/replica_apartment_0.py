@@ -22,12 +22,11 @@ from scipy.spatial.transform import Rotation
 
 from experiments import results
 from experiments.apc_bin import read_png
-from experiments.datasets.depth_points import labels_of_points
+from experiments.datasets.depth_points import SampledPoints, labels_of_points, sampled_points
 from experiments.protocols.points import point_accuracy, point_class_means
 from experiments.tables.codes import region_codes
 from jsecon.errors import InputError
 from jsecon.field.evidence import region_votes
-from jsecon.fit.depth import DepthPoints, points_from_depth
 from jsecon.numerics import cosine_matrix
 from jsecon.paper.distill import distill_votes
 from jsecon.splat.points import gaussians_from_points
@@ -113,10 +112,10 @@ def load_replica(folder: str | Path, *, voting_every: int) -> tuple[Capture, np.
     return Capture(frames, cameras, *nothing, held_out, depths, np.eye(4), names), labels
 
 
-def points_as_gaussians(capture: Capture, options: Options) -> tuple[DepthPoints, Gaussians]:
+def points_as_gaussians(capture: Capture, options: Options) -> tuple[SampledPoints, Gaussians]:
     """The back-projected depths of all views, one per voxel, and a Gaussian for each."""
     every_view = dataclasses.replace(capture, held_out=np.zeros_like(capture.held_out))
-    points = points_from_depth(every_view, voxel=options.voxel_m, stride=options.stride)
+    points = sampled_points(every_view, voxel=options.voxel_m, stride=options.stride)
     gaussians = gaussians_from_points(
         points.points, points.colors, opacity=options.opacity, scale=options.scale, max_scale=2 * options.voxel_m
     )

@@ -1,10 +1,38 @@
 """Depths that other views confirm, and the labels of back-projected points."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float, Int
 
-from jsecon.fit.depth import DepthPoints, back_project_frame
+from jsecon.fit.start import back_project_frame, points_from_depth
+from jsecon.splat.points import voxel_ids
 from jsecon.types import Array, Capture
+
+
+class SampledPoints(NamedTuple):
+    """The points of `points_from_depth`, and the pixels that each comes from."""
+
+    points: np.ndarray
+    """(P, 3) float32"""
+    colors: np.ndarray
+    """(P, 3) uint8"""
+    pixels: np.ndarray
+    """(S, 3) frame, row, column of each sample"""
+    point_of: np.ndarray
+    """(S,) its point"""
+
+
+def sampled_points(capture: Capture, *, voxel: float, stride: int) -> SampledPoints:
+    """The back-projected depths of the training frames, one point per voxel."""
+    cloud, chosen = (
+        points_from_depth(capture, voxel=voxel, stride=stride),
+        np.flatnonzero(~np.asarray(capture.held_out)),
+    )
+    worlds, _, pixels = zip(*(back_project_frame(capture, int(t), stride) for t in chosen))
+    frame = np.repeat(chosen, [len(world) for world in worlds])
+    pixels = np.column_stack([frame, np.concatenate(pixels)])
+    return SampledPoints(cloud.points, cloud.colors, pixels, voxel_ids(np.concatenate(worlds), voxel))
 
 
 def confirmed_depths(capture: Capture, *, tolerance: float, min_views: int) -> Float[np.ndarray, "t h w"]:
@@ -38,13 +66,13 @@ def confirmed_depths(capture: Capture, *, tolerance: float, min_views: int) -> F
     return filtered
 
 
-def labels_of_points(points: DepthPoints, labels: Int[Array, "t h w"], num_labels: int) -> Int[np.ndarray, " p"]:
+def labels_of_points(points: SampledPoints, labels: Int[Array, "t h w"], num_labels: int) -> Int[np.ndarray, " p"]:
     """(P,) int32 the label that most of each point's pixels carry; -1 where none is labelled. Ties go to the
     smaller."""
-    frame, row, column = points.sample_pixels.T
+    frame, row, column = points.pixels.T
     sample = np.asarray(labels)[frame, row, column].astype(np.int64)
     known = sample >= 0
-    key = points.sample_points[known].astype(np.int64) * num_labels + sample[known]
+    key = points.point_of[known].astype(np.int64) * num_labels + sample[known]
     pairs, counts = np.unique(key, return_counts=True)
     result = np.full(len(points.points), -1, np.int32)
     # Ascending by count, and within a count descending by label: the last assignment to a point is its winner.

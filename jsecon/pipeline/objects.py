@@ -19,7 +19,7 @@ from jsecon.errors import InputError
 from jsecon.field.columns import vote_blocks
 from jsecon.field.evidence import IGNORED, list_evidence, pack_evidence, scratch_folder, sum_evidence, votes_memory
 from jsecon.field.regions import choose_crops, crop_geometry, region_embeddings
-from jsecon.fit.depth import points_from_depth
+from jsecon.fit.start import points_from_depth
 from jsecon.networks.hub import model_name
 from jsecon.paper.algorithm1 import masklets
 from jsecon.paper.autoencoder import encode, train_autoencoder

@@ -4,7 +4,6 @@
 and poses in OpenCV axes. Other packages add readers by entry points in the group jsecon.captures.
 """
 
-import collections
 import contextlib
 import os
 import re
@@ -33,8 +32,6 @@ _OTHER_WORD = re.compile(
 )
 _IMAGE_WORD = re.compile(r"(?<![a-z])(colou?r|rgba?|images?|img|frame|photo)(?![a-z])")
 """words in names of images, beside each other: frame0001.jpg and depth0001.png, a.color.png and a.depth.png"""
-_JPEG = (".jpg", ".JPG", ".jpeg", ".JPEG")
-"""suffixes of photographs, whose masks may be a .png of the same name"""
 _EXIF, _TAKEN, _DATE = 0x8769, 0x9003, re.compile(r"(\d{4}):(\d\d):(\d\d)")
 """EXIF's block of a photograph, its tag DateTimeOriginal, and the date in that"""
 _POSE_FOLDER = re.compile(r"(camera_?)?poses?|cams?|cameras|extrinsics?|traj(ectory)?")
@@ -123,10 +120,7 @@ def _sort_images(path: Path) -> tuple[list[Path], list[Path]]:
 
 
 def _derived_images(images: Sequence[Path]) -> set[Path]:
-    """Images whose names are those of others with a word added or changed: masks, depth maps, masked copies.
-
-    A word that is not known counts if at least two images, and half of those without it, have such a copy.
-    """
+    """Images whose names are those of others with a word added or changed: masks, depth maps, masked copies."""
 
     def base(file: Path) -> tuple[Path, str]:
         plain = _IMAGE_WORD.sub("", _OTHER_WORD.sub("", file.stem.lower()))
@@ -136,14 +130,8 @@ def _derived_images(images: Sequence[Path]) -> set[Path]:
     bases = {base(file) for file in images if not _OTHER_WORD.search(file.stem.lower())}
     derived = {file for file in images if _OTHER_WORD.search(file.stem.lower()) and base(file) in bases}
     derived |= {file for file in images if file.with_suffix("") in names}
-    derived |= {f for f in images if f.suffix.lower() == ".png" and any(f.with_suffix(end) in names for end in _JPEG)}
-    stems, copies = {(file.parent, file.stem) for file in images}, collections.defaultdict(set)
-    for file in images:
-        first, last = re.match("([A-Za-z]+)[_. -](.+)", file.stem), re.match("(.+)[_. -]([A-Za-z]+)$", file.stem)
-        for word, stem in ((first[1], first[2]) if first else ("", ""), (last[2], last[1]) if last else ("", "")):
-            if (file.parent, stem) in stems:
-                copies[word].add(file)
-    return derived.union(*(some for some in copies.values() if len(some) > 1 and 3 * len(some) >= len(images)))
+    pngs = [file for file in images if file.suffix.lower() == ".png"]  # masks of photographs of the same names
+    return derived.union(f for f in pngs if any(f.with_suffix(end) in names for end in (".jpg", ".JPG", ".jpeg")))
 
 
 def _is_image(file: Path) -> bool:

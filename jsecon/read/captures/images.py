@@ -42,25 +42,13 @@ _UNREAD |= {".hdr": "Radiance's HDR", ".tga": "Targa", ".ppm": "PPM", ".pgm": "P
 """suffixes of images that are not read, and their names"""
 _UNREAD_HEADS = {b"GIF8": ".gif", b"v/1\1": ".exr", b"\xff\x0a": ".jxl", b"\0\0\0\x0cJXL": ".jxl"}
 _UNREAD_HEADS |= {b"\0\0\0\x0cjP": ".jp2", b"8BPS": ".psd", b"#?": ".hdr"}
-_ORIENTATION = 0x0112
-"""EXIF tag: 1 is upright; 6, the commonest of a phone held upright, asks for a turn clockwise by 90 degrees. From 5
-on they swap width and height."""
-
-
-@contextlib.contextmanager
-def _size_limit() -> Iterator[None]:
-    """Turns Pillow's error for an image of impossible size into a ValueError, which `reading` reports."""
-    try:
-        yield
-    except Image.DecompressionBombError as error:
-        raise ValueError(str(error)) from error
 
 
 @contextlib.contextmanager
 def _open(path: Path) -> Iterator[ImageFile]:
     """Opens an image; only its header is read. Errors of the decoder in the body of the `with` become InputErrors."""
     again = "Copy or export the file again."
-    with reading(path, remedy=again, problem="the image cannot be read"), _size_limit(), path.open("rb") as file:
+    with reading(path, remedy=again, problem="the image cannot be read"), path.open("rb") as file:
         head = file.read(32)
         file.seek(0)
         if not head:
@@ -118,12 +106,16 @@ def _heic_decoder(path: Path) -> type[ImageFile]:
 
 
 def _orientation(image: ImageFile) -> int:
-    """EXIF's orientation, 1 to 8, of pixels that Pillow returns as they are stored: it turns TIFF and HEIC itself."""
+    """EXIF's orientation, 1 to 8, of pixels that Pillow returns as they are stored: it turns TIFF and HEIC itself.
+
+    1 is upright; 6, the commonest of a phone held upright, asks for a turn clockwise by 90 degrees. From 5 on they swap
+    width and height.
+    """
     tags = Image.Exif()
     if image.format in ("JPEG", "PNG", "WEBP", "AVIF"):
         with contextlib.suppress(Exception):  # damaged EXIF turns nothing
             tags.load(image.info.get("exif", b""))
-    value = tags.get(_ORIENTATION, 1)
+    value = tags.get(0x0112, 1)
     return value if value in range(1, 9) else 1
 
 

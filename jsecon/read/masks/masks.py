@@ -376,7 +376,7 @@ class _Source:
         fits = same_aspect(upright, size)
         if file is not None and file.orientation > 1:
             stored = upright[::-1] if file.orientation > 4 else upright
-            if same_aspect(stored, size) and (not fits or self._are_of_stored_pixels):
+            if not fits and same_aspect(stored, size):
                 image, fits = apply_orientation(image, file.orientation), True
                 self.turned += 1
         if not fits and not same_aspect(self.size[::-1], size):
@@ -387,22 +387,6 @@ class _Source:
             return image
         self.resized += 1
         return resize_nearest(image, self.size[1], self.size[0])
-
-    @functools.cached_property
-    def _are_of_stored_pixels(self) -> bool:
-        """Whether masks of images that lie on their side fit the stored pixels only.
-
-        Then those of images that stand on their head, or are square, are of the stored pixels too.
-        """
-        lying = [name for name in self.readers if (file := self.frames.get(name)) and file.orientation > 4]
-        for name in lying[:8]:
-            upright = self._image_size(name)
-            _, stored = self.readers[name](upright)
-            for image in stored[:1] if isinstance(stored, list) else [stored]:
-                size = image.shape[::-1]
-                if same_aspect(upright[::-1], size) and not same_aspect(upright, size):
-                    return True
-        return False
 
 
 def load_labels(
