@@ -36,7 +36,6 @@ from jsecon.read.captures import images, video
 from jsecon.read.captures.capture import load_capture
 from jsecon.read.masks import masks
 from jsecon.read.masks.labels import load_lerf_labels
-from jsecon.read.masks.masks import TrackedMasks
 from jsecon.read.splats.files import read_gaussians, save_gaussians
 from jsecon.read.splats.points import load_point_cloud
 from jsecon.types import Capture, Codes, Gaussians, LanguageField, Regions
@@ -61,7 +60,7 @@ def check_result(found: Any) -> None:
         assert found.points.shape == found.point_colors.shape
         assert min(cameras.fx.min(), cameras.fy.min()) > 0
         assert found.depths is None or (found.depths >= 0).all()
-    elif isinstance(found, TrackedMasks):
+    elif hasattr(found, "ids"):  # tracked masks
         count = len(found.ids)
         assert -1 <= found.labels.min() <= found.labels.max() < max(count, 1)
     elif isinstance(found, LanguageField):

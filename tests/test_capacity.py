@@ -88,13 +88,3 @@ def test_one_program_serves_all_views_and_selections_of_a_size(scene, cameras):
     for t in range(1, 4):
         look(t)
     assert compilation_counts()["all"] == before
-
-
-def test_it_follows_the_sizes_alone():
-    assert default_capacity(64, 48, 40) == default_capacity(1, 8, 8) == 4096
-    # Up to 256 Gaussians there is room for all of them everywhere: here in each of 50 by 38 blocks.
-    assert default_capacity(256, 1600, 1200) >= 256 * 50 * 38
-    sizes = [default_capacity(n, 640, 480) for n in (10, 1000, 10_000, 100_000, 1_000_000)]
-    assert sizes == sorted(sizes)
-    # A million Gaussians at 1600x1200: 110 bytes for each pair stay far below what their gradients take.
-    assert 2_000_000 <= default_capacity(1_000_000, 1600, 1200) <= 3_000_000

@@ -12,7 +12,6 @@ from test_images import stored_as, with_orientation
 
 from experiments.rooms.writers import write_colmap
 from jsecon.read.captures.capture import load_capture
-from jsecon.read.captures.frames import evenly_spaced
 from jsecon.read.splats.files import save_gaussians
 
 CAPTURE = small_capture()
@@ -53,17 +52,6 @@ def test_options_and_progress(tmp_path):
     assert calls == [(1, 4), (2, 4), (3, 4), (4, 4)]
     np.testing.assert_array_equal(load_capture(tmp_path, long_side=16, frames=4).frames, loaded.frames)
     assert not load_capture(tmp_path, frames=1).held_out.any()
-
-
-@pytest.mark.parametrize("count", [1, 2, 7, 50])
-@pytest.mark.parametrize("wanted", [1, 2, 3, 7, 49, 100, None])
-def test_spread(count, wanted):
-    chosen = evenly_spaced(count, wanted)
-    assert len(chosen) == min(count, wanted or count)
-    assert chosen[0] == 0
-    assert len(chosen) == 1 or chosen[-1] == count - 1
-    gaps = np.diff(chosen)
-    assert len(gaps) == 0 or (gaps.min() >= 1 and gaps.max() - gaps.min() <= 1)
 
 
 def write_turned(capture, folder, orientations, *, upright):

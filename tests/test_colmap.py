@@ -21,15 +21,6 @@ def folder(tmp_path):
     return tmp_path / "scene"
 
 
-def test_quaternions_in_every_quadrant(tmp_path):
-    """Half turns about each axis are where the common formulas divide by zero."""
-    capture = small_capture(4)
-    poses = capture.cameras.world_to_camera
-    poses[:, :3, :3] = [np.diag(signs) for signs in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))]
-    write_colmap(capture, tmp_path)
-    np.testing.assert_array_equal(load_capture(tmp_path).cameras.world_to_camera, poses)
-
-
 def test_tracks_of_all_lengths_and_observations(folder):
     records = []
     for n, (point, colour) in enumerate(zip(CAPTURE.points, CAPTURE.point_colors)):
@@ -54,13 +45,6 @@ def test_the_split_of_inrias_training_is_kept(folder):
     (folder / "sparse/0/test.txt").write_text("frame_001.png\nframe_003.png\n")
     np.testing.assert_array_equal(load_capture(folder).held_out, [False, True, False, True, False])
     np.testing.assert_array_equal(load_capture(folder, holdout=4).held_out, [True, False, False, False, True])
-
-
-def test_downscale_is_an_area_mean(folder):
-    loaded = load_capture(folder, downscale=2)
-    means = CAPTURE.frames.reshape(5, 8, 2, 12, 2, 3).mean((2, 4))
-    assert np.abs(loaded.frames - means).max() <= 1
-    np.testing.assert_allclose(loaded.cameras.cy, CAPTURE.cameras.cy / 2)
 
 
 def test_smaller_images_than_the_model_says(tmp_path):
@@ -156,7 +140,7 @@ NAMES = ["p 1.png", "1 2 3.png", "0001.png", "cam a/p.png", "cam b/p.png"]
 SECONDS = {
     "none": 5 * [[]],
     "empty": 5 * [[""]],
-    "observations": 5 * [["1.5 2.5 -1 3 4 17 1e2 2 3 4 5 6"]],
+    "observations": 5 * [["1.5 2.5 -1 3 4 17 1e2 2 3 nan -inf 6"]],
     "mixed": [[], [""], ["12 13 14"], [], ["1.5 2.5 -1"]],
 }
 
@@ -230,15 +214,6 @@ def test_a_model_given_without_its_capture_has_the_images_above_it(folder, inner
         for file in (folder / "sparse/0").iterdir():
             file.rename(folder / "sparse" / file.name)
     assert load_capture(folder / inner).names == CAPTURE.names
-
-
-def test_features_of_a_text_model_may_be_not_finite(tmp_path):
-    write_text_model(CAPTURE, tmp_path / "sparse/0")
-    write_images(CAPTURE, tmp_path / "images")
-    path = tmp_path / "sparse/0/images.txt"
-    names = [line for line in path.read_text().splitlines() if line.endswith(".png")]
-    path.write_text("".join(f"{name}\n1 2 -1 nan -inf 3\n" for name in names))
-    assert load_capture(tmp_path).names == CAPTURE.names
 
 
 def test_intrinsics_in_shares_of_the_image_are_refused(folder, tmp_path):

@@ -1,7 +1,6 @@
 """Growth of a fit: halves keep what the whole was, and rows stay in place; its rates, and smaller frames."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import gaussians_at
@@ -15,9 +14,8 @@ from jsecon.fit.growth import (
     pad_with_free_rows,
 )
 from jsecon.fit.resize import resize_frame, scale_cameras
-from jsecon.fit.step import LearningRates, _rates_at
 from jsecon.splat.capacity import round_capacity
-from jsecon.types import Camera, Gaussians
+from jsecon.types import Camera
 
 
 def scene(count=30, seed=0):
@@ -74,17 +72,6 @@ def test_faint_gaussians_make_room_and_nothing_is_added_where_nothing_is_wrong()
     whole = pad_with_free_rows(scene(), 64)
     after, _ = grow(whole, (whole, whole), np.zeros(64, np.float32), 60, 60, [0])
     jax.tree.map(np.testing.assert_array_equal, after, whole)
-
-
-def test_rates_decay_log_linearly_and_frozen_positions_stay():
-    shape = Gaussians(*(np.zeros((2, *rest), np.float32) for rest in ((3,), (3,), (4,), (), (9, 3))))
-    rates = LearningRates(means=1e-2, means_last=1e-4, colors=1.0, rest_last=0.25)
-    half = _rates_at(jnp.float32(0.5), rates, shape, jnp.float32(3.0), jnp.int32(1))
-    assert float(half.means) == pytest.approx(3e-3, rel=1e-5)
-    assert float(half.log_scales) == pytest.approx(1e-2, rel=1e-5)
-    np.testing.assert_allclose(half.sh[0, :, 0], [0.5] + 3 * [0.025] + 5 * [0.0], rtol=1e-5)
-    frozen = _rates_at(jnp.float32(0.5), LearningRates(means=0.0), shape, jnp.float32(3.0), jnp.int32(1))
-    assert float(frozen.means) == 0
 
 
 def test_smaller_frames_are_means_seen_by_cameras_as_much_smaller():

@@ -2,7 +2,6 @@
 
 import struct
 import sys
-import zlib
 
 import cv2
 import numpy as np
@@ -29,30 +28,6 @@ def test_what_is_written_comes_back(tmp_path):
     assert np.abs(read_image(tmp_path / "a.jpg")[0].astype(int) - corners()).mean() < 6
     with refused("a.xyz", "'.xyz'"):
         write_image(tmp_path / "a.xyz", FRAME)
-
-
-def deep_png(rows, *, woven=0, behind=b""):
-    """16 bits of colour; `rows` as PNG filters them, each behind a zero."""
-    header = struct.pack(">IIBBBBB", 17, 13, 16, 2, 0, 0, woven)
-    parts = png_chunk(b"IHDR", header), png_chunk(b"IDAT", zlib.compress(rows)), behind, png_chunk(b"IEND", b"")
-    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
-
-
-def test_16_bits_of_colour_are_read_whole_or_refused_in_silence(tmp_path, capfd):
-    """libpng would tell of these on stderr, and leave pixels black."""
-    deep, file = FRAME.astype(">u2") * np.array(257, ">u2"), tmp_path / "deep.png"
-    rows = b"".join(b"\0" + row.tobytes() for row in deep)
-    passes = (0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2)
-    woven = b"".join(b"\0" + row.tobytes() for x, y, across, down in passes for row in deep[y::down, x::across])
-    late = deep_png(rows, behind=png_chunk(b"tRNS", bytes(6)))
-    for whole in (deep_png(rows), deep_png(woven, woven=1), late):
-        file.write_bytes(whole)
-        np.testing.assert_array_equal(read_image(file)[0], FRAME)
-    for wrong in (deep_png(rows[:-40]), deep_png(rows, woven=1), deep_png(woven[:-1], woven=1)):
-        file.write_bytes(wrong)
-        with pytest.raises(InputError, match=r"deep\.png"):
-            read_image(file)
-    assert capfd.readouterr() == ("", "")
 
 
 def corners(width=48, height=32):

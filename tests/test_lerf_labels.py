@@ -2,13 +2,10 @@
 
 import json
 import shutil
-import tempfile
 
-import cv2
 import numpy as np
 import pytest
 from capture_files import refused
-from hypothesis import given, settings, strategies as st
 
 from experiments.rooms.writers import write_lerf_labels
 from jsecon.read.masks.labels import LabelledFrame, load_lerf_labels
@@ -58,25 +55,6 @@ def test_excerpt(shared, tmp_path):
         rows, columns = np.nonzero(mask)
         assert (np.abs(boxes.min(0)[:2] - [columns.min(), rows.min()]) <= 2).all()
         assert (np.abs(boxes.max(0)[2:] - [columns.max(), rows.max()]) <= 2).all()
-
-
-@settings(deadline=None, max_examples=60)
-@given(st.integers(0, 2**32 - 1), st.integers(1, 24), st.integers(1, 24), st.floats(0.05, 0.95), st.integers(0, 2))
-def test_masks_and_boxes_come_back(seed, height, width, share, smooth):
-    """Noise of any density: many pieces, holes, pieces within holes, touching corners, the image's edge."""
-    noise = np.random.default_rng(seed).random((height, width)).astype(np.float32)
-    for _ in range(smooth):
-        noise = cv2.blur(noise, (3, 3))
-    mask = noise <= np.quantile(noise, share)
-    boxes = np.float32([[0, 0, 1, 1], [3, 4, 14, 19]])  # which no polygon may fit
-    with tempfile.TemporaryDirectory() as folder:
-        write_lerf_labels(
-            folder, [LabelledFrame("a", width, height, {"mug": (mask, boxes), "ball": (mask, boxes[:1])})]
-        )
-        (found,) = load_lerf_labels(folder)
-    assert (found.name, found.width, found.height, list(found.objects)) == ("a", width, height, ["mug", "ball"])
-    np.testing.assert_array_equal(found.objects["mug"][0], mask)
-    np.testing.assert_array_equal(sorted(found.objects["mug"][1].tolist()), boxes)
 
 
 def test_no_labels_and_nothing_to_write(tmp_path):

@@ -133,15 +133,6 @@ def test_names_with_dots_with_windows_separators_and_without_ending(tmp_path):
     np.testing.assert_array_equal(loaded.frames, CAPTURE.frames)
 
 
-def test_rounded_rotations_are_made_exact(tmp_path):
-    def change(content):
-        for entry in content["frames"]:
-            entry["transform_matrix"] = np.round(entry["transform_matrix"], 4).tolist()
-
-    rotation = load_changed(tmp_path, change).cameras.world_to_camera[:, :3, :3].astype(np.float64)
-    np.testing.assert_allclose(rotation @ rotation.transpose(0, 2, 1), np.tile(np.eye(3), (5, 1, 1)), atol=1e-6)
-
-
 def test_fox(shared):
     """67 entries, 17 of which have no image."""
     loaded = load_capture(shared / "captures/fox", downscale=2)

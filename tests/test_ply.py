@@ -5,7 +5,6 @@ import pytest
 from splat_files import C0, PLY_NAMES, gaussians, opacity, ply_columns, scene, spz, write_ply
 
 from jsecon.read.splats.files import load_gaussians, save_gaussians
-from jsecon.read.splats.points import load_point_cloud
 
 
 @pytest.mark.parametrize("basis", [1, 4, 9, 16])
@@ -97,15 +96,3 @@ def test_training_with_antialiasing_is_said(tmp_path):
         (tmp_path / "a.spz").write_bytes(spz(scene(30), version, flags=1))
         with pytest.warns(UserWarning, match="antialiasing"):
             load_gaussians(tmp_path / "a.spz")
-
-
-def test_plain_points(tmp_path):
-    colours = ("red", "green", "blue")
-    given = {"x": np.arange(3.0), "y": np.ones(3), "z": -np.arange(3.0)}
-    types = dict.fromkeys(colours, "uchar") | {"x": "double"}
-    write_ply(tmp_path / "p.ply", given | dict.fromkeys(colours, np.array([0, 51, 255])), types=types)
-    points, found = load_point_cloud(tmp_path / "p.ply")
-    np.testing.assert_array_equal(points, np.stack([given[axis] for axis in "xyz"], -1).astype(np.float32))
-    np.testing.assert_array_equal(found, np.repeat([[0], [51], [255]], 3, 1))
-    write_ply(tmp_path / "p.ply", given)
-    np.testing.assert_array_equal(load_point_cloud(tmp_path / "p.ply")[1], 128)

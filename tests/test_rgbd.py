@@ -215,17 +215,6 @@ def test_polycam_without_sizes(tmp_path, before, smaller):
             load_capture(tmp_path)
 
 
-def test_polycam_without_corrected_cameras(tmp_path):
-    write_polycam(tmp_path)
-    frames = tmp_path / "keyframes"
-    (frames / "corrected_cameras").rename(frames / "cameras")
-    with refused("keyframes", "images/"):
-        load_capture(tmp_path)
-    shutil.copytree(frames / "corrected_images", frames / "images")  # the corrected ones alone are no capture
-    found = load_capture(tmp_path, holdout=0)
-    np.testing.assert_array_equal(found.frames, CAPTURE.frames[expected("polycam")])
-
-
 def test_record3d_as_its_archive_unpacks(tmp_path):
     write_record3d(tmp_path)
     (tmp_path / "rgb").rename(tmp_path / "rgbd")

@@ -5,9 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from capture_files import context_of
 
-from jsecon.pipeline.scene import plan_capture
 from jsecon.read.captures.video import write_frames
 
 SHARP = (2, 7, 12, 16, 20, 29)
@@ -38,17 +36,6 @@ def test_the_sharpest_frame_of_each_stretch_is_taken(video, tmp_path):
     assert told[-1] == (60, 60)
     assert sorted(told) == told
     assert len(write_frames(video, tmp_path / "all")[0]) == 30  # a short one gives each of its frames
-
-
-def test_a_run_on_a_video_takes_as_many_frames_as_it_is_told(video, tmp_path):
-    keys = []
-    for frames in (None, 20, 30):
-        work = context_of(video, tmp_path, frames=frames)
-        poses, load = plan_capture(work)
-        assert f"the {frames or 150} sharpest frames of walk.avi" in poses.how
-        assert load.after == ("poses",)
-        keys.append(poses.key({}, work.out))
-    assert len(set(keys)) == 3
 
 
 def moving(path, code, count=30):

@@ -15,7 +15,7 @@ from experiments.rooms.room import Room
 from experiments.rooms.writers import write_colmap, write_lerf_labels
 from jsecon.errors import require
 from jsecon.files import write_text
-from jsecon.read.captures.frames import FrameOptions, holdout_mask
+from jsecon.read.captures.frames import FrameOptions
 from jsecon.read.captures.images import write_image
 from jsecon.read.masks.labels import LabelledFrame
 from jsecon.types import Camera, Capture, Progress
@@ -98,7 +98,7 @@ def room_capture(
       ValueError: Fewer than two frames are not held out.
     """
     FrameOptions(frames=views, holdout=holdout)  # checks both
-    is_held_out = holdout_mask(views, holdout)
+    is_held_out = np.arange(views) % holdout == 0 if holdout else np.zeros(views, bool)
     got, remedy = f"{views} with every {holdout}. held out", "Sparse points are those that two views see: take more."
     require(int((~is_held_out).sum()) >= 2, "views", got, "2 that are not held out", remedy)
     cameras = room_cameras(room, views=views, width=width, height=height)

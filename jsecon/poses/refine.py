@@ -42,12 +42,8 @@ from jsecon.poses.alignment import align_cameras
 from jsecon.splat.render import render_rgb
 from jsecon.types import Array, Camera, Capture, Gaussians, Progress
 
-VISITS = 30
-"""Visits of each frame by a probe."""
 MIN_VISITS = 6
 """Visits below which poses do not become stable."""
-PROBES = 4
-"""Maximum number of probes, one after the other."""
 ALIGN_VISITS = 120
 """Visits of each held-out frame while it is aligned to the last probe."""
 DECIDE_VISITS = 24
@@ -169,8 +165,8 @@ def refine_capture(
     *,
     key: PRNGKeyArray,
     max_fit_steps: float | None = None,
-    visits: int = VISITS,
-    probes: int = PROBES,
+    visits: int = 30,
+    probes: int = 4,
     progress: Progress | None = None,
 ) -> Capture:
     """Corrects the poses and exposures of a capture by short fits; its notes say what was done and why.

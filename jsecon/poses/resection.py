@@ -29,8 +29,6 @@ _FIRST_VIEWS = 16
 """Views whose pictures look most alike, which are matched first; the others only if these do not suffice."""
 _ZOOMS = (1.0, 0.6, 0.75, 1.33, 1.75)
 """Focal lengths that are tried then, in those of the field's views."""
-_SAME_LENS = 0.04
-"""Relative change of the focal length up to which a photograph counts as one of the field's lens."""
 _TOLERANCE = 0.008
 """Distance over the longer side up to which a match agrees with a pose."""
 
@@ -49,7 +47,7 @@ class Landmarks:
         self._views: dict[int, tuple[Features, np.ndarray]] = {}
         self._thumbnails = np.stack([_thumbnail(picture) for picture in pictures])
 
-    def lens(self, width: int, height: int) -> Camera:
+    def _lens(self, width: int, height: int) -> Camera:
         """Guesses the lens of a photograph: the median one of the views, its centre only for the same aspect."""
         poses, *numbers = (np.median(column, axis=0) for column in jax.tree.leaves(self.cameras))
         usual = Camera(poses, *numbers, width=self.cameras.width, height=self.cameras.height)
@@ -58,11 +56,11 @@ class Landmarks:
         focal = usual.fx * max(width, height) / max(usual.width, usual.height)
         return Camera(poses, focal, focal, *np.array([width / 2, height / 2], np.float32), width=width, height=height)
 
-    def alike(self, photo: UInt8[np.ndarray, "h w 3"]) -> list[int]:
+    def _alike(self, photo: UInt8[np.ndarray, "h w 3"]) -> list[int]:
         """Lists the views, those whose picture looks most like a photograph first."""
         return np.argsort(-(self._thumbnails @ _thumbnail(photo)), kind="stable").tolist()
 
-    def match(self, features: Features, t: int) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 3"]]:
+    def _match(self, features: Features, t: int) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 3"]]:
         """Matches features with those of a view: the rays of the first, and their places in the world."""
         if t not in self._views:
             found = detect_features(self.pictures[t], self.cameras[t])
@@ -83,11 +81,11 @@ def find_pose(photo: UInt8[np.ndarray, "h w 3"], landmarks: Landmarks) -> tuple[
     Returns:
       The camera, None if too few matches agree on one, and the number of those that agree.
     """
-    lens, order = landmarks.lens(*photo.shape[1::-1]), landmarks.alike(photo)
+    lens, order = landmarks._lens(*photo.shape[1::-1]), landmarks._alike(photo)
     features, error = detect_features(photo, lens), _TOLERANCE * max(photo.shape) / float(lens.fx)
     matches, count, best = [(np.zeros((0, 2)), np.zeros((0, 3)))], 0, None
     for views, zooms in ((order[:_FIRST_VIEWS], (1.0,)), (order[_FIRST_VIEWS:], _ZOOMS)):
-        matches += [landmarks.match(features, t) for t in views]
+        matches += [landmarks._match(features, t) for t in views]
         rays, places = (np.concatenate(column) for column in zip(*matches))
         for zoom in zooms if len(rays) > 3 else ():
             cv2.setRNGSeed(0)
@@ -105,7 +103,7 @@ def find_pose(photo: UInt8[np.ndarray, "h w 3"], landmarks: Landmarks) -> tuple[
         return None, count
     pose, zoom, rays, places = best
     refined = _refine(rays, places, pose, zoom, lens, is_free=True)
-    if is_same := abs(np.log(refined[1])) <= _SAME_LENS:
+    if is_same := abs(np.log(refined[1])) <= 0.04:  # it counts as one of the field's lens
         refined = _refine(rays, places, pose, 1.0, lens, is_free=False)
     for _ in range(3):
         rays, places = _flow_matches(photo, landmarks.gaussians, _placed(lens, *refined), lens)

@@ -15,8 +15,6 @@ LOOKS = 8
 """frames with masks that should show a Gaussian: its object is what most of them agree on"""
 LEAST_GAIN = 0.01
 """share of the Gaussians that a further frame must show to one that lacks looks"""
-COUNTED = 100_000
-"""Gaussians, evenly spaced, by which frames are compared"""
 
 
 def greedy_cover(
@@ -70,7 +68,7 @@ def frames_by_need(
     A frame is needed where it shows Gaussians that fewer than `LOOKS` chosen frames show. Several processes that make
     the same call share the work.
     """
-    counted = np.unique(np.linspace(0, gaussians.count - 1, min(gaussians.count, COUNTED)).astype(int))
+    counted = np.unique(np.linspace(0, gaussians.count - 1, min(gaussians.count, 100_000)).astype(int))
     whole = np.zeros((cameras.height, cameras.width), np.int32)
 
     def shown(t: int) -> Float[np.ndarray, " n"]:

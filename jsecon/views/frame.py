@@ -24,8 +24,6 @@ _DIRECTIONS = 1500
 _ROLL_BINS = 45
 _ROLL_SPREAD = 2 * np.pi / _ROLL_BINS
 """radians, of the rolls of cameras that are held alike"""
-_SAMPLE = 4000
-"""Gaussians from which the inner scene is told from its surroundings: their spacing is the same for any number"""
 _LINK = 0.35
 """distance, in radii of the inner scene, from which points are not connected to it"""
 _FAR = 3.0
@@ -33,8 +31,6 @@ _FAR = 3.0
 _FAR_SHARE, _FAR_MASS = 0.01, 0.05
 """surroundings are at least this share of the Gaussians, and at most this share of number times density"""
 _QUARTERS = np.radians([0.0, 90.0, 180.0, 270.0])
-_UPWARDS = 0.05
-"""mean sine of the cameras' pitch above which they may stand on their heads instead of looking up"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +67,8 @@ def inner_scene(gaussians: Gaussians) -> Bool[np.ndarray, " n"]:
     if visible.sum() < 16:
         return everything
     points = means[visible]
-    points = points[np.unique(np.linspace(0, len(points) - 1, min(len(points), _SAMPLE)).astype(int))]
+    sample = np.linspace(0, len(points) - 1, min(len(points), 4000))  # its spacing is the same for any number
+    points = points[np.unique(sample.astype(int))]
     spacing = KDTree(points).query(points, 9)[0][:, -1]
     spacing = np.maximum(spacing, np.quantile(spacing, 0.05))
     if not spacing.min() > 0:
@@ -202,7 +199,7 @@ def _up_of_cameras(cameras: Camera) -> UpAxis:
     up = up if ends[0] >= ends[1] else -up
     from_quarters = np.cos(_rolls(up[None], right, down)[0][:, None] - _QUARTERS) >= np.cos(np.radians(20))  # (T, 4)
     is_clear = from_quarters.any(1).mean() >= 0.85 and scores[best] - scores[others].max() >= 0.8
-    is_clear &= (ahead @ up).mean() <= _UPWARDS
+    is_clear &= (ahead @ up).mean() <= 0.05  # else they may stand on their heads instead of looking up
     level = from_quarters[:, 0].mean()
     evidence = "the cameras, which are level" if level >= 0.85 else "the cameras, with their roll taken out"
     return UpAxis(tuple(up.tolist()), evidence, bool(is_clear and level >= 0.4))

@@ -36,8 +36,6 @@ DEFAULT_VIEWS = 24
 """views that are planned"""
 _LEAST_ALPHA = 0.03
 """mean alpha of a view from which it shows some of the scene"""
-_SHOWN_SHARE = 0.03
-"""share of the mean weight of a Gaussian from which given views show it, whatever the number of Gaussians"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,9 +145,9 @@ def cover_with(gaussians: Gaussians, cameras: Camera, views: int, progress: Prog
 
     seen, alpha, fog = _weights_by_view(gaussians, counted, small, diagonal, report)
     usable = np.flatnonzero((alpha >= _LEAST_ALPHA) & (fog < FOG_SHARE))
-    even_px = max(float(seen.sum(0).mean()), 1e-30)
+    shown_px = 0.03 * max(float(seen.sum(0).mean()), 1e-30)  # whatever the number of Gaussians
     chosen = usable[greedy_cover(seen[usable] / SEEN_PX, counted.opacity, views)]
-    coverage = counted.share_seen(seen[usable], _SHOWN_SHARE * even_px)
+    coverage = counted.share_seen(seen[usable], shown_px)
     return _Cover(chosen, len(usable) / len(cameras), coverage)
 
 

@@ -30,7 +30,6 @@ from jsecon.read.captures.frames import (
     PosedImages,
     evenly_spaced,
     frame_names,
-    holdout_mask,
     make_rigid,
     same_aspect,
     transform_poses,
@@ -151,8 +150,8 @@ def _hold_out(frames: Sequence[_Frame], options: FrameOptions) -> tuple[Bool[np.
         held_out = own
         notes.append(f"{own.sum()} of {len(own)} frames are held out, those that the capture's own split sets aside.")
     else:
-        photographs, count = _photographs(frames)
-        held_out = holdout_mask(count, 8 if options.holdout is None else options.holdout)[photographs]
+        every = 8 if options.holdout is None else options.holdout  # as in Mip-NeRF 360 and INRIA's split
+        held_out = _photographs(frames)[0] % every == 0 if every else np.zeros(len(frames), bool)
     if has_split and options.holdout is not None:
         notes.append(f"The capture's own split, {own.sum()} frames for testing, is not used: a holdout is given.")
     if held_out.all():

@@ -130,8 +130,8 @@ def _derived_images(images: Sequence[Path]) -> set[Path]:
     bases = {base(file) for file in images if not _OTHER_WORD.search(file.stem.lower())}
     derived = {file for file in images if _OTHER_WORD.search(file.stem.lower()) and base(file) in bases}
     derived |= {file for file in images if file.with_suffix("") in names}
-    pngs = [file for file in images if file.suffix.lower() == ".png"]  # masks of photographs of the same names
-    return derived.union(f for f in pngs if any(f.with_suffix(end) in names for end in (".jpg", ".JPG", ".jpeg")))
+    photographs = {file.with_suffix("") for file in images if file.suffix.lower() in (".jpg", ".jpeg")}
+    return derived.union(f for f in images if f.suffix.lower() == ".png" and f.with_suffix("") in photographs)
 
 
 def _is_image(file: Path) -> bool:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 
 from jsecon.errors import InputError
 from jsecon.numerics import is_finite_and_bounded
@@ -103,11 +103,6 @@ def same_aspect(size: tuple[int, ...], other: tuple[int, ...]) -> bool:
     """Whether two sizes (width, height) have one aspect, to a pixel of the coarser of the two, which was rounded."""
     (width, height), (columns, rows) = size, other
     return min(abs(columns * height / rows - width), abs(width * rows / height - columns)) <= 1
-
-
-def holdout_mask(count: int, every: int) -> Bool[np.ndarray, " t"]:
-    """Marks the held-out frames 0, k, 2k, ..., as in Mip-NeRF 360 and INRIA's split; 0 holds out no frame."""
-    return np.arange(count) % every == 0 if every else np.zeros(count, bool)
 
 
 def frame_names(files: Sequence[str], where: object) -> tuple[str, ...]:

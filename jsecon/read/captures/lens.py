@@ -22,11 +22,10 @@ from jsecon.numerics import is_finite_and_bounded
 
 PANORAMA = "EQUIRECTANGULAR"
 """COLMAP's and nerfstudio's model of a panorama"""
-_TURNS = [*((-60 * view, 0) for view in range(6)), (0, 90), (0, -90)]
-PANORAMA_VIEWS = Rotation.from_euler("YX", _TURNS, degrees=True).as_matrix()
+PANORAMA_VIEWS = Rotation.from_euler(
+    "YX", [*((-60 * view, 0) for view in range(6)), (0, 90), (0, -90)], degrees=True
+).as_matrix()
 """(8, 3, 3) rotations from the axes of a panorama to those of its views: six along the horizon, one down and one up"""
-_VIEW_TANGENT = 1.1
-"""tangent of half a view's angle, 95 degrees in all: from 1.07 on, the views of a panorama leave no gap"""
 OPERATOR_DEGREES = 30.0
 """half angle of the cone straight below a panorama in which its tripod, or whoever carries it, is seen"""
 
@@ -161,7 +160,7 @@ def undistorted_pinhole(lens: Lens, where: object) -> Lens:
     """
     if lens.view is not None:
         side, _ = lens.undistorted_size
-        focal = side / (2 * _VIEW_TANGENT)
+        focal = side / 2.2  # 95 degrees: the views of a panorama leave no gap from a tangent of 1.07 of their half on
         return Lens(side, side, focal, focal, side / 2, side / 2)
     if not lens.distorted:
         return dataclasses.replace(lens, distortion=())

@@ -263,5 +263,6 @@ def _focal(keys: dict[str, Any], direct: str, angle: str, size: int) -> float | 
     return None
 
 
-_MARKS = ("transforms.json", "transforms_train.json", ".json")
-READERS = tuple(Reader("nerfstudio", (mark,), _read_nerfstudio) for mark in _MARKS)
+READERS = tuple(
+    Reader("nerfstudio", (mark,), _read_nerfstudio) for mark in ("transforms.json", "transforms_train.json", ".json")
+)

@@ -11,8 +11,6 @@ from jsecon.read.captures.lens import PANORAMA_VIEWS, Lens, panorama_lens
 
 _MARK = re.compile(rb"ProjectionType\s*(?:=\s*[\"']|>)\s*equirectangular|sv3d.{0,200}?equi", re.DOTALL)
 """of XMP (GPano), and of Google's spherical video, versions 1 and 2"""
-_HEAD = 1 << 18
-"""bytes of a file in which its mark lies"""
 
 
 def has_mark(head: bytes) -> bool:
@@ -32,7 +30,7 @@ def find_panoramas(photos: Sequence[Path], *, declared: bool) -> tuple[list[Path
             panorama_lens(photo, width, height)  # refuses another aspect
         if width == 2 * height:
             with photo.open("rb") as file:
-                is_found = declared or has_mark(file.read(_HEAD))
+                is_found = declared or has_mark(file.read(1 << 18))
             found += [photo] if is_found else []
             unmarked += not is_found
     note = f"{unmarked} photographs are twice as wide as high, but their files do not call them panoramas."

@@ -19,8 +19,6 @@ from jsecon.types import Progress
 
 DEFAULT_VIDEO_FRAMES = 150
 """frames taken by default: two or three rounds about a table top"""
-_MAX_FAILURES = 1000
-"""frames in a row that cannot be decoded after which the file is taken to end: a header may promise any number"""
 _COUNTED = (".mp4", ".mov", ".m4v", ".avi", ".3gp")
 """containers whose headers count frames; others have a duration, of which the count is an estimate"""
 
@@ -115,7 +113,7 @@ def _decode(video: Path) -> Iterator[tuple[int, UInt8[np.ndarray, "h w 3"], int]
     try:
         total = max(1, int(reader.get(cv2.CAP_PROP_FRAME_COUNT)))
         number = failures = 0
-        while failures == 0 or (number < total and failures < _MAX_FAILURES):
+        while failures == 0 or (number < total and failures < 1000):  # a header may promise any number
             read, image = reader.read()
             failures = 0 if read else failures + 1
             if read:

@@ -86,7 +86,7 @@ READERS = (
 )
 
 
-class TrackedMasks(NamedTuple):
+class _TrackedMasks(NamedTuple):
     """Labels of tracked regions, and their ids in the files."""
 
     labels: Int16[np.ndarray, "t h w"]
@@ -398,7 +398,7 @@ def load_labels(
     frames: AllFrames | None = None,
     limit: int | None = None,
     progress: Progress | None = None,
-) -> TrackedMasks:
+) -> _TrackedMasks:
     """Reads masks as labels (H, W) of regions over T frames called `names`.
 
     Ids mean the same object in every frame; the masks of single frames (SAM's, COCO's, LangSplat's) are regions of
@@ -452,7 +452,7 @@ def load_labels(
         notes.append("The masks hold negative ids: these count as unlabelled, and 0 as a region.")
     if not is_shared:
         notes.append("Each frame's masks count as regions of their own, since their ids are not shared.")
-    return TrackedMasks(labels, tuple(map(int, ids)), tuple(notes))
+    return _TrackedMasks(labels, tuple(map(int, ids)), tuple(notes))
 
 
 def _no_object_notes(blended: set[int], ignored: int | None) -> list[str]:

@@ -34,7 +34,7 @@ FIRST_CLASS, LAST_CLASS = 64, 255
 """classes of LAS that its users may define, in points of 8 bits for the class"""
 
 
-class PointCloud(NamedTuple):
+class _PointCloud(NamedTuple):
     """P points of a file."""
 
     points: np.ndarray
@@ -43,13 +43,13 @@ class PointCloud(NamedTuple):
     """(P, 3) uint8."""
 
 
-def _cloud(columns: Mapping[str, np.ndarray]) -> PointCloud:
+def _cloud(columns: Mapping[str, np.ndarray]) -> _PointCloud:
     """Makes a cloud of the columns of a file."""
     columns = {re.sub("^cartesian|^color", "", name.lower()): column for name, column in columns.items()}
     if missing := [axis for axis in "xyz" if axis not in columns]:
         raise ValueError(f"its points have no {', '.join(missing)}, expected a point cloud with x y z")
     points = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
-    return PointCloud(points, _colours(columns, len(points)))
+    return _PointCloud(points, _colours(columns, len(points)))
 
 
 @np.errstate(invalid="ignore")
@@ -72,7 +72,7 @@ def _colours(columns: Mapping[str, np.ndarray], count: int) -> UInt8[np.ndarray,
     return np.full((count, 3), 128, np.uint8)
 
 
-def _read_las(path: Path) -> PointCloud:
+def _read_las(path: Path) -> _PointCloud:
     with decoding(path, "laspy") as laspy:
         las = laspy.read(path)
         if len(las.points) < las.header.point_count:
@@ -81,15 +81,15 @@ def _read_las(path: Path) -> PointCloud:
         return _cloud({name: np.asarray(las[name]) for name in (*names, *"xyz")})
 
 
-def _read_e57(path: Path) -> PointCloud:
+def _read_e57(path: Path) -> _PointCloud:
     """Reads all scans of a .e57, each moved by its pose."""
     with decoding(path, "pye57") as pye57, pye57.E57(str(path)) as file:
         options = {"colors": True, "intensity": True, "ignore_missing_fields": True}
         clouds = [_cloud(file.read_scan(n, **options)) for n in range(file.scan_count)]
-        return PointCloud(*map(np.concatenate, zip(*clouds)))
+        return _PointCloud(*map(np.concatenate, zip(*clouds)))
 
 
-def _read_pcd(path: Path) -> PointCloud:
+def _read_pcd(path: Path) -> _PointCloud:
     with decoding(path, "pypcd4") as pypcd4:
         cloud = pypcd4.PointCloud.from_path(path)
         if len(cloud.pc_data) < cloud.metadata.points:
@@ -97,7 +97,7 @@ def _read_pcd(path: Path) -> PointCloud:
         return _cloud({name: cloud.pc_data[name] for name in cloud.pc_data.dtype.names})
 
 
-def _read_xyz(path: Path) -> PointCloud:
+def _read_xyz(path: Path) -> _PointCloud:
     """Reads a text with a point in each line: columns as a header names them, else x y z, intensity, red green blue."""
     lines = [line.lower().strip(" /#\t\r\n") for line in itertools.islice(read_lines(path), 50)]
     first = next((n for n, line in enumerate(lines) if _NUMBERS.fullmatch(line)), None)
@@ -113,7 +113,7 @@ def _read_xyz(path: Path) -> PointCloud:
     return _cloud(dict(zip(names, table.T)))
 
 
-def read_point_ply(path: Path) -> PointCloud:
+def _read_point_ply(path: Path) -> _PointCloud:
     """Reads a .ply of points."""
     vertices = read_vertices(path)
     return _cloud({name: vertices[name] for name in vertices.dtype.names or ()})
@@ -124,11 +124,11 @@ READERS = (
     Reader("E57", (".e57",), _read_e57),
     Reader("PCD", (".pcd",), _read_pcd),
     Reader("XYZ", (".xyz", ".txt"), _read_xyz),
-    Reader("PLY of points", (".ply",), read_point_ply),
+    Reader("PLY of points", (".ply",), _read_point_ply),
 )
 
 
-def load_point_cloud(path: str | Path) -> PointCloud:
+def load_point_cloud(path: str | Path) -> _PointCloud:
     """Reads a point cloud of any of these formats."""
     path = Path(path)
     reader = next((reader for reader in READERS if reader.fits(path)), None)
