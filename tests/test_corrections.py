@@ -173,15 +173,6 @@ def test_a_known_twist_and_gain_are_found(capture, truth):
     np.testing.assert_allclose(found.colours[train, :, :3], wrong["gains"][train, None, None] * np.eye(3), atol=0.05)
 
 
-def test_a_refining_fit_goes_on_from_a_checkpoint_to_the_same_result(capture, truth):
-    states, given = [], {"steps": 30, "refine": CorrectionRates(), **GIVEN}
-    whole, losses = fit_gaussians(capture, start=truth, on_checkpoint=states.append, **given)
-    stopped, ends = jax.tree.map(np.asarray, states[0]), []
-    again, others = fit_gaussians(capture, start=stopped, on_checkpoint=ends.append, **given)
-    assert same((again, ends[-1].train.corrections), (whole, states[-1].train.corrections))
-    np.testing.assert_array_equal(losses, others)
-
-
 def test_a_rough_capture_is_corrected_and_its_held_out_frames_have_no_part_in_it(capture, truth):
     told = rough(capture, **errors())
     given = {"key": KEY, "visits": 15, "probes": 2, "max_fit_steps": MANY}

@@ -14,11 +14,8 @@ from experiments.simulated_vision.embeddings import (
     LEANING,
     SimulatedEmbedder,
     leanings,
-    made_text_space,
-    named_after,
 )
 from experiments.simulated_vision.worlds import World, seen_in, world_of
-from jsecon.errors import InputError
 from jsecon.read.masks.labels import LabelledFrame
 
 TABLE = 7
@@ -84,17 +81,6 @@ def test_parts_are_the_same_points_in_all_views_that_tell_them_apart(made):
     assert 0.2 < np.mean(cut) < 0.8
 
 
-def test_groups_join_nearest_neighbours(made):
-    room = made[0]
-    _, by_point = seen(made, groups=1)
-    centres = np.stack([item.centre for item in room.objects])
-    away = np.linalg.norm(centres[:, None] - centres, axis=-1) + 9 * np.eye(4)
-    for t in range(6):
-        assert len(np.unique(by_point[t][:960])) < 4
-    a, b = np.unravel_index(away.argmin(), away.shape)
-    assert (by_point[:, 240 * a] == by_point[:, 240 * b]).all()
-
-
 def test_masks_reach_over_the_table_away_from_the_lamp(made):
     room, truth, points, _ = made
     found, _ = seen(made, shadow=1)
@@ -106,34 +92,6 @@ def test_masks_reach_over_the_table_away_from_the_lamp(made):
         own = points[taken & (found.masks == k)][:, :2] - item.centre[:2]
         if len(own):
             assert (own @ (item.centre[:2] - room.light[:2])).mean() > 0
-
-
-def embedded(frames, space, world, noise):  # noqa: F811
-    labels = np.full(frames.shape[:3], -1, np.int16)
-    for k in range(6):
-        labels[:, 4:20, 4 + 13 * k : 14 + 13 * k] = k
-    faults = dataclasses.replace(NONE, view_noise=noise, gap=1.0, gap_along=0.0)
-    turns = np.linspace(0, 2 * np.pi, len(frames), endpoint=False)
-    names = space.names[:6]
-    hard = SimulatedEmbedder(frames, labels, names, space, faults, world=world, azimuths=turns)
-    return np.stack(
-        [hard.embed_regions(frame, labels[t] == np.arange(6)[:, None, None]) for t, frame in enumerate(frames)]
-    )
-
-
-def test_noise_follows_the_azimuth_and_the_gap_the_class(frames, space):  # noqa: F811
-    apart = {}
-    for turning in (0.0, 1.0):
-        rows = embedded(frames, space, World(azimuth=turning), 2.0)
-        off = rows - rows.mean(0)
-        off /= np.linalg.norm(off, axis=-1, keepdims=True)
-        apart[turning] = [float((off * np.roll(off, by, axis=0)).sum(-1).mean()) for by in (1, 4)]
-    assert abs(apart[0.0][0] - apart[0.0][1]) < 0.1
-    assert apart[1.0][0] > apart[1.0][1] + 0.4
-    even, uneven = (embedded(frames, space, World(gap=hard), 0.0) for hard in (0.0, 1.0))
-    np.testing.assert_allclose(uneven, np.broadcast_to(uneven[0], uneven.shape), atol=1e-6)
-    along = even[0].mean(0) - space.vectors[:6].mean(0)
-    assert np.ptp(uneven[0] @ along) > 3 * np.ptp(even[0] @ along)
 
 
 PLAIN = dataclasses.replace(NONE, gap=0.0, gap_along=0.0)
@@ -164,18 +122,6 @@ def test_a_shared_error_is_the_same_in_every_view_and_leans_to_other_classes(spa
     np.testing.assert_allclose(mixture.sum(1), 1)
     np.testing.assert_array_equal((mixture[:, 12:] > 0).sum(1), CONFUSED)
     assert not leanings(("cup", "cup"), 0, seed=0).any()  # no other class: its own text stays
-
-
-def test_names_with_words_in_common_lie_near_each_other_and_real_ones_too(space):  # noqa: F811
-    names = ("dark green mug", "light green mug", "red ball", *(f"word{i}" for i in range(200)))
-    plain, near = (made_text_space(names, common=common).vectors for common in (0.0, 1.0))
-    assert near[0] @ near[1] > near[0] @ near[2] + 0.05
-    assert abs(plain[0] @ plain[1] - plain[0] @ plain[2]) < 0.05
-    lot, near = (named_after(space, list("abcdefgh"), near=n) for n in (False, True))
-    assert lot.names == tuple("abcdefgh")
-    assert (near.vectors @ near.vectors.T).mean() > (lot.vectors @ lot.vectors.T).mean() + 0.01
-    with pytest.raises(InputError, match="9999 or more"):
-        named_after(space, ["a"] * 9999, near=True)
 
 
 def test_things_of_a_kind_are_one_answer_and_camouflage_takes_their_colours():
