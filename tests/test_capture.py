@@ -71,14 +71,6 @@ def test_mixed_exif_orientations_come_upright(tmp_path):
     assert any("7 images were turned upright" in note for note in read.notes)
 
 
-def test_other_images_tell_that_a_program_ignored_exif(tmp_path):
-    """The camera model of the first, on its side, leaves EXIF out: so does that of the second, upside down."""
-    capture = small_capture(3, points=0)
-    write_text_model(capture, tmp_path / "sparse/0")
-    write_turned(capture, tmp_path / "images", [6, 3, 1], upright=False)
-    np.testing.assert_array_equal(load_capture(tmp_path).frames[1], capture.frames[1])
-
-
 @pytest.mark.parametrize(("orientation", "upright"), [(3, False), (6, False), (6, True)])
 def test_poses_of_stored_pixels_keep_them(tmp_path, orientation, upright):
     """By the size of the camera model; where that cannot tell, because COLMAP ignores EXIF."""

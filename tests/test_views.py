@@ -220,8 +220,7 @@ def test_frames_for_masks_are_those_that_show_what_others_do_not():
 
 
 @pytest.mark.parametrize("place", SURROUNDINGS)
-@pytest.mark.parametrize("share", [0.02, 0.13, 0.4, 0.6])
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(("share", "seed"), [(0.02, 0), (0.13, 1), (0.6, 0)])
 def test_far_surroundings_of_any_share_leave_the_frame_as_it_is(object_alone, place, share, seed):
     count = round(object_alone.count * share / (1 - share))
     points = SURROUNDINGS[place](np.random.default_rng(seed), count)

@@ -95,29 +95,26 @@ class _Prober:
 
     key: PRNGKeyArray
     start: Gaussians | None
+    refine: CorrectionRates
     total: int
     progress: Progress | None
     done: int = 0
-
-    def initial(self, capture: Capture) -> Gaussians:
-        """Gaussians that a probe of this capture starts from."""
-        return starting_gaussians(capture, max_points=12_000)[0] if self.start is None else self.start
 
     def report(self, done: int) -> None:
         if self.progress is not None:
             self.progress(min(done, self.total), self.total)
 
     def fit(
-        self,
-        capture: Capture,
-        start: Gaussians,
-        refine: CorrectionRates,
-        size: float,
-        steps: int,
-        rates: LearningRates | None = None,
+        self, capture: Capture, size: float, steps: int, frozen: Gaussians | None = None, *, corrects: bool = True
     ) -> tuple[Gaussians, Corrections]:
-        """A short fit to frames of this size, and the corrections of all frames."""
+        """A short fit to frames of this size, and the corrections of all frames; of a `frozen` scene these alone."""
         states: list[FitState] = []
+        start, rates = self.start if frozen is None else frozen, LearningRates()
+        if start is None:
+            start = starting_gaussians(capture, max_points=12_000)[0]
+        if frozen is not None:
+            still = dict.fromkeys(("log_scales", "quaternions", "opacity_logits", "colors"), 0.0)
+            rates = LearningRates(means=0.0, means_last=0.0, **still)
         # Soft Gaussians render a depth before the surface: as a target, depth would push every camera back.
         ignored = capture.ignored
         if ignored is None:  # one program serves probes and alignments on parts of a frame
@@ -128,8 +125,8 @@ class _Prober:
             key=self.key,
             steps=steps,
             start=start,
-            refine=refine,
-            rates=LearningRates() if rates is None else rates,
+            refine=self.refine if corrects else CorrectionRates(0.0, 0.0),  # which shares the program
+            rates=rates,
             schedule=Schedule(sizes=((size, 1.0),), max_gaussians=0),
             on_checkpoint=lambda state: states.__setitem__(slice(None), [state]),
             progress=lambda done, _: self.report(before + done),
@@ -137,21 +134,11 @@ class _Prober:
         return scene, jax.tree.map(np.asarray, states[0].train.corrections.current)
 
     def align(
-        self,
-        capture: Capture,
-        scene: Gaussians,
-        corrections: Corrections,
-        frames: Bool[np.ndarray, " t"],
-        refine: CorrectionRates,
-        size: float,
-        visits: int,
+        self, capture: Capture, scene: Gaussians, corrections: Corrections, frames: np.ndarray, size: float, visits: int
     ) -> Corrections:
-        """The corrections, with those of `frames` replaced by alignment to the frozen scene."""
+        """The corrections, with those of `frames` (T,) replaced by alignment to the frozen scene."""
         only = dataclasses.replace(capture, held_out=~frames)
-        frozen = LearningRates(
-            means=0.0, means_last=0.0, log_scales=0.0, quaternions=0.0, opacity_logits=0.0, colors=0.0
-        )
-        _, aligned = self.fit(only, scene, refine, size, visits * int(frames.sum()), frozen)
+        _, aligned = self.fit(only, size, visits * int(frames.sum()), scene)
 
         def pick(a, b):
             return np.where(frames.reshape(-1, *[1] * (a.ndim - 1)), b, a)
@@ -197,10 +184,10 @@ def refine_capture(
         remedy = "use more --steps, fewer --frames, or --refine always, which takes longer"
         return _with_notes(capture, f"poses and exposures stay as they are: {problem} ({remedy})")
     steps, held_out = plan.visits * int(train.sum()), int((~train).sum())
-    prober = _Prober(key, start, steps * (plan.probes + 2 * decide) + ALIGN_VISITS * held_out, progress)
+    prober = _Prober(key, start, refine, steps * (plan.probes + 2 * decide) + ALIGN_VISITS * held_out, progress)
     remaining, notes = plan.probes, []
     if decide:
-        corrections, note = _decide(capture, prober, refine, plan, by_depth=by_depth)
+        corrections, note = _decide(capture, prober, plan, by_depth=by_depth)
         if corrections is None:
             return _with_notes(capture, note)
         notes.append(note)
@@ -209,14 +196,14 @@ def refine_capture(
     capture = capture if aligned is None else aligned
     extent = max(cameras_extent(capture.cameras[train]), 1e-6)
     while remaining > 1:
-        _, corrections = prober.fit(capture, prober.initial(capture), refine, plan.coarse_size, steps)
+        _, corrections = prober.fit(capture, plan.coarse_size, steps)
         before, capture = capture, _move_cameras(capture, corrections)
         shift, turn = _pose_changes(before.cameras[train], capture.cameras[train])
         pixels = np.asarray(capture.cameras.fx)[train] * np.hypot(shift / extent, turn)
         remaining = 1 if np.median(pixels) < 0.25 else remaining - 1  # px at full size: the poses are stable
-    scene, corrections = prober.fit(capture, prober.initial(capture), refine, FINE_SIZE, steps)
+    scene, corrections = prober.fit(capture, FINE_SIZE, steps)
     if held_out:
-        corrections = prober.align(capture, scene, corrections, ~train, refine, FINE_SIZE, ALIGN_VISITS)
+        corrections = prober.align(capture, scene, corrections, ~train, FINE_SIZE, ALIGN_VISITS)
     refined = _even_exposures(_move_cameras(capture, corrections), corrections)
     prober.report(prober.total)
     return _with_notes(refined, *notes, *_describe(original, refined, corrections, by_depth=by_depth))
@@ -243,9 +230,7 @@ def _with_poses(capture: Capture, poses: Float[np.ndarray, "t 4 4"]) -> Capture:
     return dataclasses.replace(capture, cameras=cameras)
 
 
-def _decide(
-    capture: Capture, prober: _Prober, refine: CorrectionRates, plan: _Plan, *, by_depth: bool
-) -> tuple[Corrections | None, str]:
+def _decide(capture: Capture, prober: _Prober, plan: _Plan, *, by_depth: bool) -> tuple[Corrections | None, str]:
     """Compares a probe with corrections and one without on training frames kept aside.
 
     Returns:
@@ -267,11 +252,10 @@ def _decide(
     steps = plan.visits * int((~held_out).sum())
     aligned = (_align_by_depth(half, ~held_out, aside) if by_depth else None) or half
     size = plan.coarse_size
-    scene, corrections = prober.fit(aligned, prober.initial(aligned), refine, size, steps)
-    no_correction = CorrectionRates(0.0, 0.0)  # shares the program of a probe with corrections
-    plain_scene, _ = prober.fit(half, prober.initial(half), no_correction, size, steps)
-    corrections = prober.align(aligned, scene, corrections, aside, refine, size, DECIDE_VISITS)
-    plain = prober.align(half, plain_scene, identity_corrections(len(aside)), aside, refine, size, DECIDE_VISITS)
+    scene, corrections = prober.fit(aligned, size, steps)
+    plain_scene, _ = prober.fit(half, size, steps, corrects=False)
+    corrections = prober.align(aligned, scene, corrections, aside, size, DECIDE_VISITS)
+    plain = prober.align(half, plain_scene, identity_corrections(len(aside)), aside, size, DECIDE_VISITS)
     counted = even & ~ignored
     corrected_db = _mean_psnr(scene, aligned, corrections, aside, counted, size)
     plain_db = _mean_psnr(plain_scene, capture, plain, aside, counted, size)

@@ -5,7 +5,6 @@ they stand on orbits. The two kinds are never mixed: from outside a room, the th
 """
 
 import dataclasses
-from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import jax
@@ -94,14 +93,14 @@ def place_cameras(
     places = _free_places(points, frame)
     inside = _interior_cameras(frame, places)
     orbits = _orbit_cameras(frame)
-    total = len(inside) + len(orbits)
-
-    def report(start: int) -> Callable[[int], None]:
-        return lambda done: None if progress is None else progress(start + done, total)
 
     def weights(poses: np.ndarray, start: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        def report(done: int, _: int) -> None:
+            if progress is not None:
+                progress(start + done, len(inside) + len(orbits))
+
         cameras = _cameras(poses, CANDIDATE_WIDTH, CANDIDATE_HEIGHT)
-        return _weights_by_view(gaussians, counted, cameras, frame.diagonal, report(start))
+        return _weights_by_view(gaussians, counted, cameras, frame.diagonal, report)
 
     counted = _Counted.of(gaussians)
     seen, alpha, fog = weights(inside, 0)
@@ -138,12 +137,7 @@ def cover_with(gaussians: Gaussians, cameras: Camera, views: int, progress: Prog
     diagonal = scene_frame(surface_points(gaussians), np.eye(3)[2]).diagonal
     counted = _Counted.of(gaussians)
     small = scale_cameras(cameras, CANDIDATE_WIDTH / max(cameras.width, cameras.height))
-
-    def report(done: int) -> None:
-        if progress is not None:
-            progress(done, len(cameras))
-
-    seen, alpha, fog = _weights_by_view(gaussians, counted, small, diagonal, report)
+    seen, alpha, fog = _weights_by_view(gaussians, counted, small, diagonal, progress)
     usable = np.flatnonzero((alpha >= _LEAST_ALPHA) & (fog < FOG_SHARE))
     shown_px = 0.03 * max(float(seen.sum(0).mean()), 1e-30)  # whatever the number of Gaussians
     chosen = usable[greedy_cover(seen[usable] / SEEN_PX, counted.opacity, views)]
@@ -263,7 +257,7 @@ def _cameras(poses: np.ndarray, width: int, height: int) -> Camera:
 
 
 def _weights_by_view(
-    gaussians: Gaussians, counted: _Counted, cameras: Camera, diagonal: float, report: Callable[[int], None]
+    gaussians: Gaussians, counted: _Counted, cameras: Camera, diagonal: float, progress: Progress | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns the weight of the sample in each small view (V, M), and the mean alpha and the fog of each (V,).
 
@@ -286,7 +280,7 @@ def _weights_by_view(
         wide = widest * cameras.fx[t] > 0.1 * cameras.width * depth
         return shown, weights[counted.inner].sum() / pixels, shown[wide].sum() / max(shown.sum(), 1e-30)
 
-    found = [*each_view(gaussians.count, len(poses), view, lambda done, _: report(done))]
+    found = [*each_view(gaussians.count, len(poses), view, progress)]
     seen = np.array([shown for shown, _, _ in found], np.float32).reshape(len(poses), len(means))
     alpha, fog = np.array([shares for _, *shares in found]).reshape(-1, 2).T
     return seen, alpha, fog

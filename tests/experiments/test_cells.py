@@ -2,44 +2,12 @@
 
 import lzma
 import os
-import subprocess
-import sys
 import warnings
-from pathlib import Path
 
 import pytest
 
 from experiments.cells import append_cell, available_cores, exclusive_lock, read_cells, split_cores
 from jsecon.errors import InputError
-
-ROOT = Path(__file__).parent.parent.parent
-
-# Settings and figures that cost nothing: what is tested is who computes them.
-TABLE = """
-import argparse, os, time
-from pathlib import Path
-from types import SimpleNamespace
-from experiments.tables import fill, twins
-
-def figures(setting, answers):
-    (here / f"{os.getpid()}.here").touch()
-    while len(list(here.glob("*.here"))) < 2:  # for the other process, however long its start takes
-        time.sleep(0.05)
-    return {"miou": 0.5, "process": os.getpid()}
-
-fill.prepare = lambda *a, **k: SimpleNamespace(bench=SimpleNamespace(twin=True), shared=SimpleNamespace(settle=float))
-fill.measure = figures
-parser = argparse.ArgumentParser()
-parser.add_argument("--out")
-parser.add_argument("--processes", type=int)
-given = parser.parse_args()
-here = Path(given.out)
-data = twins.Data("lerf", scenes=("a", "b"), seeds=(0, 1))
-plan = fill.Plan(data, ("x",), sweep=(), out=given.out, processes=given.processes)
-cells = fill.fill(plan, {"x": lambda setting, steps: None}, tell=lambda line: print(os.getpid(), line, flush=True))
-assert [(cell["scene"], cell["seed"]) for cell in cells] == [(s, k) for s in "ab" for k in (0, 1)]
-print("whole", flush=True)
-"""
 
 
 def test_a_writer_killed_within_a_line_costs_that_cell_alone(tmp_path):
@@ -87,24 +55,6 @@ def test_a_lock_is_held_by_one(tmp_path):
         assert first
         assert not second
     assert not file.exists()
-
-
-@pytest.mark.long
-def test_two_processes_share_a_table_and_each_cell_is_computed_once(tmp_path):
-    file, script = tmp_path / "cells.jsonl", tmp_path / "table.py"
-    script.write_text(TABLE)
-    append_cell(file, "of another table", {"miou": 1})  # is left alone
-    command = [sys.executable, str(script), "--out", str(tmp_path), "--processes", "2"]
-    environment = {"PYTHONPATH": str(ROOT)}
-    told = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
-    assert told.returncode == 0, told.stderr
-    lines = told.stdout.splitlines()
-    assert lines.count("whole") == 1, lines  # the processes that share it end without one
-    found = read_cells(file)
-    assert found.pop("of another table") == {"miou": 1}
-    assert len(file.read_text().splitlines()) - 1 == len(found) == len(lines) - 1 == 4, lines
-    assert not list(tmp_path.glob("*.lock"))
-    assert len({cell["process"] for cell in found.values()}) == 2
 
 
 def test_cores_are_shared_out():

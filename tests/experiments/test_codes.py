@@ -5,7 +5,6 @@ from small_field import unit_rows
 
 from experiments.tables.codes import (
     CODE_THRESHOLD,
-    LATENTS,
     Rotation,
     Spread,
     confused_pairs,
@@ -57,13 +56,3 @@ def test_spread_codes_keep_crowded_regions_apart_where_a_rotation_does_not(count
     assert codes[3] @ codes[7] > CODE_THRESHOLD  # one thing seen twice
     assert confused_pairs(units, codes) == 0
     assert not np.asarray(Spread(units, codes).encode(np.zeros(64, np.float32))).any()
-
-
-def test_auto_takes_the_smallest_code_that_keeps_regions_apart():
-    units = crowded(100)
-    codes, coder, _ = region_codes(units, latent="auto", key=KEY)
-    assert isinstance(coder, Rotation | Spread)
-    assert not confused_pairs(units, codes)
-    for smaller in (latent for latent in LATENTS if latent < codes.shape[1]):
-        assert confused_pairs(units, principal_rotation(units, smaller).encode(units))
-        assert confused_pairs(units, spread_codes(units, smaller))

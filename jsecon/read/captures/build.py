@@ -68,18 +68,13 @@ def _resolve_orientations(frames: Sequence[_Frame], posed: PosedImages) -> tuple
 
     A camera model belongs to the stored pixels or to the upright image: COLMAP ignores EXIF, other programs apply it.
     If only one of the two has the model's aspect, it is that one. If both have it (a square, or a turn by 180 degrees),
-    the other images of the capture decide, else the program (`PosedImages.ignores_exif`).
+    the program decides (`PosedImages.ignores_exif`).
     """
-    fits = [_fitting_pixels(frame.image, frame.lens) for frame in frames]
-    ignores_exif = posed.ignores_exif
-    if (True, True) in fits:
-        others = {_fitting_pixels(image.image, image.lens) for image in posed.images if image.image and image.lens}
-        others &= {(True, False), (False, True)}
-        ignores_exif = others == {(True, False)} if others else ignores_exif
     result, stored, turned = [], [], []
-    for frame, (fits_stored, fits_upright) in zip(frames, fits):
+    for frame in frames:
         header = image_header(frame.image)
-        orientation = 1 if fits_stored and (ignores_exif or not fits_upright) else header.orientation
+        fits_stored, fits_upright = (same_aspect(frame.size, size) for size in (header.stored, header.upright))
+        orientation = 1 if fits_stored and (posed.ignores_exif or not fits_upright) else header.orientation
         if orientation != 1:
             turned.append(frame.posed.name)
         elif header.orientation != 1:
@@ -93,15 +88,6 @@ def _resolve_orientations(frames: Sequence[_Frame], posed: PosedImages) -> tuple
     if turned:
         notes.append(f"{len(turned)} images were turned upright by their EXIF orientation (the first: {turned[0]}).")
     return result, notes
-
-
-def _fitting_pixels(image: Path, lens: Lens) -> tuple[bool, bool]:
-    """Whether the stored, and the upright pixels of an image have its lens's aspect; False if it has no orientation."""
-    header = image_header(image)
-    if header.orientation == 1:
-        return False, False
-    size = lens.width, lens.height
-    return same_aspect(size, header.stored), same_aspect(size, header.upright)
 
 
 def _lens_at_size(frame: _Frame, width: int, height: int) -> Lens:

@@ -11,7 +11,7 @@ images (`cam0/<frame>.png`). Any other subfolders stand for objects (`<object>/<
 writes them with --per_obj_png_file).
 
 Masks must be of the frames as the capture was loaded, undistorted. Other sizes of the same aspect are resized
-(nearest), and masks of the stored pixels of photographs are turned upright with them.
+(nearest), and masks of the stored pixels of photographs that lie on their side are turned upright with them.
 
 LangSplat's `<frame>_s.npy` float32 (4, H, W) has ids by level, -1 = none, which are rows of `<frame>_f.npy` float32
 (M, E), unit (minghanqin/LangSplat, preprocess.py). The same thing has another row in each frame.
@@ -130,10 +130,11 @@ def _match_frames(frames: AllFrames) -> _Matcher:
         word = _AFFIX.fullmatch(base)
         keys = [base, _without_image_suffix(base), *([word[1], _without_image_suffix(word[1])] if word else [])]
         for rank, key in enumerate(dict.fromkeys(keys)):
-            fits = [(*_extra_folders(path.parts[:-1], folders), name) for name, folders in by_key.get(key, ())]
-            if fits := sorted(fits):
-                is_unclear = len(fits) > 1 and fits[0][:2] == fits[1][:2]
-                return None if is_unclear else _Match(fits[0][3], "/".join(fits[0][2]), rank, path)
+            fits = [(_extra_folders(path.parts[:-1], folders), name) for name, folders in by_key.get(key, ())]
+            if fits:
+                fewest = min(len(extra) for extra, _ in fits)
+                (extra, name), *others = (fit for fit in fits if len(fit[0]) == fewest)
+                return None if others else _Match(name, "/".join(extra), rank, path)
         return None
 
     return match
@@ -145,15 +146,15 @@ def _without_image_suffix(name: str) -> str:
     return stem if suffix.lower() in IMAGE_SUFFIXES else name
 
 
-def _extra_folders(folders: tuple[str, ...], of_image: tuple[str, ...]) -> tuple[int, int, tuple[str, ...]]:
-    """The folders of a mask that its image does not have: their number, minus the number of others, and they."""
+def _extra_folders(folders: tuple[str, ...], of_image: tuple[str, ...]) -> list[str]:
+    """The folders of a mask that its image does not have."""
     others, extra = list(of_image), []
     for folder in reversed(folders):
         if folder in others:
             others.remove(folder)
         else:
             extra.insert(0, folder)
-    return len(extra), len(extra) - len(folders), tuple(extra)
+    return extra
 
 
 def _find_masks(
