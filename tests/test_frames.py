@@ -13,7 +13,6 @@ from conftest import cameras_of, gaussians_at, look_at
 from jsecon import open_scene, render_rgb
 from jsecon.association.scene import SceneSuperpixels, label_by_regions, one_hot
 from jsecon.poses.resection import MIN_INLIERS, Landmarks, find_pose
-from jsecon.types import Capture
 
 
 def centre(pose):
@@ -119,26 +118,6 @@ def test_a_frame_that_was_forgotten_is_added_again(field, room):
     assert same.mean() > 0.97
     with refused("already"):
         grown.add(room)
-
-
-def test_a_scale_and_an_update_keep_the_ledger(field, tmp_path):
-    scene = open_scene(field)
-    scaled = scene.scaled((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 2.5)
-    scaled.save(tmp_path / "scaled" / "field.safetensors")
-    again = open_scene(tmp_path / "scaled")
-    assert again.field.metres_per_unit == pytest.approx(2.5)
-    assert {*again.ledger.views} == {*scene.ledger.views} == {*scene.as_of("2026-01-01").ledger.views}
-    none_changed = dataclasses.replace(scene.changes(_one_frame(scene)), found=())
-    assert {*scene.update(none_changed, date="2026-01-01").ledger.views} == {*scene.ledger.views}
-
-
-def _one_frame(scene):
-    """A capture of the first frame of a scene, as the scene shows it."""
-    camera = scene.field.cameras[:1]
-    frame = np.clip(np.asarray(render_rgb(scene.field.gaussians, camera[0]).features), 0, 1)
-    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
-    frames = (255 * frame[None]).astype(np.uint8)
-    return Capture(frames, camera, *nothing, np.zeros(1, bool), None, scene.field.source_from_scene, ("later",))
 
 
 def test_the_command_line_forgets_and_adds(field, room, tmp_path, capsys):

@@ -31,24 +31,6 @@ def test_a_planned_render_is_a_render(scene, camera, channels):
     np.testing.assert_allclose(by_plan, whole, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.long
-def test_plans_are_stacked_and_differentiated_through(scene, cameras):
-    features = features_of(scene.count, 3)
-    plans = jax.jit(jax.vmap(lambda camera: plan_view(scene, camera)))(cameras)
-    images = jax.jit(jax.vmap(lambda plan: render_plan(plan, features).features))(plans)
-    for t in range(4):
-        np.testing.assert_allclose(images[t], render(scene, cameras[t], features).features, atol=1e-5)
-
-    def through_plan(gaussians):
-        return (render_plan(plan_view(gaussians, cameras[0]), features).features ** 2).sum()
-
-    def directly(gaussians):
-        return (render(gaussians, cameras[0], features).features ** 2).sum()
-
-    got, expected = jax.jit(jax.grad(through_plan))(scene), jax.jit(jax.grad(directly))(scene)
-    np.testing.assert_allclose(got.means, expected.means, rtol=1e-4, atol=1e-5)
-
-
 def test_a_plan_says_what_it_lacks(scene, camera):
     with pytest.raises(ValueError, match="one row"):
         render_plan(plan_view(scene, camera), features_of(scene.count + 1, 3))
