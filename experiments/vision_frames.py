@@ -27,7 +27,7 @@ from jsecon.association.consensus import track_masks
 from jsecon.association.scene import SceneSuperpixels
 from jsecon.field.evidence import region_votes
 from jsecon.read.captures.frames import evenly_spaced
-from jsecon.views.cover import frames_by_need
+from jsecon.views.plan import frames_by_need
 
 LEAST_PX = 100
 """px of a mask; SAM's generator drops smaller ones"""

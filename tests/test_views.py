@@ -20,9 +20,8 @@ from jsecon.pipeline.stages import Checkpoint, Results, RunContext, StageInput
 from jsecon.splat.sh import C0
 from jsecon.splat.transform import transform_gaussians
 from jsecon.views import plan
-from jsecon.views.cover import frames_by_need
 from jsecon.views.frame import inner_scene, scene_frame, surface_points
-from jsecon.views.plan import place_cameras
+from jsecon.views.plan import frames_by_need, place_cameras
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Models
 

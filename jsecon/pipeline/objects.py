@@ -41,7 +41,7 @@ from jsecon.read.captures.frames import evenly_spaced
 from jsecon.read.masks.masks import load_labels, load_proposals
 from jsecon.splat.render import render_depth
 from jsecon.types import Camera, Capture, Codes, Gaussians, Progress
-from jsecon.views.cover import LEAST_GAIN, frames_by_need
+from jsecon.views.plan import LEAST_GAIN, frames_by_need
 from jsecon.vision.classical import GRANULARITIES, ClassicalSegmenter
 from jsecon.vision.protocols import Segmenter
 from jsecon.vision.surfaces import smooth_depth, surfaces_from_depth
