@@ -1,12 +1,11 @@
 """Cells of tables: kept in one file, also where writers are killed, and shared out among processes."""
 
 import lzma
-import os
 import warnings
 
 import pytest
 
-from experiments.cells import append_cell, available_cores, exclusive_lock, read_cells, split_cores
+from experiments.cells import append_cell, exclusive_lock, read_cells
 from jsecon.errors import InputError
 
 
@@ -55,11 +54,3 @@ def test_a_lock_is_held_by_one(tmp_path):
         assert first
         assert not second
     assert not file.exists()
-
-
-def test_cores_are_shared_out():
-    assert split_cores([0, 1], 2) == [[0], [1]]
-    assert split_cores([3, 5, 8, 9, 11], 2) == [[3, 8, 11], [5, 9]]
-    assert split_cores([4, 7], 5) == [[4], [7], [4], [7], [4]]
-    assert split_cores([], 2) == [[], []]  # unknown: the processes are left where they are
-    assert available_cores() == sorted(os.sched_getaffinity(0))

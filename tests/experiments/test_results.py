@@ -4,7 +4,6 @@ experiments; and the verdicts of the export (the export itself needs torch, and 
 import dataclasses
 import json
 import re
-import sys
 from pathlib import Path
 
 import pytest
@@ -58,20 +57,3 @@ def test_the_readme_names_every_experiment_and_no_other():
     runnable = {path.stem for path in EXPERIMENTS.glob("*.py")} - SHARED
     runnable |= {path.parent.name for path in EXPERIMENTS.glob("*/__main__.py")}
     assert set(re.findall(r"python -m experiments\.(\w+)", TEXT)) == runnable
-
-
-@dataclasses.dataclass(frozen=True)
-class RoomOptions:
-    seeds: tuple[int, ...] = (1, 2)
-    quick: bool = False
-    out: str = ""
-
-
-@pytest.mark.parametrize(("words", "seeds", "folder"), [
-    ("", (1, 2), results.HOME / "results" / "rooms"), ("--seeds 3 4 5", (3, 4, 5), results.HOME / "results" / "rooms"),
-    ("--seeds 3 4 --quick", (0,), results.HOME / "results" / "quick" / "rooms"), ("--quick --out there", (0,), "there"),
-])  # fmt: skip
-def test_options_come_from_the_command_line(words, seeds, folder, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["rooms", *words.split()])
-    options = results.read_options(RoomOptions, "rooms", "Rooms.", {"seeds": (0,)})
-    assert options == RoomOptions(seeds, "--quick" in words, str(folder))

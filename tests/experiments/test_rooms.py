@@ -3,16 +3,15 @@
 import dataclasses
 import json
 
-import cv2
 import jax
 import numpy as np
 import pytest
 from conftest import look_at
 
-from experiments.datasets.plain_room import PALETTE, make_room
-from experiments.rooms import render_views, room_cameras, room_capture, write_room
+from experiments.datasets.plain_room import make_room
+from experiments.rooms import room_capture, write_room
 from experiments.rooms.raycast import trace_rays
-from experiments.rooms.room import Part, crowded_room
+from experiments.rooms.room import Part
 from experiments.rooms.shapes import (
     blocks_segment,
     box,
@@ -127,39 +126,7 @@ def test_a_hollow_is_seen_into_and_lit_from_above_only():
     np.testing.assert_allclose(normal.T, [[0, 0, 1], [-1, 0, 0], [1, 0, 0]], atol=1e-5)
 
 
-# The room.
-
-
-def test_objects_have_one_name_each_and_the_colours_of_their_names():
-    """The mean colour of an object's pixels is nearest, in CIELAB, to the palette's colour of its own name."""
-    room = make_room(0)
-    assert len(room.names) == len(set(room.names)) == 12
-    frames, instances, _ = render_views(room, room_cameras(room, views=3, width=128, height=96))
-    lab = cv2.cvtColor(frames.astype(np.float32).reshape(-1, 1, 3) / 255, cv2.COLOR_RGB2LAB).reshape(*frames.shape)
-    palette = cv2.cvtColor(np.float32(list(PALETTE.values()))[:, None] / 255, cv2.COLOR_RGB2LAB)[:, 0]
-    for k, item in enumerate(room.objects):
-        assert item.name == f"{item.colour} {item.shape}"
-        distance = np.linalg.norm(palette - lab[instances == k].mean(0), axis=1)
-        assert list(PALETTE)[distance.argmin()] == item.colour
-        for other in room.objects[:k]:
-            assert np.linalg.norm(item.centre - other.centre) > item.radius + other.radius
-
-
 # The capture.
-
-
-def test_labels_of_a_crowded_room_join_two_of_a_kind_and_leave_out_what_has_no_name(tmp_path):
-    write_room(tmp_path, crowded_room(0), views=4, width=96, height=72, points=200, holdout=2)
-    told = list(json.loads((tmp_path / "scene.json").read_text())["objects"].values())
-    assert "" in told
-    twice = next(name for name in told if told.count(name) == 2)
-    for frame in load_lerf_labels(tmp_path / "label"):
-        ids = cv2.imread(str(tmp_path / "masks" / f"{frame.name}.png"), cv2.IMREAD_UNCHANGED)
-        assert "" not in frame.objects
-        mask, boxes = frame.objects[twice]
-        both = [k + 1 for k, name in enumerate(told) if name == twice]
-        np.testing.assert_array_equal(mask, np.isin(ids, both))
-        assert len(boxes) == sum((ids == k).any() for k in both)
 
 
 def test_written_room_reads_back_as_an_ordinary_capture(tmp_path, small):

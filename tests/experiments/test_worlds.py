@@ -7,8 +7,6 @@ import pytest
 from experiments.test_simulated import NONE, frames, space  # noqa: F401
 
 from experiments.datasets.plain_room import make_room
-from experiments.datasets.twins import by_kind, camouflaged
-from experiments.rooms.room import TABLE_WOOD, srgb_to_linear
 from experiments.simulated_vision.embeddings import (
     CONFUSED,
     LEANING,
@@ -16,7 +14,6 @@ from experiments.simulated_vision.embeddings import (
     leanings,
 )
 from experiments.simulated_vision.worlds import World, seen_in, world_of
-from jsecon.read.masks.labels import LabelledFrame
 
 TABLE = 7
 """the label after four objects, wall, floor and ceiling"""
@@ -81,19 +78,6 @@ def test_parts_are_the_same_points_in_all_views_that_tell_them_apart(made):
     assert 0.2 < np.mean(cut) < 0.8
 
 
-def test_masks_reach_over_the_table_away_from_the_lamp(made):
-    room, truth, points, _ = made
-    found, _ = seen(made, shadow=1)
-    taken = (found.masks != truth) & (truth == TABLE)
-    assert taken.any()
-    np.testing.assert_array_equal(found.masks[~taken], truth[~taken])
-    np.testing.assert_array_equal(found.content, truth)  # an embedder sees what is there
-    for k, item in enumerate(room.objects):
-        own = points[taken & (found.masks == k)][:, :2] - item.centre[:2]
-        if len(own):
-            assert (own @ (item.centre[:2] - room.light[:2])).mean() > 0
-
-
 PLAIN = dataclasses.replace(NONE, gap=0.0, gap_along=0.0)
 """embeddings are their texts' directions"""
 
@@ -122,18 +106,3 @@ def test_a_shared_error_is_the_same_in_every_view_and_leans_to_other_classes(spa
     np.testing.assert_allclose(mixture.sum(1), 1)
     np.testing.assert_array_equal((mixture[:, 12:] > 0).sum(1), CONFUSED)
     assert not leanings(("cup", "cup"), 0, seed=0).any()  # no other class: its own text stays
-
-
-def test_things_of_a_kind_are_one_answer_and_camouflage_takes_their_colours():
-    room = make_room(0)
-    a = room.objects[0]
-    b = next(item for item in room.objects[1:] if item.shape == a.shape)
-    left, right = (np.arange(80).reshape(8, 10) % 10 == c for c in (1, 7))
-    box = np.zeros((1, 4), np.float32)
-    frame = by_kind(LabelledFrame("f", 10, 8, {a.name: (left, box), b.name: (right, box + 1)}), room)
-    np.testing.assert_array_equal(frame.objects[a.shape][0], left | right)
-    assert frame.objects[a.shape][1].shape == (2, 4)
-    assert camouflaged(room, 0) is room
-    for item in camouflaged(room, 1.0).objects:
-        for part in item.parts:
-            np.testing.assert_allclose(part.albedo, srgb_to_linear(TABLE_WOOD), rtol=1e-6)

@@ -17,7 +17,7 @@ from jsecon.files import describe_substitute, is_output_folder, list_files, read
 from jsecon.read.captures import colmap, nerfstudio, opensfm, rgbd
 from jsecon.read.captures.build import build_capture
 from jsecon.read.captures.frames import FrameOptions, PosedImages
-from jsecon.read.captures.images import IMAGE_SUFFIXES, convert_remedy, is_photograph, unread_format
+from jsecon.read.captures.images import IMAGE_SUFFIXES, convert_remedy, image_header, unread_format
 from jsecon.read.captures.panoramas import cut_panoramas
 from jsecon.read.captures.video import is_video
 from jsecon.read.registry import SCENES, Reader, find_reader
@@ -115,8 +115,21 @@ def _sort_images(path: Path) -> tuple[list[Path], list[Path]]:
         parts = {file: file.relative_to(folder).parts[:-1] for file in inner}
         images = [file for file in inner if not any(_OTHER_IMAGES.search(part.lower()) for part in parts[file])]
     derived = _derived_images(images)
-    photos = [file for file in images if file not in derived and is_photograph(file)]
+    photos = [file for file in images if file not in derived and _is_photograph(file)]
     return photos, sorted({*images}.difference(photos))
+
+
+def _is_photograph(path: Path) -> bool:
+    """Whether the header of an image may be a photograph's: grey of 16 bits is depth, and 1 bit a mask.
+
+    True for files that cannot be read: whoever reads them says why.
+    """
+    if path.suffix.lower() not in (".png", ".tif", ".tiff", ".bmp"):
+        return True
+    try:
+        return image_header(path).mode not in ("1", "I", "F", "I;16", "I;16B", "I;16L")
+    except InputError:
+        return True
 
 
 def _derived_images(images: Sequence[Path]) -> set[Path]:

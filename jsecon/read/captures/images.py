@@ -173,29 +173,17 @@ class _ImageHeader(NamedTuple):
     """The size once the orientation is applied."""
     orientation: int
     """1 to 8."""
+    mode: str
+    """Pillow's, of the kind of pixels."""
 
 
 def image_header(path: str | Path) -> _ImageHeader:
-    """Reads size and orientation of an image file, from its header alone."""
+    """Reads size, orientation and kind of an image file, from its header alone."""
     with _open(Path(path)) as image:
         orientation = _orientation(image)
         width, height = image.size
         upright = (height, width) if orientation > 4 else (width, height)
-        return _ImageHeader((width, height), upright, orientation)
-
-
-def is_photograph(path: Path) -> bool:
-    """Whether the header of an image may be a photograph's: grey of 16 bits is depth, and 1 bit a mask.
-
-    True for files that cannot be read: whoever reads them says why.
-    """
-    if path.suffix.lower() not in (".png", ".tif", ".tiff", ".bmp"):
-        return True
-    try:
-        with _open(path) as image:
-            return image.mode not in ("1", "I", "F", "I;16", "I;16B", "I;16L")
-    except InputError:
-        return True
+        return _ImageHeader((width, height), upright, orientation, image.mode)
 
 
 def size_around(path: Path, cx: object, cy: object) -> tuple[int, int]:
