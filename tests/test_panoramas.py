@@ -146,14 +146,6 @@ def test_a_limit_of_frames_takes_whole_panoramas_and_large_ones_are_shrunk(poses
     assert np.abs(capture.frames[13] - truth).max() < 3
 
 
-@pytest.mark.parametrize("write", WRITERS)
-def test_a_panorama_of_another_aspect_is_refused(poses, tmp_path, write):
-    write_images(tmp_path)
-    write(tmp_path, poses, size=(WIDTH, HEIGHT - 20))
-    with refused(f"{WIDTH}x{HEIGHT - 20}", "twice as wide as high"):
-        load_capture(tmp_path)
-
-
 def test_wide_photographs_are_cut_only_where_their_camera_or_the_user_says_so(poses, tmp_path):
     write_images(tmp_path)
     write_nerfstudio(tmp_path, poses, model="OPENCV")
