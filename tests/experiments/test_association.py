@@ -1,12 +1,11 @@
 """Regions from labels: who holds which pixels of which mask, what that makes of the embeddings; and shared work."""
 
 import dataclasses
-import time
 
 import numpy as np
 
 from experiments.rivals.evidence import Evidence, unit
-from experiments.tables.association import ROWS, Shared, associated, overlaps
+from experiments.tables.association import ROWS, associated, overlaps
 from jsecon.types import Camera
 
 
@@ -44,19 +43,3 @@ def test_a_region_is_the_mean_of_its_masks_by_pixels_or_by_views(scene):
         both.embeddings[0], unit(np.array([5.0, 0, 0, 5])), atol=1e-6
     )  # not the 3 of 10 in view 1
     assert not both.embeddings[1].any()  # two of ten pixels of the two levels
-
-
-def test_shared_work_is_done_once_and_charged_to_each_that_asks():
-    shared, calls = Shared(), []
-
-    def work():
-        calls.append(1)
-        time.sleep(0.05)
-        return np.ones(2)
-
-    assert shared.get("a", work) is shared.get("a", work)
-    assert shared.settle() == 0  # who did it has spent the time already
-    shared.get("a", work)
-    assert shared.settle() > 0
-    assert shared.settle() == 0
-    assert len(calls) == 1
