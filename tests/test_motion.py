@@ -20,7 +20,7 @@ from jsecon.pipeline.scene import plan_capture
 from jsecon.pipeline.stages import KEY_FILE
 from jsecon.poses import sfm
 from jsecon.poses.sfm import find_poses
-from jsecon.read.captures.capture import load_capture, unposed_photographs
+from jsecon.read.captures.capture import load_capture, read_posed_images, unposed_photographs
 
 COUNT = 8
 
@@ -61,6 +61,25 @@ def test_poses_are_found_up_to_a_similarity_and_progress_counts(photos, found):
     poses_are_true(capture.cameras.world_to_camera, photos[1])
     np.testing.assert_allclose(capture.cameras.fx, FOCAL, rtol=0.03)
     assert counts[-1] == (COUNT, COUNT)
+
+
+def test_an_incremental_model_replaces_a_global_one_that_contradicts_matches(photos, found, tmp_path, monkeypatch):
+    import pycolmap
+
+    work = shutil.copytree(found[2], tmp_path / "work", symlinks=True)
+    model = pycolmap.Reconstruction(found[0] / "sparse" / "0")
+    assert sfm._is_consistent(pycolmap, work / "database.db", model, COUNT)
+    image = next(iter(model.images.values()))
+    for index, point in enumerate(image.points2D):  # a photograph whose matches become no points
+        if point.has_point3D():
+            model.delete_observation(image.image_id, index)
+    monkeypatch.setattr(pycolmap, "global_mapping", lambda *_: {0: model})
+    model, count = sfm._map(pycolmap, COUNT, work, lambda *_: None)
+    assert (model.num_reg_images(), count) == (COUNT, 1)
+    (tmp_path / "sparse" / "0").mkdir(parents=True)
+    model.write_binary(tmp_path / "sparse" / "0")
+    poses = {image.name: image.world_to_camera for image in read_posed_images(tmp_path).images}
+    poses_are_true(np.stack([poses[name] for name in sorted(poses)]), photos[1])
 
 
 def test_one_lens_for_the_photographs_of_one_camera_and_focal_length(photos, tmp_path):
