@@ -52,21 +52,6 @@ def test_wrong_usage_is_an_error_object_too(capsys, line):
     assert err == ""
 
 
-def test_debug_shows_where_an_error_came_from(tmp_path, capsys, monkeypatch):
-    line = ["eval", str(tmp_path / "none.safetensors"), "--labels", str(tmp_path), "--out", str(tmp_path)]
-    assert cli.main(line) == 2
-    assert "Traceback" not in capsys.readouterr().err
-    for user, value in ((None, "off"), ("auto", "auto")):  # what the user has set stays
-        monkeypatch.delenv("JAX_TRACEBACK_FILTERING", raising=False)
-        if user:
-            monkeypatch.setenv("JAX_TRACEBACK_FILTERING", user)
-        assert cli.main([*line, "--debug"]) == 2
-        err = capsys.readouterr().err
-        assert "in locate_field" in err
-        assert err.splitlines()[-1].startswith("jsecon: ")
-        assert os.environ["JAX_TRACEBACK_FILTERING"] == value
-
-
 @pytest.mark.skipif(os.name != "posix", reason="pipes of POSIX")
 def test_the_program_ends_quietly_with_the_code_of_a_broken_pipe():
     read, write = os.pipe()

@@ -12,17 +12,15 @@ import importlib
 import inspect
 import io
 import json
-import os
 import re
 import sys
-import traceback
 from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, Union
 
 import tyro
 
 import jsecon
-from jsecon.app.verbs import VERBS, OutputOptions, Verb, VerbResult
+from jsecon.app.verbs import VERBS, Verb, VerbResult
 from jsecon.errors import InputError, describe_error, is_out_of_memory, machine_error
 from jsecon.pipeline.options import check_ranges
 from jsecon.pipeline.progress import Console
@@ -38,16 +36,14 @@ def main(argv: Sequence[str] | None = None) -> int:
       The exit code.
     """
     argv = sys.argv[1:] if argv is None else list(argv)
-    output = OutputOptions("--json" in argv, "--debug" in argv)  # also for a line that cannot be read
+    as_json = "--json" in argv  # also for a line that cannot be read
     try:
         if argv == ["--version"]:
             print(f"jsecon {jsecon.__version__}")
             return 0
         verb = parse(argv)
-        output = verb.output
-        if output.debug:
-            os.environ.setdefault("JAX_TRACEBACK_FILTERING", "off")  # before jax is imported
-        result = _run_verb(verb, Console(sys.stderr if output.json else sys.stdout, sys.stderr))
+        as_json = verb.json
+        result = _run_verb(verb, Console(sys.stderr if as_json else sys.stdout, sys.stderr))
     except SystemExit as stop:  # --help
         return int(stop.code or 0)
     except (KeyboardInterrupt, Exception) as error:
@@ -55,19 +51,19 @@ def main(argv: Sequence[str] | None = None) -> int:
             remedy = "Run the same command again to resume."
             print(f"\njsecon: interrupted. {remedy}", file=sys.stderr)
             result = {"error": InputError("", "interrupted", remedy=remedy)}
-            return _finish(output, result, 130)
+            return _finish(as_json, result, 130)
         if is_out_of_memory(error):
             remedy = "End other programs, or take a machine with more memory."
             error = InputError("", f"memory has no room left ({str(error)[:200]})", remedy=remedy)
         error = machine_error(error, "") or error
         if isinstance(error, InputError):
-            return _finish(output, {"errors": [error]})
+            return _finish(as_json, {"errors": [error]})
         # a bug, whose trace the interpreter prints
         remedy = "Report it with the trace on standard error."
-        _finish(output, {"error": InputError("jsecon", f"internal error: {describe_error(error)}", remedy=remedy)})
+        _finish(as_json, {"error": InputError("jsecon", f"internal error: {describe_error(error)}", remedy=remedy)})
         raise
     then = result.pop("then", lambda: None)
-    code = _finish(output, result)
+    code = _finish(as_json, result)
     with contextlib.suppress(KeyboardInterrupt):  # so a server ends
         then()
     return code
@@ -145,19 +141,17 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__ or error.__context__
 
 
-def _finish(output: OutputOptions, result: VerbResult, code: int = 0) -> int:
-    """Prints errors, and with --json the result, with the last error as "error"; returns 2 if there are any."""
+def _finish(as_json: bool, result: VerbResult, code: int = 0) -> int:
+    """Prints errors, or as JSON the result, with the last error as "error"; returns 2 if there are any."""
     errors = result.get("errors", ())
-    for error in errors:
-        if output.debug:
-            traceback.print_exception(error)
-        if not output.json:
-            print(f"jsecon: {error}", file=sys.stderr)
-    if output.json:
+    if as_json:
         fields = {name: value for name, value in result.items() if name != "errors" or len(errors) > 1}
         if errors:
             fields["error"] = errors[-1]
         print(json.dumps(fields, default=_to_json), flush=True)
+    else:
+        for error in errors:
+            print(f"jsecon: {error}", file=sys.stderr)
     return 2 if errors else code
 
 

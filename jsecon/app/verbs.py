@@ -39,31 +39,21 @@ VerbResult: TypeAlias = dict[str, Any]
 what it could not do besides, under "then" what to do after that is printed."""
 
 
-@dataclasses.dataclass(frozen=True)
-class OutputOptions:
-    """Options of every verb.
-
-    Attributes:
-      json: Prints one JSON object on standard output at the end, with {"error": ...} of message, where, problem,
-        expected and remedy if the verb fails. Everything else goes to standard error.
-      debug: Prints the whole trace of an error.
-    """
-
-    json: Option[bool] = False
-    debug: Option[bool] = False
-
-
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Verb:
     """Base of the verbs, whose classes become frozen dataclasses.
 
     Its help shows the examples, command lines; `extra` is the extra of jsecon that it needs.
+
+    Attributes:
+      json: Prints one JSON object on standard output at the end, with {"error": ...} of message, where, problem,
+        expected and remedy if the verb fails. Everything else goes to standard error.
     """
 
     examples: ClassVar[tuple[str, ...]]
     extra: ClassVar[str] = ""
-    output: OutputOptions = OutputOptions()
+    json: Option[bool] = False
 
     def __init_subclass__(cls) -> None:
         """Makes a dataclass of the class of a verb."""
