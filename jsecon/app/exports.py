@@ -190,7 +190,7 @@ def _is_unsure(records: list[dict[str, Any]], record: dict[str, Any]) -> bool:
 
 def _title(record: dict[str, Any]) -> str:
     """Returns the best name of an object, or "object" where there is no vocabulary."""
-    return record["names"][0]["name"] if record["names"] else "object"
+    return record["name"] or "object"
 
 
 def _words(record: dict[str, Any]) -> str:

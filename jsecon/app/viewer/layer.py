@@ -76,9 +76,7 @@ class SplatLayer:
                 opacities=self._opacity[rows, None],
             )
             self._groups.append((rows, handle))
-        poses = np.asarray(field.cameras.world_to_camera, np.float64)
-        self._rotations = Rotation.from_matrix(poses[:, :3, :3].transpose(0, 2, 1))
-        self._centers = -np.einsum("tji,tj->ti", poses[:, :3, :3], poses[:, :3, 3]) * self.scale
+        self._poses = np.asarray(field.cameras.world_to_camera, np.float64)
         eye, target, up = first_view(field)
         server.scene.set_up_direction(up)
         camera = server.initial_camera
@@ -102,9 +100,10 @@ class SplatLayer:
 
     def go_to(self, client: Any, frame: int) -> None:
         """Moves a viser client to the camera of a frame."""
+        pose = np.linalg.inv(self._poses[frame])
         with client.atomic():
-            client.camera.position = self._centers[frame]
-            client.camera.wxyz = self._rotations[frame].as_quat(scalar_first=True)
+            client.camera.position = pose[:3, 3] * self.scale
+            client.camera.wxyz = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
         client.camera.fov = float(self.fovs[frame])
 
     def draw_length(self, number: int, start: np.ndarray, end: np.ndarray, words: str) -> None:
