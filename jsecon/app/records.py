@@ -145,7 +145,6 @@ class Answer:
       field: The field.
       count: Number of separate objects: 0 if nothing is selected, and 1 where the selection does not tell.
       reason: Why nothing is selected, or not the number that the text says; "" if there is nothing to say.
-      skipped: Part of the work -> why it was not needed.
       objects: With by="relation", the objects that the text names, best first.
       reading: With by="relation", how the text was read; else "".
       viewpoint: From where directions were seen; "" if nothing depends on it.
@@ -161,7 +160,6 @@ class Answer:
     field: LanguageField = dataclasses.field(repr=False)
     count: int = 1
     reason: str = ""
-    skipped: Mapping[str, str] = dataclasses.field(default_factory=dict)
     objects: tuple[Object, ...] = ()
     reading: str = ""
     viewpoint: str = ""
@@ -227,7 +225,6 @@ class Answer:
             "outliers": {"dropped": selected - len(self.rows), "selected": selected},
             "place": self._place_record() if len(self.rows) else None,
             "reason": self.reason,
-            "skipped": dict(self.skipped),
             **world_record(self.field),
             "frame_size": [self.field.cameras.width, self.field.cameras.height],
         }

@@ -395,7 +395,7 @@ class Scene:
         if isinstance(question, Box | Mask):
             return self._answer_outline(query, question)
         if isinstance(question, Region):
-            return self._answer_region(query, question.id, "the region is the query")
+            return self._answer_region(query, question.id)
         index = self.frame_index(question.frame)
         name = self.field.names[index]
         cameras = self.field.cameras
@@ -406,7 +406,7 @@ class Scene:
             remedy = "Choose another pixel or frame: report.html of the run shows the regions."
             raise InputError(f"frame {name}", problem, remedy=remedy)
         query = dataclasses.replace(query, question=At(name, x, y))
-        return self._answer_region(query, region, "the region under the pixel is the query")
+        return self._answer_region(query, region)
 
     def _answer_text(self, query: Query) -> Answer:
         """Selects the Gaussians that a text names."""
@@ -423,14 +423,14 @@ class Scene:
         found = answer_question(field, texts, rules, excluded=without, outliers=query.outliers)
         warnings = [] if found[1].mask.any() else run_warnings(field)
         reason = " ".join(["no region matches it; the run warned:", *warnings]).rstrip(".") if warnings else ""
-        return self._finish(query, found, {}, reason)
+        return self._finish(query, found, reason)
 
-    def _answer_region(self, query: Query, region: int, why: str) -> Answer:
+    def _answer_region(self, query: Query, region: int) -> Answer:
         """Selects the Gaussians of a region, and of those that the query's options add to it."""
         found = answer_question(self.field, region, self._rules(query, ONE_REGION), outliers=query.outliers)
         last = (self.field.regions.count if self.field.tree is None else len(self.field.tree)) - 1
         reason = "" if 0 <= region <= last else f"there is no region {region}: the regions are 0 to {last}"
-        return self._finish(query, found, {"text encoder": why}, reason)
+        return self._finish(query, found, reason)
 
     def wider(self, region: Region) -> Region | None:
         """What a region belongs to: the next larger thing that views see as one; None if nothing larger is known.
@@ -470,11 +470,9 @@ class Scene:
         box = isinstance(question, Box)
         question = dataclasses.replace(question, frame=next(iter(named))) if box else Mask(named)
         query = dataclasses.replace(query, question=question)
-        return self._finish(query, (selection, outliers, 1), {"text encoder": "the outline is the query"})
+        return self._finish(query, (selection, outliers, 1))
 
-    def _finish(
-        self, query: Query, found: tuple[Selection, OutlierResult, int], skipped: dict[str, str], reason: str = ""
-    ) -> Answer:
+    def _finish(self, query: Query, found: tuple[Selection, OutlierResult, int], reason: str = "") -> Answer:
         """The answer of a query whose Gaussians were selected and trimmed: these, and the number of objects."""
         selection, outliers, count = found
         return Answer(
@@ -485,7 +483,6 @@ class Scene:
             self.field,
             count=count if outliers.mask.any() else 0,
             reason=reason,
-            skipped=skipped | ({"DBSCAN": outliers.skipped} if outliers.skipped else {}),
         )
 
     def relate(self, text: str, *, frame: int | str | None = None) -> Answer:

@@ -68,7 +68,7 @@ class _Answered(NamedTuple):
     selection: Selection
     """The Gaussians of the regions that match."""
     outliers: OutlierResult
-    """The mask of the selection without outliers, and how many clusters stay."""
+    """The mask of the selection without outliers, and the number of its clusters."""
     objects: int
     """Number of separate objects: groups of regions that overlap, at most as many as there are clusters."""
 
@@ -101,7 +101,7 @@ def answer_question(
     count, overlap = 1, field.votes.overlap
     if overlap is not None and node is None and rules.code_threshold is None:
         groups = join_fragments(np.flatnonzero(match.chosen), np.asarray(overlap))
-        count = max(1, min(len(groups), kept.clusters_kept))
+        count = max(1, min(len(groups), kept.clusters))
     return _Answered(selection, kept, count)
 
 
@@ -234,7 +234,7 @@ def _select_from_votes(votes: Votes, match: RegionMatch, min_share: Number) -> S
 def trim(field: LanguageField, selection: Selection, keep: str | None = "supported") -> OutlierResult:
     """Drops the selected Gaussians that lie apart (`remove_outliers`); None in `keep` drops none. Host code."""
     if keep is None:
-        return OutlierResult(np.asarray(selection.mask), "outliers are kept", 0)
+        return OutlierResult(np.asarray(selection.mask), 0)
     weight = np.clip(np.asarray(selection.similarity), 0.0, 1.0) * np.asarray(field.votes.total)
     return split_outliers(field.gaussians.means, selection.mask, keep=keep, weight=weight)
 

@@ -24,14 +24,12 @@ MIN_SAMPLES = 10
 
 
 class OutlierResult(NamedTuple):
-    """A selection without its outliers, and how many clusters stay."""
+    """A selection without its outliers."""
 
     mask: Bool[np.ndarray, " n"]
     """The Gaussians that stay."""
-    skipped: str
-    """Why DBSCAN was not needed; empty if it was."""
-    clusters_kept: int
-    """Clusters that stay."""
+    clusters: int
+    """Clusters that stay; 0 if there is none."""
 
 
 def remove_outliers(
@@ -75,7 +73,7 @@ def split_outliers(
     keep: str = "supported",
     eps: float | None = None,
 ) -> OutlierResult:
-    """Removes outliers as `remove_outliers` does, and reports what became of the clusters."""
+    """Removes outliers as `remove_outliers` does, and counts the clusters that stay."""
     require_one_of("remove_outliers", keep, ("largest", "supported", "all"), "Use 'all' to keep several objects.")
     remedy = "Leave eps out to have it follow the selection's spacing."
     require(eps is None or eps > 0, "remove_outliers", f"eps={eps}", "eps > 0", remedy)
@@ -88,13 +86,13 @@ def split_outliers(
     mask[chosen[~finite]] = False
     chosen, points = chosen[finite], points[finite]
     if len(chosen) < MIN_SAMPLES:
-        return OutlierResult(mask, f"fewer than {MIN_SAMPLES} Gaussians are selected", 0)
+        return OutlierResult(mask, 0)
     eps = _default_eps(points) if eps is None else eps
     if _one_component(points, eps):  # then nothing lies apart, and DBSCAN is not needed
-        return OutlierResult(mask, "the selection is one component", 1)
+        return OutlierResult(mask, 1)
     labels = _dbscan(points, eps)
     if labels.max() < 0:
-        return OutlierResult(mask, "", 0)
+        return OutlierResult(mask, 0)
     clustered = labels >= 0
     sizes = np.bincount(labels[clustered])
     stays = np.ones(len(sizes), bool)
@@ -105,7 +103,7 @@ def split_outliers(
         support = np.bincount(labels[clustered], np.nan_to_num(support[clustered], posinf=0.0))
         stays = support >= 0.1 * support.max()
     mask[chosen[~(clustered & stays[labels])]] = False
-    return OutlierResult(mask, "", int(stays.sum()))
+    return OutlierResult(mask, int(stays.sum()))
 
 
 def _default_eps(points: Float[Array, "m 3"]) -> float:
