@@ -16,10 +16,13 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from jsecon.app.catalogue import Catalogue
-from jsecon.app.records import Answer, Object, Query, rounded, source_points
+from jsecon.app.records import Answer, Object, Query, rounded, source_points, source_shapes
 from jsecon.errors import InputError
+from jsecon.field.columns import votes_of_rows
+from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction_of_regions
 from jsecon.query.answer import RegionMatch, match_regions
 from jsecon.query.expressions import ANY_OBJECT, parse_expression
+from jsecon.query.object_shapes import ObjectShapes
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.referring import evaluate
 from jsecon.query.relations import Viewpoint, order_values, viewpoint
@@ -82,6 +85,8 @@ class ObjectIndex:
         poses = transform_poses(np.asarray(field.cameras.world_to_camera), np.asarray(field.source_from_scene))
         self._cameras = dataclasses.replace(jax.tree.map(np.asarray, field.cameras), world_to_camera=poses)
         self._rules = QueryRules(all_of_class=True)
+        self._votes = jax.tree.map(np.asarray, field.votes)
+        self._measured = functools.lru_cache(1024)(self._measure)
         self._objects_of = functools.lru_cache(1024)(self._find_objects)
 
     def _find_objects(self, phrase: str) -> tuple[list[Object], float]:
@@ -93,7 +98,8 @@ class ObjectIndex:
         listed = self._catalogue
         if phrase == ANY_OBJECT:
             things = np.flatnonzero(~listed.surroundings).tolist()
-            return [self._object(str(listed.names[n, 0]) or f"object {n}", n) for n in things], np.nan
+            named = [self._object(str(listed.names[n, 0]) or f"object {n}", n) for n in things]
+            return [found for found in named if len(found.rows)], np.nan
         texts = choose_shades(self._field, self._embedder, [phrase], self._rules, every=True)
         embedded = jax.device_put(self._embedder.embed_text(texts))
         match = match_regions(self._field, embedded, self._rules)
@@ -101,17 +107,33 @@ class ObjectIndex:
         owners = listed.regions[regions]
         named = set(owners[self._is_best_name(texts, regions)].tolist()) - {-1}
         things = sorted(named or set(owners.tolist()) - {-1})
-        return [self._object(phrase, n, int(match.state)) for n in things], float(match.rank)
+        found = [self._object(phrase, n, int(match.state)) for n in things]
+        return [one for one in found if len(one.rows)], float(match.rank)
 
     def _object(self, phrase: str, index: int, state: int = FOUND) -> Object:
-        """An object of the catalogue by its id, without the Gaussians that stand apart from it."""
-        listed = self._catalogue
-        mask = listed.mask(index)
-        means, weight = np.asarray(self._field.gaussians.means), np.asarray(self._field.votes.total)
-        rows = np.flatnonzero(remove_outliers(means, mask, keep="supported", weight=weight))
-        regions = tuple(np.flatnonzero(listed.regions == index).tolist())
-        shape = listed.shapes[index : index + 1]
-        return Object(phrase, regions, rows, shape, sure=bool(listed.sure[index]), state=state)
+        """An object of the catalogue by its id."""
+        regions, rows, shape = self._measured(index)
+        return Object(phrase, regions, rows, shape, sure=bool(self._catalogue.sure[index]), state=state)
+
+    def _measure(self, index: int) -> tuple[tuple[int, ...], np.ndarray, ObjectShapes]:
+        """Regions of an object, its Gaussians, and their shape: without its parts, and what stands apart from it."""
+        regions = tuple(np.flatnonzero(self._catalogue.regions == index).tolist())
+        voters = np.unique(np.concatenate([self._voters[region] for region in regions]))
+        share = inside_fraction_of_regions(votes_of_rows(self._votes, voters), regions).fraction
+        rows, share = voters[share >= SHARE_THRESHOLD], share[share >= SHARE_THRESHOLD]
+        means, weight = np.asarray(self._field.gaussians.means)[rows], share * self._votes.total[rows]
+        rows = rows[remove_outliers(means, np.ones(len(rows), bool), keep="supported", weight=weight)]
+        return regions, rows, source_shapes(self._field, rows, np.zeros(len(rows), int), self._catalogue.up)
+
+    @functools.cached_property
+    def _voters(self) -> list[np.ndarray]:
+        """The Gaussians that have votes for each region, rising."""
+        regions = self._votes.regions
+        count = self._field.regions.count
+        owners = np.where((regions >= 0) & (regions < count), regions, count).ravel()
+        order = np.argsort(owners.astype(np.uint16 if count < 1 << 16 else np.int32), kind="stable")
+        ends = np.cumsum(np.bincount(owners, minlength=count + 1))[:count]
+        return np.split(order // regions.shape[1], ends)[:count]
 
     def _is_best_name(self, texts: Sequence[str], regions: np.ndarray) -> np.ndarray:
         """Which regions no other name of the vocabulary fits better than the text; all, if there is no vocabulary.
