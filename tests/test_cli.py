@@ -127,7 +127,7 @@ def test_what_is_not_given_has_the_default_of_the_dataclass():
     ("query f x --out o --threshold a", "--threshold does not take 'a'"),
     ("run c --out o --steps 1.5", "--steps does not take '1.5'"),
     ("query f x --out o --by magic", "'votes'"), ("query f --out o --at 0 1", "--at'. Expected 3"),
-    ("query f x --out", "--out'. Expected 1"), ("models look x", "'check'"),
+    ("query f x --out", "--out'. Expected 1"), ("models look x", "'get'"),
 ])  # fmt: skip
 def test_a_wrong_line_is_one_sentence_and_exit_code_2(capsys, line, says):
     assert run_cli(*line.split()) == 2
