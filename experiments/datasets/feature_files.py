@@ -10,8 +10,7 @@ from jaxtyping import Float, Int
 
 from jsecon.errors import InputError
 from jsecon.files import atomic_write, map_npy, reading, write_text
-from jsecon.read.masks.masks import LEVELS, _compact_ids, _read_level, _Source
-from jsecon.read.registry import Reader
+from jsecon.read.masks.masks import LEVELS, _compact_ids, _read_level, resize_nearest
 from jsecon.vision.protocols import CANONICAL
 
 
@@ -40,16 +39,15 @@ class FrameMasks(NamedTuple):
 def load_features(folder: Path, names: Sequence[str], size: tuple[int, int], *, level: str = "l") -> FrameMasks:
     """Reads one level of the masks of frames as labels (H, W), with their embeddings; without masks that vanish at this
     size."""
-    source = _Source(folder, names, size, level, None, (Reader("LangSplat", ("_s.npy",), _read_level),))
     remedy = "Run LangSplat's preprocess.py on every frame."
-    if source.missing:
-        raise InputError(folder / f"{source.missing[0]}_s.npy", "there is no such file", remedy=remedy)
     labels = np.full((len(names), *size), -1, np.int32)
     rows: list[np.ndarray] = []
     for t, name in enumerate(names):
-        path, ids = source.read(name)
-        file = path.with_name(path.name[: -len("_s.npy")] + "_f.npy")
-        kept, index = _compact_ids(path, np.asarray(ids))
+        path, file = (folder / f"{name}_{kind}.npy" for kind in "sf")
+        if not path.is_file():
+            raise InputError(path, "there is no such file", remedy=remedy)
+        ids = _read_level(path, size, level)
+        kept, index = _compact_ids(path, ids if ids.shape == size else resize_nearest(ids, size[1], size[0]))
         with reading(file, "a row for each id of the _s.npy beside it", remedy):
             table = map_npy(file)[kept]
         labels[t] = np.where(index >= 0, index + sum(map(len, rows)), -1)

@@ -332,24 +332,15 @@ def _read_files(
 class _Source:
     """The masks of a folder, or of a COCO file, frame by frame at the size of the frames."""
 
-    def __init__(
-        self,
-        folder: Path,
-        names: Sequence[str],
-        size: tuple[int, int],
-        level: str,
-        frames: AllFrames | None,
-        formats: Sequence[Reader] = (),
-    ):
+    def __init__(self, folder: Path, names: Sequence[str], size: tuple[int, int], level: str, frames: AllFrames | None):
         self.size, self.frames = size, frames or dict.fromkeys(names)
         self.resized = self.turned = 0
         self.notes: list[str] = []
         match = _match_frames(self.frames)
-        coco = None if formats else open_coco(folder, match)
-        if coco is None:
-            formats = formats or readers("jsecon.masks", READERS)
-            coco, self.notes = _find_masks(folder, self.frames, match, formats, level)
-        self.readers: dict[str, ReadMasks] = coco
+        found = open_coco(folder, match)
+        if found is None:
+            found, self.notes = _find_masks(folder, self.frames, match, readers("jsecon.masks", READERS), level)
+        self.readers: dict[str, ReadMasks] = found
         self.missing = [name for name in names if name not in self.readers]
         if len(self.missing) == len(names):
             problem = f"it has masks, but of none of the {len(names)} frames in use"
