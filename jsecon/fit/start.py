@@ -6,6 +6,7 @@ Depth frames are back-projected, and become one point per voxel.
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from jsecon.errors import InputError, require
 from jsecon.fit.triangulate import MIN_POINTS, triangulated_points
@@ -15,6 +16,11 @@ from jsecon.types import Capture, Gaussians, Progress
 FEW_POINTS = 300
 """Sparse points of a capture for a megapixel of its frames, below which points of matches join them: structure from
 motion of panoramas keeps few."""
+ENOUGH_POINTS = 1000, 10_000
+"""Points for a megapixel, and in all, up to which pixels at the depth of their neighbours join those. A made-up room of
+bare walls without points has 30.4 dB after 400 steps, 22.8 without these."""
+NEIGHBOURS = 5
+"""Known points nearest to a pixel, the median of whose depths it takes."""
 
 
 class _DepthPoints(NamedTuple):
@@ -71,6 +77,38 @@ def points_from_depth(
     return _DepthPoints(mean.astype(np.float32), np.rint(color).astype(np.uint8), float(voxel))
 
 
+def points_between(capture: Capture, points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Places pixels of the training frames, drawn at random, at the depth of the known points that are nearest there.
+
+    Surfaces without texture have no points of their own, but often the depth of what lies around them.
+
+    Returns:
+      At most `count` points (P, 3) float32 and their colours (P, 3) uint8: none of frames that show too few points, and
+      none of ignored pixels.
+    """
+    rng, train = np.random.default_rng(0), np.flatnonzero(~np.asarray(capture.held_out))
+    height, width = np.shape(capture.frames)[1:3]
+    found = [(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))]
+    for t, number in zip(train, np.bincount(np.arange(count) % len(train), minlength=len(train))):
+        camera, pose = capture.cameras[int(t)], np.asarray(capture.cameras.world_to_camera[t], np.float64)
+        focal, centre = np.array([camera.fx, camera.fy], np.float64), np.array([camera.cx, camera.cy], np.float64)
+        seen = points @ pose[:3, :3].T + pose[:3, 3]
+        seen = seen[seen[:, 2] > 0]
+        at = seen[:, :2] / seen[:, 2:] * focal + centre
+        near = (np.abs(at / (width, height) - 0.5) < 1).all(1)  # half of a frame around it, too
+        pixels = rng.integers(0, (height, width), (number, 2))
+        if capture.ignored is not None:
+            pixels = pixels[~np.asarray(capture.ignored[t])[*pixels.T]]
+        if near.sum() < NEIGHBOURS:
+            continue
+        places = pixels[:, ::-1] + 0.5
+        depth = np.median(seen[near, 2][cKDTree(at[near]).query(places, NEIGHBOURS)[1]], axis=1)[:, None]
+        world = (np.hstack([(places - centre) / focal * depth, depth]) - pose[:3, 3]) @ pose[:3, :3]
+        found.append((world.astype(np.float32), np.asarray(capture.frames[t])[*pixels.T]))
+    world, colors = (np.concatenate(columns) for columns in zip(*found))
+    return world, colors
+
+
 def starting_gaussians(
     capture: Capture,
     *,
@@ -81,7 +119,7 @@ def starting_gaussians(
     """Makes the Gaussians that a fit of `capture` starts from, and a clause on where they come from.
 
     Points come from depth frames where there are any, else from the capture's sparse points. Where these are few,
-    others are triangulated from the training frames.
+    others are triangulated from the training frames, and put between all of these (`points_between`).
 
     The scale (in units of the distance to the neighbours) is smaller and the opacity larger than INRIA's 1 and 0.1.
     Measured with the same number of steps: the demo room (seed 0, 400 steps) has 32.6 dB held out with opacity 0.8 and
@@ -94,7 +132,7 @@ def starting_gaussians(
       max_points: Maximum number of points from depth frames.
       progress: Called with the number of frames and pairs triangulated and of all.
     """
-    count = len(capture.points)
+    count, megapixels = len(capture.points), np.prod(np.shape(capture.frames)[:3]) / 1e6
     if capture.depths is not None:
         cloud = points_from_depth(capture, max_points=max_points, stride=2)
         gaussians = gaussians_from_points(
@@ -103,7 +141,7 @@ def starting_gaussians(
         origin = f"{len(cloud.points)} points from the depth frames, one per voxel of {cloud.voxel:.3g} world units"
         return gaussians, origin
     points, colors, origin = capture.points, capture.point_colors, f"{count} sparse points of the capture"
-    if count < max(MIN_POINTS, FEW_POINTS * np.prod(capture.frames.shape[:3]) / 1e6):
+    if count < max(MIN_POINTS, FEW_POINTS * megapixels):
         few = f"only {count} points" if count else "no points"
         try:
             found = triangulated_points(capture, progress=progress)
@@ -114,4 +152,8 @@ def starting_gaussians(
         except InputError:  # no more can be had
             if count < MIN_POINTS:
                 raise
+        enough = min(round(ENOUGH_POINTS[0] * megapixels), ENOUGH_POINTS[1])
+        more = points_between(capture, np.asarray(points), max(0, enough - len(points)))
+        points, colors = (np.concatenate(pair) for pair in zip((points, colors), more))
+        origin += f"; {len(more[0])} put between them" if len(more[0]) else ""
     return gaussians_from_points(points, colors, opacity=0.7, scale=0.6, sh_degree=sh_degree), origin
