@@ -246,7 +246,7 @@ def _frames_around(field: LanguageField, rows: Int[np.ndarray, " m"]) -> Bool[np
         return np.zeros(len(field.names), bool)
     means = np.asarray(field.gaussians.means)[rows]
     corners = np.stack(np.meshgrid(*np.stack([means.min(0), means.max(0)], 1)), -1).reshape(-1, 3)
-    return points_in_view(field.cameras, corners).all(1)
+    return np.all(points_in_view(field.cameras, corners), axis=1)
 
 
 def _vocabulary(

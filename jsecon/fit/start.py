@@ -6,7 +6,7 @@ Depth frames are back-projected, and become one point per voxel.
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jsecon.errors import InputError, require
 from jsecon.fit.triangulate import MIN_POINTS, triangulated_points
@@ -102,7 +102,7 @@ def points_between(capture: Capture, points: np.ndarray, count: int) -> tuple[np
         if near.sum() < NEIGHBOURS:
             continue
         places = pixels[:, ::-1] + 0.5
-        depth = np.median(seen[near, 2][cKDTree(at[near]).query(places, NEIGHBOURS)[1]], axis=1)[:, None]
+        depth = np.median(seen[near, 2][KDTree(at[near]).query(places, NEIGHBOURS)[1]], axis=1)[:, None]
         world = (np.hstack([(places - centre) / focal * depth, depth]) - pose[:3, 3]) @ pose[:3, :3]
         found.append((world.astype(np.float32), np.asarray(capture.frames[t])[*pixels.T]))
     world, colors = (np.concatenate(columns) for columns in zip(*found))
