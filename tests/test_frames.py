@@ -10,7 +10,7 @@ from balls import ring_of_balls
 from capture_files import refused, run_cli
 from conftest import cameras_of, gaussians_at, look_at
 
-from jsecon import open_scene, render_rgb
+from jsecon import load_capture, open_scene, render_rgb
 from jsecon.association.scene import SceneSuperpixels, label_by_regions, one_hot
 from jsecon.poses.resection import MIN_INLIERS, Landmarks, find_pose
 
@@ -118,6 +118,21 @@ def test_a_frame_that_was_forgotten_is_added_again(field, room):
     assert same.mean() > 0.97
     with refused("already"):
         grown.add(room)
+
+
+def test_ignored_pixels_of_a_new_frame_count_nowhere(field, room):
+    scene = open_scene(field)
+    name = list(scene.ledger.views)[2]
+    less, capture = scene.forget([name]), load_capture(room)
+    ignored = np.zeros(np.shape(capture.frames)[:3], bool)
+    ignored[:, :, : ignored.shape[2] // 2] = True
+    whole = less.add(capture, masks=room / "masks")
+    part = less.add(dataclasses.replace(capture, ignored=ignored), masks=room / "masks")
+    t = part.field.names.index(name)
+    pixels = [np.asarray(s.field.regions.pixel_counts)[:, t].sum() for s in (part, whole)]
+    weight = [np.asarray(s.field.votes.total, np.float64).sum() for s in (less, part, whole)]
+    assert 0 < pixels[0] < pixels[1]
+    assert 0.3 < (weight[1] - weight[0]) / (weight[2] - weight[0]) < 0.7
 
 
 def test_the_command_line_forgets_and_adds(field, room, tmp_path, capsys):

@@ -1,1 +1,1 @@
-"""Gaussians from images: their start (start, depth, triangulate), the loss (photometric), and the fit (optimise)."""
+"""Gaussians from images: their start (start, triangulate), the loss (photometric), and the fit (optimise)."""

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from jsecon.errors import InputError, require
 from jsecon.fit.triangulate import MIN_POINTS, triangulated_points
 from jsecon.splat.points import gaussians_from_points, voxel_for, voxel_ids, voxel_means
-from jsecon.types import Capture, Gaussians, Progress
+from jsecon.types import Camera, Capture, Gaussians, Progress
 
 FEW_POINTS = 300
 """Sparse points of a capture for a megapixel of its frames, below which points of matches join them: structure from
@@ -47,11 +47,17 @@ def back_project_frame(capture: Capture, frame: int, stride: int):
     rows, columns = np.nonzero(np.isfinite(depth) & (depth > 0))
     z = depth[rows, columns]
     rows, columns = rows * stride, columns * stride
-    x = (columns + 0.5 - float(camera.cx)) / float(camera.fx) * z
-    y = (rows + 0.5 - float(camera.cy)) / float(camera.fy) * z
+    pixels = np.stack([rows, columns], axis=1)
+    return _back_project(camera, pixels, z), np.asarray(capture.frames[frame])[rows, columns], pixels
+
+
+def _back_project(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """World points (S, 3) float64 of pixels (S, 2) row, column of one camera, at depths (S,)."""
+    rows, columns = pixels.T
+    x = (columns + 0.5 - float(camera.cx)) / float(camera.fx) * depth
+    y = (rows + 0.5 - float(camera.cy)) / float(camera.fy) * depth
     pose = np.asarray(camera.world_to_camera, np.float64)
-    world = (np.stack([x, y, z], axis=1) - pose[:3, 3]) @ pose[:3, :3]
-    return world, np.asarray(capture.frames[frame])[rows, columns], np.stack([rows, columns], axis=1)
+    return (np.stack([x, y, depth], axis=1) - pose[:3, 3]) @ pose[:3, :3]
 
 
 def points_from_depth(
@@ -78,7 +84,7 @@ def points_from_depth(
 
 
 def points_between(capture: Capture, points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Places pixels of the training frames, drawn at random, at the depth of the known points that are nearest there.
+    """Makes points of pixels of the training frames, drawn at random, at the depth of the known points nearest to them.
 
     Surfaces without texture have no points of their own, but often the depth of what lies around them.
 
@@ -101,9 +107,8 @@ def points_between(capture: Capture, points: np.ndarray, count: int) -> tuple[np
             pixels = pixels[~np.asarray(capture.ignored[t])[*pixels.T]]
         if near.sum() < NEIGHBOURS:
             continue
-        places = pixels[:, ::-1] + 0.5
-        depth = np.median(seen[near, 2][KDTree(at[near]).query(places, NEIGHBOURS)[1]], axis=1)[:, None]
-        world = (np.hstack([(places - centre) / focal * depth, depth]) - pose[:3, 3]) @ pose[:3, :3]
+        nearest = KDTree(at[near]).query(pixels[:, ::-1] + 0.5, NEIGHBOURS)[1]
+        world = _back_project(camera, pixels, np.median(seen[near, 2][nearest], axis=1))
         found.append((world.astype(np.float32), np.asarray(capture.frames[t])[*pixels.T]))
     world, colors = (np.concatenate(columns) for columns in zip(*found))
     return world, colors

@@ -8,16 +8,16 @@ from typing import Any, NamedTuple, cast
 import cv2
 import jax
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 from scipy import sparse
 
 from jsecon.association.scene import FrameSuperpixels, SceneSuperpixels, label_by_regions
 from jsecon.errors import InputError, join_first
-from jsecon.field.evidence import pack_evidence, view_evidence
+from jsecon.field.evidence import IGNORED, pack_evidence, view_evidence
 from jsecon.field.ledger import Ledger, LedgerView, camera_row, view_order
 from jsecon.field.membership import LABELLED_PART, SHARE_THRESHOLD
 from jsecon.files import parse_json
-from jsecon.fit.resize import resize_camera, resize_frame
+from jsecon.fit.resize import resize_camera, resize_frame, resize_mask
 from jsecon.poses.resection import MIN_INLIERS, Landmarks, find_pose
 from jsecon.read.captures.build import build_capture
 from jsecon.read.captures.capture import lone_photographs, read_posed_images
@@ -40,6 +40,8 @@ class _NewFrame(NamedTuple):
     pixels: UInt8[np.ndarray, "h w 3"]
     camera: Camera
     """In the field's world."""
+    ignored: Bool[np.ndarray, "h w"] | None = None
+    """Pixels that count nowhere."""
 
 
 def read_frames(
@@ -67,7 +69,10 @@ def read_frames(
     rows = _without_known(field, capture.names, range(len(capture.names)))
     frames = {}
     for done, (name, t) in enumerate(rows.items()):
-        frames[name] = _sized(field, np.asarray(capture.frames[t]), cameras[t])
+        frame = _sized(field, np.asarray(capture.frames[t]), cameras[t])
+        if capture.ignored is not None:
+            frame = frame._replace(ignored=resize_mask(np.asarray(capture.ignored[t]), frame.camera))
+        frames[name] = frame
         progress(done + 1, len(rows))
     return frames
 
@@ -164,7 +169,7 @@ def make_views(
     # Without masks from outside, leftovers that many views left without a region stay so.
     unknown = (owner < 0) if masks is not None else votes.views == 0
     consensus = cast(Any, sparse.diags_array(~uncovered * 1.0) @ _consensus(votes))
-    for done, (name, (pixels, camera)) in enumerate(frames.items()):
+    for done, (name, (pixels, camera, ignored)) in enumerate(frames.items()):
         batch = jax.tree.map(lambda a: np.asarray(a)[None], camera)
         scene = SceneSuperpixels(gaussians, batch, [propose(pixels, done)], **centre)
         view = scene.all(pixels[None])[0]
@@ -177,6 +182,8 @@ def make_views(
             refuse(InputError(f"photograph {name}", problem, remedy=remedy))
             continue
         labels, new = label_by_regions(view, owner, consensus, unknown, split=masks is not None)
+        if ignored is not None:
+            labels = np.where(ignored, IGNORED, labels)
         old, count = consensus.shape[1], consensus.shape[1] + new
         evidence = view_evidence(gaussians, camera, labels, count, **centre)
         if new:  # the next frame may show them too
