@@ -90,7 +90,6 @@ def _splats(folder: Path) -> None:
     made |= {f"v{version}.spz": spz(arrays, version) for version in (2, 3, 4)}
     for name, data in made.items():
         (folder / name).write_bytes(data)
-    save_gaussians(folder / "g.glb", gaussians(scene(30, 4)))
 
 
 def _clouds(folder: Path) -> None:

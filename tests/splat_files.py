@@ -217,24 +217,6 @@ def sog(arrays: dict, *, codebook: int = 256) -> bytes:
     return file.getvalue()
 
 
-GLTF = "KHR_gaussian_splatting"
-
-
-def rewrite_glb(path, change, more: bytes = b"") -> None:
-    """Changes the JSON of a .glb, and puts `more` behind its numbers."""
-    data = path.read_bytes()
-    size = struct.unpack_from("<I", data, 12)[0]
-    content = json.loads(data[20 : 20 + size])
-    change(content)
-    text = json.dumps(content).encode()
-    text += b" " * (-len(text) % 4)
-    numbers = data[28 + size :] + more
-    behind = struct.pack("<I4s", len(numbers), b"BIN\0") + numbers
-    path.write_bytes(
-        struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(behind), len(text), b"JSON") + text + behind
-    )
-
-
 def splat(arrays: dict) -> bytes:
     """antimatter15's, without header and harmonics."""
     colour = np.clip(0.5 + C0 * arrays["sh"][:, 0], 0, 1)

@@ -786,9 +786,9 @@ class Scene:
         """Writes Gaussians in the world of the capture's files, in blocks, so that a mapped field need not fit memory.
 
         Args:
-          file: The .ply, .glb or .usda to write; with points .las, .laz or .ply.
+          file: The .ply or .usda to write; with points .las, .laz or .ply.
           selected: Answer or mask whose Gaussians are written; None writes the whole scene.
-          labels: Catalogue of the scene. A .ply, a .glb and points get the object_id and the class_id of each Gaussian,
+          labels: Catalogue of the scene. A .ply and points get the object_id and the class_id of each Gaussian,
             a .usda a prim for each object.
           points: Whether to write, in place of Gaussians, the points of the file that the field was made of or that its
             fit started from: those whose nearest Gaussian is near and written, with its labels; all without `selected`.

@@ -133,7 +133,7 @@ class Fit(_PipelineVerb):
 
     Attributes:
       capture: The same captures as for jsecon run.
-      out: The .ply (INRIA's layout, which SuperSplat opens) or .glb to write.
+      out: The .ply (INRIA's layout, which SuperSplat opens) or .usda to write.
     """
 
     examples = ("jsecon fit my_capture --out scene.ply --minutes 5",)
@@ -293,14 +293,13 @@ class Forget(Verb):
 class Export(_FieldVerb):
     """Writes the scene of a field, or objects of it, for other programs.
 
-    The scene is in the capture's world. A .glb is glTF with Khronos' KHR_gaussian_splatting, y up. A .usda is a text of
-    OpenUSD with a prim for each object. The file labels.json beside each export has id, name, probability, colour, box,
-    parent and frames of each object.
+    The scene is in the capture's world. A .usda is a text of OpenUSD with a prim for each object. The file labels.json
+    beside each export has id, name, probability, colour, box, parent and frames of each object.
 
     Attributes:
-      out: The .ply (INRIA's layout), .glb, .usda, .las or .laz to write.
+      out: The .ply (INRIA's layout), .usda, .las or .laz to write.
       with_labels: Adds object_id, the id of each Gaussian's object in jsecon objects or -1, and class_id, which objects
-        of one name share, to the .ply or .glb.
+        of one name share, to the .ply.
       objects: Folder to write a .ply of each object to, named by its id and name. They replace those of an earlier
         export to that folder.
       shapes: File for the solids of whole objects but surroundings, in metres if their length is known: .json (box,
@@ -313,7 +312,7 @@ class Export(_FieldVerb):
     """
 
     examples = (
-        "jsecon export my_field/field.safetensors --out scene.glb",
+        "jsecon export my_field/field.safetensors --out scene.ply",
         "jsecon export my_field/field.safetensors --objects objects",
         "jsecon export my_field/field.safetensors --shapes robot",
         "jsecon export scan_field/field.safetensors --out labelled.laz",
@@ -388,8 +387,8 @@ class Clean(Verb):
     near the scene, as for jsecon run, or are planned. Prints how many of each kind went, and how the pictures changed.
 
     Attributes:
-      scene: A file of Gaussians (.ply, .spz, .sog, .splat, .glb), or a field.
-      out: The .ply, .glb or .usda to write.
+      scene: A file of Gaussians (.ply, .spz, .sog, .splat), or a field.
+      out: The .ply or .usda to write.
       cameras: Poses to look from instead: a COLMAP model, a transforms.json, or INRIA's cameras.json.
       views: Number of views to plan, in place of poses near the scene.
       capture: Capture of the scene, as for jsecon run. Its poses are the views, and its photographs give the PSNR

@@ -89,10 +89,10 @@ class InputOptions:
     Attributes:
       capture: Folder with images/ and sparse/0 (COLMAP), or with transforms.json (nerfstudio, instant-ngp); a folder of
         ScanNet, TUM, ARKitScenes, Polycam, Record3D or OpenSfM; or a folder of photographs, or a video, without poses
-        (extra sfm). Or a file of Gaussians (.ply, .spz, .sog, .splat, .glb) or a point cloud (.las, .laz, .e57, .pcd,
+        (extra sfm). Or a file of Gaussians (.ply, .spz, .sog, .splat) or a point cloud (.las, .laz, .e57, .pcd,
         .xyz, .txt, .ply) without photographs: jsecon renders it from poses that lie near it, or plans virtual views.
       gaussians: File with the 3D Gaussians of the scene: .ply (INRIA's layout, also of 2D Gaussians, or SuperSplat's
-        compressed one), .glb, .spz, .splat, with the extra formats also .sog. Its world may be that of the capture's
+        compressed one), .spz, .splat, with the extra formats also .sog. Its world may be that of the capture's
         files, of its poses, of a dataparser_transforms.json near it, or the one that gsplat or nerfstudio normalise
         to: jsecon renders a few frames to find out, and warns if none fits. Without it, Gaussians are fitted to the
         frames.

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from jsecon.errors import InputError, describe_error
 
-SCENES = (".ply", ".spz", ".sog", ".splat", ".glb", ".las", ".laz", ".e57", ".pcd", ".xyz", ".txt")
+SCENES = (".ply", ".spz", ".sog", ".splat", ".las", ".laz", ".e57", ".pcd", ".xyz", ".txt")
 """suffixes of files of Gaussians or points, which may be scenes without photographs"""
 
 

@@ -29,7 +29,6 @@ from jaxtyping import Float, Int
 from jsecon.errors import InputError, require_shape
 from jsecon.files import parse_json, reading
 from jsecon.read.registry import SCENES, Reader, decoding, find_reader
-from jsecon.read.splats.gltf import read_glb, save_glb
 from jsecon.read.splats.ply import drawable_gaussians, read_ply, read_ply_file, save_ply
 from jsecon.read.splats.points import READERS as POINTS, gaussians_of_cloud
 from jsecon.read.splats.usd import save_usda
@@ -210,7 +209,6 @@ def _read_ply(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
 
 READERS = (
     Reader("PLY", (".ply",), _read_ply),
-    Reader("glTF", (".glb",), lambda path: (read_glb(path), ())),
     Reader("SPZ", (".spz",), _read_spz),
     Reader("SOG", (".sog",), _read_sog),
     Reader("splat", (".splat",), _read_splat),
@@ -219,11 +217,11 @@ READERS = (
 
 
 def load_gaussians(path: str | Path, *, similarity: Float[Array, "4 4"] | None = None) -> Gaussians:
-    """Reads Gaussians from a .ply (INRIA's layout, or SuperSplat's compressed one), .glb, .spz, .sog or .splat.
+    """Reads Gaussians from a .ply (INRIA's layout, or SuperSplat's compressed one), .spz, .sog or .splat.
 
     Points of a .las, .laz, .e57, .pcd, .xyz, .txt or .ply become round, opaque Gaussians, at most 200,000.
-    All come in the world of the .ply that they were made from: .spz and .glb have y up by their makers' definition, and
-    are turned back, (x, -y, -z) and (-x, -y, z). Warns (UserWarning) if a file was trained with antialiasing, which is
+    All come in the world of the .ply that they were made from: a .spz has y up by its makers' definition, and
+    is turned back, (x, -y, -z). Warns (UserWarning) if a file was trained with antialiasing, which is
     not done.
 
     Args:
@@ -267,8 +265,6 @@ def read_gaussians(path: str | Path) -> tuple[Gaussians, tuple[str, ...]]:
         remedy = "Export the scene as a .ply."
         if path.suffix.lower() in (".ksplat", ".lcc", ".mjs") or path.name == "meta.json":  # of an unpacked .sog
             remedy = f"Run: npx @playcanvas/splat-transform {path.name} {path.stem}.ply"
-        elif path.suffix.lower() == ".gltf":
-            remedy = "Export it as one .glb file, or as a .ply."
         raise InputError(path, f"its name ends in {path.suffix or 'no suffix'}", _FORMATS, remedy)
     with reading(path, remedy="Export it again, or as a .ply."):
         return reader.read(path)
@@ -282,16 +278,16 @@ def save_gaussians(
     names: Sequence[str] = (),
     similarity: Float[Array, "4 4"] | None = None,
 ) -> None:
-    """Writes Gaussians as a .ply (INRIA's layout, exact), a .glb or a .usda.
+    """Writes Gaussians as a .ply (INRIA's layout, exact) or a .usda.
 
-    A .ply and a .glb are written in blocks: memory-mapped arrays need not fit into memory. A .usda is a text of OpenUSD
+    A .ply is written in blocks: memory-mapped arrays need not fit into memory. A .usda is a text of OpenUSD
     with a ParticleField3DGaussianSplat for each object.
 
     Args:
       path: The file; its suffix names the format.
       gaussians: N Gaussians.
-      ids: Integers of each Gaussian by name, such as "object_id", -1 for none: properties of a .ply, attributes of a
-        .glb. A .usda has a prim for each "object_id".
+      ids: Integers of each Gaussian by name, such as "object_id", -1 for none: properties of a .ply. A .usda has a prim
+        for each "object_id".
       names: Names of the objects by id, for a .usda.
       similarity: (4, 4) transform into the world of the file.
 
@@ -314,9 +310,10 @@ def require_writable_format(path: Path, points: bool = False) -> None:
     """Checks that `save_gaussians`, or `save_point_cloud`, can write a file, which need not exist."""
     known = (".las", ".laz", ".ply") if points else tuple(_WRITERS)
     if path.suffix.lower() not in known:
-        remedy = f"For example: {path.stem}.ply; npx @playcanvas/splat-transform makes other formats of it."
+        command = f"npx @playcanvas/splat-transform {path.stem}.ply {path.stem}.glb"
+        remedy = f"Write {path.stem}.ply. To make a .glb, .spz or .sog of it, run: {command}"
         raise InputError(path, f"its name ends in {path.suffix or 'no suffix'}", " or ".join(known), remedy)
 
 
-_WRITERS: dict[str, Callable[..., None]] = {".ply": save_ply, ".glb": save_glb, ".usda": save_usda}
+_WRITERS: dict[str, Callable[..., None]] = {".ply": save_ply, ".usda": save_usda}
 """suffix -> function that writes a file from Gaussians, ids by name, and a similarity or None"""
