@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from importlib import metadata
 from pathlib import Path
 
-EXTRAS = ("figures", "formats", "mcp", "serve", "sfm", "viewer", "words", "dev", "docs")
+EXTRAS = ("figures", "formats", "mcp", "serve", "sfm", "words", "dev", "docs")
 SHARE_ALIKE = re.compile(r"\b(A?GPL|LGPL|MPL|EPL|CDDL|EUPL)\b|(?:GNU (?:LESSER |AFFERO )?GENERAL|Mozilla) Public", re.I)
 """licences that ask something of whoever passes the package on, changed or linked"""
 _DATED = ",? Version [0-9.]+,? [0-9]+ [A-Z][a-z]+ [0-9]{4}"

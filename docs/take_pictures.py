@@ -23,8 +23,8 @@ from browser import opened  # noqa: E402
 
 TEXTS = ("orange ball", "dark green bottle", "purple vase")
 """what the viewer highlights"""
-SECONDS = 25
-"""s until the software has drawn the splats and the candidates"""
+SECONDS = 12
+"""s until the answers are there and the software has drawn them"""
 
 
 def photograph(address: str, width: int, height: int, seconds: float) -> Image.Image:
@@ -40,8 +40,6 @@ def photograph(address: str, width: int, height: int, seconds: float) -> Image.I
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         page.send("Emulation.setDeviceMetricsOverride", **size)
         time.sleep(seconds)
-        page.js("document.querySelectorAll('.mantine-Notification-closeButton').forEach(button => button.click())")
-        time.sleep(min(seconds, 4))  # the notice that WebGL runs in software fades
         return Image.open(io.BytesIO(page.png())).convert("RGB")
 
 

@@ -29,7 +29,7 @@ def test_the_wheel_holds_the_packages_files_and_nothing_else(tmp_path):
         wheel = set(archive.namelist())
     own = {path for path in (HOME / "jsecon").rglob("*") if path.is_file() and "__pycache__" not in path.parts}
     names = {path.relative_to(HOME).as_posix() for path in own}
-    assert {"jsecon/py.typed", "jsecon/__init__.pyi", "jsecon/app/viewer/static_page.html"} < names
+    assert {"jsecon/py.typed", "jsecon/__init__.pyi", "jsecon/app/viewer/page.html"} < names
     about = {name for name in wheel if name.partition("/")[0].endswith(".dist-info")}
     assert wheel - about == names
     assert any(name.endswith("licenses/LICENSE") for name in about)

@@ -7,6 +7,7 @@ time. A request reads only the fields, and photographs are added in memory: no n
 import hmac
 import json
 import re
+import socket
 import tempfile
 import threading
 from collections.abc import Callable
@@ -245,11 +246,16 @@ def _serve(verb: verbs.Serve, console: Console) -> verbs.VerbResult:
     scenes = {
         name: open_prepared(name, path, verb.embedder, console) for name, path in name_fields(verb.fields).items()
     }
-    # The limit counts cheap requests too; those beyond it get 503.
-    options: dict[str, Any] = {"timeout_keep_alive": 5, "limit_concurrency": 256}
     app = application(scenes, token=token)
-    config = uvicorn.Config(app, log_level="warning", ws="none", server_header=False, **options)
     address = f"http://{bracketed(verb.host)}:{listening.getsockname()[1]}"
     fields = [_describe(scene) for scene in scenes.values()]
     console.print_line("\n".join([*map(str, scenes.values()), address]))
-    return {"address": address, "fields": fields, "then": lambda: uvicorn.Server(config).run(sockets=[listening])}
+    return {"address": address, "fields": fields, "then": runner(app, listening)}
+
+
+def runner(app: FastAPI, listening: socket.socket) -> Callable[[], None]:
+    """Makes what answers the requests to a socket until it is stopped."""
+    # The limit counts cheap requests too; those beyond it get 503.
+    options: dict[str, Any] = {"timeout_keep_alive": 5, "limit_concurrency": 256}
+    config = uvicorn.Config(app, log_level="warning", ws="none", server_header=False, **options)
+    return lambda: uvicorn.Server(config).run(sockets=[listening])

@@ -441,9 +441,9 @@ class Measure(_FieldVerb):
 class View(_FieldVerb):
     """Shows a field in a browser and answers queries there.
 
-    A page on this machine shows the Gaussians (extra viewer). A text highlights what it selects, a click what lies
+    A page on this machine shows the Gaussians (extra serve). A text highlights what it selects, a click what lies
     there. The page has a threshold, the frames, and a file of the selection. With --export, jsecon writes one HTML file
-    instead, which opens by double click, without a server.
+    instead, which opens by double click, without a server, with the answers to TEXTS.
 
     Attributes:
       texts: Texts to highlight.
@@ -577,7 +577,7 @@ VERBS: dict[type[Verb], str] = {
     Update: "app.changes:_update",
     Clean: "app.cleaning:_clean",
     Measure: "app.measuring:_measure",
-    View: "app.viewer.window:_view",
+    View: "app.viewer.view:_view",
     Eval: "app.evaluation:_eval",
     Serve: "app.server:_serve",
     Mcp: "app.mcp_server:_mcp",

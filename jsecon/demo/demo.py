@@ -46,7 +46,7 @@ def _demo(verb: verbs.Demo, console: Console) -> verbs.VerbResult:
     lead += "on a plain CPU and without any learned weights."
     parts = [_queries(run, rows, summary, labels)]
     metrics = running.write_run(run, out, console, "jsecon demo", lead, parts, anchored=summary)
-    view = f'jsecon view {out / "field.safetensors"} "{texts[0]}"  (extra viewer; --export writes a page)'
+    view = f'jsecon view {out / "field.safetensors"} "{texts[0]}"  (extra serve; --export writes a page)'
     console.print_line(f"answers {out / 'queries'}\nview it {view}")
     return {"written": [out / name for name in (*running.FILES, running.FIRST_VIEW, "queries")]} | metrics
 

@@ -78,16 +78,6 @@ def region_shares_seen(field: LanguageField, camera: Camera, x: int, y: int) -> 
     return shares
 
 
-def depth_seen(gaussians: Gaussians, camera: Camera, x: int, y: int) -> float | None:
-    """Finds the z-depth at which half of what a pixel shows is reached, in world units; None where it shows nothing."""
-    ids, weights = _pixel_weights(gaussians, camera, x, y)
-    if weights.sum() < MIN_SHARE:
-        return None
-    middle = ids[np.searchsorted(np.cumsum(weights), weights.sum() / 2)]
-    pose = np.asarray(camera.world_to_camera, np.float64)
-    return float(pose[2, :3] @ np.asarray(gaussians.means[middle], np.float64) + pose[2, 3])
-
-
 def region_at(field: LanguageField, frame: int | str, x: int, y: int) -> int:
     """Finds the region that makes up most of a pixel.
 

@@ -1,0 +1,44 @@
+"""`jsecon view`: the page of a field, served or as a file."""
+
+from pathlib import Path
+
+from jsecon.app import verbs
+from jsecon.app.records import Answer
+from jsecon.app.scene import open_scene
+from jsecon.app.viewer.page import page
+from jsecon.errors import InputError
+from jsecon.files import write_text
+from jsecon.pipeline.options import require_writable
+from jsecon.pipeline.progress import Console
+
+
+def _view(verb: verbs.View, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon view`."""
+    if verb.export is not None:
+        return _export_page(verb, verb.export, console)
+    try:
+        from jsecon.app.viewer.served import serve_page
+    except ModuleNotFoundError as error:
+        remedy = 'Run: pip install "jsecon[serve]". Or write a page with --export.'
+        raise InputError("jsecon view", f"the package {error.name} is missing", remedy=remedy) from error
+    return serve_page(verb, console)
+
+
+def _export_page(verb: verbs.View, file: Path, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon view --export`; the result has the texts that were answered."""
+    if file.suffix != ".html":
+        raise InputError("--export", f"{file} does not end in .html", remedy="For example: --export page.html")
+    require_writable(file.parent)
+    scene = open_scene(verb.field, embedder=verb.embedder, console=console)
+    with console.progress("page"):
+        if verb.texts:
+            _ = scene.embedder  # without it one error stands for all texts
+        results = scene.ask_all(verb.texts)
+        answers = {str(answer.query): answer for answer in results if isinstance(answer, Answer)}
+        errors = [error for error in results if isinstance(error, InputError)]
+        write_text(file, page(scene.field, answers, title=scene.name))
+    for answer in answers.values():
+        console.print_line(str(answer))
+    count, size = scene.field.gaussians.count, file.stat().st_size
+    console.print_line(f"{count} Gaussians, texts answered: {len(answers)}, {size / 2**20:.1f} MiB  {file}")
+    return {"written": {"page": file}, "gaussians": count, "answers": [*answers], "bytes": size, "errors": errors}
