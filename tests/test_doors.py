@@ -167,11 +167,25 @@ def test_the_viewers_page(door, tmp_path):
     page = (tmp_path / "page.html").read_text()
     content = json.loads(re.search(r'id="scene-data">(.*?)</script>', page)[1])
     assert content["count"] == scene.field.gaussians.count
-    for text, shown in zip(TEXTS, content["texts"], strict=True):
+    assert [*content["texts"]] == [*TEXTS]
+    for text, shown in content["texts"].items():
         packed = np.frombuffer(base64.b64decode(shown["mask"]), np.uint8)
         mask = np.unpackbits(packed, count=content["count"], bitorder="little")
-        assert shown["text"] == text
         np.testing.assert_array_equal(np.flatnonzero(mask), rows[text])
+
+
+def test_the_served_page(door):
+    pytest.importorskip("fastapi", reason="the extra serve is not installed")
+    from starlette.testclient import TestClient
+
+    from jsecon.app.viewer.served import page_application
+
+    asked = TestClient(page_application(door[0]), "http://127.0.0.1:8766")
+    for texts in (TEXTS[:20], TEXTS[20:]):
+        answers = asked.post("/ask", json={"questions": texts}).json()["answers"]
+        for text, shown in zip(texts, answers, strict=True):
+            mask = np.unpackbits(np.frombuffer(base64.b64decode(shown["mask"]), np.uint8), bitorder="little")
+            np.testing.assert_array_equal(np.flatnonzero(mask), door[2][text])
 
 
 def test_the_evaluation(door):

@@ -146,7 +146,7 @@ await press(2, canvas.height - 2); found.background = [...asked];
 element("regions").click(); found.byRegion = apart(start, pixels()); element("regions").click();
 element("measure").click(); await press(...at(24, 20)); await press(...at(18, 28));
 found.ends = [pick(...at(24, 20)).point, pick(...at(18, 28)).point];
-found.length = element("lengths").textContent; found.told = words();
+draw(); found.length = element("lengths").textContent; found.told = words();
 await press(2, canvas.height - 2); found.nowhere = words();
 found.hidden = ["find", "all", "share", "export"].every(id => element(id).hidden);
 found.requests = performance.getEntriesByType("resource").length;

@@ -23,6 +23,7 @@ from starlette.testclient import TestClient
 from jsecon import load_gaussians, save_field
 from jsecon.app import verbs
 from jsecon.app.access import listen
+from jsecon.app.catalogue import main_regions
 from jsecon.app.records import Query, Region
 from jsecon.app.scene import Scene
 from jsecon.app.viewer.served import page_application
@@ -32,12 +33,14 @@ from jsecon.pipeline.progress import Console
 from jsecon.vision.colours import BASIC, ColourEmbedder
 
 HERE = "http://127.0.0.1:8766"
-TREE = np.array([5, 5, -1, -1, -1, -1])
+TREE = np.array([5, 5, -1, -1, -1, -1], np.int32)
 
 
 @pytest.fixture(scope="module")
 def asked(scene, cameras):
-    field = dataclasses.replace(colour_field(scene, cameras), tree=TREE, metres_per_unit=0.5)
+    field = colour_field(scene, cameras)
+    leaf = main_regions(field).astype(np.int32)
+    field = dataclasses.replace(field, tree=TREE, leaf=leaf, metres_per_unit=0.5)
     mask, event = np.arange(64) < 9, {"kind": "moved", "name": "ball", "date": "2026-11-02", "region": 0}
     return Scene(move_object(field, mask, np.eye(4), event), ColourEmbedder(), name="<desk>")
 

@@ -71,7 +71,7 @@ def page_application(scene: Scene, texts: Sequence[str] = ()) -> FastAPI:
     def selection(request: _Export) -> Response:
         scene_now = scenes[scene.name]
         found = [answer for answer in request.ask(scene_now) if isinstance(answer, Answer) and len(answer.rows)]
-        ends = [source_points(scene.field, np.array(pair)).tolist() for pair in request.lengths]
+        ends = [source_points(scene.field, np.array(pair, np.float64)).tolist() for pair in request.lengths]
         if not found and not ends:
             raise InputError("export", "no Gaussian is selected", remedy="Ask a text, or click an object.")
         packed = io.BytesIO()
