@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from jsecon.app import report
 from jsecon.app.catalogue import main_regions, palette
 from jsecon.field.columns import is_mapped
+from jsecon.field.evidence import MAX_WHOLE
 from jsecon.fit.resize import resize_frame, scale_cameras
 from jsecon.read.captures.frames import evenly_spaced
 from jsecon.splat.render import render, render_rgb
@@ -65,10 +66,10 @@ def region_colours(field: LanguageField) -> Float[np.ndarray, "n 3"]:
 def render_picture(
     gaussians: Gaussians, camera: Camera, rgb: Float[np.ndarray, "n 3"] | None = None
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Renders a view in the scene's colours, or in others, each in [0, 1]; a mapped scene in its own, by blocks."""
+    """Renders a view in the scene's colours, or in others, each in [0, 1]; a large scene in its own, by blocks."""
     if rgb is not None:
         image = render(gaussians, camera, np.asarray(rgb, np.float32)).features
-    elif is_mapped(gaussians):
+    elif is_mapped(gaussians) or gaussians.count > MAX_WHOLE:
         image = render_in_blocks(gaussians, camera)
     else:
         image = render_rgb(gaussians, camera).features

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jsecon.numerics import NEAR
+from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.project import check_gaussians, project
 from jsecon.splat.render import render
 from jsecon.splat.sh import colours_from_sh
@@ -71,7 +72,7 @@ def geometry_of_rows(gaussians: Gaussians, ids: Int[np.ndarray, " m"], least: in
 
 
 def render_in_blocks(gaussians: Gaussians, camera: Camera) -> Float[np.ndarray, "h w 3"]:
-    """Renders the features of `render_rgb` of N finite Gaussians whose columns may be memory-mapped."""
+    """Renders the features of `render_rgb` of N finite Gaussians, many or in memory-mapped columns."""
     camera = jax.tree.map(np.asarray, camera)
     ids = visible_rows(gaussians, camera)
     colours = np.zeros((_padded_size(len(ids)), 3), np.float32)
@@ -81,7 +82,9 @@ def render_in_blocks(gaussians: Gaussians, camera: Camera) -> Float[np.ndarray, 
         colours[first : first + len(rows)] = _colours(part, camera)
     if not len(ids):
         return np.zeros((camera.height, camera.width, 3), np.float32)
-    return np.asarray(render(geometry_of_rows(gaussians, ids), camera, jnp.asarray(colours)).features)
+    part = geometry_of_rows(gaussians, ids)
+    capacity = plan_capacity(part, camera, margin=1.0, devices=1)  # of the default's room most would be empty
+    return np.asarray(render(part, camera, jnp.asarray(colours), capacity=capacity).features)
 
 
 _colours = jax.jit(colours_from_sh)

@@ -8,6 +8,7 @@ only what overlaps with hardly any other Gaussian goes.
 
 import dataclasses
 import functools
+import math
 
 import jax
 import numpy as np
@@ -37,6 +38,8 @@ _REACH = (0.8, 1.0)
 """Sums of both largest deviations within which two Gaussians overlap: of haze, and of all others."""
 _LEAST_ALPHA = 0.3
 """Alpha of a pixel from which it shows a surface."""
+_PART = 1_250_000
+"""Gaussians of a large scene for each part that its views are divided into."""
 _STEP = 0.01
 """Ratio of two depths that are told apart, less one."""
 
@@ -44,25 +47,25 @@ _STEP = 0.01
 def find_litter(gaussians: Gaussians, cameras: Camera, progress: Progress | None = None) -> Int8[np.ndarray, " n"]:
     """Finds the kind (`KINDS`) of each of N Gaussians from T views that cover the scene.
 
-    Above `MAX_WHOLE` Gaussians, memory beside them is that of a quarter of one view.
+    Above `MAX_WHOLE` Gaussians, memory beside them is that of a part of one view.
     """
     count, seen = gaussians.count, np.ones(gaussians.count, bool)
     means = np.asarray(gaussians.means, np.float32)
     peak = np.zeros(count, np.float32)
     reach = np.exp(np.asarray(gaussians.log_scales).max(1))
-    part_of, room = None, [0, 0]
+    seen_by, room, side = None, [0, 0], math.ceil(math.sqrt(count / _PART))
     if count <= MAX_WHOLE:  # once for all views
         gaussians = jax.device_put(dataclasses.replace(gaussians, sh=None))
     else:
-        part_of = functools.lru_cache(1)(functools.partial(_part, gaussians, cameras))
-        cameras = _quarters(cameras)
+        seen_by = functools.lru_cache(1)(functools.partial(_seen_by, gaussians, cameras))
+        cameras = _divided(cameras, side)
     for n, (least, gap) in enumerate(((_FIRST_SHARE, _FIRST_GAP), (_SHARE, _GAP))):
         front, total, peak = np.zeros((3, count), np.float32)
 
         def view(t: int, seen=seen, gap=gap) -> tuple[np.ndarray, ...]:
-            if part_of is None:
+            if seen_by is None:
                 return _view(gaussians, seen, cameras[t], gap)
-            return _quarter(*part_of(t // 4), seen, cameras[t], gap, room)
+            return _part(*seen_by(t // side**2), seen, cameras[t], gap, room)
 
         def report(done: int, views: int, first: int = n * len(cameras)) -> None:
             if progress is not None:
@@ -105,30 +108,30 @@ def _is_apart(
     return (touching & (others != rows[:, None])).sum(1) < _COMPANY
 
 
-def _quarters(cameras: Camera) -> Camera:
-    """Divides T views into 4 T, which overlap by a pixel where a side is odd."""
-    width, height = -(-cameras.width // 2), -(-cameras.height // 2)
-    corners = [(x, y) for x in (0, cameras.width - width) for y in (0, cameras.height - height)]
-    moved = [dataclasses.replace(cameras, cx=cameras.cx - x, cy=cameras.cy - y) for x, y in corners]
-    whole = jax.tree.map(lambda *parts: np.stack(parts, 1).reshape(-1, *parts[0].shape[1:]), *moved)
-    return dataclasses.replace(whole, width=width, height=height)
+def _divided(cameras: Camera, side: int) -> Camera:
+    """Divides T views into side^2 T of one size, which overlap where it does not divide theirs."""
+    whole, part = (cameras.width, cameras.height), (-(-cameras.width // side), -(-cameras.height // side))
+    starts = [[min(k * p, w - p) for k in range(side)] for w, p in zip(whole, part)]
+    moved = [dataclasses.replace(cameras, cx=cameras.cx - x, cy=cameras.cy - y) for x in starts[0] for y in starts[1]]
+    parts = jax.tree.map(lambda *parts: np.stack(parts, 1).reshape(-1, *parts[0].shape[1:]), *moved)
+    return dataclasses.replace(parts, width=part[0], height=part[1])
 
 
-def _part(gaussians: Gaussians, cameras: Camera, t: int) -> tuple[np.ndarray, Gaussians]:
+def _seen_by(gaussians: Gaussians, cameras: Camera, t: int) -> tuple[np.ndarray, Gaussians]:
     """Returns the Gaussians that a view can see: their rows, and their geometry in memory."""
     rows = visible_rows(gaussians, cameras[t])
     return rows, geometry_of_rows(gaussians, rows)
 
 
-def _quarter(
-    rows: np.ndarray, part: Gaussians, seen: np.ndarray, camera: Camera, gap: float, room: list[int]
+def _part(
+    rows: np.ndarray, whole: Gaussians, seen: np.ndarray, camera: Camera, gap: float, room: list[int]
 ) -> tuple[np.ndarray, ...]:
-    """Does what `_view` does of a quarter of a view, of its `_part`.
+    """Does what `_view` does of a part of a view, of those that this is `_seen_by`.
 
-    `room` keeps the largest numbers of Gaussians and of their pairs, so that quarters share programs.
+    `room` keeps the largest numbers of Gaussians and of their pairs, so that parts share programs.
     """
-    ids = visible_rows(part, camera)
-    gaussians = geometry_of_rows(part, ids, room[0])
+    ids = visible_rows(whole, camera)
+    gaussians = geometry_of_rows(whole, ids, room[0])
     room[0] = gaussians.count
     room[1] = max(room[1], plan_capacity(gaussians, camera, margin=1.0, devices=1))
     inside, *columns = _view(gaussians, np.pad(seen[rows[ids]], (0, room[0] - len(ids))), camera, gap, room[1])
