@@ -50,7 +50,8 @@ def copied(field: LanguageField, copies: int) -> LanguageField:
     gaussians, votes = jax.tree.map(tile, field.gaussians), jax.tree.map(tile, field.votes)
     shift = np.repeat(np.arange(copies), count)[:, None] * np.float32([apart, 0, 0])
     gaussians = dataclasses.replace(gaussians, means=(np.asarray(gaussians.means) + shift).astype(np.float32))
-    return dataclasses.replace(field, gaussians=gaussians, votes=votes, codes=None)
+    leaf = None if field.leaf is None else tile(field.leaf)
+    return dataclasses.replace(field, gaussians=gaussians, votes=votes, codes=None, leaf=leaf)
 
 
 def free_port() -> int:
