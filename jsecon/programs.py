@@ -21,7 +21,13 @@ from jsecon.files import atomic_write
 from jsecon.numerics import is_traced
 
 
-def stored_jit(function: Callable, *, static_argnums: tuple[int, ...] = (), small_kernels: bool = False) -> Callable:
+def stored_jit(
+    function: Callable,
+    *,
+    static_argnums: tuple[int, ...] = (),
+    small_kernels: bool = False,
+    compiler_options: dict[str, Any] | None = None,
+) -> Callable:
     """Compiles a function like jax.jit, and keeps each trace in jax's folder of compiled programs, if there is one.
 
     Inside a trace, off the CPU, and for arrays that were put on a device, it is jax.jit.
@@ -33,6 +39,7 @@ def stored_jit(function: Callable, *, static_argnums: tuple[int, ...] = (), smal
       small_kernels: Whether the function is made of many small kernels, as tile lists are. Without XLA's fusion
         emitters it then compiles in half of the time and runs as fast. Compositing, of few long ones, would run at a
         third of the speed.
+      compiler_options: As for jax.jit, where the kernels are not small.
 
     Returns:
       The compiled function.
@@ -40,8 +47,8 @@ def stored_jit(function: Callable, *, static_argnums: tuple[int, ...] = (), smal
     inlined = jax.jit(function, static_argnums=static_argnums)
     programs: dict[Any, Callable] = {}
 
-    def options() -> dict[str, bool] | None:
-        return _without_emitters() if small_kernels else None
+    def options() -> dict[str, Any] | None:
+        return _without_emitters() if small_kernels else compiler_options
 
     @functools.cache
     def compiled() -> Callable:

@@ -69,7 +69,7 @@ def test_a_new_view_takes_the_regions_of_its_gaussians():
     """A mask of what no region holds opens one, and so does a small part of a region, if that is asked for."""
     gaussians, cameras, frames, truth, proposals = ring_of_balls()
     view = SceneSuperpixels(gaussians, cameras[:1], proposals[:1]).all(frames[:1])[0]
-    owner = np.repeat([0, 1, 2, 3], [2500, 1500, 1500, 1500])
+    owner = np.repeat([0, 1, 2, 3], [2500, 1500, 1500, 1500])[view.seen]
     all_known = np.zeros(len(owner), bool)
 
     def agreement(labels, expected):

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 from scipy import sparse
 
 from jsecon.errors import require
-from jsecon.field.evidence import view_evidence
+from jsecon.field.evidence import CastLabels, plan_evidence
 from jsecon.parallel import map_views
 from jsecon.types import Camera, Gaussians, Progress
 from jsecon.vision.region_graph import relabel_sequential
@@ -85,23 +85,10 @@ class SceneSuperpixels:
     def _view(self, frame: UInt8[np.ndarray, "h w 3"], t: int) -> tuple:
         """Superpixels, visible Gaussians, arrays and shape of their weights, and proposals of a frame."""
         masks = np.asarray(self.propose(t), bool)
-        labels = superpixels(frame, masks, count=self.superpixels_per_frame)
-        within = superpixel_coverage(labels, masks, int(labels.max()) + 1)
-        votes = self._superpixel_votes(t, labels)
-        seen = np.flatnonzero(np.diff(votes.indptr))
-        votes = votes[seen]
-        return labels, seen, [votes.data, votes.indices, votes.indptr], votes.shape, within
-
-    def _superpixel_votes(self, t: int, labels: Int32[np.ndarray, "h w"]) -> Sparse:
-        """Adds up the weights of N Gaussians on the A superpixels of a frame, (N, A), but for the faintest."""
-        count = int(labels.max()) + 1
-        centre = self.centre_pixel_weight
-        evidence = view_evidence(self.gaussians, self.cameras[t], labels, count, centre_pixel_weight=centre)
-        votes = evidence.matrix(self.count, count)[:, :-1]
-        total = np.repeat(np.asarray(votes.sum(1)).ravel(), np.diff(votes.indptr))
-        votes.data[votes.data <= 0.005 * total] = 0.0
-        votes.eliminate_zeros()
-        return votes
+        cast = plan_evidence(self.gaussians, self.cameras[t], centre_pixel_weight=self.centre_pixel_weight)
+        view = frame_superpixels(frame, masks, cast, count=self.superpixels_per_frame)
+        votes = view.votes
+        return view.labels, view.seen, [votes.data, votes.indices, votes.indptr], votes.shape, view.proposals
 
     def all(self, frames: UInt8[np.ndarray, "t h w 3"], progress: Progress | None = None) -> list[FrameSuperpixels]:
         """Computes the superpixels of all frames, which are the same at every call; several processes divide them."""
@@ -135,6 +122,23 @@ class SceneSuperpixels:
             cross_sections /= np.maximum(np.linalg.norm(cross_sections, axis=1, keepdims=True), 1e-30)
             self.shared = cross_sections @ cross_sections.T
         return self._views
+
+
+def frame_superpixels(
+    frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m h w"], cast: CastLabels, *, count: int = 256
+) -> FrameSuperpixels:
+    """Cuts a frame into about `count` superpixels, with the weights of the Gaussians on them, but for the faintest."""
+    labels = superpixels(frame, masks, count=count)
+    number = int(labels.max()) + 1
+    evidence = cast(labels, number)
+    columns = evidence.weights.copy(), evidence.regions, evidence.starts
+    votes = sparse.csr_matrix(columns, shape=(len(evidence.gaussians), number + 1))[:, :number]
+    total = np.repeat(np.asarray(votes.sum(1)).ravel(), np.diff(votes.indptr))
+    votes.data[votes.data <= 0.005 * total] = 0.0
+    votes.eliminate_zeros()
+    seen = np.flatnonzero(np.diff(votes.indptr))
+    within = superpixel_coverage(labels, masks, number)
+    return FrameSuperpixels(labels, evidence.gaussians[seen], votes[seen], within, np.ones(len(seen), np.float32))
 
 
 def _weighted_median(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"]) -> float:
@@ -204,19 +208,19 @@ def label_by_regions(
 
     Args:
       view: The view with its masks.
-      owner: Region of each of the N Gaussians, -1 for none.
-      consensus: (N, R) share of each Gaussian in each region, over the views that see both.
-      unknown: Gaussians on which a region may be opened.
+      owner: Region of each of the n Gaussians that the view shows, -1 for none.
+      consensus: (n, R) share of each in each region, over the views that see both.
+      unknown: Those on which a region may be opened.
       split: Whether a part of a region may be one of its own.
 
     Returns:
       (H, W) labels, -1 for none, and the number of new regions.
     """
     count = consensus.shape[1]
-    mass = (view.votes.T @ one_hot(owner[view.seen], max(count, 1))).toarray()
+    mass = (view.votes.T @ one_hot(owner, max(count, 1))).toarray()
     classes = assign_superpixels(view, mass, mass.sum(1, keepdims=True))
-    total, shares = np.asarray(view.votes.sum(0)).ravel(), (view.votes.T @ consensus[view.seen]).toarray()
-    fresh, area = view.votes.T @ (unknown[view.seen] * 1.0), np.bincount(view.labels.reshape(-1))
+    total, shares = np.asarray(view.votes.sum(0)).ravel(), (view.votes.T @ consensus).toarray()
+    fresh, area = view.votes.T @ (unknown * 1.0), np.bincount(view.labels.reshape(-1))
     new = 0
     for share in view.proposals:
         weight, inside, members = share @ total, shares.T @ share, share > 0.5

@@ -20,7 +20,7 @@ import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +34,7 @@ from jsecon.files import map_npy
 from jsecon.numerics import FULL_PRECISION, NEAR, array_module, is_traced, require_labels
 from jsecon.parallel import MESH_OPTIONS, map_views
 from jsecon.process import cores
+from jsecon.programs import stored_jit
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.fusion import compute_once
 from jsecon.splat.plan import ViewPlan, plan_view, render_plan
@@ -52,6 +53,8 @@ _BITS = 17
 """Significant bits of a weight: an error of 4e-6 of it, where float32's sums of pixels have 1e-6."""
 _SLOTS = 4
 """Labels of a tile that are summed at once. A tile of 8x8 pixels seldom shows more; then its batch is scanned again."""
+_RANDOM_PLANES = (13, 14, 17, 18)
+"""Planes of a packed list that deflate does not shrink: the middle bytes of its floats."""
 _HEAD = 23
 """numbers at the start of a packed list: its Gaussians, entries and overflow, and the bytes of each of 20 planes"""
 MAX_WHOLE = 1 << 21
@@ -86,12 +89,21 @@ class ViewEvidence(NamedTuple):
         gaussians, starts, regions, weights, largest = map(np.asarray, columns)
         return ViewEvidence(gaussians, starts, regions, weights, largest)
 
+    def totals(self) -> Float[np.ndarray, " m"]:
+        """Sums the weight of each Gaussian, float64."""
+        shape = len(self.gaussians), max(self.regions.max(initial=0) + 1, 1)
+        return sparse.csr_matrix((self.weights, self.regions, self.starts), shape=shape) @ np.ones(shape[1])
+
     def matrix(self, count: int, num_regions: int) -> Any:
         """Lays the list out as a scipy.sparse.csr_matrix (N, R + 1)."""
         lengths = np.zeros(count + 1, np.int32)
         lengths[1 + self.gaussians] = np.diff(self.starts)
         columns = self.weights, self.regions, np.cumsum(lengths, dtype=np.int32)
         return sparse.csr_matrix(columns, shape=(count, num_regions + 1))
+
+
+CastLabels: TypeAlias = Callable[[Shaped[np.ndarray, "h w"], int], ViewEvidence]
+"""Lists what a view casts on some label image of so many regions."""
 
 
 def region_votes(
@@ -190,36 +202,60 @@ def view_evidence(
     near: float = NEAR,
 ) -> ViewEvidence:
     """Lists what one view casts on N Gaussians; options as for `region_votes`. Host code."""
-    require_shape("labels", labels, (camera.height, camera.width), "Give images of the camera's size.")
-    require_labels(labels, num_regions)
+    options = {"centre_pixel_weight": centre_pixel_weight, "capacity": capacity, "near": near}
+    return plan_evidence(gaussians, camera, **options)(labels, num_regions)
+
+
+def plan_evidence(
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    centre_pixel_weight: float = 0.0,
+    capacity: int | None = None,
+    near: float = NEAR,
+) -> CastLabels:
+    """Plans a view once; the function that it returns is `view_evidence` of any labels. Host code."""
     rows = None
+    if not gaussians.count:
+        nothing, weightless = np.zeros(0, np.int32), np.zeros(0, np.float32)
+        return lambda labels, num_regions: ViewEvidence(nothing, np.zeros(1, np.int32), nothing, weightless, weightless)
     if gaussians.count > MAX_WHOLE and capacity is None:
         rows = visible_rows(gaussians, camera, near=near)
         gaussians = geometry_of_rows(gaussians, rows)
         capacity = plan_capacity(gaussians, camera, margin=1.0, devices=1, near=near)
-    elif not gaussians.count:
-        nothing, weightless = np.zeros(0, np.int32), np.zeros(0, np.float32)
-        return ViewEvidence(nothing, np.zeros(1, np.int32), nothing, weightless, weightless)
     plan = plan_view(gaussians, camera, capacity=capacity, near=near)
-    tiles, names, steps = _tile_labels(plan, _named(np.asarray(labels, np.int32), num_regions))
+
+    def cast(labels: Shaped[np.ndarray, "h w"], num_regions: int) -> ViewEvidence:
+        require_shape("labels", labels, (camera.height, camera.width), "Give images of the camera's size.")
+        require_labels(labels, num_regions)
+        evidence = _walk_plan(plan, _named(np.asarray(labels, np.int32), num_regions), num_regions, centre_pixel_weight)
+        return evidence if rows is None else evidence._replace(gaussians=rows[evidence.gaussians].astype(np.int32))
+
+    return cast
+
+
+def _walk_plan(plan: ViewPlan, labels: Array, num_regions: int, centre_pixel_weight: float) -> ViewEvidence:
+    """Lists what the Gaussians of a plan cast on labels up to `num_regions`."""
+    count = plan.depths.shape[0]
+    tiles, names, steps = _tile_labels(plan, labels)
     steps = int(steps)
     room = 1 << 2 * max(-(-(steps - 1).bit_length() // 2), 5)  # powers of 4 from 1,024 on: views share a program
     done, *chunks = _list_chunks(plan, (tiles, names), room, centre_pixel_weight)
     ids, slots, sums, largest = (np.asarray(chunk)[: int(done)] for chunk in chunks)
-    entries = np.flatnonzero(sums)
+    entries = np.flatnonzero(sums > 0)
     pairs = entries // _SLOTS
     regions = slots.reshape(-1, _SLOTS)[pairs // CHUNK, entries % _SLOTS]
     columns = sums.reshape(-1)[entries].astype(np.float64), (ids.reshape(-1)[pairs], regions)
-    weights = sparse.csr_matrix(columns, shape=(gaussians.count, num_regions + 1))
-    peaks = np.zeros(gaussians.count, np.float32)
+    weights = sparse.csr_matrix(columns, shape=(count, num_regions + 1))
+    peaks = np.zeros(count, np.float32)
     np.maximum.at(peaks, ids.reshape(-1), largest.reshape(-1))
     seen = np.flatnonzero(np.diff(weights.indptr))
     rounded = np.rint(weights.data.astype(np.float32) * np.float32(_RESOLUTION)) / np.float32(_RESOLUTION)
     rounded, peaks = _round_mantissa(rounded), _round_mantissa(peaks)
     starts = np.append(weights.indptr[seen], len(rounded)).astype(np.int32)
-    own = (seen if rows is None else rows[seen]).astype(np.int32)
     overflow = int(np.asarray(plan.lists.overflow).sum())
-    return ViewEvidence(own, starts, weights.indices.astype(np.int32), rounded, peaks[seen], overflow)
+    regions = weights.indices.astype(np.int32)
+    return ViewEvidence(seen.astype(np.int32), starts, regions, rounded, peaks[seen], overflow)
 
 
 def _round_mantissa(values: Float32[np.ndarray, " e"]) -> Float32[np.ndarray, " e"]:
@@ -246,7 +282,7 @@ def _named(labels: Array, num_regions: int) -> Array:
     return xp.where(labels == IGNORED, -1, xp.where(known, labels, num_regions)).astype(np.int32)
 
 
-@jax.jit
+@stored_jit
 def _tile_labels(plan: ViewPlan, labels: Array) -> tuple[Array, Array, Array]:
     """Finds the labels of the pixels of each tile, -1 outside of the image; the distinct ones; and a number of chunks.
 
@@ -261,7 +297,7 @@ def _tile_labels(plan: ViewPlan, labels: Array) -> tuple[Array, Array, Array]:
 
 
 # Views run side by side, each on one core.
-@functools.partial(jax.jit, static_argnums=(2, 3), compiler_options=MESH_OPTIONS)
+@functools.partial(stored_jit, static_argnums=(2, 3), compiler_options=MESH_OPTIONS)
 def _list_chunks(
     plan: ViewPlan, labels: tuple[Array, Array], room: int, centre_pixel_weight: float
 ) -> tuple[Array, ...]:
@@ -444,9 +480,9 @@ class EvidenceSum(NamedTuple):
     overflow: int = 0
     """Pairs beyond the capacity."""
 
-    def votes(self, top: int) -> Votes:
-        """Cuts the sum to the `top` strongest regions of each Gaussian."""
-        return _make_votes(_cut_sum(self, top), self.overflow, self.weights.shape[1])
+    def votes(self, top: int, least: Float32[np.ndarray, " n"] | None = None) -> Votes:
+        """Cuts the sum to the `top` strongest regions of each Gaussian; weights below `least` are known not to be."""
+        return _make_votes(_cut_sum(self, top, least), self.overflow, self.weights.shape[1])
 
 
 def _make_votes(columns: dict[str, np.ndarray], overflow: int, num_regions: int) -> Votes:
@@ -467,42 +503,47 @@ def _sum_rows(views: Sequence[ViewEvidence], rows: slice, num_regions: int, by_v
     count = rows.stop - rows.start
     total, seen, peak = np.zeros(count), np.zeros(count, np.int32), np.zeros(count, np.float32)
     each = np.zeros((len(views) if by_view else 0, count), np.float32).T
-    cells, entries = [np.zeros(0, np.int64)], [np.zeros(0, np.float32)]
+    dense = np.zeros((count, num_regions + 1) if len(views) != 1 else (0, 0))
     for t, view in enumerate(views):
-        own = np.add.reduceat(view.weights, view.starts[:-1], dtype=np.float64) if len(view.gaussians) else 0.0
+        own = view.totals()
         total[view.gaussians] += own
         seen[view.gaussians] += 1
         peak[view.gaussians] = np.maximum(peak[view.gaussians], view.max_pixel_weights)
         if by_view:
             each[view.gaussians, t] = own
-        rows_of_dense = view.gaussians.astype(np.int64) * (num_regions + 1)
-        cells.append(np.repeat(rows_of_dense, np.diff(view.starts)) + view.regions)
-        entries.append(view.weights)
-    dense = np.bincount(np.concatenate(cells), np.concatenate(entries), count * (num_regions + 1))
-    weights = sparse.csr_matrix(dense.reshape(count, num_regions + 1)[:, :num_regions])
+        if dense.size:
+            cells = np.repeat(view.gaussians.astype(np.int64) * (num_regions + 1), np.diff(view.starts)) + view.regions
+            np.add.at(dense.reshape(-1), cells, view.weights.astype(np.float64))
+    weights = views[0].matrix(count, num_regions) if len(views) == 1 else sparse.csr_matrix(dense)
+    weights = weights[:, :num_regions].astype(np.float64)
     return EvidenceSum(weights, total, seen, peak, each, sum(view.overflow for view in views))
 
 
-def _cut_sum(evidence: EvidenceSum, top: int) -> dict[str, np.ndarray]:
+def _cut_sum(evidence: EvidenceSum, top: int, least: Float32[np.ndarray, " n"] | None = None) -> dict[str, np.ndarray]:
     """Computes the columns of votes."""
     weights, columns = evidence.weights, evidence._asdict()
-    columns["regions"], columns["weights"] = _strongest(weights, min(top, max(weights.shape[1], 1)))
+    columns["regions"], columns["weights"] = _strongest(weights, min(top, max(weights.shape[1], 1)), least)
     columns["labelled"] = np.asarray(weights.sum(1)).reshape(-1).astype(np.float32)
     columns["total"] = evidence.total.astype(np.float32)
     return {name: column for name, column in columns.items() if name != "overflow"}
 
 
-def _strongest(votes: Any, top: int) -> tuple[Int32[np.ndarray, "n k"], Float32[np.ndarray, "n k"]]:
+def _strongest(
+    votes: Any, top: int, least: Float32[np.ndarray, " n"] | None
+) -> tuple[Int32[np.ndarray, "n k"], Float32[np.ndarray, "n k"]]:
     """Finds the `top` largest weights of each row of a csr_matrix (N, R), equal ones by id; then -1 and 0."""
-    lengths, weights = np.diff(votes.indptr), votes.data.astype(np.float32)
-    rows = np.repeat(np.arange(votes.shape[0]), lengths)
+    weights, count = votes.data.astype(np.float32), votes.shape[0]
+    rows = np.repeat(np.arange(count), np.diff(votes.indptr))
+    candidates = np.flatnonzero((weights > 0) & (weights >= (np.float32(0) if least is None else least[rows])))
+    weights, rows = weights[candidates], rows[candidates]
     # One key of row and falling weight: positive float32 sort like their bits.
     order = np.argsort((rows << 32) | (0xFFFFFFFF - weights.view(np.uint32).astype(np.int64)), kind="stable")
-    rank = np.arange(len(order)) - np.repeat(votes.indptr[:-1], lengths)
-    kept = (rank < top) & (weights[order] > 0)
-    ids, largest = np.full((votes.shape[0], top), -1, np.int32), np.zeros((votes.shape[0], top), np.float32)
-    ids[rows[kept], rank[kept]] = votes.indices[order][kept]
-    largest[rows[kept], rank[kept]] = weights[order][kept]
+    rank = np.arange(len(order)) - np.searchsorted(rows, np.arange(count))[rows]
+    kept = np.flatnonzero(rank < top)
+    ids, largest = np.full((count, top), -1, np.int32), np.zeros((count, top), np.float32)
+    places, order = rows[kept] * top + rank[kept], order[kept]
+    ids.reshape(-1)[places] = votes.indices[candidates[order]]
+    largest.reshape(-1)[places] = weights[order]
     return ids, largest
 
 
@@ -536,9 +577,10 @@ def pack_evidence(evidence: ViewEvidence, num_regions: int) -> UInt8[np.ndarray,
         evidence.weights.view(np.uint32),
         evidence.max_pixel_weights.view(np.uint32),
     )
-    # The bytes of each place together: those that are 0 throughout are left out, and deflate shrinks the others.
-    planes = [np.asarray(column, "<u4").view(np.uint8).reshape(-1, 4).T for column in columns]
-    parts = [zlib.compress(plane.tobytes(), 1) if plane.any() else b"" for column in planes for plane in column]
+    # The bytes of each place together: those that are 0 throughout are left out, and deflate shrinks most others.
+    planes = [plane for column in columns for plane in np.asarray(column, "<u4").view(np.uint8).reshape(-1, 4).T]
+    levels = [0 if n in _RANDOM_PLANES else 1 for n in range(len(planes))]
+    parts = [zlib.compress(plane.tobytes(), level) if plane.any() else b"" for plane, level in zip(planes, levels)]
     sizes = len(evidence.gaussians), len(evidence.regions), int(evidence.overflow)
     head = np.array([*sizes, *map(len, parts)], "<u4")
     return np.frombuffer(b"".join([head.tobytes(), *parts]), np.uint8)

@@ -88,7 +88,8 @@ def add_views(field: LanguageField, ledger: Ledger, views: Mapping[str, LedgerVi
     new = [name for name in ordered if name in views]
     lists = unpack_views([views[name].evidence for name in new], field.gaussians.count, count)
     total = add_evidence(before, lists, [ordered.index(name) for name in new], count)
-    return _build_field(field, Ledger(count, {**ledger.views, **views}, total), {*field.names, *views})
+    is_cut = ledger.sum is not None  # the field's votes are then those of `before`
+    return _build_field(field, Ledger(count, {**ledger.views, **views}, total), {*field.names, *views}, grows=is_cut)
 
 
 def forget_views(field: LanguageField, ledger: Ledger, names: Collection[str]) -> tuple[LanguageField, Ledger]:
@@ -123,14 +124,20 @@ def _sum_all(field: LanguageField, ledger: Ledger) -> EvidenceSum:
     return sum_views(lists, field.gaussians.count, ledger.num_regions)
 
 
-def _build_field(field: LanguageField, ledger: Ledger, names: Collection[str]) -> tuple[LanguageField, Ledger]:
-    """Builds the field of frames from a ledger and its sum; some frames may have no part in the votes."""
+def _build_field(
+    field: LanguageField, ledger: Ledger, names: Collection[str], *, grows: bool = False
+) -> tuple[LanguageField, Ledger]:
+    """Builds the field of frames from a ledger and its sum; some frames may have no part in the votes.
+
+    With `grows` the weights are at least those of the votes of `field`.
+    """
     count, top = ledger.num_regions, field.votes.regions.shape[1]
     top = max(top, TOP) if top == field.regions.count else top  # a field of few regions holds all
     ordered = sorted(names, key=view_order)
     views = {name: ledger.views[name] for name in ordered if name in ledger.views}
     assert ledger.sum is not None
-    votes = ledger.sum.votes(top)
+    known = np.asarray(field.votes.weights)
+    votes = ledger.sum.votes(top, known[:, -1] if grows and known.shape[1] == top else None)
     total = np.zeros((count, field.regions.embeddings.shape[1]))
     pixels = np.zeros((count, len(views)), np.int32)
     for t, view in enumerate(views.values()):

@@ -118,10 +118,17 @@ def _views_that_show(regions: Regions) -> Bool[Array, "r t"]:
     return (alike.astype(np.float32) @ (regions.pixel_counts > 0).astype(np.float32)) > 0
 
 
-@jax.jit
 def _sum_visible_weight(votes: Votes, shows: Bool[Array, "r t"]) -> Votes:
-    """Replaces `by_view` by `shown`, with the (R, T) views that show a region; Gaussian by Gaussian."""
-    by_view, regions = jnp.asarray(votes.by_view), jnp.asarray(votes.regions)
+    """Replaces `by_view` by `weight_where_region_visible`, with the (R, T) views that show a region."""
+    visible = _visible_weight(jnp.asarray(votes.by_view), jnp.asarray(votes.regions), shows)
+    return dataclasses.replace(votes, by_view=None, weight_where_region_visible=visible)
+
+
+@stored_jit
+def _visible_weight(
+    by_view: Float[Array, "t n"], regions: Int[Array, "n k"], shows: Bool[Array, "r t"]
+) -> Float[Array, "n k"]:
+    """Sums the weight of each Gaussian over the views that show each of its regions, Gaussian by Gaussian."""
     count = regions.shape[0]
     block = min(1 << 15, max(count, 1))  # its arrays are dense in the regions
 
@@ -136,7 +143,7 @@ def _sum_visible_weight(votes: Votes, shows: Bool[Array, "r t"]) -> Votes:
     shown = jnp.zeros(regions.shape, by_view.dtype)
     if count and shows.shape[0]:
         shown = lax.fori_loop(0, -(-count // block), one_block, shown)
-    return dataclasses.replace(votes, by_view=None, weight_where_region_visible=shown)
+    return shown
 
 
 def _with_overlap(votes: Votes) -> Votes:
@@ -152,7 +159,7 @@ def _with_overlap(votes: Votes) -> Votes:
     return dataclasses.replace(votes, overlap=_soft_iou(sums))
 
 
-@functools.partial(jax.jit, static_argnums=2)
+@functools.partial(stored_jit, static_argnums=(2,))
 def _overlap_sums(regions: Int[Array, "n k"], share: Float[Array, "n k"], count: int) -> Float[Array, "r r"]:
     """Sums min(p_nr, p_ns) over n to (R, R); for each n at [r, s] where r is the stronger of the two."""
     valid = (regions >= 0) & (regions < count) & jnp.isfinite(share)
@@ -166,7 +173,7 @@ def _overlap_sums(regions: Int[Array, "n k"], share: Float[Array, "n k"], count:
     return lax.fori_loop(0, len(first), add, jnp.zeros((count, count), share.dtype))
 
 
-@jax.jit
+@stored_jit
 def _soft_iou(both: Float[Array, "r r"]) -> Float[Array, "r r"]:
     """Computes the overlap of `_with_overlap` from the sums, which add up over blocks of Gaussians."""
     size = jnp.diagonal(both)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import cv2
 import jax
@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 from scipy import sparse
 
-from jsecon.association.scene import FrameSuperpixels, SceneSuperpixels, label_by_regions
+from jsecon.association.scene import FrameSuperpixels, frame_superpixels, label_by_regions
 from jsecon.errors import InputError, join_first
-from jsecon.field.evidence import IGNORED, pack_evidence, view_evidence
+from jsecon.field.columns import votes_of_rows
+from jsecon.field.evidence import IGNORED, pack_evidence, plan_evidence
 from jsecon.field.ledger import Ledger, LedgerView, camera_row, view_order
 from jsecon.field.membership import LABELLED_PART, SHARE_THRESHOLD
 from jsecon.files import parse_json
@@ -153,14 +154,13 @@ def make_views(
     `refuse` gets the error of each photograph that is unlike the scene.
     """
     options = parse_json(field.provenance).get("options", {})
-    centre: dict[str, Any] = {"centre_pixel_weight": float(options.get("centre_pixel_weight", 0.0))}
     propose = ClassicalSegmenter(**GRANULARITIES.get(options.get("granularity"), GRANULARITIES["medium"]))
     if masks is not None:
         size = field.cameras.height, field.cameras.width
         read = load_proposals(masks, list(frames), size, level=options.get("level", "l"))[0]
         propose = lambda pixels, index: read(index)  # noqa: E731
     gaussians = jax.device_put(replace(field.gaussians, sh=None))  # as a run's, whose programs are compiled
-    votes, views = jax.tree.map(np.asarray, field.votes), {}
+    votes, views, opened = jax.tree.map(np.asarray, field.votes), {}, []
     held = (votes.labelled >= LABELLED_PART * SHARE_THRESHOLD * votes.total) & (votes.views > 0)
     strongest, uncovered = votes.regions[:, 0], np.zeros(len(held), bool)
     for event in field.history:  # what lay behind a thing that went has the votes of that thing's pixels
@@ -168,11 +168,9 @@ def make_views(
     owner = np.where(held & ~uncovered, strongest, -1)
     # Without masks from outside, leftovers that many views left without a region stay so.
     unknown = (owner < 0) if masks is not None else votes.views == 0
-    consensus = cast(Any, sparse.diags_array(~uncovered * 1.0) @ _consensus(votes))
     for done, (name, (pixels, camera, ignored)) in enumerate(frames.items()):
-        batch = jax.tree.map(lambda a: np.asarray(a)[None], camera)
-        scene = SceneSuperpixels(gaussians, batch, [propose(pixels, done)], **centre)
-        view = scene.all(pixels[None])[0]
+        list_labels = plan_evidence(gaussians, camera, centre_pixel_weight=options.get("centre_pixel_weight", 0.0))
+        view = frame_superpixels(pixels, propose(pixels, done), list_labels)
         progress(done + 1, len(frames))
         if (like := _likeness(view, field, pixels)) < MIN_CORRELATION:
             problem = (
@@ -181,15 +179,17 @@ def make_views(
             remedy = "Give poses in the world of the field's capture, or the photographs alone to find their poses."
             refuse(InputError(f"photograph {name}", problem, remedy=remedy))
             continue
-        labels, new = label_by_regions(view, owner, consensus, unknown, split=masks is not None)
+        seen = view.seen
+        shares = _region_shares(votes_of_rows(votes, seen), votes.num_regions, ~uncovered[seen])
+        consensus = sparse.hstack([shares, *(part[seen] for part in opened)], "csr")
+        labels, new = label_by_regions(view, owner[seen], consensus, unknown[seen], split=masks is not None)
         if ignored is not None:
             labels = np.where(ignored, IGNORED, labels)
         old, count = consensus.shape[1], consensus.shape[1] + new
-        evidence = view_evidence(gaussians, camera, labels, count, **centre)
+        evidence = list_labels(labels, count)
         if new:  # the next frame may show them too
             own = evidence.matrix(len(owner), count)
-            opened = own[:, old:count].multiply(1 / np.maximum(own.sum(1), 1e-9))
-            consensus = cast(Any, sparse.hstack([consensus, opened], "csr"))
+            opened.append(own[:, old:count].multiply(1 / np.maximum(own.sum(1), 1e-9)).tocsr())
         shown, areas = np.unique(labels[labels >= 0], return_counts=True)
         rows = np.asarray(embedder.embed_regions(pixels, labels[None] == shown[:, None, None]), np.float32)
         pixel_counts = np.stack([shown, areas]).astype(np.int32)
@@ -198,12 +198,12 @@ def make_views(
     return views
 
 
-def _consensus(votes: Votes) -> Any:
-    """Returns the share (N, R) of each Gaussian in its regions, over the views that see both."""
-    rows, columns = np.nonzero(votes.weights)
+def _region_shares(votes: Votes, num_regions: int, counts: Bool[np.ndarray, " n"]) -> Any:
+    """Returns the share (N, R) of each Gaussian that counts in its regions, over the views that see both."""
+    rows, columns = np.nonzero(votes.weights * counts[:, None])
     seen = votes.total[:, None] if votes.weight_where_region_visible is None else votes.weight_where_region_visible
     share = (votes.weights / np.maximum(seen, 1e-9))[rows, columns]
-    return sparse.csr_matrix((share, (rows, votes.regions[rows, columns])), (len(votes.total), votes.num_regions))
+    return sparse.csr_matrix((share, (rows, votes.regions[rows, columns])), (len(votes.total), num_regions))
 
 
 def _likeness(view: FrameSuperpixels, field: LanguageField, pixels: UInt8[np.ndarray, "h w 3"]) -> float:
