@@ -18,6 +18,7 @@ from jsecon.errors import InputError
 from jsecon.field.evidence import ViewEvidence, pack_evidence
 from jsecon.field.ledger import Ledger, LedgerView, camera_row
 from jsecon.fit.resize import resize_camera, resize_frame, shrink_cameras
+from jsecon.fit.start import back_project
 from jsecon.read.captures.frames import evenly_spaced, transform_poses
 from jsecon.read.captures.images import encode_jpeg
 from jsecon.splat.points import gaussians_from_points
@@ -181,19 +182,15 @@ def _new_gaussians(changes: Changes, change: Change) -> Gaussians:
 
 def _surface(mask: np.ndarray, camera: Camera, place: np.ndarray, depth: np.ndarray | None) -> np.ndarray:
     """Points (P, 3) of a mask's pixels: at their depth, or on a dome as deep as it is wide around a place."""
-    pose = np.asarray(camera.world_to_camera, np.float64)
-    rows, columns = np.nonzero(mask)
-    x, y = (columns + 0.5 - float(camera.cx)) / float(camera.fx), (rows + 0.5 - float(camera.cy)) / float(camera.fy)
-    middle = float(pose[2, :3] @ place + pose[2, 3])
-    inward = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)[rows, columns]
+    pixel = np.asarray(camera.world_to_camera, np.float64)[2] @ np.append(place, 1) / float(camera.fx)  # size there
+    inward = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)[mask]
     largest = inward.max()
-    z = middle - np.sqrt(np.maximum(largest**2 - (largest - inward) ** 2, 0)) * middle / float(camera.fx)
+    z = (float(camera.fx) - np.sqrt(np.maximum(largest**2 - (largest - inward) ** 2, 0))) * pixel
     if depth is not None:
-        measured = np.asarray(depth, np.float64)[rows, columns]
-        known = measured[measured > 0]
-        usual = np.median(known) if len(known) else middle
+        measured = np.asarray(depth, np.float64)[mask]
+        usual = np.median(measured[measured > 0]) if (measured > 0).any() else float(camera.fx) * pixel
         z = np.where(np.abs(measured - usual) < largest * 4 * usual / float(camera.fx), measured, usual)
-    return (np.stack([x * z, y * z, z], 1) - pose[:3, 3]) @ pose[:3, :3]
+    return back_project(camera, np.argwhere(mask), z)
 
 
 def splat_capture(field: LanguageField, gaussians: Gaussians, transform: np.ndarray) -> Capture:

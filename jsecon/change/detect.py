@@ -22,6 +22,7 @@ from jsecon.change import MIN_PROBABILITY
 from jsecon.change.compare import colour_cost, depth_cost, find_shift, fit_exposure, shifted
 from jsecon.errors import InputError, require_shape
 from jsecon.field.evidence import view_evidence
+from jsecon.fit.start import back_project
 from jsecon.numerics import axes_across
 from jsecon.query.render import hide
 from jsecon.splat.render import render, render_rgb
@@ -51,6 +52,8 @@ MIN_MOVE = 0.2
 """Shift, as a share of its size, or turn, radians, from which an object has moved."""
 _KNOWN = 0.8
 """Alpha from which a rendering tells what a pixel shows."""
+_SUBPIXEL = 16
+"""Parts of a pixel in which discs are placed; a power of two."""
 _FIT_FRAMES = 4
 """Frames, the best ones, that poses of moved objects are fitted to."""
 
@@ -111,62 +114,58 @@ class _View(NamedTuple):
         image = _render(gaussians, self.camera)
         return self._replace(rgb=image[0], alpha=image[1], z=image[2], cost=self.compare(*image))
 
-    def place(self, discs: "_Discs", motion: np.ndarray) -> tuple["_View", np.ndarray]:
+    def place(self, body: "_Body", motion: np.ndarray) -> tuple["_View", np.ndarray]:
         """The same frame with an object added to what it shows, after a motion, and its visible silhouette."""
-        found = discs.draw(self.camera, motion)
-        if found is None:
-            return self, np.zeros_like(self.alpha, bool)
-        window, rgb, z = found
-        behind = self.z[window]
-        inside = (z > 0) & ((z < behind * 1.02) | (self.alpha[window] < 0.5))
-        silhouette, new = np.zeros_like(self.alpha, bool), [a.copy() for a in (self.rgb, self.alpha, self.z, self.cost)]
+        silhouette, drawn = np.zeros_like(self.alpha, bool), body.draw(self.camera, motion)
+        if drawn is None:
+            return self, silhouette
+        window, rgb, z = drawn
+        inside = (z > 0) & ((z < self.z[window] * 1.02) | (self.alpha[window] < 0.5))
         silhouette[window] = inside
-        new[0][window] = np.where(inside[..., None], rgb, new[0][window])
-        new[1][window] = np.where(inside, 1, new[1][window])
-        new[2][window] = np.where(inside, z, behind)
-        new[3][window] = self.compare(*(a[window] for a in new[:3]), window=window)
-        return self._replace(rgb=new[0], alpha=new[1], z=new[2], cost=new[3]), silhouette
+        shown = [column.copy() for column in (self.rgb, self.alpha, self.z)]
+        for column, values in zip(shown, (rgb, np.ones_like(z), z)):
+            column[window][inside] = values[inside]
+        cost = self.cost.copy()
+        cost[window] = self.compare(*(column[window] for column in shown), window=window)
+        return self._replace(rgb=shown[0], alpha=shown[1], z=shown[2], cost=cost), silhouette
 
 
-class _Discs:
-    """The Gaussians of an object as opaque discs: drawn thousands of times, in a millisecond each."""
+class _Body:
+    """An object: where it stands, and its Gaussians as opaque discs, which are drawn thousands of times."""
 
-    def __init__(self, gaussians: Gaussians, rows: np.ndarray):
-        step = -(-len(rows) // 3000)  # of a large object every second or third Gaussian is a larger disc
+    def __init__(self, gaussians: Gaussians, rows: np.ndarray, up: np.ndarray):
+        means = np.asarray(gaussians.means, np.float64)
+        own = means[rows] if len(rows) else np.zeros((1, 3))
+        self.middle = np.median(own, axis=0)
+        self.foot = self.middle + (np.quantile(own @ up, 0.03) - self.middle @ up) * up
+        self.extent = float(np.linalg.norm(np.quantile(own, 0.95, 0) - np.quantile(own, 0.05, 0))) / np.sqrt(2)
+        step = -(-len(rows) // 3000) or 1  # of a large object every second or third Gaussian is a larger disc
         rows = rows[::step]
-        self.means = np.asarray(gaussians.means, np.float64)[rows]
-        self.radii = (
-            1.1 * np.sqrt(step) * np.exp(np.sort(np.asarray(gaussians.log_scales, np.float64)[rows], axis=1)[:, 1])
-        )
-        self.colours = np.clip(0.5 + C0 * np.asarray(gaussians.sh)[rows, 0], 0, 1)
+        self.means, sizes = means[rows], np.asarray(gaussians.log_scales, np.float64)[rows]
+        self.radii = 1.1 * np.sqrt(step) * np.exp(np.sort(sizes, axis=1)[:, 1])
+        self.colours = np.clip(0.5 + C0 * np.asarray(gaussians.sh)[rows, 0], 0, 1).astype(np.float32)
 
     def draw(self, camera: Camera, motion: np.ndarray) -> tuple[tuple[slice, slice], np.ndarray, np.ndarray] | None:
-        """Draws them after a motion: a window of the image, with colours and z-depth there, 0 where there is none."""
+        """Draws it after a motion: a window of the image, with colours and z-depth there, 0 where there is none."""
         pose = np.asarray(camera.world_to_camera, np.float64) @ motion
-        local = self.means @ pose[:3, :3].T + pose[:3, 3]
-        order = np.argsort(-local[:, 2])  # the nearest is drawn last
-        x, y, z = local[order].T
-        seen = z > 1e-6
-        x, y, z, order = x[seen], y[seen], z[seen], order[seen]
-        focal = float(camera.fx)
-        u, v = focal * x / z + float(camera.cx), float(camera.fy) * y / z + float(camera.cy)
-        radii = np.clip(self.radii[order] * focal / z, 0.75, 24)
-        reach = int(np.ceil(radii.max(initial=1)))
-        steps = np.arange(-reach, reach + 1)
-        columns, rows = np.floor(u)[:, None, None] + steps, np.floor(v)[:, None, None] + steps[:, None]
-        u, v, radii = (a[:, None, None] for a in (u, v, radii))
-        near = (columns + 0.5 - u) ** 2 + (rows + 0.5 - v) ** 2 <= radii**2
-        near &= (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)
-        owner, i, j = np.nonzero(near)
-        if not len(owner):
+        x, y, z = (self.means @ pose[:3, :3].T + pose[:3, 3]).T
+        order = np.argsort(-z)  # the nearest is drawn last
+        order = order[z[order] > 1e-6]
+        x, y, z = x[order], y[order], z[order]
+        u, v = float(camera.fx) * x / z + float(camera.cx) - 0.5, float(camera.fy) * y / z + float(camera.cy) - 0.5
+        centres = np.rint(_SUBPIXEL * np.clip(np.stack([u, v], 1), -1e4, 1e4)).astype(int).tolist()
+        radii = np.clip(self.radii[order] * float(camera.fx) / z, 0.75, 24) - 0.25  # OpenCV also fills its rim
+        radii = np.rint(_SUBPIXEL * radii).astype(int).tolist()
+        image = np.full((camera.height, camera.width), -1, np.float32)
+        for n, (centre, radius) in enumerate(zip(centres, radii)):
+            cv2.circle(image, centre, radius, n, cv2.FILLED, shift=_SUBPIXEL.bit_length() - 1)
+        left, top, width, height = cv2.boundingRect((image >= 0).astype(np.uint8))
+        if not width:
             return None
-        rows, columns = rows[owner, i, 0].astype(int), columns[owner, 0, j].astype(int)
-        top, left = max(rows.min() - 2, 0), max(columns.min() - 2, 0)
-        window = slice(top, min(rows.max() + 3, camera.height)), slice(left, min(columns.max() + 3, camera.width))
-        shape = window[0].stop - top, window[1].stop - left
-        rgb, depth = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)
-        rgb[rows - top, columns - left] = self.colours[order[owner]]
-        depth[rows - top, columns - left] = z[owner]
+        window = slice(max(top - 2, 0), top + height + 2), slice(max(left - 2, 0), left + width + 2)
+        disc = image[window].astype(int)
+        inside = disc >= 0
+        rgb, depth = self.colours[order[disc]] * inside[..., None], (z[disc] * inside).astype(np.float32)
         return window, rgb, depth
 
 
@@ -255,7 +254,7 @@ def object_changes(
     search.remove(np.flatnonzero(displaced).tolist(), list(turns))
     moved = {k: search.settle(k, *turn) for k, turn in turns.items()} | search.moved()
     changes = [moved.get(k, change) for k, change in enumerate(changes)]
-    clusters = search.clusters(min(2, len(views)))
+    clusters = search.clusters()
     for k in np.flatnonzero(displaced).tolist():
         if k not in moved:
             changes[k], clusters = search.gone(k, seen[k], clusters)
@@ -280,10 +279,15 @@ class _Cluster(NamedTuple):
     radius: float
     """Radius of the largest disc in a mask, px."""
 
+    def join(self, other: "_Cluster") -> "_Cluster":
+        """Joins the pixels of one more frame; the size stays that of the first, which has most pixels."""
+        place = (len(self.masks) * self.place + other.place) / (len(self.masks) + 1)
+        return _Cluster(place, self.size, self.masks | other.masks, max(self.radius, other.radius))
 
-def _gains(views: Sequence[_View], discs: _Discs, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+
+def _gains(views: Sequence[_View], body: _Body, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The cost that an object takes away in each view after a motion, and the pixels of its silhouette."""
-    placed = [view.place(discs, motion) for view in views]
+    placed = [view.place(body, motion) for view in views]
     gains = [float(np.nansum(view.cost - new.cost)) for view, (new, _) in zip(views, placed)]
     return np.array(gains), np.array([inside.sum() for _, inside in placed])
 
@@ -298,17 +302,12 @@ class _Search:
     def __init__(self, gaussians, labels, views, cameras, up):
         self.gaussians, self.labels, self.first, self.cameras, self.up = gaussians, labels, views, cameras, up
         self.flat = axes_across(up)
-        self.means = np.asarray(gaussians.means, np.float64)
-        self.discs = functools.cache(lambda k: _Discs(gaussians, np.flatnonzero(labels == k)))
+        self.body = functools.cache(lambda k: _Body(gaussians, np.flatnonzero(labels == k), up))
 
     def remove(self, displaced: list[int], turned: list[int]) -> None:
         """Renders the scene without some objects."""
         self.displaced, mask = displaced, np.isin(self.labels, [*displaced, *turned])
         self.views = [view.render(hide(self.gaussians, mask)) if mask.any() else view for view in self.first]
-
-    def _middle(self, k: int) -> np.ndarray:
-        own = self.means[self.labels == k]
-        return np.median(own, axis=0) if len(own) else np.zeros(3)
 
     def silhouettes(self, k: int) -> np.ndarray:
         """(F, H, W) the pixels that an object makes up in the scene as it was."""
@@ -326,31 +325,21 @@ class _Search:
         kind = "same" if seen.any() else "not seen"
         order = [int(t) for t in np.argsort(differing) if seen[t]]
         probability = _sigmoid(-12 * excess) if seen.any() else 1.0
-        return Change(kind, k, probability, tuple(order), np.eye(4), self._middle(k), empty, empty)
+        return Change(kind, k, probability, tuple(order), np.eye(4), self.body(k).middle, empty, empty)
 
-    def clusters(self, min_frames: int) -> list[_Cluster]:
-        """Places the unexplained pixels of the frames, and joins those that lie at one place."""
-        found = [cluster for t in range(len(self.views)) for cluster in self._components(t)]
-        groups: list[list[_Cluster]] = []
-        for cluster in sorted(found, key=lambda c: -sum(mask.sum() for mask in c.masks.values())):
-            for group in groups:
-                away = np.linalg.norm(np.mean([other.place for other in group], 0) - cluster.place)
-                if away < 0.75 * max(cluster.size, group[0].size) and not (set(group[0].masks) & set(cluster.masks)):
-                    group.append(cluster)
-                    group[0].masks.update(cluster.masks)
+    def clusters(self) -> list[_Cluster]:
+        """Places the unexplained pixels of the frames, and joins those that lie at one place; of two frames or more."""
+        parts = [cluster for t in range(len(self.views)) for cluster in self._components(t)]
+        groups: list[_Cluster] = []
+        for part in sorted(parts, key=lambda c: -sum(int(mask.sum()) for mask in c.masks.values())):
+            for n, group in enumerate(groups):
+                near = np.linalg.norm(group.place - part.place) < 0.75 * max(part.size, group.size)
+                if near and not group.masks.keys() & part.masks.keys():
+                    groups[n] = group.join(part)
                     break
             else:
-                groups.append([cluster])
-        return [
-            _Cluster(
-                np.mean([c.place for c in group], 0),
-                float(np.median([c.size for c in group])),
-                group[0].masks,
-                max(c.radius for c in group),
-            )
-            for group in groups
-            if len(group[0].masks) >= min_frames
-        ]
+                groups.append(part)
+        return [group for group in groups if len(group.masks) >= min(2, len(self.views))]
 
     def _components(self, t: int) -> list[_Cluster]:
         """The connected unexplained pixels of a frame, each with the place where it stands."""
@@ -358,8 +347,7 @@ class _Search:
         mask = (np.nan_to_num(view.cost) > 0.5).astype(np.uint8)
         mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
         number, image, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
-        pose = np.asarray(view.camera.world_to_camera, np.float64)
-        down = -(pose[:3, :3] @ self.up)[:2]
+        down = -(np.asarray(view.camera.world_to_camera, np.float64)[:3, :3] @ self.up)[:2]
         height, width = mask.shape
         result = []
         for n in range(1, number):
@@ -375,9 +363,7 @@ class _Search:
             along = down[0] * columns + down[1] * rows
             low = along >= np.quantile(along, 0.95)
             z = float(np.median(view.z[rows[low], columns[low]]))
-            x = (columns[low].mean() + 0.5 - float(view.camera.cx)) / float(view.camera.fx)
-            y = (rows[low].mean() + 0.5 - float(view.camera.cy)) / float(view.camera.fy)
-            contact = (np.array([x * z, y * z, z]) - pose[:3, 3]) @ pose[:3, :3]
+            contact = back_project(view.camera, np.array([[rows[low].mean(), columns[low].mean()]]), z)[0]
             size = z * np.sqrt(area) / float(view.camera.fx)
             ahead = contact - np.asarray(view.camera.centres, np.float64)
             ahead -= (ahead @ self.up) * self.up
@@ -390,9 +376,10 @@ class _Search:
         result: dict[int, Change] = {}
         left = set(self.displaced)
         while left:
-            clusters = self.clusters(min(2, len(self.views)))[:6]  # the largest
+            clusters = self.clusters()[:6]  # the largest
             places = [(cluster.place, cluster.size) for cluster in clusters]
-            places += [self._stand(k) for k in self.displaced]  # its own, too: what moved may hide it, or it is turned
+            bodies = map(self.body, self.displaced)  # their own, too: what moved may hide it, or it is turned
+            places += [(body.foot, body.extent) for body in bodies]
             fits = [self._fit(k, *place) for k in left for place in places]
             fits = [fit for fit in fits if fit is not None and fit.gain >= MIN_GAIN]
             if not fits:
@@ -406,20 +393,20 @@ class _Search:
         """Puts an object into the views where it is now; `evidence` is the logit of its probability."""
         before, masks = self.silhouettes(k), []
         for t, view in enumerate(self.views):
-            self.views[t], inside = view.place(self.discs(k), motion)
+            self.views[t], inside = view.place(self.body(k), motion)
             masks.append(inside)
         order = tuple(int(t) for t in np.argsort([-m.sum() for m in masks]) if masks[t].sum() >= MIN_PIXELS)
-        middle = self._middle(k)
+        middle = self.body(k).middle
         place = middle @ motion[:3, :3].T + motion[:3, 3]
         evidence -= len(order) < 2
-        away = np.linalg.norm(place - middle) / max(self._stand(k)[1], 1e-9)
+        away = np.linalg.norm(place - middle) / max(self.body(k).extent, 1e-9)
         if away < MIN_MOVE and Rotation.from_matrix(motion[:3, :3]).magnitude() < MIN_MOVE:
             return Change("same", k, _sigmoid(evidence), order, np.eye(4), middle, before, before)
         return Change("moved", k, _sigmoid(evidence), order, motion, place, before, np.stack(masks))
 
     def _motion(self, k: int, pose: np.ndarray) -> np.ndarray:
         """The motion that turns an object about its middle by pose[2], and shifts it by pose[:2] and up by pose[3]."""
-        middle, motion = self._middle(k), np.eye(4)
+        middle, motion = self.body(k).middle, np.eye(4)
         motion[:3, :3] = Rotation.from_rotvec(self.up * pose[2]).as_matrix()
         motion[:3, 3] = middle - motion[:3, :3] @ middle + pose[:2] @ self.flat + pose[3] * self.up
         return motion
@@ -429,31 +416,24 @@ class _Search:
         k = change.object
         views = [self.first[t].render(hide(self.gaussians, self.labels == k)) for t in change.frames[:_FIT_FRAMES]]
         motions = [self._motion(k, np.array([0, 0, angle, 0])) for angle in np.radians(np.arange(0, 341, 20))]
-        scores = [_gains(views, self.discs(k), motion) for motion in motions]
+        scores = [_gains(views, self.body(k), motion) for motion in motions]
         values, pixels = [gains.sum() for gains, _ in scores], scores[0][1].sum()
         gain = (max(values) - values[0]) / max(pixels, 1)
         return None if gain < MIN_TURN_GAIN else (motions[int(np.argmax(values))], 40 * (gain - MIN_TURN_GAIN))
 
-    def _stand(self, k: int) -> tuple[np.ndarray, float]:
-        """The lower end of an object, and its size."""
-        own = self.means[self.labels == k]
-        extent = float(np.linalg.norm(np.quantile(own, 0.95, 0) - np.quantile(own, 0.05, 0))) / np.sqrt(2)
-        middle = self._middle(k)
-        return middle + (np.quantile(own @ self.up, 0.03) - middle @ self.up) * self.up, extent
-
     def _fit(self, k: int, place: np.ndarray, size: float) -> "_Fit | None":
         """Turns and shifts an object about a place until it explains most of the photographs there."""
-        stand, extent = self._stand(k)
+        body = self.body(k)
+        middle, extent = body.middle, body.extent
         if not 1 / 3 < size / max(extent, 1e-9) < 3:
             return None
-        middle = self._middle(k)
         shift = (place - middle) @ self.flat.T
-        lift = float((place - stand) @ self.up)
+        lift = float((place - body.foot) @ self.up)
         lift = 0.0 if abs(lift) < 0.35 * extent else lift
         frames = self._frames_near(middle + shift @ self.flat + lift * self.up)
 
         def score(pose: np.ndarray) -> tuple[float, int, int]:
-            gains, pixels = _gains([self.views[t] for t in frames], self.discs(k), self._motion(k, pose))
+            gains, pixels = _gains([self.views[t] for t in frames], self.body(k), self._motion(k, pose))
             return float(gains.sum()), int(pixels.sum()), int((gains > np.maximum(0.5 * MIN_GAIN * pixels, 0)).sum())
 
         best = np.array([*shift, 0.0, lift])
@@ -489,27 +469,20 @@ class _Search:
         It is gone where the scene without it explains the photographs. Where something of its outline stands in its
         place, it has another look. Else something hides it.
         """
-        before = self.silhouettes(k)
+        before, middle = self.silhouettes(k), self.body(k).middle
         inside = [(first.cost[m], view.cost[m]) for first, view, m in zip(self.first, self.views, before)]
         margins = [np.nanmean(a - b) if len(a) and np.isfinite(a - b).any() else 0.0 for a, b in inside]
         margin = float(np.mean(np.asarray(margins)[seen]))
         order = tuple(int(t) for t in np.argsort(-np.asarray(margins)) if seen[t])
         wider = [cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0 for mask in before]
-        own, others, after = [], [], np.zeros_like(before)
-        for cluster in clusters:
-            pixels = sum(int(mask.sum()) for mask in cluster.masks.values())
-            shared = sum(int((mask & wider[t]).sum()) for t, mask in cluster.masks.items())
-            (own if shared > 0.6 * pixels else others).append(cluster)
-        for cluster in own:
-            for t, mask in cluster.masks.items():
-                after[t] |= mask
+        others = [c for c in clusters if np.mean(np.concatenate([wider[t][m] for t, m in c.masks.items()])) <= 0.6]
         if margin >= GONE_MARGIN:
-            kind, after, probability = "gone", np.zeros_like(before), _sigmoid(10 * (margin - GONE_MARGIN))
-        else:
-            filled = (after & before).sum() / max(before[list(seen)].sum(), 1)
-            kind = "look" if filled > 0.5 else "not seen"
-            probability = filled if kind == "look" else 1 - filled
-        return Change(kind, k, float(probability), order, np.eye(4), self._middle(k), before, after), others
+            gone = _sigmoid(10 * (margin - GONE_MARGIN))
+            return Change("gone", k, gone, order, np.eye(4), middle, before, np.zeros_like(before)), others
+        after = before & np.stack([np.nan_to_num(view.cost) > 0.5 for view in self.views])
+        filled = float(after.sum() / max(before[seen].sum(), 1))
+        kind, probability = ("look", filled) if filled > 0.5 else ("not seen", 1 - filled)
+        return Change(kind, k, probability, order, np.eye(4), middle, before, after), others
 
     def new(self, cluster: _Cluster) -> Change:
         """Something that no object explains, coherent over the frames."""

@@ -48,16 +48,16 @@ def back_project_frame(capture: Capture, frame: int, stride: int):
     z = depth[rows, columns]
     rows, columns = rows * stride, columns * stride
     pixels = np.stack([rows, columns], axis=1)
-    return _back_project(camera, pixels, z), np.asarray(capture.frames[frame])[rows, columns], pixels
+    return back_project(camera, pixels, z), np.asarray(capture.frames[frame])[rows, columns], pixels
 
 
-def _back_project(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+def back_project(camera: Camera, pixels: np.ndarray, depth: np.ndarray | float) -> np.ndarray:
     """World points (S, 3) float64 of pixels (S, 2) row, column of one camera, at depths (S,)."""
     rows, columns = pixels.T
     x = (columns + 0.5 - float(camera.cx)) / float(camera.fx) * depth
     y = (rows + 0.5 - float(camera.cy)) / float(camera.fy) * depth
     pose = np.asarray(camera.world_to_camera, np.float64)
-    return (np.stack([x, y, depth], axis=1) - pose[:3, 3]) @ pose[:3, :3]
+    return (np.stack([x, y, np.broadcast_to(depth, x.shape)], axis=1) - pose[:3, 3]) @ pose[:3, :3]
 
 
 def points_from_depth(
@@ -108,7 +108,7 @@ def points_between(capture: Capture, points: np.ndarray, count: int) -> tuple[np
         if near.sum() < NEIGHBOURS:
             continue
         nearest = KDTree(at[near]).query(pixels[:, ::-1] + 0.5, NEIGHBOURS)[1]
-        world = _back_project(camera, pixels, np.median(seen[near, 2][nearest], axis=1))
+        world = back_project(camera, pixels, np.median(seen[near, 2][nearest], axis=1))
         found.append((world.astype(np.float32), np.asarray(capture.frames[t])[*pixels.T]))
     world, colors = (np.concatenate(columns) for columns in zip(*found))
     return world, colors
