@@ -1,6 +1,6 @@
 """What changed in made-up rooms: is each change found, with its kind, and is nothing found where nothing changed?
 
-    python -m experiments.changes [--seeds FIRST LAST] [--quick]
+    python -m experiments.changes [--seeds FIRST LAST] [--counts 1 3] [--rooms FOLDER]
 
 Ray-traced rooms (the ray tracer shares no code with the renderer) of nine things on a table. The field of a room has
 its true masks, and Gaussians from true depth. Then the room is changed, lit anew or photographed with another exposure,
@@ -10,11 +10,11 @@ AP is that of SceneDiff with the kind of change: changes of all rooms, the most 
 be reported, are right if their masks in the new photographs have an IoU of at least 0.5 with those of a true change of
 the same kind. Masks are the pixels where the thing would be seen had nothing changed (gone, moved) and where it is seen
 now (new, moved). A turned thing counts as moved. The other columns count what is reported. Things that moved or are
-gone are asked for by their colours in the updated field, and in the field as it was. The seeds 0 to 4 chose the
-constants.
+gone are asked for by their colours in the updated field. The seeds 0 to 4 chose the constants.
 """
 
 import dataclasses
+import itertools
 import time
 from pathlib import Path
 
@@ -41,6 +41,7 @@ from jsecon.vision.colours import ColourEmbedder
 KINDS = ("remove", "move", "add", "swap", "turn", "nothing", "other light", "other exposure")
 UNTURNED = ("box", "mug", "kettle", "pot", "teddy")
 """Shapes that look another way when they are turned."""
+SENSORS = ("RGB", "RGB-D")
 SIZE = {"width": 160, "height": 120}
 GAUSSIANS = 26_000
 """Gaussians of each field, with transparent ones, so that all rooms share their programs."""
@@ -98,32 +99,28 @@ def make_case(seed: int, kind: str) -> Case:
         for k in range(10)
     ]
     before, after = tuple(things[:count]), list(things[:count])
+    changes: tuple[tuple[str, int, int], ...] = ()
+    light, exposure = 0.0, 1.0
     if kind == "remove":
-        return Case(before, tuple(after[1:]), (("gone", 0, -1),))
-    if kind == "move":
-        yaw = things[0].yaw + float(draw.uniform(-1, 1))
+        changes, after = (("gone", 0, -1),), after[1:]
+    elif kind == "move":
+        changes, yaw = (("moved", 0, 0),), things[0].yaw + float(draw.uniform(-1, 1))
         after[0] = dataclasses.replace(things[0], spot=tuple(map(float, spots[10])), yaw=yaw)
-        return Case(before, tuple(after), (("moved", 0, 0),))
-    if kind == "add":
-        return Case(before, (*after, things[9]), (("new", -1, 9),))
-    if kind == "swap":
-        far = np.argsort([abs(radii[k] - radii[0]) if k else 9 for k in range(count)])[0]
-        after[0], after[far] = (
-            dataclasses.replace(things[a], spot=things[b].spot) for a, b in ((0, int(far)), (int(far), 0))
-        )
-        return Case(before, tuple(after), (("moved", 0, 0), ("moved", int(far), int(far))))
-    if kind == "turn":
-        after[0] = dataclasses.replace(
-            things[0], yaw=things[0].yaw + float(draw.choice([-1, 1]) * draw.uniform(0.7, 2.4))
-        )
-        return Case(before, tuple(after), (("moved", 0, 0),))
-    return Case(
-        before,
-        before,
-        (),
-        light=float(draw.choice([-1, 1]) * draw.uniform(0.8, 2.2)) if kind == "other light" else 0.0,
-        exposure=float(draw.choice([0.55, 0.75, 1.3, 1.5])) if kind == "other exposure" else 1.0,
-    )
+    elif kind == "add":
+        changes, after = (("new", -1, 9),), things
+    elif kind == "swap":
+        far = int(np.argsort([abs(radii[k] - radii[0]) if k else 9 for k in range(count)])[0])
+        changes = ("moved", 0, 0), ("moved", far, far)
+        for a, b in ((0, far), (far, 0)):
+            after[a] = dataclasses.replace(things[a], spot=things[b].spot)
+    elif kind == "turn":
+        turn = float(draw.choice([-1, 1]) * draw.uniform(0.7, 2.4))
+        changes, after[0] = (("moved", 0, 0),), dataclasses.replace(things[0], yaw=things[0].yaw + turn)
+    elif kind == "other light":
+        light = float(draw.choice([-1, 1]) * draw.uniform(0.8, 2.2))
+    elif kind == "other exposure":
+        exposure = float(draw.choice([0.55, 0.75, 1.3, 1.5]))
+    return Case(before, tuple(after), changes, light, exposure)
 
 
 def make_room(things: tuple[Thing, ...], seed: int, light: float = 0.0) -> Room:
@@ -191,12 +188,8 @@ class Options:
     """First seed, and the one after the last."""
     counts: tuple[int, ...] = (1, 3)
     """Numbers of photographs."""
-    quick: bool = False
-    """Measure one room with three photographs."""
     rooms: str = "experiments/data/changes"
     """Folder that keeps fields and photographs."""
-    only_make: bool = False
-    """Make the rooms, and measure nothing."""
     out: str = ""
 
 
@@ -204,7 +197,6 @@ def load_case(folder: Path, seed: int, kind: str, count: int) -> dict[str, np.nd
     """The photographs of a case, which are made once."""
     file = folder / f"{seed}-{kind.replace(' ', '-')}.npz"
     if not file.is_file():
-        folder.mkdir(parents=True, exist_ok=True)
         np.savez_compressed(file, **photographs(seed, kind, count))
     with np.load(file) as stored:
         return dict(stored)
@@ -214,7 +206,6 @@ def load_room_field(folder: Path, seed: int) -> LanguageField:
     """The field of a room, which is made once."""
     file = folder / f"{seed}.safetensors"
     if not file.is_file():
-        folder.mkdir(parents=True, exist_ok=True)
         save_field(file, room_field(make_room(make_case(seed, "nothing").before, seed)))
     return load_field(file)
 
@@ -272,24 +263,20 @@ def judge(changes: Changes, case: Case, shots: dict[str, np.ndarray], chosen: np
     return {"found": found, "truth": len(truth), "moved": moved}
 
 
-def ask_updated(scene: Scene, changes: Changes, case: Case) -> list[tuple[str, bool, bool]]:
-    """Asks for each thing that moved or is gone by its colour, in the updated field and in the field as it was.
+def ask_updated(scene: Scene, changes: Changes, case: Case) -> list[tuple[str, bool]]:
+    """Asks the updated field for each thing that moved or is gone by its colour.
 
     Returns:
-      The kind, and whether the answers of the two are right: at the new place, or no Gaussian.
+      The kind, and whether the answer is right: at the new place, or no Gaussian.
     """
     known = dataclasses.replace(changes, found=tuple(change for change in changes.found if change.object >= 0))
     rows, new = [], scene.update(known, date="2026-11-28")  # what is new would need a ledger
-
-    def is_right(asked: Scene, kind: str, i: int, j: int) -> bool:
-        answer = asked.ask(case.before[i].colour)
-        if kind == "gone":
-            return not answer.mask.any()
-        return bool(answer.mask.any()) and np.linalg.norm(answer.place.center[:2] - case.after[j].spot) < FOUND_M
-
     for kind, i, j in case.changes:
-        if kind != "new":
-            rows.append((kind, bool(is_right(new, kind, i, j)), bool(is_right(scene, kind, i, j))))
+        answer = new.ask(case.before[i].colour)
+        is_found = bool(answer.mask.any())
+        if is_found and kind == "moved":
+            is_found = bool(np.linalg.norm(answer.place.center[:2] - case.after[j].spot) < FOUND_M)
+        rows.append((kind, is_found == (kind == "moved")))
     return rows
 
 
@@ -305,27 +292,48 @@ def average_precision(found: list[tuple[float, bool]], truth: int) -> float:
 def measure_room(seed: int, options: Options) -> dict:
     """Measures all cases of a room: by the kind of case, the number of photographs and whether they have depth."""
     folder, rows = Path(options.rooms), {}
-    most = max(options.counts)
+    folder.mkdir(parents=True, exist_ok=True)
     field = load_room_field(folder, seed)
     for kind in KINDS:
-        shots = load_case(folder, seed, kind, most)
-        if options.only_make:
-            continue
-        cameras, case = new_cameras(seed + 1000 * KINDS.index(kind), len(shots["frames"])), make_case(seed, kind)
-        for count in options.counts:
+        shots, case = load_case(folder, seed, kind, max(options.counts)), make_case(seed, kind)
+        cameras = new_cameras(seed + 1000 * KINDS.index(kind), len(shots["frames"]))
+        for count, depth in itertools.product(options.counts, (False, True)):
             chosen = np.linspace(0, len(shots["frames"]), count, endpoint=False).astype(int)
-            for depth in (False, True):
-                scene = Scene(field, ColourEmbedder())
-                _ = scene.objects()
-                began = time.perf_counter()
-                changes = scene.changes(new_capture(shots, cameras, chosen, seed, depth))
-                seconds = time.perf_counter() - began
-                rows[f"{kind}, {count}, {'RGB-D' if depth else 'RGB'}"] = {
-                    **judge(changes, case, shots, chosen),
-                    "seconds": seconds,
-                    "asked": ask_updated(scene, changes, case) if kind in ("remove", "move") else [],
-                }
+            scene = Scene(field, ColourEmbedder())
+            _ = scene.objects()
+            began = time.perf_counter()
+            changes = scene.changes(new_capture(shots, cameras, chosen, seed, depth))
+            seconds = time.perf_counter() - began
+            asked = ask_updated(scene, changes, case) if kind in ("remove", "move") else []
+            row = judge(changes, case, shots, chosen) | {"seconds": seconds, "asked": asked}
+            rows[f"{kind}, {count}, {SENSORS[depth]}"] = row
     return rows
+
+
+def summarise(rows: dict, count: int, sensor: str) -> tuple[dict[str, float], list[str]]:
+    """The figures of all rooms for a number of photographs and a sensor, and what was reported of each kind."""
+    cells = {kind: [row[f"{kind}, {count}, {sensor}"] for row in rows.values()] for kind in KINDS}
+    every = [cell for column in cells.values() for cell in column]
+    found = [tuple(pair) for cell in every for pair in cell["found"]]
+    moved = [pair for cell in every for pair in cell["moved"]]
+    asked = [pair for cell in every for pair in cell["asked"]]
+    right, wrong = (
+        {kind: sum(pair[3] and pair[1] == is_right for cell in cells[kind] for pair in cell["found"]) for kind in KINDS}
+        for is_right in (True, False)
+    )
+    figures = {
+        "AP": average_precision(found, sum(cell["truth"] for cell in every)),
+        **{f"false in {kind}": wrong[kind] for kind in KINDS[5:]},
+        "place of moved, cm": 100 * float(np.median([error for error, _ in moved])) if moved else float("nan"),
+        "same id": float(np.mean([same for _, same in moved])) if moved else float("nan"),
+        **{
+            f"{words}, updated": float(np.mean([is_right for asked_kind, is_right in asked if asked_kind == kind]))
+            for kind, words in (("moved", "moved found"), ("gone", "gone refused"))
+        },
+        "seconds, median": float(np.median([cell["seconds"] for cell in every])),
+    }
+    truth = {kind: sum(cell["truth"] for cell in cells[kind]) for kind in KINDS[:5]}
+    return figures, [f"{right[kind]} of {number}, {wrong[kind]} false" for kind, number in truth.items()]
 
 
 def main(options: Options) -> dict:
@@ -334,46 +342,16 @@ def main(options: Options) -> dict:
     file = out / "run" / "cells.jsonl"
     for seed in range(*options.seeds):
         key = f"{seed} {options.counts}"
-        if options.only_make:
-            measure_room(seed, options)
-        elif key not in read_cells(file):
+        if key not in read_cells(file):
             append_cell(file, key, measure_room(seed, options))
         print(seed, flush=True)
-        rows[seed] = {} if options.only_make else read_cells(file)[key]
-    if options.only_make:
-        return {}
+        rows[seed] = read_cells(file)[key]
     figures, lines, kinds = {}, [], []
-    for count in options.counts:
-        for sensor in ("RGB", "RGB-D"):
-            cells = {kind: [rows[seed][f"{kind}, {count}, {sensor}"] for seed in rows] for kind in KINDS}
-            every = [cell for column in cells.values() for cell in column]
-            found = [tuple(pair) for cell in every for pair in cell["found"]]
-            moved = [pair for cell in every for pair in cell["moved"]]
-            reported = {k: [pair for cell in cells[k] for pair in cell["found"] if pair[3]] for k in KINDS}
-            quiet = {k: len(reported[k]) for k in KINDS[5:]}
-            figures[f"{count} {sensor}"] = figure = {
-                "AP": average_precision(found, sum(cell["truth"] for cell in every)),
-                "false in nothing": quiet["nothing"],
-                "false in other light": quiet["other light"],
-                "false in other exposure": quiet["other exposure"],
-                "place of moved, cm": 100 * float(np.median([error for error, _ in moved])) if moved else float("nan"),
-                "same id": float(np.mean([same for _, same in moved])) if moved else float("nan"),
-                **{
-                    f"{words}, {when}": float(
-                        np.mean([row[n] for cell in every for row in cell["asked"] if row[0] == kind])
-                    )
-                    for kind, words in (("moved", "moved found"), ("gone", "gone refused"))
-                    for n, when in ((1, "updated"), (2, "as it was"))
-                },
-                "seconds, median": float(np.median([cell["seconds"] for cell in every])),
-            }
-            lines.append((count, sensor, *figure.values()))
-            parts = []
-            for kind in KINDS[:5]:
-                right = sum(pair[1] for pair in reported[kind])
-                wrong = len(reported[kind]) - right
-                parts.append(f"{right} of {sum(cell['truth'] for cell in cells[kind])}, {wrong} false")
-            kinds.append((count, sensor, *parts))
+    for count, sensor in itertools.product(options.counts, SENSORS):
+        figure, reported = summarise(rows, count, sensor)
+        figures[f"{count} {sensor}"] = figure
+        lines.append((count, sensor, *figure.values()))
+        kinds.append((count, sensor, *reported))
     header = ("photographs", "sensor", *next(iter(figures.values())))
     text = results.table(header, lines) + "\n\n" + results.table(("photographs", "sensor", *KINDS[:5]), kinds)
     results.save(out, options, figures, text)
@@ -382,4 +360,4 @@ def main(options: Options) -> dict:
 
 
 if __name__ == "__main__":
-    main(results.read_options(Options, "changes", __doc__, {"seeds": (100, 101), "counts": (3,)}))
+    main(results.read_options(Options, "changes", __doc__))

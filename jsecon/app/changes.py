@@ -17,7 +17,7 @@ from jsecon.app.scene import Scene, open_scene
 from jsecon.change.detect import KINDS
 from jsecon.errors import InputError, require
 from jsecon.field.ledger import Ledger
-from jsecon.files import FIELD_FILE, csv_text, exclusive_lock, reading, write_text
+from jsecon.files import FIELD_FILE, csv_text, exclusive_lock, parse_json, reading, write_text
 from jsecon.numerics import axes_across
 from jsecon.pipeline.new_frames import read_frames
 from jsecon.pipeline.options import is_bare_scene, read_date, require_writable
@@ -37,19 +37,18 @@ def _changes(verb: verbs.Changes, console: Console) -> verbs.VerbResult:
     require_writable(verb.out)
     if verb.transform is not None and not is_bare_scene(verb.photos):
         raise InputError("--transform", "photographs have poses", remedy="Leave it out: it is for a file of Gaussians.")
-    _, changes, refused = _compare(verb, console, verb.transform)
-    return _write_changes(changes, verb.out, console) | {"errors": refused}
+    scene = open_scene(verb.field, embedder=verb.embedder, console=console)
+    return _write_changes(verb, scene, verb.out, console, verb.transform)[1]
 
 
-def _compare(
-    verb: verbs.Changes | verbs.Update, console: Console, transform: Path | None = None
-) -> tuple[Scene, Changes, list[InputError]]:
-    """Opens the field of a verb, and compares it with photographs, or with another file of Gaussians.
+def _write_changes(
+    verb: verbs.Changes | verbs.Update, scene: Scene, out: Path, console: Console, transform: Path | None = None
+) -> tuple[Changes, verbs.VerbResult]:
+    """Compares a scene with photographs or other Gaussians; prints what changed, and writes changes.json, .csv, .html.
 
-    The errors are those of photographs that cannot be placed.
+    The errors of the result are those of photographs that cannot be placed.
     """
     refused: list[InputError] = []
-    scene = open_scene(verb.field, embedder=verb.embedder, console=console)
     with console.progress("photographs") as progress:
         if is_bare_scene(verb.photos):
             capture = splat_capture(scene.field, read_scene(verb.photos)[0], _read_similarity(transform))
@@ -58,7 +57,21 @@ def _compare(
         else:
             capture = load_capture(verb.photos, long_side=LONG_SIDE, holdout=0, progress=progress)
     with console.progress("changes"):
-        return scene, scene.changes(capture, min_probability=verb.min_probability), refused
+        changes = scene.changes(capture, min_probability=verb.min_probability)
+    records = changes.records()
+    for record in records:
+        if record["kind"] not in ("same", "not seen"):
+            console.print_line(_words(record))
+    count = {kind: sum(record["kind"] == kind for record in records) for kind in KINDS}
+    console.print_line(", ".join(f"{number} {kind}" for kind, number in count.items() if number) or "no objects")
+    files = {name: out / f"changes.{name}" for name in ("json", "csv", "html")}
+    content = {"frame": "the capture's world", "changes": records} | world_record(changes.field)
+    write_text(files["json"], json.dumps(content, indent=2) + "\n")
+    write_text(files["csv"], _table(records))
+    with console.progress("pictures"):
+        write_text(files["html"], _page(changes))
+    console.print_line(f"pictures  {files['html']}")
+    return changes, {"changes": records, "written": files, "errors": refused}
 
 
 def _placed_capture(
@@ -97,32 +110,18 @@ def _update(verb: verbs.Update, console: Console) -> verbs.VerbResult:
     if date is None:
         date, origin = datetime.date.today().isoformat(), "today, as the photographs have no date"
     read_date(date)
-    scene, changes, refused = _compare(verb, console)
-    updated = scene.update(changes, date=date)
-    result = _write_changes(changes, out, console)
-    path = out / FIELD_FILE
+    scene = open_scene(verb.field, embedder=verb.embedder, console=console)
+    if "ledger" in parse_json(scene.field.provenance):
+        _ = scene.ledger  # a missing file stops here, before the work
+    changes, result = _write_changes(verb, scene, out, console)
+    updated, path = scene.update(changes, date=date), out / FIELD_FILE
     with exclusive_lock(out), console.progress("write"):
         updated.save(path)
+    if unsure := sum(change.kind == "unsure" for change in changes.found):
+        remedy = "more photographs, or a lower --min-probability, decide"
+        console.print_line(f"unsure  {unsure} of {len(changes.found)} objects stay as they were: {remedy}")
     console.print_line(f"date    {date} ({origin})\nfield   {path}")
-    return result | {"date": date, "errors": refused, "written": {**result["written"], "field": path}}
-
-
-def _write_changes(changes: Changes, out: Path, console: Console) -> verbs.VerbResult:
-    """Prints changes, and writes changes.json, changes.csv and changes.html to a folder."""
-    records = changes.records()
-    for record in records:
-        if record["kind"] not in ("same", "not seen"):
-            console.print_line(_words(record))
-    count = {kind: sum(record["kind"] == kind for record in records) for kind in KINDS}
-    console.print_line(", ".join(f"{number} {kind}" for kind, number in count.items() if number) or "no objects")
-    files = {name: out / f"changes.{name}" for name in ("json", "csv", "html")}
-    content = {"frame": "the capture's world", "changes": records} | world_record(changes.field)
-    write_text(files["json"], json.dumps(content, indent=2) + "\n")
-    write_text(files["csv"], _table(records))
-    with console.progress("pictures"):
-        write_text(files["html"], _page(changes))
-    console.print_line(f"pictures  {files['html']}")
-    return {"changes": records, "written": files}
+    return result | {"date": date, "written": {**result["written"], "field": path}}
 
 
 def _words(record: dict[str, Any]) -> str:

@@ -135,7 +135,12 @@ def apply_changes(
         masks = np.stack([new[k][0].after[t] for k in shown])
         name = _new_name(changes.capture.names[t], date, (*field.names, *views))
         views[name] = _new_view(changes, embedder, t, masks, rows, regions)
-    return add_objects(field, ledger(), things, views, [description for _, description in new])
+    try:
+        known = ledger()
+    except InputError as error:
+        problem = f"the photographs show something new, which needs the field's ledger, and {error.problem}"
+        raise InputError(error.where, problem, remedy=error.remedy) from error
+    return add_objects(field, known, things, views, [description for _, description in new])
 
 
 def _new_name(name: str, date: str, known: tuple[str, ...]) -> str:
