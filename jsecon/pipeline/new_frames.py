@@ -185,7 +185,8 @@ def make_views(
         labels, new = label_by_regions(view, owner[seen], consensus, unknown[seen], split=masks is not None)
         if ignored is not None:
             labels = np.where(ignored, IGNORED, labels)
-        old, count = consensus.shape[1], consensus.shape[1] + new
+        old = votes.num_regions + sum(part.shape[1] for part in opened)
+        count = old + new
         evidence = list_labels(labels, count)
         if new:  # the next frame may show them too
             own = evidence.matrix(len(owner), count)
