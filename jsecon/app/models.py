@@ -42,10 +42,7 @@ def _get_models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
             continue
         for model in hub.models_of_name(name, verb.role):
             try:
-                with console.progress("hub"):
-                    download = hub.plan_download(model)
-                console.note(f"fetching {download}")
-                folder = hub.fetch(download)
+                folder = hub.fetch(model, lambda line: console.note(f"fetching {line}"))
             except InputError as error:
                 errors.append(error)
                 continue

@@ -2,8 +2,7 @@
 
 A user names a model by a name of catalogue.toml ("clip"), by its repository ("hub:owner/name",
 "hub:owner/name@revision"), or by a folder. huggingface_hub transfers the files and keeps the cache, so HF_HOME,
-HF_ENDPOINT, HF_HUB_OFFLINE and HF_TOKEN work as they do elsewhere. A transfer is planned first (files, size, licence),
-so that the user can be asked. Afterwards huggingface_hub compares each file with the hub's hash.
+HF_ENDPOINT, HF_HUB_OFFLINE and HF_TOKEN work as they do elsewhere. Afterwards it compares each file with the hub's hash.
 """
 
 import contextlib
@@ -19,8 +18,6 @@ from jsecon.errors import InputError, describe_error
 
 Role = Literal["embedder", "segmenter", "tracker"]
 
-_SUFFIXES = {"fp32": "", "fp16": "_fp16", "int8": "_quantized"}
-"""precision of graphs -> what public exports append to their names; the first that is there is taken"""
 PREFIX = "hub:"
 RECOMMENDED: Mapping[Role, str] = {"segmenter": "edgetam", "embedder": "siglip2"}
 """what `--models auto` takes"""
@@ -33,8 +30,6 @@ class _Layout(NamedTuple):
     """files without which the model does not work"""
     optional: tuple[str, ...] = ()
     """files that are fetched where the repository has them"""
-    precision: str = "fp32"
-    """precision of the graphs"""
 
 
 _TRACKER = tuple(
@@ -44,23 +39,20 @@ _TRACKER = tuple(
 _LAYOUTS: Mapping[Role, tuple[_Layout, ...]] = {
     "embedder": (
         _Layout(
-            ("onnx/vision_model{p}.onnx", "onnx/text_model{p}.onnx", "preprocessor_config.json", "tokenizer.json"),
+            ("onnx/vision_model.onnx", "onnx/text_model.onnx", "preprocessor_config.json", "tokenizer.json"),
             ("config.json", "tokenizer_config.json"),
         ),
         _Layout(
-            ("visual/model{p}.onnx", "textual/model{p}.onnx", "visual/preprocess_cfg.json", "textual/tokenizer.json"),
+            ("visual/model.onnx", "textual/model.onnx", "visual/preprocess_cfg.json", "textual/tokenizer.json"),
             ("config.json", "textual/tokenizer_config.json"),
         ),
     ),
     "segmenter": (
-        _Layout(
-            ("onnx/vision_encoder{p}.onnx", "onnx/prompt_encoder_mask_decoder{p}.onnx", "preprocessor_config.json"),
-        ),
+        _Layout(("onnx/vision_encoder.onnx", "onnx/prompt_encoder_mask_decoder.onnx", "preprocessor_config.json")),
     ),
     "tracker": (_Layout((*_TRACKER, "constants.json")), _Layout((*_TRACKER, "onnx/constants.json"))),
 }
-"""role -> the layouts that its public exports have; `{p}` stands for the suffix of the precision. A graph's external
-data (`.onnx_data`) comes with the graph."""
+"""role -> the layouts that its public exports have. A graph's external data (`.onnx_data`) comes with the graph."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,28 +93,17 @@ class HubModel:
         from huggingface_hub import snapshot_download
         from huggingface_hub.errors import LocalEntryNotFoundError
 
-        for required, optional, _ in _layouts(self.role):
+        for required, optional in _LAYOUTS[self.role]:
             patterns = [*required, *optional, *(f"{name}_data*" for name in required)]
             with contextlib.suppress(LocalEntryNotFoundError, ValueError):  # ValueError: no name of a repository
-                folder = snapshot_download(
-                    self.repository, revision=self.revision, local_files_only=True, allow_patterns=patterns
+                folder = Path(
+                    snapshot_download(
+                        self.repository, revision=self.revision, local_files_only=True, allow_patterns=patterns
+                    )
                 )
-                if all((Path(folder) / name).is_file() for name in required):
-                    return Path(folder)
+                if all((folder / name).is_file() for name in required):
+                    return folder
         return None
-
-
-def _layouts(role: Role) -> list[_Layout]:
-    """Lists the layouts of a role in each precision, the highest first."""
-
-    def filled(names: tuple[str, ...], suffix: str) -> tuple[str, ...]:
-        return tuple(name.format(p=suffix) for name in names)
-
-    return [
-        _Layout(filled(layout.required, suffix), filled(layout.optional, suffix), precision)
-        for precision, suffix in _SUFFIXES.items()
-        for layout in _LAYOUTS[role]
-    ]
 
 
 @functools.cache
@@ -198,10 +179,7 @@ def cached_address(folder: Path) -> str | None:
 
 
 def find_files(folder: str | Path, role: Role) -> list[Path]:
-    """Finds the required files of a model in a folder, in the order of its layout, or raises InputError.
-
-    The graphs are those of the highest precision that is there.
-    """
+    """Finds the required files of a model in a folder, in the order of its layout, or raises InputError."""
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(folder, "no such folder", "", "Check the path of the model.")
@@ -212,7 +190,7 @@ def find_files(folder: str | Path, role: Role) -> list[Path]:
 def _present_layout(role: Role, exists: Callable[[str], object], where: object) -> _Layout:
     """Returns the first layout whose required files exist, or raises InputError."""
     missing = []
-    for layout in _layouts(role):
+    for layout in _LAYOUTS[role]:
         missing.append([name for name in layout.required if not exists(name)])
         if not missing[-1]:
             return layout
@@ -220,59 +198,29 @@ def _present_layout(role: Role, exists: Callable[[str], object], where: object) 
     raise InputError(where, f"no {role}, since it lacks {', '.join(min(missing, key=len))}", "", remedy)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Download:
-    """What has to be fetched for a model."""
-
-    model: HubModel
-    sizes: Mapping[str, int]
-    """Files that the model needs, with their bytes."""
-    licence: str
-    """Licence by the repository's own card, or "not stated"."""
-    precision: str
-    """Precision of the graphs."""
-
-    def __str__(self) -> str:
-        """Describes it on one line."""
-        megabytes = max(round(sum(self.sizes.values()) / 1e6), 1)
-        files = f"{len(self.sizes)} files, {megabytes:,} MB, {self.precision}"
-        return f"{self.model.address} ({files}, licence: {self.licence})"
-
-
-def plan_download(model: HubModel) -> _Download:
-    """Asks the hub which files a model needs, or raises InputError."""
-    from huggingface_hub import HfApi
-
-    with _hub_errors(model):
-        info = HfApi().model_info(model.repository, revision=model.revision, files_metadata=True)
-    sizes = {file.rfilename: file.size or 0 for file in info.siblings or ()}
-    layout = _present_layout(model.role, sizes.__contains__, model.address)
-    data = tuple(f"{name}_data" for name in layout.required)
-    needed = {
-        path: size
-        for path, size in sizes.items()
-        if path in (*layout.required, *layout.optional) or path.startswith(data)
-    }
-    licences = [tag.removeprefix("license:") for tag in info.tags or () if tag.startswith("license:")]
-    return _Download(model, needed, ", ".join(licences) or "not stated", layout.precision)
-
-
-def fetch(download: _Download) -> Path:
+def fetch(model: HubModel, note: Callable[[str], None]) -> Path:
     """Brings the files of a model into the hub's cache, or raises InputError; returns their folder.
 
-    What is there already stays, and a transfer that broke goes on. A file that differs from its hash is removed.
+    What is there already stays, and a transfer that broke goes on. A file that differs from its hash is removed. `note`
+    takes a line with address, size and licence, before the transfer.
     """
     from huggingface_hub import HfApi, snapshot_download
 
-    model = download.model
     with _hub_errors(model):
-        names = list(download.sizes)
+        info = HfApi().model_info(model.repository, revision=model.revision, files_metadata=True)
+        sizes = {file.rfilename: file.size or 0 for file in info.siblings or ()}
+        layout = _present_layout(model.role, sizes.__contains__, model.address)
+        data = tuple(f"{name}_data" for name in layout.required)
+        names = [name for name in sizes if name in layout.required + layout.optional or name.startswith(data)]
+        licences = [tag.removeprefix("license:") for tag in info.tags or () if tag.startswith("license:")]
+        megabytes = max(round(sum(sizes[name] for name in names) / 1e6), 1)
+        note(f"{model.address} ({megabytes:,} MB, licence: {', '.join(licences) or 'not stated'})")
         folder = Path(snapshot_download(model.repository, revision=model.revision, allow_patterns=names))
         check = HfApi().verify_repo_checksums(model.repository, revision=folder.name, local_dir=folder)
     damaged = [mismatch["path"] for mismatch in check.mismatches]
     for path in damaged:
-        (folder / path).resolve().unlink(missing_ok=True)
-        (folder / path).unlink(missing_ok=True)
+        (folder / path).resolve().unlink()
+        (folder / path).unlink(missing_ok=True)  # the link to it
     if damaged:
         problem = "its content differs from the hash that the hub gives for it, so it was removed"
         raise InputError(f"{model.address} {', '.join(damaged)}", problem, "", f"Fetch it again: {model.get_command}")
@@ -286,25 +234,21 @@ def _hub_errors(model: HubModel) -> Iterator[None]:
 
     try:
         yield
+    except InputError:
+        raise
     except Exception as error:
         cause: BaseException = error
         while isinstance(cause, FileNotFoundError) and cause.__cause__ is not None:  # LocalEntryNotFoundError
             cause = cause.__cause__
         page, get = f"{constants.ENDPOINT}/{model.repository}", model.get_command
         match cause:  # in this order: GatedRepoError is a RepositoryNotFoundError
-            case errors.OfflineModeIsEnabled():
-                problem = "not in the cache, and HF_HUB_OFFLINE forbids requests"
-                remedy = f"Unset HF_HUB_OFFLINE, then {get}"
             case errors.GatedRepoError():
                 problem = "its owner grants access to accounts only"
                 remedy = f"Accept its licence on {page}, set HF_TOKEN to a token of your account, then {get}"
-            case errors.RevisionNotFoundError():
-                problem = f"the repository has no revision {model.revision}"
-                remedy = f"See {page}/commits/main for those it has."
-            case errors.RepositoryNotFoundError():
-                problem = "the hub has no such repository, or it is private"
-                remedy = "Check the name; for a private one set HF_TOKEN."
+            case errors.RepositoryNotFoundError() | errors.RevisionNotFoundError():
+                problem = "the hub has no such repository or revision, or it is private"
+                remedy = f"Check {page}; for a private one set HF_TOKEN."
             case _:
                 problem = f"not fetched from {constants.ENDPOINT} ({describe_error(cause)})"
-                remedy = f"Check the network and the disk. Run it again: {get}"
+                remedy = f"Check the network, the disk and HF_HUB_OFFLINE. Run it again: {get}"
         raise InputError(model.address, problem, "", remedy) from error
