@@ -141,19 +141,6 @@ def write_sog(folder, change):
     return folder / "a.sog"
 
 
-@pytest.mark.parametrize("part", ["scales", "sh0"])
-def test_a_codebook_that_begins_with_null_is_repaired_as_viewers_do(tmp_path, part):
-    read, notes = read_gaussians(write_sog(tmp_path, lambda meta: meta[part]["codebook"].__setitem__(0, None)))
-    whole = load_gaussians(tmp_path / "whole.sog")
-    assert part in notes[0]
-    assert read.count == whole.count
-    name = {"scales": "log_scales", "sh0": "sh"}[part]
-    changed = getattr(read, name) != np.asarray(getattr(whole, name))
-    assert changed.mean() < 0.05
-    book = np.unique(np.asarray(getattr(whole, name)))
-    np.testing.assert_allclose(getattr(read, name), getattr(whole, name), atol=0.1 * np.ptp(book))
-
-
 @pytest.mark.parametrize("kind", ["null in a .sog", "NaN in a .splat"])
 def test_gaussians_that_cannot_be_drawn_are_left_out_of_compressed_files(tmp_path, kind):
     if kind == "NaN in a .splat":

@@ -136,9 +136,8 @@ def test_label_bits(tmp_path, bits):
 @pytest.mark.parametrize("dtype", [bool, np.uint8, np.int32, np.int64, np.float32])
 def test_label_arrays(tmp_path, dtype):
     ids = RNG.integers(0, 2 if dtype is bool else 200, (9, 11)).astype(dtype)
-    for shape in (ids, ids[None], ids[..., None]):
-        np.save(tmp_path / "a.npy", shape)
-        np.testing.assert_array_equal(read_label_image(tmp_path / "a.npy"), ids)
+    np.save(tmp_path / "a.npy", ids)
+    np.testing.assert_array_equal(read_label_image(tmp_path / "a.npy"), ids)
     for wrong, words in ((np.zeros((3, 9, 11)), "shape"), (ids + 0.5, "not ids"), (ids[0], "shape")):
         np.save(tmp_path / "a.npy", wrong)
         with refused("a.npy", words):
@@ -193,19 +192,13 @@ def test_lenses_that_cannot_be_undone():
     assert undistorted_pinhole(plain, "here") == Lens(160, 120, 130.0, 130.0, 80.0, 60.0)
 
 
-@pytest.mark.parametrize(
-    ("name", "kind"), [("a.gif", "GIF"), ("b.png", "JPEG XL"), ("c.dng", "raw"), ("d.exr", "OpenEXR")]
-)
-def test_a_format_that_is_not_read_is_named(tmp_path, name, kind):
-    """By its first bytes, or its suffix: a raw file is a TIFF whose first image is a thumbnail."""
-    heads = {"a.gif": b"GIF89a", "b.png": b"\xff\x0a", "c.dng": b"II*\0", "d.exr": b"v/1\1"}
-    (tmp_path / name).write_bytes(heads[name] + bytes(200))
-    with refused(name, kind, "magick"):
-        image_header(tmp_path / name)
-    with refused(tmp_path.name, kind, "magick"):
-        if name.endswith(".png"):
-            (tmp_path / name).rename(tmp_path / "b.jxl")
-        load_capture(tmp_path)
+@pytest.mark.parametrize("name", ["a.gif", "c.DNG", "d.exr"])
+def test_a_format_that_is_not_read_is_named(tmp_path, name):
+    """A raw file is a TIFF whose first image is a thumbnail."""
+    (tmp_path / name).write_bytes(b"II*\0" + bytes(200))
+    for read, path in ((image_header, tmp_path / name), (load_capture, tmp_path)):
+        with refused(name[1:], "not read", "magick"):
+            read(path)
 
 
 @pytest.mark.parametrize("turn", [1, 6])
@@ -218,11 +211,3 @@ def test_avif_is_read_if_pillow_has_it(tmp_path, turn):
     PIL.Image.fromarray(stored).save(tmp_path / "a.avif", quality=95, exif=tags.tobytes())
     assert image_header(tmp_path / "a.avif").upright == (96, 64)
     assert np.abs(read_image(tmp_path / "a.avif")[0].astype(int) - corners(96, 64)).mean() < 6
-
-
-def test_a_transparent_label_image_is_its_opaque_part(tmp_path):
-    opaque = FRAME[..., 0] > 99
-    for colours in (FRAME, FRAME * 0):  # black is the mask itself where it is opaque
-        cv2.imwrite(str(tmp_path / "cut.png"), np.dstack([colours[..., ::-1], np.uint8(255 * opaque)]))
-        ids = colours.astype(int) @ [65536, 256, 1] if colours.any() else 1
-        np.testing.assert_array_equal(read_label_image(tmp_path / "cut.png"), np.where(opaque, ids, 0))

@@ -2,14 +2,12 @@
 objects."""
 
 import json
-import shutil
 
 import cv2
 import numpy as np
 import pytest
 from capture_files import refused
 
-from jsecon.read.captures.images import write_image
 from jsecon.read.masks.masks import LEVELS, load_labels, load_proposals
 from jsecon.types import ImageFile
 
@@ -172,7 +170,6 @@ def test_resizing_takes_the_value_at_each_centre(tmp_path, width):
 
 @pytest.mark.parametrize(("frame", "file"), [
     ("a", "a.PNG"), ("frame.0001", "frame.0001.png"), ("frame.0001", "frame.0001.jpg.png"), ("a", "a.JPG.Png"),
-    ("a", "a_mask.png"), ("frame.0001", "frame.0001_masks.png"), ("0001", "mask_0001.png"), ("a", "a.jpg_mask.png"),
     ("cam0_a", "cam0/a.png"), ("cam0_a", "cam0_a.png"),
 ])  # fmt: skip
 def test_what_a_mask_may_be_called(tmp_path, frame, file):
@@ -208,21 +205,6 @@ def test_arrays_with_negative_numbers(tmp_path):
     np.testing.assert_array_equal(labels, [image, image - 1])
     assert ids == (0, 1, 2, 3, 4)
     assert "negative" in notes[0]
-
-
-def test_masks_of_stored_pixels_are_turned_like_their_photographs(tmp_path):
-    """A lies on its side (6: its stored pixels are turned clockwise), and b is upright."""
-    upright = [ids_image() for _ in range(2)]
-    files = {name: ImageFile(f"{name}.jpg", 16, 12, turn) for name, turn in zip("ab", (6, 1))}
-    stored = [np.rot90(upright[0]), upright[1]]
-    for images, note in ((upright, ""), ([image.repeat(2, 0).repeat(2, 1) for image in stored], "1 masks were of the")):
-        for name, image in zip("ab", images):
-            write(tmp_path / f"{name}.png", image)
-        labels, _, notes = load_labels(tmp_path, tuple("ab"), FRAME, frames=files)
-        np.testing.assert_array_equal(labels, np.stack(upright) - 1)
-        assert note in "".join(notes)
-    read, _ = load_proposals(tmp_path, tuple("ab"), FRAME, frames=files)
-    np.testing.assert_array_equal(read(0), [upright[0] == id for id in range(1, 5)])
 
 
 SQUARE = [1, 1, 9, 1, 9, 9, 1, 9]
@@ -276,23 +258,15 @@ def outlined(image):
     return cv2.dilate(small, np.ones((3, 3))) != cv2.erode(small, np.ones((3, 3)))
 
 
-@pytest.mark.parametrize("kind", ["8 bits", "16 bits", "int64", "around", "white", "254", "in one frame"])
+@pytest.mark.parametrize("kind", ["8 bits", "16 bits", "around", "in one frame"])
 def test_an_id_to_ignore_is_no_region(tmp_path, kind):
     """The largest of its type: on outlines, or on all that is no thing."""
     names, plain = ("a", "b", "c"), [things(shift) for shift in range(3)]
     for name, ids in zip(names, plain):
-        if kind == "white":
-            colours = np.array([[0, 0, 0], [200, 30, 0], [0, 90, 200], [7, 200, 90], [90, 90, 90]], np.uint8)[ids]
-            colours[outlined(ids)] = 255
-            write_image(tmp_path / f"{name}.png", colours)
-            continue
-        void = {"16 bits": 65535, "int64": 2**32 - 1, "254": 254}.get(kind, 255)
+        void = 65535 if kind == "16 bits" else 255
         marked = np.where(ids == 0 if kind == "around" else outlined(ids), void, ids.astype(np.int64))
         marked = ids if kind == "in one frame" and name != "b" else marked
-        if kind == "int64":
-            np.save(tmp_path / f"{name}.npy", marked)
-        else:
-            cv2.imwrite(str(tmp_path / f"{name}.png"), marked.astype(np.uint16 if void > 255 else np.uint8))
+        cv2.imwrite(str(tmp_path / f"{name}.png"), marked.astype(np.uint16 if void > 255 else np.uint8))
     labels, ids, notes = load_labels(tmp_path, names, (60, 80))
     assert len(ids) == 4
     assert len(notes) == 1
@@ -316,46 +290,6 @@ def test_the_largest_number_may_be_a_thing(tmp_path, kind):
     _, ids, notes = load_labels(tmp_path, ("a", "b"), (60, 80))
     assert ids[-1] == 255
     assert notes == ()
-
-
-@pytest.mark.parametrize("kind", ["half size", "blurred", "sharpened"])
-def test_colours_of_smoothed_edges_are_no_regions(tmp_path, kind):
-    table = np.array([[0, 0, 0], [230, 25, 75], [60, 180, 75], [255, 225, 25], [0, 130, 200]], np.uint8)
-    for shift, name in enumerate("abc"):
-        colours = table[things(shift)]
-        if kind == "half size":
-            large = cv2.resize(colours, None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST)
-            colours = cv2.resize(large, (60, 45), interpolation=cv2.INTER_AREA)
-        elif kind == "blurred":
-            colours = cv2.GaussianBlur(colours, (0, 0), 0.8)
-        else:
-            colours = cv2.resize(cv2.resize(colours, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), (80, 60))
-        write_image(tmp_path / f"{name}.png", colours)
-    labels, ids, notes = load_labels(tmp_path, ("a", "b", "c"), colours.shape[:2])
-    assert set(ids) == {int(each @ [65536, 256, 1]) for each in table[1:].astype(int)}
-    assert labels.max() == 3
-    assert "smoothed edges" in notes[0]
-    read, _ = load_proposals(tmp_path, ("a", "b", "c"), colours.shape[:2])
-    assert len(read(0)) == 4
-
-
-@pytest.mark.parametrize("steps", [60, 200])
-def test_greys_of_smoothed_edges_are_no_regions_and_narrow_things_are(tmp_path, steps):
-    """Four things, or one, smoothed; and ids of three narrow things between those beside them."""
-    narrow_things = tmp_path / "narrow"
-    narrow_things.mkdir()
-    for shift, name in enumerate("abc"):
-        greys = np.minimum(steps * things(shift), 240 if steps == 60 else 200).astype(np.uint8)
-        cv2.imwrite(str(tmp_path / f"{name}.png"), cv2.GaussianBlur(greys, (0, 0), 0.8))
-        greys[::20, 5:60], greys[:, 2], greys[:, 77] = 90, 30, 20
-        cv2.imwrite(str(narrow_things / f"{name}.png"), greys)
-    _, ids, notes = load_labels(narrow_things, ("a", "b", "c"), (60, 80))
-    assert {20, 30, 90} < {*ids}
-    assert notes == ()
-    shutil.rmtree(narrow_things)
-    _, ids, notes = load_labels(tmp_path, ("a", "b", "c"), (60, 80))
-    assert ids == ((60, 120, 180, 240) if steps == 60 else (200,))
-    assert "smoothed edges" in notes[0]
 
 
 def test_many_more_ids_than_things_are_hinted_at(tmp_path):

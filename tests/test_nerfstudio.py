@@ -166,21 +166,14 @@ def test_a_lost_pose_is_left_out_and_counted(tmp_path, value):
     assert "1 frames were left out: their poses" in loaded.notes[0]
 
 
-@pytest.mark.parametrize("both", [True, False])
-def test_intrinsics_in_shares_of_the_image_are_pixels_again(tmp_path, both):
-    width, height = CAPTURE.cameras.width, CAPTURE.cameras.height
-
+@pytest.mark.parametrize("keys", [("cx", "cy"), ("fl_x", "fl_y")])
+def test_intrinsics_in_shares_of_the_image_are_refused(tmp_path, keys):
     def shares(content):
-        content["cx"], content["cy"] = content["cx"] / width, content["cy"] / height
-        for entry in content["frames"]:
-            if both:
-                entry["fl_x"], entry["fl_y"] = entry["fl_x"] / width, entry["fl_y"] / height
+        for entry in (content, *content["frames"]):
+            entry.update({key: entry[key] / 100 for key in keys if key in entry})
 
-    loaded = load_changed(tmp_path, shares, holdout=0)
-    for name in ("fx", "fy"):
-        np.testing.assert_allclose(getattr(loaded.cameras, name), getattr(CAPTURE.cameras, name), rtol=1e-5)
-    np.testing.assert_allclose(loaded.cameras.cx, CAPTURE.cameras.cx[0], rtol=1e-5)
-    assert "shares of the image size" in loaded.notes[0]
+    with refused("shares of the image size"):
+        load_changed(tmp_path, shares, holdout=0)
 
 
 @pytest.mark.parametrize(("key", "value", "axis"), [
@@ -241,8 +234,5 @@ def test_the_captures_own_split_is_kept_unless_a_holdout_is_given(tmp_path, chan
 def test_keys_that_change_what_numbers_mean_are_named(tmp_path):
     def change(content):
         content["frames"][1] |= {"is_bad": True, "depth_path": "depth/1.png"}
-        content["test_filenames"] = ["images/gone.png", NAMES[0]]
 
-    notes = " ".join(load_changed(tmp_path, change).notes)
-    assert "depth_path, is_bad" in notes
-    assert "1 images of no frame" in notes
+    assert "depth_path, is_bad" in " ".join(load_changed(tmp_path, change).notes)

@@ -171,7 +171,7 @@ DAMAGE = {
     "depths/depth.png": [(put("", np.ones((4, 5, 3), np.uint8)), "uint8")],
     "masks/grey": [
         (edit("a.png", lambda data: data[:-20]), "a.png", "cannot be read"),
-        (put("a.png", IDS.T), "a.png", "24x36", "36x24"), (put("a.png", np.dstack([IDS] * 4)), "half transparent"),
+        (put("a.png", IDS.T), "a.png", "24x36", "36x24"), (put("a.png", np.dstack([IDS] * 4)), "transparency"),
         (put("a.png", np.dstack([IDS.astype(np.uint16)] * 3)), "16 bits"),
     ],
     "masks/levels": [

@@ -105,16 +105,6 @@ def write_record3d(folder) -> None:
     (folder / "metadata.json").write_text(json.dumps(told))
 
 
-def write_seven_scenes(folder) -> None:
-    """Frame 4 was lost by the tracker. The depth camera writes 65535 where it sees nothing."""
-    folder.mkdir(parents=True)
-    for n, pose in enumerate(poses()):
-        write_image(folder / f"frame-{n:06d}.color.png", CAPTURE.frames[n])
-        depth(folder / f"frame-{n:06d}.depth.png", n)
-        np.savetxt(folder / f"frame-{n:06d}.pose.txt", np.full((4, 4), np.nan) if n == 4 else pose)
-    (folder / "intrinsics.txt").write_text(" ".join(map(str, K)))
-
-
 def write_replica(folder) -> None:
     """With the parameters of the camera in the scene; the downloads have them one folder up."""
     rows = [np.full(16, np.inf) if n == 4 else pose.ravel() for n, pose in enumerate(poses())]
@@ -126,8 +116,7 @@ def write_replica(folder) -> None:
     (folder / "cam_params.json").write_text(json.dumps({"camera": camera}))
 
 
-WRITERS = write_seven_scenes, write_replica
-WRITERS += write_scannet, write_tum, write_arkitscenes, write_polycam, write_record3d
+WRITERS = write_scannet, write_replica, write_tum, write_arkitscenes, write_polycam, write_record3d
 FORMATS = {write.__name__.removeprefix("write_"): write for write in WRITERS}
 
 
@@ -226,22 +215,21 @@ def test_record3d_as_its_archive_unpacks(tmp_path):
     np.testing.assert_allclose(found.cameras.cx, K[2], rtol=1e-6)
 
 
-@pytest.mark.parametrize(("write", "size"), [(write_seven_scenes, (640, 480)), (write_replica, (1200, 680))])
-def test_poses_without_intrinsics_take_the_benchmarks_at_its_size_only(tmp_path, write, size):
+def test_replicas_parameters_lie_in_the_scene_or_above_or_are_the_benchmarks(tmp_path):
     folder = tmp_path / "inner" / "scene"
-    write(folder)
-    for file in (folder / "intrinsics.txt", folder / "cam_params.json"):
-        file.unlink(missing_ok=True)
-    with refused("scene", "24x16", "intrinsics.txt", "photographs alone"):
+    write_replica(folder)
+    expected = load_capture(folder)
+    (folder / "cam_params.json").rename(folder.parent / "cam_params.json")
+    np.testing.assert_array_equal(load_capture(folder).cameras.cx, expected.cameras.cx)
+    (folder.parent / "cam_params.json").unlink()
+    with refused("scene", "24x16", "cam_params.json"):
         load_capture(folder)
     for file in folder.rglob("*.png"):
-        if "depth" in file.name:
-            file.unlink()
-        else:
-            cv2.imwrite(str(file), np.zeros((*size[::-1], 3), np.uint8))
+        kind = np.uint16 if "depth" in file.name else np.uint8
+        cv2.imwrite(str(file), np.full((680, 1200), 13107, kind) if kind == np.uint16 else np.zeros((680, 1200, 3), kind))
     found = load_capture(folder, frames=2)
-    np.testing.assert_allclose(found.cameras.cx[0], size[0] / 2)
-    assert any("benchmark" in note for note in found.notes)
+    np.testing.assert_allclose(found.cameras.cx[0], found.cameras.width / 2)
+    np.testing.assert_allclose(found.depths, 2 / np.cbrt(np.linalg.det(found.source_from_scene[:3, :3])), rtol=1e-5)
 
 
 def test_depth_of_the_largest_number_is_unknown(tmp_path):

@@ -17,7 +17,7 @@ from jsecon.files import describe_substitute, is_output_folder, list_files, read
 from jsecon.read.captures import colmap, nerfstudio, opensfm, rgbd
 from jsecon.read.captures.build import build_capture
 from jsecon.read.captures.frames import FrameOptions, PosedImages
-from jsecon.read.captures.images import IMAGE_SUFFIXES, convert_remedy, image_header, unread_format
+from jsecon.read.captures.images import IMAGE_SUFFIXES, convert_remedy, image_header, is_unread
 from jsecon.read.captures.panoramas import cut_panoramas
 from jsecon.read.captures.video import is_video
 from jsecon.read.registry import SCENES, Reader, find_reader
@@ -34,10 +34,11 @@ _IMAGE_WORD = re.compile(r"(?<![a-z])(colou?r|rgba?|images?|img|frame|photo)(?![
 """words in names of images, beside each other: frame0001.jpg and depth0001.png, a.color.png and a.depth.png"""
 _EXIF, _TAKEN, _DATE = 0x8769, 0x9003, re.compile(r"(\d{4}):(\d\d):(\d\d)")
 """EXIF's block of a photograph, its tag DateTimeOriginal, and the date in that"""
-_POSE_FOLDER = re.compile(r"(camera_?)?poses?|cams?|cameras|extrinsics?|traj(ectory)?")
-_POSE_FILE = re.compile(
-    r".*(pose|traj|extrinsic|odometry|ground_?truth|camera).*\.(txt|json|npy|npz|csv|log|xml|ya?ml)"
+_POSE = re.compile(
+    r"(camera_?)?poses?|cams?|cameras|extrinsics?|traj(ectory)?"
+    r"|.*(pose|traj|extrinsic|odometry|ground_?truth|camera).*\.(txt|json|npy|npz|csv|log|xml|ya?ml)"
 )
+"""names of folders and files that may hold poses"""
 
 
 def load_capture(
@@ -202,27 +203,20 @@ def _capture_above(path: Path) -> tuple[Path, str] | None:
 
 def _notes_beside(path: Path, photos: Sequence[Path], others: Sequence[Path]) -> tuple[str, ...]:
     """Says what lies beside the photographs of a folder and is not used."""
-    folders = {path, photos[0].parent, photos[0].parent.parent} if path in photos[0].parents else {path}
-    folders = {folder for folder in folders if folder == path or path in folder.parents}
-    folders |= {child for child in path.iterdir() if child.is_dir() and _POSE_FOLDER.fullmatch(child.name.lower())}
-    files = sorted(f for folder in folders for f in folder.iterdir() if f.is_file() and not f.name.startswith("."))
-    stems = {photo.stem for photo in photos} | {re.sub(r"[_.-]\w+$", "", photo.stem) for photo in photos}
-    numbers = [f for f in files if f.suffix.lower() in (".txt", ".json", ".npy", ".xml") and f.stem in stems]
-    poses = [file for file in files if _POSE_FILE.fullmatch(file.name.lower())]
-    poses += [f for f in numbers if f not in poses] if 2 * len(numbers) >= len(photos) else []
-    unread = [file for file in files if unread_format(file) or is_video(file)]
+    children = [*path.iterdir(), *(photos[0].parent.iterdir() if photos[0].parent != path else ())]
+    poses = [child for child in children if _POSE.fullmatch(child.name.lower())]
+    unread = [child for child in children if is_unread(child) or is_video(child)]
     notes = []
     if others:
         left_out = "are left out as depth maps, masks or copies of the photographs"
         notes.append(f"{len(others)} images {left_out} ({join_first([file.name for file in others])}).")
     if poses:
-        names = join_first([file.name for file in poses])
+        names = join_first(sorted(file.name for file in poses))
         remedy = "Write them as a COLMAP model or a transforms.json to use them."
         notes.append(f"What may be poses is of a layout that jsecon does not read ({names}). {remedy}")
     if unread:
-        names = join_first([file.name for file in unread])
-        remedy = "Convert images to JPEG or PNG; give a video by itself."
-        notes.append(f"{len(unread)} files are left out, whose formats are not read here ({names}). {remedy}")
+        names = join_first(sorted(file.name for file in unread))
+        notes.append(f"Files of formats that are not read here are left out ({names}). Give a video by itself.")
     return tuple(notes)
 
 
@@ -236,20 +230,16 @@ def _no_capture(path: Path) -> InputError:
     """The error of a path without a capture: what lies there, and what to give instead."""
     expected = "a capture of COLMAP, nerfstudio, a depth camera or a phone; or photographs, or a video"
     entries = sorted(child for child in path.iterdir() if not child.name.startswith(".")) if path.is_dir() else []
-    names = ", ".join(child.name for child in entries[:5]) + (", ..." if len(entries) > 5 else "")
-    problem = f"a folder without poses and photographs, but with {names}"
+    images = [*entries, *path.glob("images/*")] if path.is_dir() else []
+    problem = f"a folder without poses and photographs, but with {join_first([child.name for child in entries])}"
     remedy = "Give a folder with images/ and sparse/0, with transforms.json, or with photographs in it."
-    videos = [child for child in entries if is_video(child)]
-    unread = [child for child in (*entries, *path.glob("images/*")) if unread_format(child)] if path.is_dir() else []
-    archives = [child for child in entries if _is_archive(child)]
     scenes = [child for child in entries if child.suffix.lower() in SCENES[:-1]]
     scenes = sorted(path.glob("point_cloud/*/*.ply"), key=lambda file: file.stat().st_mtime) or scenes  # INRIA's
     if not path.exists():
         problem, remedy = "there is no such file or folder", "Check the path."
     elif _is_archive(path):
-        problem = "an archive" + " of Record3D" * (path.suffix.lower() == ".r3d")
-        remedy = f"Unpack it and give the folder: unzip {path.name} -d {path.stem}"
-    elif unread_format(path) or _is_image(path):
+        problem, remedy = "an archive", f"Unpack it and give the folder: unzip {path.name} -d {path.stem}"
+    elif is_unread(path) or _is_image(path):
         problem, remedy = "one image", "Give the folder of the photographs, in JPEG or PNG."
     elif not path.is_dir():
         problem = f"a file with the suffix {path.suffix!r} is not a capture"
@@ -261,23 +251,12 @@ def _no_capture(path: Path) -> InputError:
         problem, remedy = "an empty folder", "Copy the capture there, or check the path."
     elif captures := _inner_captures(path):
         remedy = f"Give the capture's own folder, for example {captures[0]}."
-    elif unread:
-        kinds = ", ".join(sorted({str(unread_format(child)) for child in unread}))
-        problem, remedy = f"{len(unread)} images in {kinds}, which is not read", convert_remedy(unread[0])
-    elif others := _sort_images(path)[1]:
-        problem = (
-            f"{len(others)} depth maps or masks ({join_first([file.name for file in others])}), but no photographs"
-        )
-    elif videos:
-        problem = f"a folder with {'a video' if len(videos) == 1 else f'{len(videos)} videos'}, but no photographs"
+    elif unread := list(filter(is_unread, images)):
+        problem, remedy = f"{len(unread)} {unread[0].suffix} images, which are not read", convert_remedy(unread[0])
+    elif videos := list(filter(is_video, entries)):
         remedy = f"Give one video: jsecon run {videos[0]}"
     elif scenes:
-        problem = "a folder with a scene of Gaussians, but no photographs"
         remedy = f"Give the scene: jsecon run {scenes[-1]}"
-    elif archives:
-        problem, remedy = f"a folder with an archive ({archives[0].name})", "Unpack it, and give what is in it."
-    elif files := [child for child in entries if child.suffix.lower() == ".json"]:
-        remedy = f"Give the transforms file itself, for example {files[0]}."
     return InputError(path, problem, expected, remedy)
 
 

@@ -9,6 +9,7 @@ Images are returned upright, as their EXIF orientation asks. If poses belong to 
 
 import contextlib
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +17,15 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt, UInt8
-from PIL import BmpImagePlugin, Image, JpegImagePlugin, PngImagePlugin, TiffImagePlugin, WebPImagePlugin
+from PIL import (
+    AvifImagePlugin,
+    BmpImagePlugin,
+    Image,
+    JpegImagePlugin,
+    PngImagePlugin,
+    TiffImagePlugin,
+    WebPImagePlugin,
+)
 from PIL.ImageFile import ImageFile
 
 from jsecon.errors import InputError
@@ -36,12 +45,10 @@ _DECODERS: dict[bytes, type[ImageFile]] = {
     b"MM\0*": TiffImagePlugin.TiffImageFile,
 }
 """first bytes of a file -> Pillow's decoder"""
-_RAW = dict.fromkeys((".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2"), "a camera's raw format")
-_UNREAD = {".gif": "GIF", ".exr": "OpenEXR", ".jxl": "JPEG XL", ".jp2": "JPEG 2000", ".psd": "Photoshop's format"}
-_UNREAD |= {".hdr": "Radiance's HDR", ".tga": "Targa", ".ppm": "PPM", ".pgm": "PGM", ".svg": "SVG"} | _RAW
-"""suffixes of images that are not read, and their names"""
-_UNREAD_HEADS = {b"GIF8": ".gif", b"v/1\1": ".exr", b"\xff\x0a": ".jxl", b"\0\0\0\x0cJXL": ".jxl"}
-_UNREAD_HEADS |= {b"\0\0\0\x0cjP": ".jp2", b"8BPS": ".psd", b"#?": ".hdr"}
+_UNREAD = re.compile(
+    r".*\.(gif|exr|jxl|jp2|psd|hdr|tga|ppm|pgm|svg|dng|nef|cr2|cr3|arw|raf|orf|rw2)", re.IGNORECASE | re.DOTALL
+)
+"""names of images that are not read; a camera's raw file is a TIFF whose first image is a thumbnail"""
 
 
 @contextlib.contextmanager
@@ -55,11 +62,11 @@ def _open(path: Path) -> Iterator[ImageFile]:
             raise ValueError("the file is empty")
         decoder = next((kind for magic, kind in _DECODERS.items() if head.startswith(magic)), None)
         if decoder is None and head[4:8] == b"ftyp" and b"avi" in head[8:]:
-            decoder = _avif_decoder(path)
+            decoder = AvifImagePlugin.AvifImageFile
         if decoder is None and head[4:12] in (b"ftypheic", b"ftypheix", b"ftypmif1", b"ftyphevc"):
             decoder = _heic_decoder(path)
-        if (decoder is None or path.suffix.lower() in _RAW) and (kind := unread_format(path, head)) is not None:
-            raise InputError(path, f"the image is in {kind}, which is not read", remedy=convert_remedy(path))
+        if is_unread(path):
+            raise InputError(path, f"{path.suffix} images are not read", remedy=convert_remedy(path))
         if decoder is None:
             raise ValueError("it is not an image of a known kind")
         with decoder(file) as image:
@@ -72,27 +79,14 @@ def _open(path: Path) -> Iterator[ImageFile]:
             yield image
 
 
-def unread_format(path: Path, head: bytes = b"") -> str | None:
-    """Names the format of an image that is not read, by its first bytes or its suffix; None for other files."""
-    by_head = next((suffix for start, suffix in _UNREAD_HEADS.items() if head.startswith(start)), None)
-    return _UNREAD.get(by_head or path.suffix.lower())
+def is_unread(path: Path) -> bool:
+    """Whether a file is named like an image of a format that is not read."""
+    return _UNREAD.fullmatch(path.name) is not None
 
 
 def convert_remedy(path: Path) -> str:
     """Says how to convert an image and those beside it."""
     return f"Convert it to JPEG or PNG, for example: magick mogrify -format jpg '{path.parent}/*{path.suffix}'"
-
-
-def _avif_decoder(path: Path) -> type[ImageFile]:
-    """Pillow's decoder of AVIF, if this Pillow has it."""
-    try:
-        from PIL.AvifImagePlugin import SUPPORTED, AvifImageFile
-    except ImportError:
-        SUPPORTED = False
-    if not SUPPORTED:
-        remedy = f"Run: pip install 'pillow>=11.3'. {convert_remedy(path)}"
-        raise InputError(path, "an AVIF photograph needs a later Pillow", remedy=remedy)
-    return AvifImageFile
 
 
 def _heic_decoder(path: Path) -> type[ImageFile]:
@@ -250,7 +244,7 @@ def read_label_image(path: str | Path) -> Int[np.ndarray, "h w"]:
     """Reads the ids of a label image (.png or .npy).
 
     A grey PNG of 1 to 16 bits has its values as ids; a palette PNG the indices into it, never its colours; an RGB PNG
-    of 8 bits R*65536 + G*256 + B. Transparent pixels are 0; if all colours are black, the opaque pixels are the mask. A
+    of 8 bits R*65536 + G*256 + B. A
     .npy has whole numbers or booleans (H, W), negative where there is no label.
     """
     path = Path(path)
@@ -268,14 +262,9 @@ def read_label_image(path: str | Path) -> Int[np.ndarray, "h w"]:
         return ids // (255 // (2**bits - 1)) if is_stretched else ids
     if bits > 8:
         raise InputError(path, f"the mask has {bits} bits in each of its channels", expected, remedy)
-    colours = image.astype(np.int32)
-    ids = colours[..., 0] if image.shape[2] == 2 else colours[..., :3] @ np.array([65536, 256, 1], np.int32)
-    if image.shape[2] in (2, 4):
-        opaque = image[..., -1] == 255
-        if not (opaque | (image[..., -1] == 0)).all():
-            raise InputError(path, "the mask has half transparent pixels", expected, remedy)
-        ids = np.where(opaque, ids, 0) if ids.any() else opaque.astype(np.int32)
-    return ids
+    if image.shape[2] != 3:
+        raise InputError(path, "the mask has a channel of transparency", expected, remedy)
+    return image.astype(np.int32) @ np.array([65536, 256, 1], np.int32)
 
 
 def _read_id_array(path: Path) -> Int[np.ndarray, "h w"]:
@@ -283,7 +272,7 @@ def _read_id_array(path: Path) -> Int[np.ndarray, "h w"]:
     expected, remedy = "whole numbers of shape (H, W)", "Write one array of ids for each frame."
     with reading(path, expected, remedy, problem="the array cannot be read"):
         image = map_npy(path)
-    image = np.asarray(image.squeeze() if image.ndim == 3 and 1 in (image.shape[0], image.shape[2]) else image)
+    image = np.asarray(image)
     if image.ndim != 2 or not image.size:
         raise InputError(path, f"the array has shape {image.shape}", expected, remedy)
     with np.errstate(invalid="ignore"):

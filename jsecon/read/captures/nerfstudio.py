@@ -49,7 +49,7 @@ def _read_nerfstudio(path: Path) -> PosedImages:
     content = read_json(file, "a transforms.json", _REMEDY)
     if isinstance(content, list):
         return _read_inria(file, content)
-    images, scaled = [], 0
+    images = []
     with reading(file, remedy=_REMEDY):
         tested = path / "transforms_test.json"
         if file.name == "transforms_train.json" and tested.is_file():
@@ -63,14 +63,11 @@ def _read_nerfstudio(path: Path) -> PosedImages:
                 image = find_image(file.parent, name)
                 # From OpenGL's axes of the camera to OpenCV's.
                 pose = rigid_or_nan(_matrix(entry["transform_matrix"]) * [1, -1, -1, 1], file, name)
-                lens, is_scaled = _lens({**content, **entry}, image)
-                scaled += is_scaled
+                lens = _lens({**content, **entry}, image)
                 depth = None if image is None else _named_file(file, entry, "depth_file_path")
                 mask = None if image is None else _named_file(file, entry, "mask_path")
                 full_name, pose = _full_name(name, image), np.linalg.inv(pose)
                 images.append(PosedImage(full_name, image, lens, pose, depth, unit, held_out=held_out, mask=mask))
-        if scaled:
-            notes.append(f"The intrinsics of {scaled} frames are shares of the image size; they were scaled to pixels.")
         up = _stated_up(content)
         source_from_poses = _source_from_poses(content, scale)
         photographed = any(image.image is not None for image in images)  # poses alone need no points
@@ -118,9 +115,6 @@ def _split_frames(file: Path, content: dict[str, Any]) -> tuple[list[tuple[dict[
     entries += [(entry, True) for entry in apart.values()]
     if notes:
         notes = [f"{len(notes)} frames that no list of the split names were left out (the first: {notes[0]})."]
-    named = {_plain_name(str(entry["file_path"])) for entry, _ in entries if "file_path" in entry}
-    if unknown := sorted(set().union(*lists.values()) - named):
-        notes.append(f"The split of {file.name} names {len(unknown)} images of no frame (the first: {unknown[0]}).")
     records = [content, *(entry for entry, _ in entries)]
     keys = {key for record in records for key, value in record.items() if value not in (None, False, "", [])}
     if unused := sorted(keys - _KNOWN):
@@ -209,11 +203,8 @@ def _stated_up(content: dict[str, Any]) -> UpAxis | None:
     return None
 
 
-def _lens(keys: dict[str, Any], image: Path | None) -> tuple[Lens | None, bool]:
-    """The lens of a frame by its keys and, after them, those of the file, and whether they are shares of its size.
-
-    The lens is None if neither gives its size.
-    """
+def _lens(keys: dict[str, Any], image: Path | None) -> Lens | None:
+    """The lens of a frame by its keys and, after them, those of the file; None if neither gives its size."""
     model = str(keys.get("camera_model", "OPENCV")).upper()
     if model not in _PERSPECTIVE | _FISHEYE | {PANORAMA}:
         known = ", ".join(sorted(_PERSPECTIVE | _FISHEYE | {PANORAMA}))
@@ -226,9 +217,9 @@ def _lens(keys: dict[str, Any], image: Path | None) -> tuple[Lens | None, bool]:
     elif image is not None:
         width, height = size_around(image, keys.get("cx"), keys.get("cy"))
     else:
-        return None, False
+        return None
     if model == PANORAMA:
-        return panorama_lens(image or "a frame", width, height), False
+        return panorama_lens(image or "a frame", width, height)
     fx, fy = _focal(keys, "fl_x", "camera_angle_x", width), _focal(keys, "fl_y", "camera_angle_y", height)
     fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
     if fx is None or fy is None:
@@ -240,15 +231,9 @@ def _lens(keys: dict[str, Any], image: Path | None) -> tuple[Lens | None, bool]:
         raise ValueError(f"k4 = {keys['k4']} with camera_model OPENCV: undistort the images first, or use FULL_OPENCV")
     cx, cy = _number(keys, "cx", width / 2), _number(keys, "cy", height / 2)
     # Nobody has a lens of 160 degrees or more with its focal length in pixels, or its centre in the first pixel.
-    is_image = min(width, height) >= 8
-    focal_shares = is_image and max(fx, fy) < min(10, width / 12)
-    centre_shares = is_image and max(cx, cy) <= 1
-    if focal_shares:
-        fx, fy = fx * width, fy * height
-    if centre_shares:
-        cx, cy = cx * width, cy * height
-    lens = Lens(width, height, fx, fy, cx, cy, distortion, is_fisheye)
-    return lens, focal_shares or centre_shares
+    if min(width, height) >= 8 and (max(fx, fy) < min(10, width / 12) or max(cx, cy) <= 1):
+        raise ValueError("its intrinsics are shares of the image size: multiply them by w and h")
+    return Lens(width, height, fx, fy, cx, cy, distortion, is_fisheye)
 
 
 def _focal(keys: dict[str, Any], direct: str, angle: str, size: int) -> float | None:

@@ -1,14 +1,13 @@
-"""Captures of depth cameras and phones, on the host: ScanNet, 7-Scenes, Replica, TUM, ARKitScenes, Polycam, Record3D.
+"""Captures of depth cameras and phones, on the host: ScanNet, Replica, TUM, ARKitScenes, Polycam, Record3D.
 
-Formats: ScanNet SensReader/python; 7-Scenes' page; NICE-SLAM's renders of Replica; TUM's RGB-D benchmark
-(file_formats); ARKitScenes DATA.md; nerfstudio process_data polycam_utils.py and record3d_utils.py.
+Formats: ScanNet SensReader/python; NICE-SLAM's renders of Replica; TUM's RGB-D benchmark (file_formats); ARKitScenes
+DATA.md; nerfstudio process_data polycam_utils.py and record3d_utils.py.
 Each keeps its world. Phones look along -z of their own axes, and gravity is along an axis of their worlds: y of Polycam
 and Record3D, z of ARKitScenes. Frames without a pose are left out, and counted in a note.
 """
 
 import dataclasses
 import functools
-import os
 import re
 from pathlib import Path
 from typing import Any
@@ -110,72 +109,33 @@ def _read_scannet(path: Path) -> PosedImages:
     return _posed_images(path, posed, len(images))
 
 
-def _read_seven_scenes(path: Path) -> PosedImages:
-    """Reads a sequence of 7-Scenes, or one in its layout (12-Scenes)."""
-    images = [file for file in _list_images(path) if file.stem.endswith(".color")]
-    lens, _, notes = _stated_lens(path, images[0], (640, 480), (585.0, 585.0, 320.0, 240.0))
-    posed = []
-    for image in images:
-        stem = image.stem.removesuffix(".color")
-        file = path / f"{stem}.pose.txt"
-        pose = _numbers(file, 4, 4) if file.is_file() else np.full((4, 4), np.nan)
-        if np.isfinite(pose).all():  # not finite where tracking was lost
-            posed.append(_posed_image(image, lens, pose, find_image(path, f"{stem}.depth.png")))
-    return _posed_images(path, posed, len(images), *notes)
-
-
 def _read_replica(path: Path) -> PosedImages:
-    """Reads a scene of Replica in the layout of NICE-SLAM's renders."""
+    """Reads a scene of Replica in the layout of NICE-SLAM's renders, whose cam_params.json lies in it or above it."""
     images = [file for file in _list_images(path / "results") if not file.stem.startswith("depth")]
     poses = _numbers(path / "traj.txt", 16).reshape(-1, 4, 4)
-    with _parsing(path / "results"):
-        numbers = [int(re.sub(r"\D", "", file.stem)) for file in images]
-    if len(poses) == len(images):
-        numbers = [*range(len(images))]
-    size = 1200, 680
-    lens, scale, notes = _stated_lens(path, images[0], size, (600.0, 600.0, 600.0, 340.0))
-    scale = scale or (6553.5 if image_header(images[0]).upright == size else 0.0)
-    if not scale:
-        notes += ("The depth maps are not used, since no cam_params.json states their scale.",)
+    numbers = [*range(len(images))]
+    if len(poses) != len(images):
+        with _parsing(path / "results"):
+            numbers = [int(re.sub(r"\D", "", file.stem)) for file in images]
+    stated = [file for file in (path / "cam_params.json", path.absolute().parent / "cam_params.json") if file.is_file()]
+    width, height = image_header(images[0]).upright
+    if stated:
+        with _parsing(stated[0]):
+            camera = parse_json(stated[0].read_bytes())["camera"]
+            fx, fy, cx, cy, scale = (float(camera[name]) for name in ("fx", "fy", "cx", "cy", "scale"))
+            lens = _lens(camera["w"], camera["h"], fx, fy, cx + 0.5, cy + 0.5)
+    elif (width, height) == (1200, 680):
+        lens, scale = _lens(width, height, 600.0, 600.0, 600.0, 340.0), 6553.5
+    else:
+        problem = f"no cam_params.json states the intrinsics of its images, which are {width}x{height}"
+        raise InputError(path, problem, remedy="Write it as NICE-SLAM's, or give a transforms.json.")
     posed = []
     for image, number in zip(images, numbers):
         if number < len(poses) and np.isfinite(poses[number]).all():
             depth = find_image(path / "results", image.stem.replace("frame", "depth") + ".png")
-            frame = _posed_image(image, lens, poses[number], depth if scale and depth != image else None)
-            posed.append(dataclasses.replace(frame, depth_unit=1 / (scale or 1.0)))
-    return _posed_images(path, posed, len(images), *notes)
-
-
-def _stated_lens(
-    path: Path, image: Path, size: tuple[int, int], intrinsics: tuple[float, ...]
-) -> tuple[Lens, float, tuple[str, ...]]:
-    """The lens of a layout without a place for one: of a file, else the benchmark's `intrinsics` of images of `size`.
-
-    Files, in the folder or above it, are intrinsics.txt (fx fy cx cy, or a matrix) and NICE-SLAM's cam_params.json.
-    Also returns the counts of depth in a unit, 0 where no file states them, and notes.
-    """
-    width, height = image_header(image).upright
-    for folder in (path, Path(os.path.abspath(path)).parent):
-        for file in (*sorted(folder.glob("*intrinsics.txt")), folder / "cam_params.json"):
-            if not file.is_file():
-                continue
-            with _parsing(file):
-                if file.suffix == ".json":
-                    camera = parse_json(file.read_bytes())["camera"]
-                    fx, fy, cx, cy = (float(camera[name]) for name in ("fx", "fy", "cx", "cy"))
-                    lens = _lens(camera["w"], camera["h"], fx, fy, cx + 0.5, cy + 0.5)
-                    return lens, float(camera.get("scale", 0.0)), ()
-                k = [float(word) for line in _lines(file) for word in line.split()]
-                side = {9: 3, 16: 4}.get(len(k))
-                k = k[:4] if side is None else [k[0], k[side + 1], k[2], k[side + 2]]
-                return _lens(width, height, *k), 0.0, ()
-    if (width, height) == size:
-        stated = " ".join(f"{number:g}" for number in intrinsics)
-        note = f"No file states the intrinsics: the benchmark's (fx fy cx cy {stated}) are taken."
-        return _lens(width, height, *intrinsics), 0.0, (note,)
-    remedy = f"Write fx fy cx cy (px) to {path / 'intrinsics.txt'}, or give the photographs alone to find poses anew."
-    problem = f"it has poses, but no file states the intrinsics of its images, which are {width}x{height}"
-    raise InputError(path, problem, remedy=remedy)
+            frame = _posed_image(image, lens, poses[number], depth if depth != image else None)
+            posed.append(dataclasses.replace(frame, depth_unit=1 / scale))
+    return _posed_images(path, posed, len(images))
 
 
 def _read_tum_list(file: Path) -> tuple[np.ndarray, list[Path]]:
@@ -299,7 +259,6 @@ def _read_record3d(path: Path) -> PosedImages:
 
 READERS = (
     Reader("ScanNet", ("color", "pose", "intrinsic/intrinsic_color.txt"), _read_scannet),
-    Reader("7-Scenes", ("*.color.*", "*.pose.txt"), _read_seven_scenes),
     Reader("Replica", ("results", "traj.txt"), _read_replica),
     Reader("TUM", ("rgb.txt", "groundtruth.txt"), _read_tum),
     Reader("ARKitScenes", ("lowres_wide", "lowres_wide.traj"), _read_arkitscenes),

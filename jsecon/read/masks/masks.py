@@ -5,13 +5,12 @@ level. It returns ids (H, W), the same for the same object in every frame, 0 for
 then); or a list of masks (H, W) of this frame alone, the best first, which may overlap. Other packages add readers by
 entry points in the group jsecon.masks.
 
-A mask is named like its frame: `<frame>.png`, like the image's whole name (`<frame>.jpg.png`, as COLMAP has it), or
-with a word for what it is (`<frame>_mask.png`). It lies in the folder itself, or in subfolders named like those of the
-images (`cam0/<frame>.png`). Any other subfolders stand for objects (`<object>/<frame>.png`, black and white, as SAM 2
-writes them with --per_obj_png_file).
+A mask is named like its frame, `<frame>.png`, or like the image's whole name (`<frame>.jpg.png`, as COLMAP has it). It
+lies in the folder itself, or in subfolders named like those of the images (`cam0/<frame>.png`). Any other subfolders
+stand for objects (`<object>/<frame>.png`, black and white, as SAM 2 writes them with --per_obj_png_file).
 
-Masks must be of the frames as the capture was loaded, undistorted. Other sizes of the same aspect are resized
-(nearest), and masks of the stored pixels of photographs that lie on their side are turned upright with them.
+Masks must be of the frames as the capture was loaded, upright and undistorted. Other sizes of the same aspect are
+resized (nearest).
 
 LangSplat's `<frame>_s.npy` float32 (4, H, W) has ids by level, -1 = none, which are rows of `<frame>_f.npy` float32
 (M, E), unit (minghanqin/LangSplat, preprocess.py). The same thing has another row in each frame.
@@ -35,7 +34,7 @@ from jaxtyping import Bool, Int, Int16
 from jsecon.errors import InputError, join_first
 from jsecon.files import list_files, map_npy, reading
 from jsecon.read.captures.frames import same_aspect
-from jsecon.read.captures.images import IMAGE_SUFFIXES, apply_orientation, read_label_image
+from jsecon.read.captures.images import IMAGE_SUFFIXES, read_label_image
 from jsecon.read.masks.json_masks import READER as JSON_READER, ReadMasks, open_coco
 from jsecon.read.registry import Reader, readers
 from jsecon.types import ImageFile, Progress
@@ -43,14 +42,8 @@ from jsecon.types import ImageFile, Progress
 LEVELS = ("default", "s", "m", "l")
 """levels of LangSplat's `_s.npy`, in their order: all of SAM's masks, subparts, parts, whole objects"""
 _MAX_REGIONS = int(np.iinfo(np.int16).max)
-_WHITE = 0xFFFFFF
-_LARGEST = (254, 255, 65534, 65535, _WHITE, 2**31 - 1, 2**32 - 1)
-"""largest numbers of the types of ids and those before, white among them: masks have them on pixels to ignore"""
-
-
-_WORD = r"masks?|seg|segs|segmentations?|labels?|ids?|instances?|objects?|annotations?"
-_AFFIX = re.compile(rf"(?:(?:{_WORD})[_.-])?(.+?)(?:[_.-](?:{_WORD}))?", re.IGNORECASE)
-"""a frame's name within that of its mask"""
+_LARGEST = (255, 65535)
+"""largest numbers of the types of ids: masks have them on pixels to ignore"""
 
 AllFrames: TypeAlias = Mapping[str, ImageFile | None]
 """all frames of a capture in order, by name, each with its image or None"""
@@ -104,8 +97,6 @@ class _Match(NamedTuple):
     frame: str
     extra: str
     """Its folders that the frame's image does not have, with "/"."""
-    rank: int
-    """The lower, the closer is the file's name to the frame's."""
     path: PurePosixPath
     """Path in the folder of masks."""
 
@@ -127,14 +118,12 @@ def _match_frames(frames: AllFrames) -> _Matcher:
 
     def match(path: PurePosixPath, suffix: str) -> _Match | None:
         base = path.name[: len(path.name) - len(suffix)]
-        word = _AFFIX.fullmatch(base)
-        keys = [base, _without_image_suffix(base), *([word[1], _without_image_suffix(word[1])] if word else [])]
-        for rank, key in enumerate(dict.fromkeys(keys)):
+        for key in dict.fromkeys((base, _without_image_suffix(base))):
             fits = [(_extra_folders(path.parts[:-1], folders), name) for name, folders in by_key.get(key, ())]
             if fits:
                 fewest = min(len(extra) for extra, _ in fits)
                 (extra, name), *others = (fit for fit in fits if len(fit[0]) == fewest)
-                return None if others else _Match(name, "/".join(extra), rank, path)
+                return None if others else _Match(name, "/".join(extra), path)
         return None
 
     return match
@@ -182,9 +171,8 @@ def _find_masks(
         for path in unread:
             suffix = path.suffix.lower()
             if suffix in (*IMAGE_SUFFIXES, ".npz", ".gif", ".exr"):  # may be meant as masks
-                because = ", and its compression changes ids" if suffix in (".jpg", ".jpeg") else ""
                 remedy = "Export the masks again: one that is converted from JPEG keeps the wrong ids."
-                raise InputError(path, f"the mask is a {suffix} file{because}", "a PNG or .npy", remedy)
+                raise InputError(path, f"the mask is a {suffix} file", "a PNG or .npy", remedy)
         count = sum(map(len, unmatched.values()))
         problem = f"it holds {count} masks{', none of which is called like a frame' if count else ''}"
         expected = " or ".join(next(iter(frames)) + mark for reader in formats for mark in reader.marks) + " and so on"
@@ -206,7 +194,7 @@ def _find_masks(
         files = f"{len(others)} of the {reader.marks[0]} files, first {others[0].name}"
         notes.append(f"There are masks of no frame of this capture: {files}.")
     paths: dict[str, dict[str, Path]] = collections.defaultdict(dict)
-    for found in sorted(matches, key=lambda found: (found.rank, -len(found.path.parts))):
+    for found in sorted(matches, key=lambda found: -len(found.path.parts)):
         if found.extra in (objects or extras[:1]):
             paths[found.frame].setdefault(found.extra, folder / found.path)
     return {name: functools.partial(_read_files, reader, objects, some, level) for name, some in paths.items()}, notes
@@ -217,61 +205,37 @@ class _FrameIds(NamedTuple):
 
     ids: set[int]
     """All that are above 0."""
-    whole: set[int]
-    """Those with a pixel amid its own, 0 among them; all, where no colours or greys are blended."""
-    blended: set[int]
-    """Those of the others that lie between the colours around them."""
     largest: int
-    """The largest, if it may be the largest number of a type, else 0."""
+    """The largest, if it is one of _LARGEST, else 0."""
     neighbours: set[int]
     """Those that touch the largest."""
-    thin: float
-    """Share of the largest's pixels with another id within two pixels."""
 
 
 def _inspect_ids(image: Int[np.ndarray, "h w"]) -> _FrameIds:
-    """Looks for ids of one frame that may stand for no object."""
+    """Looks for the id of one frame that may stand for no object."""
     ids = {number for number in np.unique(image).tolist() if number > 0}
     largest = max(ids, default=0)
-    whole, blended = {*ids, 0}, set()
-    if 1 < largest <= 255 or 65535 < largest <= _WHITE:
-        is_grey = largest <= 255
-        channels = [image] * 3 if is_grey else [image >> 16, image >> 8 & 255, image & 255]
-        colours = np.stack(channels, axis=-1).clip(0, 255).astype(np.uint8)
-        inner = (cv2.dilate(colours, np.ones((3, 3))) == cv2.erode(colours, np.ones((3, 3)))).all(-1)
-        whole = {*np.unique(image[inner]).tolist()}
-        is_whole, slack = np.isin(image, [*whole]), 0 if is_grey else 40  # sharpened edges overshoot
-        low = cv2.erode(np.where(is_whole[..., None], colours, 255).astype(np.uint8), np.ones((13, 13)))
-        high = cv2.dilate(np.where(is_whole[..., None], colours, 0).astype(np.uint8), np.ones((13, 13)))
-        is_between = (colours.astype(int) >= low.astype(int) - slack) & (colours <= high.astype(int) + slack)
-        blended = ids - whole - {*np.unique(image[~is_whole & ~is_between.all(-1)]).tolist()}
-        if is_grey and len(blended) <= 3 * len(whole):  # a few narrow things, of ids between those beside them
-            whole, blended = {*ids, 0}, set()
     if largest not in _LARGEST:
-        return _FrameIds(ids, whole, blended, 0, set(), 0.0)
-    place = (image == largest).astype(np.uint8)
-    around = (cv2.dilate(place, np.ones((3, 3))) > 0) & (image > 0)
-    thin = 1 - float(cv2.erode(place, np.ones((5, 5)))[place > 0].mean())
-    return _FrameIds(ids, whole, blended, largest, {*np.unique(image[around]).tolist()}, thin)
+        return _FrameIds(ids, 0, set())
+    around = (cv2.dilate((image == largest).astype(np.uint8), np.ones((3, 3))) > 0) & (image > 0)
+    return _FrameIds(ids, largest, {*np.unique(image[around]).tolist()} - {largest})
 
 
-def _find_no_objects(frames: Sequence[_FrameIds]) -> tuple[set[int], int | None]:
-    """The ids that blend the colours beside them in all frames, and the id that stands for pixels to ignore, or None.
-
-    The latter is the largest number of a type and touches the other ids, in the frames that have it if it lies on
-    outlines; or in all, and stands apart: further above the others than these from each other.
-    """
-    blended = set().union(*(frame.blended for frame in frames)) - set().union(*(frame.whole for frame in frames))
+def _find_ignored(frames: Sequence[_FrameIds]) -> int | None:
+    """The id that stands for pixels to ignore: one of _LARGEST, far above the others, most of which it touches."""
     largest = max((frame.largest for frame in frames), default=0)
-    others = sorted(set().union(*(frame.ids for frame in frames)) - blended - {largest})
-    if not largest or not others or others[-1] > largest:
-        return blended, None
-    marked = [frame for frame in frames if frame.largest == largest]
-    is_thin = np.mean([frame.thin for frame in marked]) > 0.9
-    places = sum(len(frame.ids - blended - {largest}) for frame in (marked if is_thin else frames))
-    touched = sum(len(frame.neighbours - blended - {largest}) for frame in marked)
-    is_apart = largest - others[-1] > 2 * max(np.diff([0, *others])) and len(others) > 1 and largest != _WHITE
-    return blended, largest if touched >= 0.8 * places and (is_thin or is_apart) else None
+    others = sorted(set().union(*(frame.ids for frame in frames)) - {largest})
+    if not largest or len(others) < 2 or largest - others[-1] <= 2 * max(np.diff([0, *others])):
+        return None
+    marked = [frame for frame in frames if frame.largest]
+    touched = sum(len(frame.neighbours) for frame in marked)
+    return largest if touched >= 0.8 * sum(len(frame.ids) - 1 for frame in marked) else None
+
+
+def _ignored_notes(ignored: int | None) -> list[str]:
+    """Says which id was taken as unlabelled."""
+    borders = "it lies along the borders of the others and is the largest number of its type"
+    return [] if ignored is None else [f"The id {ignored} counts as unlabelled (pixels to ignore): {borders}."]
 
 
 def _count_things(labels: Int16[np.ndarray, "h w"]) -> int:
@@ -334,7 +298,7 @@ class _Source:
 
     def __init__(self, folder: Path, names: Sequence[str], size: tuple[int, int], level: str, frames: AllFrames | None):
         self.size, self.frames = size, frames or dict.fromkeys(names)
-        self.resized = self.turned = 0
+        self.resized = 0
         self.notes: list[str] = []
         match = _match_frames(self.frames)
         found = open_coco(folder, match)
@@ -363,15 +327,9 @@ class _Source:
         return (self.size[1], self.size[0]) if file is None else (file.width, file.height)
 
     def _fit(self, path: Path, image: np.ndarray, name: str) -> np.ndarray:
-        """Turns and resizes the mask of a frame to (H, W); raises InputError, with its file, for another aspect."""
-        file, upright, size = self.frames.get(name), self._image_size(name), image.shape[::-1]
-        fits = same_aspect(upright, size)
-        if file is not None and file.orientation > 1:
-            stored = upright[::-1] if file.orientation > 4 else upright
-            if not fits and same_aspect(stored, size):
-                image, fits = apply_orientation(image, file.orientation), True
-                self.turned += 1
-        if not fits and not same_aspect(self.size[::-1], size):
+        """Resizes the mask of a frame to (H, W); raises InputError, with its file, for another aspect."""
+        upright, size = self._image_size(name), image.shape[::-1]
+        if not same_aspect(upright, size) and not same_aspect(self.size[::-1], size):
             remedy = "Make the masks from the frames as they are loaded (undistorted, upright), at any scale."
             expected = f"{upright[0]}x{upright[1]} like its frame, or that aspect"
             raise InputError(path, f"the mask is {size[0]}x{size[1]}", expected, remedy)
@@ -421,8 +379,8 @@ def load_labels(
         frame_ids.append(ids)
         if progress is not None:
             progress(t + 1, len(names))
-    blended, ignored = _find_no_objects(inspected)
-    ids = np.setdiff1d(np.concatenate(frame_ids), [*blended, *(() if ignored is None else (ignored,))])
+    ignored = _find_ignored(inspected)
+    ids = np.setdiff1d(np.concatenate(frame_ids), [] if ignored is None else [ignored])
     ids = ids[ids != 0] if is_shared and not has_negative else ids
     tables = [np.where(np.isin(each, ids), np.searchsorted(ids, each), -1) for each in frame_ids]
     if len(ids) > _MAX_REGIONS:
@@ -430,7 +388,7 @@ def load_labels(
         raise InputError(folder, f"there are {len(ids)} regions", f"at most {_MAX_REGIONS}", remedy)
     for frame, table in zip(labels, tables):
         frame[:] = np.append(table, -1).astype(np.int16)[frame]
-    notes = [*source.notes, *_no_object_notes(blended, ignored)]
+    notes = [*source.notes, *_ignored_notes(ignored)]
     things = np.median([_count_things(frame) for frame in labels]) if is_shared else np.inf
     if len(ids) > 10 * max(things, 1):
         hint = f"There are {len(ids)} ids, but a frame shows some {things:.0f} connected things."
@@ -438,24 +396,11 @@ def load_labels(
         notes.append(f"{hint} {reasons}; if colours were smoothed or compressed, export the masks again.")
     if source.resized:
         notes.append(f"{source.resized} masks were resized to {size[1]}x{size[0]} (nearest).")
-    if source.turned:
-        notes.append(f"{source.turned} masks were of the stored pixels, and were turned upright like their images.")
     if has_negative:
         notes.append("The masks hold negative ids: these count as unlabelled, and 0 as a region.")
     if not is_shared:
         notes.append("Each frame's masks count as regions of their own, since their ids are not shared.")
     return _TrackedMasks(labels, tuple(map(int, ids)), tuple(notes))
-
-
-def _no_object_notes(blended: set[int], ignored: int | None) -> list[str]:
-    """Says which ids were taken as unlabelled."""
-    notes = []
-    if blended:
-        notes.append(f"{len(blended)} colours that blend those beside them (smoothed edges) count as unlabelled.")
-    if ignored is not None:
-        borders = "it lies along the borders of the others and is one of the largest numbers of its type"
-        notes.append(f"The id {ignored} counts as unlabelled (pixels to ignore): {borders}.")
-    return notes
 
 
 def load_proposals(
@@ -477,13 +422,12 @@ def load_proposals(
         with contextlib.suppress(InputError):  # which comes when the frame is asked for
             stored = source.read(name)[1]
             some += [] if isinstance(stored, list) else [stored]
-    blended, ignored = _find_no_objects([_inspect_ids(stored) for stored in some])
+    ignored = _find_ignored([_inspect_ids(stored) for stored in some])
 
     def read(index: int) -> Bool[np.ndarray, "m h w"]:
         _, stored = (None, []) if names[index] in source.missing else source.read(names[index])
         if not isinstance(stored, list):
-            frame = _inspect_ids(stored)
-            stored = [stored == number for number in sorted(frame.ids - frame.blended - {ignored})]
+            stored = [stored == number for number in np.unique(stored) if number > 0 and number != ignored]
         return np.stack([np.zeros(size, bool), *stored])[1:]
 
-    return read, (*source.notes, *_no_object_notes(blended, ignored))
+    return read, (*source.notes, *_ignored_notes(ignored))

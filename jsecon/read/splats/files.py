@@ -11,8 +11,6 @@ opacities.
 
 import dataclasses
 import gzip
-import io
-import json
 import struct
 import warnings
 import zipfile
@@ -149,31 +147,11 @@ def _read_sog(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
     with decoding(path, "gsply") as gsply:
         with zipfile.ZipFile(path) as archive:
             meta = parse_json(archive.read("meta.json"))
-            codebooks = {
-                name: part["codebook"] for name, part in meta.items() if isinstance(part, dict) and "codebook" in part
-            }
-            # gsply indexes a codebook without a check of its size
-            if any(len(codebook) < 256 for codebook in codebooks.values()):
+            books = [part["codebook"] for part in meta.values() if isinstance(part, dict) and "codebook" in part]
+            if any(len(book) < 256 for book in books):  # gsply indexes them without a check of their size
                 raise ValueError("a codebook of fewer than 256 numbers")
-            # Converters write null for an infinite first number; PlayCanvas' viewers go on from the others.
-            repaired = [
-                name for name, book in codebooks.items() if book[0] is None and None not in (book[1], book[255])
-            ]
-            for name in repaired:
-                book = codebooks[name]
-                book[0] = book[1] + (book[1] - book[255]) / 255
-            data = path.read_bytes()
-            if repaired:
-                with io.BytesIO() as whole, zipfile.ZipFile(whole, "w") as copy:
-                    for name in archive.namelist():
-                        copy.writestr(name, json.dumps(meta) if name == "meta.json" else archive.read(name))
-                    copy.close()
-                    data = whole.getvalue()
-        gaussians, notes = _gaussians(path, gsply.sogread(data))
-        notes += _antialiasing_notes(path, meta.get("antialias") is True)
-        if repaired:
-            notes += (f"{path.name}: the codebook of {', '.join(repaired)} begins with null, which was extrapolated.",)
-        return gaussians, notes
+        gaussians, notes = _gaussians(path, gsply.sogread(path.read_bytes()))
+        return gaussians, (*notes, *_antialiasing_notes(path, meta.get("antialias") is True))
 
 
 def _read_splat(path: Path) -> tuple[Gaussians, tuple[str, ...]]:

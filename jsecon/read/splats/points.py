@@ -12,7 +12,7 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Int, UInt8
@@ -195,12 +195,12 @@ def save_point_cloud(
         with atomic_write(path) as temporary:
             write_vertices(temporary, columns, f"crs {crs}" if crs.startswith("EPSG:") else "")
         return
+    if source.suffix.lower() not in (".las", ".laz"):
+        problem = f"the points of {source.name} cannot be written as {path.suffix}"
+        raise InputError(path, problem, remedy="Write a .ply.")
     with decoding(source, "laspy") as laspy:
-        if source.suffix.lower() in (".las", ".laz"):
-            las = laspy.read(source)
-            las.points = las.points[rows]
-        else:
-            las = _new_las(laspy, source, rows, crs)
+        las = laspy.read(source)
+        las.points = las.points[rows]
         old = {*las.point_format.extra_dimension_names}
         las.add_extra_dims([laspy.ExtraBytesParams(name, np.int32) for name in ids if name not in old])
         for name, column in ids.items():
@@ -211,20 +211,3 @@ def save_point_cloud(
             las.classification = np.where(fits, classes, las.classification)
     with atomic_write(path) as temporary:
         las.write(str(temporary), do_compress=path.suffix.lower() == ".laz")
-
-
-def _new_las(laspy: Any, source: Path, rows: np.ndarray, crs: str) -> Any:
-    """Makes LAS data of points of a file, at the finest power of ten that holds them."""
-    points, colors = (column[rows] for column in load_point_cloud(source))
-    if not np.isfinite(points).all():
-        raise InputError(source, "some of its points have no place, and a .las holds no such", remedy="Write a .ply.")
-    las = laspy.create(point_format=7, file_version="1.4")
-    las.header.offsets = np.floor(points.min(axis=0))
-    las.header.scales = np.full(3, 10.0 ** math.ceil(math.log10(max(np.ptp(points, axis=0).max(), 1e-6) / 2e9)))
-    if crs:
-        import pyproj
-
-        las.header.add_crs(pyproj.CRS.from_user_input(crs))
-    las.x, las.y, las.z = points.T
-    las.red, las.green, las.blue = colors.T.astype(np.uint16) * 257
-    return las
