@@ -226,7 +226,9 @@ def test_replicas_parameters_lie_in_the_scene_or_above_or_are_the_benchmarks(tmp
         load_capture(folder)
     for file in folder.rglob("*.png"):
         kind = np.uint16 if "depth" in file.name else np.uint8
-        cv2.imwrite(str(file), np.full((680, 1200), 13107, kind) if kind == np.uint16 else np.zeros((680, 1200, 3), kind))
+        cv2.imwrite(
+            str(file), np.full((680, 1200), 13107, kind) if kind == np.uint16 else np.zeros((680, 1200, 3), kind)
+        )
     found = load_capture(folder, frames=2)
     np.testing.assert_allclose(found.cameras.cx[0], found.cameras.width / 2)
     np.testing.assert_allclose(found.depths, 2 / np.cbrt(np.linalg.det(found.source_from_scene[:3, :3])), rtol=1e-5)
