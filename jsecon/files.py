@@ -53,10 +53,7 @@ _SUBSTITUTES = (
     (b"version https://git-lfs", "a Git LFS pointer", "Run: git lfs pull", ()),
     (b"PK\3\4", "a zip archive", _UNPACK, (".sog", ".npz")),
     (b"\x1f\x8b", "a gzip archive", _UNPACK, (".spz",)),
-    *((head, "a compressed archive", _UNPACK, (".spz",)) for head in (b"BZh", b"\xfd7zXZ", b"7z\xbc\xaf", b"Rar!")),
-    (b"\x28\xb5\x2f\xfd", "a compressed archive", _UNPACK, (".spz",)),
-    *((head, "a page of HTML", _DOWNLOAD, ()) for head in (b"<!doctype", b"<html", b"<head", b"<body")),
-    *((head, "a page of XML", _DOWNLOAD, (".xml",)) for head in (b"<?xml", b"<error")),
+    *((head, "a page of HTML", _DOWNLOAD, ()) for head in (b"<!doctype", b"<html")),
 )
 """first bytes in small letters, what begins so, what to do about it, and the suffixes of files that may begin so"""
 
@@ -159,19 +156,13 @@ def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
 
 
 def read_text(path: Path) -> str:
-    """Reads a text file as UTF-8, or as UTF-16 if it begins with that byte order mark."""
-    data = path.read_bytes()
-    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        return data.decode("utf-16", "replace")
-    return data.removeprefix(codecs.BOM_UTF8).decode("utf-8", "surrogateescape")
+    """Reads a text file as UTF-8, with or without a byte order mark; other bytes become surrogates."""
+    return path.read_text(encoding="utf-8-sig", errors="surrogateescape")
 
 
 def read_lines(path: Path) -> Iterator[str]:
     """Reads a text file line by line, as `read_text` reads it."""
-    with path.open("rb") as file:
-        is_wide = file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-    encoding, errors = ("utf-16", "replace") if is_wide else ("utf-8-sig", "surrogateescape")
-    with path.open(encoding=encoding, errors=errors, newline="\n") as file:
+    with path.open(encoding="utf-8-sig", errors="surrogateescape", newline="\n") as file:
         yield from file
 
 

@@ -216,7 +216,6 @@ def test_damage_is_named(tmp_path, row):
 SUBSTITUTES = {
     "Git LFS pointer": b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345678\n",
     "page of HTML": b"\n<!DOCTYPE html><html><body>404 Not Found</body></html>",
-    "compressed archive": b"\xfd7zXZ\0\0\4" + bytes(99),
 }
 
 
@@ -230,7 +229,7 @@ def test_what_stands_in_place_of_a_file_is_named(tmp_path, name):
     for case in cases(name, tmp_path / "plain"):
         for number, file in enumerate(case.files):
             intact = file.read_bytes()
-            what, head = [*SUBSTITUTES.items()][number % 3]
+            what, head = [*SUBSTITUTES.items()][number % len(SUBSTITUTES)]
             file.write_bytes(head)
             try:
                 case.read()
