@@ -243,7 +243,8 @@ def read_gaussians(path: str | Path) -> tuple[Gaussians, tuple[str, ...]]:
         remedy = "Export the scene as a .ply."
         if path.suffix.lower() in (".ksplat", ".lcc", ".mjs") or path.name == "meta.json":  # of an unpacked .sog
             remedy = f"Run: npx @playcanvas/splat-transform {path.name} {path.stem}.ply"
-        raise InputError(path, f"its name ends in {path.suffix or 'no suffix'}", _FORMATS, remedy)
+        with reading(path):  # a pointer of Git LFS may stand there
+            raise InputError(path, f"its name ends in {path.suffix or 'no suffix'}", _FORMATS, remedy)
     with reading(path, remedy="Export it again, or as a .ply."):
         return reader.read(path)
 
