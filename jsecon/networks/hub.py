@@ -2,7 +2,8 @@
 
 A user names a model by a name of catalogue.toml ("clip"), by its repository ("hub:owner/name",
 "hub:owner/name@revision"), or by a folder. huggingface_hub transfers the files and keeps the cache, so HF_HOME,
-HF_ENDPOINT, HF_HUB_OFFLINE and HF_TOKEN work as they do elsewhere. Afterwards it compares each file with the hub's hash.
+HF_ENDPOINT, HF_HUB_OFFLINE and HF_TOKEN work as they do elsewhere. Afterwards each file is compared with the hub's
+hash.
 """
 
 import contextlib

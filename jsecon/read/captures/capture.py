@@ -253,6 +253,9 @@ def _no_capture(path: Path) -> InputError:
         remedy = f"Give the capture's own folder, for example {captures[0]}."
     elif unread := list(filter(is_unread, images)):
         problem, remedy = f"{len(unread)} {unread[0].suffix} images, which are not read", convert_remedy(unread[0])
+    elif others := _sort_images(path)[1]:
+        names = join_first([file.name for file in others])
+        problem = f"{len(others)} depth maps or masks ({names}), but no photographs"
     elif videos := list(filter(is_video, entries)):
         remedy = f"Give one video: jsecon run {videos[0]}"
     elif scenes:
