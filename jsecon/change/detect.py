@@ -183,20 +183,13 @@ def _first_view(gaussians: Gaussians, camera: Camera, frame: np.ndarray, depth: 
     photo = fit_exposure(shifted(photo, shift), image[0], known)
     if depth is not None:
         depth = shifted(np.asarray(depth, np.float32), shift)
-        depth = np.where(depth > 0, cv2.medianBlur(depth, 3), 0)  # a third of the noise
     view = _View(camera, photo, depth, *image, image[1])
     return view._replace(cost=view.compare(*image))
 
 
 def _pooled(view: _View, gaussians: Gaussians, labels: np.ndarray, count: int) -> np.ndarray:
-    """Sums each object's weight on pixels that are explained, that are not, and that are not known: (K, 3).
-
-    The walk is that of the votes (`view_evidence`). A measured surface in front of the scene tells nothing of what it
-    hides.
-    """
+    """Sums each object's weight on pixels that are explained, that are not, and that are not known: (K, 3)."""
     image = np.where(np.isnan(view.cost), -1, view.cost > 0.5).astype(np.int32)
-    if view.depth is not None:
-        image = np.where(np.nan_to_num(depth_cost(view.depth, view.z)) < -0.5, -1, image)
     matrix = view_evidence(gaussians, view.camera, image, 2).matrix(len(labels), 2)
     inside = np.flatnonzero(labels >= 0)
     columns = matrix[inside].toarray()
@@ -242,9 +235,7 @@ def object_changes(
     known = pooled[..., :2].sum(-1)
     differing = pooled[..., 1] / np.maximum(known, 1e-9)
     seen = known >= MIN_PIXELS
-    # A frame that shows an object where it was weighs twice: what stands before it in another frame hides it there.
-    weight = np.where(seen, np.minimum(known / 60, 1), 0) * np.where(differing < DISPLACED_SHARE, 2, 1)
-    excess = np.where(seen, weight * (differing - DISPLACED_SHARE), 0).sum(1) / np.maximum(weight.sum(1), 1e-9)
+    excess = np.where(seen, differing - DISPLACED_SHARE, 0).sum(1) / np.maximum(seen.sum(1), 1)
     displaced = seen.any(1) & (excess > 0)
     search = _Search(gaussians, labels, views, cameras, up / np.linalg.norm(up))
     changes = [search.unmoved(k, seen[k], excess[k], differing[k]) for k in range(count)]
@@ -285,11 +276,11 @@ class _Cluster(NamedTuple):
         return _Cluster(place, self.size, self.masks | other.masks, max(self.radius, other.radius))
 
 
-def _gains(views: Sequence[_View], body: _Body, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The cost that an object takes away in each view after a motion, and the pixels of its silhouette."""
+def _gain(views: Sequence[_View], body: _Body, motion: np.ndarray) -> tuple[float, int]:
+    """The cost that an object takes away in some views after a motion, and the pixels of its silhouette."""
     placed = [view.place(body, motion) for view in views]
-    gains = [float(np.nansum(view.cost - new.cost)) for view, (new, _) in zip(views, placed)]
-    return np.array(gains), np.array([inside.sum() for _, inside in placed])
+    gain = sum(float(np.nansum(view.cost - new.cost)) for view, (new, _) in zip(views, placed))
+    return gain, sum(int(inside.sum()) for _, inside in placed)
 
 
 def _sigmoid(evidence: float) -> float:
@@ -398,7 +389,6 @@ class _Search:
         order = tuple(int(t) for t in np.argsort([-m.sum() for m in masks]) if masks[t].sum() >= MIN_PIXELS)
         middle = self.body(k).middle
         place = middle @ motion[:3, :3].T + motion[:3, 3]
-        evidence -= len(order) < 2
         away = np.linalg.norm(place - middle) / max(self.body(k).extent, 1e-9)
         if away < MIN_MOVE and Rotation.from_matrix(motion[:3, :3]).magnitude() < MIN_MOVE:
             return Change("same", k, _sigmoid(evidence), order, np.eye(4), middle, before, before)
@@ -416,10 +406,9 @@ class _Search:
         k = change.object
         views = [self.first[t].render(hide(self.gaussians, self.labels == k)) for t in change.frames[:_FIT_FRAMES]]
         motions = [self._motion(k, np.array([0, 0, angle, 0])) for angle in np.radians(np.arange(0, 341, 20))]
-        scores = [_gains(views, self.body(k), motion) for motion in motions]
-        values, pixels = [gains.sum() for gains, _ in scores], scores[0][1].sum()
-        gain = (max(values) - values[0]) / max(pixels, 1)
-        return None if gain < MIN_TURN_GAIN else (motions[int(np.argmax(values))], 40 * (gain - MIN_TURN_GAIN))
+        gains, pixels = zip(*(_gain(views, self.body(k), motion) for motion in motions))
+        gain = (max(gains) - gains[0]) / max(pixels[0], 1)
+        return None if gain < MIN_TURN_GAIN else (motions[int(np.argmax(gains))], 40 * (gain - MIN_TURN_GAIN))
 
     def _fit(self, k: int, place: np.ndarray, size: float) -> "_Fit | None":
         """Turns and shifts an object about a place until it explains most of the photographs there."""
@@ -432,9 +421,8 @@ class _Search:
         lift = 0.0 if abs(lift) < 0.35 * extent else lift
         frames = self._frames_near(middle + shift @ self.flat + lift * self.up)
 
-        def score(pose: np.ndarray) -> tuple[float, int, int]:
-            gains, pixels = _gains([self.views[t] for t in frames], self.body(k), self._motion(k, pose))
-            return float(gains.sum()), int(pixels.sum()), int((gains > np.maximum(0.5 * MIN_GAIN * pixels, 0)).sum())
+        def score(pose: np.ndarray) -> tuple[float, int]:
+            return _gain([self.views[t] for t in frames], body, self._motion(k, pose))
 
         best = np.array([*shift, 0.0, lift])
         value = score(best)
@@ -451,8 +439,6 @@ class _Search:
                 if values[top][0] <= value[0]:
                     break
                 best, value = options[top], values[top]
-        if value[2] < min(2, len(frames)):
-            return None
         gain = value[0] / max(value[1], 1)
         return _Fit(k, self._motion(k, best), value[0], gain)
 
