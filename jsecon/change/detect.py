@@ -183,13 +183,19 @@ def _first_view(gaussians: Gaussians, camera: Camera, frame: np.ndarray, depth: 
     photo = fit_exposure(shifted(photo, shift), image[0], known)
     if depth is not None:
         depth = shifted(np.asarray(depth, np.float32), shift)
+        depth = np.where(depth > 0, cv2.medianBlur(depth, 3), 0)  # a third of the noise
     view = _View(camera, photo, depth, *image, image[1])
     return view._replace(cost=view.compare(*image))
 
 
 def _pooled(view: _View, gaussians: Gaussians, labels: np.ndarray, count: int) -> np.ndarray:
-    """Sums each object's weight on pixels that are explained, that are not, and that are not known: (K, 3)."""
+    """Sums each object's weight on pixels that are explained, that are not, and that are not known: (K, 3).
+
+    A measured surface in front of the scene tells nothing of what it hides.
+    """
     image = np.where(np.isnan(view.cost), -1, view.cost > 0.5).astype(np.int32)
+    if view.depth is not None:
+        image = np.where(np.nan_to_num(depth_cost(view.depth, view.z)) < -0.5, -1, image)
     matrix = view_evidence(gaussians, view.camera, image, 2).matrix(len(labels), 2)
     inside = np.flatnonzero(labels >= 0)
     columns = matrix[inside].toarray()
