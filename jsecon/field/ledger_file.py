@@ -69,7 +69,7 @@ def load_ledger(path: Path, field: LanguageField) -> Ledger:
         raise InputError(path, "the field has no ledger of its views", remedy=_REMEDY)
     if not file.is_file():
         problem = f"its ledger is missing: {file.parent.name}/{file.name}"
-        raise InputError(path, problem, remedy=f"Copy that folder along with the field, or m{_REMEDY[1:]}")
+        raise InputError(path, problem, remedy=f"Copy that folder along with the field. If it is lost: {_REMEDY}")
     with reading(file, "a whole one", _REMEDY, problem="the ledger is damaged"):
         header, arrays = read_arrays(file)
         if [header.get("format"), header.get("version")] != ["jsecon-ledger", 2]:

@@ -109,7 +109,7 @@ def _is_apart(
 
 
 def _divided(cameras: Camera, side: int) -> Camera:
-    """Divides T views into side^2 T of one size, which overlap where it does not divide theirs."""
+    """Divides T views into side^2 T of one size; neighbours overlap where a view is no multiple of `side`."""
     whole, part = (cameras.width, cameras.height), (-(-cameras.width // side), -(-cameras.height // side))
     starts = [[min(k * p, w - p) for k in range(side)] for w, p in zip(whole, part)]
     moved = [dataclasses.replace(cameras, cx=cameras.cx - x, cy=cameras.cy - y) for x in starts[0] for y in starts[1]]
