@@ -1,11 +1,14 @@
 """Every reader in a folder of an odd name, on whole, empty and damaged files: it refuses each with an InputError, or
 returns a well-formed result.
 
-Longer, with other seeds:
+A file is taken apart into texts and bytes, one of them is damaged, and the checksums are made right again. Every choice
+comes from a seed. Longer, with other seeds:
 
     FUZZ_MUTATIONS=10000 FUZZ_SEED=1 pytest -m long tests/test_fuzz.py
 """
 
+import contextlib
+import json
 import os
 import re
 import time
@@ -14,9 +17,10 @@ import zlib
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 from fuzz_readers import READERS, cases, check_result
-from mutations import damaged
+from google.protobuf import json_format
 
 from jsecon.errors import InputError
 
@@ -32,6 +36,200 @@ LONGEST_MESSAGE = 2500
 HIDDEN = ResourceWarning, DeprecationWarning, PendingDeprecationWarning, ImportWarning
 ODD_NAME = "Gr\xf6\xdfe [1] * 50%, \u6e2c\u8a66 'x'"
 """with signs of patterns, of lists and of other alphabets; names that are not UTF-8: test_names"""
+NUMBERS = (0, -1, 1, 2**31, -(2**31), 2**32 - 1, 2**62, 2**64 - 1, float("nan"), float("inf"), 1e308, -1e308, 1e-320)
+WORDS = (*map(repr, NUMBERS), "1e400", "9" * 5000, "1_0", "٣", "1,5", "0x10", "", "\0", "../x", "x" * 300)
+WORDS += tuple(f"'{code}'" for code in ("<f8", ">f4", "<i4", "<u8", "|u1", "|b1", "<f2", "<c8", "|S3", "<M8[s]"))
+"""the last are types of NumPy, as the header of a .npy has them"""
+CODES = ("<i4", "<u4", "<i8", "<u8", "<f4", "<f8", "<u2", "u1", ">u4", ">u2", ">f4")
+ODD = (None, True, *NUMBERS, 10**400, "", "a\0b", "\ud800", "x" * 5000, "../x", [], {}, [[]], [1, 2, 3], {"a": 1})
+RAW = {"@deep list@": "[" * 100_000 + "]" * 100_000, "@deep dict@": '{"a":' * 50_000 + "1" + "}" * 50_000}
+"""JSON that is nested too deep to be written by `json`, and what stands for it"""
+
+
+def pick(rng, items):
+    return items[int(rng.integers(len(items)))]
+
+
+def packed(rng) -> bytes:
+    kind, number = np.dtype(pick(rng, CODES)), pick(rng, NUMBERS)
+    if kind.kind == "f":
+        with np.errstate(over="ignore"):
+            return np.array(number).astype(kind).tobytes()
+    whole = int(number) % 2**64 if np.isfinite(number) else 2 ** (8 * kind.itemsize - 1)
+    return np.array(whole, np.uint64).astype(kind).tobytes()
+
+
+def of_bytes(rng, data: bytes) -> bytes:
+    """A bit flipped, the end cut off, blocks doubled, dropped or of noise, numbers replaced by extremes."""
+    result = bytearray(data)
+    for _ in range(rng.choice([1, 1, 2, 4])):
+        if not result:
+            return packed(rng)
+        at = int(rng.integers(min(len(result), 64) if rng.random() < 0.3 else len(result)))  # headers come first
+        block = int(min(len(result) - at, 2 ** rng.integers(0, 12)))
+        match rng.integers(7):
+            case 0:
+                result[at] ^= 1 << int(rng.integers(8))
+            case 1:
+                del result[at:]
+            case 2:
+                result[at:at] = result[at : at + block]
+            case 3:
+                del result[at : at + block]
+            case 4:
+                result[at : at + block] = rng.bytes(block)
+            case _:
+                number = packed(rng)
+                at -= at % len(number) * int(rng.integers(2))
+                result[at : at + len(number)] = number
+    return bytes(result)
+
+
+def of_text(rng, data: bytes) -> bytes:
+    """Words and numbers replaced, lines dropped, doubled or joined, and other encodings."""
+    text = data.decode("utf-8", "surrogateescape")
+    for _ in range(rng.choice([1, 1, 3])):
+        lines, words = text.split("\n"), list(re.finditer(r"[^\s,:\"\[\]{}]+", text))
+        at, other = int(rng.integers(len(lines))), pick(rng, lines)
+        match rng.integers(8):
+            case 0:
+                del lines[at]
+            case 1:
+                lines.insert(at, other)
+            case 2:
+                lines[at] += " " + other
+            case _ if words:
+                word = pick(rng, words)
+                new = pick(rng, words)[0] if rng.random() < 0.3 else pick(rng, WORDS)
+                lines = [text[: word.start()] + new + text[word.end() :]]
+        text = "\n".join(lines)
+    if rng.random() < 0.15:
+        return text.encode(pick(rng, ("utf-16", "utf-8-sig", "utf-32", "cp037")), "replace")
+    return text.encode("utf-8", "surrogateescape")
+
+
+def places(node) -> list:
+    """(container, key) of each value within a JSON tree."""
+    items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+    return [place for key, value in items for place in ((node, key), *places(value))]
+
+
+def of_json(rng, data: bytes) -> bytes:
+    """JSON's values with keys and entries missing, doubled or renamed, and values of other kinds and sizes."""
+    content = {"root": json.loads(data)}
+    for _ in range(rng.choice([1, 1, 2])):
+        found = places(content)
+        if rng.random() < 0.5:  # near the root: there are few of those among many numbers
+            found = found[:1] + [place for place in found if not isinstance(place[0], list)]
+        (holder, key), (other, at) = pick(rng, found), pick(rng, found)
+        match rng.integers(6):
+            case 0 if holder is not content:
+                del holder[key]
+            case 1 if isinstance(holder, list):
+                holder.insert(key, holder[key])
+            case 1 if holder is not content:
+                holder[str(pick(rng, ODD))[:300]] = holder.pop(key)
+            case 2:
+                holder[key] = json.loads(json.dumps(other[at]))
+            case 3 if rng.random() < 0.3:
+                holder[key] = pick(rng, list(RAW))
+            case 4 if isinstance(holder[key], list):
+                holder[key] = holder[key][: int(rng.integers(len(holder[key]) + 1))]
+            case _:
+                holder[key] = pick(rng, ODD)
+    text = json.dumps(content["root"])
+    for mark, raw in RAW.items():
+        text = text.replace(json.dumps(mark), raw)
+    return text.encode()
+
+
+def split_header(end: bytes, start: int = 0):
+    """Takes a file apart in front of its header, which begins at `start`, and behind the `end` of that."""
+
+    def split(data: bytes) -> list[bytes]:
+        at = data.index(end) + len(end)
+        return [data[:start], data[start:at], data[at:]]
+
+    return split
+
+
+def join_npy(parts: list[bytes]) -> bytes:
+    start, header, body = parts
+    return start[:8] + len(header).to_bytes(2, "little") + header + body
+
+
+def split_png(data: bytes) -> list[bytes]:
+    chunks, at = [], 8
+    while at < len(data):
+        size = int.from_bytes(data[at : at + 4])
+        kind, body = data[at + 4 : at + 8], data[at + 8 : at + 8 + size]
+        chunks.append(kind + (zlib.decompress(body) if kind == b"IDAT" else body))
+        at += 12 + size
+    return chunks
+
+
+def join_png(chunks: list[bytes]) -> bytes:
+    bodies = [b"IDAT" + zlib.compress(chunk[4:]) if chunk[:4] == b"IDAT" else chunk for chunk in chunks]
+    parts = [(len(b) - 4).to_bytes(4) + b + zlib.crc32(b).to_bytes(4) for b in bodies]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+def split_tensors(data: bytes) -> list[bytes]:
+    length = int.from_bytes(data[:8], "little")
+    layout = json.loads(data[8 : 8 + length])
+    return [layout.pop("__metadata__")["jsecon"].encode(), json.dumps(layout).encode(), data[8 + length :]]
+
+
+def join_tensors(parts: list[bytes]) -> bytes:
+    told, layout, body = parts
+    with contextlib.suppress(Exception):  # of a damaged part
+        entries = json.loads(layout).items()
+        content = json.loads(told)
+        content["crc32"] = {name: zlib.crc32(body[slice(*entry["data_offsets"])]) for name, entry in entries}
+        told = json.dumps(content).encode()
+    metadata = json.dumps({"jsecon": told.decode(), "crc32": str(zlib.crc32(told))}).encode()
+    header = layout.rstrip()[:-1] + b', "__metadata__": ' + metadata + b"}"
+    return len(header).to_bytes(8, "little") + header + body
+
+
+def split_onnx(data: bytes) -> list[bytes]:
+    return [json.dumps(json_format.MessageToDict(onnx.load_from_string(data))).encode()]
+
+
+def join_onnx(parts: list[bytes]) -> bytes:
+    return json_format.ParseDict(json.loads(parts[0]), onnx.ModelProto()).SerializeToString()
+
+
+CONTAINERS = {
+    ".npy": (split_header(b"\n", 10), join_npy),
+    ".ply": (split_header(b"end_header\n"), b"".join),
+    ".png": (split_png, join_png),
+    ".safetensors": (split_tensors, join_tensors),
+    ".onnx": (split_onnx, join_onnx),
+}
+"""ending of a file -> what takes it apart, and what joins its parts"""
+
+
+def damaged(rng, data: bytes, ending: str) -> tuple[str, bytes]:
+    """(what was done, the bytes) of a file of this ending."""
+    split, join = CONTAINERS.get(ending, (lambda data: [data], b"".join))
+    try:
+        parts = split(data) if rng.random() < 0.75 else [data]
+        at, is_whole = int(rng.integers(len(parts))), len(parts) == 1
+        match rng.integers(12):
+            case 0 if not is_whole:
+                del parts[at]
+            case 1 if not is_whole:
+                parts.insert(at, pick(rng, parts))
+            case _:
+                ways = [of_json] if parts[at][:1] in (b"{", b"[") else []
+                ways += [of_text] if parts[at].isascii() and parts[at] else []
+                way = pick(rng, [*ways, *ways, of_bytes])
+                parts[at] = way(rng, parts[at])
+                return way.__name__, join(parts)
+        return "parts", join(parts)
+    except Exception:  # no longer of its format
+        return of_bytes.__name__, of_bytes(rng, data)
 
 
 def read_and_check(case, size, capfd):
