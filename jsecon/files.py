@@ -155,13 +155,8 @@ def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
     return text.getvalue()
 
 
-def read_text(path: Path) -> str:
-    """Reads a text file as UTF-8, with or without a byte order mark; other bytes become surrogates."""
-    return path.read_text(encoding="utf-8-sig", errors="surrogateescape")
-
-
 def read_lines(path: Path) -> Iterator[str]:
-    """Reads a text file line by line, as `read_text` reads it."""
+    """Reads a text file as UTF-8, with or without a byte order mark, line by line; other bytes become surrogates."""
     with path.open(encoding="utf-8-sig", errors="surrogateescape", newline="\n") as file:
         yield from file
 

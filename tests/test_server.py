@@ -1,5 +1,7 @@
 """The server: that odd input has an error of its own kind and nothing crashes. test_doors.py has its answers."""
 
+import socket
+
 import cv2
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from table_field import table_field
 from jsecon import save_field
 from jsecon.app import verbs
 from jsecon.app.scene import Scene
-from jsecon.app.server import MAX_BODY, _serve, application
+from jsecon.app.server import MAX_BODY, _serve, _token_for, application, listen
 from jsecon.pipeline.progress import Console
 from jsecon.vision.colours import ColourEmbedder
 
@@ -45,7 +47,11 @@ def test_a_field_is_chosen_by_its_name_and_a_frame_by_its_place(client):
 @pytest.mark.parametrize(("status", "headers"), [
     (200, {"host": "localhost", **JSON}),
     (200, {"host": "[::1]:8765", "content-type": "Application/JSON; charset=utf-8"}),
-    (403, {"host": "box.lan", **JSON}), (403, {"host": "evil.example:8765", **JSON}), (403, {"host": "", **JSON}),
+    *((200, {"host": name, **JSON}) for name in ("127.9.9.9", "LOCALHOST.:80")),
+    *((403, {"host": name, **JSON}) for name in (
+        *("box.lan:1", "[fe80::2]:5", "evil.example:8765", "localhost.evil.example", "127.0.0.1.evil.example"),
+        *("evil.example@", "", "[::1", "0.0.0.0"),
+    )),
     (415, {"content-type": "text/plain"}), (415, {"content-type": ""}),
     (415, {"content-type": "application/x-www-form-urlencoded"}),
 ])  # fmt: skip
@@ -125,5 +131,27 @@ def test_fields_are_opened_by_their_folders_names_and_the_address_is_told(scenes
     told = _serve(verbs.Serve(fields=[files[0].parent, files[1]], port=0), Console())
     assert int(told["address"].removeprefix("http://127.0.0.1:")) > 0
     assert [scene["name"] for scene in told["fields"]] == ["a/desk", "b/desk"]
-    with refused("a token that clients must have"):
-        _serve(verbs.Serve(fields=files, host="0.0.0.0", port=0), Console())
+
+
+def test_beyond_loopback_a_token_is_needed(monkeypatch):
+    monkeypatch.delenv("JSECON_TOKEN", raising=False)
+    for host in ("::1", "[::1]", "localhost"):
+        assert _token_for(host, "") == ""
+    for host in ("0.0.0.0", "::", "192.168.0.3", "box"):
+        with refused("--token"):
+            _serve(verbs.Serve(fields=[], host=host, port=0), Console())
+    assert _token_for("0.0.0.0", "a") == "a"
+    monkeypatch.setenv("JSECON_TOKEN", "b")
+    assert _token_for("0.0.0.0", "") == "b"
+
+
+def test_addresses_of_both_families_are_listened_on():
+    four, url = listen("127.0.0.1", 0)
+    with four:
+        assert four.family == socket.AF_INET
+        assert url == f"http://127.0.0.1:{four.getsockname()[1]}"
+        with refused("in use"):
+            listen("127.0.0.1", four.getsockname()[1])
+    for host, port in (("no.such.host.invalid", 0), ("a\0b", 0), ("x" * 300, 0), ("127.0.0.1", 70000)):
+        with refused("cannot listen"):
+            listen(host, port)

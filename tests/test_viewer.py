@@ -22,10 +22,10 @@ from starlette.testclient import TestClient
 
 from jsecon import load_gaussians, save_field
 from jsecon.app import verbs
-from jsecon.app.access import listen
 from jsecon.app.catalogue import main_regions
 from jsecon.app.records import Query, Region
 from jsecon.app.scene import Scene
+from jsecon.app.server import listen
 from jsecon.app.viewer.served import page_application
 from jsecon.app.viewer.view import _view
 from jsecon.change.history import move_object
@@ -110,7 +110,7 @@ def test_the_page_is_shown_to_who_names_this_machine_and_asks_in_json(client):
 
 def test_a_taken_port_and_a_missing_extra_are_refused(asked, tmp_path, monkeypatch):
     save_field(tmp_path / "field.safetensors", asked.field)
-    with listen("127.0.0.1", 0) as taken, refused("--port"):
+    with listen("127.0.0.1", 0)[0] as taken, refused("--port"):
         _view(verbs.View(field=tmp_path, texts=[], port=taken.getsockname()[1]), Console())
     for module in ("jsecon.app.viewer.served", "jsecon.app.server"):
         monkeypatch.delitem(sys.modules, module)
@@ -121,11 +121,12 @@ def test_a_taken_port_and_a_missing_extra_are_refused(asked, tmp_path, monkeypat
 
 @pytest.fixture(scope="module")
 def address(asked):
-    with listen("127.0.0.1", 0) as socket:
+    socket, url = listen("127.0.0.1", 0)
+    with socket:
         server = uvicorn.Server(uvicorn.Config(page_application(asked, ["pink"]), log_level="warning"))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [socket]})
         thread.start()
-        yield f"http://127.0.0.1:{socket.getsockname()[1]}/"
+        yield f"{url}/"
         server.should_exit = True
         thread.join()
 

@@ -15,7 +15,7 @@ T = TypeVar("T")
 _REMEDY = "Give field.safetensors, the folder that jsecon run wrote it to, a splat or a point cloud."
 
 
-class FieldPath(NamedTuple):
+class _FieldPath(NamedTuple):
     """Where a field is, or will be."""
 
     named: Path
@@ -26,7 +26,7 @@ class FieldPath(NamedTuple):
     """the file of Gaussians of which the field is made"""
 
 
-def locate_field(path: Path, out: Path | None = None) -> FieldPath:
+def locate_field(path: Path, out: Path | None = None) -> _FieldPath:
     """Finds the field that a path names, or raises an InputError that describes the file.
 
     `out` is the folder for the field of a splat, by default NAME_field beside NAME.ply.
@@ -36,7 +36,7 @@ def locate_field(path: Path, out: Path | None = None) -> FieldPath:
             if not (path / FIELD_FILE).is_file():
                 remedy = f"Give the folder that jsecon run wrote, or make a field: jsecon run {path} --out my_field"
                 raise InputError(path, f"a folder without {FIELD_FILE}", "the folder of a field", remedy)
-            return FieldPath(path.resolve(), path / FIELD_FILE, None)
+            return _FieldPath(path.resolve(), path / FIELD_FILE, None)
         if not path.exists():
             raise InputError(path, "no such file", "a field file", f"Check the path. {_REMEDY}")
         with path.open("rb") as file:
@@ -47,11 +47,11 @@ def locate_field(path: Path, out: Path | None = None) -> FieldPath:
         raise InputError(path, f"it is {substitute[0]}", "" if splat else "a field", remedy)
     if splat:
         folder = path.with_name(f"{path.stem}_field") if out is None else out
-        return FieldPath(path.resolve().with_suffix(""), folder / FIELD_FILE, path)
+        return _FieldPath(path.resolve().with_suffix(""), folder / FIELD_FILE, path)
     if path.suffix != ".safetensors" and head[8:9] != b"{":  # what is damaged is the reader's to say
         raise InputError(path, "it is a file of another kind" if head else "it is an empty file", "a field", _REMEDY)
     place = path.resolve()
-    return FieldPath(place.parent if path.name == FIELD_FILE else place.with_suffix(""), path, None)
+    return _FieldPath(place.parent if path.name == FIELD_FILE else place.with_suffix(""), path, None)
 
 
 def name_fields(paths: Sequence[Path]) -> dict[str, Path]:

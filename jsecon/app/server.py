@@ -2,10 +2,16 @@
 
 FastAPI makes /openapi.json from the models below, and answers each question in a thread; a scene computes one at a
 time. A request reads only the fields, and photographs are added in memory: no name in it is a path.
+
+A page of another site can send requests to a server on loopback under a name that it has made to stand for 127.0.0.1
+(DNS rebinding). So without a token, a request must name this machine in its Host header. Beyond loopback, where only
+`jsecon serve` listens, it must carry the token.
 """
 
 import hmac
+import ipaddress
 import json
+import os
 import re
 import socket
 import tempfile
@@ -13,6 +19,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -27,11 +34,10 @@ from starlette.exceptions import HTTPException as AnyHTTPException
 
 import jsecon
 from jsecon.app import verbs
-from jsecon.app.access import bracketed, is_allowed_host, listen, token_for
 from jsecon.app.opening import find_scene, name_fields
 from jsecon.app.records import At, Query
 from jsecon.app.scene import Scene, open_prepared
-from jsecon.errors import InputError
+from jsecon.errors import InputError, describe_error
 from jsecon.pipeline.progress import Console
 
 MAX_BODY, MAX_FRAME = 64 * 1024, 32 * 1024 * 1024
@@ -91,8 +97,37 @@ class _AsciiResponse(JSONResponse):
         return json.dumps(content, allow_nan=False).encode()
 
 
+def _is_loopback(host: str) -> bool:
+    """Returns whether a host is this machine and cannot be reached by others: localhost, 127.0.0.0/8 or ::1."""
+    try:
+        return ipaddress.ip_address(host.strip("[]").partition("%")[0]).is_loopback
+    except ValueError:
+        return host.rstrip(".").lower() == "localhost"
+
+
+def _is_allowed_host(header: str) -> bool:
+    """Checks whether a Host header names this machine, by a name of loopback."""
+    try:
+        host = urlsplit(f"//{header}").hostname
+    except ValueError:
+        return False
+    return host is not None and _is_loopback(host)
+
+
+def _token_for(host: str, token: str) -> str:
+    """Finds the token that clients of an address must have, or raises InputError where others reach it without one.
+
+    A `token` of "" is that of the environment; the result is "" if no token is needed.
+    """
+    token = token or os.environ.get("JSECON_TOKEN", "")
+    if not token and not _is_loopback(host):
+        problem = f"others can reach {host}, so there must be a token that clients must have"
+        raise InputError("--host", problem, remedy="Set --token, or leave --host out to listen on 127.0.0.1 alone.")
+    return token
+
+
 class _Guard:
-    """Middleware that refuses requests by the rules of `jsecon.app.access`, and bodies that are too large."""
+    """Middleware that refuses requests from elsewhere or without the token, and bodies that are too large."""
 
     def __init__(self, app: Any, token: str):
         self._app = app
@@ -122,7 +157,7 @@ class _Guard:
             sent = headers.get("authorization", "").encode("latin-1")
             if not hmac.compare_digest(sent, f"Bearer {self._token}".encode("utf-8", "surrogateescape")):
                 return 401, "A token is required. Send the header Authorization: Bearer TOKEN."
-        elif not is_allowed_host(headers.get("host", "")):
+        elif not _is_allowed_host(headers.get("host", "")):
             return 403, "The Host header does not name this machine. Behind a proxy, start jsecon serve with --token."
         kind = headers.get("content-type", "").partition(";")[0].strip().lower()
         if method == "POST" and kind != "application/json":  # what a page of another site can send without asking
@@ -241,16 +276,33 @@ def _describe(scene: Scene) -> dict[str, Any]:
 
 def _serve(verb: verbs.Serve, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon serve`: address, fields, and under "then" what answers requests until it is stopped."""
-    token = token_for(verb.host, verb.token)
-    listening = listen(verb.host, verb.port)
+    token = _token_for(verb.host, verb.token)
+    listening, address = listen(verb.host, verb.port)
     scenes = {
         name: open_prepared(name, path, verb.embedder, console) for name, path in name_fields(verb.fields).items()
     }
     app = application(scenes, token=token)
-    address = f"http://{bracketed(verb.host)}:{listening.getsockname()[1]}"
     fields = [_describe(scene) for scene in scenes.values()]
     console.print_line("\n".join([*map(str, scenes.values()), address]))
     return {"address": address, "fields": fields, "then": runner(app, listening)}
+
+
+def listen(host: str, port: int) -> tuple[socket.socket, str]:
+    """Opens a socket that listens, of IPv4 or IPv6, or raises InputError; port 0 takes a free one. Adds its URL."""
+    try:
+        addresses = socket.getaddrinfo(host.strip("[]"), port, type=socket.SOCK_STREAM)
+        family, _, _, _, address = min(addresses, key=lambda info: info[0] != socket.AF_INET)
+        opened = socket.create_server((address[0], port, *address[2:]), family=family)
+        return opened, f"http://{_bracketed(host)}:{opened.getsockname()[1]}"
+    except (OSError, OverflowError, ValueError) as error:
+        reason = describe_error(error) if isinstance(error, OSError) else "it is not an address"
+        remedy = "Take another --port, or 0 to have one chosen. --host must be an address of this machine."
+        raise InputError("--port", f"cannot listen on {_bracketed(host)}:{port} ({reason})", remedy=remedy) from error
+
+
+def _bracketed(host: str) -> str:
+    """Writes a host as it stands in a URL: an IPv6 address in brackets."""
+    return f"[{host}]" if ":" in host and not host.startswith("[") else host
 
 
 def runner(app: FastAPI, listening: socket.socket) -> Callable[[], None]:

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsecon.errors import InputError
-from jsecon.evaluate.metrics import accuracy_at, in_any_box, iou, mean_iou
+from jsecon.evaluate.metrics import accuracy_at, iou, localization_accuracy, mean_iou
 from jsecon.fit.resize import resize_camera
 from jsecon.query.render import ALPHA_THRESHOLD, VALA_THRESHOLD, render_selection
 from jsecon.read.masks.labels import LabelledFrame
@@ -123,10 +123,9 @@ def _rows(
     for threshold in thresholds:
         mask = alpha > threshold
         share = float(iou(mask, true)) if true.any() else 0.0
-        located = point is not None and in_any_box(point, boxes)
-        touched = any(in_any_box((int(x), int(y)), boxes) for y, x in np.argwhere(_peak(mask)))
-        centre = _box_centre(mask)
-        centred = centre is not None and in_any_box(centre, boxes)
+        peaks = [(int(x), int(y)) for y, x in np.argwhere(_peak(mask))]
+        located, centred = (localization_accuracy([place], [boxes]) > 0 for place in (point, _box_centre(mask)))
+        touched = localization_accuracy(peaks, [boxes] * len(peaks)) > 0
         rows.append(Row(frame.name, category, share, located, touched, centred, point, count, region, score, mask))
     return rows
 

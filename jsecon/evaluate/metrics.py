@@ -71,11 +71,11 @@ def localization_accuracy(points: Iterable[Point | None], boxes: Iterable[Float[
     Returns:
       The share, NaN without pairs.
     """
-    hits = [point is not None and in_any_box(point, box) for point, box in zip(points, boxes, strict=True)]
+    hits = [point is not None and _in_any_box(point, box) for point, box in zip(points, boxes, strict=True)]
     return float(np.mean(hits)) if hits else float("nan")
 
 
-def in_any_box(point: Point, boxes: Float[Array, "b 4"]) -> bool:
+def _in_any_box(point: Point, boxes: Float[Array, "b 4"]) -> bool:
     """Whether a point (x, y) lies inside of any box, edges included; B may be 0."""
     x, y = point
     boxes = np.asarray(boxes)

@@ -27,15 +27,11 @@ RADIUS_PX = 5
 """Radius of the SSIM window: 11 = 2 * 5 + 1."""
 _C1, _C2 = 0.01**2, 0.03**2
 """Keep the luminance and the contrast term finite if both images are black or flat."""
+SSIM_WINDOW = np.exp(-(np.arange(-RADIUS_PX, RADIUS_PX + 1) ** 2) / (2 * 1.5**2))
+SSIM_WINDOW /= SSIM_WINDOW.sum()
+"""Weights of the SSIM window along one axis."""
 SSIM_SHARE = 0.2
 """Share of SSIM in the loss (Kerbl et al. 2023)."""
-
-
-def gaussian_window() -> np.ndarray:
-    """Returns the 11 weights of the SSIM window along one axis."""
-    offsets = np.arange(-RADIUS_PX, RADIUS_PX + 1)
-    weights = np.exp(-(offsets**2) / (2 * 1.5**2))
-    return weights / weights.sum()
 
 
 def _blur_once(image, axis: int):
@@ -51,7 +47,7 @@ def _shifts(image: Array, axis: int, step: int) -> Array:
     """The window along one axis with a step between its numbers; without padding."""
     size = image.shape[axis] - 2 * RADIUS_PX * step
     starts = range(0, image.shape[axis], step)
-    terms = (float(w) * jax.lax.slice_in_dim(image, i, i + size, axis=axis) for i, w in zip(starts, gaussian_window()))
+    terms = (float(w) * jax.lax.slice_in_dim(image, i, i + size, axis=axis) for i, w in zip(starts, SSIM_WINDOW))
     return functools.reduce(operator.add, terms)
 
 

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from jsecon.fit.photometric import gaussian_window, psnr, ssim_map
+from jsecon.fit.photometric import SSIM_WINDOW, psnr, ssim_map
 from jsecon.fit.resize import resize_frame, resize_mask, shrink_cameras
 from jsecon.parallel import map_over_processes
 from jsecon.splat.render import render_rgb
@@ -33,8 +33,7 @@ def _compare(
 
 def _blur(image: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
     """Blurs an image with the SSIM window, with zeros outside of it, by OpenCV: no program is compiled for a size."""
-    window = gaussian_window()
-    return cv2.sepFilter2D(image, -1, window, window, borderType=cv2.BORDER_CONSTANT)
+    return cv2.sepFilter2D(image, -1, SSIM_WINDOW, SSIM_WINDOW, borderType=cv2.BORDER_CONSTANT)
 
 
 def measure_quality(

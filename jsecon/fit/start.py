@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from jsecon.errors import InputError, require
 from jsecon.fit.triangulate import MIN_POINTS, triangulated_points
-from jsecon.splat.points import gaussians_from_points, voxel_for, voxel_ids, voxel_means
+from jsecon.splat.points import gaussians_from_points, voxel_means
 from jsecon.types import Camera, Capture, Gaussians, Progress
 
 FEW_POINTS = 300
@@ -77,13 +77,11 @@ def points_from_depth(
     if not any(len(world) for world, _, _ in parts):
         raise InputError("capture", "no pixel with a known depth", "depths above 0", "Check their encoding and unit.")
     points, colors, _ = (np.concatenate(columns) for columns in zip(*parts))
-    if max_points is not None and (not voxel or voxel_ids(points, voxel).max() >= max_points):
-        voxel = voxel_for(points, max_points)
-    mean, color = voxel_means(voxel_ids(points, voxel), points, colors)
-    return _DepthPoints(mean.astype(np.float32), np.rint(color).astype(np.uint8), float(voxel))
+    mean, *rest = voxel_means(points, colors, max_points, voxel)
+    return _DepthPoints(mean.astype(np.float32), *rest)
 
 
-def points_between(capture: Capture, points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _points_between(capture: Capture, points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Makes points of pixels of the training frames, drawn at random, at the depth of the known points nearest to them.
 
     Surfaces without texture have no points of their own, but often the depth of what lies around them.
@@ -124,7 +122,7 @@ def starting_gaussians(
     """Makes the Gaussians that a fit of `capture` starts from, and a clause on where they come from.
 
     Points come from depth frames where there are any, else from the capture's sparse points. Where these are few,
-    others are triangulated from the training frames, and put between all of these (`points_between`).
+    others are triangulated from the training frames, and put between all of these (`_points_between`).
 
     The scale (in units of the distance to the neighbours) is smaller and the opacity larger than INRIA's 1 and 0.1.
     Measured with the same number of steps: the demo room (seed 0, 400 steps) has 32.6 dB held out with opacity 0.8 and
@@ -158,7 +156,7 @@ def starting_gaussians(
             if count < MIN_POINTS:
                 raise
         enough = min(round(ENOUGH_POINTS[0] * megapixels), ENOUGH_POINTS[1])
-        more = points_between(capture, np.asarray(points), max(0, enough - len(points)))
+        more = _points_between(capture, np.asarray(points), max(0, enough - len(points)))
         points, colors = (np.concatenate(pair) for pair in zip((points, colors), more))
         origin += f"; {len(more[0])} put between them" if len(more[0]) else ""
     return gaussians_from_points(points, colors, opacity=0.7, scale=0.6, sh_degree=sh_degree), origin

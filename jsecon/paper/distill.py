@@ -105,7 +105,7 @@ class _State(NamedTuple):
     step: Array  # () int32 steps taken
 
 
-class Distillation(NamedTuple):
+class _Distillation(NamedTuple):
     """What `distill_l1` trains. A loss is NaN for a view that overflowed the capacity."""
 
     codes: Float[Array, "n d"]
@@ -125,7 +125,7 @@ def distill_l1(
     init: str | Float[Array, "n d"] = "zero",
     capacity: int | None = None,
     progress: Progress | None = None,
-) -> Distillation:
+) -> _Distillation:
     """Distills as the paper does (LangSplat, train.py): Adam on the rendered L1 (`rendered_l1`), with rate 0.0025.
 
     One view a step, all views before any repeats, in an order drawn from `key`. The geometry is fixed.
@@ -190,7 +190,7 @@ def distill_l1(
     if isinstance(init, str) and init == "random":
         # What never moved was never seen: a random code would be a wrong answer, a zero code is "unknown".
         codes = jnp.where(jnp.any(state.features != features, axis=1, keepdims=True), codes, 0.0)
-    return Distillation(codes, state.history)
+    return _Distillation(codes, state.history)
 
 
 def rendered_l1(

@@ -50,7 +50,7 @@ from jsecon.read.captures.images import encode_jpeg
 from jsecon.read.masks.masks import load_labels, load_proposals
 from jsecon.read.splats.points import load_point_cloud
 from jsecon.types import Capture, Gaussians, LanguageField, Quality, Regions
-from jsecon.views.frame import find_up_axis, given_up
+from jsecon.views.frame import field_up
 from jsecon.vision.classical import require_contrib
 from jsecon.vision.protocols import Embedder
 from jsecon.vision.unrelated_words import embed_unrelated_words
@@ -308,9 +308,8 @@ def _join_field(results: Results, embedder: Embedder, provenance: str, options: 
     capture, embedded = results.load, results.regions
     pixels = np.zeros((embedded.count, len(capture.names)), np.int32)
     pixels[:, results.objects.frames] = embedded.pixel_counts
-    given = None if options.up is None else given_up(options.up, capture.source_from_scene)
     scale = capture.metres_per_unit if options.metres_per_unit is None else options.metres_per_unit
-    return LanguageField(
+    field = LanguageField(
         gaussians=results.gaussians,
         votes=normalise_votes(results.votes.sum, embedded),
         regions=Regions(embedded.embeddings, pixels),
@@ -322,11 +321,12 @@ def _join_field(results: Results, embedder: Embedder, provenance: str, options: 
         provenance=provenance,
         unrelated_words=embed_unrelated_words(embedder).astype(np.float16),
         codes=results.codes,
-        up=given or capture.up or find_up_axis(results.gaussians, capture.cameras),
+        up=capture.up,
         metres_per_unit=scale,
         tree=results.objects.tree,
         leaf=results.objects.leaf,
     )
+    return dataclasses.replace(field, up=field_up(field, options.up))
 
 
 def _make_ledger(results: Results) -> Ledger:

@@ -22,7 +22,7 @@ from jsecon.query.rules import ABSENT, RULES, QueryRules
 from jsecon.types import Array, LanguageField
 
 
-class Classes(NamedTuple):
+class _Classes(NamedTuple):
     """The class of each of N Gaussians."""
 
     labels: Int[Array, " n"]
@@ -38,7 +38,7 @@ def query_classes(
     rules: QueryRules = RULES,
     standardise: bool = True,
     every: bool = False,
-) -> Classes:
+) -> _Classes:
     """Divides the Gaussians among a list of classes, however many objects each class has.
 
         sum_r p_nr s_rq / sum_r p_nr
@@ -71,13 +71,13 @@ def query_classes(
     require(fit, "query_classes", f"texts {texts.shape}", f"(Q >= 1, {size})", remedy)
     if field.regions.count == 0:
         count, dtype = field.gaussians.count, jnp.asarray(field.regions.embeddings).dtype
-        return Classes(jnp.full(count, -1, jnp.int32), jnp.zeros((count, texts.shape[0]), dtype))
+        return _Classes(jnp.full(count, -1, jnp.int32), jnp.zeros((count, texts.shape[0]), dtype))
     arrays = field.regions.embeddings, texts, field.regions.pixel_counts, field.votes
     return _classes(*jax.tree.map(jnp.asarray, arrays), unrelated_words(field), rules, standardise, every)
 
 
 @functools.partial(jax.jit, static_argnames=("standardise", "every"))
-def _classes(embeddings, texts, pixels, votes, words, rules: QueryRules, standardise: bool, every: bool) -> Classes:
+def _classes(embeddings, texts, pixels, votes, words, rules: QueryRules, standardise: bool, every: bool) -> _Classes:
     def compare(text):
         return region_similarities(embeddings, text, words, rules.retrieval)
 
@@ -120,7 +120,7 @@ def _classes(embeddings, texts, pixels, votes, words, rules: QueryRules, standar
         share = jax.vmap(lambda chosen: inside_fraction(votes, chosen).fraction, out_axes=1)(of_class)
         possible &= share >= SHARE_THRESHOLD
     label = jnp.argmax(jnp.where(possible, mean, -jnp.inf), axis=1)
-    return Classes(jnp.where(jnp.any(possible, axis=1), label, -1).astype(jnp.int32), mean)
+    return _Classes(jnp.where(jnp.any(possible, axis=1), label, -1).astype(jnp.int32), mean)
 
 
 def _standardised(table: Array, known: Array, pixels: Array) -> Array:

@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull, QhullError
 from jsecon.query.object_shapes import ObjectShapes
 
 
-class Solid(NamedTuple):
+class _Solid(NamedTuple):
     """The solids of one object, in the world of its shape."""
 
     vertices: Float[np.ndarray, "v 3"]
@@ -30,7 +30,7 @@ class Solid(NamedTuple):
     """(3, 3) right-handed unit columns: axes of the primitive, a cylinder's along the third."""
 
 
-def object_solid(means: Float[np.ndarray, "n 3"], spreads: Float[np.ndarray, "n 3 3"], shape: ObjectShapes) -> Solid:
+def object_solid(means: Float[np.ndarray, "n 3"], spreads: Float[np.ndarray, "n 3 3"], shape: ObjectShapes) -> _Solid:
     """Measures one object from centres and `gaussian_spreads` of its Gaussians, and from its shape.
 
     The hull reaches one deviation beyond the centres, but not out of the object's box.
@@ -52,7 +52,7 @@ def object_solid(means: Float[np.ndarray, "n 3"], spreads: Float[np.ndarray, "n 
     triangles[inwards] = triangles[inwards][:, ::-1]
     name, size, axis = _primitive(vertices, triangles, np.linalg.norm(normals, axis=1), float(hull.volume), half)
     axes = np.roll(shape.axes, 2 - axis, axis=1)
-    return Solid(vertices @ shape.axes.T + shape.center, triangles, float(hull.volume), name, size, axes)
+    return _Solid(vertices @ shape.axes.T + shape.center, triangles, float(hull.volume), name, size, axes)
 
 
 def _primitive(

@@ -258,10 +258,10 @@ def _attribute_gradient(moments: Array, attributes: Array, corners: tuple[Array,
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4, 5))
-def rasterize_finite(
+def _rasterize_finite(
     splats: Array, features: Array, lists: TileLists, width: int, height: int, mesh: Mesh | None
 ) -> tuple[Array, Array]:
-    """Composites finite features as `rasterize_nan_contained` does, in half of its program."""
+    """Composites finite features."""
     return _forward(splats, features, lists, width, height, mesh)[:2]
 
 
@@ -287,7 +287,7 @@ def _rasterize_backward(width, height, mesh, residual, cotangents):
     return by_splat, gradient.astype(features.dtype), None
 
 
-rasterize_finite.defvjp(_rasterize_forward, _rasterize_backward, symbolic_zeros=True)
+_rasterize_finite.defvjp(_rasterize_forward, _rasterize_backward, symbolic_zeros=True)
 
 
 def _forward(splats, features, lists, width: int, height: int, mesh: Mesh | None) -> tuple[Array, Array, Array]:
@@ -338,24 +338,23 @@ def _unmerge(array: Array, sets: int) -> Array:
     return jnp.moveaxis(array.reshape(*array.shape[:-1], sets, -1), -2, 0)
 
 
-def rasterize_nan_contained(
-    splats: Array, features: Array, lists: TileLists, width: int, height: int, mesh: Mesh | None
+def rasterize(
+    splats: Array, features: Array, lists: TileLists, width: int, height: int, mesh: Mesh | None, *, finite: bool
 ) -> tuple[Array, Array]:
-    """Composites features (N, D) of which some may be NaN or infinite.
+    """Composites features (N, D) of which some may be NaN or infinite; if all are `finite`, in half of the program.
 
     Returns:
       Image (H, W, D), NaN in exactly the pixels that a Gaussian with a non-finite feature touches, and final
       transmittance (H, W). Those pixels and features have gradient zero.
     """
-    finite = jnp.isfinite(features)
-    image, transmittance = rasterize_finite(splats, jnp.where(finite, features, 0.0), lists, width, height, mesh)
-    bad = lax.stop_gradient(1.0 - finite.all(1, keepdims=True).astype(splats.dtype))
+    if finite:
+        return cast(tuple[Array, Array], _rasterize_finite(splats, features, lists, width, height, mesh))
+    known = jnp.isfinite(features)
+    image, transmittance = _rasterize_finite(splats, jnp.where(known, features, 0.0), lists, width, height, mesh)
+    bad = lax.stop_gradient(1.0 - known.all(1, keepdims=True).astype(splats.dtype))
 
     def mark(bad) -> Array:
-        image, _ = cast(
-            tuple[Array, Array], rasterize_finite(lax.stop_gradient(splats), bad, lists, width, height, mesh)
-        )
-        return image[..., 0] > 0
+        return rasterize(lax.stop_gradient(splats), bad, lists, width, height, mesh, finite=True)[0][..., 0] > 0
 
     touched = lax.cond(_any(bad), mark, lambda bad: jnp.zeros((height, width), bool), bad)
     return jnp.where(touched[..., None], jnp.nan, image), transmittance

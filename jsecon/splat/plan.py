@@ -22,7 +22,7 @@ from jsecon.numerics import NEAR, all_finite, is_traced
 from jsecon.parallel import MESH_OPTIONS, map_rows
 from jsecon.programs import stored_jit
 from jsecon.splat.capacity import default_capacity, enough_capacity, round_capacity
-from jsecon.splat.composite import rasterize_finite, rasterize_nan_contained
+from jsecon.splat.composite import rasterize
 from jsecon.splat.project import Projection, check_gaussians, project
 from jsecon.splat.strips import map_strips
 from jsecon.splat.tiles import TileLists, tile_lists
@@ -178,8 +178,8 @@ def _composite_plan(plan: ViewPlan, features: Array, background: Array | None, d
     """Renders features through a plan. Pure; arguments as for `render_plan`."""
     features = jnp.asarray(features).astype(plan.splats.dtype)
     columns = jnp.concatenate([features, plan.depths[:, None]], axis=1) if depth else features
-    rasterize = rasterize_finite if finite else rasterize_nan_contained
-    image, transmittance = rasterize(plan.splats, columns, plan.lists, plan.width, plan.height, plan.mesh)
+    view = plan.splats, columns, plan.lists, plan.width, plan.height, plan.mesh
+    image, transmittance = rasterize(*view, finite=finite)
     image, transmittance = (jnp.where(plan.camera_is_finite, a, jnp.nan) for a in (image, transmittance))
     alpha, expected_depth = 1 - transmittance, None
     if depth:

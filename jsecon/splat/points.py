@@ -28,7 +28,7 @@ def _voxel_keys(points: np.ndarray, voxel: float) -> np.ndarray:
     return np.asarray(np.ravel_multi_index(tuple(cells.T), tuple(size)))
 
 
-def voxel_for(points: Float[Array, "s 3"], max_points: int) -> float:
+def _voxel_for(points: Float[Array, "s 3"], max_points: int) -> float:
     """Finds the smallest voxel edge (to 2 %) that leaves at most `max_points` voxels of the points (S, 3) occupied."""
     points = np.asarray(points, np.float64)
     sample = points[:: max(len(points) // (5 * max_points), 1)]  # which lies in nearly as many voxels
@@ -42,10 +42,21 @@ def voxel_for(points: Float[Array, "s 3"], max_points: int) -> float:
     return high
 
 
-def voxel_means(ids: np.ndarray, *columns: np.ndarray) -> list[np.ndarray]:
-    """Averages columns (S, C) over the samples of each voxel."""
+def voxel_means(
+    points: Float[np.ndarray, "s 3"], colors: UInt8[np.ndarray, "s 3"], max_points: int | None, voxel: float = 0.0
+) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"], float]:
+    """Averages points and their colours in voxels of an edge, or of the smallest that leaves at most `max_points`.
+
+    Also returns the edge.
+    """
+    if max_points is not None and (not voxel or voxel_ids(points, voxel).max() >= max_points):
+        voxel = _voxel_for(points, max_points)
+    ids = voxel_ids(points, voxel)
     counts = np.bincount(ids)[:, None]
-    return [np.stack([np.bincount(ids, a) for a in column.T], axis=1) / counts for column in columns]
+    means, mean_colors = (
+        np.stack([np.bincount(ids, a) for a in column.T], axis=1) / counts for column in (points, colors)
+    )
+    return means, np.rint(mean_colors).astype(np.uint8), float(voxel)
 
 
 def _neighbour_distances(points: Float[Array, "p 3"]) -> Float[np.ndarray, " p"]:

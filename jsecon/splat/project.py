@@ -17,7 +17,7 @@ from jsecon.splat.sh import COEFFICIENT_COUNTS
 from jsecon.types import Array, Camera, Gaussians, Leaf, record
 
 
-def is_usable(gaussians: Gaussians) -> Bool[Array, " n"]:
+def _is_usable(gaussians: Gaussians) -> Bool[Array, " n"]:
     """Finds the Gaussians that can be rendered; the others are hidden, without effect on image and gradients.
 
     A NaN, an infinite mean or quaternion, or an infinite size disables a Gaussian. A log scale of minus infinity is a
@@ -31,7 +31,7 @@ def is_usable(gaussians: Gaussians) -> Bool[Array, " n"]:
 def unusable_rows(name: str, numbers: np.ndarray) -> Bool[np.ndarray, " m"]:
     """Finds rows of the field `name` of `Gaussians` that no file may hold. Host code (NumPy).
 
-    These are the rows that `is_usable` excludes, colours that are not finite, and quaternions of length 0.
+    These are the rows that `_is_usable` excludes, colours that are not finite, and quaternions of length 0.
     """
     if name == "opacity_logits":
         wrong = np.isnan(numbers)
@@ -50,7 +50,7 @@ def count_non_finite(gaussians: Gaussians, features: Float[Array, "n d"] | None 
     The latter have features (by default the spherical harmonics, if there are any) that are not finite.
     """
     channels = gaussians.sh if features is None else features
-    usable = is_usable(gaussians)
+    usable = _is_usable(gaussians)
     if channels is not None:
         usable &= jnp.isfinite(channels).all(tuple(range(1, channels.ndim)))
     return jnp.sum(~usable, dtype=jnp.int32)
@@ -221,7 +221,7 @@ def _replace_non_finite(gaussians: Gaussians, camera: Camera) -> tuple[Gaussians
     reaches the pose.
     """
     finite = all_finite(*jax.tree.leaves(camera))
-    drawn = is_usable(gaussians) & finite
+    drawn = _is_usable(gaussians) & finite
 
     def keep(array):
         return jnp.where(drawn.reshape(-1, *[1] * (array.ndim - 1)), array, 0.0)

@@ -271,12 +271,7 @@ def field_up(field: LanguageField, up: Sequence[Any] | np.ndarray | None = None)
       field: The field.
       up: (3,) the up axis in the capture's world where it is known.
     """
-    if up is not None:
-        return given_up(up, field.source_from_scene)
-    return field.up or find_up_axis(field.gaussians, field.cameras)
-
-
-def given_up(up: Any, source_from_scene: Any) -> UpAxis:
-    """Brings an up axis (3,) that the user gave in the capture's world into that of the scene."""
-    turned = np.asarray(source_from_scene, np.float64)[:3, :3].T @ _direction(up)
+    if up is None:
+        return field.up or find_up_axis(field.gaussians, field.cameras)
+    turned = np.asarray(field.source_from_scene, np.float64)[:3, :3].T @ _direction(up)
     return UpAxis(tuple((turned / np.linalg.norm(turned)).tolist()), "what was given")

@@ -18,12 +18,11 @@ from fastapi.responses import Response
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictFloat, StrictInt
 
 from jsecon.app import verbs
-from jsecon.app.access import listen
 from jsecon.app.measuring import LENGTH_COLUMNS
 from jsecon.app.querying import write_answer
 from jsecon.app.records import Answer, Query, Region, source_points
 from jsecon.app.scene import Scene, open_scene
-from jsecon.app.server import Place, Text, application, runner
+from jsecon.app.server import Place, Text, application, listen, runner
 from jsecon.app.viewer.page import answer_record, drawn_gaussians, page
 from jsecon.errors import InputError
 from jsecon.field.membership import SHARE_THRESHOLD
@@ -90,13 +89,12 @@ def page_application(scene: Scene, texts: Sequence[str] = ()) -> FastAPI:
 
 def serve_page(verb: verbs.View, console: Console) -> verbs.VerbResult:
     """Opens a scene and its page: address, and under "then" what answers requests until it is stopped."""
-    listening = listen("127.0.0.1", verb.port)
+    listening, address = listen("127.0.0.1", verb.port)
     # Without its model a field can be clicked, so the model is opened when the first text is asked.
     scene = open_scene(verb.field, embedder=verb.embedder, console=console)
     if verb.texts:
         _ = scene.embedder
     app = page_application(scene, list(dict.fromkeys(verb.texts)))
-    address = f"http://127.0.0.1:{listening.getsockname()[1]}"
     console.print_line(f"{scene}\n{address}")
 
     def prepare() -> None:

@@ -17,7 +17,7 @@ from jsecon.files import describe_substitute, is_output_folder, list_files, read
 from jsecon.read.captures import colmap, nerfstudio, opensfm, rgbd
 from jsecon.read.captures.build import build_capture
 from jsecon.read.captures.frames import FrameOptions, PosedImages
-from jsecon.read.captures.images import IMAGE_SUFFIXES, convert_remedy, image_header, is_unread
+from jsecon.read.captures.images import IMAGE_SUFFIXES, image_header, unread_remedy
 from jsecon.read.captures.panoramas import cut_panoramas
 from jsecon.read.captures.video import is_video
 from jsecon.read.registry import SCENES, Reader, find_reader
@@ -205,7 +205,7 @@ def _notes_beside(path: Path, photos: Sequence[Path], others: Sequence[Path]) ->
     """Says what lies beside the photographs of a folder and is not used."""
     children = [*path.iterdir(), *(photos[0].parent.iterdir() if photos[0].parent != path else ())]
     poses = [child for child in children if _POSE.fullmatch(child.name.lower())]
-    unread = [child for child in children if is_unread(child) or is_video(child)]
+    unread = [child for child in children if unread_remedy(child) or is_video(child)]
     notes = []
     if others:
         left_out = "are left out as depth maps, masks or copies of the photographs"
@@ -239,7 +239,7 @@ def _no_capture(path: Path) -> InputError:
         problem, remedy = "there is no such file or folder", "Check the path."
     elif _is_archive(path):
         problem, remedy = "an archive", f"Unpack it and give the folder: unzip {path.name} -d {path.stem}"
-    elif is_unread(path) or _is_image(path):
+    elif unread_remedy(path) or _is_image(path):
         problem, remedy = "one image", "Give the folder of the photographs, in JPEG or PNG."
     elif not path.is_dir():
         problem = f"a file with the suffix {path.suffix!r} is not a capture"
@@ -251,8 +251,8 @@ def _no_capture(path: Path) -> InputError:
         problem, remedy = "an empty folder", "Copy the capture there, or check the path."
     elif captures := _inner_captures(path):
         remedy = f"Give the capture's own folder, for example {captures[0]}."
-    elif unread := list(filter(is_unread, images)):
-        problem, remedy = f"{len(unread)} {unread[0].suffix} images, which are not read", convert_remedy(unread[0])
+    elif unread := list(filter(unread_remedy, images)):
+        problem, remedy = f"{len(unread)} {unread[0].suffix} images, which are not read", unread_remedy(unread[0])
     elif others := _sort_images(path)[1]:
         names = join_first([file.name for file in others])
         problem = f"{len(others)} depth maps or masks ({names}), but no photographs"

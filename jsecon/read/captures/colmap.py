@@ -20,7 +20,7 @@ from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from jsecon.errors import InputError
-from jsecon.files import path_within, read_lines, read_text, reading
+from jsecon.files import path_within, read_lines, reading
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.read.captures.frames import PosedImage, PosedImages
 from jsecon.read.captures.images import find_image
@@ -73,7 +73,7 @@ def _read_colmap(places: Sequence[str], path: Path) -> PosedImages:
     above = (path.parent / "images", path.parent.parent / "images") if model == path else ()
     files = _find_images(path, [name for name, _, _ in images], above)
     split = model / "test.txt"  # the split of INRIA's training: names of images
-    tested = {line.strip() for line in read_text(split).splitlines()} if split.is_file() else None
+    tested = {line.strip() for line in read_lines(split)} if split.is_file() else None
     posed = []
     for name, camera, pose in images:
         if camera not in lenses:

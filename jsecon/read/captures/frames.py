@@ -125,30 +125,32 @@ def frame_names(files: Sequence[str], where: object) -> tuple[str, ...]:
 
 def usable_images(posed: PosedImages) -> tuple[list[PosedImage], list[str]]:
     """Chooses the images of a capture with a pose of ordinary numbers, each once, and says what was left out."""
-    placed = [image for image in posed.images if is_finite_and_bounded(image.world_to_camera)]
+    placed = [image for image in posed.images if _is_known(image.world_to_camera)]
     once = list({image.name: image for image in reversed(placed)}.values())[::-1]
     lost, twice = len(posed.images) - len(placed), len(placed) - len(once)
     notes = [f"{lost} frames were left out: their poses are 0, NaN, infinite or absurd numbers."] if lost else []
     return once, [*notes, f"{twice} frames are listed twice; the first of each was taken."] if twice else notes
 
 
-def rigid_or_nan(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Float[np.ndarray, "4 4"]:
-    """`make_rigid`, or NaN for a pose that is lost, which `usable_images` leaves out."""
-    is_known = is_finite_and_bounded(pose) and pose[:3, :3].any()  # some programs write zeros for a lost pose
-    return make_rigid(pose, where, name) if is_known else np.full((4, 4), np.nan)
+def _is_known(pose: np.ndarray) -> bool:
+    """Whether a pose is of ordinary numbers; some programs write zeros for a lost one."""
+    return is_finite_and_bounded(pose) and bool(np.asarray(pose)[:3, :3].any())
 
 
 def make_rigid(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Float[np.ndarray, "4 4"]:
-    """Makes the rotation of a (4, 4) pose exactly orthonormal; `where` and `name` are its file and frame for errors."""
+    """Makes the rotation of a (4, 4) pose exactly orthonormal; `where` and `name` are its file and frame for errors.
+
+    A pose that is lost becomes NaN, which `usable_images` leaves out: numbers that are not finite, or zeros.
+    """
     pose = np.asarray(pose, np.float64)
-    remedy = "Estimate the poses again, or take this frame out of the capture."
-    if not is_finite_and_bounded(pose):
-        raise InputError(where, f"the pose of {name} has NaN, infinite or absurd numbers", remedy=remedy)
     rotation = pose[:3, :3]
+    if not _is_known(pose):
+        return np.full((4, 4), np.nan)
     error = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if error > 1e-3 or np.linalg.det(rotation) < 0 or not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):
         measured = f"R R^T is off by {error:.2g}, determinant {np.linalg.det(rotation):.3g}"
         expected = "a rotation and a translation, without scale, shear or mirror"
+        remedy = "Estimate the poses again, or take this frame out of the capture."
         raise InputError(where, f"the pose of {name} is not rigid ({measured})", expected, remedy)
     left, _, right = np.linalg.svd(rotation)
     result = pose.copy()

@@ -65,8 +65,8 @@ def _open(path: Path) -> Iterator[ImageFile]:
             decoder = AvifImagePlugin.AvifImageFile
         if decoder is None and head[4:12] in (b"ftypheic", b"ftypheix", b"ftypmif1", b"ftyphevc"):
             decoder = _heic_decoder(path)
-        if is_unread(path):
-            raise InputError(path, f"{path.suffix} images are not read", remedy=convert_remedy(path))
+        if remedy := unread_remedy(path):
+            raise InputError(path, f"{path.suffix} images are not read", remedy=remedy)
         if decoder is None:
             raise ValueError("it is not an image of a known kind")
         with decoder(file) as image:
@@ -79,13 +79,10 @@ def _open(path: Path) -> Iterator[ImageFile]:
             yield image
 
 
-def is_unread(path: Path) -> bool:
-    """Whether a file is named like an image of a format that is not read."""
-    return _UNREAD.fullmatch(path.name) is not None
-
-
-def convert_remedy(path: Path) -> str:
-    """Says how to convert an image and those beside it."""
+def unread_remedy(path: Path) -> str:
+    """Says how to convert an image that is named like one of a format that is not read; "" for any other file."""
+    if _UNREAD.fullmatch(path.name) is None:
+        return ""
     return f"Convert it to JPEG or PNG, for example: magick mogrify -format jpg '{path.parent}/*{path.suffix}'"
 
 

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from jsecon.errors import InputError
 from jsecon.files import read_json, reading
 from jsecon.numerics import is_finite_and_bounded
-from jsecon.read.captures.frames import PosedImage, PosedImages, make_rigid, rigid_or_nan
+from jsecon.read.captures.frames import PosedImage, PosedImages, make_rigid
 from jsecon.read.captures.images import IMAGE_SUFFIXES, find_image, size_around
 from jsecon.read.captures.lens import PANORAMA, Lens, panorama_lens
 from jsecon.read.registry import Reader
@@ -62,7 +62,7 @@ def _read_nerfstudio(path: Path) -> PosedImages:
             with reading(file, remedy=_REMEDY, problem=f"frame {index} ({name}) cannot be read"):
                 image = find_image(file.parent, name)
                 # From OpenGL's axes of the camera to OpenCV's.
-                pose = rigid_or_nan(_matrix(entry["transform_matrix"]) * [1, -1, -1, 1], file, name)
+                pose = make_rigid(_matrix(entry["transform_matrix"]) * [1, -1, -1, 1], file, name)
                 lens = _lens({**content, **entry}, image)
                 depth = None if image is None else _named_file(file, entry, "depth_file_path")
                 mask = None if image is None else _named_file(file, entry, "mask_path")
@@ -85,7 +85,7 @@ def _read_inria(file: Path, cameras: list[Any]) -> PosedImages:
             pose[:3] = np.column_stack([camera["rotation"], camera["position"]])
             width, height, fx, fy = (_number(camera, key, 0.0) for key in ("width", "height", "fx", "fy"))
             lens = Lens(round(width), round(height), fx, fy, width / 2, height / 2)
-            images.append(PosedImage(name, None, lens, np.linalg.inv(rigid_or_nan(pose, file, name))))
+            images.append(PosedImage(name, None, lens, np.linalg.inv(make_rigid(pose, file, name))))
     return PosedImages(images, file)
 
 
@@ -163,9 +163,9 @@ def source_from_trained(file: Path) -> Float[np.ndarray, "4 4"]:
     content = read_json(file, "a dataparser_transforms.json", remedy)
     with reading(file, remedy=remedy):
         scale = _number(content, "scale", 1.0)
-        if not scale > 0:
-            raise ValueError(f"scale is {scale}")
         transform = make_rigid(_matrix(content["transform"]), file, "the trained world")
+        if not (scale > 0 and np.isfinite(transform).all()):
+            raise ValueError(f"its scale is {scale}, or its transform has no ordinary numbers")
         return np.linalg.inv(np.diag([scale, scale, scale, 1.0]) @ transform)
 
 

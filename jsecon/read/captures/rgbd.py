@@ -18,8 +18,8 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from jsecon.errors import InputError
-from jsecon.files import parse_json, read_text, reading
-from jsecon.read.captures.frames import PosedImage, PosedImages, rigid_or_nan, same_aspect
+from jsecon.files import parse_json, read_lines, reading
+from jsecon.read.captures.frames import PosedImage, PosedImages, make_rigid, same_aspect
 from jsecon.read.captures.images import find_image, image_header, size_around
 from jsecon.read.captures.lens import Lens
 from jsecon.read.registry import Reader
@@ -40,7 +40,7 @@ _parsing = functools.partial(reading, remedy=_EXPORT)
 
 def _lines(file: Path) -> list[str]:
     """Lines of a text file that are neither empty nor comments."""
-    return [line for line in read_text(file).splitlines() if line.strip() and not line.startswith("#")]
+    return [line for line in read_lines(file) if line.strip() and not line.startswith("#")]
 
 
 def _numbers(file: Path, columns: int, rows: int = -1) -> Float[np.ndarray, "n m"]:
@@ -78,7 +78,7 @@ def _lens(width: Any, height: Any, *intrinsics: Any) -> Lens:
 
 def _posed_image(image: Path, lens: Lens, camera_to_world: np.ndarray, depth: Path | None = None) -> PosedImage:
     """A frame."""
-    world_to_camera = np.linalg.inv(rigid_or_nan(camera_to_world, image, image.name))
+    world_to_camera = np.linalg.inv(make_rigid(camera_to_world, image, image.name))
     return PosedImage(image.name, image, lens, world_to_camera, depth)
 
 

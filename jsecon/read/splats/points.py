@@ -21,7 +21,7 @@ from jsecon.errors import InputError
 from jsecon.files import atomic_write, read_lines, reading
 from jsecon.read.registry import Reader, decoding
 from jsecon.read.splats.ply import read_vertices, write_vertices
-from jsecon.splat.points import gaussians_from_points, voxel_for, voxel_ids, voxel_means
+from jsecon.splat.points import gaussians_from_points, voxel_means
 from jsecon.types import Gaussians
 
 MAX_GAUSSIANS = 200_000
@@ -153,10 +153,9 @@ def gaussians_of_cloud(path: Path, most: int = MAX_GAUSSIANS) -> tuple[Gaussians
     if not len(points):
         raise InputError(path, "none of its points has finite coordinates", remedy="Export it again.")
     if len(points) > most:
-        voxel = voxel_for(points, most)
-        means, colours = voxel_means(voxel_ids(points, voxel), points - points[0], colors)
+        means, colors, voxel = voxel_means(points - points[0], colors, most)
         notes = (f"{len(points):,} points of {path.name} became {len(means):,} Gaussians, one per {voxel:.3g} units.",)
-        points, colors = means + points[0], np.rint(colours).astype(np.uint8)
+        points = means + points[0]
     gaussians = gaussians_from_points(points - points[0], colors, opacity=0.95, scale=0.6)
     sizes = np.minimum(gaussians.log_scales, np.median(gaussians.log_scales) + math.log(3))
     return dataclasses.replace(gaussians, means=points, log_scales=sizes), notes
