@@ -216,11 +216,11 @@ def _bake_once():
 
 @pytest.fixture(scope="session")
 def room(made_once) -> Path:
-    """A small demo room on disk: 8 views of 160x120, 2 held out."""
+    """A small demo room on disk, in a folder of an odd name: 8 views of 160x120, 2 held out."""
     from experiments.datasets.plain_room import make_room
     from experiments.rooms import write_room
 
-    with made_once("room") as folder:
+    with made_once("Büro für Köln 日本 #1 %20 'é'") as folder:
         if not (folder / "written").exists():
             write_room(folder / "capture", make_room(0), views=8, width=160, height=120, holdout=4, points=1200)
             (folder / "written").touch()
@@ -237,5 +237,5 @@ def room_run(room, made_once, tmp_path_factory):
     options = pipeline.Options(room, masks=room / "masks", **ROOM_FIT)
     with made_once("run") as folder:
         pipeline.run(options, folder)
-        own = Path(shutil.copytree(folder, tmp_path_factory.mktemp("run") / "out"))
+        own = Path(shutil.copytree(folder, tmp_path_factory.mktemp("run") / "Ausgabe ß 出力"))
     return pipeline.run(options, own), own  # a field names the folders of its run as seen from its own

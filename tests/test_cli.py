@@ -4,9 +4,11 @@ import dataclasses
 import io
 import json
 import math
+import os
 import re
 import shlex
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 from typing import get_args, get_type_hints
@@ -258,6 +260,14 @@ def test_a_verb_without_its_extra_names_it(tmp_path, capsys, monkeypatch, verb, 
 
 
 # What is said while it works
+
+
+def test_a_terminal_that_lacks_some_of_the_letters_shows_them_by_number(room_run, tmp_path):
+    command = [sys.executable, "-m", "jsecon", "export", room_run[1], "--out", tmp_path / "Szene ö 図.ply"]
+    environ = {**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent), "PYTHONIOENCODING": "latin-1"}
+    done = subprocess.run(command, capture_output=True, env=environ, check=True)
+    assert r"Szene ö \u56f3.ply" in done.stdout.decode("latin-1")
+    assert load_gaussians(tmp_path / "Szene ö 図.ply").count == room_run[0].field.gaussians.count
 
 
 class Terminal(io.StringIO):

@@ -63,7 +63,12 @@ def bare(field):
     return dataclasses.replace(field, codes=None, gaussians=gaussians)
 
 
-@pytest.mark.parametrize("changed", [with_coder, empty, bare])
+def with_tree(field):
+    leaf = np.arange(field.gaussians.count, dtype=np.int32) % REGIONS
+    return dataclasses.replace(field, tree=np.array([REGIONS, REGIONS, *[-1] * (REGIONS - 1)], np.int32), leaf=leaf)
+
+
+@pytest.mark.parametrize("changed", [with_coder, with_tree, empty, bare])
 def test_what_a_field_may_have_or_lack_comes_out(field, changed, tmp_path):
     whole = changed(field)
     save_field(tmp_path / "a.field", whole)
@@ -206,31 +211,14 @@ def test_numbers_that_are_not_finite_are_found_a_piece_at_a_time(path, monkeypat
 ALONE = [-1] * REGIONS
 
 
-@pytest.mark.parametrize("tree", [
-    ALONE[1:], [1, *ALONE[1:]], [REGIONS, *ALONE[1:]], [-1.0] * REGIONS, [REGIONS, *ALONE[1:], 0],
-])  # fmt: skip
-def test_a_tree_that_is_none_is_refused(field, tmp_path, tree):
-    """Too few nodes, a region under a region, a parent that is not there, no integers, a circle."""
-    nodes = dataclasses.replace(field, tree=np.array(tree), leaf=np.full(field.gaussians.count, -1, np.int32))
-    with pytest.raises(ValueError, match="a tree whose nodes"):
-        save_field(tmp_path / "field.safetensors", nodes)
-
-
 @pytest.mark.parametrize(("tree", "leaf", "problem"), [
+    (ALONE[1:], -1, "a tree whose nodes"), ([1, *ALONE[1:]], -1, "a tree whose nodes"),
+    ([REGIONS, *ALONE[1:]], -1, "a tree whose nodes"), ([-1.0] * REGIONS, -1, "a tree whose nodes"),
+    ([REGIONS, *ALONE[1:], 0], -1, "a tree whose nodes"),
     (ALONE, None, "a tree without the smallest nodes"), (ALONE, REGIONS, "beyond"),
 ])  # fmt: skip
-def test_a_tree_and_the_nodes_of_its_gaussians_belong_together(field, tmp_path, tree, leaf, problem):
+def test_a_tree_that_is_none_or_not_of_its_gaussians_is_refused(field, tmp_path, tree, leaf, problem):
+    """Too few nodes, a region under a region, a parent that is not there, no integers, a circle."""
     leaf = None if leaf is None else np.full(field.gaussians.count, leaf, np.int32)
-    nodes = dataclasses.replace(field, tree=np.array(tree), leaf=leaf)
     with pytest.raises(ValueError, match=problem):
-        save_field(tmp_path / "field.safetensors", nodes)
-
-
-def test_a_field_keeps_its_tree(field, tmp_path):
-    count = field.regions.count
-    tree = np.array([count, count, *[-1] * (count - 1)], np.int32)
-    save_field(
-        tmp_path / "field.safetensors",
-        dataclasses.replace(field, tree=tree, leaf=np.arange(field.gaussians.count, dtype=np.int32) % REGIONS),
-    )
-    np.testing.assert_array_equal(load_field(tmp_path / "field.safetensors").tree, tree)
+        save_field(tmp_path / "field.safetensors", dataclasses.replace(field, tree=np.array(tree), leaf=leaf))

@@ -11,7 +11,7 @@ from capture_files import refused
 from jsecon.read.masks.masks import LEVELS, load_labels, load_proposals
 from jsecon.types import ImageFile
 
-NAMES = ("b", "a", "c")
+NAMES = ("b", "a ä 図", "c")
 SIZE = (12, 18)
 RNG = np.random.default_rng(11)
 IDS = RNG.choice([0, 3, 7, 200], (3, *SIZE))
@@ -41,16 +41,6 @@ def test_integers(tmp_path, dtype):
     np.testing.assert_array_equal(labels, expected)
     assert (labels.dtype, ids, notes) == (np.int16, expected_ids, ())
     assert calls == [(1, 3), (2, 3), (3, 3)]
-
-
-def test_folders_without_masks_of_the_frames(tmp_path):
-    with refused(tmp_path, "0 masks", "b.png"):
-        load_labels(tmp_path, NAMES, SIZE)
-    write_masks(tmp_path, IDS, ("0000", "0001", "0002"))
-    with refused(tmp_path, "3 masks, none of which is called like a frame"):
-        load_labels(tmp_path, NAMES, SIZE)
-    with refused("nowhere", "no such folder"):
-        load_labels(tmp_path / "nowhere", NAMES, SIZE)
 
 
 @pytest.mark.parametrize("level", LEVELS)

@@ -6,7 +6,7 @@ import json
 import cv2
 import numpy as np
 import pytest
-from capture_files import assert_same, refused, small_capture, transforms, write_images, write_transforms
+from capture_files import assert_same, small_capture, transforms, write_images, write_transforms
 from splat_files import write_ply
 
 from jsecon.read.captures.capture import load_capture
@@ -74,8 +74,6 @@ def test_black_pixels_of_a_mask_are_ignored(tmp_path, size):
     expected = np.zeros((5, 16, 24), bool)
     expected[1, :8, :6] = True
     np.testing.assert_array_equal(loaded.ignored, expected)
-    with refused("missing.png", "mask_path of transforms.json"):
-        load_changed(tmp_path, lambda content: content["frames"][0].update(mask_path="missing.png"))
 
 
 def test_applied_transform_and_scale_are_undone(tmp_path):
@@ -164,16 +162,6 @@ def test_a_lost_pose_is_left_out_and_counted(tmp_path, value):
     loaded = load_changed(tmp_path, lose, holdout=0)
     assert loaded.names == (CAPTURE.names[0], *CAPTURE.names[2:])
     assert "1 frames were left out: their poses" in loaded.notes[0]
-
-
-@pytest.mark.parametrize("keys", [("cx", "cy"), ("fl_x", "fl_y")])
-def test_intrinsics_in_shares_of_the_image_are_refused(tmp_path, keys):
-    def shares(content):
-        for entry in (content, *content["frames"]):
-            entry.update({key: entry[key] / 100 for key in keys if key in entry})
-
-    with refused("shares of the image size"):
-        load_changed(tmp_path, shares, holdout=0)
 
 
 @pytest.mark.parametrize(("key", "value", "axis"), [

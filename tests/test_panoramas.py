@@ -1,15 +1,17 @@
 """Panoramas: cut into views of the right directions, of every format, with one pose; told from wide photographs."""
 
+import dataclasses
 import importlib.util
 import json
 
 import cv2
 import numpy as np
 import pytest
-from capture_files import context_of, refused
+from capture_files import context_of, refused, small_capture, transforms, write_text_model
 from photo_files import apart
 from scipy.spatial.transform import Rotation
 
+from jsecon import Camera
 from jsecon.pipeline.scene import plan_capture
 from jsecon.poses.sfm import find_poses
 from jsecon.read.captures.capture import load_capture, unposed_photographs
@@ -47,33 +49,29 @@ def write_images(folder):
         write_image(folder / "images" / f"pano_{n:03d}.png", image)
 
 
-def write_nerfstudio(folder, poses, size=(WIDTH, HEIGHT), model="EQUIRECTANGULAR"):
-    frames = []
-    for n, pose in enumerate(poses):
-        matrix = np.linalg.inv(pose) @ np.diag([1, -1, -1, 1])
-        frames.append({"file_path": f"images/pano_{n:03d}.png", "transform_matrix": matrix.tolist()})
-    lens = {"fl_x": size[1], "fl_y": size[1], "cx": size[0] / 2, "cy": size[1] / 2, "w": size[0], "h": size[1]}
-    (folder / "transforms.json").write_text(json.dumps({"camera_model": model, **lens, "frames": frames}))
+def panoramas(poses):
+    """A capture of photographs as wide as panoramas at these poses; its frames are none."""
+    lens = (np.full(COUNT, value, np.float32) for value in (HEIGHT, HEIGHT, WIDTH / 2, HEIGHT / 2))
+    names = tuple(f"pano_{n:03d}" for n in range(COUNT))
+    return dataclasses.replace(small_capture(COUNT), cameras=Camera(poses, *lens, WIDTH, HEIGHT), names=names)
 
 
-def write_colmap(folder, poses, size=(WIDTH, HEIGHT)):
-    model = folder / "sparse" / "0"
-    model.mkdir(parents=True)
-    (model / "cameras.txt").write_text("1 EQUIRECTANGULAR {0} {1} {0} {1}\n".format(*size))
-    lines = []
-    for n, pose in enumerate(poses):
-        turn = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
-        lines += [" ".join(map(str, [n + 1, *turn, *pose[:3, 3], 1, f"pano_{n:03d}.png"])), ""]
-    (model / "images.txt").write_text("\n".join(lines) + "\n")
+def write_nerfstudio(folder, poses, model="EQUIRECTANGULAR"):
+    (folder / "transforms.json").write_text(json.dumps(transforms(panoramas(poses), camera_model=model)))
 
 
-def write_opensfm(folder, poses, size=(WIDTH, HEIGHT), kind="spherical"):
+def write_colmap(folder, poses):
+    lens = f"1 EQUIRECTANGULAR {WIDTH} {HEIGHT} {WIDTH} {HEIGHT}"
+    write_text_model(panoramas(poses), folder / "sparse" / "0", [lens])
+
+
+def write_opensfm(folder, poses):
     shots = {}
     for n, pose in enumerate(poses):
         turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec().tolist()
         place = {"rotation": turn, "translation": pose[:3, 3].tolist(), "camera": "v2 theta", "orientation": 1}
         shots[f"pano_{n:03d}.png"] = place
-    cameras = {"v2 theta": {"projection_type": kind, "width": size[0], "height": size[1]}}
+    cameras = {"v2 theta": {"projection_type": "spherical", "width": WIDTH, "height": HEIGHT}}
     points = {"7": {"color": [255.0, 12.0, 0.0], "coordinates": [0.1, -0.2, 0.3]}}
     models = [{"cameras": cameras, "shots": {}}, {"cameras": cameras, "shots": shots, "points": points}]
     (folder / "reconstruction.json").write_text(json.dumps(models))

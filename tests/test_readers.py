@@ -40,6 +40,12 @@ def swap(name, old, new):
     return edit(name, lambda data: data.replace(old, new))
 
 
+def emptied(entry):
+    """Damage: no file in a folder."""
+    for file in entry.iterdir():
+        file.unlink()
+
+
 def numbers(name, offset, code, *values):
     """Damage: binary numbers at an offset."""
     new = struct.pack(code, *values)
@@ -104,9 +110,11 @@ DAMAGE = {
     "colmap/text": [
         (put(CAMERAS, "1 EQUIRECTANGULAR 24 16 24 16"), "cameras.txt", "24x16", "twice as wide as high"),
         *((put(CAMERAS, f"1 {name} 24 16 24 16"), name, "image_undistorter") for name in ("NEW_FISHEYE", "FOV")),
+        (put(CAMERAS, "1 PINHOLE 24 16 0.9 0.9 0.5 0.5"), "cameras.txt", "give it in pixels"),
     ],
     "colmap/binary": [
         (numbers("sparse/0/cameras.bin", 12, "<i", 99), "cameras.bin", "99", "image_undistorter"),
+        (numbers("sparse/0/cameras.bin", 32, "<4d", 0.9, 0.9, 0.5, 0.5), "cameras.bin", "give it in pixels"),
         (put(IMAGES, None), "no images.bin"),
         (swap(IMAGES, b"frame_000.png\0", b"../me_000.png\0"), "leads out"),
         (put("images/frame_000.png", POINTER), "frame_000.png"),
@@ -121,6 +129,9 @@ DAMAGE = {
         (key(JSON, "EQUIRECTANGULAR", "camera_model"), "twice as wide"),
         (key(JSON, 0.1, "ftheta_p0"), JSON, "ftheta_p0"),
         (lambda entry: shutil.rmtree(entry / "images"), JSON, "none of which"),
+        (swap(JSON, b'"cx": 11.75, "cy": 8.5', b'"cx": 0.1175, "cy": 0.085'), "shares of the image size"),
+        (swap(JSON, b'"camera_angle_x": 1.0', b'"fl_x": 0.2, "fl_y": 0.2'), "shares of the image size"),
+        (key(JSON, "missing.png", "frames", 0, "mask_path"), "missing.png", "mask_path of transforms.json"),
     ],
     "nerfstudio/deep": [
         (key(JSON, 0.0, "applied_scale"), "cannot be inverted"), (key(JSON, "gone.ply", "ply_file_path"), "gone.ply"),
@@ -170,6 +181,8 @@ DAMAGE = {
     "images/plain.jpg": [(edit("", cut_behind_a_thumbnail), "truncated")],
     "depths/depth.png": [(put("", np.ones((4, 5, 3), np.uint8)), "uint8")],
     "masks/grey": [
+        (shutil.rmtree, "no such folder"), (emptied, "0 masks", "a.png"),
+        (lambda entry: [file.rename(entry / f"0{file.name}") for file in [*entry.iterdir()]], "called like a frame"),
         (edit("a.png", lambda data: data[:-20]), "a.png", "cannot be read"),
         (put("a.png", IDS.T), "a.png", "24x36", "36x24"), (put("a.png", np.dstack([IDS] * 4)), "transparency"),
         (put("a.png", np.dstack([IDS.astype(np.uint16)] * 3)), "16 bits"),
@@ -190,6 +203,7 @@ DAMAGE = {
         (runs([-10, 100]), "90 of 9x10"), (runs("61 X"), "is not a digit"), (runs("abc\u00e9"), "is not a digit"),
     ],
     "labels/lerf": [
+        (emptied, "no .json file"),
         (key(LABEL, [], *OUTLINE), LABEL, "segmentation is empty"), (key(LABEL, [[1, 2, 3]], *OUTLINE), "object 0"),
         (key(LABEL, [[1, np.nan], [2, 3], [4, 5]], *OUTLINE), LABEL, "out of all range"),
         (key(LABEL, [1, 2, 3], "objects", 0, "bbox"), LABEL, "object 0"), (key(LABEL, "mug", "objects", 0), "object 0"),
