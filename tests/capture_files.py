@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from jsecon import Camera, Capture, InputError
 from jsecon.app import cli
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.stages import RunContext
+from jsecon.pipeline.run import _run_stages
+from jsecon.pipeline.stages import Checkpoint, Results, RunContext, Stage, StageInput, StageResult
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Models
 
@@ -37,6 +38,12 @@ def refused(*parts):
 def context_of(capture, out, **options) -> RunContext:
     """What the stages of a run without models share."""
     return RunContext(Options(capture, **options), Models(ColourEmbedder()), out)
+
+
+def compute_stage(work: RunContext, name: str, **results) -> tuple[StageResult, Stage]:
+    """The outcome of a stage of a run, given the results of others, and the stage."""
+    stage = next(stage for stage in _run_stages(work) if stage.name == name)
+    return stage.compute(StageInput(work, Results(**results), lambda done, total: None, Checkpoint(work.out))), stage
 
 
 ROOM_FIT = {"holdout": 4, "steps": 110}
@@ -123,8 +130,35 @@ def transforms(capture: Capture, ending: str = ".png", **more) -> dict:
 
 
 def write_transforms(capture: Capture, folder, content: dict | None = None) -> None:
+    """The capture as nerfstudio lays it out, with its depth in thousandths; `content` in place of its own."""
     write_images(capture, folder / "images")
-    (folder / "transforms.json").write_text(json.dumps(transforms(capture) if content is None else content))
+    content = transforms(capture) if content is None else content
+    for n, entry in enumerate(content["frames"] if capture.depths is not None else ()):
+        entry["depth_file_path"] = f"depth/depth{n}.png"
+        (folder / "depth").mkdir(exist_ok=True)
+        assert cv2.imwrite(str(folder / f"depth/depth{n}.png"), np.rint(capture.depths[n] * 1000).astype(np.uint16))
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+def edit(name, change):
+    """Damage: what `change` makes of the bytes of the file `name` of a folder."""
+    return lambda folder: (folder / name).write_bytes(change((folder / name).read_bytes()))
+
+
+def numbers(name, offset, code, *values):
+    """Damage: binary numbers at an offset."""
+    new = struct.pack(code, *values)
+    return edit(name, lambda data: data[:offset] + new + data[offset + len(new) :])
+
+
+def inria(capture: Capture, turn=None) -> list[dict]:
+    """The cameras of a capture as INRIA's cameras.json, their poses times `turn`."""
+    rows, cameras = [], capture.cameras
+    for name, camera in zip(capture.names, cameras):
+        pose = np.linalg.inv(np.asarray(camera.world_to_camera, np.float64)) @ (np.eye(4) if turn is None else turn)
+        row = {"img_name": f"{name}.png", "width": cameras.width, "height": cameras.height, "fx": float(camera.fx)}
+        rows.append(row | {"fy": float(camera.fy), "position": pose[:3, 3].tolist(), "rotation": pose[:3, :3].tolist()})
+    return rows
 
 
 def png_chunk(kind: bytes, body: bytes) -> bytes:

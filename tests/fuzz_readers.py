@@ -7,7 +7,7 @@ import json
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import jax
@@ -25,7 +25,7 @@ from test_proposal_files import records
 from test_rgbd import FORMATS as RGBD
 from test_video import moving
 
-from experiments.rooms.writers import write_colmap
+from experiments.rooms.writers import write_colmap, write_lerf_labels
 from jsecon.field.field import check_field, load_field, save_field
 from jsecon.networks.clip import ClipEmbedder
 from jsecon.networks.sam import SamSegmenter
@@ -35,7 +35,7 @@ from jsecon.paper.autoencoder import encode, train_autoencoder
 from jsecon.read.captures import images, video
 from jsecon.read.captures.capture import load_capture
 from jsecon.read.masks import masks
-from jsecon.read.masks.labels import load_lerf_labels
+from jsecon.read.masks.labels import LabelledFrame, load_lerf_labels
 from jsecon.read.splats.files import read_gaussians, save_gaussians
 from jsecon.read.splats.points import load_point_cloud
 from jsecon.types import Capture, Codes, Gaussians, LanguageField, Regions
@@ -129,13 +129,9 @@ def _nerfstudio(folder: Path) -> None:
     write_transforms(capture, folder / "plain", plain)
     fisheye = {"camera_model": "OPENCV_FISHEYE", "k1": 0.01, "k2": 0.001}
     write_transforms(capture, folder / "fisheye", transforms(capture, **fisheye))
-    content = transforms(capture, **deep)
-    (folder / "deep").mkdir()
-    for n, entry in enumerate(content["frames"]):
-        entry["depth_file_path"] = f"depth{n}.png"
-        cv2.imwrite(str(folder / "deep" / f"depth{n}.png"), rng.integers(0, 4000, (16, 24)).astype(np.uint16))
+    capture = dataclasses.replace(capture, depths=rng.integers(0, 4000, (3, 16, 24)) / 1000)
+    write_transforms(capture, folder / "deep", transforms(capture, **deep))
     write_ply(folder / "deep" / "cloud.ply", {axis: np.linspace(-1, 1, 5) for axis in "xyz"}, "ascii")
-    write_transforms(capture, folder / "deep", content)
 
 
 def _images(folder: Path) -> None:
@@ -203,13 +199,11 @@ def _read_proposals(folder: Path) -> list[np.ndarray]:
 
 
 def _labels(folder: Path) -> None:
-    shape = {"segmentation": [[1, 2], [9, 3], [5, 9.5]], "area": 9.0, "bbox": [1, 2, 9, 9]}
-    thing = {"category": "red mug", "group": 1, "iscrowd": 0} | shape
+    mask = np.zeros((20, 30), bool)
+    mask[2:9, 3:8] = True
+    things = {"red mug": (mask, np.float32([[1, 2, 9, 9], [0, 0, 3, 3]])), "tea": (mask, np.float32([[1, 2, 9, 9]]))}
     (folder / "lerf").mkdir()
-    for name in ("frame_1", "frame_2"):
-        info = {"name": f"{name}.jpg", "width": 30, "height": 20, "note": ""}
-        content = {"info": info, "objects": [thing, thing | {"bbox": [0, 0, 3, 3]}, thing | {"category": "tea"}]}
-        (folder / "lerf" / f"{name}.json").write_text(json.dumps(content))
+    write_lerf_labels(folder / "lerf", [LabelledFrame(name, 30, 20, things) for name in ("frame_1", "frame_2")])
 
 
 def tiny_field(**own) -> LanguageField:
@@ -294,20 +288,12 @@ READERS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any], tuple[str
 names of those files in them end that are damaged; () for all"""
 
 
-class Case(NamedTuple):
-    """A file or folder of a format, and what reads it."""
-
-    files: list[Path]
-    """to damage, one at a time"""
-    read: Callable[[], Any]
-
-
-def cases(name: str, folder: Path) -> Iterator[Case]:
-    """Writes the files and folders of a reader into a new folder."""
+def cases(name: str, folder: Path) -> Iterator[tuple[list[Path], Callable[[], Any]]]:
+    """Writes the files and folders of a reader into a new folder; of each the files to damage, and what reads it."""
     write, read, endings = READERS[name]
     folder.mkdir()
     write(folder)
     for entry in sorted(folder.iterdir()):
         files = [file for file in (entry, *sorted(entry.rglob("*"))) if file.is_file()]
         damaged = [file for file in files if not endings or file.name.endswith(endings)]
-        yield Case(damaged, functools.partial(read, entry))
+        yield damaged, functools.partial(read, entry)

@@ -5,6 +5,8 @@ import io
 import json
 import struct
 import zipfile
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -182,9 +184,9 @@ def _webp(pixels: np.ndarray) -> bytes:
     return file.getvalue()
 
 
-def sog(arrays: dict, *, codebook: int = 256) -> bytes:
-    """PlayCanvas', version 2, of degree 0: images in a zip; sizes and colours by tables of 256 numbers, of which the
-    first `codebook` are written."""
+def sog(arrays: dict, *, change: Callable[[dict], Any] = dict) -> bytes:
+    """PlayCanvas', version 2, of degree 0: images in a zip, sizes and colours by tables of 256 numbers, and what
+    `change` makes of their description."""
     logs = np.sign(arrays["means"]) * np.log1p(np.abs(arrays["means"]))
     low, high = logs.min(0), logs.max(0)
     places = np.round((logs - low) / (high - low) * 65535).astype(np.uint32)
@@ -205,10 +207,11 @@ def sog(arrays: dict, *, codebook: int = 256) -> bytes:
         "version": 2,
         "count": len(logs),
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
-        "scales": {"codebook": tables["scales"].tolist()[:codebook], "files": ["scales.webp"]},
+        "scales": {"codebook": tables["scales"].tolist(), "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": tables["sh0"].tolist(), "files": ["sh0.webp"]},
     }
+    change(meta)
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
         archive.writestr("meta.json", json.dumps(meta))

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 
-import cv2
 import numpy as np
 import pytest
 from capture_files import refused, small_capture, transforms, write_images, write_text_model, write_transforms
@@ -116,16 +115,13 @@ def moved(capture, scale, shift):
 def written(kind, capture, folder, scale, shift):
     """A capture folder of the kind: COLMAP, nerfstudio with depth, and nerfstudio with nothing but poses."""
     there = moved(capture, scale, shift)
-    write_images(capture, folder / "images")
     if kind == "colmap":
+        write_images(capture, folder / "images")
         write_text_model(there, folder / "sparse" / "0")
         return folder
+    depths = np.full(capture.frames.shape[:3], 2.5) if kind == "depth" else None
     told = transforms(there, depth_unit_scale_factor=0.001 * scale)
-    (folder / "depth").mkdir()
-    for frame, name in zip(told["frames"] if kind == "depth" else (), capture.names):
-        frame["depth_file_path"] = f"depth/{name}.png"
-        cv2.imwrite(str(folder / frame["depth_file_path"]), np.full(capture.frames.shape[1:3], 2500, np.uint16))
-    (folder / "transforms.json").write_text(json.dumps(told))
+    write_transforms(dataclasses.replace(there, depths=depths), folder, told)
     return folder
 
 

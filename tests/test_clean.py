@@ -1,11 +1,12 @@
 """What cleaning takes from a wall with things before it and behind it, and the file and the words of it."""
 
+import dataclasses
 import json
 
 import jax
 import numpy as np
 import pytest
-from capture_files import run_cli
+from capture_files import inria, run_cli, small_capture
 from conftest import cameras_of, gaussians_at, look_at
 
 from jsecon import load_gaussians, save_gaussians
@@ -13,6 +14,7 @@ from jsecon.views import clean
 from jsecon.views.clean import KINDS, find_litter
 
 EYES = [(x, y, -3.0) for x, y in ((-0.8, 0.0), (0.8, 0.0), (0.0, -0.8), (0.0, 0.8))]
+CAMERAS = cameras_of([look_at(eye) for eye in EYES], (70, 70, 32, 24), 64, 48)
 FRONT, AIR = [(-0.3, 0.1, -1.0), (0.4, -0.2, -0.7)], [(0.0, 0.2, -1.2), (-0.2, -0.4, -0.8)]
 
 
@@ -35,19 +37,15 @@ def littered():
 
 def test_each_kind_is_told_from_the_wall(littered, monkeypatch):
     scene, kinds = littered
-    cameras = cameras_of([look_at(eye) for eye in EYES], (70, 70, 32, 24), 64, 48)
-    np.testing.assert_array_equal(find_litter(scene, cameras), kinds)
+    np.testing.assert_array_equal(find_litter(scene, CAMERAS), kinds)
     monkeypatch.setattr(clean, "MAX_WHOLE", 100)  # one view after the other, of what it sees
-    np.testing.assert_array_equal(find_litter(scene, cameras), kinds)
+    np.testing.assert_array_equal(find_litter(scene, CAMERAS), kinds)
 
 
 def test_a_clean_scene_is_written_bit_for_bit_and_counted(littered, tmp_path, capsys):
     scene, kinds = littered
     save_gaussians(tmp_path / "scene.ply", scene)
-    rows = [{"img_name": f"{n}", "width": 64, "height": 48, "fx": 70, "fy": 70} for n in range(4)]
-    for row, pose in zip(rows, np.linalg.inv([look_at(eye, dtype=np.float64) for eye in EYES])):
-        row |= {"position": pose[:3, 3].tolist(), "rotation": pose[:3, :3].tolist()}
-    (tmp_path / "poses.json").write_text(json.dumps(rows))
+    (tmp_path / "poses.json").write_text(json.dumps(inria(dataclasses.replace(small_capture(4), cameras=CAMERAS))))
     out = tmp_path / "clean.ply"
     options = ["--cameras", tmp_path / "poses.json", "--json"]
     assert run_cli("clean", tmp_path / "scene.ply", "--out", out, *options) == 0

@@ -211,19 +211,6 @@ def _refused(capsys, *arguments, says=()):
         assert word in message[0]
 
 
-@pytest.mark.parametrize(("file", "options"), [
-    ("images/frame_00003.png", []), ("scene.ply", ["--gaussians", "scene.ply"]),
-])  # fmt: skip
-def test_a_damaged_capture_is_one_message(room, tmp_path, capsys, monkeypatch, file, options):
-    """The tests of each reader have all kinds of damage."""
-    capture, out = shutil.copytree(room, tmp_path / "capture"), tmp_path / "out"
-    (capture / file).write_text("no such file")
-    monkeypatch.chdir(capture)
-    _refused(capsys, "run", capture, "--out", out, "--holdout", 4, "--steps", 5, *options, says=[Path(file).name])
-    left = {path.name for path in out.rglob("*.safetensors")}
-    assert not any("partial" in name or name == "field.safetensors" for name in left)
-
-
 def test_an_output_folder_that_cannot_be_written(room, room_run, tmp_path, capsys):
     (tmp_path / "file").write_text("not a folder")
     field, out = room_run[1] / "field.safetensors", tmp_path / "file" / "out"

@@ -5,7 +5,7 @@ import struct
 
 import numpy as np
 import pytest
-from capture_files import assert_same, refused, small_capture, write_images, write_text_model
+from capture_files import assert_same, numbers, refused, small_capture, write_images, write_text_model
 
 from experiments.rooms.writers import write_colmap
 from jsecon import load_capture
@@ -193,14 +193,8 @@ def test_bonsai(shared):
 @pytest.mark.parametrize(("place", "pose", "value"), [(44, [np.nan], np.nan), (12, [0.0] * 4, -np.inf)])
 def test_lost_poses_and_points_are_left_out_and_counted(folder, place, pose, value):
     """A pose with a number that is not finite, and one whose quaternion is 0."""
-    path = folder / "sparse/0/images.bin"
-    data = bytearray(path.read_bytes())
-    struct.pack_into(f"<{len(pose)}d", data, place, *pose)
-    path.write_bytes(data)
-    path = folder / "sparse/0/points3D.bin"
-    data = bytearray(path.read_bytes())
-    struct.pack_into("<d", data, 8 + 3 * 51 + 16, value)  # y of the point 3
-    path.write_bytes(data)
+    numbers("sparse/0/images.bin", place, f"<{len(pose)}d", *pose)(folder)
+    numbers("sparse/0/points3D.bin", 8 + 3 * 51 + 16, "<d", value)(folder)  # y of the point 3
     loaded = load_capture(folder)
     assert len(loaded.names) == len(CAPTURE.names) - 1
     assert len(loaded.points) == len(CAPTURE.points) - 1

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import cameras_of, capture_of, gaussians_at, look_at
+from conftest import cameras_of, capture_of, look_at
 from scipy.linalg import expm
-from test_fit import same
+from test_fit import COUNT, same, truth as truth  # a fixture
 
 from jsecon import render
 from jsecon.fit.corrections import (
@@ -39,14 +39,6 @@ def _one_size(monkeypatch):
     monkeypatch.setattr(refine, "FINE_SIZE", 1.0)
     monkeypatch.setattr(refine, "ALIGN_VISITS", 40)
     monkeypatch.setattr(refine, "MIN_ASIDE", 1)
-
-
-@pytest.fixture(scope="module")
-def truth():
-    rng = np.random.default_rng(0)
-    means, sizes = rng.uniform(-0.7, 0.7, (40, 3)), rng.uniform(0.1, 0.25, (40, 3))
-    turns, logit = rng.normal(size=(40, 4)), rng.uniform(0, 3, 40)
-    return gaussians_at(means, sizes, turns=turns, logit=logit, sh=rng.uniform(-1.5, 1.2, (40, 1, 3)))
 
 
 def photographed(truth, poses):
@@ -125,7 +117,7 @@ def test_gradients_through_the_whole_step_are_central_differences(capture, truth
     view = jax.tree.map(double, views[0])
     scene = jax.tree.map(lambda a: double(a) + 0.02 * rng.normal(size=a.shape), truth)
     own = Corrections(double(0.02 * rng.normal(size=6)), np.eye(3, 4) + 0.05 * rng.normal(size=(3, 4)))
-    nothing, extent = jnp.zeros((40, 1)), jnp.float64(1.7)
+    nothing, extent = jnp.zeros((COUNT, 1)), jnp.float64(1.7)
 
     def loss(scene, own):
         return _view_loss(scene, nothing, own, view, extent, 4096)[0]

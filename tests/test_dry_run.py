@@ -86,7 +86,3 @@ def test_a_dry_run_on_photographs_lists_their_poses_and_needs_what_finds_them(ro
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     assert run_cli(*line, "--dry-run") == 2
     assert "jsecon[sfm]" in capsys.readouterr().err
-    shutil.rmtree(tmp_path / "photos")
-    (tmp_path / "photos").mkdir()
-    assert run_cli(*line, "--dry-run") == 2
-    assert "empty folder" in capsys.readouterr().err

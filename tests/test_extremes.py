@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import gaussians_at, look_at
+from small_field import unit_rows
 
 import jsecon
 from jsecon import Camera, Gaussians, LanguageField, Regions, Votes
@@ -33,8 +34,12 @@ class World:
 
     def rows(self, count: int) -> np.ndarray:
         """(count, d) unit vectors."""
-        rows = np.random.default_rng(count).normal(size=(count, self.d)).astype(np.float32)
-        return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+        return unit_rows(np.random.default_rng(count), count, self.d)
+
+    @property
+    def ones(self) -> np.ndarray:
+        """A selection of all Gaussians."""
+        return np.ones(self.n, bool)
 
     @property
     def gaussians(self) -> Gaussians:
@@ -135,24 +140,8 @@ def lifted(w: World) -> list:
     return selected(jsecon.lift(w.field, np.ones((w.t, HEIGHT, WIDTH), bool), list(range(w.t))), w)
 
 
-def outside(w: World) -> list:
-    return [(jsecon.remove_outliers(np.asarray(w.gaussians.means), np.ones(w.n, bool)), (w.n,))]
-
-
-def one_step(w: World) -> list:
-    return selected(jsecon.query_one_step(w.rows(w.n), w.rows(1)[0], 0.5), w)
-
-
-def canonical(w: World) -> list:
-    return selected(jsecon.query_canonical(w.rows(w.n), w.rows(1)[0], w.rows(4), 0.5), w)
-
-
 def located(_: World) -> list:
     return [(jnp.asarray(jsecon.localization_accuracy([(1.0, 1.0)], [np.array([[0.0, 0.0, 2.0, 2.0]])])), ())]
-
-
-def drawn(w: World) -> list:
-    return [(jsecon.selection_mask(w.gaussians, w.camera, np.ones(w.n, bool)), (HEIGHT, WIDTH))]
 
 
 def voted(w: World) -> list:
@@ -187,14 +176,17 @@ CALLS: dict[str, tuple[str, Callable[[World], list]]] = {
     "mean_iou": ("", lambda _: [(jnp.asarray(jsecon.mean_iou([0.5, None])), ())]),
     "accuracy_at": ("", lambda _: [(jnp.asarray(jsecon.accuracy_at([0.5, None])), ())]),
     "localization_accuracy": ("", located),
-    "query_one_step": ("n1 n0 d1", one_step),
-    "query_canonical": ("n1 n0 d1", canonical),
+    "query_one_step": ("n1 n0 d1", lambda w: selected(jsecon.query_one_step(w.rows(w.n), w.rows(1)[0], 0.5), w)),
+    "query_canonical": (
+        "n1 n0 d1",
+        lambda w: selected(jsecon.query_canonical(w.rows(w.n), w.rows(1)[0], w.rows(4), 0.5), w),
+    ),
     "lift": ("n1 n0 t1 r0", lifted),
     "region_at": ("n1 n0 t1", lambda w: [(np.asarray(jsecon.region_at(w.field, 0, 8, 6)), ())]),
-    "selection_mask": ("n1 n0", drawn),
-    "remove_outliers": ("n1 n0", outside),
+    "selection_mask": ("n1 n0", lambda w: [(jsecon.selection_mask(w.gaussians, w.camera, w.ones), (HEIGHT, WIDTH))]),
+    "remove_outliers": ("n1 n0", lambda w: [(jsecon.remove_outliers(w.gaussians.means, w.ones), (w.n,))]),
     "object_shapes": ("n1 n0 r0", shapes),
-    "iou": ("n1 n0", lambda w: [(jsecon.iou(np.ones(w.n, bool), np.ones(w.n, bool)), ())]),
+    "iou": ("n1 n0", lambda w: [(jsecon.iou(w.ones, w.ones), ())]),
     "train_autoencoder": ("d1", encoded),
     "masklets": ("t1 t0", tracked),
 }

@@ -102,14 +102,10 @@ def fails(path, match, **options):
     assert str(path) in str(caught.value)
 
 
-def test_no_file_a_folder_an_empty_file_and_another_kind(tmp_path):
-    fails(tmp_path / "none.field", "no such file")
+def test_a_folder_and_files_of_other_kinds(tmp_path):
     fails(tmp_path, "a folder")
-    for name, content in {"empty": b"", "ply": b"ply\nformat ascii 1.0\n", "text": b"hello" * 1000}.items():
-        (tmp_path / name).write_bytes(content)
-        fails(tmp_path / name, "damaged")
-    np.savez(tmp_path / "field.npz", a=np.ones(3))
-    fails(tmp_path / "field.npz", "field file")
+    (tmp_path / "text").write_bytes(b"hello" * 1000)
+    fails(tmp_path / "text", "damaged")
     save_file({"a": np.ones(3)}, tmp_path / "other.safetensors")
     fails(tmp_path / "other.safetensors", "another program")
     for description in ({"format": "something"}, [1, 2], None):

@@ -6,13 +6,7 @@ import pytest
 from conftest import gaussians_at
 from scipy.spatial.transform import Rotation
 
-from jsecon.fit.growth import (
-    MIN_OPACITY,
-    _in_use,
-    _split_in_two,
-    grow,
-    pad_with_free_rows,
-)
+from jsecon.fit.growth import MIN_OPACITY, _in_use, _split_in_two, grow, pad_with_free_rows
 from jsecon.fit.resize import resize_frame, scale_cameras
 from jsecon.splat.capacity import round_capacity
 from jsecon.types import Camera

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments.datasets.ovs3d import box_of
 from jsecon import InputError, Selection, selection_mask
 from jsecon.evaluate.lerf import ALPHA_THRESHOLD, VALA_THRESHOLD, evaluate_at_thresholds
 from jsecon.fit.resize import resize_camera
@@ -22,11 +23,6 @@ def selection(mask, similarity=None):
     mask = jnp.asarray(mask)
     similarity = jnp.where(mask, 1.0, 0.0) if similarity is None else jnp.asarray(similarity)
     return Selection(mask, similarity, jnp.asarray(3, jnp.int32), jnp.asarray(0.8))
-
-
-def box_of(mask):
-    y, x = np.nonzero(mask)
-    return np.array([[x.min(), y.min(), x.max(), y.max()]], np.float32)
 
 
 @pytest.fixture(scope="module")

@@ -32,11 +32,8 @@ def test_round_trip(tmp_path):
 
 def test_opengl_axes(tmp_path):
     """The identity looks along -z with y up: a point in front and above lies at z > 0, y < 0 of the OpenCV camera."""
-
-    def change(content):
-        content["frames"][0]["transform_matrix"] = np.eye(4).tolist()
-
-    pose = load_changed(tmp_path, change).cameras.world_to_camera[0]
+    loaded = load_changed(tmp_path, lambda content: content["frames"][0].update(transform_matrix=np.eye(4).tolist()))
+    pose = loaded.cameras.world_to_camera[0]
     np.testing.assert_allclose(pose @ [1.0, 2.0, -5.0, 1.0], [1.0, -2.0, 5.0, 1.0])
 
 
@@ -220,7 +217,5 @@ def test_the_captures_own_split_is_kept_unless_a_holdout_is_given(tmp_path, chan
 
 
 def test_keys_that_change_what_numbers_mean_are_named(tmp_path):
-    def change(content):
-        content["frames"][1] |= {"is_bad": True, "depth_path": "depth/1.png"}
-
-    assert "depth_path, is_bad" in " ".join(load_changed(tmp_path, change).notes)
+    loaded = load_changed(tmp_path, lambda content: content["frames"][1].update(is_bad=True, depth_path="depth/1.png"))
+    assert "depth_path, is_bad" in " ".join(loaded.notes)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_files import refused, run_cli
+from capture_files import compute_stage, refused, run_cli
 from clip_files import COLOURS, write_clip, write_visual
 from hub_server import Repository, files_in, running_hub, use_hub
 from sam2_files import write_sam2
@@ -20,8 +20,7 @@ from jsecon.fit.start import starting_gaussians
 from jsecon.networks.sam import SamSegmenter
 from jsecon.pipeline import model_loading, run as pipeline
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.run import _run_stages
-from jsecon.pipeline.stages import Checkpoint, Results, RunContext, StageInput
+from jsecon.pipeline.stages import RunContext
 from jsecon.vision.stores import StoredSegmenter
 
 
@@ -119,13 +118,10 @@ def test_a_damaged_model_and_two_sources_of_masks_are_refused_before_any_work(se
 
 def test_a_segmenter_takes_the_frames_that_number_and_time_allow(seen, tmp_path):
     run, _, _ = seen
-    results = Results(load=run.capture, gaussians=run.field.gaussians)
     for limit, count in (({"vision_frames": 3}, 3), ({"vision_minutes": 1e-6}, 2)):
         options = dataclasses.replace(run.options, **limit)
         context = RunContext(options, model_loading.open_models(options, tmp_path), tmp_path)
-        stage = next(stage for stage in _run_stages(context) if stage.name == "objects")
-        none = Checkpoint(tmp_path / "none.safetensors")
-        found = stage.compute(StageInput(context, results, lambda done, total: None, none))
+        found, _ = compute_stage(context, "objects", load=run.capture, gaussians=run.field.gaussians)
         assert len(found.value.labels) == len(found.value.frames) == count
         assert not run.capture.held_out[found.value.frames].any()
         assert f"{count} of 6 training frames: --{next(iter(limit)).replace('_', '-')} allows no more" in found.notes[0]

@@ -6,13 +6,11 @@ import sys
 import laspy
 import numpy as np
 import pytest
-from capture_files import context_of, refused, run_cli, small_capture, write_transforms
+from capture_files import compute_stage, context_of, refused, run_cli, small_capture, write_transforms
 from point_files import OFFSET, WRITERS, las, points_of
 from splat_files import write_ply
 
 from jsecon import InputError, load_gaussians
-from jsecon.pipeline.run import _run_stages
-from jsecon.pipeline.stages import Checkpoint, Results, StageInput
 from jsecon.read.splats import points as cloud_files
 from jsecon.read.splats.files import read_gaussians, require_writable_format
 from jsecon.read.splats.points import load_point_cloud, read_crs, save_point_cloud
@@ -110,8 +108,7 @@ def test_a_cloud_gives_a_capture_its_points_and_their_depth(tmp_path):
     ball /= np.linalg.norm(ball, axis=1, keepdims=True)
     las(tmp_path / "ball.laz", ball + OFFSET, np.full((4000, 3), (200, 0, 0), np.uint8))
     work = context_of(tmp_path / "capture", tmp_path / "out", points=tmp_path / "ball.laz")
-    stage = next(stage for stage in _run_stages(work) if stage.name == "load")
-    found = stage.compute(StageInput(work, Results(), lambda done, total: None, Checkpoint(work.out))).value
+    found = compute_stage(work, "load")[0].value
     centre = np.linalg.inv(found.source_from_scene)[:3, 3] + np.linalg.inv(found.source_from_scene)[:3, :3] @ OFFSET
     np.testing.assert_allclose(np.linalg.norm(found.points - centre, axis=1), 1, atol=2e-3)
     np.testing.assert_array_equal(found.point_colors, np.full((4000, 3), (200, 0, 0)))
@@ -121,7 +118,7 @@ def test_a_cloud_gives_a_capture_its_points_and_their_depth(tmp_path):
     assert not found.depths[~train].any()
     las(tmp_path / "ball.laz", ball + 2 * OFFSET)
     with refused("ball.laz", "in the view of two or more"):
-        stage.compute(StageInput(work, Results(), lambda done, total: None, Checkpoint(work.out)))
+        compute_stage(work, "load")
     assert run_cli("run", tmp_path / "ball.laz", "--points", tmp_path / "ball.laz", "--out", tmp_path / "field") == 2
 
 

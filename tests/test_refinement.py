@@ -1,12 +1,9 @@
 """`--refine` of a run: which captures it looks at by default, what it decides, and what the plan tells of it."""
 
 import dataclasses
-import json
 
-import cv2
-import numpy as np
 import pytest
-from capture_files import context_of, transforms, write_images
+from capture_files import context_of, write_transforms
 from test_corrections import (
     capture as capture,  # fixtures
     errors,
@@ -18,19 +15,6 @@ from test_fit import same
 from jsecon.pipeline.run import _compute_stages
 from jsecon.pipeline.scene import plan_capture
 from jsecon.poses import refine
-
-
-def write(capture, folder, *, depth=True):
-    """As nerfstudio lays out an RGB-D capture."""
-    write_images(capture, folder / "images")
-    scene = transforms(capture)
-    if depth:
-        (folder / "depth").mkdir()
-        for frame, name, image in zip(scene["frames"], capture.names, capture.depths):
-            assert cv2.imwrite(str(folder / "depth" / f"{name}.png"), np.rint(image * 1000).astype(np.uint16))
-            frame["depth_file_path"] = f"depth/{name}.png"
-    (folder / "transforms.json").write_text(json.dumps(scene))
-    return folder
 
 
 def load(folder, out, **options):
@@ -47,7 +31,8 @@ def test_by_default_a_rough_capture_with_depth_is_corrected_once(capture, truth,
     monkeypatch.setattr(refine, "FINE_SIZE", 1.0)
     monkeypatch.setattr(refine, "MIN_ASIDE", 1)
     monkeypatch.setattr(refine, "starting_gaussians", lambda capture, **_: (truth, ""))
-    told = write(capture if exact else rough(capture, **errors()), tmp_path / "told")
+    told = tmp_path / "told"
+    write_transforms(capture if exact else rough(capture, **errors()), told)
     as_it_is, _, _ = load(told, tmp_path / "none", refine="never")
     found = []
     for status in ("run", "cached"):
@@ -63,8 +48,9 @@ def test_without_depth_or_with_gaussians_nothing_is_tried(capture, tmp_path):
     def how(folder, **options):
         return plan_capture(context_of(folder, tmp_path / "out", **options))[-1]
 
-    plain = write(capture, tmp_path / "plain", depth=False)
-    deep = write(capture, tmp_path / "deep")
+    plain, deep = tmp_path / "plain", tmp_path / "deep"
+    write_transforms(dataclasses.replace(capture, depths=None), plain)
+    write_transforms(capture, deep)
     for one, other in (
         (how(plain), how(plain, refine="never")),
         (how(deep, gaussians=plain), how(deep, refine="never")),

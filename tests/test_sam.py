@@ -15,7 +15,6 @@ from jsecon.networks.sam import TOKENS, SamSegmenter, _box_nms, _box_of, _Guided
 from jsecon.vision.protocols import Segmenter
 
 KINDS = [("sam", 1), ("sam", "batch"), ("sam", 7), ("sam2", "batch")]
-DECODER = "prompt_encoder_mask_decoder.onnx"
 
 
 @pytest.fixture(scope="module")
@@ -169,10 +168,3 @@ def test_prompts_end_where_no_mask_explains_anything():
     every = np.concatenate(rounds)
     assert len(rounds) <= 4
     assert len(np.unique(every, axis=0)) == len(every) <= sam._MAX_PROMPTS
-
-
-def test_variants_beside_the_plain_graph_are_left_alone(tmp_path):
-    folder = write_sam(tmp_path)
-    (folder / "onnx" / "vision_encoder_quantized.onnx").write_bytes(b"not looked at")
-    (folder / "onnx" / DECODER.replace(".", "_fp16.")).write_bytes(b"not looked at")
-    assert [path.name for path in find_files(folder, "segmenter")[:2]] == ["vision_encoder.onnx", DECODER]

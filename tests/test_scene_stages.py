@@ -1,18 +1,17 @@
 """Gaussians given to a run: read in every format, in whichever world they are that the frames show."""
 
 import dataclasses
+import itertools
 import json
 
 import numpy as np
 import pytest
-from capture_files import context_of, refused, small_capture
+from capture_files import compute_stage, context_of, refused, small_capture
 from scipy.spatial.transform import Rotation
 from splat_files import scene
 from test_gaussian_files import gaussians
 
 from jsecon import load_gaussians, render_rgb, save_gaussians
-from jsecon.pipeline.run import _run_stages
-from jsecon.pipeline.stages import Checkpoint, Results, StageInput
 from jsecon.read.captures.nerfstudio import source_from_trained
 from jsecon.splat.transform import transform_gaussians
 
@@ -23,10 +22,7 @@ TRAINED = np.diag([0.4, 0.4, 0.4, 1]) @ TURN
 
 def read(capture, file, name="gaussians", **results):
     """The outcome of the stage that reads `file` (or another, given the results before it), and the stage."""
-    work = context_of(file.parent, file.parent / "out", gaussians=file)
-    stage = next(stage for stage in _run_stages(work) if stage.name == name)
-    stage_input = StageInput(work, Results(load=capture, **results), lambda done, total: None, Checkpoint(work.out))
-    return stage.compute(stage_input), stage
+    return compute_stage(context_of(file.parent, file.parent / "out", gaussians=file), name, load=capture, **results)
 
 
 @pytest.fixture
@@ -59,19 +55,21 @@ def test_a_scene_that_nerfstudio_trained_is_carried_back(tmp_path, near):
     assert before.key_options != after.key_options
 
 
-@pytest.mark.parametrize("world", ["files", "poses", "gsplat", "nerfstudio"])
-def test_the_world_is_found_that_the_frames_show(tmp_path, near, world):
+BLACK, WHITE, BLUE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.2, 0.4, 0.8)
+
+
+@pytest.mark.parametrize(("world", "background"), [
+    ("files", BLACK), ("poses", WHITE), *itertools.product(("gsplat", "nerfstudio"), (BLACK, WHITE, BLUE)),
+])  # fmt: skip
+def test_the_world_is_found_that_the_frames_show(tmp_path, near, world, background):
     """The one before an applied_transform, which jsecon writes; that of the poses; and those that trainings make of it.
     The capture's points are not about the origin, so that the trainings' worlds are their own."""
     applied = np.array([[1, 0, 0, 2], [0, 0, 1, 0], [0, -1, 0, 0.1], [0, 0, 0, 1.0]])
     source_from_scene = np.linalg.inv(applied) if world in ("files", "poses") else np.eye(4)
-    capture = dataclasses.replace(photographed(near), source_from_scene=source_from_scene)
-    others = {
-        "files": source_from_scene,
-        "poses": np.eye(4),
-        "gsplat": gsplat_world(capture),
-        "nerfstudio": nerfstudio_world(capture),
-    }
+    shown = photographed(near, background=background)
+    capture = dataclasses.replace(shown, source_from_scene=source_from_scene)
+    others = {"files": source_from_scene, "poses": np.eye(4)}
+    others |= {"gsplat": gsplat_world(capture), "nerfstudio": nerfstudio_world(capture)}
     save_gaussians(tmp_path / "scene.ply", near, similarity=others[world])
     found, _ = read(capture, tmp_path / "scene.ply")
     np.testing.assert_allclose(found.value.means, near.means, atol=1e-5)
@@ -114,9 +112,6 @@ def nerfstudio_world(capture):
     return world
 
 
-BLACK, WHITE, BLUE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.2, 0.4, 0.8)
-
-
 def crude(scene):
     """The scene with places and colours that are a bit off."""
     rng = np.random.default_rng(3)
@@ -143,17 +138,6 @@ def test_a_scene_may_be_trained_over_any_colour(tmp_path, near, background, over
     if frames == 8 or over:  # four views over black do not tell it from a crude scene
         save_gaussians(file, transform_gaussians(near, TURN @ np.diag([3.0, 3, 3, 1])))
         assert read(capture, file)[0].notes[0].startswith("WARNING")
-
-
-@pytest.mark.parametrize("background", [WHITE, BLUE])
-@pytest.mark.parametrize("world", [gsplat_world, nerfstudio_world])
-def test_a_normalised_world_is_found_over_any_colour(tmp_path, near, world, background):
-    capture = photographed(near, background=background)
-    save_gaussians(tmp_path / "scene.ply", near, similarity=world(capture))
-    found, _ = read(capture, tmp_path / "scene.ply")
-    np.testing.assert_allclose(found.value.means, near.means, atol=1e-5)
-    assert world.__name__.split("_")[0] in found.notes[0]
-    assert "WARNING" not in found.notes[0]
 
 
 def test_a_thing_of_one_colour_is_recognised_by_its_outline(tmp_path, near):

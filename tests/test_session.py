@@ -1,7 +1,5 @@
 """ONNX graphs: signatures as the file has them, and a message that names file or tensor for whatever does not fit."""
 
-from pathlib import Path
-
 import numpy as np
 import onnx
 import onnxruntime
@@ -51,19 +49,6 @@ def test_a_scalar_stays_one(tmp_path):
 def test_a_tensor_that_does_not_fit_is_named(affine, feeds, outputs, named):
     with refused("affine.onnx", *named):
         Graph(affine).run(feeds, outputs)
-
-
-@pytest.mark.parametrize(("damage", "words"), [
-    (Path.unlink, "No such file"), (lambda path: path.write_bytes(b""), "an empty file"),
-    (lambda path: path.write_bytes(path.read_bytes()[:100]), "cannot open"),
-    (lambda path: path.write_bytes(b"<!DOCTYPE html><html>not found</html>"), "a page of HTML"),
-    (lambda path: path.write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n"), "Git LFS pointer"),
-    (lambda path: path.write_bytes(b"PK\x03\x04" + bytes(200)), "a zip archive"),
-], ids=["missing", "empty", "cut", "page", "pointer", "torch"])  # fmt: skip
-def test_a_file_that_is_no_graph_is_refused_by_name(affine, damage, words):
-    damage(affine)
-    with refused(affine, words):
-        Graph(affine)
 
 
 def test_a_graph_that_fails_at_run_time_is_named(tmp_path):

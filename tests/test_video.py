@@ -12,27 +12,27 @@ SHARP = (2, 7, 12, 16, 20, 29)
 """of 30 frames, one in each stretch of five"""
 
 
-@pytest.fixture(scope="module")
-def video(tmp_path_factory):
-    """30 frames of 128x96 that slide over noise, all but SHARP blurred."""
-    path = tmp_path_factory.mktemp("video") / "walk.avi"
-    wide = cv2.resize(np.random.default_rng(0).integers(0, 255, (24, 60, 3), np.uint8), (240, 96))
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (128, 96))
+def written(path, code, frames):
+    """A video of frames of 128x96."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*code), 10, (128, 96))
     assert writer.isOpened()
-    for number in range(30):
-        frame = np.ascontiguousarray(wide[:, 2 * number : 2 * number + 128])
-        writer.write(frame if number in SHARP else cv2.GaussianBlur(frame, (0, 0), 2.5))
+    for frame in frames:
+        writer.write(frame)
     writer.release()
     return path
 
 
-def test_the_sharpest_frame_of_each_stretch_is_taken(video, tmp_path):
-    told = []
-    written, notes = write_frames(video, tmp_path / "frames", frames=6, progress=lambda *at: told.append(at))
+def test_the_sharpest_frame_of_each_stretch_is_taken(tmp_path):
+    """Of a video that slides over noise, of which all but SHARP are blurred."""
+    wide, told = cv2.resize(np.random.default_rng(0).integers(0, 255, (24, 60, 3), np.uint8), (240, 96)), []
+    frames = (np.ascontiguousarray(wide[:, 2 * n : 2 * n + 128]) for n in range(30))
+    blurred = (frame if n in SHARP else cv2.GaussianBlur(frame, (0, 0), 2.5) for n, frame in enumerate(frames))
+    video = written(tmp_path / "walk.avi", "MJPG", blurred)
+    found, notes = write_frames(video, tmp_path / "frames", frames=6, progress=lambda *at: told.append(at))
     assert notes == ()
-    assert [path.name for path in written] == [f"frame_{number:06d}.jpg" for number in SHARP]
-    assert sorted((tmp_path / "frames").iterdir()) == written
-    assert cv2.imread(str(written[0])).shape == (96, 128, 3)
+    assert [path.name for path in found] == [f"frame_{number:06d}.jpg" for number in SHARP]
+    assert sorted((tmp_path / "frames").iterdir()) == found
+    assert cv2.imread(str(found[0])).shape == (96, 128, 3)
     assert told[-1] == (60, 60)
     assert sorted(told) == told
     assert len(write_frames(video, tmp_path / "all")[0]) == 30  # a short one gives each of its frames
@@ -40,12 +40,8 @@ def test_the_sharpest_frame_of_each_stretch_is_taken(video, tmp_path):
 
 def moving(path, code, count=30):
     """A video of noise that moves."""
-    noise, writer = np.random.default_rng(0), cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*code), 10, (128, 96))
-    assert writer.isOpened()
-    for _ in range(count):
-        writer.write(cv2.resize(noise.integers(0, 255, (24, 32, 3), np.uint8), (128, 96)))
-    writer.release()
-    return path
+    noise = np.random.default_rng(0).integers(0, 255, (count, 24, 32, 3), np.uint8)
+    return written(path, code, (cv2.resize(frame, (128, 96)) for frame in noise))
 
 
 @pytest.mark.parametrize(("name", "code"), [("a.mp4", "mp4v"), ("b.avi", "MJPG"), ("c.avi", "XVID")])
@@ -56,19 +52,19 @@ def test_a_damaged_stretch_does_not_end_a_video(tmp_path, name, code):
     start = len(data) // 2
     data[start : start + 3000] = bytes(3000)
     path.write_bytes(data)
-    written, notes = write_frames(path, tmp_path / "frames")
-    assert 20 <= len(written) <= whole == 30
-    assert written[-1].name >= "frame_000025.jpg"
-    assert len(written) == 30 or f"{30 - len(written)} of 30 frames of {name} cannot be decoded" in notes[0]
+    found, notes = write_frames(path, tmp_path / "frames")
+    assert 20 <= len(found) <= whole == 30
+    assert found[-1].name >= "frame_000025.jpg"
+    assert len(found) == 30 or f"{30 - len(found)} of 30 frames of {name} cannot be decoded" in notes[0]
 
 
 @pytest.mark.parametrize("code", ["MJPG", "XVID"])
 def test_a_video_that_is_cut_short_says_so(tmp_path, code):
     path = moving(tmp_path / "a.avi", code)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    written, notes = write_frames(path, tmp_path / "frames")
-    assert 8 <= len(written) <= 22
-    assert f"{30 - len(written)} of 30 frames" in notes[0]
+    found, notes = write_frames(path, tmp_path / "frames")
+    assert 8 <= len(found) <= 22
+    assert f"{30 - len(found)} of 30 frames" in notes[0]
     assert "cut short" in notes[0]
 
 

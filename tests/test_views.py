@@ -7,23 +7,27 @@ import jax
 import laspy
 import numpy as np
 import pytest
-from capture_files import refused, run_cli, small_capture, transforms, write_text_model
+from capture_files import (
+    compute_stage,
+    context_of,
+    inria,
+    refused,
+    run_cli,
+    small_capture,
+    transforms,
+    write_text_model,
+)
 from conftest import gaussians_at
 from point_files import OFFSET, las
 from scipy.spatial.transform import Rotation
 
 import jsecon
 from jsecon.app.cli import main
-from jsecon.pipeline.options import Options
-from jsecon.pipeline.scene import plan_scene
-from jsecon.pipeline.stages import Checkpoint, Results, RunContext, StageInput
 from jsecon.splat.sh import C0
 from jsecon.splat.transform import transform_gaussians
 from jsecon.views import plan
 from jsecon.views.frame import inner_scene, scene_frame, surface_points
 from jsecon.views.plan import frames_by_need, place_cameras
-from jsecon.vision.colours import ColourEmbedder
-from jsecon.vision.protocols import Models
 
 BALLS = {"red": (0.8, 0.1, 0.1), "blue": (0.1, 0.2, 0.8), "green": (0.1, 0.6, 0.15)}
 CENTRES = np.array([(-1.2, -0.8, 0.4), (1.0, 0.2, 0.4), (-0.2, 1.1, 0.4)])
@@ -290,21 +294,9 @@ def posed(around):
     return dataclasses.replace(small_capture(len(names)), cameras=around.cameras, names=names)
 
 
-def inria(capture, turn=None):
-    """The cameras of a capture as INRIA's cameras.json, their poses times `turn`."""
-    rows, cameras = [], capture.cameras
-    for name, camera in zip(capture.names, cameras):
-        pose = np.linalg.inv(np.asarray(camera.world_to_camera, np.float64)) @ (np.eye(4) if turn is None else turn)
-        row = {"img_name": f"{name}.png", "width": cameras.width, "height": cameras.height, "fx": float(camera.fx)}
-        rows.append(row | {"fy": float(camera.fy), "position": pose[:3, 3].tolist(), "rotation": pose[:3, :3].tolist()})
-    return rows
-
-
 def views_of(splat, **options):
     """The capture of renders that a run makes of a splat, its notes, and what the run plans."""
-    work = RunContext(Options(capture=splat, long_side=160, **options), Models(ColourEmbedder()), splat.parent / "out")
-    stage = plan_scene(work)[0]
-    result = stage.compute(StageInput(work, Results(), lambda done, total: None, Checkpoint(work.out)))
+    result, stage = compute_stage(context_of(splat, splat.parent / "out", long_side=160, **options), "load")
     return result.value, " ".join(result.notes), stage.how
 
 

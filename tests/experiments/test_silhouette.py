@@ -4,12 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.tables.silhouette import (
-    SWEEPS,
-    WEIGHTS,
-    Footprints,
-    ascend,
-)
+from experiments.tables.silhouette import SWEEPS, WEIGHTS, Footprints, ascend
 from jsecon.query.render import ALPHA_THRESHOLD, VALA_THRESHOLD
 
 

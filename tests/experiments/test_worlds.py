@@ -7,12 +7,7 @@ import pytest
 from experiments.test_simulated import NONE, frames, space  # noqa: F401
 
 from experiments.datasets.plain_room import make_room
-from experiments.simulated_vision.embeddings import (
-    CONFUSED,
-    LEANING,
-    SimulatedEmbedder,
-    leanings,
-)
+from experiments.simulated_vision.embeddings import CONFUSED, LEANING, SimulatedEmbedder, leanings
 from experiments.simulated_vision.worlds import World, seen_in, world_of
 
 TABLE = 7
