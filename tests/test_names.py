@@ -8,8 +8,8 @@ import pytest
 from capture_files import run_cli
 from small_field import answer_of, colour_field
 
-from jsecon import At, InputError, Query, Region, Scene, load_gaussians, save_field
-from jsecon.app.querying import file_stem, write_answer
+from jsecon import At, InputError, Region, Scene, load_gaussians, save_field
+from jsecon.app.querying import write_answer
 from jsecon.files import path_within
 from jsecon.read.captures.images import write_image
 from jsecon.vision.colours import ColourEmbedder
@@ -37,8 +37,13 @@ TEXTS = [
 ]
 
 
-def test_texts_have_names_of_their_own_also_without_case():
-    names = {text: file_stem(Query(text)) for text in TEXTS}
+def stem_of(answer, out) -> str:
+    """What the files of an answer are called."""
+    return write_answer(answer, Scene(answer.field), out, {})["ply"].removesuffix(".ply")
+
+
+def test_texts_have_names_of_their_own_also_without_case(field, tmp_path):
+    names = {text: stem_of(answer_of(field, text, np.arange(64) < 2), tmp_path) for text in TEXTS}
     assert (names["red mug"], names["c"], names["café"]) == ("red-mug", "c", "café")
     assert len({name.casefold() for name in names.values()}) == len(TEXTS)
     for name in names.values():
@@ -47,11 +52,13 @@ def test_texts_have_names_of_their_own_also_without_case():
         assert name not in ("con", "nul", "com1")
 
 
-def test_a_text_and_a_pixel_of_one_name_do_not_share_files(field):
+def test_a_text_and_a_pixel_of_one_name_do_not_share_files(field, tmp_path):
     asked = At(1, 24, 20), At("frame_1", 24, 20), At(1, 24, 21), Region(1)
-    pixel, same, *others = (file_stem(Scene(field).ask(question).query) for question in asked)
+    answers = [Scene(field).ask(question) for question in asked]
+    answers += [answer_of(field, text, np.arange(64) < 2) for text in ("at frame_1 24 20", "region 1")]
+    pixel, same, *others = (stem_of(answer, tmp_path) for answer in answers)
     assert pixel == same
-    assert len({pixel, *others, file_stem(Query("at frame_1 24 20")), file_stem(Query("region 1"))}) == 5
+    assert len({pixel, *others}) == 5
 
 
 def test_frames_of_hostile_names_are_written_beneath_the_folder(field, tmp_path):

@@ -1,7 +1,7 @@
 """`jsecon query`: its options as questions, and its answers as files: Gaussians, a record, masks, a page of pictures.
 
 Every query has unique file names, the same in every run: an ordinary text is its name ("red mug" is red-mug), any other
-name ends in a hash of what it stands for (`file_stem`).
+name ends in a hash of what it stands for (`_file_stem`).
 """
 
 import hashlib
@@ -46,7 +46,7 @@ def _query(verb: verbs.Query, console: Console) -> verbs.VerbResult:
         console.note("Words in quotes are searched for as they stand, without relations.")
     for query, result in zip(queries, results):
         if isinstance(result, InputError) and isinstance(query.question, str):
-            _remove_answer(verb.out, file_stem(query))
+            _remove_answer(verb.out, _file_stem(query))
     if not answers:
         remove_files(verb.out, [_PAGE])
     result = _write_answers(scene, answers, verb.out, console, verb.views) if answers else {"answers": []}
@@ -99,7 +99,7 @@ def write_answer(
       out: Output folder.
       masks: Index of a frame -> mask to write (`Scene.mask`).
     """
-    stem = file_stem(answer.query)
+    stem = _file_stem(answer.query)
     _remove_answer(out, stem)
     record = answer.as_dict() | {"ply": None, "masks": {}}
     if len(answer.rows):
@@ -124,7 +124,7 @@ def _write_answers(scene: Scene, answers: Sequence[Answer], out: Path, console: 
         console.print_line(str(answer))
     with console.progress("pictures") as progress:
         for n, answer in enumerate(answers):
-            stem = file_stem(answer.query)
+            stem = _file_stem(answer.query)
             if stem not in records:  # else the question stands there twice
                 masks = {t: scene.mask(answer, t) for t in scene.best_frames(answer, views)}
                 records[stem] = write_answer(answer, scene, out, masks)
@@ -145,7 +145,7 @@ def _write_answers(scene: Scene, answers: Sequence[Answer], out: Path, console: 
         written["pictures"] = out / _PAGE
     else:
         remove_files(out, [_PAGE])  # of an earlier command
-    return {"written": written, "answers": [records[file_stem(answer.query)] for answer in answers]}
+    return {"written": written, "answers": [records[_file_stem(answer.query)] for answer in answers]}
 
 
 def _remove_answer(out: Path, stem: str) -> None:
@@ -159,7 +159,7 @@ def _remove_answer(out: Path, stem: str) -> None:
     remove_files(out, [*(name for name in texts if name.startswith((f"{stem}.", f"{stem}-"))), f"{stem}.json"])
 
 
-def file_stem(query: Query) -> str:
+def _file_stem(query: Query) -> str:
     """Names the files of an answer without ending: the same name in every run, and not that of any other query."""
     question, name = query.question, str(query)
     plain = slug(name)
