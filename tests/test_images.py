@@ -146,8 +146,9 @@ def test_label_arrays(tmp_path, dtype):
 
 def test_depth(tmp_path):
     counts = RNG.integers(0, 65536, (6, 5)).astype(np.uint16)
+    counts[0, 0] = 65535  # the largest number: unknown
     cv2.imwrite(str(tmp_path / "d.png"), counts)
-    np.testing.assert_allclose(read_depth(tmp_path / "d.png", 0.001), counts / 1000, rtol=1e-6)
+    np.testing.assert_allclose(read_depth(tmp_path / "d.png", 0.001), counts % 65535 / 1000, rtol=1e-6)
     np.save(tmp_path / "d.npy", np.array([[1.0, np.nan, -2.0]]))
     np.testing.assert_array_equal(read_depth(tmp_path / "d.npy", 2.0), [[2, 0, 0]])
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from jsecon import load_capture
 from jsecon.pipeline.scene import plan_capture
-from jsecon.read.captures.images import read_depth, write_image
+from jsecon.read.captures.images import write_image
 from jsecon.read.captures.lens import Lens, resample_depth
 
 _RANDOM = small_capture(count=12)
@@ -232,11 +232,6 @@ def test_replicas_parameters_lie_in_the_scene_or_above_or_are_the_benchmarks(tmp
     found = load_capture(folder, frames=2)
     np.testing.assert_allclose(found.cameras.cx[0], found.cameras.width / 2)
     np.testing.assert_allclose(found.depths, 2 / np.cbrt(np.linalg.det(found.source_from_scene[:3, :3])), rtol=1e-5)
-
-
-def test_depth_of_the_largest_number_is_unknown(tmp_path):
-    cv2.imwrite(str(tmp_path / "a.png"), np.array([[65535, 1500]], np.uint16))
-    np.testing.assert_allclose(read_depth(tmp_path / "a.png", 0.001), [[0, 1.5]])
 
 
 @pytest.mark.parametrize(("write", "inner"), [

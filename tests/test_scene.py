@@ -49,11 +49,14 @@ def test_a_node_of_the_tree_selects_the_gaussians_under_it():
     leaf = np.repeat(np.array([0, 1, 2, 8, 9, 4, 5], np.int32), (120, 120, 120, 40, 80, 120, 120))
     scene = Scene(dataclasses.replace(field, tree=tree, leaf=leaf), embedder, up=(0, 0, 1))
     things = [scene.ask(Region(region)).mask for region in range(6)]
-    first, whole = Region(6), Region(7)
+    first = scene.wider(Region(2))
+    whole = scene.wider(first)
+    assert (first, whole, scene.wider(whole), scene.wider(Region(3))) == (Region(6), Region(7), None, None)
     np.testing.assert_array_equal(scene.ask(first).mask, things[0] | things[2])
     np.testing.assert_array_equal(scene.ask(whole).mask, things[0] | things[1] | things[2])
     assert (scene.ask(whole).count, scene.ask(whole).as_dict()["region"]) == (1, 7)
     assert scene.best_frames(scene.ask(whole), 1) == [0]
+    assert scene.wider(Region(8)) == scene.wider(Region(9)) == Region(3)
     np.testing.assert_array_equal(scene.ask(Region(8)).mask | scene.ask(Region(9)).mask, things[3])
     assert "there is no region 10" in str(scene.ask(Region(10)))
 

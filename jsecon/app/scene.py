@@ -432,6 +432,16 @@ class Scene:
         reason = "" if 0 <= region <= last else f"there is no region {region}: the regions are 0 to {last}"
         return self._finish(query, found, reason)
 
+    def wider(self, region: Region) -> Region | None:
+        """What a region belongs to: the next larger thing that views see as one; None if nothing larger is known.
+
+        Args:
+          region: A region, or what this method returned. What it consists of has it as parent in `field.tree`.
+        """
+        tree = self.field.tree
+        parent = -1 if tree is None or not 0 <= region.id < len(tree) else int(tree[region.id])
+        return None if parent < 0 else Region(parent)
+
     def _rules(self, query: Query, rules: QueryRules) -> QueryRules:
         """Rules with the options of a query."""
         options: dict[str, Any] = {"min_rank": query.min_rank, "all_of_class": query.all_of_class}
