@@ -77,8 +77,8 @@ def points_from_depth(
     if not any(len(world) for world, _, _ in parts):
         raise InputError("capture", "no pixel with a known depth", "depths above 0", "Check their encoding and unit.")
     points, colors, _ = (np.concatenate(columns) for columns in zip(*parts))
-    mean, *rest = voxel_means(points, colors, max_points, voxel)
-    return _DepthPoints(mean.astype(np.float32), *rest)
+    means, colors, voxel = voxel_means(points, colors, max_points, voxel)
+    return _DepthPoints(means.astype(np.float32), colors, voxel)
 
 
 def _points_between(capture: Capture, points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
