@@ -16,6 +16,7 @@ gone are asked for by their colours in the updated field. The seeds 0 to 5 chose
 import dataclasses
 import itertools
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -29,11 +30,15 @@ from experiments.rooms.capture import look_at, room_cameras
 from experiments.rooms.raycast import render_views, trace_rays
 from experiments.rooms.room import Room, build_room, footprint_radius, place_object, scatter_circles
 from experiments.rooms.shapes import SHAPES
-from jsecon import Scene
+from jsecon import Scene, open_scene
 from jsecon.app.comparison import Changes
-from jsecon.field.field import load_field, save_field
+from jsecon.field.evidence import list_evidence, pack_evidence
+from jsecon.field.ledger import Ledger, LedgerView, camera_row
+from jsecon.field.ledger_file import save_with_ledger
+from jsecon.field.regions import region_embeddings
 from jsecon.fit.start import points_from_depth
 from jsecon.query.render import HIDDEN_LOGIT
+from jsecon.read.captures.images import encode_jpeg
 from jsecon.splat.points import gaussians_from_points
 from jsecon.types import Camera, Capture, LanguageField
 from jsecon.vision.colours import ColourEmbedder
@@ -42,6 +47,10 @@ KINDS = ("remove", "move", "add", "swap", "turn", "nothing", "other light", "oth
 UNTURNED = ("box", "mug", "kettle", "pot", "teddy")
 """Shapes that look another way when they are turned."""
 SENSORS = ("RGB", "RGB-D")
+METHODS = ("updated", "just add", "new frames only")
+"""How a field takes new photographs: `update`, `add`, or a field of their own (true masks, Gaussians of true depth)."""
+ASKED = {"moved": "moved found", "gone": "gone refused", "same": "others found"}
+"""What is asked for after a thing moved or is gone, by what became of it."""
 SIZE = {"width": 160, "height": 120}
 GAUSSIANS = 26_000
 """Gaussians of each field, with transparent ones, so that all rooms share their programs."""
@@ -143,13 +152,13 @@ def new_cameras(seed: int, count: int) -> Camera:
     return Camera(poses, *lens, **SIZE)
 
 
-def room_field(room: Room, *, views: int = 16) -> LanguageField:
-    """The field of a room with its true masks: Gaussians from true depth, regions named by their colours."""
-    cameras = room_cameras(room, views=views, width=240, height=180)
-    frames, instances, depths = render_views(room, cameras, coarser=2)
-    names = tuple(f"frame_{view + 1:05d}" for view in range(views))
+def field_of_views(
+    cameras: Camera, frames: np.ndarray, instances: np.ndarray, depths: np.ndarray, count: int
+) -> tuple[LanguageField, Ledger]:
+    """The field of views with their true masks: Gaussians from true depth, `count` regions named by their colours."""
+    names = tuple(f"frame_{view + 1:05d}" for view in range(len(frames)))
     nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
-    capture = Capture(frames, cameras, *nothing, np.zeros(views, bool), depths, np.eye(4), names)
+    capture = Capture(frames, cameras, *nothing, np.zeros(len(frames), bool), depths, np.eye(4), names)
     cloud = points_from_depth(capture, voxel=0.013)
     near = (np.abs(cloud.points[:, :2]) < 0.75).all(1) & (cloud.points[:, 2] > -0.1)
     coarse = points_from_depth(capture, voxel=0.08)
@@ -163,7 +172,15 @@ def room_field(room: Room, *, views: int = 16) -> LanguageField:
     scene = jax.tree.map(lambda a: np.concatenate([a, np.repeat(np.asarray(a)[:1], more, 0)]), scene)
     logits = np.where(np.arange(GAUSSIANS) < len(chosen), scene.opacity_logits, np.float32(HIDDEN_LOGIT))
     scene = dataclasses.replace(scene, opacity_logits=logits)
-    return field_of_masks(scene, cameras, frames, instances, len(room.objects))
+    field, labels = field_of_masks(scene, cameras, frames, instances, count), np.asarray(instances, np.int16)
+    regions = region_embeddings(frames, labels, ColourEmbedder().embed_regions, num_regions=count)
+    views = {}
+    for t, (name, evidence) in enumerate(zip(names, list_evidence(scene, cameras, labels, count))):
+        shown, rows = np.flatnonzero(regions.pixel_counts[:, t]), regions.embedded[:, 1] == t
+        pixels = np.stack([shown, regions.pixel_counts[shown, t]]).astype(np.int32)
+        packed, embedded = pack_evidence(evidence, count), (regions.embedded[rows, 0], regions.view_embeddings[rows])
+        views[name] = LedgerView(packed, pixels, *embedded, camera_row(cameras[t]), encode_jpeg(frames[t]))
+    return field, Ledger(count, views)
 
 
 def photographs(seed: int, kind: str, count: int) -> dict[str, np.ndarray]:
@@ -195,19 +212,21 @@ class Options:
 
 def load_case(folder: Path, seed: int, kind: str, count: int) -> dict[str, np.ndarray]:
     """The photographs of a case, which are made once."""
-    file = folder / f"{seed}-{kind.replace(' ', '-')}.npz"
+    file = folder / f"{seed}-{kind.replace(' ', '-')}-{count}.npz"
     if not file.is_file():
         np.savez_compressed(file, **photographs(seed, kind, count))
     with np.load(file) as stored:
         return dict(stored)
 
 
-def load_room_field(folder: Path, seed: int) -> LanguageField:
-    """The field of a room, which is made once."""
+def load_scene(folder: Path, seed: int) -> Scene:
+    """The scene of a room, with the field of its true masks, which is made once."""
     file = folder / f"{seed}.safetensors"
     if not file.is_file():
-        save_field(file, room_field(make_room(make_case(seed, "nothing").before, seed)))
-    return load_field(file)
+        room = make_room(make_case(seed, "nothing").before, seed)
+        cameras = room_cameras(room, views=16, width=240, height=180)
+        save_with_ledger(file, *field_of_views(cameras, *render_views(room, cameras, coarser=2), len(room.objects)))
+    return open_scene(file)
 
 
 def new_capture(shots: dict[str, np.ndarray], cameras: Camera, chosen: np.ndarray, seed: int, depth: bool) -> Capture:
@@ -263,20 +282,30 @@ def judge(changes: Changes, case: Case, shots: dict[str, np.ndarray], chosen: np
     return {"found": found, "truth": len(truth), "moved": moved}
 
 
-def ask_updated(scene: Scene, changes: Changes, case: Case) -> list[tuple[str, bool]]:
-    """Asks the updated field for each thing that moved or is gone by its colour.
+def later_scenes(
+    scene: Scene, changes: Changes, capture: Capture, shots: dict[str, np.ndarray], chosen: np.ndarray
+) -> Iterator[tuple[str, Scene]]:
+    """The scene after a change by each of METHODS."""
+    known = tuple(change for change in changes.found if change.object >= 0)
+    yield METHODS[0], scene.update(dataclasses.replace(changes, found=known), date="2026-11-28")
+    yield METHODS[1], scene.add(capture)
+    views = shots["frames"][chosen], shots["after"][chosen], shots["depths"][chosen]
+    yield METHODS[2], Scene(field_of_views(capture.cameras, *views, int(shots["after"].max()) + 1)[0], scene.embedder)
+
+
+def ask_things(scene: Scene, case: Case) -> list[tuple[str, bool]]:
+    """Asks a scene for each thing of the room before by its colour.
 
     Returns:
-      The kind, and whether the answer is right: at the new place, or no Gaussian.
+      What became of it, and whether the answer is right: at the place where it is now, or no Gaussian.
     """
-    known = dataclasses.replace(changes, found=tuple(change for change in changes.found if change.object >= 0))
-    rows, new = [], scene.update(known, date="2026-11-28")  # what is new would need a ledger
-    for kind, i, j in case.changes:
-        answer = new.ask(case.before[i].colour)
-        is_found = bool(answer.mask.any())
-        if is_found and kind == "moved":
-            is_found = bool(np.linalg.norm(answer.place.center[:2] - case.after[j].spot) < FOUND_M)
-        rows.append((kind, is_found == (kind == "moved")))
+    rows, changed = [], {i: (kind, j) for kind, i, j in case.changes}
+    for i, thing in enumerate(case.before):
+        kind, j = changed.get(i, ("same", -1))
+        spot = case.after[j].spot if kind == "moved" else thing.spot
+        answer = scene.ask(thing.colour)
+        is_there = bool(answer.mask.any()) and float(np.linalg.norm(answer.place.center[:2] - spot)) < FOUND_M
+        rows.append((kind, not answer.mask.any() if kind == "gone" else is_there))
     return rows
 
 
@@ -293,18 +322,19 @@ def measure_room(seed: int, options: Options) -> dict:
     """Measures all cases of a room: by the kind of case, the number of photographs and whether they have depth."""
     folder, rows = Path(options.rooms), {}
     folder.mkdir(parents=True, exist_ok=True)
-    field = load_room_field(folder, seed)
+    loaded = load_scene(folder, seed)
     for kind in KINDS:
         shots, case = load_case(folder, seed, kind, max(options.counts)), make_case(seed, kind)
         cameras = new_cameras(seed + 1000 * KINDS.index(kind), len(shots["frames"]))
         for count, depth in itertools.product(options.counts, (False, True)):
             chosen = np.linspace(0, len(shots["frames"]), count, endpoint=False).astype(int)
-            scene = Scene(field, ColourEmbedder())
-            _ = scene.objects()
+            capture = new_capture(shots, cameras, chosen, seed, depth)
+            _ = loaded.objects()
             began = time.perf_counter()
-            changes = scene.changes(new_capture(shots, cameras, chosen, seed, depth))
+            changes = loaded.changes(capture)
             seconds = time.perf_counter() - began
-            asked = ask_updated(scene, changes, case) if kind in ("remove", "move") else []
+            later = later_scenes(loaded, changes, capture, shots, chosen) if kind in ("remove", "move") else ()
+            asked = [(method, *row) for method, scene in later for row in ask_things(scene, case)]
             row = judge(changes, case, shots, chosen) | {"seconds": seconds, "asked": asked}
             rows[f"{kind}, {count}, {SENSORS[depth]}"] = row
     return rows
@@ -327,8 +357,8 @@ def summarise(rows: dict, count: int, sensor: str) -> tuple[dict[str, float], li
         "place of moved, cm": 100 * float(np.median([error for error, _ in moved])) if moved else float("nan"),
         "same id": float(np.mean([same for _, same in moved])) if moved else float("nan"),
         **{
-            f"{words}, updated": float(np.mean([is_right for asked_kind, is_right in asked if asked_kind == kind]))
-            for kind, words in (("moved", "moved found"), ("gone", "gone refused"))
+            f"{words}, {method}": float(np.mean([row[2] for row in asked if row[:2] == [method, kind]]))
+            for method, (kind, words) in itertools.product(METHODS, ASKED.items())
         },
         "seconds, median": float(np.median([cell["seconds"] for cell in every])),
     }
@@ -346,14 +376,17 @@ def main(options: Options) -> dict:
             append_cell(file, key, measure_room(seed, options))
         print(seed, flush=True)
         rows[seed] = read_cells(file)[key]
-    figures, lines, kinds = {}, [], []
+    figures, lines, kinds, answers = {}, [], [], []
     for count, sensor in itertools.product(options.counts, SENSORS):
         figure, reported = summarise(rows, count, sensor)
         figures[f"{count} {sensor}"] = figure
-        lines.append((count, sensor, *figure.values()))
+        lines.append((count, sensor, *(value for name, value in figure.items() if not name.endswith(METHODS))))
+        for method in METHODS:
+            answers.append((count, sensor, method, *(figure[f"{words}, {method}"] for words in ASKED.values())))
         kinds.append((count, sensor, *reported))
-    header = ("photographs", "sensor", *next(iter(figures.values())))
-    text = results.table(header, lines) + "\n\n" + results.table(("photographs", "sensor", *KINDS[:5]), kinds)
+    first, plain = ("photographs", "sensor"), [name for name in figure if not name.endswith(METHODS)]
+    heads = (*first, *plain), (*first, *KINDS[:5]), (*first, "field", *ASKED.values())
+    text = "\n\n".join(map(results.table, heads, (lines, kinds, answers)))
     results.save(out, options, figures, text)
     print(text)
     return figures

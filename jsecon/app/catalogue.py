@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
-from scipy.sparse.csgraph import connected_components
+from scipy import sparse  # loads csgraph on its first use
 from scipy.special import softmax
 
 from jsecon.app.records import gaussian_rows, rounded, source_shapes, source_up, world_record
@@ -372,7 +372,7 @@ def _region_objects(field: LanguageField, main: np.ndarray, up: np.ndarray) -> I
     large = _counts(main, len(joined)) >= MIN_SAMPLES
     for first, second in np.argwhere(np.triu(alike & ~joined & large & large[:, None], 1)).tolist():
         joined[first, second] = _is_continued(shape(first), shape(second), functools.partial(shape, first, second))
-    return connected_components(joined, directed=False)[1]
+    return sparse.csgraph.connected_components(joined, directed=False)[1]
 
 
 def _is_continued(first: ObjectShapes, second: ObjectShapes, common: Callable[[], ObjectShapes]) -> bool:

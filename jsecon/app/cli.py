@@ -177,6 +177,7 @@ def _run_verb(verb: Verb, console: Console) -> VerbResult:
             problem = f"the package {str(error.name).partition('.')[0]} is missing"
             raise InputError(f"jsecon {name}", problem, remedy=f'Run: pip install "jsecon[{verb.extra}]"') from error
         finally:
+            gc.freeze()  # later collections need not look at modules
             gc.enable()
     return work(verb, console)
 

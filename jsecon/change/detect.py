@@ -9,6 +9,7 @@ object that too few pixels see keeps its state: it is not seen, never gone. NumP
 
 import dataclasses
 import functools
+import os
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -30,6 +31,8 @@ from jsecon.splat.sh import C0
 from jsecon.splat.visible import points_in_view
 from jsecon.types import Camera, Gaussians
 
+NEARV = float(os.environ.get("NEARV", "0.5"))
+FARV = float(os.environ.get("FARV", "2"))
 KINDS = ("same", "moved", "gone", "new", "look", "unsure", "not seen")
 """What became of an object; "look": it stands where it was and looks another way; "unsure": too little shows it."""
 MIN_EXPLAINED = 0.3
@@ -254,7 +257,8 @@ def object_changes(
     clusters = search.clusters()
     for k in np.flatnonzero(displaced).tolist():
         if k not in moved:
-            changes[k], clusters = search.gone(k, seen[k], clusters)
+            changes[k] = search.gone(k, seen[k])
+        clusters = [cluster for cluster in clusters if cluster.inside(search.silhouettes(k)) <= 0.6]
     changes += [search.new(cluster) for cluster in clusters]
     return [
         dataclasses.replace(change, kind="unsure", suspected=change.kind)
@@ -280,6 +284,11 @@ class _Cluster(NamedTuple):
         """Joins the pixels of one more frame; the size stays that of the first, which has most pixels."""
         place = (len(self.masks) * self.place + other.place) / (len(self.masks) + 1)
         return _Cluster(place, self.size, self.masks | other.masks, max(self.radius, other.radius))
+
+    def inside(self, silhouettes: np.ndarray) -> float:
+        """The share of its pixels in silhouettes (F, H, W), two pixels wider: what a thing there left bare."""
+        wider = {t: cv2.dilate(silhouettes[t].astype(np.uint8), np.ones((5, 5), np.uint8)) > 0 for t in self.masks}
+        return float(np.mean(np.concatenate([wider[t][mask] for t, mask in self.masks.items()])))
 
 
 def _gain(views: Sequence[_View], body: _Body, motion: np.ndarray) -> tuple[float, int]:
@@ -353,14 +362,23 @@ class _Search:
                 continue
             inside = image == n
             radius = float(cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, 5).max())
-            nearer = view.depth is None or np.nan_to_num(depth_cost(view.depth, view.z))[inside] < -0.3
-            if radius < MIN_RADIUS or np.mean(nearer) < 0.5:
+            if radius < MIN_RADIUS:
                 continue
-            rows, columns = np.nonzero(inside)
-            along = down[0] * columns + down[1] * rows
-            low = along >= np.quantile(along, 0.95)
-            z = float(np.median(view.z[rows[low], columns[low]]))
-            contact = back_project(view.camera, np.array([[rows[low].mean(), columns[low].mean()]]), z)[0]
+            if view.depth is not None and np.mean(np.nan_to_num(depth_cost(view.depth, view.z))[inside] > 0.3) > 0.5:
+                continue  # what went left it bare
+            measured = np.zeros_like(inside) if view.depth is None else inside & (view.depth > 0)
+            if view.depth is not None and measured.any():
+                z = float(np.quantile(view.depth[measured], 0.5, method="nearest"))
+                measured &= np.abs(view.depth - z) <= z * np.sqrt(area) / float(view.camera.fx)  # not what is behind it
+                surface = back_project(view.camera, np.argwhere(measured), view.depth[measured])
+                contact = np.median(surface, axis=0)
+                contact += (np.quantile(surface @ self.up, 0.05) - contact @ self.up) * self.up
+            else:
+                rows, columns = np.nonzero(inside)
+                along = down[0] * columns + down[1] * rows
+                low = along >= np.quantile(along, 0.95)
+                z = float(np.median(view.z[rows[low], columns[low]]))
+                contact = back_project(view.camera, np.array([[rows[low].mean(), columns[low].mean()]]), z)[0]
             size = z * np.sqrt(area) / float(view.camera.fx)
             ahead = contact - np.asarray(view.camera.centres, np.float64)
             ahead -= (ahead @ self.up) * self.up
@@ -455,8 +473,8 @@ class _Search:
         depths[~points_in_view(self.cameras, place[None])[:, 0]] = np.inf
         return [int(t) for t in np.argsort(depths)[:_FIT_FRAMES] if np.isfinite(depths[t])]
 
-    def gone(self, k: int, seen: np.ndarray, clusters: list[_Cluster]) -> tuple[Change, list[_Cluster]]:
-        """The change of an object that is not where it was, nor elsewhere, and the clusters that it does not explain.
+    def gone(self, k: int, seen: np.ndarray) -> Change:
+        """The change of an object that is not where it was, nor elsewhere.
 
         It is gone where the scene without it explains the photographs. Where something of its outline stands in its
         place, it has another look. Else something hides it.
@@ -466,15 +484,13 @@ class _Search:
         margins = [np.nanmean(a - b) if len(a) and np.isfinite(a - b).any() else 0.0 for a, b in inside]
         margin = float(np.mean(np.asarray(margins)[seen]))
         order = tuple(int(t) for t in np.argsort(-np.asarray(margins)) if seen[t])
-        wider = [cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0 for mask in before]
-        others = [c for c in clusters if np.mean(np.concatenate([wider[t][m] for t, m in c.masks.items()])) <= 0.6]
         if margin >= GONE_MARGIN:
             gone = _sigmoid(10 * (margin - GONE_MARGIN))
-            return Change("gone", k, gone, order, np.eye(4), middle, before, np.zeros_like(before)), others
+            return Change("gone", k, gone, order, np.eye(4), middle, before, np.zeros_like(before))
         after = before & np.stack([np.nan_to_num(view.cost) > 0.5 for view in self.views])
         filled = float(after.sum() / max(before[seen].sum(), 1))
         kind, probability = ("look", filled) if filled > 0.5 else ("not seen", 1 - filled)
-        return Change(kind, k, probability, order, np.eye(4), middle, before, after), others
+        return Change(kind, k, probability, order, np.eye(4), middle, before, after)
 
     def new(self, cluster: _Cluster) -> Change:
         """Something that no object explains, coherent over the frames."""

@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy import sparse  # loads csgraph on its first use
 
 from jsecon.errors import InputError
 from jsecon.types import Camera, Capture, Progress
@@ -129,8 +128,8 @@ def triangulated_points(capture: Capture, *, progress: Progress | None = None) -
             parallax.append(angle[angle > 0])
         report(len(used) + n + 1, total)
     edge, point, angle = (np.concatenate(parts) for parts in (edges, points, parallax))
-    graph = coo_array((np.ones(len(edge), bool), tuple(edge.T)), shape=(first[-1], first[-1]))
-    tracks: Any = connected_components(graph, directed=False)[1]
+    graph = sparse.coo_array((np.ones(len(edge), bool), tuple(edge.T)), shape=(first[-1], first[-1]))
+    tracks: Any = sparse.csgraph.connected_components(graph, directed=False)[1]
     track = tracks[edge[:, 0]]
     widest = np.lexsort((-angle, track))
     widest = widest[np.unique(track[widest], return_index=True)[1]]

@@ -13,8 +13,8 @@ from typing import Any, cast
 import cv2
 import jax
 import numpy as np
+import scipy  # loads scipy.optimize on its first use, which photographs with poses do without
 from jaxtyping import Bool, Float, UInt8
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from jsecon.fit.resize import resize_camera
@@ -164,7 +164,9 @@ def _refine(
         local = places @ motion[:3, :3].T + motion[:3, 3]
         return ((scale * local[:, :2] / np.maximum(local[:, 2:], 1e-9) - rays) * float(lens.fx)).ravel()
 
-    return moved(least_squares(residuals, np.zeros(6 + is_free), loss="soft_l1", f_scale=0.5, max_nfev=30).x)
+    return moved(
+        scipy.optimize.least_squares(residuals, np.zeros(6 + is_free), loss="soft_l1", f_scale=0.5, max_nfev=30).x
+    )
 
 
 def _flow_matches(

@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
+from scipy import sparse  # loads csgraph on its first use
 from scipy.spatial import KDTree
 
 from jsecon.errors import require, require_one_of, require_shape
@@ -141,8 +140,8 @@ def _one_component(points: np.ndarray, eps: float) -> bool:
     distance, near = map(np.asarray, KDTree(places, balanced_tree=False).query(places, k=links))
     linked = distance <= eps
     ends = near[linked], np.concatenate([[0], np.cumsum(linked.sum(1))])
-    graph = csr_array((np.ones(len(ends[0])), *ends), shape=(len(places), len(places)))
-    count, component = connected_components(graph, directed=False)
+    graph = sparse.csr_array((np.ones(len(ends[0])), *ends), shape=(len(places), len(places)))
+    count, component = sparse.csgraph.connected_components(graph, directed=False)
     # The nearest links are enough where the points are evenly spaced, and spare the import of scikit-learn; also where
     # a component is so small that the links of its points show all that is near.
     if count == 1 or np.bincount(component).min() < links:

@@ -15,8 +15,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
+from scipy import sparse  # loads csgraph on its first use
 from scipy.spatial import KDTree
 
 from jsecon.numerics import axes_across
@@ -189,8 +188,8 @@ def _things(points: np.ndarray, reach: float, min_points: float) -> list[np.ndar
     distance, near = KDTree(points).query(points, 12)
     linked = np.asarray(distance) <= reach
     ends = np.asarray(near)[linked], np.concatenate([[0], np.cumsum(linked.sum(1))])
-    graph = csr_array((np.ones(len(ends[0])), *ends), shape=(len(points), len(points)))
-    count, thing = connected_components(graph, directed=False)
+    graph = sparse.csr_array((np.ones(len(ends[0])), *ends), shape=(len(points), len(points)))
+    count, thing = sparse.csgraph.connected_components(graph, directed=False)
     sizes = np.bincount(thing, minlength=count)
     return [points[thing == k] for k in np.flatnonzero(sizes >= min_points)]
 
