@@ -9,7 +9,6 @@ object that too few pixels see keeps its state: it is not seen, never gone. NumP
 
 import dataclasses
 import functools
-import os
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -31,8 +30,6 @@ from jsecon.splat.sh import C0
 from jsecon.splat.visible import points_in_view
 from jsecon.types import Camera, Gaussians
 
-NEARV = float(os.environ.get("NEARV", "0.5"))
-FARV = float(os.environ.get("FARV", "2"))
 KINDS = ("same", "moved", "gone", "new", "look", "unsure", "not seen")
 """What became of an object; "look": it stands where it was and looks another way; "unsure": too little shows it."""
 MIN_EXPLAINED = 0.3
