@@ -333,7 +333,8 @@ def measure_room(seed: int, options: Options) -> dict:
             began = time.perf_counter()
             changes = loaded.changes(capture)
             seconds = time.perf_counter() - began
-            later = later_scenes(loaded, changes, capture, shots, chosen) if kind in ("remove", "move") else ()
+            is_asked = kind in ("remove", "move") and count == max(options.counts)
+            later = later_scenes(loaded, changes, capture, shots, chosen) if is_asked else ()
             asked = [(method, *row) for method, scene in later for row in ask_things(scene, case)]
             row = judge(changes, case, shots, chosen) | {"seconds": seconds, "asked": asked}
             rows[f"{kind}, {count}, {SENSORS[depth]}"] = row
@@ -346,7 +347,6 @@ def summarise(rows: dict, count: int, sensor: str) -> tuple[dict[str, float], li
     every = [cell for column in cells.values() for cell in column]
     found = [tuple(pair) for cell in every for pair in cell["found"]]
     moved = [pair for cell in every for pair in cell["moved"]]
-    asked = [pair for cell in every for pair in cell["asked"]]
     right, wrong = (
         {kind: sum(pair[3] and pair[1] == is_right for cell in cells[kind] for pair in cell["found"]) for kind in KINDS}
         for is_right in (True, False)
@@ -356,14 +356,22 @@ def summarise(rows: dict, count: int, sensor: str) -> tuple[dict[str, float], li
         **{f"false in {kind}": wrong[kind] for kind in KINDS[5:]},
         "place of moved, cm": 100 * float(np.median([error for error, _ in moved])) if moved else float("nan"),
         "same id": float(np.mean([same for _, same in moved])) if moved else float("nan"),
-        **{
-            f"{words}, {method}": float(np.mean([row[2] for row in asked if row[:2] == [method, kind]]))
-            for method, (kind, words) in itertools.product(METHODS, ASKED.items())
-        },
         "seconds, median": float(np.median([cell["seconds"] for cell in every])),
     }
     truth = {kind: sum(cell["truth"] for cell in cells[kind]) for kind in KINDS[:5]}
     return figures, [f"{right[kind]} of {number}, {wrong[kind]} false" for kind, number in truth.items()]
+
+
+def summarise_answers(rows: dict, count: int, sensor: str) -> dict[str, dict[str, float]]:
+    """The share of right answers in the fields of each of METHODS, by what became of the thing."""
+    asked = [answer for row in rows.values() for kind in KINDS for answer in row[f"{kind}, {count}, {sensor}"]["asked"]]
+    return {
+        method: {
+            words: float(np.mean([is_right for of, became, is_right in asked if (of, became) == (method, kind)]))
+            for kind, words in ASKED.items()
+        }
+        for method in METHODS
+    }
 
 
 def main(options: Options) -> dict:
@@ -380,12 +388,14 @@ def main(options: Options) -> dict:
     for count, sensor in itertools.product(options.counts, SENSORS):
         figure, reported = summarise(rows, count, sensor)
         figures[f"{count} {sensor}"] = figure
-        lines.append((count, sensor, *(value for name, value in figure.items() if not name.endswith(METHODS))))
-        for method in METHODS:
-            answers.append((count, sensor, method, *(figure[f"{words}, {method}"] for words in ASKED.values())))
+        lines.append((count, sensor, *figure.values()))
         kinds.append((count, sensor, *reported))
-    first, plain = ("photographs", "sensor"), [name for name in figure if not name.endswith(METHODS)]
-    heads = (*first, *plain), (*first, *KINDS[:5]), (*first, "field", *ASKED.values())
+    for sensor in SENSORS:
+        figures[f"answers, {sensor}"] = summarise_answers(rows, max(options.counts), sensor)
+        for method, shares in figures[f"answers, {sensor}"].items():
+            answers.append((max(options.counts), sensor, method, *shares.values()))
+    first = "photographs", "sensor"
+    heads = (*first, *figure), (*first, *KINDS[:5]), (*first, "field", *ASKED.values())
     text = "\n\n".join(map(results.table, heads, (lines, kinds, answers)))
     results.save(out, options, figures, text)
     print(text)

@@ -44,8 +44,10 @@ MIN_GAIN = 0.25
 """Cost that a moved object must take away at its new place, per pixel of its silhouette."""
 TURN_SHARE = 0.1
 """Share of an object's pixels in two frames or more that the scene does not explain from which it may be turned."""
-MIN_TURN_GAIN = 0.035
+MIN_TURN_GAIN = 0.03
 """Cost that a turn must take away, per pixel of the object, beyond what the unturned object does."""
+LIGHT_FACTOR = 3.0
+"""By how much more than what turns explain of most things a turn must explain: other light shades them all anew."""
 MIN_RADIUS = 2.0
 """Radius of the largest disc in the pixels of a new thing: edges that lie a pixel off are narrower."""
 MIN_MOVE = 0.2
@@ -247,7 +249,10 @@ def object_changes(
     changes = [search.unmoved(k, seen[k], excess[k], differing[k]) for k in range(count)]
     shares = (known * differing).sum(1) / np.maximum(known.sum(1), 1e-9)
     suspects = np.flatnonzero((seen.sum(1) > 1) & ~displaced & (shares >= TURN_SHARE)).tolist()
-    turns = {k: turn for k in suspects if (turn := search.turn(changes[k])) is not None}
+    turns = {k: search.turn(changes[k]) for k in suspects}
+    usual = sorted([0.0, 0.0, 0.0, *(gain for _, gain in turns.values())])[-3]  # two may be turned
+    least = MIN_TURN_GAIN + LIGHT_FACTOR * usual
+    turns = {k: (motion, 40 * (gain - least)) for k, (motion, gain) in turns.items() if gain >= least}
     search.remove(np.flatnonzero(displaced).tolist(), list(turns))
     moved = {k: search.settle(k, *turn) for k, turn in turns.items()} | search.moved()
     changes = [moved.get(k, change) for k, change in enumerate(changes)]
@@ -422,14 +427,13 @@ class _Search:
         motion[:3, 3] = middle - motion[:3, :3] @ middle + pose[:2] @ self.flat + pose[3] * self.up
         return motion
 
-    def turn(self, change: Change) -> tuple[np.ndarray, float] | None:
-        """The motion of an object that is where it was and turned, if that explains clearly more, and its evidence."""
+    def turn(self, change: Change) -> tuple[np.ndarray, float]:
+        """The turn in its place that explains most of an object, and the cost per pixel that it takes away by that."""
         k = change.object
         views = [self.first[t].render(hide(self.gaussians, self.labels == k)) for t in change.frames[:_FIT_FRAMES]]
         motions = [self._motion(k, np.array([0, 0, angle, 0])) for angle in np.radians(np.arange(0, 341, 20))]
         gains, pixels = zip(*(_gain(views, self.body(k), motion) for motion in motions))
-        gain = (max(gains) - gains[0]) / max(pixels[0], 1)
-        return None if gain < MIN_TURN_GAIN else (motions[int(np.argmax(gains))], 40 * (gain - MIN_TURN_GAIN))
+        return motions[int(np.argmax(gains))], (max(gains) - gains[0]) / max(pixels[0], 1)
 
     def _fit(self, k: int, place: np.ndarray, size: float) -> "_Fit | None":
         """Turns and shifts an object about a place until it explains most of the photographs there."""
