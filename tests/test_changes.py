@@ -218,3 +218,35 @@ def test_what_too_little_shows_is_unsure_and_not_applied(eyes):
     gone = object_changes(before, labels, frames, eyes, up=UP)[1]
     certain = object_changes(before, labels, frames, eyes, up=UP, min_probability=gone.probability + 0.001)[1]
     assert (gone.kind, certain.kind, certain.suspected) == ("gone", "unsure", "gone")
+
+
+def test_frames_with_depth_that_are_added_give_gaussians_to_what_is_new(eyes):
+    """Once, and the others stay as they are, to the bit; without depth there are no new ones."""
+    before, labels = scene_of(red=PLACES["red"], blue=PLACES["blue"], green=PLACES["green"])
+    after, _ = scene_of(red=PLACES["red"], blue=PLACES["blue"], green=PLACES["green"], orange=PLACES["orange"])
+    field, ledger = field_with_ledger(before, labels, eyes, photographs(before, eyes))
+    old = Scene(field, ColourEmbedder(), ledger=lambda: ledger)
+    poses = [look_at(1.5 * np.array([np.cos(a), np.sin(a), 0.6]), up=UP) for a in (0.4, 0.1)]
+    shown = cameras_of(poses, (80, 80, 48, 36), 96, 72)
+    capture = capture_of(photographs(after, shown), shown, np.zeros(2, bool))
+    depths = np.stack([np.asarray(render_rgb(after, camera, depth=True).depth) for camera in shown])
+    first, second = (
+        dataclasses.replace(
+            capture,
+            frames=capture.frames[t : t + 1],
+            cameras=jax.tree.map(lambda a, t=t: a[t : t + 1], shown),
+            depths=depths[t : t + 1],
+            held_out=np.zeros(1, bool),
+            names=(f"f{t}",),
+        )
+        for t in range(2)
+    )
+    assert old.add(dataclasses.replace(first, depths=None)).field.gaussians.count == field.gaussians.count
+    new = old.add(first)
+    assert new.field.gaussians.count > field.gaussians.count
+    for grown, given in zip(*(jax.tree.leaves(f.gaussians) for f in (new.field, field)), strict=True):
+        np.testing.assert_array_equal(np.asarray(grown)[: field.gaussians.count], given)
+    assert new.field.regions.count == 4
+    np.testing.assert_allclose(new.ask("orange").place.center[:2], PLACES["orange"], atol=0.06)
+    np.testing.assert_allclose(new.ask("red").place.center[:2], PLACES["red"], atol=0.03)
+    assert new.add(second).field.gaussians.count == new.field.gaussians.count

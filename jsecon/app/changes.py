@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import jax
 import numpy as np
 
 from jsecon.app import pictures, report, verbs
-from jsecon.app.comparison import LONG_SIDE, Changes, splat_capture
+from jsecon.app.comparison import LONG_SIDE, Changes, frames_capture, splat_capture
 from jsecon.app.opening import locate_field
 from jsecon.app.records import world_record
 from jsecon.app.scene import Scene, open_scene
@@ -81,10 +80,7 @@ def _placed_capture(
     placed = read_frames(field, ledger, photos, None, refused.append, progress)
     if not placed:
         raise refused.pop()
-    cameras = jax.tree.map(lambda *columns: np.stack(columns), *(frame.camera for frame in placed.values()))
-    frames, nothing = np.stack([frame.pixels for frame in placed.values()]), np.zeros((0, 3), np.float32)
-    none, world = np.zeros(len(frames), bool), np.asarray(field.source_from_scene)
-    return Capture(frames, cameras, nothing, nothing.astype(np.uint8), none, None, world, tuple(placed))
+    return frames_capture(field, placed)
 
 
 def _read_similarity(file: Path | None) -> np.ndarray:

@@ -3,8 +3,8 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import jax
@@ -12,12 +12,13 @@ import numpy as np
 
 from jsecon.app.catalogue import Catalogue
 from jsecon.app.records import rounded, source_points
+from jsecon.change import MIN_PROBABILITY
 from jsecon.change.detect import Change, object_changes
-from jsecon.change.history import add_objects, dates, move_object, remove_object
+from jsecon.change.history import add_objects, add_unseen, dates, move_object, remove_object
 from jsecon.errors import InputError
 from jsecon.field.evidence import ViewEvidence, pack_evidence
 from jsecon.field.ledger import Ledger, LedgerView, camera_row
-from jsecon.fit.resize import resize_camera, resize_frame, shrink_cameras
+from jsecon.fit.resize import resize_camera, resize_frame, resize_mask, shrink_cameras
 from jsecon.fit.start import back_project
 from jsecon.read.captures.frames import evenly_spaced, transform_poses
 from jsecon.read.captures.images import encode_jpeg
@@ -28,6 +29,9 @@ from jsecon.types import Camera, Capture, Gaussians, LanguageField
 from jsecon.views.capture import render_capture
 from jsecon.views.frame import field_up
 from jsecon.vision.protocols import Embedder
+
+if TYPE_CHECKING:
+    from jsecon.pipeline.new_frames import NewFrame
 
 LONG_SIDE = 320
 """Longest side at which photographs are compared, px."""
@@ -141,6 +145,33 @@ def apply_changes(
         problem = f"the photographs show something new, which needs the field's ledger, and {error.problem}"
         raise InputError(error.where, problem, remedy=error.remedy) from error
     return add_objects(field, known, things, views, [description for _, description in new])
+
+
+def frames_capture(field: LanguageField, frames: Mapping[str, "NewFrame"]) -> Capture:
+    """Frames in a field's world as a capture."""
+    cameras = jax.tree.map(lambda *columns: np.stack(columns), *(frame.camera for frame in frames.values()))
+    pixels, nothing = np.stack([frame.pixels for frame in frames.values()]), np.zeros((0, 3), np.float32)
+    depths = [np.zeros(pixels.shape[1:3], np.float32) if f.depth is None else f.depth for f in frames.values()]
+    measured = np.stack(depths) if any(depth.any() for depth in depths) else None
+    world, held_out = np.asarray(field.source_from_scene), np.zeros(len(pixels), bool)
+    return Capture(pixels, cameras, nothing, nothing.astype(np.uint8), held_out, measured, world, tuple(frames))
+
+
+def add_new_things(
+    field: LanguageField, listed: Callable[[], Catalogue], frames: Mapping[str, "NewFrame"]
+) -> tuple[LanguageField, dict[str, "NewFrame"]]:
+    """Gives Gaussians to what frames with depth show and no Gaussian explains, and its masks to these frames."""
+    shown = {name: frame for name, frame in frames.items() if frame.depth is not None and frame.depth.any()}
+    if not shown:
+        return field, dict(frames)
+    changes = find_changes(field, listed(), frames_capture(field, shown), MIN_PROBABILITY)
+    new = [change for change in changes.found if change.kind == "new" and change.frames]
+    masked = {}
+    for t, (name, frame) in enumerate(shown.items()):
+        if masks := [resize_mask(change.after[t], frame.camera) for change in new if t in change.frames]:
+            masked[name] = frame._replace(things=np.stack(masks))
+    things = [_new_gaussians(changes, change) for change in new]
+    return add_unseen(field, things) if things else field, {**frames, **masked}
 
 
 def _new_name(name: str, date: str, known: tuple[str, ...]) -> str:

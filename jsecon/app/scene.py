@@ -20,7 +20,7 @@ from jaxtyping import Bool, UInt8
 
 from jsecon.app import pictures
 from jsecon.app.catalogue import Catalogue, objects
-from jsecon.app.comparison import Changes, apply_changes, find_changes, splat_capture
+from jsecon.app.comparison import Changes, add_new_things, apply_changes, find_changes, splat_capture
 from jsecon.app.object_index import ObjectIndex, choose_shades
 from jsecon.app.opening import locate_field
 from jsecon.app.records import Answer, At, Box, Mask, Query, Question, Region, gaussian_rows, world_record
@@ -249,7 +249,8 @@ class Scene:
     ) -> "Scene":
         """Adds photographs of the same scene: its regions grow by what they show.
 
-        Old poses and Gaussians stay as they are. To the last bit, the votes are those of one run with all frames and
+        Old poses and Gaussians stay as they are. Where frames have depth, what they show and no Gaussian explains gets
+        Gaussians and a region of its own. To the last bit, the votes are those of one run with all frames and
         the same regions, in whatever order they are added. Photographs that the field has by their names are left out.
 
         Args:
@@ -285,10 +286,15 @@ class Scene:
                 frames = read_frames(self.field, ledger, photos, pose_file, refuse, progress)
             with console.progress("views") as progress:
                 views = make_views(self.field, frames, embedder, mask_folder, refuse, progress)
-            if not views:
-                raise errors.pop()
+                if not views:
+                    raise errors.pop()
+                kept = {name: frames[name] for name in views}
+                field, kept = add_new_things(self.field, lambda: self._catalogue, kept)
+                if field is not self.field:
+                    ledger = Ledger(ledger.num_regions, ledger.views)  # whose sum has other rows
+                    views = make_views(field, kept, embedder, mask_folder, refuse, progress)
             with console.progress("votes"):
-                field, grown = add_views(self.field, ledger, views)
+                field, grown = add_views(field, ledger, views)
                 return self._with(field, lambda: grown)
 
     def forget(self, frames: Sequence[int | str]) -> "Scene":

@@ -231,6 +231,7 @@ def label_by_regions(
             classes[members & (classes < count)] = both.argmax()
         elif share @ fresh >= 0.5 * weight or (split and inside.max(initial=0) >= 0.5 * weight):
             classes[members & (classes < count)] = count + new
+            fresh[members] = 0.0  # a mask that overlaps this one opens a region for the rest of it alone
             new += 1
     return classes[view.labels].astype(np.int32), new
 

@@ -91,6 +91,21 @@ def remove_object(
     return _remembered(field, event, new)
 
 
+def add_unseen(field: LanguageField, things: Sequence[Gaussians]) -> LanguageField:
+    """Adds Gaussians that no view has seen behind those of a field; all others stay as they are, to the bit."""
+    gaussians = jax.tree.map(lambda *columns: np.concatenate(columns), field.gaussians, *things)
+    more = gaussians.count - field.gaussians.count
+
+    def longer(column, value=0):
+        return np.concatenate([column, np.full((more, *np.shape(column)[1:]), value, column.dtype)])
+
+    rows = "weights", "labelled", "total", "max_pixel_weight", "views", "weight_where_region_visible"
+    columns = {name: longer(column) for name in rows if (column := getattr(field.votes, name)) is not None}
+    votes = dataclasses.replace(field.votes, regions=longer(field.votes.regions, -1), **columns)
+    leaf = None if field.leaf is None else longer(field.leaf, -1)
+    return dataclasses.replace(field, gaussians=gaussians, votes=votes, leaf=leaf)
+
+
 def add_objects(
     field: LanguageField,
     ledger: Ledger,
@@ -104,11 +119,8 @@ def add_objects(
     """
     region, first = field.regions.count, field.gaussians.count
     owners = np.repeat(np.arange(region, region + len(things)), [thing.count for thing in things]).astype(np.int32)
-    gaussians = jax.tree.map(lambda *columns: np.concatenate(columns), field.gaussians, *things)
-    field = dataclasses.replace(field, gaussians=gaussians)
+    field = add_unseen(field, things)
     field, ledger = add_views(field, Ledger(ledger.num_regions, ledger.views), views)
-    if field.leaf is not None:
-        field = dataclasses.replace(field, leaf=np.append(field.leaf, owners))
     history = field.history
     for number, description in enumerate(descriptions, region):
         rows = first + np.flatnonzero(owners == number)

@@ -156,7 +156,7 @@ def _build_field(
         regions=Regions(embeddings, all_pixels),
         cameras=Camera(cameras[:, :16].reshape(-1, 4, 4), *cameras[:, 16:].T, width=width, height=height),
         names=tuple(ordered),
-        **_grown_tree(field, count),
+        **_grown_tree(field, count, votes.regions[:, 0]),
         codes=None,
     )
     return _with_history(new), ledger
@@ -176,10 +176,11 @@ def _with_history(field: LanguageField) -> LanguageField:
     return dataclasses.replace(field, votes=votes, regions=regions, history=tuple(events))
 
 
-def _grown_tree(field: LanguageField, count: int) -> dict[str, np.ndarray]:
+def _grown_tree(field: LanguageField, count: int, strongest: Int32[np.ndarray, " n"]) -> dict[str, np.ndarray]:
     """Tree and smallest nodes of a field that has `count` regions now: new ones stand alone, before all other nodes."""
     if field.tree is None:
         return {}
     old, tree, leaf = field.regions.count, np.asarray(field.tree), np.asarray(field.leaf)
     tree, leaf = (np.where(nodes >= old, nodes + count - old, nodes).astype(np.int32) for nodes in (tree, leaf))
+    leaf = np.where((leaf < 0) & (strongest >= old), strongest, leaf)
     return {"tree": np.insert(tree, old, np.full(count - old, -1)), "leaf": leaf}

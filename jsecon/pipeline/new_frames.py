@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import cv2
 import jax
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float32, UInt8
 from scipy import sparse
 
 from jsecon.association.scene import FrameSuperpixels, frame_superpixels, label_by_regions
@@ -35,7 +35,7 @@ MIN_CORRELATION = 0.75
 0.95 and more from their own poses, and up to 0.72 from those of their neighbours."""
 
 
-class _NewFrame(NamedTuple):
+class NewFrame(NamedTuple):
     """A photograph at the size of a field's frames."""
 
     pixels: UInt8[np.ndarray, "h w 3"]
@@ -43,6 +43,10 @@ class _NewFrame(NamedTuple):
     """In the field's world."""
     ignored: Bool[np.ndarray, "h w"] | None = None
     """Pixels that count nowhere."""
+    depth: Float32[np.ndarray, "h w"] | None = None
+    """z-depth in units of the field's world, 0 = unknown."""
+    things: Bool[np.ndarray, "m h w"] | None = None
+    """Masks of things whose Gaussians no view of the field saw."""
 
 
 def read_frames(
@@ -52,7 +56,7 @@ def read_frames(
     poses: Path | None,
     refuse: Callable[[InputError], None],
     progress: Progress,
-) -> dict[str, _NewFrame]:
+) -> dict[str, NewFrame]:
     """Reads photographs, finds poses that they lack, and leaves out those that the field has.
 
     `refuse` gets the error of each photograph that cannot be read or placed.
@@ -73,6 +77,10 @@ def read_frames(
         frame = _sized(field, np.asarray(capture.frames[t]), cameras[t])
         if capture.ignored is not None:
             frame = frame._replace(ignored=resize_mask(np.asarray(capture.ignored[t]), frame.camera))
+        if capture.depths is not None:
+            size, unit = frame.pixels.shape[1::-1], np.cbrt(np.linalg.det(scene_from_capture[:3, :3]))
+            depth = cv2.resize(np.asarray(capture.depths[t], np.float32), size, interpolation=cv2.INTER_NEAREST)
+            frame = frame._replace(depth=depth * np.float32(unit))
         frames[name] = frame
         progress(done + 1, len(rows))
     return frames
@@ -103,10 +111,10 @@ def _read_capture(field: LanguageField, photos: Path, poses: Path | None) -> Cap
     return build_capture(replace(posed, images=list(new.values())), size)
 
 
-def _sized(field: LanguageField, pixels: UInt8[np.ndarray, "h w 3"], camera: Camera) -> _NewFrame:
+def _sized(field: LanguageField, pixels: UInt8[np.ndarray, "h w 3"], camera: Camera) -> NewFrame:
     """Brings a photograph to the size of the field's frames, each axis by its own factor."""
     camera = resize_camera(camera, field.cameras.width, field.cameras.height)
-    return _NewFrame(resize_frame(pixels, camera), camera)
+    return NewFrame(resize_frame(pixels, camera), camera)
 
 
 def _place(
@@ -115,7 +123,7 @@ def _place(
     files: Mapping[str, Path],
     refuse: Callable[[InputError], None],
     progress: Progress,
-) -> dict[str, _NewFrame]:
+) -> dict[str, NewFrame]:
     """Finds the poses of photographs by the pictures of the ledger."""
     rows = [t for t, name in enumerate(field.names) if name in ledger.views]
     cameras = jax.tree.map(lambda a: np.asarray(a)[rows], field.cameras)
@@ -143,7 +151,7 @@ def _place(
 
 def make_views(
     field: LanguageField,
-    frames: Mapping[str, _NewFrame],
+    frames: Mapping[str, NewFrame],
     embedder: Embedder,
     masks: Path | None,
     refuse: Callable[[InputError], None],
@@ -168,9 +176,12 @@ def make_views(
     owner = np.where(held & ~uncovered, strongest, -1)
     # Without masks from outside, leftovers that many views left without a region stay so.
     unknown = (owner < 0) if masks is not None else votes.views == 0
-    for done, (name, (pixels, camera, ignored)) in enumerate(frames.items()):
+    for done, (name, (pixels, camera, ignored, _, things)) in enumerate(frames.items()):
         list_labels = plan_evidence(gaussians, camera, centre_pixel_weight=options.get("centre_pixel_weight", 0.0))
-        view = frame_superpixels(pixels, propose(pixels, done), list_labels)
+        proposals = propose(pixels, done)
+        if things is not None:
+            proposals = np.concatenate([things, proposals])  # first: what covers them too opens no other region
+        view = frame_superpixels(pixels, proposals, list_labels)
         progress(done + 1, len(frames))
         if (like := _likeness(view, field, pixels)) < MIN_CORRELATION:
             problem = (
