@@ -156,7 +156,7 @@ def _build_field(
         regions=Regions(embeddings, all_pixels),
         cameras=Camera(cameras[:, :16].reshape(-1, 4, 4), *cameras[:, 16:].T, width=width, height=height),
         names=tuple(ordered),
-        **_grown_tree(field, count, votes.regions[:, 0]),
+        **_grown_tree(field, count, np.asarray(votes.regions)[:, 0]),
         codes=None,
     )
     return _with_history(new), ledger
