@@ -13,6 +13,7 @@ now (new, moved). A turned thing counts as moved. The other columns count what i
 gone are asked for by their colours in the updated field. The seeds 0 to 5 chose the constants and the cues.
 """
 
+import contextlib
 import dataclasses
 import itertools
 import time
@@ -32,6 +33,7 @@ from experiments.rooms.room import Room, build_room, footprint_radius, place_obj
 from experiments.rooms.shapes import SHAPES
 from jsecon import Scene, open_scene
 from jsecon.app.comparison import Changes
+from jsecon.errors import InputError
 from jsecon.field.evidence import list_evidence, pack_evidence
 from jsecon.field.ledger import Ledger, LedgerView, camera_row
 from jsecon.field.ledger_file import save_with_ledger
@@ -288,7 +290,10 @@ def later_scenes(
     """The scene after a change by each of METHODS."""
     known = tuple(change for change in changes.found if change.object >= 0)
     yield METHODS[0], scene.update(dataclasses.replace(changes, found=known), date="2026-11-28")
-    yield METHODS[1], scene.add(capture)
+    added = scene
+    with contextlib.suppress(InputError):  # all are refused as unlike the scene
+        added = scene.add(capture, refused=[])
+    yield METHODS[1], added
     views = shots["frames"][chosen], shots["after"][chosen], shots["depths"][chosen]
     yield METHODS[2], Scene(field_of_views(capture.cameras, *views, int(shots["after"].max()) + 1)[0], scene.embedder)
 

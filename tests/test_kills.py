@@ -1,5 +1,7 @@
 """Runs that are stopped by SIGKILL or by a full disk end in the same field when the same command is started again.
 
+`jsecon add` and `jsecon update` that are stopped so leave the old field or have written the new one, whole.
+
 KILLS=30 DISKS=10 pytest -m long tests/test_kills.py
 """
 
@@ -14,6 +16,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from jsecon import open_scene
 
 pytestmark = pytest.mark.long
 HOME = Path(__file__).resolve().parent.parent
@@ -33,7 +37,14 @@ LARGE_DISK = 64 << 20
 
 def start(room, out, programs, kill_at=None):
     """(exit code or None if killed, stderr without progress) of `jsecon run`, killed `kill_at` seconds after start."""
-    command = [sys.executable, "-c", FREQUENT, "run", str(room), "--out", str(out), "--steps", "50"]
+    return execute(["run", room, "--out", out, "--steps", "50"], programs, kill_at)
+
+
+def execute(arguments, programs, kill_at=None, file_size=None):
+    """The same of any command; `file_size` is the size in bytes beyond which no file grows, as on a full disk."""
+    command = [sys.executable, "-c", FREQUENT, *map(str, arguments)]
+    if file_size is not None:
+        command = ["prlimit", f"--fsize={file_size}", *command]
     environ = {**os.environ, "PYTHONPATH": str(HOME), "XDG_CACHE_HOME": str(programs)}
     environ.pop("JAX_COMPILATION_CACHE_DIR", None)
     pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
@@ -98,3 +109,56 @@ def test_a_run_on_a_full_disk_resumes_once_there_is_room(room, straight, tmp_pat
         check_resumed(room, tmp_path / "out", programs, expected)
     finally:
         subprocess.run(["umount", "-l", str(tmp_path)], check=True)
+
+
+@pytest.fixture(scope="module")
+def changing(room_run, room, tmp_path_factory):
+    """(folder of a field that lacks a frame, programs, {command: (arguments behind the field, seconds, files)})."""
+    base = tmp_path_factory.mktemp("changing")
+    shutil.copytree(room_run[1], base / "old")
+    scene, commands = open_scene(base / "old"), {}
+    scene.forget([scene.field.names[1]]).save(base / "old" / "field.safetensors")
+    for name, options in (("add", ()), ("update", ("--date", "2026-11-28"))):
+        for folder in ("warm", name):
+            shutil.copytree(base / "old", base / folder)
+            began = time.monotonic()
+            assert execute((name, base / folder, room, *options), base / "programs") == (0, "")
+        commands[name] = (room, *options), time.monotonic() - began, fields_of(base / name)
+        shutil.rmtree(base / "warm")
+    return base / "old", base / "programs", commands
+
+
+def fields_of(folder):
+    """The bytes of a field and of its ledger."""
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*.safetensors")}
+
+
+@pytest.mark.parametrize("verb", ["add", "update"])
+@pytest.mark.parametrize("number", range(KILLS))
+def test_a_killed_change_leaves_the_old_field(changing, tmp_path, verb, number):
+    old, programs, commands = changing
+    rest, seconds, expected = commands[verb]
+    folder, moments = shutil.copytree(old, tmp_path / "field"), np.random.default_rng(number)
+    code, _ = execute((verb, folder, *rest), programs, kill_at=moments.uniform(0.3, 1) * seconds)
+    if code is None:
+        field = folder / "field.safetensors"
+        assert field.read_bytes() in (fields_of(old)[Path(field.name)], expected[Path(field.name)])
+        assert open_scene(folder).ledger.views
+        if field.read_bytes() != expected[Path(field.name)]:
+            assert execute((verb, folder, *rest), programs) == (0, "")
+    assert fields_of(folder) == expected
+
+
+@pytest.mark.skipif(shutil.which("prlimit") is None, reason="no prlimit here")
+@pytest.mark.parametrize("verb", ["add", "update"])
+@pytest.mark.parametrize("number", range(DISKS))
+def test_a_change_on_a_full_disk_leaves_the_old_field(changing, tmp_path, verb, number):
+    old, programs, commands = changing
+    rest, _, _ = commands[verb]
+    folder = shutil.copytree(old, tmp_path / "field")
+    largest = max(len(content) for content in fields_of(old).values())
+    size = int(np.random.default_rng(number).uniform(0.1, 0.9) * largest)
+    code, error = execute((verb, folder, *rest), programs, file_size=size)
+    assert code == 2
+    assert re.fullmatch("jsecon: .*File too large.*", error)
+    assert fields_of(folder) == fields_of(old)

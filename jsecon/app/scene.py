@@ -11,6 +11,7 @@ import functools
 import re
 import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from jsecon.change.history import change_question, events, field_as_of
 from jsecon.errors import InputError
 from jsecon.field.columns import is_mapped
 from jsecon.field.field import check_field, load_field
-from jsecon.field.ledger import Ledger, add_views, forget_views
+from jsecon.field.ledger import Ledger, add_views, forget_views, sum_ledger
 from jsecon.field.ledger_file import load_ledger, save_with_ledger
 from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.field.regions import ALIKE_THRESHOLD
@@ -278,8 +279,9 @@ class Scene:
                 raise error
             refused.append(error)
 
-        with self._lock:
+        with self._lock, ThreadPoolExecutor(1) as pool:
             ledger, embedder = self.ledger, self.embedder
+            summed = pool.submit(sum_ledger, self.field, ledger)  # meanwhile frames are read and labelled
             pose_file, mask_folder = (None if path is None else Path(path) for path in (poses, masks))
             photos = photos if isinstance(photos, Capture) else Path(photos)
             with console.progress("frames") as progress:
@@ -290,10 +292,11 @@ class Scene:
                     raise errors.pop()
                 kept = {name: frames[name] for name in views}
                 field, kept = add_new_things(self.field, lambda: self._catalogue, kept)
-                if field is not self.field:
-                    ledger = Ledger(ledger.num_regions, ledger.views)  # whose sum has other rows
+                has_more_rows = field is not self.field
+                if has_more_rows:
                     views = make_views(field, kept, embedder, mask_folder, refuse, progress)
             with console.progress("votes"):
+                ledger = Ledger(ledger.num_regions, ledger.views) if has_more_rows else summed.result()
                 field, grown = add_views(field, ledger, views)
                 return self._with(field, lambda: grown)
 

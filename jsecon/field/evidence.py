@@ -91,7 +91,8 @@ class ViewEvidence(NamedTuple):
 
     def totals(self) -> Float[np.ndarray, " m"]:
         """Sums the weight of each Gaussian, float64."""
-        return np.add.reduceat(self.weights.astype(np.float64), self.starts[:-1])
+        shape = len(self.gaussians), max(self.regions.max(initial=0) + 1, 1)
+        return sparse.csr_matrix((self.weights, self.regions, self.starts), shape=shape) @ np.ones(shape[1])
 
     def matrix(self, count: int, num_regions: int) -> Any:
         """Lays the list out as a scipy.sparse.csr_matrix (N, R + 1)."""

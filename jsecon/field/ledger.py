@@ -84,11 +84,12 @@ def add_views(field: LanguageField, ledger: Ledger, views: Mapping[str, LedgerVi
     require(not twice, "add_views", f"views that are there already: {twice[:3]}", "new names", "Forget them first.")
     counts = [ledger.num_regions, *(int(view.pixel_counts[0].max(initial=-1)) + 1 for view in views.values())]
     count, ordered = max(counts), sorted({**ledger.views, **views}, key=view_order)
-    before = _sum_all(field, ledger) if ledger.sum is None else ledger.sum
+    is_cut = ledger.sum is not None  # the field's votes are then those of the sum
+    before = sum_ledger(field, ledger).sum
+    assert before is not None
     new = [name for name in ordered if name in views]
     lists = unpack_views([views[name].evidence for name in new], field.gaussians.count, count)
     total = add_evidence(before, lists, [ordered.index(name) for name in new], count)
-    is_cut = ledger.sum is not None  # the field's votes are then those of `before`
     return _build_field(field, Ledger(count, {**ledger.views, **views}, total), {*field.names, *views}, grows=is_cut)
 
 
@@ -113,15 +114,16 @@ def forget_views(field: LanguageField, ledger: Ledger, names: Collection[str]) -
     require(names <= known, "forget_views", sorted(names - known)[:3], "names of the field's frames", "Check them.")
     views = {name: view for name, view in ledger.views.items() if name not in names}
     require(len(views) > 0, "forget_views", "all views", "at least one view that stays", "Delete the field instead.")
-    ledger = Ledger(ledger.num_regions, views)
-    return _build_field(field, dataclasses.replace(ledger, sum=_sum_all(field, ledger)), known - names)
+    return _build_field(field, sum_ledger(field, Ledger(ledger.num_regions, views)), known - names)
 
 
-def _sum_all(field: LanguageField, ledger: Ledger) -> EvidenceSum:
-    """Sums the views of a ledger in the order of their names."""
+def sum_ledger(field: LanguageField, ledger: Ledger) -> Ledger:
+    """Returns a ledger that knows the sum of its views, in the order of their names."""
+    if ledger.sum is not None:
+        return ledger
     packed = [ledger.views[name].evidence for name in sorted(ledger.views, key=view_order)]
     lists = unpack_views(packed, field.gaussians.count, ledger.num_regions)
-    return sum_views(lists, field.gaussians.count, ledger.num_regions)
+    return dataclasses.replace(ledger, sum=sum_views(lists, field.gaussians.count, ledger.num_regions))
 
 
 def _build_field(

@@ -47,10 +47,16 @@ def save_with_ledger(path: Path, field: LanguageField, ledger: Ledger | None) ->
             digest.update(np.ascontiguousarray(array).data)
         origin["ledger"] = digest.hexdigest()
     field = dataclasses.replace(field, provenance=json.dumps(origin, sort_keys=True))
-    if ledger is not None and not ledger_file(path, field).is_file():
+    is_new = ledger is not None and not ledger_file(path, field).is_file()
+    if is_new:
         with atomic_write(ledger_file(path, field)) as temporary:
             write_arrays(temporary, arrays, {"format": "jsecon-ledger", "version": 2, "ledger": tree})
-    save_field(path, field)
+    try:
+        save_field(path, field)
+    except InputError:
+        if is_new:  # a full disk needs its room
+            remove_files(ledger_file(path, field).parent, [ledger_file(path, field).name])
+        raise
     remove_stale(path, field)
     return field
 
