@@ -153,6 +153,8 @@ DAMAGE = {
         (header("vertex 0\nproperty float x\nproperty float x"), "more than once"),
     ],
     "clouds/ascii-None.ply": [(columns(z=None), "no z")],
+    "clouds/old.las": [(numbers("", 100, "<I", 2**31), "claims 2147483648 records")],
+    "clouds/a.laz": [(edit("", lambda data: data[:-9] + b"\xff" * 4 + data[-5:]), "claims 4294967295 records")],
     "splats/c.ply": [
         (swap("", b"element chunk 2", b"element chunk 1"), "damaged"),
         (swap("", b"float min_scale_x", b"float odd_scale_x"), "SuperSplat 2", "splat-transform"),

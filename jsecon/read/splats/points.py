@@ -10,6 +10,7 @@ import dataclasses
 import itertools
 import math
 import re
+import struct
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -72,8 +73,28 @@ def _colours(columns: Mapping[str, np.ndarray], count: int) -> UInt8[np.ndarray,
     return np.full((count, 3), 128, np.uint8)
 
 
+def _require_counts(path: Path) -> None:
+    """Checks that a .las or .laz can hold what it claims: decoders take memory for all of it, or end the process."""
+    with path.open("rb") as file:
+        head = file.read(375)
+        minor, points_at, records = struct.unpack_from("<25xB70xII", head)
+        counts = [records, struct.unpack_from("<I", head, 243)[0] if minor >= 4 else 0]
+        head += file.read(max(points_at + 8 - len(head), 0))
+        if (laszip := head.find(b"laszip encoded")) >= 0:
+            (place,) = struct.unpack_from("<q", head, points_at)
+            if place == -1:  # it was not known before the end
+                file.seek(-8, 2)
+                (place,) = struct.unpack("<q", file.read(8))
+            file.seek(place)
+            chunk = struct.unpack_from("<I", head, laszip + 64)[0]
+            counts += [struct.unpack("<4xI", file.read(8))[0], chunk if 1 << 22 < chunk < 2**32 - 1 else 0]
+    if max(counts) > path.stat().st_size:
+        raise ValueError(f"it claims {max(counts)} records")
+
+
 def _read_las(path: Path) -> _PointCloud:
     with decoding(path, "laspy") as laspy:
+        _require_counts(path)
         las = laspy.read(path)
         if len(las.points) < las.header.point_count:
             raise EOFError
