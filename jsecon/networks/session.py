@@ -10,7 +10,7 @@ import hashlib
 import math
 import mmap
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -135,7 +135,7 @@ class Graph:
         """
         tensors = self.inputs if side == "input" else self.outputs
         if name not in tensors or not tensors[name]._fits(shape):
-            missing = f"no such {side}; the graph has {_describe(tensors.values())}"
+            missing = f"no such {side}; the graph has {', '.join(map(str, tensors.values())) or 'no tensor'}"
             problem = str(tensors[name]) if name in tensors else missing
             expected = f"{Tensor(name, '', None if shape is None else tuple(shape))}, as {what} has".replace(" [", "[")
             remedy = "Give the right file."
@@ -164,11 +164,6 @@ class Graph:
         is_same_kind = dtype.kind.replace("u", "i") == array.dtype.kind.replace("u", "i")
         # np.ascontiguousarray makes a row of a scalar
         return np.asarray(array, dtype if is_same_kind else None, order="C")
-
-
-def _describe(tensors: Iterable[Tensor]) -> str:
-    """Lists name, type and shape of tensors on one line."""
-    return ", ".join(map(str, tensors)) or "no tensor"
 
 
 def _graph_files(path: Path) -> tuple[Path, ...]:

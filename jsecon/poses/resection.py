@@ -124,16 +124,13 @@ def _placed(lens: Camera, pose: Float[np.ndarray, "4 4"], zoom: float) -> Camera
     return dataclasses.replace(lens, world_to_camera=pose.astype(np.float32), fx=fx, fy=fy)
 
 
-def _pixels(camera: Camera, rays: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 2"]:
-    return rays * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-
-
 def _places(
     gaussians: Gaussians, camera: Camera, rays: Float[np.ndarray, "m 2"]
 ) -> tuple[Float[np.ndarray, "m 3"], Bool[np.ndarray, " m"]]:
     """Returns the places in the world along rays by rendered depth, and which of them lie on a surface."""
     depth, alpha = (np.asarray(image) for image in render_depth(gaussians, camera))
-    x, y = np.clip(_pixels(camera, rays).T.astype(int), 0, [[camera.width - 1], [camera.height - 1]])
+    pixels = rays * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    x, y = np.clip(pixels.T.astype(int), 0, [[camera.width - 1], [camera.height - 1]])
     around = np.ones((3, 3), np.uint8)
     z, step = depth[y, x].astype(np.float64), (cv2.dilate(depth, around) - cv2.erode(depth, around))[y, x]
     pose = np.asarray(camera.world_to_camera, np.float64)

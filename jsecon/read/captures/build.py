@@ -317,11 +317,6 @@ def build_capture(posed: PosedImages, options: FrameOptions, *, progress: Progre
     )
 
 
-def _centres(poses: np.ndarray) -> np.ndarray:
-    """(T, 3) camera centres of world-to-camera poses."""
-    return -np.einsum("tji,tj->ti", poses[:, :3, :3], poses[:, :3, 3])
-
-
 def _normalizing_transform(
     poses: Float[np.ndarray, "t 4 4"], points: Float[np.ndarray, "p 3"], depths: Sequence[np.ndarray] = ()
 ) -> tuple[Float[np.ndarray, "4 4"], tuple[str, ...]]:
@@ -331,7 +326,7 @@ def _normalizing_transform(
     scaled by a power of 1000, comes out in the same world up to a shift of its own size. Depth maps of a few views, in
     world units with 0 where unknown, stand in for missing points; without either, the spread of the cameras counts.
     """
-    centres = _centres(poses)
+    centres = -np.einsum("tji,tj->ti", poses[:, :3, :3], poses[:, :3, 3])
     middle = np.median(centres, axis=0)
     spread = float(np.median(np.linalg.norm(centres - middle, axis=1)))
     near = _near_depth(poses, np.asarray(points, np.float64), depths) or spread
