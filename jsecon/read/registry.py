@@ -60,11 +60,6 @@ def _added_readers(group: str, path: tuple[str, ...]) -> tuple[Reader, ...]:
     return tuple(added)
 
 
-def find_reader(group: str, own: Sequence[Reader], path: Path) -> Reader | None:
-    """Finds the first reader of `readers` whose marks a file or folder has."""
-    return next((reader for reader in readers(group, own) if reader.fits(path)), None)
-
-
 @contextlib.contextmanager
 def decoding(path: Path, name: str) -> Iterator[Any]:
     """Yields a package of the extra formats; whatever it raises on damaged bytes becomes an InputError."""

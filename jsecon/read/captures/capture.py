@@ -20,7 +20,7 @@ from jsecon.read.captures.frames import FrameOptions, PosedImages
 from jsecon.read.captures.images import IMAGE_SUFFIXES, image_header, unread_remedy
 from jsecon.read.captures.panoramas import cut_panoramas
 from jsecon.read.captures.video import is_video
-from jsecon.read.registry import SCENES, Reader, find_reader
+from jsecon.read.registry import SCENES, Reader, readers
 from jsecon.types import Capture, Progress
 
 READERS = (*colmap.READERS, *nerfstudio.READERS, *colmap.NESTED_READERS, *opensfm.READERS, *rgbd.READERS)
@@ -86,7 +86,7 @@ def read_posed_images(path: Path) -> PosedImages:
 
 def _find_reader(path: Path) -> Reader | None:
     """The reader of a capture's format, or None."""
-    return find_reader("jsecon.captures", READERS, path)
+    return next((reader for reader in readers("jsecon.captures", READERS) if reader.fits(path)), None)
 
 
 def has_depth(path: Path) -> bool:

@@ -26,7 +26,7 @@ from jaxtyping import Float, Int
 
 from jsecon.errors import InputError, require_shape
 from jsecon.files import parse_json, reading
-from jsecon.read.registry import SCENES, Reader, decoding, find_reader
+from jsecon.read.registry import SCENES, Reader, decoding, readers
 from jsecon.read.splats.ply import drawable_gaussians, read_ply, read_ply_file, save_ply
 from jsecon.read.splats.points import READERS as POINTS, gaussians_of_cloud
 from jsecon.read.splats.usd import save_usda
@@ -238,7 +238,7 @@ def read_gaussians(path: str | Path) -> tuple[Gaussians, tuple[str, ...]]:
     if path.is_dir() or not path.exists():
         problem = "it is a folder" if path.is_dir() else "there is no such file"
         raise InputError(path, problem, _FORMATS, "Check the path.")
-    reader = find_reader("jsecon.splats", READERS, path)
+    reader = next((reader for reader in readers("jsecon.splats", READERS) if reader.fits(path)), None)
     if reader is None:
         remedy = "Export the scene as a .ply."
         if path.suffix.lower() in (".ksplat", ".lcc", ".mjs") or path.name == "meta.json":  # of an unpacked .sog
