@@ -44,6 +44,7 @@ class _PointCloud(NamedTuple):
     """(P, 3) uint8."""
 
 
+@np.errstate(invalid="ignore")  # of numbers that are none
 def _cloud(columns: Mapping[str, np.ndarray]) -> _PointCloud:
     """Makes a cloud of the columns of a file."""
     columns = {re.sub("^cartesian|^color", "", name.lower()): column for name, column in columns.items()}
@@ -53,7 +54,6 @@ def _cloud(columns: Mapping[str, np.ndarray]) -> _PointCloud:
     return _PointCloud(points, _colours(columns, len(points)))
 
 
-@np.errstate(invalid="ignore")
 def _colours(columns: Mapping[str, np.ndarray], count: int) -> UInt8[np.ndarray, "p 3"]:
     """The colours of points: as they are, or packed into one number (PCL), of 8 or 16 bits or shares; or greys."""
     if "rgb" in columns and columns["rgb"].dtype.itemsize == 4:
