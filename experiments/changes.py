@@ -209,6 +209,8 @@ class Options:
     """Numbers of photographs."""
     rooms: str = "experiments/data/changes"
     """Folder that keeps fields and photographs."""
+    beside: int = 10
+    """Rooms, the first ones, whose fields that only add, or see only the new photographs, are asked too."""
     out: str = ""
 
 
@@ -284,12 +286,16 @@ def judge(changes: Changes, case: Case, shots: dict[str, np.ndarray], chosen: np
     return {"found": found, "truth": len(truth), "moved": moved}
 
 
-def later_scenes(
-    scene: Scene, changes: Changes, capture: Capture, shots: dict[str, np.ndarray], chosen: np.ndarray
-) -> Iterator[tuple[str, Scene]]:
-    """The scene after a change by each of METHODS."""
+def updated_scene(scene: Scene, changes: Changes) -> tuple[str, Scene]:
+    """The first of METHODS, and the scene after what moved or is gone."""
     known = tuple(change for change in changes.found if change.object >= 0)
-    yield METHODS[0], scene.update(dataclasses.replace(changes, found=known), date="2026-11-28")
+    return METHODS[0], scene.update(dataclasses.replace(changes, found=known), date="2026-11-28")
+
+
+def later_scenes(
+    scene: Scene, capture: Capture, shots: dict[str, np.ndarray], chosen: np.ndarray
+) -> Iterator[tuple[str, Scene]]:
+    """The other METHODS, and the scene after a change by each."""
     added = scene
     with contextlib.suppress(InputError):  # all are refused as unlike the scene
         added = scene.add(capture, refused=[])
@@ -338,8 +344,11 @@ def measure_room(seed: int, options: Options) -> dict:
             began = time.perf_counter()
             changes = loaded.changes(capture)
             seconds = time.perf_counter() - began
-            is_asked = kind in ("remove", "move") and count == max(options.counts)
-            later = later_scenes(loaded, changes, capture, shots, chosen) if is_asked else ()
+            later = []
+            if kind in ("remove", "move"):
+                later.append(updated_scene(loaded, changes))
+                if count == max(options.counts) and seed < options.seeds[0] + options.beside:
+                    later += later_scenes(loaded, capture, shots, chosen)
             asked = [(method, *row) for method, scene in later for row in ask_things(scene, case)]
             row = judge(changes, case, shots, chosen) | {"seconds": seconds, "asked": asked}
             rows[f"{kind}, {count}, {SENSORS[depth]}"] = row
