@@ -10,7 +10,8 @@ AP is that of SceneDiff with the kind of change: changes of all rooms, the most 
 be reported, are right if their masks in the new photographs have an IoU of at least 0.5 with those of a true change of
 the same kind. Masks are the pixels where the thing would be seen had nothing changed (gone, moved) and where it is seen
 now (new, moved). A turned thing counts as moved. The other columns count what is reported. Things that moved or are
-gone are asked for by their colours in the updated field. The seeds 0 to 5 chose the constants and the cues.
+gone are asked for by their colours in the updated field, and in the first rooms in fields by the other METHODS. The
+seeds 0 to 5 and 200 to 213 chose the constants and the cues.
 """
 
 import contextlib
