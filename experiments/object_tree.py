@@ -16,7 +16,7 @@ import tyro
 
 from experiments import results
 from experiments.words.scenes import DEFAULT, SCENES, load_scene
-from jsecon.field.regions import node_members
+from jsecon.field.tree import node_members
 
 LEAST_POINTS = {"replica_apartment_0": 100}
 

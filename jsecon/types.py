@@ -357,6 +357,10 @@ class LanguageField(_Shown):
     tracker."""
     leaf: Array | None = None
     """(N,) int32 smallest node of each Gaussian, -1 for none: a part of a region, or a region without parts."""
+    parts: Regions | None = None
+    """P disjoint parts of regions that masks show alone, with their embeddings; None where they are not known."""
+    part_nodes: Array | None = None
+    """(P,) int32 node of each of these parts."""
     history: tuple[Event, ...] = ()
     """changes of the field since it was made, in order of time (NumPy)."""
 

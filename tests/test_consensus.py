@@ -16,7 +16,7 @@ from jsecon.association.consensus import (
     track_masks,
 )
 from jsecon.association.scene import SceneSuperpixels
-from jsecon.field.regions import node_members
+from jsecon.field.tree import node_members
 
 
 @pytest.fixture(scope="module")

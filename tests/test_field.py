@@ -11,14 +11,14 @@ from small_field import REGIONS, make_field, unit_rows
 
 from jsecon import InputError, check_field, load_field, save_field, train_autoencoder
 from jsecon.field import field as module
-from jsecon.field.membership import _with_overlap
+from jsecon.field.membership import with_overlap
 from jsecon.files import read_arrays, write_arrays
 
 
 @pytest.fixture(scope="module")
 def field(scene, cameras):
     field = make_field(scene, cameras)[0]
-    return dataclasses.replace(field, votes=_with_overlap(field.votes))
+    return dataclasses.replace(field, votes=with_overlap(field.votes))
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ an answer is 0, 1 or several objects, with what came nearest or what would settl
 
 import dataclasses
 import functools
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,10 +21,13 @@ from jsecon.app.records import Answer, Object, Query, rounded, source_points, so
 from jsecon.errors import InputError
 from jsecon.field.columns import votes_of_rows
 from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction_of_regions
+from jsecon.field.tree import part_objects
 from jsecon.query.answer import RegionMatch, match_regions
-from jsecon.query.expressions import ANY_OBJECT, parse_expression
+from jsecon.query.expressions import ANY_OBJECT, parse_expression, split_part
+from jsecon.query.match import select_node
 from jsecon.query.object_shapes import ObjectShapes
 from jsecon.query.outliers import remove_outliers
+from jsecon.query.parts import match_parts
 from jsecon.query.referring import evaluate
 from jsecon.query.relations import Viewpoint, order_values, viewpoint
 from jsecon.query.rules import ABSENT, FOUND, MIN_RANK, QueryRules
@@ -93,9 +97,12 @@ class ObjectIndex:
         """Finds the objects that a phrase names: those with a region that matches it.
 
         Where a text is the best name of some of the objects, the others do not count. The second value is the share of
-        unrelated words that are less similar to the scene than the phrase.
+        unrelated words that are less similar to the scene than the phrase. A phrase such as "handle of the mug" names
+        the parts of a thing, if the thing has such parts.
         """
         listed = self._catalogue
+        if (named := split_part(phrase)) and (found := self.find_parts(*named)):
+            return found, np.nan
         if phrase == ANY_OBJECT:
             things = np.flatnonzero(~listed.surroundings).tolist()
             named = [self._object(str(listed.names[n, 0]) or f"object {n}", n) for n in things]
@@ -109,6 +116,26 @@ class ObjectIndex:
         things = sorted(named or set(owners.tolist()) - {-1})
         found = [self._object(phrase, n, int(match.state)) for n in things]
         return [one for one in found if len(one.rows)], float(match.rank)
+
+    def find_parts(self, part: str, whole: str) -> list[Object]:
+        """Finds the parts that a text names of each thing that another one names; "part" names all of them."""
+        field, found = self._field, []
+        if field.parts is None:
+            return []
+        name = re.sub(r"(^| )(parts?|pieces?)$", "", part)
+        for one in self._objects_of(whole)[0]:
+            nodes, state = np.asarray(field.part_nodes)[np.isin(part_objects(field), one.regions)], one.state
+            if name:
+                texts = jax.device_put(self._embedder.embed_text([name]))
+                nodes, state = match_parts(field, texts, one.regions, self._rules)
+            found += [self._part(f"{part} of {one.phrase}", int(node), state) for node in nodes]
+        return [one for one in found if len(one.rows)]
+
+    def _part(self, phrase: str, node: int, state: int) -> Object:
+        """A part of an object as an object of its own."""
+        rows = np.flatnonzero(select_node(self._field, node).mask)
+        shape = source_shapes(self._field, rows, np.zeros(len(rows), int), self._catalogue.up)
+        return Object(phrase, (node,), rows, shape, state=state)
 
     def _object(self, phrase: str, index: int, state: int = FOUND) -> Object:
         """An object of the catalogue by its id."""

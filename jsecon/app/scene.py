@@ -42,7 +42,7 @@ from jsecon.pipeline.progress import Console
 from jsecon.pipeline.sources import forget_warnings, locate_sources, move_hints, run_warnings
 from jsecon.process import MEMORY, memory_budget
 from jsecon.query.answer import answer_question, trim
-from jsecon.query.expressions import is_expression, parse_query
+from jsecon.query.expressions import is_expression, parse_query, split_part
 from jsecon.query.object_shapes import ObjectShapes
 from jsecon.query.outliers import OutlierResult
 from jsecon.query.pointing import box_mask, lift, region_at
@@ -400,7 +400,9 @@ class Scene:
         if isinstance(question, str):
             if (kind := change_question(question)) is not None:
                 return self._answer_history(query, kind)
-            return self.relate(question, frame=query.frame) if is_expression(question) else self._answer_text(query)
+            names_part = split_part(question) and self._index.find_parts(*split_part(question))
+            is_related = is_expression(question) or names_part
+            return self.relate(question, frame=query.frame) if is_related else self._answer_text(query)
         if isinstance(question, Box | Mask):
             return self._answer_outline(query, question)
         if isinstance(question, Region):

@@ -36,6 +36,8 @@ PART_AGREEMENT = 0.9
 """Probability of a common mask from which pieces are one part of an object."""
 NEW_NODE = 0.1
 """Share of its weight that a join must add to make a node of its own."""
+LEAST_PART, MOST_PART = 0.03, 0.85
+"""Shares of an object's weight between which a part is one that a text may name."""
 
 
 class Objects(NamedTuple):
@@ -47,6 +49,10 @@ class Objects(NamedTuple):
     """(M,) parent of each node, as `LanguageField.tree` has it. None if it is not known what belongs together."""
     leaf: Int32[np.ndarray, " n"] | None = None
     """(N,) smallest node of each Gaussian, as `LanguageField.leaf` has it."""
+    parts: Int16[np.ndarray, "l t h w"] | None = None
+    """(L, T, H, W) part 0 .. P-1 of an object at each pixel, -1 for none; parts in each other are on other layers."""
+    part_nodes: Int32[np.ndarray, " p"] | None = None
+    """(P,) node of each of these parts."""
 
 
 class _Groups(NamedTuple):
@@ -77,9 +83,9 @@ def _group_by_consensus(
 
     The Gaussians are first gathered into small pieces (`_scene_pieces`). Then `_average_linkage` joins pieces while the
     views that see two groups put both into one mask with a probability of at least `agreement`, or of 1 if they lie off
-    each other's plane (`_coplanarity`). What joins at PART_AGREEMENT is a part, and
-    what joins down to 0.05 a union. Groups that have less than 0.02 of
-    their visibility in common stay separate.
+    each other's plane (`_coplanarity`). What joins at
+    PART_AGREEMENT is a part, and what joins down to 0.05 a union. Groups that have less than 0.02 of their visibility
+    in common stay separate.
 
     Args:
       membership: (N, M) share of each Gaussian in each of the M masks of all frames, times its visibility there.
@@ -301,7 +307,8 @@ def track_masks(
             mass = (view.votes.T @ one_hot(owner[view.seen], count)).toarray()
             image[:] = assign_superpixels(view, mass, mass.sum(1, keepdims=True))[view.labels]
     cleaned, number = _clean(labels, count)
-    return Objects(cleaned, *_with_parts(_object_tree(groups, number), groups, number))
+    tree, leaf = _with_parts(_object_tree(groups, number), groups, number)
+    return Objects(cleaned, tree, *_visible_parts(views, cleaned, tree, leaf, signatures[2]))
 
 
 def _object_tree(groups: _Groups, number: Int[np.ndarray, " g"]) -> Int32[np.ndarray, " m"]:
@@ -355,6 +362,90 @@ def _with_parts(
     of_leaf[kept] = node[: kept.sum()]
     leaf[known] = of_leaf[parts.owner[known]]
     return np.concatenate([tree, node[below[~is_top]]]).astype(np.int32), leaf
+
+
+def _visible_parts(
+    views: list[FrameSuperpixels],
+    labels: Int16[np.ndarray, "t h w"],
+    tree: Int32[np.ndarray, " m"],
+    leaf: Int32[np.ndarray, " n"],
+    weights: Float[np.ndarray, " n"],
+) -> tuple[Int32[np.ndarray, " n"], Int16[np.ndarray, "l t h w"], Int32[np.ndarray, " p"]]:
+    """Finds the parts of objects that masks of two views show alone, with an IoU of at least 0.5.
+
+    A part has LEAST_PART to MOST_PART of its object's weight. Of one and a part of it with more than MOST_PART of its
+    weight, the one that more views show stays. Parts that lie in each other have labels on different layers. Pieces
+    are coarse: a Gaussian belongs to the smallest part with at least half of its weight on its object's pixels.
+
+    Args:
+      views: Superpixels of the frames.
+      labels: Object 0 .. R-1 of each pixel, -1 for none.
+      tree: Parent of each node, whose first R are the objects.
+      leaf: Smallest node of each Gaussian.
+      weights: Weight of each Gaussian.
+
+    Returns:
+      Smallest node of each Gaussian; part 0 .. P-1 of each pixel on each layer, -1 for none; and the node of each part.
+    """
+    count = int(labels.max(initial=-1)) + 1
+    under = _nodes_under(tree)
+    total = under @ np.bincount(leaf[leaf >= 0], weights[leaf >= 0], len(tree))
+    objects = np.where(np.arange(len(tree)) < count, np.arange(len(tree)), -1)
+    for node in range(len(tree) - 1, count - 1, -1):  # parents come after their children
+        objects[node] = -1 if tree[node] < 0 else objects[tree[node]]
+    share = total / np.maximum(total[objects], 1e-12)
+    is_part = (np.arange(len(tree)) >= count) & (objects >= 0)
+    nodes = np.flatnonzero(is_part & (share >= LEAST_PART) & (share <= MOST_PART))
+    nodes = nodes[np.argsort(-total[nodes], kind="stable")]
+    inside = one_hot(leaf, len(tree)) @ under[nodes].T  # (N, P)
+    shown, masks = np.zeros(len(nodes), int), []
+    for view, own in zip(views, labels):
+        item = np.full(view.proposals.shape[1], -1)
+        item[view.labels] = own
+        seen = view.votes.T.tocsr()
+        of_objects = (seen @ one_hot(objects[leaf[view.seen]], count)).toarray()
+        mask = (seen @ inside[view.seen]).toarray() >= 0.5 * of_objects[:, objects[nodes]]
+        mask &= (item[:, None] == objects[nodes]) & (of_objects[:, objects[nodes]] > 0)
+        area = np.bincount(view.labels.reshape(-1))
+        both = (view.proposals * area) @ mask
+        either = (view.proposals @ area)[:, None] + area @ mask - both
+        shown += (both / np.maximum(either, 1.0)).max(0, initial=0.0) >= 0.5
+        masks.append(mask)
+    above = under[nodes][:, nodes].toarray() > 0  # (P, P) whether one lies in another, or is the same
+    alike = above & (total[nodes] > MOST_PART * total[nodes][:, None])
+    alike |= alike.T
+    kept = shown >= 2
+    for n in np.argsort(-shown, kind="stable"):
+        if kept[n]:
+            kept[np.flatnonzero(alike[n])] = False
+            kept[n] = True
+    layer = above[np.ix_(kept, kept)].sum(0) - 1
+    nodes = nodes[kept]
+    result = np.full((int(layer.max(initial=0)) + 1, *labels.shape), -1, np.int16)
+    inside, of_object = np.zeros((2, len(leaf), len(nodes)), np.float32)
+    for t, (view, own, mask) in enumerate(zip(views, labels, masks)):
+        item = np.full(view.proposals.shape[1], -1)
+        item[view.labels] = own
+        for n, part in enumerate(mask[:, kept].T):
+            result[layer[n], t][part[view.labels]] = n
+        inside[view.seen] += view.votes @ mask[:, kept].astype(np.float32)
+        of_object[view.seen] += view.votes @ (item[:, None] == objects[nodes]).astype(np.float32)
+    is_inside = (of_object > 0) & (inside >= 0.5 * of_object) & (objects[leaf][:, None] == objects[nodes])
+    smallest = np.where(is_inside, layer + 1, 0)
+    refined = np.where(is_inside.any(1), nodes[smallest.argmax(1)] if len(nodes) else -1, objects[leaf])
+    stays = (leaf >= 0) & (np.asarray(under[refined, leaf]).ravel() > 0) & (refined >= count)
+    return np.where(stays | (leaf < 0), leaf, refined).astype(np.int32), result, nodes.astype(np.int32)
+
+
+def _nodes_under(tree: Int32[np.ndarray, " m"]) -> Sparse:
+    """Finds the nodes under each node of a tree, itself among them: a sparse matrix (M, M) of ones."""
+    rows = [np.arange(len(tree))]
+    while (up := np.where(rows[-1] >= 0, np.append(tree, -1)[rows[-1]], -1)).max(initial=-1) >= 0:
+        rows.append(up)
+    above = np.concatenate(rows)
+    columns = np.tile(np.arange(len(tree)), len(rows))[above >= 0]
+    shape = (len(tree), len(tree))
+    return sparse.csr_matrix((np.ones(len(columns), np.float32), (above[above >= 0], columns)), shape=shape)
 
 
 def clean_tracks(

@@ -43,6 +43,7 @@ _LETTERS = {
     "w": ("unrelated_words", 0),
     "b": ("gaussians.sh", 1),
     "m": ("tree", 0),
+    "p": ("part_nodes", 0),
 }
 """Array and axis of each of a field's sizes."""
 _SHAPES = {
@@ -62,10 +63,12 @@ _SHAPES = {
     ("w", "e"): "unrelated_words",
     (4, 4): "source_from_scene",
     ("m",): "tree",
+    ("p",): "part_nodes",
+    ("p", "e"): "parts.embeddings",
 }
 _OPTIONAL = (
     "gaussians.sh", "votes.weight_where_region_visible", "votes.overlap", "unrelated_words",
-    "codes.gaussians", "codes.regions", "tree", "leaf",
+    "codes.gaussians", "codes.regions", "tree", "leaf", "parts.embeddings", "part_nodes",
 )  # fmt: skip
 
 
@@ -187,7 +190,8 @@ def _disagreement(field: LanguageField) -> str | None:
 
 def _oddity(field: LanguageField, checked: bool = True) -> str | None:
     """What is wrong with the numbers or texts, in words, or None; mapped columns are read only if `checked`."""
-    sizes = {"votes.regions": field.regions.count, "leaf": 0 if field.tree is None else len(field.tree)}
+    nodes = 0 if field.tree is None else len(field.tree)
+    sizes = {"votes.regions": field.regions.count, "leaf": nodes, "part_nodes": nodes}
     for place, leaf in jax.tree_util.tree_leaves_with_path(field):
         if isinstance(leaf, np.memmap) and not checked:
             continue

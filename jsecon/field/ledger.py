@@ -10,8 +10,8 @@ the sum before the cut, which a ledger keeps once it is known.
 import dataclasses
 import json
 import re
-from collections.abc import Collection, Mapping
-from typing import NamedTuple
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -159,6 +159,7 @@ def _build_field(
         cameras=Camera(cameras[:, :16].reshape(-1, 4, 4), *cameras[:, 16:].T, width=width, height=height),
         names=tuple(ordered),
         **_grown_tree(field, count, np.asarray(votes.regions)[:, 0]),
+        **_parts_in_frames(field, ordered, count),
         codes=None,
     )
     return _with_history(new), ledger
@@ -176,6 +177,17 @@ def _with_history(field: LanguageField) -> LanguageField:
     votes = dataclasses.replace(field.votes, views=views)
     regions = dataclasses.replace(field.regions, embeddings=embeddings)
     return dataclasses.replace(field, votes=votes, regions=regions, history=tuple(events))
+
+
+def _parts_in_frames(field: LanguageField, names: Sequence[str], count: int) -> dict[str, Any]:
+    """The parts of a field of other frames and `count` regions: without those that a frame which is gone shows."""
+    if field.parts is None or field.part_nodes is None:
+        return {}
+    place = {name: t for t, name in enumerate(field.names)}
+    old, nodes = np.asarray(field.parts.pixel_counts), np.asarray(field.part_nodes) + count - field.regions.count
+    kept = ~old[:, [t for name, t in place.items() if name not in names]].any(1)
+    pixels = np.pad(old, [(0, 0), (0, 1)])[:, [place.get(name, -1) for name in names]]
+    return {"parts": Regions(field.parts.embeddings[kept], pixels[kept]), "part_nodes": nodes[kept].astype(np.int32)}
 
 
 def _grown_tree(field: LanguageField, count: int, strongest: Int32[np.ndarray, " n"]) -> dict[str, np.ndarray]:

@@ -66,7 +66,7 @@ def normalise_votes(votes: Votes, regions: Regions) -> Votes:
       ValueError: The votes have no `by_view`, or other views than `regions`.
     """
     if not is_mapped(votes):
-        return _with_overlap(_add_visible_weight(*_pad_views(votes, regions)))
+        return with_overlap(_add_visible_weight(*_pad_views(votes, regions)))
     shows = _views_that_show(regions)
     sums = jnp.zeros((regions.count, regions.count), jnp.float32)
     visible = [np.zeros((0, votes.regions.shape[1]), np.float32)]
@@ -146,7 +146,7 @@ def _visible_weight(
     return shown
 
 
-def _with_overlap(votes: Votes) -> Votes:
+def with_overlap(votes: Votes) -> Votes:
     """Adds `overlap` (R, R), the soft IoU of two regions' Gaussians. Pure.
 
         o_rs = sum_n min(p_nr, p_ns) / sum_n max(p_nr, p_ns)
@@ -175,7 +175,7 @@ def _overlap_sums(regions: Int[Array, "n k"], share: Float[Array, "n k"], count:
 
 @stored_jit
 def _soft_iou(both: Float[Array, "r r"]) -> Float[Array, "r r"]:
-    """Computes the overlap of `_with_overlap` from the sums, which add up over blocks of Gaussians."""
+    """Computes the overlap of `with_overlap` from the sums, which add up over blocks of Gaussians."""
     size = jnp.diagonal(both)
     both = jnp.where(jnp.eye(len(both), dtype=bool), both, both + both.T)
     either = size[:, None] + size - both

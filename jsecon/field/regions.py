@@ -168,12 +168,3 @@ def mean_residuals(embeddings: Float[Array, "r e"]) -> tuple[Float[Array, "r e"]
     units = xp.where(known[:, None], units, 0.0)
     total = units.sum(axis=0) / (known.sum(dtype=units.dtype) + 1)
     return xp.where(known[:, None], units - total, 0.0), known
-
-
-def node_members(tree: Int[np.ndarray, " m"], leaf: Int[np.ndarray, " n"], node: int) -> Bool[np.ndarray, " n"]:
-    """Finds what belongs to a node of `LanguageField.tree`: (N,) of what has the smallest nodes `leaf`, -1 for none."""
-    under, fresh = np.zeros(len(tree) + 1, bool), np.array([node])  # the last entry is that of -1
-    while len(fresh):
-        under[fresh] = True
-        fresh = np.flatnonzero(under[tree] & ~under[:-1])
-    return under[leaf]

@@ -40,16 +40,19 @@ from jsecon.process import cores, memory_budget
 from jsecon.read.captures.frames import evenly_spaced
 from jsecon.read.masks.masks import load_labels, load_proposals
 from jsecon.splat.render import render_depth
-from jsecon.types import Camera, Capture, Codes, Gaussians, Progress
+from jsecon.types import Camera, Capture, Codes, Gaussians, Progress, Regions
 from jsecon.views.plan import LEAST_GAIN, frames_by_need
 from jsecon.vision.classical import GRANULARITIES, ClassicalSegmenter
 from jsecon.vision.protocols import Segmenter
 from jsecon.vision.surfaces import smooth_depth, surfaces_from_depth
 
+PART_CROPS, PART_PX = 2, 100
+"""Largest number of views in which a part is embedded, and its least pixels there: fewer show an encoder little."""
+
 
 def plan_objects(context: RunContext) -> list[Stage]:
     """Plans objects, their embeddings and votes; and codes, if the options ask for them."""
-    return [_plan_labels(context), _plan_regions(context), *_plan_lifting(context)]
+    return [_plan_labels(context), *_plan_regions(context), *_plan_lifting(context)]
 
 
 def _plan_labels(context: RunContext) -> Stage:
@@ -92,12 +95,17 @@ def _plan_labels(context: RunContext) -> Stage:
     return Stage("objects", how, _find_objects, after, key_options, files, distributed=consensus)
 
 
-def _plan_regions(context: RunContext) -> Stage:
-    """Plans an embedding of each region."""
+def _plan_regions(context: RunContext) -> list[Stage]:
+    """Plans an embedding of each region, and of each part that the tree of objects has."""
     options, embedder, after = context.options, context.models.embedder.name, ("load", "objects")
     how = f"embedded by {embedder!r} in at most {options.crops} views each, weighted by pixels"
-    key_options = {"embedder": embedder} | context.key_options("crops")
-    return Stage("regions", how, _embed_objects, after=after, key_options=key_options, distributed=True)
+    settings: dict[str, Any] = {"after": after, "distributed": True}
+    settings["key_options"] = {"embedder": embedder} | context.key_options("crops")
+    stages = [Stage("regions", how, _embed_objects, **settings)]
+    if options.masks is None and options.associated_by == "consensus":
+        how = f"parts of objects, in at most {min(options.crops, PART_CROPS)} views each"
+        stages.append(Stage("parts", how, _embed_parts, **(settings | {"after": (*after, "regions")})))
+    return stages
 
 
 def _plan_lifting(context: RunContext) -> list[Stage]:
@@ -186,9 +194,10 @@ def _find_objects(stage: StageInput) -> StageResult:
     proposals, notes = _frame_proposals(context, view, scene)
     found = _associate_masks(context, view, scene, proposals, stage.progress)
     context.models.close()
-    _clear_ignored(found.labels, view)
+    for labels in (found.labels, *(() if found.parts is None else found.parts)):
+        _clear_ignored(labels, view)
     _require_regions(found.labels, str(context.options.capture))
-    return StageResult(ObjectLabels(found.labels, frames, found.tree, found.leaf), notes=(*why_fewer, *notes))
+    return StageResult(ObjectLabels(frames=frames, **found._asdict()), notes=(*why_fewer, *notes))
 
 
 def _frame_proposals(
@@ -281,6 +290,23 @@ def _embed_objects(stage: StageInput) -> StageResult:
         return StageResult(embedded)
     why = f"a region is embedded in at most {context.options.crops} views (--crops)"
     return StageResult(embedded, notes=(f"{kept} of {total} crops embedded: {why}",))
+
+
+def _embed_parts(stage: StageInput) -> StageResult:
+    """Embeds the parts of objects in the few views that show most of them."""
+    context, objects = stage.context, stage.results.objects
+    assert objects.parts is not None
+    assert objects.part_nodes is not None
+    view, count = _TrainingView(stage.results.load, context.options, objects.frames), len(objects.part_nodes)
+    embed, most = context.models.embedder.embed_regions, min(context.options.crops, PART_CROPS)
+    embeddings, pixels = np.zeros((count, stage.results.regions.embeddings.shape[1]), np.float32), 0
+    for labels in objects.parts:  # each part is on one layer
+        shown, cut, directions = crop_geometry(labels, view.cameras, count)
+        chosen = choose_crops(np.where(shown >= PART_PX, shown, 0), cut, directions, most)
+        layer = region_embeddings(view.frames, labels, embed, num_regions=count, views=chosen, progress=stage.progress)
+        embeddings, pixels = embeddings + layer.embeddings, pixels + layer.pixel_counts
+    context.models.close()
+    return StageResult(Regions(embeddings, pixels))
 
 
 def _accumulate_votes(stage: StageInput) -> StageResult:

@@ -291,7 +291,7 @@ def run(
     with console.progress("field"):
         warnings = [note.removeprefix(WARNING) for note in state.notes if note.startswith(WARNING)]
         origin = provenance(context.options, state.keys, embedder.name, out, warnings)
-        field = _join_field(results, embedder, origin, context.options)
+        field = join_field(results, embedder, origin, context.options)
         field = save_with_ledger(out / FIELD_FILE, field, _make_ledger(results) if options.ledger else None)
     seconds["field"] = time.monotonic() - started
     console.done("field", seconds["field"], True)
@@ -303,16 +303,21 @@ def run(
     return Run(field, context.options, *made, state.steps, seconds, state.notes, programs)
 
 
-def _join_field(results: Results, embedder: Embedder, provenance: str, options: Options) -> LanguageField:
+def join_field(results: Results, embedder: Embedder, provenance: str, options: Options) -> LanguageField:
     """Joins the results of a run to a field."""
     capture, embedded = results.load, results.regions
-    pixels = np.zeros((embedded.count, len(capture.names)), np.int32)
-    pixels[:, results.objects.frames] = embedded.pixel_counts
+
+    def of_capture(regions: Regions) -> Regions:
+        """Regions with their pixels in all frames of the capture."""
+        pixels = np.zeros((regions.count, len(capture.names)), np.int32)
+        pixels[:, results.objects.frames] = regions.pixel_counts
+        return Regions(regions.embeddings, pixels)
+
     scale = capture.metres_per_unit if options.metres_per_unit is None else options.metres_per_unit
     field = LanguageField(
         gaussians=results.gaussians,
         votes=normalise_votes(results.votes.sum, embedded),
-        regions=Regions(embedded.embeddings, pixels),
+        regions=of_capture(embedded),
         cameras=capture.cameras,
         canonical_phrases=np.asarray(embedder.canonical_phrases, np.float32),
         source_from_scene=np.asarray(capture.source_from_scene),
@@ -325,6 +330,8 @@ def _join_field(results: Results, embedder: Embedder, provenance: str, options: 
         metres_per_unit=scale,
         tree=results.objects.tree,
         leaf=results.objects.leaf,
+        parts=None if results.parts is None else of_capture(results.parts),
+        part_nodes=results.objects.part_nodes,
     )
     return dataclasses.replace(field, up=field_up(field, options.up))
 

@@ -6,6 +6,7 @@
     gaussians  scene.plan_scene       load: fitted, or read from a file
     objects    objects.plan_objects   load, gaussians (--masks: load alone)
     regions    objects.plan_objects   load, objects
+    parts      objects.plan_objects   load, objects, where masks have a tree
     votes      objects.plan_objects   load, gaussians, objects
     codes      objects.plan_objects   regions, votes, with --paper
     held_out   scene.plan_scene       load, gaussians, if there are photographs
@@ -55,6 +56,10 @@ class ObjectLabels:
     """(M,) int32 parent of each node, as `LanguageField.tree` has it."""
     leaf: np.ndarray | None = None
     """(N,) int32 smallest node of each Gaussian, as `LanguageField.leaf` has it."""
+    parts: np.ndarray | None = None
+    """(L, T, H, W) int16 part 0 .. P-1 at each pixel, -1 for none; parts that lie in each other are on other layers."""
+    part_nodes: np.ndarray | None = None
+    """(P,) int32 node of each of these parts."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,6 +83,8 @@ class Results:
     """labels of the training frames that vision uses"""
     regions: Regions
     """R regions of the training frames"""
+    parts: Regions | None = None
+    """P parts of the regions; None where masks have no tree"""
     votes: CastVotes
     """weight of each region on each Gaussian"""
     codes: Codes | None = None

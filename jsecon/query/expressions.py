@@ -191,9 +191,29 @@ _FIXED_NAMES = {tuple(words.split()): "" for words in re.split(r"[|\n]", _LEXICO
 _FITTED = frozenset(_LEXICON["names"]["fitted"].split())
 _QUANTIFIERS = {*_WORDS["determiners"], *_WORDS["every"], *_ORDINALS, *_NUMBERS}
 _DESCRIBING = {*_QUANTIFIERS, *_WORDS["adjectives"], *_WORDS["anything"]}
+_ARTICLE = "(?:the|a|an|this|that|my|your|our) "
+_PART_OF = (
+    re.compile(rf"(?:{_ARTICLE})?(?P<part>.+?) of {_ARTICLE}(?P<whole>.+)", re.IGNORECASE),
+    re.compile(rf"(?:{_ARTICLE})?(?P<whole>.+?)'s (?P<part>.+)", re.IGNORECASE),
+)
 _ABOUT_PROPERTY = re.compile(_LEXICON["about_property"])
 _INDEFINITE = ("a", "an", "any", "some", "of")
 _PREPOSITIONS = {words[0] for words in _RELATION_OF if len(words) == 1} - {"nearest", "closest"}
+
+
+def split_part(text: str) -> tuple[str, str] | None:
+    """Reads "handle of the red mug", "part of the mug that is a handle" or "the mug's handle": ("handle", "red mug").
+
+    None if the text names no part of another thing. "Cup of tea" and "statue of liberty" are names: they lack an
+    article after "of".
+    """
+    if _QUOTED.search(text):
+        return None
+    plain = " ".join(text.replace("\N{RIGHT SINGLE QUOTATION MARK}", "'").split()).rstrip(".?!")
+    for pattern in _PART_OF:
+        if match := pattern.fullmatch(plain):
+            return match["part"], match["whole"]
+    return None
 
 
 def is_expression(text: str) -> bool:

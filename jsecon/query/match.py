@@ -23,8 +23,9 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from jsecon.field.regions import mean_residuals, node_members
+from jsecon.field.regions import mean_residuals
 from jsecon.field.similarity import Number, similarities
+from jsecon.field.tree import node_members
 from jsecon.numerics import array_module, cosine_matrix, inline_jit, normalize
 from jsecon.programs import stored_jit
 from jsecon.query.rules import QueryRules

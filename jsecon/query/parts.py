@@ -1,0 +1,33 @@
+"""Which part of a thing a text names, such as the handle of a mug. Pure."""
+
+import dataclasses
+from collections.abc import Collection
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jsecon.field.tree import part_objects
+from jsecon.query.answer import match_regions
+from jsecon.query.rules import ABSENT, FOUND, QueryRules
+from jsecon.types import Array, LanguageField, Regions
+
+
+def match_parts(
+    field: LanguageField, texts: Float[Array, "q e"], wholes: Collection[int], rules: QueryRules
+) -> tuple[Int[np.ndarray, " m"], int]:
+    """Finds the parts of regions that a text names for certain, unless it names the regions better.
+
+    Returns:
+      Nodes of the tree, and an index of `rules.STATES`: ABSENT if there are none.
+    """
+    own = np.flatnonzero(np.isin(part_objects(field), list(wholes)))
+    if field.parts is None or not len(own):
+        return np.zeros(0, int), ABSENT
+    rows, whole = np.asarray(field.parts.embeddings)[own], np.asarray(field.regions.embeddings)[list(wholes)]
+    pixels = np.asarray(field.parts.pixel_counts)[own], np.asarray(field.regions.pixel_counts)[list(wholes)]
+    regions = Regions(np.concatenate([rows, whole]), np.concatenate(pixels))
+    votes = dataclasses.replace(field.votes, overlap=None)
+    match = match_regions(dataclasses.replace(field, regions=regions, votes=votes), texts, rules)
+    if not 0 <= int(match.region) < len(own) or int(match.state) < FOUND:
+        return np.zeros(0, int), ABSENT
+    return np.asarray(field.part_nodes)[own[np.asarray(match.chosen)[: len(own)]]], int(match.state)
