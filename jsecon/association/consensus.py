@@ -308,7 +308,7 @@ def track_masks(
             image[:] = assign_superpixels(view, mass, mass.sum(1, keepdims=True))[view.labels]
     cleaned, number = _clean(labels, count)
     tree, leaf = _with_parts(_object_tree(groups, number), groups, number)
-    return Objects(cleaned, tree, *_visible_parts(views, cleaned, tree, leaf, signatures[2]))
+    return Objects(cleaned, tree, leaf, *_visible_parts(views, cleaned, tree, leaf, signatures[2]))
 
 
 def _object_tree(groups: _Groups, number: Int[np.ndarray, " g"]) -> Int32[np.ndarray, " m"]:
@@ -370,12 +370,11 @@ def _visible_parts(
     tree: Int32[np.ndarray, " m"],
     leaf: Int32[np.ndarray, " n"],
     weights: Float[np.ndarray, " n"],
-) -> tuple[Int32[np.ndarray, " n"], Int16[np.ndarray, "l t h w"], Int32[np.ndarray, " p"]]:
+) -> tuple[Int16[np.ndarray, "l t h w"], Int32[np.ndarray, " p"]]:
     """Finds the parts of objects that masks of two views show alone, with an IoU of at least 0.5.
 
     A part has LEAST_PART to MOST_PART of its object's weight. Of one and a part of it with more than MOST_PART of its
-    weight, the one that more views show stays. Parts that lie in each other have labels on different layers. Pieces
-    are coarse: a Gaussian belongs to the smallest part with at least half of its weight on its object's pixels.
+    weight, the one that more views show stays. Parts that lie in each other have labels on different layers.
 
     Args:
       views: Superpixels of the frames.
@@ -385,7 +384,7 @@ def _visible_parts(
       weights: Weight of each Gaussian.
 
     Returns:
-      Smallest node of each Gaussian; part 0 .. P-1 of each pixel on each layer, -1 for none; and the node of each part.
+      Part 0 .. P-1 of each pixel on each layer, -1 for none; and the node of each part.
     """
     count = int(labels.max(initial=-1)) + 1
     under = _nodes_under(tree)
@@ -406,10 +405,10 @@ def _visible_parts(
         of_objects = (seen @ one_hot(objects[leaf[view.seen]], count)).toarray()
         mask = (seen @ inside[view.seen]).toarray() >= 0.5 * of_objects[:, objects[nodes]]
         mask &= (item[:, None] == objects[nodes]) & (of_objects[:, objects[nodes]] > 0)
-        area = np.bincount(view.labels.reshape(-1))
-        both = (view.proposals * area) @ mask
-        either = (view.proposals @ area)[:, None] + area @ mask - both
-        shown += (both / np.maximum(either, 1.0)).max(0, initial=0.0) >= 0.5
+        area, here = np.bincount(view.labels.reshape(-1)).astype(np.float32), mask.any(0)
+        both = (view.proposals * area) @ mask[:, here]
+        either = (view.proposals @ area)[:, None] + area @ mask[:, here] - both
+        shown[here] += (both / np.maximum(either, 1.0)).max(0, initial=0.0) >= 0.5
         masks.append(mask)
     above = under[nodes][:, nodes].toarray() > 0  # (P, P) whether one lies in another, or is the same
     alike = above & (total[nodes] > MOST_PART * total[nodes][:, None])
@@ -420,21 +419,13 @@ def _visible_parts(
             kept[np.flatnonzero(alike[n])] = False
             kept[n] = True
     layer = above[np.ix_(kept, kept)].sum(0) - 1
-    nodes = nodes[kept]
     result = np.full((int(layer.max(initial=0)) + 1, *labels.shape), -1, np.int16)
-    inside, of_object = np.zeros((2, len(leaf), len(nodes)), np.float32)
-    for t, (view, own, mask) in enumerate(zip(views, labels, masks)):
-        item = np.full(view.proposals.shape[1], -1)
-        item[view.labels] = own
-        for n, part in enumerate(mask[:, kept].T):
-            result[layer[n], t][part[view.labels]] = n
-        inside[view.seen] += view.votes @ mask[:, kept].astype(np.float32)
-        of_object[view.seen] += view.votes @ (item[:, None] == objects[nodes]).astype(np.float32)
-    is_inside = (of_object > 0) & (inside >= 0.5 * of_object) & (objects[leaf][:, None] == objects[nodes])
-    smallest = np.where(is_inside, layer + 1, 0)
-    refined = np.where(is_inside.any(1), nodes[smallest.argmax(1)] if len(nodes) else -1, objects[leaf])
-    stays = (leaf >= 0) & (np.asarray(under[refined, leaf]).ravel() > 0) & (refined >= count)
-    return np.where(stays | (leaf < 0), leaf, refined).astype(np.int32), result, nodes.astype(np.int32)
+    for t, (view, mask) in enumerate(zip(views, masks)):
+        part = np.full((len(result), view.proposals.shape[1]), -1, np.int16)
+        for n, own in enumerate(mask[:, kept].T):
+            part[layer[n], own] = n
+        result[:, t] = part[:, view.labels]
+    return result, nodes[kept].astype(np.int32)
 
 
 def _nodes_under(tree: Int32[np.ndarray, " m"]) -> Sparse:
