@@ -119,6 +119,36 @@ def test_what_some_views_cut_has_a_common_node(world):
         assert max((half & found).sum() / (half | found).sum() for found in members[count:]) > 0.55
 
 
+def test_parts_that_masks_show_alone_are_labelled(world):
+    """Every view has a mask of a whole ball and masks of its halves: the object has two parts, those of the masks."""
+    _, _, frames, truth, proposals = world
+    layered = list(proposals)
+    for t in range(VIEWS):
+        rows = np.flatnonzero((truth[t] == 1).any(1))
+        if len(rows):
+            upper = np.arange(HEIGHT)[:, None] < rows.mean()
+            halves = np.stack([(truth[t] == 1) & upper, (truth[t] == 1) & ~upper])
+            layered[t] = np.concatenate([proposals[t], halves])
+    found = track_masks(frames, scene_of(world, layered, atoms=300))
+    count, ball = int(found.labels.max()) + 1, int(np.bincount(found.labels[truth == 1] + 1).argmax()) - 1
+    assert found.parts.shape[1:] == found.labels.shape
+    own = []
+    for part, node in enumerate(found.part_nodes):
+        shown = (found.parts == part).any(0)
+        assert shown.any()
+        objects = np.unique(found.labels[shown])
+        assert len(objects) == 1  # a part lies in its object
+        members = node_members(found.tree, found.leaf, int(node))
+        assert count <= node < len(found.tree)
+        if objects[0] == ball:
+            own.append((members[2500:4000].sum(), shown))
+    assert 2 <= len(own) <= 8
+    for t in np.flatnonzero((truth == 1).any((1, 2))):
+        rows = np.flatnonzero((truth[t] == 1).any(1))
+        upper = (truth[t] == 1) & (np.arange(HEIGHT)[:, None] < rows.mean())
+        assert max((shown[t] & upper).sum() / (shown[t] | upper).sum() for _, shown in own) > 0.5
+
+
 def test_parents_come_after_their_children_in_any_tree():
     """Random groups and joins, some of groups that were removed: what joined is under one node, and a tree it is."""
     for seed in range(200):

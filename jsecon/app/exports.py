@@ -27,7 +27,7 @@ def _objects(verb: verbs.Objects, console: Console) -> verbs.VerbResult:
     if verb.out is not None:
         require_writable(verb.out)
     names = None if verb.vocabulary is None else _read_vocabulary(verb.vocabulary)
-    scene = open_scene(verb.field, embedder=verb.embedder, console=console)
+    scene = open_scene(verb.field, embedder=verb.embedder, console=console).at_level(verb.level)
     with console.progress("objects"):
         listed = scene.objects(names)
     records = listed.records()
@@ -39,7 +39,7 @@ def _objects(verb: verbs.Objects, console: Console) -> verbs.VerbResult:
         ids = " to ".join(map(str, sorted({unsure[0], unsure[-1]})))
         few = f"shown by fewer than {SURE_SHARE:.0%} of the frames that see it, so perhaps a fragment"
         console.print_line(f"  unsure, {few}: {ids}")
-    if hidden := int((listed.regions < 0).sum()):
+    if hidden := int(np.any(np.asarray(scene.field.regions.pixel_counts)[listed.regions < 0], axis=1).sum()):
         console.print_line(f"  too small to be listed, with fewer than {MIN_SAMPLES} Gaussians: {hidden} regions")
     elif not records:
         console.print_line("  there are no objects: the field has no regions")
@@ -75,7 +75,7 @@ def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
     points = verb.points or suffix in (".las", ".laz")
     if verb.out is not None:
         require_writable_format(verb.out, points)
-    scene = open_scene(verb.field, embedder=verb.embedder, console=console)
+    scene = open_scene(verb.field, embedder=verb.embedder, console=console).at_level(verb.level)
     answer = None if text is None else scene.ask(text)
     if answer is not None and not len(answer.rows):
         option = "--only" if verb.only is not None else "--without"

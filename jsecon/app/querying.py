@@ -36,7 +36,7 @@ def _query(verb: verbs.Query, console: Console) -> verbs.VerbResult:
     queries = _queries(verb)
     require_writable(verb.out)
     scene = open_scene(verb.field, embedder=verb.embedder, up=verb.up, out=verb.out / "field", console=console)
-    scene = scene if verb.as_of is None else scene.as_of(verb.as_of)
+    scene = (scene if verb.as_of is None else scene.as_of(verb.as_of)).at_level(verb.level)
     with console.progress("answers"):
         if verb.texts:
             _ = scene.embedder  # without it one error stands for all texts

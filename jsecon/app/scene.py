@@ -34,6 +34,7 @@ from jsecon.field.ledger import Ledger, add_views, forget_views, sum_ledger
 from jsecon.field.ledger_file import load_ledger, save_with_ledger
 from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.field.regions import ALIKE_THRESHOLD
+from jsecon.field.tree import PARTS, cut_field
 from jsecon.files import FIELD_FILE, parse_json
 from jsecon.networks.hub import parse_model
 from jsecon.paper.queries import CODE_THRESHOLD
@@ -400,8 +401,7 @@ class Scene:
         if isinstance(question, str):
             if (kind := change_question(question)) is not None:
                 return self._answer_history(query, kind)
-            names_part = split_part(question) and self._index.find_parts(*split_part(question))
-            is_related = is_expression(question) or names_part
+            is_related = is_expression(question) or self._names_part(question)
             return self.relate(question, frame=query.frame) if is_related else self._answer_text(query)
         if isinstance(question, Box | Mask):
             return self._answer_outline(query, question)
@@ -418,6 +418,11 @@ class Scene:
             raise InputError(f"frame {name}", problem, remedy=remedy)
         query = dataclasses.replace(query, question=At(name, x, y))
         return self._answer_region(query, region)
+
+    def _names_part(self, text: str) -> bool:
+        """Whether a text such as "the lid of the pot" names a part that a thing of the scene has."""
+        named = split_part(text) if self.field.parts is not None and not is_mapped(self.field) else None
+        return named is not None and len(self._index.find_parts(*named)) > 0
 
     def _answer_text(self, query: Query) -> Answer:
         """Selects the Gaussians that a text names."""
@@ -452,6 +457,25 @@ class Scene:
         tree = self.field.tree
         parent = -1 if tree is None or not 0 <= region.id < len(tree) else int(tree[region.id])
         return None if parent < 0 else Region(parent)
+
+    def at_level(self, level: int) -> "Scene":
+        """The scene with another cut of its tree as its objects. Regions keep their ids, those of nodes.
+
+        Args:
+          level: -1 for the parts that masks show alone, 0 for the objects, 1 and more for unions, so many joins up.
+
+        Raises:
+          InputError: There is no such level, the field has no tree, or it is too large for memory.
+        """
+        if level == 0:
+            return self
+        self._require_memory("another level")
+        if level < PARTS:
+            raise InputError("level", f"{level}", "-1 for parts, 0 for objects, or more", "Give another level.")
+        if self.field.tree is None:
+            problem = "the field has no tree of objects, as its masks were given or tracked"
+            raise InputError("level", problem, remedy="Leave it out, or make the field with masks that jsecon finds.")
+        return self._with(cut_field(self.field, level), None)
 
     def _rules(self, query: Query, rules: QueryRules) -> QueryRules:
         """Rules with the options of a query."""

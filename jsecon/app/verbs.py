@@ -156,7 +156,18 @@ class _FieldVerb(Verb):
     embedder: ModelOption = None
 
 
-class Query(_FieldVerb):
+class _LevelVerb(_FieldVerb):
+    """Options of the verbs that list or select objects.
+
+    Attributes:
+      level: What counts as one object in the field's tree: -1 parts, 0 objects, 1 and more what belongs together, so
+        many joins up.
+    """
+
+    level: Annotated[Option[int], Range(-1, 100)] = 0
+
+
+class Query(_LevelVerb):
     """Selects the Gaussians of a text, of a pixel, or of an outline.
 
     For each text, pixel or outline, writes to the output folder: the selected Gaussians as a .ply (INRIA's layout, in
@@ -221,7 +232,7 @@ class Query(_FieldVerb):
     as_of: Option[str | None] = None
 
 
-class Objects(_FieldVerb):
+class Objects(_LevelVerb):
     """Lists the objects of a field with names, boxes and sizes.
 
     Prints a line for each. With --out it also writes objects.json and catalogue.html, a page with pictures of each.
@@ -290,7 +301,7 @@ class Forget(Verb):
     out: Option[Path | None] = None
 
 
-class Export(_FieldVerb):
+class Export(_LevelVerb):
     """Writes the scene of a field, or objects of it, for other programs.
 
     The scene is in the capture's world. A .usda is a text of OpenUSD with a prim for each object. The file labels.json

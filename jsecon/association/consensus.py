@@ -373,8 +373,8 @@ def _visible_parts(
 ) -> tuple[Int16[np.ndarray, "l t h w"], Int32[np.ndarray, " p"]]:
     """Finds the parts of objects that masks of two views show alone, with an IoU of at least 0.5.
 
-    A part has LEAST_PART to MOST_PART of its object's weight. Of one and a part of it with more than MOST_PART of its
-    weight, the one that more views show stays. Parts that lie in each other have labels on different layers.
+    A part has LEAST_PART to MOST_PART of its object's weight. Of one and a part of it with more than half of its weight,
+    the one that more views show stays. Parts that lie in each other have labels on different layers.
 
     Args:
       views: Superpixels of the frames.
@@ -405,13 +405,14 @@ def _visible_parts(
         of_objects = (seen @ one_hot(objects[leaf[view.seen]], count)).toarray()
         mask = (seen @ inside[view.seen]).toarray() >= 0.5 * of_objects[:, objects[nodes]]
         mask &= (item[:, None] == objects[nodes]) & (of_objects[:, objects[nodes]] > 0)
-        area, here = np.bincount(view.labels.reshape(-1)).astype(np.float32), mask.any(0)
+        area, here = np.bincount(view.labels.reshape(-1)).astype(np.float32), np.flatnonzero(mask.any(0))
         both = (view.proposals * area) @ mask[:, here]
-        either = (view.proposals @ area)[:, None] + area @ mask[:, here] - both
-        shown[here] += (both / np.maximum(either, 1.0)).max(0, initial=0.0) >= 0.5
+        fit = both / np.maximum((view.proposals @ area)[:, None] + area @ mask[:, here] - both, 1.0)
+        if fit.size:  # a mask shows the part that it fits best
+            shown[here[np.unique(fit.argmax(1)[fit.max(1) >= 0.5])]] += 1
         masks.append(mask)
     above = under[nodes][:, nodes].toarray() > 0  # (P, P) whether one lies in another, or is the same
-    alike = above & (total[nodes] > MOST_PART * total[nodes][:, None])
+    alike = above & (total[nodes] > 0.5 * total[nodes][:, None])
     alike |= alike.T
     kept = shown >= 2
     for n in np.argsort(-shown, kind="stable"):

@@ -71,12 +71,10 @@ def cut_field(field: LanguageField, level: int) -> LanguageField:
     if level == PARTS:
         pixels[:count], weighted[:count] = own, field.regions.embeddings
         if field.parts is not None:
-            nodes, part_of = np.asarray(field.part_nodes), _part_of_gaussians(field)
+            nodes = np.asarray(field.part_nodes)
             pixels[nodes], weighted[nodes] = field.parts.pixel_counts, field.parts.embeddings
-            above = _first_above(field, np.concatenate([np.arange(count), nodes]))
-            np.subtract.at(pixels, above, np.asarray(field.parts.pixel_counts))
-            of_part = np.append(nodes, -1)[part_of][:, None]
-            regions = np.where(np.append(part_objects(field), -2)[part_of][:, None] == regions, of_part, regions)
+            np.subtract.at(pixels, parts_above(field)[nodes], np.asarray(field.parts.pixel_counts))
+            regions = np.stack([smallest_nodes(field, column) for column in regions.T], axis=1)
     else:
         node = np.arange(count)
         for _ in range(level):
@@ -94,13 +92,27 @@ def cut_field(field: LanguageField, level: int) -> LanguageField:
     )
 
 
-def _part_of_gaussians(field: LanguageField) -> Int[np.ndarray, " n"]:
-    """Finds the smallest part of each Gaussian of a field, -1 for none."""
-    part, tree, leaf = np.full(field.gaussians.count, -1), np.asarray(field.tree), np.asarray(field.leaf)
-    nodes = np.asarray(field.part_nodes)
-    for p in np.argsort(-nodes, kind="stable"):  # children come before their parents
-        part[node_members(tree, leaf, int(nodes[p]))] = p
-    return part
+def smallest_nodes(field: LanguageField, regions: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """Replaces the region of each Gaussian, -1 for none, by the node of its smallest part in that region, if any."""
+    if field.part_nodes is None or field.tree is None:
+        return regions
+    part_of, tree = np.full(len(field.tree) + 1, -1), np.asarray(field.tree)  # the last entry is that of -1
+    part_of[np.asarray(field.part_nodes)] = np.arange(len(field.part_nodes))
+    for node in range(len(tree) - 1, field.regions.count - 1, -1):  # parents come after their children
+        if part_of[node] < 0 and tree[node] >= field.regions.count:
+            part_of[node] = part_of[tree[node]]
+    part = part_of[np.asarray(field.leaf)]
+    inside = (part >= 0) & (np.append(part_objects(field), -2)[part] == regions)
+    return np.where(inside, np.append(np.asarray(field.part_nodes), -1)[part], regions)
+
+
+def parts_above(field: LanguageField) -> Int[np.ndarray, " m"]:
+    """Returns the tree of a field, in which parts have the next larger part or their region as parent."""
+    tree = np.array(field.tree)
+    if field.part_nodes is not None:
+        nodes = np.asarray(field.part_nodes)
+        tree[nodes] = _first_above(field, np.concatenate([np.arange(field.regions.count), nodes]))
+    return tree
 
 
 def _merge_votes(votes: Votes, regions: Int[np.ndarray, "n k"], count: int) -> Votes:

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 from jsecon.app.catalogue import main_regions
 from jsecon.app.records import Answer
 from jsecon.errors import InputError
+from jsecon.field.tree import parts_above, smallest_nodes
 from jsecon.numerics import sigmoid
 from jsecon.splat.sh import C0
 from jsecon.types import Gaussians, LanguageField
@@ -33,14 +34,14 @@ def page(field: LanguageField, texts: Mapping[str, Answer | None], *, title: str
     A served page asks for the answers that are None.
     """
     drawn, low, high = drawn_gaussians(field)
-    splats, size_range = _pack(field.gaussians, main_regions(field), drawn, low, high)
+    splats, size_range = _pack(field.gaussians, smallest_nodes(field, main_regions(field)), drawn, low, high)
     cameras, turn = field.cameras, np.asarray(field.source_from_scene, np.float64)[:3, :3]
     scene = {
         "served": served,
         "gaussians": field.gaussians.count,
         "count": int(drawn.sum()),
         "regions": field.regions.count,
-        "tree": [] if field.tree is None else np.asarray(field.tree).tolist(),
+        "tree": [] if field.tree is None else parts_above(field).tolist(),
         "low": low.tolist(),
         "span": (high - low).tolist(),
         "texts": {text: answer and answer_record(answer, drawn) for text, answer in texts.items()},
