@@ -13,6 +13,7 @@ it has at least 30 Gaussians and the room has one thing of that name. Absent: ot
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -151,7 +152,9 @@ def field_of_parts(seed: int, options: Options) -> tuple[LanguageField, PartEmbe
             return proposals[index]
 
     words = sorted({word for name in names for word in name.split("|")} | {*UNRELATED_WORDS})
-    embedder = PartEmbedder(capture.frames, solids, names, made_text_space(words, seed=seed), options.noise, seed)
+    embedder = PartEmbedder(
+        np.asarray(capture.frames), solids, names, made_text_space(words, seed=seed), options.noise, seed
+    )
     run = RunOptions(Path(), seed=seed)
     context, done = RunContext(run, Models(embedder, TrueMasks()), Path()), Results(load=capture)
     done.gaussians = gaussians
@@ -198,7 +201,7 @@ def _ask(scene: Scene, part: str, thing: str) -> np.ndarray:
 
 def main(options: Options = Options()) -> dict:
     """Runs the experiment, writes its results and returns the metrics."""
-    measured = {f"seed {seed}": ask_parts(seed, options) for seed in options.seeds}
+    measured: dict[str, Any] = {f"seed {seed}": ask_parts(seed, options) for seed in options.seeds}
     measured["all"] = tuple([x for row in measured.values() for x in row[k]] for k in range(3))
     header = ("room", "expressions", "right", "mean IoU", "best node, mean IoU", "absent parts", "refused")
     rows = []

@@ -357,8 +357,8 @@ class LanguageField(_Shown):
     tracker."""
     leaf: Array | None = None
     """(N,) int32 smallest node of each Gaussian, -1 for none: a part of a region, or a region without parts."""
-    parts: Regions | None = None
-    """P disjoint parts of regions that masks show alone, with their embeddings; None where they are not known."""
+    part_regions: Regions | None = None
+    """P parts of regions that masks show alone, as a text names them; None where they are not known."""
     part_nodes: Array | None = None
     """(P,) int32 node of each of these parts."""
     history: tuple[Event, ...] = ()

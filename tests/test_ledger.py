@@ -188,3 +188,21 @@ def test_a_field_without_its_ledger_is_refused_in_one_sentence(scene, cameras, l
     file.unlink()
     with refused(path, "missing", file.name):
         load_ledger(path, field)
+
+
+def test_parts_follow_the_frames_of_a_field(scene, cameras, labels, rows, views):
+    """A part of which a forgotten frame shows something is gone; the columns of the others follow the frames."""
+    before = run_on(scene, cameras, labels, rows, [0, 1, 2])
+    pixels = np.array([[4, 0, 3], [0, 2, 1]], np.int32)
+    parts = {"part_regions": Regions(unit_rows(np.random.default_rng(2), 2, 12), pixels)}
+    parts |= {"part_nodes": np.array([6, 7], np.int32), "tree": np.array([5, 5, -1, -1, -1, -1, 0, 1], np.int32)}
+    before = dataclasses.replace(before, leaf=true_regions(scene).astype(np.int32), **parts)
+    ledger = Ledger(REGIONS, {name: views[name] for name in before.names})
+    fewer, _ = forget_views(before, ledger, [before.names[0]])
+    np.testing.assert_array_equal(fewer.part_nodes, [7])
+    np.testing.assert_array_equal(fewer.part_regions.pixel_counts, [[2, 1]])
+    more, _ = add_views(before, ledger, {NAMES[3]: views[NAMES[3]]})
+    columns = [more.names.index(name) for name in before.names]
+    np.testing.assert_array_equal(np.asarray(more.part_regions.pixel_counts)[:, columns], pixels)
+    assert not np.delete(np.asarray(more.part_regions.pixel_counts), columns, axis=1).any()
+    np.testing.assert_array_equal(np.asarray(more.tree)[more.part_nodes], [0, 1])

@@ -32,7 +32,7 @@ def field(scene, cameras):
         regions=Regions(rows[:5], pixels),
         tree=TREE,
         leaf=leaf,
-        parts=Regions(rows[[5, 6]], np.stack([pixels[0] // 2, pixels[0] // 4])),
+        part_regions=Regions(rows[[5, 6]], np.stack([pixels[0] // 2, pixels[0] // 4])),
         part_nodes=np.array([9, 8], np.int32),
         unrelated_words=words,
         codes=None,
@@ -123,7 +123,7 @@ def test_levels_are_scenes_of_the_same_gaussians(scene_of_parts, field):
     assert len(union.objects()) <= len(scene_of_parts.objects())
     with pytest.raises(InputError, match="level"):
         scene_of_parts.at_level(-2)
-    flat = Scene(dataclasses.replace(field, tree=None, leaf=None, parts=None, part_nodes=None))
+    flat = Scene(dataclasses.replace(field, tree=None, leaf=None, part_regions=None, part_nodes=None))
     with pytest.raises(InputError, match="no tree"):
         flat.at_level(1)
 
@@ -132,7 +132,8 @@ def test_parts_are_kept_in_the_file(field, tmp_path):
     save_field(tmp_path / "field.safetensors", field)
     loaded = load_field(tmp_path / "field.safetensors")
     np.testing.assert_array_equal(loaded.part_nodes, field.part_nodes)
-    np.testing.assert_array_equal(loaded.parts.embeddings, field.parts.embeddings)
+    assert loaded.part_regions is not None
+    np.testing.assert_array_equal(loaded.part_regions.embeddings, field.part_regions.embeddings)
     broken = dataclasses.replace(field, part_nodes=np.array([9, 10], np.int32))
     with pytest.raises(ValueError, match="part_nodes"):
         save_field(tmp_path / "broken.safetensors", broken)

@@ -120,7 +120,7 @@ class ObjectIndex:
     def find_parts(self, part: str, whole: str) -> list[Object]:
         """Finds the parts that a text names of each thing that another one names; "part" names all of them."""
         field, found = self._field, []
-        if field.parts is None:
+        if field.part_regions is None:
             return []
         name = re.sub(r"(^| )(parts?|pieces?)$", "", part)
         for one in self._objects_of(whole)[0]:

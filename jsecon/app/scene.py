@@ -421,7 +421,7 @@ class Scene:
 
     def _names_part(self, text: str) -> bool:
         """Whether a text such as "the lid of the pot" names a part that a thing of the scene has."""
-        named = split_part(text) if self.field.parts is not None and not is_mapped(self.field) else None
+        named = split_part(text) if self.field.part_regions is not None and not is_mapped(self.field) else None
         return named is not None and len(self._index.find_parts(*named)) > 0
 
     def _answer_text(self, query: Query) -> Answer:

@@ -373,8 +373,8 @@ def _visible_parts(
 ) -> tuple[Int16[np.ndarray, "l t h w"], Int32[np.ndarray, " p"]]:
     """Finds the parts of objects that masks of two views show alone, with an IoU of at least 0.5.
 
-    A part has LEAST_PART to MOST_PART of its object's weight. Of one and a part of it with more than half of its weight,
-    the one that more views show stays. Parts that lie in each other have labels on different layers.
+    A part has LEAST_PART to MOST_PART of its object's weight. Of one and a part of it with more than half of its
+    weight, the one that more views show stays. Parts that lie in each other have labels on different layers.
 
     Args:
       views: Superpixels of the frames.

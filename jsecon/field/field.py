@@ -64,11 +64,11 @@ _SHAPES = {
     (4, 4): "source_from_scene",
     ("m",): "tree",
     ("p",): "part_nodes",
-    ("p", "e"): "parts.embeddings",
+    ("p", "e"): "part_regions.embeddings",
 }
 _OPTIONAL = (
     "gaussians.sh", "votes.weight_where_region_visible", "votes.overlap", "unrelated_words",
-    "codes.gaussians", "codes.regions", "tree", "leaf", "parts.embeddings", "part_nodes",
+    "codes.gaussians", "codes.regions", "tree", "leaf", "part_regions.embeddings", "part_nodes",
 )  # fmt: skip
 
 

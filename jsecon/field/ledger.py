@@ -181,13 +181,16 @@ def _with_history(field: LanguageField) -> LanguageField:
 
 def _parts_in_frames(field: LanguageField, names: Sequence[str], count: int) -> dict[str, Any]:
     """The parts of a field of other frames and `count` regions: without those that a frame which is gone shows."""
-    if field.parts is None or field.part_nodes is None:
+    if field.part_regions is None or field.part_nodes is None:
         return {}
     place = {name: t for t, name in enumerate(field.names)}
-    old, nodes = np.asarray(field.parts.pixel_counts), np.asarray(field.part_nodes) + count - field.regions.count
+    old, nodes = np.asarray(field.part_regions.pixel_counts), np.asarray(field.part_nodes) + count - field.regions.count
     kept = ~old[:, [t for name, t in place.items() if name not in names]].any(1)
     pixels = np.pad(old, [(0, 0), (0, 1)])[:, [place.get(name, -1) for name in names]]
-    return {"parts": Regions(field.parts.embeddings[kept], pixels[kept]), "part_nodes": nodes[kept].astype(np.int32)}
+    return {
+        "part_regions": Regions(field.part_regions.embeddings[kept], pixels[kept]),
+        "part_nodes": nodes[kept].astype(np.int32),
+    }
 
 
 def _grown_tree(field: LanguageField, count: int, strongest: Int32[np.ndarray, " n"]) -> dict[str, np.ndarray]:

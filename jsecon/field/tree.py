@@ -70,10 +70,10 @@ def cut_field(field: LanguageField, level: int) -> LanguageField:
     own, regions = np.asarray(field.regions.pixel_counts), np.array(field.votes.regions)
     if level == PARTS:
         pixels[:count], weighted[:count] = own, field.regions.embeddings
-        if field.parts is not None:
+        if field.part_regions is not None:
             nodes = np.asarray(field.part_nodes)
-            pixels[nodes], weighted[nodes] = field.parts.pixel_counts, field.parts.embeddings
-            np.subtract.at(pixels, parts_above(field)[nodes], np.asarray(field.parts.pixel_counts))
+            pixels[nodes], weighted[nodes] = field.part_regions.pixel_counts, field.part_regions.embeddings
+            np.subtract.at(pixels, parts_above(field)[nodes], np.asarray(field.part_regions.pixel_counts))
             regions = np.stack([smallest_nodes(field, column) for column in regions.T], axis=1)
     else:
         node = np.arange(count)
@@ -87,7 +87,7 @@ def cut_field(field: LanguageField, level: int) -> LanguageField:
         field,
         votes=with_overlap(votes),
         regions=Regions(unit_rows(weighted), np.maximum(pixels, 0)),
-        **dict.fromkeys(("tree", "leaf", "parts", "part_nodes", "codes")),
+        **dict.fromkeys(("tree", "leaf", "part_regions", "part_nodes", "codes")),
         history=(),
     )
 
@@ -128,7 +128,7 @@ def _merge_votes(votes: Votes, regions: Int[np.ndarray, "n k"], count: int) -> V
             regions[same, j], weights[same, j], shown[same, j] = -1, 0.0, 0.0
     order = np.argsort(-weights, axis=1, kind="stable")
     regions, weights, shown = (np.take_along_axis(column, order, axis=1) for column in (regions, weights, shown))
-    shown = None if visible is None else np.maximum(shown, weights)
-    return dataclasses.replace(
-        votes, regions=regions, weights=weights, weight_where_region_visible=shown, num_regions=count
-    )
+    votes = dataclasses.replace(votes, regions=regions, weights=weights, num_regions=count)
+    if visible is None:
+        return votes
+    return dataclasses.replace(votes, weight_where_region_visible=np.maximum(shown, weights))

@@ -99,12 +99,11 @@ def _plan_regions(context: RunContext) -> list[Stage]:
     """Plans an embedding of each region, and of each part that the tree of objects has."""
     options, embedder, after = context.options, context.models.embedder.name, ("load", "objects")
     how = f"embedded by {embedder!r} in at most {options.crops} views each, weighted by pixels"
-    settings: dict[str, Any] = {"after": after, "distributed": True}
-    settings["key_options"] = {"embedder": embedder} | context.key_options("crops")
-    stages = [Stage("regions", how, _embed_objects, **settings)]
+    key_options = {"embedder": embedder} | context.key_options("crops")
+    stages = [Stage("regions", how, _embed_objects, after=after, key_options=key_options, distributed=True)]
     if options.masks is None and options.associated_by == "consensus":
-        how = f"parts of objects, in at most {min(options.crops, PART_CROPS)} views each"
-        stages.append(Stage("parts", how, _embed_parts, **(settings | {"after": (*after, "regions")})))
+        how, after = f"parts of objects, in at most {min(options.crops, PART_CROPS)} views each", (*after, "regions")
+        stages.append(Stage("parts", how, _embed_parts, after=after, key_options=key_options, distributed=True))
     return stages
 
 
@@ -299,7 +298,8 @@ def _embed_parts(stage: StageInput) -> StageResult:
     assert objects.part_nodes is not None
     view, count = _TrainingView(stage.results.load, context.options, objects.frames), len(objects.part_nodes)
     embed, most = context.models.embedder.embed_regions, min(context.options.crops, PART_CROPS)
-    embeddings, pixels = np.zeros((count, stage.results.regions.embeddings.shape[1]), np.float32), 0
+    embeddings = np.zeros((count, stage.results.regions.embeddings.shape[1]), np.float32)
+    pixels = np.zeros((count, len(view.train)), np.int32)
     for labels in objects.parts:  # each part is on one layer
         shown, cut, directions = crop_geometry(labels, view.cameras, count)
         chosen = choose_crops(np.where(shown >= PART_PX, shown, 0), cut, directions, most)

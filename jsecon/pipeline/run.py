@@ -330,7 +330,7 @@ def join_field(results: Results, embedder: Embedder, provenance: str, options: O
         metres_per_unit=scale,
         tree=results.objects.tree,
         leaf=results.objects.leaf,
-        parts=None if results.parts is None else of_capture(results.parts),
+        part_regions=None if results.parts is None else of_capture(results.parts),
         part_nodes=results.objects.part_nodes,
     )
     return dataclasses.replace(field, up=field_up(field, options.up))

@@ -21,10 +21,10 @@ def match_parts(
       Nodes of the tree, and an index of `rules.STATES`: ABSENT if there are none.
     """
     own = np.flatnonzero(np.isin(part_objects(field), list(wholes)))
-    if field.parts is None or not len(own):
+    if field.part_regions is None or not len(own):
         return np.zeros(0, int), ABSENT
-    rows, whole = np.asarray(field.parts.embeddings)[own], np.asarray(field.regions.embeddings)[list(wholes)]
-    pixels = np.asarray(field.parts.pixel_counts)[own], np.asarray(field.regions.pixel_counts)[list(wholes)]
+    rows, whole = np.asarray(field.part_regions.embeddings)[own], np.asarray(field.regions.embeddings)[list(wholes)]
+    pixels = np.asarray(field.part_regions.pixel_counts)[own], np.asarray(field.regions.pixel_counts)[list(wholes)]
     regions = Regions(np.concatenate([rows, whole]), np.concatenate(pixels))
     votes = dataclasses.replace(field.votes, overlap=None)
     match = match_regions(dataclasses.replace(field, regions=regions, votes=votes), texts, rules)
