@@ -49,8 +49,8 @@ class Page:
         return told["result"].get("value")
 
     def until(self, code: str, seconds: float = 20.0) -> Any:
-        """The value of an expression as soon as it is true."""
-        return until(lambda: self.js(code), code, seconds)
+        """The value of an expression as soon as it is true; a page whose script has not run yet is waited for."""
+        return until(lambda: self.js("typeof element !== 'undefined'") and self.js(code), code, seconds)
 
     def click(self, x: float, y: float) -> None:
         self.send("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
