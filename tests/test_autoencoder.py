@@ -1,10 +1,13 @@
 """The autoencoder: LangSplat's layers, against NumPy in float64."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import MANY
+from jax.test_util import check_grads
 from small_field import unit_rows
 
 from jsecon.numerics import cosine
@@ -111,6 +114,20 @@ def test_zero_is_unknown_nan_stays_nan_and_codes_of_other_sizes_are_told(trained
         encode(coder, np.ones((2, 47), np.float32))
     with pytest.raises(ValueError, match=r"\.\.\., 3"):
         decode(coder, np.ones((2, 4), np.float32))
+
+
+def test_gradients_are_those_of_finite_differences(trained):
+    embeddings, coder, _ = trained
+    with jax.enable_x64(True):
+        coder, rows = jax.tree.map(lambda a: jnp.asarray(a, jnp.float64), (coder, embeddings[:3]))
+
+        def back(rows, bias):
+            params = coder.decoder["params"]
+            changed = {"params": params | {"Dense_6": params["Dense_6"] | {"bias": bias}}}
+            return decode(dataclasses.replace(coder, decoder=changed), encode(coder, rows))
+
+        given = rows, coder.decoder["params"]["Dense_6"]["bias"]
+        check_grads(jax.jit(back), given, order=1, modes=["rev"], eps=1e-6, rtol=1e-4)
 
 
 def test_what_cannot_be_trained_on_is_told():

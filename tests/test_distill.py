@@ -7,9 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import MANY
+from jax.test_util import check_grads
 from small_field import REGIONS, labels_of, true_regions, unit_rows
 
-from jsecon import Votes, distill_l1, distill_votes, plan_capacity, render
+from jsecon import Votes, distill_l1, distill_votes, plan_capacity, plan_view, render
+from jsecon.paper.distill import rendered_l1
 
 KEY = jax.random.key(0)
 
@@ -137,6 +139,20 @@ def test_steps_equal_the_definition_in_float64(task):
     assert sorted(taken) == [0, 1, 2, 3]
     # a Gaussian with a gradient near zero may take its +-0.0025 step either way
     assert np.quantile(np.abs(np.asarray(got) - expected).max(axis=1), 0.95) < 1e-4
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-3])
+def test_the_gradient_of_the_rendered_l1_is_that_of_finite_differences(task, scale):
+    scene, cameras, labels, codes, _, capacity = task
+    with jax.enable_x64(True):
+        scene, camera, codes = jax.tree.map(lambda a: jnp.asarray(a, jnp.float64), (scene, cameras[1], codes))
+        plan = plan_view(scene, camera, capacity=capacity)
+        start = scale * jnp.asarray(unit_rows(np.random.default_rng(3), scene.count, 3), jnp.float64)
+
+        def loss(features):
+            return rendered_l1(features, plan, jnp.asarray(labels[1]), codes)[0]
+
+        check_grads(jax.jit(loss), (start,), order=1, modes=["rev"], eps=1e-7 * scale, rtol=1e-4)
 
 
 def test_unseen_gaussians_get_no_code_and_unlabelled_pixels_count_in_the_denominator_alone(task):

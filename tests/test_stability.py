@@ -401,12 +401,45 @@ def test_row(case):
         assert distance <= case.bounds.get(name, GRADIENT), name
 
 
-@pytest.mark.long
-def test_colour_and_depth_of_bad_gaussians():
-    """In every run the rows have features of such Gaussians."""
+@pytest.fixture(scope="module")
+def touched():
+    """A scene, and bool (H, W) the pixels that its sixth Gaussian touches, by brute force."""
     case = ordinary()
-    covered = weights_reference(case.gaussians, case.camera)[..., 5] > 0  # by the sixth
+    covered = weights_reference(case.gaussians, case.camera)[..., 5] > 0
     assert 20 < covered.sum() < covered.size / 2
+    return case, covered
+
+
+def nan_pixels(image) -> np.ndarray:
+    """(H, W) pixels that are NaN, which must be so in all channels or in none."""
+    wrong = np.isnan(np.asarray(image))
+    np.testing.assert_array_equal(wrong.any(-1), wrong.all(-1))
+    return wrong.any(-1)
+
+
+@pytest.mark.long
+def test_a_bad_feature_stays_where_it_is_seen_however_wide_and_in_its_own_set_under_vmap(touched):
+    case, covered = touched
+    sets = np.random.default_rng(0).normal(size=(2, 64, 12)).astype(np.float32)
+    broken = sets.copy()
+    broken[1, 5, 0] = np.nan
+
+    def loss(f):
+        image = render(case.gaussians, case.camera, f, capacity=CAPACITY).features
+        return jnp.nan_to_num(image).sum(), image
+
+    compiled = jax.jit(jax.vmap(jax.value_and_grad(loss, has_aux=True)))
+    ((_, clean), _), ((_, image), gradient) = compiled(sets), compiled(broken)
+    np.testing.assert_array_equal(image[0], clean[0])
+    np.testing.assert_array_equal(nan_pixels(image[1]), covered)
+    np.testing.assert_array_equal(np.asarray(image[1])[~covered], np.asarray(clean[1])[~covered])
+    assert bool(jnp.isfinite(gradient).all())
+
+
+@pytest.mark.long
+def test_colour_and_depth_of_bad_gaussians(touched):
+    """In every run the rows have features of such Gaussians."""
+    case, covered = touched
     coefficients = np.random.default_rng(1).normal(scale=0.2, size=(64, 4, 3)).astype(np.float32)
     means, sh = case.gaussians.means.copy(), coefficients.copy()
     means[7], sh[5, 2, 1] = np.nan, np.nan
@@ -419,9 +452,8 @@ def test_colour_and_depth_of_bad_gaussians():
     compiled = jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True))
     (_, image), gradients = compiled(broken, case.camera)
     assert all(bool(jnp.isfinite(g).all()) for g in jax.tree.leaves(gradients))
-    missing = np.isnan(image)
-    np.testing.assert_array_equal(missing.any(-1), missing.all(-1))
-    assert not (missing.any(-1) & ~covered).any()
+    missing = nan_pixels(image)
+    assert not (missing & ~covered).any()
     assert bool(jnp.isfinite(render_depth(broken, case.camera)[0]).all())
     assert int(count_non_finite(broken)) == 2
     assert int(count_non_finite(dataclasses.replace(broken, sh=None))) == 1

@@ -1,7 +1,7 @@
 """Distillation: the codes of the regions become codes of the Gaussians.
 
 With the geometry fixed the rendered map is linear in the features, F_p = sum_i w_ip f_i, and the target of a pixel is
-the code l_r(p) of its region. The paper minimises L = sum_p |F_p - l_r(p)| by Adam (`_rendered_l1`, `distill_l1`). The
+the code l_r(p) of its region. The paper minimises L = sum_p |F_p - l_r(p)| by Adam (`rendered_l1`, `distill_l1`). The
 votes W_ir = sum of w_ip over the pixels of r hold all that a closed form needs (`distill_votes`):
 
     mode      l_r of the largest W_ir
@@ -126,7 +126,7 @@ def distill_l1(
     capacity: int | None = None,
     progress: Progress | None = None,
 ) -> _Distillation:
-    """Distills as the paper does (LangSplat, train.py): Adam on the rendered L1 (`_rendered_l1`), with rate 0.0025.
+    """Distills as the paper does (LangSplat, train.py): Adam on the rendered L1 (`rendered_l1`), with rate 0.0025.
 
     One view a step, all views before any repeats, in an order drawn from `key`. The geometry is fixed.
 
@@ -193,7 +193,7 @@ def distill_l1(
     return _Distillation(codes, state.history)
 
 
-def _rendered_l1(
+def rendered_l1(
     features: Float[Array, "n d"], plan: ViewPlan, labels: Integer[Array, "h w"], region_codes: Float[Array, "r d"]
 ) -> tuple[Float[Array, ""], Int[Array, ""]]:
     """Computes the paper's loss of one view, the mean over all H W d numbers of |F m - G m|, and the overflow.
@@ -227,7 +227,7 @@ def _descend(state, gaussians, cameras, labels, region_codes, plans, until, capa
             plan = plan_view(gaussians, cameras[view], capacity=capacity)
         else:
             plan = jax.tree.map(lambda a: a[view], plans)
-        return _rendered_l1(features, plan, labels[view], codes)
+        return rendered_l1(features, plan, labels[view], codes)
 
     def step(index, state):
         (value, overflow), gradient = jax.value_and_grad(loss, has_aux=True)(state.features, state.order[index])
