@@ -5,7 +5,7 @@ import itertools
 
 import numpy as np
 import pytest
-from small_field import KnownTexts, make_field, unit_rows
+from small_field import KnownTexts, colour_field, make_field, unit_rows
 
 from jsecon import InputError, Regions, load_field, save_field
 from jsecon.app.records import Region
@@ -13,6 +13,7 @@ from jsecon.app.scene import Scene
 from jsecon.field.tree import cut_field, node_members, part_objects
 from jsecon.query.expressions import split_part
 from jsecon.query.match import select_node
+from jsecon.vision.colours import ColourEmbedder
 
 TREE = np.array([5, 5, 6, -1, -1, 6, -1, 9, 9, 0], np.int32)
 """Regions 0 to 4; 5 is 0 and 1, 6 is that and 2; 9 is a part of 0, and 7 and 8 are parts of 9."""
@@ -112,6 +113,20 @@ def test_a_text_names_a_part_of_a_thing(scene_of_parts, field):
     name = scene_of_parts.ask("lid of the mug")  # no such part: the text is the name of a thing
     assert name.by == "votes"
     assert int(name.selection.region) == 2
+
+
+def test_a_part_without_a_word_of_the_embedder_is_a_name(scene, cameras, field):
+    """Of colours "handle" says nothing: "handle of the red mug" asks for red, as "red mug" does."""
+    colours = Scene(
+        dataclasses.replace(
+            colour_field(scene, cameras),
+            **{name: getattr(field, name) for name in ("tree", "leaf", "part_nodes")},
+            part_regions=Regions(np.eye(2, ColourEmbedder().dim, dtype=np.float32), field.part_regions.pixel_counts),
+        )
+    )
+    named, plain = colours.ask("handle of the red mug"), colours.ask("red mug")
+    assert plain.mask.any()
+    np.testing.assert_array_equal(named.mask, plain.mask)
 
 
 def test_levels_are_scenes_of_the_same_gaussians(scene_of_parts, field):

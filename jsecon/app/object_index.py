@@ -118,15 +118,22 @@ class ObjectIndex:
         return [one for one in found if len(one.rows)], float(match.rank)
 
     def find_parts(self, part: str, whole: str) -> list[Object]:
-        """Finds the parts that a text names of each thing that another one names; "part" names all of them."""
+        """Finds the parts that a text names of each thing that another one names; "part" names all of them.
+
+        There are none where the embedder has no words for either: the text is the name of a thing then.
+        """
         field, found = self._field, []
         if field.part_regions is None:
             return []
         name = re.sub(r"(^| )(parts?|pieces?)$", "", part)
-        for one in self._objects_of(whole)[0]:
+        try:
+            texts = jax.device_put(self._embedder.embed_text([name])) if name else None
+            wholes = self._objects_of(whole)[0]
+        except InputError:
+            return []
+        for one in wholes:
             nodes, state = np.asarray(field.part_nodes)[np.isin(part_objects(field), one.regions)], one.state
-            if name:
-                texts = jax.device_put(self._embedder.embed_text([name]))
+            if texts is not None:
                 nodes, state = match_parts(field, texts, one.regions, self._rules)
             found += [self._part(f"{part} of {one.phrase}", int(node), state) for node in nodes]
         return [one for one in found if len(one.rows)]
