@@ -50,7 +50,16 @@ class Page:
 
     def until(self, code: str, seconds: float = 20.0) -> Any:
         """The value of an expression as soon as it is true; a page whose script has not run yet is waited for."""
-        return until(lambda: self.js("typeof element !== 'undefined'") and self.js(code), code, seconds)
+
+        def value() -> Any:
+            try:
+                return self.js(code)
+            except RuntimeError as error:
+                if "ReferenceError" in str(error):
+                    return None
+                raise
+
+        return until(value, code, seconds)
 
     def click(self, x: float, y: float) -> None:
         self.send("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)

@@ -19,7 +19,7 @@ from small_field import seen_of, shares_of
 from jsecon.field.membership import (
     CORRELATION,
     _add_visible_weight,
-    _with_overlap,
+    with_overlap,
     inside_fraction,
     inside_fraction_of_regions,
     membership_probability,
@@ -84,7 +84,7 @@ def test_shown_and_overlap_are_the_stated_sums_under_jit_as_eagerly(count):
     traced = jax.jit(_add_visible_weight)(*(jax.tree.map(jnp.asarray, tree) for tree in (votes, regions)))
     shown = found.weight_where_region_visible
     np.testing.assert_allclose(traced.weight_where_region_visible, shown, rtol=1e-6)
-    overlap = np.asarray(_with_overlap(found).overlap)
+    overlap = np.asarray(with_overlap(found).overlap)
     np.testing.assert_allclose(overlap, exact_overlap(found), rtol=2e-5, atol=1e-6)
     np.testing.assert_array_equal(overlap, overlap.T)
     np.testing.assert_array_equal(normalise_votes(votes, regions).overlap, overlap)
@@ -93,17 +93,17 @@ def test_shown_and_overlap_are_the_stated_sums_under_jit_as_eagerly(count):
 def test_overlap_under_vmap_is_a_loop_and_leaves_out_numbers_that_are_not_finite():
     several = [known_votes(100, shown=False, seed=seed) for seed in range(3)]
     stacked = jax.tree.map(lambda *a: jnp.stack([jnp.asarray(x) for x in a]), *several)
-    traced = jax.jit(jax.vmap(_with_overlap))(stacked)
-    np.testing.assert_allclose(traced.overlap, np.stack([_with_overlap(v).overlap for v in several]), rtol=1e-6)
+    traced = jax.jit(jax.vmap(with_overlap))(stacked)
+    np.testing.assert_allclose(traced.overlap, np.stack([with_overlap(v).overlap for v in several]), rtol=1e-6)
     votes = known_votes(300)
     weights, shown = np.array(votes.weights), np.array(votes.weight_where_region_visible)
     weights[:50, 0], shown[50:60, 1] = np.nan, np.inf
     broken = dataclasses.replace(votes, weights=weights, weight_where_region_visible=shown)
     without = np.where(np.isfinite(weights) & np.isfinite(shown), votes.regions, -1)
-    expected = _with_overlap(dataclasses.replace(votes, regions=without)).overlap
-    np.testing.assert_allclose(_with_overlap(broken).overlap, expected, rtol=1e-6)
+    expected = with_overlap(dataclasses.replace(votes, regions=without)).overlap
+    np.testing.assert_allclose(with_overlap(broken).overlap, expected, rtol=1e-6)
     none = {"regions": np.full((5, 1), -1), "weights": np.zeros((5, 1), np.float32), "num_regions": 0}
-    assert _with_overlap(dataclasses.replace(known_votes(5, shown=False), **none)).overlap.shape == (0, 0)
+    assert with_overlap(dataclasses.replace(known_votes(5, shown=False), **none)).overlap.shape == (0, 0)
 
 
 def test_votes_without_views_or_of_other_views_are_refused():
