@@ -19,12 +19,12 @@ from small_field import seen_of, shares_of
 from jsecon.field.membership import (
     CORRELATION,
     _add_visible_weight,
-    with_overlap,
     inside_fraction,
     inside_fraction_of_regions,
     membership_probability,
     normalise_votes,
     vote_shares,
+    with_overlap,
 )
 from jsecon.types import Regions, Votes
 
