@@ -149,6 +149,15 @@ def test_parts_that_masks_show_alone_are_labelled(world):
         assert max((shown[t] & upper).sum() / (shown[t] | upper).sum() for _, shown in own) > 0.5
 
 
+def test_without_objects_there_are_no_parts(world):
+    gaussians, cameras, frames, _, proposals = world
+    none = [np.zeros((0, *masks.shape[1:]), bool) for masks in proposals]
+    found = track_masks(frames, scene_of((gaussians, cameras), none))
+    assert (found.labels == -1).all()
+    assert found.parts.shape == (1, *found.labels.shape)
+    assert len(found.part_nodes) == len(found.tree) == 0
+
+
 def test_parents_come_after_their_children_in_any_tree():
     """Random groups and joins, some of groups that were removed: what joined is under one node, and a tree it is."""
     for seed in range(200):

@@ -396,13 +396,16 @@ def _visible_parts(
     is_part = (np.arange(len(tree)) >= count) & (objects >= 0)
     nodes = np.flatnonzero(is_part & (share >= LEAST_PART) & (share <= MOST_PART))
     nodes = nodes[np.argsort(-total[nodes], kind="stable")]
+    if not len(nodes):
+        return np.full((1, *labels.shape), -1, np.int16), nodes.astype(np.int32)
+    object_of = np.append(objects, -1)[leaf]
     inside = one_hot(leaf, len(tree)) @ under[nodes].T  # (N, P)
     shown, masks = np.zeros(len(nodes), int), []
     for view, own in zip(views, labels):
         item = np.full(view.proposals.shape[1], -1)
         item[view.labels] = own
         seen = view.votes.T.tocsr()
-        of_objects = (seen @ one_hot(objects[leaf[view.seen]], count)).toarray()
+        of_objects = (seen @ one_hot(object_of[view.seen], count)).toarray()
         mask = (seen @ inside[view.seen]).toarray() >= 0.5 * of_objects[:, objects[nodes]]
         mask &= (item[:, None] == objects[nodes]) & (of_objects[:, objects[nodes]] > 0)
         area, here = np.bincount(view.labels.reshape(-1)).astype(np.float32), np.flatnonzero(mask.any(0))
