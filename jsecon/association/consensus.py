@@ -83,9 +83,8 @@ def _group_by_consensus(
 
     The Gaussians are first gathered into small pieces (`_scene_pieces`). Then `_average_linkage` joins pieces while the
     views that see two groups put both into one mask with a probability of at least `agreement`, or of 1 if they lie off
-    each other's plane (`_coplanarity`). What joins at
-    PART_AGREEMENT is a part, and what joins down to 0.05 a union. Groups that have less than 0.02 of their visibility
-    in common stay separate.
+    each other's plane (`_coplanarity`). What joins at PART_AGREEMENT is a part, and what joins down to 0.05 a union.
+    Groups that have less than 0.02 of their visibility in common stay separate.
 
     Args:
       membership: (N, M) share of each Gaussian in each of the M masks of all frames, times its visibility there.

@@ -196,7 +196,7 @@ class ModelOptions:
       embedder: CLIP model for regions and texts, instead of colours: a name (clip, siglip2, mobileclip),
         hub:owner/name, or a folder.
       crops: Maximum number of views in which a region is embedded: those that show most of it, not cut off by the
-        frame's border, from different directions.
+        frame's border, from different directions. Parts of objects take at most two.
       vision_frames: Maximum number of training frames in which masks are found and embedded; the fit uses all. A
         segmenter takes those that show most of the scene first, and ends where a further one adds less than 1 %. Other
         masks, and a tracker, take evenly spaced frames, by default all.

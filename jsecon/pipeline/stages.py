@@ -6,7 +6,7 @@
     gaussians  scene.plan_scene       load: fitted, or read from a file
     objects    objects.plan_objects   load, gaussians (--masks: load alone)
     regions    objects.plan_objects   load, objects
-    parts      objects.plan_objects   load, objects, where masks have a tree
+    parts      objects.plan_objects   load, objects, regions, where masks have a tree
     votes      objects.plan_objects   load, gaussians, objects
     codes      objects.plan_objects   regions, votes, with --paper
     held_out   scene.plan_scene       load, gaussians, if there are photographs

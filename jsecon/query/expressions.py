@@ -202,14 +202,15 @@ _PREPOSITIONS = {words[0] for words in _RELATION_OF if len(words) == 1} - {"near
 
 
 def split_part(text: str) -> tuple[str, str] | None:
-    """Reads "handle of the red mug", "part of the mug that is a handle" or "the mug's handle": ("handle", "red mug").
+    """Reads "handle of the red mug", "where is the red mug's handle": ("handle", "red mug").
 
-    None if the text names no part of another thing. "Cup of tea" and "statue of liberty" are names: they lack an
-    article after "of".
+    None if the text names no part of another thing, or several things. "Cup of tea" and "statue of liberty" are names:
+    they lack an article after "of".
     """
-    if _QUOTED.search(text):
+    included, excluded = parse_query(text)
+    if _QUOTED.search(text) or len(included) > 1 or excluded:
         return None
-    plain = " ".join(text.replace("\N{RIGHT SINGLE QUOTATION MARK}", "'").split()).rstrip(".?!")
+    plain = " ".join(included[0].replace("\N{RIGHT SINGLE QUOTATION MARK}", "'").split()).rstrip(".?!")
     for pattern in _PART_OF:
         if match := pattern.fullmatch(plain):
             return match["part"], match["whole"]
