@@ -34,9 +34,11 @@ SURFACE_WIDTH = 0.08
 """Distance from a plane at which pieces count as off it, as a share of the median depth: 12 cm in a small room."""
 PART_AGREEMENT = 0.9
 """Probability of a common mask from which pieces are one part of an object."""
+PART_PIECES, PART_PIECE = 300, 16
+"""Most pieces of one object, and mean number of Gaussians of each: those of fewer have no plane to tell a wall by."""
 NEW_NODE = 0.1
 """Share of its weight that a join must add to make a node of its own."""
-LEAST_PART, MOST_PART = 0.03, 0.85
+LEAST_PART, MOST_PART = 0.01, 0.85
 """Shares of an object's weight between which a part is one that a text may name."""
 
 
@@ -65,7 +67,7 @@ class _Groups(NamedTuple):
     weight: Float[np.ndarray, " r"]
     """(R,) rendering weight of each group."""
     parts: "_Groups | None" = None
-    """The groups that joined to these, and how."""
+    """The parts of these, and how they join."""
 
 
 def _group_by_consensus(
@@ -83,8 +85,8 @@ def _group_by_consensus(
 
     The Gaussians are first gathered into small pieces (`_scene_pieces`). Then `_average_linkage` joins pieces while the
     views that see two groups put both into one mask with a probability of at least `agreement`, or of 1 if they lie off
-    each other's plane (`_coplanarity`). What joins at PART_AGREEMENT is a part, and what joins down to 0.05 a union.
-    Groups that have less than 0.02 of their visibility in common stay separate.
+    each other's plane (`_coplanarity`). What joins at PART_AGREEMENT within a group is a part (`_parts_within`), and
+    what joins down to 0.05 a union. Groups that have less than 0.02 of their visibility in common stay separate.
 
     Args:
       membership: (N, M) share of each Gaussian in each of the M masks of all frames, times its visibility there.
@@ -104,8 +106,26 @@ def _group_by_consensus(
     owner = np.full(len(piece), -1, np.int64)
     if not len(live):
         return _Groups(owner, [], np.zeros(0))
-    shape = (int(piece.max()) + 1, len(piece))
-    gather = sparse.csr_matrix((weights[live], (piece[live], live)), shape=shape)
+    together, both = _linked(piece, membership, visible, weights, means, surface_width, agreement)
+    group, _ = _average_linkage(together, both, least_ratio=agreement, least_shared=0.02)
+    owner[live] = group[piece[live]]
+    _, joins = _average_linkage(*_merged(group, together, both), least_ratio=0.05, least_shared=0.02)
+    parts = _parts_within(owner, membership, visible, weights, means, surface_width, agreement, seed)
+    return _Groups(owner, joins, np.bincount(owner[live], weights[live]), parts)
+
+
+def _linked(
+    piece: Int[np.ndarray, " n"],
+    membership: Sparse,
+    visible: Sparse,
+    weights: Float[np.ndarray, " n"],
+    means: Float[np.ndarray, "n 3"],
+    surface_width: float,
+    agreement: float,
+) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "k k"]]:
+    """Links pieces: how much views put two into one mask, less off each other's plane, and how much they see both."""
+    live = np.flatnonzero(piece >= 0)
+    gather = sparse.csr_matrix((weights[live], (piece[live], live)), shape=(int(piece.max()) + 1, len(piece)))
     in_masks, in_view = gather @ membership, gather @ visible
     off_plane = min(agreement, 1.0)  # then a probability of 1 equals `agreement` in the plane
     coplanarity = _coplanarity(*_piece_planes(gather[:, live], means[live]), surface_width)
@@ -113,15 +133,43 @@ def _group_by_consensus(
     sparse_pieces = np.bincount(piece[live]) < 8
     coplanarity[sparse_pieces[:, None] | sparse_pieces] = 1.0
     together = (in_masks @ in_masks.T).toarray() * (off_plane + (1.0 - off_plane) * coplanarity)
-    both = (in_view @ in_view.T).toarray()
-    group, groups = np.arange(len(both)), None
-    for least_ratio in (max(PART_AGREEMENT, agreement), agreement, 0.05):
-        joined, joins = _average_linkage(together, both, least_ratio=least_ratio, least_shared=0.02)
-        owner[live] = group[piece[live]]
-        groups = _Groups(owner.copy(), joins, np.bincount(owner[live], weights[live]), groups)
-        member, group = one_hot(joined, int(joined.max()) + 1), joined[group]
-        together, both = (member.T @ (member.T @ matrix).T for matrix in (together, both))
-    return groups
+    return together, (in_view @ in_view.T).toarray()
+
+
+def _merged(group: Int[np.ndarray, " k"], *matrices: Float[np.ndarray, "k k"]) -> list[Float[np.ndarray, "g g"]]:
+    """Sums rows and columns of the members of each group."""
+    member = one_hot(group, int(group.max()) + 1)
+    return [member.T @ (member.T @ matrix).T for matrix in matrices]
+
+
+def _parts_within(
+    owner: Int[np.ndarray, " n"],
+    membership: Sparse,
+    visible: Sparse,
+    weights: Float[np.ndarray, " n"],
+    means: Float[np.ndarray, "n 3"],
+    surface_width: float,
+    agreement: float,
+    seed: int,
+) -> _Groups:
+    """Divides each object into parts, and joins these to it, as the scene into objects but by pieces of its own.
+
+    In pieces of the scene a knob or an ear would be one with what it stands on. Arguments as for
+    `_group_by_consensus`, with the object of each Gaussian in `owner`, -1 for none.
+    """
+    part, joins, first = np.full(len(owner), -1), [], 0
+    order = np.argsort(owner, kind="stable")
+    for rows in np.split(order, np.searchsorted(owner[order], np.arange(int(owner.max()) + 1)))[1:]:
+        own = membership[rows], visible[rows], weights[rows], means[rows]
+        piece = _scene_pieces(*own, pieces=min(max(len(rows) // PART_PIECE, 1), PART_PIECES), seed=seed)
+        links = _linked(piece, *own, surface_width, agreement)
+        group, _ = _average_linkage(*links, least_ratio=PART_AGREEMENT, least_shared=0.02)
+        _, pairs = _average_linkage(*_merged(group, *links), least_ratio=0.0)
+        part[rows] = first + group[piece]
+        joins += [(first + a, first + b) for a, b in pairs]
+        first += int(group.max()) + 1
+    known = part >= 0
+    return _Groups(part, joins, np.bincount(part[known], weights[known], first))
 
 
 def _piece_planes(
@@ -181,13 +229,14 @@ def _scene_pieces(
     sketch = membership[live] @ basis
     sketch /= np.maximum(np.linalg.norm(sketch, axis=1, keepdims=True), 1e-12)
     points = np.concatenate([4.0 * centred, sketch], axis=1).astype(np.float32)
-    centres = _cell_means(points, _split_cells(points, min(pieces, max(len(live) // 4, 1))))
+    exact = points.astype(np.float64)
+    centres = _cell_means(exact, _split_cells(exact, min(pieces, max(len(live) // 4, 1))))
     for _ in range(2):
         # |p - c|^2 / 2 but for |p|^2 / 2, which is the same for all centres
         lines = np.concatenate([-centres, 0.5 * np.square(centres).sum(1, keepdims=True)], axis=1).astype(np.float32)
         parts = np.array_split(np.pad(points, [(0, 0), (0, 1)], constant_values=1.0), len(points) // 4096 + 1)
         nearest = relabel_sequential(np.concatenate([(part @ lines.T).argmin(1) for part in parts]))
-        centres = _cell_means(points, nearest)
+        centres = _cell_means(exact, nearest)
     piece[live] = nearest
     return piece
 
@@ -200,7 +249,7 @@ def _split_cells(points: Float[np.ndarray, "n d"], count: int) -> Int[np.ndarray
     cell = np.zeros(len(points), np.int64)
     while (have := int(cell.max()) + 1) < count:
         away = points - _cell_means(points, cell)[cell]
-        spread = np.stack([np.bincount(cell, column) for column in np.square(away).T], axis=1)
+        spread = _cell_sums(np.square(away), cell)
         axis, most = spread.argmax(1), spread.max(1)
         widest = np.argsort(-most, kind="stable")[: min(count - have, (have + 1) // 2)]
         widest = widest[most[widest] > 1e-9]
@@ -213,7 +262,13 @@ def _split_cells(points: Float[np.ndarray, "n d"], count: int) -> Int[np.ndarray
 
 
 def _cell_means(points: Float[np.ndarray, "n d"], cell: Int[np.ndarray, " n"]) -> Float[np.ndarray, "k d"]:
-    return np.stack([np.bincount(cell, column) for column in points.T], axis=1) / np.bincount(cell)[:, None]
+    return _cell_sums(points, cell) / np.bincount(cell)[:, None]
+
+
+def _cell_sums(points: Float[np.ndarray, "n d"], cell: Int[np.ndarray, " n"]) -> Float[np.ndarray, "k d"]:
+    """Sums the points of each cell, in their order."""
+    shape = (int(cell.max()) + 1, len(cell))
+    return sparse.csc_matrix((np.ones(len(cell)), cell, np.arange(len(cell) + 1)), shape=shape) @ points
 
 
 def _average_linkage(
