@@ -149,6 +149,27 @@ def test_parts_that_masks_show_alone_are_labelled(world):
         assert max((shown[t] & upper).sum() / (shown[t] | upper).sum() for _, shown in own) > 0.5
 
 
+def test_a_small_part_of_a_large_scene_has_a_node_of_its_own():
+    """Twenty things and few pieces: in these the knob of 40 Gaussians is one with what it stands on."""
+    rng, views = np.random.default_rng(0), 6
+    things = np.repeat(np.arange(20), 500)
+    means = rng.normal(0, 0.1, (len(things), 3)) + 2.0 * np.stack(np.unravel_index(things, (5, 4, 1)), axis=1)
+    knob = np.zeros(len(things), bool)
+    middle = means[:500].mean(0) + np.array([0, 0, 0.3])
+    knob[:40], means[:40] = True, middle + rng.normal(0, 0.01, (40, 3))
+    of_things, of_knob = np.eye(20)[things] * np.where(knob, 0.7, 0.8)[:, None], 0.7 * knob[:, None]
+    membership = sparse.csr_matrix(np.tile(np.concatenate([of_things, of_knob], axis=1), views))
+    visible = sparse.csr_matrix(np.repeat(np.where(knob, 0.99, 0.8)[:, None], views, axis=1))
+    found = _group_by_consensus(membership, visible, np.ones(len(things)), means, pieces=40)
+    assert found.owner.max() + 1 == 20  # the knob is no object
+    assert len(np.unique(found.owner[:500])) == 1
+    parts = found.parts.owner
+    assert max(((parts == k) & knob).sum() / ((parts == k) | knob).sum() for k in np.unique(parts)) > 0.8
+    assert {tuple(np.unique(found.owner[np.isin(parts, pair)])) for pair in found.parts.joins} <= {
+        (k,) for k in range(20)
+    }
+
+
 def test_without_objects_there_are_no_parts(world):
     gaussians, cameras, frames, _, proposals = world
     none = [np.zeros((0, *masks.shape[1:]), bool) for masks in proposals]
