@@ -107,6 +107,19 @@ def test_the_grammar(text, thing, conditions, order, number, every):
     assert len(expression.readings()) == (1 if expression.joined else max(1, len(conditions)))
 
 
+@pytest.mark.parametrize(("text", "thing", "relation"), [
+    ("the table with everything on it", "table", "on"), ("The red tray and all that is on it.", "red tray", "on"),
+    ("where is the shelf with what's in it?", "shelf", "in"), ("box with all the things inside it", "box", "in"),
+    ("the leftmost plate, with everything that is on top of it", "plate", "on"),
+])  # fmt: skip
+def test_what_is_on_a_thing_may_be_added(text, thing, relation):
+    expression = parse_expression(text)
+    assert is_expression(text)
+    assert (expression.thing.text, expression.adds) == (thing, relation)
+    assert expression.describe(()).endswith(f"with everything {relation} it")
+    assert not is_expression(f'"{text}"')
+
+
 def test_every_spelling_is_understood_and_quotes_protect():
     for name, spellings in RELATIONS.items():
         for words in spellings.replace("\n", "|").split("|"):

@@ -244,6 +244,21 @@ def test_odd_input_has_an_error_of_its_own(scene):
     assert "nothing to compare with" in answer.reason
 
 
+def test_everything_on_a_thing_and_on_that_is_added():
+    tray = ("purple tray", (0.0, -0.5, -0.01), (0.2, 0.2, 0.01))
+    scene = Scene(*table_field((*THINGS, tray)), up=(0, 0, 1))
+    tray, plate, ball = (scene.ask(name).mask for name in ("purple tray", "white plate", "orange ball"))
+    answer = scene.ask("the purple tray with everything on it")
+    np.testing.assert_array_equal(answer.mask, tray | plate | ball)
+    assert answer.count == 3
+    assert "with everything on it" in answer.reading
+    np.testing.assert_array_equal(scene.ask("the white plate and what is on it").mask, plate | ball)
+    alone = scene.ask("the dark blue box with everything on it")
+    np.testing.assert_array_equal(alone.mask, scene.ask("dark blue box").mask)
+    with pytest.raises(InputError, match="names no object"):
+        scene.ask("everything on it")
+
+
 def test_options_of_relations_need_one_in_a_text(tmp_path, capsys):
     save_field(tmp_path / "field.safetensors", table_field()[0])
     asked = ["query", str(tmp_path / "field.safetensors"), "red mug", "--out", str(tmp_path / "out")]

@@ -28,7 +28,7 @@ from jsecon.query.match import select_node
 from jsecon.query.object_shapes import ObjectShapes
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.parts import match_parts
-from jsecon.query.referring import evaluate
+from jsecon.query.referring import evaluate, with_what_is
 from jsecon.query.relations import Viewpoint, order_values, viewpoint
 from jsecon.query.rules import ABSENT, FOUND, MIN_RANK, QueryRules
 from jsecon.read.captures.frames import transform_poses
@@ -228,11 +228,14 @@ class ObjectIndex:
         if not question and any({found.regions for found in other.chosen} not in (set(), chosen) for other in others):
             first, second = expression.conditions
             question = f"is it the {expression.thing.text} or the {first.anchors[-1].text} that is {second}?"
+        named = best.chosen
+        if named and expression.adds:
+            named = with_what_is(expression.adds, named, self._objects_of(ANY_OBJECT)[0], view)
         mask = np.zeros(self._field.gaussians.count, bool)
-        for found in best.chosen:
+        for found in named:
             mask[found.rows] = True
-        region = best.chosen[0].regions[0] if len(best.chosen) == 1 else -1
-        score = best.chosen[0].score if best.chosen else 0.0
+        region = named[0].regions[0] if len(named) == 1 else -1
+        score = named[0].score if named else 0.0
         state = np.asarray(min((found.state for found in [*best.chosen, *best.used]), default=ABSENT), np.int32)
         score = np.asarray(score, np.float32)
         selection = Selection(mask, mask.astype(np.float32), np.asarray(region, np.int32), score, state=state)
@@ -242,12 +245,12 @@ class ObjectIndex:
             mask=mask,
             selection=selection,
             field=self._field,
-            count=len(best.chosen),
+            count=len(named),
             reason=best.reason,
-            objects=tuple(best.chosen),
+            objects=tuple(named),
             reading=expression.describe(readings[place]),
             viewpoint=words if expression.depends_on_view else "",
-            up=self._up if expression.conditions or expression.thing.order else None,
+            up=self._up if expression.conditions or expression.thing.order or expression.adds else None,
             used=tuple(best.used),
             question=question,
         )

@@ -10,6 +10,8 @@ small grammar. There is no language model.
     ORDER       before the object: largest, second tallest, left, smaller ...; behind it: "from the left"
     object      any other words, which an embedder reads; or "thing", "everything", which is any object
 
+Behind it may stand "with everything on it" or "in it", which adds what stands on the objects, and on that.
+
 The words are in lexicon.toml. Everyday names contain many of them: "first aid kit", "one way sign", "under cabinet
 light", "carry on bag". A word of the grammar therefore belongs to a name where it does no work:
 
@@ -152,6 +154,8 @@ class _Expression:
     """Whether all conditions belong to the object for certain."""
     depends_on_view: bool = False
     """Whether a relation or an order depends on the viewpoint."""
+    adds: str = ""
+    """The relation of what is meant beside the objects, "on" or "in"; "" for the objects alone."""
 
     def readings(self) -> list[tuple[Condition, ...]]:
         """Lists the ways to attach the relations to the objects.
@@ -169,6 +173,7 @@ class _Expression:
         """Describes one of the `readings`: the object, its conditions and its order, in words."""
         rank = "" if self.thing.rank == 1 else f"{_ORDINALS[self.thing.rank - 1]} "
         order = [] if self.thing.order is None else [f"{rank}{self.thing.order}"]
+        order += [f"with everything {self.adds} it"] if self.adds else []
         return ", ".join([f"{self.thing.text!r}", *map(str, conditions), *order])
 
 
@@ -196,6 +201,11 @@ _PART_OF = (
     re.compile(rf"(?:{_ARTICLE})?(?P<part>.+?) of {_ARTICLE}(?P<whole>.+)", re.IGNORECASE),
     re.compile(rf"(?:{_ARTICLE})?(?P<whole>.+?)'s (?P<part>.+)", re.IGNORECASE),
 )
+_ADDS = re.compile(
+    r"(?P<things>.+?),? (?:with|and) (?:all|everything|whatever|what|(?:all )?the (?:things|objects))"
+    r"(?: that)?(?:'s| is| are)? (?P<relation>on|in)(?:(?<=on) top of|side)? (?:it|them)",
+    re.IGNORECASE,
+)
 _ABOUT_PROPERTY = re.compile(_LEXICON["about_property"])
 _INDEFINITE = ("a", "an", "any", "some", "of")
 _PREPOSITIONS = {words[0] for words in _RELATION_OF if len(words) == 1} - {"nearest", "closest"}
@@ -222,8 +232,17 @@ def is_expression(text: str) -> bool:
     return any(map(_needs_grammar, itertools.chain(*_alternatives(text))))
 
 
+def _split_added(text: str) -> tuple[str, str]:
+    """Splits "the tray with everything on it" into "the tray" and "on"; the second is "" for any other text."""
+    plain = " ".join(text.replace("\N{RIGHT SINGLE QUOTATION MARK}", "'").split()).rstrip(".?!")
+    match = None if _QUOTED.search(text) else _ADDS.fullmatch(plain)
+    return (text, "") if match is None else (match["things"], match["relation"].lower())
+
+
 def _needs_grammar(text: str) -> bool:
     """Whether a text without "or" and "but not" needs the grammar."""
+    if _split_added(text)[1]:
+        return True
     counted, tokens = _question(_tokens(text))
     if counted or not tokens or _asks_for_property(text):
         return bool(tokens)
@@ -239,8 +258,9 @@ def parse_expression(text: str) -> _Expression:
     not UTF-8, has a relation without an object, or a word that looks like a relation and is none.
     """
     _require_utf8(text)
-    tokens = _tokens(text)
     where = f"expression {text!r}"
+    text, adds = _split_added(text)
+    tokens = _tokens(text)
     if not tokens:
         raise InputError("expression", "the text is empty", remedy=_REMEDY)
     if asked := _asks_for_property(text):
@@ -278,7 +298,7 @@ def parse_expression(text: str) -> _Expression:
     phrases = [thing, *(anchor for condition in conditions for anchor in condition.anchors)]
     named = [*(condition.relation for condition in conditions), *(phrase.order for phrase in phrases)]
     depends_on_view = not _OF_VIEW.isdisjoint(named)
-    return _Expression(thing, tuple(conditions), joined, depends_on_view)
+    return _Expression(thing, tuple(conditions), joined, depends_on_view, adds)
 
 
 def _tokens(text: str) -> list[_Token]:

@@ -121,6 +121,17 @@ def evaluate(
     return _ReferringResult(chosen, used, undecided, "; ".join(wrong))
 
 
+def with_what_is(relation: str, chosen: Sequence[Object], things: Sequence[Object], view: Viewpoint) -> list[Object]:
+    """Adds the things that are on objects, or in them, and on what was added."""
+    found, condition = list(chosen), Condition(relation, ())
+    while left := [thing for thing in things if _apart([thing], found).all()]:
+        scores = _condition_scores(left, _stack_shapes(left), condition, [found], view, (1.0, 1.0))
+        if scores.max() < SATISFIED:
+            break
+        found += [thing for thing, score in zip(left, scores) if score >= SATISFIED]
+    return found
+
+
 def _apart(a: Sequence[Object], b: Sequence[Object]) -> Bool[np.ndarray, "k l"]:
     """Which pairs of objects have no region in common."""
     return np.array([[not set(one.regions) & set(other.regions) for other in b] for one in a])
