@@ -9,6 +9,8 @@ each mask and each solid. A solid that is a part shows mostly the part's word; t
 
 An expression is right if the IoU of its Gaussians with the true ones of that part is above 0.25. A part is asked for if
 it has at least 30 Gaussians and the room has one thing of that name. Absent: other names of parts, of the same things.
+A lone word, as "lid", is right if more than half of its Gaussians are of parts of that name; or, where the room has no
+such part, if there are none.
 """
 
 import dataclasses
@@ -166,8 +168,8 @@ def field_of_parts(seed: int, options: Options) -> tuple[LanguageField, PartEmbe
     return join_field(done, embedder, "{}", run), embedder, names, np.where(truth < len(names), truth, -1)
 
 
-def ask_parts(seed: int, options: Options) -> tuple[list[float], list[float], list[bool]]:
-    """The IoU of each expression of a room, that of the best node of the tree, and whether absent parts are refused."""
+def ask_parts(seed: int, options: Options) -> tuple[list[float], list[float], list[bool], list[bool]]:
+    """The IoU of each expression of a room, that of the best node, whether absent parts are refused, and lone words."""
     field, embedder, names, truth = field_of_parts(seed, options)
     scene, ious, best, refused = Scene(field, embedder), [], [], []
     tree, leaf = np.asarray(field.tree), np.asarray(field.leaf)
@@ -184,7 +186,12 @@ def ask_parts(seed: int, options: Options) -> tuple[list[float], list[float], li
                 best.append(max(_iou(node, true) for node in nodes))
                 print(f"{part} of the {thing}: {true.sum()} {mask.sum()} {ious[-1]:.2f} {best[-1]:.2f}", flush=True)
         refused += [not _ask(scene, part, thing).any() for part in sorted(words - own) if own]
-    return ious, best, refused
+    lone, shown = [], {name.split("|")[1] for name in names if "|" in name}
+    for word in sorted(words):
+        mask = scene.ask(word).mask
+        true = np.isin(truth, [n for n, name in enumerate(names) if name.endswith(f"|{word}")])
+        lone.append(mask.any() and true[mask].mean() > 0.5 if word in shown else not mask.any())
+    return ious, best, refused, lone
 
 
 def _iou(mask: np.ndarray, true: np.ndarray) -> float:
@@ -202,13 +209,22 @@ def _ask(scene: Scene, part: str, thing: str) -> np.ndarray:
 def main(options: Options = Options()) -> dict:
     """Runs the experiment, writes its results and returns the metrics."""
     measured: dict[str, Any] = {f"seed {seed}": ask_parts(seed, options) for seed in options.seeds}
-    measured["all"] = tuple([x for row in measured.values() for x in row[k]] for k in range(3))
-    header = ("room", "expressions", "right", "mean IoU", "best node, mean IoU", "absent parts", "refused")
+    measured["all"] = tuple([x for row in measured.values() for x in row[k]] for k in range(4))
+    header = (
+        "room",
+        "expressions",
+        "right",
+        "mean IoU",
+        "best node, mean IoU",
+        "absent parts",
+        "refused",
+        "lone words",
+    )
     rows = []
-    for name, (ious, best, refused) in measured.items():
-        shares = [np.mean(np.array(ious) > RIGHT), np.mean(ious), np.mean(best), np.mean(refused)]
-        right, iou, node, refusal = (round(float(share), 3) for share in shares)
-        rows.append((name, len(ious), right, iou, node, len(refused), refusal))
+    for name, (ious, best, refused, lone) in measured.items():
+        shares = [np.mean(np.array(ious) > RIGHT), np.mean(ious), np.mean(best), np.mean(refused), np.mean(lone)]
+        right, iou, node, refusal, words = (round(float(share), 3) for share in shares)
+        rows.append((name, len(ious), right, iou, node, len(refused), refusal, words))
     table = results.table(header, rows)
     metrics = {"rows": [dict(zip(header, row)) for row in rows]}
     bars = {name: [row[header.index(name)] for row in rows] for name in ("right", "mean IoU", "refused")}

@@ -111,6 +111,11 @@ def test_a_text_names_a_part_of_a_thing(scene_of_parts, field):
         np.testing.assert_array_equal(answer.mask, select_node(field, node).mask)
         assert answer.state == "found"
         assert answer.objects[0].regions == (node,)
+    for text, node in (("handle", 9), ("rim", 8)):  # of any thing, as no thing is called so
+        np.testing.assert_array_equal(scene_of_parts.ask(text).mask, select_node(field, node).mask)
+    assert int(scene_of_parts.ask("mug").selection.region) == 0
+    assert scene_of_parts.ask("lid").state != "found"
+    assert scene_of_parts.ask("handle or rim").by == "votes"
     every = scene_of_parts.ask("the parts of the mug")
     assert {one.regions for one in every.objects} == {(9,), (8,)}
     name = scene_of_parts.ask("lid of the mug")  # no such part: the text is the name of a thing

@@ -98,7 +98,7 @@ class ObjectIndex:
 
         Where a text is the best name of some of the objects, the others do not count. The second value is the share of
         unrelated words that are less similar to the scene than the phrase. A phrase such as "handle of the mug" names
-        the parts of a thing, if the thing has such parts.
+        the parts of a thing, if the thing has such parts, and "handle" parts of any thing, if no thing is called so.
         """
         listed = self._catalogue
         if (named := split_part(phrase)) and (found := self.find_parts(*named)):
@@ -110,6 +110,10 @@ class ObjectIndex:
         texts = choose_shades(self._field, self._embedder, [phrase], self._rules, every=True)
         embedded = jax.device_put(self._embedder.embed_text(texts))
         match = match_regions(self._field, embedded, self._rules)
+        if int(match.state) < FOUND:  # no thing has that name; parts of things may
+            nodes, state = match_parts(self._field, embedded, range(self._field.regions.count), self._rules)
+            if len(nodes):
+                return [self._part(phrase, int(node), state) for node in nodes], float(match.rank)
         regions = np.flatnonzero(np.asarray(match.chosen)) if int(match.region) >= 0 else np.zeros(0, int)
         owners = listed.regions[regions]
         named = set(owners[self._is_best_name(texts, regions)].tolist()) - {-1}
