@@ -233,6 +233,21 @@ def test_a_known_length_gives_metres_which_the_field_keeps(tmp_path, capsys):
     assert "Give two places" in capsys.readouterr().err
 
 
+def test_a_length_is_that_of_the_thing_that_a_query_selects():
+    """A cloth is nearly white: "white plate" names the plate, which matches best, for a query and for a length."""
+    field, embedder = table_field((*THINGS, ("white cloth", (0.3, 0.6, 0.01), (0.1, 0.1, 0.01))))
+    rows = np.array(field.regions.embeddings)
+    rows[6] = 0.7 * rows[3] + 0.3 * np.asarray(embedder.embed_text(["light yellow"]))[0]
+    rows[6] /= np.linalg.norm(rows[6])
+    regions = Regions(rows, field.regions.pixel_counts)
+    scene = Scene(dataclasses.replace(field, regions=regions), embedder, up=(0, 0, 1))
+    assert scene.ask("white plate").count == 1
+    assert scene.relate("white plate").count == 2
+    assert scene.measure("white plate", "orange ball")["centers"] == pytest.approx(0.06, abs=0.01)
+    with pytest.raises(InputError, match="the left one at"):  # two that match alike
+        scene.measure("red mug", "orange ball")
+
+
 def test_odd_input_has_an_error_of_its_own(scene):
     with pytest.raises(InputError, match="is no direction"):
         Scene(*table_field(), up=(0, 0, 0)).ask("the leftmost red mug")

@@ -153,6 +153,14 @@ class ObjectIndex:
         regions, rows, shape = self._measured(index)
         return Object(phrase, regions, rows, shape, sure=bool(self._catalogue.sure[index]), state=state)
 
+    def object_of(self, phrase: str, answer: Answer) -> Object:
+        """The object that an answer selects, as the catalogue measures it if it has it."""
+        if answer.objects:
+            return answer.objects[0]
+        region = int(answer.selection.region)
+        index = int(self._catalogue.regions[region])
+        return self._object(phrase, index) if index >= 0 else Object(phrase, (region,), answer.rows, answer.place)
+
     def _measure(self, index: int) -> tuple[tuple[int, ...], np.ndarray, ObjectShapes]:
         """Regions of an object, its Gaussians, and their shape: without its parts, and what stands apart from it."""
         regions = tuple(np.flatnonzero(self._catalogue.regions == index).tolist())

@@ -553,7 +553,7 @@ class Scene:
         with self._lock:
             return self._index.answer(Query(text, frame=frame), None if frame is None else self.frame_index(frame))
 
-    def locate(self, text: str, *, frame: int | str | None = None, relate: bool = False) -> Answer:
+    def locate(self, text: str, *, frame: int | str | None = None) -> Answer:
         """Finds the one thing that a text names.
 
         In five made-up rooms it finds all 60 things that have a unique name; the centre of their `place` is off by 5 mm
@@ -562,7 +562,6 @@ class Scene:
         Args:
           text: For example "orange ball" or "the red mug left of the bottle".
           frame: As for `relate`.
-          relate: Whether to read any text as `relate` does.
 
         Returns:
           The answer, of one object.
@@ -570,10 +569,12 @@ class Scene:
         Raises:
           InputError: The text names no object, or several.
         """
-        answer = self.relate(text, frame=frame) if relate else self.ask(text, frame=frame)
+        answer = self.ask(text, frame=frame)
         if answer.count != 1:
             problem = f"it names {answer.count} objects" + (f": {answer.reason}" if answer.reason else "")
-            remedy = answer.question or "Say which, as in 'the red mug left of the green bottle', or point at it."
+            several = answer.count > 1 and not answer.question and not is_mapped(self.field)
+            question = self.relate(text, frame=frame).question if several else answer.question
+            remedy = question or "Say which, as in 'the red mug left of the green bottle', or point at it."
             raise InputError(f"query {text!r}", problem, "one object", remedy[:1].upper() + remedy[1:])
         return answer
 
@@ -600,9 +601,10 @@ class Scene:
         with self._lock:
             places = []
             for end in (a, b):
-                named = isinstance(end, str)
-                place = self.locate(end, frame=frame, relate=True).objects[0] if named else np.asarray(end, np.float64)
-                places.append(place)
+                if isinstance(end, str):
+                    places.append(self._index.object_of(end, self.locate(end, frame=frame)))
+                else:
+                    places.append(np.asarray(end, np.float64))
             return {"a": a, "b": b} | self._index.distances(*places)
 
     def scaled(self, a: str | Sequence[float | int], b: str | Sequence[float | int], metres: float | int) -> "Scene":
