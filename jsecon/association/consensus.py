@@ -101,7 +101,8 @@ def _group_by_consensus(
     shapes = [rows.shape for rows in (membership, visible, weights, means)]
     equal = len({shape[0] for shape in shapes}) == 1
     require(equal, "membership, visible, weights, means", shapes, "N rows each", "Pass one row per Gaussian.")
-    piece = _scene_pieces(membership, visible, weights, means, pieces=pieces, seed=seed)
+    sketch = _mask_sketch(membership, seed)
+    piece = _scene_pieces(sketch, weights, means, pieces)
     live = np.flatnonzero(piece >= 0)
     owner = np.full(len(piece), -1, np.int64)
     if not len(live):
@@ -110,7 +111,7 @@ def _group_by_consensus(
     group, _ = _average_linkage(together, both, least_ratio=agreement, least_shared=0.02)
     owner[live] = group[piece[live]]
     _, joins = _average_linkage(*_merged(group, together, both), least_ratio=0.05, least_shared=0.02)
-    parts = _parts_within(owner, membership, visible, weights, means, surface_width, agreement, seed)
+    parts = _parts_within(owner, sketch, membership, visible, weights, means, surface_width, agreement)
     return _Groups(owner, joins, np.bincount(owner[live], weights[live]), parts)
 
 
@@ -144,24 +145,27 @@ def _merged(group: Int[np.ndarray, " k"], *matrices: Float[np.ndarray, "k k"]) -
 
 def _parts_within(
     owner: Int[np.ndarray, " n"],
+    sketch: Float[np.ndarray, "n d"],
     membership: Sparse,
     visible: Sparse,
     weights: Float[np.ndarray, " n"],
     means: Float[np.ndarray, "n 3"],
     surface_width: float,
     agreement: float,
-    seed: int,
 ) -> _Groups:
     """Divides each object into parts, and joins these to it, as the scene into objects but by pieces of its own.
 
     In pieces of the scene a knob or an ear would be one with what it stands on. Arguments as for
-    `_group_by_consensus`, with the object of each Gaussian in `owner`, -1 for none.
+    `_group_by_consensus`, with the object of each Gaussian in `owner`, -1 for none, and its `_mask_sketch`.
     """
     part, joins, first = np.full(len(owner), -1), [], 0
     order = np.argsort(owner, kind="stable")
     for rows in np.split(order, np.searchsorted(owner[order], np.arange(int(owner.max()) + 1)))[1:]:
+        piece = _scene_pieces(sketch[rows], weights[rows], means[rows], min(len(rows) // PART_PIECE, PART_PIECES))
+        if not piece.any():
+            part[rows], first = first, first + 1
+            continue
         own = membership[rows], visible[rows], weights[rows], means[rows]
-        piece = _scene_pieces(*own, pieces=min(max(len(rows) // PART_PIECE, 1), PART_PIECES), seed=seed)
         links = _linked(piece, *own, surface_width, agreement)
         group, _ = _average_linkage(*links, least_ratio=PART_AGREEMENT, least_shared=0.02)
         _, pairs = _average_linkage(*_merged(group, *links), least_ratio=0.0)
@@ -200,21 +204,22 @@ def _coplanarity(
     return np.exp(-np.square(np.minimum(off, off.T) / width))
 
 
+def _mask_sketch(membership: Sparse, seed: int) -> Float[np.ndarray, "n 24"]:
+    """Projects the masks of each Gaussian at random, to vectors of unit length."""
+    basis = np.random.default_rng(seed).standard_normal((membership.shape[1], 24)).astype(np.float32)
+    sketch = membership @ basis
+    return sketch / np.maximum(np.linalg.norm(sketch, axis=1, keepdims=True), 1e-12)
+
+
 def _scene_pieces(
-    membership: Sparse,
-    visible: Sparse,
-    weights: Float[np.ndarray, " n"],
-    means: Float[np.ndarray, "n 3"],
-    *,
-    pieces: int,
-    seed: int = 0,
+    sketch: Float[np.ndarray, "n d"], weights: Float[np.ndarray, " n"], means: Float[np.ndarray, "n 3"], pieces: int
 ) -> Int[np.ndarray, " n"]:
     """Gathers Gaussians into pieces that are compact and lie in the same masks: (N,) piece, -1 if its weight is 0.
 
     It runs k-means over the centres (compressed outside of the middle half of the scene, so that distant objects get
-    few pieces) and a random projection of the masks, initialised by `_split_cells`. Two rounds end within 6 % of the
-    sum of squares of k-means++ and mini-batches (bonsai, replica_apartment_0), in a tenth to a third of the time.
-    Arguments as for `_group_by_consensus`.
+    few pieces) and their `_mask_sketch`, initialised by `_split_cells`. Two rounds end within 6 % of the sum
+    of squares of k-means++ and mini-batches (bonsai, replica_apartment_0), in a tenth to a third of the time. Arguments
+    otherwise as for `_group_by_consensus`.
     """
     piece = np.full(len(means), -1, np.int64)
     live = np.flatnonzero(weights > 0)
@@ -224,13 +229,9 @@ def _scene_pieces(
     centred = centred / max(1.5 * float(np.median(np.abs(centred))), 1e-12)
     reach = np.maximum(np.linalg.norm(centred, axis=1, keepdims=True), 1.0)
     centred = centred * (2.0 - 1.0 / reach) / reach
-    rng = np.random.default_rng(seed)
-    basis = rng.standard_normal((membership.shape[1], 24)).astype(np.float32)
-    sketch = membership[live] @ basis
-    sketch /= np.maximum(np.linalg.norm(sketch, axis=1, keepdims=True), 1e-12)
-    points = np.concatenate([4.0 * centred, sketch], axis=1).astype(np.float32)
+    points = np.concatenate([4.0 * centred, sketch[live]], axis=1).astype(np.float32)
     exact = points.astype(np.float64)
-    centres = _cell_means(exact, _split_cells(exact, min(pieces, max(len(live) // 4, 1))))
+    centres = _cell_means(exact, _split_cells(exact, max(min(pieces, len(live) // 4), 1)))
     for _ in range(2):
         # |p - c|^2 / 2 but for |p|^2 / 2, which is the same for all centres
         lines = np.concatenate([-centres, 0.5 * np.square(centres).sum(1, keepdims=True)], axis=1).astype(np.float32)
