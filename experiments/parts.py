@@ -153,7 +153,8 @@ def field_of_parts(seed: int, options: Options) -> tuple[LanguageField, PartEmbe
         def __call__(self, frame: np.ndarray, index: int) -> np.ndarray:
             return proposals[index]
 
-    words = sorted({word for name in names for word in name.split("|")} | {*UNRELATED_WORDS})
+    parts = {part for own in PARTS.values() for part in own} - {""}
+    words = sorted({word for name in names for word in name.split("|")} | parts | {*UNRELATED_WORDS})
     embedder = PartEmbedder(
         np.asarray(capture.frames), solids, names, made_text_space(words, seed=seed), options.noise, seed
     )
@@ -199,7 +200,7 @@ def _iou(mask: np.ndarray, true: np.ndarray) -> float:
 
 
 def _ask(scene: Scene, part: str, thing: str) -> np.ndarray:
-    """The Gaussians of an answer; none where the embedder lacks the text as a whole, as no part has the word."""
+    """The Gaussians of an answer; none where the embedder lacks the text as a whole: no part of the thing matched."""
     try:
         return scene.ask(f"the {part} of the {thing}").mask
     except InputError:
