@@ -13,6 +13,7 @@ without photographs. With --poses, the cameras of the field lie beside it as INR
   those that both fields find (IoU of at least 0.5), and its median.
 - matched: share of the regions of the field with photographs (of at least 50 Gaussians) that a region of the bare
   field matches by an IoU of at least 0.5.
+- matched_by_node: the same by any node of the bare field's tree: a region, a union of regions, or a part of one.
 """
 
 import dataclasses
@@ -28,6 +29,7 @@ from scipy.spatial.transform import Rotation
 import jsecon
 from experiments import results
 from experiments.demo_rooms import fields_of_room
+from jsecon.field.tree import node_members
 from jsecon.read.captures.frames import transform_poses
 
 SMALLEST = 50
@@ -63,10 +65,21 @@ def best_match(labels: np.ndarray, members: np.ndarray) -> tuple[float, int]:
     return float(overlaps.max()), int(ids[overlaps.argmax()])
 
 
-def compare(photographs: np.ndarray, bare: np.ndarray, truth: np.ndarray | None) -> dict[str, float]:
-    """The figures of one scene, from the strongest regions of its Gaussians (N,) in each field."""
+def compare(
+    photographs: np.ndarray, bare: np.ndarray, truth: np.ndarray | None, field: jsecon.LanguageField
+) -> dict[str, float]:
+    """The figures of one scene, from the strongest regions of its Gaussians (N,) in each field, and the bare field."""
     ids = [k for k in np.unique(photographs[photographs >= 0]) if (photographs == k).sum() >= SMALLEST]
-    figures = {"matched": float(np.mean([best_match(bare, photographs == k)[0] >= 0.5 for k in ids]))}
+    regions = [best_match(bare, photographs == k)[0] >= 0.5 for k in ids]
+    tree, leaf = np.asarray(field.tree), np.asarray(field.leaf)
+    things = np.append(np.arange(len(ids)), -1)[[ids.index(k) if k in ids else -1 for k in photographs.tolist()]]
+    best, size = np.zeros(len(ids)), np.bincount(things[things >= 0], minlength=len(ids))
+    for node in range(len(tree)):
+        inside = node_members(tree, leaf, node)
+        shared = np.bincount(things[inside & (things >= 0)], minlength=len(ids))
+        best = np.maximum(best, shared / (size + inside.sum() - shared))
+    nodes = [one or other for one, other in zip(regions, (best >= 0.5).tolist())]
+    figures = {"matched": float(np.mean(regions)), "matched_by_node": float(np.mean(nodes))}
     if truth is None:
         return figures
     rows = []
@@ -131,7 +144,7 @@ def main(options: Options) -> dict[str, dict]:
         folder = Path(options.out) / "runs" / name.replace(" ", "_")
         bare, seconds = bare_field(field, seed, folder, options.views, poses=options.poses)
         truth = None if true_path is None else strongest_regions(jsecon.load_field(true_path))
-        figures = compare(strongest_regions(field), strongest_regions(bare), truth)
+        figures = compare(strongest_regions(field), strongest_regions(bare), truth, bare)
         seen = float((np.asarray(bare.votes.views) > 0).mean())
         found[name] = figures | {"seen": seen, "seconds": seconds, "gaussians": field.gaussians.count}
         print(name, json.dumps(found[name]), flush=True)
