@@ -108,10 +108,10 @@ class Run:
 
 def _run_stages(context: RunContext) -> list[Stage]:
     """Plans the stages of a run. Mask files come before the long fit, so that their errors are found early."""
-    by_name = {stage.name: stage for stage in [*plan_scene(context), *plan_objects(context)]}
+    stages = [*plan_scene(context), *plan_objects(context)]
     early = ("objects", "gaussians") if context.options.masks is not None else ("gaussians", "objects")
-    order = ("poses", "load", *early, "regions", "votes", "codes", "held_out")
-    return [by_name[name] for name in order if name in by_name]
+    order = ("poses", "load", *early, "regions", "parts", "votes", "codes", "held_out")
+    return sorted(stages, key=lambda stage: order.index(stage.name))
 
 
 def _plan(context: RunContext, stage_list: list[Stage]) -> _RunState:
