@@ -12,6 +12,7 @@ from mask_overlaps import iou_matrix
 
 from jsecon import InputError, load_field, save_gaussians
 from jsecon.field import field as field_file
+from jsecon.field.tree import part_objects
 from jsecon.files import write_arrays
 from jsecon.paper import autoencoder
 from jsecon.pipeline import cache, run as pipeline
@@ -136,6 +137,12 @@ def test_default_vision_finds_regions_by_itself(room, room_run, tmp_path):
     assert len(found_as) >= 10
     assert found_as[1] > 0.8
     assert found_as[0] > 0.4
+    field = load_field(tmp_path / "field.safetensors")
+    assert field.part_regions.count == len(field.part_nodes) > 0
+    assert (part_objects(field) >= 0).all()
+    shown = (np.asarray(field.part_regions.pixel_counts) > 0).any(1)
+    np.testing.assert_allclose(np.linalg.norm(field.part_regions.embeddings[shown], axis=1), 1, rtol=1e-4)
+    assert {stage.name for stage in found.steps} >= {"parts"}
 
 
 def test_gaussians_of_another_world_are_refused(room_run, tmp_path):
