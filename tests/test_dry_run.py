@@ -13,7 +13,7 @@ from jsecon.read.captures.build import plan_frames
 from jsecon.read.captures.capture import load_capture, read_posed_images
 from jsecon.read.captures.frames import FrameOptions
 
-STAGES = ["load", "gaussians", "objects", "regions", "votes", "held_out"]
+STAGES = ["load", "gaussians", "objects", "regions", "parts", "votes", "held_out"]
 
 
 def _dry(capsys, *arguments):

@@ -84,7 +84,7 @@ def test_regions_are_embedded_in_few_views_and_their_pixels_count_in_all(seen, t
     assert "in at most 5 views each" in console.planned["regions"].why
     shutil.copytree(folder / "cache", tmp_path / "out" / "cache")
     single, console = again(run, tmp_path / "out", crops=1)
-    assert fresh_of(console) == {"regions"}
+    assert fresh_of(console) == {"regions", "parts"}
     pixels = np.asarray(run.field.regions.pixel_counts)
     np.testing.assert_array_equal(single.field.regions.pixel_counts, pixels)
     assert f"{len(pixels)} of {np.count_nonzero(pixels)} crops embedded" in " ".join(single.notes)
