@@ -158,7 +158,7 @@ class ObjectIndex:
         if answer.objects:
             return answer.objects[0]
         region = int(answer.selection.region)
-        index = int(self._catalogue.regions[region])
+        index = -1 if region < 0 else int(self._catalogue.regions[region])
         return self._object(phrase, index) if index >= 0 else Object(phrase, (region,), answer.rows, answer.place)
 
     def _measure(self, index: int) -> tuple[tuple[int, ...], np.ndarray, ObjectShapes]:
