@@ -27,7 +27,7 @@ from jsecon.query.expressions import ANY_OBJECT, parse_expression, split_part
 from jsecon.query.match import select_node
 from jsecon.query.object_shapes import ObjectShapes
 from jsecon.query.outliers import remove_outliers
-from jsecon.query.parts import match_parts
+from jsecon.query.parts import match_lone_parts, match_parts
 from jsecon.query.referring import evaluate, with_what_is
 from jsecon.query.relations import Viewpoint, order_values, viewpoint
 from jsecon.query.rules import ABSENT, FOUND, MIN_RANK, QueryRules
@@ -111,7 +111,8 @@ class ObjectIndex:
         embedded = jax.device_put(self._embedder.embed_text(texts))
         match = match_regions(self._field, embedded, self._rules)
         if int(match.state) < FOUND:  # no thing has that name; parts of things may
-            nodes, state = match_parts(self._field, embedded, range(self._field.regions.count), self._rules)
+            unsure = int(match.region) if int(match.state) > ABSENT else -1
+            nodes, state = match_lone_parts(self._field, embedded, unsure, self._rules)
             if len(nodes):
                 return [self._part(phrase, int(node), state) for node in nodes], float(match.rank)
         regions = np.flatnonzero(np.asarray(match.chosen)) if int(match.region) >= 0 else np.zeros(0, int)

@@ -46,10 +46,10 @@ from jsecon.query.answer import answer_question, trim
 from jsecon.query.expressions import is_expression, parse_query, split_part
 from jsecon.query.object_shapes import ObjectShapes
 from jsecon.query.outliers import OutlierResult
-from jsecon.query.parts import match_parts
+from jsecon.query.parts import match_lone_parts
 from jsecon.query.pointing import box_mask, lift, region_at
 from jsecon.query.render import selection_mask
-from jsecon.query.rules import FOUND, ONE_REGION, STATES, QueryRules
+from jsecon.query.rules import FOUND, ONE_REGION, STATES, UNSURE, QueryRules
 from jsecon.read.captures.images import read_pixels
 from jsecon.read.masks.masks import resize_nearest
 from jsecon.read.splats.files import save_gaussians
@@ -405,7 +405,7 @@ class Scene:
             is_related = is_expression(question) or self._names_part(question)
             answer = None if is_related else self._answer_text(query)
             if answer is None or (
-                answer.state != STATES[FOUND] and query.by == "votes" and self._names_any_part(question)
+                answer.state != STATES[FOUND] and query.by == "votes" and self._names_any_part(question, answer)
             ):
                 answer = self.relate(question, frame=query.frame)
             return answer
@@ -430,13 +430,14 @@ class Scene:
         named = split_part(text) if self.field.part_regions is not None and not is_mapped(self.field) else None
         return named is not None and len(self._index.find_parts(*named)) > 0
 
-    def _names_any_part(self, text: str) -> bool:
+    def _names_any_part(self, text: str, answer: Answer) -> bool:
         """Whether a text that no region matches for certain, such as "lid", names parts of things."""
         texts, excluded = parse_query(text)
         if self.field.part_regions is None or is_mapped(self.field) or len(texts) > 1 or excluded:
             return False
-        embedded, every = np.asarray(self.embedder.embed_text(texts)), range(self.field.regions.count)
-        return len(match_parts(self._text_field, embedded, every, QueryRules())[0]) > 0
+        unsure = int(answer.selection.region) if answer.state == STATES[UNSURE] else -1
+        embedded = np.asarray(self.embedder.embed_text(texts))
+        return len(match_lone_parts(self._text_field, embedded, unsure, QueryRules())[0]) > 0
 
     def _answer_text(self, query: Query) -> Answer:
         """Selects the Gaussians that a text names."""

@@ -31,3 +31,16 @@ def match_parts(
     if not 0 <= int(match.region) < len(own) or int(match.state) < FOUND:
         return np.zeros(0, int), ABSENT
     return np.asarray(field.part_nodes)[own[np.asarray(match.chosen)[: len(own)]]], int(match.state)
+
+
+def match_lone_parts(
+    field: LanguageField, texts: Float[Array, "q e"], region: int, rules: QueryRules
+) -> tuple[Int[np.ndarray, " m"], int]:
+    """Finds the parts of any region that a text names, as `match_parts` does, if no region has that name for certain.
+
+    There are none where `region`, which may be what the text names, or -1, has one of them: it is the larger of both.
+    """
+    nodes, state = match_parts(field, texts, range(field.regions.count), rules)
+    if len(nodes) and (part_objects(field)[np.isin(np.asarray(field.part_nodes), nodes)] == region).any():
+        return np.zeros(0, int), ABSENT
+    return nodes, state
