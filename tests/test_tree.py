@@ -13,6 +13,8 @@ from jsecon.app.scene import Scene
 from jsecon.field.tree import cut_field, node_members, part_objects
 from jsecon.query.expressions import split_part
 from jsecon.query.match import select_node
+from jsecon.query.parts import match_lone_parts
+from jsecon.query.rules import ABSENT, FOUND, QueryRules
 from jsecon.vision.colours import ColourEmbedder
 
 TREE = np.array([5, 5, 6, -1, -1, 6, -1, 9, 9, 0], np.int32)
@@ -121,6 +123,15 @@ def test_a_text_names_a_part_of_a_thing(scene_of_parts, field):
     name = scene_of_parts.ask("lid of the mug")  # no such part: the text is the name of a thing
     assert name.by == "votes"
     assert int(name.selection.region) == 2
+
+
+def test_a_thing_that_a_text_may_name_stands_before_its_parts(field):
+    """ "Teddy" may match head and arms for certain and the teddy hardly: it is the teddy still."""
+    handle = unit_rows(np.random.default_rng(3), len(TEXTS), 32)[5:6]
+    for region, nodes in ((-1, [9]), (1, [9]), (0, [])):  # the part is one of region 0
+        found, state = match_lone_parts(field, handle, region, QueryRules())
+        assert found.tolist() == nodes
+        assert state == (FOUND if nodes else ABSENT)
 
 
 def test_a_part_without_a_word_of_the_embedder_is_a_name(scene, cameras, field):

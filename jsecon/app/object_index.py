@@ -28,7 +28,7 @@ from jsecon.query.match import select_node
 from jsecon.query.object_shapes import ObjectShapes
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.parts import match_lone_parts, match_parts
-from jsecon.query.referring import evaluate, with_what_is
+from jsecon.query.referring import evaluate, with_everything
 from jsecon.query.relations import Viewpoint, order_values, viewpoint
 from jsecon.query.rules import ABSENT, FOUND, MIN_RANK, QueryRules
 from jsecon.read.captures.frames import transform_poses
@@ -243,7 +243,7 @@ class ObjectIndex:
             question = f"is it the {expression.thing.text} or the {first.anchors[-1].text} that is {second}?"
         named = best.chosen
         if named and expression.adds:
-            named = with_what_is(expression.adds, named, self._objects_of(ANY_OBJECT)[0], view)
+            named = with_everything(expression.adds, named, self._objects_of(ANY_OBJECT)[0], view)
         mask = np.zeros(self._field.gaussians.count, bool)
         for found in named:
             mask[found.rows] = True

@@ -34,7 +34,7 @@ SURFACE_WIDTH = 0.08
 """Distance from a plane at which pieces count as off it, as a share of the median depth: 12 cm in a small room."""
 PART_AGREEMENT = 0.9
 """Probability of a common mask from which pieces are one part of an object."""
-PART_PIECES, PART_PIECE = 300, 16
+MOST_PIECES, PIECE_SIZE = 300, 16
 """Most pieces of one object, and mean number of Gaussians of each: those of fewer have no plane to tell a wall by."""
 NEW_NODE = 0.1
 """Share of its weight that a join must add to make a node of its own."""
@@ -161,7 +161,7 @@ def _parts_within(
     part, joins, first = np.full(len(owner), -1), [], 0
     order = np.argsort(owner, kind="stable")
     for rows in np.split(order, np.searchsorted(owner[order], np.arange(int(owner.max()) + 1)))[1:]:
-        piece = _scene_pieces(sketch[rows], weights[rows], means[rows], min(len(rows) // PART_PIECE, PART_PIECES))
+        piece = _scene_pieces(sketch[rows], weights[rows], means[rows], min(len(rows) // PIECE_SIZE, MOST_PIECES))
         if not piece.any():
             part[rows], first = first, first + 1
             continue

@@ -121,7 +121,7 @@ def evaluate(
     return _ReferringResult(chosen, used, undecided, "; ".join(wrong))
 
 
-def with_what_is(relation: str, chosen: Sequence[Object], things: Sequence[Object], view: Viewpoint) -> list[Object]:
+def with_everything(relation: str, chosen: Sequence[Object], things: Sequence[Object], view: Viewpoint) -> list[Object]:
     """Adds the things that are on objects, or in them, and on what was added."""
     found, condition = list(chosen), Condition(relation, ())
     while left := [thing for thing in things if _apart([thing], found).all()]:
