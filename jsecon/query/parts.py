@@ -6,7 +6,7 @@ from collections.abc import Collection
 import numpy as np
 from jaxtyping import Float, Int
 
-from jsecon.field.tree import part_objects
+from jsecon.field.tree import node_members, part_objects
 from jsecon.query.answer import match_regions
 from jsecon.query.rules import ABSENT, FOUND, QueryRules
 from jsecon.types import Array, LanguageField, Regions
@@ -38,9 +38,11 @@ def match_lone_parts(
 ) -> tuple[Int[np.ndarray, " m"], int]:
     """Finds the parts of any region that a text names, as `match_parts` does, if no region has that name for certain.
 
-    There are none where `region`, which may be what the text names, or -1, has one of them: it is the larger of both.
+    There are none where one of them is most of `region`, which may be what the text names, or -1: the larger is meant.
     """
     nodes, state = match_parts(field, texts, range(field.regions.count), rules)
-    if len(nodes) and (part_objects(field)[np.isin(np.asarray(field.part_nodes), nodes)] == region).any():
-        return np.zeros(0, int), ABSENT
+    if len(nodes) and region >= 0:
+        inside = np.asarray(field.leaf)[node_members(np.asarray(field.tree), np.asarray(field.leaf), region)]
+        if any(node_members(np.asarray(field.tree), inside, int(node)).mean() > 0.5 for node in nodes):
+            return np.zeros(0, int), ABSENT
     return nodes, state

