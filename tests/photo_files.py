@@ -29,14 +29,14 @@ def photo_poses(count: int, spread: float = 0.7) -> np.ndarray:
     return np.stack([look_at(target + offset, target, dtype=float) for offset in away])
 
 
-def photo_images(poses: np.ndarray) -> list[np.ndarray]:
-    """What cameras of FOCAL px at `poses` see, (HEIGHT, WIDTH, 3) uint8."""
+def photo_images(poses: np.ndarray, boards=BOARDS) -> list[np.ndarray]:
+    """What cameras of FOCAL px at `poses` see of boards, (HEIGHT, WIDTH, 3) uint8."""
     draw, images = np.random.default_rng(0), []
-    textures = [_texture(draw) for _ in BOARDS]
+    textures = [_texture(draw) for _ in boards]
     lens = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
     for pose in poses:
         image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-        for (corner, across, down), texture in zip(BOARDS, textures):
+        for (corner, across, down), texture in zip(boards, textures):
             plane = np.stack([across, down, corner], axis=1).astype(float)
             to_pixels = lens @ (pose[:3, :3] @ plane + np.outer(pose[:3, 3], (0, 0, 1)))
             height, width = texture.shape[:2]

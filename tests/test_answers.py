@@ -10,7 +10,7 @@ import pytest
 from capture_files import refused, run_cli
 from small_field import answer_of, colour_field
 
-from jsecon import Scene, load_gaussians, objects, save_field
+from jsecon import Scene, load_gaussians, save_field
 from jsecon.app.querying import _write_answers
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Console
@@ -30,17 +30,12 @@ def saved(scene, cameras, tmp_path_factory):
     return field, file
 
 
-@pytest.mark.parametrize("more", [[], ["--with-labels"]])
-def test_a_field_is_exported_in_the_world_of_its_source(saved, tmp_path, more):
+def test_a_field_is_exported_in_the_world_of_its_source(saved, tmp_path):
     field, file = saved
     means, out = np.add(field.gaussians.means, [2, 0, 0]), tmp_path / "scene.ply"
-    assert run_cli("export", file, "--out", out, *more) == 0
+    assert run_cli("export", file, "--out", out) == 0
     np.testing.assert_allclose(load_gaussians(out).means, means, atol=2**-16)
-    table = read_vertices(out)
-    if more:
-        np.testing.assert_array_equal(table["object_id"], objects(field).labels)
-    else:
-        assert "object_id" not in table.dtype.names
+    assert "object_id" not in read_vertices(out).dtype.names
 
 
 @pytest.mark.parametrize("embedder", ["colours-1", "clip-of-nowhere"])

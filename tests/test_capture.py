@@ -11,7 +11,6 @@ from test_images import stored_as, with_orientation
 
 from experiments.rooms.writers import write_colmap
 from jsecon.read.captures.capture import load_capture
-from jsecon.read.splats.files import save_gaussians
 
 CAPTURE = small_capture()
 
@@ -157,9 +156,3 @@ def test_the_world_of_a_capture_is_that_of_all_its_frames(tmp_path):
     folder = written("colmap", small_capture(), tmp_path, 1e-3, SHIFT)
     whole, some = load_capture(folder), load_capture(folder, frames=3)
     np.testing.assert_array_equal(some.source_from_scene, whole.source_from_scene)
-
-
-def test_an_ordinary_scene_is_written_in_single_precision(tmp_path, scene):
-    """As INRIA's readers expect it, whatever turns and moves it a little."""
-    save_gaussians(tmp_path / "a.ply", scene, similarity=np.diag([2.0, 2.0, 2.0, 1.0]) + np.eye(4, k=3))
-    assert b"property double" not in (tmp_path / "a.ply").read_bytes()

@@ -8,6 +8,7 @@ import numpy as np
 import PIL.features
 import PIL.Image
 import PIL.ImageOps
+import pillow_heif
 import pytest
 from capture_files import png, png_chunk, refused
 
@@ -65,17 +66,23 @@ def test_images_come_upright(tmp_path, ending, orientation):
     assert stored.shape[:2] == ((48, 32) if orientation > 4 else (32, 48))
 
 
-def test_a_heic_is_turned_once_and_damage_and_absence_are_told(tmp_path, monkeypatch):
-    """Its decoder applies the file's own rotation; EXIF's must not be applied again."""
-    import pillow_heif
-
+@pytest.mark.parametrize("turn", [1, 6])
+@pytest.mark.parametrize("name", ["a.heic", "a.avif"])
+def test_a_heic_or_an_avif_is_turned_once(tmp_path, name, turn):
+    """Their decoders apply the file's own rotation; EXIF's must not be applied again."""
+    if name == "a.avif" and not PIL.features.check("avif"):
+        pytest.skip("this Pillow has no AVIF")
     tags = PIL.Image.Exif()
-    tags[0x0112] = 6
-    stored = np.rot90(corners(96, 64))
-    photo = pillow_heif.from_pillow(PIL.Image.fromarray(np.ascontiguousarray(stored)))
-    photo.save(tmp_path / "a.heic", quality=95, exif=tags.tobytes())
-    assert image_header(tmp_path / "a.heic").upright == (96, 64)
-    assert np.abs(read_image(tmp_path / "a.heic")[0].astype(int) - corners(96, 64)).mean() < 6
+    tags[0x0112] = turn
+    photo = PIL.Image.fromarray(np.ascontiguousarray(np.rot90(corners(96, 64), k=int(turn == 6))))
+    photo = pillow_heif.from_pillow(photo) if name == "a.heic" else photo
+    photo.save(tmp_path / name, quality=95, exif=tags.tobytes())
+    assert image_header(tmp_path / name).upright == (96, 64)
+    assert np.abs(read_image(tmp_path / name)[0].astype(int) - corners(96, 64)).mean() < 6
+
+
+def test_damage_and_absence_of_a_heics_decoder_are_told(tmp_path, monkeypatch):
+    pillow_heif.from_pillow(PIL.Image.fromarray(corners(96, 64))).save(tmp_path / "a.heic")
     data = (tmp_path / "a.heic").read_bytes()
     (tmp_path / "cut.heic").write_bytes(data[: len(data) // 2])
     with refused("cut.heic", "cannot be read"):
@@ -200,15 +207,3 @@ def test_a_format_that_is_not_read_is_named(tmp_path, name):
     for read, path in ((image_header, tmp_path / name), (load_capture, tmp_path)):
         with refused(name[1:], "not read", "magick"):
             read(path)
-
-
-@pytest.mark.parametrize("turn", [1, 6])
-def test_avif_is_read_if_pillow_has_it(tmp_path, turn):
-    if not PIL.features.check("avif"):
-        pytest.skip("this Pillow has no AVIF")
-    tags = PIL.Image.Exif()
-    tags[0x0112] = turn
-    stored = corners(96, 64) if turn == 1 else np.ascontiguousarray(np.rot90(corners(96, 64)))
-    PIL.Image.fromarray(stored).save(tmp_path / "a.avif", quality=95, exif=tags.tobytes())
-    assert image_header(tmp_path / "a.avif").upright == (96, 64)
-    assert np.abs(read_image(tmp_path / "a.avif")[0].astype(int) - corners(96, 64)).mean() < 6

@@ -30,13 +30,6 @@ def test_round_trip(tmp_path):
     np.testing.assert_array_equal(loaded.source_from_scene, np.eye(4))
 
 
-def test_opengl_axes(tmp_path):
-    """The identity looks along -z with y up: a point in front and above lies at z > 0, y < 0 of the OpenCV camera."""
-    loaded = load_changed(tmp_path, lambda content: content["frames"][0].update(transform_matrix=np.eye(4).tolist()))
-    pose = loaded.cameras.world_to_camera[0]
-    np.testing.assert_allclose(pose @ [1.0, 2.0, -5.0, 1.0], [1.0, -2.0, 5.0, 1.0])
-
-
 def test_camera_angle_and_sizes_from_the_images(tmp_path):
     def change(content):
         for record in (content, *content["frames"]):

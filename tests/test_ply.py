@@ -58,9 +58,8 @@ def read(tmp_path, *, types=None, comment=b"of mine", **changes):
     return columns, load_gaussians(tmp_path / "a.PLY")
 
 
-@pytest.mark.parametrize("third", [None, np.full(40, -np.inf)])
-def test_a_flat_gaussian_has_no_thickness(tmp_path, third):
-    columns, found = read(tmp_path, scale_2=third)
+def test_a_flat_gaussian_has_no_thickness(tmp_path):
+    columns, found = read(tmp_path, scale_2=None)
     assert np.isneginf(found.log_scales[:, 2]).all()
     np.testing.assert_array_equal(found.log_scales[:, 0], columns["scale_0"])
 

@@ -2,16 +2,17 @@
 
 import dataclasses
 
-import cv2
 import numpy as np
 import pytest
 from conftest import cameras_of, capture_of, look_at
+from photo_files import FOCAL, HEIGHT, WIDTH, photo_images
 
 from jsecon import InputError
 from jsecon.fit.start import starting_gaussians
 from jsecon.fit.triangulate import triangulated_points
 
-WIDTH, HEIGHT, FOCAL = 240, 180, 200.0
+PLANE = (((-1, -1, 0), (2, 0, 0), (0, 2, 0)),)
+"""a board of 2 x 2 in the plane z = 0"""
 
 
 def poses(count):
@@ -19,24 +20,9 @@ def poses(count):
     return np.array([look_at((0.9 * np.sin(a), 0.1 * np.cos(3 * a), -2 * np.cos(a)), dtype=float) for a in angles])
 
 
-INTRINSICS = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
-
-
-def picture(pose, seed=0):
-    """A noise-textured unit plane z = 0 as the camera sees it, drawn through its homography."""
-    rng = np.random.default_rng(seed)
-    texture = cv2.GaussianBlur(rng.integers(0, 256, (400, 400, 3)).astype(np.float32), (0, 0), 2.5)
-    texture = np.clip((texture - texture.mean()) * 5 + 128, 0, 255).astype(np.uint8)
-    # Texture pixel centres (u, v) are integers: x = (u + 0.5) / 200 - 1; image pixel centres lie at +0.5.
-    to_world = np.array([[1 / 200, 0, 0.5 / 200 - 1], [0, 1 / 200, 0.5 / 200 - 1], [0, 0, 0], [0, 0, 1]])
-    homography = INTRINSICS @ pose[:3] @ to_world
-    shift = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
-    return cv2.warpPerspective(texture, shift @ homography, (WIDTH, HEIGHT), flags=cv2.INTER_LINEAR)
-
-
 def plane_capture(count=5, textured=True):
     pose = poses(count)
-    frames = np.array([picture(p) if textured else np.full((HEIGHT, WIDTH, 3), 90, np.uint8) for p in pose])
+    frames = photo_images(pose, PLANE) if textured else np.full((count, HEIGHT, WIDTH, 3), 90)
     held_out = np.zeros(count, bool)
     held_out[2] = True
     return capture_of(frames, cameras_of(pose, (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2), WIDTH, HEIGHT), held_out)
