@@ -287,6 +287,3 @@ def test_many_more_ids_than_things_are_hinted_at(tmp_path):
     _, ids, notes = load_labels(tmp_path, names, (60, 80))
     assert len(ids) == 56
     assert "--proposals" in notes[0]
-    assert load_labels(tmp_path, names[:5], (60, 80)).notes == (
-        "There are masks of no frame of this capture: 9 of the .png files, first f05.png.",
-    )

@@ -61,20 +61,9 @@ def test_a_text_and_a_pixel_of_one_name_do_not_share_files(field, tmp_path):
     assert len({pixel, *others}) == 5
 
 
-def test_frames_of_hostile_names_are_written_beneath_the_folder(field, tmp_path):
-    masks = {t: np.ones((4, 4), bool) for t in range(4)}
-    for number, names in enumerate((HOSTILE[:4], HOSTILE[4:8], HOSTILE[6:])):
-        own, out = dataclasses.replace(field, names=names), tmp_path / "deep" / str(number)
-        told = write_answer(answer_of(own, "red", np.arange(64) < 9), Scene(own), out, masks)
-        assert set(told["masks"]) == set(names)
-        files = {file.name.casefold() for file in out.iterdir()}
-        assert {file.casefold() for file in told["masks"].values()} < files
-        assert len({file.casefold() for file in told["masks"].values()}) == 4
-    assert all(file.parent.parent == tmp_path / "deep" for file in tmp_path.rglob("*.png"))
-
-
-def test_a_field_file_with_hostile_frames_writes_nothing_elsewhere(field, word, tmp_path):
-    save_field(tmp_path / "field.safetensors", dataclasses.replace(field, names=HOSTILE[:4]))
+@pytest.mark.parametrize("names", [HOSTILE[:4], HOSTILE[4:8], HOSTILE[6:]], ids=["paths", "long", "alike"])
+def test_a_field_file_with_hostile_frames_writes_nothing_elsewhere(field, word, tmp_path, names):
+    save_field(tmp_path / "field.safetensors", dataclasses.replace(field, names=names))
     out = tmp_path / "a" / "b" / "out"
     masks = []
     for folder in (tmp_path, tmp_path / "other"):
@@ -86,6 +75,10 @@ def test_a_field_file_with_hostile_frames_writes_nothing_elsewhere(field, word, 
     assert sorted(told["query"] for told in answers) == sorted((*texts, "mug", "mug"))
     for told in answers:
         assert load_gaussians(out / told["ply"]).count == told["count"] > 0
+        assert set(told["masks"]) == set(names)
+        written = {file.casefold() for file in told["masks"].values()}
+        assert len(written) == 4
+        assert written < {file.name.casefold() for file in out.iterdir()}
     outside = [file for file in tmp_path.rglob("*.*") if out not in file.parents]
     assert sorted(file.name for file in outside) == ["field.safetensors", "mug.png", "mug.png"]
 

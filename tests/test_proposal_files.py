@@ -4,7 +4,6 @@ import json
 import tempfile
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
@@ -43,19 +42,12 @@ def test_json_of_sams_generator_may_overlap_and_is_ordered_by_score(tmp_path, ma
     assert notes == ("1 of 3 frames have no masks (the first: c).",)
 
 
-def test_png_and_langsplat_files_hold_one_layer(tmp_path, masks):
-    ids = np.zeros(SIZE, np.uint8)
-    ids[masks[0]], ids[masks[2]] = 7, 200
-    cv2.imwrite(str(tmp_path / "a.png"), ids)
-    read, notes = load_proposals(tmp_path, ("a",), SIZE)
-    np.testing.assert_array_equal(read(0), masks[[0, 2]])
-    assert notes == ()
+def test_langsplat_files_hold_one_layer(tmp_path, masks):
     levels = np.full((4, *SIZE), -1, np.float32)
     levels[3][masks[2]], levels[1][masks[1]] = 4, 0
-    (tmp_path / "langsplat").mkdir()
-    np.save(tmp_path / "langsplat" / "a_s.npy", levels)
+    np.save(tmp_path / "a_s.npy", levels)
     for level, n in (("l", 2), ("s", 1)):
-        read, _ = load_proposals(tmp_path / "langsplat", ("a",), SIZE, level=level)
+        read, _ = load_proposals(tmp_path, ("a",), SIZE, level=level)
         np.testing.assert_array_equal(read(0), masks[[n]])
 
 

@@ -77,14 +77,19 @@ def test_the_world_is_found_that_the_frames_show(tmp_path, near, world, backgrou
     assert "WARNING" not in found.notes[0]
 
 
-def gsplat_world(capture):
-    """As examples/datasets/normalize.py of gsplat has it, for cameras whose up is not +y."""
+def up_turned_to(capture, to):
+    """Camera to world, and the turn that carries the cameras' mean up onto an axis."""
     c2w = np.linalg.inv(capture.cameras.world_to_camera.astype(np.float64))
-    up, to = -c2w[:, :3, 1].mean(0), np.array([0, -1.0, 0])
+    up = -c2w[:, :3, 1].mean(0)
     up = up / np.linalg.norm(up)
     axis = np.cross(up, to)
     angle = np.arctan2(np.linalg.norm(axis), up @ to)
-    turn = Rotation.from_rotvec(angle * axis / max(np.linalg.norm(axis), 1e-12)).as_matrix()
+    return c2w, Rotation.from_rotvec(angle * axis / max(np.linalg.norm(axis), 1e-12)).as_matrix()
+
+
+def gsplat_world(capture):
+    """As examples/datasets/normalize.py of gsplat has it, for cameras whose up is not +y."""
+    c2w, turn = up_turned_to(capture, np.array([0, -1.0, 0]))
     ahead, places = c2w[:, :3, 2] @ turn.T, c2w[:, :3, 3] @ turn.T
     middle = np.median(places - (ahead * places).sum(1)[:, None] * ahead, axis=0)
     size = np.median(np.linalg.norm(places - middle, axis=1))
@@ -99,12 +104,7 @@ def gsplat_world(capture):
 
 def nerfstudio_world(capture):
     """As auto_orient_and_center_poses of nerfstudio has it: up to z, the mean to the origin, the largest to 1."""
-    c2w = np.linalg.inv(capture.cameras.world_to_camera.astype(np.float64))
-    up = -c2w[:, :3, 1].mean(0)
-    up = up / np.linalg.norm(up)
-    axis = np.cross(up, [0, 0, 1])
-    angle = np.arctan2(np.linalg.norm(axis), up[2])
-    turn = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
+    c2w, turn = up_turned_to(capture, np.array([0, 0, 1.0]))
     places = (c2w[:, :3, 3] - c2w[:, :3, 3].mean(0)) @ turn.T
     world = np.eye(4)
     world[:3, :3] = turn / np.abs(places).max()

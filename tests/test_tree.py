@@ -93,13 +93,9 @@ def test_parts_take_the_votes_of_their_region_on_their_gaussians(field):
         ("handle of the red mug", ("handle", "red mug")),
         ("The lid of a pot?", ("lid", "pot")),
         ("the mug's handle", ("handle", "mug")),
-        ("back of this chair", ("back", "chair")),
         ("where is the handle of the red mug?", ("handle", "red mug")),
         ("handle of the mug or lid of the pot", None),
-        ("lid of the pot but not knob", None),
         ("cup of tea", None),
-        ("box of chocolates", None),
-        ("red mug", None),
         ('"lid of the pot"', None),
     ],
 )

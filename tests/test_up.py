@@ -48,6 +48,15 @@ def test_the_cameras_tell_up_however_they_are_rolled(name):
         assert ("level" in up.evidence) == (name == "level")
 
 
+def test_one_camera_and_two_that_stand_head_to_foot_have_an_up():
+    assert _up_of_cameras(cameras_around(ROLLS["level"], count=1)).axis[2] > 0.8
+    for first in (np.eye(4), np.diag([-1.0, -1, 1, 1])):
+        poses = np.stack([first, first @ np.diag([1.0, -1, -1, 1])])  # the second stands on its head
+        up = np.array(_up_of_cameras(Camera(poses, *(np.ones(2),) * 4, 4, 4)).axis)
+        np.testing.assert_allclose(np.linalg.norm(up), 1)
+        assert abs(up[2]) < 1e-6  # across the optical axes
+
+
 @pytest.mark.parametrize("around", [360.0, 150.0])
 def test_cameras_that_may_stand_on_their_heads_are_not_sure(around):
     """They look as level ones that look up; without the scene nothing tells the two apart."""
