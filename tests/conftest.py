@@ -173,6 +173,20 @@ def camera(cameras) -> Camera:
 
 
 @pytest.fixture(scope="session")
+def made(scene, cameras):
+    """The small field of the scene, and its label images."""
+    from small_field import make_field
+
+    return make_field(scene, cameras)
+
+
+@pytest.fixture(scope="session")
+def field(made):
+    """The small field of the scene."""
+    return made[0]
+
+
+@pytest.fixture(scope="session")
 def shared() -> Path:
     """Folder of real captures beside the checkout; without it the test is skipped."""
     folder = HOME.parent / "shared"

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import MANY
-from small_field import REGIONS, make_field, shares, unit_rows
+from small_field import REGIONS, shares, unit_rows
 from test_classes import made_field
 from test_direct import exact_cosines
 
@@ -31,16 +31,6 @@ from jsecon.types import Codes, Regions
 
 def by_code(field, region, threshold=CODE_THRESHOLD):
     return select_by_code(field, match_region(field, region), threshold)
-
-
-@pytest.fixture(scope="module")
-def made(scene, cameras):
-    return make_field(scene, cameras)
-
-
-@pytest.fixture(scope="module")
-def field(made):
-    return made[0]
 
 
 def test_a_region_has_the_same_members_however_it_is_asked_for(made):

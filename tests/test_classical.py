@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from mask_overlaps import iou_matrix
 
-from jsecon.vision.classical import ClassicalSegmenter, _adapt_exposure
+from jsecon.vision.classical import ClassicalSegmenter
 from jsecon.vision.protocols import Segmenter
 from jsecon.vision.region_graph import merge_regions
 
@@ -37,9 +37,11 @@ def best_ious(truth, masks):
     return iou_matrix(truth.reshape(len(truth), -1), masks.reshape(len(masks), -1)).max(1)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_each_thing_is_one_region_in_spite_of_shading_shadow_and_noise(seed):
+@pytest.mark.parametrize(("seed", "gain"), [(0, 1.0), (1, 1.0), (2, 1.0), (1, 0.05), (1, 20.0)])
+def test_each_thing_is_one_region_in_spite_of_shading_shadow_noise_and_exposure(seed, gain):
     frame, things = desk(seed)
+    linear = (frame / 255.0) ** 2.2
+    frame = (255 * (gain * linear / (1 + (gain - 1) * linear)) ** (1 / 2.2)).round().astype(np.uint8)
     masks = ClassicalSegmenter()(frame, 0)
     assert (best_ious(things, masks) > 0.85).all()
     assert len(masks) <= 12
@@ -75,19 +77,6 @@ def test_depth_parts_what_colour_does_not():
     assert len(unknown) == 1
     with pytest.raises(ValueError, match="depths"):
         ClassicalSegmenter(depths=lambda index: depth[:-1])(frame, 0)
-
-
-def test_dark_and_bright_frames_are_seen_by_adapted_eyes():
-    frame, _ = desk()
-
-    def median(image):
-        return np.median(((image / 255.0) ** 2.2) @ [0.2126, 0.7152, 0.0722])
-
-    linear = (frame / 255.0) ** 2.2
-    for gain, low, high in ((0.2, 0.21, 0.23), (5.0, 0.29, 0.31)):
-        exposed = (255 * (gain * linear / (1 + (gain - 1) * linear)) ** (1 / 2.2)).round().astype(np.uint8)
-        assert not low <= median(exposed) <= high
-        assert low <= median(_adapt_exposure(exposed)) <= high
 
 
 @pytest.mark.parametrize("frame", [

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
-from small_field import REGIONS, make_field, unit_rows
+from small_field import REGIONS, unit_rows
 
 from jsecon import InputError, check_field, load_field, save_field, train_autoencoder
 from jsecon.field import field as module
@@ -16,8 +16,7 @@ from jsecon.files import read_arrays, write_arrays
 
 
 @pytest.fixture(scope="module")
-def field(scene, cameras):
-    field = make_field(scene, cameras)[0]
+def field(field):
     return dataclasses.replace(field, votes=with_overlap(field.votes))
 
 

@@ -5,7 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_field import make_field, rows_of_a_kind, shares, unit_rows
+from small_field import rows_of_a_kind, shares, unit_rows
 
 from jsecon import QueryRules, Regions, query_anchored, query_region
 from jsecon.query.match import MIN_FRAGMENT_OVERLAP, regions_with
@@ -47,9 +47,8 @@ def test_fragments_duplicates_and_things_of_a_class_answer_with_the_best_region(
 
 
 @pytest.fixture(scope="module")
-def broken(scene, cameras):
+def broken(field):
     """A field whose text names regions 0 and 1 (cosine 0.9), which share Gaussians: halves of one thing."""
-    field, _ = make_field(scene, cameras)
     overlap = np.eye(5, dtype=np.float32)
     overlap[0, 1] = overlap[1, 0] = 0.4
     return with_other(field, overlap, regions=Regions(rows_of_a_kind(), field.regions.pixel_counts))

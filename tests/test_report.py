@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from browser import CHROMIUM, driven
 from capture_files import small_capture
-from small_field import make_field
 
 from jsecon.app import pictures, report
 
@@ -99,8 +98,8 @@ def picture(page, kind="jpeg"):
     return cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
 
 
-def test_a_field_shows_its_first_view_and_its_regions(scene, cameras):
-    image = picture(make_field(scene, cameras)[0]._repr_html_())
+def test_a_field_shows_its_first_view_and_its_regions(field):
+    image = picture(field._repr_html_())
     assert image.shape == (40, 96, 3)
     assert image[:, :48].std() > 3
     assert np.abs(image[:, :48].astype(int) - image[:, 48:]).mean() > 3  # colours and regions are not the same picture

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import MANY
 from jax.test_util import check_grads
-from small_field import KnownTexts, make_field, unit_rows
+from small_field import KnownTexts, unit_rows
 
 from jsecon import Regions, Scene, load_field, query_anchored, query_classes, query_region, query_several, save_field
 from jsecon.field.similarity import similarities
@@ -115,10 +115,9 @@ def exact_standing(embeddings, text, words, weight):
 
 
 @pytest.fixture
-def worded(scene, cameras):
+def worded(field):
     """A field of five regions with 61 unrelated words, and texts."""
     rng = np.random.default_rng(3)
-    field, _ = make_field(scene, cameras)
     return dataclasses.replace(field, unrelated_words=unit_rows(rng, 61, SIZE)), unit_rows(rng, 200, SIZE)
 
 
@@ -215,7 +214,4 @@ def test_an_answer_has_its_rank_and_that_of_an_old_field_has_none(worded, tmp_pa
     assert unseen["rank"] == pytest.approx(min(ranks), abs=0.02)
     assert seen["region"] is not None
     assert unseen["region"] is None
-    for answer in answers(None):
-        assert answer["rank"] is None
-    cosine = query_anchored(dataclasses.replace(field, unrelated_words=None), rows["seen"])
-    assert answers(None)[0]["score"] == pytest.approx(float(cosine.score), abs=1e-5)
+    assert [answer["rank"] for answer in answers(None)] == [None, None]

@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from small_field import KnownTexts, make_field, rows_of_a_kind, shares, unit_rows
+from small_field import KnownTexts, rows_of_a_kind, shares, unit_rows
 from table_field import table_field
 
 from jsecon import InputError, QueryRules, Regions, Scene
@@ -13,8 +13,7 @@ from jsecon.query.answer import query_several
 
 
 @pytest.fixture(scope="module")
-def field(scene, cameras):
-    field, _ = make_field(scene, cameras)
+def field(field):
     return dataclasses.replace(field, regions=Regions(rows_of_a_kind(), field.regions.pixel_counts))
 
 

@@ -4,7 +4,6 @@ import dataclasses
 import json
 
 import pytest
-from small_field import make_field
 
 from jsecon import InputError, load_field, save_field
 from jsecon.pipeline.model_loading import field_embedder
@@ -13,11 +12,6 @@ from jsecon.pipeline.sources import locate_sources, provenance
 from jsecon.vision.colours import ColourEmbedder
 
 CLIP = "clip-0123456789abcdef"
-
-
-@pytest.fixture(scope="module")
-def field(scene, cameras):
-    return make_field(scene, cameras)[0]
 
 
 def told(field, **given):

@@ -7,6 +7,7 @@ import jax
 import laspy
 import numpy as np
 import pytest
+from balls import sphere
 from capture_files import (
     compute_stage,
     context_of,
@@ -51,9 +52,7 @@ def scene_of(parts):
 
 
 def ball_points(centre):
-    rng = np.random.default_rng(3)
-    points = rng.normal(size=(400, 3))
-    return centre + 0.32 * points / np.linalg.norm(points, axis=1, keepdims=True)
+    return sphere(np.random.default_rng(3), centre, 0.32, 400)
 
 
 def balls():
@@ -63,12 +62,9 @@ def balls():
 @pytest.fixture(scope="module")
 def room():
     """A floor of 6 x 5, walls of 2.4, and three balls on the floor."""
-    grey = (0.55, 0.55, 0.5)
-    x, y, z = np.diag([6.0, 5.0, 2.4])
-    corner = np.array([-3.0, -2.5, 0.0])
-    walls = [sheet(corner, x, z), sheet(corner, y, z), sheet(corner + y, x, z), sheet(corner + x, y, z)]
-    parts = [(sheet(corner, x, y), (0.4, 0.35, 0.3), 0.1), *((wall, grey, 0.1) for wall in walls)]
-    return scene_of([*parts, *balls()])
+    floor, *walls = (points - (3.0, 2.5, 0.0) for points in walls_of(6.0, 5.0, 2.4))
+    grey = [(wall, (0.55, 0.55, 0.5), 0.1) for wall in walls]
+    return scene_of([(floor, (0.4, 0.35, 0.3), 0.1), *grey, *balls()])
 
 
 @pytest.fixture(scope="module")
@@ -91,12 +87,12 @@ def around(object_alone):
     return place_cameras(object_alone, views=6, width=160, height=120)
 
 
-def moved(gaussians, seed, scale=None):
-    """The scene turned, scaled (by default at random) and shifted at random; and the similarity."""
+def moved(gaussians, seed):
+    """The scene turned, scaled and shifted at random; and the similarity."""
     rng = np.random.default_rng(seed)
     similarity = np.eye(4)
     factor = np.exp(rng.uniform(-2, 2))
-    similarity[:3, :3] = Rotation.random(random_state=seed).as_matrix() * (scale or factor)
+    similarity[:3, :3] = Rotation.random(random_state=seed).as_matrix() * factor
     similarity[:3, 3] = rng.normal(size=3) * 20
     return transform_gaussians(gaussians, similarity), similarity
 
@@ -189,9 +185,9 @@ def test_a_room_is_seen_from_inside_and_an_object_from_around(room, object_alone
 
 def directions(draw, count):
     """Unit vectors above the horizon."""
-    vectors = draw.normal(size=(count, 3))
+    vectors = sphere(draw, 0.0, 1.0, count)
     vectors[:, 2] = np.abs(vectors[:, 2])
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors
 
 
 def far_houses(draw, count):
