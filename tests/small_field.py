@@ -117,11 +117,17 @@ def shares(field, regions):
     return shares_of(field.votes, regions)
 
 
+def votes_of(regions, weights, count: int, **own) -> Votes:
+    """Votes of Gaussians that three views show, on some of `count` regions (N, K), all labelled; and `own` columns."""
+    weights = np.asarray(weights, np.float32)
+    total, views = weights.sum(1), np.full(len(weights), 3, np.int32)
+    votes = Votes(np.asarray(regions, np.int32), weights, total, total, total, views, np.int32(0), count)
+    return dataclasses.replace(votes, **own)
+
+
 def lone_votes(regions, count: int) -> Votes:
-    """Votes of Gaussians that three views show, each with all of its weight on one of `count` regions."""
-    ones = np.ones(len(regions), np.float32)
-    views = np.full(len(regions), 3, np.int32)
-    return Votes(np.int32(regions)[:, None], ones[:, None], ones, ones, ones, views, np.int32(0), count)
+    """Votes of Gaussians, each with all of its weight on one of `count` regions."""
+    return votes_of(np.int32(regions)[:, None], np.ones((len(regions), 1)), count)
 
 
 def answer_of(field, text, mask, similarity=None, *, region=0, score=0.5) -> Answer:

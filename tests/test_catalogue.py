@@ -7,11 +7,11 @@ import re
 import numpy as np
 import pytest
 from capture_files import refused, run_cli
-from small_field import REGIONS, make_field, shares, true_regions
+from small_field import REGIONS, make_field, shares, true_regions, votes_of
 from table_field import table_field
 
 import jsecon
-from jsecon import Regions, Votes, load_gaussians, save_field
+from jsecon import Regions, load_gaussians, save_field
 from jsecon.read.splats.ply import read_ply_file
 from jsecon.vision.colours import ColourEmbedder
 
@@ -23,13 +23,8 @@ COLOURS = ["red", "green", "blue", "orange", "pink"]
 def field(scene, cameras):
     """Five slabs of plain colours; a fifth of each lies in the masks of the next one."""
     field, _ = make_field(scene, cameras, dim=EMBEDDER.dim)
-    own = true_regions(scene).astype(np.int32)
-    count = len(own)
-    rows = np.stack([own, (own + 1) % REGIONS, np.full(count, -1, np.int32)], axis=1)
-    weights = np.tile(np.array([8.0, 2.0, 0.0], np.float32), (count, 1))
-    all_of_it, half = np.full(count, 10, np.float32), np.full(count, 0.5, np.float32)
-    views = np.full(count, 4, np.int32)
-    votes = Votes(rows, weights, all_of_it, all_of_it, half, views, np.zeros((), np.int32), REGIONS)
+    own = true_regions(scene)
+    votes = votes_of(np.stack([own, (own + 1) % REGIONS], axis=1), np.tile([8.0, 2.0], (len(own), 1)), REGIONS)
     regions = Regions(EMBEDDER.embed_text([f"plain {colour} thing" for colour in COLOURS]), field.regions.pixel_counts)
     changes = {"embedder": EMBEDDER.name, "unrelated_words": EMBEDDER.unrelated_words.astype(np.float16)}
     field = dataclasses.replace(field, votes=votes, regions=regions, **changes)

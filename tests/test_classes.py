@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import MANY
-from small_field import field_of, seen_of, unit_rows
+from small_field import field_of, seen_of, unit_rows, votes_of
 
-from jsecon import QueryRules, Regions, Votes
+from jsecon import QueryRules, Regions
 from jsecon.query import classes
 
 SIZE, REGIONS, KEPT = 12, 6, 3
@@ -24,11 +24,8 @@ def made_field(count, *, regions=REGIONS, seed=0):
     ids = np.argsort(rng.random((count, regions)), axis=1)[:, :KEPT].astype(np.int32)
     weights = -np.sort(-rng.uniform(0.1, 9, (count, KEPT)), axis=1).astype(np.float32)
     ids[::4, -1], weights[::4, -1] = -1, 0
-    labelled = weights.sum(1)
-    views, peak = np.full(count, 3, np.int32), np.full(count, 0.5, np.float32)
     shown = np.where(ids >= 0, weights * rng.uniform(1, 3, weights.shape), 0).astype(np.float32)
-    columns = ids, weights, labelled, labelled + 1, peak, views, np.int32(0), regions
-    votes = Votes(*columns, weight_where_region_visible=shown)
+    votes = votes_of(ids, weights, regions, total=weights.sum(1) + 1, weight_where_region_visible=shown)
     known = Regions(unit_rows(rng, regions, SIZE), rng.integers(1, 900, (regions, 2)).astype(np.int32))
     return field_of(votes, known, canonical_phrases=unit_rows(rng, 4, SIZE))
 

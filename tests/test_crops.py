@@ -39,19 +39,6 @@ def test_the_choice_equals_loops_and_grows_by_one_view_at_a_time(seed, most):
     np.testing.assert_array_equal(choose_crops(pixels, cut, directions, 6), pixels > 0)
 
 
-def test_whole_views_and_other_directions_come_first():
-    ahead, aside = [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]
-
-    def first_two(pixels, cut, directions):
-        return np.flatnonzero(
-            choose_crops(np.array([pixels]), np.array([cut], float), np.array([directions]), 2)[0]
-        ).tolist()
-
-    assert first_two([900, 800, 250], [0, 0, 0], [ahead, ahead, aside]) == [0, 2]
-    assert first_two([900, 800, 150], [0, 0, 0], [ahead, ahead, aside]) == [0, 1]
-    assert first_two([900, 800, 250], [0, 1, 0], [ahead, aside, aside]) == [0, 2]
-
-
 def test_geometry_of_regions_by_their_pixels():
     rng = np.random.default_rng(0)
     labels = rng.integers(-1, 4, (2, 6, 9)).astype(np.int16)

@@ -8,19 +8,12 @@ import numpy as np
 import pytest
 from conftest import MANY
 from jax.test_util import check_grads
-from small_field import REGIONS, labels_of, true_regions, unit_rows
+from small_field import REGIONS, labels_of, true_regions, unit_rows, votes_of
 
-from jsecon import Votes, distill_l1, distill_votes, plan_capacity, plan_view, render
+from jsecon import distill_l1, distill_votes, plan_capacity, plan_view, render
 from jsecon.paper.distill import rendered_l1
 
 KEY = jax.random.key(0)
-
-
-def make_votes(regions, weights, num_regions):
-    regions, weights = np.asarray(regions, np.int32), np.asarray(weights, np.float32)
-    total = weights.sum(-1)
-    views = (total > 0).astype(np.int32)
-    return Votes(regions, weights, total, total, np.zeros_like(total), views, np.int32(0), num_regions)
 
 
 def random_votes(rng, count, top, num_regions):
@@ -28,7 +21,7 @@ def random_votes(rng, count, top, num_regions):
     weights = -np.sort(-rng.exponential(size=(count, top)) * 10.0 ** rng.uniform(-4, 4, (count, 1)), axis=1)
     gone = rng.random((count, 1)) < 0.1
     empty = gone | (np.arange(top) >= rng.integers(1, top + 1, (count, 1)))
-    return make_votes(np.where(empty, -1, regions), np.where(empty, 0, weights), num_regions)
+    return votes_of(np.where(empty, -1, regions), np.where(empty, 0, weights), num_regions)
 
 
 def exact(votes, codes, reduce):
@@ -73,8 +66,8 @@ def test_extremes(reduce):
     codes = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 0], [np.nan, 0, 0]], np.float32)
     regions = [[0, 1], [0, 1], [-1, -1], [2, 0], [0, 2], [0, 1], [3, 0], [0, 1]]
     weights = [[3e30, 1e30], [3e-30, 1e-30], [0, 0], [3, 1], [3, 1], [np.nan, 1], [3, 1], [np.inf, 1]]
-    got = np.asarray(distill_votes(make_votes(regions, weights, 4), codes, reduce))
-    first = exact(make_votes([[0, 1]], [[3, 1]], 4), np.nan_to_num(codes), reduce)[0]
+    got = np.asarray(distill_votes(votes_of(regions, weights, 4), codes, reduce))
+    first = exact(votes_of([[0, 1]], [[3, 1]], 4), np.nan_to_num(codes), reduce)[0]
     np.testing.assert_allclose(got[[0, 1]], [first, first], atol=1e-6)
     assert (got[[2, 3, 5, 7]] == 0).all()  # no votes, a region without a code, votes that are not finite
     np.testing.assert_allclose(got[4], [1, 0, 0], atol=1e-6)
@@ -83,11 +76,11 @@ def test_extremes(reduce):
 
 def test_ties_what_is_mostly_unlabelled_no_regions_and_wrong_tables():
     codes = np.eye(3, dtype=np.float32)
-    tied = make_votes([[2, 0, -1]], [[3.0, 3.0, 0]], 3)
+    tied = votes_of([[2, 0, -1]], [[3.0, 3.0, 0]], 3)
     np.testing.assert_allclose(distill_votes(tied, codes, "median"), [[0, 0, 1]], atol=1e-6)  # the first, whole
-    votes = dataclasses.replace(make_votes([[0, 1]] * 3, [[2.0, 1.0]] * 3, 2), total=jnp.asarray([3.0, 6.0, 7.0]))
+    votes = dataclasses.replace(votes_of([[0, 1]] * 3, [[2.0, 1.0]] * 3, 2), total=jnp.asarray([3.0, 6.0, 7.0]))
     np.testing.assert_array_equal(distill_votes(votes, codes[:2, :2]), [[1, 0], [1, 0], [0, 0]])
-    nothing = make_votes(np.zeros((7, 0)), np.zeros((7, 0)), 0)
+    nothing = votes_of(np.zeros((7, 0)), np.zeros((7, 0)), 0)
     np.testing.assert_array_equal(distill_votes(nothing, codes[:0]), np.zeros((7, 3)))
     with pytest.raises(ValueError, match="expected 'mean' or"):
         distill_votes(votes, codes[:2], "sum")

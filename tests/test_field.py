@@ -151,14 +151,7 @@ def test_a_header_that_does_not_fit(path, change, match):
     fails(path, match)
 
 
-def test_a_field_written_before_regions_overlapped_is_read(field, path):
-    rewritten(path, lambda header, _: header["field"]["fields"]["votes"]["fields"].pop("overlap"))
-    back = load_field(path)
-    assert back.votes.overlap is None
-    assert_same(back, dataclasses.replace(field, votes=dataclasses.replace(field.votes, overlap=None)))
-
-
-def test_what_another_version_has_is_passed_over(field, path):
+def test_what_another_version_has_is_passed_over_and_what_it_lacks_is_none(field, path):
     def add(header, arrays):
         arrays["votes.novel"] = np.ones(7)
         parts = header["field"]["fields"]["votes"]["fields"]
@@ -170,6 +163,8 @@ def test_what_another_version_has_is_passed_over(field, path):
 
     rewritten(path, add)
     assert_same(load_field(path), field)
+    rewritten(path, lambda header, _: header["field"]["fields"]["votes"]["fields"].pop("overlap"))
+    assert_same(load_field(path), dataclasses.replace(field, votes=dataclasses.replace(field.votes, overlap=None)))
 
 
 def test_mapped_columns_are_not_read_until_they_are_asked_for(field, path, monkeypatch):

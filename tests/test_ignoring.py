@@ -6,21 +6,12 @@ import cv2
 import numpy as np
 from capture_files import small_capture
 
-from jsecon.pipeline.ignoring import _is_named, ignore_named
+from jsecon.pipeline.ignoring import ignore_named
 from jsecon.read.captures.images import read_label_image
 from jsecon.types import ImageFile
 from jsecon.vision.classical import ClassicalSegmenter
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Models
-
-
-def test_a_mask_is_named_by_what_matches_it_better_than_other_words():
-    axes = np.eye(200, dtype=np.float32)
-    masks = np.stack([axes[0], axes[1], 0.7 * axes[0] + 0.1 * axes[5], 0 * axes[0]])
-    words = axes[2:]
-    assert _is_named(masks, axes[:1], words).tolist() == [True, False, True, False]
-    assert _is_named(masks, axes[:2], words).tolist() == [True, True, True, False]
-    assert _is_named(masks, axes[2:3], words).tolist() == [False] * 4
 
 
 def test_what_is_named_is_ignored_and_its_masks_are_written(tmp_path):
@@ -41,6 +32,8 @@ def test_what_is_named_is_ignored_and_its_masks_are_written(tmp_path):
     both, either = (found.ignored & (red > 0)).sum(), (found.ignored | (red > 0)).sum()
     assert both / either > 0.85
     assert f"in {count - 1} of {count} frames" in found.notes[-1]
+    none = ignore_named(capture, ["blue ball"], models, tmp_path / "none", lambda done, total: None)
+    assert none.ignored is None or not none.ignored.any()
     for name, ignored in zip(capture.names, found.ignored):
         written = read_label_image(tmp_path / "masks" / f"{name}.png")
         np.testing.assert_array_equal(written[::2, ::2] == 0, ignored)

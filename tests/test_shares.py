@@ -14,7 +14,7 @@ from hypothesis import given, settings, strategies as st
 from hypothesis.extra.numpy import arrays
 from jax.test_util import check_grads
 from scipy.stats import beta
-from small_field import seen_of, shares_of
+from small_field import lone_votes, seen_of, shares_of
 
 from jsecon.field.membership import (
     CORRELATION,
@@ -213,9 +213,8 @@ def test_gradient_equals_central_differences(x64):
     check_grads(share, given, order=1, modes=["rev"], rtol=1e-4, atol=0, eps=1e-7)
 
 
-def votes_of(views, total):
-    nobody = np.zeros((len(views), 1), np.int32), np.ones((len(views), 1), np.float32)
-    return Votes(*nobody, total, total, total, views, np.int32(0), REGIONS)
+def seen_in(views, total):
+    return dataclasses.replace(lone_votes(0 * views, REGIONS), views=views, total=total)
 
 
 def test_probability_equals_the_beta_distribution():
@@ -225,6 +224,6 @@ def test_probability_equals_the_beta_distribution():
     looks = np.minimum(views, total.astype(np.float64))
     looks = looks / (1 + np.maximum(looks - 1, 0) * CORRELATION)
     expected = beta.sf(0.5, 1 + share * looks, 1 + (1 - share) * looks)
-    np.testing.assert_allclose(membership_probability(share, votes_of(views, total)), expected, atol=2e-5)
-    unknown = votes_of(np.array([0, 3], np.int32), np.float32([0, np.nan]))
+    np.testing.assert_allclose(membership_probability(share, seen_in(views, total)), expected, atol=2e-5)
+    unknown = seen_in(np.array([0, 3], np.int32), np.float32([0, np.nan]))
     np.testing.assert_array_equal(membership_probability(np.float32([1, 1]), unknown), 0)

@@ -1,7 +1,6 @@
 """Parts and unions: other cuts of a field's tree, and texts that name parts."""
 
 import dataclasses
-import itertools
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from small_field import KnownTexts, colour_field, make_field, unit_rows
 from jsecon import InputError, Regions, load_field, save_field
 from jsecon.app.records import Region
 from jsecon.app.scene import Scene
-from jsecon.field.tree import cut_field, node_members, part_objects
+from jsecon.field.tree import cut_field, part_objects
 from jsecon.query.expressions import split_part
 from jsecon.query.match import select_node
 from jsecon.query.parts import match_lone_parts
@@ -167,12 +166,3 @@ def test_parts_are_kept_in_the_file(field, tmp_path):
     broken = dataclasses.replace(field, part_nodes=np.array([9, 10], np.int32))
     with pytest.raises(ValueError, match="part_nodes"):
         save_field(tmp_path / "broken.safetensors", broken)
-
-
-def test_members_of_nodes_nest():
-    leaf = np.arange(-1, len(TREE))
-    members = [node_members(TREE, leaf, node) for node in range(len(TREE))]
-    assert not members[0][0]
-    for node, parent in itertools.product(range(len(TREE)), repeat=2):
-        if TREE[node] == parent:
-            assert (members[node] <= members[parent]).all()
