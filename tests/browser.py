@@ -1,6 +1,5 @@
 """Chromium without a window, driven over its debugging port: keys, clicks, pictures, and what it asked for."""
 
-import base64
 import contextlib
 import itertools
 import json
@@ -77,9 +76,6 @@ class Page:
         self.send("Input.insertText", text=text)
         time.sleep(0.12)  # the page tells the server of a text at most every 50 ms
         self.key("Enter", 13, "\r")
-
-    def png(self) -> bytes:
-        return base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"])
 
 
 def until(found: Callable[[], Any], told: str, seconds: float = 20.0) -> Any:

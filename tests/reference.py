@@ -1,5 +1,7 @@
 """Slow, readable reference: brute force over all Gaussians in NumPy float64. It defines the image."""
 
+from collections.abc import Iterator
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -45,20 +47,25 @@ def project_reference(gaussians: Gaussians, camera: Camera) -> dict[str, np.ndar
     return out
 
 
-def weights_reference(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """Computes the weight alpha T of every Gaussian at every pixel, (H, W, N); equal depths in index order."""
-    splats = project_reference(gaussians, camera)
+def alphas_reference(splats: dict[str, np.ndarray], camera: Camera) -> Iterator[tuple[int, np.ndarray]]:
+    """Gives each Gaussian before the camera, front to back, with its alpha (H, W) before any cut."""
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    weights = np.zeros((camera.height, camera.width, len(splats["depths"])))
-    transmittance = np.ones((camera.height, camera.width))
-    running = np.ones((camera.height, camera.width), bool)
     for i in np.argsort(splats["depths"], kind="stable"):
         if not splats["in_front"][i]:
             continue
         a, b, c = splats["conics"][i]
         dx, dy = x - splats["means_px"][i, 0], y - splats["means_px"][i, 1]
-        q = a * dx * dx + 2 * b * dx * dy + c * dy * dy
-        alpha = np.minimum(MAX_ALPHA, splats["opacities"][i] * np.exp(-0.5 * q))
+        yield i, splats["opacities"][i] * np.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
+
+
+def weights_reference(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    """Computes the weight alpha T of every Gaussian at every pixel, (H, W, N); equal depths in index order."""
+    splats = project_reference(gaussians, camera)
+    weights = np.zeros((camera.height, camera.width, len(splats["depths"])))
+    transmittance = np.ones((camera.height, camera.width))
+    running = np.ones((camera.height, camera.width), bool)
+    for i, alpha in alphas_reference(splats, camera):
+        alpha = np.minimum(MAX_ALPHA, alpha)
         alpha = np.where(alpha < MIN_ALPHA, 0.0, alpha)
         running &= transmittance * (1 - alpha) > MIN_TRANSMITTANCE
         weights[..., i] = np.where(running, alpha * transmittance, 0.0)

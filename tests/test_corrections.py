@@ -41,22 +41,17 @@ def _one_size(monkeypatch):
     monkeypatch.setattr(refine, "MIN_ASIDE", 1)
 
 
-def photographed(truth, poses):
-    """A capture of `truth` with depth, the third frame held out; no pixel is ignored, so that all fits share programs
-    with the one that ignores some."""
-    count = len(poses)
-    cameras = cameras_of(poses, (30, 30, 16, 12), 32, 24)
-    views = [render(truth, camera, np.maximum(0.5 + 0.28209479 * truth.sh[:, 0], 0), depth=True) for camera in
-             (jax.tree.map(jnp.asarray, cameras[t]) for t in range(count))]  # fmt: skip
-    frames = np.stack([np.rint(np.clip(view.features, 0, 1) * 255).astype(np.uint8) for view in views])
-    depths = np.stack([np.where(view.alpha > 0.5, view.depth, 0) for view in views]).astype(np.float32)
-    return capture_of(frames, cameras, np.arange(count) == 2, depths, ignored=np.zeros(frames.shape[:3], bool))
-
-
 @pytest.fixture(scope="module")
 def capture(truth):
-    turns = np.linspace(-0.8, 0.8, VIEWS)
-    return photographed(truth, [look_at((2.2 * np.sin(a), -0.6, -2.2 * np.cos(a))) for a in turns])
+    """`truth` with depth, the third frame held out; no pixel is ignored, so that all fits share programs with the one
+    that ignores some."""
+    poses = [look_at((2.2 * np.sin(a), -0.6, -2.2 * np.cos(a))) for a in np.linspace(-0.8, 0.8, VIEWS)]
+    cameras = cameras_of(poses, (30, 30, 16, 12), 32, 24)
+    colours = np.maximum(0.5 + 0.28209479 * truth.sh[:, 0], 0)
+    views = [render(truth, jax.tree.map(jnp.asarray, cameras[t]), colours, depth=True) for t in range(VIEWS)]
+    frames = np.stack([np.rint(np.clip(view.features, 0, 1) * 255).astype(np.uint8) for view in views])
+    depths = np.stack([np.where(view.alpha > 0.5, view.depth, 0) for view in views]).astype(np.float32)
+    return capture_of(frames, cameras, np.arange(VIEWS) == 2, depths, ignored=np.zeros(frames.shape[:3], bool))
 
 
 def rough(capture, *, twists, gains):

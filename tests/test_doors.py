@@ -1,7 +1,6 @@
 """Questions of all kinds through every door: command line, export, HTTP, tools, viewer's page, evaluation and Python
 give the same Gaussians, to the bit."""
 
-import asyncio
 import base64
 import json
 import re
@@ -11,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 from capture_files import run_cli
-from mcp import Client
 from starlette.testclient import TestClient
 from table_field import THINGS, table_field
+from test_mcp import call
 
 from jsecon import At, Box, InputError, Mask, Region, Scene, load_gaussians, open_scene, save_field
 from jsecon.app.evaluation import evaluate
@@ -78,11 +77,8 @@ def find(door):
     opened = Future()
     opened.set_result(door[0])
 
-    async def call(texts):
-        async with Client(make_server({"table": opened})) as tools:
-            return [await tools.call_tool("find", {"text": text}) for text in texts]
-
-    return lambda *texts: asyncio.run(call(texts))
+    server = make_server({"table": opened})
+    return lambda *texts: [call(server, "find", text=text) for text in texts]
 
 
 def test_they_are_of_all_kinds(door):

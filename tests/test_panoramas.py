@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 from capture_files import context_of, refused, small_capture, transforms, write_text_model
+from conftest import cameras_of
 from photo_files import apart
 from scipy.spatial.transform import Rotation
 
-from jsecon import Camera
 from jsecon.pipeline.scene import plan_capture
 from jsecon.poses.sfm import find_poses
 from jsecon.read.captures.capture import load_capture, unposed_photographs
@@ -51,9 +51,10 @@ def write_images(folder):
 
 def panoramas(poses):
     """A capture of photographs as wide as panoramas at these poses; its frames are none."""
-    lens = (np.full(COUNT, value, np.float32) for value in (HEIGHT, HEIGHT, WIDTH / 2, HEIGHT / 2))
-    names = tuple(f"pano_{n:03d}" for n in range(COUNT))
-    return dataclasses.replace(small_capture(COUNT), cameras=Camera(poses, *lens, WIDTH, HEIGHT), names=names)
+    cameras = cameras_of(poses, (HEIGHT, HEIGHT, WIDTH / 2, HEIGHT / 2), WIDTH, HEIGHT)
+    return dataclasses.replace(
+        small_capture(COUNT), cameras=cameras, names=tuple(f"pano_{n:03d}" for n in range(COUNT))
+    )
 
 
 def write_nerfstudio(folder, poses, model="EQUIRECTANGULAR"):

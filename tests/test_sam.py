@@ -9,7 +9,6 @@ import pytest
 from sam_files import MEAN, STD, write_sam
 from scipy import ndimage
 
-from jsecon.networks import sam
 from jsecon.networks.hub import find_files
 from jsecon.networks.sam import TOKENS, SamSegmenter, _box_nms, _box_of, _GuidedPrompts, _langsplat_nms, _SamGraphs
 from jsecon.vision.protocols import Segmenter
@@ -157,14 +156,3 @@ def test_a_frame_without_anything_good_gives_no_masks(folders, frame, monkeypatc
 
     monkeypatch.setattr(_SamGraphs, "decode", decode_poorly)
     assert SamSegmenter(folders["sam", "batch"])(frame, 0).shape == (0, 120, 160)
-
-
-def test_prompts_end_where_no_mask_explains_anything():
-    frame = np.random.default_rng(0).integers(0, 256, (12, 16, 3), dtype=np.uint8).repeat(20, 0).repeat(20, 1)
-    prompts = _GuidedPrompts(frame, 3)
-    rounds = []
-    while len(points := prompts.next_points()):
-        rounds.append(points)
-    every = np.concatenate(rounds)
-    assert len(rounds) <= 4
-    assert len(np.unique(every, axis=0)) == len(every) <= sam._MAX_PROMPTS

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import gaussians_at
-from reference import project_reference, render_reference, weights_reference
+from reference import alphas_reference, project_reference, render_reference, weights_reference
 from scipy.spatial.transform import Rotation
 
 from jsecon.numerics import BLUR_PX2, FRUSTUM_MARGIN, MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, NEAR
@@ -340,14 +340,9 @@ def cuts_in_doubt(gaussians: Gaussians, camera: Camera, tolerance: float) -> tup
     """(H, W) what a cut in doubt can change there, in units of a feature, 0 where none is in doubt; and bool (H, W, N)
     the pixels that each Gaussian touches."""
     splats = project_reference(gaussians, camera)
-    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    left, running = np.ones_like(x), np.ones_like(x, bool)
-    jump, touched = np.zeros_like(x), np.zeros((*x.shape, gaussians.count), bool)
-    for i in np.argsort(splats["depths"], kind="stable"):
-        if not splats["in_front"][i]:
-            continue
-        (a, b, c), dx, dy = splats["conics"][i], x - splats["means_px"][i, 0], y - splats["means_px"][i, 1]
-        alpha = splats["opacities"][i] * np.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
+    left, running = np.ones((camera.height, camera.width)), np.ones((camera.height, camera.width), bool)
+    jump, touched = np.zeros_like(left), np.zeros((*left.shape, gaussians.count), bool)
+    for i, alpha in alphas_reference(splats, camera):
         faint = running & (np.abs(alpha / MIN_ALPHA - 1) < tolerance)
         capped = running & (np.abs(alpha / MAX_ALPHA - 1) < 1e-4)
         alpha = np.where(alpha < MIN_ALPHA, 0.0, np.minimum(alpha, MAX_ALPHA))

@@ -8,16 +8,7 @@ import laspy
 import numpy as np
 import pytest
 from balls import sphere
-from capture_files import (
-    compute_stage,
-    context_of,
-    inria,
-    refused,
-    run_cli,
-    small_capture,
-    transforms,
-    write_text_model,
-)
+from capture_files import compute_stage, context_of, inria, refused, small_capture, transforms, write_text_model
 from conftest import gaussians_at
 from point_files import OFFSET, las
 from scipy.spatial.transform import Rotation
@@ -360,7 +351,7 @@ def test_poses_that_do_not_show_the_splat_are_named_and_views_planned(splat, pos
 
 def test_a_number_of_views_plans_them_although_poses_lie_beside(splat, posed, capsys):
     (splat.parent / "cameras.json").write_text(json.dumps(inria(posed)))
-    assert run_cli("run", splat, "--out", splat.parent / "field", "--dry-run") == 0
+    assert main(["run", str(splat), "--out", str(splat.parent / "field"), "--dry-run"]) == 0
     assert "cameras.json" in capsys.readouterr().out
     capture, _, how = views_of(splat, views=3)
     assert "3 virtual views, planned" in how
