@@ -118,13 +118,9 @@ def scene() -> Gaussians:
     """64 Gaussians of many sizes, turns and opacities in a unit ball at the origin, SH degree 1, float32 NumPy."""
     rng = np.random.default_rng(0)
     count = 64
-    return Gaussians(
-        means=rng.uniform(-0.6, 0.6, (count, 3)).astype(np.float32),
-        log_scales=np.log(rng.uniform(0.02, 0.2, (count, 3))).astype(np.float32),
-        quaternions=rng.normal(size=(count, 4)).astype(np.float32),
-        opacity_logits=rng.uniform(-2.0, 4.0, count).astype(np.float32),
-        sh=(0.3 * rng.normal(size=(count, 4, 3))).astype(np.float32),
-    )
+    means, sizes = rng.uniform(-0.6, 0.6, (count, 3)), rng.uniform(0.02, 0.2, (count, 3))
+    turns, logit = rng.normal(size=(count, 4)), rng.uniform(-2.0, 4.0, count)
+    return gaussians_at(means, sizes, turns=turns, logit=logit, sh=0.3 * rng.normal(size=(count, 4, 3)))
 
 
 def gaussians_at(means, size, *, turns=(1, 0, 0, 0), logit=3.0, sh=((0, 0, 0),)) -> Gaussians:

@@ -75,7 +75,7 @@ def test_texts_that_say_the_same(embedder, one, other):
 @pytest.mark.parametrize("order", [
     ("red", "crimson", "orange", "yellow", "blue"), ("teal", "turquoise", "light blue", "orange"),
     ("greenish", "green", "blue"), ("grey", "greenish", "green"), ("bluish-green", "green", "blue"),
-    ("blue", "bluish-green", "green"), ("navy blue", "navy", "blue"),
+    ("blue", "bluish-green", "green"), ("navy blue", "navy", "blue"), ("bright red", "red", "dark red"),
 ])  # fmt: skip
 def test_likeness_falls_with_the_distance_of_colours(embedder, order):
     """ "-ish" and compounds lie between."""

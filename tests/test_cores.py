@@ -35,13 +35,7 @@ def work(out: str, field: str, word: str, parts: tuple[str, ...]) -> None:
 
     rng = np.random.default_rng(0)
     count = 61
-    scene = jsecon.Gaussians(
-        means=rng.uniform(-0.6, 0.6, (count, 3)).astype(np.float32),
-        log_scales=np.log(rng.uniform(0.05, 0.2, (count, 3))).astype(np.float32),
-        quaternions=rng.normal(size=(count, 4)).astype(np.float32),
-        opacity_logits=rng.uniform(-1.0, 3.0, count).astype(np.float32),
-        sh=rng.normal(size=(count, 1, 3)).astype(np.float32),
-    )
+    scene = jax.tree.map(lambda column: column[:count], jsecon.load_field(field).gaussians)
     poses = np.stack([look_at((2.5 * np.sin(a), -2.5 * np.cos(a), 0.7), np.zeros(3)) for a in np.linspace(0, 1, VIEWS)])
     lens = (np.full(VIEWS, value, np.float32) for value in (45, 43, 25.5, 117))
     cameras = jsecon.Camera(poses, *lens, width=WIDTH, height=HEIGHT)

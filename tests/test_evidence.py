@@ -138,15 +138,3 @@ def test_a_bare_colour_word_names_the_shades_that_fill_a_room(family):
         region, score = asked_of(embeddings, pixels, family)
         assert region == len(embeddings) - 1, shade
         assert score > 0.14, shade
-
-
-def test_a_modifier_narrows_the_family_and_the_typical_colour_comes_first():
-    row = ["red", "dark red", "green", "dark green", "light green", "blue", "light blue"]
-    embeddings, pixels = painted((128, 126, 120), [PALETTE[name] for name in row])
-    for text in row:
-        assert row[asked_of(embeddings, pixels, text)[0]] == text
-    assert row[asked_of(embeddings, pixels, "bright red")[0]] == "red"
-    of_dark, of_bright = embeddings[1], embeddings[0]
-    red, dark, bright = COLOURS.embed_text(["red", "dark red", "bright red"])
-    assert red @ of_dark > bright @ of_dark + 0.2  # the family includes it, the plain colour does not
-    assert dark @ of_dark > dark @ of_bright + 0.3

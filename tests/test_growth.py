@@ -3,7 +3,6 @@
 import jax
 import numpy as np
 import pytest
-from conftest import gaussians_at
 from scipy.spatial.transform import Rotation
 
 from jsecon.fit.growth import MIN_OPACITY, _in_use, _split_in_two, grow, pad_with_free_rows
@@ -12,11 +11,9 @@ from jsecon.splat.capacity import round_capacity
 from jsecon.types import Camera
 
 
-def scene(count=30, seed=0):
-    rng = np.random.default_rng(seed)
-    means, sizes = rng.normal(size=(count, 3)), np.exp(rng.normal(-2, 0.5, (count, 3)))
-    turns, logit = rng.normal(size=(count, 4)), rng.uniform(-2, 3, count)
-    return gaussians_at(means, sizes, turns=turns, logit=logit, sh=rng.normal(size=(count, 4, 3)))
+@pytest.fixture
+def whole(scene):
+    return jax.tree.map(lambda column: column[:30].copy(), scene)
 
 
 def covariance(gaussians):
@@ -24,8 +21,7 @@ def covariance(gaussians):
     return np.einsum("nij,nj,nkj->nik", rotation, np.exp(2 * gaussians.log_scales), rotation)
 
 
-def test_halves_have_the_mean_the_covariance_and_the_alpha_at_the_centre_of_the_whole():
-    whole = scene()
+def test_halves_have_the_mean_the_covariance_and_the_alpha_at_the_centre_of_the_whole(whole):
     one, other = _split_in_two(whole)
     np.testing.assert_allclose((one.means + other.means) / 2, whole.means, atol=1e-6)
     offset = (one.means - whole.means)[:, :, None]
@@ -41,8 +37,8 @@ def test_halves_have_the_mean_the_covariance_and_the_alpha_at_the_centre_of_the_
 
 
 @pytest.mark.parametrize("target", [36, 80, 2000])
-def test_grown_scenes_have_as_many_as_wanted_and_their_moments_begin_anew(target):
-    whole = pad_with_free_rows(scene(), 32)
+def test_grown_scenes_have_as_many_as_wanted_and_their_moments_begin_anew(whole, target):
+    whole = pad_with_free_rows(whole, 32)
     moments = jax.tree.map(np.ones_like, whole), jax.tree.map(np.ones_like, whole)
     votes = np.where(np.arange(32) < 30, 1.0 + np.arange(32), 7.0).astype(np.float32)
     after, (first, second) = grow(whole, moments, votes, target, 2000, [0, 1])
@@ -57,13 +53,12 @@ def test_grown_scenes_have_as_many_as_wanted_and_their_moments_begin_anew(target
     np.testing.assert_array_equal(after.means[untouched], whole.means[: after.count][untouched[:32]])
 
 
-def test_faint_gaussians_make_room_and_nothing_is_added_where_nothing_is_wrong():
-    whole = scene()
+def test_faint_gaussians_make_room_and_nothing_is_added_where_nothing_is_wrong(whole):
     whole.opacity_logits[:5] = np.log(MIN_OPACITY / 2)
     after, _ = grow(whole, (whole, whole), np.ones(30, np.float32), 30, 30, [0])
     assert after.count == 30
     assert _in_use(after).all()
-    whole = pad_with_free_rows(scene(), 64)
+    whole = pad_with_free_rows(whole, 64)
     after, _ = grow(whole, (whole, whole), np.zeros(64, np.float32), 60, 60, [0])
     jax.tree.map(np.testing.assert_array_equal, after, whole)
 

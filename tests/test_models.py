@@ -80,7 +80,6 @@ def damage(path, change):
     ("clip", TOKENS, {"model": {"type": "BPE", "vocab": {"a": "b"}, "merges": []}}, "no tokenizer of this model"),
     ("clip", TOKENS, b'{"model": {"type": "Unigram", "unk_id": 0, "vocab": [["a", 0.0]]}}', "no tokenizer of this"),
     ("clip", TOKENS, {"post_processor": None}, "a start and an end around a word"),
-    ("siglip", "visual/preprocess_cfg.json", {"mean": None}, ("preprocess_cfg.json", "cannot be read")),
     ("siglip", "textual/tokenizer_config.json", None, "tokenizer_config.json: No such file"),
     ("siglip", "textual/tokenizer_config.json", {"pad_token": None}, ("pad_token None", "pads short texts")),
     ("siglip", "textual/tokenizer_config.json", {"pad_token": "<none>"}, "without '<none>'"),

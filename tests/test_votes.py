@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import cameras_of
+from conftest import cameras_of, gaussians_at
 from reference import weights_reference
 
 from jsecon import plan_view
@@ -16,7 +16,7 @@ from jsecon.field.evidence import IGNORED, region_votes, sum_evidence, view_evid
 from jsecon.field.membership import normalise_votes
 from jsecon.splat.render import render_rgb
 from jsecon.splat.visible import geometry_of_rows, render_in_blocks, visible_rows
-from jsecon.types import Gaussians, Regions, Votes
+from jsecon.types import Regions, Votes
 
 REGIONS = 11
 COLUMNS = "regions", "weights", "labelled", "total", "max_pixel_weight", "views"
@@ -62,12 +62,12 @@ def assert_same_bits(found: Votes, votes: Votes, names=(*COLUMNS, "by_view")):
 def ball(count, views, width, height, *, opaque=0.0, seed=0):
     rng = np.random.default_rng(seed)
     size = 0.7 * count ** (-1 / 3)
-    arrays = rng.normal(size=(count, 3)), np.log(rng.uniform(0.1 * size, size, (count, 3)))
-    arrays = *arrays, rng.normal(size=(count, 4)), rng.normal(opaque, 1, count), np.zeros((count, 1, 3))
+    means, sizes = rng.normal(size=(count, 3)), rng.uniform(0.1 * size, size, (count, 3))
+    turns, logit = rng.normal(size=(count, 4)), rng.normal(opaque, 1, count)
     poses = np.tile(np.eye(4, dtype=np.float32), (views, 1, 1))
     poses[:, 2, 3] = 4 - 0.3 * np.arange(views)
     cameras = cameras_of(poses, (0.9 * width, 0.9 * width, width / 2, height / 2), width, height)
-    return Gaussians(*(a.astype(np.float32) for a in arrays)), cameras
+    return gaussians_at(means, sizes, turns=turns, logit=logit), cameras
 
 
 def test_equals_the_oracles_weights(cast, expected):
