@@ -23,6 +23,12 @@ def unit_rows(rng, rows, size):
     return x / np.linalg.norm(x, axis=1, keepdims=True)
 
 
+def crowded(rng, rows, size, common):
+    """Unit rows about a common direction, as CLIP's are."""
+    x = common * unit_rows(rng, 1, size) + unit_rows(rng, rows, size)
+    return x / np.linalg.norm(x, axis=1, keepdims=True)
+
+
 def true_regions(scene):
     """(N,) region of each Gaussian: five slabs of like numbers, from below to above."""
     return np.argsort(np.argsort(np.asarray(scene.means)[:, 1])) * REGIONS // scene.means.shape[0]

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from conftest import cameras_of, capture_of, look_at
-from scipy.linalg import expm
+from test_corrections import hat_exp
 
 from jsecon.poses.alignment import align_cameras
 from jsecon.types import Capture
@@ -36,11 +36,8 @@ def in_a_corner() -> Capture:
 def moved(capture: Capture, centimetres: float, degrees: float) -> Capture:
     """The capture with poses off by so much along and about each of the camera's axes (normal)."""
     draw, poses = np.random.default_rng(3), np.asarray(capture.cameras.world_to_camera, np.float64)
-    twists = np.zeros((VIEWS, 4, 4))
-    for twist in twists:
-        twist[:3, :3] = np.cross(np.eye(3), np.radians(degrees) * draw.normal(size=3))
-        twist[:3, 3] = centimetres / 100 * draw.normal(size=3)
-    return posed(capture, np.stack([expm(twist) @ pose for twist, pose in zip(twists, poses)]))
+    twists = np.repeat([np.radians(degrees), centimetres / 100], 3) * draw.normal(size=(VIEWS, 6))
+    return posed(capture, np.stack([hat_exp(twist) @ pose for twist, pose in zip(twists, poses)]))
 
 
 def posed(capture: Capture, poses: np.ndarray) -> Capture:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import MANY
 from jax.test_util import check_grads
-from small_field import unit_rows
+from small_field import crowded, unit_rows
 
 from jsecon.numerics import cosine
 from jsecon.paper.autoencoder import decode, encode, train_autoencoder
@@ -16,15 +16,9 @@ from jsecon.paper.autoencoder import decode, encode, train_autoencoder
 KEY = jax.random.key(0)
 
 
-def clustered(rng, regions, size, spread=0.8):
-    """Embeddings about a common direction, as CLIP's are."""
-    x = rng.normal(size=size) + spread * rng.normal(size=(regions, size))
-    return (x / np.linalg.norm(x, axis=1, keepdims=True)).astype(np.float32)
-
-
 @pytest.fixture(scope="module")
 def trained():
-    embeddings = clustered(np.random.default_rng(0), 65, 48)
+    embeddings = crowded(np.random.default_rng(0), 65, 48, common=1.25)
     calls = []
     coder = train_autoencoder(embeddings, latent=3, key=KEY, epochs=300, progress=lambda *done: calls.append(done))
     return embeddings, coder, calls

@@ -118,15 +118,10 @@ def asked_of(embeddings, pixels, text):
 THINGS = ("red", "orange", "yellow", "green", "blue", "purple", "pink", "brown", "black", "white")
 SHADES = {
     "red": ("dark red", "burgundy", "crimson", "maroon", "light red"),
-    "orange": ("dark orange", "light orange"),
     "yellow": ("dark yellow", "light yellow", "mustard"),
     "green": ("dark green", "light green"),
     "blue": ("dark blue", "light blue", "navy", "sky"),
-    "purple": ("dark purple", "light purple"),
-    "pink": ("dark pink", "light pink"),
-    "brown": ("dark brown", "light brown"),
     "black": ("charcoal",),
-    "white": ("ivory", "cream"),
     "gray": ("dark grey",),
 }
 

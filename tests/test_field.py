@@ -142,7 +142,6 @@ def exchanged(header, record, name, other):
     (lambda h, a: h["field"]["fields"].update(gaussians={"value": None}), "damaged"),
     (lambda h, a: exchanged(h, "gaussians", "sh", "cameras"), "damaged"),
     (lambda h, a: exchanged(h, "cameras", "fy", "gaussians"), "damaged"),
-    (lambda h, a: exchanged(h, "votes", "overflow", "regions"), "damaged"),
     (lambda h, a: h["field"]["fields"]["names"].update(value=["one"]), "1 frame names"),
     (lambda h, a: h["field"]["fields"]["votes"]["fields"]["num_regions"].update(value=4), "votes over 4 regions"),
 ])  # fmt: skip

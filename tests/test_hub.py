@@ -89,14 +89,12 @@ def test_a_file_of_another_content_is_refused_and_removed(local):
 
 
 @pytest.mark.parametrize(("change", "clause"), [
-    (lambda local, patch: local.repositories.clear(), "no such repository or revision"),
     (lambda local, patch: setattr(local.repositories[NAME], "gated", 401), "HF_TOKEN"),
-    (lambda local, patch: setattr(local.repositories[NAME], "gated", 403), "HF_TOKEN"),
     (lambda local, patch: local.repositories[NAME].files.pop("onnx/vision_encoder.onnx"), "onnx/vision_encoder.onnx"),
     (lambda local, patch: patch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9"), "Check the network"),
     (lambda local, patch: patch.setattr(constants, "HF_HUB_OFFLINE", True), "jsecon models get slimsam"),
     (lambda local, patch: patch.setattr("huggingface_hub.snapshot_download", full_disk), "No space left on device"),
-], ids=["unknown", "no token", "no access", "incomplete", "no network", "offline", "full disk"])  # fmt: skip
+], ids=["no token", "incomplete", "no network", "offline", "full disk"])  # fmt: skip
 def test_what_the_hub_or_the_disk_refuses_is_said_in_a_sentence(local, monkeypatch, change, clause):
     change(local, monkeypatch)
     with refused(clause):

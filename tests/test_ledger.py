@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from capture_files import refused
 from small_field import REGIONS, labels_of, make_field, true_regions, unit_rows
+from test_field import assert_same
 
 from jsecon.app.scene import open_scene
 from jsecon.errors import InputError
@@ -68,12 +69,6 @@ def views(scene, cameras, labels, rows):
     return made
 
 
-def assert_equal(field, expected):
-    assert field.names == expected.names
-    for (path, a), (_, b) in zip(*(jax.tree_util.tree_leaves_with_path(f) for f in (field, expected)), strict=True):
-        np.testing.assert_array_equal(np.asarray(a), np.asarray(b), err_msg=jax.tree_util.keystr(path))
-
-
 def test_views_added_in_any_order_make_the_field_of_one_run(scene, cameras, labels, rows, views):
     """To the last bit, also if the first views lack a region, and if one is forgotten and added again."""
     expected = run_on(scene, cameras, labels, rows, [0, 1, 2, 3])
@@ -83,11 +78,11 @@ def test_views_added_in_any_order_make_the_field_of_one_run(scene, cameras, labe
         field, ledger = start, Ledger(REGIONS, {first: views[first]})
         for batch in ([batches[0]], batches[1:]):
             field, ledger = add_views(field, ledger, {name: views[name] for name in batch})
-        assert_equal(field, expected)
+        assert_same(field, expected)
     for t, name in enumerate(NAMES):
         less, shorter = forget_views(field, ledger, [name])
-        assert_equal(less, run_on(scene, cameras, labels, rows, [n for n in range(4) if n != t]))
-        assert_equal(add_views(less, shorter, {name: views[name]})[0], expected)
+        assert_same(less, run_on(scene, cameras, labels, rows, [n for n in range(4) if n != t]))
+        assert_same(add_views(less, shorter, {name: views[name]})[0], expected)
 
 
 def test_regions_that_a_field_lacks_are_added(scene, cameras, labels, rows, views):
@@ -131,7 +126,7 @@ def test_no_byte_of_a_forgotten_frame_stays_in_its_files(scene, cameras, labels,
         assert bytes(trace) not in content
     assert len(files(tmp_path)) == 2
     assert b"a sparse scene" in content
-    assert_equal(load_field(path), less.field)
+    assert_same(load_field(path), less.field)
 
 
 @pytest.mark.parametrize("fault", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])

@@ -36,11 +36,6 @@ def casts(output):
     return lambda path: write_graph(path, [node("Cast", ["text"], [output], to=1)], given, result)
 
 
-def flat(path):
-    kind = "float32", [1, 5]
-    write_graph(path, [node("Identity", ["pixel_values"], ["y"])], {"pixel_values": kind}, {"y": kind})
-
-
 def not_finite(path):
     write_textual(path, ("text", "embedding"), np.nan * token_colours(), [1, 77], "int32")
 
@@ -71,8 +66,8 @@ def damage(path, change):
     ("clip", TEXTS, None, (f"lacks {TEXTS}", "huggingface.co")),
     ("clip.js", "preprocessor_config.json", None, "lacks preprocessor_config.json"),
     ("clip", IMAGES, TEXTS, "input 'image': no such input; the graph has text int32[1, 77]"),
-    ("clip", TEXTS, IMAGES, f"{TEXTS}, input 'image'"), ("clip", TEXTS, b"", (TEXTS, "an empty file")),
-    ("clip", TEXTS, 100, (TEXTS, "cannot open")), ("clip", TEXTS, b"PK\x03\x04 of torch", (TEXTS, "a zip archive")),
+    ("clip", TEXTS, b"", (TEXTS, "an empty file")), ("clip", TEXTS, 100, (TEXTS, "cannot open")),
+    ("clip", TEXTS, b"PK\x03\x04 of torch", (TEXTS, "a zip archive")),
     ("clip", TEXTS, casts("pooler_output"), "output 'embedding': no such output; the graph has pooler_output"),
     ("clip", TEXTS, casts("embedding"), "texts of 77 numbers, expected 3"),
     ("clip", TEXTS, not_finite, "model.onnx: an embedding that is zero or not finite"),
@@ -92,18 +87,16 @@ def damage(path, change):
     ("siglip.js", "tokenizer_config.json", {"tokenizer_class": "BertTokenizer"}, ("'BertTokenizer'", "Siglip")),
     ("sam", ENCODER, None, ("no segmenter, since it lacks onnx/vision_encoder.onnx", "huggingface.co")),
     ("sam", "preprocessor_config.json", {"image_mean": None}, ("preprocessor_config.json", "cannot be read")),
-    ("sam", ENCODER, DECODER, ("vision_encoder.onnx, input 'pixel_values'", "input_points")),
     ("sam", DECODER, ENCODER, "decoder.onnx, input 'input_points': no such input"),
     ("sam", ENCODER, lambda path: write_encoder(path, 128, ("image_embeddings", "image_positional_embeddings")),
      ("vision_encoder.onnx, output 'image_embeddings'", "8, 8], expected ", "16, 16]")),
     ("sam", ENCODER, lambda path: write_encoder(path, 256), "output 'image_positional_embeddings': no such output"),
-    ("sam", ENCODER, flat, "input 'pixel_values': pixel_values float32[1, 5], expected"),
     ("sam", DECODER, lambda path: write_decoder(path, 256, "sam", "batch", masks=1), ("'pred_masks'", "3 or 4 masks")),
     ("sam2", "constants.json", None, "constants.json"), ("sam2", "constants.json", b"PK\x03\x04 cut", "a zip archive"),
     ("sam2", "constants.json", {"memory_temporal_positional_encoding": [[0.0] * 4] * 3}, "(3, 4)"),
     ("sam2", "constants.json", {"image_mean": ["a"] * 3}, "cannot be read"),
     ("sam2", "onnx/mask_decoder.onnx", "onnx/pointer_tpos.onnx", "feats2_cond"),
-    ("sam2", "onnx/memory_encoder.onnx", wider_memory, "tokens"), ("sam2", ENCODER, 999, "vision_encoder.onnx"),
+    ("sam2", "onnx/memory_encoder.onnx", wider_memory, "tokens"),
 ])  # fmt: skip
 def test_a_damaged_folder_is_named(tmp_path, model, name, change, words):
     open_model, write = MODELS[model]

@@ -260,22 +260,17 @@ def test_what_lies_beside_photographs_and_is_not_used_is_named_in_the_plan(tmp_p
     assert says in stage.how
 
 
-@pytest.mark.parametrize(("names", "says"), [
-    (["a.mp4"], "jsecon run {}/a.mp4"), (["a.mov", "b.mov"], "run {}/a.mov"), (["images/a.gif"], "1 .gif"),
-    (["cameras.json", "point_cloud/iteration_7/point_cloud.ply"], "run {}/point_cloud/iteration_7/point_cloud.ply"),
-    (["a.spz", "notes.txt"], "jsecon run {}/a.spz"),
+@pytest.mark.parametrize(("names", "head", "says"), [
+    (["a.mp4"], b"", "jsecon run {}/a.mp4"), (["a.mov", "b.mov"], b"", "run {}/a.mov"),
+    (["images/a.gif"], b"", "1 .gif"), (["a.spz", "notes.txt"], b"", "jsecon run {}/a.spz"),
+    (["cameras.json", "point_cloud/iteration_7/point_cloud.ply"], b"", "{}/point_cloud/iteration_7/point_cloud.ply"),
+    (["a.r3d"], b"PK\3\4", "unzip a.r3d"), (["a.tgz"], b"\x1f\x8b", "an archive"),
+    (["a.jpg"], b"\xff\xd8", "one image"), (["a.nef"], b"II*\0", "one image"),
 ])  # fmt: skip
-def test_a_folder_without_photographs_says_what_is_there(tmp_path, names, says):
+def test_a_folder_without_photographs_and_a_file_that_is_no_capture_are_named(tmp_path, names, head, says):
+    """A file begins with the bytes `head`."""
     _touch(tmp_path, *names)
-    with refused(says.format(tmp_path)):
-        load_capture(tmp_path)
-
-
-@pytest.mark.parametrize(("name", "head", "says"), [
-    ("a.r3d", b"PK\3\4", "unzip a.r3d"), ("a.zip", b"PK\3\4", "unzip a.zip"), ("a.tgz", b"\x1f\x8b", "an archive"),
-    ("a.jpg", b"\xff\xd8", "one image"), ("a.nef", b"II*\0", "one image"),
-])  # fmt: skip
-def test_a_file_that_is_no_capture_is_named(tmp_path, name, head, says):
-    (tmp_path / name).write_bytes(head + bytes(99))
-    with refused(name, says):
-        load_capture(tmp_path / name)
+    if head:
+        (tmp_path / names[0]).write_bytes(head + bytes(99))
+    with refused(names[0] if head else tmp_path, says.format(tmp_path)):
+        load_capture(tmp_path / names[0] if head else tmp_path)

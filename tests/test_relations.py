@@ -138,7 +138,6 @@ def test_metres_need_a_scene_in_metres(scene):
 
 
 @pytest.mark.parametrize(("text", "regions"), [
-    ("the red mug right of the dark green bottle", [1]),
     ("the orange ball on the white plate", [4]),
     ("the white plate under the orange ball", [3]), ("the dark green bottle between the red mugs", [2]),
     ("the dark blue box behind the dark green bottle", [5]), ("the leftmost red mug", [0]),
@@ -149,7 +148,6 @@ def test_metres_need_a_scene_in_metres(scene):
     ("the dark blue box on the white plate", []), ("third red mug from the left", []),
     ("the right red mug", [1]), ("the front red mug", [0]), ("the back red mug", [1]),
     ("the orange ball smaller than the dark blue box", [4]), ("the orange ball larger than the dark blue box", []),
-    ("the orange ball higher than the white plate", [4]), ("the white plate lower than the orange ball", [3]),
     ("the left of the two red mugs", [0]), ("the red mug within 0.47 units of the dark blue box", [1]),
     ("the red mug at least 0.47 units from the dark blue box", [0]),
     ("red mugs within 2 units of the orange ball", [0, 1]),

@@ -88,16 +88,14 @@ def test_measures_and_objects():
 
 @pytest.mark.parametrize(("status", "body"), [
     (400, b"[" * 1900), (413, b'{"text": "' + b"x" * MAX_BODY + b'"}'), (422, b"{"), (422, b"[1, 2]"), (422, b"{}"),
-    (422, b'{"text": ""}'), (422, b'{"text": 7}'), (422, b'{"text": null}'), (422, b'{"text": "red", "at": [0, 1, 2]}'),
-    (422, b'{"at": [0, 1]}'), (422, b'{"at": [true, 1, 2]}'), (422, b'{"at": ["frame_1", NaN, 2]}'),
+    (422, b'{"text": ""}'), (422, b'{"text": "red", "at": [0, 1, 2]}'), (422, b'{"at": ["frame_1", NaN, 2]}'),
     (422, b'{"at": ["#99999999999999999999", 1, 2]}'), (422, b'{"at": [0, 1' + b"0" * 200 + b", 2]}"),
     (422, b'{"at": ["#\xc2\xb2", 1, 2]}'), (422, b'{"at": [99, 1, 2]}'),
     (422, b'{"at": [0, 99, 2]}'), (422, b'{"at": [0, 1, 2], "all": true}'), (422, b'{"text": "caf\\udce9 red"}'),
-    (422, b'{"text": "red", "by": ["votes"]}'), (422, b'{"text": "red", "by": "magic"}'),
-    (422, b'{"text": "red", "\\udce9": 1}'), (422, b'{"text": "red", "threshold": NaN}'),
-    (422, b'{"text": "red", "all": 1}'), (422, b'{"text": "red", "file": "/etc/passwd"}'),
+    (422, b'{"text": "red", "by": "magic"}'), (422, b'{"text": "red", "\\udce9": 1}'),
+    (422, b'{"text": "red", "threshold": NaN}'), (422, b'{"text": "red", "file": "/etc/passwd"}'),
     (422, b'{"text": "the meaning of life"}'), (422, b'{"text": "red", "field": "../../etc"}'),
-    (422, b'{"text": "red", "field": "\\udce9"}'), (422, b'{"text": "red", "field": ["desk"]}'),
+    (422, b'{"text": "red", "field": "\\udce9"}'),
 ])  # fmt: skip
 def test_odd_questions_have_an_error_of_their_own_kind(client, status, body):
     answer = client.post("/query", content=body, headers=JSON)

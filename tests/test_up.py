@@ -17,7 +17,6 @@ from jsecon.views.frame import _up_of_cameras, find_up_axis
 ROLLS = {
     "level": lambda k: 0,
     "a quarter": lambda k: 90,
-    "the other quarter": lambda k: -90,
     "some a quarter": lambda k: 90 * (k % 3 == 0),
     "both quarters": lambda k: 90 * (-1) ** k,
     "an odd angle": lambda k: 37,

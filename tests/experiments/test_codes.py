@@ -1,7 +1,7 @@
 import jax
 import numpy as np
 import pytest
-from small_field import unit_rows
+from small_field import crowded, unit_rows
 
 from experiments.tables.codes import (
     CODE_THRESHOLD,
@@ -15,13 +15,6 @@ from experiments.tables.codes import (
 )
 
 KEY = jax.random.key(0)
-
-
-def crowded(count, size=64, common=2.0, seed=0):
-    """Unit rows with much in common, as CLIP's are: cosines around common^2 / (1 + common^2)."""
-    rng = np.random.default_rng(seed)
-    rows = common * unit_rows(rng, 1, size) + unit_rows(rng, count, size)
-    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
 
 
 def test_no_coder_where_embeddings_are_short():
@@ -46,7 +39,7 @@ def test_a_rotation_keeps_every_cosine(regions, latent):
 
 @pytest.mark.parametrize(("count", "latent"), [(40, 3), pytest.param(300, 6, marks=pytest.mark.long)])
 def test_spread_codes_keep_crowded_regions_apart_where_a_rotation_does_not(count, latent):
-    units = crowded(count)
+    units = crowded(np.random.default_rng(0), count, 64, common=2.0)
     units[7], units[9] = units[3], 0
     assert confused_pairs(units, principal_rotation(units, latent).encode(units)) > count
     codes = np.asarray(spread_codes(units, latent))
