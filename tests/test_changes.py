@@ -218,19 +218,10 @@ def test_frames_with_depth_that_are_added_give_gaussians_to_what_is_new(eyes):
     old = Scene(field, ColourEmbedder(), ledger=lambda: ledger)
     poses = [look_at(1.5 * np.array([np.cos(a), np.sin(a), 0.6]), up=UP) for a in (0.4, 0.1)]
     shown = cameras_of(poses, (80, 80, 48, 36), 96, 72)
-    capture = capture_of(photographs(after, shown), shown, np.zeros(2, bool))
+    frames = photographs(after, shown)
     depths = np.stack([np.asarray(render_rgb(after, camera, depth=True).depth) for camera in shown])
-    first, second = (
-        dataclasses.replace(
-            capture,
-            frames=capture.frames[t : t + 1],
-            cameras=jax.tree.map(lambda a, t=t: a[t : t + 1], shown),
-            depths=depths[t : t + 1],
-            held_out=np.zeros(1, bool),
-            names=(f"f{t}",),
-        )
-        for t in range(2)
-    )
+    first, second = (capture_of(frames[[t]], shown[t : t + 1], np.zeros(1, bool), depths[[t]]) for t in range(2))
+    second = dataclasses.replace(second, names=("f1",))
     assert old.add(dataclasses.replace(first, depths=None)).field.gaussians.count == field.gaussians.count
     new = old.add(first)
     assert new.field.gaussians.count > field.gaussians.count

@@ -117,9 +117,7 @@ def test_every_model_is_undistorted_as_colmap_projects_it(tmp_path, model, param
 def test_the_largest_of_several_models_is_taken_and_the_others_are_named(tmp_path):
     write_colmap(CAPTURE, tmp_path)
     (tmp_path / "sparse/0").rename(tmp_path / "sparse/10")
-    small = dataclasses.replace(
-        CAPTURE, frames=CAPTURE.frames[:2], names=CAPTURE.names[:2], cameras=CAPTURE.cameras[np.arange(2)]
-    )
+    small = small_capture(2)
     write_colmap(small, tmp_path / "other")
     (tmp_path / "other/sparse/0").rename(tmp_path / "sparse/0")
     write_text_model(small, tmp_path / "sparse/2")

@@ -49,7 +49,6 @@ def _wrong_masks(room, folder):
 
 WRONG = {
     "no Gaussians": (lambda room, folder: ["--gaussians", "nowhere.ply"], "nowhere.ply"),
-    "no masks": (lambda room, folder: ["--masks", "nowhere"], "nowhere"),
     "the masks are of no frame": (_wrong_masks, "wrong"),
     "proposals of no frame": (lambda room, folder: ["--proposals", _wrong_masks(room, folder)[1]], "wrong"),
     "no model in the folder": (lambda room, folder: ["--embedder", folder / "capture" / "images"], "images"),

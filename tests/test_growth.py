@@ -3,12 +3,12 @@
 import jax
 import numpy as np
 import pytest
+from conftest import cameras_of
 from scipy.spatial.transform import Rotation
 
 from jsecon.fit.growth import MIN_OPACITY, _in_use, _split_in_two, grow, pad_with_free_rows
 from jsecon.fit.resize import resize_frame, scale_cameras
 from jsecon.splat.capacity import round_capacity
-from jsecon.types import Camera
 
 
 @pytest.fixture
@@ -65,7 +65,7 @@ def test_faint_gaussians_make_room_and_nothing_is_added_where_nothing_is_wrong(w
 
 def test_smaller_frames_are_means_seen_by_cameras_as_much_smaller():
     frames = np.random.default_rng(0).integers(0, 256, (2, 24, 32, 3)).astype(np.uint8)
-    cameras = Camera(np.tile(np.eye(4), (2, 1, 1)), *(np.full(2, v) for v in (30.0, 31.0, 16.0, 12.0)), 32, 24)
+    cameras = cameras_of([np.eye(4)] * 2, (30.0, 31.0, 16.0, 12.0), 32, 24)
     half = scale_cameras(cameras, 0.5)
     assert (half.width, half.height) == (16, 12)
     small = resize_frame(frames[1], half)

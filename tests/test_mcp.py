@@ -66,7 +66,6 @@ def test_the_tools_answer(server):
 @pytest.mark.parametrize(("name", "arguments", "words"), [
     ("find", {"text": "red mug", "field": "../etc"}, "no such field"), ("changes", {"later": "x"}, "no such field"),
     ("find", {"text": "the meaning of life"}, "colour"), ("find", {"text": "word " * 200}, "at most"),
-    ("find", {"text": "the leftmost red mug", "frame": "nowhere"}, "no such frame"),
     ("locate", {"text": "red mug"}, "names 2 objects"), ("measure", {"a": "red mug"}, "b"),
     ("render", {"text": "red mug", "frame": "#99"}, "no such frame"),
 ])  # fmt: skip

@@ -218,8 +218,7 @@ def _touch(folder, *names):
 
 
 @pytest.mark.parametrize("others", [
-    ["0001_mask.png", "0002_mask.png"], ["0001_masked.jpg"], ["depth0001.png", "depth0002.png"], ["0001.jpg.png"],
-    ["mask-0003.png"], ["0001.png", "0002.PNG"],
+    ["0001_mask.png", "0002_mask.png"], ["depth0001.png"], ["0001.jpg.png"], ["0003.PNG"], ["mask-0003.png"],
 ])  # fmt: skip
 def test_images_named_like_others_with_a_word_more_are_no_photographs(tmp_path, others):
     names = ["0001.jpg", "0002.jpg", "0003.jpg", "mask of zorro.jpg", "0003_b.jpg"]

@@ -23,7 +23,6 @@ def folder(scene, cameras, tmp_path_factory):
     ("field.npz", b"PK\3\4" + bytes(99), "a zip archive"), ("scene.dat", b"ply\nformat", "a file of another kind"),
     ("a.bin", b"", "an empty file"),
     ("field.safetensors", b"version https://git-lfs.github.com/spec/v1\noid", "a Git LFS pointer"),
-    ("scene.spz", b"<html>Not found</html>", "a page of HTML"),
 ])  # fmt: skip
 def test_what_is_no_field_is_named_by_what_it_is(tmp_path, capsys, name, content, words):
     (tmp_path / name).write_bytes(content)

@@ -1,6 +1,5 @@
 """Point clouds: read in every format at coordinates of a map, given to a capture, and written back with labels."""
 
-import dataclasses
 import sys
 
 import laspy
@@ -9,6 +8,7 @@ import pytest
 from capture_files import compute_stage, context_of, refused, run_cli, small_capture, write_transforms
 from point_files import OFFSET, WRITERS, las, points_of
 from splat_files import write_ply
+from test_capture import moved
 
 from jsecon import InputError, load_gaussians
 from jsecon.read.splats import points as cloud_files
@@ -100,10 +100,7 @@ def test_labels_go_back_in_order_and_place(tmp_path, source):
 def test_a_cloud_gives_a_capture_its_points_and_their_depth(tmp_path):
     """A ball of radius 1 at the middle of a ring of cameras of radius 3, at coordinates of a map."""
     capture, draw = small_capture(4, 48, 32), np.random.default_rng(0)
-    poses = np.array(capture.cameras.world_to_camera, np.float64)
-    poses[:, :3, 3] -= poses[:, :3, :3] @ OFFSET
-    moved = dataclasses.replace(capture, cameras=dataclasses.replace(capture.cameras, world_to_camera=poses))
-    write_transforms(moved, tmp_path / "capture")
+    write_transforms(moved(capture, 1, OFFSET), tmp_path / "capture")
     ball = draw.normal(size=(4000, 3))
     ball /= np.linalg.norm(ball, axis=1, keepdims=True)
     las(tmp_path / "ball.laz", ball + OFFSET, np.full((4000, 3), (200, 0, 0), np.uint8))

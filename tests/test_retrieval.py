@@ -10,7 +10,7 @@ from conftest import MANY
 from jax.test_util import check_grads
 from small_field import KnownTexts, unit_rows
 
-from jsecon import Regions, Scene, load_field, query_anchored, query_classes, query_region, query_several, save_field
+from jsecon import Regions, Scene, query_anchored, query_classes, query_region, query_several
 from jsecon.field.similarity import similarities
 from jsecon.query.match import compare_words, region_similarities, view_count_weight
 from jsecon.query.rules import ABSENT, FOUND, FOUND_MARGIN, MIN_COSINE, MIN_MARGIN, UNSURE, QueryRules
@@ -149,6 +149,8 @@ def test_a_text_is_found_unsure_or_absent_by_its_margin_among_unrelated_words(wo
         assert int(loose.state) == max(state, UNSURE)
         assert float(query_several(field, text[None]).rank) == pytest.approx(expected, abs=1e-6)
     assert seen == {ABSENT, UNSURE, FOUND}
+    answer = Scene(field, KnownTexts({"seen": text})).ask("seen").as_dict()
+    assert answer["rank"] == pytest.approx(expected, abs=1e-5)
     assert int(query_anchored(field, texts[0], rules=QueryRules(min_rank=0.0)).region) >= 0
     by_threshold = query_anchored(field, texts[0], rules=QueryRules(min_score=-1.0, min_rank=1.0))
     assert int(by_threshold.region) >= 0  # a threshold that is given decides
@@ -168,6 +170,7 @@ def test_unrelated_words_that_tell_nothing_refuse_nothing_and_no_words_fall_back
             assert np.isnan(float(found.rank))
             assert float(found.score) == float(cosine.score)
             np.testing.assert_array_equal(found.mask, cosine.mask)
+    assert Scene(old, KnownTexts({"seen": text})).ask("seen").as_dict()["rank"] is None
     nan = query_anchored(field, np.full(SIZE, np.nan, np.float32))
     assert int(nan.region) == -1
     assert np.isnan(float(nan.rank))
@@ -197,21 +200,3 @@ def test_a_list_of_classes_is_compared_in_deviations_of_each_text(worded):
     np.testing.assert_allclose(np.asarray(likeness)[seen], expected, atol=1e-4)
     nothing = query_classes(field, np.zeros((2, SIZE), np.float32))
     assert (np.asarray(nothing[0]) == -1).all()
-
-
-def test_an_answer_has_its_rank_and_that_of_an_old_field_has_none(worded, tmp_path):
-    field, texts = worded
-    ranks = [exact_standing(field.regions.embeddings, text, field.unrelated_words, np.ones(5))[0] for text in texts]
-    rows = {"seen": texts[int(np.argmax(ranks))], "unseen": texts[int(np.argmin(ranks))]}
-
-    def answers(words):
-        save_field(tmp_path / "field.safetensors", dataclasses.replace(field, unrelated_words=words))
-        scene = Scene(load_field(tmp_path / "field.safetensors"), KnownTexts(rows))
-        return [scene.ask(text).as_dict() for text in rows]
-
-    seen, unseen = answers(field.unrelated_words.astype(np.float16))
-    assert seen["rank"] == pytest.approx(max(ranks), abs=0.02)  # of words in float16
-    assert unseen["rank"] == pytest.approx(min(ranks), abs=0.02)
-    assert seen["region"] is not None
-    assert unseen["region"] is None
-    assert [answer["rank"] for answer in answers(None)] == [None, None]

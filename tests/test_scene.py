@@ -64,7 +64,6 @@ def test_a_node_of_the_tree_selects_the_gaussians_under_it():
 @pytest.mark.parametrize(("question", "options", "problem"), [
     (At("nowhere", 1, 1), {}, "no such frame"), (At(0, 99, 200), {}, "outside the frame"),
     (At(0, 0, 0), {}, "no region lies under"), (Box(0, 1, 1, 5, 5), {"by": "code"}, "by the outline alone"),
-    (Box(0, -9, -9, -2, -2), {}, "no pixels of a frame"), (Mask({0: np.zeros((80, 100), bool)}), {}, "no pixel inside"),
     (Mask({0: np.ones((80, 100), bool), "frame_0": np.ones((80, 100), bool)}), {}, "two masks"),
     ("red mug", {"by": "code"}, "has no codes"), (" ", {}, "without words"), ("a text of nothing", {}, "colour"),
 ])  # fmt: skip

@@ -88,14 +88,11 @@ def test_coincident_gaussians_and_opposite_cameras_have_a_page(made):
     assert np.linalg.norm(scene["up"]) == pytest.approx(1)
 
 
-def test_what_is_huge_or_not_finite_is_left_out(made):
+def test_what_is_huge_or_not_finite_is_left_out_and_without_a_visible_gaussian_there_is_no_page(made):
     logs, means = (np.array(getattr(made[0].gaussians, name)) for name in ("log_scales", "means"))
     logs[0], logs[1], means[3] = 20, -40, np.nan
     told, _ = read(page(with_gaussians(made[0], log_scales=logs, means=means), {}, title="odd"))
     assert told["count"] == 62
-
-
-def test_a_field_without_a_visible_gaussian_has_no_page(made):
     with pytest.raises(InputError, match="no visible Gaussian"):
         page(with_gaussians(made[0], opacity_logits=np.full(64, -50, np.float32)), {}, title="none")
 

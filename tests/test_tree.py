@@ -94,7 +94,6 @@ def test_parts_take_the_votes_of_their_region_on_their_gaussians(field):
         ("the mug's handle", ("handle", "mug")),
         ("where is the handle of the red mug?", ("handle", "red mug")),
         ("handle of the mug or lid of the pot", None),
-        ("cup of tea", None),
         ('"lid of the pot"', None),
     ],
 )

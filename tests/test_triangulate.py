@@ -15,17 +15,13 @@ PLANE = (((-1, -1, 0), (2, 0, 0), (0, 2, 0)),)
 """a board of 2 x 2 in the plane z = 0"""
 
 
-def poses(count):
-    angles = np.linspace(-0.5, 0.5, count)
-    return np.array([look_at((0.9 * np.sin(a), 0.1 * np.cos(3 * a), -2 * np.cos(a)), dtype=float) for a in angles])
-
-
 def plane_capture(count=5, textured=True):
-    pose = poses(count)
-    frames = photo_images(pose, PLANE) if textured else np.full((count, HEIGHT, WIDTH, 3), 90)
-    held_out = np.zeros(count, bool)
-    held_out[2] = True
-    return capture_of(frames, cameras_of(pose, (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2), WIDTH, HEIGHT), held_out)
+    """Views of the plane, the third held out."""
+    angles = np.linspace(-0.5, 0.5, count)
+    poses = [look_at((0.9 * np.sin(a), 0.1 * np.cos(3 * a), -2 * np.cos(a)), dtype=float) for a in angles]
+    frames = photo_images(poses, PLANE) if textured else np.full((count, HEIGHT, WIDTH, 3), 90)
+    cameras = cameras_of(poses, (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2), WIDTH, HEIGHT)
+    return capture_of(frames, cameras, np.arange(count) == 2)
 
 
 def test_points_of_a_textured_plane_lie_on_it():

@@ -66,7 +66,6 @@ def test_weights_are_probabilities_or_log_odds_above_the_least():
     ("crop", "shape", "outside"),
     [
         (Crop(0.0), (10, 20), None),
-        (Crop(0.1), (12, 24), 7),
         (Crop(0.5), (17, 40), 7),  # the box ends 5 px below the frame's upper edge and 2 px above the lower
         (Crop(0.0, "square"), (17, 20), 7),
         (Crop(0.1, "stretched", "greyed"), (12, 24), 128),

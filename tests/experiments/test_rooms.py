@@ -39,7 +39,6 @@ SOLIDS = {
     "ellipsoid": (ellipsoid(0.3, 0.2, 0.4), lambda x, y, z: (x / 0.3) ** 2 + (y / 0.2) ** 2 + (z / 0.4) ** 2 <= 1),
     "bowl": (ellipsoid(0.3, 0.3, 0.2, below=0.05, above=-0.1),
              lambda x, y, z: ((x**2 + y**2) / 0.09 + z**2 / 0.04 <= 1) & (z <= 0.05) & (z >= -0.1)),
-    "cylinder": (frustum(0.2, 0.2, 0.4), lambda x, y, z: (np.hypot(x, y) <= 0.2) & (z >= 0) & (z <= 0.4)),
     "widening": (frustum(0.1, 0.35, 0.3), lambda x, y, z: (np.hypot(x, y) <= 0.1 + z / 1.2) & (z >= 0) & (z <= 0.3)),
     "cone": (frustum(0.3, 0.0, 0.3), lambda x, y, z: (np.hypot(x, y) <= 0.3 - z) & (z >= 0) & (z <= 0.3)),
     "box": (box(0.4, 0.2, 0.3), lambda x, y, z: (abs(x) <= 0.2) & (abs(y) <= 0.1) & (z >= 0) & (z <= 0.3)),
