@@ -97,7 +97,7 @@ def test_every_spelling_is_understood_and_quotes_protect():
 
 
 @pytest.mark.parametrize(("text", "problem"), [
-    ("  ", "is empty"), ("word " * 5000, "5000 words"), ("mug across from the plate", "'across'"),
+    ("", "is empty"), ("  ", "is empty"), ("word " * 5000, "5000 words"), ("mug across from the plate", "'across'"),
     ("the widest mug", "'widest'"), ("mug near the same plate", "'same'"), ("the middle mug on the plate", "'middle'"),
     ("mug by the plate", "'by'"), ("lamp hanging over the table", "'hanging'"), ("second green jar", "'second'"),
     ("left of the plate", "no object stands before 'left of'"), ("the jar facing the lamp", "'facing'"),

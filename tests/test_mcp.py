@@ -65,6 +65,7 @@ def test_the_tools_answer(server):
 
 @pytest.mark.parametrize(("name", "arguments", "words"), [
     ("find", {"text": "red mug", "field": "../etc"}, "no such field"), ("changes", {"later": "x"}, "no such field"),
+    ("find", {"text": " "}, "pattern"),
     ("find", {"text": "the meaning of life"}, "colour"), ("find", {"text": "word " * 200}, "at most"),
     ("locate", {"text": "red mug"}, "names 2 objects"), ("measure", {"a": "red mug"}, "b"),
     ("render", {"text": "red mug", "frame": "#99"}, "no such frame"),
