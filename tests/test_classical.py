@@ -1,3 +1,5 @@
+import functools
+
 import cv2
 import numpy as np
 import pytest
@@ -42,7 +44,7 @@ def test_each_thing_is_one_region_in_spite_of_shading_shadow_noise_and_exposure(
     frame, things = desk(seed)
     linear = (frame / 255.0) ** 2.2
     frame = (255 * (gain * linear / (1 + (gain - 1) * linear)) ** (1 / 2.2)).round().astype(np.uint8)
-    masks = ClassicalSegmenter()(frame, 0)
+    masks = ClassicalSegmenter(layers=(1.0,))(frame, 0)
     assert (best_ious(things, masks) > 0.85).all()
     assert len(masks) <= 12
     assert (masks.sum(0) <= 1).all()  # a partition, but for specks
@@ -50,12 +52,24 @@ def test_each_thing_is_one_region_in_spite_of_shading_shadow_noise_and_exposure(
     assert best_ious(table[None], masks)[0] > 0.9
 
 
+def test_a_finer_layer_has_what_hardly_differs_from_what_it_lies_on():
+    frame = np.full((120, 160, 3), 120, np.uint8)
+    frame[40:60, 60:90] = 146  # nine units of lightness above the rest
+    patch = (frame[..., 0] > 130)[None]
+    both, coarse = (ClassicalSegmenter(layers=layers)(frame, 0) for layers in ((1.0, 0.5), (1.0,)))
+    assert len(coarse) == 1
+    np.testing.assert_array_equal(both[:1], coarse)
+    assert best_ious(patch, both[1:])[0] > 0.85
+    assert (both[1:].sum(0) <= 1).all()
+
+
 def test_the_same_frame_gives_the_same_masks_and_its_mirror_image_nearly_the_mirrored():
     frame, things = desk()
     segmenter = ClassicalSegmenter()
     assert isinstance(segmenter, Segmenter)
-    best = ClassicalSegmenter(max_regions=5)(frame, 0)
-    np.testing.assert_array_equal(best, segmenter(frame, 0)[:5])
+    best, coarse = ClassicalSegmenter(max_regions=5)(frame, 0), ClassicalSegmenter(layers=(1.0,))(frame, 0)
+    assert len(best) == 5 * len(segmenter.layers)
+    np.testing.assert_array_equal(best[:5], coarse[:5])
     assert (best.sum((1, 2)) >= segmenter.min_area * frame[..., 0].size).all()
     np.testing.assert_array_equal(segmenter(frame, 0), segmenter(frame, 7))
     mirrored = segmenter(np.ascontiguousarray(frame[:, ::-1]), 0)
@@ -70,13 +84,14 @@ def test_depth_parts_what_colour_does_not():
     depth = np.full((60, 80), 2.0, np.float32)
     depth[20:40, 30:60] = 1.0
     near = depth < 1.5
-    assert len(ClassicalSegmenter()(frame, 0)) == 1
-    by_depth = ClassicalSegmenter(depths=lambda index: depth)(frame, 0)
+    coarse = functools.partial(ClassicalSegmenter, layers=(1.0,))
+    assert len(coarse()(frame, 0)) == 1
+    by_depth = coarse(depths=lambda index: depth)(frame, 0)
     assert best_ious(near[None], by_depth)[0] > 0.8
-    unknown = ClassicalSegmenter(depths=lambda index: np.zeros((60, 80), np.float32))(frame, 0)
+    unknown = coarse(depths=lambda index: np.zeros((60, 80), np.float32))(frame, 0)
     assert len(unknown) == 1
     with pytest.raises(ValueError, match="depths"):
-        ClassicalSegmenter(depths=lambda index: depth[:-1])(frame, 0)
+        coarse(depths=lambda index: depth[:-1])(frame, 0)
 
 
 @pytest.mark.parametrize("frame", [
@@ -84,9 +99,9 @@ def test_depth_parts_what_colour_does_not():
     np.random.default_rng(0).integers(0, 256, (40, 50, 3), np.uint8),
 ])  # fmt: skip
 def test_flat_tiny_and_noisy_frames(frame):
-    labels = ClassicalSegmenter().partition(frame, 0)
-    assert labels.shape == frame.shape[:2]
-    np.testing.assert_array_equal(np.unique(labels), np.arange(labels.max() + 1))
+    for labels in ClassicalSegmenter().partitions(frame, 0):
+        assert labels.shape == frame.shape[:2]
+        np.testing.assert_array_equal(np.unique(labels), np.arange(labels.max() + 1))
     assert len(ClassicalSegmenter()(frame, 0)) >= (frame.std() < 1)
 
 
@@ -95,7 +110,7 @@ def test_real_photographs_come_apart_into_tens_of_regions(shared, path):
     picture = cv2.imread(str(shared / path))[..., ::-1]
     frame = cv2.resize(picture, (400, 400 * len(picture) // picture.shape[1]), interpolation=cv2.INTER_AREA)
     masks = ClassicalSegmenter()(frame, 0)
-    assert 8 <= len(masks) <= 64
+    assert 8 <= len(masks) <= 128
     assert masks.any(0).mean() > 0.9
     assert masks.mean((1, 2)).max() < 0.6
 

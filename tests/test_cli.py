@@ -106,6 +106,14 @@ def test_examples_of_a_verb_parse(verb, capsys, monkeypatch):
     assert "--json" in printed
 
 
+def test_help_lists_the_verbs_and_tyro_prints_a_completion_script(capsys):
+    assert run_cli("--help") == 0
+    printed = capsys.readouterr().out
+    assert all(re.search(rf"^\W+{verb} +[A-Z]", printed, re.MULTILINE) for verb in VERB_NAMES)
+    assert run_cli("--tyro-print-completion", "bash") == 0
+    assert "granularity" in capsys.readouterr().out
+
+
 def test_what_is_not_given_has_the_default_of_the_dataclass():
     assert cli.parse(["run", "room", "--out", "out"]).options == Options(Path("room"))
     changed = ["--paper", "--masks", "m", "--steps", "7", "--agreement", "1"]

@@ -146,7 +146,7 @@ class _GuidedPrompts:
     """
 
     def __init__(self, image: UInt8[np.ndarray, "h w 3"], levels: int):
-        self._regions = ClassicalSegmenter(merge_distance=10.0).partition(image, 0)
+        self._regions = ClassicalSegmenter(merge_distance=10.0, layers=(1.0,)).partitions(image, 0)[0]
         self._explained = np.zeros((levels, *self._regions.shape), bool)
         self._prompted = np.zeros(self._regions.shape, bool)
         self._rounds = 0

@@ -13,8 +13,8 @@ from scipy.spatial import ConvexHull, QhullError
 from jsecon.query.object_shapes import ObjectShapes
 
 DEVIATIONS = 2.0
-"""Standard deviations of its Gaussians to which a solid reaches. In three made-up rooms hulls then have 0.97 to 1.03 of the
-true volumes (median), and to one deviation 0.85 to 0.91."""
+"""Standard deviations of its Gaussians to which a solid reaches. In three made-up rooms hulls then have 0.97 to 1.03 of
+the true volumes (median), and to one deviation 0.85 to 0.91."""
 
 
 class _Solid(NamedTuple):

@@ -45,11 +45,14 @@ class ClassicalSegmenter:
 
     merge_distance: float = 16.0
     """Dissimilarity below which neighbours are joined, CIELAB units."""
+    layers: tuple[float, ...] = (1.0, 0.5)
+    """Shares of `merge_distance`, each of which makes a layer of masks: the finer ones have the small things that the
+    others join to what they stand on."""
     min_area: float = 0.0012
     """Least area of a region, as a share of the frame; smaller ones join their most similar neighbour or are
     dropped."""
     max_regions: int = 64
-    """Maximum number of regions, best first."""
+    """Maximum number of regions of a layer, best first."""
     depths: Callable[[int], np.ndarray] | None = None
     """Returns the z-depth (H, W) of a frame, 0 = unknown; a jump separates neighbours."""
     depth_jump: float = 0.04
@@ -59,35 +62,41 @@ class ClassicalSegmenter:
     of depth are measured from the plane, because the depth of a wall seen from the side changes everywhere."""
 
     def __call__(self, frame: np.ndarray, index: int) -> Bool[np.ndarray, "m h w"]:
-        """Segments a frame (H, W, 3) uint8 into masks (M, H, W) bool, best first: a partition without specks."""
-        labels = self.partition(frame, index)
-        return _masks_best_first(frame, labels, max_regions=self.max_regions, min_area=self.min_area)
+        """Segments a frame (H, W, 3) uint8 into masks (M, H, W) bool without specks, best first in each layer."""
+        layers = self.partitions(frame, index)
+        limits = {"max_regions": self.max_regions, "min_area": self.min_area}
+        return np.concatenate([_masks_best_first(frame, labels, **limits) for labels in layers])
 
-    def partition(self, frame: np.ndarray, index: int) -> Int32[np.ndarray, "h w"]:
-        """Partitions a frame (H, W, 3) uint8 into connected regions, labels 0 .. M-1."""
+    def partitions(self, frame: np.ndarray, index: int) -> list[Int32[np.ndarray, "h w"]]:
+        """Partitions a frame (H, W, 3) uint8 into connected regions, labels 0 .. M-1 of each layer."""
         fits = frame.ndim == 3 and frame.shape[2] == 3 and frame.dtype == np.uint8
         require(fits, "frame", (frame.shape, frame.dtype), "(H, W, 3) uint8", "Pass RGB frames as 8-bit arrays.")
-        features = _colour_features(frame)
-        settings = {"distance": self.merge_distance, "min_area": self.min_area * frame.shape[0] * frame.shape[1]}
-        surface = None if self.surfaces is None else self.surfaces(index)
+        colour, steepness = _colour_features(frame), 1.0
+        turned: np.ndarray | None = None
+        shape: np.ndarray | Surface | None = None
+        seeds, surface = colour, None if self.surfaces is None else self.surfaces(index)
         if surface is not None:
-            features, seeds = self._with_surface(features, surface)
-            superpixels = _oversegment(seeds)
-            steepness = self.merge_distance / self.depth_jump
-            return merge_regions(superpixels, features, surface, steepness=steepness, **settings)
-        shape = None
-        if self.depths is not None:
+            turned, seeds = self._with_surface(colour, surface)
+            shape, steepness = surface, self.merge_distance / self.depth_jump
+        elif self.depths is not None:
             depth = self.depths(index)
             require_shape("depths", depth, frame.shape[:2], "Pass depth of the size of the frame.")
             shape = log_depth(depth) * np.float32(self.merge_distance / np.log1p(self.depth_jump))
-        superpixels = _oversegment(features if shape is None else np.concatenate([features, shape], -1))
-        return merge_regions(superpixels, features, shape, **settings)
+            seeds = np.concatenate([colour, shape], -1)
+        superpixels, least = _oversegment(seeds), self.min_area * frame.shape[0] * frame.shape[1]
+        layers = []
+        for share in self.layers:  # of colours alone: creases and steps of depth separate alike in all layers
+            features = colour if turned is None else np.concatenate([colour, np.float32(share) * turned], -1)
+            own = np.float32(share) * shape if isinstance(shape, np.ndarray) else shape
+            limits = {"distance": share * self.merge_distance, "min_area": least, "steepness": share * steepness}
+            layers.append(merge_regions(superpixels, features, own, **limits))
+        return layers
 
     def _with_surface(self, colour: np.ndarray, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
-        """Joins colours and normals as features of pixels.
+        """Makes features of pixels of colours and a surface.
 
-        Returns (H, W, 6) colours and normals, where a crease of 50 degrees equals a step of `merge_distance`; and
-        (H, W, 7) features for the oversegmentation: colours, normals at half weight, and depth.
+        Returns (H, W, 3) normals, of which a crease of 50 degrees equals a step of `merge_distance`; and (H, W, 7)
+        features for the oversegmentation: colours, normals at half weight, and depth.
         """
         for array in (surface.points, surface.normals):
             require_shape("surface", array, colour.shape, "Pass surfaces of the size of the frame.")
@@ -95,7 +104,7 @@ class ClassicalSegmenter:
         turned = surface.normals * np.float32(self.merge_distance / crease)
         jump = np.float32(0.5 * self.merge_distance / np.log1p(self.depth_jump))
         depth = np.log(np.maximum(surface.points[..., 2:], 1e-6)) * jump
-        return np.concatenate([colour, turned], -1), np.concatenate([colour, 0.5 * turned, depth], -1)
+        return turned, np.concatenate([colour, 0.5 * turned, depth], -1)
 
 
 def _colour_features(frame: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
