@@ -1,5 +1,3 @@
-import functools
-
 import cv2
 import numpy as np
 import pytest
@@ -77,21 +75,6 @@ def test_the_same_frame_gives_the_same_masks_and_its_mirror_image_nearly_the_mir
     for wrong in (np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3), np.float32)):
         with pytest.raises(ValueError, match="frame"):
             segmenter(wrong, 0)
-
-
-def test_depth_parts_what_colour_does_not():
-    frame = np.full((60, 80, 3), 150, np.uint8)
-    depth = np.full((60, 80), 2.0, np.float32)
-    depth[20:40, 30:60] = 1.0
-    near = depth < 1.5
-    coarse = functools.partial(ClassicalSegmenter, layers=(1.0,))
-    assert len(coarse()(frame, 0)) == 1
-    by_depth = coarse(depths=lambda index: depth)(frame, 0)
-    assert best_ious(near[None], by_depth)[0] > 0.8
-    unknown = coarse(depths=lambda index: np.zeros((60, 80), np.float32))(frame, 0)
-    assert len(unknown) == 1
-    with pytest.raises(ValueError, match="depths"):
-        coarse(depths=lambda index: depth[:-1])(frame, 0)
 
 
 @pytest.mark.parametrize("frame", [

@@ -39,12 +39,11 @@ from jsecon.pipeline.stages import (
 from jsecon.process import cores, memory_budget
 from jsecon.read.captures.frames import evenly_spaced
 from jsecon.read.masks.masks import load_labels, load_proposals
-from jsecon.splat.render import render_depth
 from jsecon.types import Camera, Capture, Codes, Gaussians, Progress, Regions
 from jsecon.views.plan import LEAST_GAIN, frames_by_need
 from jsecon.vision.classical import GRANULARITIES, ClassicalSegmenter
 from jsecon.vision.protocols import Segmenter
-from jsecon.vision.surfaces import smooth_depth, surfaces_from_depth
+from jsecon.vision.surfaces import surfaces_from_depth
 
 PART_CROPS, PART_PX = 2, 100
 """Largest number of views in which a part is embedded, and its least pixels there: fewer show an encoder little."""
@@ -190,7 +189,7 @@ def _find_objects(stage: StageInput) -> StageResult:
     context, scene = stage.context, stage.results.gaussians
     frames, why_fewer = _frames_of_vision(stage)
     view = _TrainingView(stage.results.load, context.options, frames)
-    proposals, notes = _frame_proposals(context, view, scene)
+    proposals, notes = _frame_proposals(context, view)
     found = _associate_masks(context, view, scene, proposals, stage.progress)
     context.models.close()
     for labels in (found.labels, *(() if found.parts is None else found.parts)):
@@ -199,9 +198,7 @@ def _find_objects(stage: StageInput) -> StageResult:
     return StageResult(ObjectLabels(frames=frames, **found._asdict()), notes=(*why_fewer, *notes))
 
 
-def _frame_proposals(
-    context: RunContext, view: _TrainingView, gaussians: Gaussians
-) -> tuple[Callable[[int], np.ndarray], tuple[str, ...]]:
+def _frame_proposals(context: RunContext, view: _TrainingView) -> tuple[Callable[[int], np.ndarray], tuple[str, ...]]:
     """Opens the proposals, masks (M, H, W) of the t-th training frame: from files, a segmenter, or by colour."""
     options, frames, segmenter = context.options, view.frames, context.models.segmenter
     if options.proposals is not None:
@@ -214,33 +211,24 @@ def _frame_proposals(
                 return segmenter(frames[t], t)
 
         return segment, ()
-    classical = _classical_segmenter(options, view, gaussians)
+    classical = _classical_segmenter(options, view)
     return lambda t: classical(frames[t], t), ()
 
 
-def _classical_segmenter(options: Options, view: _TrainingView, gaussians: Gaussians) -> Segmenter:
-    """Opens the segmenter without weights for the training frames.
+def _classical_segmenter(options: Options, view: _TrainingView) -> Segmenter:
+    """Opens the segmenter without weights for the training frames, with surfaces if the capture has depth.
 
-    Surfaces come from the capture's depth. Without depth, the coarse granularity takes the depth that the Gaussians
-    render; the finer ones do not, as rendered depth costs them more outline than it tells.
+    The depth that Gaussians render costs masks more outline than it tells.
     """
-    capture, cameras, setting = view.capture, view.cameras, GRANULARITIES[options.granularity]
+    capture, surfaces = view.capture, None
     depths = None if capture.depths is None else np.asarray(capture.depths)[view.train]
     if depths is not None and depths[:, ::4, ::4].any():
         known = depths[:, ::4, ::4]
         spacing = 0.02 * float(np.median(known[known > 0]))  # closer points show a sensor's noise, not the surface
         most = 100_000  # points whose normals are estimated
         cloud = points_from_depth(capture, voxel=spacing, max_points=most, stride=4)
-        surfaces = surfaces_from_depth(depths, cameras, cloud.points)
-        return ClassicalSegmenter(**setting, surfaces=surfaces)
-    if options.granularity != "coarse":
-        return ClassicalSegmenter(**setting)
-
-    def rendered(t: int) -> np.ndarray:
-        depth, alpha = (np.asarray(image) for image in render_depth(gaussians, cameras[t]))
-        return smooth_depth(np.where(alpha > 0.5, depth, 0.0).astype(np.float32))
-
-    return ClassicalSegmenter(**setting, depths=rendered)
+        surfaces = surfaces_from_depth(depths, view.cameras, cloud.points)
+    return ClassicalSegmenter(**GRANULARITIES[options.granularity], surfaces=surfaces)
 
 
 def _associate_masks(

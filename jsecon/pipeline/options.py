@@ -176,7 +176,7 @@ class MaskOptions:
     masks: Option[Path | None] = None
     proposals: Option[Path | None] = None
     ignore: Option[str | None] = None
-    granularity: Option[Literal["fine", "medium", "coarse"]] = "medium"
+    granularity: Option[Literal["fine", "medium"]] = "medium"
     association: Option[Literal["consensus", "tracking"]] = "consensus"
     agreement: Annotated[Option[float], Range(0, 1, above=True)] = 0.4
 

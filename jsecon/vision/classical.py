@@ -14,15 +14,13 @@ from jaxtyping import Bool, Float32, Int32, UInt8
 
 from jsecon.errors import InputError, require, require_shape
 from jsecon.vision.region_graph import merge_regions
-from jsecon.vision.surfaces import Surface, log_depth
+from jsecon.vision.surfaces import Surface
 
 GRANULARITIES: dict[str, dict[str, Any]] = {
     "fine": {"merge_distance": 10.0},
     "medium": {"merge_distance": 16.0},
-    "coarse": {"merge_distance": 28.0, "depth_jump": 0.06},
 }
-"""Settings of ClassicalSegmenter by the size of its regions. The coarse one joins the colours of an object, and so
-needs depth to separate objects."""
+"""Settings of ClassicalSegmenter by the size of its regions."""
 
 
 def require_contrib() -> None:
@@ -53,13 +51,11 @@ class ClassicalSegmenter:
     dropped."""
     max_regions: int = 64
     """Maximum number of regions of a layer, best first."""
-    depths: Callable[[int], np.ndarray] | None = None
-    """Returns the z-depth (H, W) of a frame, 0 = unknown; a jump separates neighbours."""
     depth_jump: float = 0.04
     """Relative step of depth equivalent to `merge_distance`."""
     surfaces: Callable[[int], Surface | None] | None = None
-    """Returns the surface of a frame, None = unknown, in place of `depths`. Creases separate neighbours too, and steps
-    of depth are measured from the plane, because the depth of a wall seen from the side changes everywhere."""
+    """Returns the surface of a frame, None = unknown. Creases separate neighbours, and steps of depth, measured from
+    the plane, because the depth of a wall seen from the side changes everywhere."""
 
     def __call__(self, frame: np.ndarray, index: int) -> Bool[np.ndarray, "m h w"]:
         """Segments a frame (H, W, 3) uint8 into masks (M, H, W) bool without specks, best first in each layer."""
@@ -71,25 +67,15 @@ class ClassicalSegmenter:
         """Partitions a frame (H, W, 3) uint8 into connected regions, labels 0 .. M-1 of each layer."""
         fits = frame.ndim == 3 and frame.shape[2] == 3 and frame.dtype == np.uint8
         require(fits, "frame", (frame.shape, frame.dtype), "(H, W, 3) uint8", "Pass RGB frames as 8-bit arrays.")
-        colour, steepness = _colour_features(frame), 1.0
-        turned: np.ndarray | None = None
-        shape: np.ndarray | Surface | None = None
-        seeds, surface = colour, None if self.surfaces is None else self.surfaces(index)
-        if surface is not None:
-            turned, seeds = self._with_surface(colour, surface)
-            shape, steepness = surface, self.merge_distance / self.depth_jump
-        elif self.depths is not None:
-            depth = self.depths(index)
-            require_shape("depths", depth, frame.shape[:2], "Pass depth of the size of the frame.")
-            shape = log_depth(depth) * np.float32(self.merge_distance / np.log1p(self.depth_jump))
-            seeds = np.concatenate([colour, shape], -1)
+        colour, surface = _colour_features(frame), None if self.surfaces is None else self.surfaces(index)
+        turned, seeds = (None, colour) if surface is None else self._with_surface(colour, surface)
         superpixels, least = _oversegment(seeds), self.min_area * frame.shape[0] * frame.shape[1]
         layers = []
         for share in self.layers:  # of colours alone: creases and steps of depth separate alike in all layers
             features = colour if turned is None else np.concatenate([colour, np.float32(share) * turned], -1)
-            own = np.float32(share) * shape if isinstance(shape, np.ndarray) else shape
-            limits = {"distance": share * self.merge_distance, "min_area": least, "steepness": share * steepness}
-            layers.append(merge_regions(superpixels, features, own, **limits))
+            distance = share * self.merge_distance
+            limits = {"distance": distance, "min_area": least, "steepness": distance / self.depth_jump}
+            layers.append(merge_regions(superpixels, features, surface, **limits))
         return layers
 
     def _with_surface(self, colour: np.ndarray, surface: Surface) -> tuple[np.ndarray, np.ndarray]:

@@ -35,13 +35,13 @@ class _RegionBorders:
     colour: np.ndarray
     """(E,) sum of the step of colour across the border, CIELAB units."""
     shape: np.ndarray
-    """(E,) sum of the step of shape across the border; 0 if the shape is unknown."""
+    """(E,) sum of the step of shape across the border; 0 if the surface is unknown."""
 
 
 def _region_borders(
     superpixels: Int32[np.ndarray, "h w"],
     features: Float32[np.ndarray, "h w d"],
-    shape: Float32[np.ndarray, "h w c"] | Surface | None,
+    surface: Surface | None,
     steepness: float,
 ) -> _RegionBorders:
     """Measures the borders between regions.
@@ -61,12 +61,10 @@ def _region_borders(
 
         keys.append(np.sort(np.stack([a[cut], b[cut]], -1), axis=-1))
         colours.append(step(features))
-        if shape is None:
+        if surface is None:
             shapes.append(np.zeros(len(colours[-1])))
-        elif isinstance(shape, Surface):
-            shapes.append(np.minimum(steepness * _off_plane(shape, axis, inner, outer)[cut], _MAX_STEP))
         else:
-            shapes.append(np.minimum(step(shape), _MAX_STEP))
+            shapes.append(np.minimum(steepness * _off_plane(surface, axis, inner, outer)[cut], _MAX_STEP))
     count = int(superpixels.max()) + 1
     first, second = np.concatenate(keys).T.astype(np.int64)
     pairs, inverse = np.unique(first * count + second, return_inverse=True)
@@ -94,7 +92,7 @@ def _off_plane(
 def merge_regions(
     superpixels: Int32[np.ndarray, "h w"],
     features: Float32[np.ndarray, "h w d"],
-    shape: Float32[np.ndarray, "h w c"] | Surface | None,
+    surface: Surface | None,
     *,
     distance: float,
     min_area: float,
@@ -106,7 +104,7 @@ def merge_regions(
     weight for small regions, which texture consists of; the step of shape is the other leg of a right triangle. Finally
     regions that are too small or too thin join their most similar neighbour.
     """
-    edges = _region_borders(superpixels, features, shape, steepness)
+    edges = _region_borders(superpixels, features, surface, steepness)
     # Numbered by first appearance, so that ties do not depend on the numbers of the superpixels.
     flat = relabel_sequential(superpixels.reshape(-1))
     count = int(flat.max()) + 1
