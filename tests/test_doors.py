@@ -188,3 +188,11 @@ def test_texts_come_back_in_order(door):
     answers = scene.ask_all(texts)
     assert [isinstance(found, InputError) for found in answers] == [False, False, False, True, False]
     assert [str(found.query) for found in answers[:3]] == texts[:3]
+
+
+def test_a_mask_that_changes_is_asked_anew(door):
+    outline = OUTLINE.copy()
+    before = door[0].ask(Mask({"#0": outline})).mask
+    outline[:] = False
+    outline[:20, :20] = True
+    assert not np.array_equal(door[0].ask(Mask({"#0": outline})).mask, before)
