@@ -7,6 +7,7 @@
 """
 
 import argparse
+import base64
 import io
 import subprocess
 import sys
@@ -40,7 +41,8 @@ def photograph(address: str, width: int, height: int, seconds: float) -> Image.I
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         page.send("Emulation.setDeviceMetricsOverride", **size)
         time.sleep(seconds)
-        return Image.open(io.BytesIO(page.png())).convert("RGB")
+        shot = page.send("Page.captureScreenshot", format="png")["data"]
+        return Image.open(io.BytesIO(base64.b64decode(shot))).convert("RGB")
 
 
 def save(image: Image.Image, name: str) -> None:
