@@ -1,5 +1,6 @@
 """The stages of objects: labels of the training frames, embeddings of the regions, votes, codes."""
 
+import dataclasses
 import functools
 import itertools
 import shutil
@@ -228,7 +229,9 @@ def _classical_segmenter(options: Options, view: _TrainingView) -> Segmenter:
         most = 100_000  # points whose normals are estimated
         cloud = points_from_depth(capture, voxel=spacing, max_points=most, stride=4)
         surfaces = surfaces_from_depth(depths, view.cameras, cloud.points)
-    return ClassicalSegmenter(**GRANULARITIES[options.granularity], surfaces=surfaces)
+    segmenter = ClassicalSegmenter(**GRANULARITIES[options.granularity], surfaces=surfaces)
+    # A tracker follows each mask for itself, and needs none twice.
+    return segmenter if options.associated_by == "consensus" else dataclasses.replace(segmenter, layers=(1.0,))
 
 
 def _associate_masks(
