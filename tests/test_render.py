@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import MANY, look_at
+from conftest import MANY, gaussians_at, look_at
 from reference import project_reference, render_reference
 
-from jsecon import Camera, Gaussians, project, render, render_rgb
+from jsecon import Camera, Gaussians, project, render, render_depth, render_rgb
 from jsecon.splat.sh import colours_from_sh
 
 
@@ -146,10 +146,16 @@ def test_projection_and_colours_equal_their_twins(scene, cameras, camera, count)
     assert bool(got.visible.any())
 
 
-def test_colour_follows_the_view(scene, cameras):
+def test_colour_follows_the_view_and_depth_is_that_of_the_surface(scene, cameras):
     for t in (0, 2):
         expected, _ = render_reference(scene, cameras[t], colours_twin(scene, cameras[t]))
         np.testing.assert_allclose(render_rgb(scene, cameras[t]).features, expected, atol=1 / 255)
+    side = np.linspace(-2, 2, 30)
+    wall = gaussians_at(np.stack(np.meshgrid(side, side, [0.0]), -1).reshape(-1, 3), 0.08, logit=6)
+    camera = Camera(look_at((0, 0, -2.0), up=(0, -1, 0)), *(np.float32(v) for v in (45, 45, 24, 20)), 48, 40)
+    depth, alpha = render_depth(wall, camera)
+    assert float(alpha[10:30, 12:36].min()) > 0.95
+    np.testing.assert_allclose(depth[10:30, 12:36], 2.0, atol=0.02)
 
 
 def test_an_image_size_that_no_tile_divides(scene):

@@ -49,9 +49,11 @@ def test_a_field_is_chosen_by_its_name_and_a_frame_by_its_place(client):
     (200, {"host": "[::1]:8765", "content-type": "Application/JSON; charset=utf-8"}),
     *((200, {"host": name, **JSON}) for name in ("127.9.9.9", "LOCALHOST.:80")),
     *((403, {"host": name, **JSON}) for name in (
-        *("[fe80::2]:5", "localhost.evil.example", "127.0.0.1.evil.example", "evil.example@", "", "[::1", "0.0.0.0"),
+        *("box.lan:1", "[fe80::2]:5", "evil.example:8765", "localhost.evil.example", "127.0.0.1.evil.example"),
+        *("evil.example@", "", "[::1", "0.0.0.0"),
     )),
-    (415, {"content-type": "application/x-www-form-urlencoded"}), (415, {"content-type": ""}),
+    (415, {"content-type": "text/plain"}), (415, {"content-type": ""}),
+    (415, {"content-type": "application/x-www-form-urlencoded"}),
 ])  # fmt: skip
 def test_a_page_of_another_site_cannot_ask(scenes, status, headers):
     client = TestClient(application(scenes), HERE)
@@ -79,6 +81,7 @@ def test_measures_and_objects():
     for path, body, word in (
         ("/query", {"text": "leftmost red mug", "frame": "no"}, "no such frame"),
         ("/query", {"text": "red mug", "frame": 1.5}, "frame"), ("/measure", {"a": "red mug"}, '"b"'),
+        ("/measure", {"a": "red mug", "b": "dark blue box"}, "names 2 objects"),
     ):  # fmt: skip
         answer = client.post(path, json=body)
         assert answer.status_code == 422
@@ -87,14 +90,16 @@ def test_measures_and_objects():
 
 @pytest.mark.parametrize(("status", "body"), [
     (400, b"[" * 1900), (413, b'{"text": "' + b"x" * MAX_BODY + b'"}'), (422, b"{"), (422, b"[1, 2]"), (422, b"{}"),
-    (422, b'{"text": ""}'), (422, b'{"text": "red", "at": [0, 1, 2]}'), (422, b'{"at": ["frame_1", NaN, 2]}'),
-    (422, b'{"at": ["#99999999999999999999", 1, 2]}'), (422, b'{"at": [0, 1' + b"0" * 200 + b", 2]}"),
-    (422, b'{"at": ["#\xc2\xb2", 1, 2]}'), (422, b'{"at": [99, 1, 2]}'),
+    (422, b'{"text": ""}'), (422, b'{"text": 7}'), (422, b'{"text": null}'), (422, b'{"text": "red", "at": [0, 1, 2]}'),
+    (422, b'{"at": [0, 1]}'), (422, b'{"at": [true, 1, 2]}'), (422, b'{"at": ["frame_1", NaN, 2]}'),
+    (422, b'{"at": ["\\udce9", 1, 2]}'), (422, b'{"at": ["#99999999999999999999", 1, 2]}'),
+    (422, b'{"at": ["#\xc2\xb2", 1, 2]}'), (422, b'{"at": [0, 1' + b"0" * 200 + b", 2]}"), (422, b'{"at": [99, 1, 2]}'),
     (422, b'{"at": [0, 99, 2]}'), (422, b'{"at": [0, 1, 2], "all": true}'), (422, b'{"text": "caf\\udce9 red"}'),
-    (422, b'{"text": "red", "by": "magic"}'), (422, b'{"text": "red", "\\udce9": 1}'),
-    (422, b'{"text": "red", "threshold": NaN}'), (422, b'{"text": "red", "file": "/etc/passwd"}'),
+    (422, b'{"text": "red", "by": ["votes"]}'), (422, b'{"text": "red", "by": "magic"}'),
+    (422, b'{"text": "red", "\\udce9": 1}'), (422, b'{"text": "red", "threshold": NaN}'),
+    (422, b'{"text": "red", "all": 1}'), (422, b'{"text": "red", "file": "/etc/passwd"}'),
     (422, b'{"text": "the meaning of life"}'), (422, b'{"text": "red", "field": "../../etc"}'),
-    (422, b'{"text": "red", "field": "\\udce9"}'),
+    (422, b'{"text": "red", "field": "\\udce9"}'), (422, b'{"text": "red", "field": ["desk"]}'),
 ])  # fmt: skip
 def test_odd_questions_have_an_error_of_their_own_kind(client, status, body):
     answer = client.post("/query", content=body, headers=JSON)

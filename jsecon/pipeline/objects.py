@@ -230,7 +230,7 @@ def _classical_segmenter(options: Options, view: _TrainingView) -> Segmenter:
         cloud = points_from_depth(capture, voxel=spacing, max_points=most, stride=4)
         surfaces = surfaces_from_depth(depths, view.cameras, cloud.points)
     segmenter = ClassicalSegmenter(**GRANULARITIES[options.granularity], surfaces=surfaces)
-    # A tracker follows each mask for itself, and needs none twice.
+    # A tracker follows each mask for itself: the same thing in two layers would be followed twice.
     return segmenter if options.associated_by == "consensus" else dataclasses.replace(segmenter, layers=(1.0,))
 
 

@@ -166,7 +166,7 @@ class MaskOptions:
       ignore: What is no part of the scene, such as "person, screen": a segmenter and an embedder find it in each frame.
         Its pixels count nowhere, and OUT/masks has them in black, as nerfstudio and LichtFeld Studio read masks.
       granularity: Without --masks, how large the objects are that jsecon finds by itself. Fine separates parts of
-        things. Coarse joins the colours of a thing, and separates things by the depth that the Gaussians render.
+        things.
       association: How the proposals of the frames are brought together: what most views agree on (consensus), or
         Algorithm 1 of the paper with a tracker through the Gaussians (tracking).
       agreement: For consensus, share of the views that must put two things into one proposal, or all of them if one

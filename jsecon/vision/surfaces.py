@@ -15,25 +15,19 @@ from scipy.spatial import KDTree
 from jsecon.types import Camera
 
 
-def smooth_depth(depth: Float32[np.ndarray, "h w"]) -> np.ndarray:
-    """Removes noise from rendered z-depth and keeps its jumps: a median, then bilateral filters of its logarithm.
+def _smooth_depth(depth: Float32[np.ndarray, "h w"]) -> np.ndarray:
+    """Removes noise from z-depth and keeps its jumps: a median, then bilateral filters of its logarithm.
 
     Unknown pixels (0) are filled from the nearest known one; depth that is unknown everywhere stays so.
     """
     known = np.asarray(depth > 0)
     if not known.any():
         return depth
-    logarithm = cv2.medianBlur(log_depth(depth)[..., 0], 5)
+    logarithm = np.log(np.maximum(fill_nearest(depth, known), 1e-12)).astype(np.float32)
+    logarithm = cv2.medianBlur(logarithm, 5)
     for _ in range(3):
         logarithm = cv2.bilateralFilter(logarithm, 9, 0.06, 4)  # steps up to 6 % are noise
     return np.exp(logarithm)
-
-
-def log_depth(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w 1"]:
-    """Computes the logarithm of z-depth; unknown pixels (0) are filled from the nearest known one, else with 0."""
-    known = np.asarray(depth > 0)
-    depth = fill_nearest(depth, known) if known.any() else np.ones_like(depth)
-    return np.log(np.maximum(depth, 1e-12))[..., None].astype(np.float32)
 
 
 def fill_nearest(values: Shaped[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]) -> Shaped[np.ndarray, "h w"]:
@@ -93,7 +87,7 @@ def surfaces_from_depth(
         if not (depths[t] > 0).any():
             return None
         rotation, camera = poses[t, :3, :3], cameras[t]
-        local_points = _camera_points(smooth_depth(np.asarray(depths[t], np.float32)), camera)
+        local_points = _camera_points(_smooth_depth(np.asarray(depths[t], np.float32)), camera)
         # Normals change slowly: every second pixel in each direction is enough.
         sampled = local_points[::2, ::2]
         nearest = tree.query((sampled.reshape(-1, 3) - poses[t, :3, 3]) @ rotation, workers=-1)[1]

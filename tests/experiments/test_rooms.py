@@ -1,13 +1,17 @@
 """The demo room: exact geometry, true names, and files that read back as an ordinary capture."""
 
+import dataclasses
 import json
 
 import jax
 import numpy as np
 import pytest
+from conftest import look_at
 
 from experiments.datasets.plain_room import make_room
 from experiments.rooms import room_capture, write_room
+from experiments.rooms.raycast import trace_rays
+from experiments.rooms.room import Part
 from experiments.rooms.shapes import (
     blocks_segment,
     box,
@@ -21,7 +25,7 @@ from experiments.rooms.shapes import (
     ray_interval,
     rotation,
 )
-from jsecon import load_capture
+from jsecon import Camera, load_capture
 from jsecon.read.masks.labels import load_lerf_labels
 from jsecon.read.masks.masks import load_labels
 
@@ -39,6 +43,7 @@ SOLIDS = {
     "ellipsoid": (ellipsoid(0.3, 0.2, 0.4), lambda x, y, z: (x / 0.3) ** 2 + (y / 0.2) ** 2 + (z / 0.4) ** 2 <= 1),
     "bowl": (ellipsoid(0.3, 0.3, 0.2, below=0.05, above=-0.1),
              lambda x, y, z: ((x**2 + y**2) / 0.09 + z**2 / 0.04 <= 1) & (z <= 0.05) & (z >= -0.1)),
+    "cylinder": (frustum(0.2, 0.2, 0.4), lambda x, y, z: (np.hypot(x, y) <= 0.2) & (z >= 0) & (z <= 0.4)),
     "widening": (frustum(0.1, 0.35, 0.3), lambda x, y, z: (np.hypot(x, y) <= 0.1 + z / 1.2) & (z >= 0) & (z <= 0.3)),
     "cone": (frustum(0.3, 0.0, 0.3), lambda x, y, z: (np.hypot(x, y) <= 0.3 - z) & (z >= 0) & (z <= 0.3)),
     "box": (box(0.4, 0.2, 0.3), lambda x, y, z: (abs(x) <= 0.2) & (abs(y) <= 0.1) & (z >= 0) & (z <= 0.3)),
@@ -86,6 +91,27 @@ def test_normals_point_out_of_the_solid(name):
     assert ((normal * rays).sum(0) < 1e-3).all()
     assert not contains(solid, points + 1e-3 * normal).any()
     assert contains(solid, points - 1e-3 * normal, margin=1e-4).mean() > 0.98  # all but the sharpest edges
+
+
+def test_a_ray_meets_the_sphere_where_its_equation_says():
+    centre, r = np.array([0.1, 0.05, 0.3]), 0.2
+    eye = np.array([1.4, -0.3, 0.6])
+    room = make_room(0, num_objects=2)
+    ball = Part(place(ellipsoid(r, r, r), centre), None, 0, np.full(3, 0.5, np.float32))
+    ball = dataclasses.replace(room.objects[0], parts=(ball,))
+    room = dataclasses.replace(room, objects=(ball,), furniture=())
+    pose = look_at(eye, centre, up=(0, 0, 1))
+    depth, index = trace_rays(room, Camera(pose, 200.0, 200.0, 40.5, 40.5, 81, 81))
+    distance = np.linalg.norm(centre - eye)
+    y, x = np.mgrid[:81, :81] + 0.5
+    rays = np.stack([(x - 40.5) / 200, (y - 40.5) / 200, np.ones_like(x)])
+    angle, edge = np.arctan2(np.hypot(rays[0], rays[1]), 1), np.arcsin(r / distance)
+    sure = np.abs(angle - edge) > 1e-5
+    np.testing.assert_array_equal((index == 0)[sure], (angle < edge)[sure])
+    d = rays / np.linalg.norm(rays, axis=0)
+    along = distance * d[2] - np.sqrt(np.maximum(r**2 - distance**2 * (1 - d[2] ** 2), 0))
+    inner = angle < 0.97 * edge
+    np.testing.assert_allclose(depth[inner], (along * d[2])[inner], atol=5e-6)
 
 
 def test_a_hollow_is_seen_into_and_lit_from_above_only():
