@@ -24,7 +24,7 @@ import jsecon
 from experiments import results
 from experiments.rooms import write_room
 from experiments.rooms.room import Room, RoomObject, crowded_room
-from experiments.rooms.shapes import contains
+from experiments.rooms.shapes import ray_interval
 from jsecon.app.catalogue import Catalogue
 from jsecon.errors import InputError
 from jsecon.files import FIELD_FILE
@@ -37,7 +37,7 @@ from jsecon.types import LanguageField
 FOUND = 0.5
 """IoU from which an object is found."""
 GRID = 48
-"""Points along each side of a grid that fills a solid's bounding box."""
+"""Rays along each side of a grid over a solid."""
 HOLDOUT = 5
 QUICK_ROOM = {"views": 8, "width": 96, "height": 72}
 
@@ -80,14 +80,23 @@ def true_objects(field: LanguageField, capture: Path) -> Int[np.ndarray, " n"]:
 
 
 def true_points(item: RoomObject) -> Float[np.ndarray, "p 3"]:
-    """Points that fill the solids of an object, world."""
-    steps = np.linspace(-1, 1, GRID)
-    grid = np.stack(np.meshgrid(steps, steps, steps)).reshape(3, -1)
+    """Points of the surfaces of an object's solids, where rays along their axes enter and leave them, world."""
     points = []
     for part in item.parts:
-        bound = part.solid.bound
-        inside = bound[:3, None] + bound[3] * grid
-        points.append(inside[:, contains(part.solid, inside.astype(np.float32), margin=1e-6)].T)
+        solid, low, high = part.solid, -np.ones(3), np.ones(3)
+        for _ in range(2):  # first within the bounding sphere, then within the sides of what is found
+            found = []
+            for axis in range(3):
+                steps = [np.linspace(low[other], high[other], GRID) for other in np.delete(np.arange(3), axis)]
+                starts = np.insert(np.stack(np.meshgrid(*steps)).reshape(2, -1), axis, 0.0, axis=0)
+                origin = (solid.bound[:3, None] + solid.bound[3] * (solid.axes @ starts)).astype(np.float32)
+                direction = np.repeat(solid.axes[:, axis, None], origin.shape[1], axis=1)
+                enter, leave = ray_interval(solid, origin, direction)
+                met = leave > enter
+                found += [(origin + end * direction)[:, met].T for end in (enter, leave)]
+            sides = (np.concatenate(found) - solid.bound[:3]) @ solid.axes / solid.bound[3]
+            low, high = sides.min(0), sides.max(0)
+        points += found
     return np.concatenate(points)
 
 

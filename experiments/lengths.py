@@ -21,10 +21,9 @@ from experiments import results
 from experiments.catalogue import true_points
 from experiments.demo_rooms import fields_of_room
 from experiments.rooms.room import Room, crowded_room
-from jsecon.app.records import gaussian_rows, source_points
+from jsecon.app.records import source_points
 from jsecon.errors import InputError
-from jsecon.query.object_shapes import gaussian_spreads
-from jsecon.query.solids import object_solid
+from jsecon.query.solids import object_solid, surface_points
 from jsecon.types import LanguageField
 
 
@@ -43,7 +42,7 @@ class Options:
 def measure(field: LanguageField, room: Room) -> dict[str, float]:
     """The figures of a room."""
     scene, names = jsecon.Scene(field), [item.name for item in room.objects]
-    middles, volumes = {}, []
+    middles, found, labels = {}, [], np.full(field.gaussians.count, -1)
     for item in room.objects:
         try:
             if not item.name or names.count(item.name) > 1:
@@ -54,11 +53,14 @@ def measure(field: LanguageField, room: Room) -> dict[str, float]:
             continue
         points = true_points(item)
         middles[item.name] = (points.min(0) + points.max(0)) / 2
-        rows = gaussian_rows(field.gaussians, answer.rows)
-        solid = object_solid(source_points(field, np.asarray(rows.means)), gaussian_spreads(rows), answer.place)
+        labels[answer.rows] = len(found)
+        found.append((answer.place, ConvexHull(points).volume))
+    volumes = []
+    for points, (place, volume) in zip(surface_points(field.gaussians, field.cameras, labels), found):
+        solid = object_solid(source_points(field, points), place)
         a, *rest = solid.size
         kinds = {"box": np.prod(solid.size), "cylinder": np.pi * a**2 * sum(rest), "sphere": 4 / 3 * np.pi * a**3}
-        volumes.append(np.array([solid.volume, kinds[solid.primitive]]) / ConvexHull(points).volume)
+        volumes.append(np.array([solid.volume, kinds[solid.primitive]]) / volume)
     pairs = [*itertools.combinations(middles, 2)]
     true = np.array([np.linalg.norm(middles[a] - middles[b]) for a, b in pairs])
     known = int(true.argmax())
@@ -69,7 +71,8 @@ def measure(field: LanguageField, room: Room) -> dict[str, float]:
     off = np.abs(ratio[None] / ratio[:, None] - 1)[~np.eye(len(pairs), dtype=bool)]
     hull, primitive = np.median(volumes, axis=0)
     figures = {"lengths": len(error), "error": np.median(error), "90 %": np.quantile(error, 0.9), "any": np.median(off)}
-    figures |= {"hull": hull, "primitive": primitive}
+    near = np.abs(np.array(volumes)[:, 0] - 1)
+    figures |= {"hull": hull, "primitive": primitive, "hull off": np.median(near), "within 10 %": np.mean(near < 0.1)}
     return {name: float(value) for name, value in figures.items()}
 
 

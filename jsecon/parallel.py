@@ -21,7 +21,7 @@ from jax.experimental.multihost_utils import process_allgather
 from jax.sharding import AxisType, Mesh, PartitionSpec
 
 from jsecon.files import pack_tree, unpack_tree
-from jsecon.process import cores
+from jsecon.process import VIEWS_AT_ONCE, cores
 from jsecon.types import Progress
 
 AXIS = "devices"
@@ -102,7 +102,7 @@ def map_views(count: int, view: Callable[[int], Any], progress: Progress | None 
 
     def on_cores(indices: Sequence[int]) -> Iterator[Any]:
         yield from map(view, indices[:1])
-        pool = ThreadPoolExecutor(min(cores(), 8))  # each view at work holds its plan in memory
+        pool = ThreadPoolExecutor(min(cores(), VIEWS_AT_ONCE))
         try:
             yield from pool.map(view, indices[1:])
         finally:

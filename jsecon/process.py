@@ -109,6 +109,10 @@ def _stop_main() -> None:
         _thread.interrupt_main(signal.SIGTERM)
 
 
+VIEWS_AT_ONCE = 8
+"""largest number of views that are worked on side by side, as each holds its plan in memory"""
+
+
 def cores() -> int:
     """Counts the CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -7,11 +7,13 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 from capture_files import run_cli
+from conftest import cameras_of
 from scipy.spatial.transform import Rotation
 from table_field import table_field
 
 from jsecon import object_shapes, save_field
-from jsecon.query.solids import object_solid
+from jsecon.query.solids import object_solid, surface_points
+from jsecon.splat.points import gaussians_from_points
 
 
 def surface(kind: str, count: int = 3000) -> np.ndarray:
@@ -38,9 +40,9 @@ VOLUMES = {"box": 0.6 * 0.4 * 0.3, "cylinder": np.pi * 0.2**2 * 0.5, "sphere": 4
 def test_the_primitive_and_the_volumes_are_those_of_the_thing(kind, lying):
     turn = Rotation.from_euler("xz", [90 if lying else 0, 30], degrees=True)
     turn = Rotation.from_euler("z", 20, degrees=True) * turn
-    means, spreads = turn.apply(surface(kind)) + np.array([5, 6, 7]), np.tile(0.004 * np.eye(3), (3000, 1, 1))
-    shape = object_shapes(means, np.zeros(3000, int), np.array([0, 0, 1.0]), spreads=spreads)[0]
-    solid = object_solid(means, spreads, shape)
+    points = turn.apply(surface(kind)) + np.array([5, 6, 7])
+    shape = object_shapes(points[::3], np.zeros(1000, int), np.array([0, 0, 1.0]))[0]
+    solid = object_solid(points, shape)
     assert solid.primitive == kind
     a, *others = solid.size
     volume = {"box": np.prod(solid.size), "cylinder": np.pi * a**2 * sum(others), "sphere": 4 / 3 * np.pi * a**3}[kind]
@@ -55,7 +57,20 @@ def test_the_primitive_and_the_volumes_are_those_of_the_thing(kind, lying):
 def test_a_flat_thing_has_a_thin_hull():
     means = np.random.default_rng(0).uniform(-1, 1, (50, 3)) * [1, 1, 0]
     shape = object_shapes(means, np.zeros(50, int), np.array([0, 0, 1.0]))[0]
-    assert 0 < object_solid(means, np.zeros((50, 3, 3)), shape).volume < 0.01
+    for points in (means, means[:0]):
+        assert 0 < object_solid(points, shape).volume < 0.01
+
+
+def test_surfaces_are_those_of_the_pixels_that_show_an_object():
+    means = np.mgrid[-10:11, -10:11, 0:2].reshape(3, -1).T * [0.1, 0.1, 1.0] + [0, 0, 2]
+    means[means[:, 2] > 2.5, 0] += 1.0  # behind the right half of the near wall
+    walls = gaussians_from_points(means, np.full(means.shape, 128, np.uint8), opacity=0.99)
+    view = cameras_of(np.eye(4)[None], (50.0, 50.0, 50.0, 40.0), 100, 80)
+    near, far = surface_points(walls, view, np.int64(means[:, 2] > 2.5))
+    np.testing.assert_allclose(near[:, 2], 2, atol=1e-4)
+    np.testing.assert_allclose(far[:, 2], 3, atol=1e-4)
+    assert near[:, 0].max() < 1.2
+    assert far[:, 0].min() > 1.4  # as seen past the edge of the near wall
 
 
 def test_files_for_robots_agree_and_are_in_metres(tmp_path, capsys):

@@ -19,10 +19,9 @@ from jsecon.errors import InputError
 from jsecon.field.evidence import ViewEvidence, pack_evidence
 from jsecon.field.ledger import Ledger, LedgerView, camera_row
 from jsecon.fit.resize import resize_camera, resize_frame, resize_mask, shrink_cameras
-from jsecon.fit.start import back_project
 from jsecon.read.captures.frames import evenly_spaced, transform_poses
 from jsecon.read.captures.images import encode_jpeg
-from jsecon.splat.points import gaussians_from_points
+from jsecon.splat.points import back_project, gaussians_from_points
 from jsecon.splat.render import render_depth
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Camera, Capture, Gaussians, LanguageField

@@ -10,13 +10,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jsecon.app.catalogue import Catalogue
-from jsecon.app.records import gaussian_rows, source_points
+from jsecon.app.records import source_points
 from jsecon.app.scene import Scene
 from jsecon.errors import InputError
 from jsecon.files import write_text
-from jsecon.query.object_shapes import gaussian_spreads
-from jsecon.query.solids import object_solid
-from jsecon.splat.transform import transform_gaussians
+from jsecon.query.solids import object_solid, surface_points
 
 _Item: TypeAlias = dict[str, Any]
 """An object with its box, hull and primitive, as the JSON has it with lists in place of arrays."""
@@ -27,21 +25,20 @@ def write_shapes(scene: Scene, listed: Catalogue, out: Path) -> list[Path]:
 
     They stand in the capture's world, in metres if the field knows their length.
     """
-    scale = scene.field.metres_per_unit or 1.0
+    field, scale = scene.field, scene.field.metres_per_unit or 1.0
+    wholes = [record for record in listed.records() if record["parent"] is None and not record["surroundings"]]
+    labels = np.full(field.gaussians.count, -1)
+    for n, record in enumerate(wholes):
+        labels[listed.mask(record["id"])] = n
     items = []
-    for record in listed.records():
-        if record["parent"] is None and not record["surroundings"]:
-            shape = listed.shapes[record["id"]]
-            gaussians = gaussian_rows(scene.field.gaussians, listed.mask(record["id"]))
-            spreads = gaussian_spreads(transform_gaussians(gaussians, scene.field.source_from_scene))
-            solid = object_solid(source_points(scene.field, np.asarray(gaussians.means)), spreads, shape)
-            center, volume = scale * shape.center, scale**3 * solid.volume
-            hull = {"vertices": scale * solid.vertices, "triangles": solid.triangles, "volume": volume}
-            size = scale * np.array(solid.size)
-            primitive = {"type": solid.primitive, "size": size, "axes": solid.axes, "center": center}
-            box = {"center": center, "size": 2 * scale * shape.half_size, "axes": shape.axes}
-            item = {"id": record["id"], "name": record["name"], "box": box, "hull": hull, "primitive": primitive}
-            items.append(item)
+    for record, points in zip(wholes, surface_points(field.gaussians, field.cameras, labels)):
+        shape = listed.shapes[record["id"]]
+        solid = object_solid(source_points(field, points), shape)
+        hull = {"vertices": scale * solid.vertices, "triangles": solid.triangles, "volume": scale**3 * solid.volume}
+        primitive = {"type": solid.primitive, "size": scale * np.array(solid.size), "axes": solid.axes}
+        box = {"center": scale * shape.center, "size": 2 * scale * shape.half_size, "axes": shape.axes}
+        item = {"id": record["id"], "name": record["name"], "box": box, "hull": hull}
+        items.append(item | {"primitive": primitive | {"center": scale * solid.center}})
     unit = "capture units" if scene.field.metres_per_unit is None else "metres"
     files = [out] if out.suffix in _WRITERS else [out / f"shapes{suffix}" for suffix in _WRITERS]
     for file in files:
@@ -87,7 +84,7 @@ def _to_mjcf(items: list[_Item], unit: str) -> str:
     """Returns a model for MuJoCo: static bodies, whose primitives collide and whose hulls are seen."""
     assets, bodies = [], []
     for item in items:
-        name, center = quoteattr(_title(item)), item["box"]["center"]
+        name, center = quoteattr(_title(item)), item["primitive"]["center"]
         kind, size = item["primitive"]["type"], item["primitive"]["size"]
         half = {"box": 0.5 * size, "sphere": size}.get(kind, np.array([size[0], 0.5 * size[-1]]))
         assets.append(f"<mesh name={name} vertex={_words(item['hull']['vertices'] - center)}/>")
@@ -117,7 +114,7 @@ def _to_moveit(items: list[_Item], unit: str) -> str:
     for item in items:
         kind, size = item["primitive"]["type"], item["primitive"]["size"].tolist()
         size = size[::-1] if kind == "cylinder" else size  # its height comes first
-        position, turn = (dict(zip("xyzw", row.tolist())) for row in (item["box"]["center"], _turn(item)))
+        position, turn = (dict(zip("xyzw", row.tolist())) for row in (item["primitive"]["center"], _turn(item)))
         message = {"header": {"frame_id": "world"}, "id": _title(item), "operation": 0}
         message |= {"primitives": [{"type": kinds[kind], "dimensions": size}]}
         messages.append(message | {"primitive_poses": [{"position": position, "orientation": turn}]})

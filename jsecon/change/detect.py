@@ -22,9 +22,9 @@ from jsecon.change import MIN_PROBABILITY
 from jsecon.change.compare import colour_cost, depth_cost, find_shift, fit_exposure, shifted
 from jsecon.errors import InputError, require_shape
 from jsecon.field.evidence import view_evidence
-from jsecon.fit.start import back_project
 from jsecon.numerics import axes_across
 from jsecon.query.render import hide
+from jsecon.splat.points import back_project
 from jsecon.splat.render import render, render_rgb
 from jsecon.splat.sh import C0
 from jsecon.splat.visible import points_in_view

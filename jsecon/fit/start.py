@@ -10,8 +10,8 @@ from scipy.spatial import KDTree
 
 from jsecon.errors import InputError, require
 from jsecon.fit.triangulate import MIN_POINTS, triangulated_points
-from jsecon.splat.points import gaussians_from_points, voxel_means
-from jsecon.types import Camera, Capture, Gaussians, Progress
+from jsecon.splat.points import back_project, gaussians_from_points, voxel_means
+from jsecon.types import Capture, Gaussians, Progress
 
 FEW_POINTS = 300
 """Sparse points of a capture for a megapixel of its frames, below which points of matches join them: structure from
@@ -49,15 +49,6 @@ def back_project_frame(capture: Capture, frame: int, stride: int):
     rows, columns = rows * stride, columns * stride
     pixels = np.stack([rows, columns], axis=1)
     return back_project(camera, pixels, z), np.asarray(capture.frames[frame])[rows, columns], pixels
-
-
-def back_project(camera: Camera, pixels: np.ndarray, depth: np.ndarray | float) -> np.ndarray:
-    """World points (S, 3) float64 of pixels (S, 2) row, column of one camera, at depths (S,)."""
-    rows, columns = pixels.T
-    x = (columns + 0.5 - float(camera.cx)) / float(camera.fx) * depth
-    y = (rows + 0.5 - float(camera.cy)) / float(camera.fy) * depth
-    pose = np.asarray(camera.world_to_camera, np.float64)
-    return (np.stack([x, y, np.broadcast_to(depth, x.shape)], axis=1) - pose[:3, 3]) @ pose[:3, :3]
 
 
 def points_from_depth(

@@ -30,6 +30,7 @@ from jsecon.errors import InputError, require
 from jsecon.networks.clip import read_preprocessing
 from jsecon.networks.hub import find_files
 from jsecon.networks.session import Graph, content_digest
+from jsecon.process import VIEWS_AT_ONCE, cores
 from jsecon.vision.classical import ClassicalSegmenter
 
 _BOX_IOU = 0.7
@@ -68,8 +69,8 @@ class _SamGraphs:
 
     def __init__(self, encoder: Path, decoder: Path, config: Path):
         mean, std, side = read_preprocessing(config)
-        self._encoder = Graph(encoder)
-        self._decoder = Graph(decoder)
+        threads = -(-cores() // VIEWS_AT_ONCE)  # frames are segmented side by side (parallel.map_views)
+        self._encoder, self._decoder = Graph(encoder, threads), Graph(decoder, threads)
         image = self._encoder.require("input", "pixel_values", (1, 3, None, None), "SAM's image encoder")
         inputs = self._decoder.inputs
         self.stretched = "image_embeddings.0" in inputs

@@ -80,14 +80,15 @@ class Graph:
 
     Args:
       path: The .onnx file.
+      threads: Threads of a run; None takes all cores.
 
     Attributes:
       inputs: Input tensors by name, in the order of the file.
       outputs: Output tensors by name, in the order of the file.
     """
 
-    def __init__(self, path: str | os.PathLike):
-        self.path = Path(path)
+    def __init__(self, path: str | os.PathLike, threads: int | None = None):
+        self.path, self._threads = Path(path), threads or cores()
         _check_bytes(self.path)
         session = self._open(optimise=False)
         self.inputs = {tensor.name: tensor for tensor in map(_tensor, session.get_inputs())}
@@ -103,7 +104,7 @@ class Graph:
 
     def _open(self, *, optimise: bool) -> onnxruntime.InferenceSession:
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = cores()
+        options.intra_op_num_threads = self._threads
         options.inter_op_num_threads = 1
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.log_severity_level = 4

@@ -4,9 +4,8 @@ import dataclasses
 import functools
 import itertools
 import shutil
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -26,7 +25,7 @@ from jsecon.paper.algorithm1 import masklets
 from jsecon.paper.autoencoder import encode, train_autoencoder
 from jsecon.paper.distill import distill_votes
 from jsecon.paper.tracker import GeometricTracker
-from jsecon.parallel import map_over_processes
+from jsecon.parallel import map_views
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.stages import (
     CastVotes,
@@ -37,7 +36,7 @@ from jsecon.pipeline.stages import (
     StageResult,
     training_frames,
 )
-from jsecon.process import cores, memory_budget
+from jsecon.process import VIEWS_AT_ONCE, cores, memory_budget
 from jsecon.read.captures.frames import evenly_spaced
 from jsecon.read.masks.masks import load_labels, load_proposals
 from jsecon.types import Camera, Capture, Codes, Gaussians, Progress, Regions
@@ -136,14 +135,13 @@ def _frames_of_vision(stage: StageInput) -> tuple[np.ndarray, tuple[str, ...]]:
     if minutes is not None:
         began, segmenter = time.monotonic(), context.models.segmenter
 
-        def segment(rows: Sequence[int]) -> Iterator[bool]:
-            for row in rows:
-                is_early = row < 2 or time.monotonic() - began < 60 * minutes
-                if is_early:  # the masks are stored on disk
-                    segmenter(capture.frames[train[order[row]]], row)
-                yield is_early
+        def segment(row: int) -> bool:
+            is_early = row < 2 or time.monotonic() - began < 60 * minutes
+            if is_early:  # the masks are stored on disk
+                segmenter(capture.frames[train[order[row]]], row)
+            return is_early
 
-        is_early = np.array(map_over_processes(len(order), segment, stage.progress))
+        is_early = np.array(map_views(len(order), segment, stage.progress))
         why = why if is_early.all() else "--vision-minutes allows no more"
         order = order[is_early]
     notes = (f"masks in {len(order)} of {len(train)} training frames: {why}",) if len(order) < len(train) else ()
@@ -204,16 +202,8 @@ def _frame_proposals(context: RunContext, view: _TrainingView) -> tuple[Callable
     options, frames, segmenter = context.options, view.frames, context.models.segmenter
     if options.proposals is not None:
         return load_proposals(options.proposals, view.names, view.size, **view.mask_layout)
-    if segmenter is not None:  # it stores its masks on disk
-        lock = threading.Lock()  # a network takes all cores for one frame
-
-        def segment(t: int) -> np.ndarray:
-            with lock:
-                return segmenter(frames[t], t)
-
-        return segment, ()
-    classical = _classical_segmenter(options, view)
-    return lambda t: classical(frames[t], t), ()
+    segment = segmenter or _classical_segmenter(options, view)
+    return lambda t: np.asarray(segment(frames[t], t)), ()
 
 
 def _classical_segmenter(options: Options, view: _TrainingView) -> Segmenter:
@@ -246,6 +236,9 @@ def _associate_masks(
     if options.associated_by == "consensus":
         scene = SceneSuperpixels(gaussians, cameras, proposals, centre_pixel_weight=options.centre_pixel_weight)
         return track_masks(frames, scene, agreement=options.agreement, seed=options.seed, progress=progress)
+    if context.models.segmenter is not None:  # its masks are stored on disk, from which the tracker's order takes them
+        with ThreadPoolExecutor(min(cores(), VIEWS_AT_ONCE)) as pool:
+            list(pool.map(lambda t: len(proposals(t)), range(len(frames))))
     tracker = context.models.tracker or GeometricTracker(gaussians, cameras, proposals)
     labels = masklets(frames, lambda frame, index: proposals(index), tracker, progress=progress)
     if isinstance(tracker, GeometricTracker):

@@ -1,4 +1,4 @@
-"""Gaussians made from points, and points thinned by voxels. Host code (NumPy)."""
+"""Points of pixels, points thinned by voxels, and Gaussians made from points. Host code (NumPy)."""
 
 import math
 
@@ -9,10 +9,19 @@ from scipy.spatial import KDTree
 from jsecon.errors import require
 from jsecon.process import cores
 from jsecon.splat.sh import C0
-from jsecon.types import Array, Gaussians
+from jsecon.types import Array, Camera, Gaussians
 
 _MIN_SQUARED_DISTANCE = 1e-7
 """Least squared distance to the neighbours, world units^2 (INRIA): duplicate points get a scale too."""
+
+
+def back_project(camera: Camera, pixels: np.ndarray, depth: np.ndarray | float) -> np.ndarray:
+    """World points (S, 3) float64 of pixels (S, 2) row, column of one camera, at depths (S,)."""
+    rows, columns = pixels.T
+    x = (columns + 0.5 - float(camera.cx)) / float(camera.fx) * depth
+    y = (rows + 0.5 - float(camera.cy)) / float(camera.fy) * depth
+    pose = np.asarray(camera.world_to_camera, np.float64)
+    return (np.stack([x, y, np.broadcast_to(depth, x.shape)], axis=1) - pose[:3, 3]) @ pose[:3, :3]
 
 
 def voxel_ids(points: np.ndarray, voxel: float) -> np.ndarray:
