@@ -25,7 +25,7 @@ from experiments.rooms.room import crowded_room
 from experiments.simulated_vision.exact_sam import ExactGridSam, ExactSam, found_shares, level_labels, masks_of
 from jsecon.networks.clip import ClipEmbedder
 from jsecon.networks.hub import Role, find_files
-from jsecon.networks.sam import Level, _SamGraphs
+from jsecon.networks.sam import Level, _GuidedPrompts, _SamGraphs
 from jsecon.networks.sam2 import _open_sam2, follow
 from jsecon.process import cores
 
@@ -36,9 +36,29 @@ GRID = 1024
 """prompts of SAM's grid"""
 GUIDED = 70
 """guided prompts of a frame"""
+LIMITS = (8, 16, 32, 64)
+"""numbers of guided prompts of a frame that are tried beside the default's"""
 REGIONS = 40
 """regions of a frame that are embedded"""
 TEXT = "a red mug"
+
+
+def _limited(most: int) -> type[ExactSam]:
+    """`ExactSam` with fewer guided prompts."""
+
+    class Prompts(_GuidedPrompts):
+        def __init__(self, image: np.ndarray, levels: int):
+            super().__init__(image, levels)
+            self._left = most
+
+    return type("Limited", (ExactSam,), {"prompts": Prompts})
+
+
+PROMPTS: dict[str, type[ExactSam]] = {
+    "grid": ExactGridSam,
+    "guided": ExactSam,
+    **{f"guided, at most {most}": _limited(most) for most in LIMITS},
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +103,7 @@ def count_masks(options: Options) -> dict[str, dict[str, dict[str, Any]]]:
         for t, frame in enumerate(frames):
             labels = level_labels(room, cameras[t])
             for level in ("l", "default"):
-                empty = {"frames": 0, "true": 0, "guided": dict(zeros), "grid": dict(zeros)}
+                empty = {"frames": 0, "true": 0} | {name: dict(zeros) for name in PROMPTS}
                 row = counted.setdefault(kind, {}).setdefault(level, empty)
                 _count_frame(row, frame, labels, level)
     return counted
@@ -98,7 +118,7 @@ def _count_frame(row: dict[str, Any], frame: np.ndarray, labels: dict[str, np.nd
         truth = np.unpackbits(packed, axis=1, count=frame[..., 0].size).reshape(-1, *frame.shape[:2]).astype(bool)
     row["frames"] += 1
     row["true"] += len(truth)
-    for prompts, kind in (("guided", ExactSam), ("grid", ExactGridSam)):
+    for prompts, kind in PROMPTS.items():
         segmenter = kind(labels, level)
         started = time.perf_counter()
         masks = segmenter(frame, 0)
@@ -187,7 +207,7 @@ def table(metrics: dict) -> str:
         rows = []
         for kind, levels in metrics["masks"].items():
             for level, row in levels.items():
-                for prompts in ("grid", "guided"):
+                for prompts in PROMPTS:
                     mine = row[prompts]
                     count = mine["prompts"] / row["frames"]
                     rows.append((kind, level, prompts, f"{count:.0f}", row["true"], *mine["found"]))

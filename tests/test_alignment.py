@@ -2,12 +2,15 @@
 
 import dataclasses
 
+import jax
 import numpy as np
 import pytest
 from conftest import cameras_of, capture_of, look_at
 from test_corrections import hat_exp
+from test_fit import same
 
 from jsecon.poses.alignment import align_cameras
+from jsecon.poses.refine import refine_capture
 from jsecon.types import Capture
 
 VIEWS, WIDTH, HEIGHT, FOCAL = 10, 120, 90, 110.0
@@ -77,3 +80,13 @@ def test_exact_poses_stay_and_frames_that_share_nothing_have_none():
     truth = in_a_corner()
     assert align_cameras(truth, ~truth.held_out) is None
     assert align_cameras(dataclasses.replace(truth, depths=np.zeros_like(truth.depths)), ~truth.held_out) is None
+
+
+def test_frames_that_depth_aligns_need_no_proof_and_keep_it_where_no_time_is_left_for_a_probe():
+    truth = in_a_corner()
+    rough, given = moved(truth, 2.0, 1.0), {"key": jax.random.key(0), "visits": 1}
+    alone = refine_capture(rough, max_fit_steps=1.0, **given)
+    assert "depth of their frames alone" in alone.notes[-1]
+    assert off(np.float64(alone.cameras.world_to_camera), truth)[0] < 0.5
+    whole, limited = (refine_capture(rough, max_fit_steps=most, **given) for most in (None, 1e9))
+    assert same(whole, limited)

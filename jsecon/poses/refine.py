@@ -4,16 +4,17 @@ A probe is a short fit with corrections (corrections.py); it measures how far ea
 again, in the same world, with its frames as under one exposure.
 
 If the frames have depth, the cameras are first aligned to each other by colour and depth (alignment.py), provided that
-the frames then agree better: one probe is enough after that. Otherwise points from depth lie where the wrong pose of
-their frame puts them, and keep it there. So such a probe starts from few points, which several frames must share,
-and each further probe starts from points made with the poses of the one before. The first probes see small frames and
-end as soon as the poses are stable; the last sees larger ones.
+the frames then agree clearly better: one probe is enough after that. Otherwise points from depth lie where the wrong
+pose of their frame puts them, and keep it there. So such a probe starts from few points, which several frames must
+share, and each further probe starts from points made with the poses of the one before. The first probes see small
+frames and end as soon as the poses are stable; the last sees larger ones.
 
-With a limit of time, a capture is corrected only if it helps, measured on training frames kept aside: a first probe
-with corrections and one without are fitted to the other training frames and compared on these. A frame kept aside is
-aligned to either frozen probe on half of its pixels and compared on the other half, so that alignment alone has no
-advantage. Held-out frames have no part in the probes or in the decision. They are aligned to the last probe once it is
-frozen, each by its pose and exposure, as methods that refine poses are measured (Lin et al. 2021, BARF, section 4.2).
+With a limit of time, what depth does not align is corrected only if that helps, measured on training frames kept aside:
+a first probe with corrections and one without are fitted to the other training frames and compared on these. A frame
+kept aside is aligned to either frozen probe on half of its pixels and compared on the other half, so that alignment
+alone has no advantage. Held-out frames have no part in the probes or in the decision. They are aligned to the last
+probe once it is frozen, each by its pose and exposure, as methods that refine poses are measured (Lin et al. 2021,
+BARF, section 4.2).
 """
 
 import dataclasses
@@ -60,6 +61,8 @@ MIN_ASIDE, MAX_ASIDE = 2, 8
 _STEP_COST_PIXELS, _STEP_COST_GAUSSIANS = 0.46, 0.072
 """Time of a step of a probe in steps of the fit: for frames of full size, and for its Gaussians."""
 
+_UNCHANGED = "poses and exposures stay as they are"
+
 
 class _Plan(NamedTuple):
     """Sizes and lengths of the probes."""
@@ -71,7 +74,9 @@ class _Plan(NamedTuple):
     """Visits of each frame by each probe."""
 
 
-def _plan_probes(capture: Capture, visits: int, probes: int, max_fit_steps: float | None) -> _Plan | None:
+def _plan_probes(
+    capture: Capture, visits: int, probes: int, max_fit_steps: float | None, *, decide: bool
+) -> _Plan | None:
     """Plans as many visits as fit into the time of `max_fit_steps` steps; None if these are below MIN_VISITS."""
     held_out = np.asarray(capture.held_out)
     train = int((~held_out).sum())
@@ -80,8 +85,9 @@ def _plan_probes(capture: Capture, visits: int, probes: int, max_fit_steps: floa
         return _Plan(coarse_size, probes, visits)
     coarse, fine = (_STEP_COST_PIXELS * size**2 + _STEP_COST_GAUSSIANS for size in (coarse_size, FINE_SIZE))
     # The decision takes one probe more, without corrections; two more if there is only one otherwise.
-    per_visit = train * (fine + coarse * (probes + (probes == 1)))
-    fixed = ALIGN_VISITS * int(held_out.sum()) * fine + DECIDE_VISITS * min(MAX_ASIDE, train // 3) * coarse * 2
+    per_visit = train * (fine + coarse * (probes - 1 + decide * (1 + (probes == 1))))
+    fixed = ALIGN_VISITS * int(held_out.sum()) * fine
+    fixed += decide * DECIDE_VISITS * min(MAX_ASIDE, train // 3) * coarse * 2
     if capture.depths is not None:  # to align a frame by colour and depth takes about a step of the fit
         fixed += 2 * len(held_out)
     # Alignments are never shortened: an unfinished pose would spoil the measurement of a held-out frame.
@@ -166,34 +172,35 @@ def refine_capture(
       capture: Frames with the poses to correct. Held-out frames have no part in the probes.
       start: Gaussians that each probe starts from. By default points made with the poses of the probe before.
       key: Key of the order of the frames.
-      max_fit_steps: Corrects only if that lowers the error of training frames kept aside, and in about the time of so
-        many steps of the fit, by fewer visits. If that leaves too few of them, the capture stays as it is. None
-        corrects in any case.
+      max_fit_steps: Corrects in about the time of so many steps of the fit, by fewer visits, and only if depth aligns
+        the frames or corrections lower the error of training frames kept aside. If too few visits are left, the capture
+        stays as it is or as depth aligns it. None corrects in any case.
       visits: Visits of each frame by each probe, at least 1.
       probes: Maximum number of probes, at least 1.
       progress: Called with the number of steps done and of all.
     """
-    original, train, decide = capture, ~np.asarray(capture.held_out), max_fit_steps is not None
+    original, train = capture, ~np.asarray(capture.held_out)
     aligned = None if capture.depths is None else _align_by_depth(capture, train, ~train)
     by_depth, refine = aligned is not None, CorrectionRates()
-    if by_depth:
-        probes, refine = 1, CorrectionRates(pose=1e-4)  # what is left after depth is small
-    plan = _plan_probes(capture, visits, probes, max_fit_steps)
+    decide = max_fit_steps is not None and not by_depth
+    if aligned is not None:
+        capture, probes, refine = aligned, 1, CorrectionRates(pose=1e-4)  # what is left after depth is small
+    plan = _plan_probes(capture, visits, probes, max_fit_steps, decide=decide)
     if plan is None:
         problem = f"{len(capture.names)} frames are too many to correct them within half of the fit's time"
         remedy = "use more --steps, fewer --frames, or --refine always, which takes longer"
-        return _with_notes(capture, f"poses and exposures stay as they are: {problem} ({remedy})")
+        what = "poses are refined by colour and depth of their frames alone" if by_depth else _UNCHANGED
+        return _with_notes(capture, f"{what}: {problem} ({remedy})")
     steps, held_out = plan.visits * int(train.sum()), int((~train).sum())
     prober = _Prober(key, start, refine, steps * (plan.probes + 2 * decide) + ALIGN_VISITS * held_out, progress)
     remaining, notes = plan.probes, []
     if decide:
-        corrections, note = _decide(capture, prober, plan, by_depth=by_depth)
+        corrections, note = _decide(capture, prober, plan)
         if corrections is None:
             return _with_notes(capture, note)
         notes.append(note)
         if remaining > 1:
             capture, remaining = _move_cameras(capture, corrections), remaining - 1
-    capture = capture if aligned is None else aligned
     extent = max(cameras_extent(capture.cameras[train]), 1e-6)
     while remaining > 1:
         _, corrections = prober.fit(capture, plan.coarse_size, steps)
@@ -230,7 +237,7 @@ def _with_poses(capture: Capture, poses: Float[np.ndarray, "t 4 4"]) -> Capture:
     return dataclasses.replace(capture, cameras=cameras)
 
 
-def _decide(capture: Capture, prober: _Prober, plan: _Plan, *, by_depth: bool) -> tuple[Corrections | None, str]:
+def _decide(capture: Capture, prober: _Prober, plan: _Plan) -> tuple[Corrections | None, str]:
     """Compares a probe with corrections and one without on training frames kept aside.
 
     Returns:
@@ -238,7 +245,7 @@ def _decide(capture: Capture, prober: _Prober, plan: _Plan, *, by_depth: bool) -
     """
     train = np.flatnonzero(~np.asarray(capture.held_out))
     count = min(MAX_ASIDE, len(train) // 3)
-    too_few = "poses and exposures stay as they are: there are too few training frames to test on some of them"
+    too_few = f"{_UNCHANGED}: there are too few training frames to test on some of them"
     if count < MIN_ASIDE:
         return None, too_few
     aside = np.zeros(len(capture.names), bool)
@@ -250,21 +257,20 @@ def _decide(capture: Capture, prober: _Prober, plan: _Plan, *, by_depth: bool) -
     held_out = np.asarray(capture.held_out) | aside
     half = dataclasses.replace(capture, ignored=ignored | (even & aside[:, None, None]), held_out=held_out)
     steps = plan.visits * int((~held_out).sum())
-    aligned = (_align_by_depth(half, ~held_out, aside) if by_depth else None) or half
     size = plan.coarse_size
-    scene, corrections = prober.fit(aligned, size, steps)
+    scene, corrections = prober.fit(half, size, steps)
     plain_scene, _ = prober.fit(half, size, steps, corrects=False)
-    corrections = prober.align(aligned, scene, corrections, aside, size, DECIDE_VISITS)
+    corrections = prober.align(half, scene, corrections, aside, size, DECIDE_VISITS)
     plain = prober.align(half, plain_scene, identity_corrections(len(aside)), aside, size, DECIDE_VISITS)
     counted = even & ~ignored
-    corrected_db = _mean_psnr(scene, aligned, corrections, aside, counted, size)
+    corrected_db = _mean_psnr(scene, capture, corrections, aside, counted, size)
     plain_db = _mean_psnr(plain_scene, capture, plain, aside, counted, size)
     if math.isnan(corrected_db):  # every pixel to compare is ignored
         return None, too_few
     helps = corrected_db >= plain_db + MIN_GAIN_DB
-    verdict = "are corrected" if helps else "stay as they are"
+    verdict = "poses and exposures are corrected" if helps else _UNCHANGED
     note = (
-        f"poses and exposures {verdict}: training frames kept aside have {corrected_db:.1f} dB in a short fit with "
+        f"{verdict}: training frames kept aside have {corrected_db:.1f} dB in a short fit with "
         f"corrections, {plain_db:.1f} dB in one without"
     )
     return corrections if helps else None, note
