@@ -67,10 +67,8 @@ def test_surfaces_are_those_of_the_pixels_that_show_an_object():
     walls = gaussians_from_points(means, np.full(means.shape, 128, np.uint8), opacity=0.99)
     view = cameras_of(np.eye(4)[None], (50.0, 50.0, 50.0, 40.0), 100, 80)
     near, far = surface_points(walls, view, np.int64(means[:, 2] > 2.5))
-    np.testing.assert_allclose(near[:, 2], 2, atol=1e-4)
-    np.testing.assert_allclose(far[:, 2], 3, atol=1e-4)
-    assert near[:, 0].max() < 1.2
-    assert far[:, 0].min() > 1.4  # as seen past the edge of the near wall
+    assert np.ptp(near, axis=0)[2] < 1e-3
+    np.testing.assert_allclose([near[:, 0].max(), near[0, 2], far[:, 0].min(), far[0, 2]], [1.1, 2, 1.6, 3], atol=0.1)
 
 
 def test_files_for_robots_agree_and_are_in_metres(tmp_path, capsys):
