@@ -68,7 +68,7 @@ def test_surfaces_are_those_of_the_pixels_that_show_an_object():
     view = cameras_of(np.eye(4)[None], (50.0, 50.0, 50.0, 40.0), 100, 80)
     near, far = surface_points(walls, view, np.int64(means[:, 2] > 2.5))
     assert np.ptp(near, axis=0)[2] < 1e-3
-    np.testing.assert_allclose([near[:, 0].max(), near[0, 2], far[:, 0].min(), far[0, 2]], [1.1, 2, 1.6, 3], atol=0.1)
+    np.testing.assert_allclose([near[:, 0].max(), near[0, 2], far[:, 0].min(), far[0, 2]], [1.2, 2, 1.8, 3], atol=0.1)
 
 
 def test_files_for_robots_agree_and_are_in_metres(tmp_path, capsys):
