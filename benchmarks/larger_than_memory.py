@@ -354,7 +354,7 @@ def query_growth(base: Path, largest: int) -> None:
         if count <= largest:
             votes, told = random_votes(base / f"{count}", count), {}
             none = Gaussians(*(np.zeros((0, *rest), np.float32) for rest in SHAPES.values()))
-            field = field_of(none, votes, np.zeros((count, 0), np.float32), cameras, regions)
+            field = field_of(none, votes, cameras, regions)
             for _ in range(2):
                 timed(told, "one", lambda f=field: list(answers(f, texts[:1])))
                 timed(told, "many", lambda f=field: [own.mask.sum() for own in answers(f, texts)])

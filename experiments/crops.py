@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments import lerf, real_words, results
+from experiments.tables import published
 from experiments.tables.answers import Answers, Steps
 from experiments.tables.association import Association, associated
 from experiments.tables.fill import Plan, fill
@@ -40,10 +41,10 @@ class Options:
     limits: tuple[int, ...] = (3, 5, 8, ALL)
     seeds: tuple[int, ...] = (70,)
     """Of the twins."""
-    twins: tuple[str, ...] = ("figurines",)
+    twins: tuple[str, ...] = published.LERF_SCENES
     """Scenes of Table 1."""
     levels: tuple[str, ...] = ("low", "medium", "high")
-    """Of the noise of the twins; the first seed's scenes are measured with all of them."""
+    """Of the noise of the twins."""
     out: str = ""
 
 
@@ -93,15 +94,15 @@ def twin_rows(options: Options) -> dict[str, dict]:
     """Crops and IoUs of the twins by level and limit."""
     data = dataclasses.replace(lerf.PLAN.data, scenes=options.twins, seeds=options.seeds)
     methods = {str(limit): functools.partial(of_few_views, limit=limit) for limit in options.limits}
-    plan = Plan(data, tuple(methods), sweep=options.levels, out=str(Path(options.out) / "run"))
-    found = {
-        f"twins, {level} noise": {name: {"crops": 0, "ious": {"ours, consensus": []}} for name in methods}
-        for level in options.levels
-    }
-    for cell in fill(plan, methods, tell=print):
-        row = found[f"twins, {cell['level']} noise"][cell["method"]]
-        row["crops"] += cell["crops"]
-        row["ious"]["ours, consensus"] += [np.mean(strict) for strict, _ in cell["texts"].values()]
+    found = {}
+    for level in options.levels:
+        rows = found[f"twins, {level} noise"] = {
+            name: {"crops": 0, "ious": {"ours, consensus": []}} for name in methods
+        }
+        plan = Plan(data, tuple(methods), level=level, sweep=(), out=str(Path(options.out) / "run"))
+        for cell in fill(plan, methods, tell=print):
+            rows[cell["method"]]["crops"] += cell["crops"]
+            rows[cell["method"]]["ious"]["ours, consensus"] += [np.mean(strict) for strict, _ in cell["texts"].values()]
     return found
 
 

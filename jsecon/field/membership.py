@@ -13,6 +13,7 @@ weight in views of its own room. Where the votes do not know which views show a 
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple, cast
 
 import jax
@@ -26,6 +27,7 @@ from jsecon.errors import require
 from jsecon.field.columns import is_mapped, row_slices, votes_of_rows
 from jsecon.field.regions import ALIKE_THRESHOLD, mean_residuals
 from jsecon.numerics import FULL_PRECISION, array_module, cosine_matrix, inline_jit
+from jsecon.process import cores
 from jsecon.programs import stored_jit
 from jsecon.types import Array, Regions, Votes
 
@@ -244,6 +246,26 @@ def inside_fraction_of_regions(votes: Votes, regions: Sequence[int] | np.ndarray
     weight = functools.reduce(np.add, np.where(inside, weights, 0).T)  # in the order of `inside_fraction`
     known = (np.asarray(votes.views) > 0) & (seen > 0) & np.isfinite(seen) & np.isfinite(weight)
     return _InsideFraction(np.where(known, np.clip(weight / np.where(known, seen, 1), 0, 1), 0), known)
+
+
+def inside_fraction_of_mapped(votes: Votes, regions: Sequence[int] | np.ndarray) -> _InsideFraction:
+    """Computes the same bits as `inside_fraction` of memory-mapped votes. Host code.
+
+    Columns but that of the regions are read only where a Gaussian has a vote for one of them.
+    """
+    count, places = votes.regions.shape
+    fraction, known = np.zeros(count, np.float32), np.zeros(count, bool)
+    chosen = np.zeros(votes.num_regions + 1, bool)  # the last is that of no vote, -1
+    chosen[regions] = True
+
+    def add(rows: slice) -> None:
+        voted = np.flatnonzero(np.take(chosen, votes.regions[rows]))
+        own = rows.start + np.unique(voted // places)
+        fraction[own], known[own] = inside_fraction_of_regions(votes_of_rows(votes, own), regions)
+
+    with ThreadPoolExecutor(cores()) as pool:
+        list(pool.map(add, row_slices(votes, count)))
+    return _InsideFraction(fraction, known)
 
 
 def _lookup(chosen: Bool[Array, " r"]) -> Callable[[Array], Array]:

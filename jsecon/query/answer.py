@@ -21,8 +21,8 @@ from jax import export
 from jaxtyping import Bool, Float, Int
 
 from jsecon.errors import require
-from jsecon.field.columns import is_mapped, vote_blocks
-from jsecon.field.membership import inside_fraction, inside_fraction_of_regions
+from jsecon.field.columns import is_mapped
+from jsecon.field.membership import inside_fraction, inside_fraction_of_mapped, inside_fraction_of_regions
 from jsecon.field.similarity import Number, similarities
 from jsecon.numerics import array_module, is_traced
 from jsecon.paper.queries import select_by_code
@@ -207,20 +207,17 @@ def select_gaussians(field: LanguageField, match: RegionMatch, rules: QueryRules
     """Selects the Gaussians in which the matched regions have a share of at least `rules.min_share`. Pure.
 
     The share (`inside_fraction`) estimates the probability that a pixel of the Gaussian belongs to the regions.
-    Gaussians that no view sees, or with votes that are not finite, stay out. Mapped votes are read in blocks. With
+    Gaussians that no view sees, or with votes that are not finite, stay out. Mapped votes stay on disk. With
     `rules.code_threshold` the codes decide in place of the votes (`select_by_code`).
     """
     if rules.code_threshold is not None:
         return select_by_code(field, match, rules.code_threshold)
-    # Of so few NumPy selects in 10 ms; to compile a program takes a second.
-    if field.gaussians.count <= 1 << 17 and not is_traced((field.votes, match, rules)):
-        share, known = inside_fraction_of_regions(field.votes, np.flatnonzero(match.chosen))
-        return Selection(known & (share >= rules.min_share) & (np.asarray(match.region) >= 0), share, *match[1:])
-    if not is_mapped(field.votes):
+    few = len(field.votes.views) <= 1 << 17  # of so few NumPy selects in 10 ms; to compile a program takes a second
+    if is_traced((field.votes, match, rules)) or not (few or is_mapped(field.votes)):
         return _select_from_votes(jax.tree.map(jnp.asarray, field.votes), match, rules.min_share)
-    parts = [_select_from_votes(votes, match, rules.min_share) for votes in vote_blocks(field.votes)]
-    mask, share = (np.concatenate(column) for column in zip(*((part.mask, part.similarity) for part in parts)))
-    return Selection(mask, share, *match[1:])
+    fraction = inside_fraction_of_regions if few else inside_fraction_of_mapped
+    share, known = fraction(field.votes, np.flatnonzero(match.chosen))
+    return Selection(known & (share >= rules.min_share) & (np.asarray(match.region) >= 0), share, *match[1:])
 
 
 @stored_jit
