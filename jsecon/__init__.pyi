@@ -33,7 +33,6 @@ from .paper.distill import distill_l1 as distill_l1, distill_votes as distill_vo
 from .paper.queries import query_canonical as query_canonical, query_one_step as query_one_step
 from .parallel import host_mesh as host_mesh
 from .query.answer import (
-    RegionMatch as RegionMatch,
     match_regions as match_regions,
     query_anchored as query_anchored,
     query_region as query_region,
@@ -41,6 +40,7 @@ from .query.answer import (
     select_gaussians as select_gaussians,
 )
 from .query.classes import query_classes as query_classes
+from .query.match import RegionMatch as RegionMatch
 from .query.object_shapes import ObjectShapes as ObjectShapes, object_shapes as object_shapes
 from .query.outliers import remove_outliers as remove_outliers
 from .query.pointing import lift as lift, region_at as region_at

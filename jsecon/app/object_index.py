@@ -22,9 +22,9 @@ from jsecon.errors import InputError
 from jsecon.field.columns import votes_of_rows
 from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction_of_regions
 from jsecon.field.tree import part_objects
-from jsecon.query.answer import RegionMatch, match_regions
+from jsecon.query.answer import match_regions
 from jsecon.query.expressions import ANY_OBJECT, parse_expression, split_part
-from jsecon.query.match import select_node
+from jsecon.query.match import RegionMatch, select_node
 from jsecon.query.object_shapes import ObjectShapes
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.parts import match_lone_parts, match_parts

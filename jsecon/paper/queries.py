@@ -98,7 +98,7 @@ def _relevancies(
 
 
 def select_by_code(field: LanguageField, match: tuple, threshold: Number = CODE_THRESHOLD) -> Selection:
-    """Selects the Gaussians whose code is close to that of the best region of a `query.answer.RegionMatch`."""
+    """Selects the Gaussians whose code is close to that of the best region of a `query.match.RegionMatch`."""
     codes: Any = field.codes
     require(codes is not None, "field.codes", None, "codes", "Make the field with jsecon run --paper.")
     _, region, *scores = match

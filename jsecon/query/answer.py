@@ -17,8 +17,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import export
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from jsecon.errors import require
 from jsecon.field.columns import is_mapped
@@ -28,6 +27,8 @@ from jsecon.numerics import array_module, is_traced
 from jsecon.paper.queries import select_by_code
 from jsecon.programs import numpy_outside_traces, stored_jit
 from jsecon.query.match import (
+    NO_REGIONS,
+    RegionMatch,
     compare_words,
     join_fragments,
     regions_with,
@@ -36,30 +37,8 @@ from jsecon.query.match import (
     unrelated_words,
 )
 from jsecon.query.outliers import OutlierResult, split_outliers
-from jsecon.query.rules import ABSENT, ALL_OF_CLASS, FOUND, ONE_REGION, RULES, QueryRules
+from jsecon.query.rules import ABSENT, ALL_OF_CLASS, ONE_REGION, RULES, QueryRules
 from jsecon.types import Array, LanguageField, Selection, Votes
-
-
-class RegionMatch(NamedTuple):
-    """The regions of a field, R of them, that match a question."""
-
-    chosen: Bool[Array, " r"]
-    """Regions that match."""
-    region: Int[Array, ""]
-    """The best of them; -1 if there is none."""
-    score: Float[Array, ""]
-    """Similarity of the best region, whether it is chosen or not; 0 without regions."""
-    rank: Float[Array, ""] | np.ndarray = np.asarray(np.nan, np.float32)
-    """Share of unrelated words that match the scene less than the text does; NaN without such words."""
-    state: Int[Array, ""] | np.ndarray = np.asarray(FOUND, np.int32)
-    """Index of `rules.STATES`: whether the scene has what the text names."""
-
-
-export.register_namedtuple_serialization(RegionMatch, serialized_name="jsecon.RegionMatch")  # for `stored_jit`
-NO_REGIONS = RegionMatch(
-    np.zeros(0, bool), np.asarray(-1, np.int32), np.asarray(0.0, np.float32), state=np.asarray(ABSENT)
-)
-"""The match of a field without regions."""
 
 
 class _Answered(NamedTuple):

@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jax import export
 from jaxtyping import Bool, Float, Int, Shaped
 
 from jsecon.field.regions import mean_residuals
@@ -28,7 +29,7 @@ from jsecon.field.similarity import Number, similarities
 from jsecon.field.tree import node_members
 from jsecon.numerics import array_module, cosine_matrix, inline_jit, normalize
 from jsecon.programs import stored_jit
-from jsecon.query.rules import QueryRules
+from jsecon.query.rules import ABSENT, FOUND, QueryRules
 from jsecon.types import Array, LanguageField, Selection
 
 HEIGHT_WEIGHT = 0.5
@@ -43,6 +44,28 @@ def unrelated_words(field: LanguageField) -> Array | None:
     """Returns the unrelated words of a field (W, E), or None if it has none."""
     words = field.unrelated_words
     return words if words is not None and len(words) else None
+
+
+class RegionMatch(NamedTuple):
+    """The regions of a field, R of them, that match a question."""
+
+    chosen: Bool[Array, " r"]
+    """Regions that match."""
+    region: Int[Array, ""]
+    """The best of them; -1 if there is none."""
+    score: Float[Array, ""]
+    """Similarity of the best region, whether it is chosen or not; 0 without regions."""
+    rank: Float[Array, ""] | np.ndarray = np.asarray(np.nan, np.float32)
+    """Share of unrelated words that match the scene less than the text does; NaN without such words."""
+    state: Int[Array, ""] | np.ndarray = np.asarray(FOUND, np.int32)
+    """Index of `rules.STATES`: whether the scene has what the text names."""
+
+
+export.register_namedtuple_serialization(RegionMatch, serialized_name="jsecon.RegionMatch")  # for `stored_jit`
+NO_REGIONS = RegionMatch(
+    np.zeros(0, bool), np.asarray(-1, np.int32), np.asarray(0.0, np.float32), state=np.asarray(ABSENT)
+)
+"""The match of a field without regions."""
 
 
 class _TextScores(NamedTuple):
