@@ -2,7 +2,7 @@
 
 `choose_crops` chooses which views of each region are embedded: a few that show most of it, uncut, from different
 directions. An encoder needs a fifth of a second for each view (SigLIP 2, two cores), and the views of one object share
-most of its errors (docs/models.md).
+most of its errors (docs/results/vision.md).
 """
 
 from collections.abc import Callable, Iterator, Sequence
