@@ -159,7 +159,7 @@ def _seconds(call: Callable[[], Any]) -> float:
     """Seconds of a call, after one that is not counted.
 
     They are CPU seconds divided by the cores, so that other work on the machine counts little. Threads of ONNX Runtime
-    that wait take no CPU time here, and its graphs keep all cores busy.
+    that wait take no CPU time here, and its graphs, or the frames side by side, keep all cores busy.
     """
     call()
     started = time.process_time()

@@ -87,3 +87,5 @@ def test_frames_that_depth_aligns_need_no_proof_and_keep_it_where_no_time_is_lef
     alone, limited, whole = (refine_capture(moved(truth, 2.0, 1.0), max_fit_steps=n, **given) for n in (1.0, 1e9, None))
     assert off(np.float64(alone.cameras.world_to_camera), truth)[0] < 0.5
     assert same(whole, limited)
+    other = dataclasses.replace(truth, depths=1.25 * truth.depths)  # another unit
+    assert same(refine_capture(other, max_fit_steps=1.0, **given).cameras, truth.cameras)

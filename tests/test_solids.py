@@ -57,8 +57,7 @@ def test_the_primitive_and_the_volumes_are_those_of_the_thing(kind, lying):
 def test_a_flat_thing_has_a_thin_hull():
     means = np.random.default_rng(0).uniform(-1, 1, (50, 3)) * [1, 1, 0]
     shape = object_shapes(means, np.zeros(50, int), np.array([0, 0, 1.0]))[0]
-    for points in (means, means[:0]):
-        assert 0 < object_solid(points, shape).volume < 0.01
+    assert all(0 < object_solid(points, shape).volume < 0.01 for points in (means, means[:0]))
 
 
 def test_surfaces_are_those_of_the_pixels_that_show_an_object():

@@ -259,7 +259,7 @@ def inside_fraction_of_mapped(votes: Votes, regions: Sequence[int] | np.ndarray)
     chosen[regions] = True
 
     def add(rows: slice) -> None:
-        voted = np.flatnonzero(np.take(chosen, votes.regions[rows]))
+        voted = np.flatnonzero(np.take(chosen, votes.regions[rows], mode="wrap"))  # any further id is looked at below
         own = rows.start + np.unique(voted // places)
         fraction[own], known[own] = inside_fraction_of_regions(votes_of_rows(votes, own), regions)
 

@@ -236,7 +236,7 @@ def _associate_masks(
     if options.associated_by == "consensus":
         scene = SceneSuperpixels(gaussians, cameras, proposals, centre_pixel_weight=options.centre_pixel_weight)
         return track_masks(frames, scene, agreement=options.agreement, seed=options.seed, progress=progress)
-    if context.models.segmenter is not None:  # its masks are stored on disk, from which the tracker's order takes them
+    if context.models.segmenter is not None and options.proposals is None:  # it stores its masks
         proposals(0)  # opens the model once
         with ThreadPoolExecutor(min(cores(), VIEWS_AT_ONCE)) as pool:
             list(pool.map(lambda t: len(proposals(t)), range(len(frames))))

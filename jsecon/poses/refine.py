@@ -56,6 +56,8 @@ COARSE_PX, MIN_COARSE_SIZE = 100, 0.25
 MIN_GAIN_DB = 0.5
 """PSNR that corrections must gain on the frames kept aside. In the demo's room they gain 0.1 dB without errors,
 0.9 if poses are off by 3 mm and 0.15 degrees, and 2 to 3 at three times as much."""
+MAX_SPREAD = 0.08
+"""Largest change of the cameras' extent by depth, as a share. Rough poses of made-up rooms change it by 0.005."""
 MIN_ASIDE, MAX_ASIDE = 2, 8
 """Number of training frames kept aside for the decision, a third of all at most."""
 _STEP_COST_PIXELS, _STEP_COST_GAUSSIANS = 0.46, 0.072
@@ -221,10 +223,16 @@ def _with_notes(capture: Capture, *notes: str) -> Capture:
 
 
 def _align_by_depth(capture: Capture, train: Bool[np.ndarray, " t"], others: Bool[np.ndarray, " t"]) -> Capture | None:
-    """Aligns the training cameras to each other, then the others to them, in one world; None if it does not help."""
+    """Aligns the training cameras to each other, then the others to them, in one world; None if it does not help.
+
+    It does not either where it spreads the cameras or draws them together: the depth then has another unit.
+    """
     poses = np.asarray(capture.cameras.world_to_camera, np.float64)
     moved = align_cameras(capture, train)
     if moved is None:
+        return None
+    before, after = (cameras_extent(_with_poses(capture, each).cameras[train]) for each in (poses, moved))
+    if not abs(after - before) <= MAX_SPREAD * before:
         return None
     moved = moved @ _rigid_drift(moved[train], poses[train], cameras_extent(capture.cameras[train]))
     aligned = _with_poses(capture, moved)
