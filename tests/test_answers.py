@@ -57,7 +57,8 @@ def test_a_scene_is_exported_without_names_where_they_cannot_be_had(saved, tmp_p
 def test_a_selection_is_written_with_its_masks(saved, tmp_path):
     field, file = saved
     size = field.cameras.width, field.cameras.height
-    assert run_cli("query", file, "--box", "#0", 0, 0, *size, "--out", tmp_path, "--views", 1) == 0
+    cv2.imwrite(str(outline := tmp_path / "outline.png"), np.full(size[::-1], 255, np.uint8))
+    assert run_cli("query", file, "--mask", "#0", outline, "--out", tmp_path, "--views", 1) == 0
     told = json.loads(next(tmp_path.glob("*.json")).read_text())
     means = np.asarray(load_gaussians(tmp_path / told["ply"]).means, np.float64)
     assert len(means) == told["count"] > 0

@@ -2,6 +2,8 @@
 
 import json
 
+import cv2
+import numpy as np
 import pytest
 from capture_files import run_cli
 
@@ -39,9 +41,11 @@ def test_the_same_files_as_in_memory(room_run, tmp_path, forced, monkeypatch, ca
     assert blocks == memory
 
 
-@pytest.mark.parametrize("more", [("--box", "#1", 2, 2, 9, 9), ("the leftmost red",)])
-def test_what_needs_all_columns_at_once_is_refused(room_run, tmp_path, forced, capsys, more):
+@pytest.mark.parametrize("more", [("--mask", "#1", "mask.png"), ("the leftmost red",)])
+def test_what_needs_all_columns_at_once_is_refused(room_run, tmp_path, forced, capsys, monkeypatch, more):
     _, out = room_run
+    monkeypatch.chdir(tmp_path)
+    cv2.imwrite("mask.png", np.full((120, 160), 255, np.uint8))
     assert _query(out / "field.safetensors", tmp_path / "answers", *more) == 2
     message = capsys.readouterr().err
     assert ("an outline" if len(more) > 1 else "a relation") in message

@@ -145,6 +145,17 @@ def test_default_vision_finds_regions_by_itself(room, room_run, tmp_path):
     assert {stage.name for stage in found.steps} >= {"parts"}
 
 
+def test_a_tracker_without_a_model_follows_proposals_through_the_gaussians(room_run, tmp_path):
+    run, out = room_run
+    shutil.copytree(out / "cache", tmp_path / "out" / "cache")
+    found, console = again(run, tmp_path / "out", masks=None, tracker="geometric")
+    assert console.planned["objects"].why.endswith("followed through the Gaussians")
+    assert not console.fresh["gaussians"]
+    assert len(found.labels) == (~run.capture.held_out).sum()
+    assert found.labels.max() >= 10
+    assert found.field.tree is None
+
+
 def test_gaussians_of_another_world_are_refused(room_run, tmp_path):
     run, _ = room_run
     far = dataclasses.replace(run.field.gaussians, means=np.asarray(run.field.gaussians.means) + np.float32(1000))

@@ -56,7 +56,7 @@ def _write_changes(
         else:
             capture = load_capture(verb.photos, long_side=LONG_SIDE, holdout=0, progress=progress)
     with console.progress("changes"):
-        changes = scene.changes(capture, min_probability=verb.min_probability)
+        changes = scene.changes(capture)
     records = changes.records()
     for record in records:
         if record["kind"] not in ("same", "not seen"):
@@ -114,8 +114,8 @@ def _update(verb: verbs.Update, console: Console) -> verbs.VerbResult:
     with exclusive_lock(out), console.progress("write"):
         updated.save(path)
     if unsure := sum(change.kind == "unsure" for change in changes.found):
-        remedy = "more photographs, or a lower --min-probability, decide"
-        console.print_line(f"unsure  {unsure} of {len(changes.found)} objects stay as they were: {remedy}")
+        count = len(changes.found)
+        console.print_line(f"unsure  {unsure} of {count} objects stay as they were: more photographs decide")
     console.print_line(f"date    {date} ({origin})\nfield   {path}")
     return result | {"date": date, "written": {**result["written"], "field": path}}
 

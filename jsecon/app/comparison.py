@@ -12,7 +12,6 @@ import numpy as np
 
 from jsecon.app.catalogue import Catalogue
 from jsecon.app.records import rounded, source_points
-from jsecon.change import MIN_PROBABILITY
 from jsecon.change.detect import Change, object_changes
 from jsecon.change.history import add_objects, add_unseen, dates, move_object, remove_object
 from jsecon.errors import InputError
@@ -84,7 +83,7 @@ def _main_region(field: LanguageField, catalogue: Catalogue, index: int) -> int:
     return int(own[pixels.argmax()]) if len(own) else -1
 
 
-def find_changes(field: LanguageField, listed: Catalogue, capture: Capture, min_probability: float) -> Changes:
+def find_changes(field: LanguageField, listed: Catalogue, capture: Capture) -> Changes:
     """Compares a field with a capture whose poses are in the world of the field's own capture."""
     world = np.linalg.inv(np.asarray(field.source_from_scene, np.float64)) @ np.asarray(capture.source_from_scene)
     poses = transform_poses(np.asarray(capture.cameras.world_to_camera), world).astype(np.float32)
@@ -99,7 +98,7 @@ def find_changes(field: LanguageField, listed: Catalogue, capture: Capture, min_
     things = np.append(~listed.surroundings, False)
     labels = np.where(things[listed.labels], listed.labels, -1)
     up = np.array(field_up(field).axis)
-    found = object_changes(field.gaussians, labels, frames, cameras, depths, up=up, min_probability=min_probability)
+    found = object_changes(field.gaussians, labels, frames, cameras, depths, up=up)
     kept = [change for change in found if change.object < 0 or (labels == change.object).any()]
     capture = dataclasses.replace(capture, frames=frames, cameras=cameras, depths=depths)
     return Changes(field, listed, capture, tuple(kept))
@@ -163,7 +162,7 @@ def add_new_things(
     shown = {name: frame for name, frame in frames.items() if frame.depth is not None and frame.depth.any()}
     if not shown:
         return field, dict(frames)
-    changes = find_changes(field, listed(), frames_capture(field, shown), MIN_PROBABILITY)
+    changes = find_changes(field, listed(), frames_capture(field, shown))
     new = [change for change in changes.found if change.kind == "new" and change.frames]
     masked = {}
     for t, (name, frame) in enumerate(shown.items()):

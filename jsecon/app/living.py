@@ -14,7 +14,6 @@ from jsecon.field.ledger_file import remove_stale
 from jsecon.files import FIELD_FILE, exclusive_lock, remove_files
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console
-from jsecon.pipeline.stages import KEY_FILE
 
 
 def _add(verb: verbs.Add, console: Console) -> verbs.VerbResult:
@@ -72,9 +71,8 @@ def _remove_traces(folder: Path) -> list[str]:
 
     names = [name for name in (*FILES[1:], FIRST_VIEW) if (folder / name).is_file()]
     remove_files(folder, names)
-    cache = "cache/CACHEDIR.TAG"  # as of a run; beside it `jsecon demo` keeps pictures of its answers
-    marks = {"cache": cache, "queries": cache, "poses": f"poses/{KEY_FILE}"}
-    for place in [place for place, mark in marks.items() if (folder / mark).is_file() and (folder / place).is_dir()]:
+    mark = "cache/CACHEDIR.TAG"  # as of a run; beside it `jsecon demo` keeps pictures of its answers
+    for place in [place for place in ("cache", "queries") if (folder / mark).is_file() and (folder / place).is_dir()]:
         shutil.rmtree(folder / place)
         names.append(f"{place}/")
     return names

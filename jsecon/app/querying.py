@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from jsecon.app import pictures, report, verbs
-from jsecon.app.records import Answer, At, Box, Mask, Query, Question
+from jsecon.app.records import Answer, At, Mask, Query, Question
 from jsecon.app.scene import Scene, open_scene
 from jsecon.errors import InputError
 from jsecon.files import parse_json, remove_files, write_text
@@ -54,13 +54,12 @@ def _query(verb: verbs.Query, console: Console) -> verbs.VerbResult:
 
 
 def _queries(verb: verbs.Query) -> list[Query]:
-    """The queries of a command, in order: texts, pixels, masks and boxes; InputError for options that do not fit."""
+    """The queries of a command, in order: texts, pixels and masks; InputError for options that do not fit."""
     masks = [Mask(_frames_of(pairs)) for pairs in verb.mask]
-    boxes = [Box(*box) for box in verb.box]
-    questions: list[Question] = [*verb.texts, *(At(*at) for at in verb.at), *masks, *boxes]
+    questions: list[Question] = [*verb.texts, *(At(*at) for at in verb.at), *masks]
     if not questions:
         remedy = 'For example: jsecon query field.safetensors "red mug" --out answers'
-        raise InputError("query", "there is no query", "a TEXT, --at FRAME X Y, --mask or --box", remedy)
+        raise InputError("query", "there is no query", "a TEXT, --at FRAME X Y or --mask", remedy)
     relates = any(map(is_expression, verb.texts))
     if verb.from_frame is not None and not relates:
         remedy = 'For example: "the red mug left of the bottle" --from frame_00012'

@@ -25,7 +25,6 @@ from jsecon.app.comparison import Changes, add_new_things, apply_changes, find_c
 from jsecon.app.object_index import ObjectIndex, choose_shades
 from jsecon.app.opening import locate_field
 from jsecon.app.records import Answer, At, Box, Mask, Query, Question, Region, gaussian_rows, world_record
-from jsecon.change import MIN_PROBABILITY
 from jsecon.change.history import change_question, events, field_as_of
 from jsecon.errors import InputError
 from jsecon.field.columns import is_mapped
@@ -650,7 +649,7 @@ class Scene:
                 return self._catalogue
             return objects(self.field, vocabulary, self.embedder, up=self._up)
 
-    def changes(self, later: "Capture | Scene", *, min_probability: float = MIN_PROBABILITY) -> Changes:
+    def changes(self, later: "Capture | Scene") -> Changes:
         """Finds what became of each object, and what is new, in new photographs.
 
         An object is the same, moved, gone, of another look, unsure or not seen. Light, shadows and exposure are no
@@ -659,7 +658,6 @@ class Scene:
         Args:
           later: The photographs, with poses in the world of the field's own capture, and with depth if there is any; or
             a later scene of the same place, of the same world.
-          min_probability: Probability of what became of an object below which it is "unsure", and no change.
 
         Returns:
           The changes; `records()` has plain values.
@@ -671,7 +669,7 @@ class Scene:
             self._require_memory("a comparison")
             if isinstance(later, Scene):
                 later = splat_capture(self.field, later.field.gaussians, np.asarray(later.field.source_from_scene))
-            return find_changes(self.field, self._catalogue, later, min_probability)
+            return find_changes(self.field, self._catalogue, later)
 
     def update(self, changes: Capture | Changes, *, date: str) -> "Scene":
         """Applies what changed: objects move or are gone, and new ones come. Ids of regions stay.

@@ -10,7 +10,6 @@ from typing import Annotated, Any, ClassVar, Literal, TypeAlias, TypeVar, datacl
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from jsecon.change import MIN_PROBABILITY
 from jsecon.networks.hub import Role
 from jsecon.pipeline.options import (
     BareOptions,
@@ -191,7 +190,6 @@ class Query(_LevelVerb):
         shares of their width and height such as 0.25 0.5. A frame is named by its name, the end of its name, or its
         place such as #10.
       mask: Selects the object that a mask outlines in a frame, or masks in several frames. Black is outside.
-      box: Selects the regions that are seen by more than half in a box of a frame.
       out: Output folder.
       by: How a matching region selects Gaussians: by its votes, or by its code in a field of jsecon run --paper.
       threshold: Smallest similarity of a selected Gaussian. By default it is 0.5 for votes and 0.9 for code.
@@ -217,9 +215,6 @@ class Query(_LevelVerb):
         default_factory=list
     )
     mask: Annotated[Repeated[list[str]], arg(metavar="FRAME PNG ...")] = dataclasses.field(default_factory=list)
-    box: Annotated[Repeated[tuple[str, int, int, int, int]], arg(metavar="FRAME X0 Y0 X1 Y1"), Range(0, 100_000)] = (
-        dataclasses.field(default_factory=list)
-    )
     out: Option[Path] = Path("answers")
     from_frame: Annotated[Option[str | None], arg(name="from", metavar="FRAME")] = None
     up: Direction[Option[tuple[float, float, float] | None]] = None
@@ -346,11 +341,9 @@ class _ChangesVerb(_FieldVerb):
       photos: A capture with poses in the world of the field's own capture, with or without depth, in any format of
         jsecon run; photographs without poses, which are placed as by jsecon add; or, for jsecon changes, another file
         of Gaussians of the same place.
-      min_probability: Probability of what became of an object below which it is unsure, and no change.
     """
 
     photos: Positional[Path]
-    min_probability: Annotated[Option[float], Range(0, 1)] = MIN_PROBABILITY
 
 
 class Changes(_ChangesVerb):

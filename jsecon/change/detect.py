@@ -18,7 +18,6 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from scipy.spatial.transform import Rotation
 
-from jsecon.change import MIN_PROBABILITY
 from jsecon.change.compare import colour_cost, depth_cost, find_shift, fit_exposure, shifted
 from jsecon.errors import InputError, require_shape
 from jsecon.field.evidence import view_evidence
@@ -212,7 +211,7 @@ def object_changes(
     depths: Float[np.ndarray, "f h w"] | None = None,
     *,
     up: Float[np.ndarray, " 3"],
-    min_probability: float = MIN_PROBABILITY,
+    min_probability: float = 0.5,
 ) -> list[Change]:
     """Finds what became of each object of a scene, and what is new, in new photographs.
 
@@ -223,7 +222,7 @@ def object_changes(
       cameras: Batch of F cameras in the scene's world.
       depths: z-depth of the photographs, world units, 0 = unknown.
       up: Up axis of the scene's world, unit length.
-      min_probability: Probability of a kind below which it is "unsure".
+      min_probability: Probability of a kind below which it is "unsure": neither reported nor applied as a change.
 
     Returns:
       A change for each of the K objects, in order, then the new ones.

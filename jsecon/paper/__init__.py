@@ -11,6 +11,6 @@
 | one-step, canonical and GT-anchored queries            | `queries`                                |
 | DBSCAN                                                 | `query/outliers.remove_outliers`         |
 
-`jsecon run --association tracking --paper` takes this way; its codes follow from votes. experiments/tables/ours.py
+`jsecon run --tracker geometric --paper` takes this way; its codes follow from votes. experiments/tables/ours.py
 trains them.
 """

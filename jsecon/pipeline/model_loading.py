@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from jsecon.errors import InputError
 from jsecon.networks.hub import RECOMMENDED, HubModel, Role, parse_model
-from jsecon.pipeline.options import Options
+from jsecon.pipeline.options import GEOMETRIC, Options
 from jsecon.pipeline.sources import locate_sources
 from jsecon.types import LanguageField
 from jsecon.vision.protocols import Embedder, Models
@@ -42,7 +42,7 @@ def with_folders(options: Options) -> Options:
     for role in get_args(Role):
         choice = getattr(options, role)
         choice = recommended.get(role) if choice is None else choice
-        if choice is not None:
+        if choice not in (None, GEOMETRIC):
             models[role] = parse_model(choice, role)
     return dataclasses.replace(options, **_local_folders(models))
 
@@ -55,7 +55,7 @@ def open_models(options: Options, store: Path) -> Models:
 
         sam = SamSegmenter(Path(options.segmenter), level=options.level)
         segmenter = StoredSegmenter(sam, store / "proposals")
-    if options.tracker is not None:
+    if options.tracker not in (None, GEOMETRIC):
         from jsecon.networks.sam2 import Sam2Tracker
 
         tracker = Sam2Tracker(Path(options.tracker))

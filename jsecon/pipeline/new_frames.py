@@ -27,7 +27,7 @@ from jsecon.read.captures.images import decode_jpeg, encode_jpeg, read_image
 from jsecon.read.masks.masks import load_proposals
 from jsecon.splat.sh import C0
 from jsecon.types import Camera, Capture, LanguageField, Progress, Votes
-from jsecon.vision.classical import GRANULARITIES, ClassicalSegmenter
+from jsecon.vision.classical import ClassicalSegmenter
 from jsecon.vision.protocols import Embedder
 
 MIN_CORRELATION = 0.75
@@ -162,7 +162,7 @@ def make_views(
     `refuse` gets the error of each photograph that is unlike the scene.
     """
     options = parse_json(field.provenance).get("options", {})
-    propose = ClassicalSegmenter(**GRANULARITIES.get(options.get("granularity"), GRANULARITIES["medium"]))
+    propose = ClassicalSegmenter()
     if masks is not None:
         size = field.cameras.height, field.cameras.width
         read = load_proposals(masks, list(frames), size, level=options.get("level", "l"))[0]

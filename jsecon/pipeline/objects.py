@@ -1,6 +1,5 @@
 """The stages of objects: labels of the training frames, embeddings of the regions, votes, codes."""
 
-import dataclasses
 import functools
 import itertools
 import shutil
@@ -26,7 +25,7 @@ from jsecon.paper.autoencoder import encode, train_autoencoder
 from jsecon.paper.distill import distill_votes
 from jsecon.paper.tracker import GeometricTracker
 from jsecon.parallel import map_views
-from jsecon.pipeline.options import Options
+from jsecon.pipeline.options import GEOMETRIC, Options
 from jsecon.pipeline.stages import (
     CastVotes,
     ObjectLabels,
@@ -41,7 +40,7 @@ from jsecon.read.captures.frames import evenly_spaced
 from jsecon.read.masks.masks import load_labels, load_proposals
 from jsecon.types import Camera, Capture, Codes, Gaussians, Progress, Regions
 from jsecon.views.plan import LEAST_GAIN, frames_by_need
-from jsecon.vision.classical import GRANULARITIES, ClassicalSegmenter
+from jsecon.vision.classical import ClassicalSegmenter
 from jsecon.vision.protocols import Segmenter
 from jsecon.vision.surfaces import surfaces_from_depth
 
@@ -74,24 +73,23 @@ def _plan_labels(context: RunContext) -> Stage:
         how = f"proposals of level {options.level} by {model_name(options.segmenter or '', 'segmenter')}"
         key_options["model"] = models.segmenter.name
     else:
-        how = f"{options.granularity} proposals by colour and texture"
-        key_options |= context.key_options("granularity")
-    if consensus := options.associated_by == "consensus":
+        how = "proposals by colour and texture"
+    if options.tracker is None:
         how += ", what the views agree on"
-        key_options |= context.key_options("agreement", "seed", "centre_pixel_weight")
+        key_options |= context.key_options("seed", "centre_pixel_weight")
+    elif options.tracker == GEOMETRIC:
+        how += ", followed through the Gaussians"
     else:
-        by = "through the Gaussians" if options.tracker is None else f"by {model_name(options.tracker, 'tracker')}"
-        how += f", followed {by}"
+        how += f", followed by {model_name(options.tracker, 'tracker')}"
     if _chooses_frames(context):
         how += ", in the frames that show most of the scene"
     if options.vision_frames is not None:
         how += f", in at most {options.vision_frames} frames"
     if options.vision_minutes is not None:
         how += f", for {options.vision_minutes:g} minutes"
-    tracker = None if models.tracker is None else models.tracker.name
-    key_options |= {"association": options.associated_by, "tracker": tracker}
+    key_options["tracker"] = options.tracker if models.tracker is None else models.tracker.name
     after, files = ("load", "gaussians"), (options.proposals,)
-    return Stage("objects", how, _find_objects, after, key_options, files, distributed=consensus)
+    return Stage("objects", how, _find_objects, after, key_options, files, distributed=options.tracker is None)
 
 
 def _plan_regions(context: RunContext) -> list[Stage]:
@@ -100,7 +98,7 @@ def _plan_regions(context: RunContext) -> list[Stage]:
     how = f"embedded by {embedder!r} in at most {options.crops} views each, weighted by pixels"
     key_options = {"embedder": embedder} | context.key_options("crops")
     stages = [Stage("regions", how, _embed_objects, after=after, key_options=key_options, distributed=True)]
-    if options.masks is None and options.associated_by == "consensus":
+    if options.masks is None and options.tracker is None:
         how, after = f"parts of objects, in at most {min(options.crops, PART_CROPS)} views each", (*after, "regions")
         stages.append(Stage("parts", how, _embed_parts, after=after, key_options=key_options, distributed=True))
     return stages
@@ -120,7 +118,7 @@ def _plan_lifting(context: RunContext) -> list[Stage]:
 
 def _chooses_frames(context: RunContext) -> bool:
     """Whether a network finds masks in frames that are chosen by need: a tracker needs them evenly spaced."""
-    return context.models.segmenter is not None and context.options.associated_by == "consensus"
+    return context.models.segmenter is not None and context.options.tracker is None
 
 
 def _frames_of_vision(stage: StageInput) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -219,9 +217,10 @@ def _classical_segmenter(options: Options, view: _TrainingView) -> Segmenter:
         most = 100_000  # points whose normals are estimated
         cloud = points_from_depth(capture, voxel=spacing, max_points=most, stride=4)
         surfaces = surfaces_from_depth(depths, view.cameras, cloud.points)
-    segmenter = ClassicalSegmenter(**GRANULARITIES[options.granularity], surfaces=surfaces)
+    if options.tracker is None:
+        return ClassicalSegmenter(surfaces=surfaces)
     # A tracker follows each mask for itself: the same thing in two layers would be followed twice.
-    return segmenter if options.associated_by == "consensus" else dataclasses.replace(segmenter, layers=(1.0,))
+    return ClassicalSegmenter(surfaces=surfaces, layers=(1.0,))
 
 
 def _associate_masks(
@@ -233,9 +232,9 @@ def _associate_masks(
 ) -> Objects:
     """Associates proposals by consensus or by a tracker, which makes no tree."""
     options, frames, cameras = context.options, view.frames, view.cameras
-    if options.associated_by == "consensus":
+    if options.tracker is None:
         scene = SceneSuperpixels(gaussians, cameras, proposals, centre_pixel_weight=options.centre_pixel_weight)
-        return track_masks(frames, scene, agreement=options.agreement, seed=options.seed, progress=progress)
+        return track_masks(frames, scene, seed=options.seed, progress=progress)
     if context.models.segmenter is not None and options.proposals is None:  # it stores its masks
         proposals(0)  # opens the model once
         with ThreadPoolExecutor(min(cores(), VIEWS_AT_ONCE)) as pool:

@@ -17,6 +17,8 @@ from jsecon.errors import InputError, describe_error
 from jsecon.read.registry import SCENES
 
 T = TypeVar("T")
+GEOMETRIC = "geometric"
+"""the tracker that needs no model: it follows masks through the Gaussians"""
 
 
 def _default_hint(default: str) -> str:
@@ -165,20 +167,11 @@ class MaskOptions:
         generator, a COCO file of all frames, LangSplat's _s.npy, PNGs or .npy, named like the masks of --masks.
       ignore: What is no part of the scene, such as "person, screen": a segmenter and an embedder find it in each frame.
         Its pixels count nowhere, and OUT/masks has them in black, as nerfstudio and LichtFeld Studio read masks.
-      granularity: Without --masks, how large the objects are that jsecon finds by itself. Fine separates parts of
-        things.
-      association: How the proposals of the frames are brought together: what most views agree on (consensus), or
-        Algorithm 1 of the paper with a tracker through the Gaussians (tracking).
-      agreement: For consensus, share of the views that must put two things into one proposal, or all of them if one
-        leaves the other's surface. A lower share joins more.
     """
 
     masks: Option[Path | None] = None
     proposals: Option[Path | None] = None
     ignore: Option[str | None] = None
-    granularity: Option[Literal["fine", "medium"]] = "medium"
-    association: Option[Literal["consensus", "tracking"]] = "consensus"
-    agreement: Annotated[Option[float], Range(0, 1, above=True)] = 0.4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -191,8 +184,8 @@ class ModelOptions:
         hub:owner/name of huggingface.co, or a folder. `jsecon models list` has sizes and licences. A folder that is
         called like a model is written as a path: ./sam2.
       level: Level of SAM's proposals and of LangSplat's masks: subparts (s), parts (m), wholes (l), or all (default).
-      tracker: SAM 2 model that follows the proposals (Algorithm 1 of the paper), instead of consensus: a name (sam2,
-        edgetam), hub:owner/name, or a folder.
+      tracker: What follows the proposals (Algorithm 1 of the paper), instead of consensus: geometric, through the
+        Gaussians, or a SAM 2 model: a name (sam2, edgetam), hub:owner/name, or a folder.
       embedder: CLIP model for regions and texts, instead of colours: a name (clip, siglip2, mobileclip),
         hub:owner/name, or a folder.
       crops: Maximum number of views in which a region is embedded: those that show most of it, not cut off by the
@@ -241,11 +234,6 @@ class FieldOptions:
 @dataclasses.dataclass(frozen=True)
 class Options(FieldOptions, ModelOptions, MaskOptions, BareOptions, SceneOptions, InputOptions):
     """All that the result of a run depends on, except for the content of its files."""
-
-    @property
-    def associated_by(self) -> Literal["consensus", "tracking"]:
-        """How masks are associated over the frames: by tracking with a tracker, else by `association`."""
-        return self.association if self.tracker is None else "tracking"
 
 
 def is_bare_scene(capture: Path) -> bool:

@@ -31,7 +31,6 @@ from jsecon.pipeline.scene import plan_scene
 from jsecon.pipeline.scene_files import read_scene
 from jsecon.pipeline.sources import provenance
 from jsecon.pipeline.stages import (
-    KEY_FILE,
     WARNING,
     Checkpoint,
     Results,
@@ -64,8 +63,6 @@ class _RunState:
     """Key of each stage."""
     paths: dict[str, Path]
     """Cache file of each stage."""
-    stale: list[str]
-    """Stages whose result is stored and whose output folder is another run's."""
     steps: list[Step]
     """Stages, and what was skipped."""
     results: Results = dataclasses.field(default_factory=Results)
@@ -123,11 +120,10 @@ def _plan(context: RunContext, stage_list: list[Stage]) -> _RunState:
     for stage in stage_list:
         keys[stage.name] = stage.key(keys, context.out)
     paths = {name: context.out / "cache" / f"{name}-{key}.safetensors" for name, key in keys.items()}
-    stale = [stage.name for stage in stage_list if not _owns_output(stage, stage_list, paths)]
-    cached = {name for name, path in paths.items() if path.exists() and name not in stale}
-    steps = [Step(stage.name, "cached" if stage.name in cached else "run", stage.how) for stage in stage_list]
+    status = {name: "cached" if path.exists() else "run" for name, path in paths.items()}
+    steps = [Step(stage.name, status[stage.name], stage.how) for stage in stage_list]
     steps += [Step(part, "skipped", why) for stage in stage_list for part, why in stage.skipped.items()]
-    return _RunState(keys, paths, stale, steps)
+    return _RunState(keys, paths, steps)
 
 
 def _require_inputs(options: Options) -> None:
@@ -176,16 +172,6 @@ def _require_own_folder(options: Options, out: Path) -> None:
                 raise InputError(out, problem, "", remedy)
 
 
-def _owns_output(stage: Stage, stage_list: list[Stage], paths: dict[str, Path]) -> bool:
-    """Whether a stage's output folder still belongs to it, or no later stage will read it."""
-    if stage.output_dir is None:
-        return True
-    file = stage.output_dir / KEY_FILE
-    if file.is_file() and file.read_text() == Checkpoint(paths[stage.name]).folder.name:
-        return True
-    return all(paths[other.name].exists() for other in stage_list if stage.name in other.after)
-
-
 def _compute_stages(
     context: RunContext,
     stage_list: list[Stage],
@@ -202,8 +188,6 @@ def _compute_stages(
         require_writable(context.out)
     with exclusive_lock(context.out):
         cache.prepare(context.out / "cache")
-        for name in state.stale:
-            state.paths[name].unlink(missing_ok=True)
         console.print_line(f"{context.options.capture} -> {context.out}")
         for step in state.steps:
             console.step(step)
@@ -402,7 +386,7 @@ def _check_inputs(context: RunContext, plan: _RunState) -> None:
     if "poses" in running:
         require_pycolmap(options.capture)
         return
-    folder = context.out / "poses" if "poses" in plan.paths else options.capture
+    folder = plan.paths["poses"].with_suffix("") if "poses" in plan.paths else options.capture
     of_frames = FrameOptions(long_side=options.long_side, frames=options.frames, holdout=options.holdout)
     frames, (width, height), held_out = plan_frames(read_posed_images(folder), of_frames)
     train = training_frames(held_out)

@@ -16,13 +16,12 @@ import jax
 import numpy as np
 
 from jsecon.errors import InputError
-from jsecon.files import write_text
 from jsecon.fit.quality import QUICK_LONG_SIDE, is_weak, measure_quality
 from jsecon.fit.start import starting_gaussians
 from jsecon.pipeline.ignoring import ignore_named
 from jsecon.pipeline.options import Options, is_bare_scene
 from jsecon.pipeline.scene_files import check_overlap, fit_background, place_in_capture, read_scene, with_points
-from jsecon.pipeline.stages import KEY_FILE, WARNING, RunContext, Stage, StageInput, StageResult, training_frames
+from jsecon.pipeline.stages import WARNING, RunContext, Stage, StageInput, StageResult, training_frames
 from jsecon.poses.sfm import find_poses
 from jsecon.read.captures.capture import has_depth, load_capture, read_posed_images, unposed_photographs
 from jsecon.read.captures.frames import (
@@ -76,12 +75,11 @@ def plan_capture(context: RunContext) -> list[Stage]:
         return [_plan_load(context, capture)]
     key_options |= context.key_options("panoramas")
     how = f"found by structure from motion (pycolmap) for {what}"
-    folder = context.out / "poses"
     if context.options.points is not None:
         problem = "the photographs have no poses, so no world that the points could be in"
         raise InputError("--points", problem, "", "Give a capture with poses in the world of the points.")
-    poses = Stage("poses", how, _estimate_poses, key_options=key_options, files=tuple(files), output_dir=folder)
-    return [poses, dataclasses.replace(_plan_load(context, folder), after=("poses",), files=())]
+    poses = Stage("poses", how, _estimate_poses, key_options=key_options, files=tuple(files))
+    return [poses, dataclasses.replace(_plan_load(context, None), after=("poses",))]
 
 
 def _frames_of_video(options: Options) -> tuple[int, bool]:
@@ -90,8 +88,11 @@ def _frames_of_video(options: Options) -> tuple[int, bool]:
     return options.frames or DEFAULT_VIDEO_FRAMES // (3 if is_round else 1), is_round
 
 
-def _plan_load(context: RunContext, capture: Path) -> Stage:
-    """Plans the frames at the size that the options ask for, corrected if they ask for that."""
+def _plan_load(context: RunContext, capture: Path | None) -> Stage:
+    """Plans the frames at the size that the options ask for, corrected if they ask for that.
+
+    The capture is None if its poses are yet to be found.
+    """
     options = context.options
     key_options = context.key_options("long_side", "frames", "holdout")
     count = "all frames" if options.frames is None else f"at most {options.frames} frames"
@@ -166,9 +167,9 @@ def _plan_gaussians(context: RunContext) -> Stage:
 
 
 def _estimate_poses(stage: StageInput) -> StageResult:
-    """Finds the poses of photographs or of a video's frames, and writes them as a COLMAP capture to OUT/poses."""
+    """Finds the poses of photographs or of a video's frames; the result names their COLMAP capture in OUT/cache."""
     context, folder = stage.context, stage.checkpoint.folder
-    capture, out = context.options.capture, context.out / "poses"
+    capture, out = context.options.capture, folder.with_suffix("")
     video, declared = is_video(capture), context.options.panoramas
     if video:
         frames, declared = _frames_of_video(context.options)
@@ -182,23 +183,23 @@ def _estimate_poses(stage: StageInput) -> StageResult:
         (folder / "frames").rename(posed / "images")
     shutil.rmtree(out, ignore_errors=True)
     shutil.move(posed, out)
-    write_text(out / KEY_FILE, folder.name)
-    return StageResult(None, (*found, *hints, *notes, f"The poses are in {out}: COLMAP opens them."))
+    return StageResult(out.name, (*found, *hints, *notes, f"The poses are in {out}: COLMAP opens them."))
 
 
-def _refinement(options: Options, capture: Path) -> str:
+def _refinement(options: Options, capture: Path | None) -> str:
     """When a run corrects poses and exposures: "auto" only if depth and the data can still decide it."""
     if options.refine != "auto":
         return options.refine
     if options.gaussians is not None:  # they belong to the poses as they are
         return "never"
-    return "auto" if has_depth(capture) else "never"
+    return "auto" if capture is not None and has_depth(capture) else "never"
 
 
 def _load_frames(stage: StageInput) -> StageResult:
-    """Loads the capture, in OUT/poses if its poses were estimated, and corrects it as the options ask."""
+    """Loads the capture, in OUT/cache if its poses were estimated, and corrects it as the options ask."""
     options, sizes = stage.context.options, stage.context.key_options("long_side", "frames", "holdout")
-    folder = stage.context.out / "poses" if hasattr(stage.results, "poses") else options.capture
+    poses = stage.results.poses
+    folder = options.capture if poses is None else stage.context.out / "cache" / poses
     capture = load_capture(folder, **sizes, progress=stage.progress)
     if options.points is not None:
         capture = with_points(capture, options.points, stage.progress)

@@ -43,7 +43,7 @@ def provenance(options: Options, keys: dict[str, str], embedder: str, out: Path,
     """Writes where the field of a run comes from, and what the run warned of."""
     values = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
     folders = {name: getattr(options, name) for name in ("segmenter", "tracker", "embedder")}
-    addresses = {name: cached_address(folder) for name, folder in folders.items() if folder is not None}
+    addresses = {name: cached_address(folder) for name, folder in folders.items() if isinstance(folder, Path)}
     models = {name: address for name, address in addresses.items() if address is not None}
     origin = {"jsecon": jsecon.__version__, "options": values | models, "keys": keys, "embedder": embedder}
     origin |= {"folders": _relative_folders(options, out), "models": models, "warnings": list(warnings)}

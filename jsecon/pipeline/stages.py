@@ -40,8 +40,6 @@ CHECKPOINT_SECONDS = 20.0
 """s between two checkpoints of a stage; a stop loses at most this and one chunk of steps"""
 WARNING = "WARNING: "
 """begins a note on what makes answers wrong"""
-KEY_FILE = "made_by.txt"
-"""file with the name and key of a stage, in the folder that the stage writes beside its result"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,8 +89,8 @@ class Results:
     """codes of the paper, if the options ask for them"""
     held_out: Quality = Quality(np.zeros(0, int), np.zeros(0), np.zeros(0))
     """PSNR and SSIM of the held-out frames; of no frame for a scene without photographs"""
-    poses: Any
-    """None: structure from motion writes its poses to OUT/poses"""
+    poses: str | None = None
+    """name of the folder in OUT/cache with the capture of photographs that came without poses"""
 
     def __init__(self, **results: Any):
         vars(self).update(results)
@@ -183,9 +181,6 @@ class Stage:
     """Parts that the options make needless, each with the reason."""
     distributed: bool = False
     """Whether several processes compute it together, each a part of the views."""
-    output_dir: Path | None = None
-    """Folder that it writes for later stages, with its key in KEY_FILE; it runs again if another run wrote that
-    folder."""
 
     def key(self, keys: Mapping[str, str], out: Path) -> str:
         """Hashes all that the result depends on; of the input files, but for those in `out`, names, sizes and times."""

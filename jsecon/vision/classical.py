@@ -6,7 +6,6 @@ The frame is smoothed, cut into small regions that follow its edges (graph segme
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import cv2
 import numpy as np
@@ -15,12 +14,6 @@ from jaxtyping import Bool, Float32, Int32, UInt8
 from jsecon.errors import InputError, require, require_shape
 from jsecon.vision.region_graph import merge_regions
 from jsecon.vision.surfaces import Surface
-
-GRANULARITIES: dict[str, dict[str, Any]] = {
-    "fine": {"merge_distance": 10.0},
-    "medium": {"merge_distance": 16.0},
-}
-"""Settings of ClassicalSegmenter by the size of its regions."""
 
 
 def require_contrib() -> None:

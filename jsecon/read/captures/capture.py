@@ -246,7 +246,7 @@ def _no_capture(path: Path) -> InputError:
         remedy = "Give the folder of the capture, its transforms file (.json), or the video."
     elif photos := unposed_photographs(path)[0]:
         problem, expected = f"{len(photos)} photographs without poses", "a capture with poses"
-        remedy = "Find their poses first: jsecon run does so (extra sfm), and keeps them in OUT/poses as a capture."
+        remedy = "Find their poses first: jsecon run does so (extra sfm), and keeps them in OUT/cache as a capture."
     elif not entries:
         problem, remedy = "an empty folder", "Copy the capture there, or check the path."
     elif captures := _inner_captures(path):
