@@ -152,7 +152,7 @@ def compare(
         points = true_points(item)
         boxes.append(box_iou(catalogue.shapes.low[row], catalogue.shapes.high[row], points))
         if item.name:
-            named.append(catalogue.names[row, 0] == item.colour)
+            named.append(catalogue.names[row] == item.colour)
     share, centre, grasp = located(field, room)
     return dict(
         objects=int(seen.sum()),

@@ -26,7 +26,7 @@ from experiments.rooms.shapes import SHAPES
 from jsecon import Scene
 from jsecon.field.regions import region_embeddings
 from jsecon.numerics import cosine_matrix
-from jsecon.types import Gaussians, LanguageField, Votes
+from jsecon.types import Gaussians, LanguageField, UpAxis, Votes
 from jsecon.vision.colours import BASIC, PALETTE, VOCABULARY, ColourEmbedder
 
 COLOURS = "red orange yellow green blue purple pink brown turquoise teal cyan magenta violet olive navy maroon"
@@ -126,9 +126,9 @@ def ask_room(seed: int, options: Options, embedder: ColourEmbedder) -> dict[str,
     names = sorted({name for name, seen in zip(room.names, visible) if seen})
     bare = [basic for basic in BASIC if not any(name.split()[0] == basic for name in room.names)]
     shades = [basic for basic in bare if any(shade in name for name in names for shade in embedder.narrower(basic))]
-    scene = Scene(field, embedder, up=(0, 0, 1))
+    scene = Scene(dataclasses.replace(field, up=UpAxis((0.0, 0.0, 1.0), "the room")), embedder)
     listed = scene.objects()
-    sure = [str(name) for name, share in zip(listed.names[:, 0], listed.probability[:, 0]) if share >= 0.5]
+    sure = [str(name) for name, share in zip(listed.names, listed.probability) if share >= 0.5]
     asked = {"present": names, "absent": absent_colours(room.names, embedder), "by shades": shades, "rows": sure}
     return {kind: [(text, scene.ask(text).state) for text in texts] for kind, texts in asked.items()}
 

@@ -1,7 +1,6 @@
 """Public names of `jsecon`, and the module of each."""
 
 from .app.catalogue import Catalogue as Catalogue, objects as objects
-from .app.pictures import to_html as to_html
 from .app.records import (
     Answer as Answer,
     At as At,

@@ -49,15 +49,6 @@ def record(cls):
     return cls
 
 
-class _Shown:
-    """What a notebook shows as a picture and a line: they are drawn when it asks for them, by `jsecon.to_html`."""
-
-    def _repr_html_(self) -> str:
-        import jsecon
-
-        return jsecon.to_html(self)  # pyright: ignore[reportArgumentType]
-
-
 @record
 class Gaussians:
     """A scene of N anisotropic 3D Gaussians (Kerbl et al. 2023), stored before their activations."""
@@ -148,11 +139,11 @@ class UpAxis:
 
     def __str__(self) -> str:
         """Its evidence, and whether that is sure."""
-        return f"{self.evidence}{'' if self.sure else ' (not sure: --up X Y Z sets it)'}"
+        return f"{self.evidence}{'' if self.sure else ' (not sure: jsecon run --up X Y Z sets it)'}"
 
 
 @record
-class Capture(_Shown):
+class Capture:
     """A posed set of frames, as every loader returns it. Arrays are NumPy on the host."""
 
     frames: Array
@@ -320,7 +311,7 @@ class _Texts(tuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class LanguageField(_Shown):
+class LanguageField:
     """Everything a query needs, in one file: the scene, its votes, its regions, and where they came from.
 
     jit compiles once for all fields of the same shapes. So a field has no names, embedder and provenance inside of a

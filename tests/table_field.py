@@ -10,7 +10,7 @@ from conftest import gaussians_at
 from small_field import lone_votes
 
 from experiments.rooms.capture import look_at
-from jsecon.types import Camera, LanguageField, Regions
+from jsecon.types import Camera, LanguageField, Regions, UpAxis
 from jsecon.vision.colours import ColourEmbedder
 
 THINGS = (
@@ -22,9 +22,11 @@ THINGS = (
     ("dark blue box", (0.0, 0.6, 0.1), (0.2, 0.1, 0.1)),
 )
 """name, middle and half size, m"""
+UP = UpAxis((0.0, 0.0, 1.0), "what the test says")
+"""up of the table, which one camera that looks down does not tell"""
 
 
-def table_field(things=THINGS, *, source_from_scene=None, directions=((0.0, -2.0, 0.8),)):
+def table_field(things=THINGS, *, source_from_scene=None, directions=((0.0, -2.0, 0.8),), up=None):
     """(field, embedder). The cameras stand at `directions` and look at the origin."""
     draw = np.random.default_rng(3)
     embedder = ColourEmbedder()
@@ -46,6 +48,7 @@ def table_field(things=THINGS, *, source_from_scene=None, directions=((0.0, -2.0
         source_from_scene=np.eye(4) if source_from_scene is None else source_from_scene,
         names=tuple(f"frame_{t}" for t in range(len(directions))),
         embedder=embedder.name,
+        up=up,
         unrelated_words=np.asarray(embedder.unrelated_words, np.float16),
     )
     return field, embedder

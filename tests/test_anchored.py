@@ -63,7 +63,7 @@ def test_a_region_has_the_same_members_however_it_is_asked_for(made):
         for way, selection in {
             "number": query_region(field, region),
             "pixel": under[region],
-            "--all": query_several(field, text[None]),
+            "all": query_several(field, text[None]),
             "one": query_several(field, text[None], rules=QueryRules()),
             "but not": others,
         }.items():
@@ -165,7 +165,13 @@ def test_broken_texts_and_regions_select_nothing(field):
 
 @pytest.mark.parametrize(
     ("frame", "x", "y", "match"),
-    [(4, 0, 0, "0 to 3"), (-1, 0, 0, "0 to 3"), (0, 48, 0, "0 to 47"), (0, 0, 40, "0 to 39"), (0, -1, 0, "0 to 47")],
+    [
+        (4, 0, 0, "#0 to #3"),
+        (-1, 0, 0, "#0 to #3"),
+        (0, 48, 0, "0 to 47"),
+        (0, 0, 40, "0 to 39"),
+        (0, -1, 0, "0 to 47"),
+    ],
 )
 def test_pixels_that_are_not_there_are_told(field, frame, x, y, match):
     with pytest.raises(InputError, match=match):

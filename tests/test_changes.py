@@ -19,6 +19,7 @@ from jsecon.app.scene import open_scene
 from jsecon.app.server import application
 from jsecon.change.compare import depth_cost
 from jsecon.change.detect import object_changes
+from jsecon.change.history import events
 from jsecon.field.evidence import pack_evidence, view_evidence
 from jsecon.field.ledger import Ledger, LedgerView, add_views, camera_row
 from jsecon.field.ledger_file import save_with_ledger
@@ -129,7 +130,7 @@ def test_an_updated_field_answers_as_things_are_now_and_as_they_were(eyes, tmp_p
     assert sorted(rows) == [["gone", "blue"], ["moved", "red"], ["new", ""], ["same", "green"]]
     assert "moved red (object" in (tmp_path / "new" / "changes.html").read_text()
     new = Scene(load_field(tmp_path / "new" / "field.safetensors"), embedder)
-    assert [(event["kind"], event["region"]) for event in new.history()] == [("moved", 0), ("gone", 1), ("new", 3)]
+    assert [(event["kind"], event["region"]) for event in events(new.field)] == [("moved", 0), ("gone", 1), ("new", 3)]
     np.testing.assert_allclose(new.ask("red").place.center[:2], (-0.1, -0.05), atol=0.03)
     assert old.ask("blue").mask.any()
     assert not new.ask("blue").mask.any()
@@ -179,7 +180,12 @@ def test_frames_are_added_and_forgotten_after_an_update_and_it_is_updated_again(
         assert not scene.ask("blue").mask.any()
     day3 = dataclasses.replace(day2, frames=photographs(later, eyes), names=("h", "i", "j"))
     last = grown.update(day3, date="2026-11-03")
-    assert [(e["kind"], e["region"]) for e in last.history()] == [("moved", 0), ("gone", 1), ("new", 3), ("moved", 2)]
+    assert [(e["kind"], e["region"]) for e in events(last.field)] == [
+        ("moved", 0),
+        ("gone", 1),
+        ("new", 3),
+        ("moved", 2),
+    ]
     np.testing.assert_allclose(last.ask("green").place.center[:2], (0.35, 0.3), atol=0.03)
     assert [change.kind for change in updated.changes(last).found if change.kind != "same"] == ["moved"]
     then = Scene(dataclasses.replace(last.field, provenance='{"date": "2026-11-01"}'), last.embedder).as_of(

@@ -204,7 +204,7 @@ def test_a_function_takes_the_ends_of_its_input(name, end):
 def test_the_table_has_every_pure_function():
     """Those that are left out read or write files, print, or are called in the row of another."""
     others = {
-        *("objects", "locate", "to_html", "open_scene", "check_backend", "host_mesh", "render_plan", "encode"),
+        *("objects", "locate", "open_scene", "check_backend", "host_mesh", "render_plan", "encode"),
         *("check_field", "load_field", "save_field", "load_capture", "load_gaussians", "save_gaussians"),
         "select_gaussians",
     }

@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 from capture_files import run_cli
 from hypothesis import given, settings, strategies as st
-from table_field import THINGS, table_field
+from table_field import THINGS, UP, table_field
 
-import jsecon
 from jsecon import InputError, ObjectShapes, Regions, Scene, open_scene, save_field
-from jsecon.app import cli
 from jsecon.query.expressions import ANCHORED_ORDERS, RELATIONS
 from jsecon.query.relations import Viewpoint, between_scores, order_values, pair_scores
 
@@ -111,7 +109,7 @@ def test_predicates_are_batched():
 
 @pytest.fixture(scope="module")
 def scene():
-    return Scene(*table_field(), up=(0, 0, 1))  # one camera that looks down does not tell
+    return Scene(*table_field(up=UP))
 
 
 def test_any_object_has_its_name_in_the_answer(scene):
@@ -131,8 +129,8 @@ def test_metres_need_a_scene_in_metres(scene):
     for text in ("the red mug within 1 m of the dark blue box", "red mugs at least 30 cm from the orange ball"):
         with pytest.raises(InputError, match="in metres is not known"):
             scene.ask(text)
-    field, embedder = table_field(source_from_scene=np.diag([4.0, 4.0, 4.0, 1.0]))
-    known = Scene(dataclasses.replace(field, metres_per_unit=0.5), embedder, up=(0, 0, 1))
+    field, embedder = table_field(source_from_scene=np.diag([4.0, 4.0, 4.0, 1.0]), up=UP)
+    known = Scene(dataclasses.replace(field, metres_per_unit=0.5), embedder)
     near = {cm: known.ask(f"red mugs within {cm} cm of the dark blue box").count for cm in (20, 95, 400)}
     assert near == {20: 0, 95: 1, 400: 2}
 
@@ -169,7 +167,7 @@ def test_one_object_and_what_it_was_compared_with(scene):
 
 
 def test_an_open_question_is_asked_and_a_near_miss_is_named(scene):
-    assert scene.relate("the red mug").question.startswith("2 'red mug': ")
+    assert scene.relate("the red mug").question.startswith("which of 2 'red mug' is meant, from left")
     for text, reason in (
         ("the orange ball on the dark blue box", "not on dark blue box"),
         ("the pink vase on the white plate", "'pink"),
@@ -183,7 +181,6 @@ def test_directions_follow_the_frame_and_cameras_around_take_the_fullest_frame()
     field, embedder = table_field(directions=around)
     scene = Scene(field, embedder)
     np.testing.assert_allclose(scene.objects().up, [0, 0, 1], atol=1e-3)
-    np.testing.assert_allclose(jsecon.objects(field, None, embedder, up=(0, 2, 0)).up, [0, 1, 0], atol=1e-9)
     text = "the red mug left of the dark green bottle"
     for frame, region in (("frame_0", 0), ("frame_1", 1)):
         answer = scene.relate(text, frame=frame)
@@ -199,7 +196,6 @@ def test_measures_are_in_the_captures_world():
     told = Scene(field, embedder).measure("the leftmost red mug", "the dark green bottle")
     assert told["centers"] == pytest.approx(2 * np.hypot(0.5, 0.1), rel=0.05)
     assert told["surfaces"] == pytest.approx(2 * 0.41, rel=0.08)
-    assert told["gap"] == pytest.approx(2 * 0.41, rel=0.1)
     assert told["angle"] == pytest.approx(np.degrees(np.arctan2(0.1, 0.5)), abs=2)
     with pytest.raises(InputError, match="names 2 objects"):
         Scene(field, embedder).measure("the red mug", "the dark green bottle")
@@ -226,22 +222,20 @@ def test_a_known_length_gives_metres_which_the_field_keeps(tmp_path, capsys):
 
 def test_a_length_is_that_of_the_thing_that_a_query_selects():
     """A cloth is nearly white: "white plate" names the plate, which matches best, for a query and for a length."""
-    field, embedder = table_field((*THINGS, ("white cloth", (0.3, 0.6, 0.01), (0.1, 0.1, 0.01))))
+    field, embedder = table_field((*THINGS, ("white cloth", (0.3, 0.6, 0.01), (0.1, 0.1, 0.01))), up=UP)
     rows = np.array(field.regions.embeddings)
     rows[6] = 0.7 * rows[3] + 0.3 * np.asarray(embedder.embed_text(["light yellow"]))[0]
     rows[6] /= np.linalg.norm(rows[6])
     regions = Regions(rows, field.regions.pixel_counts)
-    scene = Scene(dataclasses.replace(field, regions=regions), embedder, up=(0, 0, 1))
+    scene = Scene(dataclasses.replace(field, regions=regions), embedder)
     assert scene.ask("white plate").count == 1
     assert scene.relate("white plate").count == 2
     assert scene.measure("white plate", "orange ball")["centers"] == pytest.approx(0.06, abs=0.01)
-    with pytest.raises(InputError, match="the left one at"):  # two that match alike
+    with pytest.raises(InputError, match="names 2 objects"):  # two that match alike
         scene.measure("red mug", "orange ball")
 
 
 def test_odd_input_has_an_error_of_its_own(scene):
-    with pytest.raises(InputError, match="is no direction"):
-        Scene(*table_field(), up=(0, 0, 0)).ask("the leftmost red mug")
     field, embedder = table_field()
     none = Regions(np.zeros((0, embedder.dim), np.float32), np.zeros((0, 1), np.int32))
     with pytest.raises(InputError, match="no regions"):
@@ -252,7 +246,7 @@ def test_odd_input_has_an_error_of_its_own(scene):
 
 def test_everything_on_a_thing_and_on_that_is_added():
     tray = ("purple tray", (0.0, -0.5, -0.01), (0.2, 0.2, 0.01))
-    scene = Scene(*table_field((*THINGS, tray)), up=(0, 0, 1))
+    scene = Scene(*table_field((*THINGS, tray), up=UP))
     tray, plate, ball = (scene.ask(name).mask for name in ("purple tray", "white plate", "orange ball"))
     answer = scene.ask("the purple tray with everything on it")
     np.testing.assert_array_equal(answer.mask, tray | plate | ball)
@@ -263,11 +257,3 @@ def test_everything_on_a_thing_and_on_that_is_added():
     np.testing.assert_array_equal(alone.mask, scene.ask("dark blue box").mask)
     with pytest.raises(InputError, match="names no object"):
         scene.ask("everything on it")
-
-
-def test_options_of_relations_need_one_in_a_text(tmp_path, capsys):
-    save_field(tmp_path / "field.safetensors", table_field()[0])
-    asked = ["query", str(tmp_path / "field.safetensors"), "red mug", "--out", str(tmp_path / "out")]
-    for option in (["--from", "frame_0"], ["--up", "0", "0", "1"]):
-        assert cli.main([*asked, *option]) == 2
-        assert f"{option[0]}: no text has a relation" in capsys.readouterr().err

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 from browser import CHROMIUM, driven
-from capture_files import small_capture
 
-from jsecon.app import pictures, report
+from jsecon.app import report
+from jsecon.app.exports import _crop
 
 
 class _Reader(HTMLParser):
@@ -42,6 +42,11 @@ def page():
     cards = report.grid(report.card(_image(), name, "words", view) for name in ("red <mug>", "blue mug"))
     table = report.table(["a", "<b>fit</b>"], [[1, "<script>"]])
     return report.page("A <title> & more", "lead", [report.section("Frames", "words", figures), cards, table])
+
+
+def picture(page, kind):
+    data = re.search(rf'src="data:image/{kind};base64,([^"]+)"', page).group(1)
+    return cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
 
 
 def test_the_page_is_well_formed_and_holds_all_it_shows_and_words_from_outside_are_escaped(page):
@@ -81,31 +86,10 @@ def test_in_a_browser_pictures_are_enlarged_and_cards_open(page, tmp_path):
 
 
 def test_a_picture_is_cut_to_a_mask():
-    np.testing.assert_array_equal(pictures.crop(_image(), np.zeros((24, 32), bool)), _image())
+    np.testing.assert_array_equal(_crop(_image(), np.zeros((24, 32), bool)), _image())
     mask = np.zeros((240, 320), bool)
     mask[100:150, 200:220] = True
     rows, columns = np.mgrid[:240, :320]
-    part = pictures.crop(np.stack([rows, columns, mask], axis=-1).astype(np.uint8), mask)
+    part = _crop(np.stack([rows, columns, mask], axis=-1).astype(np.uint8), mask)
     assert part[..., 2].sum() == mask.sum()
     assert part[..., 2].mean() > 0.15
-
-
-# What a notebook shows
-
-
-def picture(page, kind="jpeg"):
-    data = re.search(rf'src="data:image/{kind};base64,([^"]+)"', page).group(1)
-    return cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
-
-
-def test_a_field_shows_its_first_view_and_its_regions(field):
-    image = picture(field._repr_html_())
-    assert image.shape == (40, 96, 3)
-    assert image[:, :48].std() > 3
-    assert np.abs(image[:, :48].astype(int) - image[:, 48:]).mean() > 3  # colours and regions are not the same picture
-
-
-def test_a_capture_shows_a_few_small_frames():
-    page = small_capture(4, 480, 400)._repr_html_()
-    assert "Capture of 4 frames of 480x400, 0 held out, 50 sparse points<" in page
-    assert picture(page).shape == (200, 4 * 240, 3)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from table_field import table_field
 
 from jsecon import At, load_field, save_field
-from jsecon.app.scene import Scene
+from jsecon.app.scene import Scene, _pixel_of
 from jsecon.errors import InputError
 from jsecon.types import Camera, UpAxis
 from jsecon.views.frame import _up_of_cameras, find_up_axis
@@ -90,7 +90,7 @@ def test_answers_about_a_table_are_the_same_from_rolled_cameras(name):
     scene = Scene(field, embedder)
     answer = scene.ask("the orange ball on the white plate")
     assert answer.count == 1
-    assert "up is from the cameras, with their roll taken out (not sure: --up" in str(answer)
+    assert "up is from the cameras, with their roll taken out (not sure: jsecon run --up" in str(answer)
     assert answer.as_dict()["relation"]["up"]["axis"] == pytest.approx([0, 0, 1], abs=0.08)
     assert scene.objects().up == pytest.approx([0, 0, 1], abs=0.08)
     red = scene.ask("the red mug left of the dark green bottle", frame="frame_9")  # seen along y
@@ -128,6 +128,6 @@ def test_a_field_keeps_up_and_metres_and_an_older_one_has_neither(tmp_path):
 )
 def test_a_pixel_can_be_shares_of_the_frame(share, pixel):
     scene = Scene(*table_field())
-    assert At(0, *share).pixel(100, 80) == pixel
+    assert _pixel_of(At(0, *share), 100, 80) == pixel
     with pytest.raises(InputError, match="of 100x80 px"):
         scene.ask(At(0, 0.001, 0.002))

@@ -14,7 +14,7 @@ folder = Path(sys.argv[2] if len(sys.argv) > 2 else "jsecon-demo/objects")
 folder.mkdir(parents=True, exist_ok=True)
 
 catalogue, table = scene.objects(), {}
-for number, (name, *_) in enumerate(catalogue.names):
+for number, name in enumerate(catalogue.names):
     mask = catalogue.labels == number
     if mask.any() and not catalogue.surroundings[number]:
         file = folder / f"{number:03d}.ply"

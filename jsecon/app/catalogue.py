@@ -9,14 +9,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy import sparse  # loads csgraph on its first use
 from scipy.special import softmax
 
 from jsecon.app.records import gaussian_rows, rounded, source_shapes, source_up, world_record
 from jsecon.errors import InputError
 from jsecon.field.columns import vote_blocks
-from jsecon.field.membership import SHARE_THRESHOLD, membership_probability, ratio, vote_columns, vote_shares
+from jsecon.field.membership import SHARE_THRESHOLD, ratio, vote_columns, vote_shares
 from jsecon.field.similarity import similarities
 from jsecon.programs import stored_jit
 from jsecon.query.match import MIN_FRAGMENT_OVERLAP, judge_texts, regions_with, unrelated_words
@@ -28,8 +28,6 @@ from jsecon.types import Array, LanguageField, Votes
 from jsecon.views.frame import field_up, inner_scene
 from jsecon.vision.unrelated_words import UNRELATED_WORDS, embed_unrelated_words
 
-NAMES = 3
-"""names of each object"""
 SURE_SHARE = 0.4
 """Share of the frames which see an object that must show it, or it is unsure. On replica_apartment_0, 4 of 78 regions
 below it have an IoU of 0.4 with an instance, and 61 of 163 others."""
@@ -59,22 +57,17 @@ class Catalogue:
     """
 
     names: np.ndarray
-    """(K, 3) str: names of the vocabulary, the most probable first; "" beyond its end, and where a field of
-    embeddings from files has no model for texts."""
+    """(K,) str: the most probable name of the vocabulary."""
     probability: np.ndarray
-    """(K, 3) probability of each name if exactly one of the vocabulary is right; 0 of one that a query finds absent."""
+    """(K,) its probability if exactly one of the vocabulary is right; 0 of a name that a query finds absent."""
     surroundings: np.ndarray
-    """(K,) bool: the best name is one of walls, floors and the like."""
+    """(K,) bool: the name is one of walls, floors and the like."""
     sure: np.ndarray
     """(K,) bool: enough of the frames that see it show it; what is unsure may be a fragment."""
     parent: np.ndarray
     """(K,) int id of the object that this one is a part of, or -1. A parent has none."""
-    confidence: np.ndarray
-    """(K,) mean probability that a Gaussian of the object belongs to it (`membership_probability`)."""
-    views: np.ndarray
-    """(K,) int number of frames that show it."""
-    frames: np.ndarray
-    """(K, 3) int frames that show most of it, best first; -1 beyond the last."""
+    pixels: np.ndarray
+    """(K, T) number of pixels that show it in each frame."""
     shapes: ObjectShapes
     """its boxes, points and number of Gaussians; boxes stand upright along `up`."""
     labels: np.ndarray
@@ -98,9 +91,8 @@ class Catalogue:
 
     @functools.cached_property
     def class_ids(self) -> Int[np.ndarray, " k"]:
-        """(K,) number of each object's best name among all names, sorted; -1 without a name."""
-        classes = {name: n for n, name in enumerate(sorted(set(self.names[:, 0]) - {""}))}
-        return np.array([classes.get(name, -1) for name in self.names[:, 0]], np.int32)
+        """(K,) number of each object's name among all names, sorted."""
+        return np.unique(self.names.astype(str), return_inverse=True)[1].astype(np.int32)
 
     def mask(self, index: int | np.integer) -> Bool[np.ndarray, " n"]:
         """Selects the Gaussians of an object.
@@ -116,6 +108,7 @@ class Catalogue:
     def records(self) -> list[dict[str, Any]]:
         """Plain values of each object for JSON; the columns of a box's "axes" are its axes.
 
+        "views" is the number of frames that show it, and "frames" has the three that show most of it, best first.
         `pandas.json_normalize` makes a table of them.
         """
         return [self._record(n) for n in range(len(self))]
@@ -127,23 +120,22 @@ class Catalogue:
 
     def _record(self, n: int) -> dict[str, Any]:
         """Plain values of one object."""
-        shape = self.shapes[n]
+        shape, shown = self.shapes[n], self.pixels[n]
+        best = np.argsort(-shown, kind="stable")[:3]
         length = float(np.linalg.norm(shape.high - shape.low))
-        names = zip(self.names[n], self.probability[n])
         box = {"center": rounded(shape.center, length), "size": rounded(2 * shape.half_size, length)}
         return {
             "id": n,
-            "name": self.names[n, 0],
+            "name": self.names[n],
+            "probability": round(float(self.probability[n]), 4),
             "class_id": int(self.class_ids[n]),
             "colour": palette(n + 1)[n].tolist(),
-            "names": [{"name": name, "probability": round(float(p), 4)} for name, p in names if name],
             "surroundings": bool(self.surroundings[n]),
             "sure": bool(self.sure[n]),
             "parent": int(self.parent[n]) if self.parent[n] >= 0 else None,
             "gaussians": int(shape.count),
-            "confidence": round(float(self.confidence[n]), 4),
-            "views": int(self.views[n]),
-            "frames": [self.frame_names[t] for t in self.frames[n] if t >= 0],
+            "views": int(np.count_nonzero(shown)),
+            "frames": [self.frame_names[t] for t in best if shown[t] > 0],
             "box": box | {"axes": np.round(shape.axes, 6).tolist()},
             "low": rounded(shape.low, length),
             "high": rounded(shape.high, length),
@@ -154,8 +146,6 @@ def objects(
     field: LanguageField,
     vocabulary: Sequence[str] | None = None,
     embedder: Any = None,
-    *,
-    up: Sequence[Any] | np.ndarray | None = None,
 ) -> Catalogue:
     """Lists the objects of a field.
 
@@ -168,15 +158,14 @@ def objects(
       vocabulary: Names to choose from. None takes those of the embedder: of colours their names, of things and of the
         background; of others common nouns.
       embedder: Embedder of the field; None opens it if names need it.
-      up: Up axis in the capture's world; None takes the field's own.
 
     Returns:
       The catalogue. It is empty if the field has no regions.
 
     Raises:
-      InputError: The vocabulary is empty, the embedder cannot represent a name, or `up` has no direction.
+      InputError: The vocabulary is empty, or the embedder cannot represent a name.
     """
-    axis = field_up(field, up)
+    axis = field_up(field)
     upright = np.array(axis.axis)
     texts, embeddings, scale = _vocabulary(field, vocabulary, embedder)
     size, main = _sizes(field)
@@ -186,20 +175,21 @@ def objects(
     weighted = pixels.sum(1)[:, None] * np.asarray(field.regions.embeddings, np.float64)
     arrays = field.regions.embeddings, embeddings, field.regions.pixel_counts
     present = np.zeros(len(texts), bool)
-    if len(members) and len(texts):
+    if len(members):
         present = np.asarray(judge_texts(*map(jnp.asarray, arrays), unrelated_words(field), RULES)) > ABSENT
-    text = np.asarray((*texts, ""), object)
+    text = np.asarray(texts, object)
     is_background = np.array(["background" in name.lower().split() for name in texts], bool)
     allowed = present & ~(_is_small(field, groups, main)[:, None] & is_background)
-    order, probability = _name(members @ weighted, embeddings, scale, allowed)
-    surroundings = np.array([bool(SURROUNDINGS & set(name.lower().split())) for name in text[order[:, 0]]], bool)
+    best, probability = _name(members @ weighted, embeddings, scale, allowed)
+    surroundings = np.array([bool(SURROUNDINGS & set(name.lower().split())) for name in text[best]], bool)
     whole = _wholes(field, groups, members, size, surroundings)
-    labels, part_labels, confidence = _assign(field, groups, whole)
+    labels, part_labels = _assign(field, groups, whole)
     groups_of = zip(whole, _places(labels, len(whole)), _places(part_labels, len(whole)))
     own = [parts if above >= 0 else wholes for above, wholes, parts in groups_of]
     gaussians = np.array([len(group) for group in own], int)
     shown, views = members @ pixels, np.asarray(field.votes.views)
-    sure = np.array([_is_sure(row, views[group]) for row, group in zip(shown, own)], bool)
+    counts = np.count_nonzero(shown, axis=1)
+    sure = np.array([len(r) and n >= SURE_SHARE * np.median(views[r]) for n, r in zip(counts, own)], bool)
     complete = np.array([_frames_around(field, group)[row > 0].sum() for row, group in zip(shown, own)], int)
     top, listed = np.where(whole < 0, np.arange(len(whole)), whole), gaussians >= MIN_SAMPLES
     order_of_wholes = (top, -gaussians[top], -complete[top], ~sure[top], surroundings[top])
@@ -211,19 +201,14 @@ def objects(
     labels, part_labels = renumber[labels], renumber[part_labels]
     wholes, parts = np.flatnonzero(labels >= 0), np.flatnonzero(part_labels >= 0)
     ids = np.concatenate([labels[wholes], part_labels[parts]])
-    shown = shown[rows]
-    best = np.argsort(-shown, axis=1, kind="stable")[:, :3]  # those that show most of it
-    best = np.where(np.take_along_axis(shown, best, axis=1) > 0, best, -1)
     source_axis = np.array(source_up(field, axis).axis)
     return Catalogue(
-        names=text[order[rows]],
+        names=text[best[rows]],
         probability=probability[rows],
         surroundings=surroundings[rows],
         sure=sure[rows],
         parent=renumber[whole[rows]],
-        confidence=confidence[rows],
-        views=(shown > 0).sum(1),
-        frames=np.pad(best, ((0, 0), (0, 3 - best.shape[1])), constant_values=-1),
+        pixels=shown[rows],
         shapes=source_shapes(field, np.concatenate([wholes, parts]), ids, source_axis),
         labels=labels,
         part_labels=part_labels,
@@ -233,11 +218,6 @@ def objects(
         frame_names=field.names,
         world=world_record(field),
     )
-
-
-def _is_sure(pixels: Shaped[np.ndarray, " t"], views: Shaped[np.ndarray, " m"]) -> bool:
-    """Whether enough of the frames that see an object show it, by its pixels in each and the views of its Gaussians."""
-    return bool(len(views) and np.count_nonzero(pixels) >= SURE_SHARE * np.median(views))
 
 
 def _frames_around(field: LanguageField, rows: Int[np.ndarray, " m"]) -> Bool[np.ndarray, " t"]:
@@ -270,26 +250,24 @@ def _vocabulary(
 
 def _name(
     embeddings: np.ndarray, names: np.ndarray, scale: float, allowed: Bool[np.ndarray, "k v"]
-) -> tuple[Int[np.ndarray, "k m"], Float[np.ndarray, "k m"]]:
-    """Returns the most probable of V names (V, E) of K embeddings (K, E) of any length, and their probabilities.
+) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """Returns the most probable of V names (V, E) of each of K embeddings (K, E) of any length, and its probability.
 
     A name that is not `allowed`, because a query finds it absent, has probability 0: the catalogue and queries have one
-    judgement. A name's index is V where the vocabulary has fewer than `NAMES`, and its probability 0.
+    judgement.
     """
     rows, columns = np.asarray(embeddings, np.float64), np.asarray(names, np.float64)
     lengths = np.linalg.norm(rows, axis=1)[:, None] * np.linalg.norm(columns, axis=1)
     cosines = rows @ columns.T / np.where(lengths > 0, lengths, 1.0)
-    probability = softmax(scale * cosines, axis=1) if len(names) else cosines
-    raw, probability = probability, np.where(allowed, probability, 0.0)
-    order = np.lexsort((-raw, -probability), axis=1)[:, :NAMES]  # stable
-    missing = ((0, 0), (0, NAMES - order.shape[1]))
-    best = np.pad(np.take_along_axis(probability, order, axis=1), missing)
-    return np.pad(order, missing, constant_values=len(names)), best
+    raw = softmax(scale * cosines, axis=1)
+    probability = np.where(allowed, raw, 0.0)
+    best = np.lexsort((-raw, -probability), axis=1)[:, 0]  # stable
+    return best, probability[np.arange(len(best)), best]
 
 
-def palette(count: int, hue: float = 0.11) -> UInt8[np.ndarray, "n 3"]:
-    """Chooses RGB of regions 0 .. count-1, none of which depends on `count`: golden angles apart, from a hue on."""
-    hues = (hue + 0.61803398875 * np.arange(count)) % 1.0
+def palette(count: int) -> UInt8[np.ndarray, "n 3"]:
+    """Chooses RGB of regions 0 .. count-1, none of which depends on `count`: golden angles apart."""
+    hues = (0.11 + 0.61803398875 * np.arange(count)) % 1.0
     colours = [colorsys.hls_to_rgb(h, (0.62, 0.42, 0.72)[i % 3], 0.85) for i, h in enumerate(hues)]
     return (np.asarray(colours, np.float64).reshape(count, 3) * 255).astype(np.uint8)
 
@@ -413,8 +391,8 @@ def _wholes(
 
 
 @stored_jit
-def _objects_of_gaussians(votes: Votes, objects: Int[Array, " r_and_1"]) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
-    """Assigns each Gaussian to the object with the largest share in it: (N,) the object, and its share.
+def _objects_of_gaussians(votes: Votes, objects: Int[Array, " r_and_1"]) -> Int[Array, " n"]:
+    """Assigns each Gaussian to the object with the largest share in it.
 
     The share is that of all regions of the object together (`inside_fraction`), so a query for exactly these regions
     selects the same Gaussians, and those that belong to another object even more. -1 is no object: of a region, and of
@@ -431,26 +409,20 @@ def _objects_of_gaussians(votes: Votes, objects: Int[Array, " r_and_1"]) -> tupl
         share = jnp.nan_to_num(share)
         better = (owner >= 0) & (votes.views > 0) & (share > best_share)
         best, best_share = jnp.where(better, owner, best), jnp.where(better, share, best_share)
-    return jnp.where(best_share >= SHARE_THRESHOLD, best, -1).astype(jnp.int32), best_share
+    return jnp.where(best_share >= SHARE_THRESHOLD, best, -1).astype(jnp.int32)
 
 
-def _assign(field: LanguageField, groups: np.ndarray, whole: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the whole (N,) and the part (N,) of each Gaussian, and the confidence (G,) of each group."""
+def _assign(field: LanguageField, groups: np.ndarray, whole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the whole (N,) and the part (N,) of each Gaussian."""
     own, above = np.arange(len(whole)), np.append(whole, -1)  # the last entry is that of -1
     columns = np.where(whole < 0, own, whole)[groups], np.where(whole < 0, -1, own)[groups]
     tops, parts = (jnp.asarray(np.append(column, -1).astype(np.int32)) for column in columns)
-    labels, part_labels, total = [], [], np.zeros(len(whole))
+    labels, part_labels = [], []
     for votes in vote_blocks(field.votes):
-        (top, top_share), (part, part_share) = (_objects_of_gaussians(votes, objects) for objects in (tops, parts))
-        part = np.where(above[part] == top, part, -1)
-        for label, share in ((np.asarray(top), top_share), (part, part_share)):
-            inside = membership_probability(share, votes)
-            total += np.bincount(label[label >= 0], inside[label >= 0], len(whole))
-        labels.append(np.asarray(top))
-        part_labels.append(part)
-    labels, part_labels = np.concatenate(labels), np.concatenate(part_labels)
-    counts = _counts(labels, len(whole)) + _counts(part_labels, len(whole))
-    return labels, part_labels, total / np.maximum(counts, 1)
+        top, part = (np.asarray(_objects_of_gaussians(votes, objects)) for objects in (tops, parts))
+        labels.append(top)
+        part_labels.append(np.where(above[part] == top, part, -1))
+    return np.concatenate(labels), np.concatenate(part_labels)
 
 
 def _places(labels: np.ndarray, count: int) -> list[np.ndarray]:

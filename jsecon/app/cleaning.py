@@ -11,14 +11,13 @@ from jsecon.app.scene import open_scene
 from jsecon.errors import InputError
 from jsecon.fit.photometric import psnr
 from jsecon.fit.quality import measure_quality
-from jsecon.pipeline.options import Options, is_bare_scene
+from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Console
 from jsecon.pipeline.scene import open_bare_scene
 from jsecon.pipeline.scene_files import fit_background, place_in_capture, read_scene
 from jsecon.read.captures.capture import load_capture
 from jsecon.read.captures.frames import evenly_spaced
 from jsecon.read.splats.files import require_writable_format, save_gaussians
-from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Camera, Capture, Gaussians, Progress
 from jsecon.views.clean import KINDS, find_litter, without
 
@@ -30,15 +29,13 @@ def _clean(verb: verbs.Clean, console: Console) -> verbs.VerbResult:
         raise InputError("--out", "it is the scene itself", remedy="Write to another file.")
     if verb.capture is not None and (verb.cameras is not None or verb.views is not None):
         raise InputError("--capture", "its poses are the views", remedy="Leave --cameras and --views out.")
-    opened = None
-    if verb.keep_objects or not is_bare_scene(verb.scene):
-        opened = open_scene(verb.scene, console=console)
+    opened = open_scene(verb.scene, console=console) if verb.keep_objects else None
     with console.progress("views") as progress:
-        scene, cameras, capture = _open(verb, opened and opened.field, console, progress)
+        scene, cameras, capture = _open(verb, console, progress)
     cameras = jax.tree.map(np.asarray, cameras[evenly_spaced(len(cameras), 128)])  # more would show little more
     with console.progress("clean") as progress:
         kinds = find_litter(scene, cameras, progress)
-    if verb.keep_objects and opened is not None:
+    if opened is not None:
         kinds[opened.objects().labels >= 0] = 0
     counts = {kind: int((kinds == n).sum()) for n, kind in enumerate(KINDS)}
     if not counts["kept"]:
@@ -50,33 +47,23 @@ def _clean(verb: verbs.Clean, console: Console) -> verbs.VerbResult:
     console.print_line(line)
     with console.progress("files"):
         del scene  # read again, a large one fits into memory once
-        save_gaussians(verb.out, gaussian_rows(_source(verb, opened and opened.field), kinds == 0))
+        save_gaussians(verb.out, gaussian_rows(read_scene(verb.scene)[0], np.flatnonzero(kinds == 0)))
     console.print_line(f"{counts['kept']} Gaussians, {verb.out.stat().st_size / 2**20:.1f} MiB  {verb.out}")
     return {"written": {"scene": verb.out}, "gaussians": counts} | quality
 
 
-def _open(verb: verbs.Clean, field: Any, console: Console, progress: Progress) -> tuple[Any, ...]:
+def _open(verb: verbs.Clean, console: Console, progress: Progress) -> tuple[Gaussians, Camera, Capture | None]:
     """Returns the Gaussians in the world of the views, the views, and the photographs."""
-    if (verb.capture is None and field is None) or verb.cameras is not None or verb.views is not None:
+    if verb.capture is None:
         bare = open_bare_scene(Options(verb.scene, cameras=verb.cameras, views=verb.views), progress)
         for note in bare.views.notes:
             console.note(note)
         return bare.scene, bare.views.cameras, None
-    if verb.capture is None:
-        assert field is not None
-        return field.gaussians, field.cameras, None
     capture = load_capture(verb.capture, long_side=Options.long_side, progress=progress)
-    placed, notes = place_in_capture(_source(verb, field), capture, verb.scene, None, progress)
+    placed, notes = place_in_capture(read_scene(verb.scene)[0], capture, verb.scene, None, progress)
     for note in notes:
         console.note(note)
     return placed, capture.cameras, capture
-
-
-def _source(verb: verbs.Clean, field: Any) -> Gaussians:
-    """Returns the Gaussians as the file has them."""
-    if is_bare_scene(verb.scene):
-        return read_scene(verb.scene)[0]
-    return transform_gaussians(field.gaussians, field.source_from_scene)
 
 
 def _quality(

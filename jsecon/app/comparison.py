@@ -65,7 +65,7 @@ class Changes:
             "kind": change.kind,
             **({"suspected": change.suspected} if change.suspected else {}),
             "probability": round(change.probability, 3),
-            "name": str(listed.names[index, 0]) if is_known else "",
+            "name": str(listed.names[index]) if is_known else "",
             "id": index if is_known else None,
             "region": _main_region(field, listed, index) if is_known else None,
             "from": None if kind == "new" else rounded(start, 1.0),

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, UInt8
 
 from jsecon.app import pictures, report, verbs
 from jsecon.app.catalogue import SURE_SHARE, Catalogue
@@ -15,7 +16,7 @@ from jsecon.app.scene import Scene, open_scene
 from jsecon.app.shapes import require_shapes_format, write_shapes
 from jsecon.errors import InputError
 from jsecon.field.columns import is_mapped
-from jsecon.files import parse_json, reading, remove_files, write_text
+from jsecon.files import parse_json, remove_files, write_text
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console
 from jsecon.query.outliers import MIN_SAMPLES
@@ -26,15 +27,14 @@ def _objects(verb: verbs.Objects, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon objects`; the result has the records of the objects."""
     if verb.out is not None:
         require_writable(verb.out)
-    names = None if verb.vocabulary is None else _read_vocabulary(verb.vocabulary)
     scene = open_scene(verb.field, embedder=verb.embedder, console=console).at_level(verb.level)
     with console.progress("objects"):
-        listed = scene.objects(names)
+        listed = scene.objects()
     records = listed.records()
     unsure = [record["id"] for record in records if _is_unsure(records, record)]
     for record in records:
         if record["id"] not in unsure:
-            console.print_line(f"{record['id']:>4}  {_title(record)}: {_words(record)}")
+            console.print_line(f"{record['id']:>4}  {record['name']}: {_words(record)}")
     if unsure:
         ids = " to ".join(map(str, sorted({unsure[0], unsure[-1]})))
         few = f"shown by fewer than {SURE_SHARE:.0%} of the frames that see it, so perhaps a fragment"
@@ -57,18 +57,8 @@ def _write_records(file: Path, listed: Catalogue) -> None:
     write_text(file, json.dumps(listed.as_dict(), indent=2) + "\n")
 
 
-def _read_vocabulary(file: Path) -> list[str]:
-    """Reads names in UTF-8, one a line, each once. Empty lines and those that begin with # are left out."""
-    with reading(file, remedy="Give a text file with one name a line."):
-        lines = [line.strip() for line in file.read_text(encoding="utf-8-sig").splitlines()]
-    names = list(dict.fromkeys(line for line in lines if line and not line.startswith("#")))
-    if not names:
-        raise InputError(file, "it has no names", remedy="Write one name a line.")
-    return names
-
-
 def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon export`; the result has the number of exported Gaussians and the bytes of the scene."""
+    """Does the work of `jsecon export`; the result has the number of exported Gaussians."""
     _check_export(verb)
     text = verb.only if verb.only is not None else verb.without
     suffix = "" if verb.out is None else verb.out.suffix.lower()
@@ -85,18 +75,15 @@ def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
     mask = None if answer is None else ~answer.mask if verb.without is not None else answer.mask
     count = scene.field.gaussians.count if mask is None else int(mask.sum())
     result: verbs.VerbResult = {"written": {}, "gaussians": count}
-    has_labels = verb.out is not None and (verb.with_labels or points or suffix == ".usda")
+    is_needed = points or suffix == ".usda" or bool(verb.objects or verb.shapes)
     with console.progress("objects"):
-        listed = _list_objects(scene, has_labels or verb.out is None or bool(verb.objects or verb.shapes), console)
+        listed = _list_objects(scene, is_needed, console)
     written = result["written"]
     with console.progress("files"):
         if verb.out is not None:
-            scene.export(verb.out, mask, labels=listed if has_labels else None, points=points)
-            result["bytes"] = verb.out.stat().st_size
+            scene.export(verb.out, mask, labels=listed, points=points)
             written["scene"] = verb.out
-            console.print_line(
-                f"{'points of ' * points}{count} Gaussians, {result['bytes'] / 2**20:.1f} MiB  {verb.out}"
-            )
+            console.print_line(f"{count} Gaussians  {verb.out}")
         if verb.objects is not None and listed is not None:
             written["objects"] = _save_objects(scene, listed, verb.objects)
             console.print_line(f"{len(written['objects'])} objects  {verb.objects}")
@@ -113,15 +100,12 @@ def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
 
 def _list_objects(scene: Scene, is_needed: bool, console: Console) -> Catalogue | None:
     """Lists the objects; None with a note where an export can do without and they cannot be had."""
-    reason: Any = "the field is larger than memory"
-    if is_needed or not is_mapped(scene.field):
-        try:
+    if is_needed:
+        return scene.objects()
+    with contextlib.suppress(InputError):
+        if not is_mapped(scene.field):
             return scene.objects()
-        except InputError as error:  # such as no model for the names
-            if is_needed:
-                raise
-            reason = error
-    console.note(f"no labels.json is written: {reason}")
+    console.note("no labels.json is written: the field is larger than memory, or its model is not on this machine")
     return None
 
 
@@ -131,8 +115,6 @@ def _check_export(verb: verbs.Export) -> None:
         raise InputError("export", "there is nothing to write", remedy="Give --out scene.ply, --objects or --shapes.")
     if verb.shapes is not None:
         require_shapes_format(verb.shapes)
-    if verb.with_labels and verb.out is None:
-        raise InputError("--with-labels", "there is no file to write them to", remedy="Give --out scene.ply.")
     if verb.only is not None and verb.without is not None:
         raise InputError("--only", "it cannot be combined with --without", remedy="Export twice, with one of them.")
     if verb.objects is not None and (verb.only is not None or verb.without is not None):
@@ -158,7 +140,7 @@ def _save_objects(scene: Scene, listed: Catalogue, folder: Path) -> list[Path]:
 
 def _object_file(record: dict[str, Any]) -> str:
     """Names the file of an object by its id and name."""
-    name = slug(_title(record)).encode()[:60].decode("utf-8", "ignore")
+    name = slug(record["name"]).encode()[:60].decode("utf-8", "ignore")
     return f"{record['id']:03d}-{name}.ply"
 
 
@@ -169,11 +151,11 @@ def _page(scene: Scene, catalogue: Catalogue, records: list[dict[str, Any]], con
         for record in records:
             mask = catalogue.mask(record["id"])
             figures = [report.figure(scene.render(name, mask), name) for name in record["frames"]]
-            best = scene.frame_index(record["frames"][0]) if record["frames"] else 0
+            best = next(iter(record["frames"]), 0)
             outline = scene.mask(mask, best)
-            picture = pictures.crop(pictures.selection_overlay(scene.render(best), outline, tint=0.0), outline)
+            picture = _crop(pictures.selection_overlay(scene.render(best), outline, tint=0.0), outline)
             words = f"{record['id']}: {_words(record)}"
-            card = report.card(picture, _title(record), words, report.grid(figures, 3))
+            card = report.card(picture, record["name"], words, report.grid(figures, 3))
             cards[_is_unsure(records, record) or record["surroundings"]].append(card)
             progress(record["id"] + 1, len(records))
     lead = "The objects of the scene. Open an object to see it in the frames that show most of it."
@@ -182,15 +164,20 @@ def _page(scene: Scene, catalogue: Catalogue, records: list[dict[str, Any]], con
     return report.page("Objects", lead, [report.grid(cards[False]), *folded])
 
 
+def _crop(image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """Cuts out the square around a mask, with a margin; the whole image if the mask is empty."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    if not len(rows):
+        return image
+    half = 0.8 * max(np.ptp(rows), np.ptp(columns), 16)  # px; the margin is 0.3 of the object's size
+    top, left = (int(max((ends[0] + ends[-1]) / 2 - half, 0)) for ends in (rows, columns))
+    return image[top : int(top + 2 * half) + 1, left : int(left + 2 * half) + 1]
+
+
 def _is_unsure(records: list[dict[str, Any]], record: dict[str, Any]) -> bool:
     """Whether an object, or the one that it is a part of, is unsure."""
     whole = record if record["parent"] is None else records[record["parent"]]
     return not whole["sure"] and not whole["surroundings"]
-
-
-def _title(record: dict[str, Any]) -> str:
-    """Returns the best name of an object, or "object" where there is no vocabulary."""
-    return record["name"] or "object"
 
 
 def _words(record: dict[str, Any]) -> str:

@@ -76,7 +76,9 @@ class _Tools:
 
     def history(self, field: FieldName = None) -> dict[str, Any]:
         """Lists what moved, is gone, is new or looks another way since a field was made, in order of time."""
-        return {"changes": self._scene(field).history()}
+        from jsecon.change.history import events  # late: it imports jax
+
+        return {"changes": events(self._scene(field).field)}
 
     def changes(
         self, later: Annotated[str, Field(description="Name of the later field")], field: FieldName = None
@@ -95,7 +97,7 @@ class _Tools:
         return answer.as_dict() | {"top": np.round(top, 6).tolist(), "up_evidence": listed.up_evidence}
 
     def measure(self, a: Words, b: Words, frame: Frame = None, field: FieldName = None) -> dict[str, Any]:
-        """Measures the distance of two things: between surfaces, between centres, free gap, angle above horizontal."""
+        """Measures the distance of two things: between surfaces, between centres, angle above horizontal."""
         return self._scene(field).measure(a, b, frame=frame)
 
     def render(self, text: Words, frame: Frame = None, field: FieldName = None) -> Image:
@@ -104,8 +106,8 @@ class _Tools:
 
         scene = self._scene(field)
         answer = scene.ask(text, frame=frame)
-        index = scene.frame_index(frame) if frame is not None else [*scene.best_frames(answer, 1), 0][0]
-        image = cv2.cvtColor(scene.render(index, answer), cv2.COLOR_RGB2BGR)
+        seen = [*scene.best_frames(answer, 1), 0][0] if frame is None else frame
+        image = cv2.cvtColor(scene.render(seen, answer), cv2.COLOR_RGB2BGR)
         return Image(data=cv2.imencode(".png", image)[1].tobytes(), format="png")
 
 

@@ -11,9 +11,6 @@ from jsecon.field.field import save_field
 from jsecon.files import csv_text, write_text
 from jsecon.pipeline.progress import Console
 
-LENGTH_COLUMNS = ("a", "b", "surfaces", "centers", "gap", "angle", "unit")
-"""columns of the CSV, values of `Scene.measure`"""
-
 
 def _measure(verb: verbs.Measure, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon measure`; the result has the measurements, and the scale of the field."""
@@ -36,10 +33,10 @@ def _measure(verb: verbs.Measure, console: Console) -> verbs.VerbResult:
         rows = [scene.measure(*pair) for pair in pairs]
     for row in rows:
         lengths = ", ".join(f"{row[name]:.4g} between {name}" for name in ("centers", "surfaces"))
-        console.print_line(f"{row['a']} to {row['b']}: {lengths}, gap {row['gap']:.4g} ({row['unit']})")
+        console.print_line(f"{row['a']} to {row['b']}: {lengths} ({row['unit']})")
     result: verbs.VerbResult = {"measurements": rows, "metres_per_unit": scene.field.metres_per_unit}
     if verb.out is None:
         return result
-    write_text(verb.out, csv_text(LENGTH_COLUMNS, rows))
+    write_text(verb.out, csv_text(("a", "b", "surfaces", "centers", "angle", "unit"), rows))
     console.print_line(f"table   {verb.out}")
     return result | {"written": {"table": verb.out}}

@@ -12,12 +12,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import KDTree
 
 from jsecon.app.catalogue import Catalogue
-from jsecon.app.records import Answer, Object, Query, rounded, source_points, source_shapes
+from jsecon.app.records import Answer, Object, Query, rounded, source_shapes
 from jsecon.errors import InputError
 from jsecon.field.columns import votes_of_rows
 from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction_of_regions
@@ -28,6 +27,7 @@ from jsecon.query.match import RegionMatch, select_node
 from jsecon.query.object_shapes import ObjectShapes
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.parts import match_lone_parts, match_parts
+from jsecon.query.pointing import frame_index
 from jsecon.query.referring import evaluate, with_everything
 from jsecon.query.relations import Viewpoint, order_values, viewpoint
 from jsecon.query.rules import ABSENT, FOUND, MIN_RANK, QueryRules
@@ -50,7 +50,7 @@ def choose_shades(
         return list(texts)
 
     def match(text: str, rules: QueryRules) -> RegionMatch:
-        return match_regions(field, jnp.asarray(embedder.embed_text([text])), rules)
+        return match_regions(field, embedder.embed_text([text]), rules)
 
     replaced: list[str] = []
     for text in texts:
@@ -81,9 +81,7 @@ class ObjectIndex:
     """
 
     def __init__(self, field: LanguageField, embedder: Any, catalogue: Catalogue, up: UpAxis):
-        regions = jax.tree.map(jnp.asarray, field.regions)  # on the device once, not for each phrase
-        reference = None if field.unrelated_words is None else jnp.asarray(field.unrelated_words)
-        self._field = dataclasses.replace(field, regions=regions, unrelated_words=reference)
+        self._field = field
         self._embedder = embedder
         self._catalogue, self._up = catalogue, up
         poses = transform_poses(np.asarray(field.cameras.world_to_camera), np.asarray(field.source_from_scene))
@@ -93,34 +91,34 @@ class ObjectIndex:
         self._measured = functools.lru_cache(1024)(self._measure)
         self._objects_of = functools.lru_cache(1024)(self._find_objects)
 
-    def _find_objects(self, phrase: str) -> tuple[list[Object], float]:
+    def _find_objects(self, phrase: str) -> list[Object]:
         """Finds the objects that a phrase names: those with a region that matches it.
 
-        Where a text is the best name of some of the objects, the others do not count. The second value is the share of
-        unrelated words that are less similar to the scene than the phrase. A phrase such as "handle of the mug" names
-        the parts of a thing, if the thing has such parts, and "handle" parts of any thing, if no thing is called so.
+        Where a text is the best name of some of the objects, the others do not count. A phrase such as "handle of the
+        mug" names the parts of a thing, if the thing has such parts, and "handle" parts of any thing, if no thing is
+        called so.
         """
         listed = self._catalogue
         if (named := split_part(phrase)) and (found := self.find_parts(*named)):
-            return found, np.nan
+            return found
         if phrase == ANY_OBJECT:
             things = np.flatnonzero(~listed.surroundings).tolist()
-            named = [self._object(str(listed.names[n, 0]) or f"object {n}", n) for n in things]
-            return [found for found in named if len(found.rows)], np.nan
+            named = [self._object(str(listed.names[n]), n) for n in things]
+            return [found for found in named if len(found.rows)]
         texts = choose_shades(self._field, self._embedder, [phrase], self._rules, every=True)
-        embedded = jax.device_put(self._embedder.embed_text(texts))
+        embedded = self._embedder.embed_text(texts)
         match = match_regions(self._field, embedded, self._rules)
         if int(match.state) < FOUND:  # no thing has that name; parts of things may
             unsure = int(match.region) if int(match.state) > ABSENT else -1
             nodes, state = match_lone_parts(self._field, embedded, unsure, self._rules)
             if len(nodes):
-                return [self._part(phrase, int(node), state) for node in nodes], float(match.rank)
+                return [self._part(phrase, int(node), state) for node in nodes]
         regions = np.flatnonzero(np.asarray(match.chosen)) if int(match.region) >= 0 else np.zeros(0, int)
         owners = listed.regions[regions]
         named = set(owners[self._is_best_name(texts, regions)].tolist()) - {-1}
         things = sorted(named or set(owners.tolist()) - {-1})
         found = [self._object(phrase, n, int(match.state)) for n in things]
-        return [one for one in found if len(one.rows)], float(match.rank)
+        return [one for one in found if len(one.rows)]
 
     def find_parts(self, part: str, whole: str) -> list[Object]:
         """Finds the parts that a text names of each thing that another one names; "part" names all of them.
@@ -132,8 +130,8 @@ class ObjectIndex:
             return []
         name = re.sub(r"(^| )(parts?|pieces?)$", "", part)
         try:
-            texts = jax.device_put(self._embedder.embed_text([name])) if name else None
-            wholes = self._objects_of(whole)[0]
+            texts = self._embedder.embed_text([name]) if name else None
+            wholes = self._objects_of(whole)
         except InputError:
             return []
         for one in wholes:
@@ -154,33 +152,15 @@ class ObjectIndex:
         regions, rows, shape = self._measured(index)
         return Object(phrase, regions, rows, shape, sure=bool(self._catalogue.sure[index]), state=state)
 
-    def object_of(self, phrase: str, answer: Answer) -> Object:
-        """The object that an answer selects, as the catalogue measures it if it has it."""
-        if answer.objects:
-            return answer.objects[0]
-        region = int(answer.selection.region)
-        index = -1 if region < 0 else int(self._catalogue.regions[region])
-        return self._object(phrase, index) if index >= 0 else Object(phrase, (region,), answer.rows, answer.place)
-
     def _measure(self, index: int) -> tuple[tuple[int, ...], np.ndarray, ObjectShapes]:
         """Regions of an object, its Gaussians, and their shape: without its parts, and what stands apart from it."""
         regions = tuple(np.flatnonzero(self._catalogue.regions == index).tolist())
-        voters = np.unique(np.concatenate([self._voters[region] for region in regions]))
-        share = inside_fraction_of_regions(votes_of_rows(self._votes, voters), regions).fraction
-        rows, share = voters[share >= SHARE_THRESHOLD], share[share >= SHARE_THRESHOLD]
+        rows = np.flatnonzero(self._catalogue.mask(index))
+        share = inside_fraction_of_regions(votes_of_rows(self._votes, rows), regions).fraction
+        rows, share = rows[share >= SHARE_THRESHOLD], share[share >= SHARE_THRESHOLD]
         means, weight = np.asarray(self._field.gaussians.means)[rows], share * self._votes.total[rows]
         rows = rows[remove_outliers(means, np.ones(len(rows), bool), keep="supported", weight=weight)]
         return regions, rows, source_shapes(self._field, rows, np.zeros(len(rows), int), self._catalogue.up)
-
-    @functools.cached_property
-    def _voters(self) -> list[np.ndarray]:
-        """The Gaussians that have votes for each region, rising."""
-        regions = self._votes.regions
-        count = self._field.regions.count
-        owners = np.where((regions >= 0) & (regions < count), regions, count).ravel()
-        order = np.argsort(owners.astype(np.uint16 if count < 1 << 16 else np.int32), kind="stable")
-        ends = np.cumsum(np.bincount(owners, minlength=count + 1))[:count]
-        return np.split(order // regions.shape[1], ends)[:count]
 
     def _is_best_name(self, texts: Sequence[str], regions: np.ndarray) -> np.ndarray:
         """Which regions no other name of the vocabulary fits better than the text; all, if there is no vocabulary.
@@ -200,7 +180,7 @@ class ObjectIndex:
         names = getattr(self._embedder, "vocabulary", ())
         return np.asarray(self._embedder.embed_text(list(names))) if names else None
 
-    def _view(self, frame: int | None) -> tuple[Viewpoint, str]:
+    def _view(self, frame: int | str | None) -> tuple[Viewpoint, str]:
         """From where directions are seen, and what that is in words.
 
         Without a frame it is the mean camera, or the frame that shows most objects where the cameras look in all
@@ -217,10 +197,11 @@ class ObjectIndex:
                 return Viewpoint(middle, mean / np.linalg.norm(mean), up), "as seen from the mean of the cameras"
             pixels = np.asarray(self._field.regions.pixel_counts, np.int64)
             frame = int(np.lexsort((pixels.sum(0), (pixels > 0).sum(0)))[-1])
-        return viewpoint(cameras[frame], up), f"as seen from {self._field.names[frame]}"
+        index = frame_index(self._field, frame)
+        return viewpoint(cameras[index], up), f"as seen from {self._field.names[index]}"
 
-    def answer(self, query: Query, frame: int | None) -> Answer:
-        """Finds the objects that a referring expression names, with directions as seen from a frame."""
+    def answer(self, query: Query) -> Answer:
+        """Finds the objects that a referring expression names."""
         expression = parse_expression(str(query))
         metres = self._field.metres_per_unit
         if any(condition.in_metres for condition in expression.conditions) and metres is None:
@@ -228,7 +209,7 @@ class ObjectIndex:
             remedy = 'Ask in units of the capture ("within 2 units of"), or run with --metres-per-unit.'
             raise InputError(f"expression {str(query)!r}", problem, remedy=remedy)
         units = 1.0, 1.0 / (metres or 1.0)
-        view, words = self._view(frame)
+        view, words = self._view(query.frame)
         readings = expression.readings()
         outcomes = [evaluate(self._objects_of, expression.thing, reading, view, units) for reading in readings]
         place = next((n for n, outcome in enumerate(outcomes) if outcome.chosen), 0)
@@ -236,14 +217,15 @@ class ObjectIndex:
         chosen = {found.regions for found in best.chosen}
         question = ""
         if best.undecided:
-            number = str(len(best.chosen)) if best.undecided is best.chosen else "which"
-            question = f"{number} {expression.thing.text!r}: {self._tell_apart(best.undecided, view)}?"
+            number = f"which of {len(best.chosen)}" if best.undecided is best.chosen else "which"
+            places = self._places(best.undecided, view)
+            question = f"{number} {expression.thing.text!r} is meant, from left to right at {places}?"
         if not question and any({found.regions for found in other.chosen} not in (set(), chosen) for other in others):
             first, second = expression.conditions
             question = f"is it the {expression.thing.text} or the {first.anchors[-1].text} that is {second}?"
         named = best.chosen
         if named and expression.adds:
-            named = with_everything(expression.adds, named, self._objects_of(ANY_OBJECT)[0], view)
+            named = with_everything(expression.adds, named, self._objects_of(ANY_OBJECT), view)
         mask = np.zeros(self._field.gaussians.count, bool)
         for found in named:
             mask[found.rows] = True
@@ -268,38 +250,29 @@ class ObjectIndex:
             question=question,
         )
 
-    def _tell_apart(self, objects: Sequence[Object], view: Viewpoint) -> str:
-        """Says how objects of one name could be told apart: from left to right."""
-        centers = np.concatenate([found.shape.center for found in objects])
-        bearing = [order_values(found.shape, view)["leftmost"][0] for found in objects]
-        places = ["the left one", *["a middle one"] * (len(objects) - 2), "the right one"]
-        words = [
-            f"{place} at ({', '.join(f'{x:.2f}' for x in centers[k])})" for place, k in zip(places, np.argsort(bearing))
-        ]
-        return f"{', '.join(words[:-1])} or {words[-1]}"
+    def _places(self, objects: Sequence[Object], view: Viewpoint) -> str:
+        """Says where objects are, from left to right."""
+        ordered = sorted(objects, key=lambda found: order_values(found.shape, view)["leftmost"][0])
+        return ", ".join(f"({', '.join(f'{x:.2f}' for x in found.shape.center[0])})" for found in ordered)
 
-    def distances(self, first: Object | np.ndarray, second: Object | np.ndarray) -> dict[str, Any]:
-        """Distances of two objects, or points (3,), in metres if they are known.
+    def distances(self, ends: Sequence[Answer | Sequence[float | int]]) -> dict[str, Any]:
+        """Distances of what two answers select, or of points, in metres if they are known.
 
         The angle is that of the second above the horizontal, degrees.
         """
-        points, middles, axes, halves = zip(*map(self._extent, (first, second)))
-        surfaces = float(KDTree(points[0]).query(points[1])[0].min())
-        line = middles[1] - middles[0]
-        centers = float(np.linalg.norm(line))
-        way = line / max(centers, 1e-300)
-        reach = sum(float(np.min(half / np.maximum(np.abs(turn.T @ way), 1e-12))) for turn, half in zip(axes, halves))
-        angle = float(np.degrees(np.arcsin(np.clip(way @ self._catalogue.up, -1, 1))))
+        (points, middle), (others, end) = map(self._extent, ends)
+        centers = float(np.linalg.norm(end - middle))
+        angle = float(np.degrees(np.arcsin(np.clip((end - middle) @ self._catalogue.up / max(centers, 1e-300), -1, 1))))
         metres = self._field.metres_per_unit
         scale = metres or 1.0
-        lengths = scale * np.array([surfaces, centers, max(centers - reach, 0.0)])
-        result: dict[str, Any] = dict(zip(("surfaces", "centers", "gap"), rounded(lengths, scale * centers)))
+        lengths = scale * np.array([KDTree(points).query(others)[0].min(), centers])
+        result: dict[str, Any] = dict(zip(("surfaces", "centers"), rounded(lengths, scale * centers)))
         unit = "capture units" if metres is None else "metres"
         return result | {"angle": round(angle, 2), "unit": unit, "up": str(self._up)}
 
-    def _extent(self, place: Object | np.ndarray) -> tuple[np.ndarray, ...]:
-        """Points (M, 3), middle (3,), axes (3, 3) and half sizes (3,) of an object or a point."""
-        if isinstance(place, np.ndarray):
-            return place[None], place, np.eye(3), np.zeros(3)
-        points = source_points(self._field, np.asarray(self._field.gaussians.means)[place.rows])
-        return points, place.shape.center[0], place.shape.axes[0], place.shape.half_size[0]
+    def _extent(self, end: Answer | Sequence[float | int]) -> tuple[np.ndarray, np.ndarray]:
+        """Points (M, 3) of what an answer selects and the middle (3,) of its upright box; of a point itself."""
+        if not isinstance(end, Answer):
+            return np.array([end], np.float64), np.asarray(end, np.float64)
+        shape = source_shapes(self._field, end.rows, np.zeros(len(end.rows), int), self._catalogue.up)
+        return end.points, shape.center[0]

@@ -26,10 +26,10 @@ class _FieldPath(NamedTuple):
     """the file of Gaussians of which the field is made"""
 
 
-def locate_field(path: Path, out: Path | None = None) -> _FieldPath:
+def locate_field(path: Path) -> _FieldPath:
     """Finds the field that a path names, or raises an InputError that describes the file.
 
-    `out` is the folder for the field of a splat, by default NAME_field beside NAME.ply.
+    That of a splat is in NAME_field beside NAME.ply.
     """
     with reading(path):
         if path.is_dir():
@@ -46,8 +46,8 @@ def locate_field(path: Path, out: Path | None = None) -> _FieldPath:
         remedy = substitute[1] if splat or path.name == FIELD_FILE else _REMEDY
         raise InputError(path, f"it is {substitute[0]}", "" if splat else "a field", remedy)
     if splat:
-        folder = path.with_name(f"{path.stem}_field") if out is None else out
-        return _FieldPath(path.resolve().with_suffix(""), folder / FIELD_FILE, path)
+        file = path.with_name(f"{path.stem}_field") / FIELD_FILE
+        return _FieldPath(path.resolve().with_suffix(""), file, path)
     if path.suffix != ".safetensors" and head[8:9] != b"{":  # what is damaged is the reader's to say
         raise InputError(path, "it is a file of another kind" if head else "it is an empty file", "a field", _REMEDY)
     place = path.resolve()

@@ -1,37 +1,25 @@
-"""Pictures of a run: regions in colours that stay the same in every view, selections, what a notebook shows.
-
-jsecon.types calls `to_html` through the table of contents when a notebook asks.
-"""
+"""Pictures of a run: regions in colours that stay the same in every view, selections, rendered views."""
 
 import cv2
-import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from jsecon.app import report
 from jsecon.app.catalogue import main_regions, palette
 from jsecon.field.columns import is_mapped
 from jsecon.field.evidence import MAX_WHOLE
-from jsecon.fit.resize import resize_frame, scale_cameras
-from jsecon.read.captures.frames import evenly_spaced
 from jsecon.splat.render import render, render_rgb
 from jsecon.splat.visible import render_in_blocks
-from jsecon.types import Camera, Capture, Gaussians, LanguageField
+from jsecon.types import Camera, Gaussians, LanguageField
 
 SELECTED = (255, 64, 160)
 """RGB of a selection, which no natural object has"""
 
 
 def label_overlay(frame: UInt8[np.ndarray, "h w 3"], labels: Int[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Paints regions (-1 for none) over a frame in grey: each in its colour (`palette`), a dark line between them."""
+    """Paints regions (-1 for none) over a frame in grey, each in its colour (`palette`)."""
     grey = np.repeat(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=2).astype(np.float32)
     colours = palette(int(labels.max(initial=0)) + 1)[np.maximum(labels, 0)]
-    image = np.where((labels >= 0)[..., None], 0.28 * grey + 0.72 * colours, 0.55 * grey)
-    border = np.zeros(labels.shape, bool)
-    border[1:] |= labels[1:] != labels[:-1]
-    border[:, 1:] |= labels[:, 1:] != labels[:, :-1]
-    image[border] *= 0.35
-    return image.astype(np.uint8)
+    return np.where((labels >= 0)[..., None], 0.28 * grey + 0.72 * colours, 0.55 * grey).astype(np.uint8)
 
 
 def selection_overlay(
@@ -74,42 +62,3 @@ def render_picture(
     else:
         image = render_rgb(gaussians, camera).features
     return (np.clip(np.asarray(image), 0.0, 1.0) * 255 + 0.5).astype(np.uint8)
-
-
-def crop(image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Cuts out the square around a mask, with a margin; the whole image if the mask is empty."""
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    if not len(rows):
-        return image
-    half = 0.8 * max(np.ptp(rows), np.ptp(columns), 16)  # px; the margin is 0.3 of the object's size
-    top, left = (int(max((ends[0] + ends[-1]) / 2 - half, 0)) for ends in (rows, columns))
-    return image[top : int(top + 2 * half) + 1, left : int(left + 2 * half) + 1]
-
-
-def to_html(value: LanguageField | Capture) -> str:
-    """Shows a value as HTML.
-
-    Args:
-      value: A LanguageField or a Capture.
-
-    Returns:
-      Its picture and a line of words.
-    """
-    image, words = _picture(value)
-    return report.figure(image, words)
-
-
-def _picture(value: LanguageField | Capture) -> tuple[UInt8[np.ndarray, "h w 3"], str]:
-    """Returns the picture and the line of a value."""
-    cameras = jax.tree.map(np.asarray, value.cameras)
-    small = scale_cameras(cameras, min(240 / max(cameras.width, cameras.height), 1.0))
-    if isinstance(value, Capture):
-        chosen = evenly_spaced(len(value.names), 4)
-        image = np.concatenate([resize_frame(np.asarray(value.frames[t]), small) for t in chosen], axis=1)
-        words = f"Capture of {len(value.names)} frames of {cameras.width}x{cameras.height}, "
-        words += f"{int(np.asarray(value.held_out).sum())} held out, {len(value.points):,} sparse points"
-        return image, words + ("" if value.depths is None else ", with depth")
-    views = [render_picture(value.gaussians, small[0], rgb) for rgb in (None, region_colours(value))]
-    image = np.concatenate(views, axis=1)
-    words = f"LanguageField of {value.gaussians.count:,} Gaussians, {value.regions.count} regions and "
-    return image, f"{words}{len(value.names)} frames, texts by {value.embedder or 'no embedder'}"

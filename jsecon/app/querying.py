@@ -16,13 +16,12 @@ import numpy as np
 from jaxtyping import Bool
 
 from jsecon.app import pictures, report, verbs
-from jsecon.app.records import Answer, At, Mask, Query, Question
+from jsecon.app.records import Answer, At, Query
 from jsecon.app.scene import Scene, open_scene
 from jsecon.errors import InputError
 from jsecon.files import parse_json, remove_files, write_text
-from jsecon.pipeline.options import is_bare_scene, require_writable
+from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console
-from jsecon.query.expressions import is_expression
 from jsecon.read.captures.images import write_image
 
 _PAGE = "answers.html"
@@ -35,15 +34,13 @@ def _query(verb: verbs.Query, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon query`; the result has the records of the answers, and the errors of failed queries."""
     queries = _queries(verb)
     require_writable(verb.out)
-    scene = open_scene(verb.field, embedder=verb.embedder, up=verb.up, out=verb.out / "field", console=console)
+    scene = open_scene(verb.field, embedder=verb.embedder, console=console)
     scene = (scene if verb.as_of is None else scene.as_of(verb.as_of)).at_level(verb.level)
     with console.progress("answers"):
         if verb.texts:
             _ = scene.embedder  # without it one error stands for all texts
         results = scene.ask_all(queries)
     answers = [answer for answer in results if not isinstance(answer, InputError)]
-    if any(answer.by == "relation" for answer in answers):
-        console.note("Words in quotes are searched for as they stand, without relations.")
     for query, result in zip(queries, results):
         if isinstance(result, InputError) and isinstance(query.question, str):
             _remove_answer(verb.out, _file_stem(query))
@@ -54,35 +51,14 @@ def _query(verb: verbs.Query, console: Console) -> verbs.VerbResult:
 
 
 def _queries(verb: verbs.Query) -> list[Query]:
-    """The queries of a command, in order: texts, pixels and masks; InputError for options that do not fit."""
-    masks = [Mask(_frames_of(pairs)) for pairs in verb.mask]
-    questions: list[Question] = [*verb.texts, *(At(*at) for at in verb.at), *masks]
+    """The queries of a command, in order: texts, then pixels."""
+    questions = [*verb.texts, *(At(*at) for at in verb.at)]
     if not questions:
         remedy = 'For example: jsecon query field.safetensors "red mug" --out answers'
-        raise InputError("query", "there is no query", "a TEXT, --at FRAME X Y or --mask", remedy)
-    relates = any(map(is_expression, verb.texts))
-    if verb.from_frame is not None and not relates:
-        remedy = 'For example: "the red mug left of the bottle" --from frame_00012'
-        raise InputError("--from", "no text has a relation that is seen from a frame", remedy=remedy)
-    if verb.up is not None and not relates and not is_bare_scene(verb.field):
-        problem = "no text has a relation, and the field has its views"
-        raise InputError("--up", problem, remedy="Leave it out, or make the field again: jsecon run --up.")
+        raise InputError("query", "there is no query", "a TEXT, or --at FRAME X Y", remedy)
     options: dict[str, Any] = {"by": verb.by, "threshold": verb.threshold, "min_rank": verb.min_rank}
-    options |= {"all_of_class": verb.all, "outliers": not verb.keep_outliers, "frame": verb.from_frame}
-    try:
-        return [Query(question, **options) for question in questions]
-    except InputError as error:  # of an option
-        raise InputError(f"--{error.where}", error.problem, error.expected, error.remedy) from error
-
-
-def _frames_of(pairs: list[str]) -> dict[int | str, Path]:
-    """The masks of a frame, a file, a frame, a file ..."""
-    if len(pairs) % 2:
-        raise InputError("--mask", " ".join(pairs), "FRAME PNG, in pairs", "For example: --mask frame_00012 mug.png")
-    frames: dict[int | str, Path] = dict(zip(pairs[::2], map(Path, pairs[1::2])))
-    if 2 * len(frames) < len(pairs):
-        raise InputError("--mask", "a frame has two masks", remedy="Give one mask of an object in each frame.")
-    return frames
+    options |= {"outliers": not verb.keep_outliers, "frame": verb.from_frame}
+    return [Query(question, **options) for question in questions]
 
 
 def write_answer(
@@ -162,8 +138,8 @@ def _file_stem(query: Query) -> str:
     """Names the files of an answer without ending: the same name in every run, and not that of any other query."""
     question, name = query.question, str(query)
     plain = slug(name)
-    pointed = re.fullmatch(r"(at|box|region) .*\d", name, re.DOTALL)  # a text may be called like a pixel
-    by_name = bool(pointed) != isinstance(question, str) and not isinstance(question, Mask)
+    pointed = re.fullmatch(r"at .*\d", name, re.DOTALL)  # a text may be called like a pixel
+    by_name = bool(pointed) != isinstance(question, str)
     device = re.fullmatch(r"con|prn|aux|nul|(com|lpt)\d", plain)  # on Windows, whatever its ending
     short = len(plain.encode()) <= _MAX_SLUG_BYTES and not device
     if by_name and short and plain.replace("-", " ") == name:

@@ -8,16 +8,13 @@ import dataclasses
 import functools
 import math
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, TypeAlias
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int
 
 from jsecon.errors import InputError, require_one_of
-from jsecon.field.columns import votes_of_rows
-from jsecon.field.membership import membership_probability
 from jsecon.files import parse_json, scratch_array
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.referring import Object
@@ -34,17 +31,10 @@ class At:
     """The pixel in column x and row y of a frame: selects the region that lies there."""
 
     frame: int | str
-    """name, the end of a name, or index of the frame; "#10" is an index too"""
+    """name or index of the frame; "#10" is an index too"""
     x: int | float
     """column, px; or if x and y are from 0 to 1 and not both integers, a share of the width"""
     y: int | float
-
-    def pixel(self, width: int, height: int) -> tuple[int, int]:
-        """Column and row in frames of a size, px."""
-        is_share = 0 <= self.x <= 1 and 0 <= self.y <= 1 and any(number % 1 for number in (self.x, self.y))
-        scale = (width, height) if is_share else (1, 1)
-        column, row = (int(number * size) for number, size in zip((self.x, self.y), scale))
-        return (min(column, width - 1), min(row, height - 1)) if is_share else (column, row)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,8 +52,8 @@ class Box:
 class Mask:
     """One object, outlined in one frame or several."""
 
-    frames: Mapping[Any, np.ndarray | str | Path]
-    """frame -> (H, W) bool at the size of the field's frames, or an image file in which black is outside"""
+    frames: Mapping[Any, np.ndarray]
+    """frame -> (H, W) bool at the size of the field's frames"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,7 +81,6 @@ class Query:
       threshold: Smallest similarity of a selected Gaussian; None takes 0.5 for votes and 0.9 for codes.
       min_rank: Share of unrelated words that must be less similar to the scene than a text, else it is absent; 0
         selects the best match of every text. None judges by its margin among these words (`jsecon.query.rules`).
-      all_of_class: Whether to select all regions of the class, such as all chairs, instead of the best one.
       outliers: Whether to drop the Gaussians that stand apart from the rest.
       frame: Frame from which left, right, front and behind are seen. None takes the mean camera, or the frame that
         shows most objects where the cameras look in all directions.
@@ -105,7 +94,6 @@ class Query:
     by: str = "votes"
     threshold: float | int | None = None
     min_rank: float | int | None = None
-    all_of_class: bool = False
     outliers: bool = True
     frame: int | str | None = None
 
@@ -117,9 +105,6 @@ class Query:
             if value is not None and not least <= value <= 1:
                 expected = f"a number from {least} to 1"
                 raise InputError(name, f"{value:g}", expected, f"Leave {name} out for the default.")
-        if isinstance(self.question, Box | Mask) and self.by != "votes":
-            problem = "a mask or a box selects by the outline alone"
-            raise InputError("by", problem, remedy="Leave it out, or ask a text.")
 
     def __str__(self) -> str:
         """The text, or the name of a pixel, box, mask or region."""
@@ -127,8 +112,7 @@ class Query:
         if isinstance(question, str):
             return question
         if isinstance(question, Mask):
-            first = next(iter(question.frames.values()), "mask")
-            return Path(first).stem if isinstance(first, str | Path) else f"mask {next(iter(question.frames))}"
+            return f"mask {next(iter(question.frames), '')}"
         return " ".join(map(str, (type(question).__name__.lower(), *vars(question).values())))
 
 
@@ -137,7 +121,7 @@ class Answer:
     """What a query selects of a field of N Gaussians. `str` of it is the line that the command line prints.
 
     Attributes:
-      query: The query, with the names of its frames.
+      query: The query, of a pixel with the name of its frame.
       by: "votes" or "code"; "outline" for a box or masks; "relation" for a text that tells things apart; "history" for
         what moved, is gone or is new.
       mask: (N,) bool, the selected Gaussians, without outliers.
@@ -205,12 +189,6 @@ class Answer:
     def as_dict(self) -> dict[str, Any]:
         """The record of the answer as plain values for JSON, in the capture's world: the same at every door."""
         region, selected = int(self.selection.region), int(np.asarray(self.selection.mask).sum())
-        probability = {}
-        if len(self.rows) and self.by == "votes":
-            votes = votes_of_rows(jax.tree.map(np.asarray, self.field.votes), self.rows)
-            inside = membership_probability(np.asarray(self.selection.similarity)[self.rows], votes)
-            probability["mean"] = round(float(inside.mean()), 4)
-            probability["percentile_10"] = round(float(np.quantile(inside, 0.1)), 4)
         record = {
             "query": str(self.query),
             "state": self.state,
@@ -221,7 +199,6 @@ class Answer:
             "score": round(float(self.selection.score), 6),
             "rank": _known(self.selection.rank),
             "region": region if region >= 0 else None,
-            "probability": probability or None,
             "outliers": {"dropped": selected - len(self.rows), "selected": selected},
             "place": self._place_record() if len(self.rows) else None,
             "reason": self.reason,
@@ -231,7 +208,6 @@ class Answer:
         if self.by != "relation":
             return record
         relation: dict[str, Any] = {name: getattr(self, name) for name in ("reading", "viewpoint", "question")}
-        relation["ambiguous"] = bool(self.question)
         relation["up"] = None if self.up is None else dataclasses.asdict(source_up(self.field, self.up))
         for name in ("objects", "used"):
             relation[name] = [self._object_record(found) for found in getattr(self, name)]
@@ -347,10 +323,8 @@ def source_shapes(
     return object_shapes(source_points(field, np.asarray(taken.means)), labels, up, spreads=spreads)
 
 
-def gaussian_rows(gaussians: Gaussians, rows: np.ndarray | Bool[np.ndarray, " n"]) -> Gaussians:
-    """Takes some of the Gaussians, by their ids or a mask, as NumPy arrays (`scratch_array`)."""
-    ids = np.asarray(rows)
-    ids = np.flatnonzero(ids) if ids.dtype == bool else ids
+def gaussian_rows(gaussians: Gaussians, ids: Int[np.ndarray, " m"]) -> Gaussians:
+    """Takes some of the Gaussians as NumPy arrays (`scratch_array`)."""
 
     def take(column: Any) -> np.ndarray:
         column = np.asarray(column)

@@ -41,7 +41,7 @@ def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 def figure(image: np.ndarray, caption: str, *, strong: str = "", sharp: bool = False) -> str:
     """Makes a figure of an RGB image, which a click enlarges; `sharp` keeps flat colours without loss."""
     bold = f"<b>{_escaped(strong)}</b> " if strong else ""
-    picture = _image(image, f"{strong} {caption}", sharp, " tabindex=0")
+    picture = _image(image, f"{strong} {caption}".strip(), sharp, " tabindex=0")
     return f"<figure>{picture}<figcaption>{bold}{_escaped(caption)}</figcaption></figure>"
 
 
@@ -57,20 +57,16 @@ def grid(elements: Iterable[str], columns: int | None = None, *, folded: str = "
 
 def card(image: np.ndarray, title: str, words: str, *parts: str) -> str:
     """Makes a card of an RGB image with words under it, which a click opens to show its elements."""
-    summary = f"<summary>{_image(image, title)}<b>{_escaped(title)}</b><span>{_escaped(words)}</span></summary>"
+    summary = f"<summary>{_image(image, title, False)}<b>{_escaped(title)}</b><span>{_escaped(words)}</span></summary>"
     return f'<details class="card">{summary}{"".join(parts)}</details>'
 
 
-def _data_uri(image: np.ndarray, *, sharp: bool = False) -> str:
-    """Encodes an RGB image as a data URI: of a JPEG, or of a PNG if `sharp`."""
+def _image(image: np.ndarray, words: str, sharp: bool, attributes: str = "") -> str:
+    """Returns the tag of an RGB image, whose data is a JPEG, or a PNG if `sharp`."""
     ending, kind, options = (".png", "png", []) if sharp else (".jpg", "jpeg", [cv2.IMWRITE_JPEG_QUALITY, 88])
     _, data = cv2.imencode(ending, cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2BGR), options)
-    return f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode()}"
-
-
-def _image(image: np.ndarray, words: str, sharp: bool = False, attributes: str = "") -> str:
-    """Returns the tag of an image."""
-    return f'<img alt="{_escaped(words.strip())}" src="{_data_uri(image, sharp=sharp)}"{attributes}>'
+    source = f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode()}"
+    return f'<img alt="{_escaped(words)}" src="{source}"{attributes}>'
 
 
 def _escaped(value: object) -> str:

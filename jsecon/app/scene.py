@@ -8,7 +8,6 @@ frames and units.
 import contextlib
 import dataclasses
 import functools
-import re
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -32,7 +31,6 @@ from jsecon.field.field import check_field, load_field
 from jsecon.field.ledger import Ledger, add_views, forget_views, sum_ledger
 from jsecon.field.ledger_file import load_ledger, save_with_ledger
 from jsecon.field.membership import SHARE_THRESHOLD
-from jsecon.field.regions import ALIKE_THRESHOLD
 from jsecon.field.tree import PARTS, cut_field
 from jsecon.files import FIELD_FILE, parse_json
 from jsecon.networks.hub import parse_model
@@ -46,11 +44,9 @@ from jsecon.query.expressions import is_expression, parse_query, split_part
 from jsecon.query.object_shapes import ObjectShapes
 from jsecon.query.outliers import OutlierResult
 from jsecon.query.parts import match_lone_parts
-from jsecon.query.pointing import box_mask, lift, region_at
+from jsecon.query.pointing import box_mask, frame_index, lift, region_at
 from jsecon.query.render import selection_mask
 from jsecon.query.rules import FOUND, ONE_REGION, STATES, UNSURE, QueryRules
-from jsecon.read.captures.images import read_pixels
-from jsecon.read.masks.masks import resize_nearest
 from jsecon.read.splats.files import save_gaussians
 from jsecon.read.splats.points import load_point_cloud, save_point_cloud
 from jsecon.splat.points import nearest_gaussians
@@ -67,20 +63,15 @@ def open_scene(
     path: str | Path,
     *,
     embedder: Any = None,
-    up: Sequence[float | int] | None = None,
-    out: str | Path | None = None,
     console: Console | None = None,
 ) -> "Scene":
     """Opens a field, or a file of Gaussians, to be asked.
 
     Args:
       path: A field file, a folder with field.safetensors, or a file of Gaussians without photographs (.ply, .spz ...),
-        of which a field is made once, as the verbs of the command line do.
-      embedder: What embeds texts: an embedder, a folder or a name of a CLIP model that is on this machine and is opened
-        when a text needs it, or a function that returns an embedder for a field. None takes the model that the field
-        was made with.
-      up: Up axis of the capture's world, three numbers. None takes the field's own.
-      out: Folder for the field of a file of Gaussians; by default NAME_field beside NAME.ply.
+        of which a field is made once, in NAME_field beside NAME.ply.
+      embedder: What embeds texts: an embedder, or a folder or a name of a CLIP model that is on this machine, which is
+        opened when a text needs it. None takes the model that the field was made with.
       console: Receives the progress where a field is made.
 
     Returns:
@@ -91,24 +82,20 @@ def open_scene(
       InputError: The file cannot be read, or no model has such a name.
     """
     console = console or Console()
-    named, file, splat = locate_field(Path(path), None if out is None else Path(out))
+    named, file, splat = locate_field(Path(path))
     model = embedder if isinstance(embedder, str | Path) else None
     if splat is not None:
-        axis: Any = None if up is None else tuple(map(float, up))
-        file = _field_of_gaussians(Options(splat, embedder=model, up=axis), file.parent, console)
+        file = _field_of_gaussians(Options(splat, embedder=model), file.parent, console)
     large = file.is_file() and file.stat().st_size > memory_budget()
     with console.progress("field"):
         if large:
             check_field(file)
         field = load_field(file, mapped=large)
     if model is not None:
-        from jsecon.pipeline.model_loading import field_embedder
-
         parse_model(model, "embedder")
-        embedder = functools.partial(field_embedder, folder=model)
     has_ledger = "ledger" in parse_json(field.provenance)
     ledger = functools.partial(load_ledger, file, field) if has_ledger else None
-    return Scene(field, embedder, up=up, name=named.name, ledger=ledger)
+    return Scene(field, embedder, name=named.name, ledger=ledger)
 
 
 def open_prepared(name: str, path: Path, embedder: str | Path | None, console: Console) -> "Scene":
@@ -119,8 +106,7 @@ def open_prepared(name: str, path: Path, embedder: str | Path | None, console: C
     scene = open_scene(path, embedder=embedder, console=console)
     scene.name = name
     _ = scene.embedder
-    with contextlib.suppress(InputError):  # an embedder that has no word for what is asked to prepare it
-        scene.prepare()
+    scene.prepare()
     return scene
 
 
@@ -133,22 +119,15 @@ def _field_of_gaussians(options: Options, folder: Path, console: Console) -> Pat
 
     with console.progress("plan"):
         if options.embedder is None and (folder / FIELD_FILE).is_file():
-            options = dataclasses.replace(options, embedder=_model_of(folder / FIELD_FILE))
+            with contextlib.suppress(InputError):  # damaged: it is made anew
+                sources = locate_sources(load_field(folder / FIELD_FILE, mapped=True))
+                options = dataclasses.replace(options, embedder=sources.model or sources.address)
         path = pipeline.current_field(options, folder)
     if path is None:
         pipeline.run(options, folder, console=console)
         path = folder / FIELD_FILE
         console.print_line(f"field   {path}")
     return path
-
-
-def _model_of(file: Path) -> str | Path | None:
-    """The folder or address of the model that a field was made with; None if it had none."""
-    try:
-        sources = locate_sources(load_field(file, mapped=True))
-    except InputError:  # damaged: it is made anew
-        return None
-    return sources.model or sources.address
 
 
 class Scene:
@@ -160,8 +139,7 @@ class Scene:
     Args:
       field: The field. One from `load_field(mapped=True)` is read in blocks; boxes, masks and relations need all of it
         in memory.
-      embedder: Its embedder, or a function that makes one of the field; None opens it when a text needs it.
-      up: Up axis of the capture's world; None takes the field's own.
+      embedder: Its embedder, or as for `open_scene`.
       name: Name of the scene.
       ledger: Returns the ledger of the field's views, which `add` and `forget` need; None if the field has none.
 
@@ -175,7 +153,6 @@ class Scene:
         field: LanguageField,
         embedder: Any = None,
         *,
-        up: Sequence[float | int] | None = None,
         name: str = "scene",
         ledger: Callable[[], Ledger] | None = None,
     ):
@@ -183,7 +160,6 @@ class Scene:
         self._read_ledger = ledger
         self.name = name
         self._embedder = embedder
-        self._up = up
         self._lock = threading.RLock()
         count = max(CACHED_BYTES // (5 * max(field.gaussians.count, 1)), 1)
         self._answers = functools.lru_cache(count)(lambda query: self._answer(query))
@@ -201,23 +177,11 @@ class Scene:
         Raises:
           InputError: The model is not on this machine, or is another one.
         """
+        from jsecon.pipeline.model_loading import field_embedder  # late: questions without a text need none of it
+
         with self._lock:
-            if self._embedder is None:
-                from jsecon.pipeline.model_loading import field_embedder
-
-                return field_embedder(self.field)
-            return self._embedder if hasattr(self._embedder, "embed_text") else self._embedder(self.field)
-
-    @functools.cached_property
-    def _text_field(self) -> LanguageField:
-        """The field with phrases and words that texts are compared with: embeddings from files came without them."""
-        field = self.field
-        if len(field.canonical_phrases):
-            return field
-        words = None if field.unrelated_words is None else getattr(self.embedder, "unrelated_words", None)
-        words = field.unrelated_words if words is None else np.float16(words)
-        canonical = np.float32(self.embedder.canonical_phrases)
-        return dataclasses.replace(field, canonical_phrases=canonical, unrelated_words=words)
+            is_open = hasattr(self._embedder, "embed_text")
+            return self._embedder if is_open else field_embedder(self.field, self._embedder)
 
     @functools.cached_property
     def _index(self) -> ObjectIndex:
@@ -225,7 +189,7 @@ class Scene:
         self._require_memory("a relation, an order or a number")
         if self.field.regions.count == 0:
             raise InputError("field", "it has no regions, so no objects", remedy="Make it again with other --masks.")
-        return ObjectIndex(self._text_field, self.embedder, self._catalogue, field_up(self.field, self._up))
+        return ObjectIndex(self.field, self.embedder, self._catalogue, field_up(self.field))
 
     @functools.cached_property
     def ledger(self) -> Ledger:
@@ -307,7 +271,7 @@ class Scene:
         The Gaussians stay, which a run may have fitted to these frames too.
 
         Args:
-          frames: Their names or indices (`frame_index`).
+          frames: Their names or indices.
 
         Returns:
           The new scene.
@@ -316,7 +280,7 @@ class Scene:
           InputError: The field has no such frame, no ledger, or no frame would be left.
         """
         with self._lock:
-            names = {self.field.names[self.frame_index(frame)] for frame in frames}
+            names = {self.field.names[frame_index(self.field, frame)] for frame in frames}
             if names >= {*self.ledger.views}:
                 raise InputError("frames", "no frame with evidence would be left", remedy="Delete the field instead.")
             field = forget_warnings(self.field, sorted(names))
@@ -325,7 +289,7 @@ class Scene:
 
     def _with(self, field: LanguageField, ledger: Callable[[], Ledger] | None) -> "Scene":
         """A scene of another state of the field, with what returns its ledger."""
-        scene = Scene(field, self._embedder, up=self._up, name=self.name, ledger=ledger)
+        scene = Scene(field, self._embedder, name=self.name, ledger=ledger)
         if "embedder" in vars(self):
             scene.embedder = self.embedder
         return scene
@@ -357,7 +321,7 @@ class Scene:
 
         Args:
           question: A text, `At`, `Box`, `Mask` or `Region`; or a `Query`, which has its options.
-          **options: Options of `Query` for a question: by, threshold, min_rank, all_of_class, outliers, frame.
+          **options: Options of `Query` for a question: by, threshold, min_rank, outliers, frame.
 
         Returns:
           The answer. Its mask is empty if the scene does not have what the question names; `reason` and `str` say why.
@@ -371,24 +335,19 @@ class Scene:
             # The arrays of a mask may change.
             return (self._answer if isinstance(query.question, Mask) else self._answers)(query)
 
-    def ask_all(self, questions: Sequence[Question | Query], **options: Any) -> list[Answer | InputError]:
+    def ask_all(self, questions: Sequence[Question | Query]) -> list[Answer | InputError]:
         """Answers several questions.
 
         Args:
           questions: As for `ask`.
-          **options: Options of `Query` for questions that are none.
 
         Returns:
           For each question in turn its answer, or the error that it ends in.
-
-        Raises:
-          InputError: An option is out of its range.
         """
-        queries = [query if isinstance(query, Query) else Query(query, **options) for query in questions]
         results: list[Answer | InputError] = []
-        for query in queries:
+        for question in questions:
             try:
-                results.append(self.ask(query))
+                results.append(self.ask(question))
             except InputError as error:
                 results.append(error)
         return results
@@ -412,10 +371,10 @@ class Scene:
             return self._answer_outline(query, question)
         if isinstance(question, Region):
             return self._answer_region(query, question.id)
-        index = self.frame_index(question.frame)
+        index = frame_index(self.field, question.frame)
         name = self.field.names[index]
         cameras = self.field.cameras
-        x, y = question.pixel(cameras.width, cameras.height)
+        x, y = _pixel_of(question, cameras.width, cameras.height)
         region = region_at(self.field, index, x, y)
         if region < 0:
             problem = f"no region lies under column {x}, row {y} of {cameras.width}x{cameras.height} px"
@@ -436,16 +395,16 @@ class Scene:
             return False
         unsure = int(answer.selection.region) if answer.state == STATES[UNSURE] else -1
         embedded = np.asarray(self.embedder.embed_text(texts))
-        return len(match_lone_parts(self._text_field, embedded, unsure, QueryRules())[0]) > 0
+        return len(match_lone_parts(self.field, embedded, unsure, QueryRules())[0]) > 0
 
     def _answer_text(self, query: Query) -> Answer:
         """Selects the Gaussians that a text names."""
-        field, embedder = self._text_field, self.embedder
+        field, embedder = self.field, self.embedder
         included, excluded = parse_query(str(query))
         rules = self._rules(query, QueryRules())
-        included = choose_shades(field, embedder, included, rules, every=query.all_of_class or bool(excluded))
+        included = choose_shades(field, embedder, included, rules, every=bool(excluded))
         excluded = choose_shades(field, embedder, excluded, rules, every=True)
-        if query.by == "code" and (query.all_of_class or len(included + excluded) > 1):
+        if query.by == "code" and len(included + excluded) > 1:
             problem = "codes cannot select several regions"
             raise InputError(f"query {str(query)!r}", problem, remedy="Ask by votes, or for one thing.")
         embedded = embedder.embed_text(included + excluded)
@@ -456,21 +415,11 @@ class Scene:
         return self._finish(query, found, reason)
 
     def _answer_region(self, query: Query, region: int) -> Answer:
-        """Selects the Gaussians of a region, and of those that the query's options add to it."""
+        """Selects the Gaussians of a region."""
         found = answer_question(self.field, region, self._rules(query, ONE_REGION), outliers=query.outliers)
         last = (self.field.regions.count if self.field.tree is None else len(self.field.tree)) - 1
         reason = "" if 0 <= region <= last else f"there is no region {region}: the regions are 0 to {last}"
         return self._finish(query, found, reason)
-
-    def wider(self, region: Region) -> Region | None:
-        """What a region belongs to: the next larger thing that views see as one; None if nothing larger is known.
-
-        Args:
-          region: A region, or what this method returned. What it consists of has it as parent in `field.tree`.
-        """
-        tree = self.field.tree
-        parent = -1 if tree is None or not 0 <= region.id < len(tree) else int(tree[region.id])
-        return None if parent < 0 else Region(parent)
 
     def at_level(self, level: int) -> "Scene":
         """The scene with another cut of its tree as its objects. Regions keep their ids, those of nodes.
@@ -493,13 +442,11 @@ class Scene:
 
     def _rules(self, query: Query, rules: QueryRules) -> QueryRules:
         """Rules with the options of a query."""
-        options: dict[str, Any] = {"min_rank": query.min_rank, "all_of_class": query.all_of_class}
+        options: dict[str, Any] = {"min_rank": query.min_rank}
         if query.by == "code":
             options["code_threshold"] = CODE_THRESHOLD if query.threshold is None else query.threshold
         elif query.threshold is not None:
             options["min_share"] = query.threshold
-        if query.all_of_class and not isinstance(query.question, str):
-            options |= {"duplicate_cosine": ALIKE_THRESHOLD, "all_of_class": False}
         return dataclasses.replace(rules, **options)
 
     def _answer_outline(self, query: Query, question: Box | Mask) -> Answer:
@@ -507,18 +454,11 @@ class Scene:
         self._require_memory("an outline")
         ends = [] if isinstance(question, Mask) else [question.x0, question.y0, question.x1, question.y1]
         frames = question.frames if isinstance(question, Mask) else {question.frame: box_mask(self.field, *ends)}
-        given = {self.frame_index(frame): mask for frame, mask in frames.items()}
-        if len(given) < len(frames):
-            raise InputError("mask", "a frame has two masks", remedy="Give one mask of an object in each frame.")
-        size = self.field.cameras.width, self.field.cameras.height
-        masks = [_read_mask(m, *size) if isinstance(m, str | Path) else np.asarray(m) for m in given.values()]
+        given = {frame_index(self.field, frame): mask for frame, mask in frames.items()}
+        masks = np.stack([np.asarray(mask, int) for mask in given.values()])
         threshold = SHARE_THRESHOLD if query.threshold is None else query.threshold
-        selection = lift(self.field, np.stack([mask.astype(int) for mask in masks]), list(given), threshold=threshold)
+        selection = lift(self.field, masks, list(given), threshold=threshold)
         outliers = trim(self.field, selection, "supported" if query.outliers else None)
-        named = {self.field.names[index]: mask for index, mask in given.items()}
-        box = isinstance(question, Box)
-        question = dataclasses.replace(question, frame=next(iter(named))) if box else Mask(named)
-        query = dataclasses.replace(query, question=question)
         return self._finish(query, (selection, outliers, 1))
 
     def _finish(self, query: Query, found: tuple[Selection, OutlierResult, int], reason: str = "") -> Answer:
@@ -551,7 +491,7 @@ class Scene:
             words for an object.
         """
         with self._lock:
-            return self._index.answer(Query(text, frame=frame), None if frame is None else self.frame_index(frame))
+            return self._index.answer(Query(text, frame=frame))
 
     def locate(self, text: str, *, frame: int | str | None = None) -> Answer:
         """Finds the one thing that a text names.
@@ -572,9 +512,7 @@ class Scene:
         answer = self.ask(text, frame=frame)
         if answer.count != 1:
             problem = f"it names {answer.count} objects" + (f": {answer.reason}" if answer.reason else "")
-            several = answer.count > 1 and not answer.question and not is_mapped(self.field)
-            question = self.relate(text, frame=frame).question if several else answer.question
-            remedy = question or "Say which, as in 'the red mug left of the green bottle', or point at it."
+            remedy = answer.question or "Say which, as in 'the red mug left of the green bottle', or point at it."
             raise InputError(f"query {text!r}", problem, "one object", remedy[:1].upper() + remedy[1:])
         return answer
 
@@ -589,9 +527,8 @@ class Scene:
           frame: As for `relate`.
 
         Returns:
-          Plain values: "a" and "b"; "surfaces", the smallest distance between Gaussians of the two;
-          "centers", that of the middles of their boxes; "gap", the free way between their boxes on the line between the
-          middles, 0 where they meet; "angle", degrees of the second above the horizontal as seen from the first; the
+          Plain values: "a" and "b"; "surfaces", the smallest distance between Gaussians of the two; "centers", that of
+          the middles of their boxes; "angle", degrees of the second above the horizontal as seen from the first; the
           "unit" of the lengths (metres if the capture's format guarantees them or the run was given a scale, else
           capture units); and "up", what the up axis was taken from.
 
@@ -599,13 +536,8 @@ class Scene:
           InputError: As for `relate`; or a text names no object, or several.
         """
         with self._lock:
-            places = []
-            for end in (a, b):
-                if isinstance(end, str):
-                    places.append(self._index.object_of(end, self.locate(end, frame=frame)))
-                else:
-                    places.append(np.asarray(end, np.float64))
-            return {"a": a, "b": b} | self._index.distances(*places)
+            ends = [self.locate(end, frame=frame) if isinstance(end, str) else end for end in (a, b)]
+            return {"a": a, "b": b} | self._index.distances(ends)
 
     def scaled(self, a: str | Sequence[float | int], b: str | Sequence[float | int], metres: float | int) -> "Scene":
         """Gives the scene its scale by one known length, which replaces any other.
@@ -630,7 +562,7 @@ class Scene:
     @functools.cached_property
     def _catalogue(self) -> Catalogue:
         """All objects, named by an embedder that was given, else by the words that the field holds."""
-        return objects(self.field, None, self._embedder and self.embedder, up=self._up)
+        return objects(self.field, None, self._embedder and self.embedder)
 
     def objects(self, vocabulary: Sequence[str] | None = None) -> Catalogue:
         """Lists the objects of the scene with names, boxes and sizes.
@@ -647,7 +579,7 @@ class Scene:
         with self._lock:
             if vocabulary is None:
                 return self._catalogue
-            return objects(self.field, vocabulary, self.embedder, up=self._up)
+            return objects(self.field, vocabulary, self.embedder)
 
     def changes(self, later: "Capture | Scene") -> Changes:
         """Finds what became of each object, and what is new, in new photographs.
@@ -674,7 +606,7 @@ class Scene:
     def update(self, changes: Capture | Changes, *, date: str) -> "Scene":
         """Applies what changed: objects move or are gone, and new ones come. Ids of regions stay.
 
-        The field's history keeps what it was (`as_of`, `history`). What is unsure stays as it is.
+        The field's history keeps what it was (`as_of`). What is unsure stays as it is.
 
         Args:
           changes: What `changes` returned, or the photographs.
@@ -701,13 +633,9 @@ class Scene:
         field = field_as_of(self.field, read_date(date, "--as-of"))
         return self._with(field, self._read_ledger if field is self.field else None)
 
-    def history(self) -> list[dict[str, Any]]:
-        """Plain values of each change of the field since it was made, in order of time."""
-        return events(self.field)
-
     def _answer_history(self, query: Query, kind: str) -> Answer:
         """Selects what moved, is gone or is new."""
-        found = [e for e in zip(self.field.history, self.history()) if kind in ("", e[1]["kind"])]
+        found = [e for e in zip(self.field.history, events(self.field)) if kind in ("", e[1]["kind"])]
         mask = np.zeros(self.field.gaussians.count, bool)
         for event, _ in found:
             mask[np.asarray(event.rows)] = True
@@ -718,46 +646,10 @@ class Scene:
         return Answer(query, "history", mask, selection, self.field, count=len(found), reason=reason)
 
     def prepare(self) -> None:
-        """Compiles what questions need, so that the first question is as fast as later ones.
-
-        Raises:
-          InputError: The embedder has no words.
-        """
-        with self._lock:
+        """Compiles what questions need, so that the first question is as fast as later ones."""
+        with self._lock, contextlib.suppress(InputError):  # an embedder without words: each text then has this error
             self.mask(self.ask("red"), 0)
             self.relate("red")
-
-    def frame_index(self, frame: int | str) -> int:
-        """Finds a frame.
-
-        Args:
-          frame: Its name, the end of a name that no other name has, or its index, an integer or "#10".
-
-        Returns:
-          Its index.
-
-        Raises:
-          InputError: The field has no such frame, or several.
-        """
-        names = self.field.names
-        if isinstance(frame, str):
-            for name in (frame, Path(frame).stem):
-                if name in names:
-                    return names.index(name)
-            matches = [t for t, name in enumerate(names) if frame and name.endswith(frame)]
-            if len(matches) == 1:
-                return matches[0]
-            if len(matches) > 1:
-                problem = f"{len(matches)} frames have names that end so, such as {names[matches[0]]}"
-                raise InputError(f"frame {frame}", problem, remedy="Give more of the name.")
-        digits = re.fullmatch(r"#([0-9]{1,9})", frame) if isinstance(frame, str) else None
-        index = int(digits[1]) if digits else frame if isinstance(frame, int) and not isinstance(frame, bool) else -1
-        if 0 <= index < len(names):
-            return index
-        known = f"a name ({names[0]} ... {names[-1]}), the end of one, or a place, #0 to #{len(names) - 1}"
-        raise InputError(
-            f"frame {frame}", "no such frame in the field", known, "report.html of the run shows the frames."
-        )
 
     def best_frames(self, answer: Answer, count: int) -> list[int]:
         """Chooses the frames that show an answer best.
@@ -799,7 +691,7 @@ class Scene:
                 rows[: len(chosen)] = chosen
                 mask = np.arange(len(rows)) < len(chosen)
                 gaussians = jax.device_put(gaussian_rows(gaussians, rows))
-            return np.asarray(selection_mask(gaussians, self._cameras[self.frame_index(frame)], mask))
+            return np.asarray(selection_mask(gaussians, self._cameras[frame_index(self.field, frame)], mask))
 
     @functools.cached_property
     def _gaussians(self) -> Gaussians:
@@ -822,7 +714,7 @@ class Scene:
           InputError: There is no such frame.
         """
         with self._lock:
-            photo = self._photo(self.frame_index(frame))
+            photo = self._photo(frame_index(self.field, frame))
             return photo if selected is None else pictures.selection_overlay(photo, self.mask(selected, frame))
 
     def export(
@@ -849,8 +741,8 @@ class Scene:
         field, ids, names, world = self.field, {}, (), self.field.source_from_scene
         gaussians = field.gaussians
         if labels is not None:
-            names, classes = labels.names[:, 0].tolist(), np.append(labels.class_ids, np.int32(-1))
-            ids = {"object_id": labels.labels, "class_id": classes[labels.labels]}
+            classes = np.append(labels.class_ids, np.int32(-1))
+            names, ids = labels.names.tolist(), {"object_id": labels.labels, "class_id": classes[labels.labels]}
         mask = selected.mask if isinstance(selected, Answer) else selected
         if points:
             cloud = locate_sources(field).points
@@ -874,7 +766,6 @@ def locate(
     embedder: Any = None,
     *,
     frame: int | str | None = None,
-    up: Sequence[float | int] | None = None,
 ) -> ObjectShapes:
     """Locates the one thing that a text names.
 
@@ -883,7 +774,6 @@ def locate(
       text: For example "orange ball" or "the red mug left of the bottle".
       embedder: Embedder of the field; None opens it.
       frame: As for `Scene.relate`.
-      up: Up axis of the capture's world; None takes the field's own.
 
     Returns:
       Its boxes and points, in the capture's world and its unit.
@@ -891,18 +781,15 @@ def locate(
     Raises:
       InputError: As for `Scene.locate`.
     """
-    return Scene(field, embedder, up=up).locate(text, frame=frame).place
+    return Scene(field, embedder).locate(text, frame=frame).place
 
 
-def _read_mask(file: str | Path, width: int, height: int) -> Bool[np.ndarray, "h w"]:
-    """Reads an image, in which black is outside, as a mask at the size of a field's frames, px."""
-    image = read_pixels(Path(file))
-    inside = np.asarray(image[..., :3].any(-1) if image.ndim == 3 else image > 0, np.uint8)
-    if abs(inside.shape[1] * height - inside.shape[0] * width) > max(width, height) + max(inside.shape):
-        problem = f"the mask is {inside.shape[1]}x{inside.shape[0]}"
-        expected = f"{width}x{height}, or the same shape at another size"
-        raise InputError(file, problem, expected, "Outline the frame as the run used it.")
-    return resize_nearest(inside, width, height) > 0
+def _pixel_of(point: At, width: int, height: int) -> tuple[int, int]:
+    """Column and row of a point in frames of a size, px."""
+    is_share = 0 <= point.x <= 1 and 0 <= point.y <= 1 and any(number % 1 for number in (point.x, point.y))
+    if not is_share:
+        return int(point.x), int(point.y)
+    return min(int(point.x * width), width - 1), min(int(point.y * height), height - 1)
 
 
 def _padded(count: int, most: int) -> int:

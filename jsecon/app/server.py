@@ -27,7 +27,8 @@ import uvicorn
 from fastapi import FastAPI, HTTPException, Query as Parameters, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
-from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictFloat, StrictInt, StrictStr, StringConstraints
+from jaxtyping import Bool
+from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt, StrictStr, StringConstraints
 from pydantic.types import Base64Bytes
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException as AnyHTTPException
@@ -35,10 +36,12 @@ from starlette.exceptions import HTTPException as AnyHTTPException
 import jsecon
 from jsecon.app import verbs
 from jsecon.app.opening import find_scene, name_fields
-from jsecon.app.records import At, Query
+from jsecon.app.records import At
 from jsecon.app.scene import Scene, open_prepared
+from jsecon.change.history import events
 from jsecon.errors import InputError, describe_error
 from jsecon.pipeline.progress import Console
+from jsecon.query.pointing import frame_index
 
 MAX_BODY, MAX_FRAME = 64 * 1024, 32 * 1024 * 1024
 """bytes of a request's body, and of one with a photograph"""
@@ -65,7 +68,6 @@ class _Question(_Request):
     at: tuple[Frame, Place, Place] | None = Field(None, description="[frame, column, row], px or shares of the frame")
     by: verbs.By = "votes"
     threshold: Annotated[StrictFloat | StrictInt, Field(ge=-1, le=1)] | None = None
-    all: StrictBool = False
     frame: Seen = None
 
 
@@ -187,11 +189,10 @@ def application(scenes: dict[str, Scene], *, token: str = "") -> FastAPI:
         if (request.text is None) == (request.at is None):
             raise HTTPException(422, 'Field "text": give it, or "at", and not both.')
         question = request.text or "" if request.at is None else At(*request.at)
-        options = {"by": request.by, "threshold": request.threshold, "all_of_class": request.all}
-        answer = scene.ask(Query(question, frame=request.frame, **options))
+        answer = scene.ask(question, by=request.by, threshold=request.threshold, frame=request.frame)
         return _AsciiResponse({"field": scene.name} | answer.as_dict())
 
-    @app.post("/measure", summary="Distances between two objects: surfaces, centres, free gap, angle")
+    @app.post("/measure", summary="Distances between two objects: surfaces, centres, angle")
     def measure(request: _Pair) -> Response:
         scene = find_scene(scenes, request.field)
         return _AsciiResponse({"field": scene.name} | scene.measure(request.a, request.b, frame=request.frame))
@@ -204,7 +205,7 @@ def application(scenes: dict[str, Scene], *, token: str = "") -> FastAPI:
     @app.get("/changes", summary="What moved, is gone or is new since a field was made, in order of time")
     def changes(request: Annotated[_Request, Parameters()]) -> Response:
         scene = find_scene(scenes, request.field)
-        return _AsciiResponse({"field": scene.name, "changes": scene.history()})
+        return _AsciiResponse({"field": scene.name, "changes": events(scene.field)})
 
     @app.post("/frames", summary="Adds a photograph to a field, as jsecon add does, until the server stops")
     def frames(request: _NewFrame) -> Response:
@@ -220,20 +221,14 @@ def application(scenes: dict[str, Scene], *, token: str = "") -> FastAPI:
     @app.get("/selection.ply", summary="The selected Gaussians in the capture's world")
     def selection(request: Annotated[_Selection, Parameters()]) -> Response:
         scene = find_scene(scenes, request.field)
-        answer = scene.ask(request.text, by=request.by)
-        if not len(answer.rows):
-            raise InputError(f"query {request.text!r}", "no Gaussian is selected", remedy="Ask with other words.")
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder, "selection.ply")
-            scene.export(file, answer)
-            return Response(file.read_bytes(), media_type="application/octet-stream")
+        return ply_response(scene, scene.ask(request.text, by=request.by).mask)
 
     @app.get("/mask.png", summary="The selection alone in a frame, alpha above 0.7")
     def mask(request: Annotated[_MaskOf, Parameters()]) -> Response:
         scene = find_scene(scenes, request.field)
         answer = scene.ask(request.text, by=request.by)
         best = [*scene.best_frames(answer, 1), 0][0]
-        index = best if request.frame is None else scene.frame_index(request.frame)
+        index = best if request.frame is None else frame_index(scene.field, request.frame)
         image = cv2.imencode(".png", scene.mask(answer, index).astype(np.uint8) * 255)[1].tobytes()
         name = re.sub("[^ -~]", "?", scene.field.names[index])
         return Response(image, media_type="image/png", headers={"x-frame": name})
@@ -264,6 +259,16 @@ def application(scenes: dict[str, Scene], *, token: str = "") -> FastAPI:
         return _AsciiResponse({"error": "Internal error. The server's log has it."}, 500)
 
     return app
+
+
+def ply_response(scene: Scene, mask: Bool[np.ndarray, " n"]) -> Response:
+    """The Gaussians of a mask as a .ply in the capture's world; InputError if there is none."""
+    if not mask.any():
+        raise InputError("selection", "no Gaussian is selected", remedy="Ask with other words.")
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder, "selection.ply")
+        scene.export(file, mask)
+        return Response(file.read_bytes(), media_type="application/octet-stream")
 
 
 def _describe(scene: Scene) -> dict[str, Any]:

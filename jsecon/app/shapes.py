@@ -60,7 +60,7 @@ def _to_json(items: list[_Item], unit: str) -> str:
 
 def _title(item: _Item) -> str:
     """Returns the id and the name of an object."""
-    return f"{item['id']:03d} {item['name']}".rstrip()
+    return f"{item['id']:03d} {item['name']}"
 
 
 def _turn(item: _Item) -> np.ndarray:

@@ -13,7 +13,6 @@ from tyro.conf import Positional, UseAppendAction, arg
 from jsecon.networks.hub import Role
 from jsecon.pipeline.options import (
     BareOptions,
-    Direction,
     FieldOptions,
     InputOptions,
     MaskOptions,
@@ -167,9 +166,9 @@ class _LevelVerb(_FieldVerb):
 
 
 class Query(_LevelVerb):
-    """Selects the Gaussians of a text, of a pixel, or of an outline.
+    """Selects the Gaussians of a text or of a pixel.
 
-    For each text, pixel or outline, writes to the output folder: the selected Gaussians as a .ply (INRIA's layout, in
+    For each text or pixel, writes to the output folder: the selected Gaussians as a .ply (INRIA's layout, in
     the capture's world; SuperSplat opens it), a .json with count, score, region, centroid and bounding box, masks
     of the frames that show it best, and answers.html with the pictures. They replace the files of an earlier answer to
     the same text. A field of more than half of the free memory,
@@ -177,26 +176,18 @@ class Query(_LevelVerb):
     and --at.
 
     Attributes:
-      field: Path of field.safetensors, the folder that jsecon run wrote it to, or a file of Gaussians without
-        photographs, of which the field is made once, to OUT/field.
       texts: What to find, such as "red mug" "dark green bottle" "mug or bowl but not handle", or with a relation, an
         order or a number: "the red mug left of the bottle", "the second largest box", "what is on the table". Quotes
         in a text make its words an object as they stand.
       from_frame: Frame from which left, right, front and behind are seen. By default it is the mean camera, or the
         frame that shows most objects where the cameras look in all directions.
-      up: Up axis of the capture's world, three numbers, for relations, and for the views of a file of Gaussians. By
-        default it is the field's own, and an answer says what that was taken from.
       at: Selects what lies under the pixel in column X and row Y of a frame, in the frames as the run used them, or at
-        shares of their width and height such as 0.25 0.5. A frame is named by its name, the end of its name, or its
-        place such as #10.
-      mask: Selects the object that a mask outlines in a frame, or masks in several frames. Black is outside.
+        shares of their width and height such as 0.25 0.5. A frame is named by its name, or its place such as #10.
       out: Output folder.
       by: How a matching region selects Gaussians: by its votes, or by its code in a field of jsecon run --paper.
       threshold: Smallest similarity of a selected Gaussian. By default it is 0.5 for votes and 0.9 for code.
       min_rank: Share of unrelated words that must be less similar to the scene than a text, else the text is absent.
         With 0 every text is answered. By default it is found, unsure or absent by how its match compares with theirs.
-      all: Selects every region of the kind that a text names, such as all chairs, instead of the best one: those whose
-        similarity lies at least 0.75 of the way from the median region to the best one (by votes).
       keep_outliers: Keeps the Gaussians that stand apart from the rest of an answer. By default DBSCAN drops them, and
         clusters with less than a tenth of the largest one's weight in the views. The .json counts them.
       views: Number of masks to write for each query. 0 leaves out answers.html too: nothing is rendered, and the first
@@ -214,14 +205,11 @@ class Query(_LevelVerb):
     at: Annotated[Repeated[tuple[str, float, float]], arg(metavar="FRAME X Y"), Range(0, 100_000)] = dataclasses.field(
         default_factory=list
     )
-    mask: Annotated[Repeated[list[str]], arg(metavar="FRAME PNG ...")] = dataclasses.field(default_factory=list)
     out: Option[Path] = Path("answers")
     from_frame: Annotated[Option[str | None], arg(name="from", metavar="FRAME")] = None
-    up: Direction[Option[tuple[float, float, float] | None]] = None
     by: Option[By] = "votes"
     threshold: Annotated[Option[float | None], Range(-1, 1)] = None
     min_rank: Annotated[Option[float | None], Range(0, 1)] = None
-    all: Option[bool] = False
     keep_outliers: Option[bool] = False
     views: Annotated[Option[int], Range(0, 1000)] = 3
     as_of: Option[str | None] = None
@@ -236,17 +224,14 @@ class Objects(_LevelVerb):
 
     Attributes:
       out: Output folder.
-      vocabulary: Text file of names to choose from, one a line. By default these are colours for a field without
-        models, and some 330 common nouns for one with CLIP.
     """
 
     examples = (
         "jsecon objects my_field/field.safetensors",
-        "jsecon objects my_field/field.safetensors --vocabulary names.txt --out catalogue",
+        "jsecon objects my_field/field.safetensors --out catalogue",
     )
 
     out: Option[Path | None] = None
-    vocabulary: Option[Path | None] = None
 
 
 class Add(_FieldVerb):
@@ -299,13 +284,12 @@ class Forget(Verb):
 class Export(_LevelVerb):
     """Writes the scene of a field, or objects of it, for other programs.
 
-    The scene is in the capture's world. A .usda is a text of OpenUSD with a prim for each object. The file labels.json
-    beside each export has id, name, probability, colour, box, parent and frames of each object.
+    The scene is in the capture's world. A .ply has object_id, the id of each Gaussian's object in jsecon objects or -1,
+    and class_id, which objects of one name share. A .usda is a text of OpenUSD with a prim for each object. The file
+    labels.json beside each export has id, name, probability, colour, box, parent and frames of each object.
 
     Attributes:
       out: The .ply (INRIA's layout), .usda, .las or .laz to write.
-      with_labels: Adds object_id, the id of each Gaussian's object in jsecon objects or -1, and class_id, which objects
-        of one name share, to the .ply.
       objects: Folder to write a .ply of each object to, named by its id and name. They replace those of an earlier
         export to that folder.
       shapes: File for the solids of whole objects but surroundings, in metres if their length is known: .json (box,
@@ -326,7 +310,6 @@ class Export(_LevelVerb):
     )
 
     out: Option[Path | None] = None
-    with_labels: Option[bool] = False
     objects: Option[Path | None] = None
     shapes: Option[Path | None] = None
     points: Option[bool] = False
@@ -391,13 +374,13 @@ class Clean(Verb):
     near the scene, as for jsecon run, or are planned. Prints how many of each kind went, and how the pictures changed.
 
     Attributes:
-      scene: A file of Gaussians (.ply, .spz, .sog, .splat), or a field.
+      scene: A file of Gaussians (.ply, .spz, .sog, .splat).
       out: The .ply or .usda to write.
       cameras: Poses to look from instead: a COLMAP model, a transforms.json, or INRIA's cameras.json.
       views: Number of views to plan, in place of poses near the scene.
       capture: Capture of the scene, as for jsecon run. Its poses are the views, and its photographs give the PSNR
         before and after.
-      keep_objects: Keeps every Gaussian of an object of the field, which is made first where the scene has none.
+      keep_objects: Keeps every Gaussian of an object of the scene's field, which is made first where it has none.
     """
 
     examples = (
@@ -416,9 +399,9 @@ class Clean(Verb):
 class Measure(_FieldVerb):
     """Measures lengths between things or points, and gives a field its scale by one known length.
 
-    Lengths are those between the middles, between the surfaces, and the gap between the boxes. They are in metres if
-    the capture's format has them or a length is known, else in units of the capture. The field keeps its scale, and
-    every answer uses it ("within 1 m of the table").
+    Lengths are those between the middles, and between the surfaces. They are in metres if the capture's format has them
+    or a length is known, else in units of the capture. The field keeps its scale, and every answer uses it ("within 1 m
+    of the table").
 
     Attributes:
       texts: Things to measure between, each with each other.

@@ -66,10 +66,9 @@ def answer_question(
     node of `LanguageField.tree` for the Gaussians under it.
     `outliers` drops the Gaussians that lie apart; regions of the `excluded` texts are left out.
     """
-    node = None
+    node, several = None, False
     if isinstance(query, int | np.integer):
         match = match_region(field, query, rules)
-        several = rules.duplicate_cosine is not None
         if field.tree is not None and field.regions.count <= query < len(field.tree):
             node, several = select_node(field, int(query)), True
     else:

@@ -5,7 +5,9 @@ several, its rendering weights decide on the Gaussians that the frames see. The 
 decide on the others, such as the far side of a mug.
 """
 
+import re
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -93,7 +95,7 @@ def region_at(field: LanguageField, frame: int | str, x: int, y: int) -> int:
     Raises:
       InputError: The field does not have the frame or the pixel.
     """
-    frame, width, height = _frame(field, frame), field.cameras.width, field.cameras.height
+    frame, width, height = frame_index(field, frame), field.cameras.width, field.cameras.height
     if not (0 <= x < width and 0 <= y < height):
         remedy = f"Give x and y in the frames as the run used them, {width}x{height}."
         known = f"column 0 to {width - 1}, row 0 to {height - 1}"
@@ -132,7 +134,7 @@ def lift(
       InputError: The field does not have a frame, or the masks have no pixel inside.
       ValueError: The masks have another size.
     """
-    index = [_frame(field, frame) for frame in frames]
+    index = [frame_index(field, frame) for frame in frames]
     size = field.cameras.height, field.cameras.width
     masks = np.asarray(masks).astype(np.int32)
     valid = bool(np.isin(masks, (OUTSIDE, INSIDE, UNKNOWN)).all())
@@ -182,9 +184,17 @@ def _regions_within(field: LanguageField, inside: np.ndarray, outside: np.ndarra
     return totals[0] / np.maximum(totals[0] + totals[1], 1e-9)
 
 
-def _frame(field: LanguageField, frame: int | str) -> int:
-    known = field.names.index(frame) if frame in field.names else frame
-    if not isinstance(known, int | np.integer) or not 0 <= known < len(field.names):
-        names = f"0 to {len(field.names) - 1}, or a name ({field.names[0]} ... {field.names[-1]})"
-        raise InputError(f"frame {frame}", "no such frame in the field", names, "See LanguageField.names.")
-    return int(known)
+def frame_index(field: LanguageField, frame: int | str) -> int:
+    """Finds a frame by its name, or by its index, an integer or "#10"; raises InputError if there is no such frame."""
+    names, index = field.names, frame
+    if isinstance(frame, str):
+        for name in (frame, Path(frame).stem):
+            if name in names:
+                return names.index(name)
+        digits = re.fullmatch(r"#([0-9]{1,9})", frame)
+        index = int(digits[1]) if digits else -1
+    if isinstance(index, int | np.integer) and 0 <= index < len(names):
+        return int(index)
+    known = f"a name ({names[0]} ... {names[-1]}) or a place, #0 to #{len(names) - 1}"
+    remedy = "report.html of the run shows the frames."
+    raise InputError(f"frame {frame}", "no such frame in the field", known, remedy)

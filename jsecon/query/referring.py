@@ -41,8 +41,8 @@ class Object:
         return min(self.conditions.values(), default=1.0)
 
 
-Find = Callable[[str], tuple[list[Object], float]]
-"""The objects that a phrase names (all for ANY_OBJECT), and the share of unrelated words less similar to the scene."""
+Find = Callable[[str], list[Object]]
+"""The objects that a phrase names; all for ANY_OBJECT."""
 
 
 @dataclasses.dataclass
@@ -75,10 +75,9 @@ def evaluate(
 
     `units` are the capture's unit and the metre, in the world of the shapes.
     """
-    candidates, rank = find(thing.text)
+    candidates = find(thing.text)
     if not candidates:
-        known = "" if np.isnan(rank) else f" ({int(100 * rank)} % of unrelated words are less like the scene)"
-        return _ReferringResult([], reason=f"there is no {thing.text!r} in the scene{known}")
+        return _ReferringResult([], reason=f"there is no {thing.text!r} in the scene")
     shapes = _stack_shapes(candidates)
     used: list[Object] = []
     orders: list[tuple[str, np.ndarray]] = []

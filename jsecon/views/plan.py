@@ -61,7 +61,7 @@ class _PlannedViews:
     def __str__(self) -> str:
         """Describes the plan on one line: number of views, kind of scene, coverage and up axis."""
         up = ", ".join(f"{number:.2f}" for number in self.frame.axes[2])
-        trust = "" if self.frame.sure else "; not sure, --up X Y Z sets it"
+        trust = "" if self.frame.sure else "; not sure, jsecon run --up X Y Z sets it"
         return (
             f"{len(self.cameras)} virtual views of {'a room' if self.kind == 'room' else 'an object'}, "
             f"{self.coverage:.0%} of it seen; up is ({up}), from {self.frame.evidence}{trust}"

@@ -35,7 +35,7 @@ def page(field: LanguageField, texts: Mapping[str, Answer | None], *, title: str
     """
     drawn, low, high = drawn_gaussians(field)
     splats, size_range = _pack(field.gaussians, smallest_nodes(field, main_regions(field)), drawn, low, high)
-    cameras, turn = field.cameras, np.asarray(field.source_from_scene, np.float64)[:3, :3]
+    cameras = field.cameras
     scene = {
         "served": served,
         "gaussians": field.gaussians.count,
@@ -48,7 +48,8 @@ def page(field: LanguageField, texts: Mapping[str, Answer | None], *, title: str
         "history": ["what moved", "what is new"] if served and field.history else [],
         "up": list(field_up(field).axis),
         "unit": "units" if field.metres_per_unit is None else "m",
-        "unit_length": float(np.cbrt(abs(np.linalg.det(turn)))) * (field.metres_per_unit or 1.0),
+        "world": np.asarray(field.source_from_scene, np.float64)[:3].tolist(),
+        "unit_length": field.metres_per_unit or 1.0,
         "frames": list(field.names),
         "poses": np.asarray(cameras.world_to_camera, np.float64)[:, :3].tolist(),
         "focals": np.asarray(cameras.fx, np.float64).tolist(),
@@ -66,9 +67,7 @@ def answer_record(result: Answer | InputError, drawn: Bool[np.ndarray, " n"]) ->
     if isinstance(result, InputError):
         return {"words": result.sentence, "remedy": result.remedy or "Ask in other words.", "mask": ""}
     mask = np.packbits(np.asarray(result.mask)[drawn], bitorder="little").tobytes()
-    score = round(float(result.selection.score), 6)
-    packed = base64.b64encode(mask).decode()
-    return {"state": result.state, "score": score, "words": result.describe(), "mask": packed}
+    return {"words": result.describe(), "mask": base64.b64encode(mask).decode()}
 
 
 def drawn_gaussians(

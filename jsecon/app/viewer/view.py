@@ -39,6 +39,5 @@ def _export_page(verb: verbs.View, file: Path, console: Console) -> verbs.VerbRe
         write_text(file, page(scene.field, answers, title=scene.name))
     for answer in answers.values():
         console.print_line(str(answer))
-    count, size = scene.field.gaussians.count, file.stat().st_size
-    console.print_line(f"{count} Gaussians, texts answered: {len(answers)}, {size / 2**20:.1f} MiB  {file}")
-    return {"written": {"page": file}, "gaussians": count, "answers": [*answers], "bytes": size, "errors": errors}
+    console.print_line(f"page    {file}, texts answered: {len(answers)}")
+    return {"written": {"page": file}, "answers": [*answers], "errors": errors}
