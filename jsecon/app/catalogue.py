@@ -19,7 +19,7 @@ from jsecon.field.columns import vote_blocks
 from jsecon.field.membership import SHARE_THRESHOLD, ratio, vote_columns, vote_shares
 from jsecon.field.similarity import similarities
 from jsecon.programs import stored_jit
-from jsecon.query.match import MIN_FRAGMENT_OVERLAP, judge_texts, regions_with, unrelated_words
+from jsecon.query.match import MIN_FRAGMENT_OVERLAP, compare_words, regions_with, score_text, unrelated_words
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.outliers import MIN_SAMPLES
 from jsecon.query.rules import ABSENT, RULES, QueryRules
@@ -173,10 +173,13 @@ def objects(
     members = np.arange(groups.max(initial=-1) + 1)[:, None] == groups  # (G, R)
     pixels = np.asarray(field.regions.pixel_counts, np.float64)
     weighted = pixels.sum(1)[:, None] * np.asarray(field.regions.embeddings, np.float64)
-    arrays = field.regions.embeddings, embeddings, field.regions.pixel_counts
     present = np.zeros(len(texts), bool)
     if len(members):
-        present = np.asarray(judge_texts(*map(jnp.asarray, arrays), unrelated_words(field), RULES)) > ABSENT
+        regions, words = jax.tree.map(np.asarray, (field.regions, unrelated_words(field)))
+        with np.errstate(invalid="ignore"):  # as a query does, without a program
+            words = compare_words(regions.embeddings, words, RULES.retrieval)
+            scores = [score_text(regions.embeddings, row, regions.pixel_counts, words, RULES) for row in embeddings]
+        present = np.array([score.state for score in scores]) > ABSENT
     text = np.asarray(texts, object)
     is_background = np.array(["background" in name.lower().split() for name in texts], bool)
     allowed = present & ~(_is_small(field, groups, main)[:, None] & is_background)

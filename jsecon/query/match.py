@@ -19,7 +19,6 @@ Pure functions but for `join_fragments`.
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jax import export
 from jaxtyping import Bool, Float, Int, Shaped
@@ -28,7 +27,6 @@ from jsecon.field.regions import mean_residuals
 from jsecon.field.similarity import Number, similarities
 from jsecon.field.tree import node_members
 from jsecon.numerics import array_module, cosine_matrix, inline_jit, normalize
-from jsecon.programs import stored_jit
 from jsecon.query.rules import ABSENT, FOUND, QueryRules
 from jsecon.types import Array, LanguageField, Selection
 
@@ -134,19 +132,6 @@ def score_text(
         rank = standing[0]
     state = rules.judge(standing, similarity[best])
     return _TextScores(similarity, known, best, state, rank)
-
-
-@stored_jit
-def judge_texts(
-    embeddings: Float[Array, "r e"],
-    texts: Float[Array, "q e"],
-    pixels: Shaped[Array, "r t"],
-    words: Float[Array, "w e"] | None,
-    rules: QueryRules,
-) -> Int[Array, " q"]:
-    """Judges whether a scene has what each text names: indices of `rules.STATES`, those of `score_text`."""
-    word_scores = compare_words(embeddings, words, rules.retrieval)
-    return jax.vmap(lambda text: score_text(embeddings, text, pixels, word_scores, rules).state)(texts)
 
 
 def region_similarities(
