@@ -3,7 +3,7 @@
 import colorsys
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -17,9 +17,9 @@ from jsecon.app.records import gaussian_rows, rounded, source_shapes, source_up,
 from jsecon.errors import InputError
 from jsecon.field.columns import vote_blocks
 from jsecon.field.membership import SHARE_THRESHOLD, ratio, vote_columns, vote_shares
-from jsecon.field.similarity import similarities
 from jsecon.programs import stored_jit
-from jsecon.query.match import MIN_FRAGMENT_OVERLAP, compare_words, regions_with, score_text, unrelated_words
+from jsecon.query.answer import match_region
+from jsecon.query.match import MIN_FRAGMENT_OVERLAP, compare_words, score_text, unrelated_words
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.outliers import MIN_SAMPLES
 from jsecon.query.rules import ABSENT, RULES, QueryRules
@@ -308,30 +308,26 @@ def _is_small(
     return np.array([sides(rows).max() < limit for rows in owned], bool)
 
 
-@stored_jit
-def _same_object(
-    embeddings: Float[Array, "r e"], overlap: Float[Array, "r r"] | None
-) -> tuple[Bool[Array, "r r"], Bool[Array, "r r"]]:
+def _same_object(field: LanguageField) -> tuple[Bool[np.ndarray, "r r"], Bool[np.ndarray, "r r"]]:
     """Finds the pairs of regions that show one object, and those that look as if they did (`duplicate_cosine`).
 
     A question for either region of the first pairs adds the other, and they overlap; without `Votes.overlap` no two
     regions are joined. Both relations are symmetric.
     """
-    count = embeddings.shape[0]
-    itself = jnp.eye(count, dtype=bool)
+    itself = np.eye(field.regions.count, dtype=bool)
 
-    def matched(rules: QueryRules) -> Array:
-        def with_region(region):
-            cosines, known = similarities(embeddings, embeddings[region])
-            return regions_with(region, cosines, known, embeddings, overlap, rules)
-
-        chosen = jax.vmap(with_region)(jnp.arange(count))
+    def matched(regions: Iterable[int], rules: QueryRules) -> np.ndarray:
+        chosen = itself.copy()
+        for region in regions:
+            chosen[region] = match_region(field, region, rules).chosen
         return chosen & chosen.T
 
-    alike = itself | matched(QueryRules(fragment_score=None))
-    if overlap is None:
-        return (itself, alike)
-    return (itself | (matched(QueryRules()) & (overlap >= MIN_FRAGMENT_OVERLAP)), alike)
+    alike = matched(range(len(itself)), QueryRules(fragment_score=None))
+    if field.votes.overlap is None:
+        return itself, alike
+    overlaps = itself | (np.asarray(field.votes.overlap) >= MIN_FRAGMENT_OVERLAP)
+    several = np.flatnonzero(overlaps.sum(axis=1) > 1).tolist()
+    return overlaps & matched(several, QueryRules()), alike
 
 
 def _region_objects(field: LanguageField, main: np.ndarray, up: np.ndarray) -> Int[np.ndarray, " r"]:
@@ -341,8 +337,7 @@ def _region_objects(field: LanguageField, main: np.ndarray, up: np.ndarray) -> I
     """
     if field.regions.count == 0:
         return np.zeros(0, int)
-    arrays = jax.tree.map(jnp.asarray, (field.regions.embeddings, field.votes.overlap))
-    joined, alike = map(np.array, _same_object(*arrays))
+    joined, alike = _same_object(field)
     plain = dataclasses.replace(field.gaussians, sh=None)
 
     @functools.cache
