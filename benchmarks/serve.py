@@ -107,7 +107,7 @@ def load(port: int, clients: int, seconds: float) -> dict:
 def odd(port: int, count: int) -> dict:
     """Statuses of mutated requests and of what should be refused."""
     draw, statuses = random.Random(0), collections.Counter()
-    seeds = [b'{"text": "red mug", "by": "votes", "all": true}', b'{"at": ["#1", 30, 40], "threshold": 0.5}']
+    seeds = [b'{"text": "red mug", "by": "votes", "threshold": 0.4}', b'{"at": ["#1", 30, 40], "threshold": 0.5}']
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
     for _ in range(count):
         body = bytearray(draw.choice(seeds))
